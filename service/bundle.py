@@ -1,0 +1,168 @@
+"""Reading one bundle: every byte checked against the manifest before anything is parsed."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import os
+import re
+import stat
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import onnx
+from numpy.typing import NDArray
+from pydantic import ValidationError
+
+from geometry.mesh import MeshError, TriangleMesh
+from service.manifest import NAME_PATTERN, VERSION_PATTERN, FileEntry, Manifest
+
+MANIFEST = "manifest.json"
+MANIFEST_LIMIT = 4 * 2**20
+
+
+class BundleError(ValueError):
+    """A bundle that must not be served, with one line that says why."""
+
+
+@dataclass(frozen=True)
+class Bundle:
+    """A bundle whose files are what the manifest says, read into memory.
+
+    Attributes:
+        manifest: what it says about itself.
+        digest: SHA-256 of the manifest in hexadecimal. The manifest holds the digests of all files, so this
+            one identifies every byte of the bundle.
+        reference: the reference shape, normalised.
+        networks: bytes of each ONNX file by its name.
+    """
+
+    manifest: Manifest
+    digest: str
+    reference: TriangleMesh
+    networks: Mapping[str, bytes]
+
+
+def read_bundle(folder: Path) -> Bundle:
+    """Read and verify ``models/NAME/VERSION``.
+
+    Raises:
+        BundleError: anything that isn't exactly as the manifest and the contract say.
+    """
+    name, version = folder.parent.name, folder.name
+    if not re.fullmatch(NAME_PATTERN, name) or not re.fullmatch(VERSION_PATTERN, version):
+        raise BundleError("a bundle lies in NAME/VERSION: a name in small letters, a version that is a whole number")
+    present = _regular_files(folder)
+    if MANIFEST not in present:
+        raise BundleError(f"{MANIFEST} is missing")
+    text = _read(folder / MANIFEST, MANIFEST_LIMIT)
+    try:
+        manifest = Manifest.model_validate_json(text)
+    except ValidationError as error:
+        first = error.errors(include_url=False, include_input=False)[0]
+        place = ".".join(map(str, first["loc"]))
+        raise BundleError(f"{MANIFEST}: {place + ': ' if place else ''}{first['msg']}") from None
+    if (manifest.name, manifest.version) != (name, version):
+        raise BundleError(f"{MANIFEST} is of {manifest.name}/{manifest.version}, not of {name}/{version}")
+    for missing in sorted(manifest.files.keys() - present):
+        raise BundleError(f"{missing} is missing")
+    for extra in sorted(present - manifest.files.keys() - {MANIFEST}):
+        raise BundleError(f"{extra} is not in the manifest")
+    files = {file: _verified(folder / file, entry) for file, entry in manifest.files.items()}
+    reference = _reference(files.pop(manifest.geometry.file), manifest)
+    for file, content in files.items():
+        _check_network(file, content)
+    return Bundle(manifest, hashlib.sha256(text).hexdigest(), reference, files)
+
+
+def _regular_files(folder: Path) -> set[str]:
+    for path in (folder.parent, folder):
+        if path.is_symlink():
+            raise BundleError(f"{path.name} is a link; bundles must be real folders")
+    with os.scandir(folder) as entries:
+        found = list(entries)
+    for entry in sorted(found, key=lambda entry: entry.name):
+        if not entry.is_file(follow_symlinks=False):
+            raise BundleError(f"{entry.name} is a link or not a plain file")
+    return {entry.name for entry in found}
+
+
+def _read(path: Path, limit: int) -> bytes:
+    # O_NOFOLLOW closes the gap between looking at the folder and opening the file.
+    descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_NOFOLLOW", 0))
+    with os.fdopen(descriptor, "rb") as file:
+        status = os.fstat(descriptor)
+        if not stat.S_ISREG(status.st_mode) or status.st_size > limit:
+            raise BundleError(f"{path.name} is longer than {limit} bytes")
+        return file.read(limit + 1)
+
+
+def _verified(path: Path, entry: FileEntry) -> bytes:
+    content = _read(path, entry.bytes)
+    if len(content) != entry.bytes:
+        raise BundleError(f"{path.name} has {len(content)} bytes, not {entry.bytes} as the manifest says")
+    if hashlib.sha256(content).hexdigest() != entry.sha256:
+        raise BundleError(f"{path.name} does not have the digest that the manifest says")
+    return content
+
+
+def _reference(content: bytes, manifest: Manifest) -> TriangleMesh:
+    file = manifest.geometry.file
+    try:
+        with np.load(io.BytesIO(content), allow_pickle=False) as arrays:
+            geometry = dict(arrays)
+        reference = TriangleMesh.from_mapping(geometry)
+        edges = geometry["edges"]
+    except KeyError as error:
+        raise BundleError(f"{file} has no array {error}") from None
+    except MeshError as error:
+        raise BundleError(f"{file}: {error}") from None
+    except Exception as error:  # zip and array headers fail in many ways
+        raise BundleError(f"{file} is not a readable NPZ file: {error}") from None
+    for array_name, array in geometry.items():
+        if np.issubdtype(array.dtype, np.floating) and not np.isfinite(array).all():
+            raise BundleError(f"{file}: {array_name} has an entry that is not finite")
+    counts = (len(reference.vertices), len(reference.faces), len(reference.edges))
+    if counts != (manifest.vertices, manifest.faces, manifest.edges):
+        raise BundleError(
+            f"{file} has (V, F, E) = {counts}, the manifest says {(manifest.vertices, manifest.faces, manifest.edges)}"
+        )
+    if not np.array_equal(edges, reference.edges):
+        raise BundleError(f"{file}: edges are not those of the faces in lexicographic order")
+    return reference
+
+
+def _check_network(file: str, content: bytes) -> None:
+    try:
+        model = onnx.load_model_from_string(content)
+    except Exception as error:  # protobuf's errors have no common public class
+        raise BundleError(f"{file} is not a readable ONNX file: {error}") from None
+    functions = (node for function in model.functions for node in function.node)
+    for tensor in [*_tensors_of_graph(model.graph), *_tensors_of_nodes(functions)]:
+        if tensor.data_location == onnx.TensorProto.EXTERNAL or tensor.external_data:
+            raise BundleError(f"{file}: {tensor.name or 'a tensor'} keeps its data in another file")
+        if not _is_finite(onnx.numpy_helper.to_array(tensor)):
+            raise BundleError(f"{file}: {tensor.name or 'a tensor'} has a weight that is not finite")
+
+
+def _tensors_of_graph(graph: onnx.GraphProto) -> Iterator[onnx.TensorProto]:
+    yield from graph.initializer
+    for sparse in graph.sparse_initializer:
+        yield from (sparse.values, sparse.indices)
+    yield from _tensors_of_nodes(graph.node)
+
+
+def _tensors_of_nodes(nodes: Iterable[onnx.NodeProto]) -> Iterator[onnx.TensorProto]:
+    for node in nodes:
+        for attribute in node.attribute:
+            yield from (*([attribute.t] if attribute.HasField("t") else []), *attribute.tensors)
+            for sparse in [*([attribute.sparse_tensor] if attribute.HasField("sparse_tensor") else [])]:
+                yield from (sparse.values, sparse.indices)
+            for graph in (*([attribute.g] if attribute.HasField("g") else []), *attribute.graphs):
+                yield from _tensors_of_graph(graph)
+
+
+def _is_finite(array: NDArray) -> bool:
+    return array.dtype.kind not in "fc" or bool(np.isfinite(array).all())

@@ -1,0 +1,82 @@
+"""What routes share: the parts of the running service, and the parameters they have in common."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated
+
+from fastapi import Depends, Path, Query, Request
+
+from service.problems import ProblemError
+from service.repository import ModelRepository
+from service.settings import Settings
+from service.shape_model import ShapeModel
+from service.workers import Workers
+
+
+@dataclass(frozen=True)
+class Service:
+    """The parts of a running service."""
+
+    settings: Settings
+    repository: ModelRepository
+    workers: Workers
+
+
+def _service(request: Request) -> Service:
+    service: Service = request.app.state.service
+    return service
+
+
+ServiceDependency = Annotated[Service, Depends(_service)]
+
+Version = Annotated[str | None, Query(description="Version of the model; by default the newest.")]
+Format = Annotated[
+    str | None, Query(description="Format of the answer, which wins over `Accept`; 406 lists the choices.")
+]
+
+
+def _model(
+    service: ServiceDependency,
+    name: Annotated[str, Path(description="Name of a model.", examples=["freaky-torus"])],
+    version: Version = None,
+) -> ShapeModel:
+    return service.repository.get(name, version)
+
+
+Model = Annotated[ShapeModel, Depends(_model)]
+
+
+def require_json(request: Request) -> None:
+    """Refuse bodies that aren't declared as JSON; raises ProblemError, unsupported-media-type."""
+    declared = request.headers.get("content-type", "")
+    media_type = declared.split(";")[0].strip().lower()
+    if media_type != "application/json" and not (
+        media_type.startswith("application/") and media_type.endswith("+json")
+    ):
+        raise ProblemError(
+            "unsupported-media-type",
+            f"The body is {declared or 'of no declared type'}. Send JSON, and the header "
+            "Content-Type: application/json with it.",
+        )
+
+
+def limit_codes(service: Service, count: int) -> None:
+    """Refuse requests for no shape or too many; raises ProblemError, too-many-codes or invalid-request."""
+    if count > service.settings.max_codes:
+        raise ProblemError(
+            "too-many-codes",
+            f"latents has {count} codes; the limit is {service.settings.max_codes}. Send several requests.",
+        )
+    if count == 0:
+        raise ProblemError("invalid-request", "latents is empty. Send at least one code.")
+
+
+def limit_frames(service: Service, frames: int) -> None:
+    """Refuse too long animations; raises ProblemError, too-many-frames."""
+    if frames > service.settings.max_frames:
+        raise ProblemError(
+            "too-many-frames",
+            f"frames is {frames}; the limit is {service.settings.max_frames}. Ask for fewer, or for "
+            "parts of the path by start and stop.",
+        )

@@ -1,0 +1,117 @@
+"""The manifest of a bundle: ``models/NAME/VERSION/manifest.json``."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    NonNegativeFloat,
+    PositiveFloat,
+    PositiveInt,
+    model_validator,
+)
+
+NAME_PATTERN = r"^[a-z0-9][a-z0-9._-]{0,63}$"
+VERSION_PATTERN = r"^[1-9][0-9]{0,8}$"
+#: A plain file name: no folder, no way out of the bundle, nothing hidden.
+FileName = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]*(\.[A-Za-z0-9_-]+)*$", max_length=100)]
+
+
+class _Strict(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class Network(_Strict):
+    """An ONNX file with the names of its one input and its one output."""
+
+    file: FileName
+    input: str
+    output: str
+
+
+class Factor(Network):
+    """The network ψ_j of one factor, fed with latents ``start`` to ``stop``, the last one excluded."""
+
+    name: str
+    start: int = Field(ge=0)
+    stop: PositiveInt
+
+
+class Geometry(_Strict):
+    """The NPZ file with ``vertices``, ``faces`` and ``edges`` of the reference."""
+
+    file: FileName
+
+
+class Tolerance(_Strict):
+    """How far ONNX may be from PyTorch, and is, relative in the weighted norm."""
+
+    required: PositiveFloat
+    measured: NonNegativeFloat
+
+
+class Origin(_Strict):
+    """Where a bundle comes from."""
+
+    config: Any
+    data_digest: str
+    code_version: str
+
+
+class FileEntry(_Strict):
+    """What a file must be."""
+
+    sha256: str = Field(pattern=r"^[0-9a-f]{64}$")
+    bytes: int = Field(ge=0)
+
+
+class Manifest(_Strict):
+    """What a bundle says about itself. Lengths are normalised: one unit is ``scale`` units of the user."""
+
+    schema_version: Literal[1]
+    name: str = Field(pattern=NAME_PATTERN)
+    version: str = Field(pattern=VERSION_PATTERN)
+    licence: str
+    title: str
+    description: str
+    latent_dimension: PositiveInt
+    latent_names: list[str]
+    factors: list[Factor] = Field(min_length=1)
+    lower: list[float]
+    upper: list[float]
+    period: list[PositiveFloat | None]
+    edges: PositiveInt
+    vertices: PositiveInt
+    faces: PositiveInt
+    mu: PositiveFloat
+    lambda_: PositiveFloat = Field(alias="lambda")
+    eta: PositiveFloat
+    eta_reconstruction: PositiveFloat
+    scale: PositiveFloat
+    combiner: Network
+    start: Network | None
+    geometry: Geometry
+    onnx_tolerance: Tolerance
+    figures: dict[str, Any]
+    origin: Origin
+    files: dict[FileName, FileEntry]
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Manifest:
+        m = self.latent_dimension
+        for field in ("latent_names", "lower", "upper", "period"):
+            if len(getattr(self, field)) != m:
+                raise ValueError(f"{field} has {len(getattr(self, field))} entries, not one for each of {m} latents")
+        if any(low >= high for low, high in zip(self.lower, self.upper, strict=True)):
+            raise ValueError("lower must lie below upper in every coordinate")
+        stops = [0, *(factor.stop for factor in self.factors)]
+        if [factor.start for factor in self.factors] != stops[:-1] or stops[-1] != m or sorted(set(stops)) != stops:
+            raise ValueError(f"the factors must split the {m} latents into consecutive, non-empty ranges")
+        named = [network.file for network in (*self.factors, self.combiner)] + [self.geometry.file]
+        named += [self.start.file] if self.start else []
+        if sorted(named) != sorted(self.files):
+            raise ValueError("files must list exactly the networks and the geometry")
+        return self

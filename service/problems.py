@@ -1,0 +1,202 @@
+"""Errors as problem details (RFC 9457): a stable type, and a sentence that says what to do."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from http import HTTPStatus
+from typing import Any
+
+from fastapi import FastAPI, HTTPException, Request, Response
+from fastapi.exceptions import RequestValidationError
+from starlette.exceptions import HTTPException as StarletteHTTPException
+from starlette.routing import Match
+
+from service.animation import PathTooLongError, UnknownInterpolationError
+from service.encodings import dump_json
+from service.latent_space import NotFiniteError, OutOfBoundsError, WrongLengthError
+from service.repository import UnknownModelError, UnknownVersionError
+from service.workers import BusyError, DeadlineError
+
+MEDIA_TYPE = "application/problem+json"
+TYPE_PREFIX = "urn:shapespace:problem:"
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A kind of problem: its status, and a title that never changes."""
+
+    status: int
+    title: str
+
+
+#: Every kind by the name that ends its ``type``.
+KINDS = {
+    "malformed-request": Kind(400, "The request can't be read"),
+    "not-found": Kind(404, "Nothing is here"),
+    "unknown-model": Kind(404, "Unknown model"),
+    "unknown-version": Kind(404, "Unknown version of the model"),
+    "unknown-interpolation": Kind(404, "Unknown interpolation"),
+    "unknown-frame": Kind(404, "Unknown frame"),
+    "method-not-allowed": Kind(405, "Method not allowed"),
+    "not-acceptable": Kind(406, "No such format"),
+    "body-too-large": Kind(413, "Body too large"),
+    "unsupported-media-type": Kind(415, "Unsupported media type"),
+    "invalid-request": Kind(422, "Invalid request"),
+    "wrong-length": Kind(422, "Wrong number of latent coordinates"),
+    "not-finite": Kind(422, "Not a finite number"),
+    "out-of-bounds": Kind(422, "Code out of bounds"),
+    "too-many-codes": Kind(422, "Too many codes"),
+    "too-many-frames": Kind(422, "Too many frames"),
+    "path-too-long": Kind(422, "Too many keyframes"),
+    "internal-error": Kind(500, "Internal error"),
+    "busy": Kind(503, "Busy"),
+    "not-ready": Kind(503, "Not ready"),
+    "deadline-passed": Kind(504, "Deadline passed"),
+}
+
+#: What the domain raises, by kind; the message becomes the detail.
+_OF_EXCEPTION: dict[type[Exception], str] = {
+    UnknownModelError: "unknown-model",
+    UnknownVersionError: "unknown-version",
+    UnknownInterpolationError: "unknown-interpolation",
+    WrongLengthError: "wrong-length",
+    NotFiniteError: "not-finite",
+    OutOfBoundsError: "out-of-bounds",
+    PathTooLongError: "path-too-long",
+    BusyError: "busy",
+    DeadlineError: "deadline-passed",
+}
+_HEADERS = {"busy": {"Retry-After": "1"}, "not-ready": {"Retry-After": "1"}}
+
+
+class ProblemError(HTTPException):
+    """A problem that a route or a middleware finds itself.
+
+    Args:
+        kind: one of KINDS.
+        detail: a sentence that says what to do.
+        extensions: further members of the answer.
+    """
+
+    def __init__(self, kind: str, detail: str, **extensions: Any) -> None:
+        super().__init__(KINDS[kind].status, detail)
+        self.kind, self.extensions = kind, extensions
+
+
+def problem(kind: str, detail: str, headers: Mapping[str, str] | None = None, **extensions: Any) -> Response:
+    """A problem as an answer."""
+    content = {
+        "type": TYPE_PREFIX + kind,
+        "title": KINDS[kind].title,
+        "status": KINDS[kind].status,
+        "detail": detail,
+    }
+    return Response(
+        dump_json(content | extensions),
+        KINDS[kind].status,
+        {**_HEADERS.get(kind, {}), **(headers or {})},
+        MEDIA_TYPE,
+    )
+
+
+def install(app: FastAPI) -> None:
+    """Make every error of an application a problem."""
+    for exception in _OF_EXCEPTION:
+        app.add_exception_handler(exception, _domain)
+    app.add_exception_handler(StarletteHTTPException, _http)
+    app.add_exception_handler(RequestValidationError, _validation)
+    app.add_exception_handler(Exception, _internal)
+
+
+async def _domain(_: Request, error: Exception) -> Response:
+    return problem(_OF_EXCEPTION[type(error)], str(error))
+
+
+async def _http(request: Request, error: Exception) -> Response:
+    assert isinstance(error, StarletteHTTPException)  # noqa: S101 - narrows the type that the handler is registered for
+    if isinstance(error, ProblemError):
+        return problem(error.kind, error.detail, error.headers, **error.extensions)
+    path, method = request.url.path, request.method
+    if error.status_code == HTTPStatus.NOT_FOUND:
+        return problem("not-found", f"Nothing answers at {path}. /openapi.json lists every call.")
+    if error.status_code == HTTPStatus.METHOD_NOT_ALLOWED:
+        allowed = ", ".join(_allowed(request)) or (error.headers or {}).get("Allow", "")
+        return problem("method-not-allowed", f"{path} does not take {method}. Use {allowed}.", {"Allow": allowed})
+    return problem(
+        "malformed-request",
+        "The body can't be read. Send one JSON object in UTF-8, as /openapi.json describes it.",
+    )
+
+
+def _allowed(request: Request) -> list[str]:
+    # The router names the methods of the first route only; a path may have several.
+    routes = request.app.router.routes
+    scopes = {
+        method: {**request.scope, "method": method} for method in ("GET", "HEAD", "POST", "PUT", "PATCH", "DELETE")
+    }
+    return [m for m, scope in scopes.items() if any(route.matches(scope)[0] is Match.FULL for route in routes)]
+
+
+async def _internal(_: Request, __: Exception) -> Response:
+    # The traceback goes to the log only, by way of the server.
+    return problem(
+        "internal-error",
+        "The server made a mistake, which its log describes. Try again, and report it if it happens again.",
+    )
+
+
+async def _validation(_: Request, error: Exception) -> Response:
+    assert isinstance(error, RequestValidationError)  # noqa: S101 - as above
+    faults = error.errors()
+    if any(fault["type"] == "json_invalid" for fault in faults):
+        where = faults[0]["loc"][-1]
+        reason = faults[0].get("ctx", {}).get("error", "")
+        return problem(
+            "malformed-request",
+            f"The body is not JSON (character {where}: {reason}). Send one valid JSON object.",
+        )
+    kind = "not-finite" if all(fault["type"] == "finite_number" for fault in faults) else "invalid-request"
+    errors = [{"pointer": _pointer(fault["loc"]), "detail": _advice(fault)} for fault in faults[:10]]
+    more = f" ({len(faults) - 1} more under errors.)" if len(faults) > 1 else ""
+    return problem(kind, errors[0]["detail"] + more, errors=errors)
+
+
+def _pointer(loc: tuple[Any, ...]) -> str:
+    place = loc[1:] if loc and loc[0] == "body" else loc
+    return "#/" + "/".join(map(str, place))
+
+
+def _advice(fault: Mapping[str, Any]) -> str:
+    """One sentence on one fault that pydantic found, saying what to do."""
+    where, *place = fault["loc"]
+    name = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in place).lstrip(".")
+    name = name or f"the {where}"
+    limits = fault.get("ctx", {})
+    match fault["type"]:
+        case "missing":
+            return f"Add {name!r}: it is required." if place else "Send a JSON object as the body."
+        case "extra_forbidden":
+            return f"Remove {name!r}: there is no such field. /openapi.json lists those there are."
+        case "finite_number":
+            return f"Send finite numbers only: {name} is NaN or infinite."
+        case "float_type" | "float_parsing":
+            return f"Send a number for {name}."
+        case "int_type" | "int_from_float" | "int_parsing":
+            return f"Send a whole number for {name}."
+        case "bool_type" | "bool_parsing":
+            return f"Send true or false for {name}."
+        case "list_type":
+            return f"Send a list for {name}."
+        case "model_attributes_type" | "model_type" | "dict_type":
+            return f"Send a JSON object for {name}."
+        case "enum" | "literal_error":
+            return f"Send {limits['expected']} for {name}."
+        case "too_short":
+            return f"Send at least {limits['min_length']} entries for {name}, not {limits['actual_length']}."
+        case "greater_than_equal":
+            return f"Send a number of at least {limits['ge']} for {name}."
+        case "value_error":
+            return f"Correct {name}: {limits['error']}."
+        case _:
+            return f"Correct {name}: {fault['msg']}."

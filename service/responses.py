@@ -1,0 +1,141 @@
+"""Shapes as HTTP answers: entity tags, diagnostics and timings in headers, problems in the description."""
+
+from __future__ import annotations
+
+import hashlib
+import time
+from collections.abc import Mapping
+from dataclasses import asdict
+from functools import partial
+from typing import Any
+
+from fastapi import Request, Response
+
+from geometry.reconstruction import Status
+from service import __version__
+from service.dependencies import Service
+from service.encodings import SHAPE_FORMATS, dump_json
+from service.latent_space import Codes
+from service.problems import KINDS, MEDIA_TYPE
+from service.shape_model import MeshChoice, Shape, ShapeModel
+from service.workers import Workers
+
+Timings = dict[str, float]
+_HEADERS = {
+    name: {"description": description, "schema": {"type": "string"}}
+    for name, description in {
+        "ETag": "Strong; the same from every replica. Sent back as `If-None-Match` it saves the work.",
+        "Shape-Diagnostics": "JSON: `status`, `iterations`, `residual`, `flipped_faces`, `inside_bounds`, `model`.",
+        "Server-Timing": "Milliseconds by stage: `network`, `reconstruct`, `encode`.",
+    }.items()
+}
+
+
+def entity_tag(*parts: str | bytes) -> str:
+    """A strong entity tag of all that the bytes of an answer depend on; the product's version is added."""
+    digest = hashlib.sha256()
+    for part in (__version__, *parts):
+        data = part.encode() if isinstance(part, str) else part
+        digest.update(len(data).to_bytes(8, "big") + data)
+    return f'"{digest.hexdigest()[:32]}"'
+
+
+def cache_headers(tag: str) -> dict[str, str]:
+    """Headers that let a client keep an answer and ask whether it still holds."""
+    return {"ETag": tag, "Vary": "Accept", "Cache-Control": "no-cache"}
+
+
+def not_modified(request: Request, tag: str) -> Response | None:
+    """304 where the client has the answer already."""
+    known = {part.strip().removeprefix("W/") for part in request.headers.get("if-none-match", "").split(",")}
+    return Response(status_code=304, headers=cache_headers(tag)) if tag in known or "*" in known else None
+
+
+def server_timing(seconds: Timings) -> str:
+    """The ``Server-Timing`` header, in milliseconds."""
+    return ", ".join(f"{stage};dur={1e3 * duration:.3f}" for stage, duration in seconds.items())
+
+
+def file_headers(diagnostics: Mapping[str, Any], seconds: Timings, filename: str) -> dict[str, str]:
+    """Headers of an answer that is a file."""
+    return {
+        "Shape-Diagnostics": dump_json(diagnostics).decode(),
+        "Server-Timing": server_timing(seconds),
+        "Content-Disposition": f'inline; filename="{filename}"',
+    }
+
+
+def solve(workers: Workers, model: ShapeModel, mesh: MeshChoice, code: tuple[Codes, bool], deadline: float) -> Shape:
+    """A code (m,) and whether it is inside the bounds to its shape; raises DeadlineError."""
+    shape = model.shape(*code, mesh, deadline)
+    if shape.diagnostics.status is Status.DEADLINE:
+        raise workers.late()
+    return shape
+
+
+async def shape_response(
+    service: Service,
+    request: Request,
+    model: ShapeModel,
+    code: tuple[Codes, bool] | None,
+    mesh: MeshChoice,
+    format: str,
+) -> Response:
+    """One shape as a file; without a code the reference."""
+    tag = entity_tag("shape", model.digest, b"" if code is None else code[0].tobytes(), mesh, format)
+    if answer := not_modified(request, tag):
+        return answer
+
+    def make(deadline: float) -> tuple[bytes, Shape, float]:
+        shape = model.reference_shape() if code is None else solve(service.workers, model, mesh, code, deadline)
+        began = time.perf_counter()
+        content = SHAPE_FORMATS[format].encode(shape.vertices, model.faces)
+        return content, shape, time.perf_counter() - began
+
+    with service.workers.admit() as deadline:
+        content, shape, encoding = await service.workers.run(make, deadline)
+    headers = file_headers(
+        asdict(shape.diagnostics), {**shape.seconds, "encode": encoding}, f"{model.manifest.name}.{format}"
+    )
+    return Response(content, headers=cache_headers(tag) | headers, media_type=SHAPE_FORMATS[format].media_type)
+
+
+async def shapes(
+    service: Service, model: ShapeModel, codes: Codes, inside: Any, mesh: MeshChoice, deadline: float
+) -> list[Shape]:
+    """Shapes of codes (n, m), side by side."""
+    work = partial(solve, service.workers, model, mesh)
+    items = zip(codes, map(bool, inside), strict=True)
+    return [shape async for shape in service.workers.map(work, items, deadline)]
+
+
+def total_seconds(shapes: list[Shape]) -> Timings:
+    """Time of several shapes by stage."""
+    return {stage: sum(shape.seconds[stage] for shape in shapes) for stage in ("network", "reconstruct")}
+
+
+def binary(media_types: Mapping[str, str], description: str, *, cached: bool = True) -> dict[int | str, dict[str, Any]]:
+    """OpenAPI's description of an answer in one of several binary formats, with an entity tag where ``cached``."""
+    schema = {"schema": {"type": "string", "format": "binary"}}
+    others = {media_type: schema for media_type in media_types.values() if media_type != "application/json"}
+    headers = {name: header for name, header in _HEADERS.items() if cached or name != "ETag"}
+    answers: dict[int | str, dict[str, Any]] = {
+        200: {"description": description, "content": others, "headers": headers}
+    }
+    if cached:
+        answers[304] = {"description": "The client has this answer already, by `If-None-Match`."}
+    return answers
+
+
+def problems(*statuses: int) -> dict[int | str, dict[str, Any]]:
+    """OpenAPI's description of the problems that a call may answer."""
+    reference = {MEDIA_TYPE: {"schema": {"$ref": "#/components/schemas/Problem"}}}
+    return {
+        status: {
+            "description": "; ".join(
+                f"{kind.title} (`{name}`)" for name, kind in KINDS.items() if kind.status == status
+            ),
+            "content": reference,
+        }
+        for status in statuses
+    }

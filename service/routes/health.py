@@ -1,0 +1,26 @@
+"""Whether the server lives and can answer, by the Open Inference Protocol's paths."""
+
+from __future__ import annotations
+
+from fastapi import APIRouter
+
+from service.dependencies import ServiceDependency
+from service.problems import ProblemError
+from service.responses import problems
+from service.schemas import Health, Readiness
+
+router = APIRouter(prefix="/v2/health", tags=["health"])
+
+
+@router.get("/live")
+async def live() -> Health:
+    """Whether the process answers at all."""
+    return Health(live=True)
+
+
+@router.get("/ready", responses=problems(503))
+async def ready(service: ServiceDependency) -> Readiness:
+    """Whether there is a model to serve."""
+    if len(service.repository) == 0:
+        raise ProblemError("not-ready", "No model is served. Put a bundle into the models folder; the log says more.")
+    return Readiness(ready=True)

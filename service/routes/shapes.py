@@ -1,0 +1,143 @@
+"""Latent codes to meshes, positions, lengths and angles."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import asdict
+from typing import Annotated
+
+import numpy as np
+from fastapi import APIRouter, Depends, Query, Request, Response
+
+from geometry.formats import npz
+from service.dependencies import Format, Model, ServiceDependency, limit_codes, require_json
+from service.encodings import OCTET_STREAM, SHAPE_FORMATS, diagnostics_arrays, dump_json, float32, worst
+from service.latent_space import Bounds
+from service.negotiation import choose
+from service.problems import ProblemError
+from service.responses import (
+    binary,
+    file_headers,
+    problems,
+    server_timing,
+    shape_response,
+    shapes,
+    total_seconds,
+)
+from service.schemas import MeshAnswer, MeshRequest, NRICAnswer, NRICRequest, VerticesAnswer, VerticesRequest
+from service.shape_model import MeshChoice
+
+router = APIRouter(prefix="/v1/models/{name}", tags=["shapes"])
+
+_MESH_TYPES = {name: format.media_type for name, format in SHAPE_FORMATS.items()}
+_VERTICES_TYPES = {"json": "application/json", "npz": OCTET_STREAM}
+_MESH_RESPONSES = binary(_MESH_TYPES, "The mesh. `Shape-Diagnostics` says how well it was found.")
+_MESH_RESPONSES[200]["model"] = MeshAnswer
+
+
+@router.get("/mesh", responses=_MESH_RESPONSES | problems(404, 406, 422, 503, 504), response_class=Response)
+async def get_mesh(
+    service: ServiceDependency,
+    request: Request,
+    model: Model,
+    latent: Annotated[
+        str | None,
+        Query(
+            description="Coordinates separated by commas; without them the reference shape.",
+            openapi_examples={"a code": {"value": "1,2,3,4"}},
+        ),
+    ] = None,
+    mesh: Annotated[MeshChoice, Query(description="Which mesh, where the model has a finer one.")] = MeshChoice.FINE,
+    bounds: Annotated[Bounds, Query(description="What to do with a code outside the bounds.")] = Bounds.ALLOW,
+    format: Format = None,
+) -> Response:
+    """The shape of a code as a mesh file, for a link or a browser."""
+    chosen = choose(_MESH_TYPES, format, request.headers.get("accept"))
+    code = None
+    if latent is not None:
+        codes, inside = model.latents.codes([_numbers(latent)], bounds)
+        code = codes[0], bool(inside[0])
+    return await shape_response(service, request, model, code, mesh, chosen)
+
+
+@router.post(
+    "/mesh",
+    responses=_MESH_RESPONSES | problems(400, 404, 406, 413, 415, 422, 503, 504),
+    response_class=Response,
+    dependencies=[Depends(require_json)],
+)
+async def post_mesh(
+    service: ServiceDependency, request: Request, model: Model, body: MeshRequest, format: Format = None
+) -> Response:
+    """The shape of a code as a mesh file."""
+    chosen = choose(_MESH_TYPES, format, request.headers.get("accept"))
+    codes, inside = model.latents.codes([body.latent], body.bounds)
+    return await shape_response(service, request, model, (codes[0], bool(inside[0])), body.mesh, chosen)
+
+
+@router.post(
+    "/vertices",
+    responses=binary(_VERTICES_TYPES, "Positions and diagnostics of every shape.", cached=False)
+    | problems(400, 404, 406, 413, 415, 422, 503, 504),
+    response_model=VerticesAnswer,
+    dependencies=[Depends(require_json)],
+)
+async def post_vertices(
+    service: ServiceDependency, request: Request, model: Model, body: VerticesRequest, format: Format = None
+) -> Response:
+    """The positions of many shapes at once."""
+    chosen = choose(_VERTICES_TYPES, format, request.headers.get("accept"))
+    limit_codes(service, len(body.latents))
+    codes, inside = model.latents.codes(body.latents, body.bounds)
+    with service.workers.admit() as deadline:
+        found = await shapes(service, model, codes, inside, body.mesh, deadline)
+        diagnostics = [shape.diagnostics for shape in found]
+        began = time.perf_counter()
+
+        def encode(_: float) -> bytes:
+            vertices = float32(np.stack([shape.vertices for shape in found]))
+            if chosen == "json":
+                return dump_json({"vertices": vertices, "diagnostics": list(map(asdict, diagnostics))})
+            return npz(vertices=vertices, faces=model.faces, latents=codes, **diagnostics_arrays(diagnostics))
+
+        content = await service.workers.run(encode, deadline)
+    seconds = {**total_seconds(found), "encode": time.perf_counter() - began}
+    headers = file_headers(worst(diagnostics), seconds, f"{model.manifest.name}.{chosen}")
+    return Response(content, headers={"Vary": "Accept", **headers}, media_type=_VERTICES_TYPES[chosen])
+
+
+@router.post(
+    "/nric",
+    responses=problems(400, 404, 413, 415, 422, 503, 504),
+    response_model=NRICAnswer,
+    response_model_exclude_none=True,
+    dependencies=[Depends(require_json)],
+)
+async def post_nric(service: ServiceDependency, model: Model, body: NRICRequest) -> Response:
+    """Lengths and angles as the networks predict them, before any reconstruction."""
+    limit_codes(service, len(body.latents))
+    codes, _ = model.latents.codes(body.latents, body.bounds)
+
+    def make(_: float) -> tuple[bytes, dict[str, float]]:
+        began = time.perf_counter()
+        z = model.lengths_and_angles(codes)
+        predicted = time.perf_counter()
+        answer = {"lengths": float32(z.lengths), "angles": float32(z.angles)}
+        if body.factors:
+            answer["factors"] = float32(z.factors)
+        content = dump_json(answer)
+        return content, {"network": predicted - began, "encode": time.perf_counter() - predicted}
+
+    with service.workers.admit() as deadline:
+        content, seconds = await service.workers.run(make, deadline)
+    return Response(content, headers={"Server-Timing": server_timing(seconds)}, media_type="application/json")
+
+
+def _numbers(text: str) -> list[float]:
+    try:
+        return [float(part) for part in text.split(",")] if text else []
+    except ValueError:
+        raise ProblemError(
+            "invalid-request",
+            "latent is not a list of numbers. Send them separated by commas: ?latent=0.1,0.2",
+        ) from None

@@ -1,0 +1,175 @@
+"""Bodies of requests and answers, as OpenAPI describes them."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from service.animation import Number
+from service.latent_space import Bounds
+from service.shape_model import MeshChoice
+
+Latent = Annotated[
+    list[Number],
+    Field(
+        description="One latent code: as many numbers as the card's `latent_dimension`.",
+        examples=[[1, 2, 3, 4]],
+    ),
+]
+Latents = Annotated[
+    list[Latent], Field(description="Latent codes, one shape each.", examples=[[[1, 2, 3, 4], [0, 0, 0, 0]]])
+]
+
+
+class _Request(BaseModel):
+    model_config = ConfigDict(extra="forbid")
+
+
+class MeshRequest(_Request):
+    """One code, and how to shape it."""
+
+    latent: Latent
+    mesh: MeshChoice = Field(MeshChoice.FINE, description="Which mesh to answer, where the model has a finer one.")
+    bounds: Bounds = Field(
+        Bounds.ALLOW, description="Outside the bounds: extrapolate, clamp to the nearest bound, or reject."
+    )
+
+
+class VerticesRequest(_Request):
+    """Several codes, and how to shape them."""
+
+    latents: Latents
+    mesh: MeshChoice = Field(MeshChoice.FINE, description="Which mesh to answer, where the model has a finer one.")
+    bounds: Bounds = Field(
+        Bounds.ALLOW, description="Outside the bounds: extrapolate, clamp to the nearest bound, or reject."
+    )
+
+
+class NRICRequest(_Request):
+    """Several codes, and whether to answer each factor's own lengths and angles too."""
+
+    latents: Latents
+    factors: bool = Field(False, strict=True, description="Also answer ψ_j of each factor j.")
+    bounds: Bounds = Field(
+        Bounds.ALLOW, description="Outside the bounds: extrapolate, clamp to the nearest bound, or reject."
+    )
+
+
+class MeshAnswer(BaseModel):
+    """A mesh as JSON, in the units of the training meshes."""
+
+    vertices: list[list[float]] = Field(description="V positions.")
+    faces: list[list[int]] = Field(description="F triples of vertex indices, from 0.")
+
+
+class DiagnosticsAnswer(BaseModel):
+    """How well a shape was found."""
+
+    status: str = Field(description="How Gauss–Newton ended: converged, stalled, iteration_limit.")
+    iterations: int = Field(description="Its iterations.")
+    residual: float = Field(description="Relative misfit of lengths and angles in the weighted norm.")
+    flipped_faces: int = Field(description="Faces folded more than π/2 away from what the networks ask for.")
+    inside_bounds: bool = Field(description="Whether the code lies inside the model's bounds.")
+    model: str = Field(description="SHA-256 of the model's manifest.")
+
+
+class VerticesAnswer(BaseModel):
+    """Positions of n shapes."""
+
+    vertices: list[list[list[float]]] = Field(description="n × V × 3 positions, in the units of the training meshes.")
+    diagnostics: list[DiagnosticsAnswer] = Field(description="One for each shape.")
+
+
+class NRICAnswer(BaseModel):
+    """Lengths and angles as the networks predict them, edges in lexicographic order."""
+
+    lengths: list[list[float]] = Field(description="n × E edge lengths, in the units of the training meshes.")
+    angles: list[list[float]] = Field(description="n × E signed dihedral angles in radians, positive where convex.")
+    factors: list[list[list[float]]] | None = Field(
+        None, description="n × J × 2E: lengths, then angles, of each factor on its own."
+    )
+
+
+class FactorSummary(BaseModel):
+    """A factor and its range of latent coordinates, the last excluded."""
+
+    name: str
+    start: int
+    stop: int
+
+
+class ModelSummary(BaseModel):
+    """A model in the list."""
+
+    name: str
+    version: str
+    title: str
+    description: str
+    licence: str
+    latent_dimension: int
+    latent_names: list[str]
+    factors: list[FactorSummary]
+    lower: list[float] = Field(description="Lower bound of each coordinate.")
+    upper: list[float] = Field(description="Upper bound of each coordinate.")
+    period: list[float | None] = Field(description="Period of each coordinate that is an angle, else null.")
+    vertices: int
+    edges: int
+    faces: int
+    links: dict[str, str] = Field(description="Addresses of the model's calls.")
+
+
+class ModelList(BaseModel):
+    """The newest version of every model."""
+
+    models: list[ModelSummary]
+
+
+class ModelCard(ModelSummary):
+    """What a model is, how good it is, and where it comes from."""
+
+    model_config = ConfigDict(populate_by_name=True)
+
+    versions: list[str] = Field(description="Versions that are served, oldest first.")
+    digest: str = Field(description="SHA-256 of the manifest, which holds the digests of all its files.")
+    scale: float = Field(description="Length of one normalised unit in the units of the training meshes.")
+    mu: float
+    lambda_: float = Field(alias="lambda")
+    eta: float = Field(description="Weight of bending in the metric.")
+    eta_reconstruction: float = Field(description="Weight of the angles in Gauss–Newton.")
+    onnx_tolerance: dict[str, float]
+    figures: dict[str, Any] = Field(description="Evaluation figures on the test split.")
+    origin: dict[str, Any]
+
+
+class InterpolationAnswer(BaseModel):
+    """A new interpolation; its id holds all of it and stays valid as long as the model is served."""
+
+    id: str
+    frames: int = Field(description="Number of frames, from 0.")
+    links: dict[str, str]
+
+
+class Health(BaseModel):
+    """Open Inference Protocol: server live."""
+
+    live: bool
+
+
+class Readiness(BaseModel):
+    """Open Inference Protocol: server ready."""
+
+    ready: bool
+
+
+class Problem(BaseModel):
+    """Problem details, RFC 9457."""
+
+    model_config = ConfigDict(extra="allow")
+
+    type: str = Field(
+        description="Stable name of the kind of problem.", examples=["urn:shapespace:problem:wrong-length"]
+    )
+    title: str
+    status: int
+    detail: str = Field(description="A sentence that says what to do.")

@@ -1,0 +1,250 @@
+"""One bundle at work: latent codes to lengths and angles, and those to vertices."""
+
+from __future__ import annotations
+
+import queue
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from enum import StrEnum
+from typing import Any
+
+import numpy as np
+import onnxruntime
+from numpy.typing import NDArray
+
+from geometry.mesh import FloatArray, align
+from geometry.reconstruction import Reconstruction, Reconstructor, Status
+from service.bundle import Bundle, BundleError
+from service.latent_space import Codes, LatentSpace, NotFiniteError
+from service.manifest import Network
+
+#: Gauss–Newton stops once no vertex moves further than this fraction of the diagonal: below float32's
+#: resolution.
+TOLERANCE = 1e-7
+
+
+class MeshChoice(StrEnum):
+    """Which mesh to answer; a model without a finer one answers both with the one it has."""
+
+    FINE = "fine"
+    COARSE = "coarse"
+
+
+@dataclass(frozen=True)
+class Diagnostics:
+    """How well a shape was found.
+
+    Attributes:
+        status: how Gauss–Newton ended, see geometry.reconstruction.Status.
+        iterations: its factorisations.
+        residual: distance between the lengths and angles asked for and those of the shape, relative,
+            weighted norm.
+        flipped_faces: faces at an edge that is folded more than π/2 away from what was asked for.
+        inside_bounds: whether the code lies inside the model's bounds.
+        model: digest of the model.
+    """
+
+    status: Status
+    iterations: int
+    residual: float
+    flipped_faces: int
+    inside_bounds: bool
+    model: str
+
+
+@dataclass(frozen=True)
+class Shape:
+    """A shape as it leaves: aligned to the reference, in the units of the training meshes.
+
+    Attributes:
+        vertices: (V, 3).
+        diagnostics: how well it was found.
+        seconds: time spent by stage, ``network`` and ``reconstruct``.
+    """
+
+    vertices: FloatArray
+    diagnostics: Diagnostics
+    seconds: dict[str, float] = field(compare=False)
+
+
+@dataclass(frozen=True)
+class LengthsAndAngles:
+    """NRIC in the units of the training meshes.
+
+    Attributes:
+        lengths, angles: (n, E) each, angles in radians.
+        factors: (n, J, 2E), the factors' own lengths and angles.
+    """
+
+    lengths: FloatArray
+    angles: FloatArray
+    factors: FloatArray
+
+
+class ShapeModel:
+    """The networks and the Gauss–Newton solver of a bundle, ready for any number of threads.
+
+    Every code goes through the networks on its own and starts from the same place, so that a shape doesn't
+    depend on what it was asked for together with.
+
+    Args:
+        bundle: verified.
+        threads: shapes that may be reconstructed at once; each gets a solver, analysed here and not in a
+            request.
+
+    Raises:
+        BundleError: a network that doesn't load, or has other inputs or outputs than the manifest says.
+    """
+
+    def __init__(self, bundle: Bundle, threads: int = 1) -> None:
+        manifest = bundle.manifest
+        self.manifest, self.digest = manifest, bundle.digest
+        self.latents = LatentSpace(manifest)
+        self.reference = bundle.reference
+        n_nric = 2 * manifest.edges
+        self._factors = [
+            _Session(bundle, factor, [factor.stop - factor.start], [n_nric]) for factor in manifest.factors
+        ]
+        self._combiner = _Session(bundle, manifest.combiner, [len(manifest.factors), n_nric], [n_nric])
+        self._start = None
+        if manifest.start:
+            self._start = _Session(bundle, manifest.start, [manifest.latent_dimension], [manifest.vertices, 3])
+        self._solvers: queue.SimpleQueue[Reconstructor] = queue.SimpleQueue()
+        for _ in range(threads):
+            self._solvers.put(Reconstructor(self.reference, manifest.eta_reconstruction))
+
+    @property
+    def faces(self) -> NDArray[np.int64]:
+        """(F, 3)."""
+        return self.reference.faces
+
+    def reference_shape(self) -> Shape:
+        """The reference itself: the answer where there is no code."""
+        diagnostics = Diagnostics(Status.CONVERGED, 0, 0.0, 0, True, self.digest)
+        vertices = self.manifest.scale * self.reference.vertices
+        return Shape(vertices, diagnostics, {"network": 0.0, "reconstruct": 0.0})
+
+    def shape(
+        self,
+        code: Codes,
+        inside_bounds: bool = True,
+        mesh: MeshChoice = MeshChoice.FINE,
+        deadline: float | None = None,
+    ) -> Shape:
+        """The shape of one code (m,), whatever Gauss–Newton's status.
+
+        Args:
+            code: checked by ``latents.codes``.
+            inside_bounds: goes into the diagnostics.
+            mesh: fine or coarse.
+            deadline: time.monotonic() after which Gauss–Newton gives up with Status.DEADLINE.
+
+        Raises:
+            NotFiniteError: the code is so far out that the numbers overflow.
+        """
+        began = time.perf_counter()
+        _, target = self._networks(code[None])
+        start = self._start(code[None])[0] if self._start else None
+        if start is not None and not np.isfinite(start).all():
+            start = None
+        predicted = time.perf_counter()
+        with self._solver() as reconstruct:
+            found: Reconstruction = reconstruct(target[0], start, tolerance=TOLERANCE, deadline=deadline)
+        vertices = self.manifest.scale * align(found.vertices, self.reference.vertices)
+        with np.errstate(over="ignore"):
+            if found.status is Status.NOT_FINITE or not np.isfinite(vertices.astype(np.float32)).all():
+                raise NotFiniteError(self._overflow)
+        diagnostics = Diagnostics(
+            found.status, found.iterations, found.residual, found.flipped_faces, inside_bounds, self.digest
+        )
+        seconds = {"network": predicted - began, "reconstruct": time.perf_counter() - predicted}
+        return Shape(vertices, diagnostics, seconds)
+
+    def lengths_and_angles(self, codes: Codes) -> LengthsAndAngles:
+        """What the networks say to codes (n, m), before any reconstruction; raises NotFiniteError."""
+        pairs = [self._networks(code[None]) for code in codes]
+        factors, z = (np.concatenate(arrays) for arrays in zip(*pairs, strict=True))
+        half = self.manifest.edges
+        for array in (factors, z):
+            array[..., :half] *= self.manifest.scale
+            with np.errstate(over="ignore"):
+                if not np.isfinite(array.astype(np.float32)).all():
+                    raise NotFiniteError(self._overflow)
+        return LengthsAndAngles(z[:, :half], z[:, half:], factors)
+
+    def _networks(self, codes: Codes) -> tuple[FloatArray, FloatArray]:
+        """Factors (n, J, 2E) and combined NRIC (n, 2E), normalised."""
+        parts = [
+            session(codes[:, factor.start : factor.stop])
+            for session, factor in zip(self._factors, self.manifest.factors, strict=True)
+        ]
+        factors = np.stack(parts, axis=1)
+        return factors.astype(np.float64), self._combiner(factors).astype(np.float64)
+
+    @contextmanager
+    def _solver(self) -> Iterator[Reconstructor]:
+        solver = self._solvers.get()
+        try:
+            yield solver
+        finally:
+            self._solvers.put(solver)
+
+    @property
+    def _overflow(self) -> str:
+        return (
+            "The code lies so far outside the bounds that the model's numbers overflow. Choose one "
+            f'nearer to the bounds, which the card of {self.manifest.name} lists, or send "bounds": "clamp".'
+        )
+
+
+class _Session:
+    """One ONNX network, checked once against what the manifest says of it.
+
+    Args:
+        bundle: holds its bytes.
+        network: names of file, input and output.
+        inputs, outputs: expected shape of one row.
+    """
+
+    def __init__(self, bundle: Bundle, network: Network, inputs: list[int], outputs: list[int]) -> None:
+        options = onnxruntime.SessionOptions()
+        # The workers run side by side, a network inside one of them: a second layer of threads would only
+        # get in the way. The arena keeps the memory of the largest run for ever.
+        options.intra_op_num_threads = options.inter_op_num_threads = 1
+        options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+        options.enable_cpu_mem_arena = False
+        options.log_severity_level = 3
+        try:
+            self._session = onnxruntime.InferenceSession(
+                bundle.networks[network.file], options, providers=["CPUExecutionProvider"]
+            )
+        except Exception as error:  # ONNX Runtime's exceptions have no common public class
+            raise BundleError(f"{network.file} does not load: {str(error).splitlines()[0]}") from None
+        for role, nodes, name, row in (
+            ("input", self._session.get_inputs(), network.input, inputs),
+            ("output", self._session.get_outputs(), network.output, outputs),
+        ):
+            if [node.name for node in nodes] != [name] or not _fits(nodes[0], row):
+                have = ", ".join(f"{node.name} {node.type} {node.shape}" for node in nodes)
+                raise BundleError(f"{network.file} must have one {role}, {name} float32 [n, {row}], but has {have}")
+        self._input, self._output, self._shape = network.input, network.output, tuple(outputs)
+        result = self(np.zeros((2, *inputs), np.float32))
+        if result.shape != (2, *outputs) or not np.isfinite(result).all():
+            raise BundleError(f"{network.file} does not give finite [n, {outputs}] for zeros")
+
+    def __call__(self, rows: NDArray[np.float32]) -> NDArray[np.float32]:
+        result: Any = self._session.run([self._output], {self._input: rows})[0]
+        return result
+
+
+def _fits(node: Any, row: list[int]) -> bool:
+    """Whether a value is float32 with a free first dimension, and the known others as wanted."""
+    shape = node.shape
+    return (
+        node.type == "tensor(float)"
+        and len(shape) == 1 + len(row)
+        and not isinstance(shape[0], int)
+        and all(size == want or not isinstance(size, int) for size, want in zip(shape[1:], row, strict=True))
+    )

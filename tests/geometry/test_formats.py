@@ -1,0 +1,139 @@
+"""Mesh files: written by us and read by others, written by others and read by us."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from geometry.animated_gltf import DENSE_FRAMES, animated_glb
+from geometry.formats import MESH_FORMATS, read_mesh
+from geometry.gltf import vertex_normals
+from geometry.mesh import MeshError, TriangleMesh
+from training import freaky_torus
+
+CUBE = np.array([[x, y, z] for x in (0.0, 1.0) for y in (0.0, 1.0) for z in (0.0, 1.0)])
+SIDES = np.array([[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]])
+
+
+def cube() -> TriangleMesh:
+    faces = np.concatenate([SIDES[:, [0, 1, 2]], SIDES[:, [0, 2, 3]]])
+    return TriangleMesh.from_arrays(CUBE, faces)
+
+
+def loaded(data: bytes, format: str) -> trimesh.Trimesh:
+    import io
+
+    mesh = trimesh.load_mesh(io.BytesIO(data), file_type=format, process=False, maintain_order=True)
+    assert isinstance(mesh, trimesh.Trimesh)
+    return mesh
+
+
+@pytest.mark.parametrize("format", sorted(MESH_FORMATS.keys() - {"npz", "stl"}))
+@pytest.mark.parametrize("size", [1e-4, 1.0, 2e5])
+def test_others_read_what_we_write(format: str, size: float) -> None:
+    mesh = freaky_torus.reference()
+    found = loaded(MESH_FORMATS[format].encode(size * mesh.vertices, mesh.faces), format)
+    np.testing.assert_allclose(found.vertices, size * mesh.vertices, atol=1e-6 * size)
+    assert np.array_equal(found.faces, mesh.faces)
+    assert found.volume > 0, "wound inside out"
+
+
+def test_stl_keeps_the_order_of_faces() -> None:
+    mesh = freaky_torus.reference()
+    found = loaded(MESH_FORMATS["stl"].encode(mesh.vertices, mesh.faces), "stl")
+    np.testing.assert_allclose(found.triangles, mesh.vertices[mesh.faces], atol=1e-6)
+
+
+@pytest.mark.parametrize("format", sorted(MESH_FORMATS.keys() - {"stl"}))
+def test_we_read_what_we_write(format: str, tmp_path: Path) -> None:
+    mesh = freaky_torus.reference()
+    path = tmp_path / f"torus.{format}"
+    path.write_bytes(MESH_FORMATS[format].encode(mesh.vertices, mesh.faces))
+    for found in (read_mesh(path), read_mesh(path.read_bytes(), format)):
+        np.testing.assert_allclose(found.vertices, mesh.vertices, atol=1e-6)
+        assert np.array_equal(found.faces, mesh.faces)
+
+
+@pytest.mark.parametrize("format", ["ply", "off", "obj", "glb"])
+def test_we_read_what_others_write(format: str) -> None:
+    mesh = cube()
+    data = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).export(file_type=format)
+    found = read_mesh(data if isinstance(data, bytes) else data.encode(), format)
+    np.testing.assert_allclose(found.vertices, mesh.vertices, atol=1e-6)
+    assert np.array_equal(found.faces, mesh.faces)
+
+
+def test_texture_coordinates_do_not_shuffle_vertices() -> None:
+    lines = ["mtllib none.mtl", *(f"v {x} {y} {z}" for x, y, z in CUBE), "vt 0 0", "vt 1 0", "vt 1 1", "vt 0 1"]
+    lines += ["f " + " ".join(f"{v + 1}/{k + 1}" for k, v in enumerate(side)) for side in SIDES]
+    found = read_mesh("\n".join(lines).encode(), "obj")
+    np.testing.assert_array_equal(found.vertices, CUBE)
+    assert len(found.faces) == 12
+    relative = "\n".join(["v 0 0 0", "v 1 0 0", "v 0 1 0", "f -3//1 -2//1 -1//1"])
+    assert read_mesh(relative.encode(), "obj").faces.tolist() == [[0, 1, 2]]
+
+
+@pytest.mark.parametrize(
+    ("data", "format", "fault"),
+    [
+        (b"nonsense", "glb", "not a readable glb file"),
+        (b"nonsense", "npz", "not a readable npz file"),
+        (b"v 0 0 0\nf 1 2 x\n", "obj", "not a readable obj file"),
+        (b"nonsense", "obj", "non-empty"),
+        (b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 2\n", "obj", "same vertex twice"),
+        (b"v 0 0 0\nv 1 0 0\nv nan 1 0\nf 1 2 3\n", "obj", "not finite"),
+    ],
+)
+def test_faulty_files_are_refused_with_the_reason(data: bytes, format: str, fault: str) -> None:
+    with pytest.raises(MeshError, match=fault):
+        read_mesh(data, format)
+
+
+def test_a_file_that_is_not_there_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(MeshError, match="No such file"):
+        read_mesh(tmp_path / "none.obj")
+
+
+def test_normals_point_outwards_with_unit_length() -> None:
+    torus = freaky_torus.reference()
+    normals = vertex_normals(torus.vertices, torus.faces)
+    np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1, atol=1e-12)
+    corners = cube()
+    at_corners = vertex_normals(corners.vertices, corners.faces)
+    assert (np.sign(at_corners) == np.sign(corners.vertices - 0.5)).all()
+
+
+def test_a_vertex_whose_faces_cancel_still_has_a_unit_normal() -> None:
+    vertices = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]])
+    normals = vertex_normals(vertices, np.array([[0, 1, 2], [0, 2, 1]]))
+    np.testing.assert_array_equal(np.linalg.norm(normals, axis=1), 1)
+
+
+def test_equal_meshes_give_equal_bytes() -> None:
+    mesh = freaky_torus.reference()
+    for format in MESH_FORMATS.values():
+        assert format.encode(mesh.vertices, mesh.faces) == format.encode(mesh.vertices.copy(), mesh.faces.copy())
+
+
+def test_few_frames_are_exact_and_many_are_within_the_tolerance() -> None:
+    faces = freaky_torus.connectivity().faces
+    for count in (DENSE_FRAMES, DENSE_FRAMES + 1):
+        codes = np.linspace([0, 0, 1, 1], [0.5, 0.3, 1.1, 1], count)
+        frames = freaky_torus.vertices(codes)
+        animated = animated_glb(frames, faces)
+        diagonal = np.linalg.norm(np.ptp(frames.reshape(-1, 3), axis=0))
+        if count == DENSE_FRAMES:
+            assert animated.targets == count - 1
+            assert animated.max_vertex_error < 1e-7
+        else:
+            assert 1 < animated.targets < 20
+            assert animated.max_vertex_error < 1.1e-4 * diagonal
+
+
+def test_frames_that_stand_still_make_a_file_too() -> None:
+    mesh = cube()
+    for count in (1, 3, DENSE_FRAMES + 2):
+        animated = animated_glb(np.repeat(mesh.vertices[None], count, axis=0), mesh.faces)
+        assert animated.max_vertex_error == 0
+        np.testing.assert_array_equal(loaded(animated.data, "glb").vertices, CUBE)

@@ -1,0 +1,214 @@
+"""Small bundles with networks written down by hand, so that lengths and angles are known in closed form."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnx
+from onnx import TensorProto, helper, numpy_helper
+
+from geometry.formats import npz
+from geometry.mesh import TriangleMesh
+from geometry.nric import nric
+from training import freaky_torus
+
+SCALE = 3.0
+LATENTS = ("size", "turn", "twist")
+
+
+def reference() -> TriangleMesh:
+    """A coarse torus of unit area."""
+    torus = freaky_torus.reference()
+    v = torus.vertices.reshape(64, 32, 3)[::8, ::4].reshape(-1, 3)
+    i, j = np.meshgrid(np.arange(8), np.arange(8), indexing="ij")
+
+    def at(di: int, dj: int) -> np.ndarray:
+        return ((i + di) % 8 * 8 + (j + dj) % 8).ravel()
+
+    faces = np.concatenate([np.stack([at(0, 0), at(1, 0), at(1, 1)], 1), np.stack([at(0, 0), at(1, 1), at(0, 1)], 1)])
+    mesh = TriangleMesh.from_arrays(v, faces)
+    return mesh.with_vertices(mesh.vertices / np.sqrt(mesh.area))
+
+
+def directions(mesh: TriangleMesh) -> np.ndarray:
+    """(3, 2E): what each latent adds to lengths and angles; the first, a uniform scaling, is integrable."""
+    z = nric(mesh.vertices, mesh.connectivity)
+    size = z.copy()
+    size[mesh.connectivity.edge_count :] = 0
+    stretched = nric(mesh.vertices * [1.15, 1, 1], mesh.connectivity) - z
+    twisted = nric(mesh.vertices * [1, 1, 1.3], mesh.connectivity) - z
+    return np.stack([size, stretched, twisted])
+
+
+def expected_nric(code: np.ndarray) -> np.ndarray:
+    """(2E,) what the bundle's networks say to a code (3,), normalised."""
+    mesh = reference()
+    a = np.array([code[0], np.sin(code[1]), code[2]])
+    return nric(mesh.vertices, mesh.connectivity) + a @ directions(mesh)
+
+
+def network(nodes: list[Any], weights: dict[str, np.ndarray], row_in: tuple, row_out: tuple) -> onnx.ModelProto:
+    """A model from ``latent`` or ``factors`` to ``nric`` or ``vertices``, as the nodes name them."""
+    source, target = nodes[0].input[0], nodes[-1].output[0]
+    graph = helper.make_graph(
+        nodes,
+        "network",
+        [helper.make_tensor_value_info(source, TensorProto.FLOAT, ["n", *row_in])],
+        [helper.make_tensor_value_info(target, TensorProto.FLOAT, ["n", *row_out])],
+        [numpy_helper.from_array(np.asarray(value, np.float32), name) for name, value in weights.items()],
+    )
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=9)
+    onnx.checker.check_model(model)
+    return model
+
+
+def networks() -> dict[str, onnx.ModelProto]:
+    """Factor 0 takes ``size``; factor 1 takes ``turn``, an angle, and ``twist``; the combiner adds up."""
+    mesh = reference()
+    z = nric(mesh.vertices, mesh.connectivity)
+    d = directions(mesh)
+    wide = len(z)
+    # sin of the first coordinate and the second as it is: masks pick them.
+    periodic = [
+        helper.make_node("Sin", ["latent"], ["sine"]),
+        helper.make_node("Mul", ["sine", "first"], ["angle"]),
+        helper.make_node("Mul", ["latent", "second"], ["rest"]),
+        helper.make_node("Add", ["angle", "rest"], ["features"]),
+        helper.make_node("MatMul", ["features", "D"], ["offset"]),
+        helper.make_node("Add", ["offset", "z"], ["nric"]),
+    ]
+    return {
+        "factor-0.onnx": network(
+            [
+                helper.make_node("MatMul", ["latent", "D"], ["offset"]),
+                helper.make_node("Add", ["offset", "z"], ["nric"]),
+            ],
+            {"D": d[:1], "z": z},
+            (1,),
+            (wide,),
+        ),
+        "factor-1.onnx": network(
+            periodic,
+            {"first": np.array([1, 0]), "second": np.array([0, 1]), "D": d[1:], "z": z},
+            (2,),
+            (wide,),
+        ),
+        "combiner.onnx": network(
+            [
+                helper.make_node("Einsum", ["factors"], ["sum"], equation="njz->nz"),
+                helper.make_node("Sub", ["sum", "z"], ["nric"]),
+            ],
+            {"z": z},
+            (2, wide),
+            (wide,),
+        ),
+    }
+
+
+def start_network() -> onnx.ModelProto:
+    """A start for Gauss–Newton that knows about ``size`` only."""
+    mesh = reference()
+    flat = mesh.vertices.reshape(1, -1)
+    weights = {"D": np.concatenate([flat, 0 * flat, 0 * flat]), "x": flat}
+    nodes = [
+        helper.make_node("MatMul", ["latent", "D"], ["offset"]),
+        helper.make_node("Add", ["offset", "x"], ["flat"]),
+        helper.make_node("Reshape", ["flat", "shape"], ["vertices"]),
+    ]
+    model = network_with_shape(nodes, weights, mesh)
+    onnx.checker.check_model(model)
+    return model
+
+
+def network_with_shape(nodes: list[Any], weights: dict[str, np.ndarray], mesh: TriangleMesh) -> onnx.ModelProto:
+    graph = helper.make_graph(
+        nodes,
+        "start",
+        [helper.make_tensor_value_info("latent", TensorProto.FLOAT, ["n", 3])],
+        [helper.make_tensor_value_info("vertices", TensorProto.FLOAT, ["n", len(mesh.vertices), 3])],
+        [
+            *(numpy_helper.from_array(np.asarray(value, np.float32), name) for name, value in weights.items()),
+            numpy_helper.from_array(np.array([-1, len(mesh.vertices), 3], np.int64), "shape"),
+        ],
+    )
+    return helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=9)
+
+
+def manifest(name: str, version: str, *, start: bool = False) -> dict[str, Any]:
+    """Everything but ``files``."""
+    mesh = reference()
+    return {
+        "schema_version": 1,
+        "name": name,
+        "version": version,
+        "licence": "CC0-1.0",
+        "title": "Small torus",
+        "description": "A torus for tests.",
+        "latent_dimension": 3,
+        "latent_names": list(LATENTS),
+        "factors": [
+            {
+                "name": "size",
+                "start": 0,
+                "stop": 1,
+                "file": "factor-0.onnx",
+                "input": "latent",
+                "output": "nric",
+            },
+            {
+                "name": "form",
+                "start": 1,
+                "stop": 3,
+                "file": "factor-1.onnx",
+                "input": "latent",
+                "output": "nric",
+            },
+        ],
+        "lower": [-0.2, -np.pi, 0.0],
+        "upper": [0.2, np.pi, 1.0],
+        "period": [None, 2 * np.pi, None],
+        "edges": mesh.connectivity.edge_count,
+        "vertices": len(mesh.vertices),
+        "faces": len(mesh.faces),
+        "mu": 1.0,
+        "lambda": 1.0,
+        "eta": 1e-4,
+        "eta_reconstruction": 1e-2,
+        "scale": SCALE,
+        "combiner": {"file": "combiner.onnx", "input": "factors", "output": "nric"},
+        "start": {"file": "start.onnx", "input": "latent", "output": "vertices"} if start else None,
+        "geometry": {"file": "geometry.npz"},
+        "onnx_tolerance": {"required": 1e-4, "measured": 1e-7},
+        "figures": {"r2": {"composite": {"total": 1.0}}},
+        "origin": {"config": {}, "data_digest": "0" * 64, "code_version": "test"},
+    }
+
+
+def write_bundle(models: Path, name: str = "small", version: str = "1", *, start: bool = False) -> Path:
+    """Write a whole bundle and return its folder."""
+    folder = models / name / version
+    folder.mkdir(parents=True)
+    mesh = reference()
+    for file, model in networks().items():
+        (folder / file).write_bytes(model.SerializeToString())
+    if start:
+        (folder / "start.onnx").write_bytes(start_network().SerializeToString())
+    (folder / "geometry.npz").write_bytes(npz(vertices=mesh.vertices, faces=mesh.faces, edges=mesh.edges))
+    seal(folder, manifest(name, version, start=start))
+    return folder
+
+
+def seal(folder: Path, facts: dict[str, Any] | None = None) -> None:
+    """Write the manifest with the digests of the files as they are; by default the facts stay."""
+    path = folder / "manifest.json"
+    facts = facts or json.loads(path.read_text())
+    files = sorted(file for file in folder.iterdir() if file.is_file() and file.name != path.name)
+    facts["files"] = {
+        file.name: {"sha256": hashlib.sha256(file.read_bytes()).hexdigest(), "bytes": file.stat().st_size}
+        for file in files
+    }
+    path.write_text(json.dumps(facts))

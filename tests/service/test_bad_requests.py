@@ -1,0 +1,153 @@
+"""Malformed requests: each gets its status, the type of its problem, and a sentence that says what to do."""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import httpx
+import pytest
+
+JSON = {"Content-Type": "application/json"}
+MODEL = "/v1/models/small"
+MESH, VERTICES, NRIC, PATHS = (f"{MODEL}/{call}" for call in ("mesh", "vertices", "nric", "interpolations"))
+OK = [0.1, 0.2, 0.3]
+LONG_PATH = [[round(x, 5) for x in (k / 7, k / 3, 1 / (k + 1))] for k in range(2000)]
+
+
+@dataclass
+class Bad:
+    """A request, and what its answer must be."""
+
+    method: str
+    path: str
+    status: int
+    kind: str
+    says: str
+    body: Any = None
+    headers: dict[str, str] = field(default_factory=dict)
+
+    def send(self, client: httpx.Client) -> httpx.Response:
+        raw = isinstance(self.body, (str, bytes)) or self.body is None
+        content = {"content": self.body} if raw else {"json": self.body}
+        return client.request(self.method, self.path, headers=self.headers, **content)
+
+
+def post(path: str, body: Any, status: int, kind: str, says: str) -> Bad:
+    return Bad("POST", path, status, kind, says, body, JSON if isinstance(body, (str, bytes)) else {})
+
+
+def get(path: str, status: int, kind: str, says: str, **headers: str) -> Bad:
+    return Bad("GET", path, status, kind, says, headers=headers)
+
+
+REQUESTS = {
+    "no JSON": post(MESH, '{"latent": [1, 2', 400, "malformed-request", "Send one valid JSON object"),
+    "no UTF-8": post(MESH, b'{"latent": "\xff"}', 400, "malformed-request", "UTF-8"),
+    "JSON too deep": post(MESH, "[" * 20_000 + "]" * 20_000, 400, "malformed-request", "Send one JSON object"),
+    "a number of 5000 digits": post(MESH, f'{{"latent": [{"9" * 5000}]}}', 400, "malformed-request", "JSON"),
+    "empty body": post(MESH, "", 422, "invalid-request", "Send a JSON object"),
+    "a list as body": post(MESH, [1, 2, 3], 422, "invalid-request", "Send a JSON object"),
+    "no latent": post(MESH, {}, 422, "invalid-request", "Add 'latent'"),
+    "latent null": post(MESH, {"latent": None}, 422, "invalid-request", "Send a list for latent"),
+    "code too short": post(MESH, {"latent": [0.1]}, 422, "wrong-length", "Send exactly 3"),
+    "code too long": post(MESH, {"latent": [*OK, 1]}, 422, "wrong-length", "Send exactly 3"),
+    "empty code": post(MESH, {"latent": []}, 422, "wrong-length", "Send exactly 3"),
+    "NaN": post(MESH, '{"latent": [NaN, 0, 0]}', 422, "not-finite", "finite numbers only: latent[0]"),
+    "infinity": post(MESH, '{"latent": [0, -Infinity, 0]}', 422, "not-finite", "finite numbers only: latent[1]"),
+    "beyond doubles": post(MESH, '{"latent": [0, 0, 1e999]}', 422, "not-finite", "finite numbers only: latent[2]"),
+    "beyond floats": post(MESH, {"latent": [0, 0, 1e39]}, 422, "not-finite", "Coordinate 2"),
+    "text as number": post(MESH, {"latent": ["0.1", 0, 0]}, 422, "invalid-request", "Send a number for latent[0]"),
+    "true as number": post(MESH, {"latent": [True, 0, 0]}, 422, "invalid-request", "Send a number for latent[0]"),
+    "a nested code": post(MESH, {"latent": [OK]}, 422, "invalid-request", "Send a number for latent[0]"),
+    "misspelt field": post(MESH, {"latent": OK, "bound": "clamp"}, 422, "invalid-request", "Remove 'bound'"),
+    "unknown bounds": post(MESH, {"latent": OK, "bounds": "wrap"}, 422, "invalid-request", "'allow', 'clamp' or"),
+    "unknown mesh": post(MESH, {"latent": OK, "mesh": "finest"}, 422, "invalid-request", "'fine' or 'coarse'"),
+    "out of bounds": post(
+        MESH, {"latent": [0.3, 0, 0], "bounds": "reject"}, 422, "out-of-bounds", 'Move it inside, or send "bounds"'
+    ),
+    "text in a link": get(f"{MESH}?latent=a,b,c", 422, "invalid-request", "separated by commas"),
+    "NaN in a link": get(f"{MESH}?latent=nan,0,0", 422, "not-finite", "Send finite numbers"),
+    "short code in a link": get(f"{MESH}?latent=1,2", 422, "wrong-length", "Send exactly 3"),
+    "empty code in a link": get(f"{MESH}?latent=", 422, "wrong-length", "Send exactly 3"),
+    "no code": post(VERTICES, {"latents": []}, 422, "invalid-request", "Send at least one code"),
+    "one code for many": post(VERTICES, {"latents": OK}, 422, "invalid-request", "Send a list for latents[0]"),
+    "codes of two lengths": post(VERTICES, {"latents": [OK, [1]]}, 422, "wrong-length", "Code 1 has 1 numbers"),
+    "too many codes": post(VERTICES, {"latents": [OK] * 21}, 422, "too-many-codes", "Send several requests"),
+    "too many codes for NRIC": post(NRIC, {"latents": [OK] * 21}, 422, "too-many-codes", "the limit is 20"),
+    "factors as text": post(NRIC, {"latents": [OK], "factors": "yes"}, 422, "invalid-request", "true or false"),
+    "one keyframe": post(PATHS, {"keyframes": [OK]}, 422, "invalid-request", "at least 2 entries for keyframes"),
+    "short keyframe": post(PATHS, {"keyframes": [OK, [1]]}, 422, "wrong-length", "Code 1 has 1 numbers"),
+    "times run back": post(
+        PATHS, {"keyframes": [OK, OK, OK], "times": [0, 2, 1]}, 422, "invalid-request", "times must increase"
+    ),
+    "times stand still": post(PATHS, {"keyframes": [OK, OK], "times": [1, 1]}, 422, "invalid-request", "increase"),
+    "times too few": post(PATHS, {"keyframes": [OK, OK], "times": [1]}, 422, "invalid-request", "send as many"),
+    "one frame": post(PATHS, {"keyframes": [OK, OK], "frames": 1}, 422, "invalid-request", "at least 2 for frames"),
+    "half a frame": post(PATHS, {"keyframes": [OK, OK], "frames": 2.5}, 422, "invalid-request", "whole number"),
+    "too many frames": post(PATHS, {"keyframes": [OK, OK], "frames": 201}, 422, "too-many-frames", "limit is 200"),
+    "a path beyond floats": post(PATHS, {"keyframes": [OK, [0, 0, 0]], "stop": 1e300}, 422, "not-finite", "finite"),
+    "too long a path": post(PATHS, {"keyframes": LONG_PATH}, 422, "path-too-long", "Send fewer keyframes"),
+    "unknown model": get("/v1/models/large", 404, "unknown-model", "/v1/models lists"),
+    "unknown model's mesh": post("/v1/models/large/mesh", {"latent": OK}, 404, "unknown-model", "Choose one"),
+    "a way out of the folder": get("/v1/models/..%2fsmall/mesh", 404, "not-found", "/openapi.json"),
+    "unknown version": get(f"{MODEL}?version=3", 404, "unknown-version", "Choose one of 1, 2, 10"),
+    "no version": get(f"{MODEL}?version=new", 404, "unknown-version", "Choose one of 1, 2, 10"),
+    "unknown call": get(f"{MODEL}/volume", 404, "not-found", "/openapi.json lists every call"),
+    "unknown interpolation": get("/v1/interpolations/abc", 404, "unknown-interpolation", "POST the keyframes"),
+    "frame as text": get("/v1/interpolations/abc/frames/x", 422, "invalid-request", "Send a whole number for k"),
+    "wrong method": Bad("DELETE", MESH, 405, "method-not-allowed", "Use GET, POST"),
+    "wrong method on a list": Bad("POST", "/v1/models", 405, "method-not-allowed", "Use GET"),
+    "unknown format": get(f"{MESH}?format=fbx", 406, "not-acceptable", "obj (model/obj)"),
+    "nothing acceptable": get(MESH, 406, "not-acceptable", "obj (model/obj)", Accept="image/png"),
+    "vertices as mesh": post(f"{VERTICES}?format=glb", {"latents": [OK]}, 406, "not-acceptable", "npz"),
+    "body too large": post(MESH, " " * 100_001, 413, "body-too-large", "limit of 100000 bytes"),
+    "form as body": Bad(
+        "POST", MESH, 415, "unsupported-media-type", "Content-Type: application/json", "latent=1",
+        {"Content-Type": "application/x-www-form-urlencoded"},
+    ),
+    "body of no type": Bad("POST", MESH, 415, "unsupported-media-type", "Content-Type: application/json", "{}"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("request_", [pytest.param(value, id=name) for name, value in REQUESTS.items()])
+def test_bad_requests_are_told_what_to_do(client: httpx.Client, request_: Bad) -> None:
+    answer = request_.send(client)
+    problem = answer.json()
+    assert answer.status_code == request_.status, problem
+    assert answer.headers["Content-Type"] == "application/problem+json"
+    assert problem["type"] == f"urn:shapespace:problem:{request_.kind}"
+    assert problem["status"] == request_.status
+    assert problem["title"]
+    assert request_.says in problem["detail"]
+
+
+def test_a_body_over_the_limit_is_refused_without_an_announced_length(client: httpx.Client) -> None:
+    def chunks() -> Any:
+        for _ in range(30):
+            yield b" " * 5000
+
+    answer = client.post(MESH, content=chunks(), headers=JSON)
+    assert answer.status_code == 413
+    assert answer.json()["type"] == "urn:shapespace:problem:body-too-large"
+
+
+def test_a_frame_beyond_the_end_is_not_found(client: httpx.Client) -> None:
+    links = client.post(PATHS, json={"keyframes": [OK, [0, 0, 0]], "frames": 3}).json()["links"]
+    for k in (3, -1):
+        answer = client.get(f"{links['self']}/frames/{k}")
+        assert (answer.status_code, answer.json()["type"]) == (404, "urn:shapespace:problem:unknown-frame")
+        assert "from 0 to 2" in answer.json()["detail"]
+
+
+def test_what_a_path_allows_is_said_in_the_header_too(client: httpx.Client) -> None:
+    assert client.put(MESH).headers["Allow"] == "GET, POST"
+    assert client.delete(PATHS).headers["Allow"] == "POST"
+
+
+def test_refusals_list_the_choices(client: httpx.Client) -> None:
+    choices = client.get(MESH, params={"format": "fbx"}).json()["choices"]
+    assert {"format": "glb", "media_type": "model/gltf-binary"} in choices
+
+
+def test_every_fault_of_a_body_is_listed(client: httpx.Client) -> None:
+    problem = client.post(MESH, json={"latent": ["a", 0, None], "extra": 1}).json()
+    assert [error["pointer"] for error in problem["errors"]] == ["#/latent/0", "#/latent/2", "#/extra"]

@@ -1,0 +1,277 @@
+"""What the loader refuses, and that one bad bundle takes nothing else down."""
+
+import json
+import logging
+import os
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import httpx
+import numpy as np
+import onnx
+import pytest
+from onnx import TensorProto, helper, numpy_helper
+
+from geometry.formats import npz
+from service.bundle import BundleError, read_bundle
+from service.repository import ModelRepository
+from service.shape_model import ShapeModel
+from tests.service.bundles import network, networks, reference, seal, write_bundle
+from tests.service.conftest import Start
+
+Spoil = Callable[[Path], None]
+
+
+def rewrite(folder: Path, **changes: object) -> None:
+    path = folder / "manifest.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | changes))
+
+
+def flip_a_bit(folder: Path) -> None:
+    path = folder / "factor-0.onnx"
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 1
+    path.write_bytes(data)
+
+
+def truncate(folder: Path) -> None:
+    path = folder / "geometry.npz"
+    path.write_bytes(path.read_bytes()[:-10])
+
+
+def append(folder: Path) -> None:
+    with (folder / "geometry.npz").open("ab") as file:
+        file.write(b"more")
+
+
+def add_a_file(folder: Path) -> None:
+    (folder / "run.sh").write_text("echo")
+
+
+def add_a_folder(folder: Path) -> None:
+    (folder / "more").mkdir()
+
+
+def remove_a_file(folder: Path) -> None:
+    (folder / "combiner.onnx").unlink()
+
+
+def link_a_file(folder: Path) -> None:
+    shutil.move(folder / "combiner.onnx", folder.parents[1] / "elsewhere.onnx")
+    (folder / "combiner.onnx").symlink_to(folder.parents[1] / "elsewhere.onnx")
+
+
+def link_the_folder(folder: Path) -> None:
+    moved = folder.parents[1] / "moved"
+    shutil.move(folder, moved)
+    folder.symlink_to(moved, target_is_directory=True)
+
+
+def make_a_pipe(folder: Path) -> None:
+    (folder / "combiner.onnx").unlink()
+    os.mkfifo(folder / "combiner.onnx")
+
+
+def point_outside(folder: Path) -> None:
+    path = folder / "manifest.json"
+    path.write_text(path.read_text().replace("combiner.onnx", "../combiner.onnx"))
+
+
+def no_json(folder: Path) -> None:
+    (folder / "manifest.json").write_text("{")
+
+
+def no_manifest(folder: Path) -> None:
+    (folder / "manifest.json").unlink()
+
+
+def unknown_field(folder: Path) -> None:
+    rewrite(folder, surprise=1)
+
+
+def other_schema(folder: Path) -> None:
+    rewrite(folder, schema_version=2)
+
+
+def other_name(folder: Path) -> None:
+    rewrite(folder, name="large")
+
+
+def bounds_too_short(folder: Path) -> None:
+    rewrite(folder, lower=[0.0])
+
+
+def bounds_crossed(folder: Path) -> None:
+    rewrite(folder, lower=[1.0, 1.0, 1.0], upper=[0.0, 2.0, 2.0])
+
+
+def factors_overlap(folder: Path) -> None:
+    factors = json.loads((folder / "manifest.json").read_text())["factors"]
+    factors[1]["start"] = 0
+    rewrite(folder, factors=factors)
+
+
+def more_edges(folder: Path) -> None:
+    rewrite(folder, edges=193)
+
+
+def replace_network(folder: Path, file: str, model: onnx.ModelProto) -> None:
+    (folder / file).write_bytes(model.SerializeToString())
+    seal(folder)
+
+
+def nan_weight(folder: Path) -> None:
+    model = networks()["combiner.onnx"]
+    weight = model.graph.initializer[0]
+    values = numpy_helper.to_array(weight).copy()
+    values[3] = np.nan
+    weight.CopyFrom(numpy_helper.from_array(values, weight.name))
+    replace_network(folder, "combiner.onnx", model)
+
+
+def infinite_constant(folder: Path) -> None:
+    model = networks()["combiner.onnx"]
+    value = helper.make_tensor("c", TensorProto.FLOAT, [1], [np.inf])
+    model.graph.node.insert(0, helper.make_node("Constant", [], ["unused"], value=value))
+    replace_network(folder, "combiner.onnx", model)
+
+
+def external_data(folder: Path) -> None:
+    model = networks()["factor-0.onnx"]
+    weight = model.graph.initializer[0]
+    weight.ClearField("raw_data")
+    weight.data_location = TensorProto.EXTERNAL
+    weight.external_data.add(key="location", value="../../../../etc/passwd")
+    replace_network(folder, "factor-0.onnx", model)
+
+
+def wrong_width(folder: Path) -> None:
+    nodes = [helper.make_node("MatMul", ["latent", "D"], ["nric"])]
+    replace_network(folder, "factor-0.onnx", network(nodes, {"D": np.ones((1, 7))}, (1,), (7,)))
+
+
+def wrong_output_name(folder: Path) -> None:
+    wide = 2 * len(reference().edges)
+    nodes = [helper.make_node("MatMul", ["latent", "D"], ["z"])]
+    replace_network(folder, "factor-0.onnx", network(nodes, {"D": np.ones((1, wide))}, (1,), (wide,)))
+
+
+def one_code_only(folder: Path) -> None:
+    model = networks()["factor-0.onnx"]
+    for value in (*model.graph.input, *model.graph.output):
+        value.type.tensor_type.shape.dim[0].dim_value = 1
+    replace_network(folder, "factor-0.onnx", model)
+
+
+def no_network(folder: Path) -> None:
+    (folder / "factor-0.onnx").write_bytes(b"not a network")
+    seal(folder)
+
+
+def geometry(folder: Path, **changes: np.ndarray) -> None:
+    mesh = reference()
+    arrays = {"vertices": mesh.vertices, "faces": mesh.faces, "edges": mesh.edges} | changes
+    (folder / "geometry.npz").write_bytes(npz(**arrays))
+    seal(folder)
+
+
+def nan_vertex(folder: Path) -> None:
+    vertices = reference().vertices.copy()
+    vertices[5, 1] = np.nan
+    geometry(folder, vertices=vertices)
+
+
+def unsorted_edges(folder: Path) -> None:
+    geometry(folder, edges=reference().edges[::-1])
+
+
+def turned_face(folder: Path) -> None:
+    faces = reference().faces.copy()
+    faces[0] = faces[0, ::-1]
+    geometry(folder, faces=faces)
+
+
+def pickled_geometry(folder: Path) -> None:
+    geometry(folder, vertices=np.array([{"a": 1}], dtype=object))
+
+
+def no_edges(folder: Path) -> None:
+    mesh = reference()
+    (folder / "geometry.npz").write_bytes(npz(vertices=mesh.vertices, faces=mesh.faces))
+    seal(folder)
+
+
+FAULTS: dict[Spoil, str] = {
+    flip_a_bit: "factor-0.onnx does not have the digest",
+    truncate: "geometry.npz has",
+    append: "geometry.npz is longer than",
+    add_a_file: "run.sh is not in the manifest",
+    add_a_folder: "more is a link or not a plain file",
+    remove_a_file: "combiner.onnx is missing",
+    link_a_file: "combiner.onnx is a link",
+    link_the_folder: "1 is a link",
+    make_a_pipe: "combiner.onnx is a link or not a plain file",
+    point_outside: "String should match pattern",
+    no_json: "Invalid JSON",
+    no_manifest: "manifest.json is missing",
+    unknown_field: "surprise",
+    other_schema: "schema_version",
+    other_name: "of large/1, not of small/1",
+    bounds_too_short: "lower has 1 entries",
+    bounds_crossed: "lower must lie below upper",
+    factors_overlap: "consecutive",
+    more_edges: "the manifest says",
+    nan_weight: "combiner.onnx: z has a weight that is not finite",
+    infinite_constant: "combiner.onnx: c has a weight that is not finite",
+    external_data: "keeps its data in another file",
+    wrong_width: "factor-0.onnx must have one output",
+    wrong_output_name: "factor-0.onnx must have one output",
+    one_code_only: "factor-0.onnx must have one input",
+    no_network: "factor-0.onnx is not a readable ONNX file",
+    nan_vertex: "vertex 5 has a coordinate that is not finite",
+    unsorted_edges: "edges are not those of the faces",
+    turned_face: "oriented oppositely",
+    pickled_geometry: "geometry.npz is not a readable NPZ file",
+    no_edges: "geometry.npz has no array 'edges'",
+}
+
+
+def load(folder: Path) -> ShapeModel:
+    return ShapeModel(read_bundle(folder))
+
+
+@pytest.mark.parametrize("spoil", [pytest.param(spoil, id=spoil.__name__) for spoil in FAULTS])
+def test_bundles_that_are_not_what_they_say_are_refused(tmp_path: Path, spoil: Spoil) -> None:
+    folder = write_bundle(tmp_path)
+    assert load(folder).manifest.name == "small"
+    spoil(folder)
+    with pytest.raises(BundleError) as refusal:
+        load(folder)
+    assert FAULTS[spoil] in str(refusal.value)
+
+
+def test_a_bad_bundle_is_left_out_with_one_line(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    write_bundle(tmp_path, "good")
+    flip_a_bit(write_bundle(tmp_path, "bad"))
+    write_bundle(tmp_path, "half", "1")
+    no_json(write_bundle(tmp_path, "half", "2"))
+    with caplog.at_level(logging.ERROR):
+        repository = ModelRepository(tmp_path)
+    assert [model.manifest.name for model in repository] == ["good", "half"]
+    assert repository.versions("half") == ["1"]
+    messages = [record.getMessage() for record in caplog.records]
+    assert len(messages) == 2
+    assert all("\n" not in message and "is not served" in message for message in messages)
+
+
+def test_a_server_starts_without_models_and_says_so(tmp_path: Path, start: Start) -> None:
+    flip_a_bit(write_bundle(tmp_path / "models"))
+    server = start(tmp_path / "models")
+    with httpx.Client(base_url=server.url) as client:
+        assert client.get("/v1/models").json() == {"models": []}
+        assert client.get("/v2/health/live").status_code == 200
+        ready = client.get("/v2/health/ready")
+        assert ready.status_code == 503
+        assert "models folder" in ready.json()["detail"]
+    assert "bundle small/1 is not served: factor-0.onnx" in server.stop()

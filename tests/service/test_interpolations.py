@@ -1,0 +1,236 @@
+"""Paths through latent space as animations."""
+
+import base64
+import hashlib
+import io
+import json
+import zipfile
+import zlib
+from pathlib import Path
+from typing import Any
+
+import httpx
+import numpy as np
+import pytest
+
+from geometry.formats import read_mesh
+from service.animation import Animation
+from service.bundle import read_bundle
+from service.latent_space import LatentSpace
+from tests.service.conftest import Start
+from tests.service.glb import GLB, khronos_report
+
+A, B, C = [-0.1, 0.5, 0.0], [0.1, 1.5, 1.0], [0.2, -2.0, 0.5]
+
+
+def create(client: httpx.Client, **body: Any) -> dict[str, Any]:
+    answer = client.post("/v1/models/small/interpolations", json=body)
+    assert answer.status_code == 201, answer.text
+    created: dict[str, Any] = answer.json()
+    assert answer.headers["Location"] == created["links"]["self"] == f"/v1/interpolations/{created['id']}"
+    return created
+
+
+def codes(client: httpx.Client, **body: Any) -> np.ndarray:
+    created = create(client, **body)
+    found = client.get(created["links"]["npz"]).raise_for_status()
+    with np.load(io.BytesIO(found.content)) as arrays:
+        assert len(arrays["vertices"]) == len(arrays["t"]) == created["frames"]
+        latents: np.ndarray = arrays["latents"]
+    return latents
+
+
+def frame(client: httpx.Client, id: str, k: int) -> np.ndarray:
+    answer = client.get(f"/v1/interpolations/{id}/frames/{k}", params={"format": "json"}).raise_for_status()
+    return np.array(answer.json()["vertices"])
+
+
+def test_both_ends_are_keyframes_and_steps_are_equal(client: httpx.Client) -> None:
+    found = codes(client, keyframes=[A, B], frames=5)
+    expected = np.linspace(A, B, 5)
+    np.testing.assert_allclose(found, expected, atol=1e-7)
+    assert np.array_equal(found[[0, -1]], np.array([A, B], np.float32))
+
+
+def test_the_path_is_linear_between_keyframes(client: httpx.Client) -> None:
+    found = codes(client, keyframes=[A, B, C], frames=9)
+    # C's angle is reached backwards or forwards, whichever is shorter: −2 − 1.5 = −3.5 is longer than 2.78.
+    assert np.array_equal(found[4], np.array(B, np.float32))
+    np.testing.assert_allclose(found[:5], np.linspace(A, B, 5), atol=1e-7)
+    plain = found[:, [0, 2]]
+    np.testing.assert_allclose(plain[4:], np.linspace(B, C, 5)[:, [0, 2]], atol=1e-7)
+    np.testing.assert_allclose(np.diff(np.unwrap(found[4:, 1].astype(float))), (2 * np.pi - 3.5) / 4, atol=1e-6)
+
+
+def test_times_place_the_keyframes(client: httpx.Client) -> None:
+    found = codes(client, keyframes=[A, B, C], times=[10, 11, 14], frames=5)
+    assert np.array_equal(found[1], np.array(B, np.float32))
+    np.testing.assert_allclose(found[2][[0, 2]], (2 * np.array(B) + np.array(C))[[0, 2]] / 3, atol=1e-7)
+
+
+def test_start_and_stop_cut_and_extrapolate(client: httpx.Client) -> None:
+    a, b = np.array(A), np.array(B)
+    found = codes(client, keyframes=[A, B], frames=4, start=-0.5, stop=1.5)
+    np.testing.assert_allclose(found, a + np.linspace(-0.5, 1.5, 4)[:, None] * (b - a), atol=1e-6)
+    backwards = codes(client, keyframes=[A, B], frames=3, start=1, stop=0)
+    np.testing.assert_allclose(backwards, np.linspace(B, A, 3), atol=1e-7)
+
+
+def test_an_angle_takes_the_shorter_arc(client: httpx.Client) -> None:
+    found = codes(client, keyframes=[[0, 3.0, 0], [0, -3.0, 0]], frames=3)[:, 1]
+    assert abs(found[1]) == pytest.approx(np.pi, abs=1e-6)
+    extrapolated = codes(client, keyframes=[[0, 3.0, 0], [0, -3.0, 0]], frames=2, stop=2)[:, 1]
+    assert extrapolated[1] == pytest.approx(3 + 2 * (2 * np.pi - 6) - 2 * np.pi, abs=1e-6)
+
+
+def test_a_loop_comes_back_and_leaves_the_repeated_frame_out(client: httpx.Client) -> None:
+    created = create(client, keyframes=[A, B], frames=9, loop=True)
+    assert created["frames"] == 8
+    found = codes(client, keyframes=[A, B], frames=9, loop=True)
+    np.testing.assert_allclose(found, np.concatenate([np.linspace(A, B, 5), np.linspace(B, A, 5)[1:-1]]), atol=1e-7)
+
+
+def test_frames_are_the_same_alone_and_in_every_whole(client: httpx.Client) -> None:
+    created = create(client, keyframes=[A, B, C], frames=6)
+    links = created["links"]
+    animated = GLB(client.get(links["self"]).raise_for_status().content)
+    with np.load(io.BytesIO(client.get(links["npz"]).content)) as arrays:
+        packed, faces = arrays["vertices"], arrays["faces"]
+    with zipfile.ZipFile(io.BytesIO(client.get(links["zip"]).content)) as archive:
+        names = sorted(archive.namelist())
+        zipped = [read_mesh(archive.read(name), "obj") for name in names]
+    assert len(names) == 6
+    with client.stream("GET", links["jsonl"]) as stream:
+        lines = [json.loads(line) for line in stream.iter_lines()]
+    assert animated.key_count == len(packed) == len(lines) == 6
+    assert np.array_equal(animated.faces, faces)
+    assert lines[0]["faces"] == faces.tolist()
+    backwards = {k: frame(client, created["id"], k) for k in reversed(range(6))}
+    for k, alone in backwards.items():
+        assert np.array_equal(np.float32(alone), packed[k]), k
+        assert np.array_equal(np.float32(lines[k]["vertices"]), packed[k]), k
+        np.testing.assert_allclose(zipped[k].vertices, packed[k], rtol=1e-7)
+        np.testing.assert_allclose(animated.key(k), packed[k], atol=3e-7)
+    assert np.abs(packed[0] - packed[5]).max() > 0.05, "a shape that doesn't move proves nothing"
+    code = client.post("/v1/models/small/mesh", json={"latent": B}, params={"format": "json"}).json()["vertices"]
+    middle = create(client, keyframes=[A, B], frames=3)["id"]
+    assert np.array_equal(code, frame(client, middle, 2))
+
+
+def test_long_animations_are_spanned_by_few_targets_with_a_stated_error(client: httpx.Client, tmp_path: Path) -> None:
+    created = create(client, keyframes=[A, B, C], frames=70)
+    answer = client.get(created["links"]["glb"]).raise_for_status()
+    animated = GLB(answer.content)
+    with np.load(io.BytesIO(client.get(created["links"]["npz"]).content)) as arrays:
+        packed = arrays["vertices"]
+    stated = animated.tree["asset"]["extras"]
+    error = max(np.linalg.norm(animated.key(k) - packed[k], axis=1).max() for k in range(70))
+    assert stated["max_vertex_error"] == pytest.approx(error, rel=1e-3)
+    assert json.loads(answer.headers["Shape-Diagnostics"])["max_vertex_error"] == stated["max_vertex_error"]
+    assert error < 2e-4 * np.linalg.norm(np.ptp(packed[0], axis=0))
+    assert stated["targets"] == len(animated.primitive["targets"]) < 30
+    (tmp_path / "long.glb").write_bytes(answer.content)
+    assert khronos_report(tmp_path / "long.glb")["issues"]["numErrors"] == 0
+
+
+def test_ids_are_deterministic_and_name_the_path_and_the_model(client: httpx.Client) -> None:
+    body: dict[str, Any] = {"keyframes": [A, B], "frames": 4}
+    same = {"keyframes": [[*map(float, A)], B], "frames": 4, "start": 0, "stop": 1.0, "loop": False, "mesh": "fine"}
+    assert create(client, **body)["id"] == create(client, **same)["id"]
+    ids = [create(client, **body | change)["id"] for change in ({}, {"frames": 5}, {"loop": True}, {"stop": 2})]
+    other = client.post("/v1/models/small/interpolations", params={"version": "1"}, json=body).json()["id"]
+    assert len({*ids, other}) == 5
+
+
+def test_an_id_outlives_the_server(models: Path, start: Start) -> None:
+    first = start(models)
+    with httpx.Client(base_url=first.url, timeout=60) as client:
+        id = create(client, keyframes=[A, B], frames=3)["id"]
+        before = client.get(f"/v1/interpolations/{id}/frames/1").raise_for_status()
+    first.stop()
+    with httpx.Client(base_url=start(models).url, timeout=60) as client:
+        after = client.get(f"/v1/interpolations/{id}/frames/1").raise_for_status()
+    assert after.content == before.content
+    assert after.headers["ETag"] == before.headers["ETag"]
+
+
+def test_damaged_ids_are_not_found(client: httpx.Client) -> None:
+    id = create(client, keyframes=[A, B], frames=3)["id"]
+    assert client.get(f"/v1/interpolations/{id}").status_code == 200
+    flipped = [id[:k] + ("A" if id[k] != "A" else "B") + id[k + 1 :] for k in range(0, len(id), 7)]
+    for damaged in [*flipped, id[:-1], id + "A", id + "=", "x", "-" * 40_000]:
+        answer = client.get(f"/v1/interpolations/{damaged}")
+        assert (answer.status_code, answer.json()["type"]) == (404, "urn:shapespace:problem:unknown-interpolation")
+        assert "POST" in answer.json()["detail"]
+
+
+def test_ids_can_not_be_made_to_unpack_without_end(client: httpx.Client) -> None:
+    def packed(payload: bytes) -> str:
+        name = hashlib.sha256(payload).digest()[:9] + zlib.compress(payload, 9)
+        return base64.urlsafe_b64encode(name).rstrip(b"=").decode()
+
+    id = create(client, keyframes=[A, B], frames=3)["id"]
+    payload = zlib.decompress(base64.urlsafe_b64decode(id + "=" * (-len(id) % 4))[9:])
+    assert packed(payload) == id
+    bomb = packed(payload + b" " * 8_000_000)  # the same content, if it were ever unpacked
+    assert len(bomb) < 15_000, "it must be refused for what it unpacks to"
+    assert client.get(f"/v1/interpolations/{bomb}").status_code == 404
+
+
+def test_an_id_of_a_model_that_is_gone_is_not_found(client: httpx.Client, models: Path) -> None:
+    latents = LatentSpace(read_bundle(models / "small" / "1").manifest)
+    answer = client.get(f"/v1/interpolations/{Animation(keyframes=[A, B]).to_id('f' * 64, latents)}")
+    assert answer.status_code == 404
+    assert "/v1/models" in answer.json()["detail"]
+
+
+def test_an_animation_has_an_entity_tag(client: httpx.Client) -> None:
+    links = create(client, keyframes=[A, B], frames=3)["links"]
+    tags = {name: client.get(links[name]).headers["ETag"] for name in ("glb", "npz", "zip", "jsonl")}
+    assert len(set(tags.values())) == 4
+    for name, tag in tags.items():
+        assert client.get(links[name], headers={"If-None-Match": tag}).status_code == 304
+
+
+def test_frames_arrive_as_they_get_ready(models: Path, start: Start) -> None:
+    # A place in the queue is held as long as there is work: the only one is taken when the first frame arrives.
+    with httpx.Client(base_url=start(models, workers=1, queue=0).url, timeout=60) as client:
+        links = create(client, keyframes=[A, B, C], frames=400)["links"]
+        with client.stream("GET", links["jsonl"]) as stream:
+            assert stream.headers["Content-Type"] == "application/jsonl"
+            lines = stream.iter_lines()
+            assert json.loads(next(lines))["frame"] == 0
+            assert client.get("/v1/models/small/mesh").status_code == 503
+            assert [json.loads(line)["frame"] for line in lines] == list(range(1, 400))
+        assert client.get("/v1/models/small/mesh").status_code == 200
+
+
+def test_a_reader_who_leaves_gives_the_place_back(models: Path, start: Start) -> None:
+    with httpx.Client(base_url=start(models, workers=1, queue=0).url, timeout=60) as client:
+        links = create(client, keyframes=[A, B, C], frames=600)["links"]
+        with client.stream("GET", links["jsonl"]) as stream:
+            next(stream.iter_lines())
+        while_waiting = 0
+        while client.get("/v1/models/small/mesh").status_code == 503:
+            while_waiting += 1
+            assert while_waiting < 200, "all of the frames would take that long"
+
+
+def test_the_animated_glb_passes_the_khronos_validator(client: httpx.Client, tmp_path: Path) -> None:
+    for frames in (2, 12):
+        links = create(client, keyframes=[A, B, C], frames=frames)["links"]
+        path = tmp_path / f"{frames}.glb"
+        path.write_bytes(client.get(links["glb"]).raise_for_status().content)
+        report = khronos_report(path)
+        assert report["issues"]["numErrors"] == report["issues"]["numWarnings"] == 0, report["issues"]
+        assert report["info"]["hasMorphTargets"]
+        assert report["info"]["animationCount"] == 1
+
+
+def test_moving_normals_follow_the_shape(client: httpx.Client) -> None:
+    created = create(client, keyframes=[A, B], frames=4)
+    animated = GLB(client.get(created["links"]["glb"]).content)
+    for k in range(4):
+        still = GLB(client.get(f"/v1/interpolations/{created['id']}/frames/{k}").content)
+        expected = still.array(still.primitive["attributes"]["NORMAL"])
+        np.testing.assert_allclose(animated.key(k, "NORMAL"), expected, atol=1e-5)

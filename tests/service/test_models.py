@@ -1,0 +1,40 @@
+"""The list of models, the cards, health."""
+
+import httpx
+
+from tests.service.bundles import manifest
+
+
+def test_the_list_names_the_newest_version_by_number(client: httpx.Client) -> None:
+    small = next(m for m in client.get("/v1/models").json()["models"] if m["name"] == "small")
+    assert small["version"] == "10"
+    assert small["latent_dimension"] == 3
+    assert [factor["name"] for factor in small["factors"]] == ["size", "form"]
+
+
+def test_the_card_holds_the_facts_of_the_manifest(client: httpx.Client) -> None:
+    card = client.get("/v1/models/small", params={"version": "2"}).json()
+    facts = manifest("small", "2", start=True)
+    for key in ("name", "version", "lower", "upper", "period", "edges", "vertices", "faces", "figures", "scale"):
+        assert card[key] == facts[key], key
+    assert card["versions"] == ["1", "2", "10"]
+    assert client.get("/v1/models/small").json()["version"] == "10"
+    for link in card["links"].values():
+        assert client.get(link).status_code in {200, 405}, link
+
+
+def test_health(client: httpx.Client) -> None:
+    assert client.get("/v2/health/live").json() == {"live": True}
+    assert client.get("/v2/health/ready").json() == {"ready": True}
+
+
+def test_the_page_and_all_it_needs_come_from_here(client: httpx.Client) -> None:
+    import re
+
+    page = client.get("/").raise_for_status()
+    assert page.headers["Content-Type"].startswith("text/html")
+    needed = re.findall(r'(?:href|src)="([^"]+)"', page.text)
+    assert len(needed) >= 4
+    for address in needed:
+        assert "//" not in address
+        assert client.get("/" + address).status_code == 200, address

@@ -1,0 +1,86 @@
+"""A run of the real command, small enough for the suite, shared by the tests that look at what it left."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+TINY = """
+[collection]
+generator = "freaky-torus"
+
+[samples]
+count = 60
+factor_counts = [40, 40, 120]
+part_size = 20
+
+[[networks.factors]]
+hidden = [16]
+energy = 0.999
+fit = { batch_size = 8, max_epochs = 12 }
+
+[[networks.factors]]
+hidden = [16]
+energy = 0.999
+fit = { batch_size = 8, max_epochs = 12 }
+
+[[networks.factors]]
+hidden = [16]
+fourier = 4
+skip_orders = [6, 3]
+patches = 8
+energy = 0.95
+fit = { batch_size = 20, max_epochs = 6 }
+
+[networks.combiner]
+neighbourhood = "flaps"
+width = 8
+layers = 2
+pairwise = 2
+fit = { batch_size = 8, max_epochs = 7 }
+
+[monolithic]
+hidden = [16]
+fit = { batch_size = 8, max_epochs = 3 }
+
+[variants.paper]
+title = "the paper's combiner"
+combiner = { residual = false, edge_channels = 0, width = 4, layers = 2, fit = { batch_size = 8, max_epochs = 1 } }
+
+[evaluation]
+grid_nodes = 4
+reconstructions = 2
+
+[export]
+name = "tiny-torus"
+title = "Tiny torus"
+description = "A run for the tests."
+licence = "MIT"
+"""
+
+
+def command(config: Path, out: Path, *more: str) -> list[str]:
+    return [
+        sys.executable,
+        "-m",
+        "training",
+        "run",
+        str(config),
+        "--out",
+        str(out),
+        "--models",
+        str(out / "models"),
+        *more,
+    ]
+
+
+@pytest.fixture(scope="session")
+def tiny_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("tiny")
+    config = folder / "tiny.toml"
+    config.write_text(TINY)
+    subprocess.run(command(config, folder / "run"), check=True, capture_output=True, text=True)
+    return folder / "run"

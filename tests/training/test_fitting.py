@@ -1,0 +1,93 @@
+"""The training loop: it learns, and a killed one ends where an undisturbed one does."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from geometry.mesh import TriangleMesh
+from geometry.nric import WeightedNorm, nric
+from training import fitting
+from training.config import FitSettings, LatentNetworkSettings
+from training.coordinates import Coordinates
+from training.networks import FactorNetwork, Scaling
+
+
+class Killed(Exception):  # noqa: N818 - not an error
+    pass
+
+
+@pytest.fixture(scope="module")
+def data() -> tuple[TriangleMesh, torch.Tensor, torch.Tensor]:
+    sphere = trimesh.creation.icosphere(1)
+    ball = TriangleMesh.from_arrays(sphere.vertices, sphere.faces)
+    rng = np.random.default_rng(0)
+    a = rng.uniform(-1, 1, (80, 2))
+    x = ball.vertices * (1 + 0.2 * a[:, :1, None]) + 0.2 * a[:, 1:, None] * ball.vertices[:, ::-1] ** 2
+    return ball, torch.from_numpy(a).float(), torch.from_numpy(nric(x, ball.connectivity)).float()
+
+
+def fit(data: tuple[TriangleMesh, torch.Tensor, torch.Tensor], path: Path, settings: FitSettings) -> FactorNetwork:
+    ball, latent, z = data
+    torch.manual_seed(7)
+    scaling = Scaling.of(nric(ball.vertices, ball.connectivity), WeightedNorm.of(ball, 1.0).squared, z.numpy())
+    box = Coordinates(np.full(2, -1.0), np.full(2, 1.0), np.full(2, np.nan))
+    network = FactorNetwork(LatentNetworkSettings(hidden=[16, 16]), box, scaling, None)
+    train, validation = torch.arange(64), torch.arange(64, 80)
+    fitting.fit(network, latent, z, train, validation, settings, path, "test", seed=5)
+    return network
+
+
+@pytest.mark.parametrize("schedule", ["plateau", "cosine"])
+def test_a_killed_fit_continues_to_the_same_bits(
+    data: tuple, schedule: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    settings = FitSettings(schedule=schedule, max_epochs=17, batch_size=16, patience=1, learning_rate=1e-2)
+    whole = fit(data, tmp_path / "whole.safetensors", settings).state_dict()
+    written = fitting._checkpoint
+
+    def die(*arguments: object) -> None:
+        written(*arguments)
+        raise Killed
+
+    with monkeypatch.context() as patch:
+        patch.setattr(fitting, "_checkpoint", die)
+        for _ in range(3):  # at epochs 5, 10 and 15
+            with pytest.raises(Killed):
+                fit(data, tmp_path / "killed.safetensors", settings)
+    continued = fit(data, tmp_path / "killed.safetensors", settings).state_dict()
+    for key, value in whole.items():
+        assert torch.equal(value, continued[key]), key
+
+
+def test_a_finished_fit_is_read_not_repeated(data: tuple, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    settings = FitSettings(max_epochs=3, batch_size=16)
+    first = fit(data, tmp_path / "n.safetensors", settings).state_dict()
+    monkeypatch.setattr(torch.optim.Adam, "step", None)
+    again = fit(data, tmp_path / "n.safetensors", settings).state_dict()
+    assert all(torch.equal(first[k], again[k]) for k in first)
+
+
+def test_a_fit_learns_and_keeps_its_best_epoch(data: tuple, tmp_path: Path) -> None:
+    network = fit(data, tmp_path / "n.safetensors", FitSettings(max_epochs=60, batch_size=16, learning_rate=1e-2))
+    state, _ = fitting.load_network(tmp_path / "n.safetensors", network)
+    errors = [validation for _, validation in state["history"]]
+    assert state["best"] == min(errors)
+    assert state["best"] < 0.05 * errors[0]
+    network.eval()
+    _, latent, z = data
+    found = torch.nn.functional.mse_loss(
+        fitting.predict(network.coefficients, latent[64:]), network.target(z[64:])
+    ).item()
+    assert found == pytest.approx(state["best"], rel=1e-4), "the parameters kept are those of the best epoch"
+
+
+def test_the_rate_falls_on_a_plateau_and_ends_the_fit(data: tuple, tmp_path: Path) -> None:
+    settings = FitSettings(max_epochs=500, batch_size=16, learning_rate=1e-2, final_rate=5e-3, patience=1)
+    network = fit(data, tmp_path / "n.safetensors", settings)
+    state, _ = fitting.load_network(tmp_path / "n.safetensors", network)
+    assert state["epoch"] < 500

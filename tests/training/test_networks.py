@@ -1,0 +1,191 @@
+"""Laws of the networks: what they are at the start, what they can't see, and gradients made by hand."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from geometry.mesh import Connectivity, TriangleMesh
+from geometry.nric import WeightedNorm, nric
+from training.config import CombinerSettings, LatentNetworkSettings
+from training.coordinates import Coordinates
+from training.networks import (
+    CombinerNetwork,
+    EdgeConvolution,
+    FactorNetwork,
+    FourierProducts,
+    LatentFeatures,
+    PatchBasis,
+    Scaling,
+    affine_sum,
+    edge_midpoints,
+    flaps,
+    star,
+)
+
+TORUS = Coordinates(np.zeros(2), np.full(2, 2 * np.pi), np.full(2, 2 * np.pi))
+
+
+@pytest.fixture
+def ball() -> TriangleMesh:
+    sphere = trimesh.creation.icosphere(2)
+    return TriangleMesh.from_arrays(sphere.vertices, sphere.faces)
+
+
+@pytest.fixture
+def sheet() -> TriangleMesh:
+    x, y = np.meshgrid(np.arange(5.0), np.arange(4.0))
+    quads = [(i + 5 * j, i + 1 + 5 * j, i + 6 + 5 * j, i + 5 + 5 * j) for i in range(4) for j in range(3)]
+    faces = [f for a, b, c, d in quads for f in ((a, b, c), (a, c, d))]
+    return TriangleMesh.from_arrays(np.stack([x.ravel(), y.ravel(), 0 * x.ravel()], 1), faces)
+
+
+def scaling(mesh: TriangleMesh, samples: np.ndarray) -> Scaling:
+    return Scaling.of(nric(mesh.vertices, mesh.connectivity), WeightedNorm.of(mesh, 1.0).squared, samples)
+
+
+def noisy(mesh: TriangleMesh, count: int, size: float = 0.05) -> np.ndarray:
+    rng = np.random.default_rng(3)
+    return nric(mesh.vertices + size * rng.normal(size=(count, *mesh.vertices.shape)), mesh.connectivity)
+
+
+@pytest.mark.parametrize("mesh", ["ball", "sheet"])
+def test_star_lists_the_edges_that_share_a_vertex(mesh: str, request: pytest.FixtureRequest) -> None:
+    connectivity: Connectivity = request.getfixturevalue(mesh).connectivity
+    edges = [set(e) for e in connectivity.edges.tolist()]
+    for e, row in enumerate(star(connectivity)):
+        expected = [k for k, other in enumerate(edges) if k != e and edges[e] & other]
+        assert row[row < len(edges)].tolist() == expected
+
+
+@pytest.mark.parametrize("mesh", ["ball", "sheet"])
+def test_flaps_are_the_other_edges_of_the_two_faces_in_order(mesh: str, request: pytest.FixtureRequest) -> None:
+    connectivity: Connectivity = request.getfixturevalue(mesh).connectivity
+    index = {tuple(e): k for k, e in enumerate(connectivity.edges.tolist())}
+    table = flaps(connectivity)
+    for e, (i, j) in enumerate(connectivity.edges.tolist()):
+        for side in (0, 1):
+            apex = connectivity.edge_opposite[e, side]
+            expected = [len(index)] * 2 if apex < 0 else [index[tuple(sorted((end, apex)))] for end in (i, j)]
+            assert table[e, 2 * side : 2 * side + 2].tolist() == expected
+
+
+@pytest.mark.parametrize("neighbourhood", ["star", "flaps"])
+@pytest.mark.parametrize("mesh", ["ball", "sheet"])
+def test_a_convolution_is_the_paper_s_sum_with_or_without_gradients(
+    mesh: str, neighbourhood: str, request: pytest.FixtureRequest
+) -> None:
+    connectivity: Connectivity = request.getfixturevalue(mesh).connectivity
+    torch.manual_seed(0)
+    convolution = EdgeConvolution(connectivity, 3, 5, neighbourhood).double()
+    x = torch.randn(connectivity.edge_count, 2, 3, dtype=torch.float64)
+    padded = torch.cat([x, torch.zeros_like(x[:1])])
+    table = star(connectivity) if neighbourhood == "star" else flaps(connectivity)
+    if neighbourhood == "star":
+        around = convolution.other(sum(padded[column] for column in table.T))
+    else:
+        parts = convolution.other.weight.split(3, dim=1)
+        around = sum(padded[column] @ w.T for column, w in zip(table.T, parts, strict=True))
+    expected = convolution.own(x) + around
+    torch.testing.assert_close(convolution(x), expected)
+    with torch.no_grad():
+        torch.testing.assert_close(convolution(x), expected)
+
+
+@pytest.mark.parametrize("neighbourhood", ["star", "flaps"])
+def test_the_gradient_of_a_convolution_is_right(sheet: TriangleMesh, neighbourhood: str) -> None:
+    convolution = EdgeConvolution(sheet.connectivity, 2, 2, neighbourhood).double()
+    x = torch.randn(sheet.connectivity.edge_count, 2, 2, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(convolution, (x,))
+
+
+def test_a_residual_combiner_begins_as_the_affine_sum(ball: TriangleMesh) -> None:
+    z = noisy(ball, 6).astype(np.float32)
+    factors = z.reshape(2, 3, -1)
+    network = CombinerNetwork(CombinerSettings(width=4), ball.connectivity, scaling(ball, z), 3).eval()
+    with torch.no_grad():
+        answer = network(torch.from_numpy(factors)).numpy()
+    reference = nric(ball.vertices, ball.connectivity)
+    np.testing.assert_allclose(answer, affine_sum(reference, factors), atol=2e-5)
+
+
+def test_pairwise_products_find_a_bilinear_interplay(ball: TriangleMesh) -> None:
+    """z = z̄ + a d + b e + a b f is out of reach of the affine sum and exact with one product."""
+    rng = np.random.default_rng(0)
+    reference = nric(ball.vertices, ball.connectivity)
+    d, e, f = 0.01 * rng.normal(size=(3, len(reference)))
+    a, b = rng.uniform(-1, 1, (2, 60, 1))
+    factors = np.stack([reference + a * d, reference + b * e], axis=1).astype(np.float32)
+    z = (reference + a * d + b * e + a * b * f).astype(np.float32)
+    network = CombinerNetwork(
+        CombinerSettings(width=4, pairwise=1), ball.connectivity, scaling(ball, z), 2
+    ).eval()  # fmt: skip
+    x, y = torch.from_numpy(factors), torch.from_numpy(z)
+    with torch.no_grad():
+        before = (network(x) - y).abs().max()
+        network.pairwise.fit(x_down := network.scaling.down(x), network.scaling.down(y) - x_down.sum(1), ridge=1e-9)
+        after = (network(x) - y).abs().max()
+    assert before > 0.01
+    assert after < 1e-4
+
+
+def test_scaled_differences_go_both_ways_and_have_unit_size(sheet: TriangleMesh) -> None:
+    z = noisy(sheet, 50)
+    network = scaling(sheet, z)
+    y = network.down(torch.from_numpy(z).float())
+    half = y.shape[1] // 2
+    spread = (y - y.mean(dim=0)).square()
+    assert spread[:, :half].mean() == pytest.approx(1, rel=1e-4)
+    assert spread[:, half:].mean() == pytest.approx(1, rel=1e-4)
+    inner = np.concatenate([np.ones(half, bool), sheet.connectivity.interior])
+    np.testing.assert_allclose(network.up(y)[:, inner], z[:, inner], atol=1e-5)
+    assert np.all(network.up(y + 1)[:, ~inner].numpy() == 0), "a boundary edge has no angle"
+
+
+@pytest.mark.parametrize("patches", [1, 5])
+def test_a_patch_basis_keeps_the_variance_it_promises(ball: TriangleMesh, patches: int) -> None:
+    y = noisy(ball, 40).astype(np.float32)
+    for energy in (0.6, 0.95):
+        basis = PatchBasis.fit(y, edge_midpoints(ball), patches, energy, seed=0)
+        x = torch.from_numpy(y)
+        kept = basis(basis.encode(x))
+        lost = ((x - kept).square().sum() / (x - x.mean(dim=0)).square().sum()).item()
+        assert 0 < lost <= 1 - energy + 1e-5
+        torch.testing.assert_close(basis.encode(kept), basis.encode(x), atol=1e-4, rtol=1e-3)
+
+
+def test_periodic_features_close_up_and_bounded_ones_fill_the_unit_interval() -> None:
+    mixed = Coordinates(np.array([0.0, -3.0]), np.array([2 * np.pi, 5.0]), np.array([2 * np.pi, np.nan]))
+    features = LatentFeatures(mixed, order=3)
+    assert features.size == 7
+    low, high = features(torch.tensor([[0.0, -3.0], [2 * np.pi, 5.0]]))
+    torch.testing.assert_close(low[1:], high[1:], atol=1e-5, rtol=0)
+    assert (low[0], high[0]) == (-1, 1)
+
+
+def test_fourier_products_hold_each_wave_of_the_ellipse_once() -> None:
+    products = FourierProducts(TORUS, [3, 2])
+    x = torch.rand(400, 2) * 2 * np.pi
+    values = products(x).double()
+    assert torch.linalg.matrix_rank(values) == products.size, "no wave twice"
+    for wave in (torch.cos(3 * x[:, 0]), torch.sin(2 * x[:, 1]), torch.sin(2 * x[:, 0]) * torch.cos(x[:, 1])):
+        solution = torch.linalg.lstsq(values, wave.double()[:, None]).solution
+        torch.testing.assert_close(values @ solution, wave.double()[:, None], atol=1e-5, rtol=0)
+    with pytest.raises(ValueError, match="one order for each coordinate"):
+        FourierProducts(TORUS, [3])
+
+
+def test_the_fitted_skip_layer_reproduces_a_trigonometric_polynomial(ball: TriangleMesh) -> None:
+    rng = np.random.default_rng(1)
+    a = rng.uniform(0, 2 * np.pi, (300, 2))
+    reference = nric(ball.vertices, ball.connectivity)
+    u, v = 0.01 * rng.normal(size=(2, len(reference)))
+    z = reference + np.cos(2 * a[:, :1]) * u + np.sin(a[:, :1]) * np.cos(a[:, 1:]) * v
+    settings = LatentNetworkSettings(hidden=[4], skip_orders=[3, 3])
+    network = FactorNetwork(settings, TORUS, scaling(ball, z), None).eval()
+    latent, target = torch.from_numpy(a).float(), torch.from_numpy(z).float()
+    with torch.no_grad():
+        network.fit_skip(latent, network.target(target), ridge=1e-9)
+        assert (network(latent) - target).abs().max() < 1e-4

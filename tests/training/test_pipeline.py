@@ -1,0 +1,167 @@
+"""The real command on a small torus: what it leaves, what it repeats, what a kill costs."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import onnxruntime
+import pytest
+import torch
+
+from geometry.nric import WeightedNorm, nric
+from service.bundle import read_bundle
+from tests.training.conftest import TINY, command
+from training.config import load, parse
+from training.export import ExportError, export
+from training.freaky_torus import FreakyTorus, vertices
+from training.pipeline import STAGES, Run, learner_of
+
+
+def seconds(run: Path) -> dict[str, float]:
+    return {name: json.loads((run / "stages" / f"{name}.json").read_text())["seconds"] for name in STAGES}
+
+
+def test_a_run_leaves_what_the_contract_promises(tiny_run: Path) -> None:
+    with np.load(tiny_run / "reference.npz") as reference:
+        assert reference["vertices"].shape == (2048, 3)
+        assert reference["faces"].shape == (4096, 3)
+        assert reference["edges"].shape == (6144, 2)
+        scale = float(reference["scale"])
+        np.testing.assert_allclose(scale * reference["vertices"], vertices(np.zeros((1, 4)))[0], atol=1e-12)
+    factors = json.loads((tiny_run / "factors.json").read_text())
+    assert factors["factors"] == [[0], [1], [2, 3]]
+    with np.load(tiny_run / "samples" / "part-00001.npz") as part:
+        assert part["index"].tolist() == list(range(20, 40))
+        np.testing.assert_allclose(scale * part["vertices"], vertices(part["latents"]), atol=1e-6)
+        assert set(part["status"]) == {"done"}
+        assert part["nric"].shape == (20, 2 * 6144)
+    with np.load(tiny_run / "samples" / "factor-2" / "part-00000.npz") as part:
+        assert np.all(part["latents"][:, :2] == 0)
+    with np.load(tiny_run / "samples" / "split.npz") as split:
+        every = np.concatenate([split[k] for k in ("train", "validation", "test")])
+        assert sorted(every) == list(range(60))
+        assert len(split["test"]) == 12
+    figures = json.loads((tiny_run / "evaluation.json").read_text())
+    for model in ("composite", "monolithic", "affine", "grid"):
+        assert set(figures["r2"][model]) == {"total", "lengths", "angles"}
+    assert 0.9 < figures["r2"]["affine"]["total"] < 0.99
+    assert figures["r2"]["composite"]["total"] > 0.5
+    assert figures["variants"]["paper"]["title"]
+    assert figures["vertex_error"]["max"] > figures["vertex_error"]["mean"] > 0
+    events = [json.loads(line) for line in (tiny_run / "log.jsonl").read_text().splitlines()]
+    assert [e["stage"] for e in events if e["event"] == "end"] == list(STAGES)
+    assert all(e["time"] for e in events)
+
+
+def test_the_bundle_is_one_the_server_takes_and_computes_the_same(tiny_run: Path) -> None:
+    folder = tiny_run / "models" / "tiny-torus" / "1"
+    bundle = read_bundle(folder)
+    assert bundle.manifest.figures == json.loads((tiny_run / "evaluation.json").read_text())
+    assert bundle.manifest.onnx_tolerance.measured <= 1e-4
+    text = b"".join(path.read_bytes() for path in folder.iterdir())
+    assert str(Path(__file__).parents[2]).encode() not in text, "a bundle tells nothing of the machine it was made on"
+
+    config = load(tiny_run / "config.toml")
+    run = Run(tiny_run, config, (tiny_run / "config.toml").read_text(), tiny_run / "models")
+    composite = learner_of(run).main()
+    codes = np.random.default_rng(4).uniform(0, 6, (5, 4)).astype(np.float32)
+    with torch.no_grad():
+        expected = composite(torch.from_numpy(codes)).numpy()
+    shapes = [
+        onnxruntime.InferenceSession(folder / f.file).run(None, {f.input: codes[:, f.start : f.stop]})[0]
+        for f in bundle.manifest.factors
+    ]
+    combiner = onnxruntime.InferenceSession(folder / "combiner.onnx")
+    answer = combiner.run(None, {"factors": np.stack(shapes, axis=1)})[0]
+    norm = WeightedNorm.of(FreakyTorus().reference, 1e-2)
+    assert np.sqrt(norm.square(answer - expected) / norm.square(expected)).max() < 1e-4
+
+
+def test_export_refuses_where_onnx_and_torch_disagree(tiny_run: Path, tmp_path: Path) -> None:
+    config = load(tiny_run / "config.toml")
+    run = Run(tiny_run, config, (tiny_run / "config.toml").read_text(), tmp_path)
+    strict = parse(TINY + "tolerance = 1e-12\n", "strict")
+    with pytest.raises(ExportError, match="differ by"):
+        export(learner_of(run).main(), run.collection, strict, {}, "", tmp_path)
+    assert not (tmp_path / "tiny-torus" / "1").exists()
+
+
+def test_the_same_command_again_does_nothing_and_a_changed_setting_only_its_stages(
+    tiny_run: Path, tmp_path: Path
+) -> None:
+    copy = tmp_path / "run"
+    shutil.copytree(tiny_run, copy)
+    config = tmp_path / "tiny.toml"
+    config.write_text(TINY)
+    before = seconds(copy)
+    subprocess.run(command(config, copy), check=True, capture_output=True)
+    assert seconds(copy) == before
+    config.write_text(TINY.replace("A run for the tests.", "Another description."))
+    subprocess.run(command(config, copy), check=True, capture_output=True)
+    after = seconds(copy)
+    assert {name for name in STAGES if before[name] != after[name]} == {"export"}
+    manifest = json.loads((copy / "models" / "tiny-torus" / "1" / "manifest.json").read_text())
+    assert manifest["description"] == "Another description."
+
+
+def test_a_run_killed_in_samples_and_in_networks_ends_with_the_same_figures(tiny_run: Path, tmp_path: Path) -> None:
+    config, copy = tmp_path / "tiny.toml", tmp_path / "run"
+    config.write_text(TINY)
+    for sign in ("samples/factor-2/part-00001.npz", "networks/combiner-*.safetensors"):
+        process = subprocess.Popen(
+            command(config, copy, "--until", "evaluation"), stdout=subprocess.DEVNULL, start_new_session=True
+        )
+        while not list(copy.glob(sign)):
+            assert process.poll() is None, "the run ended before it could be killed"
+            time.sleep(0.02)
+        os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
+    subprocess.run(command(config, copy, "--until", "evaluation"), check=True, capture_output=True)
+    one, other = (json.loads((run / "evaluation.json").read_text()) for run in (tiny_run, copy))
+    one.pop("times"), other.pop("times")
+    assert one == other
+    with np.load(tiny_run / "samples/part-00002.npz") as a, np.load(copy / "samples/part-00002.npz") as b:
+        assert all(np.array_equal(a[k], b[k]) for k in a)
+
+
+def test_faults_of_the_user_s_making_are_one_message(tmp_path: Path) -> None:
+    config = tmp_path / "bad.toml"
+    config.write_text("[collection]\n")
+    for arguments, says in (
+        (["run", str(config)], "collection.generator"),
+        (["run", str(tmp_path / "none.toml")], "can't be read"),
+        (["status", str(tmp_path / "nowhere")], "is no run directory"),
+    ):
+        result = subprocess.run(
+            [sys.executable, "-m", "training", *arguments], capture_output=True, text=True, check=False
+        )
+        assert result.returncode == 1
+        assert says in result.stderr
+        assert "Traceback" not in result.stderr
+
+
+def test_status_tells_how_far_a_run_is(tiny_run: Path) -> None:
+    result = subprocess.run(
+        [sys.executable, "-m", "training", "status", str(tiny_run)], capture_output=True, text=True, check=True
+    )
+    lines = dict(line.split(maxsplit=1) for line in result.stdout.splitlines())
+    assert list(lines) == list(STAGES)
+    assert all(state.startswith("done in") for state in lines.values())
+
+
+def test_samples_keep_lengths_and_angles_of_the_formula(tiny_run: Path) -> None:
+    torus = FreakyTorus()
+    with np.load(tiny_run / "samples" / "part-00000.npz") as part:
+        exact = nric(torus.shapes(part["latents"])[0], torus.reference.connectivity)
+        half = exact.shape[1] // 2
+        np.testing.assert_allclose(part["nric"][:, :half], exact[:, :half], atol=1e-6)
+        turns = (part["nric"][:, half:] - exact[:, half:]) / (2 * np.pi)
+        np.testing.assert_allclose(turns, np.round(turns), atol=1e-5)

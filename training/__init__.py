@@ -1,0 +1,1 @@
+"""Offline: from a collection of meshes to a measured bundle of networks."""

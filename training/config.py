@@ -1,0 +1,159 @@
+"""The typed configuration of a run, read from TOML."""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+#: Which edges a convolution hears of, see networks.EdgeConvolution.
+Neighbourhood = Literal["star", "flaps"]
+
+
+class ConfigError(ValueError):
+    """A configuration that can't be used, with a line for each fault."""
+
+
+class _Section(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class CollectionSettings(_Section):
+    """Where the shapes come from."""
+
+    generator: Literal["freaky-torus"]
+
+
+class SampleSettings(_Section):
+    """Codes drawn uniformly from the hypercube, and how they are split."""
+
+    count: int = Field(4000, ge=10)
+    factor_counts: list[int] | None = None
+    """Samples of each factor alone; None takes the factor's part of the joint codes, as the paper does."""
+    part_size: int = Field(200, ge=1)
+    test_fraction: float = Field(0.2, gt=0, lt=1)
+    validation_fraction: float = Field(0.1, gt=0, lt=1)
+    """Part of the training codes that chooses the learning rate and the best epoch."""
+    seed: int = 0
+
+
+class FitSettings(_Section):
+    """Adam. Its rate is divided by ten whenever the validation loss stops falling, as in the paper (section 4), or
+    falls along half a cosine to nothing at the last epoch, which is better where the number of epochs is what counts.
+    """
+
+    schedule: Literal["plateau", "cosine"] = "plateau"
+    learning_rate: float = Field(1e-3, gt=0)
+    final_rate: float = Field(1e-6, gt=0)
+    patience: int = Field(10, ge=1)
+    max_epochs: int = Field(500, ge=1)
+    batch_size: int = Field(64, ge=2)
+
+
+class LatentNetworkSettings(_Section):
+    """A network from latents to NRIC: a factor network or the monolithic baseline."""
+
+    hidden: list[int] = [256, 256]
+    fourier: int = Field(1, ge=0)
+    """Highest frequency of a periodic coordinate among the inputs; 0 feeds the bare angle, as the paper does."""
+    skip_orders: list[int] | None = None
+    """Largest frequency of each coordinate in a linear layer beside the hidden ones, fitted by ridge regression."""
+    patches: int = Field(1, ge=1)
+    """Groups of neighbouring edges with a principal basis each, as the last layer."""
+    energy: float | None = Field(None, gt=0, lt=1)
+    """Variance kept by that basis; None makes the last layer a dense one."""
+    fit: FitSettings = FitSettings()
+
+
+class CombinerSettings(_Section):
+    """Graph convolutions on edges from J factor shapes to the joint one."""
+
+    width: int = Field(48, ge=1)
+    layers: int = Field(3, ge=1)
+    neighbourhood: Neighbourhood = "star"
+    residual: bool = True
+    """Learn the difference to the affine sum of the factors instead of the shape itself; pass each layer's input on."""
+    edge_channels: int = Field(8, ge=0)
+    """Learned constants of each edge, given to the first convolution beside the factors."""
+    pairwise: int = Field(0, ge=0)
+    """Principal coefficients of each factor whose products, two factors at a time, correct the affine sum."""
+    dropout: float = Field(0.1, ge=0, lt=1)
+    fit: FitSettings = FitSettings(batch_size=8, patience=5, max_epochs=100)
+
+
+class NetworkSettings(_Section):
+    """Everything that decides what is learned from the samples."""
+
+    factors: list[LatentNetworkSettings]
+    combiner: CombinerSettings = CombinerSettings()
+    seed: int = 0
+
+
+class VariantSettings(_Section):
+    """One row of the ablation: what differs from the main recipe."""
+
+    title: str
+    factors: list[LatentNetworkSettings] | None = None
+    combiner: CombinerSettings | None = None
+
+
+class EvaluationSettings(_Section):
+    """How the test split is measured."""
+
+    eta: float = Field(1e-2, gt=0)
+    grid_nodes: int = Field(16, ge=2)
+    """Nodes per coordinate of the multilinear grid of Sassen et al. 2020."""
+    reconstructions: int = Field(100, ge=1)
+    """Test shapes whose vertices are reconstructed."""
+
+
+class ExportSettings(_Section):
+    """What the bundle says of itself."""
+
+    name: str = Field(pattern=r"^[a-z0-9][a-z0-9-]*$")
+    version: int = Field(1, ge=1)
+    title: str
+    description: str
+    licence: str
+    eta_reconstruction: float = Field(1e-2, gt=0)
+    tolerance: float = Field(1e-4, gt=0)
+    """Largest relative difference of ONNX and PyTorch, in the weighted norm."""
+
+
+class Config(_Section):
+    """A whole run."""
+
+    collection: CollectionSettings
+    samples: SampleSettings = SampleSettings()
+    networks: NetworkSettings
+    monolithic: LatentNetworkSettings = LatentNetworkSettings()
+    variants: dict[str, VariantSettings] = {}
+    evaluation: EvaluationSettings = EvaluationSettings()
+    export: ExportSettings
+
+
+def parse(text: str, source: str) -> Config:
+    """Read a configuration from TOML text.
+
+    Raises:
+        ConfigError: naming the source and every faulty setting.
+    """
+    try:
+        values: dict[str, Any] = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigError(f"{source}: not TOML: {error}") from error
+    try:
+        return Config.model_validate(values)
+    except ValidationError as error:
+        faults = "\n".join(f"  {'.'.join(map(str, e['loc']))}: {e['msg']}" for e in error.errors())
+        raise ConfigError(f"{source}: these settings can't be used\n{faults}") from error
+
+
+def load(path: Path) -> Config:
+    """Read a configuration file; raises ConfigError."""
+    try:
+        return parse(path.read_text(encoding="utf-8"), str(path))
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: can't be read: {error}") from error

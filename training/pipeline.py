@@ -1,0 +1,259 @@
+"""The stages of a run, in order; each leaves its result in the run directory and is repeated only where it must be."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import shutil
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from pydantic import BaseModel
+
+from geometry.nric import WeightedNorm, nric
+from training.config import Config
+from training.evaluation import (
+    MultilinearGrid,
+    exact_factors,
+    model_times,
+    r_squared,
+    size_bytes,
+    vertex_error,
+)
+from training.export import export
+from training.fitting import predict
+from training.freaky_torus import FreakyTorus
+from training.learning import Learner
+from training.networks import affine_sum
+from training.sampling import Collection, draw, split, write_npz
+
+GENERATORS: dict[str, Callable[[], Collection]] = {"freaky-torus": FreakyTorus}
+
+
+class Run:
+    """A run directory: configuration, log, and what the stages have left in it."""
+
+    def __init__(self, folder: Path, config: Config, source: str, models: Path) -> None:
+        self.folder, self.config, self.models = folder, config, models
+        folder.mkdir(parents=True, exist_ok=True)
+        self._stamps = folder / "stages"
+        self._stamps.mkdir(exist_ok=True)
+        (folder / "config.toml").write_text(source, encoding="utf-8")
+
+    @cached_property
+    def collection(self) -> Collection:
+        """The parametrised collection; later stages may add to what it knows."""
+        return GENERATORS[self.config.collection.generator]()
+
+    def log(self, event: str, **facts: Any) -> None:
+        """Append one line to log.jsonl."""
+        line = {"time": datetime.now(UTC).isoformat(timespec="milliseconds"), "event": event, **facts}
+        with (self.folder / "log.jsonl").open("a", encoding="utf-8") as file:
+            file.write(json.dumps(line) + "\n")
+
+    def stamp(self, stage: str) -> dict[str, Any]:
+        """What is known of a stage: its key, and its seconds once it is finished."""
+        path = self._stamps / f"{stage}.json"
+        return json.loads(path.read_text()) if path.exists() else {}
+
+    def set_stamp(self, stage: str, **facts: Any) -> None:
+        """Record a stage's key and, at its end, its seconds."""
+        write_json(self._stamps / f"{stage}.json", facts)
+
+
+def write_json(path: Path, value: Any) -> None:
+    """Write JSON whole or not at all."""
+    part = path.with_suffix(".part")
+    part.write_text(json.dumps(value, indent=2) + "\n", encoding="utf-8")
+    os.replace(part, path)
+
+
+def ingest(run: Run) -> None:
+    """reference.npz."""
+    mesh = run.collection.reference
+    write_npz(
+        run.folder / "reference.npz",
+        vertices=mesh.vertices,
+        faces=mesh.faces,
+        edges=mesh.edges,
+        scale=np.array(run.collection.scale),
+    )
+
+
+def given_by_design(run: Run) -> None:
+    """Nothing to compute: a generator's collection is a product as it stands."""
+    run.log("skipped", why="the generator gives factors and bounds itself")
+
+
+def factors(run: Run) -> None:
+    """factors.json."""
+    lists = run.collection.factors
+    write_json(run.folder / "factors.json", {"factors": list(lists.values()), "names": list(lists)})
+
+
+def samples(run: Run) -> None:
+    """samples/: joint codes with their shapes, each factor's own, and the split."""
+    settings, coordinates = run.config.samples, run.collection.coordinates
+    folder = run.folder / "samples"
+    # Independent streams: more samples of one kind don't change another's.
+    joint_rng, split_rng, *factor_rngs = (
+        np.random.default_rng(s) for s in np.random.SeedSequence(settings.seed).spawn(2 + len(run.collection.factors))
+    )
+    joint = coordinates.uniform(settings.count, joint_rng)
+    draws = [("joint samples", folder, joint)]
+    for j, (index, rng) in enumerate(zip(run.collection.factors.values(), factor_rngs, strict=True)):
+        count = settings.count if settings.factor_counts is None else settings.factor_counts[j]
+        alone = np.zeros((count, len(coordinates)))
+        own = settings.factor_counts is not None
+        alone[:, index] = coordinates[index].uniform(count, rng) if own else joint[:, index]
+        draws.append((f"samples of factor {j}", folder / f"factor-{j}", alone))
+    for title, place, latents in draws:
+        for done, total in draw(run.collection, place, latents, settings.part_size, title):
+            run.log("progress", stage="samples", what=title, done=done, total=total)
+    write_npz(
+        folder / "split.npz", **split(settings.count, settings.test_fraction, settings.validation_fraction, split_rng)
+    )
+
+
+def learner_of(run: Run) -> Learner:
+    """The networks of a run whose samples are there."""
+    return Learner(run.collection, run.config, run.folder, run.stamp("samples")["key"])
+
+
+def networks(run: Run) -> None:
+    """networks/: one file for each fitted network, and its history in the log."""
+    learner = learner_of(run)
+    learner.main()
+    learner.monolithic()
+    learner.variants()
+    write_json(run.folder / "networks" / "histories.json", learner.histories)
+
+
+def evaluation(run: Run) -> None:
+    """evaluation.json: every model on the test split, which is read here and nowhere before."""
+    collection, settings = run.collection, run.config.evaluation
+    learner = learner_of(run)
+    composite, monolithic, variants = learner.main(), learner.monolithic(), learner.variants()
+    test = learner.split["test"]
+    latents, exact, vertices = learner.joint.latents[test], learner.joint.nric[test], learner.joint.vertices[test]
+    codes = torch.as_tensor(latents, dtype=torch.float32)
+    reference = collection.reference
+    z_reference = nric(reference.vertices, reference.connectivity)
+    norm = WeightedNorm.of(reference, settings.eta)
+
+    shapes = exact_factors(collection, latents)
+    grids = [MultilinearGrid.of(collection, index, settings.grid_nodes) for index in collection.factors.values()]
+    on_grid = np.stack(
+        [grid(latents[:, index]) for grid, index in zip(grids, collection.factors.values(), strict=True)], axis=1
+    )
+    learned = predict(composite.factor_shapes, codes).numpy()
+    answer = predict(composite, codes).numpy()
+    r2 = {
+        "composite": r_squared(answer, exact, norm),
+        "monolithic": r_squared(predict(monolithic, codes).numpy(), exact, norm),
+        "affine": r_squared(affine_sum(z_reference, shapes), exact, norm),
+        "grid": r_squared(affine_sum(z_reference, on_grid), exact, norm),
+        "affine of learned factors": r_squared(affine_sum(z_reference, learned), exact, norm),
+    }
+    first = slice(settings.reconstructions)
+    write_json(
+        run.folder / "evaluation.json",
+        {
+            "eta": settings.eta,
+            "test_samples": len(test),
+            "r2": r2,
+            "r2_factors": {
+                name: r_squared(learned[:, j], shapes[:, j], norm) for j, name in enumerate(collection.factors)
+            },
+            "variants": {
+                name: {
+                    "title": run.config.variants[name].title,
+                    "r2": r_squared(predict(variant, codes).numpy(), exact, norm),
+                }
+                for name, variant in variants.items()
+            },
+            "vertex_error": vertex_error(
+                reference, run.config.export.eta_reconstruction, answer[first], vertices[first]
+            ),
+            "sizes": {
+                "composite": size_bytes(*composite.networks, composite.combiner),
+                "monolithic": size_bytes(monolithic),
+                "grid": sum(grid.values.nbytes for grid in grids),
+            },
+            "times": model_times(collection, composite),
+        },
+    )
+
+
+def export_bundle(run: Run) -> None:
+    """The bundle, in the models directory."""
+    learner = learner_of(run)
+    figures = json.loads((run.folder / "evaluation.json").read_text())
+    digest = hashlib.sha256()
+    for path in sorted((run.folder / "samples").rglob("*.npz")):
+        digest.update(path.read_bytes())
+    folder = export(learner.main(), run.collection, run.config, figures, digest.hexdigest(), run.models)
+    run.log("exported", bundle=f"{folder.parent.name}/{folder.name}")
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One step of the line.
+
+    Attributes:
+        run: does it; finds and continues what an interrupted call has left.
+        settings: the part of the configuration that it reads.
+        results: what is removed where that part, or an earlier stage, has changed.
+    """
+
+    run: Callable[[Run], None]
+    settings: Callable[[Config], Sequence[BaseModel]]
+    results: tuple[str, ...]
+
+
+STAGES: dict[str, Stage] = {
+    "ingest": Stage(ingest, lambda c: [c.collection], ("reference.npz",)),
+    "mean": Stage(given_by_design, lambda c: [], ()),
+    "modes": Stage(given_by_design, lambda c: [], ("modes.npz",)),
+    "factors": Stage(factors, lambda c: [], ("factors.json",)),
+    "samples": Stage(samples, lambda c: [c.samples], ("samples",)),
+    # Files of networks are named by samples and settings, so a change leaves those alone that it doesn't touch.
+    "networks": Stage(networks, lambda c: [c.networks, c.monolithic, *c.variants.values()], ()),
+    "evaluation": Stage(evaluation, lambda c: [c.evaluation], ("evaluation.json",)),
+    "export": Stage(export_bundle, lambda c: [c.export], ()),
+}
+
+
+def execute(run: Run, until: str | None = None, *, show: Callable[[str], None] = print) -> None:
+    """Do the stages that are not done yet, up to and including ``until``."""
+    key = ""
+    for name, stage in STAGES.items():
+        settings = [s.model_dump(mode="json") for s in stage.settings(run.config)]
+        key = hashlib.sha256(json.dumps([name, settings, key]).encode()).hexdigest()
+        stamp = run.stamp(name)
+        if stamp.get("key") == key and "seconds" in stamp:
+            show(f"{name}: done before ({stamp['seconds']:.0f} s)")
+        else:
+            if stamp and stamp["key"] != key:
+                for result in stage.results:
+                    path = run.folder / result
+                    shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
+            run.set_stamp(name, key=key)
+            run.log("begin", stage=name)
+            show(f"{name} …")
+            start = time.monotonic()
+            stage.run(run)
+            seconds = time.monotonic() - start
+            run.set_stamp(name, key=key, seconds=seconds)
+            run.log("end", stage=name, seconds=round(seconds, 3))
+            show(f"{name}: {seconds:.0f} s")
+        if name == until:
+            break
