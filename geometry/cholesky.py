@@ -22,6 +22,8 @@ from geometry.mesh import FloatArray, IntArray
 
 Backend = Literal["auto", "banded", "pardiso"]
 
+_MKL_SEQUENTIAL = 1
+
 
 class NotPositiveDefiniteError(ArithmeticError):
     """The matrix has no Cholesky factor: not positive definite to working precision, or not finite."""
@@ -130,8 +132,9 @@ def _mkl() -> ctypes.CDLL:
     from pypardiso import PyPardisoSolver
 
     library = PyPardisoSolver().libmkl
-    # One thread: requests and samples run side by side, and results don't depend on a thread count.
-    library.MKL_Set_Num_Threads(ctypes.c_int(1))
+    # One thread, as requests and samples run side by side. Left to itself MKL joins whatever OpenMP the process has
+    # loaded already (PyTorch's, say), and rounds differently with each.
+    library.MKL_Set_Threading_Layer(ctypes.c_int(_MKL_SEQUENTIAL))
     pardiso = library.pardiso
     pardiso.argtypes, pardiso.restype = [ctypes.c_void_p] * 16, None
     return library
