@@ -80,6 +80,8 @@ class CombinerSettings(_Section):
     pairwise: int = Field(0, ge=0)
     """Principal coefficients of each factor whose products, two factors at a time, correct the affine sum."""
     dropout: float = Field(0.1, ge=0, lt=1)
+    symmetries: bool = True
+    """Learn from the training samples' images under the collection's symmetries too, where it has any."""
     fit: FitSettings = FitSettings(batch_size=8, patience=5, max_epochs=100)
 
 

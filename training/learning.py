@@ -144,7 +144,9 @@ class Learner:
         )
         composite = Composite(list(self.collection.factors.values()), networks, network)
         inputs = predict(composite.factor_shapes, torch.as_tensor(self.joint.latents, dtype=torch.float32))
-        inputs, z, rows = self._with_images(inputs)
+        z, rows = self.joint.nric, self.split
+        if combiner.symmetries:
+            inputs, z, rows = self._with_images(inputs)
         path = self._path("combiner", combiner, *factors)
         if not path.exists():
             network.fit_pairwise(inputs[rows["train"]], torch.from_numpy(z[rows["train"]]))

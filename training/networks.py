@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy import sparse
 from scipy.cluster.vq import kmeans2
 from torch import Tensor, nn
 
@@ -279,23 +278,52 @@ class EdgeConvolution(nn.Module):
     at e, in the order that e's direction and the faces' orientation fix: ``W₁ x_e + Σ_k W_{2,k} x_{e_k} + b``.
     """
 
-    neighbours: Tensor
-    targets: Tensor
-    offsets: Tensor
-
     def __init__(self, connectivity: Connectivity, n_in: int, n_out: int, neighbourhood: Neighbourhood) -> None:
         super().__init__()
-        count = connectivity.edge_count
-        self.star = neighbourhood == "star"
-        table = star(connectivity) if self.star else flaps(connectivity)
         self.own = nn.Linear(n_in, n_out)
-        self.other = nn.Linear(n_in if self.star else table.shape[1] * n_in, n_out, bias=False)
-        if self.star:
+        self.around = Star(connectivity) if neighbourhood == "star" else Flaps(connectivity)
+        self.other = nn.Linear(self.around.count * n_in, n_out, bias=False)
+        if neighbourhood == "star":
             with torch.no_grad():
                 # About ten neighbours: without this their sum outweighs the edge itself at the start.
                 self.other.weight /= 10
+
+    def forward(self, x: Tensor) -> Tensor:
+        return self.own(x) + self.other(self.around(x))
+
+
+class Star(nn.Module):
+    """(E, n, C) → the same: sums over the edges that share a vertex with each, by way of sums at the vertices."""
+
+    edges: Tensor
+    at_vertex: Tensor
+    count = 1
+
+    def __init__(self, connectivity: Connectivity) -> None:
+        super().__init__()
+        self.register_buffer("edges", torch.tensor(connectivity.edges), persistent=False)
+        self.register_buffer("at_vertex", torch.as_tensor(edges_at_vertices(connectivity)), persistent=False)
+
+    def forward(self, x: Tensor) -> Tensor:
+        if torch.compiler.is_exporting():
+            at_vertex = _gather(x, self.at_vertex).sum(dim=1)
+            return at_vertex[self.edges[:, 0]] + at_vertex[self.edges[:, 1]] - 2 * x
+        return _StarSum.apply(x, self.edges, self.at_vertex)
+
+
+class Flaps(nn.Module):
+    """(E, n, C) → (E, n, 4 C): the features of the four other edges of the two faces at each edge, see `flaps`."""
+
+    neighbours: Tensor
+    targets: Tensor
+    offsets: Tensor
+    count = 4
+
+    def __init__(self, connectivity: Connectivity) -> None:
+        super().__init__()
+        table = flaps(connectivity)
         # For the gradient: at which places of the table each edge stands.
-        flat = table.ravel()
+        flat, count = table.ravel(), connectivity.edge_count
         order = np.argsort(flat, kind="stable")[: int((flat < count).sum())]
         for name, index in {
             "neighbours": table,
@@ -305,26 +333,20 @@ class EdgeConvolution(nn.Module):
             self.register_buffer(name, torch.as_tensor(index), persistent=False)
 
     def forward(self, x: Tensor) -> Tensor:
-        gather = _Gather.apply if torch.is_grad_enabled() else _gather
-        if self.star:
-            return self.own(x) + gather(self.other(x), self.neighbours, self.targets, self.offsets).sum(dim=1)
-        around = gather(x, self.neighbours, self.targets, self.offsets).transpose(1, 2).flatten(2)
-        return self.own(x) + self.other(around)
+        if torch.compiler.is_exporting():
+            around = _gather(x, self.neighbours)
+        else:
+            around = _FlapGather.apply(x, self.neighbours, self.targets, self.offsets)
+        return around.transpose(1, 2).flatten(2)
 
 
-def star(connectivity: Connectivity) -> IntArray:
-    """(E, k) edges that share a vertex with each edge, padded with E."""
-    edges, count = connectivity.edges, connectivity.edge_count
-    incidence = sparse.csr_array(
-        (np.ones(2 * count), (np.repeat(np.arange(count), 2), edges.ravel())), shape=(count, connectivity.vertex_count)
-    )
-    adjacency = sparse.csr_array(incidence @ incidence.T)
-    adjacency.setdiag(0)
-    adjacency.eliminate_zeros()
-    adjacency.sort_indices()
-    valence = np.diff(adjacency.indptr)
-    table = np.full((count, valence.max()), count)
-    table[np.arange(valence.max()) < valence[:, None]] = adjacency.indices
+def edges_at_vertices(connectivity: Connectivity) -> IntArray:
+    """(V, k) edges at each vertex, padded with E."""
+    ends, count = connectivity.edges.ravel(), connectivity.edge_count
+    order = np.argsort(ends, kind="stable")
+    valence = np.bincount(ends, minlength=connectivity.vertex_count)
+    table = np.full((len(valence), valence.max()), count)
+    table[np.arange(valence.max()) < valence[:, None]] = order // 2
     return table
 
 
@@ -341,19 +363,19 @@ def flaps(connectivity: Connectivity) -> IntArray:
     return table
 
 
-def _gather(x: Tensor, neighbours: Tensor, targets: Tensor, offsets: Tensor) -> Tensor:
+def _gather(x: Tensor, neighbours: Tensor) -> Tensor:
     """(E, k, n, C) features of the neighbours of each edge, zero where there is none."""
     padded = torch.cat([x, torch.zeros_like(x[:1])])
     return padded.index_select(0, neighbours.flatten()).unflatten(0, neighbours.shape)
 
 
-class _Gather(torch.autograd.Function):
+class _FlapGather(torch.autograd.Function):
     """The same for training: its gradient is a gather too, several times faster than autograd's scatter."""
 
     @staticmethod
     def forward(ctx: Any, x: Tensor, neighbours: Tensor, targets: Tensor, offsets: Tensor) -> Tensor:
         ctx.save_for_backward(targets, offsets)
-        return _gather(x, neighbours, targets, offsets)
+        return _gather(x, neighbours)
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None, None, None]:
@@ -361,6 +383,21 @@ class _Gather(torch.autograd.Function):
         flat = gradient.reshape(gradient.shape[0] * gradient.shape[1], -1)
         total = nn.functional.embedding_bag(targets, flat, offsets, mode="sum")
         return total.view(len(offsets), *gradient.shape[2:]), None, None, None
+
+
+class _StarSum(torch.autograd.Function):
+    """``Bᵀ(Bx) − 2x`` with the incidence B of vertices and edges; symmetric, so it is its own gradient."""
+
+    @staticmethod
+    def forward(ctx: Any, x: Tensor, edges: Tensor, at_vertex: Tensor) -> Tensor:
+        ctx.save_for_backward(edges, at_vertex)
+        padded = torch.cat([x, torch.zeros_like(x[:1])]).flatten(1)
+        sums = nn.functional.embedding_bag(at_vertex, padded, mode="sum", padding_idx=len(x))
+        return nn.functional.embedding_bag(edges, sums, mode="sum").view_as(x) - 2 * x
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None, None]:
+        return _StarSum.apply(gradient.contiguous(), *ctx.saved_tensors), None, None
 
 
 class PairwiseProducts(nn.Module):
