@@ -6,7 +6,7 @@ import tomllib
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 #: Which edges a convolution hears of, see networks.EdgeConvolution.
 Neighbourhood = Literal["star", "flaps"]
@@ -21,16 +21,58 @@ class _Section(BaseModel):
 
 
 class CollectionSettings(_Section):
-    """Where the shapes come from."""
+    """Where the shapes come from: a generator of ours, or meshes in correspondence."""
 
-    generator: Literal["freaky-torus"]
+    generator: Literal["freaky-torus", "figure"] | None = None
+    data: Path | None = None
+    """Folder of OBJ, PLY, STL, OFF or glTF files, or one NPZ file with ``vertices`` (n, V, 3) and ``faces``; relative
+    to the configuration's own folder. The command's ``--data`` goes before."""
+    reference: str | None = None
+    """Name of the mesh whose area becomes 1 and whose connectivity is coarsened; None takes the first."""
+    coarse_vertices: int | None = Field(1000, ge=50)
+    """Vertices to compute with, where the meshes have more; None computes with all of them."""
+
+    @model_validator(mode="after")
+    def _one_source(self) -> CollectionSettings:
+        if self.generator is not None and self.data is not None:
+            raise ValueError("give either a generator or data, not both")
+        return self
+
+
+class MaterialSettings(_Section):
+    """Of the shell, at unit area of the reference; see geometry.energy.Material."""
+
+    mu: float = Field(1.0, gt=0)
+    lambda_: float = Field(1.0, ge=0, alias="lambda")
+    eta: float = Field(1e-4, gt=0)
+
+
+class ModeSettings(_Section):
+    """Sparse principal geodesic analysis of the collection at its mean."""
+
+    count: int = Field(20, ge=1)
+    """m; at most the number of shapes less one."""
+    sparsity: float = Field(0.1, ge=0)
+    """λ; 0 is principal geodesic analysis."""
+    log_steps: int = Field(8, ge=2)
+    """K of the logarithms."""
+    max_iterations: int = Field(200, ge=1)
+
+
+class FactorSettings(_Section):
+    """Groups of modes whose supports overlap."""
+
+    count: int | None = Field(None, ge=1)
+    """J; None leaves it to the criterion of training.factors."""
 
 
 class SampleSettings(_Section):
     """Codes drawn uniformly from the hypercube, and how they are split."""
 
     count: int = Field(4000, ge=10)
-    factor_counts: list[int] | None = None
+    steps: int = Field(16, ge=2)
+    """K of the exponentials."""
+    factor_counts: list[int] | int | None = None
     """Samples of each factor alone; None takes the factor's part of the joint codes, as the paper does."""
     part_size: int = Field(200, ge=1)
     test_fraction: float = Field(0.2, gt=0, lt=1)
@@ -88,7 +130,8 @@ class CombinerSettings(_Section):
 class NetworkSettings(_Section):
     """Everything that decides what is learned from the samples."""
 
-    factors: list[LatentNetworkSettings]
+    factors: list[LatentNetworkSettings] | LatentNetworkSettings = LatentNetworkSettings()
+    """One for each factor, or one for all."""
     combiner: CombinerSettings = CombinerSettings()
     seed: int = 0
 
@@ -97,7 +140,7 @@ class VariantSettings(_Section):
     """One row of the ablation: what differs from the main recipe."""
 
     title: str
-    factors: list[LatentNetworkSettings] | None = None
+    factors: list[LatentNetworkSettings] | LatentNetworkSettings | None = None
     combiner: CombinerSettings | None = None
 
 
@@ -128,8 +171,11 @@ class Config(_Section):
     """A whole run."""
 
     collection: CollectionSettings
+    material: MaterialSettings = MaterialSettings()
+    modes: ModeSettings = ModeSettings()
+    factors: FactorSettings = FactorSettings()
     samples: SampleSettings = SampleSettings()
-    networks: NetworkSettings
+    networks: NetworkSettings = NetworkSettings()
     monolithic: LatentNetworkSettings = LatentNetworkSettings()
     variants: dict[str, VariantSettings] = {}
     evaluation: EvaluationSettings = EvaluationSettings()

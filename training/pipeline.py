@@ -51,7 +51,7 @@ class Run:
     @cached_property
     def collection(self) -> Collection:
         """The parametrised collection; later stages may add to what it knows."""
-        return GENERATORS[self.config.collection.generator]()
+        return GENERATORS[self.config.collection.generator or ""]()
 
     def log(self, event: str, **facts: Any) -> None:
         """Append one line to log.jsonl."""
