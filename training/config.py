@@ -102,6 +102,8 @@ class LatentNetworkSettings(_Section):
     """Highest frequency of a periodic coordinate among the inputs; 0 feeds the bare angle, as the paper does."""
     skip_orders: list[int] | None = None
     """Largest frequency of each coordinate in a linear layer beside the hidden ones, fitted by ridge regression."""
+    skip_degree: int | None = Field(None, ge=1)
+    """The same layer of polynomials up to this total degree, for coordinates without a period."""
     patches: int = Field(1, ge=1)
     """Groups of neighbouring edges with a principal basis each, as the last layer."""
     energy: float | None = Field(None, gt=0, lt=1)

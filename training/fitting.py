@@ -40,6 +40,17 @@ def load_network(path: Path, network: nn.Module) -> tuple[dict[str, Any], dict[s
     return state, {k: v for k, v in tensors.items() if not k.startswith(prefix)}
 
 
+def finished(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]] | None:
+    """State and tensors, by the network's own names, of a fit that is done; None where it isn't."""
+    if not path.exists():
+        return None
+    with safe_open(path, framework="pt") as file:
+        state = json.loads(file.metadata()["state"])
+        if not state["done"]:
+            return None
+        return state, {k.removeprefix("network."): file.get_tensor(k) for k in file.keys()}  # noqa: SIM118
+
+
 def predict(network: Callable[[Tensor], Tensor], inputs: Tensor, batch_size: int = 32) -> Tensor:
     """Apply a network batch by batch without gradients."""
     with torch.no_grad():

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -14,15 +16,15 @@ from numpy.typing import NDArray
 from pydantic import BaseModel
 from torch import Tensor
 
-from geometry.mesh import IntArray
+from geometry.mesh import FloatArray, IntArray
 from geometry.nric import WeightedNorm, nric
 from training.config import CombinerSettings, Config, FitSettings, LatentNetworkSettings
-from training.fitting import fit, predict
+from training.fitting import finished, fit, predict
+from training.layers import PatchBasis
 from training.networks import (
     CombinerNetwork,
     FactorNetwork,
     MonolithicNetwork,
-    PatchBasis,
     Scaling,
     ShapeNetwork,
     edge_midpoints,
@@ -58,27 +60,56 @@ class Composite:
 class Learner:
     """Fits networks on the samples of a run, each into a file named by everything that decides it.
 
-    Two rows that share a network share its file, and a finished or half-finished file is continued, not repeated.
+    Two rows that share a network share its file; a half-finished file is continued, and a finished one is read without
+    a look at the samples.
+
+    Args:
+        collection: what the samples are of.
+        config: of the run.
+        folder: of the run.
+        data_key: names the samples.
+        fraction: share of the training samples, joint and of factors, to learn from. With less the number of epochs
+            grows, so that the number of steps stays.
     """
 
-    def __init__(self, collection: Collection, config: Config, folder: Path, data_key: str) -> None:
-        self.collection, self.config, self.run, self._data_key = collection, config, folder, data_key
-        self.joint = read(folder / "samples")
-        with np.load(folder / "samples" / "split.npz") as file:
-            self.split: dict[str, IntArray] = dict(file)
-        reference = collection.reference
-        self._reference = nric(reference.vertices, reference.connectivity)
-        self._weights = WeightedNorm.of(reference, eta=1.0).squared
+    def __init__(
+        self, collection: Collection, config: Config, folder: Path, data_key: str, fraction: float = 1.0
+    ) -> None:
+        self.collection, self.config, self.run = collection, config, folder
+        self._data_key, self._fraction = data_key, fraction
         (folder / "networks").mkdir(exist_ok=True)
         self.histories: dict[str, Any] = {}
 
+    @cached_property
+    def joint(self) -> Samples:
+        """The joint samples."""
+        return read(self.run / "samples")
+
+    @cached_property
+    def split(self) -> dict[str, IntArray]:
+        """Rows of the joint samples: train, validation, test."""
+        with np.load(self.run / "samples" / "split.npz") as file:
+            return {name: np.searchsorted(self.joint.index, index) for name, index in file.items()}
+
+    @cached_property
+    def _reference(self) -> FloatArray:
+        reference = self.collection.reference
+        return nric(reference.vertices, reference.connectivity)
+
     def _path(self, kind: str, *settings: BaseModel) -> Path:
-        decides = [self._data_key, self.config.networks.seed, [s.model_dump(mode="json") for s in settings]]
-        text = json.dumps(decides)
+        decides = [self._data_key, self._fraction, self.config.networks.seed]
+        text = json.dumps([*decides, [s.model_dump(mode="json") for s in settings]])
         return self.run / "networks" / f"{kind}-{hashlib.sha256(text.encode()).hexdigest()[:12]}.safetensors"
 
     def _scaling(self, z: NDArray) -> Scaling:
-        return Scaling.of(self._reference, self._weights, z)
+        return Scaling.of(self._reference, WeightedNorm.of(self.collection.reference, eta=1.0).squared, z)
+
+    def _some(self, rows: dict[str, IntArray]) -> dict[str, IntArray]:
+        """The share of the rows to learn from. Codes are independent, so the first ones are as good as any."""
+        return {
+            name: index if name == "test" else index[: max(4, round(self._fraction * len(index)))]
+            for name, index in rows.items()
+        }
 
     def _fit(
         self, network: ShapeNetwork, inputs: Tensor, z: NDArray, rows: dict[str, IntArray], fitting: FitSettings,
@@ -91,28 +122,44 @@ class Learner:
             torch.from_numpy(z),
             torch.from_numpy(rows["train"]),
             torch.from_numpy(rows["validation"]),
-            fitting,
+            fitting.model_copy(update={"max_epochs": round(fitting.max_epochs / self._fraction)}),
             path,
             title,
             self.config.networks.seed,
         )
+        self._record(path, state)
+
+    def _load(self, network: ShapeNetwork, path: Path, state: dict[str, Any], tensors: dict[str, Tensor]) -> None:
+        network.load_state_dict(tensors)
+        network.eval()
+        self._record(path, state)
+
+    def _record(self, path: Path, state: dict[str, Any]) -> None:
         self.histories[path.stem] = {k: state[k] for k in ("epoch", "best", "history")}
 
     def _latent_network(
-        self, kind: type[FactorNetwork], settings: LatentNetworkSettings, index: list[int], samples: Samples,
-        rows: dict[str, IntArray], path: Path,
+        self, kind: type[FactorNetwork], settings: LatentNetworkSettings, index: list[int], path: Path,
+        data: Callable[[], tuple[Samples, dict[str, IntArray]]],
     ) -> FactorNetwork:  # fmt: skip
+        coordinates = self.collection.coordinates[index]
+        if saved := finished(path):
+            basis = {k.removeprefix("basis."): v for k, v in saved[1].items() if k.startswith("basis.")}
+            blank = PatchBasis.blank(basis) if basis else None
+            network = kind(settings, coordinates, Scaling.blank(len(self._reference)), blank)
+            self._load(network, path, *saved)
+            return network
         seed = self.config.networks.seed
         torch.manual_seed(seed)
+        samples, rows = data()
+        rows = self._some(rows)
         train = rows["train"]
         scaling = self._scaling(samples.nric[train])
-        basis = None
+        basis_fitted = None
         if settings.energy is not None:
             y = scaling.down(torch.from_numpy(samples.nric[train])).numpy()
-            basis = PatchBasis.fit(
-                y, edge_midpoints(self.collection.reference), settings.patches, settings.energy, seed
-            )
-        network = kind(settings, self.collection.coordinates[index], scaling, basis)
+            midpoints = edge_midpoints(self.collection.reference)
+            basis_fitted = PatchBasis.fit(y, midpoints, settings.patches, settings.energy, seed)
+        network = kind(settings, coordinates, scaling, basis_fitted)
         latents = torch.as_tensor(samples.latents[:, index], dtype=torch.float32)
         if not path.exists():
             network.fit_skip(latents[train], network.target(torch.from_numpy(samples.nric[train])))
@@ -122,41 +169,51 @@ class Learner:
     def factor(self, j: int, settings: LatentNetworkSettings) -> FactorNetwork:
         """ψ_j, on the factor's own samples, or on the joint ones' subvectors where there are no others."""
         index = list(self.collection.factors.values())[j]
-        samples = read(self.run / "samples" / f"factor-{j}")
-        if self.config.samples.factor_counts is None:
-            # One sample of the factor for each joint sample, in the same order: the same split keeps test codes out.
-            rows = self.split
-        else:
-            count = len(samples.latents)
-            held_out = round(self.config.samples.validation_fraction * count)
-            rows = {"validation": np.arange(held_out), "train": np.arange(held_out, count)}
-        path = self._path(f"factor-{j}", settings)
-        return self._latent_network(FactorNetwork, settings, index, samples, rows, path)
 
-    def composite(self, factors: list[LatentNetworkSettings], combiner: CombinerSettings) -> Composite:
+        def data() -> tuple[Samples, dict[str, IntArray]]:
+            samples = read(self.run / "samples" / f"factor-{j}")
+            if self.config.samples.factor_counts is not None:
+                count = len(samples.latents)
+                held_out = round(self.config.samples.validation_fraction * count)
+                return samples, {"validation": np.arange(held_out), "train": np.arange(held_out, count)}
+            # One sample of the factor for each joint sample, in the same order: the same split keeps test codes out.
+            rows = {
+                name: np.flatnonzero(np.isin(samples.index, self.joint.index[part]))
+                for name, part in self.split.items()
+            }
+            return samples, rows
+
+        return self._latent_network(FactorNetwork, settings, index, self._path(f"factor-{j}", settings), data)
+
+    def composite(
+        self, factors: Sequence[LatentNetworkSettings] | LatentNetworkSettings, combiner: CombinerSettings
+    ) -> Composite:
         """The ψ_j first, then Ψ on their outputs."""
+        if isinstance(factors, LatentNetworkSettings):
+            factors = [factors] * len(self.collection.factors)
         networks = [self.factor(j, settings) for j, settings in enumerate(factors)]
         torch.manual_seed(self.config.networks.seed)
-        train = self.split["train"]
-        reference = self.collection.reference
-        network = CombinerNetwork(
-            combiner, reference.connectivity, self._scaling(self.joint.nric[train]), len(networks)
-        )
-        composite = Composite(list(self.collection.factors.values()), networks, network)
-        inputs = predict(composite.factor_shapes, torch.as_tensor(self.joint.latents, dtype=torch.float32))
-        z, rows = self.joint.nric, self.split
-        if combiner.symmetries:
-            inputs, z, rows = self._with_images(inputs)
         path = self._path("combiner", combiner, *factors)
+        saved = finished(path)
+        rows = {} if saved else self._some(self.split)
+        scaling = Scaling.blank(len(self._reference)) if saved else self._scaling(self.joint.nric[rows["train"]])
+        network = CombinerNetwork(combiner, self.collection.reference.connectivity, scaling, len(networks))
+        composite = Composite(list(self.collection.factors.values()), networks, network)
+        if saved:
+            self._load(network, path, *saved)
+            return composite
+        inputs = predict(composite.factor_shapes, torch.as_tensor(self.joint.latents, dtype=torch.float32))
+        z = self.joint.nric
+        if combiner.symmetries:
+            inputs, z, rows = self._with_images(inputs, rows)
         if not path.exists():
             network.fit_pairwise(inputs[rows["train"]], torch.from_numpy(z[rows["train"]]))
         self._fit(network, inputs, z, rows, combiner.fit, path)
         return composite
 
-    def _with_images(self, inputs: Tensor) -> tuple[Tensor, NDArray, dict[str, IntArray]]:
-        """Factor shapes, joint shapes and split, with the images of the training samples under each symmetry."""
-        z, rows = self.joint.nric, dict(self.split)
-        train = self.split["train"]
+    def _with_images(self, inputs: Tensor, rows: dict[str, IntArray]) -> tuple[Tensor, NDArray, dict[str, IntArray]]:
+        """Factor shapes, joint shapes and rows, with the images of the training samples under each symmetry."""
+        z, rows, train = self.joint.nric, dict(rows), rows["train"]
         for edges in self.collection.symmetries:
             both_halves = np.concatenate([edges, len(edges) + edges])
             rows["train"] = np.concatenate([rows["train"], len(z) + np.arange(len(train))])
@@ -180,5 +237,6 @@ class Learner:
         """The fully connected baseline on the joint samples."""
         settings = self.config.monolithic
         index = list(range(len(self.collection.coordinates)))
-        path = self._path("monolithic", settings)
-        return self._latent_network(MonolithicNetwork, settings, index, self.joint, self.split, path)
+        return self._latent_network(
+            MonolithicNetwork, settings, index, self._path("monolithic", settings), lambda: (self.joint, self.split)
+        )

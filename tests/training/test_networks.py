@@ -11,18 +11,8 @@ from geometry.mesh import Connectivity, TriangleMesh
 from geometry.nric import WeightedNorm, nric
 from training.config import CombinerSettings, LatentNetworkSettings
 from training.coordinates import Coordinates
-from training.networks import (
-    CombinerNetwork,
-    EdgeConvolution,
-    FactorNetwork,
-    FourierProducts,
-    LatentFeatures,
-    PatchBasis,
-    Scaling,
-    affine_sum,
-    edge_midpoints,
-    flaps,
-)
+from training.layers import EdgeConvolution, FourierProducts, LatentFeatures, PatchBasis, Polynomials, flaps
+from training.networks import CombinerNetwork, FactorNetwork, Scaling, affine_sum, edge_midpoints
 
 TORUS = Coordinates(np.zeros(2), np.full(2, 2 * np.pi), np.full(2, 2 * np.pi))
 
@@ -172,6 +162,20 @@ def test_fourier_products_hold_each_wave_of_the_ellipse_once() -> None:
         torch.testing.assert_close(values @ solution, wave.double()[:, None], atol=1e-5, rtol=0)
     with pytest.raises(ValueError, match="one order for each coordinate"):
         FourierProducts(TORUS, [3])
+
+
+def test_polynomials_hold_each_monomial_once_and_are_orthonormal_over_the_box() -> None:
+    box = Coordinates(np.array([-1.0, 0.0]), np.array([3.0, 0.5]), np.full(2, np.nan))
+    products = Polynomials(box, 3)
+    assert products.size == 10
+    nodes, weights = np.polynomial.legendre.leggauss(5)
+    x = torch.from_numpy(np.stack(np.meshgrid(1 + 2 * nodes, 0.25 + 0.25 * nodes), -1).reshape(-1, 2)).float()
+    w = torch.from_numpy(np.outer(weights, weights).ravel() / 4)
+    values = products(x).double()
+    torch.testing.assert_close(values.T @ (w[:, None] * values), torch.eye(10, dtype=torch.float64), atol=1e-5, rtol=0)
+    for monomial in (x[:, 0] ** 3, x[:, 0] * x[:, 1] ** 2, x[:, 1]):
+        solution = torch.linalg.lstsq(values, monomial.double()[:, None]).solution
+        torch.testing.assert_close(values @ solution, monomial.double()[:, None], atol=1e-4, rtol=0)
 
 
 def test_the_fitted_skip_layer_reproduces_a_trigonometric_polynomial(ball: TriangleMesh) -> None:
