@@ -50,7 +50,7 @@ $(VENV)/.serve $(VENV)/.train: $(VENV)/.%: pyproject.toml | $(VENV)/.created
 	@touch $@
 
 $(VENV)/.all: pyproject.toml | $(VENV)/.created
-	$(BIN)/python -m pip install --editable '.[serve,train,dev]' $(NODE)
+	$(BIN)/python -m pip install --editable '.[serve,train,cluster,dev]' $(NODE)
 	@touch $(VENV)/.serve $(VENV)/.train $@
 
 $(VENV)/.created:
