@@ -202,8 +202,16 @@ def parse(text: str, source: str) -> Config:
 
 
 def load(path: Path) -> Config:
-    """Read a configuration file; raises ConfigError."""
+    """Read a configuration file, with ``collection.data`` made absolute, wherever it is read from.
+
+    Raises:
+        ConfigError: naming the file and every faulty setting.
+    """
     try:
-        return parse(path.read_text(encoding="utf-8"), str(path))
+        config = parse(path.read_text(encoding="utf-8"), str(path))
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path}: can't be read: {error}") from error
+    if config.collection.data is None:
+        return config
+    data = (path.parent / config.collection.data).resolve()
+    return config.model_copy(update={"collection": config.collection.model_copy(update={"data": data})})

@@ -38,3 +38,13 @@ def test_a_faulty_setting_is_named(old: str, new: str, says: str) -> None:
 def test_a_missing_file_is_named(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"none\.toml: can't be read"):
         load(tmp_path / "none.toml")
+
+
+@pytest.mark.parametrize("written", ["meshes", "./sub/../meshes", "absolute"])
+def test_data_lie_relative_to_the_configuration(written: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    data = tmp_path / "meshes" if written == "absolute" else written
+    (tmp_path / "here.toml").write_text(TINY.replace('generator = "freaky-torus"', f'data = "{data}"', 1))
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    assert load(Path("../here.toml")).collection.data == tmp_path.resolve() / "meshes"
+    assert load(tmp_path / "here.toml") == load(Path("../here.toml"))
