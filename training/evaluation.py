@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from torch import nn
 
 from geometry.mesh import FloatArray, TriangleMesh, align
-from geometry.nric import WeightedNorm, nric, unwrap
+from geometry.nric import WeightedNorm
 from geometry.reconstruction import Reconstructor
 from training.coordinates import Coordinates
 from training.sampling import Collection
@@ -38,14 +38,9 @@ def r_squared(predicted: NDArray, exact: NDArray, norm: WeightedNorm) -> dict[st
 
 
 def exact_nric(collection: Collection, latents: FloatArray, batch: int = 100) -> NDArray[np.float32]:
-    """Exact NRIC (n, 2E) of joint codes (n, m), unwrapped relative to the reference."""
-    reference = collection.reference
-    z_reference = nric(reference.vertices, reference.connectivity)
-    result = np.empty((len(latents), len(z_reference)), dtype=np.float32)
-    for start in range(0, len(latents), batch):
-        vertices, _ = collection.shapes(latents[start : start + batch])
-        result[start : start + batch] = unwrap(nric(vertices, reference.connectivity), z_reference)
-    return result
+    """Exact NRIC (n, 2E) of joint codes (n, m)."""
+    parts = (latents[start : start + batch] for start in range(0, len(latents), batch))
+    return np.concatenate([collection.shapes(part).nric.astype(np.float32) for part in parts])
 
 
 def exact_factors(collection: Collection, latents: FloatArray) -> NDArray[np.float32]:
@@ -146,8 +141,7 @@ def model_times(collection: Collection, composite: Callable[[torch.Tensor], torc
     """Median seconds for one code: exact shape, composite network, reconstruction from the reference (one thread)."""
     rng = np.random.default_rng(0)
     latents = collection.coordinates.uniform(1, rng)
-    vertices, _ = collection.shapes(latents)
-    z = nric(vertices[0], collection.reference.connectivity)
+    z = collection.shapes(latents).nric[0]
     reconstruct = Reconstructor(collection.reference)
     threads = torch.get_num_threads()
     torch.set_num_threads(1)

@@ -5,7 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from geometry.mesh import Connectivity, FloatArray, IntArray, TriangleMesh
+from geometry.nric import nric, unwrap
 from training.coordinates import Coordinates
+from training.sampling import Shapes
 
 U_COUNT, V_COUNT = 64, 32
 MAJOR_RADIUS, MINOR_RADIUS = 0.375, 0.125
@@ -93,6 +95,8 @@ class FreakyTorus:
         turned = -i % U_COUNT * V_COUNT + -j % V_COUNT
         return [edge_permutation(self.reference.connectivity, turned)]
 
-    def shapes(self, latents: FloatArray) -> tuple[FloatArray, list[str]]:
-        """Shapes (n, V, 3) of codes (n, 4); the formula never fails."""
-        return vertices(latents) / self.scale, [""] * len(latents)
+    def shapes(self, latents: FloatArray) -> Shapes:
+        """Shapes of codes (n, 4), angles as near as they can be to the reference's; the formula never fails."""
+        mesh, points = self.reference, vertices(latents) / self.scale
+        z = unwrap(nric(points, mesh.connectivity), nric(mesh.vertices, mesh.connectivity))
+        return Shapes(points, z, [""] * len(latents))

@@ -13,8 +13,23 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from geometry.mesh import FloatArray, IntArray, TriangleMesh
-from geometry.nric import nric, unwrap
 from training.coordinates import Coordinates
+
+
+@dataclass(frozen=True)
+class Shapes:
+    """Shapes of a collection.
+
+    Attributes:
+        vertices: (n, V, 3); where a shape could not be found, the last finite one on the way to it.
+        nric: (n, 2E) lengths and angles. Only the collection knows which of an angle's representatives is meant:
+            the reference's nearest, or the one that a path from the reference leads to.
+        reasons: for each why it failed, or an empty string.
+    """
+
+    vertices: FloatArray
+    nric: FloatArray
+    reasons: list[str]
 
 
 class Collection(Protocol):
@@ -43,15 +58,23 @@ class Collection(Protocol):
     @property
     def symmetries(self) -> list[IntArray]: ...  # noqa: D102
 
-    def shapes(self, latents: FloatArray) -> tuple[FloatArray, list[str]]:
-        """Vertices (n, V, 3) of codes (n, m), and for each why it failed, or an empty string."""
+    def shapes(self, latents: FloatArray) -> Shapes:
+        """The shapes of codes (n, m), each depending on nothing but its own code."""
         ...
 
 
 @dataclass(frozen=True)
 class Samples:
-    """Finished samples, in the order of their index; failed ones are left out."""
+    """Finished samples, in the order of their index; failed ones are left out.
 
+    Attributes:
+        index: (n,) increasing; samples of two folders belong together where theirs agree.
+        latents: (n, m).
+        nric: (n, 2E).
+        vertices: (n, V, 3).
+    """
+
+    index: IntArray
     latents: FloatArray
     nric: NDArray[np.float32]
     vertices: NDArray[np.float32]
@@ -74,44 +97,41 @@ def draw(
         (done, total) after each part.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    reference = collection.reference
-    z_reference = nric(reference.vertices, reference.connectivity)
     indices = np.arange(len(latents))
     parts = np.split(indices, range(part_size, len(indices), part_size))
     for k, index in enumerate(tqdm(parts, desc=title, unit="part", disable=None, leave=False)):
         path = folder / f"part-{k:05d}.npz"
         if not path.exists():
-            vertices, reasons = collection.shapes(latents[index])
-            z = unwrap(nric(vertices, reference.connectivity), z_reference)
+            shapes = collection.shapes(latents[index])
             write_npz(
                 path,
                 index=index,
                 latents=latents[index],
-                nric=z.astype(np.float32),
-                vertices=vertices.astype(np.float32),
-                status=np.array(["failed" if reason else "done" for reason in reasons]),
-                reason=np.array(reasons),
+                nric=shapes.nric.astype(np.float32),
+                vertices=shapes.vertices.astype(np.float32),
+                status=np.array(["failed" if reason else "done" for reason in shapes.reasons]),
+                reason=np.array(shapes.reasons),
             )
         yield int(index[-1]) + 1, len(latents)
 
 
 def read(folder: Path) -> Samples:
     """Read all parts of a folder."""
-    latents, z, vertices = [], [], []
+    fields = "index", "latents", "nric", "vertices"
+    found: dict[str, list[NDArray]] = {name: [] for name in fields}
     for path in sorted(folder.glob("part-*.npz")):
         with np.load(path) as part:
             done = part["status"] == "done"
-            latents.append(part["latents"][done])
-            z.append(part["nric"][done])
-            vertices.append(part["vertices"][done])
-    return Samples(np.concatenate(latents), np.concatenate(z), np.concatenate(vertices))
+            for name in fields:
+                found[name].append(part[name][done])
+    return Samples(*(np.concatenate(found[name]) for name in fields))
 
 
-def split(count: int, test: float, validation: float, rng: np.random.Generator) -> dict[str, IntArray]:
-    """Disjoint sorted indices: the test part of all, the validation part of the rest, and what trains."""
-    order = rng.permutation(count)
-    n_test = max(1, round(test * count))
-    n_validation = max(1, round(validation * (count - n_test)))
+def split(index: IntArray, test: float, validation: float, rng: np.random.Generator) -> dict[str, IntArray]:
+    """Disjoint sorted parts of the samples' indices: test of all, validation of the rest, and train, what is left."""
+    order = rng.permutation(index)
+    n_test = max(1, round(test * len(order)))
+    n_validation = max(1, round(validation * (len(order) - n_test)))
     return {
         "test": np.sort(order[:n_test]),
         "validation": np.sort(order[n_test : n_test + n_validation]),

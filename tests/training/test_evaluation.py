@@ -17,8 +17,7 @@ def torus() -> FreakyTorus:
 
 def test_r_squared_is_one_for_the_truth_zero_for_the_mean_and_weighted_between(torus: FreakyTorus) -> None:
     rng = np.random.default_rng(0)
-    vertices, _ = torus.shapes(torus.coordinates.uniform(12, rng))
-    z = nric(vertices, torus.reference.connectivity)
+    z = torus.shapes(torus.coordinates.uniform(12, rng)).nric
     norm = WeightedNorm.of(torus.reference, 1e-2)
     mean = np.broadcast_to(z.mean(axis=0), z.shape)
     assert r_squared(z, z, norm) == {"total": 1, "lengths": 1, "angles": 1}
@@ -35,7 +34,7 @@ def test_r_squared_is_one_for_the_truth_zero_for_the_mean_and_weighted_between(t
 def test_exact_factors_are_the_joint_shape_where_only_one_factor_moves(torus: FreakyTorus) -> None:
     codes = np.array([[0, 2.0, 0, 0], [0, 0, 1.0, 2.0]])
     factors = exact_factors(torus, codes)
-    joint = nric(torus.shapes(codes)[0], torus.reference.connectivity)
+    joint = torus.shapes(codes).nric
     reference = nric(torus.reference.vertices, torus.reference.connectivity)
     np.testing.assert_allclose(factors[0, 1], joint[0], atol=1e-6)
     np.testing.assert_allclose(factors[1, 2], joint[1], atol=1e-6)
@@ -55,10 +54,9 @@ def test_the_grid_is_exact_at_its_nodes_linear_between_them_and_closes_up(torus:
 
 
 def test_vertex_error_of_exact_lengths_and_angles_is_nothing(torus: FreakyTorus) -> None:
-    vertices, _ = torus.shapes(np.array([[1.0, 2.0, 3.0, 4.0]]))
-    z = nric(vertices, torus.reference.connectivity)
-    figures = vertex_error(torus.reference, 1e-2, z, vertices)
+    exact = torus.shapes(np.array([[1.0, 2.0, 3.0, 4.0]]))
+    figures = vertex_error(torus.reference, 1e-2, exact.nric, exact.vertices)
     assert figures["max"] < 1e-6
     assert figures["status"] == {"converged": 1}
-    wrong = vertex_error(torus.reference, 1e-2, 1.05 * z, vertices)
+    wrong = vertex_error(torus.reference, 1e-2, 1.05 * exact.nric, exact.vertices)
     assert wrong["mean"] > 1e-3

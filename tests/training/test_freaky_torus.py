@@ -171,9 +171,9 @@ def test_the_collection_has_a_reference_of_unit_area(reference, codes):
     assert collection.reference.area == pytest.approx(1)
     assert np.array_equal(collection.reference.faces, reference.faces)
     np.testing.assert_allclose(collection.scale * collection.reference.vertices, reference.vertices, atol=1e-15)
-    shapes, reasons = collection.shapes(codes)
-    np.testing.assert_allclose(collection.scale * shapes, freaky_torus.vertices(codes), atol=1e-15)
-    assert reasons == [""] * len(codes)
+    shapes = collection.shapes(codes)
+    np.testing.assert_allclose(collection.scale * shapes.vertices, freaky_torus.vertices(codes), atol=1e-15)
+    assert shapes.reasons == [""] * len(codes)
 
 
 def test_factors_are_two_circles_and_a_flat_torus():
@@ -186,7 +186,7 @@ def test_factors_are_two_circles_and_a_flat_torus():
 def test_its_symmetry_takes_the_shape_of_a_code_to_that_of_the_opposite_code(codes):
     collection = freaky_torus.FreakyTorus()
     connectivity = collection.reference.connectivity
-    z, opposite = (nric(collection.shapes(c)[0], connectivity) for c in (codes, -codes))
+    z, opposite = (nric(collection.shapes(c).vertices, connectivity) for c in (codes, -codes))
     (edges,) = collection.symmetries
     assert sorted(edges) == list(range(connectivity.edge_count))
     np.testing.assert_allclose(z[:, np.concatenate([edges, len(edges) + edges])], opposite, atol=1e-10)

@@ -160,7 +160,7 @@ def test_status_tells_how_far_a_run_is(tiny_run: Path) -> None:
 def test_samples_keep_lengths_and_angles_of_the_formula(tiny_run: Path) -> None:
     torus = FreakyTorus()
     with np.load(tiny_run / "samples" / "part-00000.npz") as part:
-        exact = nric(torus.shapes(part["latents"])[0], torus.reference.connectivity)
+        exact = nric(torus.shapes(part["latents"]).vertices, torus.reference.connectivity)
         half = exact.shape[1] // 2
         np.testing.assert_allclose(part["nric"][:, :half], exact[:, :half], atol=1e-6)
         turns = (part["nric"][:, half:] - exact[:, half:]) / (2 * np.pi)
