@@ -33,7 +33,7 @@ from training.fitting import predict
 from training.freaky_torus import FreakyTorus
 from training.learning import Learner
 from training.networks import affine_sum
-from training.sampling import Collection, draw, split, write_npz
+from training.sampling import Collection, draw, read, split, write_npz
 
 GENERATORS: dict[str, Callable[[], Collection]] = {"freaky-torus": FreakyTorus}
 
@@ -118,9 +118,8 @@ def samples(run: Run) -> None:
     for title, place, latents in draws:
         for done, total in draw(run.collection, place, latents, settings.part_size, title):
             run.log("progress", stage="samples", what=title, done=done, total=total)
-    write_npz(
-        folder / "split.npz", **split(settings.count, settings.test_fraction, settings.validation_fraction, split_rng)
-    )
+    index = read(folder).index
+    write_npz(folder / "split.npz", **split(index, settings.test_fraction, settings.validation_fraction, split_rng))
 
 
 def learner_of(run: Run) -> Learner:
