@@ -1,0 +1,164 @@
+"""Pictures of shapes, drawn with rays on the CPU: no display, no OpenGL, only the embreex wheel."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from geometry.gltf import vertex_normals
+from geometry.mesh import FloatArray, IntArray, face_normals
+
+#: Degrees from which a shape is seen, to the right of its front and above it.
+AZIMUTH, ELEVATION = 25.0, 18.0
+#: Distance of the eye in diagonals of everything that is to be seen: a long lens distorts little.
+DISTANCE = 2.5
+#: Directions of lights in (right, up, towards the viewer), and their brightness.
+LIGHTS = (((-0.55, 0.75, 0.65), 0.78), ((0.85, 0.10, 0.50), 0.20))
+#: Light from everywhere, at surfaces that look down and up.
+AMBIENT = (0.20, 0.46)
+#: How far light reaches round a surface's own shadow line; 0 is a bare cosine, hard as in a vacuum.
+WRAP = 0.3
+#: Directions in which a vertex looks for what keeps the ambient light from it.
+OCCLUSION_RAYS = 96
+#: Rays for a pixel along each side: what smooths the outlines.
+SUPERSAMPLING = 2
+GAMMA = 2.2
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A perspective camera, the same for all shapes of a run so that their pictures compare.
+
+    Attributes:
+        axes: (3, 3) rows are the directions right, up and towards the viewer.
+        eye: (3,) position.
+        window: left, right, bottom and top of the picture, at one unit of length before the eye.
+    """
+
+    axes: FloatArray
+    eye: FloatArray
+    window: tuple[float, float, float, float]
+
+    @classmethod
+    def facing(cls, reference: FloatArray, faces: IntArray, shapes: ArrayLike = (), margin: float = 0.03) -> Camera:
+        """Choose a view of a reference shape (V, 3) whose picture holds all points of ``shapes`` (…, 3) as well.
+
+        Collections come with any axis up. A shape is looked at along the coordinate axis in which it is thinnest,
+        from its open side or, where it is closed, from where modelling tools have their front view; up is y, or z
+        where y is the line of sight.
+        """
+        thin = int(np.argmin(reference.std(axis=0)))
+        normals = face_normals(reference, faces, normalised=False)
+        openness = normals.sum(axis=0)[thin] / np.linalg.norm(normals, axis=1).sum()
+        side = np.sign(openness) if abs(openness) > 0.05 else -1.0 if thin == 1 else 1.0
+        towards, up = side * np.eye(3)[thin], np.eye(3)[2 if thin == 1 else 1]
+        azimuth, elevation = math.radians(AZIMUTH), math.radians(ELEVATION)
+        level = math.cos(azimuth) * towards + math.sin(azimuth) * np.cross(up, towards)
+        back = math.cos(elevation) * level + math.sin(elevation) * up
+        right = np.cross(up, back) / np.linalg.norm(np.cross(up, back))
+        axes = np.stack([right, np.cross(back, right), back])
+
+        points = np.concatenate([reference, np.reshape(shapes, (-1, 3))])
+        low, high = points.min(axis=0), points.max(axis=0)
+        eye = (low + high) / 2 + DISTANCE * np.linalg.norm(high - low) * back
+        local = (points - eye) @ axes.T
+        screen = local[:, :2] / -local[:, 2:]
+        low, high = screen.min(axis=0), screen.max(axis=0)
+        border = margin * (high - low).max()
+        (left, bottom), (rightmost, top) = low - border, high + border
+        return cls(axes, eye, (float(left), float(rightmost), float(bottom), float(top)))
+
+    def render(
+        self, vertices: FloatArray, faces: IntArray, colours: ArrayLike, size: int, *, smooth: bool = True
+    ) -> NDArray[np.uint8]:
+        """Draw a shape before a transparent background.
+
+        Args:
+            vertices: (V, 3) positions.
+            faces: (F, 3) vertex indices.
+            colours: (V, 3) or (3,) sRGB between 0 and 1.
+            size: pixels of the picture's longer side.
+            smooth: shade by normals of vertices; by those of faces otherwise, which shows the triangles.
+
+        Returns:
+            (height, width, 4) sRGB and coverage.
+        """
+        # Imported here: there are platforms without this wheel, and everything but pictures works there.
+        from embreex.mesh_construction import TriangleMesh
+        from embreex.rtcore_scene import EmbreeScene
+
+        vertices = (vertices - self.eye) @ self.axes.T
+        scene = EmbreeScene()
+        TriangleMesh(scene, vertices.astype(np.float32), faces.astype(np.int32))
+        normals = vertex_normals(vertices, faces)
+        light = _ambient(scene, vertices, normals)
+
+        left, right, bottom, top = self.window
+        pixel = max(right - left, top - bottom) / size
+        shape = (round((top - bottom) / pixel), round((right - left) / pixel))
+        rays = _rays(self.window, (shape[0] * SUPERSAMPLING, shape[1] * SUPERSAMPLING))
+        hit = scene.run(np.zeros_like(rays), rays, output=True)
+        seen = hit["primID"] >= 0
+        face, u, v = hit["primID"][seen], hit["u"][seen, None], hit["v"][seen, None]
+
+        def at_hits(values: FloatArray) -> FloatArray:
+            a, b, c = (values[faces[face, corner]] for corner in range(3))
+            return (1 - u - v) * a + u * b + v * c
+
+        normal = at_hits(normals) if smooth else face_normals(vertices, faces, normalised=False)[face]
+        albedo = at_hits(np.broadcast_to(np.asarray(colours, dtype=float) ** GAMMA, vertices.shape))
+        picture = np.zeros((len(rays), 4))
+        picture[seen] = np.column_stack([_shade(normal, -rays[seen], albedo, at_hits(light[:, None])), np.ones(len(u))])
+        # Averages are taken of light, not of its encoding, and weighted by coverage: no dark seam at outlines.
+        picture = picture.reshape(shape[0], SUPERSAMPLING, shape[1], SUPERSAMPLING, 4).mean(axis=(1, 3))
+        coverage = picture[..., 3:]
+        picture[..., :3] = (picture[..., :3] / np.where(coverage > 0, coverage, 1)).clip(0, 1) ** (1 / GAMMA)
+        return (255 * picture + 0.5).astype(np.uint8)
+
+
+def _rays(window: tuple[float, float, float, float], shape: tuple[int, int]) -> NDArray[np.float32]:
+    """Directions (h·w, 3) through the pixels of a picture, row by row from the top."""
+    left, right, bottom, top = window
+    h, w = shape
+    x = left + (right - left) * (np.arange(w) + 0.5) / w
+    y = top - (top - bottom) * (np.arange(h) + 0.5) / h
+    rays = np.stack([np.tile(x, h), np.repeat(y, w), np.full(h * w, -1.0)], axis=1)
+    return (rays / np.linalg.norm(rays, axis=1, keepdims=True)).astype(np.float32)
+
+
+def _ambient(scene: object, vertices: FloatArray, normals: FloatArray) -> FloatArray:
+    """Part (V,) of the light from all sides that reaches each vertex: creases and armpits are darker."""
+    k = np.arange(OCCLUSION_RAYS) + 0.5
+    z, turn = 1 - 2 * k / OCCLUSION_RAYS, math.pi * (1 + math.sqrt(5)) * k  # evenly over the sphere (Fibonacci)
+    ring = np.sqrt(1 - z**2)
+    directions = np.stack([ring * np.cos(turn), ring * np.sin(turn), z], axis=1)
+    weight = normals @ directions.T
+    vertex, direction = np.nonzero(weight > 0.1)
+    weight = weight[vertex, direction]
+    origins = vertices + 2e-3 * np.linalg.norm(np.ptp(vertices, axis=0)) * normals
+    free = scene.run(  # type: ignore[attr-defined]
+        origins[vertex].astype(np.float32), directions[direction].astype(np.float32), query="OCCLUDED"
+    )
+    count = len(vertices)
+    return np.bincount(vertex, weight * (free < 0), count) / np.bincount(vertex, weight, count).clip(1e-9)
+
+
+def _shade(normal: FloatArray, view: FloatArray, albedo: FloatArray, ambient: FloatArray) -> FloatArray:
+    """Linear light (n, 3) that leaves n points towards the viewer; surfaces have two equal sides."""
+    normal = normal / np.linalg.norm(normal, axis=1, keepdims=True).clip(1e-12)
+    facing = np.einsum("ij,ij->i", normal, view)
+    normal = normal * np.where(facing < 0, -1.0, 1.0)[:, None]
+    low, high = AMBIENT
+    light = ambient * (low + (high - low) * (0.5 + 0.5 * normal[:, 1:2]))
+    gloss = np.zeros_like(light)
+    for direction, brightness in LIGHTS:
+        towards = np.array(direction) / np.linalg.norm(direction)
+        light += brightness * ((normal @ towards + WRAP) / (1 + WRAP)).clip(0)[:, None] * (0.4 + 0.6 * ambient)
+        halfway = view + towards
+        halfway /= np.linalg.norm(halfway, axis=1, keepdims=True)
+        gloss += 0.08 * brightness * np.einsum("ij,ij->i", normal, halfway).clip(0)[:, None] ** 40
+    edge = 0.06 * (1 - np.abs(facing))[:, None] ** 3
+    return albedo * light + gloss + edge
