@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -86,6 +87,19 @@ def read_mesh(source: bytes | Path, format: str | None = None) -> TriangleMesh:
     Raises:
         MeshError: unreadable, not exactly one mesh, or not a valid TriangleMesh; with the reason.
     """
+    return TriangleMesh.from_arrays(*read_arrays(source, format))
+
+
+def read_arrays(source: bytes | Path, format: str | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """Read one mesh as it stands in its file: vertices (V, 3) and faces (F, 3), nothing merged and nothing checked.
+
+    STL has three vertices a face. A path also finds the buffers that lie beside a glTF file. Arguments as for
+    ``read_mesh``.
+
+    Raises:
+        MeshError: unreadable, or not exactly one mesh; with the reason.
+    """
+    beside = source if isinstance(source, Path) else None
     if isinstance(source, Path):
         format = format or source.suffix.lstrip(".").lower()
         try:
@@ -93,17 +107,37 @@ def read_mesh(source: bytes | Path, format: str | None = None) -> TriangleMesh:
         except OSError as error:
             raise MeshError(f"can't be read: {error.strerror}") from error
     try:
-        vertices, faces = _READERS[format](source) if format in _READERS else _read_trimesh(source, format)
+        return _READERS[format](source) if format in _READERS else _read_trimesh(source, format, beside)
     except MeshError:
         raise
     except Exception as error:  # parsers of foreign bytes fail in every way there is
-        raise MeshError(f"not a readable {format} file: {error}") from error
-    return TriangleMesh.from_arrays(vertices, faces)
+        # An import fails where trimesh takes broken binary data for text and looks for help in guessing its encoding.
+        why = "damaged, or another kind of file" if isinstance(error, ImportError) else " ".join(str(error).split())
+        raise MeshError(f"not a readable {format} file: {why}") from error
 
 
 def _read_npz(data: bytes) -> tuple[np.ndarray, np.ndarray]:
-    with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
-        return arrays["vertices"], arrays["faces"]
+    arrays = load_npz(data)
+    return arrays["vertices"], arrays["faces"]
+
+
+def load_npz(data: bytes) -> dict[str, np.ndarray]:
+    """The arrays of an NPZ file that holds at least ``vertices`` and ``faces``.
+
+    Raises:
+        MeshError: no NPZ file, pickled objects (which could run code), or without those two; with the reason.
+    """
+    try:
+        with np.load(io.BytesIO(data), allow_pickle=False) as file:
+            arrays = dict(file)
+    except Exception as error:  # NumPy, zipfile and zlib each have their own
+        pickled = "pickle" in str(error) and data[:2] == b"PK"
+        why = "it holds pickled objects, save plain arrays instead" if pickled else "damaged, or another kind of file"
+        raise MeshError(f"not a readable npz file: {why}") from error
+    missing = {"vertices", "faces"} - arrays.keys()
+    if missing:
+        raise MeshError(f"holds no array '{min(missing)}', only {', '.join(sorted(arrays)) or 'nothing'}")
+    return arrays
 
 
 def _read_obj(data: bytes) -> tuple[np.ndarray, np.ndarray]:
@@ -124,11 +158,22 @@ def _read_obj(data: bytes) -> tuple[np.ndarray, np.ndarray]:
 _READERS = {"npz": _read_npz, "obj": _read_obj}
 
 
-def _read_trimesh(data: bytes, format: str | None) -> tuple[np.ndarray, np.ndarray]:
+def _read_trimesh(data: bytes, format: str | None, beside: Path | None) -> tuple[np.ndarray, np.ndarray]:
     import trimesh
 
-    scene = trimesh.load_scene(io.BytesIO(data), file_type=format, process=False, skip_materials=True)
-    if len(scene.geometry) != 1:
-        raise MeshError(f"holds {len(scene.geometry)} meshes; send a file with exactly one")
+    # PLY with texture coordinates would be split along its seams, and shuffled.
+    options: dict[str, Any] = {"fix_texture": False} if format == "ply" else {}
+    scene = trimesh.load_scene(
+        io.BytesIO(data),
+        file_type=format,
+        resolver=trimesh.resolvers.FilePathResolver(str(beside)) if beside else None,
+        process=False,
+        skip_materials=True,
+        **options,
+    )
+    meshes = [g for g in scene.geometry.values() if isinstance(g, trimesh.Trimesh)]
+    # A glTF mesh has a primitive for each of its materials.
+    if len(meshes) != 1 and not (meshes and all(m.metadata.get("from_gltf_primitive") for m in meshes)):
+        raise MeshError(f"holds {len(meshes)} meshes; a file needs exactly one")
     mesh = scene.to_mesh()
     return np.asarray(mesh.vertices), np.asarray(mesh.faces)

@@ -17,6 +17,17 @@ class MeshError(ValueError):
     """A mesh that can't be used, with a sentence that says why."""
 
 
+class EdgeError(MeshError):
+    """A fault at one edge: a sentence with ``{edge}`` in it, and the edge, for those who number vertices otherwise."""
+
+    def __init__(self, sentence: str, edge: tuple[int, int]) -> None:
+        super().__init__(sentence, edge)
+        self.sentence, self.edge = sentence, edge
+
+    def __str__(self) -> str:
+        return self.sentence.format(edge=self.edge)
+
+
 class Connectivity:
     """The combinatorics that every mesh of a collection shares.
 
@@ -60,13 +71,13 @@ class Connectivity:
         self.face_edges: IntArray = side_edge.reshape(3, -1).T.copy()
         """(F, 3): edge k is opposite to corner k of the face."""
         if count.max() > 2:
-            i, j = self.edges[count.argmax()]
-            raise MeshError(f"edge ({i}, {j}) has {count.max()} faces; at most two are allowed")
+            i, j = self.edges[count.argmax()].tolist()
+            raise EdgeError(f"edge {{edge}} has {count.max()} faces; at most two are allowed", (i, j))
         forward = tail < head
         if np.bincount(side_edge[forward]).max(initial=0) > 1 or np.bincount(side_edge[~forward]).max(initial=0) > 1:
             twice = np.bincount(side_edge, weights=np.where(forward, 1, -1), minlength=len(unique))
-            i, j = self.edges[int(np.flatnonzero(np.abs(twice) > 1)[0])]
-            raise MeshError(f"the two faces at edge ({i}, {j}) are oriented oppositely")
+            i, j = self.edges[int(np.flatnonzero(np.abs(twice) > 1)[0])].tolist()
+            raise EdgeError("the two faces at edge {edge} are oriented oppositely", (i, j))
 
         # The face to the left of i -> j, then the one to the right; -1 on the boundary.
         side_face = np.tile(np.arange(len(f)), 3)

@@ -1,5 +1,6 @@
 """Mesh files: written by us and read by others, written by others and read by us."""
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -7,7 +8,7 @@ import pytest
 import trimesh
 
 from geometry.animated_gltf import DENSE_FRAMES, animated_glb
-from geometry.formats import MESH_FORMATS, read_mesh
+from geometry.formats import MESH_FORMATS, read_arrays, read_mesh
 from geometry.gltf import vertex_normals
 from geometry.mesh import MeshError, TriangleMesh
 from training import freaky_torus
@@ -137,3 +138,33 @@ def test_frames_that_stand_still_make_a_file_too() -> None:
         animated = animated_glb(np.repeat(mesh.vertices[None], count, axis=0), mesh.faces)
         assert animated.max_vertex_error == 0
         np.testing.assert_array_equal(loaded(animated.data, "glb").vertices, CUBE)
+
+
+def test_seams_of_texture_and_material_do_not_shuffle_vertices(tmp_path: Path) -> None:
+    mesh = cube()
+    uv = np.random.default_rng(0).random((8, 2))
+    textured = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False, visual=trimesh.visual.TextureVisuals(uv=uv))
+    found = read_mesh(textured.export(file_type="ply"), "ply")
+    np.testing.assert_array_equal(found.vertices, CUBE)
+    assert np.array_equal(found.faces, mesh.faces)
+
+    # Two materials: one glTF mesh of two primitives on the same positions, with its buffer in a file beside it.
+    parts = [part.astype("<u4").tobytes() for part in np.split(mesh.faces, 2)]
+    blob = CUBE.astype("<f4").tobytes() + b"".join(parts)
+    views = [(0, 96, 5126, 8, "VEC3"), *((96 + 72 * k, 72, 5125, 18, "SCALAR") for k in range(2))]
+    document = {
+        "asset": {"version": "2.0"},
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0}],
+        "meshes": [{"primitives": [{"attributes": {"POSITION": 0}, "indices": k} for k in (1, 2)]}],
+        "accessors": [
+            {"bufferView": k, "componentType": kind, "count": count, "type": shape}
+            for k, (_, _, kind, count, shape) in enumerate(views)
+        ],
+        "bufferViews": [{"buffer": 0, "byteOffset": start, "byteLength": size} for start, size, *_ in views],
+        "buffers": [{"byteLength": len(blob), "uri": "cube.bin"}],
+    }
+    (tmp_path / "cube.bin").write_bytes(blob)
+    (tmp_path / "cube.gltf").write_text(json.dumps(document))
+    vertices, faces = read_arrays(tmp_path / "cube.gltf")
+    np.testing.assert_array_equal(vertices[faces], CUBE[mesh.faces])
