@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 import shutil
 import time
 from collections.abc import Callable, Sequence
@@ -19,6 +18,7 @@ import torch
 from pydantic import BaseModel
 
 from geometry.nric import WeightedNorm, nric
+from training import discovery
 from training.config import Config
 from training.evaluation import (
     MultilinearGrid,
@@ -29,11 +29,12 @@ from training.evaluation import (
     vertex_error,
 )
 from training.export import export
+from training.files import write_json, write_npz
 from training.fitting import predict
 from training.freaky_torus import FreakyTorus
 from training.learning import Learner
 from training.networks import affine_sum
-from training.sampling import Collection, draw, read, split, write_npz
+from training.sampling import Collection, draw, read, split
 
 GENERATORS: dict[str, Callable[[], Collection]] = {"freaky-torus": FreakyTorus}
 
@@ -48,10 +49,17 @@ class Run:
         self._stamps.mkdir(exist_ok=True)
         (folder / "config.toml").write_text(source, encoding="utf-8")
 
+    @property
+    def by_design(self) -> bool:
+        """Whether the collection is a product as its generator gives it."""
+        return self.config.collection.generator in GENERATORS
+
     @cached_property
     def collection(self) -> Collection:
-        """The parametrised collection; later stages may add to what it knows."""
-        return GENERATORS[self.config.collection.generator or ""]()
+        """The parametrised collection; of a folder of meshes, once its factors are known."""
+        if self.by_design:
+            return GENERATORS[str(self.config.collection.generator)]()
+        return discovery.collection(self.folder, self.config)
 
     def log(self, event: str, **facts: Any) -> None:
         """Append one line to log.jsonl."""
@@ -69,15 +77,11 @@ class Run:
         write_json(self._stamps / f"{stage}.json", facts)
 
 
-def write_json(path: Path, value: Any) -> None:
-    """Write JSON whole or not at all."""
-    part = path.with_suffix(".part")
-    part.write_text(json.dumps(value, indent=2) + "\n", encoding="utf-8")
-    os.replace(part, path)
-
-
 def ingest(run: Run) -> None:
-    """reference.npz."""
+    """reference.npz, and of a folder of meshes shapes.npz."""
+    if not run.by_design:
+        run.log("ingested", **discovery.ingest(run.folder, run.config))
+        return
     mesh = run.collection.reference
     write_npz(
         run.folder / "reference.npz",
@@ -88,13 +92,23 @@ def ingest(run: Run) -> None:
     )
 
 
-def given_by_design(run: Run) -> None:
-    """Nothing to compute: a generator's collection is a product as it stands."""
-    run.log("skipped", why="the generator gives factors and bounds itself")
+def _discovered(find: Callable[[Path, Config], dict[str, Any]]) -> Callable[[Run], None]:
+    """A stage that a collection which is a product by design has no need of."""
+
+    def stage(run: Run) -> None:
+        if run.by_design:
+            run.log("skipped", why="the generator gives factors and bounds itself")
+        else:
+            run.log("found", **find(run.folder, run.config))
+
+    return stage
 
 
 def factors(run: Run) -> None:
     """factors.json."""
+    if not run.by_design:
+        run.log("found", **discovery.factors(run.folder, run.config))
+        return
     lists = run.collection.factors
     write_json(run.folder / "factors.json", {"factors": list(lists.values()), "names": list(lists)})
 
@@ -219,10 +233,10 @@ class Stage:
 
 
 STAGES: dict[str, Stage] = {
-    "ingest": Stage(ingest, lambda c: [c.collection], ("reference.npz",)),
-    "mean": Stage(given_by_design, lambda c: [], ()),
-    "modes": Stage(given_by_design, lambda c: [], ("modes.npz",)),
-    "factors": Stage(factors, lambda c: [], ("factors.json",)),
+    "ingest": Stage(ingest, lambda c: [c.collection], ("reference.npz", "shapes.npz")),
+    "mean": Stage(_discovered(discovery.mean), lambda c: [c.material], ("mean.npz",)),
+    "modes": Stage(_discovered(discovery.modes), lambda c: [c.modes], ("modes.npz", "modes.json")),
+    "factors": Stage(factors, lambda c: [c.factors], ("factors.json",)),
     "samples": Stage(samples, lambda c: [c.samples], ("samples",)),
     # Files of networks are named by samples and settings, so a change leaves those alone that it doesn't touch.
     "networks": Stage(networks, lambda c: [c.networks, c.monolithic, *c.variants.values()], ()),

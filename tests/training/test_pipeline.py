@@ -136,7 +136,7 @@ def test_faults_of_the_user_s_making_are_one_message(tmp_path: Path) -> None:
     config = tmp_path / "bad.toml"
     config.write_text("[collection]\n")
     for arguments, says in (
-        (["run", str(config)], "collection.generator"),
+        (["run", str(config)], "export: Field required"),
         (["run", str(tmp_path / "none.toml")], "can't be read"),
         (["status", str(tmp_path / "nowhere")], "is no run directory"),
     ):

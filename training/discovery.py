@@ -1,0 +1,139 @@
+"""From a folder of meshes to a parametrised collection: what the stages up to `factors` find, in files of a run.
+
+A collection that is a product by design has no need of it.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from geometry.calculus import ShellSpace
+from geometry.energy import Material
+from geometry.mean import elastic_mean
+from geometry.mesh import TriangleMesh
+from training.config import Config, ConfigError
+from training.files import write_json, write_npz
+
+try:  # TEMPORARY until all modules are there
+    from geometry.coarsening import Prolongation, coarsen
+    from training import figure
+    from training.factors import group, names, overlap
+    from training.ingest import MeshCollection, normalised, read_collection
+    from training.modes import localisation, pga, spga, tangents
+    from training.shell_collection import ShellCollection
+except ImportError:
+    pass
+
+
+def material(config: Config) -> Material:
+    """Of the shell, as the configuration says."""
+    settings = config.material
+    return Material(settings.mu, settings.lambda_, settings.eta)
+
+
+def _meshes(config: Config) -> MeshCollection:
+    if config.collection.generator == "figure":
+        return MeshCollection(*figure.poses())
+    if config.collection.data is None:
+        raise ConfigError("collection.data: say where the meshes are, here or with --data")
+    return read_collection(config.collection.data)
+
+
+def ingest(folder: Path, config: Config) -> dict[str, Any]:
+    """``reference.npz`` and ``shapes.npz``: names and normalised vertices (n, V, 3), coarsened where that is asked for."""
+    settings = config.collection
+    meshes = _meshes(config)
+    if settings.reference is not None and settings.reference not in meshes.names:
+        raise ConfigError(f"collection.reference: no mesh is called {settings.reference!r}; the first is {meshes.names[0]!r}")
+    chosen = meshes.names.index(settings.reference) if settings.reference else 0
+    vertices, scale = normalised(meshes, chosen)
+    fine = TriangleMesh.from_arrays(vertices[chosen], meshes.faces)
+    facts: dict[str, Any] = {"shapes": len(vertices), "vertices": vertices.shape[1], "reference": meshes.names[chosen]}
+    reference, more = fine, {}
+    if settings.coarse_vertices is not None and vertices.shape[1] > settings.coarse_vertices:
+        coarsening = coarsen(fine, settings.coarse_vertices, vertices)
+        exact, vertices = vertices, vertices[:, coarsening.fine_index]
+        reference = TriangleMesh.from_arrays(vertices[chosen], coarsening.faces)
+        more = {"fine_vertices": fine.vertices, "fine_faces": fine.faces, "fine_index": coarsening.fine_index}
+        errors = Prolongation.of(reference, fine).errors(vertices, exact)
+        facts |= {"coarse_vertices": vertices.shape[1], "prolongation": errors}
+    write_npz(
+        folder / "reference.npz",
+        vertices=reference.vertices,
+        faces=reference.faces,
+        edges=reference.edges,
+        scale=np.array(scale),
+        **more,
+    )
+    write_npz(folder / "shapes.npz", names=np.array(meshes.names), vertices=vertices)
+    write_json(folder / "ingest.json", facts)
+    return facts
+
+
+def _reference(folder: Path) -> TriangleMesh:
+    with np.load(folder / "reference.npz") as file:
+        return TriangleMesh.from_mapping(file)
+
+
+def _shapes(folder: Path) -> np.ndarray:
+    with np.load(folder / "shapes.npz") as file:
+        return file["vertices"]
+
+
+def _mean(folder: Path) -> TriangleMesh:
+    with np.load(folder / "mean.npz") as file:
+        return _reference(folder).with_vertices(file["vertices"])
+
+
+def mean(folder: Path, config: Config) -> dict[str, Any]:
+    """``mean.npz``: the elastic mean of all shapes, where the tangent space is attached."""
+    found = elastic_mean(ShellSpace(_reference(folder), material(config)), _shapes(folder))
+    facts = {"status": str(found.status), "iterations": found.iterations, "residual": found.residual}
+    write_npz(folder / "mean.npz", vertices=found.vertices, **{k: np.array(v) for k, v in facts.items()})
+    return facts | {"reason": found.reason}
+
+
+def modes(folder: Path, config: Config) -> dict[str, Any]:
+    """``modes.npz`` and ``modes.json``: logarithms of the shapes at the mean, their sparse modes, PGA's beside them."""
+    settings, centre, shapes = config.modes, _mean(folder), _shapes(folder)
+    space = ShellSpace(centre, material(config))
+    logarithms = tangents(space, centre.vertices, shapes, settings.log_steps)
+    count = min(settings.count, len(shapes) - 1)
+    sparse = spga(
+        space, centre.vertices, logarithms.fields, count, settings.sparsity, max_iterations=settings.max_iterations
+    )
+    dense = pga(space, centre.vertices, logarithms.fields, count)
+    write_npz(
+        folder / "modes.npz",
+        nric=sparse.nric,
+        vertices=sparse.vertices,
+        coefficients=sparse.coefficients,
+        lower=sparse.lower,
+        upper=sparse.upper,
+        localisation=localisation(sparse, space),
+        pga_nric=dense.nric,
+        pga_vertices=dense.vertices,
+        pga_localisation=localisation(dense, space),
+    )
+    facts = {
+        "modes": count,
+        "converged": sparse.converged,
+        "explained": sparse.explained,
+        "pga_explained": dense.explained,
+        "linearised_logarithms": sum(bool(reason) for reason in logarithms.reasons),
+    }
+    write_json(folder / "modes.json", facts | {"reasons": logarithms.reasons, "history": sparse.history})
+    return facts
+
+
+def factors(folder: Path, config: Config) -> dict[str, Any]:
+    """``factors.json``: groups of modes with overlapping supports."""
+    raise NotImplementedError
+
+
+def collection(folder: Path, config: Config) -> ShellCollection:
+    """The collection that the stages found."""
+    raise NotImplementedError
