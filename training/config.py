@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tomllib
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
@@ -136,6 +136,8 @@ class NetworkSettings(_Section):
     """One for each factor, or one for all."""
     combiner: CombinerSettings = CombinerSettings()
     seed: int = 0
+    fractions: list[Annotated[float, Field(gt=0, lt=1)]] = []
+    """Shares of the training samples to learn from as well, for the study of their number."""
 
 
 class VariantSettings(_Section):
@@ -151,7 +153,9 @@ class EvaluationSettings(_Section):
 
     eta: float = Field(1e-2, gt=0)
     grid_nodes: int = Field(16, ge=2)
-    """Nodes per coordinate of the multilinear grid of Sassen et al. 2020."""
+    """Nodes per coordinate of the multilinear grid of Sassen et al. 2020, at most."""
+    grid_size: int = Field(1000, ge=1)
+    """Nodes of the grid of one factor, at most; where that leaves fewer than 3 per coordinate there is no grid."""
     reconstructions: int = Field(100, ge=1)
     """Test shapes whose vertices are reconstructed."""
 

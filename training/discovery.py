@@ -5,6 +5,8 @@ A collection that is a product by design has no need of it.
 
 from __future__ import annotations
 
+import itertools
+import json
 from pathlib import Path
 from typing import Any
 
@@ -14,13 +16,14 @@ from geometry.calculus import ShellSpace
 from geometry.energy import Material
 from geometry.mean import elastic_mean
 from geometry.mesh import TriangleMesh
+from geometry.nric import WeightedNorm
 from training.config import Config, ConfigError
 from training.files import write_json, write_npz
 
 try:  # TEMPORARY until all modules are there
     from geometry.coarsening import Prolongation, coarsen
     from training import figure
-    from training.factors import group, names, overlap
+    from training.factors import between, group, names, overlap
     from training.ingest import MeshCollection, normalised, read_collection
     from training.modes import localisation, pga, spga, tangents
     from training.shell_collection import ShellCollection
@@ -43,15 +46,14 @@ def _meshes(config: Config) -> MeshCollection:
 
 
 def ingest(folder: Path, config: Config) -> dict[str, Any]:
-    """``reference.npz`` and ``shapes.npz``: names and normalised vertices (n, V, 3), coarsened where that is asked for."""
+    """``reference.npz``, and in ``shapes.npz`` names and normalised vertices (n, V, 3), coarsened where asked for."""
     settings = config.collection
     meshes = _meshes(config)
-    if settings.reference is not None and settings.reference not in meshes.names:
-        raise ConfigError(f"collection.reference: no mesh is called {settings.reference!r}; the first is {meshes.names[0]!r}")
-    chosen = meshes.names.index(settings.reference) if settings.reference else 0
+    chosen = meshes.index(settings.reference)
     vertices, scale = normalised(meshes, chosen)
     fine = TriangleMesh.from_arrays(vertices[chosen], meshes.faces)
     facts: dict[str, Any] = {"shapes": len(vertices), "vertices": vertices.shape[1], "reference": meshes.names[chosen]}
+    facts["notes"] = list(meshes.notes)
     reference, more = fine, {}
     if settings.coarse_vertices is not None and vertices.shape[1] > settings.coarse_vertices:
         coarsening = coarsen(fine, settings.coarse_vertices, vertices)
@@ -100,12 +102,13 @@ def modes(folder: Path, config: Config) -> dict[str, Any]:
     """``modes.npz`` and ``modes.json``: logarithms of the shapes at the mean, their sparse modes, PGA's beside them."""
     settings, centre, shapes = config.modes, _mean(folder), _shapes(folder)
     space = ShellSpace(centre, material(config))
+    norm = WeightedNorm.of(centre, config.material.eta)
     logarithms = tangents(space, centre.vertices, shapes, settings.log_steps)
     count = min(settings.count, len(shapes) - 1)
     sparse = spga(
-        space, centre.vertices, logarithms.fields, count, settings.sparsity, max_iterations=settings.max_iterations
+        space, centre.vertices, logarithms.vertices, count, settings.sparsity, max_iterations=settings.max_iterations
     )
-    dense = pga(space, centre.vertices, logarithms.fields, count)
+    dense = pga(space, centre.vertices, logarithms.vertices, count)
     write_npz(
         folder / "modes.npz",
         nric=sparse.nric,
@@ -113,27 +116,84 @@ def modes(folder: Path, config: Config) -> dict[str, Any]:
         coefficients=sparse.coefficients,
         lower=sparse.lower,
         upper=sparse.upper,
-        localisation=localisation(sparse, space),
+        localisation=localisation(sparse.nric, norm),
+        rank=np.arange(len(sparse)),
         pga_nric=dense.nric,
         pga_vertices=dense.vertices,
-        pga_localisation=localisation(dense, space),
+        pga_localisation=localisation(dense.nric, norm),
     )
     facts = {
-        "modes": count,
+        "modes": len(sparse),
         "converged": sparse.converged,
         "explained": sparse.explained,
         "pga_explained": dense.explained,
-        "linearised_logarithms": sum(bool(reason) for reason in logarithms.reasons),
+        "linearised_logarithms": len(logarithms.fallbacks),
     }
-    write_json(folder / "modes.json", facts | {"reasons": logarithms.reasons, "history": sparse.history})
+    write_json(folder / "modes.json", facts | {"reasons": list(logarithms.reasons), "history": sparse.history})
     return facts
 
 
 def factors(folder: Path, config: Config) -> dict[str, Any]:
-    """``factors.json``: groups of modes with overlapping supports."""
-    raise NotImplementedError
+    """``factors.json``: groups of modes with overlapping supports; modes.npz is put in their order.
+
+    So each factor's latents are a range, as bundles want them. ``rank`` keeps the modes' own order, by strength, from
+    which the groups are always formed.
+    """
+    with np.load(folder / "modes.npz") as file:
+        found = dict(file)
+    centre = _mean(folder)
+    norm = WeightedNorm.of(centre, config.material.eta)
+    z = found["nric"][np.argsort(found["rank"])]
+    shared = overlap(z, norm)
+    groups = group(shared, config.factors.count)
+    order = [j for members in groups for j in members]
+    places = {rank: place for place, rank in enumerate(found["rank"])}
+    columns = [places[j] for j in order]
+    found["coefficients"] = found["coefficients"][:, columns]
+    for name in ("nric", "vertices", "lower", "upper", "localisation", "rank"):
+        found[name] = found[name][columns]
+    write_npz(folder / "modes.npz", **found)
+    starts = np.cumsum([0, *map(len, groups)])
+    write_json(
+        folder / "factors.json",
+        {
+            "factors": [list(range(a, b)) for a, b in itertools.pairwise(starts.tolist())],
+            "names": names(groups, z, norm, centre),
+            "overlap": between(shared, groups).tolist(),
+        },
+    )
+    return {"factors": len(groups), "largest": max(map(len, groups))}
 
 
 def collection(folder: Path, config: Config) -> ShellCollection:
     """The collection that the stages found."""
-    raise NotImplementedError
+    found = json.loads((folder / "factors.json").read_text())
+    with np.load(folder / "modes.npz") as modes, np.load(folder / "reference.npz") as reference:
+        return ShellCollection(
+            reference=_mean(folder),
+            modes=modes["vertices"],
+            lower=modes["lower"],
+            upper=modes["upper"],
+            factors=dict(zip(found["names"], found["factors"], strict=True)),
+            steps=config.samples.steps,
+            material=material(config),
+            scale=float(reference["scale"]),
+        )
+
+
+def extras(folder: Path) -> dict[str, np.ndarray]:
+    """What a bundle's geometry holds beside its reference: fine mesh at the mean, modes, codes of the shapes."""
+    if not (folder / "modes.npz").exists():
+        return {}
+    with np.load(folder / "modes.npz") as file:
+        result = {"modes": file["vertices"].astype(np.float32), "training_codes": file["coefficients"]}
+    with np.load(folder / "reference.npz") as file:
+        if "fine_vertices" in file:
+            fine = TriangleMesh.from_arrays(file["fine_vertices"], file["fine_faces"])
+            prolong = Prolongation.of(TriangleMesh.from_mapping(file), fine)
+            result |= {
+                "fine_vertices": prolong(_mean(folder).vertices),
+                "fine_faces": fine.faces.astype(np.int32),
+                **prolong.arrays(),
+            }
+    return result

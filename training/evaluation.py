@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import time
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from itertools import product
 from typing import Any
 
@@ -14,9 +16,14 @@ from numpy.typing import NDArray
 from torch import nn
 
 from geometry.mesh import FloatArray, TriangleMesh, align
-from geometry.nric import WeightedNorm
+from geometry.nric import WeightedNorm, nric
 from geometry.reconstruction import Reconstructor
+from training.config import Config, EvaluationSettings
 from training.coordinates import Coordinates
+from training.fitting import predict
+from training.gallery import extremes, strip
+from training.learning import Learner
+from training.networks import affine_sum
 from training.sampling import Collection
 
 
@@ -37,20 +44,11 @@ def r_squared(predicted: NDArray, exact: NDArray, norm: WeightedNorm) -> dict[st
     }
 
 
-def exact_nric(collection: Collection, latents: FloatArray, batch: int = 100) -> NDArray[np.float32]:
-    """Exact NRIC (n, 2E) of joint codes (n, m)."""
-    parts = (latents[start : start + batch] for start in range(0, len(latents), batch))
-    return np.concatenate([collection.shapes(part).nric.astype(np.float32) for part in parts])
-
-
-def exact_factors(collection: Collection, latents: FloatArray) -> NDArray[np.float32]:
-    """Exact factor shapes (n, J, 2E) of joint codes (n, m): each factor's part alone, the rest at the reference."""
-    shapes = []
-    for index in collection.factors.values():
-        alone = np.zeros_like(latents)
-        alone[:, index] = latents[:, index]
-        shapes.append(exact_nric(collection, alone))
-    return np.stack(shapes, axis=1)
+def alone(latents: FloatArray, factor: list[int]) -> FloatArray:
+    """Codes (n, m) of one factor's part alone, the rest at the reference."""
+    result = np.zeros_like(latents)
+    result[:, factor] = latents[:, factor]
+    return result
 
 
 @dataclass
@@ -68,17 +66,25 @@ class MultilinearGrid:
     coordinates: Coordinates
 
     @classmethod
-    def of(cls, collection: Collection, factor: list[int], nodes: int) -> MultilinearGrid:
-        """Evaluate the nodes exactly."""
-        coordinates = collection.coordinates[factor]
+    def of(
+        cls, coordinates: Coordinates, factor: list[int], nodes: int, shapes: Callable[[FloatArray], NDArray]
+    ) -> MultilinearGrid:
+        """Evaluate the nodes exactly.
+
+        Args:
+            coordinates: of all latents.
+            factor: indices of its own.
+            nodes: of each of its coordinates.
+            shapes: exact NRIC of codes (n, m).
+        """
+        own = coordinates[factor]
         axes = [
             np.linspace(low, high, nodes, endpoint=bool(np.isnan(period)))
-            for low, high, period in zip(coordinates.lower, coordinates.upper, coordinates.period, strict=True)
+            for low, high, period in zip(own.lower, own.upper, own.period, strict=True)
         ]
-        latents = np.zeros((nodes ** len(factor), len(collection.coordinates)))
+        latents = np.zeros((nodes ** len(factor), len(coordinates)))
         latents[:, factor] = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, len(factor))
-        values = exact_nric(collection, latents)
-        return cls(axes, values.reshape(*[nodes] * len(factor), -1), coordinates)
+        return cls(axes, shapes(latents).reshape(*[nodes] * len(factor), -1), own)
 
     def __call__(self, latents: FloatArray) -> NDArray:
         """NRIC (n, 2E) of the factor's latents (n, m_j)."""
@@ -96,29 +102,136 @@ class MultilinearGrid:
         return result
 
 
-def vertex_error(reference: TriangleMesh, eta: float, predicted: NDArray, exact: NDArray) -> dict[str, Any]:
-    """Distances of reconstructed vertices to exact ones (n, V, 3) after rigid alignment.
+@dataclass(frozen=True)
+class Reconstructions:
+    """Shapes reconstructed from predicted lengths and angles, beside the exact ones.
+
+    Attributes:
+        vertices: (n, V, 3), aligned to the exact ones.
+        errors: (n, V) distances, as fractions of the reference's bounding-box diagonal.
+        iterations: (n,) of Gauss–Newton from the reference.
+        statuses: (n,) how it ended.
+    """
+
+    vertices: FloatArray
+    errors: FloatArray
+    iterations: list[int]
+    statuses: list[str]
+
+    @classmethod
+    def of(cls, reference: TriangleMesh, eta: float, predicted: NDArray, exact: NDArray) -> Reconstructions:
+        """Reconstruct NRIC (n, 2E) and compare with vertices (n, V, 3) after rigid alignment."""
+        reconstruct = Reconstructor(reference, eta)
+        found = [reconstruct(z, tolerance=1e-6) for z in predicted]
+        vertices = np.array([align(f.vertices, x) for f, x in zip(found, exact, strict=True)])
+        errors = np.linalg.norm(vertices - exact, axis=2) / reference.diagonal
+        return cls(vertices, errors, [f.iterations for f in found], [str(f.status) for f in found])
+
+    def figures(self) -> dict[str, Any]:
+        """``mean`` and ``max`` error, mean ``iterations``, how often each ``status`` was met."""
+        return {
+            "mean": float(self.errors.mean()),
+            "max": float(self.errors.max()),
+            "iterations": float(np.mean(self.iterations)),
+            "status": dict(Counter(self.statuses)),
+        }
+
+
+def grid_nodes(dimension: int, settings: EvaluationSettings) -> int:
+    """Nodes of each coordinate of a factor's grid; below 3 it isn't worth its exponentials."""
+    return min(settings.grid_nodes, int(settings.grid_size ** (1 / dimension) + 1e-9))
+
+
+def evaluate(
+    learner: Callable[[float], Learner], config: Config, exact: Callable[[str, FloatArray], NDArray[np.float32]]
+) -> tuple[dict[str, Any], dict[str, NDArray]]:
+    """Every model on the test split, which is read here and nowhere before.
+
+    Args:
+        learner: by the share of the training samples that it learns from.
+        config: of the run.
+        exact: NRIC (n, 2E) of a named set of codes (n, m), with NaN for a code whose shape couldn't be found.
 
     Returns:
-        ``mean`` and ``max`` over all vertices, as fractions of the reference's bounding-box diagonal; mean
-        ``iterations`` of Gauss–Newton from the reference; how often each ``status`` was met.
+        What goes into evaluation.json and into gallery.npz.
     """
-    reconstruct = Reconstructor(reference, eta)
-    distances: list[FloatArray] = []
-    iterations: list[int] = []
-    statuses: dict[str, int] = {}
-    for z, vertices in zip(predicted, exact, strict=True):
-        result = reconstruct(z, tolerance=1e-6)
-        distances.append(np.linalg.norm(align(result.vertices, vertices) - vertices, axis=1))
-        iterations.append(result.iterations)
-        statuses[str(result.status)] = statuses.get(str(result.status), 0) + 1
-    errors = np.array(distances) / reference.diagonal
-    return {
-        "mean": float(errors.mean()),
-        "max": float(errors.max()),
-        "iterations": float(np.mean(iterations)),
-        "status": statuses,
+    settings, whole = config.evaluation, learner(1.0)
+    collection, reference = whole.collection, whole.collection.reference
+    factors, coordinates = collection.factors, collection.coordinates
+    norm = WeightedNorm.of(reference, settings.eta)
+    z_reference = nric(reference.vertices, reference.connectivity)
+    composite, monolithic, test = whole.main(), whole.monolithic(), whole.split["test"]
+
+    shapes = np.stack([_exact_factor(whole, j, exact) for j in range(len(factors))], axis=1)
+    # A joint shape can be found where a factor's own can't.
+    there = np.isfinite(shapes).all(axis=(1, 2))
+    test, shapes = test[there], shapes[there]
+    latents, z, vertices = (getattr(whole.joint, name)[test] for name in ("latents", "nric", "vertices"))
+    codes = torch.as_tensor(latents, dtype=torch.float32)
+
+    def score(predicted: NDArray) -> dict[str, float]:
+        return r_squared(predicted, z, norm)
+
+    def network_score(network: Callable[[torch.Tensor], torch.Tensor]) -> dict[str, float]:
+        return score(predict(network, codes).numpy())
+
+    learned, answer = predict(composite.factor_shapes, codes).numpy(), predict(composite, codes).numpy()
+    r2 = {
+        "composite": score(answer),
+        "monolithic": network_score(monolithic),
+        "affine": score(affine_sum(z_reference, shapes)),
+        "affine of learned factors": score(affine_sum(z_reference, learned)),
     }
+    sizes = {"composite": size_bytes(*composite.networks, composite.combiner), "monolithic": size_bytes(monolithic)}
+    nodes = [grid_nodes(len(index), settings) for index in factors.values()]
+    if min(nodes) >= 3:
+        grids = [
+            MultilinearGrid.of(coordinates, index, n, partial(exact, f"grid-{j}"))
+            for j, (index, n) in enumerate(zip(factors.values(), nodes, strict=True))
+        ]
+        values = [grid(latents[:, index]) for grid, index in zip(grids, factors.values(), strict=True)]
+        if np.isfinite(values).all():
+            r2["grid"] = score(affine_sum(z_reference, np.stack(values, axis=1)))
+            sizes["grid"] = sum(grid.values.nbytes for grid in grids)
+    first = slice(settings.reconstructions)
+    eta = config.export.eta_reconstruction
+    found = Reconstructions.of(reference, eta, answer[first], vertices[first])
+    figures = {
+        "eta": settings.eta,
+        "test_samples": len(test),
+        "r2": r2,
+        "r2_factors": {name: r_squared(learned[:, j], shapes[:, j], norm) for j, name in enumerate(factors)},
+        "variants": {
+            name: {"title": config.variants[name].title, "r2": network_score(variant)}
+            for name, variant in whole.variants().items()
+        },
+        "fractions": [
+            {
+                "fraction": fraction,
+                "training_samples": len(some.rows["train"]),
+                "r2": {"composite": network_score(some.main()), "monolithic": network_score(some.monolithic())},
+            }
+            for fraction, some in ((f, learner(f)) for f in config.networks.fractions)
+        ],
+        "vertex_error": found.figures(),
+        "sizes": sizes,
+        "times": model_times(collection, composite),
+    }
+    gallery = extremes(found.vertices, vertices[first], found.errors, test[first])
+    return figures, gallery | strip(collection, composite, eta) | {"faces": reference.faces}
+
+
+def _exact_factor(learner: Learner, j: int, exact: Callable[[str, FloatArray], NDArray]) -> NDArray[np.float32]:
+    """Exact shapes (n, 2E) of a factor's part alone of the test codes, NaN where there is none."""
+    index, test = list(learner.collection.factors.values())[j], learner.split["test"]
+    if learner.config.samples.factor_counts is not None:
+        return exact(f"factor-{j}", alone(learner.joint.latents[test], index))
+    samples = learner.factor_samples(j)
+    result = np.full((len(test), samples.nric.shape[1]), np.nan, dtype=np.float32)
+    rows = np.searchsorted(samples.index, learner.joint.index[test])
+    there = np.isin(learner.joint.index[test], samples.index)
+    result[there] = samples.nric[rows[there]]
+    return result
 
 
 def size_bytes(*networks: nn.Module) -> int:

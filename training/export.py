@@ -8,6 +8,7 @@ import logging
 import os
 import shutil
 import warnings
+from collections.abc import Mapping
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -16,15 +17,16 @@ import numpy as np
 import onnx
 import onnxruntime
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from geometry.energy import Material
 from geometry.mesh import TriangleMesh
 from geometry.nric import WeightedNorm
 from training.config import Config
 from training.fitting import predict
 from training.learning import Composite
-from training.sampling import Collection, write_npz
+from training.files import write_npz
+from training.sampling import Collection
 
 OPSET = 18
 
@@ -86,8 +88,19 @@ def export(
     figures: dict[str, Any],
     data_digest: str,
     destination: Path,
+    geometry: Mapping[str, NDArray],
 ) -> Path:
     """Write ``destination/NAME/VERSION/``, replacing what is there.
+
+    Args:
+        composite: the networks.
+        collection: what they parametrise.
+        config: of the run.
+        figures: what was measured of them.
+        data_digest: SHA-256 of the samples they learned from.
+        destination: the models directory.
+        geometry: arrays of geometry.npz beside the reference's: a finer mesh with its prolongation, modes,
+            training codes.
 
     Raises:
         ExportError: ONNX and PyTorch differ by more than the tolerance on 64 random codes.
@@ -118,6 +131,7 @@ def export(
         vertices=reference.vertices,
         faces=reference.faces.astype(np.int32),
         edges=reference.edges.astype(np.int32),
+        **geometry,
     )
     manifest = _manifest(composite, collection, config, figures, data_digest, difference)
     manifest["files"] = {path.name: _digest(path) for path in sorted(part.iterdir())}
@@ -131,7 +145,7 @@ def _manifest(
     composite: Composite, collection: Collection, config: Config, figures: dict[str, Any], data_digest: str,
     difference: float,
 ) -> dict[str, Any]:  # fmt: skip
-    settings, coordinates, material = config.export, collection.coordinates, Material()
+    settings, coordinates, material = config.export, collection.coordinates, config.material
     reference: TriangleMesh = collection.reference
     return {
         "schema_version": 1,

@@ -17,18 +17,19 @@ from training.sampling import Collection
 STRIP_FRAMES = 7
 
 
-def extremes(predicted: NDArray, exact: NDArray, errors: NDArray) -> dict[str, NDArray]:
+def extremes(predicted: NDArray, exact: NDArray, errors: NDArray, index: NDArray) -> dict[str, NDArray]:
     """Three reconstructed test shapes beside the exact ones.
 
     Args:
         predicted: (n, V, 3) vertices, aligned to the exact ones.
         exact: (n, V, 3).
         errors: (n, V) distances.
+        index: (n,) which samples they are.
     """
     order = np.argsort(errors.mean(axis=1))
     chosen = order[[0, len(order) // 2, -1]]
     return {
-        "test_index": chosen,
+        "test_index": index[chosen],
         "test_exact": exact[chosen],
         "test_predicted": predicted[chosen],
         "test_error": errors[chosen],

@@ -104,6 +104,11 @@ class Learner:
     def _scaling(self, z: NDArray) -> Scaling:
         return Scaling.of(self._reference, WeightedNorm.of(self.collection.reference, eta=1.0).squared, z)
 
+    @property
+    def rows(self) -> dict[str, IntArray]:
+        """The split, with the share of it to learn from."""
+        return self._some(self.split)
+
     def _some(self, rows: dict[str, IntArray]) -> dict[str, IntArray]:
         """The share of the rows to learn from. Codes are independent, so the first ones are as good as any."""
         return {
@@ -166,12 +171,16 @@ class Learner:
         self._fit(network, latents, samples.nric, rows, settings.fit, path)
         return network
 
+    def factor_samples(self, j: int) -> Samples:
+        """The samples of a factor alone."""
+        return read(self.run / "samples" / f"factor-{j}")
+
     def factor(self, j: int, settings: LatentNetworkSettings) -> FactorNetwork:
         """ψ_j, on the factor's own samples, or on the joint ones' subvectors where there are no others."""
         index = list(self.collection.factors.values())[j]
 
         def data() -> tuple[Samples, dict[str, IntArray]]:
-            samples = read(self.run / "samples" / f"factor-{j}")
+            samples = self.factor_samples(j)
             if self.config.samples.factor_counts is not None:
                 count = len(samples.latents)
                 held_out = round(self.config.samples.validation_fraction * count)
@@ -195,7 +204,7 @@ class Learner:
         torch.manual_seed(self.config.networks.seed)
         path = self._path("combiner", combiner, *factors)
         saved = finished(path)
-        rows = {} if saved else self._some(self.split)
+        rows = {} if saved else self.rows
         scaling = Scaling.blank(len(self._reference)) if saved else self._scaling(self.joint.nric[rows["train"]])
         network = CombinerNetwork(combiner, self.collection.reference.connectivity, scaling, len(networks))
         composite = Composite(list(self.collection.factors.values()), networks, network)

@@ -9,31 +9,22 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
+from numpy.typing import NDArray
 from pydantic import BaseModel
 
-from geometry.nric import WeightedNorm, nric
+from geometry.mesh import FloatArray
 from training import discovery
 from training.config import Config
-from training.evaluation import (
-    MultilinearGrid,
-    exact_factors,
-    model_times,
-    r_squared,
-    size_bytes,
-    vertex_error,
-)
+from training.evaluation import alone, evaluate
 from training.export import export
 from training.files import write_json, write_npz
-from training.fitting import predict
 from training.freaky_torus import FreakyTorus
 from training.learning import Learner
-from training.networks import affine_sum
 from training.sampling import Collection, draw, read, split
 
 GENERATORS: dict[str, Callable[[], Collection]] = {"freaky-torus": FreakyTorus}
@@ -113,6 +104,11 @@ def factors(run: Run) -> None:
     write_json(run.folder / "factors.json", {"factors": list(lists.values()), "names": list(lists)})
 
 
+def _draw(run: Run, folder: Path, latents: FloatArray, title: str) -> None:
+    for done, total in draw(run.collection, folder, latents, run.config.samples.part_size, title):
+        run.log("progress", what=title, done=done, total=total)
+
+
 def samples(run: Run) -> None:
     """samples/: joint codes with their shapes, each factor's own, and the split."""
     settings, coordinates = run.config.samples, run.collection.coordinates
@@ -122,98 +118,66 @@ def samples(run: Run) -> None:
         np.random.default_rng(s) for s in np.random.SeedSequence(settings.seed).spawn(2 + len(run.collection.factors))
     )
     joint = coordinates.uniform(settings.count, joint_rng)
-    draws = [("joint samples", folder, joint)]
+    _draw(run, folder, joint, "joint samples")
     for j, (index, rng) in enumerate(zip(run.collection.factors.values(), factor_rngs, strict=True)):
-        count = settings.count if settings.factor_counts is None else settings.factor_counts[j]
-        alone = np.zeros((count, len(coordinates)))
-        own = settings.factor_counts is not None
-        alone[:, index] = coordinates[index].uniform(count, rng) if own else joint[:, index]
-        draws.append((f"samples of factor {j}", folder / f"factor-{j}", alone))
-    for title, place, latents in draws:
-        for done, total in draw(run.collection, place, latents, settings.part_size, title):
-            run.log("progress", stage="samples", what=title, done=done, total=total)
+        counts = settings.factor_counts
+        if counts is None:
+            own = alone(joint, index)
+        else:
+            own = np.zeros((counts if isinstance(counts, int) else counts[j], len(coordinates)))
+            own[:, index] = coordinates[index].uniform(len(own), rng)
+        _draw(run, folder / f"factor-{j}", own, f"samples of factor {j}")
     index = read(folder).index
     write_npz(folder / "split.npz", **split(index, settings.test_fraction, settings.validation_fraction, split_rng))
 
 
-def learner_of(run: Run) -> Learner:
-    """The networks of a run whose samples are there."""
-    return Learner(run.collection, run.config, run.folder, run.stamp("samples")["key"])
+def learner_of(run: Run, fraction: float = 1.0) -> Learner:
+    """The networks of a run whose samples are there, learned from a share of them."""
+    return Learner(run.collection, run.config, run.folder, run.stamp("samples")["key"], fraction)
 
 
 def networks(run: Run) -> None:
-    """networks/: one file for each fitted network, and its history in the log."""
+    """networks/: one file for each fitted network, and the histories of all."""
     learner = learner_of(run)
     learner.main()
     learner.monolithic()
     learner.variants()
-    write_json(run.folder / "networks" / "histories.json", learner.histories)
+    histories = learner.histories
+    for fraction in run.config.networks.fractions:
+        learner = learner_of(run, fraction)
+        learner.main()
+        learner.monolithic()
+        histories |= learner.histories
+    write_json(run.folder / "networks" / "histories.json", histories)
 
 
 def evaluation(run: Run) -> None:
-    """evaluation.json: every model on the test split, which is read here and nowhere before."""
-    collection, settings = run.collection, run.config.evaluation
-    learner = learner_of(run)
-    composite, monolithic, variants = learner.main(), learner.monolithic(), learner.variants()
-    test = learner.split["test"]
-    latents, exact, vertices = learner.joint.latents[test], learner.joint.nric[test], learner.joint.vertices[test]
-    codes = torch.as_tensor(latents, dtype=torch.float32)
-    reference = collection.reference
-    z_reference = nric(reference.vertices, reference.connectivity)
-    norm = WeightedNorm.of(reference, settings.eta)
+    """evaluation.json and gallery.npz."""
 
-    shapes = exact_factors(collection, latents)
-    grids = [MultilinearGrid.of(collection, index, settings.grid_nodes) for index in collection.factors.values()]
-    on_grid = np.stack(
-        [grid(latents[:, index]) for grid, index in zip(grids, collection.factors.values(), strict=True)], axis=1
-    )
-    learned = predict(composite.factor_shapes, codes).numpy()
-    answer = predict(composite, codes).numpy()
-    r2 = {
-        "composite": r_squared(answer, exact, norm),
-        "monolithic": r_squared(predict(monolithic, codes).numpy(), exact, norm),
-        "affine": r_squared(affine_sum(z_reference, shapes), exact, norm),
-        "grid": r_squared(affine_sum(z_reference, on_grid), exact, norm),
-        "affine of learned factors": r_squared(affine_sum(z_reference, learned), exact, norm),
-    }
-    first = slice(settings.reconstructions)
-    write_json(
-        run.folder / "evaluation.json",
-        {
-            "eta": settings.eta,
-            "test_samples": len(test),
-            "r2": r2,
-            "r2_factors": {
-                name: r_squared(learned[:, j], shapes[:, j], norm) for j, name in enumerate(collection.factors)
-            },
-            "variants": {
-                name: {
-                    "title": run.config.variants[name].title,
-                    "r2": r_squared(predict(variant, codes).numpy(), exact, norm),
-                }
-                for name, variant in variants.items()
-            },
-            "vertex_error": vertex_error(
-                reference, run.config.export.eta_reconstruction, answer[first], vertices[first]
-            ),
-            "sizes": {
-                "composite": size_bytes(*composite.networks, composite.combiner),
-                "monolithic": size_bytes(monolithic),
-                "grid": sum(grid.values.nbytes for grid in grids),
-            },
-            "times": model_times(collection, composite),
-        },
-    )
+    def exact(name: str, latents: FloatArray) -> NDArray[np.float32]:
+        folder = run.folder / "exact" / name
+        _draw(run, folder, latents, f"exact shapes, {name}")
+        samples = read(folder)
+        result = np.full((len(latents), samples.nric.shape[1]), np.nan, dtype=np.float32)
+        result[samples.index] = samples.nric
+        return result
+
+    figures, gallery = evaluate(partial(learner_of, run), run.config, exact)
+    ingested = run.folder / "ingest.json"
+    if ingested.exists():
+        figures["prolongation"] = json.loads(ingested.read_text()).get("prolongation")
+    write_npz(run.folder / "gallery.npz", **gallery)
+    write_json(run.folder / "evaluation.json", figures)
 
 
 def export_bundle(run: Run) -> None:
     """The bundle, in the models directory."""
-    learner = learner_of(run)
     figures = json.loads((run.folder / "evaluation.json").read_text())
     digest = hashlib.sha256()
     for path in sorted((run.folder / "samples").rglob("*.npz")):
         digest.update(path.read_bytes())
-    folder = export(learner.main(), run.collection, run.config, figures, digest.hexdigest(), run.models)
+    composite, data = learner_of(run).main(), digest.hexdigest()
+    folder = export(composite, run.collection, run.config, figures, data, run.models, discovery.extras(run.folder))
     run.log("exported", bundle=f"{folder.parent.name}/{folder.name}")
 
 
@@ -240,7 +204,7 @@ STAGES: dict[str, Stage] = {
     "samples": Stage(samples, lambda c: [c.samples], ("samples",)),
     # Files of networks are named by samples and settings, so a change leaves those alone that it doesn't touch.
     "networks": Stage(networks, lambda c: [c.networks, c.monolithic, *c.variants.values()], ()),
-    "evaluation": Stage(evaluation, lambda c: [c.evaluation], ("evaluation.json",)),
+    "evaluation": Stage(evaluation, lambda c: [c.evaluation], ("evaluation.json", "gallery.npz", "exact")),
     "export": Stage(export_bundle, lambda c: [c.export], ()),
 }
 

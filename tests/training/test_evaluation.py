@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from geometry.nric import WeightedNorm, nric
-from training.evaluation import MultilinearGrid, exact_factors, r_squared, vertex_error
+from training.config import EvaluationSettings
+from training.evaluation import MultilinearGrid, Reconstructions, alone, grid_nodes, r_squared
 from training.freaky_torus import FreakyTorus
 
 
@@ -31,22 +32,24 @@ def test_r_squared_is_one_for_the_truth_zero_for_the_mean_and_weighted_between(t
     assert figures["total"] == pytest.approx(spread[:half].sum() / spread.sum())
 
 
-def test_exact_factors_are_the_joint_shape_where_only_one_factor_moves(torus: FreakyTorus) -> None:
-    codes = np.array([[0, 2.0, 0, 0], [0, 0, 1.0, 2.0]])
-    factors = exact_factors(torus, codes)
-    joint = torus.shapes(codes).nric
-    reference = nric(torus.reference.vertices, torus.reference.connectivity)
-    np.testing.assert_allclose(factors[0, 1], joint[0], atol=1e-6)
-    np.testing.assert_allclose(factors[1, 2], joint[1], atol=1e-6)
-    np.testing.assert_allclose(factors[1, 0], reference, atol=1e-6)
+def test_alone_keeps_one_factor_and_leaves_the_rest_at_the_reference() -> None:
+    codes = np.array([[1.0, 2, 3, 4], [5, 6, 7, 8]])
+    assert alone(codes, [2, 3]).tolist() == [[0, 0, 3, 4], [0, 0, 7, 8]]
+    assert codes[0, 0] == 1
+
+
+@pytest.mark.parametrize(("dimension", "nodes"), [(1, 16), (2, 16), (3, 10), (4, 5), (6, 3), (7, 2)])
+def test_a_grid_has_no_more_nodes_than_allowed(dimension: int, nodes: int) -> None:
+    assert grid_nodes(dimension, EvaluationSettings()) == nodes
+    assert nodes**dimension <= EvaluationSettings().grid_size
 
 
 def test_the_grid_is_exact_at_its_nodes_linear_between_them_and_closes_up(torus: FreakyTorus) -> None:
-    grid = MultilinearGrid.of(torus, [2, 3], nodes=5)
+    grid = MultilinearGrid.of(torus.coordinates, [2, 3], 5, lambda codes: torus.shapes(codes).nric)
     step = 2 * np.pi / 5
     nodes = np.array([[1, 3], [2, 3], [4, 0], [0, 0]]) * step
     full = np.concatenate([np.zeros((4, 2)), nodes], axis=1)
-    np.testing.assert_allclose(grid(nodes), exact_factors(torus, full)[:, 2], atol=1e-6)
+    np.testing.assert_allclose(grid(nodes), torus.shapes(full).nric, atol=1e-6)
     between = grid(np.array([[1.25, 3], [4.5, 0]]) * step)
     values = grid(nodes)
     np.testing.assert_allclose(between[0], 0.75 * values[0] + 0.25 * values[1], atol=1e-6)
@@ -55,8 +58,8 @@ def test_the_grid_is_exact_at_its_nodes_linear_between_them_and_closes_up(torus:
 
 def test_vertex_error_of_exact_lengths_and_angles_is_nothing(torus: FreakyTorus) -> None:
     exact = torus.shapes(np.array([[1.0, 2.0, 3.0, 4.0]]))
-    figures = vertex_error(torus.reference, 1e-2, exact.nric, exact.vertices)
+    figures = Reconstructions.of(torus.reference, 1e-2, exact.nric, exact.vertices).figures()
     assert figures["max"] < 1e-6
     assert figures["status"] == {"converged": 1}
-    wrong = vertex_error(torus.reference, 1e-2, 1.05 * exact.nric, exact.vertices)
+    wrong = Reconstructions.of(torus.reference, 1e-2, 1.05 * exact.nric, exact.vertices).figures()
     assert wrong["mean"] > 1e-3

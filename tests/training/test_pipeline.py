@@ -90,7 +90,7 @@ def test_export_refuses_where_onnx_and_torch_disagree(tiny_run: Path, tmp_path: 
     run = Run(tiny_run, config, (tiny_run / "config.toml").read_text(), tmp_path)
     strict = parse(TINY + "tolerance = 1e-12\n", "strict")
     with pytest.raises(ExportError, match="differ by"):
-        export(learner_of(run).main(), run.collection, strict, {}, "", tmp_path)
+        export(learner_of(run).main(), run.collection, strict, {}, "", tmp_path, {})
     assert not (tmp_path / "tiny-torus" / "1").exists()
 
 
