@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise
@@ -111,8 +112,11 @@ def read_arrays(source: bytes | Path, format: str | None = None) -> tuple[np.nda
     except MeshError:
         raise
     except Exception as error:  # parsers of foreign bytes fail in every way there is
-        # An import fails where trimesh takes broken binary data for text and looks for help in guessing its encoding.
-        why = "damaged, or another kind of file" if isinstance(error, ImportError) else " ".join(str(error).split())
+        why = " ".join(str(error).split())
+        if isinstance(error, ImportError):  # trimesh took broken binary data for text in some encoding, to be guessed
+            why = "damaged, or another kind of file"
+        elif isinstance(error, FileNotFoundError):
+            why = f"it needs {why}, which is not beside it"
         raise MeshError(f"not a readable {format} file: {why}") from error
 
 
@@ -163,14 +167,18 @@ def _read_trimesh(data: bytes, format: str | None, beside: Path | None) -> tuple
 
     # PLY with texture coordinates would be split along its seams, and shuffled.
     options: dict[str, Any] = {"fix_texture": False} if format == "ply" else {}
-    scene = trimesh.load_scene(
-        io.BytesIO(data),
-        file_type=format,
-        resolver=trimesh.resolvers.FilePathResolver(str(beside)) if beside else None,
-        process=False,
-        skip_materials=True,
-        **options,
-    )
+    if format == "gltf":
+        json.loads(data)  # where that fails, trimesh looks for other files and complains about those
+    # Coordinates that aren't finite are for the caller to judge.
+    with np.errstate(all="ignore"):
+        scene = trimesh.load_scene(
+            io.BytesIO(data),
+            file_type=format,
+            resolver=trimesh.resolvers.FilePathResolver(str(beside)) if beside else None,
+            process=False,
+            skip_materials=True,
+            **options,
+        )
     meshes = [g for g in scene.geometry.values() if isinstance(g, trimesh.Trimesh)]
     # A glTF mesh has a primitive for each of its materials.
     if len(meshes) != 1 and not (meshes and all(m.metadata.get("from_gltf_primitive") for m in meshes)):
