@@ -335,14 +335,17 @@ class _StarSum(torch.autograd.Function):
 class PairwiseProducts(nn.Module):
     """A bilinear correction of the affine sum, (n, J, 2E) → (n, 2E), fitted by ridge regression.
 
-    Each factor is brought to a few principal coefficients; a linear map takes these and their products between every
-    two factors to scaled differences. What two factors do to each other is smooth and global where they overlap
-    widely, and there a few products do what many convolutions would.
+    Each factor is brought to a few principal coefficients; a linear map of low rank takes these and their products
+    between every two factors to scaled differences. What two factors do to each other is smooth and global where they
+    overlap widely, and there a few products do what many convolutions would.
     """
 
     centre: Tensor
     axes: Tensor
     weights: Tensor
+    basis: Tensor
+    #: Largest rank of the linear map.
+    RANK = 64
 
     def __init__(self, factor_count: int, rank: int, size: int) -> None:
         super().__init__()
@@ -350,7 +353,8 @@ class PairwiseProducts(nn.Module):
         self.register_buffer("centre", torch.zeros(factor_count, size))
         self.register_buffer("axes", torch.zeros(factor_count, size, rank))
         features = 1 + factor_count * rank + len(self.pairs) * rank**2
-        self.register_buffer("weights", torch.zeros(features, size))
+        self.register_buffer("weights", torch.zeros(features, min(features, self.RANK)))
+        self.register_buffer("basis", torch.zeros(min(features, self.RANK), size))
 
     def _features(self, y: Tensor) -> Tensor:
         c = torch.einsum("njs,jsr->njr", y - self.centre, self.axes)
@@ -362,12 +366,18 @@ class PairwiseProducts(nn.Module):
         self.centre.copy_(y.mean(dim=0))
         for j in range(y.shape[1]):
             _, s, vt = torch.linalg.svd(y[:, j] - self.centre[j], full_matrices=False)
-            rank = self.axes.shape[2]
+            rank = min(self.axes.shape[2], len(s))
             # Coefficients of unit variance, so that one ridge suits all products.
-            self.axes[j].copy_((vt[:rank] / s[:rank, None] * len(y) ** 0.5).T)
+            self.axes[j, :, :rank] = (vt[:rank] / s[:rank, None].clamp_min(1e-6 * s[0]) * len(y) ** 0.5).T
         x = self._features(y).double()
-        gram = x.T @ x + ridge * len(x) * torch.eye(x.shape[1], dtype=torch.float64)
-        self.weights.copy_(torch.linalg.solve(gram, x.T @ residual.double()))
+        gram = x.T @ x / len(x) + ridge * torch.eye(x.shape[1], dtype=torch.float64)
+        root = torch.linalg.cholesky(gram)
+        whole = torch.linalg.solve_triangular(root, x.T @ residual.double() / len(x), upper=False)
+        # The map of low rank whose values on these samples are nearest to the whole one's.
+        u, s, vt = torch.linalg.svd(whole, full_matrices=False)
+        q = min(len(self.basis), len(s))
+        self.weights[:, :q] = torch.linalg.solve_triangular(root.T, u[:, :q] * s[:q], upper=True)
+        self.basis[:q] = vt[:q]
 
     def forward(self, y: Tensor) -> Tensor:
-        return self._features(y) @ self.weights
+        return self._features(y) @ self.weights @ self.basis
