@@ -17,13 +17,13 @@ def _open(folder: Path, models: Path) -> Run:
     source = folder / "config.toml"
     if not source.is_file():
         raise ConfigError(f"{folder} is no run directory: it holds no config.toml")
-    return Run(folder, load(source), source.read_text(encoding="utf-8"), models)
+    return Run(folder, *load(source), models)
 
 
 def _run(arguments: argparse.Namespace) -> None:
-    config = load(arguments.config)
+    config, source = load(arguments.config, arguments.data, arguments.fractions)
     folder = arguments.out or Path("runs") / arguments.config.stem
-    execute(Run(folder, config, arguments.config.read_text(encoding="utf-8"), arguments.models), arguments.until)
+    execute(Run(folder, config, source, arguments.models), arguments.until)
 
 
 def _status(arguments: argparse.Namespace) -> None:
@@ -45,6 +45,10 @@ def parser() -> argparse.ArgumentParser:
 
     run = commands.add_parser("run", help="do the stages of a configuration that are not done yet")
     run.add_argument("config", type=Path, metavar="CONFIG.toml")
+    run.add_argument("--data", type=Path, metavar="DIR", help="folder of meshes or NPZ file, instead of the config's")
+    run.add_argument(
+        "--fractions", type=float, nargs="+", default=(), metavar="F", help="also learn from these shares of the samples"
+    )
     run.add_argument("--out", type=Path, metavar="DIR", help="run directory (default: runs/ and the config's name)")
     run.add_argument("--until", choices=list(STAGES), metavar="STAGE", help=f"last stage to do: {', '.join(STAGES)}")
     run.set_defaults(do=_run)

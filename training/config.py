@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import tomllib
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+import tomlkit
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 #: Which edges a convolution hears of, see networks.EdgeConvolution.
@@ -205,17 +207,34 @@ def parse(text: str, source: str) -> Config:
         raise ConfigError(f"{source}: these settings can't be used\n{faults}") from error
 
 
-def load(path: Path) -> Config:
-    """Read a configuration file, with ``collection.data`` made absolute, wherever it is read from.
+def load(path: Path, data: Path | None = None, fractions: Sequence[float] = ()) -> tuple[Config, str]:
+    """Read a configuration file, with what the command line has to say to it.
+
+    Args:
+        path: of the file.
+        data: goes before ``collection.data``.
+        fractions: go before ``networks.fractions``.
+
+    Returns:
+        The configuration, and the text that says the same from any folder: ``collection.data`` made absolute, the
+        arguments written in, all else as it stands.
 
     Raises:
         ConfigError: naming the file and every faulty setting.
     """
     try:
-        config = parse(path.read_text(encoding="utf-8"), str(path))
+        text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path}: can't be read: {error}") from error
-    if config.collection.data is None:
-        return config
-    data = (path.parent / config.collection.data).resolve()
-    return config.model_copy(update={"collection": config.collection.model_copy(update={"data": data})})
+    config = parse(text, str(path))
+    if data is None and config.collection.data is not None:
+        data = path.parent / config.collection.data
+    if data is not None or fractions:
+        document: Any = tomlkit.parse(text)
+        if data is not None:
+            document["collection"]["data"] = str(data.resolve())
+        if fractions:
+            document.setdefault("networks", {})["fractions"] = list(fractions)
+        text = tomlkit.dumps(document)
+        config = parse(text, str(path))
+    return config, text

@@ -141,6 +141,14 @@ def export(
     return folder
 
 
+def _portable(config: Config) -> dict[str, Any]:
+    """The configuration without the folders of the machine that it was used on."""
+    values = config.model_dump(mode="json", by_alias=True)
+    if config.collection.data is not None:
+        values["collection"]["data"] = config.collection.data.name
+    return values
+
+
 def _manifest(
     composite: Composite, collection: Collection, config: Config, figures: dict[str, Any], data_digest: str,
     difference: float,
@@ -184,7 +192,7 @@ def _manifest(
         "onnx_tolerance": {"required": settings.tolerance, "measured": difference},
         "figures": figures,
         "origin": {
-            "config": config.model_dump(mode="json"),
+            "config": _portable(config),
             "data_digest": data_digest,
             "code_version": metadata.version("shapespace"),
         },

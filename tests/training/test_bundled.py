@@ -15,7 +15,7 @@ def test_the_bundle_states_the_figures_and_the_configuration_of_the_committed_ru
     bundle = read_bundle(ROOT / "models" / "freaky-torus" / "1")
     run = ROOT / "runs" / "freaky-torus"
     assert bundle.manifest.figures == json.loads((run / "evaluation.json").read_text())
-    assert bundle.manifest.origin.config == load(run / "config.toml").model_dump(mode="json")
+    assert bundle.manifest.origin.config == load(run / "config.toml")[0].model_dump(mode="json", by_alias=True)
     assert (run / "config.toml").read_text() == (ROOT / "examples" / "freaky-torus.toml").read_text()
 
 

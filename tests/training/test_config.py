@@ -14,7 +14,7 @@ EXAMPLES = sorted((Path(__file__).parents[2] / "examples").glob("*.toml"))
 
 @pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
 def test_every_example_is_a_configuration(path: Path) -> None:
-    assert load(path).export.name
+    assert load(path)[0].export.name
 
 
 @pytest.mark.parametrize(
@@ -46,5 +46,22 @@ def test_data_lie_relative_to_the_configuration(written: str, tmp_path: Path, mo
     (tmp_path / "here.toml").write_text(TINY.replace('generator = "freaky-torus"', f'data = "{data}"', 1))
     (tmp_path / "elsewhere").mkdir()
     monkeypatch.chdir(tmp_path / "elsewhere")
-    assert load(Path("../here.toml")).collection.data == tmp_path.resolve() / "meshes"
+    assert load(Path("../here.toml"))[0].collection.data == tmp_path.resolve() / "meshes"
     assert load(tmp_path / "here.toml") == load(Path("../here.toml"))
+
+
+def test_the_command_s_arguments_go_before_the_file_and_into_the_text_that_is_kept(tmp_path: Path) -> None:
+    file = tmp_path / "a.toml"
+    file.write_text('# kept\n[collection]\ndata = "old"\n[export]\nname = "a"\ntitle = "A"\ndescription = ""\nlicence = "x"\n')
+    config, text = load(file, tmp_path / "new", [0.2, 0.05])
+    assert config.collection.data == tmp_path / "new"
+    assert config.networks.fractions == [0.2, 0.05]
+    assert text.startswith("# kept")
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "config.toml").write_text(text)
+    assert load(tmp_path / "run" / "config.toml") == (config, text)
+
+
+def test_a_file_that_needs_no_changes_is_kept_as_it_stands() -> None:
+    path = Path(__file__).parents[2] / "examples" / "freaky-torus.toml"
+    assert load(path)[1] == path.read_text()

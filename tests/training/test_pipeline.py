@@ -69,8 +69,7 @@ def test_the_bundle_is_one_the_server_takes_and_computes_the_same(tiny_run: Path
     text = b"".join(path.read_bytes() for path in folder.iterdir())
     assert str(Path(__file__).parents[2]).encode() not in text, "a bundle tells nothing of the machine it was made on"
 
-    config = load(tiny_run / "config.toml")
-    run = Run(tiny_run, config, (tiny_run / "config.toml").read_text(), tiny_run / "models")
+    run = Run(tiny_run, *load(tiny_run / "config.toml"), tiny_run / "models")
     composite = learner_of(run).main()
     codes = np.random.default_rng(4).uniform(0, 6, (5, 4)).astype(np.float32)
     with torch.no_grad():
@@ -86,8 +85,7 @@ def test_the_bundle_is_one_the_server_takes_and_computes_the_same(tiny_run: Path
 
 
 def test_export_refuses_where_onnx_and_torch_disagree(tiny_run: Path, tmp_path: Path) -> None:
-    config = load(tiny_run / "config.toml")
-    run = Run(tiny_run, config, (tiny_run / "config.toml").read_text(), tmp_path)
+    run = Run(tiny_run, *load(tiny_run / "config.toml"), tmp_path)
     strict = parse(TINY + "tolerance = 1e-12\n", "strict")
     with pytest.raises(ExportError, match="differ by"):
         export(learner_of(run).main(), run.collection, strict, {}, "", tmp_path, {})
