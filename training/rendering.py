@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -98,34 +99,42 @@ class Camera:
 
         left, right, bottom, top = self.window
         pixel = max(right - left, top - bottom) / size
-        shape = (round((top - bottom) / pixel), round((right - left) / pixel))
-        rays = _rays(self.window, (shape[0] * SUPERSAMPLING, shape[1] * SUPERSAMPLING))
+        height, width = round((top - bottom) / pixel), round((right - left) / pixel)
+        rays = _rays(self.window, SUPERSAMPLING * height, SUPERSAMPLING * width)
         hit = scene.run(np.zeros_like(rays), rays, output=True)
         seen = hit["primID"] >= 0
-        face, u, v = hit["primID"][seen], hit["u"][seen, None], hit["v"][seen, None]
+        rays, face, u, v = rays[seen], hit["primID"][seen], hit["u"][seen, None], hit["v"][seen, None]
 
-        def at_hits(values: FloatArray) -> FloatArray:
-            a, b, c = (values[faces[face, corner]] for corner in range(3))
-            return (1 - u - v) * a + u * b + v * c
+        albedo = np.broadcast_to(np.asarray(colours) ** GAMMA, vertices.shape)
+        corners = np.hstack([normals, albedo, light[:, None]]).astype(np.float32)[faces]
+        a, b, c = (corners[face, corner] for corner in range(3))
+        normal, albedo, light = np.split((1 - u - v) * a + u * b + v * c, [3, 6], axis=1)
+        front = np.einsum("ij,ij->i", hit["Ng"][seen], rays) < 0
+        if not smooth:
+            normal = hit["Ng"][seen]
+        # Surfaces have two equal sides. The face tells which is seen: at a sharp edge the smooth normal may look away.
+        normal = np.where(front[:, None], normal, -normal)
 
-        normal = at_hits(normals) if smooth else face_normals(vertices, faces, normalised=False)[face]
-        albedo = at_hits(np.broadcast_to(np.asarray(colours, dtype=float) ** GAMMA, vertices.shape))
-        picture = np.zeros((len(rays), 4))
-        picture[seen] = np.column_stack([_shade(normal, -rays[seen], albedo, at_hits(light[:, None])), np.ones(len(u))])
+        picture = np.zeros((SUPERSAMPLING**2 * height * width, 4), dtype=np.float32)
+        picture[seen, :3], picture[seen, 3] = _shade(normal, -rays, albedo, light), 1
         # Averages are taken of light, not of its encoding, and weighted by coverage: no dark seam at outlines.
-        picture = picture.reshape(shape[0], SUPERSAMPLING, shape[1], SUPERSAMPLING, 4).mean(axis=(1, 3))
+        picture = np.mean(
+            [picture.reshape(height, SUPERSAMPLING, width, SUPERSAMPLING, 4)[:, i, :, j]
+             for i in range(SUPERSAMPLING) for j in range(SUPERSAMPLING)],
+            axis=0,
+        )  # fmt: skip
         coverage = picture[..., 3:]
         picture[..., :3] = (picture[..., :3] / np.where(coverage > 0, coverage, 1)).clip(0, 1) ** (1 / GAMMA)
         return (255 * picture + 0.5).astype(np.uint8)
 
 
-def _rays(window: tuple[float, float, float, float], shape: tuple[int, int]) -> NDArray[np.float32]:
-    """Directions (h·w, 3) through the pixels of a picture, row by row from the top."""
+@lru_cache(maxsize=4)
+def _rays(window: tuple[float, float, float, float], height: int, width: int) -> NDArray[np.float32]:
+    """Directions (height·width, 3) through the pixels of a picture, row by row from the top."""
     left, right, bottom, top = window
-    h, w = shape
-    x = left + (right - left) * (np.arange(w) + 0.5) / w
-    y = top - (top - bottom) * (np.arange(h) + 0.5) / h
-    rays = np.stack([np.tile(x, h), np.repeat(y, w), np.full(h * w, -1.0)], axis=1)
+    x = left + (right - left) * (np.arange(width) + 0.5) / width
+    y = top - (top - bottom) * (np.arange(height) + 0.5) / height
+    rays = np.stack([np.tile(x, height), np.repeat(y, width), np.full(height * width, -1.0)], axis=1)
     return (rays / np.linalg.norm(rays, axis=1, keepdims=True)).astype(np.float32)
 
 
@@ -146,19 +155,16 @@ def _ambient(scene: object, vertices: FloatArray, normals: FloatArray) -> FloatA
     return np.bincount(vertex, weight * (free < 0), count) / np.bincount(vertex, weight, count).clip(1e-9)
 
 
-def _shade(normal: FloatArray, view: FloatArray, albedo: FloatArray, ambient: FloatArray) -> FloatArray:
-    """Linear light (n, 3) that leaves n points towards the viewer; surfaces have two equal sides."""
+def _shade(normal: NDArray, view: NDArray, albedo: NDArray, ambient: NDArray) -> NDArray:
+    """Linear light (n, 3) that leaves n points towards the viewer; float32 throughout, for speed."""
     normal = normal / np.linalg.norm(normal, axis=1, keepdims=True).clip(1e-12)
-    facing = np.einsum("ij,ij->i", normal, view)
-    normal = normal * np.where(facing < 0, -1.0, 1.0)[:, None]
     low, high = AMBIENT
     light = ambient * (low + (high - low) * (0.5 + 0.5 * normal[:, 1:2]))
-    gloss = np.zeros_like(light)
+    gloss = 0.06 * (1 - np.einsum("ij,ij->i", normal, view)).clip(0, 1)[:, None] ** 3
     for direction, brightness in LIGHTS:
-        towards = np.array(direction) / np.linalg.norm(direction)
+        towards = (np.array(direction) / np.linalg.norm(direction)).astype(np.float32)
         light += brightness * ((normal @ towards + WRAP) / (1 + WRAP)).clip(0)[:, None] * (0.4 + 0.6 * ambient)
         halfway = view + towards
-        halfway /= np.linalg.norm(halfway, axis=1, keepdims=True)
-        gloss += 0.08 * brightness * np.einsum("ij,ij->i", normal, halfway).clip(0)[:, None] ** 40
-    edge = 0.06 * (1 - np.abs(facing))[:, None] ** 3
-    return albedo * light + gloss + edge
+        cosine = np.einsum("ij,ij->i", normal, halfway) / np.linalg.norm(halfway, axis=1)
+        gloss += 0.08 * brightness * cosine.clip(0)[:, None] ** 40
+    return albedo * light + gloss

@@ -1,0 +1,70 @@
+"""Plots as SVG elements that take the font and the colours of the page around them."""
+
+from __future__ import annotations
+
+import io
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import matplotlib as mpl
+import numpy as np
+from markupsafe import Markup
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+from numpy.typing import ArrayLike
+
+#: Stands for the page's text colour, light or dark, until the SVG is written.
+INK = "#010203"
+STYLE: dict[Any, Any] = {
+    "axes.edgecolor": INK, "axes.labelcolor": INK, "axes.linewidth": 0.6, "axes.spines.right": False,
+    "axes.spines.top": False, "axes.grid": True, "font.size": 8, "grid.alpha": 0.15, "grid.color": INK,
+    "grid.linewidth": 0.5, "legend.frameon": False, "legend.labelcolor": INK, "lines.linewidth": 1.3,
+    "svg.fonttype": "none", "text.color": INK, "text.parse_math": False, "xtick.color": INK, "ytick.color": INK,
+}  # fmt: skip
+
+
+def plot(alt: str, draw: Callable[[Axes], Any], size: tuple[float, float] = (3.5, 2.2)) -> Markup:
+    """An SVG element of what ``draw`` puts into the axes; ``alt`` is what it says to those who don't see it."""
+    file = io.StringIO()
+    with mpl.rc_context({**STYLE, "svg.hashsalt": alt}):
+        figure = Figure(figsize=size, layout="constrained")
+        draw(figure.subplots())
+        nothing = dict.fromkeys(("Creator", "Date", "Format", "Type"))
+        figure.savefig(file, format="svg", transparent=True, metadata=nothing)
+    svg = file.getvalue()
+    # Left out: the XML prologue, the fixed size, addresses of namespaces, and ids, which repeat from plot to plot.
+    # The ids that are referred to differ between plots: they are hashes, with ``alt`` as their salt.
+    svg = re.sub(r'^.*?<svg .*?(viewBox="[^"]*").*?>', r" \1>", svg, count=1, flags=re.DOTALL)
+    svg = re.sub(r' id="[a-zA-Z0-9.]+_\d+"', "", svg).replace(INK, "currentColor")
+    rest = Markup(svg.rstrip())  # noqa: S704 - matplotlib has escaped the texts in it
+    return Markup('<svg role="img" aria-label="{}"{}').format(alt, rest)
+
+
+@dataclass(frozen=True)
+class Line:
+    """A line of a plot; one without a name stays out of the legend."""
+
+    x: ArrayLike
+    y: ArrayLike
+    colour: str
+    name: str = ""
+    style: str = "-"
+    alpha: float = 1.0
+
+
+def lines(alt: str, label: str, rows: Sequence[Line], *, log: bool = False, **axis: Any) -> Markup:
+    """Plot lines over an axis with a label; ``axis`` goes to matplotlib's ``Axes.set``."""
+
+    def draw(axes: Axes) -> None:
+        for line in rows:
+            axes.plot(line.x, line.y, line.style, color=line.colour, alpha=line.alpha, label=line.name or None)
+        axes.set(xlabel=label, yscale="log" if log else "linear", **axis)
+        whole = all(np.array_equal(line.x, np.round(line.x)) for line in rows)
+        axes.xaxis.set_major_locator(MaxNLocator("auto", steps=[1, 2, 5, 10], integer=whole))
+        if any(line.name for line in rows):
+            axes.legend()
+
+    return plot(alt, draw)

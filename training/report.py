@@ -1,0 +1,463 @@
+"""A run's page, to look at rather than to read: ``report.html``, one file that asks nothing of the network."""
+
+from __future__ import annotations
+
+import base64
+import importlib.util
+import io
+import json
+import math
+import os
+import tomllib
+import zipfile
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import cycle
+from pathlib import Path
+from typing import Any
+
+import jinja2
+import numpy as np
+from markupsafe import Markup
+from matplotlib.colors import Colormap, LinearSegmentedColormap, to_hex, to_rgb
+from numpy.typing import NDArray
+from PIL import Image
+
+from geometry.mesh import FloatArray, IntArray, TriangleMesh, align
+from geometry.nric import WeightedNorm
+from training.plots import Line, lines, plot
+from training.rendering import Camera
+
+STAGES = ("ingest", "mean", "modes", "factors", "samples", "networks", "evaluation", "export")
+#: Pixels of a picture's longer side; shown at half of it or less, so that it is sharp on a phone.
+LARGE, SMALL = 480, 300
+#: More modes than these aren't drawn.
+MODES_SHOWN = 40
+#: Largest displacement at which a mode is shown, in diagonals.
+MODE_REACH = 0.1
+#: What shapes are made of: as they are, as the networks have them (yellow in the paper too), and without a factor.
+CLAY, COMPOSITE, NEUTRAL = "#d3ccc1", "#e3b23c", "#4b5a6b"
+HUES = ("#d1495b", "#2a7fba", "#3a9d5d", "#8e5bb5", "#e08a1e", "#1a9aa0", "#b5651d", "#d45fa0", "#7b9a24", "#5560c9")
+ERROR = LinearSegmentedColormap.from_list("error", [CLAY, "#f2c14e", "#e4572e", "#8f1440"])
+#: What the keys of R² in evaluation.json stand for.
+MODELS = {
+    "composite": "Composite network",
+    "monolithic": "Monolithic network",
+    "affine": "Affine sum of exact factors",
+    "affine of learned factors": "Affine sum of learned factors",
+    "grid": "Affine sum of multilinear grids",
+}
+#: Keys of evaluation.json that have their place on the page; the others come into a table of their own.
+PLACED = {"eta", "test_samples", "r2", "r2_factors", "variants", "vertex_error", "sizes", "times", "fractions"}
+PLACED |= {"prolongation"}
+
+
+class ReportError(ValueError):
+    """A folder that no report can be made of, with the reason in one line."""
+
+
+@dataclass(frozen=True)
+class Factor:
+    """A group of modes, and the hue that stands for it throughout the page."""
+
+    name: str
+    hue: str
+    modes: list[int]
+
+
+class Record:
+    """What a run has left so far; what isn't there is empty or None.
+
+    Raises:
+        ReportError: the folder is no run directory; or, on reading, a file of it is broken.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        if not (folder / "config.toml").is_file():
+            raise ReportError(f"{folder} is no run directory: it holds no config.toml")
+        self.text = self._read("config.toml", "", lambda path: path.read_text(encoding="utf-8"))
+        self.config: dict[str, Any] = self._read("config.toml", {}, lambda path: tomllib.loads(self.text))
+        self.reference, self.modes, self.gallery = (
+            self._arrays(f"{name}.npz") for name in ("reference", "modes", "gallery")
+        )
+        self.decomposition, self.evaluation, self.histories = (
+            self._json(name) for name in ("modes.json", "evaluation.json", "networks/histories.json")
+        )
+        self.mean: FloatArray | None = self._arrays("mean.npz").get("vertices")
+        #: (V, 3) what tangent vectors start from: the mean, or the reference where there is none.
+        self.base = self.reference.get("vertices") if self.mean is None else self.mean
+        grouping = self._json("factors.json")
+        groups = grouping.get("factors", [])
+        names = grouping.get("names") or [f"Factor {j}" for j in range(len(groups))]
+        self.factors = [
+            Factor(str(name), hue, group) for name, hue, group in zip(names, cycle(HUES), groups, strict=False)
+        ]
+        self.overlap = np.array(grouping.get("overlap", []))
+        stamps = {path.stem: self._json(f"stages/{path.name}") for path in (folder / "stages").glob("*.json")}
+        #: Seconds of the stages that are done, None for one at work.
+        self.seconds = {name: stamps[name].get("seconds") for name in STAGES if name in stamps}
+
+    def _read(self, name: str, missing: Any, how: Any) -> Any:
+        path = self.folder / name
+        try:
+            return how(path) if path.exists() else missing
+        except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+            raise ReportError(f"{path} can't be read: {str(error).splitlines()[0]}") from error
+
+    def _json(self, name: str) -> dict[str, Any]:
+        return self._read(name, {}, lambda path: dict(json.loads(path.read_text(encoding="utf-8"))))
+
+    def _arrays(self, name: str) -> dict[str, NDArray]:
+        return self._read(name, {}, lambda path: dict(np.load(path)))
+
+    @cached_property
+    def at_work(self) -> str:
+        """What the log says last of a stage that isn't done."""
+        path = self.folder / "log.jsonl"
+        for line in reversed(path.read_text(encoding="utf-8").splitlines() if path.exists() else []):
+            try:
+                event = json.loads(line)
+            except json.JSONDecodeError:
+                continue  # the last line of a run that was killed
+            if event.get("event") == "progress":
+                return f"{event.get('what', event.get('stage'))}: {event.get('done', '?')} of {event.get('total', '?')}"
+            return ""
+        return ""
+
+    def supports(self, tangents: FloatArray) -> FloatArray:
+        """Where tangent vectors (m, 2E) act: (m, V) between 0 and 1.
+
+        The root of the mean of the weighted norm's terms over the edges at a vertex. Displacements would tell less: a
+        bent knee moves the whole lower leg, but lengths and angles change at the knee (paper, figure of SPGA modes).
+        """
+        mesh = TriangleMesh.from_arrays(self.base, self.reference["faces"])  # type: ignore[arg-type]
+        weights = WeightedNorm.of(mesh, self.evaluation.get("eta", 1e-2)).squared
+        density = (tangents**2 * weights).reshape(len(tangents), 2, -1).sum(axis=1)
+        ends, count = mesh.edges.T.ravel(), len(mesh.vertices)
+        degree = np.bincount(ends, minlength=count).clip(1)
+        result = np.sqrt([np.bincount(ends, np.tile(row, 2), count) / degree for row in density])
+        # The very largest value may sit on a single sliver.
+        return (result / np.percentile(result, 99, axis=1, keepdims=True).clip(1e-300)).clip(0, 1)
+
+
+@dataclass(frozen=True)
+class Studio:
+    """Draws the shapes of one run, all with one camera.
+
+    Attributes:
+        camera: sees every shape of the run.
+        base: (V, 3) shape that the others are aligned to.
+        faces: (F, 3).
+    """
+
+    camera: Camera
+    base: FloatArray
+    faces: IntArray
+
+    @classmethod
+    def of(cls, record: Record) -> Studio | None:
+        """Set up the camera; None where there is no shape to draw, or nothing to draw with."""
+        if record.base is None or importlib.util.find_spec("embreex") is None:
+            return None
+        base, faces = record.base.astype(np.float64), record.reference["faces"]
+        names = {"test_exact", "test_predicted", "strip_joint", "strip_factors"} & record.gallery.keys()
+        shapes = [align(record.gallery[name].reshape(-1, *base.shape), base) for name in sorted(names)]
+        return cls(Camera.facing(base, faces, np.concatenate([base[None], *shapes])), base, faces)
+
+    def draw(
+        self, shape: FloatArray, alt: str, colours: Any = CLAY, size: int = LARGE, faces: IntArray | None = None,
+        *, smooth: bool = True,
+    ) -> Markup:  # fmt: skip
+        """An image element of a shape (V, 3) or of several (T, V, 3) side by side; colours are a name or (…, V, 3)."""
+        faces = self.faces if faces is None else faces
+        shapes = shape.reshape(-1, *shape.shape[-2:])
+        tints = np.broadcast_to(to_rgb(colours) if isinstance(colours, str) else colours, shapes.shape)
+        pictures = [self.camera.render(x, faces, c, size, smooth=smooth) for x, c in zip(shapes, tints, strict=True)]
+        pixels = np.concatenate(pictures, axis=1)
+        file = io.BytesIO()
+        Image.fromarray(pixels).save(file, format="WEBP", quality=84)
+        height, width = pixels.shape[:2]
+        return Markup('<img src="data:image/webp;base64,{}" width="{}" height="{}" alt="{}">').format(
+            base64.b64encode(file.getvalue()).decode(), width, height, alt
+        )
+
+
+def ramp(hue: str) -> Colormap:
+    """Colours from clay to a hue; in the middle more of it than on a straight line, where it would look muddy."""
+    middle = 0.35 * np.array(to_rgb(CLAY)) + 0.65 * np.array(to_rgb(hue))
+    return LinearSegmentedColormap.from_list(hue, [to_rgb(CLAY), tuple(middle), to_rgb(hue)])
+
+
+def tint(colours: Colormap, values: FloatArray) -> FloatArray:
+    """Colours (…, 3) of values between 0 and 1."""
+    return np.asarray(colours(np.nan_to_num(values).clip(0, 1)))[..., :3]
+
+
+def colour_bar(colours: Colormap, *labels: str) -> dict[str, Any]:
+    """A legend: a CSS gradient, and labels evenly along it."""
+    stops = ", ".join(to_hex(colours(x)) for x in np.linspace(0, 1, 9))
+    return {"gradient": f"linear-gradient(90deg, {stops})", "labels": labels}
+
+
+def shapes(record: Record, studio: Studio) -> Iterator[tuple[Markup, str]]:
+    """The mean and the reference, in both resolutions where there are two."""
+    reference, faces = record.reference["vertices"], record.reference["faces"]
+    if record.mean is not None:
+        yield studio.draw(studio.base, "The mean shape"), "mean of the collection"
+    aligned = align(reference, studio.base)
+    if "fine_vertices" in record.reference:
+        # The motion of the coarse reference, found as the affine map that it is, moves the fine one too.
+        motion = np.linalg.lstsq(np.c_[reference, np.ones(len(reference))], aligned)[0]
+        fine, fine_faces = record.reference["fine_vertices"], record.reference["fine_faces"]
+        picture = studio.draw(np.c_[fine, np.ones(len(fine))] @ motion, "The reference mesh", faces=fine_faces)
+        yield picture, f"reference as it came, {len(fine):,} vertices"
+    picture = studio.draw(aligned, "The reference mesh, its triangles visible", smooth=False)
+    yield picture, f"reference to compute with, {len(reference):,} vertices and {len(faces):,} faces"
+
+
+def mode_cards(record: Record, studio: Studio) -> Iterator[dict[str, Any]]:
+    """For each index the SPGA mode beside the PGA mode, moved along it and coloured by its support."""
+    modes = record.modes
+    names = modes.get("names", np.empty(0))
+    factor_of = {i: factor for factor in record.factors for i in factor.modes}
+    kinds = [(kind, prefix) for kind, prefix in (("SPGA", ""), ("PGA", "pga_")) if f"{prefix}vertices" in modes]
+    support = {kind: record.supports(modes[f"{prefix}nric"]) for kind, prefix in kinds}
+    reach = MODE_REACH * np.linalg.norm(np.ptp(studio.base, axis=0))
+    for i in range(min(len(modes["vertices"]), MODES_SHOWN)):
+        title = str(names[i]) if len(names) == len(modes["vertices"]) else f"Mode {i}"
+        factor = factor_of.get(i)
+        pictures = []
+        for kind, prefix in kinds:
+            if i < len(support[kind]):
+                field = modes[f"{prefix}vertices"][i]
+                moved = studio.base + reach / np.linalg.norm(field, axis=1).max().clip(1e-300) * field
+                colours = tint(ramp(factor.hue if factor and kind == "SPGA" else NEUTRAL), support[kind][i])
+                local = modes.get(f"{prefix}localisation")
+                caption = kind if local is None else f"{kind} · {local[i]:.2f}"
+                pictures.append((studio.draw(moved, f"{title} of {kind} by its support", colours, SMALL), caption))
+        yield {"title": title, "factor": factor, "pictures": pictures}
+
+
+def mode_plots(record: Record) -> Iterator[tuple[str, Markup]]:
+    """The course of the SPGA, what its modes explain, and how local they are."""
+    found, modes = record.decomposition, record.modes
+    history = found.get("history", [])
+    for key in ("objective", "sparsity"):
+        if any(key in step for step in history):
+            at = [step.get("iteration", k) for k, step in enumerate(history)]
+            line = Line(at, [step.get(key, math.nan) for step in history], HUES[1])
+            yield f"SPGA: {key}", lines(f"{key} of the SPGA by iteration", "iteration", [line])
+    for title, spga, pga in (
+        ("Variance explained", found.get("explained"), found.get("pga_explained")),
+        ("Localisation", modes.get("localisation"), modes.get("pga_localisation")),
+    ):
+        kinds = [(np.array(y), hue, name) for y, hue, name in ((spga, HUES[0], "SPGA"), (pga, HUES[1], "PGA"))
+                 if y is not None and np.ndim(y) == 1]  # fmt: skip
+        if kinds:
+            style = ".-" if title == "Variance explained" else "."
+            rows = [Line(np.arange(1, len(y) + 1), y, hue, name, style) for y, hue, name in kinds]
+            yield title, lines(f"{title} by mode, SPGA and PGA", "mode", rows)
+
+
+def factor_cards(record: Record, studio: Studio | None) -> Iterator[dict[str, Any]]:
+    """Each factor by the support of its modes, and before them all factors in one picture."""
+    pictures: list[Markup | None] = [None] * len(record.factors)
+    if studio and "nric" in record.modes and record.factors:
+        each = record.supports(record.modes["nric"])
+        support = np.array([each[factor.modes].max(axis=0, initial=0) for factor in record.factors])
+        for j, factor in enumerate(record.factors):
+            colours = tint(ramp(factor.hue), support[j])
+            pictures[j] = studio.draw(studio.base, f"Support of {factor.name}", colours, SMALL)
+        share, strength = support**4 / (support**4).sum(axis=0).clip(1e-300), support.max(axis=0)[:, None]
+        mixed = share.T @ np.array([to_rgb(factor.hue) for factor in record.factors])
+        colours = (1 - strength) * to_rgb(CLAY) + strength * mixed
+        yield {"factor": None, "picture": studio.draw(studio.base, "All factors, each in its colour", colours, SMALL)}
+    for factor, picture in zip(record.factors, pictures, strict=True):
+        yield {"factor": factor, "picture": picture}
+
+
+def overlap_plot(record: Record) -> Markup | None:
+    """How much the supports of modes, or factors, have in common."""
+    if record.overlap.ndim != 2 or not record.overlap.size:
+        return None
+    return plot(
+        "Overlap of supports",
+        lambda axes: axes.figure.colorbar(axes.imshow(record.overlap, cmap="magma_r", vmin=0), ax=axes),
+        size=(3.2, 2.6),
+    )
+
+
+def loss_plots(record: Record) -> Iterator[tuple[str, Markup]]:
+    """Losses by epoch; networks of the same kind, of the ablation's variants, are thin lines in the same plot."""
+    kinds: dict[str, list[NDArray]] = {}
+    for stem, state in record.histories.items():
+        if state.get("history"):
+            kinds.setdefault(stem.rpartition("-")[0] or stem, []).append(np.array(state["history"], dtype=float))
+    for kind, runs in kinds.items():
+        title = kind
+        if (index := kind.removeprefix("factor-")).isdecimal() and int(index) < len(record.factors):
+            title = record.factors[int(index)].name
+        rows = [Line(np.arange(1, len(h) + 1), h[:, 1], "#8792a0", alpha=0.5) for h in runs[1:]]
+        epochs, (train, validation) = np.arange(1, len(runs[0]) + 1), runs[0].T
+        best = int(np.argmin(np.where(np.isfinite(validation), validation, np.inf)))
+        rows += [
+            Line(epochs, train, HUES[1], "training"),
+            Line(epochs, validation, HUES[0], "validation"),
+            Line(epochs[[best]], validation[[best]], HUES[0], style="o"),
+        ]
+        yield title, lines(f"Losses of {title} by epoch", "epoch", rows, log=True)
+
+
+def extremes(record: Record, studio: Studio) -> dict[str, Any] | None:
+    """The best, the median and the worst shape of the test split, errors on one logarithmic scale of two decades."""
+    gallery = record.gallery
+    if not {"test_exact", "test_predicted", "test_error"} <= gallery.keys():
+        return None
+    error = gallery["test_error"]
+    top = max(float(error.max()), 1e-12)
+    rows = []
+    for k, title in enumerate(("Best", "Median", "Worst")[: len(error)]):
+        exact = align(gallery["test_exact"][k], studio.base)
+        colours = tint(ERROR, 1 + np.log10(error[k].clip(1e-300) / top) / 2)
+        predicted = align(gallery["test_predicted"][k], exact)
+        rows.append({
+            "title": title,
+            "number": int(gallery["test_index"][k]) if "test_index" in gallery else None,
+            "exact": studio.draw(exact, f"{title} test shape, exact"),
+            "predicted": studio.draw(predicted, f"{title} test shape as the network has it, by its error", colours),
+            "mean": float(error[k].mean()),
+            "max": float(error[k].max()),
+        })  # fmt: skip
+    return {"rows": rows, "bar": colour_bar(ERROR, *(percent(top * x) for x in (0.01, 0.1, 1)))}
+
+
+def strip(record: Record, studio: Studio) -> Iterator[tuple[str, str, Markup]]:
+    """An interpolation: the joint shapes, and below them each factor's own element (paper, figure of SCAPE)."""
+    gallery = record.gallery
+    if "strip_joint" in gallery:
+        joint = align(gallery["strip_joint"], studio.base)
+        yield "Together", COMPOSITE, studio.draw(joint, "The interpolation, frame by frame", COMPOSITE, SMALL)
+    for j, frames in enumerate(gallery.get("strip_factors", ())):
+        name, hue = f"Factor {j}", HUES[j % len(HUES)]
+        if j < len(record.factors):
+            name, hue = record.factors[j].name, record.factors[j].hue
+        frames = align(frames, studio.base)
+        moved = np.linalg.norm(frames - studio.base, axis=-1)
+        colours = tint(ramp(hue), moved / max(float(moved.max()), 1e-300))
+        yield name, hue, studio.draw(frames, f"The part of {name}, frame by frame", colours, SMALL)
+
+
+def fraction_plot(record: Record) -> Markup | None:
+    """R² by the fraction of the samples that was learned from."""
+    rows = sorted(record.evaluation.get("fractions", []), key=lambda row: row["fraction"])
+    if not rows:
+        return None
+    models = list(rows[0]["r2"])
+    flat = not isinstance(rows[0]["r2"][models[0]], Mapping)  # one model: its total, lengths and angles
+    at = [row["fraction"] for row in rows]
+    drawn = [
+        Line(at, [row["r2"].get(m, math.nan) if flat else row["r2"].get(m, {}).get("total", math.nan) for row in rows],
+             hue, m, ".-")
+        for m, hue in zip(models, HUES, strict=False)
+    ]  # fmt: skip
+    return lines("R² by the fraction of samples", "fraction of the samples", drawn)
+
+
+def flatten(value: Any, name: str = "") -> Iterator[tuple[str, Any]]:
+    """Figures that the page knows nothing of, each under its path."""
+    if isinstance(value, Mapping):
+        for key, inner in value.items():
+            yield from flatten(inner, f"{name} · {key}" if name else str(key))
+    elif not isinstance(value, list):
+        yield name, value
+
+
+def figure(value: Any) -> str:
+    """Four digits of a number, anything else as it stands."""
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return str(value)
+    return "–" if not math.isfinite(value) else f"{value:,}" if isinstance(value, int) else f"{value:.4g}"
+
+
+def r2(value: float | None) -> str:
+    """Four decimals."""
+    return "–" if value is None or not math.isfinite(value) else f"{value:.4f}"
+
+
+def percent(value: float) -> str:
+    """Two digits of a percentage."""
+    return f"{100 * value:.2g}\N{NO-BREAK SPACE}%"
+
+
+def duration(seconds: float | None) -> str:
+    """Seconds in the unit that suits them."""
+    if seconds is None or not math.isfinite(seconds):
+        return "–"
+    for unit, length in (("h", 3600.0), ("min", 60.0), ("s", 1.0)):
+        if seconds >= 2 * length or (unit == "s" and seconds >= 1):
+            return f"{seconds / length:.3g}\N{NO-BREAK SPACE}{unit}"
+    return f"{1000 * seconds:.2g}\N{NO-BREAK SPACE}ms"
+
+
+def size(value: float) -> str:
+    """Bytes, in megabytes."""
+    return f"{value / 1e6:.3g}\N{NO-BREAK SPACE}MB"
+
+
+def page(record: Record) -> str:
+    """The whole page of a run."""
+    studio = Studio.of(record)
+    figures = record.evaluation
+    export = record.config.get("export", {})
+    modes = record.modes if {"vertices", "nric"} <= record.modes.keys() else {}
+    environment = jinja2.Environment(
+        loader=jinja2.PackageLoader("training", "."),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters |= {"figure": figure, "r2": r2, "percent": percent, "duration": duration, "bytes": size}
+    return environment.get_template("report.jinja").render(
+        title=export.get("title") or record.folder.resolve().name,
+        description=export.get("description", ""),
+        record=record,
+        stages=STAGES,
+        pictures=studio is not None,
+        shapes=list(shapes(record, studio)) if studio else [],
+        modes=list(mode_cards(record, studio)) if studio and modes else [],
+        modes_count=len(modes.get("vertices", ())),
+        mode_plots=list(mode_plots(record)),
+        explained={
+            kind: value
+            for kind, key in (("SPGA", "explained"), ("PGA", "pga_explained"))
+            if isinstance(value := record.decomposition.get(key), int | float)
+        },
+        support_bar=colour_bar(ramp(NEUTRAL), "unchanged", "changes most"),
+        factors=list(factor_cards(record, studio)),
+        overlap=overlap_plot(record),
+        losses=list(loss_plots(record)),
+        longest=max((seconds for seconds in record.seconds.values() if seconds), default=1.0),
+        tests=extremes(record, studio) if studio else None,
+        strip=list(strip(record, studio)) if studio else [],
+        evaluation=figures,
+        models=MODELS,
+        fractions=fraction_plot(record),
+        others=list(flatten({key: value for key, value in figures.items() if key not in PLACED})),
+    )
+
+
+def write_report(folder: Path) -> Path:
+    """Write ``report.html`` from what a run, finished or not, has left in its directory; returns its path.
+
+    Raises:
+        ReportError: the folder is no run directory, or a file in it can't be read.
+    """
+    text = page(Record(folder))
+    path = folder / "report.html"
+    part = path.with_suffix(".part")
+    part.write_text(text, encoding="utf-8")
+    os.replace(part, path)
+    return path
