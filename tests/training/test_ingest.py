@@ -148,7 +148,7 @@ def test_vertices_that_coincide_in_one_shape_only_stay_apart(touching: int, tmp_
 
 def test_vertices_a_hair_apart_are_welded_but_not_more(tmp_path: Path) -> None:
     faces = split_at(FACES, 7, 42)
-    for part, count in ((3e-7, 42), (1e-4, 43)):
+    for part, count in ((3e-7, 42), (1e-5, 43)):
         shapes = np.concatenate([SHAPES, SHAPES[:, 7:8] + [0, 0, part * 5]], axis=1)
         np.savez(tmp_path / "poses.npz", vertices=shapes, faces=faces)
         assert read_collection(tmp_path / "poses.npz").vertices.shape[1] == count
@@ -231,11 +231,15 @@ def ball_and(vertices: Sequence[Sequence[float]], faces: Sequence[Sequence[int]]
     return written(np.concatenate([SHAPES, more], axis=1), np.concatenate([FACES, faces]))
 
 
-def shifted_and_torn(folder: Path) -> Path:
-    """Two vertices of no face go before, so that the file's numbers are not ours."""
-    shapes = np.concatenate([np.zeros((3, 2, 3)), SHAPES, np.full((3, 1, 3), 9.0)], axis=1)
-    a, b, _ = FACES[0]
-    return write(folder, shapes, np.concatenate([FACES + 2, [[a + 2, b + 2, 44]]]))
+def third_face(seam: bool) -> Callable[[Path], Path]:
+    """A face too many on A–B, or on its twins across a seam; two vertices of no face go before, so that numbers differ."""
+
+    def build(folder: Path) -> Path:
+        shapes = np.concatenate([np.zeros((3, 2, 3)), SHAPES, SHAPES[:, [A, B]], np.full((3, 1, 3), 9.0)], axis=1)
+        edge = [44, 45] if seam else [A + 2, B + 2]
+        return write(folder, shapes, np.concatenate([FACES + 2, [[*edge, 46]]]))
+
+    return build
 
 
 def nothing_at_all(folder: Path) -> Path:
@@ -333,6 +337,10 @@ REFUSALS: dict[str, tuple[Callable[[Path], Path], str]] = {
         with_other("pose2.obj", SHAPES[1], SWAPPED),
         rf"pose2\.obj: face 0 joins vertices .*, but in pose1\.obj \({A}, {B}, {C}\)",
     ),
+    "one corner of a face elsewhere": (
+        with_other("pose2.obj", SHAPES[1], np.concatenate([FACES[:9], [[A, *FACES[9, 1:]]], FACES[10:]])),
+        r"pose2\.obj: face 9 joins vertices",
+    ),
     "STL in another order": (
         with_other("pose2.stl", SHAPES[1], FACES[np.random.default_rng(0).permutation(len(FACES))]),
         r"pose2\.stl: its triangles don't meet where those of .*pose1\.stl do",
@@ -350,7 +358,11 @@ REFUSALS: dict[str, tuple[Callable[[Path], Path], str]] = {
         rf"pose1\.obj: edge \({min(A, B)}, {max(A, B)}\) has 3 faces",
     ),
     "three faces at an edge, numbered as in the file": (
-        shifted_and_torn,
+        third_face(seam=False),
+        rf"pose1\.obj: edge \({min(A, B) + 2}, {max(A, B) + 2}\) has 3 faces",
+    ),
+    "three faces at a seam, numbered as in the file": (
+        third_face(seam=True),
         rf"pose1\.obj: edge \({min(A, B) + 2}, {max(A, B) + 2}\) has 3 faces",
     ),
     "three faces at an edge of STL": (
