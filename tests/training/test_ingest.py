@@ -232,7 +232,7 @@ def ball_and(vertices: Sequence[Sequence[float]], faces: Sequence[Sequence[int]]
 
 
 def third_face(seam: bool) -> Callable[[Path], Path]:
-    """A face too many on A–B, or on its twins across a seam; two vertices of no face go before, so that numbers differ."""
+    """A face too many on A–B, or on its twins across a seam; two vertices of no face go before, so numbers differ."""
 
     def build(folder: Path) -> Path:
         shapes = np.concatenate([np.zeros((3, 2, 3)), SHAPES, SHAPES[:, [A, B]], np.full((3, 1, 3), 9.0)], axis=1)
