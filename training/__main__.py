@@ -1,14 +1,18 @@
-"""The training command: ``shapespace-train run|status|export``."""
+"""The training command: ``shapespace-train init|run|status|report|export``."""
 
 from __future__ import annotations
 
 import argparse
+import shlex
 import sys
 from pathlib import Path
 
+from training import init
 from training.config import ConfigError, load
 from training.export import ExportError
+from training.ingest import IngestError
 from training.pipeline import STAGES, Run, execute
+from training.report import ReportError, write_report
 
 FAILURE = 1
 
@@ -18,6 +22,15 @@ def _open(folder: Path, models: Path) -> Run:
     if not source.is_file():
         raise ConfigError(f"{folder} is no run directory: it holds no config.toml")
     return Run(folder, *load(source), models)
+
+
+def _init(arguments: argparse.Namespace) -> None:
+    out, collection = init.write(arguments.meshes, arguments.out, force=arguments.force)
+    shapes, vertices = collection.vertices.shape[:2]
+    print(f"{out}: for {shapes} shapes of {vertices} vertices and {len(collection.faces)} faces")
+    for note in collection.notes:
+        print(f"  {note}")
+    print(f"Next: shapespace-train run {shlex.quote(str(out))}")
 
 
 def _run(arguments: argparse.Namespace) -> None:
@@ -34,6 +47,10 @@ def _status(arguments: argparse.Namespace) -> None:
         print(f"{name:12} {state}")
 
 
+def _report(arguments: argparse.Namespace) -> None:
+    print(write_report(arguments.run))
+
+
 def _export(arguments: argparse.Namespace) -> None:
     execute(_open(arguments.run, arguments.models))
 
@@ -43,11 +60,22 @@ def parser() -> argparse.ArgumentParser:
     top = argparse.ArgumentParser(prog="shapespace-train", description="Learn a shape manifold and export its bundle.")
     commands = top.add_subparsers(required=True, metavar="COMMAND")
 
+    start = commands.add_parser("init", help="write a configuration for a folder of meshes in correspondence")
+    start.add_argument("meshes", type=Path, metavar="MESH_DIR", help="OBJ, PLY, STL, OFF or glTF files, or one NPZ")
+    start.add_argument("--out", type=Path, metavar="FILE.toml", help="default: the folder's name, here")
+    start.add_argument("--force", action="store_true", help="replace the file if it is there")
+    start.set_defaults(do=_init)
+
     run = commands.add_parser("run", help="do the stages of a configuration that are not done yet")
     run.add_argument("config", type=Path, metavar="CONFIG.toml")
     run.add_argument("--data", type=Path, metavar="DIR", help="folder of meshes or NPZ file, instead of the config's")
     run.add_argument(
-        "--fractions", type=float, nargs="+", default=(), metavar="F", help="also learn from these shares of the samples"
+        "--fractions",
+        type=float,
+        nargs="+",
+        default=(),
+        metavar="F",
+        help="also learn from these shares of the samples",
     )
     run.add_argument("--out", type=Path, metavar="DIR", help="run directory (default: runs/ and the config's name)")
     run.add_argument("--until", choices=list(STAGES), metavar="STAGE", help=f"last stage to do: {', '.join(STAGES)}")
@@ -55,9 +83,11 @@ def parser() -> argparse.ArgumentParser:
 
     status = commands.add_parser("status", help="which stages of a run are done")
     status.set_defaults(do=_status)
+    report = commands.add_parser("report", help="write RUN/report.html, pictures and figures of what is done so far")
+    report.set_defaults(do=_report)
     export = commands.add_parser("export", help="finish a run and write its bundle again")
     export.set_defaults(do=_export)
-    for command in (status, export):
+    for command in (status, report, export):
         command.add_argument("run", type=Path, metavar="RUN")
     for command in (run, status, export):
         command.add_argument("--models", type=Path, default=Path("models"), help="where bundles go (default: models)")
@@ -69,7 +99,7 @@ def main() -> int:
     arguments = parser().parse_args()
     try:
         arguments.do(arguments)
-    except (ConfigError, ExportError) as error:
+    except (ConfigError, ExportError, IngestError) as error:
         print(f"shapespace-train: {error}", file=sys.stderr)
         return FAILURE
     except KeyboardInterrupt:

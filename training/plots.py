@@ -13,7 +13,7 @@ import numpy as np
 from markupsafe import Markup
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator
+from matplotlib.ticker import FuncFormatter, MaxNLocator, NullFormatter
 from numpy.typing import ArrayLike
 
 #: Stands for the page's text colour, light or dark, until the SVG is written.
@@ -62,8 +62,11 @@ def lines(alt: str, label: str, rows: Sequence[Line], *, log: bool = False, **ax
         for line in rows:
             axes.plot(line.x, line.y, line.style, color=line.colour, alpha=line.alpha, label=line.name or None)
         axes.set(xlabel=label, yscale="log" if log else "linear", **axis)
-        whole = all(np.array_equal(line.x, np.round(line.x)) for line in rows)
+        whole = all(np.array_equal(np.asarray(line.x), np.round(np.asarray(line.x))) for line in rows)
         axes.xaxis.set_major_locator(MaxNLocator("auto", steps=[1, 2, 5, 10], integer=whole))
+        if log:
+            axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+            axes.yaxis.set_minor_formatter(NullFormatter())
         if any(line.name for line in rows):
             axes.legend()
 

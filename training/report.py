@@ -20,6 +20,7 @@ from typing import Any
 import jinja2
 import numpy as np
 from markupsafe import Markup
+from matplotlib.axes import Axes
 from matplotlib.colors import Colormap, LinearSegmentedColormap, to_hex, to_rgb
 from numpy.typing import NDArray
 from PIL import Image
@@ -213,6 +214,8 @@ def shapes(record: Record, studio: Studio) -> Iterator[tuple[Markup, str]]:
         fine, fine_faces = record.reference["fine_vertices"], record.reference["fine_faces"]
         picture = studio.draw(np.c_[fine, np.ones(len(fine))] @ motion, "The reference mesh", faces=fine_faces)
         yield picture, f"reference as it came, {len(fine):,} vertices"
+    elif record.mean is None:
+        yield studio.draw(aligned, "The reference mesh"), "reference"
     picture = studio.draw(aligned, "The reference mesh, its triangles visible", smooth=False)
     yield picture, f"reference to compute with, {len(reference):,} vertices and {len(faces):,} faces"
 
@@ -279,14 +282,19 @@ def factor_cards(record: Record, studio: Studio | None) -> Iterator[dict[str, An
 
 
 def overlap_plot(record: Record) -> Markup | None:
-    """How much the supports of modes, or factors, have in common."""
-    if record.overlap.ndim != 2 or not record.overlap.size:
+    """How much the supports of modes have in common; modes of a factor stand together, so that factors are blocks."""
+    order = [i for factor in record.factors for i in factor.modes]
+    if not order or record.overlap.shape != (len(order),) * 2:
         return None
-    return plot(
-        "Overlap of supports",
-        lambda axes: axes.figure.colorbar(axes.imshow(record.overlap, cmap="magma_r", vmin=0), ax=axes),
-        size=(3.2, 2.6),
-    )
+
+    def draw(axes: Axes) -> None:
+        axes.figure.colorbar(axes.imshow(record.overlap[np.ix_(order, order)], cmap="magma_r", vmin=0), ax=axes)
+        ticks = range(0, len(order), 1 + len(order) // 20)
+        for axis in (axes.xaxis, axes.yaxis):
+            axis.set_ticks(ticks, [str(order[k]) for k in ticks])
+        axes.grid(visible=False)
+
+    return plot("Overlap of the modes' supports, factor by factor", draw, size=(3.4, 2.7))
 
 
 def loss_plots(record: Record) -> Iterator[tuple[str, Markup]]:
@@ -395,10 +403,12 @@ def duration(seconds: float | None) -> str:
     """Seconds in the unit that suits them."""
     if seconds is None or not math.isfinite(seconds):
         return "–"
-    for unit, length in (("h", 3600.0), ("min", 60.0), ("s", 1.0)):
-        if seconds >= 2 * length or (unit == "s" and seconds >= 1):
+    if seconds < 0.9995:
+        return f"{1000 * seconds:.3g}\N{NO-BREAK SPACE}ms"
+    for unit, length in (("h", 3600), ("min", 60)):
+        if seconds >= 2 * length:
             return f"{seconds / length:.3g}\N{NO-BREAK SPACE}{unit}"
-    return f"{1000 * seconds:.2g}\N{NO-BREAK SPACE}ms"
+    return f"{seconds:.3g}\N{NO-BREAK SPACE}s"
 
 
 def size(value: float) -> str:
