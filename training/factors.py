@@ -19,10 +19,10 @@ from training.modes import edge_magnitudes
 THRESHOLD = 0.5
 #: Modes that a factor takes unless told otherwise: its samples have to fill a box of that dimension.
 LARGEST = 9
-#: An axis along which a mesh measures less than this share of its longest tells nothing.
+#: An axis along which a mesh spreads less than this share of its longest tells nothing.
 THIN = 0.2
-#: Beyond this share of the half extent from the middle a part lies to one side.
-ASIDE = 0.25
+#: A part lies to one side if it is further from the centre than this share of the mesh's standard deviation.
+ASIDE = 0.5
 
 
 class FactorError(ValueError):
@@ -119,16 +119,15 @@ def names(groups: Sequence[Sequence[int]], nric: FloatArray, norm: WeightedNorm,
         norm: at the mean.
         mean: the shape.
     """
-    low, high = mean.vertices.min(axis=0), mean.vertices.max(axis=0)
-    extent = high - low
-    telling = extent >= THIN * extent.max()
     middles = mean.vertices[mean.edges].mean(axis=1)
+    centre, spread = middles.mean(axis=0), middles.std(axis=0)
+    telling = spread >= THIN * spread.max()
     squares = edge_magnitudes(nric, norm) ** 2
     result: list[str] = []
     seen: Counter[str] = Counter()
     for modes in groups:
         weights = (squares[list(modes)] / squares[list(modes)].sum(axis=1, keepdims=True)).mean(axis=0)
-        offset = np.where(telling, (weights @ middles - (low + high) / 2) / np.where(telling, extent / 2, 1), 0)
+        offset = np.where(telling, (weights @ middles - centre) / np.where(telling, spread, 1), 0)
         words = [
             pair[int(offset[axis] > 0)]
             for axis, pair in ((1, ("lower", "upper")), (0, ("left", "right")), (2, ("back", "front")))

@@ -1,0 +1,138 @@
+"""Factors of planted supports."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import trimesh
+
+from geometry.mesh import FloatArray, TriangleMesh
+from geometry.nric import WeightedNorm
+from training.factors import FactorError, between, group, names, overlap
+
+#: Which of three regions each of seven modes moves.
+REGIONS = [1, 0, 1, 2, 0, 1, 2]
+PLANTED = [[0, 2, 5], [1, 4], [3, 6]]
+
+
+@pytest.fixture(scope="module")
+def mesh() -> TriangleMesh:
+    """Six wide, two high, one deep."""
+    ball = trimesh.creation.icosphere(subdivisions=2)
+    return TriangleMesh.from_arrays(ball.vertices * [3, 1, 0.5] + [10, 20, 30], ball.faces)
+
+
+@pytest.fixture(scope="module")
+def norm(mesh: TriangleMesh) -> WeightedNorm:
+    return WeightedNorm.of(mesh, 1e-2)
+
+
+@pytest.fixture(scope="module")
+def modes(mesh: TriangleMesh) -> FloatArray:
+    """(7, 2E), each somewhere in its region and a little everywhere."""
+    rng = np.random.default_rng(2)
+    x = mesh.vertices[mesh.edges].mean(axis=1)[:, 0]
+    region = np.digitize(x, [9, 11])
+    e = len(mesh.edges)
+    fields = 1e-3 * rng.standard_normal((len(REGIONS), 2, e))
+    for field, r in zip(fields, REGIONS, strict=True):
+        field += rng.standard_normal((2, e)) * (region == r)
+    return fields.reshape(len(REGIONS), -1)
+
+
+def test_overlap_is_one_with_itself_and_nothing_with_what_is_elsewhere(norm, mesh, rng):
+    e = len(mesh.edges)
+    nric = np.zeros((4, 2, e))
+    nric[0, :, :100] = rng.standard_normal((2, 100))
+    nric[1] = -3 * nric[0]
+    nric[2, :, 100:] = rng.standard_normal((2, e - 100))
+    nric[3, 1, :100] = np.sqrt((nric[0] ** 2 * norm.squared.reshape(2, e)).sum(axis=0) / norm.squared[e:])[:100]
+    found = overlap(nric.reshape(4, -1), norm)
+    expected = np.ones((4, 4))
+    expected[2, [0, 1, 3]] = expected[[0, 1, 3], 2] = 0
+    assert found == pytest.approx(expected, abs=1e-12)
+
+
+def test_half_shared_supports_overlap_by_half(norm, mesh):
+    e = len(mesh.edges)
+    nric = np.zeros((2, 2 * e))
+    nric[0, :200] = nric[1, 100:300] = 1
+    nric[:, :e] /= np.sqrt(norm.squared[:e])
+    assert overlap(nric, norm)[0, 1] == pytest.approx(0.5)
+
+
+@pytest.mark.parametrize("count", [None, 3])
+def test_planted_factors_are_found(modes, norm, count):
+    assert group(overlap(modes, norm), count) == PLANTED
+
+
+def test_one_factor_or_one_for_each_mode(modes, norm):
+    shared = overlap(modes, norm)
+    assert group(shared, 1) == [[0, 1, 2, 3, 4, 5, 6]]
+    assert group(shared, 7) == [[j] for j in range(7)]
+    assert group(np.eye(1)) == group(np.eye(1), 1) == [[0]]
+    assert group(np.eye(3)) == [[0], [1], [2]]
+    assert group(np.ones((3, 3))) == [[0, 1, 2]]
+
+
+@pytest.mark.parametrize("count", [0, 8, -1])
+def test_other_counts_are_refused(modes, norm, count):
+    with pytest.raises(FactorError, match=f"from 1 to the number of modes, 7, not {count}"):
+        group(overlap(modes, norm), count)
+
+
+def test_every_count_is_kept_and_every_mode_has_one_factor(rng):
+    sizes = np.abs(rng.standard_normal((9, 30))) ** 3
+    sizes /= np.linalg.norm(sizes, axis=1, keepdims=True)
+    for count in range(1, 10):
+        groups = group(sizes @ sizes.T, count)
+        assert len(groups) == count
+        assert sorted(j for g in groups for j in g) == list(range(9))
+        assert groups == sorted(sorted(g) for g in groups)
+
+
+def test_a_limit_keeps_factors_small():
+    shared = np.full((10, 10), 0.9) + 0.1 * np.eye(10)
+    assert len(group(shared)) == 2
+    assert max(map(len, group(shared, largest=4))) == 4
+    assert group(shared, 1, largest=4) == [list(range(10))]
+    assert group(shared, largest=1) == [[j] for j in range(10)]
+    with pytest.raises(FactorError, match="room for at least one mode, not 0"):
+        group(shared, largest=0)
+
+
+def test_a_threshold_decides_what_is_joined():
+    shared = np.array([[1, 0.6, 0.3], [0.6, 1, 0.2], [0.3, 0.2, 1]])
+    assert group(shared, threshold=0.7) == [[0], [1], [2]]
+    assert group(shared, threshold=0.3) == [[0, 1], [2]]
+    assert group(shared, threshold=0.2) == [[0, 1, 2]]
+    assert group(shared) == [[0, 1], [2]]
+
+
+def test_overlap_of_factors_is_the_average_over_pairs_of_modes(modes, norm):
+    shared = overlap(modes, norm)
+    found = between(shared, PLANTED)
+    assert found[0, 1] == found[1, 0] == pytest.approx(shared[np.ix_([0, 2, 5], [1, 4])].mean())
+    assert found[2, 2] == pytest.approx(shared[np.ix_([3, 6], [3, 6])].mean())
+    assert found.diagonal().min() > 10 * found[~np.eye(3, dtype=bool)].max()
+
+
+def test_names_say_where_and_are_unique(modes, norm, mesh):
+    assert names(PLANTED, modes, norm, mesh) == ["middle", "left", "right"]
+    assert names([[1], [4], [3], [6]], modes, norm, mesh) == ["left", "left 2", "right", "right 2"]
+    assert names([list(range(7))], modes, norm, mesh) == ["middle"]
+
+
+def test_names_know_every_side_but_not_of_a_thin_axis(norm, mesh):
+    middles = mesh.vertices[mesh.edges].mean(axis=1) - [10, 20, 30]
+    corner = (middles[:, 0] > 1) & (middles[:, 1] < -0.4)
+    behind = middles[:, 2] < -0.4
+    nric = np.concatenate([[corner, behind], np.zeros((2, len(corner)))], axis=1)
+    assert names([[0], [1]], nric, norm, mesh) == ["lower right", "middle"]
+    deep = mesh.with_vertices(mesh.vertices * [1, 1, 2])
+    assert names([[0], [1]], nric, norm, deep) == ["lower right", "back"]
+
+
+@pytest.fixture
+def rng() -> np.random.Generator:
+    return np.random.default_rng(7)

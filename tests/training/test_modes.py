@@ -1,0 +1,298 @@
+"""Modes of an ellipsoid with three bumps that move independently of each other."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+import trimesh
+from scipy.optimize import lsq_linear
+
+from geometry.calculus import ShellSpace, rigid_motions, without_rigid_motion
+from geometry.exponential import exponential
+from geometry.mesh import FloatArray, TriangleMesh, align
+from geometry.nric import WeightedNorm, unwrap
+from geometry.reconstruction import Status
+from training.modes import ModeError, Modes, _fit_in_box, localisation, pga, spga, tangents
+
+
+@dataclass(frozen=True)
+class Bumps:
+    """Fields (n, V, 3) mixed from three planted ones (3, V, 3) that share no edge, all about equally strong."""
+
+    space: ShellSpace
+    mean: FloatArray
+    planted: FloatArray
+    fields: FloatArray
+
+    def inner(self, a: FloatArray, b: FloatArray) -> FloatArray:
+        return np.array([[self.space.inner(self.mean, x, y) for y in b] for x in a])
+
+    def cosines(self, a: FloatArray, b: FloatArray) -> FloatArray:
+        lengths = [np.sqrt(self.inner(x, x).diagonal()) for x in (a, b)]
+        return np.abs(self.inner(a, b)) / np.outer(*lengths)
+
+    @property
+    def norm(self) -> WeightedNorm:
+        return WeightedNorm.of(self.space.reference, self.space.material.eta)
+
+
+def ellipsoid() -> TriangleMesh:
+    ball = trimesh.creation.icosphere(subdivisions=2)
+    bumpy = 1 + 0.1 * np.sin(ball.vertices @ [3.0, 5.0, 7.0])
+    return TriangleMesh.from_arrays(ball.vertices * [2, 1, 1] * bumpy[:, None], ball.faces)
+
+
+@pytest.fixture
+def rng() -> np.random.Generator:
+    return np.random.default_rng(7)
+
+
+@pytest.fixture(scope="module")
+def bumps() -> Bumps:
+    mesh = ellipsoid()
+    x = mesh.vertices
+    space = ShellSpace(mesh)
+    planted = np.zeros((3, *x.shape))
+    for field, centre in zip(planted, x[[x[:, 0].argmin(), x[:, 0].argmax(), x[:, 2].argmax()]], strict=True):
+        height = np.maximum(0, 1 - np.square(x - centre).sum(axis=1) / 0.7**2)
+        field += 0.1 * height[:, None] * centre / np.linalg.norm(centre)
+        field /= space.norm(x, field)
+    mixing = np.random.default_rng(3).uniform(-1, 1, (14, 3)) * [1, 1.02, 0.98]
+    return Bumps(space, x, planted, without_rigid_motion(np.tensordot(mixing, planted, 1), x))
+
+
+@pytest.fixture(scope="module")
+def plain(bumps: Bumps) -> Modes:
+    return pga(bumps.space, bumps.mean, bumps.fields, 3)
+
+
+@pytest.fixture(scope="module")
+def sparse(bumps: Bumps) -> Modes:
+    return spga(bumps.space, bumps.mean, bumps.fields, 3, 0.02)
+
+
+def test_sparse_modes_are_the_bumps_that_plain_ones_mix(bumps, plain, sparse):
+    assert bumps.cosines(plain.vertices, bumps.planted).max(axis=1).max() < 0.95
+    found = bumps.cosines(sparse.vertices, bumps.planted)
+    assert found.max(axis=1).min() > 0.999
+    assert sorted(found.argmax(axis=1)) == [0, 1, 2]
+    assert localisation(sparse.nric, bumps.norm).mean() < 0.5 * localisation(plain.nric, bumps.norm).mean()
+
+
+def test_plain_modes_are_the_best_subspace(bumps, rng):
+    fields = bumps.fields + 0.05 * rng.standard_normal(bumps.fields.shape)
+    fields = without_rigid_motion(fields, bumps.mean)
+    modes = pga(bumps.space, bumps.mean, fields, 2)
+    values = np.sort(np.linalg.eigvalsh(bumps.inner(fields, fields)))[::-1]
+    assert modes.explained == pytest.approx(values[:2].sum() / values.sum(), rel=1e-9)
+    gram = bumps.inner(modes.vertices, modes.vertices)
+    assert abs(gram[0, 1]) < 1e-9 * gram[0, 0]
+
+
+def test_coefficients_are_orthogonal_projections(bumps, sparse):
+    left = bumps.fields - np.tensordot(sparse.coefficients, sparse.vertices, 1)
+    assert np.abs(bumps.inner(left, sparse.vertices)).max() < 1e-9
+    whole = bumps.inner(bumps.fields, bumps.fields).trace()
+    assert sparse.explained == pytest.approx(1 - bumps.inner(left, left).trace() / whole, rel=1e-9)
+
+
+def test_without_sparsity_the_plain_subspace_is_found(bumps, rng):
+    fields = without_rigid_motion(bumps.fields + 0.02 * rng.standard_normal(bumps.fields.shape), bumps.mean)
+    plain = pga(bumps.space, bumps.mean, fields, 3)
+    modes = spga(bumps.space, bumps.mean, fields, 3, 0)
+    assert modes.explained == pytest.approx(plain.explained, rel=1e-9)
+    assert modes.history[-1]["objective"] == pytest.approx(1 - plain.explained, rel=1e-6)
+    both = np.concatenate([modes.vertices, plain.vertices])
+    both /= np.sqrt(bumps.inner(both, both).diagonal())[:, None, None]
+    assert np.linalg.eigvalsh(bumps.inner(both, both))[:3].max() < 1e-6
+
+
+@pytest.mark.parametrize("sparsity", [0.02, 0.1, 0.4])
+def test_the_objective_never_rises_and_is_that_of_the_problem(bumps, sparsity):
+    modes = spga(bumps.space, bumps.mean, bumps.fields, 3, sparsity)
+    objective = np.array([h["objective"] for h in modes.history])
+    assert (np.diff(objective) <= 1e-12).all()
+    assert objective[-1] < 0.9 * objective[0]
+    assert modes.converged
+    assert all(h["misfit"] + h["penalty"] == pytest.approx(h["objective"]) for h in modes.history)
+    assert modes.history[-1]["misfit"] >= 1 - modes.explained - 1e-9
+
+
+def test_an_iteration_cut_short_says_so(bumps):
+    modes = spga(bumps.space, bumps.mean, bumps.fields, 3, 0.1, max_iterations=4)
+    assert not modes.converged
+    assert len(modes.history) == 5
+
+
+def test_one_mode_of_one_shape_is_a_minimum(bumps, rng):
+    """Then the problem is convex, min ‖u − v‖² + λ ‖u‖_1, and no tangent vector may be better than the one found."""
+    v, share, eta = bumps.fields[0], 0.3, bumps.space.material.eta
+    lengths, bending = np.sqrt(bumps.norm.squared.reshape(2, -1))
+    weights = np.concatenate([lengths, np.sqrt(eta) * bending])
+
+    def one_norm(d: FloatArray) -> float:
+        return float(weights @ np.abs(bumps.space.point(bumps.mean).push_forward(d)))
+
+    whole = bumps.space.norm(bumps.mean, v) ** 2
+    price = share * 2 * whole / one_norm(v)
+
+    def best_multiple(d: FloatArray) -> float:
+        """The least objective among the multiples of d, as a share of ‖v‖²."""
+        along = bumps.space.inner(bumps.mean, v, d)
+        gain = max(abs(along) - price * one_norm(d) / 2, 0) ** 2
+        return 1 - gain / bumps.space.norm(bumps.mean, d) ** 2 / whole
+
+    modes = spga(bumps.space, bumps.mean, v[None], 1, share, tolerance=1e-9, max_iterations=400)
+    found = best_multiple(modes.vertices[0])
+    assert modes.history[-1]["objective"] == pytest.approx(found, abs=1e-6)
+    assert found < best_multiple(v) - 1e-3
+    others = [*bumps.planted, v, *(rng.standard_normal(v.shape) * np.abs(v) for _ in range(20))]
+    for other in others:
+        other = other / bumps.space.norm(bumps.mean, other) * np.sqrt(whole)
+        for step in (-0.1, -1e-3, 1e-3, 0.1):
+            assert best_multiple(modes.vertices[0] + step * other) > found - 1e-6
+
+
+def test_coefficients_stay_in_the_box_and_are_best_there(rng):
+    basis, targets = rng.standard_normal((9, 4)), 2 * rng.standard_normal((9, 6))
+    found = np.zeros((4, 6))
+    _fit_in_box(basis.T @ basis, basis.T @ targets, found)
+    assert np.abs(found).max() == 1
+    best = np.stack([lsq_linear(basis, b, (-1, 1)).x for b in targets.T])
+    assert found.T == pytest.approx(best, abs=1e-6)
+
+
+@pytest.mark.parametrize("which", ["plain", "sparse"])
+def test_modes_are_tangent_and_do_not_move_rigidly(bumps, which, request):
+    modes = request.getfixturevalue(which)
+    for u, d in zip(modes.nric, modes.vertices, strict=True):
+        assert bumps.space.point(bumps.mean).push_forward(d) == pytest.approx(u, abs=1e-12)
+        assert bumps.space.project(bumps.mean, u) == pytest.approx(d, abs=1e-6 * np.abs(d).max())
+        assert np.abs(rigid_motions(bumps.mean) @ d.ravel()).max() < 1e-12
+
+
+@pytest.mark.parametrize("which", ["plain", "sparse"])
+def test_modes_are_scaled_oriented_and_sorted(bumps, which, request):
+    modes = request.getfixturevalue(which)
+    assert modes.coefficients.shape == (14, 3)
+    assert modes.coefficients.max(axis=0) == pytest.approx(np.ones(3))
+    assert np.abs(modes.coefficients).max() <= 1 + 1e-12
+    assert (modes.lower <= modes.coefficients.min(axis=0)).all()
+    assert (modes.upper >= modes.coefficients.max(axis=0)).all()
+    energies = (modes.coefficients**2).sum(axis=0) * bumps.inner(modes.vertices, modes.vertices).diagonal()
+    assert (np.diff(energies) < 0).all()
+
+
+def test_the_mean_is_inside_the_box_of_shapes_that_lie_to_one_side(bumps):
+    fields = np.abs(np.random.default_rng(0).uniform(0.5, 1, (5, 1, 1))) * bumps.planted[0]
+    modes = pga(bumps.space, bumps.mean, fields, 1)
+    assert modes.coefficients.min() > 0
+    assert modes.lower == pytest.approx([-0.1])
+    assert modes.upper == pytest.approx([1])
+
+
+def test_directions_that_shapes_do_not_have_give_no_modes(bumps, plain):
+    modes = pga(bumps.space, bumps.mean, bumps.fields, 7)
+    assert len(modes) == 3
+    assert modes.vertices == pytest.approx(plain.vertices, abs=1e-9)
+    assert len(spga(bumps.space, bumps.mean, bumps.fields, 7, 0.02)) == 3
+
+
+def test_a_high_price_leaves_fewer_modes_and_then_none(bumps):
+    weak = np.concatenate([bumps.fields, 0.05 * (bumps.planted[:1] - bumps.planted[1:2])])
+    weak[:-1] -= np.tensordot(bumps.inner(weak[:-1], bumps.planted[:1])[:, 0], bumps.planted[0], 0)
+    assert len(spga(bumps.space, bumps.mean, weak, 3, 1e-3)) == 3
+    assert len(spga(bumps.space, bumps.mean, weak, 3, 0.5)) == 2
+    with pytest.raises(ModeError, match="sparsity is too high"):
+        spga(bumps.space, bumps.mean, bumps.fields, 3, 50)
+
+
+def test_nothing_is_random(bumps, sparse):
+    again = spga(bumps.space, bumps.mean, bumps.fields, 3, 0.02)
+    assert (again.vertices == sparse.vertices).all()
+    assert (again.coefficients == sparse.coefficients).all()
+
+
+def test_sparsity_means_the_same_in_other_units_and_for_twice_the_shapes(bumps, sparse):
+    larger = ShellSpace(bumps.space.reference.with_vertices(3 * bumps.mean))
+    smaller_twice = 0.1 * np.concatenate([bumps.fields, bumps.fields])
+    modes = spga(larger, 3 * bumps.mean, 3 * smaller_twice, 3, 0.02)
+    assert modes.coefficients[:14] == pytest.approx(sparse.coefficients, abs=1e-4)
+    assert modes.history[-1]["objective"] == pytest.approx(sparse.history[-1]["objective"], rel=1e-4)
+
+
+def test_another_order_of_modes(sparse):
+    turned = sparse.reordered([2, 0, 1])
+    assert (turned.nric == sparse.nric[[2, 0, 1]]).all()
+    assert (turned.vertices == sparse.vertices[[2, 0, 1]]).all()
+    assert (turned.coefficients == sparse.coefficients[:, [2, 0, 1]]).all()
+    assert (turned.lower == sparse.lower[[2, 0, 1]]).all()
+    assert (turned.upper == sparse.upper[[2, 0, 1]]).all()
+    assert turned.explained == sparse.explained
+
+
+def test_localisation_counts_edges(bumps):
+    e = bumps.space.connectivity.edge_count
+    nric = np.zeros((2, 2 * e))
+    nric[0, 5] = 3
+    nric[1] = 1 / np.sqrt(bumps.norm.squared)
+    assert localisation(nric, bumps.norm) == pytest.approx([1 / e, 0.95], abs=1.01 / e)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"count": 0}, "from 1 to the number of shapes, 14, not 0"),
+        ({"count": 15}, "from 1 to the number of shapes, 14, not 15"),
+        ({"fields": np.zeros((3, 7, 3))}, r"fields must be \(n, 162, 3\), not \(3, 7, 3\)"),
+        ({"fields": np.zeros((3, 162, 3))}, "all shapes are the same as the mean"),
+        ({"fields": np.full((3, 162, 3), np.nan)}, "not finite"),
+        ({"sparsity": -0.1}, "sparsity must be a number from 0 up, not -0.1"),
+        ({"sparsity": np.nan}, "sparsity must be a number from 0 up, not nan"),
+    ],
+)
+def test_what_is_not_possible_is_refused(bumps, change, message):
+    settings = {"fields": bumps.fields, "count": 3, "sparsity": 0.1} | change
+    with pytest.raises(ModeError, match=message):
+        spga(bumps.space, bumps.mean, **settings)
+
+
+def test_logarithms_lead_back_to_the_shapes_wherever_they_are(bumps, rng):
+    turn = np.linalg.qr(rng.standard_normal((3, 3)))[0]
+    shapes = (bumps.mean + 0.3 * bumps.fields[:2]) @ (turn * np.linalg.det(turn)) + [1, 2, 3]
+    found = tangents(bumps.space, bumps.mean, shapes, 4, workers=1)
+    assert found.status == (Status.CONVERGED,) * 2
+    assert found.steps == (4, 4)
+    assert found.fallbacks == []
+    for shape, field in zip(shapes, found.fields, strict=True):
+        assert np.abs(rigid_motions(bumps.mean) @ field.ravel()).max() < 1e-12
+        end = exponential(bumps.space, bumps.mean, field, 4).vertices[-1]
+        assert align(end, bumps.mean) == pytest.approx(align(shape, bumps.mean), abs=1e-4)
+
+
+def test_processes_give_what_one_gives(bumps):
+    shapes = bumps.mean + 0.1 * bumps.fields[:5]
+    here = tangents(bumps.space, bumps.mean, shapes, 4, workers=1)
+    there = tangents(bumps.space, bumps.mean, shapes, 4, workers=2)
+    assert (here.fields == there.fields).all()
+    assert here.reasons == there.reasons == ("",) * 5
+
+
+def test_where_there_is_no_geodesic_the_logarithm_is_linearised(bumps, rng):
+    crumpled = bumps.mean + 0.4 * rng.standard_normal(bumps.mean.shape)
+    found = tangents(bumps.space, bumps.mean, np.stack([crumpled, bumps.mean + 0.1 * bumps.fields[0]]), 4, workers=1)
+    assert found.fallbacks == [0]
+    assert found.steps == (0, 4)
+    assert found.status[0] is not Status.CONVERGED
+    assert found.reasons[0]
+    assert found.reasons[1] == ""
+    z = bumps.space.nric(bumps.mean)
+    assert (found.fields[0] == bumps.space.project(bumps.mean, unwrap(bumps.space.nric(crumpled), z) - z)).all()
+
+
+def test_a_shape_that_is_not_finite_has_no_logarithm(bumps):
+    shapes = np.stack([bumps.mean, np.where(np.arange(3) == 1, np.nan, bumps.mean)])
+    with pytest.raises(ModeError, match="shape 1 has a coordinate that is not finite"):
+        tangents(bumps.space, bumps.mean, shapes, workers=1)
