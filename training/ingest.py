@@ -42,14 +42,15 @@ class MeshCollection:
         names: of the n shapes: stems of their files in natural order (pose2 before pose10), or the NPZ's own.
         vertices: (n, V, 3) positions as in the files.
         faces: (F, 3) of every shape, in the order of the files.
-        file_vertices: (V,) which of a file's vertices each vertex is; others are welded to one of these, or in no face.
+        file_vertices: (V,) which of a file's vertices each vertex is; the others are welded to one of these, or in no
+            face. None where there are no files.
         notes: what was met and dealt with, a sentence each.
     """
 
     names: tuple[str, ...]
     vertices: FloatArray
     faces: IntArray
-    file_vertices: IntArray
+    file_vertices: IntArray | None = None
     notes: tuple[str, ...] = ()
 
     def index(self, name: str | None) -> int:

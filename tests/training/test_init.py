@@ -1,0 +1,139 @@
+"""``init``: a folder of meshes in, a configuration out that works as it is."""
+
+from __future__ import annotations
+
+import re
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from geometry.formats import MESH_FORMATS
+from training import __main__ as command
+from training.config import Config, ConfigError, load, parse
+from training.ingest import IngestError, read_collection
+from training.init import slug, write
+
+
+def meshes(folder: Path, count: int = 4, subdivisions: int = 1) -> Path:
+    folder.mkdir(parents=True)
+    ball = trimesh.creation.icosphere(subdivisions=subdivisions)
+    for k in range(count):
+        data = MESH_FORMATS["npz"].encode(ball.vertices * [1, 1, 1 + k], ball.faces)
+        (folder / f"pose{k + 8}.npz").write_bytes(data)
+    return folder
+
+
+def run(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
+    monkeypatch.setattr(sys, "argv", ["shapespace-train", *map(str, arguments)])
+    return command.main()
+
+
+@pytest.mark.parametrize(("count", "modes"), [(3, 2), (25, 20)])
+def test_values_come_from_the_meshes(count: int, modes: int, tmp_path: Path) -> None:
+    folder = meshes(tmp_path / "My Meshes_2", count)
+    out, collection = write(folder, tmp_path / "here.toml")
+    config, _ = load(out)
+    assert config.collection.data == folder.resolve()
+    assert config.collection.reference == "pose8" == collection.names[0]
+    assert config.modes.count == modes
+    assert (config.export.name, config.export.title) == ("my-meshes-2", "My Meshes_2")
+    assert "coarse_vertices" not in config.collection.model_fields_set
+
+
+def test_large_meshes_are_coarsened(tmp_path: Path) -> None:
+    out, _ = write(meshes(tmp_path / "large", 3, subdivisions=4), tmp_path / "here.toml")
+    assert "coarse_vertices" in load(out)[0].collection.model_fields_set
+    assert "2562 are all" in out.read_text()
+
+
+def test_what_is_commented_out_is_the_default_and_can_be_taken(tmp_path: Path) -> None:
+    out, _ = write(meshes(tmp_path / "meshes"), tmp_path / "here.toml")
+    taken, count = re.subn(r"^# (?=\w+ = )", "", out.read_text(encoding="utf-8"), flags=re.MULTILINE)
+    assert count >= 6
+    everything = parse(taken, "taken").model_dump(exclude={"factors": {"count"}})
+    assert everything == parse(out.read_text(encoding="utf-8"), "left").model_dump(exclude={"factors": {"count"}})
+
+
+def test_every_setting_says_what_it_does(tmp_path: Path) -> None:
+    out, _ = write(meshes(tmp_path / "meshes"), tmp_path / "here.toml")
+    settings = re.findall(r"^(?:# )?(\w+) = (.*)$", out.read_text(encoding="utf-8"), flags=re.MULTILINE)
+    assert [name for name, value in settings if "    # " not in value] == ["description"]
+    sections = re.findall(r"^\[(\w+)", out.read_text(encoding="utf-8"), flags=re.MULTILINE)
+    assert set(sections) <= set(Config.model_fields)
+
+
+@pytest.mark.parametrize("name", ["Größe & Co.", "日本", 'a "quoted" # \\n', "two\nlines", "-", "poses.v2"])
+def test_any_name_of_a_folder_will_do(name: str, tmp_path: Path) -> None:
+    folder = meshes(tmp_path / name)
+    config, _ = load(write(folder, tmp_path / "here.toml")[0])
+    assert config.export.title == name
+    assert config.collection.data == folder.resolve()
+
+
+def test_names_of_bundles() -> None:
+    assert [slug(text) for text in ("Größe & Co.", "日本", "__A--b__")] == ["groe-co", "shapes", "a-b"]
+
+
+def test_the_configuration_finds_the_meshes_from_wherever_it_lies(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = meshes(tmp_path / "data" / "meshes")
+    for place in (tmp_path, tmp_path / "data", tmp_path / "configs" / "deep"):
+        place.mkdir(parents=True, exist_ok=True)
+        monkeypatch.chdir(place)
+        out, _ = write(folder)
+        assert out == Path("meshes.toml")
+        data = load(place / out)[0].collection.data
+        assert data is not None
+        assert read_collection(data).names == ("pose8", "pose9", "pose10", "pose11")
+        assert str(tmp_path) not in out.read_text(), "no path of this machine"
+    monkeypatch.chdir(folder)
+    assert write(Path())[0] == Path("meshes.toml")
+
+
+def test_an_npz_will_do(tmp_path: Path) -> None:
+    collection = read_collection(meshes(tmp_path / "meshes"))
+    np.savez(tmp_path / "all.npz", vertices=collection.vertices, faces=collection.faces)
+    config, _ = load(write(tmp_path / "all.npz", tmp_path / "here.toml")[0])
+    assert config.collection.data == (tmp_path / "all.npz").resolve()
+    assert config.collection.reference == "0"
+    assert config.export.name == "all"
+
+
+def test_nothing_is_replaced_unless_asked_for(tmp_path: Path) -> None:
+    folder, out = meshes(tmp_path / "meshes"), tmp_path / "here.toml"
+    out.write_text("mine")
+    with pytest.raises(ConfigError, match=r"here\.toml: is there already; --force"):
+        write(folder, out)
+    assert out.read_text() == "mine"
+    write(folder, out, force=True)
+    assert load(out)[0].export.name == "meshes"
+    with pytest.raises(ConfigError, match="can't be written"):
+        write(folder, tmp_path / "none" / "here.toml")
+
+
+def test_bad_meshes_leave_no_configuration(tmp_path: Path) -> None:
+    with pytest.raises(IngestError, match="has 2 shapes"):
+        write(meshes(tmp_path / "meshes", 2), tmp_path / "here.toml")
+    assert not (tmp_path / "here.toml").exists()
+
+
+def test_the_command_says_what_comes_next(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = meshes(tmp_path / "my meshes")
+    monkeypatch.chdir(tmp_path)
+    assert run(monkeypatch, "init", folder) == 0
+    said = capsys.readouterr().out.splitlines()
+    assert said == [
+        "my meshes.toml: for 4 shapes of 42 vertices and 80 faces",
+        "Next: shapespace-train run 'my meshes.toml'",
+    ]
+    assert run(monkeypatch, "init", folder) == 1
+    assert "is there already" in capsys.readouterr().err
+    assert run(monkeypatch, "init", folder, "--force", "--out", "other.toml") == 0
+    assert run(monkeypatch, "init", tmp_path / "none") == 1
+    assert capsys.readouterr().err == f"shapespace-train: {tmp_path / 'none'}: no such file or folder\n"
