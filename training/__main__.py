@@ -99,7 +99,7 @@ def main() -> int:
     arguments = parser().parse_args()
     try:
         arguments.do(arguments)
-    except (ConfigError, ExportError, IngestError) as error:
+    except (ConfigError, ExportError, IngestError, ReportError) as error:
         print(f"shapespace-train: {error}", file=sys.stderr)
         return FAILURE
     except KeyboardInterrupt:
