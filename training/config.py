@@ -99,36 +99,36 @@ class FitSettings(_Section):
 class LatentNetworkSettings(_Section):
     """A network from latents to NRIC: a factor network or the monolithic baseline."""
 
-    hidden: list[int] = [256, 256]
+    hidden: list[int] = [128, 128]
     fourier: int = Field(1, ge=0)
     """Highest frequency of a periodic coordinate among the inputs; 0 feeds the bare angle, as the paper does."""
     skip_orders: list[int] | None = None
     """Largest frequency of each coordinate in a linear layer beside the hidden ones, fitted by ridge regression."""
-    skip_degree: int | None = Field(None, ge=1)
-    """The same layer of polynomials up to this total degree, for coordinates without a period."""
+    skip_degree: int = Field(3, ge=0)
+    """The same layer of polynomials up to this total degree, where no coordinate has a period; 0 leaves it out."""
     patches: int = Field(1, ge=1)
     """Groups of neighbouring edges with a principal basis each, as the last layer."""
-    energy: float | None = Field(None, gt=0, lt=1)
-    """Variance kept by that basis; None makes the last layer a dense one."""
-    fit: FitSettings = FitSettings()
+    energy: float = Field(0.9999, gt=0, le=1)
+    """Variance kept by that basis; 1 makes the last layer a dense one, as the paper's are."""
+    fit: FitSettings = FitSettings(schedule="cosine", learning_rate=2e-3, max_epochs=60)
 
 
 class CombinerSettings(_Section):
     """Graph convolutions on edges from J factor shapes to the joint one."""
 
-    width: int = Field(48, ge=1)
+    width: int = Field(24, ge=1)
     layers: int = Field(3, ge=1)
     neighbourhood: Neighbourhood = "star"
     residual: bool = True
     """Learn the difference to the affine sum of the factors instead of the shape itself; pass each layer's input on."""
-    edge_channels: int = Field(8, ge=0)
+    edge_channels: int = Field(4, ge=0)
     """Learned constants of each edge, given to the first convolution beside the factors."""
-    pairwise: int = Field(0, ge=0)
-    """Principal coefficients of each factor whose products, two factors at a time, correct the affine sum."""
-    dropout: float = Field(0.1, ge=0, lt=1)
+    pairwise: int = Field(4, ge=0)
+    """Principal coefficients of each factor whose products, two factors at a time, correct the affine sum of a residual one."""
+    dropout: float = Field(0.0, ge=0, lt=1)
     symmetries: bool = True
     """Learn from the training samples' images under the collection's symmetries too, where it has any."""
-    fit: FitSettings = FitSettings(batch_size=8, patience=5, max_epochs=100)
+    fit: FitSettings = FitSettings(schedule="cosine", learning_rate=2e-3, batch_size=16, max_epochs=12)
 
 
 class NetworkSettings(_Section):
@@ -184,7 +184,9 @@ class Config(_Section):
     factors: FactorSettings = FactorSettings()
     samples: SampleSettings = SampleSettings()
     networks: NetworkSettings = NetworkSettings()
-    monolithic: LatentNetworkSettings = LatentNetworkSettings()
+    monolithic: LatentNetworkSettings = LatentNetworkSettings(
+        hidden=[256, 256], skip_degree=0, energy=1, fit=FitSettings(max_epochs=150)
+    )
     variants: dict[str, VariantSettings] = {}
     evaluation: EvaluationSettings = EvaluationSettings()
     export: ExportSettings

@@ -160,7 +160,7 @@ class Learner:
         train = rows["train"]
         scaling = self._scaling(samples.nric[train])
         basis_fitted = None
-        if settings.energy is not None:
+        if settings.energy < 1:
             y = scaling.down(torch.from_numpy(samples.nric[train])).numpy()
             midpoints = edge_midpoints(self.collection.reference)
             basis_fitted = PatchBasis.fit(y, midpoints, settings.patches, settings.energy, seed)

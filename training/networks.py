@@ -104,7 +104,7 @@ class FactorNetwork(ShapeNetwork):
         self.skip_features: FourierProducts | Polynomials | None = None
         if settings.skip_orders:
             self.skip_features = FourierProducts(coordinates, settings.skip_orders)
-        elif settings.skip_degree:
+        elif settings.skip_degree and not np.isfinite(coordinates.period).any():
             self.skip_features = Polynomials(coordinates, settings.skip_degree)
         if self.skip_features is not None:
             self.register_buffer("skip", torch.zeros(self.skip_features.size, size))
@@ -165,7 +165,9 @@ class CombinerNetwork(ShapeNetwork):
         self.norms = nn.ModuleList(nn.BatchNorm1d(width) for width in widths[1:])
         self.dropout = nn.Dropout(settings.dropout)
         size = 2 * connectivity.edge_count
-        self.pairwise = PairwiseProducts(factor_count, settings.pairwise, size) if settings.pairwise else None
+        self.pairwise = None
+        if settings.residual and settings.pairwise:
+            self.pairwise = PairwiseProducts(factor_count, settings.pairwise, size)
         self.readout = nn.Linear(widths[-1], 2)
         if settings.residual:
             nn.init.zeros_(self.readout.weight)
