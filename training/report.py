@@ -168,7 +168,7 @@ class Studio:
         return cls(Camera.facing(base, faces, np.concatenate([base[None], *shapes])), base, faces)
 
     def draw(
-        self, shape: FloatArray, alt: str, colours: Any = CLAY, size: int = LARGE, faces: IntArray | None = None,
+        self, shape: FloatArray, alt: str, size: int, colours: Any = CLAY, faces: IntArray | None = None,
         *, smooth: bool = True,
     ) -> Markup:  # fmt: skip
         """An image element of a shape (V, 3) or of several (T, V, 3) side by side; colours are a name or (…, V, 3)."""
@@ -206,17 +206,18 @@ def shapes(record: Record, studio: Studio) -> Iterator[tuple[Markup, str]]:
     """The mean and the reference, in both resolutions where there are two."""
     reference, faces = record.reference["vertices"], record.reference["faces"]
     if record.mean is not None:
-        yield studio.draw(studio.base, "The mean shape"), "mean of the collection"
+        yield studio.draw(studio.base, "The mean shape", LARGE), "mean of the collection"
     aligned = align(reference, studio.base)
     if "fine_vertices" in record.reference:
         # The motion of the coarse reference, found as the affine map that it is, moves the fine one too.
         motion = np.linalg.lstsq(np.c_[reference, np.ones(len(reference))], aligned)[0]
         fine, fine_faces = record.reference["fine_vertices"], record.reference["fine_faces"]
-        picture = studio.draw(np.c_[fine, np.ones(len(fine))] @ motion, "The reference mesh", faces=fine_faces)
+        moved = np.c_[fine, np.ones(len(fine))] @ motion
+        picture = studio.draw(moved, "The reference mesh", LARGE, faces=fine_faces)
         yield picture, f"reference as it came, {len(fine):,} vertices"
     elif record.mean is None:
-        yield studio.draw(aligned, "The reference mesh"), "reference"
-    picture = studio.draw(aligned, "The reference mesh, its triangles visible", smooth=False)
+        yield studio.draw(aligned, "The reference mesh", LARGE), "reference"
+    picture = studio.draw(aligned, "The reference mesh, its triangles visible", LARGE, smooth=False)
     yield picture, f"reference to compute with, {len(reference):,} vertices and {len(faces):,} faces"
 
 
@@ -239,7 +240,7 @@ def mode_cards(record: Record, studio: Studio) -> Iterator[dict[str, Any]]:
                 colours = tint(ramp(factor.hue if factor and kind == "SPGA" else NEUTRAL), support[kind][i])
                 local = modes.get(f"{prefix}localisation")
                 caption = kind if local is None else f"{kind} · {local[i]:.2f}"
-                pictures.append((studio.draw(moved, f"{title} of {kind} by its support", colours, SMALL), caption))
+                pictures.append((studio.draw(moved, f"{title} of {kind} by its support", SMALL, colours), caption))
         yield {"title": title, "factor": factor, "pictures": pictures}
 
 
@@ -272,11 +273,11 @@ def factor_cards(record: Record, studio: Studio | None) -> Iterator[dict[str, An
         support = np.array([each[factor.modes].max(axis=0, initial=0) for factor in record.factors])
         for j, factor in enumerate(record.factors):
             colours = tint(ramp(factor.hue), support[j])
-            pictures[j] = studio.draw(studio.base, f"Support of {factor.name}", colours, SMALL)
+            pictures[j] = studio.draw(studio.base, f"Support of {factor.name}", SMALL, colours)
         share, strength = support**4 / (support**4).sum(axis=0).clip(1e-300), support.max(axis=0)[:, None]
         mixed = share.T @ np.array([to_rgb(factor.hue) for factor in record.factors])
         colours = (1 - strength) * to_rgb(CLAY) + strength * mixed
-        yield {"factor": None, "picture": studio.draw(studio.base, "All factors, each in its colour", colours, SMALL)}
+        yield {"factor": None, "picture": studio.draw(studio.base, "All factors, each in its colour", SMALL, colours)}
     for factor, picture in zip(record.factors, pictures, strict=True):
         yield {"factor": factor, "picture": picture}
 
@@ -330,11 +331,12 @@ def extremes(record: Record, studio: Studio) -> dict[str, Any] | None:
         exact = align(gallery["test_exact"][k], studio.base)
         colours = tint(ERROR, 1 + np.log10(error[k].clip(1e-300) / top) / 2)
         predicted = align(gallery["test_predicted"][k], exact)
+        alt = f"{title} test shape as the network has it, by its error"
         rows.append({
             "title": title,
             "number": int(gallery["test_index"][k]) if "test_index" in gallery else None,
-            "exact": studio.draw(exact, f"{title} test shape, exact"),
-            "predicted": studio.draw(predicted, f"{title} test shape as the network has it, by its error", colours),
+            "exact": studio.draw(exact, f"{title} test shape, exact", LARGE),
+            "predicted": studio.draw(predicted, alt, LARGE, colours),
             "mean": float(error[k].mean()),
             "max": float(error[k].max()),
         })  # fmt: skip
@@ -346,7 +348,7 @@ def strip(record: Record, studio: Studio) -> Iterator[tuple[str, str, Markup]]:
     gallery = record.gallery
     if "strip_joint" in gallery:
         joint = align(gallery["strip_joint"], studio.base)
-        yield "Together", COMPOSITE, studio.draw(joint, "The interpolation, frame by frame", COMPOSITE, SMALL)
+        yield "Together", COMPOSITE, studio.draw(joint, "The interpolation, frame by frame", SMALL, COMPOSITE)
     for j, frames in enumerate(gallery.get("strip_factors", ())):
         name, hue = f"Factor {j}", HUES[j % len(HUES)]
         if j < len(record.factors):
@@ -354,7 +356,7 @@ def strip(record: Record, studio: Studio) -> Iterator[tuple[str, str, Markup]]:
         frames = align(frames, studio.base)
         moved = np.linalg.norm(frames - studio.base, axis=-1)
         colours = tint(ramp(hue), moved / max(float(moved.max()), 1e-300))
-        yield name, hue, studio.draw(frames, f"The part of {name}, frame by frame", colours, SMALL)
+        yield name, hue, studio.draw(frames, f"The part of {name}, frame by frame", SMALL, colours)
 
 
 def fraction_plot(record: Record) -> Markup | None:
@@ -423,7 +425,7 @@ def page(record: Record) -> str:
     export = record.config.get("export", {})
     modes = record.modes if {"vertices", "nric"} <= record.modes.keys() else {}
     environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("training", "."),
+        loader=jinja2.FileSystemLoader(Path(__file__).parent),
         autoescape=True,
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,
