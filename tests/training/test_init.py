@@ -12,7 +12,7 @@ import trimesh
 
 from geometry.formats import MESH_FORMATS
 from training import __main__ as command
-from training.config import Config, ConfigError, load, parse
+from training.config import Config, ConfigError, ModeSettings, load, parse
 from training.ingest import IngestError, read_collection
 from training.init import slug, write
 
@@ -55,6 +55,13 @@ def test_what_is_commented_out_is_the_default_and_can_be_taken(tmp_path: Path) -
     assert count >= 6
     everything = parse(taken, "taken").model_dump(exclude={"factors": {"count"}})
     assert everything == parse(out.read_text(encoding="utf-8"), "left").model_dump(exclude={"factors": {"count"}})
+
+
+def test_what_the_meshes_do_not_decide_is_left_alone(tmp_path: Path) -> None:
+    config, _ = load(write(meshes(tmp_path / "meshes"), tmp_path / "here.toml")[0])
+    for name in Config.model_fields.keys() - {"collection", "modes", "export"}:
+        assert getattr(config, name) == Config.model_fields[name].default, name
+    assert config.modes == ModeSettings(count=3)
 
 
 def test_every_setting_says_what_it_does(tmp_path: Path) -> None:
