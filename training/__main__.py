@@ -13,6 +13,7 @@ from training.export import ExportError
 from training.ingest import IngestError
 from training.pipeline import STAGES, Run, execute
 from training.report import ReportError, write_report
+from training.workers import WorkersError
 
 FAILURE = 1
 
@@ -36,7 +37,7 @@ def _init(arguments: argparse.Namespace) -> None:
 def _run(arguments: argparse.Namespace) -> None:
     config, source = load(arguments.config, arguments.data, arguments.fractions)
     folder = arguments.out or Path("runs") / arguments.config.stem
-    execute(Run(folder, config, source, arguments.models), arguments.until)
+    execute(Run(folder, config, source, arguments.models, arguments.scheduler), arguments.until)
 
 
 def _status(arguments: argparse.Namespace) -> None:
@@ -79,6 +80,7 @@ def parser() -> argparse.ArgumentParser:
     )
     run.add_argument("--out", type=Path, metavar="DIR", help="run directory (default: runs/ and the config's name)")
     run.add_argument("--until", choices=list(STAGES), metavar="STAGE", help=f"last stage to do: {', '.join(STAGES)}")
+    run.add_argument("--scheduler", metavar="ADDRESS", help="Dask scheduler whose workers draw the samples")
     run.set_defaults(do=_run)
 
     status = commands.add_parser("status", help="which stages of a run are done")
@@ -99,7 +101,7 @@ def main() -> int:
     arguments = parser().parse_args()
     try:
         arguments.do(arguments)
-    except (ConfigError, ExportError, IngestError, ReportError) as error:
+    except (ConfigError, ExportError, IngestError, ReportError, WorkersError) as error:
         print(f"shapespace-train: {error}", file=sys.stderr)
         return FAILURE
     except KeyboardInterrupt:

@@ -33,8 +33,8 @@ GENERATORS: dict[str, Callable[[], Collection]] = {"freaky-torus": FreakyTorus}
 class Run:
     """A run directory: configuration, log, and what the stages have left in it."""
 
-    def __init__(self, folder: Path, config: Config, source: str, models: Path) -> None:
-        self.folder, self.config, self.models = folder, config, models
+    def __init__(self, folder: Path, config: Config, source: str, models: Path, scheduler: str | None = None) -> None:
+        self.folder, self.config, self.models, self.scheduler = folder, config, models, scheduler
         folder.mkdir(parents=True, exist_ok=True)
         self._stamps = folder / "stages"
         self._stamps.mkdir(exist_ok=True)
@@ -105,8 +105,9 @@ def factors(run: Run) -> None:
 
 
 def _draw(run: Run, folder: Path, latents: FloatArray, title: str) -> None:
-    for done, total in draw(run.collection, folder, latents, run.config.samples.part_size, title):
-        run.log("progress", what=title, done=done, total=total)
+    size = run.config.samples.part_size
+    for done, total, failed in draw(run.collection, folder, latents, size, title, scheduler=run.scheduler):
+        run.log("progress", what=title, done=done, total=total, failed=failed)
 
 
 def samples(run: Run) -> None:
@@ -127,8 +128,8 @@ def samples(run: Run) -> None:
             own = np.zeros((counts if isinstance(counts, int) else counts[j], len(coordinates)))
             own[:, index] = coordinates[index].uniform(len(own), rng)
         _draw(run, folder / f"factor-{j}", own, f"samples of factor {j}")
-    index = read(folder).index
-    write_npz(folder / "split.npz", **split(index, settings.test_fraction, settings.validation_fraction, split_rng))
+    there = read(folder).index
+    write_npz(folder / "split.npz", **split(there, settings.test_fraction, settings.validation_fraction, split_rng))
 
 
 def learner_of(run: Run, fraction: float = 1.0) -> Learner:

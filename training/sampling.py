@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Protocol
+from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +15,10 @@ from tqdm import tqdm
 
 from geometry.mesh import FloatArray, IntArray, TriangleMesh
 from training.coordinates import Coordinates
+from training.files import write_npz
+from training.workers import run
+
+DONE, FAILED = "done", "failed"
 
 
 @dataclass(frozen=True)
@@ -80,39 +85,76 @@ class Samples:
     vertices: NDArray[np.float32]
 
 
-def write_npz(path: Path, **arrays: Any) -> None:
-    """Write an NPZ file whole or not at all."""
-    part = path.with_suffix(".part")
-    with part.open("wb") as file:
-        np.savez(file, **arrays)
-    os.replace(part, path)
-
-
 def draw(
-    collection: Collection, folder: Path, latents: FloatArray, part_size: int, title: str
-) -> Iterator[tuple[int, int]]:
+    collection: Collection,
+    folder: Path,
+    latents: FloatArray,
+    part_size: int,
+    title: str,
+    *,
+    scheduler: str | None = None,
+    workers: int = -1,
+) -> Iterator[tuple[int, int, int]]:
     """Compute the shapes of codes (n, m) into ``folder/part-*.npz``, leaving out parts that are there already.
 
+    A part is written whole as soon as it is finished, in whatever order, and says of each of its samples whether it is
+    done or failed and why.
+
+    Args:
+        collection: what to draw from; sent to the workers.
+        folder: gets one file for each part, and loses parts of other codes or another part size.
+        latents: (n, m).
+        part_size: codes in a part: what a worker is given at a time, and what is lost with it.
+        title: of the progress bar.
+        scheduler: see workers.run.
+        workers: see workers.run.
+
     Yields:
-        (done, total) after each part.
+        (done, total, failed) after each part, the failed ones counted among those done.
+
+    Raises:
+        workers.WorkersError: no workers to be had; what is finished stays.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    indices = np.arange(len(latents))
-    parts = np.split(indices, range(part_size, len(indices), part_size))
-    for k, index in enumerate(tqdm(parts, desc=title, unit="part", disable=None, leave=False)):
-        path = folder / f"part-{k:05d}.npz"
-        if not path.exists():
-            shapes = collection.shapes(latents[index])
-            write_npz(
-                path,
-                index=index,
-                latents=latents[index],
-                nric=shapes.nric.astype(np.float32),
-                vertices=shapes.vertices.astype(np.float32),
-                status=np.array(["failed" if reason else "done" for reason in shapes.reasons]),
-                reason=np.array(shapes.reasons),
-            )
-        yield int(index[-1]) + 1, len(latents)
+    indices = np.split(np.arange(len(latents)), range(part_size, len(latents), part_size))
+    parts = {folder / f"part-{k:05d}.npz": index for k, index in enumerate(indices)}
+    for path in set(folder.glob("part-*.npz")) - set(parts):
+        path.unlink()
+    found = {path: _status(path, index, latents[index]) for path, index in parts.items()}
+    missing = [path for path, status in found.items() if status is None]
+    statuses = [status for status in found.values() if status is not None]
+    done, failed = sum(map(len, statuses)), sum(int((status != DONE).sum()) for status in statuses)
+    results = run(partial(_part, collection), [latents[parts[path]] for path in missing], scheduler, workers)
+    with tqdm(total=len(latents), initial=done, desc=title, unit="sample", disable=None, leave=False) as bar:
+        for k, part in results:
+            index = parts[missing[k]]
+            write_npz(missing[k], index=index, latents=latents[index], **part)
+            done, failed = done + len(index), failed + int((part["status"] != DONE).sum())
+            bar.update(len(index))
+            yield done, len(latents), failed
+    if not missing:
+        yield done, len(latents), failed
+
+
+def _part(collection: Collection, latents: FloatArray) -> dict[str, NDArray]:
+    """What a part holds of the shapes of its codes."""
+    shapes = collection.shapes(latents)
+    return {
+        "nric": shapes.nric.astype(np.float32),
+        "vertices": shapes.vertices.astype(np.float32),
+        "status": np.array([FAILED if reason else DONE for reason in shapes.reasons]),
+        "reason": np.array(shapes.reasons),
+    }
+
+
+def _status(path: Path, index: IntArray, latents: FloatArray) -> NDArray[np.str_] | None:
+    """(n,) DONE or FAILED of a part's samples; None where the file is missing, damaged or of other codes."""
+    try:
+        with np.load(path) as part:
+            same = np.array_equal(part["index"], index) and np.array_equal(part["latents"], latents)
+            return part["status"] if same else None
+    except (OSError, ValueError, KeyError, EOFError, BadZipFile):
+        return None
 
 
 def read(folder: Path) -> Samples:
@@ -121,7 +163,7 @@ def read(folder: Path) -> Samples:
     found: dict[str, list[NDArray]] = {name: [] for name in fields}
     for path in sorted(folder.glob("part-*.npz")):
         with np.load(path) as part:
-            done = part["status"] == "done"
+            done = part["status"] == DONE
             for name in fields:
                 found[name].append(part[name][done])
     return Samples(*(np.concatenate(found[name]) for name in fields))

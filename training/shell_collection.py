@@ -37,9 +37,9 @@ class ShellCollection:
     lower: FloatArray
     upper: FloatArray
     factors: dict[str, list[int]]
-    steps: int = 16
-    material: Material = Material()
-    scale: float = 1.0
+    steps: int
+    material: Material
+    scale: float
 
     def __getstate__(self) -> dict[str, Any]:
         return {name: value for name, value in self.__dict__.items() if name != "space"}

@@ -1,0 +1,192 @@
+"""One function on many items: in processes on this machine, or on a Dask cluster.
+
+Either way an item's result is the same bit for bit, because it depends on the item alone and is computed with one BLAS
+thread (only processors with different instructions may round differently). What a worker that dies was busy with is
+done again by another.
+
+The machines of a cluster need this package in the same version, with its ``cluster`` extra, and no common file system.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import pickle
+import threading
+import time
+from collections import Counter, deque
+from collections.abc import Callable, Iterator, Sequence
+from queue import Empty, SimpleQueue
+from typing import TYPE_CHECKING, Generic, TypeVar
+
+import numpy as np
+from threadpoolctl import threadpool_limits
+
+if TYPE_CHECKING:
+    from distributed import Client
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+
+#: Seconds to wait for a scheduler's answer.
+CONNECT = 10.0
+#: Seconds that a cluster may be without a worker before it is given up.
+ABANDONED = 60.0
+#: Items in flight for each thread of a cluster: one to work on, one on its way.
+AHEAD = 2
+#: How often workers' deaths are put up with before the work itself is taken for the cause. Dask counts three of its own
+#: each time.
+RETRIES = 3
+
+
+class WorkersError(RuntimeError):
+    """The workers can't be used, with a sentence that says why."""
+
+
+def run(
+    function: Callable[[Item], Result], items: Sequence[Item], scheduler: str | None = None, workers: int = -1
+) -> Iterator[tuple[int, Result]]:
+    """Call a function on each of some items, yielding (position, result) in the order in which they are finished.
+
+    Args:
+        function: picklable. Each thread that works for it unpickles it once and keeps it, so what it builds lazily is
+            built once in a thread, and needn't be safe for several.
+        items: each with enough work to be worth sending.
+        scheduler: address of a Dask scheduler; None computes on this machine.
+        workers: processes on this machine, by default one a core; 1 computes in this process.
+
+    Raises:
+        WorkersError: a scheduler that can't be reached or is lost, no workers, workers without this package, or an item
+            that kills them again and again.
+    """
+    if scheduler is not None and items:
+        return _on_cluster(_Travelling(function), items, scheduler)
+    if workers == 1 or len(items) < 2:
+        return _here(function, items)
+    return _in_processes(_Travelling(function), items, workers)
+
+
+_kept = threading.local()
+
+
+class _Travelling(Generic[Item, Result]):
+    """A function that is sent as bytes, and unpickled by a thread that doesn't hold it yet."""
+
+    def __init__(self, function: Callable[[Item], Result]) -> None:
+        pickled = pickle.dumps(function)
+        self._digest = hashlib.sha256(pickled).hexdigest()
+        # An array, because joblib lets its processes map a large one instead of sending it with every item.
+        self._pickled = np.frombuffer(pickled, np.uint8)
+
+    def __call__(self, item: Item) -> Result:
+        if getattr(_kept, "digest", None) != self._digest:
+            _kept.function = pickle.loads(self._pickled.data)  # noqa: S301 - our own, from where the results go
+            _kept.digest = self._digest
+        # For good: another thread of this process may still be at work when this one is done.
+        threadpool_limits(1)
+        return _kept.function(item)
+
+
+def _numbered(function: _Travelling[Item, Result], k: int, item: Item) -> tuple[int, Result]:
+    return k, function(item)
+
+
+def _itself(function: _Travelling[Item, Result]) -> _Travelling[Item, Result]:
+    return function
+
+
+def _here(function: Callable[[Item], Result], items: Sequence[Item]) -> Iterator[tuple[int, Result]]:
+    for k, item in enumerate(items):
+        with threadpool_limits(1):
+            result = function(item)
+        yield k, result
+
+
+def _in_processes(
+    function: _Travelling[Item, Result], items: Sequence[Item], workers: int
+) -> Iterator[tuple[int, Result]]:
+    from joblib import Parallel, delayed, parallel_config
+    from joblib.externals.loky.process_executor import TerminatedWorkerError
+
+    left = dict(enumerate(items))
+    for deaths in range(1 + RETRIES):
+        # One BLAS thread from the start, for libraries that look at the environment when they are loaded.
+        with parallel_config("loky", inner_max_num_threads=1):
+            parallel = Parallel(workers, return_as="generator_unordered", batch_size=1)
+        try:
+            for k, result in parallel(delayed(_numbered)(function, k, item) for k, item in list(left.items())):
+                del left[k]
+                yield k, result
+        except TerminatedWorkerError as error:
+            if deaths == RETRIES:
+                raise WorkersError(
+                    "worker processes were killed again and again, perhaps for want of memory"
+                ) from error
+        else:
+            return
+
+
+def _on_cluster(
+    function: _Travelling[Item, Result], items: Sequence[Item], scheduler: str
+) -> Iterator[tuple[int, Result]]:
+    with _client(scheduler) as client:
+        from distributed import CancelledError, Future, KilledWorker
+
+        lost = WorkersError(f"the scheduler at {scheduler} was lost; the same command continues once it is back")
+        waiting, deaths = deque(range(len(items))), Counter[int]()
+        flying: dict[object, tuple[int, Future]] = {}
+        finished: SimpleQueue[Future] = SimpleQueue()
+        sent, seen = None, time.monotonic()
+        while waiting or flying:
+            try:
+                threads = sum(client.nthreads().values())
+            except (OSError, RuntimeError, AttributeError) as error:  # by how far the client is with closing
+                raise lost from error
+            if threads:
+                seen = time.monotonic()
+            elif time.monotonic() - seen > ABANDONED:
+                raise WorkersError(f"the scheduler at {scheduler} has had no worker for {ABANDONED:.0f} s")
+            while waiting and len(flying) < AHEAD * threads:
+                k = waiting.popleft()
+                # As a task's result: scattered data are gone with the workers that hold them, a task is done again.
+                sent = sent or client.submit(_itself, function, pure=False)
+                future = client.submit(_call, sent, items[k], pure=False)
+                flying[future.key] = k, future
+                future.add_done_callback(finished.put)
+            try:
+                future = finished.get(timeout=1)
+            except Empty:
+                continue
+            k, _ = flying.pop(future.key)
+            try:
+                result = future.result()
+            except CancelledError as error:
+                raise lost from error
+            except ModuleNotFoundError as error:
+                raise WorkersError(
+                    f"a worker of {scheduler} lacks {error.name}: install this package there, with its extra 'cluster'"
+                ) from error
+            except KilledWorker as error:
+                deaths[k] += 1
+                if deaths[k] > RETRIES:
+                    raise WorkersError(
+                        f"workers of {scheduler} died again and again of the same item, for want of memory?"
+                    ) from error
+                waiting.append(k)
+                sent = None
+            else:
+                yield k, result
+
+
+def _call(function: Callable[[Item], Result], item: Item) -> Result:
+    return function(item)
+
+
+def _client(scheduler: str) -> Client:
+    try:
+        from distributed import Client
+    except ImportError as error:
+        raise WorkersError("a scheduler needs Dask: pip install 'shapespace[cluster]'") from error
+    try:
+        return Client(scheduler, timeout=CONNECT, set_as_default=False)
+    except (OSError, ValueError) as error:
+        raise WorkersError(f"no Dask scheduler answers at {scheduler}: {error}") from error
