@@ -31,8 +31,8 @@ class CollectionSettings(_Section):
     to the configuration's own folder. The command's ``--data`` goes before."""
     reference: str | None = None
     """Name of the mesh whose area becomes 1 and whose connectivity is coarsened; None takes the first."""
-    coarse_vertices: int | None = Field(1000, ge=50)
-    """Vertices to compute with, where the meshes have more; None computes with all of them."""
+    coarse_vertices: int = Field(1000, ge=0)
+    """Vertices to compute with, where the meshes have more; 0 computes with all of them."""
 
     @model_validator(mode="after")
     def _one_source(self) -> CollectionSettings:
@@ -76,7 +76,7 @@ class SampleSettings(_Section):
     """K of the exponentials."""
     factor_counts: list[int] | int | None = None
     """Samples of each factor alone; None takes the factor's part of the joint codes, as the paper does."""
-    part_size: int = Field(200, ge=1)
+    part_size: int = Field(50, ge=1)
     test_fraction: float = Field(0.2, gt=0, lt=1)
     validation_fraction: float = Field(0.1, gt=0, lt=1)
     """Part of the training codes that chooses the learning rate and the best epoch."""

@@ -55,7 +55,7 @@ def ingest(folder: Path, config: Config) -> dict[str, Any]:
     facts: dict[str, Any] = {"shapes": len(vertices), "vertices": vertices.shape[1], "reference": meshes.names[chosen]}
     facts["notes"] = list(meshes.notes)
     reference, more = fine, {}
-    if settings.coarse_vertices is not None and vertices.shape[1] > settings.coarse_vertices:
+    if 0 < settings.coarse_vertices < vertices.shape[1]:
         coarsening = coarsen(fine, settings.coarse_vertices, vertices)
         exact, vertices = vertices, vertices[:, coarsening.fine_index]
         reference = TriangleMesh.from_arrays(vertices[chosen], coarsening.faces)
@@ -106,9 +106,9 @@ def modes(folder: Path, config: Config) -> dict[str, Any]:
     logarithms = tangents(space, centre.vertices, shapes, settings.log_steps)
     count = min(settings.count, len(shapes) - 1)
     sparse = spga(
-        space, centre.vertices, logarithms.vertices, count, settings.sparsity, max_iterations=settings.max_iterations
+        space, centre.vertices, logarithms.fields, count, settings.sparsity, max_iterations=settings.max_iterations
     )
-    dense = pga(space, centre.vertices, logarithms.vertices, count)
+    dense = pga(space, centre.vertices, logarithms.fields, count)
     write_npz(
         folder / "modes.npz",
         nric=sparse.nric,

@@ -67,8 +67,8 @@ def configuration(collection: MeshCollection, data: str, title: str) -> str:
     count, vertices = collection.vertices.shape[:2]
     target = CollectionSettings().coarse_vertices
     coarse = (
-        f"coarse_vertices = {target}    # vertices to compute with; more take longer, {vertices} are all"
-        if target is not None and vertices > target
+        f"coarse_vertices = {target}    # vertices to compute with; more take longer, 0 takes all {vertices}"
+        if vertices > target
         else f"# coarse_vertices = {target}    # vertices to compute with, where there are more than that"
     )
     return TEMPLATE.format(
