@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -31,7 +31,7 @@ GAMMA = 2.2
 
 @dataclass(frozen=True)
 class Camera:
-    """A perspective camera, the same for all shapes of a run so that their pictures compare.
+    """A perspective camera; one serves all shapes of a run, so that their pictures compare.
 
     Attributes:
         axes: (3, 3) rows are the directions right, up and towards the viewer.
@@ -65,12 +65,16 @@ class Camera:
         points = np.concatenate([reference, np.reshape(shapes, (-1, 3))])
         low, high = points.min(axis=0), points.max(axis=0)
         eye = (low + high) / 2 + DISTANCE * np.linalg.norm(high - low) * back
-        local = (points - eye) @ axes.T
+        return cls(axes, eye, (-1.0, 1.0, -1.0, 1.0)).framing(points, margin)
+
+    def framing(self, points: FloatArray, margin: float) -> Camera:
+        """The same view, cut to points (n, 3) and a margin around them, a fraction of the picture's longer side."""
+        local = (points - self.eye) @ self.axes.T
         screen = local[:, :2] / -local[:, 2:]
         low, high = screen.min(axis=0), screen.max(axis=0)
         border = margin * (high - low).max()
-        (left, bottom), (rightmost, top) = low - border, high + border
-        return cls(axes, eye, (float(left), float(rightmost), float(bottom), float(top)))
+        (left, bottom), (right, top) = low - border, high + border
+        return replace(self, window=(float(left), float(right), float(bottom), float(top)))
 
     def render(
         self, vertices: FloatArray, faces: IntArray, colours: ArrayLike, size: int, *, smooth: bool = True

@@ -11,7 +11,7 @@ import os
 import tomllib
 import zipfile
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import cycle
 from pathlib import Path
@@ -166,6 +166,11 @@ class Studio:
         names = {"test_exact", "test_predicted", "strip_joint", "strip_factors"} & record.gallery.keys()
         shapes = [align(record.gallery[name].reshape(-1, *base.shape), base) for name in sorted(names)]
         return cls(Camera.facing(base, faces, np.concatenate([base[None], *shapes])), base, faces)
+
+    def closer(self, reference: FloatArray) -> Studio:
+        """The same view without the room that far-reaching shapes need: for the base, the reference and modes."""
+        points = np.concatenate([self.base, align(reference, self.base)])
+        return replace(self, camera=self.camera.framing(points, 1.2 * MODE_REACH))
 
     def draw(
         self, shape: FloatArray, alt: str, size: int, colours: Any = CLAY, faces: IntArray | None = None,
@@ -421,6 +426,7 @@ def size(value: float) -> str:
 def page(record: Record) -> str:
     """The whole page of a run."""
     studio = Studio.of(record)
+    close = studio and studio.closer(record.reference["vertices"])
     figures = record.evaluation
     export = record.config.get("export", {})
     modes = record.modes if {"vertices", "nric"} <= record.modes.keys() else {}
@@ -438,8 +444,8 @@ def page(record: Record) -> str:
         record=record,
         stages=STAGES,
         pictures=studio is not None,
-        shapes=list(shapes(record, studio)) if studio else [],
-        modes=list(mode_cards(record, studio)) if studio and modes else [],
+        shapes=list(shapes(record, close)) if close else [],
+        modes=list(mode_cards(record, close)) if close and modes else [],
         modes_count=len(modes.get("vertices", ())),
         mode_plots=list(mode_plots(record)),
         explained={
@@ -448,7 +454,7 @@ def page(record: Record) -> str:
             if isinstance(value := record.decomposition.get(key), int | float)
         },
         support_bar=colour_bar(ramp(NEUTRAL), "unchanged", "changes most"),
-        factors=list(factor_cards(record, studio)),
+        factors=list(factor_cards(record, close)),
         overlap=overlap_plot(record),
         losses=list(loss_plots(record)),
         longest=max((seconds for seconds in record.seconds.values() if seconds), default=1.0),
