@@ -22,7 +22,19 @@ the other is solved and the objective never rises.
 - W is least squares in a box, a small problem for each shape, by coordinate descent.
 
 The start is the modes of the plain analysis rotated among themselves to be as concentrated as they can (varimax):
-at λ = 0 that is a minimum already, and it ends lower and sooner than starting from the modes as they are.
+at λ = 0 that is a minimum already, and it ends as low as a start from localised pieces and sooner than one from the
+modes as they are.
+
+What sparsity costs and brings, share explained / mean share of edges that carry 95 % of a mode, measured at η = 1e-4 on
+a hand (57 poses, m = 12), a captured dancer (60, m = 20) and a posed body (44, m = 20):
+
+| sparsity | hand | dancer | body |
+|---|---|---|---|
+| plain | 0.983 / 0.20 | 0.943 / 0.38 | 0.969 / 0.31 |
+| 0.03 | 0.980 / 0.07 | 0.939 / 0.28 | |
+| 0.1 (default) | 0.970 / 0.06 | 0.916 / 0.20 | 0.917 / 0.04 |
+| 0.2 | | 0.878 / 0.14 | |
+| 0.3 | 0.929 / 0.05 | 0.837 / 0.11 | |
 """
 
 from __future__ import annotations
@@ -93,6 +105,9 @@ def tangents(space: ShellSpace, mean: FloatArray, shapes: ArrayLike, steps: int 
     Between far poses of real meshes a geodesic may not be found. One with half as many steps often is, as its shapes
     need not pass where the surface degenerates; failing that too, the difference of lengths and angles, with the
     angles unwrapped from the mean's, is projected to the tangent space: the logarithm to first order.
+
+    A logarithm is the inverse of the exponential with as many steps, and converges only to first order in 1/K: on real
+    collections those of 4 and of 8 steps differ by 10 to 35 % of their length.
 
     Args:
         space: where; each process gets a copy.

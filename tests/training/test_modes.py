@@ -109,6 +109,11 @@ def test_without_sparsity_the_plain_subspace_is_found(bumps, rng):
     assert np.linalg.eigvalsh(bumps.inner(both, both))[:3].max() < 1e-6
 
 
+def test_the_start_is_concentrated_already(bumps, plain, sparse):
+    assert sparse.history[0]["misfit"] == pytest.approx(0, abs=1e-9)
+    assert sparse.history[0]["support"] < 0.7 * localisation(plain.nric, bumps.norm).mean()
+
+
 @pytest.mark.parametrize("sparsity", [0.02, 0.1, 0.4])
 def test_the_objective_never_rises_and_is_that_of_the_problem(bumps, sparsity):
     modes = spga(bumps.space, bumps.mean, bumps.fields, 3, sparsity)
@@ -160,8 +165,8 @@ def test_coefficients_stay_in_the_box_and_are_best_there(rng):
     found = np.zeros((4, 6))
     _fit_in_box(basis.T @ basis, basis.T @ targets, found)
     assert np.abs(found).max() == 1
-    best = np.stack([lsq_linear(basis, b, (-1, 1)).x for b in targets.T])
-    assert found.T == pytest.approx(best, abs=1e-6)
+    best = np.stack([lsq_linear(basis, b, (-1, 1)).x for b in targets.T], axis=1)
+    assert found == pytest.approx(best, abs=1e-6)
 
 
 @pytest.mark.parametrize("which", ["plain", "sparse"])
