@@ -54,10 +54,10 @@ class ModeSettings(_Section):
 
     count: int = Field(20, ge=1)
     """m; at most the number of shapes less one."""
-    sparsity: float = Field(0.1, ge=0)
-    """λ; 0 is principal geodesic analysis."""
-    log_steps: int = Field(8, ge=2)
-    """K of the logarithms."""
+    sparsity: float = Field(0.1, ge=0, lt=1)
+    """λ as a share of the price at which the principal modes stop paying; 0 is principal geodesic analysis."""
+    log_steps: int = Field(16, ge=2)
+    """K of the logarithms, best that of the exponentials, whose inverse they are."""
     max_iterations: int = Field(200, ge=1)
 
 
