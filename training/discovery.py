@@ -17,16 +17,17 @@ from geometry.energy import Material
 from geometry.mean import elastic_mean
 from geometry.mesh import TriangleMesh
 from geometry.nric import WeightedNorm
+from training import figure
 from training.config import Config, ConfigError
+from training.factors import between, group, names, overlap
 from training.files import write_json, write_npz
+from training.ingest import MeshCollection, normalised, read_collection
+from training.modes import localisation, pga, spga, tangents
+from training.shell_collection import ShellCollection
 
 try:  # TEMPORARY until all modules are there
-    from geometry.coarsening import Prolongation, coarsen
-    from training import figure
-    from training.factors import between, group, names, overlap
-    from training.ingest import MeshCollection, normalised, read_collection
-    from training.modes import localisation, pga, spga, tangents
-    from training.shell_collection import ShellCollection
+    from geometry.coarsening import coarsen
+    from geometry.prolongation import Prolongation
 except ImportError:
     pass
 
@@ -39,7 +40,8 @@ def material(config: Config) -> Material:
 
 def _meshes(config: Config) -> MeshCollection:
     if config.collection.generator == "figure":
-        return MeshCollection(*figure.poses())
+        labels, vertices, faces = figure.poses()
+        return MeshCollection(tuple(labels), vertices, faces)
     if config.collection.data is None:
         raise ConfigError("collection.data: say where the meshes are, here or with --data")
     return read_collection(config.collection.data)
