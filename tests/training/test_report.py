@@ -227,6 +227,11 @@ def test_ids_are_used_once_and_found(page: Page) -> None:
     assert {a["xlink:href"][1:] for a in page.all("use") if a["xlink:href"]} <= set(ids)
 
 
+def test_the_same_run_makes_the_same_page(run: Path, tmp_path: Path) -> None:
+    files = ("reference.npz", "mean.npz", "modes.json")
+    assert partial(run, tmp_path / "a", *files).source == partial(run, tmp_path / "b", *files).source
+
+
 def test_pictures_show_something_and_different_shapes_differ(page: Page) -> None:
     pictures = page.pictures
     for alt, pixels in pictures.items():
