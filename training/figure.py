@@ -379,7 +379,7 @@ def _joints() -> tuple[Joint, ...]:
     left = (
         _joint("left elbow", ELBOW, 0.012 * Z, (-0.06, ARM), (0.06, ARM), hand, {"left elbow": flexion}),
         _joint("left upper arm", SHOULDER, 0 * Z, (0.02, lat), (0.24, ARM), hand, twist),
-        _joint("left shoulder", SHOULDER, 0.012 * Z, (-0.04, lat), (0.12, ARM), hand, shoulder, 0.7),
+        _joint("left shoulder", SHOULDER, 0.01 * (Y + Z), (-0.045, lat), (0.11, ARM + X), hand, shoulder, 0.7),
         _joint("left knee", KNEE, -0.012 * Z, (-0.08, LEG), (0.08, LEG), ANKLE, {"left knee": np.cross(Z, LEG)}),
         _joint("left hip", HIP, 0.035 * Z, (0.002, groin), (0.19, LEG), ANKLE, hip, 0.7),
     )

@@ -182,6 +182,7 @@ def test_collection_begins_at_rest_and_keeps_triangles_and_volume(
     assert min(smallest_angles(shape, faces).min() for shape in vertices) > 5
     volumes = np.array([volume(shape, faces) for shape in vertices])
     assert np.allclose(volumes, volumes[0], rtol=0.1)
+    assert not any(figure._touches(shape) for shape in vertices)
 
 
 def test_poses_differ_but_are_the_same_for_the_same_seed(
