@@ -25,6 +25,7 @@ from training.export import export
 from training.files import write_json, write_npz
 from training.freaky_torus import FreakyTorus
 from training.learning import Learner
+from training.report import write_report
 from training.sampling import Collection, draw, read, split
 
 GENERATORS: dict[str, Callable[[], Collection]] = {"freaky-torus": FreakyTorus}
@@ -153,7 +154,7 @@ def networks(run: Run) -> None:
 
 
 def evaluation(run: Run) -> None:
-    """evaluation.json and gallery.npz."""
+    """evaluation.json, gallery.npz and report.html."""
 
     def exact(name: str, latents: FloatArray) -> NDArray[np.float32]:
         folder = run.folder / "exact" / name
@@ -169,6 +170,7 @@ def evaluation(run: Run) -> None:
         figures["prolongation"] = json.loads(ingested.read_text()).get("prolongation")
     write_npz(run.folder / "gallery.npz", **gallery)
     write_json(run.folder / "evaluation.json", figures)
+    write_report(run.folder)
 
 
 def export_bundle(run: Run) -> None:
@@ -205,7 +207,7 @@ STAGES: dict[str, Stage] = {
     "samples": Stage(samples, lambda c: [c.samples], ("samples",)),
     # Files of networks are named by samples and settings, so a change leaves those alone that it doesn't touch.
     "networks": Stage(networks, lambda c: [c.networks, c.monolithic, *c.variants.values()], ()),
-    "evaluation": Stage(evaluation, lambda c: [c.evaluation], ("evaluation.json", "gallery.npz", "exact")),
+    "evaluation": Stage(evaluation, lambda c: [c.evaluation], ("evaluation.json", "gallery.npz", "report.html", "exact")),
     "export": Stage(export_bundle, lambda c: [c.export], ()),
 }
 

@@ -1,0 +1,213 @@
+"""From a folder of meshes to a served shape: the real command, killed in every stage, and a real server."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import httpx
+import numpy as np
+import pytest
+import trimesh
+from safetensors.numpy import load_file
+
+from geometry.mesh import TriangleMesh, align
+from tests.service.conftest import starting
+from tests.training.conftest import command
+from training.pipeline import STAGES
+
+CONFIG = """
+[collection]
+data = "meshes"
+coarse_vertices = 120
+
+[modes]
+count = 3
+log_steps = 4
+
+[factors]
+count = 2
+
+[samples]
+count = 60
+steps = 4
+part_size = 10
+
+[networks]
+fractions = [0.5]
+
+[networks.factors]
+hidden = [16]
+skip_degree = 2
+fit = { batch_size = 16, max_epochs = 8 }
+
+[networks.combiner]
+width = 4
+layers = 1
+pairwise = 2
+fit = { batch_size = 16, max_epochs = 6 }
+
+[monolithic]
+hidden = [16]
+energy = 1.0
+fit = { batch_size = 16, max_epochs = 8 }
+
+[evaluation]
+grid_size = 30
+reconstructions = 4
+
+[export]
+name = "bars"
+title = "Bars"
+description = "A run for the tests."
+licence = "MIT"
+"""
+
+
+def bars(count: int = 8) -> tuple[np.ndarray, np.ndarray]:
+    """A thick bar in some poses, far from the origin and in large units: each end bends by itself."""
+    ball = trimesh.creation.icosphere(3, 1.0)
+    rest = ball.vertices * [300.0, 80.0, 60.0]
+    rng = np.random.default_rng(1)
+    shapes = []
+    for left, right, twist in np.vstack([np.zeros(3), rng.uniform(-0.8, 0.8, (count - 1, 3))]):
+        x, y, z = rest.T
+        bend = left * np.clip(-x / 300, 0, 1) ** 2 + right * np.clip(x / 300, 0, 1) ** 2
+        turn = 0.5 * twist * np.clip(x / 300, 0, 1)
+        y, z = np.cos(turn) * y - np.sin(turn) * z, np.sin(turn) * y + np.cos(turn) * z
+        shapes.append(np.stack([x * np.cos(bend) - z * np.sin(bend), y, np.abs(x) * np.sin(bend) + z * np.cos(bend)], 1))
+    return np.array(shapes) + [1000.0, 0, 0], ball.faces
+
+
+@pytest.fixture(scope="session")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("collection")
+    (folder / "meshes").mkdir()
+    vertices, faces = bars()
+    for k, shape in enumerate(vertices):
+        trimesh.Trimesh(shape, faces, process=False).export(folder / "meshes" / f"bar{k}.obj", digits=12)
+    (folder / "bars.toml").write_text(CONFIG)
+    return folder
+
+
+@pytest.fixture(scope="session")
+def run(folder: Path) -> Path:
+    done = subprocess.run(command(folder / "bars.toml", folder / "run"), capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return folder / "run"
+
+
+def test_a_run_leaves_what_the_contract_promises(run: Path) -> None:
+    vertices, faces = bars()
+    with np.load(run / "reference.npz") as reference:
+        mesh = TriangleMesh.from_mapping(reference)
+        assert 100 <= len(mesh.vertices) <= 130
+        fine = TriangleMesh.from_arrays(reference["fine_vertices"], reference["fine_faces"])
+        assert np.array_equal(fine.faces, faces)
+        assert fine.area == pytest.approx(1)
+        np.testing.assert_allclose(reference["scale"] * fine.vertices, vertices[0], atol=1e-4)
+    with np.load(run / "modes.npz") as modes:
+        assert modes["nric"].shape == (3, 2 * len(mesh.edges))
+        assert modes["vertices"].shape == (3, *mesh.vertices.shape)
+        assert modes["coefficients"].shape == (8, 3)
+        assert (modes["lower"] < 0).all()
+        assert (modes["upper"] > 0).all()
+    groups = json.loads((run / "factors.json").read_text())
+    assert [j for members in groups["factors"] for j in members] == [0, 1, 2]
+    assert len(groups["factors"]) == len(groups["names"]) == 2
+    figures = json.loads((run / "evaluation.json").read_text())
+    for model in ("composite", "monolithic", "affine", "grid"):
+        assert set(figures["r2"][model]) == {"total", "lengths", "angles"}
+    assert figures["r2"]["affine"]["total"] > 0.5
+    assert figures["r2"]["composite"]["total"] > 0.99
+    assert figures["prolongation"]["mean"] < 0.02
+    assert [row["fraction"] for row in figures["fractions"]] == [0.5]
+    assert "<html" in (run / "report.html").read_text()
+    events = [json.loads(line) for line in (run / "log.jsonl").read_text().splitlines()]
+    assert [e["stage"] for e in events if e["event"] == "end"] == list(STAGES)
+
+
+def test_a_factor_s_samples_are_the_parts_of_the_joint_codes(run: Path) -> None:
+    groups = json.loads((run / "factors.json").read_text())["factors"]
+    with np.load(run / "samples" / "part-00002.npz") as part:
+        joint = part["latents"]
+    for j, members in enumerate(groups):
+        with np.load(run / "samples" / f"factor-{j}" / "part-00002.npz") as part:
+            np.testing.assert_array_equal(part["latents"][:, members], joint[:, members])
+            assert not np.delete(part["latents"], members, axis=1).any()
+
+
+@pytest.fixture
+def url(run: Path) -> Iterator[str]:
+    with starting() as start:
+        yield start(run / "models").url
+
+
+def test_the_server_picks_the_model_up_and_answers_in_the_units_of_the_meshes(url: str, run: Path) -> None:
+    card = httpx.get(f"{url}/v1/models/bars").json()
+    assert card["latent_dimension"] == 3
+    assert card["figures"] == json.loads((run / "evaluation.json").read_text())
+    vertices, faces = bars()
+    with np.load(run / "modes.npz") as modes:
+        codes = modes["coefficients"]
+    answer = httpx.post(f"{url}/v1/models/bars/vertices", json={"latents": codes[:3].tolist()}, timeout=60).json()
+    fine = np.array(answer["vertices"])
+    assert fine.shape == (3, *vertices.shape[1:])
+    diagonal = np.linalg.norm(np.ptp(vertices[0], axis=0))
+    for found, exact in zip(fine, vertices, strict=False):
+        assert np.linalg.norm(align(found, exact) - exact, axis=1).mean() < 0.05 * diagonal
+    mesh = httpx.get(f"{url}/v1/models/bars/mesh", params={"format": "json", "mesh": "coarse"}).json()
+    assert len(mesh["vertices"]) < 140
+    assert len(httpx.get(f"{url}/v1/models/bars/mesh", params={"format": "json"}).json()["faces"]) == len(faces)
+
+
+def results(run: Path) -> dict[str, object]:
+    """Everything a run leaves, times, logs and the report aside."""
+    found: dict[str, object] = {}
+    for path in sorted(run.rglob("*")):
+        name = str(path.relative_to(run))
+        if path.suffix == ".npz":
+            with np.load(path) as file:
+                found |= {f"{name}/{key}": file[key].tobytes() for key in file}
+        elif path.suffix == ".safetensors":
+            found |= {f"{name}/{key}": value.tobytes() for key, value in load_file(path).items()}
+        elif path.suffix == ".onnx":
+            found[name] = path.read_bytes()
+        elif path.name == "evaluation.json":
+            found[name] = {k: v for k, v in json.loads(path.read_text()).items() if k != "times"}
+    return found
+
+
+def test_a_run_killed_in_every_stage_ends_as_one_that_nobody_disturbed(run: Path, folder: Path) -> None:
+    again, rng = folder / "again", np.random.default_rng(0)
+    log = again / "log.jsonl"
+    for stage in STAGES:
+        process = subprocess.Popen(
+            command(folder / "bars.toml", again), stdout=subprocess.DEVNULL, start_new_session=True
+        )
+        while f'"begin", "stage": "{stage}"' not in (log.read_text() if log.exists() else ""):
+            assert process.poll() is None, "the run ended before it could be killed"
+            time.sleep(0.01)
+        time.sleep(rng.uniform(0, 0.5))
+        os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
+    subprocess.run(command(folder / "bars.toml", again), check=True, capture_output=True)
+    one, other = results(run), results(again)
+    assert one.keys() == other.keys()
+    assert [name for name in one if one[name] != other[name]] == []
+
+
+def test_init_writes_a_configuration_that_the_command_takes(folder: Path, tmp_path: Path) -> None:
+    out = tmp_path / "mine.toml"
+    shapespace = [sys.executable, "-m", "training"]
+    subprocess.run([*shapespace, "init", str(folder / "meshes"), "--out", str(out)], check=True, capture_output=True)
+    done = subprocess.run(command(out, tmp_path / "run", "--until", "mean"), capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    with np.load(tmp_path / "run" / "mean.npz") as mean:
+        assert str(mean["status"]) == "converged"
