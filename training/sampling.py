@@ -150,7 +150,8 @@ def _part(collection: Collection, latents: FloatArray) -> dict[str, NDArray]:
 def _status(path: Path, index: IntArray, latents: FloatArray) -> NDArray[np.str_] | None:
     """(n,) DONE or FAILED of a part's samples; None where the file is missing, damaged or of other codes."""
     try:
-        with np.load(path) as part:
+        # Opened here, because np.load leaves a damaged file open.
+        with path.open("rb") as file, np.load(file) as part:
             same = np.array_equal(part["index"], index) and np.array_equal(part["latents"], latents)
             return part["status"] if same else None
     except (OSError, ValueError, KeyError, EOFError, BadZipFile):

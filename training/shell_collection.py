@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from geometry.calculus import Path, ShellSpace
+from geometry.calculus import ShellSpace
 from geometry.energy import Material
 from geometry.mesh import FloatArray, IntArray, TriangleMesh
 from geometry.sampling import exponentials
@@ -69,13 +69,9 @@ class ShellCollection:
         # One code at a time: a product with all of them would round differently with their number.
         velocities = np.stack([np.tensordot(code, self.modes, axes=1) for code in latents])
         paths = exponentials(self.space, self.reference.vertices, velocities, self.steps, workers=1)
-        found = [(path.vertices[-1], path.nric[-1], self._failure(path)) for path in paths]
+        found = [
+            (path.vertices[-1], path.nric[-1], "" if path.converged else f"{path.status}: {path.reason}")
+            for path in paths
+        ]
         vertices, z, reasons = zip(*found, strict=True)
         return Shapes(np.stack(vertices), np.stack(z), list(reasons))
-
-    def _failure(self, path: Path) -> str:
-        """Why a geodesic isn't complete, if it isn't: status, what happened, and how near a face was to nothing."""
-        if path.converged:
-            return ""
-        areas, start = (self.space.point(path.vertices[k]).rest.areas for k in (-1, 0))
-        return f"{path.status}: {path.reason}; smallest area ratio {(areas / start).min():.1e}"
