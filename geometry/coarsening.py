@@ -1,0 +1,422 @@
+"""A coarse connectivity that serves every shape of a collection: half-edge collapses by quadric error."""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from geometry.mesh import Connectivity, FloatArray, IntArray, MeshError, TriangleMesh, face_normals
+
+#: Smallest angle (degrees) that a collapse may leave in any shape: the first limit until no collapse is left,
+#: then the next. Stricter ones cost accuracy: the cheap collapses wait while dear ones are made.
+ANGLE_LIMITS = (10.0, 6.0, 3.0, 1.5)
+#: Largest turn of a face's normal in one collapse, and largest angle between the normals of two neighbours.
+TURN_LIMIT, FOLD_LIMIT = np.cos(np.deg2rad(60)), np.cos(np.deg2rad(140))
+#: Share of the vertices kept back to heal slivers and folds that the fine mesh has already.
+HEALING_SHARE = 0.1
+#: Shapes, spread evenly over the collection, whose quadrics are summed; every shape is checked.
+QUADRIC_SHAPES = 16
+#: Weight of a plane across the boundary, and of the squared distance that the vertex moves, against that of
+#: the planes of the faces.
+BOUNDARY_WEIGHT, MOTION_WEIGHT = 10.0, 1e-2
+
+_Face = tuple[int, int, int]
+_Pairs = list[tuple[int, int]]
+
+
+@dataclass(frozen=True)
+class Coarsening:
+    """A coarse connectivity on some of the fine vertices.
+
+    Attributes:
+        fine_index: (V,) which fine vertex each coarse one is, increasing.
+        faces: (F, 3) in coarse indices.
+        smallest_angle: over all faces of all shapes, radians.
+        reason: why there are more vertices than asked for, in words; empty if there are not.
+    """
+
+    fine_index: IntArray
+    faces: IntArray
+    smallest_angle: float
+    reason: str = ""
+
+
+def coarsen(fine: TriangleMesh, target: int, shapes: FloatArray) -> Coarsening:
+    """Take vertices away until ``target`` are left, the same for all shapes.
+
+    Half-edge collapses u → v (Garland and Heckbert 1997, Hoppe 1996): u's faces are handed to v, so that every
+    coarse vertex is a fine one and the coarse faces are faces of any shape. The cheapest goes first, by the
+    quadrics of several shapes together, so that bent poses count too. Refused is what changes the topology
+    (link condition, boundary loops stay) and what would leave, in the reference or any shape, a sliver, a
+    face turned over, or two neighbours folded onto one another, unless it was worse there before. The limit on
+    slivers is relaxed only once nothing else is left. Slivers and folds of the fine mesh itself are healed
+    where a collapse or an edge flip makes them fewer, over all shapes; ``smallest_angle`` says what is left.
+
+    Args:
+        fine: the reference.
+        target: number of vertices.
+        shapes: (n, Vf, 3) all shapes of the collection, n ≥ 0.
+
+    Raises:
+        MeshError: shapes of another form, or with coordinates that aren't finite.
+    """
+    shapes = np.asarray(shapes, dtype=np.float64)
+    if shapes.ndim != 3 or shapes.shape[1:] != fine.vertices.shape:
+        raise MeshError(f"shapes must be (n, {len(fine.vertices)}, 3), not {shapes.shape}")
+    bad = np.flatnonzero(~np.isfinite(shapes).all(axis=(1, 2)))
+    if len(bad):
+        raise MeshError(f"shape {bad[0]} has a coordinate that is not finite")
+    decimation = _Decimation(fine.connectivity, np.concatenate([fine.vertices[None], shapes]))
+    sines = np.sin(np.deg2rad(ANGLE_LIMITS))
+    spare = int((1 + HEALING_SHARE) * target)
+    if any(decimation.run(spare, sine) for sine in sines):
+        for sine in sines[:0:-1]:  # the worst first
+            decimation.heal(target, sine)
+        any(decimation.run(target, sine) for sine in sines)
+    return decimation.result(target)
+
+
+@dataclass(frozen=True)
+class _Quality:
+    """Of a few faces: smallest sin² of an angle, smallest cosine between neighbours, and how many are beyond limits."""
+
+    sine: float
+    fold: float
+    faults: int
+
+
+class _Decimation:
+    """The mesh while it is being decimated.
+
+    Args:
+        connectivity: fine.
+        shapes: (n, Vf, 3).
+    """
+
+    def __init__(self, connectivity: Connectivity, shapes: FloatArray) -> None:
+        centred = shapes - shapes.mean(axis=1, keepdims=True)
+        # Vertex first: a check gathers a few vertices of every shape.
+        self.points = np.ascontiguousarray(np.moveaxis(centred, 0, 1))
+        chosen = np.unique(np.linspace(0, len(shapes) - 1, QUADRIC_SHAPES).astype(int))
+        self.sample = np.ascontiguousarray(self.points[:, chosen])
+        self.monomials = _monomials(self.sample)
+        self.quadrics, self.areas = _quadrics(connectivity, centred[chosen])
+        self.faces: dict[int, _Face] = {f: (a, b, c) for f, (a, b, c) in enumerate(connectivity.faces.tolist())}
+        self.count = connectivity.vertex_count
+        self.star: list[set[int]] = [set() for _ in range(self.count)]
+        for f, face in self.faces.items():
+            for v in face:
+                self.star[v].add(f)
+        rim = set(connectivity.edges[~connectivity.interior].ravel().tolist())
+        self.boundary = [v in rim for v in range(self.count)]
+        # A vertex where sheets touch stays, because removing it would tear them apart.
+        self.locked = [len(self._fan(self._link(v))) < len(self.star[v]) for v in range(self.count)]
+        self.version = [0] * self.count
+        """Grows whenever the offers of a vertex are renewed."""
+        self.heap: list[tuple[float, int, int, int, int]] = []
+        self.refused: dict[int, list[tuple[float, int, int, int, int]]] = {}
+        self._offer(np.concatenate([connectivity.edges, connectivity.edges[:, ::-1]]))
+
+    def run(self, target: int, sine: float) -> bool:
+        """Collapse until ``target`` vertices are left or nothing can be; whether the target is reached."""
+        for entries in self.refused.values():
+            self.heap += entries
+        self.refused.clear()
+        heapq.heapify(self.heap)
+        while self.count > target and self.heap:
+            entry = heapq.heappop(self.heap)
+            _, u, v, version_u, version_v = entry
+            if self.version[u] != version_u or self.version[v] != version_v:
+                continue
+            if self._keeps_topology(u, v) and self._keeps_shape(u, v, sine):
+                self._collapse(u, v)
+            else:
+                self.refused.setdefault(u, []).append(entry)
+        return self.count <= target
+
+    def heal(self, target: int, sine: float) -> None:
+        """Make slivers and folds fewer by flips, and by collapses as long as there are over ``target`` vertices."""
+        while vertices := self._faulty(sine):
+            changed = [self._flip_one(u, sine) or self._collapse_one([u], target, sine, heal=True) for u in vertices]
+            if any(changed):
+                continue
+            # Where nothing heals, thinning the neighbourhood makes room for it.
+            thinned = [self._collapse_one([u, *self._ring(u)], target, sine, heal=False) for u in vertices]
+            if not any(thinned):
+                break
+
+    def result(self, target: int) -> Coarsening:
+        """The mesh as it is now."""
+        fine_index, local = np.unique(list(self.faces.values()), return_inverse=True)
+        faces = Connectivity(local.reshape(-1, 3), len(fine_index)).faces
+        sine = np.sqrt(_squared_sines(*_sides(self.points[fine_index[faces.T]])).min())
+        reason = ""
+        if len(fine_index) > target:
+            reason = (
+                f"{len(fine_index)} vertices instead of {target}: any other collapse would change the topology, or "
+                "leave a sliver or a fold in some shape"
+            )
+        return Coarsening(fine_index, faces, float(np.arcsin(min(sine, 1.0))), reason)
+
+    def _faulty(self, sine: float) -> list[int]:
+        """Vertices of slivers and folds in any shape."""
+        faces = np.array(list(self.faces.values()))
+        used, local = np.unique(faces, return_inverse=True)
+        connectivity = Connectivity(local.reshape(-1, 3), len(used))
+        normals, squares = _sides(self.points[faces.T])
+        bad: NDArray[np.bool_] = (_squared_sines(normals, squares) < sine**2).any(axis=1)
+        normals = _unit(normals)
+        i, j = connectivity.edge_faces[connectivity.interior].T
+        folded = (_dots(normals[i], normals[j]) < FOLD_LIMIT).any(axis=1)
+        bad[np.concatenate([i[folded], j[folded]])] = True
+        vertices: list[int] = np.unique(faces[bad]).tolist()
+        return vertices
+
+    # ------------------------------------------------------------ offers
+
+    def _costs(self, pairs: IntArray) -> FloatArray:
+        u, v = pairs.T
+        costs: FloatArray = _dots(self.quadrics[u] + self.quadrics[v], self.monomials[v])
+        return costs + MOTION_WEIGHT * self.areas[u] * ((self.sample[u] - self.sample[v]) ** 2).sum(axis=(1, 2))
+
+    def _offer(self, pairs: IntArray) -> None:
+        """Put half-edges (k, 2), u → v, on the heap."""
+        for cost, (u, v) in zip(self._costs(pairs).tolist(), pairs.tolist(), strict=True):
+            if not self.locked[u]:
+                heapq.heappush(self.heap, (cost, u, v, self.version[u], self.version[v]))
+
+    def _offer_again(self, vertices: Sequence[int]) -> None:
+        """Renew the offers of vertices whose star has changed, and those refused before at their neighbours."""
+        pairs = set()
+        for v in vertices:
+            self.version[v] += 1
+            self.refused.pop(v, None)
+            for w in self._ring(v):
+                pairs |= {(v, w), (w, v)}
+                for entry in self.refused.pop(w, ()):
+                    heapq.heappush(self.heap, entry)
+        self._offer(np.array(sorted(pairs)))
+
+    # ------------------------------------------------------------ neighbourhoods
+
+    def _ring(self, v: int) -> list[int]:
+        return sorted({w for f in self.star[v] for w in self.faces[f]} - {v})
+
+    def _link(self, v: int) -> dict[int, tuple[int, int]]:
+        """The faces around a vertex, ``(v, a, b)`` as ``a: (b, number of the face)``."""
+        link = {}
+        for f in self.star[v]:
+            a, b, c = self.faces[f]
+            a, b = (b, c) if a == v else (c, a) if b == v else (a, b)
+            link[a] = b, f
+        return link
+
+    @staticmethod
+    def _fan(link: dict[int, tuple[int, int]]) -> list[_Face]:
+        """``(a, b, face)`` in order around the vertex, from its boundary or from the smallest neighbour."""
+        a = min(link.keys() - {b for b, _ in link.values()} or link)
+        fan: list[_Face] = []
+        while a in link and not (fan and a == fan[0][0]):
+            fan.append((a, *link[a]))
+            a = fan[-1][1]
+        return fan
+
+    def _across(self, a: int, b: int, f: int) -> list[int]:
+        """The face on the other side of an edge of face f, if there is one."""
+        return list((self.star[a] & self.star[b]) - {f})
+
+    # ------------------------------------------------------------ checks
+
+    def _keeps_topology(self, u: int, v: int) -> bool:
+        """The link condition (Dey, Edelsbrunner, Guha and Nekhayev 1999): lk u ∩ lk v = lk uv, with boundary."""
+        shared = self.star[u] & self.star[v]
+        opposite = {w for f in shared for w in self.faces[f]} - {u, v}
+        link_u, link_v = self._link(u), self._link(v)
+        return (
+            {*self._ring(u)} & {*self._ring(v)} == opposite
+            and not (self.boundary[u] and len(shared) == 2)
+            # The face (u, a, b) must not come to lie on a face (v, b, a), as it would on a tetrahedron.
+            and not any(link_v.get(b, (None,))[0] == a for a, (b, _) in link_u.items())
+            and all(self.star[w] - shared for w in opposite)
+            and (self.star[u] | self.star[v]) != shared
+        )
+
+    def _keeps_shape(self, u: int, v: int, sine: float, *, heal: bool = False) -> bool:
+        """Whether u → v leaves nothing bad that was not worse before, in any shape; or, to ``heal``, less that is."""
+        fan = self._fan(self._link(u))
+        k = len(fan)
+        gone = [v in (a, b) for a, b, _ in fan]
+        stays = [i for i in range(k) if not gone[i]]
+        rows = [(u, a, b) for a, b, _ in fan] + [(v, a, b) for a, b, _ in fan]
+        outer: list[int | None] = []
+        for a, b, f in fan:
+            across = self._across(a, b, f)
+            outer.append(len(rows) if across else None)
+            rows += [self.faces[g] for g in across]
+        neighbours = [(i, (i + 1) % k) for i in range(k if fan[-1][1] == fan[0][0] else k - 1)]
+        before = neighbours + [(i, o) for i, o in enumerate(outer) if o is not None]
+        # Faces that vanish leave the ones behind them as neighbours.
+        new = [outer[i] if gone[i] else k + i for i in range(k)]
+        after = [(new[i], new[j]) for i, j in neighbours if not (gone[i] and gone[j])]
+        after += [(new[i], outer[i]) for i in stays]
+
+        # A face of u that vanishes has no image: put another in its place rather than one without area.
+        for i in range(k):
+            if gone[i]:
+                rows[k + i] = rows[i]
+        normals, squares = _sides(self.points[np.array(rows).T])
+        sines, normals = _squared_sines(normals, squares), _unit(normals)
+        kept = [(i, j) for i, j in after if i is not None and j is not None]
+        was = _quality(sines, normals, list(range(k)), before, sine)
+        becomes = _quality(sines, normals, [k + i for i in stays], kept, sine)
+        if heal:
+            return becomes.faults < was.faults
+        turns = _dots(normals[stays], normals[[k + i for i in stays]])
+        return (
+            becomes.sine >= min(sine**2, was.sine)
+            and becomes.fold >= min(FOLD_LIMIT, was.fold)
+            and bool((turns >= TURN_LIMIT).all())
+        )
+
+    # ------------------------------------------------------------ changes
+
+    def _collapse(self, u: int, v: int) -> None:
+        shared = self.star[u] & self.star[v]
+        for f in shared:
+            for w in self.faces.pop(f):
+                self.star[w].discard(f)
+        for f in self.star[u]:
+            a, b, c = self.faces[f]
+            self.faces[f] = (v if a == u else a, v if b == u else b, v if c == u else c)
+        self.star[v] |= self.star[u]
+        self.star[u] = set()
+        self.quadrics[v] += self.quadrics[u]
+        self.areas[v] += self.areas[u]
+        self.count -= 1
+        self.version[u] += 1
+        self.refused.pop(u, None)
+        self._offer_again([v])
+
+    def _collapse_one(self, vertices: list[int], target: int, sine: float, *, heal: bool) -> bool:
+        """Do the cheapest possible collapse of one of some vertices; whether there was one."""
+        pairs = [(u, v) for u in vertices if not self.locked[u] for v in self._ring(u)]
+        if self.count <= target or not pairs:
+            return False
+        for i in np.argsort(self._costs(np.array(pairs)), kind="stable"):
+            u, v = pairs[i]
+            if self._keeps_topology(u, v) and self._keeps_shape(u, v, sine, heal=heal):
+                self._collapse(u, v)
+                return True
+        return False
+
+    def _flip_one(self, u: int, sine: float) -> bool:
+        """Flip an edge at u if that makes slivers and folds fewer; whether there was one."""
+        link = self._link(u)
+        for w, (c, f) in sorted(link.items()):
+            d, g = next(((a, g) for a, (b, g) in link.items() if b == w), (None, None))
+            if d is None or g is None or c == d or c in self._ring(d):
+                continue
+            # An inner vertex keeps three faces, one on the boundary one.
+            if any(len(self.star[x]) < (2 if self.boundary[x] else 4) for x in (u, w)):
+                continue
+            old, new = [(u, w, c), (w, u, d)], [(u, d, c), (d, w, c)]
+            rows = old + new
+            before, after = [(0, 1)], [(2, 3)]
+            for a, b, face, i, j in ((w, c, f, 0, 3), (c, u, f, 0, 2), (u, d, g, 1, 2), (d, w, g, 1, 3)):
+                for h in self._across(a, b, face):
+                    before.append((i, len(rows)))
+                    after.append((j, len(rows)))
+                    rows.append(self.faces[h])
+            normals, squares = _sides(self.points[np.array(rows).T])
+            sines, normals = _squared_sines(normals, squares), _unit(normals)
+            was = _quality(sines, normals, [0, 1], before, sine)
+            if _quality(sines, normals, [2, 3], after, sine).faults < was.faults:
+                self.faces[f], self.faces[g] = new
+                self.star[u].discard(g)
+                self.star[w].discard(f)
+                self.star[c].add(g)
+                self.star[d].add(f)
+                self._offer_again([u, w, c, d])
+                return True
+        return False
+
+
+def _quality(sines: FloatArray, normals: FloatArray, faces: list[int], pairs: _Pairs, sine: float) -> _Quality:
+    """Quality of some faces and neighbours, numbered in arrays (k, n) of sin² and (k, n, 3) of unit normals."""
+    angles = sines[faces]
+    folds = _dots(normals[[i for i, _ in pairs]], normals[[j for _, j in pairs]])
+    faults = np.count_nonzero(angles < sine**2) + np.count_nonzero(folds < FOLD_LIMIT)
+    return _Quality(float(angles.min(initial=1)), float(folds.min(initial=1)), int(faults))
+
+
+def _unit(normals: FloatArray) -> FloatArray:
+    unit: FloatArray = normals / np.maximum(np.sqrt(_dots(normals, normals)), 1e-300)[..., None]
+    return unit
+
+
+def _sides(corners: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Normals (…, 3), as long as twice the area, and squared sides (3, …) of triangles with corners (3, …, 3)."""
+    p, q = corners[1] - corners[0], corners[2] - corners[0]
+    normals = np.empty_like(p)
+    normals[..., 0] = p[..., 1] * q[..., 2] - p[..., 2] * q[..., 1]
+    normals[..., 1] = p[..., 2] * q[..., 0] - p[..., 0] * q[..., 2]
+    normals[..., 2] = p[..., 0] * q[..., 1] - p[..., 1] * q[..., 0]
+    r = q - p
+    return normals, np.stack([_dots(side, side) for side in (p, q, r)])
+
+
+def _squared_sines(normals: FloatArray, squares: FloatArray) -> FloatArray:
+    """sin² of the smallest angle: twice the area over the product of the two longer sides."""
+    product = squares.prod(axis=0)
+    return _dots(normals, normals) * squares.min(axis=0) / np.maximum(product, 1e-300)
+
+
+def _monomials(points: FloatArray) -> FloatArray:
+    """(Vf, 10n) products of the homogeneous coordinates of points (Vf, n, 3); the mixed ones twice."""
+    h = np.concatenate([points, np.ones_like(points[..., :1])], axis=-1)
+    i, j = np.triu_indices(4)
+    return (h[..., i] * h[..., j] * np.where(i == j, 1.0, 2.0)).reshape(len(points), -1)
+
+
+def _quadrics(connectivity: Connectivity, shapes: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Squared distances to the planes at a vertex in all shapes (n, Vf, 3), by area.
+
+    Returns:
+        (Vf, 10n) so that the sum over the shapes is a dot product with ``_monomials``, and (Vf,) the areas
+        around the vertices, both averaged over the shapes.
+    """
+    count, (i, j) = connectivity.vertex_count, np.triu_indices(4)
+
+    def gather(normals: FloatArray, points: FloatArray, weights: FloatArray, corners: IntArray) -> FloatArray:
+        plane = np.concatenate([normals, -(normals * points).sum(axis=-1, keepdims=True)], axis=-1)
+        values = plane[..., i] * plane[..., j] * weights[..., None] / len(shapes)
+        values = np.moveaxis(values, 0, 1).reshape(len(corners), -1)
+        out = np.zeros((count, values.shape[1]))
+        for column in corners.T:
+            np.add.at(out, column, values)
+        return out
+
+    faces = connectivity.faces
+    normals = face_normals(shapes, faces, normalised=False)
+    doubled = np.linalg.norm(normals, axis=-1)
+    normals /= np.maximum(doubled, 1e-300)[..., None]
+    quadrics = gather(normals, shapes[:, faces[:, 0]], doubled / 2, faces)
+    areas = np.bincount(faces.ravel(), np.repeat(doubled.mean(axis=0) / 2, 3), minlength=count)
+
+    rim = connectivity.edges[~connectivity.interior]
+    if len(rim):
+        face = connectivity.edge_faces[~connectivity.interior].max(axis=1)
+        along = shapes[:, rim[:, 1]] - shapes[:, rim[:, 0]]
+        squared = (along**2).sum(axis=-1)
+        across = np.cross(normals[:, face], along) / np.sqrt(np.maximum(squared, 1e-300))[..., None]
+        quadrics += gather(across, shapes[:, rim[:, 0]], BOUNDARY_WEIGHT * squared, rim)
+    return quadrics, areas / len(shapes)
+
+
+def _dots(a: FloatArray, b: FloatArray) -> FloatArray:
+    dots: FloatArray = np.einsum("...i,...i->...", a, b)
+    return dots
