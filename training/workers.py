@@ -130,6 +130,7 @@ def _on_cluster(
 ) -> Iterator[tuple[int, Result]]:
     with _client(scheduler) as client:
         from distributed import CancelledError, Future, KilledWorker
+        from distributed.comm import CommClosedError
 
         lost = WorkersError(f"the scheduler at {scheduler} was lost; the same command continues once it is back")
         waiting, deaths = deque(range(len(items))), Counter[int]()
@@ -159,7 +160,7 @@ def _on_cluster(
             k, _ = flying.pop(future.key)
             try:
                 result = future.result()
-            except CancelledError as error:
+            except (CancelledError, CommClosedError) as error:
                 raise lost from error
             except ModuleNotFoundError as error:
                 raise WorkersError(
