@@ -130,7 +130,7 @@ def _on_cluster(
 ) -> Iterator[tuple[int, Result]]:
     with _client(scheduler) as client:
         from distributed import CancelledError, Future, KilledWorker
-        from distributed.comm import CommClosedError
+        from distributed.comm.core import CommClosedError
 
         lost = WorkersError(f"the scheduler at {scheduler} was lost; the same command continues once it is back")
         waiting, deaths = deque(range(len(items))), Counter[int]()
