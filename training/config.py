@@ -124,7 +124,7 @@ class CombinerSettings(_Section):
     edge_channels: int = Field(4, ge=0)
     """Learned constants of each edge, given to the first convolution beside the factors."""
     pairwise: int = Field(4, ge=0)
-    """Principal coefficients of each factor whose products, two factors at a time, correct the affine sum of a residual one."""
+    """Principal coefficients of each factor whose products, two factors at a time, correct a residual's affine sum."""
     dropout: float = Field(0.0, ge=0, lt=1)
     symmetries: bool = True
     """Learn from the training samples' images under the collection's symmetries too, where it has any."""

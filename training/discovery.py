@@ -13,10 +13,12 @@ from typing import Any
 import numpy as np
 
 from geometry.calculus import ShellSpace
+from geometry.coarsening import coarsen
 from geometry.energy import Material
 from geometry.mean import elastic_mean
 from geometry.mesh import TriangleMesh
 from geometry.nric import WeightedNorm
+from geometry.prolongation import Prolongation
 from training import figure
 from training.config import Config, ConfigError
 from training.factors import between, group, names, overlap
@@ -24,12 +26,6 @@ from training.files import write_json, write_npz
 from training.ingest import MeshCollection, normalised, read_collection
 from training.modes import localisation, pga, spga, tangents
 from training.shell_collection import ShellCollection
-
-try:  # TEMPORARY until all modules are there
-    from geometry.coarsening import coarsen
-    from geometry.prolongation import Prolongation
-except ImportError:
-    pass
 
 
 def material(config: Config) -> Material:

@@ -23,9 +23,9 @@ from torch import Tensor, nn
 from geometry.mesh import TriangleMesh
 from geometry.nric import WeightedNorm
 from training.config import Config
+from training.files import write_npz
 from training.fitting import predict
 from training.learning import Composite
-from training.files import write_npz
 from training.sampling import Collection
 
 OPSET = 18

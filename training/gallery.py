@@ -46,7 +46,7 @@ def strip(collection: Collection, composite: Composite, eta: float, seed: int = 
     """
     coordinates = collection.coordinates
     ends = coordinates.uniform(2, np.random.default_rng(seed))
-    codes = torch.as_tensor(np.linspace(*ends, STRIP_FRAMES), dtype=torch.float32)
+    codes = torch.as_tensor(np.linspace(ends[0], ends[1], STRIP_FRAMES), dtype=torch.float32)
     with torch.no_grad():
         factors = composite.factor_shapes(codes)
         joint = composite.combiner(factors)

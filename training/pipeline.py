@@ -207,7 +207,9 @@ STAGES: dict[str, Stage] = {
     "samples": Stage(samples, lambda c: [c.samples], ("samples",)),
     # Files of networks are named by samples and settings, so a change leaves those alone that it doesn't touch.
     "networks": Stage(networks, lambda c: [c.networks, c.monolithic, *c.variants.values()], ()),
-    "evaluation": Stage(evaluation, lambda c: [c.evaluation], ("evaluation.json", "gallery.npz", "report.html", "exact")),
+    "evaluation": Stage(
+        evaluation, lambda c: [c.evaluation], ("evaluation.json", "gallery.npz", "report.html", "exact")
+    ),
     "export": Stage(export_bundle, lambda c: [c.export], ()),
 }
 

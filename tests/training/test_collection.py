@@ -81,8 +81,9 @@ def bars(count: int = 8) -> tuple[np.ndarray, np.ndarray]:
         bend = left * np.clip(-x / 300, 0, 1) ** 2 + right * np.clip(x / 300, 0, 1) ** 2
         turn = 0.5 * twist * np.clip(x / 300, 0, 1)
         y, z = np.cos(turn) * y - np.sin(turn) * z, np.sin(turn) * y + np.cos(turn) * z
-        shapes.append(np.stack([x * np.cos(bend) - z * np.sin(bend), y, np.abs(x) * np.sin(bend) + z * np.cos(bend)], 1))
-    return np.array(shapes) + [1000.0, 0, 0], ball.faces
+        x, z = x * np.cos(bend) - z * np.sin(bend), np.abs(x) * np.sin(bend) + z * np.cos(bend)
+        shapes.append(np.stack([1000 + x, y, z], axis=1))
+    return np.array(shapes), ball.faces
 
 
 @pytest.fixture(scope="session")
@@ -207,7 +208,8 @@ def test_init_writes_a_configuration_that_the_command_takes(folder: Path, tmp_pa
     out = tmp_path / "mine.toml"
     shapespace = [sys.executable, "-m", "training"]
     subprocess.run([*shapespace, "init", str(folder / "meshes"), "--out", str(out)], check=True, capture_output=True)
-    done = subprocess.run(command(out, tmp_path / "run", "--until", "mean"), capture_output=True, text=True, check=False)
+    run = command(out, tmp_path / "run", "--until", "mean")
+    done = subprocess.run(run, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     with np.load(tmp_path / "run" / "mean.npz") as mean:
         assert str(mean["status"]) == "converged"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from geometry.nric import WeightedNorm, nric
+from geometry.nric import WeightedNorm
 from training.config import EvaluationSettings
 from training.evaluation import MultilinearGrid, Reconstructions, alone, grid_nodes, r_squared
 from training.freaky_torus import FreakyTorus
