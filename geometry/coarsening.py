@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from geometry.mesh import Connectivity, FloatArray, IntArray, MeshError, TriangleMesh, face_normals
 
@@ -168,7 +167,7 @@ class _Decimation:
         used, local = np.unique(faces, return_inverse=True)
         connectivity = Connectivity(local.reshape(-1, 3), len(used))
         normals, squares = _sides(self.points[faces.T])
-        bad: NDArray[np.bool_] = (_squared_sines(normals, squares) < sine**2).any(axis=1)
+        bad = np.asarray((_squared_sines(normals, squares) < sine**2).any(axis=1))
         normals = _unit(normals)
         i, j = connectivity.edge_faces[connectivity.interior].T
         folded = (_dots(normals[i], normals[j]) < FOLD_LIMIT).any(axis=1)

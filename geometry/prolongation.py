@@ -88,6 +88,11 @@ class Prolongation:
         )
         return fine
 
+    @property
+    def vertex_count(self) -> int:
+        """Vf."""
+        return int(self.weights.shape[0])
+
     @cached_property
     def _around(self) -> sp.csr_array:
         return _around(self.faces, self.weights.shape[1] // 2)

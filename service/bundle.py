@@ -17,14 +17,30 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from geometry.mesh import MeshError, TriangleMesh
+from geometry.prolongation import PREFIX, Prolongation, ProlongationError
 from service.manifest import NAME_PATTERN, VERSION_PATTERN, FileEntry, Manifest
 
 MANIFEST = "manifest.json"
 MANIFEST_LIMIT = 4 * 2**20
+#: The fine mesh lies this close to what the reference is prolonged to, as a fraction of the diagonal: float32.
+FINE_TOLERANCE = 1e-5
 
 
 class BundleError(ValueError):
     """A bundle that must not be served, with one line that says why."""
+
+
+@dataclass(frozen=True)
+class FineMesh:
+    """A finer mesh that follows the coarse one.
+
+    Attributes:
+        reference: at the coarse reference.
+        prolong: coarse vertices to fine ones.
+    """
+
+    reference: TriangleMesh
+    prolong: Prolongation
 
 
 @dataclass(frozen=True)
@@ -36,12 +52,14 @@ class Bundle:
         digest: SHA-256 of the manifest in hexadecimal. The manifest holds the digests of all files, so this
             one identifies every byte of the bundle.
         reference: the reference shape, normalised.
+        fine: the finer mesh, if there is one.
         networks: bytes of each ONNX file by its name.
     """
 
     manifest: Manifest
     digest: str
     reference: TriangleMesh
+    fine: FineMesh | None
     networks: Mapping[str, bytes]
 
 
@@ -71,10 +89,10 @@ def read_bundle(folder: Path) -> Bundle:
     for extra in sorted(present - manifest.files.keys() - {MANIFEST}):
         raise BundleError(f"{extra} is not in the manifest")
     files = {file: _verified(folder / file, entry) for file, entry in manifest.files.items()}
-    reference = _reference(files.pop(manifest.geometry.file), manifest)
+    reference, fine = _geometry(files.pop(manifest.geometry.file), manifest)
     for file, content in files.items():
         _check_network(file, content)
-    return Bundle(manifest, hashlib.sha256(text).hexdigest(), reference, files)
+    return Bundle(manifest, hashlib.sha256(text).hexdigest(), reference, fine, files)
 
 
 def _regular_files(folder: Path) -> set[str]:
@@ -108,7 +126,7 @@ def _verified(path: Path, entry: FileEntry) -> bytes:
     return content
 
 
-def _reference(content: bytes, manifest: Manifest) -> TriangleMesh:
+def _geometry(content: bytes, manifest: Manifest) -> tuple[TriangleMesh, FineMesh | None]:
     file = manifest.geometry.file
     try:
         with np.load(io.BytesIO(content), allow_pickle=False) as arrays:
@@ -131,7 +149,53 @@ def _reference(content: bytes, manifest: Manifest) -> TriangleMesh:
         )
     if not np.array_equal(edges, reference.edges):
         raise BundleError(f"{file}: edges are not those of the faces in lexicographic order")
-    return reference
+    m, V = manifest.latent_dimension, manifest.vertices
+    for array_name, wanted, text in (
+        ("modes", (m, V, 3), f"({m}, {V}, 3)"),
+        ("training_codes", (None, m), f"(n, {m})"),
+    ):
+        _check_shape(file, geometry, array_name, wanted, text)
+    return reference, _fine(file, geometry, reference)
+
+
+def _check_shape(
+    file: str, geometry: Mapping[str, NDArray], name: str, wanted: tuple[int | None, ...], text: str
+) -> None:
+    if name not in geometry:
+        return
+    array = geometry[name]
+    fits = len(array.shape) == len(wanted) and all(
+        want in (None, size) for size, want in zip(array.shape, wanted, strict=True)
+    )
+    if not fits or not np.issubdtype(array.dtype, np.floating):
+        raise BundleError(f"{file}: {name} must be real numbers {text}, not {array.dtype} {array.shape}")
+
+
+def _fine(file: str, geometry: Mapping[str, NDArray], reference: TriangleMesh) -> FineMesh | None:
+    if not any(name.startswith(("fine_", PREFIX)) for name in geometry):
+        return None
+    try:
+        fine = TriangleMesh.from_arrays(geometry["fine_vertices"], geometry["fine_faces"])
+        prolong = Prolongation.from_arrays(geometry)
+    except KeyError as error:
+        raise BundleError(f"{file} has no array {error}, which goes with the other arrays of a fine mesh") from None
+    except ProlongationError as error:
+        raise BundleError(f"{file}: {error}") from None
+    except MeshError as error:
+        raise BundleError(f"{file}: fine mesh: {error}") from None
+    if not np.array_equal(prolong.faces, reference.faces):
+        raise BundleError(f"{file}: {PREFIX}faces are not the faces of the mesh")
+    if prolong.vertex_count != len(fine.vertices):
+        raise BundleError(
+            f"{file}: the prolongation is to {prolong.vertex_count} vertices, but there are {len(fine.vertices)} "
+            "fine_vertices"
+        )
+    distance = np.linalg.norm(prolong(reference.vertices) - fine.vertices, axis=1).max()
+    if distance > FINE_TOLERANCE * fine.diagonal:
+        raise BundleError(
+            f"{file}: fine_vertices are up to {distance:.1e} away from where the prolongation takes the reference"
+        )
+    return FineMesh(fine, prolong)
 
 
 def _check_network(file: str, content: bytes) -> None:

@@ -87,9 +87,9 @@ async def shape_response(
         return answer
 
     def make(deadline: float) -> tuple[bytes, Shape, float]:
-        shape = model.reference_shape() if code is None else solve(service.workers, model, mesh, code, deadline)
+        shape = model.reference_shape(mesh) if code is None else solve(service.workers, model, mesh, code, deadline)
         began = time.perf_counter()
-        content = SHAPE_FORMATS[format].encode(shape.vertices, model.faces)
+        content = SHAPE_FORMATS[format].encode(shape.vertices, model.mesh(mesh).faces)
         return content, shape, time.perf_counter() - began
 
     with service.workers.admit() as deadline:

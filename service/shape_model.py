@@ -14,7 +14,7 @@ import numpy as np
 import onnxruntime
 from numpy.typing import NDArray
 
-from geometry.mesh import FloatArray, align
+from geometry.mesh import FloatArray, TriangleMesh, align
 from geometry.reconstruction import Reconstruction, Reconstructor, Status
 from service.bundle import Bundle, BundleError
 from service.latent_space import Codes, LatentSpace, NotFiniteError
@@ -59,8 +59,8 @@ class Shape:
     """A shape as it leaves: aligned to the reference, in the units of the training meshes.
 
     Attributes:
-        vertices: (V, 3).
-        diagnostics: how well it was found.
+        vertices: (V, 3), of the mesh that was asked for.
+        diagnostics: how well it was found; of the coarse mesh.
         seconds: time spent by stage, ``network`` and ``reconstruct``.
     """
 
@@ -102,7 +102,7 @@ class ShapeModel:
         manifest = bundle.manifest
         self.manifest, self.digest = manifest, bundle.digest
         self.latents = LatentSpace(manifest)
-        self.reference = bundle.reference
+        self.reference, self.fine = bundle.reference, bundle.fine
         n_nric = 2 * manifest.edges
         self._factors = [
             _Session(bundle, factor, [factor.stop - factor.start], [n_nric]) for factor in manifest.factors
@@ -115,15 +115,14 @@ class ShapeModel:
         for _ in range(threads):
             self._solvers.put(Reconstructor(self.reference, manifest.eta_reconstruction))
 
-    @property
-    def faces(self) -> NDArray[np.int64]:
-        """(F, 3)."""
-        return self.reference.faces
+    def mesh(self, choice: MeshChoice) -> TriangleMesh:
+        """The reference, normalised, on the mesh of choice; its faces are those of every shape."""
+        return self.fine.reference if self.fine and choice is MeshChoice.FINE else self.reference
 
-    def reference_shape(self) -> Shape:
+    def reference_shape(self, mesh: MeshChoice = MeshChoice.FINE) -> Shape:
         """The reference itself: the answer where there is no code."""
         diagnostics = Diagnostics(Status.CONVERGED, 0, 0.0, 0, True, self.digest)
-        vertices = self.manifest.scale * self.reference.vertices
+        vertices = self.manifest.scale * self.mesh(mesh).vertices
         return Shape(vertices, diagnostics, {"network": 0.0, "reconstruct": 0.0})
 
     def shape(
@@ -152,8 +151,12 @@ class ShapeModel:
         predicted = time.perf_counter()
         with self._solver() as reconstruct:
             found: Reconstruction = reconstruct(target[0], start, tolerance=TOLERANCE, deadline=deadline)
-        vertices = self.manifest.scale * align(found.vertices, self.reference.vertices)
-        with np.errstate(over="ignore"):
+        vertices = align(found.vertices, self.reference.vertices)
+        with np.errstate(over="ignore", invalid="ignore"):
+            # The fine mesh moves along with the coarse one, so that aligning this one aligns both.
+            if self.fine and mesh is MeshChoice.FINE:
+                vertices = self.fine.prolong(vertices)
+            vertices = self.manifest.scale * vertices
             if found.status is Status.NOT_FINITE or not np.isfinite(vertices.astype(np.float32)).all():
                 raise NotFiniteError(self._overflow)
         diagnostics = Diagnostics(

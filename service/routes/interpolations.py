@@ -81,7 +81,7 @@ async def get_interpolation(service: ServiceDependency, request: Request, id: Id
 
     with service.workers.admit() as deadline:
         found = await shapes(service, model, codes, inside, animation.mesh, deadline)
-        frames = Frames(found, model.faces, animation.positions, codes)
+        frames = Frames(found, model.mesh(animation.mesh).faces, animation.positions, codes)
         began = time.perf_counter()
         content, facts = await service.workers.run(lambda _: SEQUENCE_FORMATS[chosen].encode(frames), deadline)
     diagnostics = worst([shape.diagnostics for shape in found]) | facts
@@ -126,13 +126,14 @@ def _find(service: Service, id: str) -> tuple[Animation, ShapeModel]:
 async def _stream(service: Service, animation: Animation, model: ShapeModel) -> AsyncGenerator[bytes, None]:
     codes, inside = model.latents.codes(animation.codes(model.latents))
     work = partial(solve, service.workers, model, animation.mesh)
+    faces = model.mesh(animation.mesh).faces
     with service.workers.admit():
         # Each frame has the deadline to itself: a stream may take as long as its reader likes.
         results = service.workers.map(work, zip(codes, map(bool, inside), strict=True), None)
         async with aclosing(results):
             k = 0
             async for shape in results:
-                yield json_line(k, float(animation.positions[k]), shape, None if k else model.faces)
+                yield json_line(k, float(animation.positions[k]), shape, None if k else faces)
                 k += 1
 
 

@@ -98,7 +98,8 @@ async def post_vertices(
             vertices = float32(np.stack([shape.vertices for shape in found]))
             if chosen == "json":
                 return dump_json({"vertices": vertices, "diagnostics": list(map(asdict, diagnostics))})
-            return npz(vertices=vertices, faces=model.faces, latents=codes, **diagnostics_arrays(diagnostics))
+            faces = model.mesh(body.mesh).faces
+            return npz(vertices=vertices, faces=faces, latents=codes, **diagnostics_arrays(diagnostics))
 
         content = await service.workers.run(encode, deadline)
     seconds = {**total_seconds(found), "encode": time.perf_counter() - began}

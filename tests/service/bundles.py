@@ -14,6 +14,7 @@ from onnx import TensorProto, helper, numpy_helper
 from geometry.formats import npz
 from geometry.mesh import TriangleMesh
 from geometry.nric import nric
+from geometry.prolongation import Prolongation
 from training import freaky_torus
 
 SCALE = 3.0
@@ -22,16 +23,26 @@ LATENTS = ("size", "turn", "twist")
 
 def reference() -> TriangleMesh:
     """A coarse torus of unit area."""
-    torus = freaky_torus.reference()
-    v = torus.vertices.reshape(64, 32, 3)[::8, ::4].reshape(-1, 3)
-    i, j = np.meshgrid(np.arange(8), np.arange(8), indexing="ij")
+    mesh = torus(8, 8)
+    return mesh.with_vertices(mesh.vertices / np.sqrt(mesh.area))
+
+
+def fine_reference() -> TriangleMesh:
+    """A finer torus at the same place; every other vertex of every fourth ring is one of the coarse one."""
+    mesh = torus(32, 16)
+    return mesh.with_vertices(mesh.vertices / np.sqrt(torus(8, 8).area))
+
+
+def torus(n: int, m: int) -> TriangleMesh:
+    """Of n rings with m vertices each."""
+    v = freaky_torus.reference().vertices.reshape(64, 32, 3)[:: 64 // n, :: 32 // m].reshape(-1, 3)
+    i, j = np.meshgrid(np.arange(n), np.arange(m), indexing="ij")
 
     def at(di: int, dj: int) -> np.ndarray:
-        return ((i + di) % 8 * 8 + (j + dj) % 8).ravel()
+        return ((i + di) % n * m + (j + dj) % m).ravel()
 
     faces = np.concatenate([np.stack([at(0, 0), at(1, 0), at(1, 1)], 1), np.stack([at(0, 0), at(1, 1), at(0, 1)], 1)])
-    mesh = TriangleMesh.from_arrays(v, faces)
-    return mesh.with_vertices(mesh.vertices / np.sqrt(mesh.area))
+    return TriangleMesh.from_arrays(v, faces)
 
 
 def directions(mesh: TriangleMesh) -> np.ndarray:
@@ -188,7 +199,21 @@ def manifest(name: str, version: str, *, start: bool = False) -> dict[str, Any]:
     }
 
 
-def write_bundle(models: Path, name: str = "small", version: str = "1", *, start: bool = False) -> Path:
+def fine_arrays() -> dict[str, np.ndarray]:
+    """What geometry.npz holds where there is a finer mesh, with modes and codes beside it."""
+    mesh, fine = reference(), fine_reference()
+    return {
+        "fine_vertices": fine.vertices,
+        "fine_faces": fine.faces.astype(np.int32),
+        "modes": np.zeros((3, len(mesh.vertices), 3), np.float32),
+        "training_codes": np.zeros((5, 3)),
+        **Prolongation.of(mesh, fine).arrays(),
+    }
+
+
+def write_bundle(
+    models: Path, name: str = "small", version: str = "1", *, start: bool = False, fine: bool = False
+) -> Path:
     """Write a whole bundle and return its folder."""
     folder = models / name / version
     folder.mkdir(parents=True)
@@ -197,7 +222,8 @@ def write_bundle(models: Path, name: str = "small", version: str = "1", *, start
         (folder / file).write_bytes(model.SerializeToString())
     if start:
         (folder / "start.onnx").write_bytes(start_network().SerializeToString())
-    (folder / "geometry.npz").write_bytes(npz(vertices=mesh.vertices, faces=mesh.faces, edges=mesh.edges))
+    arrays = {"vertices": mesh.vertices, "faces": mesh.faces, "edges": mesh.edges}
+    (folder / "geometry.npz").write_bytes(npz(**arrays, **(fine_arrays() if fine else {})))
     seal(folder, manifest(name, version, start=start))
     return folder
 

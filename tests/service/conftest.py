@@ -85,12 +85,13 @@ def start() -> Iterator[Start]:
 
 @pytest.fixture(scope="session")
 def models(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The bundled models, and beside them a small one in versions 1, 2 and 10."""
+    """The bundled models, and beside them a small one in versions 1, 2 and 10, and one with a finer mesh."""
     folder = tmp_path_factory.mktemp("served") / "models"
     shutil.copytree(ROOT / "models", folder)
     write_bundle(folder, "small", "1")
     write_bundle(folder, "small", "2", start=True)
     write_bundle(folder, "small", "10")
+    write_bundle(folder, "with-fine", fine=True)
     return folder
 
 

@@ -17,7 +17,7 @@ from geometry.formats import npz
 from service.bundle import BundleError, read_bundle
 from service.repository import ModelRepository
 from service.shape_model import ShapeModel
-from tests.service.bundles import network, networks, reference, seal, write_bundle
+from tests.service.bundles import fine_arrays, network, networks, reference, seal, write_bundle
 from tests.service.conftest import Start
 
 Spoil = Callable[[Path], None]
@@ -202,6 +202,61 @@ def no_edges(folder: Path) -> None:
     seal(folder)
 
 
+def no_fine_faces(folder: Path) -> None:
+    arrays = fine_arrays()
+    del arrays["fine_faces"]
+    geometry(folder, **arrays)
+
+
+def no_prolongation(folder: Path) -> None:
+    arrays = fine_arrays()
+    del arrays["prolongation_weights"]
+    geometry(folder, **arrays)
+
+
+def fine_face_out_of_range(folder: Path) -> None:
+    arrays = fine_arrays()
+    arrays["fine_faces"][7, 1] = 512
+    geometry(folder, **arrays)
+
+
+def fewer_fine_vertices(folder: Path) -> None:
+    mesh = reference()
+    geometry(folder, **fine_arrays() | {"fine_vertices": mesh.vertices, "fine_faces": mesh.faces})
+
+
+def moved_fine_vertex(folder: Path) -> None:
+    arrays = fine_arrays()
+    arrays["fine_vertices"] = arrays["fine_vertices"] + np.eye(512, 3)
+    geometry(folder, **arrays)
+
+
+def prolongation_of_other_faces(folder: Path) -> None:
+    arrays = fine_arrays()
+    arrays["prolongation_faces"] = np.roll(arrays["prolongation_faces"], 1, axis=0)
+    geometry(folder, **arrays)
+
+
+def index_out_of_range(folder: Path) -> None:
+    arrays = fine_arrays()
+    arrays["prolongation_indices"][3] = 128
+    geometry(folder, **arrays)
+
+
+def infinite_prolongation(folder: Path) -> None:
+    arrays = fine_arrays()
+    arrays["prolongation_weights"][3] = np.inf
+    geometry(folder, **arrays)
+
+
+def flat_modes(folder: Path) -> None:
+    geometry(folder, modes=np.zeros((3, 192)))
+
+
+def codes_too_long(folder: Path) -> None:
+    geometry(folder, training_codes=np.zeros((5, 4)))
+
+
 FAULTS: dict[Spoil, str] = {
     flip_a_bit: "factor-0.onnx does not have the digest",
     truncate: "geometry.npz has",
@@ -234,6 +289,16 @@ FAULTS: dict[Spoil, str] = {
     turned_face: "oriented oppositely",
     pickled_geometry: "geometry.npz is not a readable NPZ file",
     no_edges: "geometry.npz has no array 'edges'",
+    no_fine_faces: "geometry.npz has no array 'fine_faces', which goes with",
+    no_prolongation: "geometry.npz: there is no array prolongation_weights",
+    fine_face_out_of_range: "geometry.npz: fine mesh: faces name vertices 0 to 512",
+    fewer_fine_vertices: "the prolongation is to 512 vertices, but there are 64 fine_vertices",
+    moved_fine_vertex: "fine_vertices are up to 1.0e+00 away",
+    prolongation_of_other_faces: "prolongation_faces are not the faces of the mesh",
+    index_out_of_range: "prolongation_indices must lie in [0, 128)",
+    infinite_prolongation: "prolongation_weights has an entry that is not finite",
+    flat_modes: "modes must be real numbers (3, 64, 3), not float64 (3, 192)",
+    codes_too_long: "training_codes must be real numbers (n, 3), not float64 (5, 4)",
 }
 
 

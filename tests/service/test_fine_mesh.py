@@ -1,0 +1,125 @@
+"""Models with a finer mesh: every call that takes ``mesh`` answers the one that was asked for."""
+
+import io
+import json
+import zipfile
+from typing import Any
+
+import httpx
+import numpy as np
+import pytest
+
+from geometry.formats import MESH_FORMATS, read_mesh
+from geometry.mesh import TriangleMesh
+from tests.service.bundles import SCALE, fine_reference, reference
+from tests.service.glb import GLB
+
+MODEL = "/v1/models/with-fine"
+CODE = [0.1, 0.7, 0.4]
+MESHES = {"fine": fine_reference, "coarse": reference}
+
+
+@pytest.fixture(params=[*MESHES, None], ids=["fine", "coarse", "default"])
+def choice(request: pytest.FixtureRequest) -> dict[str, str]:
+    """What to ask with."""
+    return {"mesh": request.param} if request.param else {}
+
+
+@pytest.fixture
+def rest(choice: dict[str, str]) -> TriangleMesh:
+    """The mesh that is to be answered, at rest."""
+    return MESHES[choice.get("mesh", "fine")]()
+
+
+def shape(client: httpx.Client, mesh: str, code: list[float]) -> np.ndarray:
+    answer = client.post(f"{MODEL}/mesh", json={"latent": code, "mesh": mesh}, params={"format": "json"})
+    return np.array(answer.raise_for_status().json()["vertices"])
+
+
+def test_the_reference(client: httpx.Client, choice: dict[str, str], rest: TriangleMesh) -> None:
+    answer = client.get(f"{MODEL}/mesh", params={"format": "json", **choice}).raise_for_status().json()
+    assert np.array_equal(answer["faces"], rest.faces)
+    np.testing.assert_allclose(answer["vertices"], SCALE * rest.vertices, atol=1e-6)
+
+
+@pytest.mark.parametrize("format", [*MESH_FORMATS, "json"])
+def test_files(client: httpx.Client, choice: dict[str, str], rest: TriangleMesh, format: str) -> None:
+    expected = shape(client, choice.get("mesh", "fine"), CODE)
+    link = client.get(f"{MODEL}/mesh", params={"latent": "0.1,0.7,0.4", "format": format, **choice})
+    post = client.post(f"{MODEL}/mesh", json={"latent": CODE, **choice}, params={"format": format})
+    assert link.content == post.raise_for_status().content
+    assert link.headers["ETag"] == post.headers["ETag"]
+    if format == "json":
+        assert np.array_equal(link.json()["faces"], rest.faces)
+        return
+    mesh = read_mesh(link.content, format)
+    if format == "stl":
+        np.testing.assert_allclose(mesh.vertices, expected[rest.faces].reshape(-1, 3), atol=1e-6)
+    else:
+        np.testing.assert_allclose(mesh.vertices, expected, atol=1e-6)
+        assert np.array_equal(mesh.faces, rest.faces)
+
+
+def test_positions_of_many(client: httpx.Client, choice: dict[str, str], rest: TriangleMesh) -> None:
+    body = {"latents": [CODE, [0, 0, 0]], **choice}
+    answer = client.post(f"{MODEL}/vertices", json=body).raise_for_status().json()["vertices"]
+    assert np.array_equal(answer[0], shape(client, choice.get("mesh", "fine"), CODE))
+    packed = client.post(f"{MODEL}/vertices", json=body, params={"format": "npz"}).raise_for_status()
+    with np.load(io.BytesIO(packed.content)) as arrays:
+        assert np.array_equal(arrays["vertices"], np.float32(answer))
+        assert np.array_equal(arrays["faces"], rest.faces)
+
+
+def test_animations(client: httpx.Client, choice: dict[str, str], rest: TriangleMesh) -> None:
+    body: dict[str, Any] = {"keyframes": [[0, 0, 0], CODE], "frames": 3, **choice}
+    links = client.post(f"{MODEL}/interpolations", json=body).raise_for_status().json()["links"]
+    last = shape(client, choice.get("mesh", "fine"), CODE)
+
+    def get(link: str) -> bytes:
+        return client.get(links[link]).raise_for_status().content
+
+    with np.load(io.BytesIO(get("npz"))) as arrays:
+        assert np.array_equal(arrays["vertices"][2], np.float32(last))
+        assert np.array_equal(arrays["faces"], rest.faces)
+    animated = GLB(get("self"))
+    assert np.array_equal(animated.faces, rest.faces)
+    np.testing.assert_allclose(animated.key(2), last, atol=1e-6)
+    with zipfile.ZipFile(io.BytesIO(get("zip"))) as archive:
+        mesh = read_mesh(archive.read(archive.namelist()[2]), "obj")
+    np.testing.assert_allclose(mesh.vertices, last, atol=1e-6)
+    assert np.array_equal(mesh.faces, rest.faces)
+    lines = [json.loads(line) for line in get("jsonl").splitlines()]
+    assert np.array_equal(lines[0]["faces"], rest.faces)
+    assert np.array_equal(lines[2]["vertices"], last)
+    frame = client.get(links["frames"].format(k=2), params={"format": "json"}).raise_for_status().json()
+    assert np.array_equal(frame["vertices"], last)
+    assert np.array_equal(frame["faces"], rest.faces)
+
+
+def test_both_meshes_lie_at_the_same_place(client: httpx.Client) -> None:
+    on_fine = shape(client, "fine", CODE).reshape(32, 16, 3)[::4, ::2].reshape(-1, 3)
+    coarse = shape(client, "coarse", CODE)
+    np.testing.assert_allclose(on_fine, coarse, atol=1e-6)
+    assert np.abs(coarse - SCALE * reference().vertices).max() > 0.05, "a shape that doesn't move proves nothing"
+
+
+def test_the_fine_mesh_grows_with_the_coarse_one(client: httpx.Client) -> None:
+    x, centre = SCALE * fine_reference().vertices, SCALE * reference().vertices.mean(axis=0)
+    np.testing.assert_allclose(shape(client, "fine", [0.15, 0, 0]), centre + 1.15 * (x - centre), atol=1e-5)
+
+
+def test_entity_tags_depend_on_the_mesh(client: httpx.Client) -> None:
+    for params in ({}, {"latent": "0.1,0.7,0.4"}):
+        fine, coarse, default = (
+            client.get(f"{MODEL}/mesh", params=params | more) for more in ({"mesh": "fine"}, {"mesh": "coarse"}, {})
+        )
+        assert fine.headers["ETag"] == default.headers["ETag"] != coarse.headers["ETag"]
+        assert fine.content == default.content != coarse.content
+
+
+def test_a_model_without_a_finer_mesh_answers_with_the_one_it_has(client: httpx.Client) -> None:
+    fine, coarse = (
+        client.get("/v1/models/small/mesh", params={"latent": "0.1,0.7,0.4", "mesh": mesh}).raise_for_status()
+        for mesh in ("fine", "coarse")
+    )
+    assert fine.content == coarse.content
