@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections import deque
-
 import numpy as np
 
 from geometry.mesh import FloatArray
@@ -20,18 +18,20 @@ class Anderson:
     """
 
     def __init__(self, depth: int = 5) -> None:
-        self._history: deque[tuple[FloatArray, FloatArray, FloatArray]] = deque(maxlen=depth)
-        self._last: tuple[FloatArray, FloatArray, FloatArray] | None = None
+        self._depth = depth
+        self._count = 0
+        self._last: FloatArray | None = None
+        self._history = np.empty(0)
 
     def __call__(self, x: FloatArray, forces: FloatArray, step: FloatArray) -> FloatArray:
         """The next iterate from x, F(x) and M⁻¹F(x), all of one shape."""
-        now = (x, forces, step)
-        if self._last is not None:
-            dx, df, ds = (a - b for a, b in zip(now, self._last, strict=True))
-            self._history.append((dx + ds, df, ds))
-        self._last = now
-        if not self._history:
-            return x + step
-        df, ds = (np.stack([h[i].ravel() for h in self._history]) for i in (1, 2))
-        mix = np.linalg.lstsq(ds @ df.T, ds @ forces.ravel(), rcond=None)[0]
-        return x + step - np.einsum("n,n...->...", mix, np.stack([h[0] for h in self._history]))
+        now = np.concatenate([x, forces, step], axis=None).reshape(3, -1)
+        now[0] += now[2]
+        if self._last is None:
+            self._last, self._history = now, np.empty((3, self._depth, x.size))
+            return now[0].reshape(x.shape)
+        np.subtract(now, self._last, out=self._history[:, self._count % self._depth])
+        self._last, self._count = now, self._count + 1
+        images, df, ds = self._history[:, : self._count]
+        mix = np.linalg.lstsq(ds @ df.T, ds @ now[1], rcond=None)[0]
+        return (now[0] - mix @ images).reshape(x.shape)

@@ -25,6 +25,7 @@ from geometry.mesh import FloatArray, TriangleMesh
 from geometry.normal_matrix import NormalMatrix, QuadraticForm
 from geometry.nric import NRICGradients, NRICJacobian, nric, wrap
 from geometry.reconstruction import Status
+from geometry.turning import Turning
 
 #: Solved to here: ``sqrt(Fᵀ A⁻¹ F)``, the distance that a Newton step would still go, as a length in the metric.
 TOLERANCE = 1e-9
@@ -56,6 +57,11 @@ class Point:
     def gradients(self) -> NRICGradients:
         """``Dz(X)`` in parts."""
         return self.space.jacobian.gradients(self.vertices)
+
+    @cached_property
+    def frames(self) -> FloatArray:
+        """(xyz, 3, F) of the faces."""
+        return self.space.turning.frames(self.vertices)
 
     @cached_property
     def hessian(self) -> QuadraticForm:
@@ -110,22 +116,41 @@ class ChordSolver:
     def __init__(self, matrix: NormalMatrix, cholesky: Cholesky, number: int) -> None:
         self._matrix, self._cholesky, self._number = matrix, cholesky, number
         self._rigid = np.zeros((0, 0))
+        self._turn: FloatArray | None = None
 
     def factorise(self, point: Point) -> None:
         """Take the matrix of this shape; raises NotPositiveDefiniteError."""
         self._cholesky.factorise(self._matrix.entries(point.gradients, point.hessian), self._number)
         self._rigid = rigid_motions(point.vertices)
+        self._turn = None
         self.at = point
 
-    def project(self, tangent: FloatArray) -> FloatArray:
-        """The vertex field (V, 3) whose J d comes closest to a change (2E,) of lengths and angles, at ``at``."""
-        return self.solve(self.at.pull_back(self.at.lower(tangent)))
+    def turn_to(self, point: Point) -> None:
+        """Serve another shape from now on: ``R A⁻¹ Rᵀ`` and ``J Rᵀ`` with rotations of the vertices to it."""
+        self._turn = point.space.turning(self.at.frames, point.frames)
 
     def solve(self, forces: FloatArray) -> FloatArray:
         """``A⁻¹F`` (…, V, 3), up to the rigid motions of the factor's shape."""
+        return self._there(self._solve(self._back(forces)))
+
+    def push_forward(self, displacement: FloatArray) -> FloatArray:
+        """``J d`` (2E,) of a vertex field (V, 3), with the factor's shape's J."""
+        return self.at.push_forward(self._back(displacement))
+
+    def project(self, tangent: FloatArray) -> FloatArray:
+        """The vertex field (V, 3) whose J d comes closest to a change (2E,) of lengths and angles."""
+        return self._there(self._solve(self.at.pull_back(self.at.lower(tangent))))
+
+    def _solve(self, forces: FloatArray) -> FloatArray:
         flat = forces.reshape(-1, forces.shape[-2] * 3)
         balanced = flat - (flat @ self._rigid.T) @ self._rigid
         return self._cholesky.solve(balanced, self._number).reshape(forces.shape)
+
+    def _there(self, field: FloatArray) -> FloatArray:
+        return field if self._turn is None else np.einsum("vij,...vj->...vi", self._turn, field)
+
+    def _back(self, field: FloatArray) -> FloatArray:
+        return field if self._turn is None else np.einsum("vji,...vj->...vi", self._turn, field)
 
 
 def rigid_motions(vertices: FloatArray) -> FloatArray:
@@ -168,6 +193,7 @@ class ShellSpace:
         self.backend: Backend = backend
         self.energy = ShellEnergy(self.connectivity, self.material, reference.area)
         self.jacobian = NRICJacobian(self.connectivity)
+        self.turning = Turning(self.connectivity)
         self._matrix = NormalMatrix(self.connectivity)
         self._chords: list[ChordSolver] = []
 
@@ -234,7 +260,7 @@ class Path:
         reason: what happened otherwise, in words.
         iterations: of each solved step, or the iterations on all steps together.
         residuals: ``sqrt(Fᵀ A⁻¹ F)`` of the discrete Euler–Lagrange equation at each inner shape, with A
-            factorised near it.
+            factorised near it; the exponential has taken another step since.
         space: where the path lies.
     """
 

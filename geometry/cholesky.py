@@ -23,6 +23,7 @@ from geometry.mesh import FloatArray, IntArray
 Backend = Literal["auto", "banded", "pardiso"]
 
 _MKL_SEQUENTIAL = 1
+_MINIMUM_DEGREE, _NESTED_DISSECTION = 0, 2
 
 
 class NotPositiveDefiniteError(ArithmeticError):
@@ -151,16 +152,27 @@ class PardisoCholesky:
 
     def __init__(self, pattern: SymmetricPattern, factors: int = 1) -> None:
         self._size = pattern.size
-        self._handle = np.zeros(64, dtype=np.int64)
-        self._options = np.zeros(64, dtype=np.int32)
         self._structure = pattern.indptr + np.int32(1), pattern.indices + np.int32(1)
         #: Entries behind each factor; Pardiso looks at them again when it solves.
         self._entries: list[FloatArray | None] = [None] * factors
         entries = np.ones(len(pattern))
         entries[pattern.diagonal] = len(pattern)
-        self._run(11, entries)
+        # Limbs are better off with minimum degree, balls with nested dissection, by up to a third of the time.
+        sizes = {ordering: self._analyse(ordering, entries) for ordering in (_MINIMUM_DEGREE, _NESTED_DISSECTION)}
+        if sizes[_MINIMUM_DEGREE] < sizes[_NESTED_DISSECTION]:
+            self._analyse(_MINIMUM_DEGREE, entries)
         # No iterative refinement: it doubles the cost of a solve, and every caller iterates itself.
         self._options[7] = 0
+
+    def _analyse(self, ordering: int, entries: FloatArray) -> int:
+        """Analyse, instead of what has been analysed before; returns how many entries the factor will have."""
+        if hasattr(self, "_handle"):
+            self._run(-1, entries)
+        self._handle = np.zeros(64, dtype=np.int64)
+        self._options = np.zeros(64, dtype=np.int32)
+        self._options[[0, 1, 17]] = 1, ordering, -1
+        self._run(11, entries)
+        return int(self._options[17])
 
     def _run(self, phase: int, entries: FloatArray, right: FloatArray | None = None, factor: int = 0) -> FloatArray:
         b = np.zeros(self._size) if right is None else right

@@ -16,13 +16,13 @@ from geometry.mesh import FloatArray
 from geometry.normal_matrix import NormalMatrix
 from geometry.reconstruction import Status
 
-#: Shapes behind a start value: a quintic through six of them leaves an error of sixth order in the step.
-EXTRAPOLATED = 6
-#: A factor is renewed after a step that takes this many iterations more than the first one with it did, and within
-#: a step that looks like taking twice as many more.
-PATIENCE = 2
-#: Steps with new factors from such a step on.
-DISTRUST = 4
+#: Shapes behind a start value: a polynomial through eight of them leaves an error of eighth order in the step.
+EXTRAPOLATED = 8
+#: What a factor costs in iterations. An old one is renewed when it has taken so many more than it did when new, or
+#: looks like taking them within one step.
+COST = 8
+#: Old factors are turned along from the step on in which one took so many more.
+PATIENCE = 1
 #: Two iterations that leave more than this of the residual aren't worth going on with.
 SLOW = 0.5
 #: Iterations of exact Newton at one share of the known part, and the smallest share and step tried.
@@ -100,16 +100,21 @@ def extrapolate(
     if fault:
         return Path(shapes[0][None], Status.DEGENERATE, space, f"the given step: {fault}")
     chord, areas = space.chord, previous.rest.areas
-    # Steps to solve with a factor each before an old one is tried again, and the iterations that a new one takes.
-    renewals, fresh_iterations = 1, 0
+    # Iterations that the factor took when new, and that it has taken more since then.
+    fresh, more, turning = 0, COST, False
     for _ in range(steps):
         equation = _Step(previous, current, forward)
         start = _extrapolated(shapes[-EXTRAPOLATED:])
         wasted, solution = 0, None
-        if not renewals:
-            solution = _chord(equation, start, tolerance, fresh_iterations + 2 * PATIENCE)
+        if more < COST:
+            if turning:
+                chord.turn_to(current)
+            # The factor's matrix may differ from the step's own by a factor of 2 or so.
+            solution = _chord(equation, start, tolerance / 2, fresh + COST)
+            more += max(solution.iterations - fresh, 0)
+            turning = turning or solution.fault is not None or solution.iterations > fresh + PATIENCE
             if solution.fault:
-                wasted, renewals = solution.iterations, DISTRUST
+                wasted = solution.iterations
         if solution is None or solution.fault:
             try:
                 chord.factorise(current)
@@ -117,7 +122,7 @@ def extrapolate(
                 status, reason = Status.DEGENERATE, f"step {len(shapes)}: {error}"
                 break
             solution = _chord(equation, start, tolerance)
-            fresh_iterations, renewals = solution.iterations, renewals - 1
+            fresh, more = solution.iterations, 0
         if solution.fault:
             solution = _newton(equation, tolerance)
         if solution.fault:
@@ -125,8 +130,6 @@ def extrapolate(
             status = Status.STALLED
             reason = f"step {len(shapes)}: {solution.fault}; a face has {smallest:.1e} of its area at the start"
             break
-        if solution.iterations > fresh_iterations + PATIENCE:
-            renewals = max(renewals, 1)
         solved.append(replace(solution, iterations=wasted + solution.iterations))
         shapes.append(solution.point.vertices)
         previous, current = current, solution.point
@@ -203,8 +206,8 @@ def _chord(equation: _Step, start: FloatArray, tolerance: float, limit: float = 
     Args:
         equation: the step to solve.
         start: first guess.
-        tolerance: of ``sqrt(Fᵀ A_k⁻¹ F)``. The factor may be a neighbour's, whose matrix differs by a factor of up
-            to about 2, so half of it is aimed at.
+        tolerance: of ``sqrt(Fᵀ A⁻¹ F)``, with the factor at hand. Where it holds, the step at hand is taken as well:
+            that costs little, and what error it leaves grows a hundredfold when shapes are extrapolated.
         limit: iterations, above which it is given up as soon as the rate so far says so.
     """
     space = equation.current.space
@@ -216,10 +219,10 @@ def _chord(equation: _Step, start: FloatArray, tolerance: float, limit: float = 
         step = space.chord.solve(forces)
         residuals.append(float(np.sqrt(np.abs(np.vdot(forces, step)))))
         iterations = len(residuals) - 3
-        if residuals[-1] <= tolerance / 2:
-            return _checked(equation, point, iterations, residuals[-1])
+        if residuals[-1] <= tolerance:
+            return _checked(equation, space.point(x + step), iterations, residuals[-1])
         rate = (residuals[-1] / residuals[2]) ** (1 / max(iterations, 1))
-        needed = iterations + np.log(tolerance / 2 / residuals[-1]) / np.log(rate) if rate < 1 else 0
+        needed = iterations + np.log(tolerance / residuals[-1]) / np.log(rate) if rate < 1 else 0
         if not residuals[-1] < SLOW * residuals[-3] or (iterations > 1 and needed > limit):
             return _Solution(point, iterations, residuals[-1], f"no convergence, residual {residuals[-1]:.1e}")
         x = mixing(x, forces, step)

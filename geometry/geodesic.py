@@ -241,6 +241,9 @@ def _relax(space: ShellSpace, shapes: FloatArray, chords: list[ChordSolver], tol
     for renewal in range(RENEWALS):
         if renewal:
             _renew(space, shapes, chords)
+        else:
+            for chord, x in zip(chords, shapes[1:-1], strict=True):
+                chord.turn_to(space.point(x))
         before = lowest
         mixing, residuals = Anderson(), []
         for _ in range(ITERATIONS):
@@ -256,7 +259,7 @@ def _relax(space: ShellSpace, shapes: FloatArray, chords: list[ChordSolver], tol
                 lowest, best = residuals[-1], shapes.copy()
             if not np.isfinite(residuals[-1]) or (len(residuals) > 3 and residuals[-1] > SLOW * residuals[-4]):
                 break
-            tangents = np.stack([c.at.push_forward(m) for c, m in zip(chords, moves, strict=True)])
+            tangents = np.stack([c.push_forward(m) for c, m in zip(chords, moves, strict=True)])
             moves = np.stack([c.project(t) for c, t in zip(chords, inverse @ tangents, strict=True)])
             shapes[1:-1] = mixing(shapes[1:-1].copy(), forces, moves)
             iterations += 1

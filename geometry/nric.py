@@ -15,16 +15,18 @@ from scipy import sparse
 from geometry.mesh import Connectivity, FloatArray, TriangleMesh
 
 
-def _components(vertices: FloatArray) -> FloatArray:
+def components(vertices: FloatArray) -> FloatArray:
     """(3, …, V): whole arrays of x, y and z are several times faster to work on than rows of three."""
     return np.ascontiguousarray(np.moveaxis(vertices, -1, 0))
 
 
-def _dot(a: FloatArray, b: FloatArray) -> FloatArray:
+def dot(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Scalar products of vectors by components (3, …)."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
+def cross(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Vector products (3, …) of vectors by components (3, …)."""
     out = np.empty_like(a)
     for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
         np.multiply(a[j], b[k], out=out[i])
@@ -37,11 +39,11 @@ class _Frame:
 
     def __init__(self, vertices: FloatArray, connectivity: Connectivity) -> None:
         # `take` on whole components: ten times as fast as indexing.
-        x = _components(vertices)
+        x = components(vertices)
         i, j = connectivity.edge_ends
         self.edges = x.take(j, axis=-1)
         self.edges -= x.take(i, axis=-1)
-        self.lengths = np.sqrt(_dot(self.edges, self.edges))
+        self.lengths = np.sqrt(dot(self.edges, self.edges))
         inner = connectivity.hinge_edges
         closed = connectivity.is_closed
         self.hinge_edges = self.edges if closed else self.edges.take(inner, axis=-1)
@@ -52,23 +54,23 @@ class _Frame:
         self.to_left -= origin
         self.to_right = x.take(right, axis=-1)
         self.to_right -= origin
-        self.left_normal = _cross(self.hinge_edges, self.to_left)
-        self.right_normal = _cross(self.to_right, self.hinge_edges)
+        self.left_normal = cross(self.hinge_edges, self.to_left)
+        self.right_normal = cross(self.to_right, self.hinge_edges)
 
     def angles(self) -> FloatArray:
         """(…, H) by atan2 of (sine, cosine), which stays accurate near 0 and π where arccos does not."""
-        sine = _dot(self.left_normal, self.to_right)
+        sine = dot(self.left_normal, self.to_right)
         sine *= -self.hinge_lengths
         sine += 0.0  # never −0, which arctan2 takes from π to −π at a hinge folded flat
-        return np.arctan2(sine, _dot(self.left_normal, self.right_normal))
+        return np.arctan2(sine, dot(self.left_normal, self.right_normal))
 
 
 def edge_lengths(vertices: FloatArray, connectivity: Connectivity) -> FloatArray:
     """Lengths (…, E) of the edges of shapes (…, V, 3)."""
-    x = _components(vertices)
+    x = components(vertices)
     i, j = connectivity.edge_ends
     edge = x.take(j, axis=-1) - x.take(i, axis=-1)
-    return np.sqrt(_dot(edge, edge))
+    return np.sqrt(dot(edge, edge))
 
 
 def dihedral_angles(vertices: FloatArray, connectivity: Connectivity) -> FloatArray:
@@ -187,10 +189,10 @@ class NRICJacobian:
     def push_forward(self, gradients: NRICGradients, displacement: FloatArray) -> FloatArray:
         """``J d`` (2E,) of a vertex field (V, 3), without forming J."""
         e = self.connectivity.edge_count
-        d = _components(displacement)
+        d = components(displacement)
         i, j = self.connectivity.edge_ends
         out = np.zeros(2 * e)
-        out[:e] = _dot(gradients.lengths, d.take(j, axis=1) - d.take(i, axis=1))
+        out[:e] = dot(gradients.lengths, d.take(j, axis=1) - d.take(i, axis=1))
         hinges = d.take(self.connectivity.hinge_corners, axis=1)
         out[e + self.connectivity.hinge_edges] = np.einsum("vch,cvh->h", gradients.angles, hinges)
         return out
@@ -215,10 +217,10 @@ class NRICJacobian:
         # The gradient at an opposite vertex is along its face's normal, with 1/height as size.
         angles = np.empty((4, *edge.shape))
         tail, head, left, right = angles
-        np.multiply(frame.left_normal, -length / _dot(frame.left_normal, frame.left_normal), out=left)
-        np.multiply(frame.right_normal, -length / _dot(frame.right_normal, frame.right_normal), out=right)
-        np.multiply(left, -_dot(frame.to_left, edge) / square, out=head)
-        head -= (_dot(frame.to_right, edge) / square) * right
+        np.multiply(frame.left_normal, -length / dot(frame.left_normal, frame.left_normal), out=left)
+        np.multiply(frame.right_normal, -length / dot(frame.right_normal, frame.right_normal), out=right)
+        np.multiply(left, -dot(frame.to_left, edge) / square, out=head)
+        head -= (dot(frame.to_right, edge) / square) * right
         # The four sum to zero: nothing changes when all move together.
         np.negative(head, out=tail)
         tail -= left

@@ -4,6 +4,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from geometry.calculus import ShellSpace, fault_between, without_rigid_motion
 from geometry.constrained import constrained_exponential
@@ -78,6 +79,37 @@ def test_the_unit_of_length_does_not_matter(mesh, velocity):
     assert small.iterations == large.iterations
     np.testing.assert_allclose(large.vertices, 10 * small.vertices, atol=1e-8 * larger.diagonal)
     np.testing.assert_allclose(large.residuals, small.residuals, rtol=0.1, atol=1e-12)
+
+
+def test_a_factor_turned_along_with_a_rigid_motion_is_that_of_the_moved_shape(space, mesh, rng):
+    turn = Rotation.from_rotvec([1.2, -0.7, 2.1]).as_matrix()
+    moved = space.point(mesh.vertices @ turn.T + [1, 2, 3])
+    forces = moved.pull_back(rng.standard_normal(len(moved.z)))
+    change = rng.standard_normal(len(moved.z))
+    chord = space.chord
+    chord.factorise(space.point(mesh.vertices))
+    chord.turn_to(moved)
+    turned = chord.solve(forces), chord.push_forward(forces), chord.project(change)
+    chord.factorise(moved)
+    fresh = chord.solve(forces), moved.push_forward(forces), chord.project(change)
+    for a, b in zip(turned, fresh, strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-6 * np.abs(b).max())
+
+
+@pytest.mark.parametrize("pose", [1.3], indirect=True)
+def test_turning_a_factor_along_brings_it_nearer(space, mesh, pose, velocity):
+    """``A⁻¹`` of a bent shape, applied to the forces that a known field of displacements needs."""
+    there = space.point(pose)
+    field = without_rigid_motion(velocity, pose)
+    forces = there.pull_back(there.lower(there.push_forward(field)))
+    chord = space.chord
+    chord.factorise(space.point(mesh.vertices))
+    misses = []
+    for _ in range(2):
+        miss = there.push_forward(chord.solve(forces) - field)
+        misses.append(miss @ there.lower(miss))
+        chord.turn_to(there)
+    assert misses[1] < 0.5 * misses[0]
 
 
 # ---------------------------------------------------------------- exponential, geodesic, logarithm
