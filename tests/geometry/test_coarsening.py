@@ -1,0 +1,192 @@
+"""One coarse connectivity for all shapes: what it keeps, what it refuses, and that it says so."""
+
+import numpy as np
+import pytest
+import trimesh
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import connected_components
+
+from geometry.coarsening import Coarsening, coarsen
+from geometry.mesh import Connectivity, MeshError, TriangleMesh, face_areas, face_normals
+from tests.geometry.conftest import MESHES, bent, grid_faces
+
+
+def fine_mesh(name: str, rng: np.random.Generator) -> TriangleMesh:
+    """About four times as fine as the meshes of the other tests, without symmetries."""
+    mesh = MESHES[name]()
+    v, f = trimesh.remesh.subdivide(mesh.vertices, mesh.faces)
+    v = v + 0.01 * mesh.diagonal / np.sqrt(len(v)) * rng.standard_normal(v.shape)
+    return TriangleMesh.from_arrays(v, f)
+
+
+@pytest.fixture(params=MESHES)
+def fine(request: pytest.FixtureRequest, rng: np.random.Generator) -> TriangleMesh:
+    return fine_mesh(request.param, rng)
+
+
+def poses(mesh: TriangleMesh) -> np.ndarray:
+    return np.stack([bent(mesh.vertices, angle) for angle in (0.3, 1.0, 2.0)])
+
+
+def angles(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """(…, F, 3) of shapes (…, V, 3), by the law of cosines."""
+    corners = vertices[..., faces, :]
+    a, b, c = (np.linalg.norm(corners[..., i, :] - corners[..., j, :], axis=-1) for i, j in ((1, 2), (2, 0), (0, 1)))
+    opposite = ((a, b, c), (b, c, a), (c, a, b))
+    return np.stack([np.arccos((q * q + r * r - p * p) / (2 * q * r)) for p, q, r in opposite], axis=-1)
+
+
+def neighbour_cosines(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    connectivity = Connectivity(faces, vertices.shape[-2])
+    i, j = connectivity.edge_faces[connectivity.interior].T
+    normals = face_normals(vertices, faces)
+    return (normals[..., i, :] * normals[..., j, :]).sum(-1)
+
+
+def parts(edges: np.ndarray, count: int) -> np.ndarray:
+    """(count,) the number of the connected component of each vertex."""
+    graph = csr_array((np.ones(len(edges)), tuple(edges.T)), shape=(count, count))
+    return connected_components(graph, directed=False)[1]
+
+
+def loops(connectivity: Connectivity) -> int:
+    rim = connectivity.edges[~connectivity.interior]
+    return len(np.unique(parts(rim, connectivity.vertex_count)[rim]))
+
+
+def test_the_topology_is_kept(fine):
+    found = coarsen(fine, len(fine.vertices) // 4, poses(fine))
+    assert found.reason == ""
+    assert len(found.fine_index) == len(fine.vertices) // 4
+    assert (np.diff(found.fine_index) > 0).all()
+    coarse = Connectivity(found.faces, len(found.fine_index))  # manifold and oriented, or it raises
+    assert coarse.euler_characteristic == fine.connectivity.euler_characteristic
+    assert loops(coarse) == loops(fine.connectivity)
+    assert (
+        connected_components(
+            csr_array((np.ones(coarse.edge_count), tuple(coarse.edges.T)), shape=(coarse.vertex_count,) * 2)
+        )[0]
+        == 1
+    )
+
+
+def test_no_shape_gets_a_sliver_or_a_fold(fine):
+    shapes = poses(fine)
+    found = coarsen(fine, len(fine.vertices) // 4, shapes)
+    everything = np.concatenate([fine.vertices[None], shapes])[:, found.fine_index]
+    smallest = angles(everything, found.faces).min()
+    assert found.smallest_angle == pytest.approx(smallest, rel=1e-9)
+    assert smallest > np.deg2rad(5.9)
+    assert neighbour_cosines(everything, found.faces).min() > np.cos(np.deg2rad(140))
+
+
+def test_the_surface_stays_where_it_is(fine):
+    shapes = poses(fine)
+    found = coarsen(fine, len(fine.vertices) // 4, shapes)
+    for shape in (fine.vertices, *shapes):
+        area = face_areas(shape[found.fine_index], found.faces).sum()
+        assert area == pytest.approx(face_areas(shape, fine.faces).sum(), rel=0.06)
+
+
+def test_the_same_again(fine):
+    first, second = (coarsen(fine, 60, poses(fine)) for _ in range(2))
+    assert np.array_equal(first.faces, second.faces)
+    assert np.array_equal(first.fine_index, second.fine_index)
+
+
+def test_a_boundary_keeps_its_outline(rng):
+    x, y = np.meshgrid(np.linspace(0, 3, 25), np.linspace(0, 1, 13), indexing="ij")
+    flat = np.stack([x, y, 0 * x], -1).reshape(-1, 3)
+    mesh = TriangleMesh.from_arrays(flat, grid_faces(25, 13, around_u=False, around_v=False))
+    found = coarsen(mesh, 60, np.empty((0, len(flat), 3)))
+    kept = flat[found.fine_index]
+    assert face_areas(kept, found.faces).sum() == pytest.approx(3, rel=1e-9)
+    assert {(0, 0), (3, 0), (0, 1), (3, 1)} <= {(a, b) for a, b, _ in kept.tolist()}
+
+
+def sheet_with_a_wrinkle() -> tuple[TriangleMesh, np.ndarray]:
+    """A flat sheet, and a shape in which one strip of it is bent up to a ridge of half the sheet's width."""
+    x, y = np.meshgrid(np.arange(21.0), np.arange(9.0), indexing="ij")
+    flat = np.stack([x, y, 0 * x], -1).reshape(-1, 3)
+    mesh = TriangleMesh.from_arrays(flat, grid_faces(21, 9, around_u=False, around_v=False))
+    ridge = flat.copy()
+    ridge[:, 2] = np.maximum(0, 3 - np.abs(flat[:, 0] - 10))
+    return mesh, ridge
+
+
+def test_what_bends_in_any_shape_is_kept():
+    mesh, ridge = sheet_with_a_wrinkle()
+    blind = coarsen(mesh, 40, ridge[None][:0])
+    seeing = coarsen(mesh, 40, np.stack([mesh.vertices, ridge, mesh.vertices]))
+
+    def area(found: Coarsening) -> float:
+        return face_areas(ridge[found.fine_index], found.faces).sum()
+
+    exact = face_areas(ridge, mesh.faces).sum()
+    assert area(seeing) == pytest.approx(exact, rel=1e-2)
+    assert area(blind) < 0.97 * exact, "a sheet that is not missed proves nothing"
+
+
+def test_a_sliver_in_one_shape_alone_is_refused():
+    """All collapses are good for the reference, and cheap; in the shape the sheet is pulled thin."""
+    mesh, _ = sheet_with_a_wrinkle()
+    thin = mesh.vertices * [1, 0.15, 1]
+    found = coarsen(mesh, 12, thin[None])
+    assert len(found.fine_index) > 12 or found.reason == ""
+    assert angles(thin[found.fine_index], found.faces).min() > np.deg2rad(1.49)
+
+
+def test_slivers_of_the_fine_mesh_are_healed(rng):
+    mesh = fine_mesh("closed", rng)
+    hit = rng.permutation(len(mesh.vertices))[:5]
+    spoiled = mesh.vertices.copy()
+    for v in hit:
+        face = mesh.faces[(mesh.faces == v).any(axis=1)][0]
+        others = spoiled[face[face != v]]
+        spoiled[v] = 0.999 * others.mean(axis=0) + 0.001 * spoiled[v]
+    shapes = np.stack([spoiled])
+    assert angles(spoiled, mesh.faces).min() < np.deg2rad(0.5)
+    found = coarsen(mesh, 200, shapes)
+    assert found.reason == ""
+    assert np.rad2deg(found.smallest_angle) > 3
+
+
+def test_what_cannot_be_reached_is_said():
+    tetrahedron = trimesh.creation.icosphere(subdivisions=1)
+    mesh = TriangleMesh.from_arrays(tetrahedron.vertices, tetrahedron.faces)
+    found = coarsen(mesh, 2, mesh.vertices[None])
+    assert len(found.fine_index) >= 4
+    assert found.reason.startswith(f"{len(found.fine_index)} vertices instead of 2")
+    assert Connectivity(found.faces, len(found.fine_index)).euler_characteristic == 2
+
+
+def test_nothing_to_do(fine):
+    found = coarsen(fine, len(fine.vertices), poses(fine))
+    assert np.array_equal(found.fine_index, np.arange(len(fine.vertices)))
+    assert found.reason == ""
+
+
+def test_sheets_that_touch_at_a_vertex_stay_together():
+    """Two balls that share a vertex: removing it would tear them apart."""
+    ball = trimesh.creation.icosphere(subdivisions=2)
+    count, touch = len(ball.vertices), 7
+    second = 2 * ball.vertices[touch] - ball.vertices
+    faces = np.concatenate([ball.faces, ball.faces[:, ::-1] + count])
+    faces[faces == count + touch] = touch
+    used, faces = np.unique(faces, return_inverse=True)
+    vertices = np.concatenate([ball.vertices, second])[used]
+    mesh = TriangleMesh.from_arrays(vertices, faces.reshape(-1, 3))
+    found = coarsen(mesh, 60, np.empty((0, len(vertices), 3)))
+    assert touch in found.fine_index
+    assert parts(Connectivity(found.faces, len(found.fine_index)).edges, len(found.fine_index)).max() == 0
+
+
+def test_bad_shapes_are_refused(fine):
+    shapes = poses(fine)
+    with pytest.raises(MeshError, match=r"shapes must be \(n, "):
+        coarsen(fine, 10, shapes[:, 1:])
+    with pytest.raises(MeshError, match=r"shapes must be \(n, "):
+        coarsen(fine, 10, shapes[0])
+    shapes[1, 3, 2] = np.nan
+    with pytest.raises(MeshError, match="shape 1 has a coordinate that is not finite"):
+        coarsen(fine, 10, shapes)
