@@ -105,35 +105,83 @@ def test_a_boundary_keeps_its_outline(rng):
 
 
 def sheet_with_a_wrinkle() -> tuple[TriangleMesh, np.ndarray]:
-    """A flat sheet, and a shape in which one strip of it is bent up to a ridge of half the sheet's width."""
+    """A flat sheet, and a shape in which one strip of it is bent up to a low ridge."""
     x, y = np.meshgrid(np.arange(21.0), np.arange(9.0), indexing="ij")
     flat = np.stack([x, y, 0 * x], -1).reshape(-1, 3)
     mesh = TriangleMesh.from_arrays(flat, grid_faces(21, 9, around_u=False, around_v=False))
     ridge = flat.copy()
-    ridge[:, 2] = np.maximum(0, 3 - np.abs(flat[:, 0] - 10))
+    ridge[:, 2] = 0.5 * np.maximum(0, 3 - np.abs(flat[:, 0] - 10))
     return mesh, ridge
 
 
 def test_what_bends_in_any_shape_is_kept():
     mesh, ridge = sheet_with_a_wrinkle()
-    blind = coarsen(mesh, 40, ridge[None][:0])
-    seeing = coarsen(mesh, 40, np.stack([mesh.vertices, ridge, mesh.vertices]))
+    blind = coarsen(mesh, 30, ridge[None][:0])
+    seeing = coarsen(mesh, 30, np.stack([mesh.vertices, ridge, mesh.vertices]))
 
     def area(found: Coarsening) -> float:
         return face_areas(ridge[found.fine_index], found.faces).sum()
 
     exact = face_areas(ridge, mesh.faces).sum()
-    assert area(seeing) == pytest.approx(exact, rel=1e-2)
-    assert area(blind) < 0.97 * exact, "a sheet that is not missed proves nothing"
+    assert area(seeing) == pytest.approx(exact, rel=2e-3)
+    assert area(blind) < 0.99 * exact, "a sheet that is not missed proves nothing"
+
+
+def test_limits_hold_however_few_vertices_are_asked_for(fine):
+    """In the shapes it is pulled thin, each in another direction, and pleated; the reference has none of it."""
+    x, y, z = fine.vertices.T
+    pleats = np.stack([x, y, z + 0.15 * np.abs(np.mod(4 * x, 2) - 1)], axis=1)
+    thin = [fine.vertices * stretch for stretch in ([1, 0.2, 1], [0.2, 1, 1], [1, 1, 0.2])]
+    everything = np.stack([fine.vertices, pleats, *thin])
+    before = angles(everything, fine.faces).min(), neighbour_cosines(everything, fine.faces).min()
+    found = coarsen(fine, 8, everything[1:])
+    kept = everything[:, found.fine_index]
+    assert len(found.fine_index) < len(fine.vertices) / 2
+    assert angles(kept, found.faces).min() >= min(np.deg2rad(1.5), before[0]) - 1e-9
+    assert neighbour_cosines(kept, found.faces).min() >= min(np.cos(np.deg2rad(140)), before[1]) - 1e-9
 
 
 def test_a_sliver_in_one_shape_alone_is_refused():
-    """All collapses are good for the reference, and cheap; in the shape the sheet is pulled thin."""
+    """Nothing but the limit stands in the way: the sheet is flat, and in one shape pulled thin."""
     mesh, _ = sheet_with_a_wrinkle()
-    thin = mesh.vertices * [1, 0.15, 1]
-    found = coarsen(mesh, 12, thin[None])
-    assert len(found.fine_index) > 12 or found.reason == ""
-    assert angles(thin[found.fine_index], found.faces).min() > np.deg2rad(1.49)
+    thin = mesh.vertices * [1, 0.05, 1]
+    found = coarsen(mesh, 4, thin[None])
+    assert angles(thin[found.fine_index], found.faces).min() >= np.deg2rad(1.5)
+    assert found.reason.startswith(f"{len(found.fine_index)} vertices instead of 4")
+
+
+def test_a_face_that_would_turn_over_in_one_shape_alone_is_refused():
+    """A spike that only one shape has: without its tip, every face there would turn by more than 60 degrees."""
+    mesh, _ = sheet_with_a_wrinkle()
+    tip = 10 * 9 + 4
+    spiked = mesh.vertices.copy()
+    spiked[tip, 2] = 2.5
+    found = coarsen(mesh, 6, spiked[None])
+    assert tip in found.fine_index
+
+
+def annulus() -> TriangleMesh:
+    t, r = np.meshgrid(np.arange(24) * np.pi / 12, np.linspace(1, 2, 5), indexing="ij")
+    vertices = np.stack([r * np.cos(t), r * np.sin(t), 0.1 * r * np.sin(3 * t)], -1).reshape(-1, 3)
+    return TriangleMesh.from_arrays(vertices, grid_faces(24, 5, around_u=True, around_v=False))
+
+
+@pytest.mark.parametrize("mesh", [MESHES["torus"](), MESHES["sheet"](), annulus()], ids=["torus", "sheet", "annulus"])
+def test_topology_ends_it_where_shape_does_not(mesh, monkeypatch):
+    monkeypatch.setattr("geometry.coarsening._Decimation._keeps_shape", lambda *_, **__: True)
+    monkeypatch.setattr("geometry.coarsening._Decimation.heal", lambda *_: None)
+    found = coarsen(mesh, 1, np.empty((0, *mesh.vertices.shape)))
+    coarse = Connectivity(found.faces, len(found.fine_index))
+    assert coarse.euler_characteristic == mesh.connectivity.euler_characteristic
+    assert loops(coarse) == loops(mesh.connectivity)
+    assert len({tuple(sorted(face)) for face in found.faces.tolist()}) == len(found.faces)
+    assert len(found.fine_index) <= 12
+
+
+def test_a_flat_tetrahedron_does_not_become_two_faces_back_to_back():
+    corners = np.array([[0, 0, 0], [3, 0, 0], [0, 3, 0], [1.0, 1.2, 0]])
+    mesh = TriangleMesh.from_arrays(corners, [[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]])
+    assert len(coarsen(mesh, 3, corners[None]).fine_index) == 4
 
 
 def test_slivers_of_the_fine_mesh_are_healed(rng):
@@ -146,7 +194,7 @@ def test_slivers_of_the_fine_mesh_are_healed(rng):
         spoiled[v] = 0.999 * others.mean(axis=0) + 0.001 * spoiled[v]
     shapes = np.stack([spoiled])
     assert angles(spoiled, mesh.faces).min() < np.deg2rad(0.5)
-    found = coarsen(mesh, 200, shapes)
+    found = coarsen(mesh, int(0.85 * len(mesh.vertices)), shapes)
     assert found.reason == ""
     assert np.rad2deg(found.smallest_angle) > 3
 

@@ -98,7 +98,7 @@ def fold(mesh: TriangleMesh, gap: float) -> TriangleMesh:
     """Both halves of a strip lie above one another, ``gap`` apart; the bend is a step of that height."""
     x, y, _ = mesh.vertices.T
     # Waves that the coarse strip misses: to each half, the other one's coarse faces come closer than its own.
-    z = gap / 2 * np.tanh(8 * x) + 0.05 * np.sin(6 * np.pi * y)
+    z = gap / 2 * np.tanh(8 * x) + 0.05 * np.sin(3 * np.pi * y)
     return mesh.with_vertices(np.stack([np.sqrt(x**2 + 0.01), y, z], axis=1))
 
 
