@@ -18,8 +18,9 @@ help: ## list the targets
 serve: $(VENV)/.serve ## start the server with the bundled models (SHAPESPACE_HOST, SHAPESPACE_PORT)
 	@$(BIN)/python -m service
 
-train: $(VENV)/.train ## train the bundled model from its generator
-	$(BIN)/shapespace-train run examples/freaky-torus.toml --out runs/freaky-torus
+train: $(VENV)/.train ## train the bundled models from their generators
+	$(BIN)/shapespace-train run examples/freaky-torus.toml
+	$(BIN)/shapespace-train run examples/figure.toml
 
 test: $(VENV)/.all $(MODULES) ## run the whole suite (ARGS="-k glb" for a part of it)
 	PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/python -m pytest $(ARGS)

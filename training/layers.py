@@ -367,8 +367,9 @@ class PairwiseProducts(nn.Module):
         for j in range(y.shape[1]):
             _, s, vt = torch.linalg.svd(y[:, j] - self.centre[j], full_matrices=False)
             rank = min(self.axes.shape[2], len(s))
-            # Coefficients of unit variance, so that one ridge suits all products.
-            self.axes[j, :, :rank] = (vt[:rank] / s[:rank, None].clamp_min(1e-6 * s[0]) * len(y) ** 0.5).T
+            # Coefficients of unit variance, so that one ridge suits all products; those that are hardly there stay
+            # small, or they would be made of rounding errors.
+            self.axes[j, :, :rank] = (vt[:rank] / s[:rank, None].clamp_min(1e-2 * s[0]) * len(y) ** 0.5).T
         x = self._features(y).double()
         gram = x.T @ x / len(x) + ridge * torch.eye(x.shape[1], dtype=torch.float64)
         root = torch.linalg.cholesky(gram)

@@ -5,22 +5,27 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import pytest
+
 from service.bundle import read_bundle
 from training.config import load
 
 ROOT = Path(__file__).parents[2]
+MODELS = ["freaky-torus", "figure"]
 
 
-def test_the_bundle_states_the_figures_and_the_configuration_of_the_committed_run() -> None:
-    bundle = read_bundle(ROOT / "models" / "freaky-torus" / "1")
-    run = ROOT / "runs" / "freaky-torus"
+@pytest.mark.parametrize("name", MODELS)
+def test_a_bundle_states_the_figures_and_the_configuration_of_the_committed_run(name: str) -> None:
+    bundle = read_bundle(ROOT / "models" / name / "1")
+    run = ROOT / "runs" / name
     assert bundle.manifest.figures == json.loads((run / "evaluation.json").read_text())
     assert bundle.manifest.origin.config == load(run / "config.toml")[0].model_dump(mode="json", by_alias=True)
-    assert (run / "config.toml").read_text() == (ROOT / "examples" / "freaky-torus.toml").read_text()
+    assert (run / "config.toml").read_text() == (ROOT / "examples" / f"{name}.toml").read_text()
 
 
-def test_the_bundle_meets_what_it_promises() -> None:
-    folder = ROOT / "models" / "freaky-torus" / "1"
+@pytest.mark.parametrize("name", MODELS)
+def test_a_bundle_meets_what_it_promises(name: str) -> None:
+    folder = ROOT / "models" / name / "1"
     assert sum(path.stat().st_size for path in folder.iterdir()) <= 15 * 2**20
     figures = read_bundle(folder).manifest.figures
     r2 = {name: value["total"] for name, value in figures["r2"].items()}
