@@ -51,8 +51,12 @@ class ShellCollection:
 
     @property
     def latent_names(self) -> tuple[str, ...]:
-        """(m,) "mode 1" and so on."""
-        return tuple(f"mode {j + 1}" for j in range(len(self.modes)))
+        """(m,) names after the factors: "upper left", or "upper left, 1" and so on where a factor has several modes."""
+        names = [""] * len(self.modes)
+        for factor, members in self.factors.items():
+            for k, j in enumerate(members, 1):
+                names[j] = factor if len(members) == 1 else f"{factor}, {k}"
+        return tuple(names)
 
     @property
     def coordinates(self) -> Coordinates:

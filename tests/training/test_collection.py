@@ -180,7 +180,7 @@ def results(run: Path) -> dict[str, object]:
             found |= {f"{name}/{key}": value.tobytes() for key, value in load_file(path).items()}
         elif path.suffix == ".onnx":
             found[name] = path.read_bytes()
-        elif path.name == "evaluation.json":
+        elif path == run / "evaluation.json":
             found[name] = {k: v for k, v in json.loads(path.read_text()).items() if k != "times"}
     return found
 

@@ -254,7 +254,7 @@ def test_codes_are_velocities_at_the_mean(collection: ShellCollection, latents: 
     np.testing.assert_allclose(shapes.vertices[0], reference.vertices, atol=1e-12)
     tangents = [space.point(reference.vertices).push_forward(d) for d in collection.modes]
     np.testing.assert_allclose(shapes.nric[1:] - z, small @ tangents, atol=1e-10)
-    assert collection.latent_names == ("mode 1", "mode 2", "mode 3")
+    assert collection.latent_names == ("bend", "twist and swell, 1", "twist and swell, 2")
     assert np.isnan(collection.coordinates.period).all()
 
 
