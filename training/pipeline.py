@@ -154,7 +154,7 @@ def networks(run: Run) -> None:
 
 
 def evaluation(run: Run) -> None:
-    """evaluation.json, gallery.npz and report.html."""
+    """evaluation.json and gallery.npz."""
 
     def exact(name: str, latents: FloatArray) -> NDArray[np.float32]:
         folder = run.folder / "exact" / name
@@ -170,7 +170,6 @@ def evaluation(run: Run) -> None:
         figures["prolongation"] = json.loads(ingested.read_text()).get("prolongation")
     write_npz(run.folder / "gallery.npz", **gallery)
     write_json(run.folder / "evaluation.json", figures)
-    write_report(run.folder)
 
 
 def export_bundle(run: Run) -> None:
@@ -215,8 +214,8 @@ STAGES: dict[str, Stage] = {
 
 
 def execute(run: Run, until: str | None = None, *, show: Callable[[str], None] = print) -> None:
-    """Do the stages that are not done yet, up to and including ``until``."""
-    key = ""
+    """Do the stages that are not done yet, up to and including ``until``; in the end, report.html."""
+    key, news = "", False
     for name, stage in STAGES.items():
         settings = [s.model_dump(mode="json") for s in stage.settings(run.config)]
         key = hashlib.sha256(json.dumps([name, settings, key]).encode()).hexdigest()
@@ -237,5 +236,8 @@ def execute(run: Run, until: str | None = None, *, show: Callable[[str], None] =
             run.set_stamp(name, key=key, seconds=seconds)
             run.log("end", stage=name, seconds=round(seconds, 3))
             show(f"{name}: {seconds:.0f} s")
+            news = True
         if name == until:
             break
+    if (run.folder / "evaluation.json").exists() and (news or not (run.folder / "report.html").exists()):
+        show(f"report: {write_report(run.folder)}")
