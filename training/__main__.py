@@ -10,7 +10,9 @@ from pathlib import Path
 from training import init
 from training.config import ConfigError, load
 from training.export import ExportError
+from training.factors import FactorError
 from training.ingest import IngestError
+from training.modes import ModeError
 from training.pipeline import STAGES, Run, execute
 from training.report import ReportError, write_report
 from training.workers import WorkersError
@@ -101,7 +103,7 @@ def main() -> int:
     arguments = parser().parse_args()
     try:
         arguments.do(arguments)
-    except (ConfigError, ExportError, IngestError, ReportError, WorkersError) as error:
+    except (ConfigError, ExportError, FactorError, IngestError, ModeError, ReportError, WorkersError) as error:
         print(f"shapespace-train: {error}", file=sys.stderr)
         return FAILURE
     except KeyboardInterrupt:

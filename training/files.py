@@ -1,11 +1,11 @@
-"""Files that a killed run leaves whole."""
+"""Files that a killed run, or a power cut, leaves whole."""
 
 from __future__ import annotations
 
 import json
 import os
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 
@@ -15,11 +15,20 @@ def write_npz(path: Path, **arrays: Any) -> None:
     part = path.with_suffix(".part")
     with part.open("wb") as file:
         np.savez(file, **arrays)
+        _settle(file)
     os.replace(part, path)
 
 
 def write_json(path: Path, value: Any) -> None:
     """Write JSON whole or not at all."""
     part = path.with_suffix(".part")
-    part.write_text(json.dumps(value, indent=2) + "\n", encoding="utf-8")
+    with part.open("wb") as file:
+        file.write((json.dumps(value, indent=2) + "\n").encode())
+        _settle(file)
     os.replace(part, path)
+
+
+def _settle(file: IO[bytes]) -> None:
+    """Bring a file to the disk: renamed before that, it could be empty after a power cut."""
+    file.flush()
+    os.fsync(file.fileno())
