@@ -105,6 +105,10 @@ def fit(
             network.eval()
             return state
         best = _restore(network, optimiser, schedule, state, extra)
+    else:
+        # What was fitted in closed form may be the best there is.
+        network.eval()
+        state["best"] = _error(network, inputs[validation], target[validation], settings.batch_size)
 
     bar = tqdm(total=settings.max_epochs, initial=state["epoch"], desc=title, unit="epoch", disable=None, leave=False)
     while not state["done"]:
@@ -120,9 +124,7 @@ def fit(
             optimiser.step()
             total += loss.item() / len(batches)
         network.eval()
-        error = nn.functional.mse_loss(
-            predict(network.coefficients, inputs[validation], settings.batch_size), target[validation]
-        ).item()
+        error = _error(network, inputs[validation], target[validation], settings.batch_size)
         if isinstance(schedule, ReduceLROnPlateau):
             schedule.step(error)
         else:
@@ -143,6 +145,10 @@ def fit(
     network.eval()
     save_network(path, network, state)
     return state
+
+
+def _error(network: ShapeNetwork, inputs: Tensor, target: Tensor, batch_size: int) -> float:
+    return nn.functional.mse_loss(predict(network.coefficients, inputs, batch_size), target).item()
 
 
 def _checkpoint(

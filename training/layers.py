@@ -332,6 +332,29 @@ class _StarSum(torch.autograd.Function):
         return _StarSum.apply(gradient.contiguous(), *ctx.saved_tensors), None, None
 
 
+#: Weights of the penalty that `ridge_regression` chooses from, as shares of the mean square of a feature.
+RIDGES = tuple(10.0**k for k in range(-6, 3))
+
+
+def ridge_regression(x: Tensor, y: Tensor, held_out: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
+    """The linear map from features x (n, p) to y (n, q) whose penalty suits held-out pairs best.
+
+    Features ought to have a mean square of about one.
+
+    Returns:
+        H (p, p) and B (p, q), whose product is the map; the columns of x H are orthonormal but for the penalty.
+    """
+    x, y = x.double(), y.double()
+    value, vector = torch.linalg.eigh(x.T @ x / len(x))
+    right, other = vector.T @ (x.T @ y / len(x)), held_out[0].double() @ vector
+
+    def error(ridge: float) -> float:
+        return float((other @ (right / (value + ridge)[:, None]) - held_out[1]).square().mean())
+
+    scale = (value.clamp_min(0) + min(RIDGES, key=error)).rsqrt()
+    return vector * scale, right * scale[:, None]
+
+
 class PairwiseProducts(nn.Module):
     """A bilinear correction of the affine sum, (n, J, 2E) → (n, 2E), fitted by ridge regression.
 
@@ -361,7 +384,7 @@ class PairwiseProducts(nn.Module):
         products = [(c[:, i, :, None] * c[:, j, None, :]).flatten(1) for i, j in self.pairs]
         return torch.cat([torch.ones_like(c[:, 0, :1]), c.flatten(1), *products], dim=1)
 
-    def fit(self, y: Tensor, residual: Tensor, ridge: float = 1e-2) -> None:
+    def fit(self, y: Tensor, residual: Tensor, held_out: tuple[Tensor, Tensor]) -> None:
         """Fit axes and weights to factor shapes (n, J, 2E) and what the affine sum misses (n, 2E)."""
         self.centre.copy_(y.mean(dim=0))
         for j in range(y.shape[1]):
@@ -370,15 +393,11 @@ class PairwiseProducts(nn.Module):
             # Coefficients of unit variance, so that one ridge suits all products; those that are hardly there stay
             # small, or they would be made of rounding errors.
             self.axes[j, :, :rank] = (vt[:rank] / s[:rank, None].clamp_min(1e-2 * s[0]) * len(y) ** 0.5).T
-        x = self._features(y).double()
-        gram = x.T @ x / len(x) + ridge * torch.eye(x.shape[1], dtype=torch.float64)
-        root = torch.linalg.cholesky(gram)
-        whole = torch.linalg.solve_triangular(root, x.T @ residual.double() / len(x), upper=False)
+        h, b = ridge_regression(self._features(y), residual, (self._features(held_out[0]), held_out[1]))
         # The map of low rank whose values on these samples are nearest to the whole one's.
-        u, s, vt = torch.linalg.svd(whole, full_matrices=False)
-        q = min(len(self.basis), len(s))
-        self.weights[:, :q] = torch.linalg.solve_triangular(root.T, u[:, :q] * s[:q], upper=True)
-        self.basis[:q] = vt[:q]
+        strongest = torch.linalg.eigh(b @ b.T)[1][:, -len(self.basis) :]
+        self.weights.copy_(h @ strongest)
+        self.basis.copy_(strongest.T @ b)
 
     def forward(self, y: Tensor) -> Tensor:
         return self._features(y) @ self.weights @ self.basis

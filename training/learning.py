@@ -167,7 +167,11 @@ class Learner:
         network = kind(settings, coordinates, scaling, basis_fitted)
         latents = torch.as_tensor(samples.latents[:, index], dtype=torch.float32)
         if not path.exists():
-            network.fit_skip(latents[train], network.target(torch.from_numpy(samples.nric[train])))
+            pairs = [
+                (latents[part], network.target(torch.from_numpy(samples.nric[part])))
+                for part in (train, rows["validation"])
+            ]
+            network.fit_skip(*pairs[0], pairs[1])
         self._fit(network, latents, samples.nric, rows, settings.fit, path)
         return network
 
@@ -216,7 +220,8 @@ class Learner:
         if combiner.symmetries:
             inputs, z, rows = self._with_images(inputs, rows)
         if not path.exists():
-            network.fit_pairwise(inputs[rows["train"]], torch.from_numpy(z[rows["train"]]))
+            pairs = [(inputs[part], torch.from_numpy(z[part])) for part in (rows["train"], rows["validation"])]
+            network.fit_pairwise(*pairs[0], pairs[1])
         self._fit(network, inputs, z, rows, combiner.fit, path)
         return composite
 

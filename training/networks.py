@@ -25,6 +25,7 @@ from training.layers import (
     PatchBasis,
     Polynomials,
     perceptron,
+    ridge_regression,
 )
 
 
@@ -124,13 +125,12 @@ class FactorNetwork(ShapeNetwork):
             result = result + self.skip_features(inputs) @ self.skip
         return result
 
-    def fit_skip(self, latent: Tensor, target: Tensor, ridge: float = 1e-4) -> None:
-        """Fit the linear layer to coefficients by ridge regression, in double precision."""
-        if self.skip_features is None:
-            return
-        x, y = self.skip_features(latent).double(), target.double()
-        gram = x.T @ x + ridge * len(x) * torch.eye(x.shape[1], dtype=torch.float64)
-        self.skip.copy_(torch.linalg.solve(gram, x.T @ y))
+    def fit_skip(self, latent: Tensor, target: Tensor, held_out: tuple[Tensor, Tensor]) -> None:
+        """Fit the linear layer to coefficients by ridge regression; pairs held out choose its penalty."""
+        if self.skip_features is not None:
+            chosen = self.skip_features(held_out[0]), held_out[1]
+            h, b = ridge_regression(self.skip_features(latent), target, chosen)
+            self.skip.copy_(h @ b)
 
     def forward(self, latent: Tensor) -> Tensor:
         y = self.coefficients(latent)
@@ -193,11 +193,15 @@ class CombinerNetwork(ShapeNetwork):
             out = out + self.pairwise(y)
         return out + y.sum(dim=1) if self.residual else out
 
-    def fit_pairwise(self, factors: Tensor, z: Tensor) -> None:
-        """Fit the bilinear correction, where there is one, to samples (n, J, 2E) and (n, 2E)."""
+    def fit_pairwise(self, factors: Tensor, z: Tensor, held_out: tuple[Tensor, Tensor]) -> None:
+        """Fit the bilinear correction, where there is one, to samples (n, J, 2E) and (n, 2E), and others held out."""
         if self.pairwise is not None:
-            y = self.scaling.down(factors)
-            self.pairwise.fit(y, self.scaling.down(z) - y.sum(dim=1))
+            (y, residual), other = self._residual(factors, z), self._residual(*held_out)
+            self.pairwise.fit(y, residual, other)
+
+    def _residual(self, factors: Tensor, z: Tensor) -> tuple[Tensor, Tensor]:
+        y = self.scaling.down(factors)
+        return y, self.scaling.down(z) - y.sum(dim=1)
 
     def forward(self, factors: Tensor) -> Tensor:
         return self.scaling.up(self.coefficients(factors))

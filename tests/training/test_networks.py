@@ -11,7 +11,15 @@ from geometry.mesh import Connectivity, TriangleMesh
 from geometry.nric import WeightedNorm, nric
 from training.config import CombinerSettings, LatentNetworkSettings
 from training.coordinates import Coordinates
-from training.layers import EdgeConvolution, FourierProducts, LatentFeatures, PatchBasis, Polynomials, flaps
+from training.layers import (
+    EdgeConvolution,
+    FourierProducts,
+    LatentFeatures,
+    PatchBasis,
+    Polynomials,
+    flaps,
+    ridge_regression,
+)
 from training.networks import CombinerNetwork, FactorNetwork, Scaling, affine_sum, edge_midpoints
 
 TORUS = Coordinates(np.zeros(2), np.full(2, 2 * np.pi), np.full(2, 2 * np.pi))
@@ -112,10 +120,20 @@ def test_pairwise_products_find_a_bilinear_interplay(ball: TriangleMesh) -> None
     x, y = torch.from_numpy(factors), torch.from_numpy(z)
     with torch.no_grad():
         before = (network(x) - y).abs().max()
-        network.pairwise.fit(x_down := network.scaling.down(x), network.scaling.down(y) - x_down.sum(1), ridge=1e-9)
+        network.fit_pairwise(x[:40], y[:40], (x[40:], y[40:]))
         after = (network(x) - y).abs().max()
     assert before > 0.01
     assert after < 1e-4
+
+
+def test_ridge_regression_takes_a_penalty_that_held_out_pairs_ask_for() -> None:
+    torch.manual_seed(0)
+    x, other = torch.randn(30, 25), torch.randn(200, 25)
+    true = torch.randn(25, 3)
+    h, b = ridge_regression(x, x @ true, (other, other @ true))
+    torch.testing.assert_close(h @ b, true.double(), atol=1e-3, rtol=0)
+    h, b = ridge_regression(x, torch.randn(30, 3), (other, torch.zeros(200, 3)))
+    assert (other.double() @ h @ b).square().mean() < 0.01, "noise is not followed"
 
 
 def test_scaled_differences_go_both_ways_and_have_unit_size(sheet: TriangleMesh) -> None:
@@ -188,5 +206,5 @@ def test_the_fitted_skip_layer_reproduces_a_trigonometric_polynomial(ball: Trian
     network = FactorNetwork(settings, TORUS, scaling(ball, z), None).eval()
     latent, target = torch.from_numpy(a).float(), torch.from_numpy(z).float()
     with torch.no_grad():
-        network.fit_skip(latent, network.target(target), ridge=1e-9)
+        network.fit_skip(latent, network.target(target), (latent[:50], network.target(target[:50])))
         assert (network(latent) - target).abs().max() < 1e-4
