@@ -60,17 +60,22 @@ def ingest(folder: Path, config: Config) -> dict[str, Any]:
         more = {"fine_vertices": fine.vertices, "fine_faces": fine.faces, "fine_index": coarsening.fine_index}
         errors = Prolongation.of(reference, fine).errors(vertices, exact)
         facts |= {"coarse_vertices": vertices.shape[1], "prolongation": errors}
-    write_npz(
-        folder / "reference.npz",
-        vertices=reference.vertices,
-        faces=reference.faces,
-        edges=reference.edges,
-        scale=np.array(scale),
-        **more,
-    )
+    write_reference(folder, reference, scale, **more)
     write_npz(folder / "shapes.npz", names=np.array(meshes.names), vertices=vertices)
     write_json(folder / "ingest.json", facts)
     return facts
+
+
+def write_reference(folder: Path, mesh: TriangleMesh, scale: float, **fine: np.ndarray) -> None:
+    """``reference.npz``."""
+    write_npz(
+        folder / "reference.npz",
+        vertices=mesh.vertices,
+        faces=mesh.faces,
+        edges=mesh.edges,
+        scale=np.array(scale),
+        **fine,
+    )
 
 
 def _reference(folder: Path) -> TriangleMesh:

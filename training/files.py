@@ -21,9 +21,14 @@ def write_npz(path: Path, **arrays: Any) -> None:
 
 def write_json(path: Path, value: Any) -> None:
     """Write JSON whole or not at all."""
+    write_text(path, json.dumps(value, indent=2) + "\n")
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a text in UTF-8 whole or not at all."""
     part = path.with_suffix(".part")
     with part.open("wb") as file:
-        file.write((json.dumps(value, indent=2) + "\n").encode())
+        file.write(text.encode())
         _settle(file)
     os.replace(part, path)
 

@@ -32,23 +32,27 @@ def save_network(path: Path, network: nn.Module, state: dict[str, Any], extra: d
 
 def load_network(path: Path, network: nn.Module) -> tuple[dict[str, Any], dict[str, Tensor]]:
     """Read what `save_network` wrote into the network; returns state and the extra tensors."""
+    state, tensors, extra = read_network(path)
+    network.load_state_dict(tensors)
+    return state, extra
+
+
+def read_network(path: Path) -> tuple[dict[str, Any], dict[str, Tensor], dict[str, Tensor]]:
+    """What `save_network` wrote: state, the network's tensors by its own names, the extra ones."""
     with safe_open(path, framework="pt") as file:
         state = json.loads(file.metadata()["state"])
         tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 - not a mapping
     prefix = "network."
-    network.load_state_dict({k.removeprefix(prefix): v for k, v in tensors.items() if k.startswith(prefix)})
-    return state, {k: v for k, v in tensors.items() if not k.startswith(prefix)}
+    own = {k.removeprefix(prefix): tensors.pop(k) for k in list(tensors) if k.startswith(prefix)}
+    return state, own, tensors
 
 
 def finished(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]] | None:
     """State and tensors, by the network's own names, of a fit that is done; None where it isn't."""
     if not path.exists():
         return None
-    with safe_open(path, framework="pt") as file:
-        state = json.loads(file.metadata()["state"])
-        if not state["done"]:
-            return None
-        return state, {k.removeprefix("network."): file.get_tensor(k) for k in file.keys()}  # noqa: SIM118
+    state, tensors, _ = read_network(path)
+    return (state, tensors) if state["done"] else None
 
 
 def predict(network: Callable[[Tensor], Tensor], inputs: Tensor, batch_size: int = 32) -> Tensor:

@@ -208,15 +208,14 @@ class Learner:
         torch.manual_seed(self.config.networks.seed)
         path = self._path("combiner", combiner, *factors)
         saved = finished(path)
-        rows = {} if saved else self.rows
-        scaling = Scaling.blank(len(self._reference)) if saved else self._scaling(self.joint.nric[rows["train"]])
+        scaling = Scaling.blank(len(self._reference)) if saved else self._scaling(self.joint.nric[self.rows["train"]])
         network = CombinerNetwork(combiner, self.collection.reference.connectivity, scaling, len(networks))
         composite = Composite(list(self.collection.factors.values()), networks, network)
         if saved:
             self._load(network, path, *saved)
             return composite
         inputs = predict(composite.factor_shapes, torch.as_tensor(self.joint.latents, dtype=torch.float32))
-        z = self.joint.nric
+        z, rows = self.joint.nric, self.rows
         if combiner.symmetries:
             inputs, z, rows = self._with_images(inputs, rows)
         if not path.exists():

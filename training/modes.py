@@ -41,6 +41,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -53,6 +54,7 @@ from geometry.mesh import FloatArray
 from geometry.normal_matrix import NormalMatrix, QuadraticForm
 from geometry.nric import WeightedNorm, unwrap
 from geometry.reconstruction import Status
+from training.workers import run
 
 #: λ as a share of the price at which the strongest mode of the plain analysis is no longer worth having.
 SPARSITY = 0.1
@@ -118,30 +120,22 @@ def tangents(space: ShellSpace, mean: FloatArray, shapes: ArrayLike, steps: int 
 
     Raises:
         ModeError: a shape with a coordinate that isn't finite.
+        WorkersError: processes that are killed again and again.
     """
-    from joblib import Parallel, delayed
-
     x = np.stack([space.shape(shape) for shape in np.asarray(shapes, dtype=np.float64)])
     bad = np.flatnonzero(~np.isfinite(x).all(axis=(1, 2)))
     if len(bad):
         raise ModeError(f"shape {bad[0]} has a coordinate that is not finite")
     parts = [x[i : i + CHUNK] for i in range(0, len(x), CHUNK)]
-    if workers == 1:
-        done = [_logarithms(space, mean, part, steps) for part in parts]
-    else:
-        parallel = Parallel(n_jobs=workers, inner_max_num_threads=1, backend="loky")
-        done = parallel(delayed(_logarithms)(space, mean, part, steps) for part in parts)
-    fields, status, found, reasons = zip(*(one for part in done for one in part), strict=True)
+    done = dict(run(partial(_logarithms, space, mean, steps), parts, workers=workers))
+    fields, status, found, reasons = zip(*(one for k in range(len(parts)) for one in done[k]), strict=True)
     return Tangents(np.stack(fields), status, found, reasons)
 
 
 def _logarithms(
-    space: ShellSpace, mean: FloatArray, shapes: FloatArray, steps: int
+    space: ShellSpace, mean: FloatArray, steps: int, shapes: FloatArray
 ) -> list[tuple[FloatArray, Status, int, str]]:
-    from threadpoolctl import threadpool_limits
-
-    with threadpool_limits(1):
-        return [_logarithm(space, mean, shape, steps) for shape in shapes]
+    return [_logarithm(space, mean, shape, steps) for shape in shapes]
 
 
 def _logarithm(

@@ -71,36 +71,32 @@ class Run:
 
 def ingest(run: Run) -> None:
     """reference.npz, and of a folder of meshes shapes.npz."""
-    if not run.by_design:
+    if run.by_design:
+        discovery.write_reference(run.folder, run.collection.reference, run.collection.scale)
+    else:
         run.log("ingested", **discovery.ingest(run.folder, run.config))
-        return
-    mesh = run.collection.reference
-    write_npz(
-        run.folder / "reference.npz",
-        vertices=mesh.vertices,
-        faces=mesh.faces,
-        edges=mesh.edges,
-        scale=np.array(run.collection.scale),
-    )
 
 
-def _discovered(find: Callable[[Path, Config], dict[str, Any]]) -> Callable[[Run], None]:
-    """A stage that a collection which is a product by design has no need of."""
+def _nothing_to_find(run: Run) -> None:
+    run.log("skipped", why="the generator gives factors and bounds itself")
+
+
+def _discovered(
+    find: Callable[[Path, Config], dict[str, Any]], by_design: Callable[[Run], None] = _nothing_to_find
+) -> Callable[[Run], None]:
+    """A stage that finds something in a collection, or does another thing where that is a product by design."""
 
     def stage(run: Run) -> None:
         if run.by_design:
-            run.log("skipped", why="the generator gives factors and bounds itself")
+            by_design(run)
         else:
             run.log("found", **find(run.folder, run.config))
 
     return stage
 
 
-def factors(run: Run) -> None:
-    """factors.json."""
-    if not run.by_design:
-        run.log("found", **discovery.factors(run.folder, run.config))
-        return
+def given_factors(run: Run) -> None:
+    """factors.json, as the generator says."""
     lists = run.collection.factors
     write_json(run.folder / "factors.json", {"factors": list(lists.values()), "names": list(lists)})
 
@@ -202,7 +198,7 @@ STAGES: dict[str, Stage] = {
     "ingest": Stage(ingest, lambda c: [c.collection], ("reference.npz", "shapes.npz")),
     "mean": Stage(_discovered(discovery.mean), lambda c: [c.material], ("mean.npz",)),
     "modes": Stage(_discovered(discovery.modes), lambda c: [c.modes], ("modes.npz", "modes.json")),
-    "factors": Stage(factors, lambda c: [c.factors], ("factors.json",)),
+    "factors": Stage(_discovered(discovery.factors, given_factors), lambda c: [c.factors], ("factors.json",)),
     "samples": Stage(samples, lambda c: [c.samples], ("samples",)),
     # Files of networks are named by samples and settings, so a change leaves those alone that it doesn't touch.
     "networks": Stage(networks, lambda c: [c.networks, c.monolithic, *c.variants.values()], ()),

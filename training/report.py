@@ -7,7 +7,6 @@ import importlib.util
 import io
 import json
 import math
-import os
 import tomllib
 import zipfile
 from collections.abc import Iterator, Mapping
@@ -27,6 +26,8 @@ from PIL import Image
 
 from geometry.mesh import FloatArray, IntArray, TriangleMesh, align
 from geometry.nric import WeightedNorm
+from training.files import write_text
+from training.modes import edge_magnitudes
 from training.plots import Line, lines, plot
 from training.rendering import Camera
 
@@ -134,8 +135,8 @@ class Record:
         bent knee moves the whole lower leg, but lengths and angles change at the knee (paper, figure of SPGA modes).
         """
         mesh = TriangleMesh.from_arrays(self.base, self.reference["faces"])  # type: ignore[arg-type]
-        weights = WeightedNorm.of(mesh, self.evaluation.get("eta", 1e-2)).squared
-        density = (tangents**2 * weights).reshape(len(tangents), 2, -1).sum(axis=1)
+        norm = WeightedNorm.of(mesh, self.evaluation.get("eta", 1e-2))
+        density = edge_magnitudes(tangents, norm) ** 2
         ends, count = mesh.edges.T.ravel(), len(mesh.vertices)
         degree = np.bincount(ends, minlength=count).clip(1)
         result = np.sqrt([np.bincount(ends, np.tile(row, 2), count) / degree for row in density])
@@ -473,9 +474,6 @@ def write_report(folder: Path) -> Path:
     Raises:
         ReportError: the folder is no run directory, or a file in it can't be read.
     """
-    text = page(Record(folder))
     path = folder / "report.html"
-    part = path.with_suffix(".part")
-    part.write_text(text, encoding="utf-8")
-    os.replace(part, path)
+    write_text(path, page(Record(folder)))
     return path
