@@ -15,6 +15,9 @@ from geometry.mesh import Connectivity, FloatArray, IntArray, MeshError, Triangl
 ANGLE_LIMITS = (10.0, 6.0, 3.0, 1.5)
 #: Largest turn of a face's normal in one collapse, and largest angle between the normals of two neighbours.
 TURN_LIMIT, FOLD_LIMIT = np.cos(np.deg2rad(60)), np.cos(np.deg2rad(140))
+#: Where the fine mesh is crumpled already and no side of a face at a vertex is longer than this share of the coarse
+#: mesh's edges, anything goes that makes neither slivers nor folds more: the place is about to become a point.
+SMALL = 1.0
 #: Share of the vertices kept back to heal slivers and folds that the fine mesh has already.
 HEALING_SHARE = 0.1
 #: Shapes, spread evenly over the collection, whose quadrics are summed; every shape is checked.
@@ -69,13 +72,15 @@ def coarsen(fine: TriangleMesh, target: int, shapes: FloatArray) -> Coarsening:
     bad = np.flatnonzero(~np.isfinite(shapes).all(axis=(1, 2)))
     if len(bad):
         raise MeshError(f"shape {bad[0]} has a coordinate that is not finite")
-    decimation = _Decimation(fine.connectivity, np.concatenate([fine.vertices[None], shapes]))
+    edge = np.sqrt(2 / np.sqrt(3) * fine.area / target)
+    decimation = _Decimation(fine.connectivity, np.concatenate([fine.vertices[None], shapes]), SMALL * edge)
     sines = np.sin(np.deg2rad(ANGLE_LIMITS))
     spare = int((1 + HEALING_SHARE) * target)
     if any(decimation.run(spare, sine) for sine in sines):
         for sine in sines[:0:-1]:  # the worst first
             decimation.heal(target, sine)
         any(decimation.run(target, sine) for sine in sines)
+        decimation.heal(target, sines[-1])
     return decimation.result(target)
 
 
@@ -85,7 +90,12 @@ class _Quality:
 
     sine: float
     fold: float
-    faults: int
+    slivers: int
+    folds: int
+
+    @property
+    def faults(self) -> int:
+        return self.slivers + self.folds
 
 
 class _Decimation:
@@ -94,9 +104,11 @@ class _Decimation:
     Args:
         connectivity: fine.
         shapes: (n, Vf, 3).
+        small: see SMALL, as a length.
     """
 
-    def __init__(self, connectivity: Connectivity, shapes: FloatArray) -> None:
+    def __init__(self, connectivity: Connectivity, shapes: FloatArray, small: float) -> None:
+        self.small = small
         centred = shapes - shapes.mean(axis=1, keepdims=True)
         # Vertex first: a check gathers a few vertices of every shape.
         self.points = np.ascontiguousarray(np.moveaxis(centred, 0, 1))
@@ -274,6 +286,9 @@ class _Decimation:
         becomes = _quality(sines, normals, [k + i for i in stays], kept, sine)
         if heal:
             return becomes.faults < was.faults
+        no_more = becomes.slivers <= was.slivers and becomes.folds <= was.folds
+        if was.faults and no_more and squares[:, :k].max() <= self.small**2:
+            return True
         turns = _dots(normals[stays], normals[[k + i for i in stays]])
         return (
             becomes.sine >= min(sine**2, was.sine)
@@ -348,8 +363,12 @@ def _quality(sines: FloatArray, normals: FloatArray, faces: list[int], pairs: _P
     """Quality of some faces and neighbours, numbered in arrays (k, n) of sin² and (k, n, 3) of unit normals."""
     angles = sines[faces]
     folds = _dots(normals[[i for i, _ in pairs]], normals[[j for _, j in pairs]])
-    faults = np.count_nonzero(angles < sine**2) + np.count_nonzero(folds < FOLD_LIMIT)
-    return _Quality(float(angles.min(initial=1)), float(folds.min(initial=1)), int(faults))
+    return _Quality(
+        float(angles.min(initial=1)),
+        float(folds.min(initial=1)),
+        int(np.count_nonzero(angles < sine**2)),
+        int(np.count_nonzero(folds < FOLD_LIMIT)),
+    )
 
 
 def _unit(normals: FloatArray) -> FloatArray:

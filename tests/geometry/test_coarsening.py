@@ -197,6 +197,22 @@ def test_slivers_of_the_fine_mesh_are_healed(rng):
     assert np.rad2deg(found.smallest_angle) > 3
 
 
+@pytest.mark.parametrize("seed", [0, 2])
+def test_a_crumpled_place_smaller_than_a_coarse_face_is_cleared_away(seed):
+    """A corner of a mouth: in some shapes many small faces lie folded on one another."""
+    ball = trimesh.creation.icosphere(subdivisions=4)
+    mesh = TriangleMesh.from_arrays(ball.vertices, ball.faces)
+    place = np.linalg.norm(mesh.vertices - mesh.vertices[100], axis=1) < 0.15
+    shapes = np.repeat(mesh.vertices[None], 8, axis=0)
+    shapes[:, place] += 0.05 * np.random.default_rng(seed).standard_normal((8, place.sum(), 3))
+    folded = np.cos(np.deg2rad(140))
+    assert (neighbour_cosines(shapes, mesh.faces) < folded).sum() > 10
+    found = coarsen(mesh, 150, shapes)
+    assert found.reason == ""
+    assert neighbour_cosines(shapes[:, found.fine_index], found.faces).min() > folded
+    assert np.rad2deg(found.smallest_angle) > 5
+
+
 def test_what_cannot_be_reached_is_said():
     tetrahedron = trimesh.creation.icosphere(subdivisions=1)
     mesh = TriangleMesh.from_arrays(tetrahedron.vertices, tetrahedron.faces)
