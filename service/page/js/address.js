@@ -1,0 +1,51 @@
+/** The state of the page as the part of its address after the #, and back. */
+
+const FLAGS = ["wireframe", "normals", "loop"];
+const number = (value) => String(Number(value.toFixed(5)));
+const list = (numbers) => numbers.map(number).join(",");
+const unlist = (text) => text.split(",").map(Number);
+
+/** What of the store goes into the address. */
+export function toHash(store, view) {
+  const parts = new URLSearchParams({ model: store.model.name, z: list(store.code) });
+  const flags = FLAGS.filter((flag) => store[flag]);
+  if (!store.fine) flags.push("coarse");
+  if (flags.length) parts.set("show", flags.join(","));
+  if (store.locked.some(Boolean)) parts.set("locked", store.locked.flatMap((is, k) => (is ? [k] : [])).join(","));
+  if (store.keyframes.length) parts.set("keys", store.keyframes.map(list).join(";"));
+  if (store.beyond) parts.set("beyond", number(store.beyond));
+  if (store.colour !== "none") parts.set("colour", store.colour);
+  if (store.against >= 0) parts.set("against", store.against);
+  if (view) parts.set("view", list(view));
+  return `#${parts.toString().replaceAll("%2C", ",").replaceAll("%3B", ";")}`;
+}
+
+/** What an address asks for; parts that make no sense for the model are left out. */
+export function fromHash(hash, models) {
+  const parts = new URLSearchParams(hash.replace(/^#/, ""));
+  const model = models.find(({ name }) => name === parts.get("model"));
+  if (!model) return {};
+  const m = model.latent_dimension;
+  const isCode = (code) => code.length === m && code.every(Number.isFinite);
+  const code = unlist(parts.get("z") ?? "");
+  const keyframes = (parts.get("keys") ?? "").split(";").map(unlist).filter(isCode);
+  const flags = (parts.get("show") ?? "").split(",");
+  const locked = (parts.get("locked") ?? "").split(",").filter(Boolean).map(Number);
+  const against = Number(parts.get("against") ?? -1);
+  const view = unlist(parts.get("view") ?? "");
+  const beyond = Number(parts.get("beyond"));
+  return {
+    model,
+    code: isCode(code) ? code : null,
+    keyframes,
+    locked: Array.from({ length: m }, (_, k) => locked.includes(k)),
+    view: view.length === 6 && view.every(Number.isFinite) ? view : null,
+    state: {
+      ...Object.fromEntries(FLAGS.map((flag) => [flag, flags.includes(flag)])),
+      fine: !flags.includes("coarse"),
+      colour: ["stretch", "bending"].includes(parts.get("colour")) ? parts.get("colour") : "none",
+      against: Number.isInteger(against) && against < keyframes.length ? against : -1,
+      beyond: beyond > 0 && beyond <= 1 ? beyond : 0,
+    },
+  };
+}

@@ -1,0 +1,100 @@
+/** The calls of the server that the page makes. Every failure becomes a Problem with a sentence for people. */
+
+import { readNpz } from "./npz.js";
+
+export const origin = new URL(".", document.baseURI).href.replace(/\/$/, "");
+const PATIENCE = 3;
+
+/** What the server said went wrong, by RFC 9457; status 0 stands for no answer at all. */
+export class Problem extends Error {
+  constructor(message, status, type) {
+    super(message);
+    Object.assign(this, { status, type });
+  }
+
+  get offline() {
+    return this.status === 0;
+  }
+}
+
+const wait = (seconds) => new Promise((resolve) => { setTimeout(resolve, 1000 * seconds); });
+
+async function call(path, options = {}) {
+  for (let tries = 1; ; tries += 1) {
+    let response;
+    try {
+      response = await fetch(origin + path, options);
+    } catch (error) {
+      if (error.name === "AbortError") throw error;
+      throw new Problem("The server does not answer.", 0);
+    }
+    if (response.ok) return response;
+    const seconds = Number(response.headers.get("Retry-After") ?? 1);
+    if (response.status === 503 && tries < PATIENCE && seconds <= 5) {
+      await wait(seconds);
+      continue;
+    }
+    const problem = await response.json().catch(() => ({}));
+    throw new Problem(problem.detail ?? `The server answers ${response.status}.`, response.status, problem.type);
+  }
+}
+
+const post = (path, body, signal) => call(path, {
+  method: "POST",
+  headers: { "Content-Type": "application/json" },
+  body: JSON.stringify(body),
+  signal,
+});
+const json = async (response) => (await response).json();
+
+export const models = async () => (await json(call("/v1/models"))).models;
+export const modelCard = (model) => json(call(model.links.self));
+export const ready = () => call("/v2/health/ready").then(() => true, () => false);
+
+const diagnosticsOf = (response) => JSON.parse(response.headers.get("Shape-Diagnostics") ?? "{}");
+
+/** The reference's positions and faces. */
+export async function reference(model, mesh) {
+  const response = await call(`${model.links.mesh}?mesh=${mesh}&format=npz`);
+  const { vertices, faces } = await readNpz(await response.arrayBuffer(), ["vertices", "faces"]);
+  return { vertices: vertices.data, faces: faces.data };
+}
+
+/** Positions (3V numbers each) of some codes, and the worst of their diagnostics. */
+export async function shapes(model, latents, mesh, signal) {
+  const response = await post(`${model.links.vertices}?format=npz`, { latents, mesh }, signal);
+  const { vertices } = await readNpz(await response.arrayBuffer(), ["vertices"]);
+  return { shapes: split(vertices), diagnostics: diagnosticsOf(response) };
+}
+
+/** Positions and codes of the frames of a path. */
+export async function frames(model, path, signal) {
+  const { id, links } = await interpolation(model, path, signal);
+  const response = await call(`${links.self}?format=npz`, { signal });
+  const { vertices, latents, t } = await readNpz(await response.arrayBuffer(), ["vertices", "latents", "t"]);
+  return { id, shapes: split(vertices), codes: split(latents).map((code) => Array.from(code)), t: Array.from(t.data) };
+}
+
+export const interpolation = (model, path, signal) => json(post(model.links.interpolations, path, signal));
+
+/** A random code of a seed. */
+export async function sample(model, seed) {
+  const { latents } = await json(post(`${model.links.self}/sample`, { count: 1, seed, distribution: "uniform" }));
+  return latents[0];
+}
+
+/** The code whose shape comes closest to some vertices' targets. */
+export const edit = (model, body, signal) => json(post(`${model.links.self}/edit`, body, signal));
+
+/** The code of a mesh file. */
+export const encode = (model, file, format) =>
+  json(call(`${model.links.self}/encode?format=${format}`, { method: "POST", body: file }));
+
+/** A file to keep, as a blob. */
+export const file = async (path, body) => (await (body ? post(path, body) : call(path))).blob();
+
+/** Rows of an array of two or more dimensions. */
+function split({ shape, data }) {
+  const size = data.length / shape[0];
+  return Array.from({ length: shape[0] }, (_, i) => data.subarray(i * size, (i + 1) * size));
+}

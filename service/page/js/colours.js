@@ -1,0 +1,29 @@
+/** Colour scales, from numbers to linear sRGB. */
+
+import * as THREE from "three";
+import { BASE } from "./scene.js";
+
+const DIVERGING = ["#2166ac", "#6aaed6", "#e8e6e1", "#ee9a6c", "#b2182b"];
+const stops = DIVERGING.map((colour) => new THREE.Color(colour));
+const accent = new THREE.Color("#e08a2c");
+export const gradient = `linear-gradient(to right, ${DIVERGING.join(", ")})`;
+
+/** Colours (3V) of values (V) between −limit, blue, and limit, red. */
+export function diverging(values, limit) {
+  const colours = new Float32Array(3 * values.length);
+  const colour = new THREE.Color();
+  values.forEach((value, i) => {
+    const at = Math.min(Math.max((value / limit + 1) / 2, 0), 1) * (stops.length - 1);
+    const left = Math.min(Math.floor(at), stops.length - 2);
+    colour.lerpColors(stops[left], stops[left + 1], at - left).toArray(colours, 3 * i);
+  });
+  return colours;
+}
+
+/** Colours (3V) of weights (V) between 0, the surface's own colour, and 1. */
+export function tint(weights) {
+  const colours = new Float32Array(3 * weights.length);
+  const colour = new THREE.Color();
+  weights.forEach((weight, i) => colour.lerpColors(BASE, accent, weight).toArray(colours, 3 * i));
+  return colours;
+}

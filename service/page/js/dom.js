@@ -1,0 +1,26 @@
+/** Small helpers for building the page. Text only ever goes in as text. */
+
+export const find = (selector, root = document) => root.querySelector(selector);
+export const clone = (name) => document.querySelector(`template#${name}`).content.firstElementChild.cloneNode(true);
+export const element = (name, properties = {}, ...children) => {
+  const made = Object.assign(document.createElement(name), properties);
+  made.append(...children);
+  return made;
+};
+
+/** A number for people: as many digits as say something. */
+export const readable = (value, digits = 3) => Number(value.toPrecision(digits)).toString();
+
+/** A button that is on or off, tied to a value of the store. */
+export function toggle(button, store, key) {
+  const show = () => button.setAttribute("aria-pressed", String(store[key]));
+  button.addEventListener("click", () => store.set({ [key]: !store[key] }));
+  store.on([key], show);
+  show();
+}
+
+/** Width and height in device pixels, so that small pictures are sharp. */
+export function sharp(canvas, size) {
+  canvas.width = canvas.height = size * Math.min(devicePixelRatio, 2);
+  return canvas;
+}

@@ -1,0 +1,107 @@
+/** Files in and out: meshes to keep, calls to copy, meshes to encode. */
+
+import * as api from "./api.js";
+import { element, find, readable } from "./dom.js";
+import { report, reporting, say } from "./messages.js";
+
+/** What the server offers for one shape. */
+export const SHAPE_FORMATS = ["glb", "gltf", "obj", "ply", "stl", "npz", "json"];
+const EXTENSIONS = { jsonl: "jsonl", zip: "zip" };
+
+export async function copy(text, what) {
+  try {
+    await navigator.clipboard.writeText(text);
+    say(`Copied ${what}.`);
+  } catch {
+    say(`The browser does not let the page copy. Here is ${what}: ${text}`, { kind: "error" });
+  }
+}
+
+function keep(blob, name) {
+  const link = element("a", { href: URL.createObjectURL(blob), download: name });
+  link.click();
+  setTimeout(() => URL.revokeObjectURL(link.href), 10_000);
+}
+
+export class Files {
+  constructor(store, path, root, stage) {
+    Object.assign(this, { store, path });
+    this.format = find("#format", root);
+    this.format.append(...SHAPE_FORMATS.map((name) => element("option", { textContent: name })));
+    this.curl = find("#curl", root);
+    this.animation = find("#animation-format", root);
+    store.on(["code", "model", "fine", "colour"], () => this.#tell());
+    this.format.addEventListener("change", () => this.#tell());
+    find("#download", root).addEventListener("click", reporting(() => this.#shape()));
+    find("#download-animation").addEventListener("click", reporting(() => this.#animation()));
+    store.on(["keyframes"], () => { find("#download-animation").disabled = store.keyframes.length < 2; });
+    find("#copy-curl", root).addEventListener("click", () => copy(this.curl.textContent, "the call"));
+
+    const input = find("#mesh-file", root);
+    input.addEventListener("change", () => { if (input.files[0]) this.encode(input.files[0]); input.value = ""; });
+    addEventListener("dragover", (event) => {
+      if (!event.dataTransfer.types.includes("Files")) return;
+      event.preventDefault();
+      stage.classList.add("dropping");
+    });
+    addEventListener("dragleave", (event) => { if (!event.relatedTarget) stage.classList.remove("dropping"); });
+    addEventListener("drop", (event) => {
+      event.preventDefault();
+      stage.classList.remove("dropping");
+      if (event.dataTransfer.files[0]) this.encode(event.dataTransfer.files[0]);
+    });
+  }
+
+  /** Path and body of the call that answers the shape as a file. */
+  get #call() {
+    const { model, code, fine, colour } = this.store;
+    const query = new URLSearchParams({ format: this.format.value });
+    if (colour !== "none") query.set("color", colour);
+    const latent = code.map((value) => Number(value.toFixed(6)));
+    return { path: `${model.links.mesh}?${query}`, body: fine ? { latent } : { latent, mesh: "coarse" } };
+  }
+
+  #tell() {
+    if (!this.store.model) return;
+    const { path, body } = this.#call;
+    this.curl.textContent = `curl '${api.origin}${path}' -H 'content-type: application/json' `
+      + `-d '${JSON.stringify(body)}' -o ${this.store.model.name}.${this.format.value}`;
+  }
+
+  async #shape() {
+    const { path, body } = this.#call;
+    keep(await api.file(path, body), `${this.store.model.name}.${this.format.value}`);
+  }
+
+  async #animation() {
+    const { model, fine } = this.store;
+    const format = this.animation.value;
+    say("The server makes the animation …", { key: "animation" });
+    try {
+      const { links } = await api.interpolation(model, { ...this.path.request, mesh: fine ? "fine" : "coarse" });
+      const path = links[format] ?? `${links.self}?format=${format}`;
+      keep(await api.file(path), `${model.name}-animation.${EXTENSIONS[format] ?? format}`);
+      say("The animation is saved.", { key: "animation" });
+    } catch (error) {
+      say(error.message, { kind: "error", key: "animation" });
+    }
+  }
+
+  /** Find the code of a mesh file and show it. */
+  async encode(file) {
+    const { model } = this.store;
+    const format = file.name.split(".").pop().toLowerCase();
+    say(`Looking for the code of ${file.name} …`, { key: "encode" });
+    try {
+      const answer = await api.encode(model, file, format);
+      if (this.store.model !== model) return;
+      this.store.set({ code: answer.latent });
+      const error = typeof answer.vertex_error === "number" ? answer.vertex_error : answer.vertex_error?.mean;
+      say(`This is the code of ${file.name}: lengths and angles fit to ${readable(100 * answer.residual, 2)} %`
+        + (error === undefined ? "." : `, its vertices lie ${readable(error)} away on average.`), { key: "encode" });
+    } catch (error) {
+      if (error.offline) report(error);
+      else say(`${file.name}: ${error.message}`, { kind: "error", key: "encode" });
+    }
+  }
+}

@@ -1,0 +1,49 @@
+/** Undo and redo of codes: each rest of the hand is a step. */
+
+import { sameCode } from "./space.js";
+
+const LONGEST = 200;
+
+export class History {
+  #steps = [];
+  #at = -1;
+
+  constructor(store, { undo, redo }) {
+    Object.assign(this, { store, undo, redo });
+    store.on(["space"], () => { this.#steps = []; this.#at = -1; });
+    store.on(["space", "code", "moving", "playing"], () => this.#record());
+    undo.addEventListener("click", () => this.#go(-1));
+    redo.addEventListener("click", () => this.#go(1));
+    addEventListener("keydown", (event) => {
+      if (!(event.ctrlKey || event.metaKey) || event.altKey || event.target.matches("input[type=number], textarea")) return;
+      const key = event.key.toLowerCase();
+      if (key !== "z" && key !== "y") return;
+      event.preventDefault();
+      this.#go(key === "y" || event.shiftKey ? 1 : -1);
+    });
+  }
+
+  #record() {
+    const { code, moving, playing } = this.store;
+    if (!code || moving || playing) return;
+    if (this.#at < 0 || !sameCode(code, this.#steps[this.#at])) {
+      this.#steps = [...this.#steps.slice(0, this.#at + 1), code].slice(-LONGEST);
+      this.#at = this.#steps.length - 1;
+    }
+    this.#show();
+  }
+
+  #go(by) {
+    const code = this.#steps[this.#at + by];
+    if (!code || this.store.playing) return;
+    this.#at += by;
+    this.store.set({ code });
+    this.#show();
+  }
+
+  #show() {
+    this.undo.disabled = this.#at <= 0;
+    this.redo.disabled = this.#at >= this.#steps.length - 1;
+    this.undo.title = `Undo (Ctrl+Z), ${this.#at} ${this.#at === 1 ? "step" : "steps"}`;
+  }
+}

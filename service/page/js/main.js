@@ -1,0 +1,156 @@
+/** Puts the page together: one store, and everything that shows or changes what is in it. */
+
+import { fromHash, toHash } from "./address.js";
+import * as api from "./api.js";
+import { openCard } from "./card.js";
+import { Colouring } from "./colouring.js";
+import { inWords } from "./diagnostics.js";
+import { element, find, toggle } from "./dom.js";
+import { copy, Files } from "./files.js";
+import { History } from "./history.js";
+import { report, reporting } from "./messages.js";
+import { Modes } from "./modes.js";
+import { Path } from "./path.js";
+import { Pictures } from "./pictures.js";
+import { Pull } from "./pull.js";
+import { ShapeLoop } from "./shape-loop.js";
+import { Sliders } from "./sliders.js";
+import { LatentSpace } from "./space.js";
+import { Store } from "./store.js";
+import { Strip } from "./strip.js";
+import { tabs } from "./tabs.js";
+import { Viewer } from "./viewer.js";
+
+const PREFERRED = "figure";
+
+const store = new Store({
+  model: null, space: null, references: {}, hasFine: false,
+  code: null, locked: [], moving: false, playing: false, shape: null,
+  keyframes: [], loop: false, beyond: 0,
+  colour: "none", against: -1, highlight: null, regions: null, repaint: null,
+  wireframe: false, normals: false, fine: true, pull: false,
+});
+
+const viewer = new Viewer(find("#canvas"));
+const pictures = new Pictures();
+const sliders = new Sliders(store, find("#factors"));
+const modes = new Modes(store, sliders, pictures);
+const colouring = new Colouring(store, { legend: find("#legend"), against: find("#against") });
+const path = new Path(store, pictures, {
+  list: find("#keyframes"), add: find("#add-keyframe"), play: find("#play"), loop: find("#loop"),
+  beyond: find("#beyond"), timeline: find("#timeline"), time: find("#time"), status: find("#path-status"),
+});
+const strip = new Strip(store, pictures, { button: find("#draw-strip"), table: find("#strip") });
+new History(store, { undo: find("#undo"), redo: find("#redo") });
+new Files(store, path, find("#tab-files"), find(".stage"));
+new Pull(store, viewer);
+new ShapeLoop(store);
+tabs(find("[role=tablist]"));
+
+// The shape and its colours.
+store.on(["shape"], () => {
+  if (!store.shape) return;
+  viewer.show(store.shape.mesh, store.shape.positions, colouring.of(store.shape));
+});
+store.on(["colour", "against", "highlight", "regions", "repaint", "moving"], () => {
+  if (store.shape) viewer.paint(colouring.of(store.shape));
+});
+store.on(["wireframe", "normals"], () => viewer.style(store));
+
+// What is said about it.
+let timed = null;
+viewer.addEventListener("drawn", () => {
+  const { shape } = store;
+  if (!shape || shape === timed) return;
+  timed = shape;
+  const took = performance.now() - shape.began;
+  const frame = store.playing ? "playing" : `${took.toFixed(0)} ms to the picture`;
+  find("#frame-time").textContent = `${shape.positions.length / 3} vertices · ${frame}`;
+  find(".stage").dataset.shown = shape.mesh;
+});
+store.on(["shape"], () => {
+  if (!store.shape?.diagnostics) return;
+  const words = inWords(store.shape.diagnostics);
+  find("#diagnostics").replaceChildren(...words.map(([how, text]) => element("li", { className: how, textContent: text })));
+});
+
+// Switches.
+for (const key of ["wireframe", "normals", "fine", "pull"]) toggle(find(`#${key}`), store, key);
+find("#reset-view").addEventListener("click", () => { viewer.resetView(); remember(); });
+for (const radio of document.querySelectorAll("[name=colour]")) {
+  radio.addEventListener("change", () => store.set({ colour: radio.value }));
+  store.on(["colour"], () => { radio.checked = radio.value === store.colour; });
+}
+find("#theme").addEventListener("click", () => {
+  const root = document.documentElement;
+  const dark = root.dataset.theme ? root.dataset.theme === "dark" : matchMedia("(prefers-color-scheme: dark)").matches;
+  root.dataset.theme = dark ? "light" : "dark";
+});
+
+// Codes from elsewhere than the sliders.
+const take = (code) => store.set({ code: store.space.wrapAll(code).map((value, k) => (store.locked[k] ? store.code[k] : value)) });
+const seed = find("#seed");
+const draw = reporting(async () => take(await api.sample(store.model, Number(seed.value))));
+find("#random").addEventListener("click", () => { seed.value = Number(seed.value) + 1; draw(); });
+seed.addEventListener("change", () => { if (seed.validity.valid && seed.value !== "") draw(); });
+find("#reset-all").addEventListener("click", () => take(store.space.home));
+find("#draw-strip").addEventListener("click", reporting(() => strip.draw()));
+find("#about").addEventListener("click", reporting(() => openCard(find("#card"), store.model)));
+find("#share").addEventListener("click", () => { remember(); copy(location.href, "the address of this shape"); });
+
+// Models.
+const picker = find("#model");
+let models = [];
+let turned = false;
+picker.addEventListener("change", reporting(() => openModel({ model: models.find(({ name }) => name === picker.value) })));
+
+async function openModel({ model, code, keyframes = [], locked, view, state = {} }) {
+  const space = new LatentSpace(model);
+  const coarse = await api.reference(model, "coarse");
+  picker.value = model.name;
+  store.set({ shape: null, playing: false });
+  viewer.open(coarse);
+  pictures.open(coarse);
+  turned = Boolean(view);
+  if (view) viewer.view = view;
+  store.set({
+    model, space, references: { coarse }, hasFine: false, regions: null, highlight: null,
+    code: space.wrapAll(code ?? space.home), locked: locked ?? space.home.map(() => false),
+    keyframes, against: -1, ...state,
+  });
+  find("#canvas").setAttribute("aria-label", `${model.title}, the shape of the code that the sliders give`);
+  document.title = `${model.title} · shapespace`;
+  const fine = await api.reference(model, "fine");
+  if (store.model !== model) return;
+  if (fine.vertices.length !== coarse.vertices.length) {
+    viewer.addMesh("fine", fine);
+    store.set({ references: { coarse, fine }, hasFine: true });
+  }
+  find("#fine").disabled = !store.hasFine;
+  await modes.draw();
+}
+
+// The address.
+let soon = 0;
+function remember() {
+  clearTimeout(soon);
+  if (store.model && !store.playing) history.replaceState(null, "", toHash(store, turned ? viewer.view : null));
+}
+const rememberSoon = () => { clearTimeout(soon); soon = setTimeout(remember, 250); };
+store.on(["model", "code", "locked", "keyframes", "loop", "beyond", "colour", "against", "wireframe", "normals", "fine", "playing"], rememberSoon);
+viewer.addEventListener("turned", () => { turned = true; rememberSoon(); });
+addEventListener("hashchange", reporting(restore));
+
+async function restore() {
+  const asked = fromHash(location.hash, models);
+  await openModel(asked.model ? asked : { model: models.find(({ name }) => name === PREFERRED) ?? models[0] });
+}
+
+try {
+  models = await api.models();
+  picker.replaceChildren(...models.map(({ name, title }) => element("option", { value: name, textContent: title })));
+  if (models.length === 0) throw new Error("No model is served. Put a bundle into the models folder and start again.");
+  await restore();
+} catch (error) {
+  report(error);
+}

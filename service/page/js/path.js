@@ -1,0 +1,171 @@
+/** Keyframes, the path through them, and its player. */
+
+import * as api from "./api.js";
+import { clone, find, sharp } from "./dom.js";
+import { report, reporting } from "./messages.js";
+
+const PICTURE = 64;
+const SEGMENT = 24; // frames
+const LONGEST = 120; // frames
+const PACE = 1.8; // seconds for a segment
+
+export class Path {
+  #frames = null; // of the path as it is now
+  #loading = null;
+  #t = 0;
+  #clock = 0;
+
+  constructor(store, pictures, { list, add, play, loop, beyond, timeline, time, status }) {
+    Object.assign(this, { store, pictures, list, play, beyond, timeline, time, status });
+    store.on(["keyframes", "loop", "beyond", "model"], () => this.#changed());
+    store.on(["keyframes", "model"], () => this.#list());
+    store.on(["playing"], () => this.#showPlaying());
+    add.addEventListener("click", () => store.set({ keyframes: [...store.keyframes, store.code] }));
+    play.addEventListener("click", reporting(() => (store.playing ? this.pause() : this.#play())));
+    loop.addEventListener("change", () => store.set({ loop: loop.checked }));
+    store.on(["loop"], () => { loop.checked = store.loop; });
+    beyond.addEventListener("change", () => store.set({ beyond: Number(beyond.value) }));
+    timeline.addEventListener("input", reporting(() => this.#scrub(Number(timeline.value))));
+    timeline.addEventListener("change", () => this.pause());
+  }
+
+  /** What the server is asked for; the same for the file to keep. */
+  get request() {
+    const { keyframes, loop } = this.store;
+    const [start, stop] = this.#ends;
+    const segments = keyframes.length - (loop ? 0 : 1);
+    const frames = Math.min(Math.ceil(SEGMENT * segments * (stop - start)) + 1, LONGEST);
+    return { keyframes, frames, start, stop, loop };
+  }
+
+  get #ends() {
+    const { beyond, loop } = this.store;
+    return loop ? [0, 1] : [-beyond, 1 + beyond];
+  }
+
+  #changed() {
+    if (this.store.playing) this.pause();
+    this.#frames = null;
+    this.#loading?.abort();
+    this.#loading = null;
+    const { keyframes, loop } = this.store;
+    const ready = keyframes.length > 1;
+    const [start, stop] = this.#ends;
+    const percent = (t) => `${(100 * (t - start)) / (stop - start)}%`;
+    Object.assign(this.timeline, { min: start, max: stop, disabled: !ready });
+    this.timeline.style.setProperty("--low", percent(0));
+    this.timeline.style.setProperty("--high", percent(1));
+    this.#t = Math.min(Math.max(this.#t, start), stop);
+    this.timeline.value = this.#t;
+    this.play.disabled = !ready;
+    this.beyond.disabled = loop;
+    this.beyond.value = this.store.beyond;
+    this.status.textContent = ready ? "" : "Add two or more keyframes: each takes the shape as it is.";
+    this.#tell();
+  }
+
+  #list() {
+    const { keyframes, model } = this.store;
+    this.list.replaceChildren(...keyframes.map((code, i) => {
+      const item = clone("keyframe");
+      const name = `keyframe ${i + 1}`;
+      find(".number", item).textContent = i + 1;
+      const go = find("[data-do=go]", item);
+      go.setAttribute("aria-label", `Go to ${name}`);
+      go.addEventListener("click", () => this.store.set({ code: [...code] }));
+      const replace = find("[data-do=replace]", item);
+      replace.setAttribute("aria-label", `Take the shape as it is for ${name}`);
+      replace.addEventListener("click", () => this.store.set({ keyframes: keyframes.with(i, this.store.code) }));
+      const remove = find("[data-do=remove]", item);
+      remove.setAttribute("aria-label", `Remove ${name}`);
+      remove.addEventListener("click", () => this.store.set({ keyframes: keyframes.toSpliced(i, 1) }));
+      sharp(find("canvas", item), PICTURE);
+      return item;
+    }));
+    if (keyframes.length === 0) return;
+    api.shapes(model, keyframes, "coarse").then(({ shapes }) => {
+      if (this.store.keyframes !== keyframes) return;
+      this.list.querySelectorAll("canvas").forEach((canvas, i) => this.pictures.draw(canvas, shapes[i]));
+    }).catch(report);
+  }
+
+  async #load() {
+    if (this.#frames) return this.#frames;
+    const { request } = this;
+    const loading = new AbortController();
+    this.#loading?.abort();
+    this.#loading = loading;
+    this.status.textContent = `Computing ${request.frames} frames …`;
+    try {
+      this.#frames = await api.frames(this.store.model, { ...request, mesh: "coarse" }, loading.signal);
+    } finally {
+      if (this.#loading === loading) this.status.textContent = "";
+    }
+    return this.#frames;
+  }
+
+  async #play() {
+    await this.#load();
+    const [start, stop] = this.#ends;
+    if (this.#t >= stop - 1e-6) this.#t = start;
+    this.store.set({ playing: true });
+    const segments = this.request.keyframes.length - (this.store.loop ? 0 : 1);
+    let before = performance.now();
+    const step = (now) => {
+      if (!this.store.playing) return;
+      this.#t += Math.max(now - before, 0) / (1000 * PACE * segments);
+      before = now;
+      if (this.#t > stop && this.store.loop) this.#t = start + ((this.#t - start) % (stop - start));
+      this.#t = Math.min(this.#t, stop);
+      this.#show();
+      if (this.#t >= stop) this.pause();
+      else this.#clock = requestAnimationFrame(step);
+    };
+    this.#clock = requestAnimationFrame(step);
+  }
+
+  /** Rest at the nearest frame: the sliders take its code. */
+  pause() {
+    cancelAnimationFrame(this.#clock);
+    if (!this.store.playing) return;
+    this.store.set({ playing: false, code: [...this.store.code] });
+  }
+
+  async #scrub(t) {
+    cancelAnimationFrame(this.#clock);
+    this.#t = t;
+    this.#tell();
+    if (!this.#frames && this.#loading) return;
+    await this.#load();
+    this.store.set({ playing: true });
+    this.#show();
+    if (document.activeElement !== this.timeline || !this.timeline.matches(":active")) this.pause();
+  }
+
+  /** The shape at the time it is, between two frames a mixture of both. */
+  #show() {
+    const { shapes, codes } = this.#frames;
+    const [start, stop] = this.#ends;
+    const steps = this.store.loop ? shapes.length : shapes.length - 1;
+    const at = ((this.#t - start) / (stop - start)) * steps;
+    const k = Math.min(Math.floor(at), steps - 1);
+    const share = at - k;
+    const next = shapes[(k + 1) % shapes.length];
+    const positions = shapes[k].map((x, i) => x + share * (next[i] - x));
+    const code = codes[(share < 0.5 ? k : k + 1) % codes.length];
+    const { model } = this.store;
+    this.store.set({ code, shape: { model, mesh: "coarse", code, positions, diagnostics: null, began: performance.now() } });
+    this.timeline.value = this.#t;
+    this.#tell();
+  }
+
+  #tell() {
+    this.time.textContent = `t = ${this.#t.toFixed(2)}`.replace("-", "−");
+    this.timeline.setAttribute("aria-valuetext", this.time.textContent);
+  }
+
+  #showPlaying() {
+    find("span", this.play).textContent = this.store.playing ? "Pause" : "Play";
+    this.play.classList.toggle("playing", this.store.playing);
+  }
+}

@@ -1,0 +1,37 @@
+/** Small renders of shapes, all by one renderer that nobody sees. */
+
+import * as THREE from "three";
+import { frame, geometryOf, litCamera, move, paint, sphereOf, surfaceMaterial } from "./scene.js";
+
+export class Pictures {
+  constructor() {
+    this.renderer = new THREE.WebGLRenderer({ antialias: true, alpha: true, preserveDrawingBuffer: true });
+    this.camera = litCamera();
+    this.mesh = new THREE.Mesh(new THREE.BufferGeometry(), surfaceMaterial());
+    this.mesh.frustumCulled = false;
+    this.scene = new THREE.Scene();
+    this.scene.add(this.camera, this.mesh);
+  }
+
+  open({ vertices, faces }) {
+    this.mesh.geometry.dispose();
+    this.mesh.geometry = geometryOf(faces, vertices.length / 3);
+    const { center, radius } = sphereOf(vertices);
+    this.sphere = { center, radius: 0.95 * radius };
+  }
+
+  /** Draw a shape into a canvas of the page, which keeps its size. */
+  draw(canvas, positions, colours) {
+    const { width, height } = canvas;
+    this.renderer.setSize(width, height, false);
+    this.camera.aspect = width / height;
+    frame(this.camera, this.sphere);
+    move(this.mesh.geometry, positions);
+    paint(this.mesh.geometry, colours);
+    this.renderer.render(this.scene, this.camera);
+    const context = canvas.getContext("2d");
+    context.clearRect(0, 0, width, height);
+    context.drawImage(this.renderer.domElement, 0, 0);
+    canvas.classList.add("drawn");
+  }
+}

@@ -1,0 +1,123 @@
+/** A slider for each coordinate, grouped by factor. */
+
+import { clone, find, readable, sharp } from "./dom.js";
+
+const PICTURE = 44;
+
+export class Sliders {
+  #rows = [];
+
+  constructor(store, list) {
+    Object.assign(this, { store, list });
+    store.on(["space"], () => this.#build());
+    store.on(["code", "locked"], () => this.#show());
+    // The end of a drag, wherever it ends.
+    for (const end of ["pointerup", "pointercancel", "blur"]) addEventListener(end, () => store.set({ moving: false }));
+  }
+
+  /** The canvases of coordinate k for shapes at its three stations. */
+  pictures(k) {
+    return [...this.#rows[k].root.querySelectorAll("canvas")];
+  }
+
+  #build() {
+    const { model, space } = this.store;
+    this.#rows = [];
+    this.list.replaceChildren(...model.factors.map((factor, j) => {
+      const group = clone("factor");
+      find("h3", group).textContent = factor.name;
+      const rows = [];
+      for (let k = factor.start; k < factor.stop; k += 1) rows.push(this.#row(k, factor));
+      find(".rows", group).append(...rows);
+      find("[data-do=reset]", group).setAttribute("aria-label", `Reset all of ${factor.name}`);
+      find("[data-do=reset]", group).addEventListener("click", () => {
+        this.#change(this.store.code.map((value, k) => (k >= factor.start && k < factor.stop ? space.home[k] : value)));
+      });
+      const light = (on) => () => this.store.set({ highlight: on ? j : null });
+      group.addEventListener("pointerenter", light(true));
+      group.addEventListener("pointerleave", light(false));
+      group.addEventListener("focusin", light(true));
+      group.addEventListener("focusout", light(false));
+      return group;
+    }));
+    this.#show();
+  }
+
+  #row(k, factor) {
+    const { model, space } = this.store;
+    const root = clone("coordinate");
+    const name = model.latent_names[k];
+    // The factor's name stands above already.
+    const label = name.startsWith(factor.name) ? name.slice(factor.name.length).replace(/^[\s,]+/, "") : name;
+    const slider = find("input[type=range]", root);
+    const box = find("input[type=number]", root);
+    const lock = find("[data-do=lock]", root);
+    const reset = find("[data-do=reset]", root);
+    const [low, high] = space.range(k);
+    const percent = (value) => `${(100 * (value - low)) / (high - low)}%`;
+
+    find(".name", root).textContent = label;
+    find(".name", root).title = name;
+    Object.assign(slider, { min: low, max: high, id: `z${k}` });
+    slider.setAttribute("aria-label", name);
+    slider.style.setProperty("--low", percent(space.lower[k]));
+    slider.style.setProperty("--high", percent(space.upper[k]));
+    slider.style.setProperty("--home", percent(space.home[k]));
+    slider.title = `Training data from ${readable(space.lower[k])} to ${readable(space.upper[k])}`
+      + (space.period[k] ? `, period ${readable(space.period[k])}` : "");
+    box.setAttribute("aria-label", `${name}, number`);
+    lock.setAttribute("aria-label", `Lock ${name}`);
+    reset.setAttribute("aria-label", `Reset ${name}`);
+
+    slider.addEventListener("pointerdown", () => this.store.set({ moving: true }));
+    slider.addEventListener("input", () => this.#set(k, Number(slider.value)));
+    slider.addEventListener("keydown", (event) => this.#wrapAtTheEnd(event, k, slider));
+    box.addEventListener("input", () => { if (box.value !== "" && box.validity.valid) this.#set(k, Number(box.value)); });
+    box.addEventListener("change", () => this.#show());
+    reset.addEventListener("click", () => this.#set(k, space.home[k]));
+    lock.addEventListener("click", () => {
+      this.store.set({ locked: this.store.locked.map((is, i) => (i === k ? !is : is)) });
+    });
+    const signs = ["−", space.home[k] === 0 ? "mean" : "middle", "+"];
+    root.querySelectorAll(".pictures button").forEach((button, i) => {
+      const value = space.stations(k)[i];
+      button.title = `${signs[i]}: ${readable(value)}`;
+      button.setAttribute("aria-label", `${name} to ${readable(value)} (${signs[i]})`);
+      sharp(find("canvas", button), PICTURE);
+      button.addEventListener("click", () => this.#set(k, value));
+    });
+    this.#rows[k] = { root, slider, box, lock, controls: [slider, box, reset, ...root.querySelectorAll(".pictures button")] };
+    return root;
+  }
+
+  #set(k, value) {
+    this.#change(this.store.code.map((old, i) => (i === k ? this.store.space.wrap(k, value) : old)));
+  }
+
+  /** Take on a code, but for the coordinates that are locked. */
+  #change(code) {
+    this.store.set({ code: code.map((value, k) => (this.store.locked[k] ? this.store.code[k] : value)) });
+  }
+
+  /** An angle that is moved past its end by a key goes on at the other. */
+  #wrapAtTheEnd(event, k, slider) {
+    const up = ["ArrowRight", "ArrowUp"].includes(event.key);
+    const down = ["ArrowLeft", "ArrowDown"].includes(event.key);
+    if (!this.store.space.period[k] || !(up || down)) return;
+    event.preventDefault();
+    this.#set(k, Number(slider.value) + ((up ? 1 : -1) * this.store.space.period[k]) / 100);
+  }
+
+  #show() {
+    const { code, locked, space } = this.store;
+    if (!code || code.length !== this.#rows.length) return;
+    this.#rows.forEach(({ root, slider, box, lock, controls }, k) => {
+      if (Number(slider.value) !== code[k]) slider.value = code[k];
+      if (document.activeElement !== box || Number(box.value) !== code[k]) box.value = Number(code[k].toFixed(4));
+      root.classList.toggle("outside", !space.inside(k, code[k]));
+      root.classList.toggle("locked", locked[k]);
+      lock.setAttribute("aria-pressed", String(locked[k]));
+      for (const control of controls) control.disabled = locked[k];
+    });
+  }
+}

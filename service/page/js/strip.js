@@ -1,0 +1,37 @@
+/** The elements of a path's factors: the whole shape along the path, and below it each factor alone. */
+
+import * as api from "./api.js";
+import { element, find, sharp } from "./dom.js";
+
+const COLUMNS = 5;
+const PICTURE = 56;
+
+export class Strip {
+  constructor(store, pictures, { button, table }) {
+    Object.assign(this, { store, pictures, table, button });
+    store.on(["keyframes", "model"], () => {
+      table.hidden = true;
+      button.disabled = store.keyframes.length < 2;
+    });
+  }
+
+  async draw() {
+    const { keyframes, model, space } = this.store;
+    const { codes, shapes, t } = await api.frames(model, { keyframes, frames: COLUMNS, mesh: "coarse" });
+    const rows = [["all factors", null], ...model.factors.map((factor) => [factor.name, factor])];
+    find("thead tr", this.table).replaceChildren(
+      element("td"), ...t.map((time) => element("th", { scope: "col", textContent: time.toFixed(2) })));
+    const made = rows.map(([name]) => element("tr", {},
+      element("th", { scope: "row", textContent: name }),
+      ...t.map(() => element("td", {}, sharp(element("canvas"), PICTURE)))));
+    find("tbody", this.table).replaceChildren(...made);
+    this.table.hidden = false;
+    for (const [i, [, factor]] of rows.entries()) {
+      const drawn = factor
+        ? (await api.shapes(model, codes.map((code) => space.alone(factor, code)), "coarse")).shapes
+        : shapes;
+      if (this.store.keyframes !== keyframes || this.store.model !== model) return;
+      made[i].querySelectorAll("canvas").forEach((canvas, k) => this.pictures.draw(canvas, drawn[k]));
+    }
+  }
+}

@@ -1,0 +1,68 @@
+/** Lengths and angles of a mesh's edges, and how much they differ between two shapes. */
+
+/** What a mesh's faces say once for all: its edges, the faces beside them, and the edges around each vertex. */
+export class Surface {
+  constructor(faces, vertexCount) {
+    const known = new Map();
+    const edges = [];
+    for (let f = 0; f < faces.length; f += 3) {
+      for (let c = 0; c < 3; c += 1) {
+        const [a, b, opposite] = [faces[f + c], faces[f + ((c + 1) % 3)], faces[f + ((c + 2) % 3)]];
+        const key = Math.min(a, b) * vertexCount + Math.max(a, b);
+        const edge = known.get(key);
+        // Seen from the second face the edge runs the other way: its opposite corner lies to the right.
+        if (edge === undefined) {
+          known.set(key, edges.length);
+          edges.push([a, b, opposite, -1]);
+        } else edges[edge][3] = opposite;
+      }
+    }
+    this.edges = edges;
+    this.vertexCount = vertexCount;
+  }
+
+  /** Lengths and signed dihedral angles (positive where convex, 0 at a boundary) of every edge. */
+  measure(x) {
+    const lengths = new Float32Array(this.edges.length);
+    const angles = new Float32Array(this.edges.length);
+    this.edges.forEach(([a, b, c, d], i) => {
+      const e = minus(x, b, a);
+      lengths[i] = Math.hypot(...e);
+      if (d < 0) return;
+      const left = cross(e, minus(x, c, a));
+      const right = cross(minus(x, d, a), e);
+      angles[i] = Math.atan2(-dot(e, cross(right, left)), lengths[i] * dot(left, right));
+    });
+    return { lengths, angles };
+  }
+
+  /** Relative change of length of each edge. */
+  stretch(from, to) {
+    return to.lengths.map((length, i) => length / from.lengths[i] - 1);
+  }
+
+  /** Change of angle of each edge, in radians. */
+  bending(from, to) {
+    return to.angles.map((angle, i) => {
+      const change = angle - from.angles[i];
+      return change - 2 * Math.PI * Math.round(change / (2 * Math.PI));
+    });
+  }
+
+  /** The mean of the values at each vertex's edges. */
+  atVertices(values) {
+    const sums = new Float32Array(this.vertexCount);
+    const counts = new Uint16Array(this.vertexCount);
+    this.edges.forEach(([a, b], i) => {
+      for (const vertex of [a, b]) {
+        sums[vertex] += values[i];
+        counts[vertex] += 1;
+      }
+    });
+    return sums.map((sum, vertex) => sum / Math.max(counts[vertex], 1));
+  }
+}
+
+const minus = (x, i, j) => [x[3 * i] - x[3 * j], x[3 * i + 1] - x[3 * j + 1], x[3 * i + 2] - x[3 * j + 2]];
+const dot = (u, v) => u[0] * v[0] + u[1] * v[1] + u[2] * v[2];
+const cross = (u, v) => [u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]];

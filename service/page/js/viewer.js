@@ -1,0 +1,180 @@
+/** The large view: draws the shape when something has changed, and only then. */
+
+import * as THREE from "three";
+import { OrbitControls } from "three/addons/OrbitControls.js";
+import { frame, geometryOf, litCamera, move, paint, sphereOf, surfaceMaterial } from "./scene.js";
+
+const TURN = Math.PI / 24;
+
+export class Viewer extends EventTarget {
+  #scheduled = false;
+
+  constructor(canvas) {
+    super();
+    this.canvas = canvas;
+    this.renderer = new THREE.WebGLRenderer({ canvas, antialias: true, alpha: true });
+    this.renderer.setPixelRatio(Math.min(devicePixelRatio, 2));
+    this.scene = new THREE.Scene();
+    this.camera = litCamera();
+    this.scene.add(this.camera);
+    this.controls = new OrbitControls(this.camera, canvas);
+    this.controls.addEventListener("change", () => this.draw());
+    this.controls.addEventListener("end", () => this.dispatchEvent(new Event("turned")));
+
+    this.materials = { surface: surfaceMaterial(), normals: new THREE.MeshNormalMaterial({ side: THREE.DoubleSide }) };
+    this.mesh = new THREE.Mesh(new THREE.BufferGeometry(), this.materials.surface);
+    const wires = new THREE.MeshBasicMaterial({ wireframe: true, color: 0x1f2a37, transparent: true, opacity: 0.55 });
+    this.wires = new THREE.Mesh(this.mesh.geometry, wires);
+    // Lines lie on the surface: a little nearer to the eye they don't flicker.
+    Object.assign(this.materials.surface, { polygonOffset: true, polygonOffsetFactor: 1, polygonOffsetUnits: 1 });
+    Object.assign(this.materials.normals, { polygonOffset: true, polygonOffsetFactor: 1, polygonOffsetUnits: 1 });
+    this.mesh.frustumCulled = this.wires.frustumCulled = false;
+    // Not drawn while empty: three.js would take the lack of normals for flat shading, and keep to it.
+    this.mesh.visible = this.wires.visible = false;
+    this.scene.add(this.mesh, this.wires);
+    this.geometries = {};
+
+    new ResizeObserver(() => this.#resize()).observe(canvas.parentElement);
+    this.#resize();
+    canvas.addEventListener("keydown", (event) => this.#key(event));
+    canvas.addEventListener("webglcontextrestored", () => this.draw());
+  }
+
+  /** Take on a model, by its coarse reference; returns when nothing of the one before is left. */
+  open(reference) {
+    for (const geometry of Object.values(this.geometries)) geometry.dispose();
+    this.geometries = {};
+    this.addMesh("coarse", reference);
+    this.sphere = sphereOf(reference.vertices);
+    this.sphere.radius *= 1.08; // room for poses that reach further, and for the buttons
+    this.resetView();
+  }
+
+  addMesh(name, { vertices, faces }) {
+    this.geometries[name] = geometryOf(faces, vertices.length / 3);
+  }
+
+  /** Show positions on one of the model's meshes. */
+  show(name, positions, colours) {
+    const geometry = this.geometries[name];
+    move(geometry, positions);
+    paint(geometry, colours);
+    this.mesh.geometry = this.wires.geometry = geometry;
+    this.mesh.visible = true;
+    this.draw();
+  }
+
+  paint(colours) {
+    paint(this.mesh.geometry, colours);
+    this.draw();
+  }
+
+  /** Whether lines show, and whether colours stand for normals. */
+  style({ wireframe, normals }) {
+    this.wires.visible = wireframe;
+    this.mesh.material = normals ? this.materials.normals : this.materials.surface;
+    this.draw();
+  }
+
+  resetView() {
+    frame(this.camera, this.sphere);
+    this.controls.target.copy(this.sphere.center);
+    this.controls.minDistance = 0.2 * this.sphere.radius;
+    this.controls.maxDistance = 20 * this.sphere.radius;
+    this.controls.update();
+    this.draw();
+  }
+
+  /** Where the camera is and looks, as six numbers. */
+  get view() {
+    return [...this.camera.position.toArray(), ...this.controls.target.toArray()];
+  }
+
+  set view(numbers) {
+    this.camera.position.fromArray(numbers);
+    this.controls.target.fromArray(numbers, 3);
+    this.controls.update();
+    this.draw();
+  }
+
+  /** Draw before the next picture of the screen. */
+  draw() {
+    if (this.#scheduled) return;
+    this.#scheduled = true;
+    requestAnimationFrame(() => {
+      this.#scheduled = false;
+      const began = performance.now();
+      this.renderer.render(this.scene, this.camera);
+      this.dispatchEvent(new CustomEvent("drawn", { detail: performance.now() - began }));
+    });
+  }
+
+  /** The vertex nearest to where a ray through a point of the window meets the surface, or null. */
+  pick({ clientX, clientY }) {
+    const box = this.canvas.getBoundingClientRect();
+    const point = new THREE.Vector2(
+      ((clientX - box.left) / box.width) * 2 - 1, 1 - ((clientY - box.top) / box.height) * 2);
+    const caster = new THREE.Raycaster();
+    caster.setFromCamera(point, this.camera);
+    const hit = caster.intersectObject(this.mesh)[0];
+    if (!hit) return null;
+    const at = (vertex) => new THREE.Vector3().fromBufferAttribute(this.mesh.geometry.attributes.position, vertex);
+    const corners = [hit.face.a, hit.face.b, hit.face.c];
+    const vertex = corners.reduce((a, b) => (at(a).distanceTo(hit.point) <= at(b).distanceTo(hit.point) ? a : b));
+    return { vertex, position: at(vertex) };
+  }
+
+  /** The point at a place of the window, as far away as `depth` is. */
+  unproject({ clientX, clientY }, depth) {
+    const box = this.canvas.getBoundingClientRect();
+    const { z } = depth.clone().project(this.camera);
+    return new THREE.Vector3(
+      ((clientX - box.left) / box.width) * 2 - 1, 1 - ((clientY - box.top) / box.height) * 2, z,
+    ).unproject(this.camera);
+  }
+
+  /** Where a point appears in the window. */
+  project(point) {
+    const box = this.canvas.getBoundingClientRect();
+    const { x, y } = new THREE.Vector3().fromArray(point).project(this.camera);
+    return { clientX: box.left + ((x + 1) / 2) * box.width, clientY: box.top + ((1 - y) / 2) * box.height };
+  }
+
+  #resize() {
+    const { clientWidth: width, clientHeight: height } = this.canvas.parentElement;
+    if (!width || !height) return;
+    const before = Math.min(this.camera.aspect, 1);
+    this.camera.aspect = width / height;
+    this.renderer.setSize(width, height, false);
+    // A narrower window must show as much: the distance follows.
+    const after = Math.min(this.camera.aspect, 1);
+    const { target } = this.controls;
+    this.camera.position.sub(target).multiplyScalar(before / after).add(target);
+    this.camera.updateProjectionMatrix();
+    this.draw();
+  }
+
+  #key(event) {
+    const turns = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] };
+    const zooms = { "+": 1 / 1.12, "=": 1 / 1.12, "-": 1.12 };
+    if (event.ctrlKey || event.metaKey || event.altKey) return;
+    const offset = this.camera.position.clone().sub(this.controls.target);
+    if (event.key in turns) {
+      const spherical = new THREE.Spherical().setFromVector3(offset);
+      spherical.theta += TURN * turns[event.key][0];
+      spherical.phi += TURN * turns[event.key][1];
+      offset.setFromSpherical(spherical.makeSafe());
+    } else if (event.key in zooms) {
+      offset.multiplyScalar(zooms[event.key]);
+    } else if (event.key === "0" || event.key === "Home") {
+      this.resetView();
+      event.preventDefault();
+      return;
+    } else return;
+    event.preventDefault();
+    this.camera.position.copy(this.controls.target).add(offset);
+    this.controls.update();
+    this.draw();
+    this.dispatchEvent(new Event("turned"));
+  }
+}
