@@ -7,47 +7,54 @@ from typing import Annotated
 
 from fastapi import Depends, Path, Query, Request
 
+from service.metrics import Metrics
 from service.problems import ProblemError
+from service.reloading import Reloader
 from service.repository import ModelRepository
 from service.settings import Settings
 from service.shape_model import ShapeModel
 from service.workers import Workers
 
 
-@dataclass(frozen=True)
+@dataclass
 class Service:
-    """The parts of a running service."""
+    """The parts of a running service.
+
+    Attributes:
+        draining: whether it is about to end, so that nobody should send anything more.
+    """
 
     settings: Settings
     repository: ModelRepository
     workers: Workers
+    metrics: Metrics
+    reloader: Reloader
+    draining: bool = False
 
 
-def _service(request: Request) -> Service:
+# Coroutines, all of them: plain functions would each take a turn in a pool of threads.
+async def _service(request: Request) -> Service:
     service: Service = request.app.state.service
     return service
 
 
 ServiceDependency = Annotated[Service, Depends(_service)]
 
+ModelName = Annotated[str, Path(description="Name of a model.", examples=["freaky-torus"])]
 Version = Annotated[str | None, Query(description="Version of the model; by default the newest.")]
 Format = Annotated[
     str | None, Query(description="Format of the answer, which wins over `Accept`; 406 lists the choices.")
 ]
 
 
-def _model(
-    service: ServiceDependency,
-    name: Annotated[str, Path(description="Name of a model.", examples=["freaky-torus"])],
-    version: Version = None,
-) -> ShapeModel:
+async def _model(service: ServiceDependency, name: ModelName, version: Version = None) -> ShapeModel:
     return service.repository.get(name, version)
 
 
 Model = Annotated[ShapeModel, Depends(_model)]
 
 
-def require_json(request: Request) -> None:
+async def require_json(request: Request) -> None:
     """Refuse bodies that aren't declared as JSON; raises ProblemError, unsupported-media-type."""
     declared = request.headers.get("content-type", "")
     media_type = declared.split(";")[0].strip().lower()

@@ -11,6 +11,7 @@ from fastapi import FastAPI, HTTPException, Request, Response
 from fastapi.exceptions import RequestValidationError
 from starlette.exceptions import HTTPException as StarletteHTTPException
 from starlette.routing import Match
+from starlette.types import Scope
 
 from service.animation import PathTooLongError, UnknownInterpolationError
 from service.encodings import dump_json
@@ -33,6 +34,7 @@ class Kind:
 #: Every kind by the name that ends its ``type``.
 KINDS = {
     "malformed-request": Kind(400, "The request can't be read"),
+    "unauthorized": Kind(401, "No valid API key"),
     "not-found": Kind(404, "Nothing is here"),
     "unknown-model": Kind(404, "Unknown model"),
     "unknown-version": Kind(404, "Unknown version of the model"),
@@ -67,7 +69,13 @@ _OF_EXCEPTION: dict[type[Exception], str] = {
     BusyError: "busy",
     DeadlineError: "deadline-passed",
 }
-_HEADERS = {"busy": {"Retry-After": "1"}, "not-ready": {"Retry-After": "1"}}
+_HEADERS = {
+    "busy": {"Retry-After": "1"},
+    "not-ready": {"Retry-After": "1"},
+    "unauthorized": {"WWW-Authenticate": "Bearer"},
+}
+#: Below it an answer to an error also has the one member that the Open Inference Protocol wants.
+_INFERENCE_PATHS = "/v2"
 
 
 class ProblemError(HTTPException):
@@ -84,14 +92,18 @@ class ProblemError(HTTPException):
         self.kind, self.extensions = kind, extensions
 
 
-def problem(kind: str, detail: str, headers: Mapping[str, str] | None = None, **extensions: Any) -> Response:
-    """A problem as an answer."""
+def problem(
+    scope: Scope, kind: str, detail: str, headers: Mapping[str, str] | None = None, **extensions: Any
+) -> Response:
+    """A problem as the answer to the request of a scope."""
     content = {
         "type": TYPE_PREFIX + kind,
         "title": KINDS[kind].title,
         "status": KINDS[kind].status,
         "detail": detail,
     }
+    if scope["path"].startswith(_INFERENCE_PATHS):
+        content["error"] = detail
     return Response(
         dump_json(content | extensions),
         KINDS[kind].status,
@@ -106,24 +118,25 @@ def install(app: FastAPI) -> None:
         app.add_exception_handler(exception, _domain)
     app.add_exception_handler(StarletteHTTPException, _http)
     app.add_exception_handler(RequestValidationError, _validation)
-    app.add_exception_handler(Exception, _internal)
 
 
-async def _domain(_: Request, error: Exception) -> Response:
-    return problem(_OF_EXCEPTION[type(error)], str(error))
+async def _domain(request: Request, error: Exception) -> Response:
+    return problem(request.scope, _OF_EXCEPTION[type(error)], str(error))
 
 
 async def _http(request: Request, error: Exception) -> Response:
     assert isinstance(error, StarletteHTTPException)  # noqa: S101 - narrows the type that the handler is registered for
     if isinstance(error, ProblemError):
-        return problem(error.kind, error.detail, error.headers, **error.extensions)
+        return problem(request.scope, error.kind, error.detail, error.headers, **error.extensions)
     path, method = request.url.path, request.method
     if error.status_code == HTTPStatus.NOT_FOUND:
-        return problem("not-found", f"Nothing answers at {path}. /openapi.json lists every call.")
+        return problem(request.scope, "not-found", f"Nothing answers at {path}. /openapi.json lists every call.")
     if error.status_code == HTTPStatus.METHOD_NOT_ALLOWED:
         allowed = ", ".join(_allowed(request)) or (error.headers or {}).get("Allow", "")
-        return problem("method-not-allowed", f"{path} does not take {method}. Use {allowed}.", {"Allow": allowed})
+        detail = f"{path} does not take {method}. Use {allowed}."
+        return problem(request.scope, "method-not-allowed", detail, {"Allow": allowed})
     return problem(
+        request.scope,
         "malformed-request",
         "The body can't be read. Send one JSON object in UTF-8, as /openapi.json describes it.",
     )
@@ -138,28 +151,30 @@ def _allowed(request: Request) -> list[str]:
     return [m for m, scope in scopes.items() if any(route.matches(scope)[0] is Match.FULL for route in routes)]
 
 
-async def _internal(_: Request, __: Exception) -> Response:
-    # The traceback goes to the log only, by way of the server.
+def internal_error(scope: Scope) -> Response:
+    """What a mistake of the server looks like from outside; the traceback is for the log only."""
     return problem(
+        scope,
         "internal-error",
         "The server made a mistake, which its log describes. Try again, and report it if it happens again.",
     )
 
 
-async def _validation(_: Request, error: Exception) -> Response:
+async def _validation(request: Request, error: Exception) -> Response:
     assert isinstance(error, RequestValidationError)  # noqa: S101 - as above
     faults = error.errors()
     if any(fault["type"] == "json_invalid" for fault in faults):
         where = faults[0]["loc"][-1]
         reason = faults[0].get("ctx", {}).get("error", "")
         return problem(
+            request.scope,
             "malformed-request",
             f"The body is not JSON (character {where}: {reason}). Send one valid JSON object.",
         )
     kind = "not-finite" if all(fault["type"] == "finite_number" for fault in faults) else "invalid-request"
     errors = [{"pointer": _pointer(fault["loc"]), "detail": _advice(fault)} for fault in faults[:10]]
     more = f" ({len(faults) - 1} more under errors.)" if len(faults) > 1 else ""
-    return problem(kind, errors[0]["detail"] + more, errors=errors)
+    return problem(request.scope, kind, errors[0]["detail"] + more, errors=errors)
 
 
 def _pointer(loc: tuple[Any, ...]) -> str:

@@ -3,10 +3,21 @@
 from __future__ import annotations
 
 import os
+from enum import StrEnum
 from pathlib import Path
+from typing import Annotated
 
-from pydantic import Field, PositiveFloat, PositiveInt
-from pydantic_settings import BaseSettings, SettingsConfigDict
+from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt, SecretStr, field_validator
+from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict
+
+PREFIX = "SHAPESPACE_"
+
+
+class LogFormat(StrEnum):
+    """How a line of the log looks: for people, or one JSON object."""
+
+    TEXT = "text"
+    JSON = "json"
 
 
 def cpu_quota(cgroup: Path = Path("/sys/fs/cgroup")) -> int:
@@ -27,7 +38,7 @@ def cpu_quota(cgroup: Path = Path("/sys/fs/cgroup")) -> int:
 class Settings(BaseSettings):
     """Settings of the server; the README lists them."""
 
-    model_config = SettingsConfigDict(env_prefix="SHAPESPACE_", frozen=True)
+    model_config = SettingsConfigDict(env_prefix=PREFIX, env_ignore_empty=True, frozen=True)
 
     models_dir: Path = Field(default=Path("models"), description="folder of bundles, NAME/VERSION/")
     host: str = Field(default="127.0.0.1", description="address to listen on")
@@ -38,5 +49,28 @@ class Settings(BaseSettings):
     queue: int = Field(default=32, ge=0, description="requests that may wait for a worker before others get 503")
     deadline: PositiveFloat = Field(default=60.0, description="seconds a request may take before it gets 504")
     max_body: PositiveInt = Field(default=8 * 2**20, description="largest request body, in bytes")
+    max_upload: PositiveInt = Field(default=64 * 2**20, description="largest mesh file sent to be encoded, in bytes")
     max_codes: PositiveInt = Field(default=256, description="most latent codes in one request")
     max_frames: PositiveInt = Field(default=600, description="most frames of an interpolation")
+    watch: NonNegativeFloat = Field(
+        default=2.0, description="seconds between looks at the models folder for changes; 0 never looks"
+    )
+    drain: NonNegativeFloat = Field(
+        default=2.0, description="seconds after SIGTERM in which new requests are still answered, and readiness is 503"
+    )
+    api_key: SecretStr | None = Field(default=None, description="key that requests must bring; by default none")
+    cors_origins: Annotated[tuple[str, ...], NoDecode] = Field(
+        default=(), description="origins whose pages may call, separated by commas, or *"
+    )
+    log_format: LogFormat = Field(default=LogFormat.TEXT, description="text, or json for one object a line")
+
+    @field_validator("cors_origins", mode="before")
+    @classmethod
+    def _split(cls, value: object) -> object:
+        return tuple(filter(None, map(str.strip, value.split(",")))) if isinstance(value, str) else value
+
+
+def unknown_variables() -> list[str]:
+    """Variables of the environment that look like settings but are none."""
+    known = {(PREFIX + name).upper() for name in Settings.model_fields}
+    return sorted(name for name in os.environ if name.upper().startswith(PREFIX) and name.upper() not in known)

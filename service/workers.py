@@ -33,13 +33,17 @@ class Workers:
         threads: size of the pool.
         queue: requests admitted beyond those at work.
         deadline: seconds a request may take from its admission.
+
+    Attributes:
+        admitted: requests at work or waiting.
+        limit: how many those may be.
     """
 
     def __init__(self, threads: int, queue: int, deadline: float) -> None:
         self.threads, self.deadline = threads, deadline
         self._pool = ThreadPoolExecutor(threads, thread_name_prefix="shapespace")
-        self._limit = threads + queue
-        self._admitted = 0  # touched from the event loop only
+        self.limit = threads + queue
+        self.admitted = 0  # touched from the event loop only
 
     @contextmanager
     def admit(self) -> Iterator[float]:
@@ -48,13 +52,13 @@ class Workers:
         Raises:
             BusyError: too many requests are being worked on or waiting.
         """
-        if self._admitted >= self._limit:
+        if self.admitted >= self.limit:
             raise BusyError("All workers are busy and the queue is full. Try again after the time in Retry-After.")
-        self._admitted += 1
+        self.admitted += 1
         try:
             yield time.monotonic() + self.deadline
         finally:
-            self._admitted -= 1
+            self.admitted -= 1
 
     async def run(self, function: Callable[[float], T], deadline: float) -> T:
         """Run work in a thread, given its deadline; raises DeadlineError where its turn comes too late."""

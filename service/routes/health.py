@@ -20,7 +20,10 @@ async def live() -> Health:
 
 @router.get("/ready", responses=problems(503))
 async def ready(service: ServiceDependency) -> Readiness:
-    """Whether there is a model to serve."""
+    """Whether there is a model to serve, and the server isn't about to end."""
+    if service.draining:
+        raise ProblemError("not-ready", "The server is about to end. Send requests to another one.", ready=False)
     if len(service.repository) == 0:
-        raise ProblemError("not-ready", "No model is served. Put a bundle into the models folder; the log says more.")
+        detail = "No model is served. Put a bundle into the models folder; the log says more."
+        raise ProblemError("not-ready", detail, ready=False)
     return Readiness(ready=True)

@@ -100,7 +100,8 @@ app = create_app(Settings())
 def broken(): raise RuntimeError("a secret path")
 async def main():
     transport = httpx.ASGITransport(app, raise_app_exceptions=False)
-    async with httpx.AsyncClient(transport=transport, base_url="http://test") as client:
+    client = httpx.AsyncClient(transport=transport, base_url="http://test")
+    async with app.router.lifespan_context(app), client:
         answer = await client.get("/broken")
         print(answer.status_code, answer.headers["content-type"], answer.text)
 asyncio.run(main())

@@ -1,0 +1,250 @@
+"""The Open Inference Protocol's messages: JSON, and the extension that lets tensors follow it as bytes.
+
+One input, ``latent`` [n, m]; two outputs, ``nric`` [n, 2E] and ``vertices`` [n, V, 3], V being the fine mesh's where
+there is one. All are FP32, row-major, little-endian where binary.
+https://github.com/open-inference/open-inference-protocol and, for the bytes,
+https://github.com/triton-inference-server/server/blob/main/docs/protocol/extension_binary_data.md
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from itertools import chain
+from typing import Annotated, Literal
+
+import numpy as np
+import orjson
+from fastapi.exceptions import RequestValidationError
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, NonNegativeInt, ValidationError
+
+from service.animation import Number
+from service.encodings import dump_json
+from service.latent_space import Bounds
+from service.problems import ProblemError
+from service.shape_model import MeshChoice, ShapeModel
+
+#: How long the JSON part of a body is, where bytes follow it.
+HEADER = "Inference-Header-Content-Length"
+INPUT = "latent"
+OutputName = Literal["nric", "vertices"]
+OUTPUTS: tuple[OutputName, ...] = ("nric", "vertices")
+_FLOAT = np.dtype("<f4")
+
+
+class _Message(BaseModel):
+    # Clients send parameters and members of other servers: the protocol has them ignored.
+    model_config = ConfigDict(extra="ignore")
+
+
+class InputParameters(_Message):
+    """What may go with the input."""
+
+    binary_data_size: NonNegativeInt | None = Field(None, description="Its bytes, where they follow the JSON.")
+
+
+class InputTensor(_Message):
+    """The codes."""
+
+    name: Literal["latent"]
+    shape: Annotated[list[NonNegativeInt], Field(min_length=2, max_length=2, description="[n, m]")]
+    datatype: Literal["FP32"]
+    parameters: InputParameters = InputParameters(binary_data_size=None)
+    data: list[Number] | list[list[Number]] | None = Field(
+        None, description="The numbers, row by row or flat; absent where bytes follow."
+    )
+
+
+class OutputParameters(_Message):
+    """How an output is to come."""
+
+    binary_data: bool | None = Field(None, description="As bytes after the JSON.")
+
+
+class RequestedOutput(_Message):
+    """An output that is wanted."""
+
+    name: OutputName
+    parameters: OutputParameters = OutputParameters(binary_data=None)
+
+
+class InferenceParameters(_Message):
+    """What holds for the whole request."""
+
+    binary_data_output: bool = Field(False, description="All outputs as bytes, unless one says otherwise.")
+    mesh: MeshChoice = Field(MeshChoice.FINE, description="Which mesh's vertices, where the model has a finer one.")
+    bounds: Bounds = Field(
+        Bounds.ALLOW, description="Outside the bounds: extrapolate, clamp to the nearest bound, or reject."
+    )
+
+
+class InferenceRequest(_Message):
+    """A request to infer."""
+
+    id: str | None = Field(None, description="Comes back in the answer.")
+    inputs: Annotated[list[InputTensor], Field(min_length=1, max_length=1)]
+    outputs: Annotated[list[RequestedOutput], Field(description="By default both.")] = []
+    parameters: InferenceParameters = InferenceParameters()
+
+    @property
+    def wanted(self) -> list[OutputName]:
+        """Names of the outputs to give."""
+        return [output.name for output in self.outputs] or list(OUTPUTS)
+
+    def binary(self, name: OutputName) -> bool:
+        """Whether an output is to follow the JSON as bytes."""
+        asked = [output.parameters.binary_data for output in self.outputs if output.name == name]
+        return self.parameters.binary_data_output if not asked or asked[0] is None else asked[0]
+
+
+class OutputTensor(BaseModel):
+    """An output."""
+
+    name: OutputName
+    shape: list[int]
+    datatype: Literal["FP32"]
+    data: list[float] | None = Field(None, description="Flat, row by row; absent where bytes follow.")
+    parameters: dict[str, int] | None = Field(None, description="`binary_data_size`, where bytes follow.")
+
+
+class InferenceAnswer(BaseModel):
+    """What was inferred."""
+
+    model_name: str
+    model_version: str
+    id: str | None = None
+    outputs: list[OutputTensor]
+
+
+class TensorMetadata(BaseModel):
+    """A tensor that goes in or comes out; −1 stands for any number."""
+
+    name: str
+    datatype: str
+    shape: list[int]
+
+
+class ModelMetadata(BaseModel):
+    """A model as the protocol describes it."""
+
+    name: str
+    versions: list[str]
+    platform: str
+    inputs: list[TensorMetadata]
+    outputs: list[TensorMetadata]
+
+
+class ServerMetadata(BaseModel):
+    """The server as the protocol describes it."""
+
+    name: str
+    version: str
+    extensions: list[str]
+
+
+class ModelReadiness(BaseModel):
+    """Whether a model answers."""
+
+    name: str
+    ready: bool
+
+
+def model_metadata(model: ShapeModel, versions: Sequence[str]) -> ModelMetadata:
+    """A model's tensors."""
+    facts = model.manifest
+    fine = len(model.mesh(MeshChoice.FINE).vertices)
+    return ModelMetadata(
+        name=facts.name,
+        versions=list(versions),
+        platform="shapespace",
+        inputs=[TensorMetadata(name=INPUT, datatype="FP32", shape=[-1, facts.latent_dimension])],
+        outputs=[
+            TensorMetadata(name="nric", datatype="FP32", shape=[-1, 2 * facts.edges]),
+            TensorMetadata(name="vertices", datatype="FP32", shape=[-1, fine, 3]),
+        ],
+    )
+
+
+def parse(body: bytes, header: str | None) -> tuple[InferenceRequest, list[list[float]]]:
+    """A body to the request, and the codes that it holds.
+
+    Args:
+        body: JSON, and after it the input's bytes if they aren't in it.
+        header: value of HEADER, by default the length of the body.
+
+    Raises:
+        ProblemError: lengths that don't fit together.
+        RequestValidationError: JSON that isn't a request.
+    """
+    length = len(body)
+    if header is not None:
+        if not header.isascii() or not header.isdecimal() or int(header) > length:
+            raise ProblemError(
+                "malformed-request",
+                f"{HEADER} is {header!r}, but the body has {length} bytes. Send the length of its JSON part.",
+            )
+        length = int(header)
+    request = _request(body[:length])
+    tensor = request.inputs[0]
+    n, m = tensor.shape
+    size = tensor.parameters.binary_data_size
+    if (size is None) == (tensor.data is None):
+        raise _invalid(f"Send {INPUT} either as data, or with binary_data_size and its bytes after the JSON part")
+    if len(body) - length != (size or 0):
+        raise _invalid(
+            f"{len(body) - length} bytes follow the JSON part, not {size or 0} as binary_data_size says. "
+            f"Send {HEADER}, the length of the JSON part, and then the bytes of {INPUT}"
+        )
+    if tensor.data is not None:
+        rows = (row if isinstance(row, list) else [row] for row in tensor.data)
+        values = np.array(list(chain.from_iterable(rows)), dtype=np.float64)
+    elif len(body[length:]) % _FLOAT.itemsize:
+        raise _invalid(f"The bytes of {INPUT} are no whole number of FP32 values. Send {_FLOAT.itemsize} for each")
+    else:
+        values = np.frombuffer(body[length:], _FLOAT)
+    if values.size != n * m:
+        raise _invalid(f"{INPUT} has {values.size} numbers, but its shape is {tensor.shape}. Send {n * m}")
+    return request, values.reshape(n, m).tolist()
+
+
+def _invalid(detail: str) -> ProblemError:
+    return ProblemError("invalid-request", detail + ".")
+
+
+def _request(text: bytes) -> InferenceRequest:
+    try:
+        message = orjson.loads(text)
+    except orjson.JSONDecodeError as error:
+        fault = {"type": "json_invalid", "loc": ("body", error.pos), "ctx": {"error": error.msg}}
+        raise RequestValidationError([fault]) from None
+    try:
+        return InferenceRequest.model_validate(message)
+    except ValidationError as error:
+        faults = error.errors(include_url=False, include_input=False)
+        raise RequestValidationError([{**fault, "loc": ("body", *fault["loc"])} for fault in faults]) from None
+
+
+def answer(
+    request: InferenceRequest, model: ShapeModel, outputs: Mapping[OutputName, NDArray[np.float32]]
+) -> tuple[bytes, int | None]:
+    """The body of an answer, and how long its JSON part is where bytes follow.
+
+    Args:
+        request: says how each output is to come.
+        model: that inferred.
+        outputs: those that are wanted.
+    """
+    described, tail = [], []
+    for name, array in outputs.items():
+        tensor: dict[str, object] = {"name": name, "shape": list(array.shape), "datatype": "FP32"}
+        if request.binary(name):
+            tail.append(array.astype(_FLOAT).tobytes())
+            tensor["parameters"] = {"binary_data_size": len(tail[-1])}
+        else:
+            tensor["data"] = array.ravel()
+        described.append(tensor)
+    message = {"model_name": model.manifest.name, "model_version": model.manifest.version, "outputs": described}
+    if request.id is not None:
+        message["id"] = request.id
+    text = dump_json(message)
+    return b"".join([text, *tail]), len(text) if tail else None

@@ -1,0 +1,144 @@
+"""The Open Inference Protocol: metadata, readiness and inference."""
+
+from __future__ import annotations
+
+import time
+from typing import Annotated, Any
+
+import numpy as np
+from fastapi import APIRouter, Depends, Path, Request, Response
+
+from service import __version__
+from service.dependencies import ModelName, Service, ServiceDependency, limit_codes
+from service.encodings import OCTET_STREAM, dump_json, float32, worst
+from service.inference import (
+    HEADER,
+    InferenceAnswer,
+    InferenceRequest,
+    ModelMetadata,
+    ModelReadiness,
+    OutputName,
+    ServerMetadata,
+    answer,
+    model_metadata,
+    parse,
+)
+from service.responses import problems, server_timing, shapes, total_seconds
+from service.shape_model import ShapeModel
+
+router = APIRouter(prefix="/v2", tags=["inference"])
+
+
+async def _newest(service: ServiceDependency, name: ModelName) -> ShapeModel:
+    return service.repository.get(name)
+
+
+async def _versioned(
+    service: ServiceDependency,
+    name: ModelName,
+    version: Annotated[str, Path(description="Version of the model.", examples=["1"])],
+) -> ShapeModel:
+    return service.repository.get(name, version)
+
+
+Newest = Annotated[ShapeModel, Depends(_newest)]
+Versioned = Annotated[ShapeModel, Depends(_versioned)]
+
+_NEWEST, _VERSIONED = "/models/{name}", "/models/{name}/versions/{version}"
+_BYTES = {OCTET_STREAM: {"schema": {"type": "string", "format": "binary"}}}
+_REQUEST = {"$ref": f"#/components/schemas/{InferenceRequest.__name__}"}
+_INFER: dict[str, Any] = {
+    "response_model": InferenceAnswer,
+    "response_model_exclude_none": True,
+    "responses": {
+        200: {
+            "description": "The outputs, as JSON or as JSON with bytes after it.",
+            "content": _BYTES,
+            "headers": {
+                HEADER: {"description": "Length of the JSON part, where bytes follow.", "schema": {"type": "integer"}}
+            },
+        }
+    }
+    | problems(400, 404, 413, 422, 503, 504),
+    "openapi_extra": {
+        "requestBody": {
+            "required": True,
+            "content": {"application/json": {"schema": _REQUEST}, **_BYTES},
+        },
+        "parameters": [
+            {
+                "name": HEADER,
+                "in": "header",
+                "description": "Length of the JSON part of the body, where the input's bytes follow it.",
+                "schema": {"type": "integer", "minimum": 0},
+            }
+        ],
+    },
+}
+
+
+@router.get("")
+async def server_metadata() -> ServerMetadata:
+    """What this server is."""
+    return ServerMetadata(name="shapespace", version=__version__, extensions=["binary_tensor_data"])
+
+
+@router.get(_NEWEST, responses=problems(404), name="model_metadata")
+async def newest_metadata(service: ServiceDependency, model: Newest) -> ModelMetadata:
+    """The tensors of a model's newest version."""
+    return model_metadata(model, service.repository.versions(model.manifest.name))
+
+
+@router.get(_VERSIONED, responses=problems(404), name="version_metadata")
+async def versioned_metadata(service: ServiceDependency, model: Versioned) -> ModelMetadata:
+    """The tensors of one version of a model."""
+    return model_metadata(model, service.repository.versions(model.manifest.name))
+
+
+@router.get(f"{_NEWEST}/ready", responses=problems(404), name="model_ready")
+async def newest_ready(model: Newest) -> ModelReadiness:
+    """Whether a model answers; 404 where it isn't served."""
+    return ModelReadiness(name=model.manifest.name, ready=True)
+
+
+@router.get(f"{_VERSIONED}/ready", responses=problems(404), name="version_ready")
+async def versioned_ready(model: Versioned) -> ModelReadiness:
+    """Whether a version of a model answers; 404 where it isn't served."""
+    return ModelReadiness(name=model.manifest.name, ready=True)
+
+
+@router.post(f"{_NEWEST}/infer", name="infer", **_INFER)
+async def newest_infer(service: ServiceDependency, request: Request, model: Newest) -> Response:
+    """Lengths and angles, and vertices, of codes, by a model's newest version."""
+    return await _infer(service, request, model)
+
+
+@router.post(f"{_VERSIONED}/infer", name="infer_version", **_INFER)
+async def versioned_infer(service: ServiceDependency, request: Request, model: Versioned) -> Response:
+    """Lengths and angles, and vertices, of codes, by one version of a model."""
+    return await _infer(service, request, model)
+
+
+async def _infer(service: Service, request: Request, model: ShapeModel) -> Response:
+    message, values = parse(await request.body(), request.headers.get(HEADER))
+    limit_codes(service, len(values))
+    codes, inside = model.latents.codes(values, message.parameters.bounds)
+    headers: dict[str, str] = {}
+    seconds: dict[str, float] = {}
+    outputs: dict[OutputName, np.ndarray] = {}
+    with service.workers.admit() as deadline:
+        for name in message.wanted:
+            if name == "vertices":
+                found = await shapes(service, model, codes, inside, message.parameters.mesh, deadline)
+                outputs[name] = float32(np.stack([shape.vertices for shape in found]))
+                headers["Shape-Diagnostics"] = dump_json(worst([shape.diagnostics for shape in found])).decode()
+                seconds |= total_seconds(found)
+            else:
+                z = await service.workers.run(lambda _: model.lengths_and_angles(codes), deadline)
+                outputs[name] = float32(np.concatenate([z.lengths, z.angles], axis=1))
+        began = time.perf_counter()
+        content, length = await service.workers.run(lambda _: answer(message, model, outputs), deadline)
+    headers["Server-Timing"] = server_timing(seconds | {"encode": time.perf_counter() - began})
+    if length is not None:
+        headers[HEADER] = str(length)
+    return Response(content, headers=headers, media_type="application/json" if length is None else OCTET_STREAM)
