@@ -238,3 +238,11 @@ def seal(folder: Path, facts: dict[str, Any] | None = None) -> None:
         for file in files
     }
     path.write_text(json.dumps(facts))
+
+
+def rescale(folder: Path, scale: float) -> None:
+    """Turn a bundle into another one, all of whose lengths are in other units, in one step as `export` does it."""
+    facts = json.loads((folder / "manifest.json").read_text()) | {"scale": scale}
+    part = folder.parent / ".manifest.json"
+    part.write_text(json.dumps(facts))
+    part.replace(folder / "manifest.json")

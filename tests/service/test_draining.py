@@ -1,0 +1,101 @@
+"""The end of a server: readiness first, and nothing that it has accepted is lost."""
+
+import signal
+import threading
+import time
+from collections import Counter
+from pathlib import Path
+
+import httpx
+import pytest
+
+from tests.service.conftest import Server, Start
+
+MESH = "/v1/models/small/mesh"
+
+
+class Load:
+    """Clients that ask without a pause, each over a connection that it keeps, until the port is closed."""
+
+    def __init__(self, server: Server, clients: int) -> None:
+        self.outcomes: Counter[str] = Counter()
+        self._url = server.url
+        self._threads = [threading.Thread(target=self._ask, args=[k]) for k in range(clients)]
+        for thread in self._threads:
+            thread.start()
+
+    def _ask(self, k: int) -> None:
+        with httpx.Client(base_url=self._url, timeout=60) as client:
+            for i in range(100_000):
+                try:
+                    answer = client.post(MESH, json={"latent": [0.1, k, (i % 100) / 100]})
+                except httpx.ConnectError:  # the port is closed: nothing was accepted
+                    self.outcomes["refused"] += 1
+                    return
+                except httpx.HTTPError as error:
+                    self.outcomes[f"lost: {error!r}"] += 1
+                    continue
+                good = answer.status_code == 200 and answer.content[:4] == b"glTF"
+                self.outcomes["answered" if good else f"status {answer.status_code}"] += 1
+
+    def wait(self) -> None:
+        for thread in self._threads:
+            thread.join(timeout=60)
+            assert not thread.is_alive()
+
+
+@pytest.mark.parametrize("drain", [0, 1])
+def test_sigterm_under_load_loses_no_accepted_request(models: Path, start: Start, drain: float) -> None:
+    server = start(models, workers=2, drain=drain)
+    load = Load(server, 6)
+    while load.outcomes["answered"] < 30:
+        time.sleep(0.05)
+    server.process.send_signal(signal.SIGTERM)
+    load.wait()
+    assert set(load.outcomes) == {"answered", "refused"}, load.outcomes
+    assert load.outcomes["refused"] == 6
+    assert server.process.wait(60) == 0
+    assert "Traceback" not in server.log
+
+
+def test_readiness_turns_first_and_everything_is_still_answered(models: Path, start: Start) -> None:
+    server = start(models, drain=3)
+    with httpx.Client(base_url=server.url) as kept:
+        assert kept.get("/v2/health/ready").json() == {"ready": True}
+        server.process.send_signal(signal.SIGTERM)
+        while (ready := httpx.get(f"{server.url}/v2/health/ready")).status_code == 200:
+            time.sleep(0.01)
+        assert ready.status_code == 503
+        assert ready.json()["ready"] is False
+        assert "Send requests to another" in ready.json()["error"]
+        assert httpx.get(f"{server.url}/v2/health/live").status_code == 200
+        answer = kept.post(MESH, json={"latent": [0.1, 0.7, 0.4]})
+        assert answer.status_code == 200
+        assert answer.headers["Connection"] == "close", "so that the client goes elsewhere"
+    server.process.send_signal(signal.SIGTERM)  # who asks twice doesn't want to wait
+    assert server.process.wait(60) == 0
+
+
+def test_a_connection_opened_before_the_end_is_answered_after_it(models: Path, start: Start) -> None:
+    import socket
+
+    server = start(models, drain=0)
+    host, port = server.url.removeprefix("http://").split(":")
+    with socket.create_connection((host, int(port))) as connection:
+        assert httpx.get(f"{server.url}/v2/health/live").status_code == 200  # by now it is accepted
+        server.process.send_signal(signal.SIGTERM)
+        time.sleep(0.5)
+        connection.sendall(b"GET /v1/models/small HTTP/1.1\r\nHost: x\r\n\r\n")
+        with connection.makefile("rb") as answer:
+            assert b"200" in answer.readline()
+            assert b'"name":"small"' in answer.read()
+    assert server.process.wait(60) == 0
+
+
+def test_an_interrupt_ends_it_at_once_and_cleanly(models: Path, start: Start) -> None:
+    server = start(models, drain=60)
+    with httpx.Client(base_url=server.url) as client:
+        assert client.get("/v2/health/live").status_code == 200
+        server.process.send_signal(signal.SIGINT)
+        assert server.process.wait(30) == 0
+    assert "Traceback" not in server.log

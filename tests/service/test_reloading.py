@@ -1,0 +1,186 @@
+"""Bundles that come, change and go while requests run."""
+
+import json
+import shutil
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import httpx
+import numpy as np
+import pytest
+
+from tests.service.bundles import SCALE, reference, rescale, write_bundle
+from tests.service.conftest import Server, Start
+from tests.service.test_bundles import flip_a_bit
+
+CODES = [[0.1, 0.7, 0.4], [0.0, 0.0, 0.0], [0.05, 1.0, 0.2]]
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    write_bundle(tmp_path / "models", "small", "1")
+    return tmp_path / "models"
+
+
+@contextmanager
+def connected(server: Server) -> Iterator[httpx.Client]:
+    with httpx.Client(base_url=server.url, timeout=60) as client:
+        yield client
+
+
+def eventually(holds: Callable[[], bool], seconds: float = 30) -> None:
+    end = time.monotonic() + seconds
+    while not holds():
+        assert time.monotonic() < end, "it never came true"
+        time.sleep(0.02)
+
+
+def reload(server: Server) -> None:
+    """Send SIGHUP and wait for the line that says it is done."""
+    before = server.log.count("reloaded:")
+    server.process.send_signal(signal.SIGHUP)
+    eventually(lambda: server.log.count("reloaded:") > before)
+
+
+def test_sighup_takes_up_new_changed_and_removed_bundles(folder: Path, start: Start) -> None:
+    write_bundle(folder, "other")
+    server = start(folder)
+    with connected(server) as client:
+        digest = client.get("/v1/models/small").json()["digest"]
+        shutil.rmtree(folder / "other")
+        write_bundle(folder, "small", "2")
+        rescale(folder / "small" / "1", 2 * SCALE)
+        assert len(client.get("/v1/models").json()["models"]) == 2, "nothing changes unasked"
+        reload(server)
+        assert [model["name"] for model in client.get("/v1/models").json()["models"]] == ["small"]
+        assert client.get("/v1/models/small").json()["versions"] == ["1", "2"]
+        changed = client.get("/v1/models/small", params={"version": "1"}).json()
+        assert changed["digest"] != digest
+        assert changed["scale"] == 2 * SCALE
+        assert client.get("/v1/models/other").status_code == 404
+    assert "reloaded: 2 bundles loaded, 1 removed, 0 refused" in server.log
+
+
+def test_a_bad_bundle_is_refused_and_what_was_loaded_stays(folder: Path, start: Start) -> None:
+    server = start(folder)
+    with connected(server) as client:
+        before = client.get("/v1/models/small/mesh", params={"latent": "0.1,0.7,0.4"})
+        flip_a_bit(folder / "small" / "1")
+        flip_a_bit(write_bundle(folder, "small", "2"))
+        reload(server)
+        after = client.get("/v1/models/small/mesh", params={"latent": "0.1,0.7,0.4"})
+        assert after.content == before.content
+        assert after.headers["ETag"] == before.headers["ETag"]
+        assert client.get("/v1/models/small").json()["versions"] == ["1"]
+        metrics = client.get("/metrics").text
+    refusals = [line for line in server.log.splitlines() if "factor-0.onnx does not have the digest" in line]
+    assert len(refusals) == 2
+    assert "bundle small/1 is refused, and what was loaded before stays" in refusals[0]
+    assert "bundle small/2 is not served" in refusals[1]
+    assert "shapespace_bundles_refused 2.0" in metrics
+
+
+def test_models_out_of_reach_stay_loaded(folder: Path, start: Start) -> None:
+    server = start(folder)
+    folder.rename(folder.with_name("elsewhere"))
+    with connected(server) as client:
+        reload(server)
+        assert client.get("/v1/models/small/mesh").status_code == 200
+    assert "can't be read, so that nothing changes" in server.log
+
+
+def test_watching_takes_up_a_bundle_once_it_is_whole(folder: Path, start: Start, tmp_path: Path) -> None:
+    server = start(folder, watch=1)
+    source = write_bundle(tmp_path / "source", "small", "2")
+    target = folder / "small" / "2"
+    target.mkdir()
+    with connected(server) as client:
+        for k in range(50):  # a slow copy, over several looks
+            (target / "geometry.npz").write_bytes(bytes(k))
+            time.sleep(0.05)
+        for file in source.iterdir():
+            shutil.copy(file, target / file.name)
+        eventually(lambda: client.get("/v1/models/small").json()["versions"] == ["1", "2"])
+        shutil.rmtree(target)
+        eventually(lambda: client.get("/v1/models/small").json()["versions"] == ["1"])
+    assert "is not served" not in server.log, "half a bundle must not be looked at"
+
+
+def test_a_reload_under_load_mixes_no_versions(folder: Path, start: Start) -> None:
+    server = start(folder, workers=2)
+    answers: dict[str, set[str]] = {}
+    statuses: set[int] = set()
+    stop = threading.Event()
+
+    def ask() -> None:
+        with connected(server) as client:
+            while not stop.is_set():
+                answer = client.post("/v1/models/small/vertices", json={"latents": CODES})
+                statuses.add(answer.status_code)
+                models = {diagnostics["model"] for diagnostics in answer.json()["diagnostics"]}
+                assert len(models) == 1
+                # One digest, one answer: an answer is a digest's alone if no other digest has it.
+                answers.setdefault(models.pop(), set()).add(json.dumps(answer.json()["vertices"]))
+
+    threads = [threading.Thread(target=ask) for _ in range(4)]
+    for thread in threads:
+        thread.start()
+    scales = [SCALE * (1 + k) for k in range(1, 5)]
+    for scale in scales:
+        time.sleep(0.3)
+        rescale(folder / "small" / "1", scale)
+        reload(server)
+    time.sleep(0.3)
+    stop.set()
+    for thread in threads:
+        thread.join(timeout=60)
+    assert statuses == {200}, "a reload must fail no request"
+    assert len(answers) == 5, "load on every one of five bundles"
+    assert all(len(found) == 1 for found in answers.values())
+    sizes = sorted(np.ptp(np.array(json.loads(next(iter(found))))[1]) for found in answers.values())
+    expected = np.ptp(reference().vertices) * np.array([SCALE, *scales])
+    np.testing.assert_allclose(sizes, expected, rtol=1e-5)
+
+
+def test_a_running_stream_keeps_the_model_it_began_with(folder: Path, start: Start) -> None:
+    server = start(folder, workers=1)
+    with connected(server) as client:
+        path = {"keyframes": CODES, "frames": 60}
+        links = client.post("/v1/models/small/interpolations", json=path).json()["links"]
+        digest = client.get("/v1/models/small").json()["digest"]
+        with client.stream("GET", links["jsonl"]) as stream:
+            lines = stream.iter_lines()
+            first = json.loads(next(lines))
+            shutil.rmtree(folder / "small")
+            reload(server)
+            rest = [json.loads(line) for line in lines]
+        assert {frame["diagnostics"]["model"] for frame in [first, *rest]} == {digest}
+        assert len(rest) == 59
+        gone = client.get(links["jsonl"])
+        assert gone.status_code == 404
+        assert "not served here any more" in gone.json()["detail"]
+
+
+def resident(server: Server) -> int:
+    """Bytes of memory in use by a server."""
+    with connected(server) as client:
+        lines = client.get("/metrics").text.splitlines()
+    return int(float(next(line.split()[1] for line in lines if line.startswith("process_resident_memory_bytes"))))
+
+
+def test_reloads_leave_no_memory_behind(folder: Path, start: Start) -> None:
+    server = start(folder, workers=2)
+    sizes = []
+    with connected(server) as client:
+        for k in range(24):
+            rescale(folder / "small" / "1", SCALE + k)
+            reload(server)
+            client.post("/v1/models/small/vertices", json={"latents": CODES}).raise_for_status()
+            sizes.append(resident(server))
+    # The first ones fill caches and the allocator's pools.
+    growth = (np.mean(sizes[-4:]) - np.mean(sizes[8:12])) / 14
+    assert growth < 100_000, f"{growth:.0f} bytes a reload"
