@@ -10,7 +10,6 @@ import socket
 import struct
 import sys
 import time
-from asyncio.trsock import TransportSocket
 from types import FrameType
 
 import uvicorn
@@ -99,7 +98,7 @@ class Server(uvicorn.Server):
             await asyncio.sleep(0.05)
 
 
-def _greet_nobody(listener: TransportSocket) -> None:
+def _greet_nobody(listener: socket.socket) -> None:
     """Let no further connection begin, and those that have begun be accepted.
 
     Closing the port resets the connections that the system has made and the program not yet accepted: their clients
