@@ -1,0 +1,114 @@
+"""The Python client, against a server and without the rest of the project."""
+
+import subprocess
+import sys
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import httpx
+import numpy as np
+import pytest
+
+from service.client import Client, ClientError, Interpolation
+from tests.service.bundles import SCALE, expected_nric, reference
+from tests.service.conftest import ROOT, Server, Start
+from tests.service.glb import GLB
+
+CODES = np.array([[0.1, 0.7, 0.4], [0.0, -1.0, 0.2]])
+
+
+@pytest.fixture
+def shapes(server: Server) -> Iterator[Client]:
+    with Client(server.url) as client:
+        yield client
+
+
+def test_models_and_cards(shapes: Client) -> None:
+    assert {"figure", "freaky-torus", "small"} <= {model["name"] for model in shapes.models()}
+    assert shapes.model("small")["version"] == "10"
+    assert shapes.model("small", "2")["version"] == "2"
+
+
+def test_shapes_come_as_files_and_arrays(shapes: Client) -> None:
+    glb = GLB(shapes.mesh("small", CODES[0]))
+    vertices = shapes.vertices("small", CODES)
+    np.testing.assert_allclose(glb.positions, vertices[0], atol=1e-6)
+    shape = shapes.shape("small", CODES[1])
+    np.testing.assert_array_equal(shape.vertices, vertices[1])
+    np.testing.assert_array_equal(shape.faces, reference().faces)
+    np.testing.assert_allclose(shapes.shape("small").vertices, SCALE * reference().vertices, atol=1e-6)
+    coarse, fine = (shapes.vertices("with-fine", CODES, mesh=mesh) for mesh in ("coarse", "fine"))
+    assert coarse.shape[1] < fine.shape[1]
+    assert shapes.mesh("small", CODES[0], "obj", version="2").startswith(b"v ")
+
+
+def test_lengths_and_angles(shapes: Client) -> None:
+    lengths, angles = shapes.nric("small", CODES)
+    half = len(reference().edges)
+    for k, code in enumerate(CODES):
+        z = expected_nric(code)
+        np.testing.assert_allclose(lengths[k], SCALE * z[:half], rtol=1e-5)
+        np.testing.assert_allclose(angles[k], z[half:], atol=1e-5)
+
+
+def test_an_interpolation_comes_whole_by_frames_and_as_a_stream(shapes: Client) -> None:
+    path = shapes.interpolate("small", CODES, frames=4, stop=0.5)
+    assert path.frames == 4
+    vertices = path.vertices()
+    np.testing.assert_array_equal(np.stack(list(path)), vertices)
+    np.testing.assert_array_equal(vertices[0], shapes.vertices("small", CODES[:1])[0])
+    np.testing.assert_allclose(GLB(path.file()).key(3), vertices[3], atol=1e-6)
+    np.testing.assert_allclose(GLB(path.frame(2)).positions, vertices[2], atol=1e-6)
+
+
+def test_problems_are_exceptions_that_say_what_to_do(shapes: Client) -> None:
+    with pytest.raises(ClientError, match="Send exactly 3") as caught:
+        shapes.vertices("small", [[1.0]])
+    assert caught.value.status == 422
+    assert caught.value.type == "urn:shapespace:problem:wrong-length"
+    assert caught.value.request_id
+    with pytest.raises(ClientError, match="There is no model"):
+        shapes.model("large")
+    with pytest.raises(ClientError, match="POST the keyframes"):
+        next(iter(Interpolation(shapes, "abc", 3)))
+
+
+def test_a_busy_server_is_asked_again(models: Path, start: Start) -> None:
+    url = start(models, workers=1, queue=0).url
+    codes = np.tile(CODES[:1], (60, 1))
+    with ThreadPoolExecutor(3) as pool, Client(url, retries=30) as patient, Client(url, retries=0) as hasty:
+        working = [pool.submit(patient.vertices, "small", codes) for _ in range(3)]
+        refused: list[int] = []
+        while not all(work.done() for work in working):
+            try:
+                hasty.vertices("small", CODES)
+            except ClientError as error:
+                refused.append(error.status)
+        assert set(refused) == {503}
+        assert all(len(work.result()) == 60 for work in working)
+
+
+def test_it_brings_its_key(models: Path, start: Start) -> None:
+    url = start(models, api_key="sesame").url
+    with Client(url, api_key="sesame") as client:
+        assert client.models()
+    with Client(url) as stranger, pytest.raises(ClientError, match="Send the server's API key"):
+        stranger.models()
+    with pytest.raises(httpx.ConnectError), Client("http://127.0.0.1:9") as nobody:
+        nobody.models()
+
+
+def test_it_needs_httpx_and_numpy_alone() -> None:
+    program = """
+import sys
+class Refuse:
+    def find_spec(self, name, path=None, target=None):
+        if name.split(".")[0] in {"fastapi", "geometry", "onnxruntime", "orjson", "pydantic", "scipy", "starlette"}:
+            raise ModuleNotFoundError(name)
+sys.meta_path.insert(0, Refuse())
+import service.client
+print(sorted(name for name in sys.modules if name.startswith("service")))
+"""
+    found = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert found.stdout.strip() == "['service', 'service.client']"

@@ -1,0 +1,146 @@
+"""Figures, log lines, request ids; keys and origins."""
+
+import json
+import re
+from pathlib import Path
+
+import httpx
+import pytest
+from prometheus_client.parser import text_string_to_metric_families
+
+from tests.service.conftest import Start
+
+MESH = "/v1/models/small/mesh"
+CODE = {"latent": [0.1, 0.7, 0.4]}
+Samples = dict[tuple[str, frozenset[tuple[str, str]]], float]
+
+
+def samples(client: httpx.Client) -> Samples:
+    text = client.get("/metrics").raise_for_status().text
+    families = text_string_to_metric_families(text)
+    return {(s.name, frozenset(s.labels.items())): s.value for family in families for s in family.samples}
+
+
+def value(found: Samples, name: str, **labels: str) -> float:
+    return found.get((name, frozenset(labels.items())), 0)
+
+
+def test_requests_are_counted_by_route_method_and_status(models: Path, start: Start) -> None:
+    with httpx.Client(base_url=start(models).url, timeout=60) as client:
+        for _ in range(3):
+            client.post(MESH, json=CODE).raise_for_status()
+        client.post(MESH, json={"latent": [1]})
+        client.get("/v1/models/large")
+        found = samples(client)
+        digest = client.get("/v1/models/small").json()["digest"]
+    route = "/v1/models/{name}/mesh"
+    assert value(found, "shapespace_requests_total", route=route, method="POST", status="200") == 3
+    assert value(found, "shapespace_requests_total", route=route, method="POST", status="422") == 1
+    assert value(found, "shapespace_requests_total", route="/v1/models/{name}", method="GET", status="404") == 1
+    assert value(found, "shapespace_request_seconds_count", route=route, method="POST") == 4
+    for stage in ("network", "reconstruct", "encode"):
+        assert value(found, "shapespace_stage_seconds_count", stage=stage) == 3
+        assert value(found, "shapespace_stage_seconds_sum", stage=stage) > 0
+    assert value(found, "shapespace_model_info", model="small", version="10", digest=digest) == 1
+    assert value(found, "shapespace_admitted") == 0
+    assert value(found, "shapespace_admitted_limit") > value(found, "shapespace_workers") > 0
+    assert value(found, "process_resident_memory_bytes") > 0
+
+
+def test_no_request_can_lengthen_the_list_of_labels(models: Path, start: Start) -> None:
+    with httpx.Client(base_url=start(models).url, timeout=60) as client:
+
+        def ask(i: int) -> None:
+            for path in (f"/x{i}", f"/v1/models/m{i}", f"/page/p{i}", f"/v1/interpolations/i{i}", f"/v2/models/m{i}"):
+                client.get(path)
+            client.request(("PROPFIND", "MKCOL", "SEARCH", "REPORT")[i % 4], "/v1/models")
+            client.get("/v1/models", headers={"Host": f"h{i}", "X-Request-ID": f"r{i}"})
+
+        ask(0)
+        samples(client)
+        before = set(samples(client))
+        for i in range(1, 20):
+            ask(i)
+        after = set(samples(client))
+    assert after == before
+    assert {dict(found).get("method") for _, found in after} == {"GET", "other", None}
+
+
+@pytest.mark.parametrize("given", ["abc-123._X", "", "two words", "x" * 65, 'quote"'])
+def test_a_request_has_an_id_of_its_own_or_a_good_one_that_it_brings(client: httpx.Client, given: str) -> None:
+    answers = [client.get(path, headers={"X-Request-ID": given}) for path in ("/v1/models", "/nothing", MESH)]
+    for answer in answers:
+        id = answer.headers["X-Request-ID"]
+        assert (id == given) is (given == "abc-123._X")
+        assert re.fullmatch(r"[A-Za-z0-9._-]{1,64}", id)
+    if given != "abc-123._X":
+        assert len({answer.headers["X-Request-ID"] for answer in answers}) == 3
+
+
+def test_a_log_in_json_has_one_object_a_line(models: Path, start: Start) -> None:
+    server = start(models, log_format="json")
+    with httpx.Client(base_url=server.url) as client:
+        client.post(MESH, json=CODE, headers={"X-Request-ID": "mine"})
+        client.get("/v1/models/la%0Arge?latent=1")
+        client.get("/v2/health/live")
+    lines = [json.loads(line) for line in server.stop().splitlines()]
+    assert all({"time", "level", "logger", "message"} <= line.keys() for line in lines)
+    requests = [line for line in lines if line["logger"] == "service.middleware"]
+    assert [line["path"] for line in requests] == [MESH, "/v1/models/la%0Arge"], "health checks say nothing"
+    assert requests[0]["request_id"] == "mine"
+    assert (requests[0]["method"], requests[0]["status"]) == ("POST", 200)
+    assert requests[0]["route"] == "/v1/models/{name}/mesh"
+    assert requests[0]["seconds"] > 0
+    assert requests[1]["status"] == 404
+
+
+def test_a_log_for_people_names_the_request_too(models: Path, start: Start) -> None:
+    server = start(models, colour="blue")
+    with httpx.Client(base_url=server.url) as client:
+        client.get("/v1/models", headers={"X-Request-ID": "mine"})
+    lines = server.stop().splitlines()
+    assert [line for line in lines if re.fullmatch(r"INFO \S+ GET /v1/models 200 in [0-9.]+ s \[mine\]", line)]
+    assert any("SHAPESPACE_COLOUR is no setting" in line for line in lines)
+
+
+def test_a_key_opens_all_but_what_is_open(models: Path, start: Start) -> None:
+    with httpx.Client(base_url=start(models, api_key="open sesame").url, timeout=60) as client:
+        for path in ("/v2/health/live", "/v2/health/ready", "/", "/page/page.css", "/openapi.json"):
+            assert client.get(path).status_code == 200, path
+        keys: list[dict[str, str]] = [
+            {},
+            {"X-API-Key": ""},
+            {"X-API-Key": "open sesam"},
+            {"X-API-Key": "open sesame!"},
+            {"Authorization": "open sesame"},
+            {"Authorization": "Basic open sesame"},
+        ]
+        for headers in keys:
+            for path in ("/v1/models", "/v2", "/v2/health/live/", "/metrics", "/page", "/nothing"):
+                answer = client.get(path, headers=headers)
+                assert answer.status_code == 401, (path, headers)
+                assert answer.json()["type"] == "urn:shapespace:problem:unauthorized"
+                assert "Send the server's API key" in answer.json()["detail"]
+                assert answer.headers["WWW-Authenticate"] == "Bearer"
+        for headers in ({"X-API-Key": "open sesame"}, {"Authorization": "bearer open sesame"}):
+            for path in ("/v1/models", "/v2", "/metrics"):
+                assert client.get(path, headers=headers).status_code == 200
+
+
+def test_pages_of_named_origins_may_call(models: Path, start: Start) -> None:
+    server = start(models, cors_origins="https://a.example, https://b.example", api_key="sesame")
+    ask = {"Access-Control-Request-Method": "POST", "Access-Control-Request-Headers": "content-type, x-api-key"}
+    with httpx.Client(base_url=server.url) as client:
+        for origin, allowed in (("https://a.example", True), ("https://b.example", True), ("https://c.example", False)):
+            preflight = client.options(MESH, headers={"Origin": origin, **ask})
+            assert preflight.is_success is allowed
+            answer = client.get("/v1/models", headers={"Origin": origin})
+            assert (answer.headers.get("Access-Control-Allow-Origin") == origin) is allowed
+            assert answer.status_code == 401, "an origin is no key"
+        exposed = answer.headers["Access-Control-Expose-Headers"]
+        assert {"ETag", "Shape-Diagnostics", "X-Request-ID"} <= set(exposed.split(", "))
+
+
+def test_by_default_no_other_origin_may_call(client: httpx.Client) -> None:
+    answer = client.get("/v1/models", headers={"Origin": "https://a.example"})
+    assert not [name for name in answer.headers if name.lower().startswith("access-control")]
