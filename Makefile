@@ -51,7 +51,7 @@ $(VENV)/.serve $(VENV)/.train: $(VENV)/.%: pyproject.toml | $(VENV)/.created
 	@touch $@
 
 $(VENV)/.all: pyproject.toml | $(VENV)/.created
-	$(BIN)/python -m pip install --editable '.[serve,train,cluster,dev]' $(NODE)
+	$(BIN)/python -m pip install --editable '.[serve,train,cluster,usd,dev]' $(NODE)
 	@touch $(VENV)/.serve $(VENV)/.train $@
 
 $(VENV)/.created:

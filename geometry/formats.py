@@ -4,16 +4,26 @@ from __future__ import annotations
 
 import io
 import json
-from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
+from geometry.colouring import Colouring
 from geometry.gltf import Document
 from geometry.mesh import FloatArray, IntArray, MeshError, TriangleMesh
+
+#: Formats that IANA doesn't know.
+OCTET_STREAM = "application/octet-stream"
+
+
+class Encode(Protocol):
+    """Writes a file."""
+
+    def __call__(self, vertices: FloatArray, faces: IntArray, colouring: Colouring | None = None, /) -> bytes:
+        """Encode vertices (V, 3) in any unit and faces (F, 3); positions are float32."""
 
 
 @dataclass(frozen=True)
@@ -21,42 +31,73 @@ class MeshFormat:
     """A file format.
 
     Attributes:
-        media_type: as IANA has it; formats without a registration are ``application/octet-stream``.
-        encode: vertices (V, 3) in any unit and faces (F, 3) to the file's bytes. Positions are float32.
+        media_type: as IANA has it; OCTET_STREAM without a registration.
+        encode: a mesh, with the colours of its vertices or without, to the file's bytes.
+        coloured: whether files can carry colours; where not, ``encode`` leaves them out.
     """
 
     media_type: str
-    encode: Callable[[FloatArray, IntArray], bytes]
+    encode: Encode
+    coloured: bool = True
 
 
-def _glb(vertices: FloatArray, faces: IntArray) -> bytes:
-    return Document(vertices, faces).glb()
+def _glb(vertices: FloatArray, faces: IntArray, colouring: Colouring | None = None) -> bytes:
+    return Document(vertices, faces, colouring=colouring).glb()
 
 
-def _gltf(vertices: FloatArray, faces: IntArray) -> bytes:
-    return Document(vertices, faces).gltf()
+def _gltf(vertices: FloatArray, faces: IntArray, colouring: Colouring | None = None) -> bytes:
+    return Document(vertices, faces, colouring=colouring).gltf()
 
 
-def _obj(vertices: FloatArray, faces: IntArray) -> bytes:
+def _obj(vertices: FloatArray, faces: IntArray, colouring: Colouring | None = None) -> bytes:
+    return (obj_vertices(vertices, colouring) + obj_faces(faces)).encode()
+
+
+def obj_vertices(vertices: FloatArray, colouring: Colouring | None = None) -> str:
+    """The positions (V, 3) of an OBJ file, with colours behind them as most readers know them."""
     # Nine significant digits hold a float32 whatever the unit; trimesh writes a fixed number of decimals.
-    positions = map("v %.9g %.9g %.9g\n".__mod__, map(tuple, vertices.astype(np.float32).tolist()))
-    triangles = map("f %d %d %d\n".__mod__, map(tuple, (faces + 1).tolist()))
-    return "".join([*positions, *triangles]).encode()
+    comment, line, rows = "", "v %.9g %.9g %.9g\n", vertices.astype(np.float32)
+    if colouring:
+        comment = f"# color {json.dumps(colouring.legend)}\n"
+        line, rows = "v %.9g %.9g %.9g %.4g %.4g %.4g\n", np.hstack([rows, colouring.srgb])
+    # All at once is twice as fast as line by line.
+    return comment + line * len(rows) % tuple(rows.ravel().tolist())
 
 
-def _npz(vertices: FloatArray, faces: IntArray) -> bytes:
-    return npz(vertices=vertices.astype(np.float32), faces=faces.astype(np.int32))
+def obj_faces(faces: IntArray) -> str:
+    """The faces (F, 3) of an OBJ file."""
+    return "f %d %d %d\n" * len(faces) % tuple((faces + 1).ravel().tolist())
 
 
-def _trimesh(extension: str) -> Callable[[FloatArray, IntArray], bytes]:
-    def encode(vertices: FloatArray, faces: IntArray) -> bytes:
-        import trimesh
+def _ply(vertices: FloatArray, faces: IntArray, colouring: Colouring | None = None) -> bytes:
+    return _exported("ply", vertices, faces, colouring)
 
-        mesh = trimesh.Trimesh(vertices.astype(np.float32), faces, process=False)
-        content = mesh.export(file_type=extension)
-        return content if isinstance(content, bytes) else str(content).encode()
 
-    return encode
+def _stl(vertices: FloatArray, faces: IntArray, colouring: Colouring | None = None) -> bytes:
+    return _exported("stl", vertices, faces, None)
+
+
+def _exported(extension: str, vertices: FloatArray, faces: IntArray, colouring: Colouring | None) -> bytes:
+    import trimesh
+
+    colours = {}
+    if colouring:
+        values = {str(colouring.quantity): colouring.values.astype(np.float32)}
+        colours = {"vertex_colors": colouring.srgb_bytes, "vertex_attributes": values}
+    mesh = trimesh.Trimesh(vertices.astype(np.float32), faces, process=False, **colours)  # type: ignore[arg-type]
+    content = mesh.export(file_type=extension)
+    return content if isinstance(content, bytes) else str(content).encode()
+
+
+def _npz(vertices: FloatArray, faces: IntArray, colouring: Colouring | None = None) -> bytes:
+    colours = {}
+    if colouring:
+        colours = {
+            "color_quantity": np.array(str(colouring.quantity)),
+            "color_range": np.array([-colouring.limit, colouring.limit]),
+            "color_values": colouring.values.astype(np.float32),
+        }
+    return npz(vertices=vertices.astype(np.float32), faces=faces.astype(np.int32), **colours)
 
 
 #: Every mesh format by its name, which is also the extension of its files. The first is the default.
@@ -64,9 +105,9 @@ MESH_FORMATS: dict[str, MeshFormat] = {
     "glb": MeshFormat("model/gltf-binary", _glb),
     "gltf": MeshFormat("model/gltf+json", _gltf),
     "obj": MeshFormat("model/obj", _obj),
-    "ply": MeshFormat("application/octet-stream", _trimesh("ply")),
-    "stl": MeshFormat("model/stl", _trimesh("stl")),
-    "npz": MeshFormat("application/octet-stream", _npz),
+    "ply": MeshFormat(OCTET_STREAM, _ply),
+    "stl": MeshFormat("model/stl", _stl, coloured=False),
+    "npz": MeshFormat(OCTET_STREAM, _npz),
 }
 
 

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from geometry.colouring import Colouring
 from geometry.mesh import FloatArray, IntArray, face_normals
 
 FLOAT, UNSIGNED_INT = 5126, 5125
@@ -27,6 +28,11 @@ MATERIAL = {
         "metallicFactor": 0.0,
         "roughnessFactor": 0.75,
     },
+}
+#: Vertex colours are multiplied with the material's.
+WHITE = MATERIAL | {
+    "name": "coloured",
+    "pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 0.75},
 }
 
 
@@ -49,9 +55,12 @@ class Document:
         vertices: (V, 3) positions at rest, in any unit.
         faces: (F, 3).
         name: of the mesh and its node.
+        colouring: of the vertices; its legend goes into the mesh's extras.
     """
 
-    def __init__(self, vertices: FloatArray, faces: IntArray, name: str = "shape") -> None:
+    def __init__(
+        self, vertices: FloatArray, faces: IntArray, name: str = "shape", colouring: Colouring | None = None
+    ) -> None:
         self._chunks: list[bytes] = []
         self.accessors: list[dict[str, Any]] = []
         self.views: list[dict[str, Any]] = []
@@ -64,13 +73,16 @@ class Document:
             "material": 0,
         }
         self.mesh: dict[str, Any] = {"name": name, "primitives": [self.primitive]}
+        if colouring:
+            self.primitive["attributes"]["COLOR_0"] = self.add(colouring.linear, target=ARRAY_BUFFER)
+            self.mesh["extras"] = {"color": colouring.legend}
         self.tree: dict[str, Any] = {
             "asset": {"version": "2.0", "generator": "shapespace"},
             "scene": 0,
             "scenes": [{"nodes": [0]}],
             "nodes": [{"name": name, "mesh": 0}],
             "meshes": [self.mesh],
-            "materials": [MATERIAL],
+            "materials": [WHITE if colouring else MATERIAL],
         }
 
     def add(self, array: NDArray, *, bounds: bool = False, target: int | None = None) -> int:

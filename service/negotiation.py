@@ -3,11 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from types import MappingProxyType
 
 from service.problems import ProblemError
 
 
-def choose(formats: Mapping[str, str], format: str | None, accept: str | None) -> str:
+def choose(
+    formats: Mapping[str, str],
+    format: str | None,
+    accept: str | None,
+    unavailable: Mapping[str, str] = MappingProxyType({}),
+) -> str:
     """Name of the format to answer in.
 
     Args:
@@ -15,6 +21,7 @@ def choose(formats: Mapping[str, str], format: str | None, accept: str | None) -
             media type ``Accept`` gets the first.
         format: the query parameter.
         accept: the header.
+        unavailable: why a format that one may expect is not among them, by name.
 
     Raises:
         ProblemError: not-acceptable, with the choices.
@@ -22,7 +29,7 @@ def choose(formats: Mapping[str, str], format: str | None, accept: str | None) -
     if format is not None:
         if format in formats:
             return format
-        raise _not_acceptable(formats, f"There is no format {format!r} here")
+        raise _not_acceptable(formats, unavailable.get(format, f"There is no format {format!r} here"))
     if accept is None or not accept.strip():
         return next(iter(formats))
     ranges = [_parse(part) for part in accept.split(",") if part.strip()]

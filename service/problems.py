@@ -17,7 +17,7 @@ from service.animation import PathTooLongError, UnknownInterpolationError
 from service.encodings import dump_json
 from service.latent_space import NotFiniteError, OutOfBoundsError, WrongLengthError
 from service.repository import UnknownModelError, UnknownVersionError
-from service.workers import BusyError, DeadlineError
+from service.workers import BusyError, DeadlineError, DisconnectedError
 
 MEDIA_TYPE = "application/problem+json"
 TYPE_PREFIX = "urn:shapespace:problem:"
@@ -51,6 +51,7 @@ KINDS = {
     "too-many-codes": Kind(422, "Too many codes"),
     "too-many-frames": Kind(422, "Too many frames"),
     "path-too-long": Kind(422, "Too many keyframes"),
+    "client-closed": Kind(499, "The client closed the connection"),
     "internal-error": Kind(500, "Internal error"),
     "busy": Kind(503, "Busy"),
     "not-ready": Kind(503, "Not ready"),
@@ -68,6 +69,7 @@ _OF_EXCEPTION: dict[type[Exception], str] = {
     PathTooLongError: "path-too-long",
     BusyError: "busy",
     DeadlineError: "deadline-passed",
+    DisconnectedError: "client-closed",
 }
 _HEADERS = {
     "busy": {"Retry-After": "1"},

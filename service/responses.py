@@ -5,20 +5,24 @@ from __future__ import annotations
 import hashlib
 import time
 from collections.abc import Mapping
+from contextlib import aclosing
 from dataclasses import asdict
 from functools import partial
 from typing import Any
 
 from fastapi import Request, Response
 
+from geometry.colouring import Colouring
 from geometry.reconstruction import Status
 from service import __version__
+from service.comparison import Comparison
 from service.dependencies import Service
 from service.encodings import SHAPE_FORMATS, dump_json
 from service.latent_space import Codes
 from service.problems import KINDS, MEDIA_TYPE
+from service.schemas import MeshAnswer
 from service.shape_model import MeshChoice, Shape, ShapeModel
-from service.workers import Workers
+from service.workers import DisconnectedError, Workers
 
 Timings = dict[str, float]
 _HEADERS = {
@@ -80,33 +84,60 @@ async def shape_response(
     code: tuple[Codes, bool] | None,
     mesh: MeshChoice,
     format: str,
+    comparison: Comparison | None = None,
 ) -> Response:
     """One shape as a file; without a code the reference."""
-    tag = entity_tag("shape", model.digest, b"" if code is None else code[0].tobytes(), mesh, format)
+    tag = entity_tag(
+        "shape",
+        model.digest,
+        b"" if code is None else code[0].tobytes(),
+        mesh,
+        format,
+        *(comparison.key if comparison else ()),
+    )
     if answer := not_modified(request, tag):
         return answer
 
-    def make(deadline: float) -> tuple[bytes, Shape, float]:
-        shape = model.reference_shape(mesh) if code is None else solve(service.workers, model, mesh, code, deadline)
-        began = time.perf_counter()
-        content = SHAPE_FORMATS[format].encode(shape.vertices, model.mesh(mesh).faces)
-        return content, shape, time.perf_counter() - began
+    def find(code: tuple[Codes, bool] | None, deadline: float) -> Shape:
+        return model.reference_shape(mesh) if code is None else solve(service.workers, model, mesh, code, deadline)
+
+    def make(deadline: float) -> tuple[bytes, dict[str, str]]:
+        found = [find(code, deadline)]
+        began, colouring, legend = time.perf_counter(), None, {}
+        if comparison:
+            found.append(find(comparison.code, deadline))
+            began = time.perf_counter()
+            vertices, against = (shape.vertices for shape in found)
+            colouring = Colouring.between(comparison.quantity, vertices, against, model.mesh(mesh).connectivity)
+            legend = {"Shape-Color": dump_json(colouring.legend).decode()}
+        content = SHAPE_FORMATS[format].encode(found[0].vertices, model.mesh(mesh).faces, colouring)
+        seconds = {**total_seconds(found), "encode": time.perf_counter() - began}
+        filename = f"{model.manifest.name}.{format}"
+        return content, file_headers(asdict(found[0].diagnostics), seconds, filename) | legend
 
     with service.workers.admit() as deadline:
-        content, shape, encoding = await service.workers.run(make, deadline)
-    headers = file_headers(
-        asdict(shape.diagnostics), {**shape.seconds, "encode": encoding}, f"{model.manifest.name}.{format}"
-    )
+        content, headers = await service.workers.run(make, deadline)
     return Response(content, headers=cache_headers(tag) | headers, media_type=SHAPE_FORMATS[format].media_type)
 
 
 async def shapes(
-    service: Service, model: ShapeModel, codes: Codes, inside: Any, mesh: MeshChoice, deadline: float
+    service: Service,
+    request: Request,
+    model: ShapeModel,
+    codes: Codes,
+    inside: Any,
+    mesh: MeshChoice,
+    deadline: float,
 ) -> list[Shape]:
-    """Shapes of codes (n, m), side by side."""
+    """Shapes of codes (n, m), side by side; raises DisconnectedError where the client doesn't wait for them."""
     work = partial(solve, service.workers, model, mesh)
-    items = zip(codes, map(bool, inside), strict=True)
-    return [shape async for shape in service.workers.map(work, items, deadline)]
+    found = []
+    async with aclosing(service.workers.map(work, zip(codes, map(bool, inside), strict=True), deadline)) as results:
+        async for shape in results:
+            found.append(shape)
+            if await request.is_disconnected():
+                raise DisconnectedError("The client closed the connection before its answer was ready.")
+    return found
 
 
 def total_seconds(shapes: list[Shape]) -> Timings:
@@ -124,6 +155,19 @@ def binary(media_types: Mapping[str, str], description: str, *, cached: bool = T
     }
     if cached:
         answers[304] = {"description": "The client has this answer already, by `If-None-Match`."}
+    return answers
+
+
+def mesh_answers(description: str) -> dict[int | str, dict[str, Any]]:
+    """OpenAPI's description of a mesh in one of its formats."""
+    answers = binary({name: format.media_type for name, format in SHAPE_FORMATS.items()}, description)
+    answers[200]["model"] = MeshAnswer
+    answers[200]["headers"] |= {
+        "Shape-Color": {
+            "description": "JSON, with `color`: `quantity`, `range` of the legend, `map`.",
+            "schema": {"type": "string"},
+        }
+    }
     return answers
 
 

@@ -6,6 +6,7 @@ from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from geometry.colouring import Quantity
 from service.animation import Number
 from service.latent_space import Bounds
 from service.shape_model import MeshChoice
@@ -56,11 +57,21 @@ class NRICRequest(_Request):
     )
 
 
+class ColorAnswer(BaseModel):
+    """How a mesh differs from another one, vertex by vertex."""
+
+    quantity: Quantity
+    range: list[float] = Field(description="Values at the ends of the legend.", min_length=2, max_length=2)
+    map: str = Field(description="Name of the colour map that the other formats use.")
+    values: list[float] = Field(description="V values.")
+
+
 class MeshAnswer(BaseModel):
     """A mesh as JSON, in the units of the training meshes."""
 
     vertices: list[list[float]] = Field(description="V positions.")
     faces: list[list[int]] = Field(description="F triples of vertex indices, from 0.")
+    color: ColorAnswer | None = Field(None, description="Only where `color` was asked for.")
 
 
 class DiagnosticsAnswer(BaseModel):

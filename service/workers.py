@@ -23,6 +23,10 @@ class DeadlineError(TimeoutError):
     """The time a request may take has passed."""
 
 
+class DisconnectedError(ConnectionError):
+    """Nobody is there to be answered any more."""
+
+
 class Workers:
     """One long-lived pool of threads for everything that would block the event loop.
 
@@ -89,6 +93,8 @@ class Workers:
         finally:
             for task in running:
                 task.cancel()
+            # What else went wrong is of no interest any more, but would be logged as never looked at.
+            await asyncio.gather(*running, return_exceptions=True)
 
     def late(self) -> DeadlineError:
         """The error for work whose deadline has passed."""

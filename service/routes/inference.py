@@ -8,9 +8,10 @@ from typing import Annotated, Any
 import numpy as np
 from fastapi import APIRouter, Depends, Path, Request, Response
 
+from geometry.formats import OCTET_STREAM
 from service import __version__
 from service.dependencies import ModelName, Service, ServiceDependency, limit_codes
-from service.encodings import OCTET_STREAM, dump_json, float32, worst
+from service.encodings import dump_json, float32, worst
 from service.inference import (
     HEADER,
     InferenceAnswer,
@@ -129,7 +130,7 @@ async def _infer(service: Service, request: Request, model: ShapeModel) -> Respo
     with service.workers.admit() as deadline:
         for name in message.wanted:
             if name == "vertices":
-                found = await shapes(service, model, codes, inside, message.parameters.mesh, deadline)
+                found = await shapes(service, request, model, codes, inside, message.parameters.mesh, deadline)
                 outputs[name] = float32(np.stack([shape.vertices for shape in found]))
                 headers["Shape-Diagnostics"] = dump_json(worst([shape.diagnostics for shape in found])).decode()
                 seconds |= total_seconds(found)

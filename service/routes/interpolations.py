@@ -5,15 +5,17 @@ from __future__ import annotations
 import time
 from collections.abc import AsyncGenerator
 from contextlib import aclosing
-from functools import partial
-from typing import Annotated
+from itertools import count
+from typing import Annotated, Any
 
 from fastapi import APIRouter, Depends, Path, Request, Response
 from fastapi.responses import StreamingResponse
 
 from service.animation import Animation, UnknownInterpolationError
+from service.comparison import NO_COLOR, ColorQuery, choose_mesh
 from service.dependencies import Format, Model, Service, ServiceDependency, limit_frames, require_json
-from service.encodings import JSON_LINES, SEQUENCE_FORMATS, SHAPE_FORMATS, Frames, json_line, worst
+from service.encodings import worst
+from service.latent_space import Codes
 from service.negotiation import choose
 from service.problems import ProblemError
 from service.responses import (
@@ -21,6 +23,7 @@ from service.responses import (
     cache_headers,
     entity_tag,
     file_headers,
+    mesh_answers,
     not_modified,
     problems,
     shape_response,
@@ -28,15 +31,19 @@ from service.responses import (
     solve,
     total_seconds,
 )
-from service.schemas import InterpolationAnswer, MeshAnswer
+from service.schemas import InterpolationAnswer
+from service.sequences import (
+    JSON_LINES,
+    MEDIA_TYPES,
+    SEQUENCE_FORMATS,
+    UNAVAILABLE,
+    Frames,
+    json_line,
+    sequence_types,
+)
 from service.shape_model import ShapeModel
 
 router = APIRouter(prefix="/v1", tags=["interpolations"])
-
-_TYPES = {name: format.media_type for name, format in SEQUENCE_FORMATS.items()} | {"jsonl": JSON_LINES}
-_FRAME_TYPES = {name: format.media_type for name, format in SHAPE_FORMATS.items()}
-_FRAME_RESPONSES = binary(_FRAME_TYPES, "The frame as a mesh.")
-_FRAME_RESPONSES[200]["model"] = MeshAnswer
 
 Id = Annotated[str, Path(description="An interpolation's id.")]
 
@@ -56,43 +63,44 @@ async def create_interpolation(
     id = body.to_id(model.digest, model.latents)
     path = f"/v1/interpolations/{id}"
     response.headers["Location"] = path
-    links = {"self": path} | {name: f"{path}?format={name}" for name in _TYPES}
+    links = {"self": path} | {name: f"{path}?format={name}" for name in sequence_types()}
     return InterpolationAnswer(id=id, frames=body.frame_count, links=links | {"frames": f"{path}/frames/{{k}}"})
 
 
 @router.get(
     "/interpolations/{id}",
-    responses=binary(_TYPES, "The animation.") | problems(404, 406, 422, 503, 504),
+    responses=binary(MEDIA_TYPES, "The animation.") | problems(404, 406, 422, 503, 504),
     response_class=Response,
 )
 async def get_interpolation(service: ServiceDependency, request: Request, id: Id, format: Format = None) -> Response:
-    """The animation: GLB with morph targets, arrays, a zip of OBJ files, or JSON lines as they get ready."""
+    """The animation: GLB, arrays, a zip of OBJ files, a point cache, USD, or JSON lines as they get ready."""
     # Who asks for OBJ gets one a frame, in a zip.
-    chosen = choose(_TYPES, "zip" if format == "obj" else format, request.headers.get("accept"))
+    accept = request.headers.get("accept")
+    chosen = choose(sequence_types(), "zip" if format == "obj" else format, accept, UNAVAILABLE)
     animation, model = _find(service, id)
     tag = entity_tag("animation", id, chosen)
     if answer := not_modified(request, tag):
         return answer
     codes, inside = model.latents.codes(animation.codes(model.latents))
     if chosen == "jsonl":
-        lines = _stream(service, animation, model)
+        lines = _stream(service, model, animation, codes, inside)
         first = await anext(lines)  # what goes wrong up to here still has a status of its own
         return StreamingResponse(_resume(first, lines), headers=cache_headers(tag), media_type=JSON_LINES)
 
     with service.workers.admit() as deadline:
-        found = await shapes(service, model, codes, inside, animation.mesh, deadline)
+        found = await shapes(service, request, model, codes, inside, animation.mesh, deadline)
         frames = Frames(found, model.mesh(animation.mesh).faces, animation.positions, codes)
         began = time.perf_counter()
         content, facts = await service.workers.run(lambda _: SEQUENCE_FORMATS[chosen].encode(frames), deadline)
     diagnostics = worst([shape.diagnostics for shape in found]) | facts
     seconds = {**total_seconds(found), "encode": time.perf_counter() - began}
     headers = file_headers(diagnostics, seconds, f"{model.manifest.name}-animation.{chosen}")
-    return Response(content, headers=cache_headers(tag) | headers, media_type=_TYPES[chosen])
+    return Response(content, headers=cache_headers(tag) | headers, media_type=MEDIA_TYPES[chosen])
 
 
 @router.get(
     "/interpolations/{id}/frames/{k}",
-    responses=_FRAME_RESPONSES | problems(404, 406, 422, 503, 504),
+    responses=mesh_answers("The frame as a mesh.") | problems(404, 406, 422, 503, 504),
     response_class=Response,
 )
 async def get_frame(
@@ -100,15 +108,19 @@ async def get_frame(
     request: Request,
     id: Id,
     k: Annotated[int, Path(description="Number of the frame, from 0.")],
+    color: ColorQuery = NO_COLOR,
     format: Format = None,
 ) -> Response:
     """One frame of an animation in any mesh format."""
-    chosen = choose(_FRAME_TYPES, format, request.headers.get("accept"))
+    chosen = choose_mesh(format, request, color)
     animation, model = _find(service, id)
     if not 0 <= k < animation.frame_count:
         raise ProblemError("unknown-frame", f"There is no frame {k}. Choose one from 0 to {animation.frame_count - 1}.")
     codes, inside = model.latents.codes([animation.codes(model.latents)[k]])
-    return await shape_response(service, request, model, (codes[0], bool(inside[0])), animation.mesh, chosen)
+    comparison = color.on(model.latents)
+    return await shape_response(
+        service, request, model, (codes[0], bool(inside[0])), animation.mesh, chosen, comparison
+    )
 
 
 def _find(service: Service, id: str) -> tuple[Animation, ShapeModel]:
@@ -123,18 +135,22 @@ def _find(service: Service, id: str) -> tuple[Animation, ShapeModel]:
     return animation, model
 
 
-async def _stream(service: Service, animation: Animation, model: ShapeModel) -> AsyncGenerator[bytes, None]:
-    codes, inside = model.latents.codes(animation.codes(model.latents))
-    work = partial(solve, service.workers, model, animation.mesh)
+async def _stream(
+    service: Service, model: ShapeModel, animation: Animation, codes: Codes, inside: Any
+) -> AsyncGenerator[bytes, None]:
     faces = model.mesh(animation.mesh).faces
+
+    def line(frame: tuple[int, float, Codes, bool], deadline: float) -> bytes:
+        k, t, code, inside = frame
+        shape = solve(service.workers, model, animation.mesh, (code, inside), deadline)
+        return json_line(k, t, shape, None if k else faces)
+
+    frames = zip(count(), animation.positions.tolist(), codes, map(bool, inside))
     with service.workers.admit():
         # Each frame has the deadline to itself: a stream may take as long as its reader likes.
-        results = service.workers.map(work, zip(codes, map(bool, inside), strict=True), None)
-        async with aclosing(results):
-            k = 0
-            async for shape in results:
-                yield json_line(k, float(animation.positions[k]), shape, None if k else faces)
-                k += 1
+        async with aclosing(service.workers.map(line, frames, None)) as lines:
+            async for ready in lines:
+                yield ready
 
 
 async def _resume(first: bytes, rest: AsyncGenerator[bytes, None]) -> AsyncGenerator[bytes, None]:

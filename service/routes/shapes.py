@@ -9,30 +9,29 @@ from typing import Annotated
 import numpy as np
 from fastapi import APIRouter, Depends, Query, Request, Response
 
-from geometry.formats import npz
+from geometry.formats import OCTET_STREAM, npz
+from service.comparison import NO_COLOR, ColorQuery, choose_mesh, numbers
 from service.dependencies import Format, Model, ServiceDependency, limit_codes, require_json
-from service.encodings import OCTET_STREAM, SHAPE_FORMATS, diagnostics_arrays, dump_json, float32, worst
+from service.encodings import diagnostics_arrays, dump_json, float32, worst
 from service.latent_space import Bounds
 from service.negotiation import choose
-from service.problems import ProblemError
 from service.responses import (
     binary,
     file_headers,
+    mesh_answers,
     problems,
     server_timing,
     shape_response,
     shapes,
     total_seconds,
 )
-from service.schemas import MeshAnswer, MeshRequest, NRICAnswer, NRICRequest, VerticesAnswer, VerticesRequest
+from service.schemas import MeshRequest, NRICAnswer, NRICRequest, VerticesAnswer, VerticesRequest
 from service.shape_model import MeshChoice
 
 router = APIRouter(prefix="/v1/models/{name}", tags=["shapes"])
 
-_MESH_TYPES = {name: format.media_type for name, format in SHAPE_FORMATS.items()}
 _VERTICES_TYPES = {"json": "application/json", "npz": OCTET_STREAM}
-_MESH_RESPONSES = binary(_MESH_TYPES, "The mesh. `Shape-Diagnostics` says how well it was found.")
-_MESH_RESPONSES[200]["model"] = MeshAnswer
+_MESH_RESPONSES = mesh_answers("The mesh. `Shape-Diagnostics` says how well it was found.")
 
 
 @router.get("/mesh", responses=_MESH_RESPONSES | problems(404, 406, 422, 503, 504), response_class=Response)
@@ -49,15 +48,16 @@ async def get_mesh(
     ] = None,
     mesh: Annotated[MeshChoice, Query(description="Which mesh, where the model has a finer one.")] = MeshChoice.FINE,
     bounds: Annotated[Bounds, Query(description="What to do with a code outside the bounds.")] = Bounds.ALLOW,
+    color: ColorQuery = NO_COLOR,
     format: Format = None,
 ) -> Response:
     """The shape of a code as a mesh file, for a link or a browser."""
-    chosen = choose(_MESH_TYPES, format, request.headers.get("accept"))
+    chosen = choose_mesh(format, request, color)
     code = None
     if latent is not None:
-        codes, inside = model.latents.codes([_numbers(latent)], bounds)
+        codes, inside = model.latents.codes([numbers(latent, "latent")], bounds)
         code = codes[0], bool(inside[0])
-    return await shape_response(service, request, model, code, mesh, chosen)
+    return await shape_response(service, request, model, code, mesh, chosen, color.on(model.latents, bounds))
 
 
 @router.post(
@@ -67,12 +67,18 @@ async def get_mesh(
     dependencies=[Depends(require_json)],
 )
 async def post_mesh(
-    service: ServiceDependency, request: Request, model: Model, body: MeshRequest, format: Format = None
+    service: ServiceDependency,
+    request: Request,
+    model: Model,
+    body: MeshRequest,
+    color: ColorQuery = NO_COLOR,
+    format: Format = None,
 ) -> Response:
     """The shape of a code as a mesh file."""
-    chosen = choose(_MESH_TYPES, format, request.headers.get("accept"))
+    chosen = choose_mesh(format, request, color)
     codes, inside = model.latents.codes([body.latent], body.bounds)
-    return await shape_response(service, request, model, (codes[0], bool(inside[0])), body.mesh, chosen)
+    comparison = color.on(model.latents, body.bounds)
+    return await shape_response(service, request, model, (codes[0], bool(inside[0])), body.mesh, chosen, comparison)
 
 
 @router.post(
@@ -90,7 +96,7 @@ async def post_vertices(
     limit_codes(service, len(body.latents))
     codes, inside = model.latents.codes(body.latents, body.bounds)
     with service.workers.admit() as deadline:
-        found = await shapes(service, model, codes, inside, body.mesh, deadline)
+        found = await shapes(service, request, model, codes, inside, body.mesh, deadline)
         diagnostics = [shape.diagnostics for shape in found]
         began = time.perf_counter()
 
@@ -132,13 +138,3 @@ async def post_nric(service: ServiceDependency, model: Model, body: NRICRequest)
     with service.workers.admit() as deadline:
         content, seconds = await service.workers.run(make, deadline)
     return Response(content, headers={"Server-Timing": server_timing(seconds)}, media_type="application/json")
-
-
-def _numbers(text: str) -> list[float]:
-    try:
-        return [float(part) for part in text.split(",")] if text else []
-    except ValueError:
-        raise ProblemError(
-            "invalid-request",
-            "latent is not a list of numbers. Send them separated by commas: ?latent=0.1,0.2",
-        ) from None

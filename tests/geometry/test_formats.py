@@ -1,16 +1,23 @@
 """Mesh files: written by us and read by others, written by others and read by us."""
 
+import io
 import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh
+from pxr import UsdGeom
 
-from geometry.animated_gltf import DENSE_FRAMES, animated_glb
+from geometry.animated_gltf import DENSE_FRAMES, FRAMES_PER_SECOND, animated_glb
+from geometry.colouring import Colouring, Quantity
 from geometry.formats import MESH_FORMATS, read_arrays, read_mesh
 from geometry.gltf import vertex_normals
 from geometry.mesh import MeshError, TriangleMesh
+from geometry.point_cache import point_cache
+from geometry.usd import animated_usd
+from tests.sequences import read_point_cache, read_usd
+from tests.service.glb import GLB
 from training import freaky_torus
 
 CUBE = np.array([[x, y, z] for x in (0.0, 1.0) for y in (0.0, 1.0) for z in (0.0, 1.0)])
@@ -23,8 +30,6 @@ def cube() -> TriangleMesh:
 
 
 def loaded(data: bytes, format: str) -> trimesh.Trimesh:
-    import io
-
     mesh = trimesh.load_mesh(io.BytesIO(data), file_type=format, process=False, maintain_order=True)
     assert isinstance(mesh, trimesh.Trimesh)
     return mesh
@@ -115,6 +120,59 @@ def test_equal_meshes_give_equal_bytes() -> None:
     mesh = freaky_torus.reference()
     for format in MESH_FORMATS.values():
         assert format.encode(mesh.vertices, mesh.faces) == format.encode(mesh.vertices.copy(), mesh.faces.copy())
+
+
+@pytest.mark.parametrize("format", [name for name, format in MESH_FORMATS.items() if format.coloured])
+def test_others_read_our_colours(format: str) -> None:
+    mesh = freaky_torus.reference()
+    colouring = Colouring(Quantity.STRETCH, mesh.vertices[:, 0], 0.5)
+    data = MESH_FORMATS[format].encode(mesh.vertices, mesh.faces, colouring)
+    plain = MESH_FORMATS[format].encode(mesh.vertices, mesh.faces)
+    for a, b in zip(read_arrays(data, format), read_arrays(plain, format), strict=True):
+        assert np.array_equal(a, b), "colours may not move anything"
+    if format == "npz":
+        with np.load(io.BytesIO(data)) as arrays:
+            assert arrays["color_quantity"] == "stretch"
+            assert arrays["color_range"].tolist() == [-0.5, 0.5]
+            np.testing.assert_allclose(arrays["color_values"], colouring.values, atol=1e-7)
+        return
+    if format in {"glb", "gltf"}:  # trimesh sets them aside for those with a material
+        scene = trimesh.load_scene(io.BytesIO(data), file_type=format, process=False)
+        (found,) = scene.geometry.values()
+        np.testing.assert_allclose(found.visual.vertex_attributes["color"], colouring.linear, atol=1e-6)
+        assert found.visual.material.baseColorFactor is None
+        assert found.visual.material.metallicFactor == 0
+    else:
+        colours = loaded(data, format).visual.vertex_colors
+        np.testing.assert_allclose(colours[:, :3], colouring.srgb_bytes, atol=1)
+        assert (colours[:, 3] == 255).all()
+    if format == "glb":
+        assert GLB(data).tree["meshes"][0]["extras"]["color"] == colouring.legend
+    if format == "ply":
+        assert b"property float stretch" in data
+
+
+def test_a_point_cache_holds_every_frame() -> None:
+    frames = freaky_torus.vertices(np.linspace([0, 0, 1, 1], [1, 2, 3, 1], 7))
+    np.testing.assert_array_equal(read_point_cache(point_cache(frames)), frames.astype(np.float32))
+
+
+def test_usd_holds_every_frame_with_its_normals(tmp_path: Path) -> None:
+    faces = freaky_torus.connectivity().faces
+    frames = freaky_torus.vertices(np.linspace([0, 0, 1, 1], [1, 2, 3, 1], 7))
+    path = tmp_path / "animation.usdc"
+    path.write_bytes(animated_usd(frames, faces))
+    found, stage = read_usd(path)
+    mesh = UsdGeom.Mesh(stage.GetDefaultPrim())
+    np.testing.assert_array_equal(found, frames.astype(np.float32))
+    assert np.array_equal(np.reshape(mesh.GetFaceVertexIndicesAttr().Get(), (-1, 3)), faces)
+    assert set(mesh.GetFaceVertexCountsAttr().Get()) == {3}
+    assert mesh.GetSubdivisionSchemeAttr().Get() == "none", "viewers would round the shape off"
+    assert stage.GetTimeCodesPerSecond() == FRAMES_PER_SECOND
+    for k, frame in enumerate(frames):
+        np.testing.assert_allclose(mesh.GetNormalsAttr().Get(k), vertex_normals(frame, faces), atol=1e-5)
+        np.testing.assert_allclose(mesh.GetExtentAttr().Get(k), [frame.min(axis=0), frame.max(axis=0)], atol=1e-6)
+    assert path.read_bytes() == animated_usd(frames, faces)
 
 
 def test_few_frames_are_exact_and_many_are_within_the_tolerance() -> None:

@@ -98,6 +98,18 @@ REQUESTS = {
     "wrong method on a list": Bad("POST", "/v1/models", 405, "method-not-allowed", "Use GET"),
     "unknown format": get(f"{MESH}?format=fbx", 406, "not-acceptable", "obj (model/obj)"),
     "nothing acceptable": get(MESH, 406, "not-acceptable", "obj (model/obj)", Accept="image/png"),
+    "colours in STL": get(f"{MESH}?color=stretch&format=stl", 406, "not-acceptable", "STL files can't carry colours"),
+    "no coloured format": get(f"{MESH}?color=stretch", 406, "not-acceptable", "ply", Accept="model/stl"),
+    "unknown colours": get(f"{MESH}?color=heat", 422, "invalid-request", "Send 'stretch' or 'bending' for color"),
+    "nothing to colour": get(f"{MESH}?against=0,0,0", 422, "invalid-request", "Add color=stretch or bending"),
+    "colours against text": get(f"{MESH}?color=bending&against=x", 422, "invalid-request", "?against=0.1,0.2"),
+    "colours against a short code": post(
+        f"{MESH}?color=bending&against=1", {"latent": OK}, 422, "wrong-length", "Send exactly 3"
+    ),
+    "colours against a code out of bounds": post(
+        f"{MESH}?color=bending&against=0.3,0,0", {"latent": OK, "bounds": "reject"}, 422, "out-of-bounds", "Move it"
+    ),
+    "unknown animation": get("/v1/interpolations/abc?format=fbx", 406, "not-acceptable", "pc2"),
     "vertices as mesh": post(f"{VERTICES}?format=glb", {"latents": [OK]}, 406, "not-acceptable", "npz"),
     "body too large": post(MESH, " " * 100_001, 413, "body-too-large", "limit of 100000 bytes"),
     "form as body": Bad(

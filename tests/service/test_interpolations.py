@@ -4,6 +4,8 @@ import base64
 import hashlib
 import io
 import json
+import os
+import socket
 import zipfile
 import zlib
 from pathlib import Path
@@ -17,6 +19,7 @@ from geometry.formats import read_mesh
 from service.animation import Animation
 from service.bundle import read_bundle
 from service.latent_space import LatentSpace
+from tests.sequences import read_point_cache, read_usd
 from tests.service.conftest import Start
 from tests.service.glb import GLB, khronos_report
 
@@ -90,7 +93,7 @@ def test_a_loop_comes_back_and_leaves_the_repeated_frame_out(client: httpx.Clien
     np.testing.assert_allclose(found, np.concatenate([np.linspace(A, B, 5), np.linspace(B, A, 5)[1:-1]]), atol=1e-7)
 
 
-def test_frames_are_the_same_alone_and_in_every_whole(client: httpx.Client) -> None:
+def test_frames_are_the_same_alone_and_in_every_whole(client: httpx.Client, tmp_path: Path) -> None:
     created = create(client, keyframes=[A, B, C], frames=6)
     links = created["links"]
     animated = GLB(client.get(links["self"]).raise_for_status().content)
@@ -98,8 +101,13 @@ def test_frames_are_the_same_alone_and_in_every_whole(client: httpx.Client) -> N
         packed, faces = arrays["vertices"], arrays["faces"]
     with zipfile.ZipFile(io.BytesIO(client.get(links["zip"]).content)) as archive:
         names = sorted(archive.namelist())
-        zipped = [read_mesh(archive.read(name), "obj") for name in names]
+        zipped = [archive.read(name) for name in names]
     assert len(names) == 6
+    cached = read_point_cache(client.get(links["pc2"]).raise_for_status().content)
+    assert np.array_equal(cached, packed)
+    usd = tmp_path / "animation.usdc"
+    usd.write_bytes(client.get(links["usd"]).raise_for_status().content)
+    assert np.array_equal(read_usd(usd)[0], packed)
     with client.stream("GET", links["jsonl"]) as stream:
         lines = [json.loads(line) for line in stream.iter_lines()]
     assert animated.key_count == len(packed) == len(lines) == 6
@@ -109,7 +117,9 @@ def test_frames_are_the_same_alone_and_in_every_whole(client: httpx.Client) -> N
     for k, alone in backwards.items():
         assert np.array_equal(np.float32(alone), packed[k]), k
         assert np.array_equal(np.float32(lines[k]["vertices"]), packed[k]), k
-        np.testing.assert_allclose(zipped[k].vertices, packed[k], rtol=1e-7)
+        still = client.get(links["frames"].format(k=k), params={"format": "obj"})
+        assert zipped[k] == still.raise_for_status().content
+        np.testing.assert_allclose(read_mesh(zipped[k], "obj").vertices, packed[k], rtol=1e-7)
         np.testing.assert_allclose(animated.key(k), packed[k], atol=3e-7)
     assert np.abs(packed[0] - packed[5]).max() > 0.05, "a shape that doesn't move proves nothing"
     code = client.post("/v1/models/small/mesh", json={"latent": B}, params={"format": "json"}).json()["vertices"]
@@ -186,8 +196,10 @@ def test_an_id_of_a_model_that_is_gone_is_not_found(client: httpx.Client, models
 
 def test_an_animation_has_an_entity_tag(client: httpx.Client) -> None:
     links = create(client, keyframes=[A, B], frames=3)["links"]
-    tags = {name: client.get(links[name]).headers["ETag"] for name in ("glb", "npz", "zip", "jsonl")}
-    assert len(set(tags.values())) == 4
+    formats = ("glb", "npz", "zip", "pc2", "usd", "jsonl")
+    assert set(links) == {"self", "frames", *formats}
+    tags = {name: client.get(links[name]).headers["ETag"] for name in formats}
+    assert len(set(tags.values())) == len(formats)
     for name, tag in tags.items():
         assert client.get(links[name], headers={"If-None-Match": tag}).status_code == 304
 
@@ -214,6 +226,55 @@ def test_a_reader_who_leaves_gives_the_place_back(models: Path, start: Start) ->
         while client.get("/v1/models/small/mesh").status_code == 503:
             while_waiting += 1
             assert while_waiting < 200, "all of the frames would take that long"
+
+
+def test_work_ends_when_nobody_waits_for_it(models: Path, start: Start) -> None:
+    server = start(models, workers=1, queue=0)
+    with httpx.Client(base_url=server.url, timeout=60) as client:
+        link = create(client, keyframes=[A, B, C], frames=600)["links"]["glb"]
+        place = httpx.URL(server.url)
+        with socket.create_connection((place.host, place.port)) as impatient:
+            impatient.sendall(f"GET {link} HTTP/1.1\r\nHost: {place.host}\r\n\r\n".encode())
+            while client.get("/v1/models/small/mesh").status_code != 503:
+                pass
+        while_waiting = 0
+        while client.get("/v1/models/small/mesh").status_code == 503:
+            while_waiting += 1
+            assert while_waiting < 200, "all of the frames would take that long"
+    assert "Traceback" not in server.stop()
+
+
+def test_a_server_without_usd_says_how_to_get_it(
+    models: Path, start: Start, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "sitecustomize.py").write_text("import sys\nsys.modules['pxr'] = None\n")
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path), prepend=os.pathsep)
+    with httpx.Client(base_url=start(models).url, timeout=60) as client:
+        links = create(client, keyframes=[A, B], frames=3)["links"]
+        assert "usd" not in links
+        answer = client.get(links["self"], params={"format": "usd"})
+        assert (answer.status_code, answer.json()["type"]) == (406, "urn:shapespace:problem:not-acceptable")
+        assert "pip install 'shapespace[usd]'" in answer.json()["detail"]
+        choices = [choice["format"] for choice in answer.json()["choices"]]
+        assert choices == ["glb", "npz", "zip", "pc2", "jsonl"]
+
+
+@pytest.mark.parametrize(
+    ("accept", "media_type"),
+    [
+        ("application/jsonl", "application/jsonl"),
+        ("application/zip;q=0.4, application/jsonl;q=0.5", "application/jsonl"),
+        ("application/*;q=0.5, application/octet-stream;q=0", "application/zip"),
+        ("model/*", "model/gltf-binary"),
+    ],
+)
+def test_accept_is_weighed(client: httpx.Client, accept: str, media_type: str) -> None:
+    links = create(client, keyframes=[A, B], frames=3)["links"]
+    answer = client.get(links["self"], headers={"Accept": accept}).raise_for_status()
+    assert (answer.headers["Content-Type"], answer.headers["Vary"]) == (media_type, "Accept")
+    cache = client.get(links["pc2"], headers={"Accept": accept}).raise_for_status()
+    assert cache.headers["Content-Type"] == "application/octet-stream"
+    assert "animation.pc2" in cache.headers["Content-Disposition"]
 
 
 def test_the_animated_glb_passes_the_khronos_validator(client: httpx.Client, tmp_path: Path) -> None:

@@ -1,0 +1,122 @@
+"""Sequences of shapes as bytes: every format of an animation."""
+
+from __future__ import annotations
+
+import io
+import zipfile
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from geometry.animated_gltf import animated_glb
+from geometry.formats import OCTET_STREAM, npz, obj_faces, obj_vertices
+from geometry.mesh import FloatArray, IntArray
+from geometry.point_cache import point_cache
+from geometry.usd import animated_usd, usd_installed
+from service.encodings import diagnostics_arrays, dump_json, float32
+from service.latent_space import Codes
+from service.shape_model import Shape
+
+
+@dataclass(frozen=True)
+class Frames:
+    """The frames of an animation, ready to be encoded.
+
+    Attributes:
+        shapes: one a frame.
+        faces: (F, 3).
+        positions: (n,) where on the path each frame lies.
+        codes: (n, m).
+    """
+
+    shapes: Sequence[Shape]
+    faces: IntArray
+    positions: FloatArray
+    codes: Codes
+
+    @property
+    def vertices(self) -> FloatArray:
+        """(n, V, 3)."""
+        return np.stack([shape.vertices for shape in self.shapes])
+
+
+@dataclass(frozen=True)
+class SequenceFormat:
+    """A file format for a whole animation.
+
+    Attributes:
+        media_type: as IANA has it.
+        encode: a sequence to the file's bytes, and facts for the diagnostics.
+    """
+
+    media_type: str
+    encode: Callable[[Frames], tuple[bytes, dict[str, Any]]]
+
+
+def json_line(k: int, t: float, shape: Shape, faces: IntArray | None) -> bytes:
+    """One frame as a line of JSON; the first also carries the faces."""
+    line: dict[str, Any] = {"frame": k, "t": t}
+    if faces is not None:
+        line["faces"] = np.ascontiguousarray(faces)
+    line |= {"vertices": float32(shape.vertices), "diagnostics": asdict(shape.diagnostics)}
+    return dump_json(line) + b"\n"
+
+
+def _glb(frames: Frames) -> tuple[bytes, dict[str, Any]]:
+    animated = animated_glb(frames.vertices, frames.faces)
+    return animated.data, {"targets": animated.targets, "max_vertex_error": animated.max_vertex_error}
+
+
+def _npz(frames: Frames) -> tuple[bytes, dict[str, Any]]:
+    arrays = diagnostics_arrays([shape.diagnostics for shape in frames.shapes])
+    return npz(
+        vertices=float32(frames.vertices),
+        faces=frames.faces.astype(np.int32),
+        t=frames.positions,
+        latents=frames.codes,
+        **arrays,
+    ), {}
+
+
+def _point_cache(frames: Frames) -> tuple[bytes, dict[str, Any]]:
+    return point_cache(frames.vertices), {}
+
+
+def _usd(frames: Frames) -> tuple[bytes, dict[str, Any]]:
+    return animated_usd(frames.vertices, frames.faces), {}
+
+
+def _zip(frames: Frames) -> tuple[bytes, dict[str, Any]]:
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w") as archive:
+        faces = obj_faces(frames.faces)
+        for k, shape in enumerate(frames.shapes):
+            # ZipInfo's default date keeps the bytes the same from day to day.
+            entry = zipfile.ZipInfo(f"frame-{k:04d}.obj")
+            # Harder compression takes longer than the shapes themselves, for a tenth of the size.
+            archive.writestr(entry, obj_vertices(shape.vertices) + faces, zipfile.ZIP_DEFLATED, compresslevel=1)
+    return buffer.getvalue(), {}
+
+
+JSON_LINES = "application/jsonl"
+#: Formats of a whole animation but for JSON lines, which are streamed; the first is the default.
+SEQUENCE_FORMATS = {
+    "glb": SequenceFormat("model/gltf-binary", _glb),
+    "npz": SequenceFormat(OCTET_STREAM, _npz),
+    "zip": SequenceFormat("application/zip", _zip),
+    "pc2": SequenceFormat(OCTET_STREAM, _point_cache),
+    "usd": SequenceFormat(OCTET_STREAM, _usd),
+}
+#: Media types of all formats of a whole animation by name.
+MEDIA_TYPES = {name: format.media_type for name, format in SEQUENCE_FORMATS.items()} | {"jsonl": JSON_LINES}
+#: Why a format may be missing.
+UNAVAILABLE = {
+    "usd": "This server can't write USD, for which it needs the package usd-core: pip install 'shapespace[usd]'"
+}
+
+
+def sequence_types() -> dict[str, str]:
+    """Media types of the formats of a whole animation that this server can write, by name."""
+    return {name: media_type for name, media_type in MEDIA_TYPES.items() if name != "usd" or usd_installed()}

@@ -1,0 +1,135 @@
+"""``?color=``: how a shape differs from the reference or from another code, vertex by vertex."""
+
+import io
+import json
+from typing import Any
+
+import httpx
+import numpy as np
+import pytest
+import trimesh
+
+from geometry.mesh import Connectivity
+from geometry.nric import dihedral_angles, edge_lengths
+from tests.service.glb import GLB
+
+MODEL = "/v1/models/with-fine"
+MESH = f"{MODEL}/mesh"
+CODE, OTHER = [0.1, 0.7, 0.4], [-0.1, 1.5, 0.0]
+QUANTITIES = ["stretch", "bending"]
+
+
+def text(code: list[float]) -> str:
+    return ",".join(map(str, code))
+
+
+def mesh(client: httpx.Client, **params: Any) -> dict[str, Any]:
+    content: dict[str, Any] = client.get(MESH, params={"format": "json", **params}).raise_for_status().json()
+    return content
+
+
+def expected(client: httpx.Client, quantity: str, choice: str, other: dict[str, str]) -> np.ndarray:
+    """The values from the two meshes as they leave, vertex by vertex in a plain loop."""
+    shape, against = (mesh(client, mesh=choice, **which) for which in ({"latent": text(CODE)}, other))
+    a, b = (np.array(m["vertices"]) for m in (shape, against))
+    connectivity = Connectivity(np.array(shape["faces"]), len(a))
+    lengths = edge_lengths(b, connectivity)
+    if quantity == "stretch":
+        change = np.log(edge_lengths(a, connectivity) / lengths)
+    else:
+        change = dihedral_angles(a, connectivity) - dihedral_angles(b, connectivity)
+    touching = [np.flatnonzero((connectivity.edges == v).any(axis=1)) for v in range(len(a))]
+    return np.array([np.average(change[e], weights=lengths[e]) for e in touching])
+
+
+@pytest.mark.parametrize("quantity", QUANTITIES)
+@pytest.mark.parametrize("choice", ["fine", "coarse"])
+@pytest.mark.parametrize("against", [None, OTHER], ids=["reference", "code"])
+def test_values_are_those_of_the_meshes_that_leave(
+    client: httpx.Client, quantity: str, choice: str, against: list[float] | None
+) -> None:
+    asked = {"latent": text(CODE), "mesh": choice, "color": quantity}
+    if against:
+        asked["against"] = text(against)
+    found = mesh(client, **asked)
+    values = expected(client, quantity, choice, {"latent": text(against)} if against else {})
+    np.testing.assert_allclose(found["color"]["values"], values, atol=2e-4)
+    assert np.ptp(values) > 0.01, "a shape that doesn't change proves nothing"
+    low, high = found["color"]["range"]
+    assert -low == high >= np.quantile(np.abs(values), 0.97)
+    assert found["vertices"] == mesh(client, latent=text(CODE), mesh=choice)["vertices"]
+    assert found["color"]["quantity"] == quantity
+
+
+def test_every_format_says_the_same(client: httpx.Client) -> None:
+    asked = {"latent": text(CODE), "color": "bending"}
+    values = mesh(client, **asked)["color"]["values"]
+
+    def get(format: str) -> httpx.Response:
+        answer = client.get(MESH, params={**asked, "format": format}).raise_for_status()
+        legend = json.loads(answer.headers["Shape-Color"])
+        assert legend == {"quantity": "bending", "range": legend["range"], "map": "coolwarm"}
+        return answer
+
+    with np.load(io.BytesIO(get("npz").content)) as arrays:
+        assert np.array_equal(arrays["color_values"], np.float32(values))
+        assert arrays["color_range"].tolist() == json.loads(get("npz").headers["Shape-Color"])["range"]
+    animated = GLB(get("glb").content)
+    assert animated.tree["meshes"][0]["extras"]["color"] == json.loads(get("glb").headers["Shape-Color"])
+    linear = animated.array(animated.primitive["attributes"]["COLOR_0"]).astype(float)
+    shown = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+    for format in ("ply", "obj"):
+        found = trimesh.load_mesh(io.BytesIO(get(format).content), file_type=format, process=False)
+        np.testing.assert_allclose(found.visual.vertex_colors[:, :3] / 255, shown, atol=1.01 / 255)
+    # Red where it got more convex, blue where less.
+    ends = shown[[np.argmax(values), np.argmin(values)]]
+    assert (np.sign(ends[:, 0] - ends[:, 2]) == [1, -1]).all()
+
+
+def test_get_and_post_and_frames_share_bytes_and_tags(client: httpx.Client) -> None:
+    query = {"color": "stretch", "against": text(OTHER)}
+    link = client.get(MESH, params={"latent": text(CODE), **query}).raise_for_status()
+    post = client.post(MESH, params=query, json={"latent": CODE}).raise_for_status()
+    created = client.post(f"{MODEL}/interpolations", json={"keyframes": [OTHER, CODE], "frames": 2}).json()
+    frame = client.get(created["links"]["frames"].format(k=1), params=query).raise_for_status()
+    for answer in (post, frame):
+        assert answer.content == link.content
+        assert answer.headers["ETag"] == link.headers["ETag"]
+        assert answer.headers["Shape-Color"] == link.headers["Shape-Color"]
+    again = client.get(MESH, params={"latent": text(CODE), **query}, headers={"If-None-Match": link.headers["ETag"]})
+    assert again.status_code == 304
+
+
+def test_entity_tags_tell_colours_apart(client: httpx.Client) -> None:
+    asked = [{}, *({"color": q, **a} for q in QUANTITIES for a in ({}, {"against": text(OTHER)}))]
+    answers = [client.get(MESH, params={"latent": text(CODE), **query}) for query in asked]
+    assert len({answer.headers["ETag"] for answer in answers}) == len(asked)
+    assert len({answer.content for answer in answers}) == len(asked)
+    assert "Shape-Color" not in answers[0].headers
+    assert "COLOR_0" not in GLB(answers[0].content).primitive["attributes"]
+
+
+def test_the_other_code_keeps_the_bounds_too(client: httpx.Client) -> None:
+    outside, bound = [0.4, 0.7, 0.4], [0.2, 0.7, 0.4]
+
+    def values(against: list[float], **body: Any) -> list[float]:
+        params = {"color": "stretch", "against": text(against), "format": "json"}
+        answer = client.post(MESH, params=params, json={"latent": CODE, **body}).raise_for_status()
+        found: list[float] = answer.json()["color"]["values"]
+        return found
+
+    assert values(outside, bounds="clamp") == values(bound)
+    assert np.abs(np.subtract(values(outside), values(bound))).max() > 0.05
+
+
+def test_a_shape_against_itself_is_grey(client: httpx.Client) -> None:
+    for query in ({"latent": text(CODE), "against": text(CODE)}, {}):
+        for quantity in QUANTITIES:
+            found = mesh(client, color=quantity, **query)["color"]
+            np.testing.assert_allclose(found["values"], 0, atol=1e-9)
+            assert found["range"] == [-0.01, 0.01]
+
+
+def test_a_browser_that_takes_anything_gets_a_coloured_format(client: httpx.Client) -> None:
+    answer = client.get(MESH, params={"color": "stretch"}, headers={"Accept": "model/stl, model/obj;q=0.2"})
+    assert answer.raise_for_status().headers["Content-Type"] == "model/obj"
