@@ -26,7 +26,7 @@ from service.workers import Workers
 CORS_REQUEST = ["Authorization", "Content-Type", "If-None-Match", "Inference-Header-Content-Length"]
 CORS_REQUEST += ["X-API-Key", "X-Request-ID"]
 CORS_ANSWER = ["Content-Disposition", "ETag", "Inference-Header-Content-Length", "Location", "Retry-After"]
-CORS_ANSWER += ["Server-Timing", "Shape-Diagnostics", "X-Request-ID"]
+CORS_ANSWER += ["Server-Timing", "Shape-Color", "Shape-Diagnostics", "X-Request-ID"]
 
 
 def create_app(settings: Settings | None = None) -> FastAPI:
