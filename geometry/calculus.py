@@ -25,6 +25,7 @@ from geometry.mesh import FloatArray, TriangleMesh
 from geometry.normal_matrix import NormalMatrix, QuadraticForm
 from geometry.nric import NRICGradients, NRICJacobian, nric, wrap
 from geometry.reconstruction import Status
+from geometry.rigid import rigid_motions, without_rigid_motion
 from geometry.turning import Turning
 
 #: Solved to here: ``sqrt(Fᵀ A⁻¹ F)``, the distance that a Newton step would still go, as a length in the metric.
@@ -151,27 +152,6 @@ class ChordSolver:
 
     def _back(self, field: FloatArray) -> FloatArray:
         return field if self._turn is None else np.einsum("vji,...vj->...vi", self._turn, field)
-
-
-def rigid_motions(vertices: FloatArray) -> FloatArray:
-    """(6, 3V) orthonormal basis of the infinitesimal rigid motions of a shape (V, 3)."""
-    x = vertices - vertices.mean(axis=0)
-    translations = np.broadcast_to(np.eye(3)[:, None], (3, *x.shape))
-    rotations = np.cross(np.eye(3)[:, None], x)
-    motions = np.concatenate([translations, rotations]).reshape(6, -1)
-    return np.ascontiguousarray(np.linalg.qr(motions.T)[0].T)
-
-
-def without_rigid_motion(displacement: FloatArray, vertices: FloatArray) -> FloatArray:
-    """The part of vertex fields (…, V, 3) orthogonal to infinitesimal rigid motions of a shape.
-
-    A velocity of lengths and angles determines a vertex field only up to these, yet adding one changes
-    discrete results. The field without them is what aligning two shapes in least squares leaves to first
-    order *and* exactly: if X_1 is aligned to X_0, then X_1 − X_0 has no such part.
-    """
-    motions = rigid_motions(vertices)
-    flat = displacement.reshape(*displacement.shape[:-2], -1)
-    return (flat - (flat @ motions.T) @ motions).reshape(displacement.shape)
 
 
 class ShellSpace:

@@ -64,6 +64,17 @@ class _Frame:
         sine += 0.0  # never −0, which arctan2 takes from π to −π at a hinge folded flat
         return np.arctan2(sine, dot(self.left_normal, self.right_normal))
 
+    def nric(self, connectivity: Connectivity) -> FloatArray:
+        """(…, 2E) lengths and angles."""
+        e = connectivity.edge_count
+        z = np.zeros((*self.lengths.shape[:-1], 2 * e))
+        z[..., :e] = self.lengths
+        if connectivity.is_closed:
+            z[..., e:] = self.angles()
+        else:
+            z[..., e + connectivity.hinge_edges] = self.angles()
+        return z
+
 
 def edge_lengths(vertices: FloatArray, connectivity: Connectivity) -> FloatArray:
     """Lengths (…, E) of the edges of shapes (…, V, 3)."""
@@ -82,15 +93,7 @@ def dihedral_angles(vertices: FloatArray, connectivity: Connectivity) -> FloatAr
 
 def nric(vertices: FloatArray, connectivity: Connectivity) -> FloatArray:
     """Lengths and angles ``z`` (…, 2E) of shapes (…, V, 3)."""
-    frame = _Frame(vertices, connectivity)
-    e = connectivity.edge_count
-    z = np.zeros((*vertices.shape[:-2], 2 * e))
-    z[..., :e] = frame.lengths
-    if connectivity.is_closed:
-        z[..., e:] = frame.angles()
-    else:
-        z[..., e + connectivity.hinge_edges] = frame.angles()
-    return z
+    return _Frame(vertices, connectivity).nric(connectivity)
 
 
 def wrap(angles: FloatArray) -> FloatArray:
@@ -211,7 +214,14 @@ class NRICJacobian:
 
     def gradients(self, vertices: FloatArray) -> NRICGradients:
         """The derivatives at a shape (V, 3)."""
+        return self._gradients(_Frame(vertices, self.connectivity))
+
+    def linearise(self, vertices: FloatArray) -> tuple[FloatArray, NRICGradients]:
+        """``z(X)`` (2E,) and its derivatives at a shape (V, 3), which have most of their work in common."""
         frame = _Frame(vertices, self.connectivity)
+        return frame.nric(self.connectivity), self._gradients(frame)
+
+    def _gradients(self, frame: _Frame) -> NRICGradients:
         edge, length = frame.hinge_edges, frame.hinge_lengths
         square = length**2
         # The gradient at an opposite vertex is along its face's normal, with 1/height as size.

@@ -3,19 +3,29 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from enum import StrEnum
+from functools import cached_property
 
 import numpy as np
 
-from geometry.cholesky import Backend, NotPositiveDefiniteError, analyse
+from geometry.anderson import Anderson
+from geometry.cholesky import Backend, Cholesky, NotPositiveDefiniteError, analyse
+from geometry.frames import FrameIntegration
 from geometry.mesh import FloatArray, TriangleMesh
 from geometry.normal_matrix import NormalMatrix, QuadraticForm
-from geometry.nric import NRICJacobian, WeightedNorm, nric, wrap
+from geometry.nric import NRICGradients, NRICJacobian, WeightedNorm, wrap
+from geometry.rigid import rigid_motions
 
 #: Weight of the angles in the reconstruction's norm. A parameter of its own: the metric's η is far too small here,
 #: because this norm is dimensionless and sums over edges.
 DEFAULT_ETA = 1e-2
+#: A factor serves shapes around its own up to this distance of any vertex, a fraction of the diagonal; and this many
+#: steps, which is about what a new one costs.
+REACH, LIFE = 1e-2, 16
+#: A first guess from frames with a smaller relative misfit is good enough not to look for another.
+GOOD_GUESS = 0.05
 
 
 class Status(StrEnum):
@@ -36,7 +46,7 @@ class Reconstruction:
     Attributes:
         vertices: (V, 3), always finite.
         status: how the iteration ended.
-        iterations: factorisations done.
+        iterations: steps tried, each from one evaluation of z(X) and one solve.
         residual: ``‖z(X) − z*‖ / ‖z*‖`` in the weighted norm; about the relative misfit of an edge.
         flipped_faces: faces at an edge whose angle is more than π/2 away from the one asked for.
     """
@@ -53,8 +63,10 @@ class Reconstructor:
 
     Minimises ``½ ‖z(X) − z*‖²_{2,z̄}`` over X in R^{3V} (angles compared modulo 2π) by Gauss–Newton with a
     backtracking line search. The normal matrix is symmetric positive definite with a fixed pattern, so its symbolic
-    analysis happens here, once. Works for any genus and with boundary, because it never asks that z* be integrable.
-    Holds work space: use one per thread.
+    analysis happens here, once. Near the shape at which it was made a factor is used again (a modified Newton method),
+    with Anderson acceleration: where z* is no shape's, Gauss–Newton itself converges only linearly, and a step with
+    an old factor costs an eighth of one with a new factor. Works for any genus and with boundary, because it never asks
+    that z* be integrable. Holds work space: use one per thread.
 
     Args:
         reference: gives the weights, and the default start.
@@ -69,12 +81,28 @@ class Reconstructor:
         self.normal_matrix = NormalMatrix(reference.connectivity)
         self._form = QuadraticForm.of(self.norm, reference.connectivity)
         self._cholesky = analyse(self.normal_matrix.pattern, backend)
+        self._backend: Backend = backend
 
-    def _misfit(self, vertices: FloatArray, target: FloatArray) -> FloatArray:
-        r = nric(vertices, self.reference.connectivity) - target
-        half = len(r) // 2
-        r[half:] = wrap(r[half:])
-        return r
+    @cached_property
+    def integrate(self) -> FrameIntegration:
+        """The shape of integrable z, without iterating."""
+        return FrameIntegration(self.reference, self._backend)
+
+    def guess(self, target: FloatArray, *others: Callable[[], FloatArray]) -> FloatArray:
+        """A start (V, 3) near the shape of z* (2E,), which depends on nothing but z*.
+
+        Frames first, which are exact for integrable z*. Where they go astray, for errors of z* add up along them,
+        the start with the smallest misfit among them, the others, called only then, and the reference.
+        """
+        scale = self.norm.square(target)
+        best = self._point(self.integrate(target), target)
+        if best.energy <= GOOD_GUESS**2 * scale:
+            return best.vertices
+        for vertices in (*(other() for other in others), self.reference.vertices):
+            point = self._point(vertices, target)
+            if not best.energy <= point.energy < np.inf:
+                best = point
+        return best.vertices
 
     @np.errstate(divide="ignore", over="ignore", invalid="ignore")
     def __call__(
@@ -83,7 +111,7 @@ class Reconstructor:
         start: FloatArray | None = None,
         *,
         tolerance: float = 1e-8,
-        max_iterations: int = 100,
+        max_iterations: int = 200,
         deadline: float | None = None,
     ) -> Reconstruction:
         """Reconstruct one shape.
@@ -92,55 +120,93 @@ class Reconstructor:
             target: z*, (2E,); need not be integrable.
             start: (V, 3) first guess, the reference by default.
             tolerance: stop once no vertex moves further than this fraction of the reference's diagonal.
-            max_iterations: most factorisations.
+            max_iterations: most steps.
             deadline: time.monotonic() after which no iteration begins.
         """
-        x = self.reference.vertices if start is None else np.asarray(start, dtype=np.float64)
-        weights = self.norm.squared
-        step_limit = tolerance * self.reference.diagonal
-        r = self._misfit(x, target)
-        energy = self.norm.square(r)
-        if not np.isfinite(energy):
+        limit, reach = (share * self.reference.diagonal for share in (tolerance, REACH))
+        here = self._point(self.reference.vertices if start is None else np.asarray(start, np.float64), target)
+        if not np.isfinite(here.energy):
             return Reconstruction(self.reference.vertices, Status.NOT_FINITE, 0, np.inf, 0)
         status, iterations = Status.ITERATION_LIMIT, 0
+        factor: _Factor | None = None
         while iterations < max_iterations:
             if deadline is not None and time.monotonic() > deadline:
                 status = Status.DEADLINE
                 break
-            gradients = self.jacobian.gradients(x)
-            gradient = self.jacobian.matrix(gradients).T @ (weights * r)
-            try:
-                self._cholesky.factorise(self.normal_matrix.entries(gradients, self._form))
-            except NotPositiveDefiniteError:
-                status = Status.STALLED
-                break
-            iterations += 1
-            step = -self._cholesky.solve(gradient).reshape(-1, 3)
-            slope = 2 * np.vdot(gradient, step)
-            size, t = np.abs(step).max(), 1.0
-            if not np.isfinite(size):
-                status = Status.STALLED
-                break
-            while True:
-                trial = x + t * step
-                trial_r = self._misfit(trial, target)
-                trial_energy = self.norm.square(trial_r)
-                if trial_energy <= energy + 1e-4 * t * slope or size * t <= step_limit:
+            if new := factor is None:
+                try:
+                    self._cholesky.factorise(self.normal_matrix.entries(here.gradients, self._form))
+                except NotPositiveDefiniteError:
+                    status = Status.STALLED
                     break
-                t /= 2
-            if not trial_energy <= energy:
-                # The last, tiny step is taken only if it helps: at the minimum rounding decides.
-                status = Status.CONVERGED if t == 1 or size <= step_limit else Status.STALLED
+                factor = _Factor(self._cholesky, here.vertices)
+            iterations += 1
+            forces = -self.jacobian.pull_back(here.gradients, self.norm.squared * here.misfit)
+            step, mixed = factor.step(here.vertices, forces)
+            size, t = np.abs(step).max(), 1.0
+            if new and not np.isfinite(size):
+                status = Status.STALLED
                 break
-            x, r, energy = trial, trial_r, trial_energy
-            if size * t <= step_limit:
+            trial = self._point(mixed, target)
+            if new:
+                slope = 2 * np.vdot(forces, step)
+                while not (trial.energy <= here.energy - 1e-4 * t * slope or size * t <= limit):
+                    t /= 2
+                    trial = self._point(here.vertices + t * step, target)
+            if not trial.energy <= here.energy:
+                if not (new or size <= limit):
+                    factor = None
+                    continue
+                # The last, tiny step is taken only if it helps: at the minimum rounding decides.
+                status = Status.CONVERGED if t == 1 or size <= limit else Status.STALLED
+                break
+            here = trial
+            if size * t <= limit:
                 status = Status.CONVERGED if t == 1 else Status.STALLED
                 break
-        return Reconstruction(
-            x, status, iterations, float(np.sqrt(energy / self.norm.square(target))), self._flipped(r)
-        )
+            if t < 1 or factor.steps == LIFE or np.abs(here.vertices - factor.at).max() > reach:
+                factor = None
+        residual = float(np.sqrt(here.energy / self.norm.square(target)))
+        return Reconstruction(here.vertices, status, iterations, residual, self._flipped(here.misfit))
+
+    def _point(self, vertices: FloatArray, target: FloatArray) -> _Point:
+        misfit, gradients = self.jacobian.linearise(vertices)
+        misfit -= target
+        half = len(misfit) // 2
+        misfit[half:] = wrap(misfit[half:])
+        return _Point(vertices, misfit, gradients, float(self.norm.square(misfit)))
 
     def _flipped(self, misfit: FloatArray) -> int:
         connectivity = self.reference.connectivity
         folded = (np.abs(misfit[connectivity.edge_count :]) > np.pi / 2) & connectivity.interior
         return len(np.unique(connectivity.edge_faces[folded]))
+
+
+@dataclass(frozen=True)
+class _Point:
+    """A shape on the way: the misfit ``z(X) − z*`` (2E,), the derivatives of z, and the squared norm of the misfit."""
+
+    vertices: FloatArray
+    misfit: FloatArray
+    gradients: NRICGradients
+    energy: float
+
+
+class _Factor:
+    """The normal matrix of one shape, factorised, for steps from there and from its neighbours.
+
+    The rigid motions of its own shape, which the matrix doesn't resist, are taken out of the forces: at a neighbour
+    they are other motions, and forces that balance there would turn it without bound here.
+    """
+
+    def __init__(self, cholesky: Cholesky, at: FloatArray) -> None:
+        self.at, self.steps = at, 0
+        self._cholesky, self._rigid, self._mixing = cholesky, rigid_motions(at), Anderson()
+
+    def step(self, vertices: FloatArray, forces: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """The step from a shape, and the next shape, which the steps so far have their part in."""
+        self.steps += 1
+        flat = forces.ravel()
+        balanced = flat - (self._rigid @ flat) @ self._rigid
+        step = self._cholesky.solve(balanced).reshape(-1, 3)
+        return step, self._mixing(vertices, forces, step)

@@ -6,11 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from geometry.calculus import TOLERANCE, Path, ShellSpace, without_rigid_motion
+from geometry.calculus import TOLERANCE, Path, ShellSpace
 from geometry.exponential import extrapolate
 from geometry.geodesic import geodesic
 from geometry.mesh import FloatArray, align
 from geometry.reconstruction import Status
+from geometry.rigid import without_rigid_motion
 
 
 @dataclass(frozen=True)

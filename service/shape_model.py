@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import queue
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from enum import StrEnum
@@ -15,14 +15,15 @@ import onnxruntime
 from numpy.typing import NDArray
 
 from geometry.mesh import FloatArray, TriangleMesh, align
+from geometry.nric import nric
 from geometry.reconstruction import Reconstruction, Reconstructor, Status
 from service.bundle import Bundle, BundleError
 from service.latent_space import Codes, LatentSpace, NotFiniteError
 from service.manifest import Network
 
-#: Gauss–Newton stops once no vertex moves further than this fraction of the diagonal: below float32's
-#: resolution.
-TOLERANCE = 1e-7
+#: Gauss–Newton stops once no vertex moves further than this fraction of the diagonal: a fiftieth of a pixel where a
+#: shape fills a screen, and less than the residual that the diagnostics tell changes by.
+TOLERANCE = 2e-5
 
 
 class MeshChoice(StrEnum):
@@ -38,7 +39,7 @@ class Diagnostics:
 
     Attributes:
         status: how Gauss–Newton ended, see geometry.reconstruction.Status.
-        iterations: its factorisations.
+        iterations: its steps.
         residual: distance between the lengths and angles asked for and those of the shape, relative,
             weighted norm.
         flipped_faces: faces at an edge that is folded more than π/2 away from what was asked for.
@@ -113,7 +114,9 @@ class ShapeModel:
             self._start = _Session(bundle, manifest.start, [manifest.latent_dimension], [manifest.vertices, 3])
         self._solvers: queue.SimpleQueue[Reconstructor] = queue.SimpleQueue()
         for _ in range(threads):
-            self._solvers.put(Reconstructor(self.reference, manifest.eta_reconstruction))
+            solver = Reconstructor(self.reference, manifest.eta_reconstruction)
+            solver.guess(nric(self.reference.vertices, self.reference.connectivity))  # so that no request waits for it
+            self._solvers.put(solver)
 
     def mesh(self, choice: MeshChoice) -> TriangleMesh:
         """The reference, normalised, on the mesh of choice; its faces are those of every shape."""
@@ -145,11 +148,9 @@ class ShapeModel:
         """
         began = time.perf_counter()
         _, target = self._networks(code[None])
-        start = self._start(code[None])[0] if self._start else None
-        if start is not None and not np.isfinite(start).all():
-            start = None
         predicted = time.perf_counter()
         with self._solver() as reconstruct:
+            start = reconstruct.guess(target[0], *self._learned_start(code))
             found: Reconstruction = reconstruct(target[0], start, tolerance=TOLERANCE, deadline=deadline)
         vertices = align(found.vertices, self.reference.vertices)
         with np.errstate(over="ignore", invalid="ignore"):
@@ -185,6 +186,10 @@ class ShapeModel:
         ]
         factors = np.stack(parts, axis=1)
         return factors.astype(np.float64), self._combiner(factors).astype(np.float64)
+
+    def _learned_start(self, code: Codes) -> Iterator[Callable[[], FloatArray]]:
+        if network := self._start:
+            yield lambda: network(code[None])[0].astype(np.float64)
 
     @contextmanager
     def _solver(self) -> Iterator[Reconstructor]:

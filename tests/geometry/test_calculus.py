@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from geometry.calculus import ShellSpace, fault_between, without_rigid_motion
+from geometry.calculus import ShellSpace, fault_between
 from geometry.constrained import constrained_exponential
 from geometry.energy import Material
 from geometry.exponential import exponential, extrapolate
@@ -15,6 +15,7 @@ from geometry.integrability import Integrability
 from geometry.mean import centre_of_mass, elastic_mean
 from geometry.mesh import TriangleMesh, align
 from geometry.reconstruction import Status
+from geometry.rigid import without_rigid_motion
 from geometry.sampling import exponentials
 from geometry.transport import parallel_transport
 
