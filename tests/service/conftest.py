@@ -100,7 +100,7 @@ def models(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def server(models: Path) -> Iterator[Server]:
     """One server for every test that leaves it as it is."""
     with starting() as start:
-        yield start(models, workers=2, max_codes=20, max_frames=200, max_body=100_000)
+        yield start(models, workers=2, max_codes=20, max_frames=200, max_body=100_000, deadline=300)
 
 
 @pytest.fixture(scope="session")

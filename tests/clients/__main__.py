@@ -1,0 +1,40 @@
+"""``python -m tests.clients BLENDER_PYTHON``: other programs open what the server answers for every bundled model.
+
+``make clients`` sets up Blender's package in an environment of its own and calls this.
+"""
+
+import subprocess
+import sys
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import httpx
+
+from tests.clients.files import write_files
+from tests.service.conftest import ROOT, starting
+
+HERE = Path(__file__).parent
+
+
+def main(blender: str) -> bool:
+    """Whether all of them see the right vertices."""
+    good = True
+    with TemporaryDirectory() as scratch, starting() as start:
+        models = Path(scratch, "models")
+        models.symlink_to(ROOT / "models")
+        with httpx.Client(base_url=start(models, deadline=600).url, timeout=600) as client:
+            for model in [card["name"] for card in client.get("/v1/models").json()["models"]]:
+                folder = Path(scratch, model)
+                folder.mkdir()
+                write_files(client, model, folder)
+                print(f"{model}:", flush=True)
+                for command in (["node", HERE / "three.mjs"], [blender, HERE / "blender.py"]):
+                    # Blender talks a lot on its standard output.
+                    output = subprocess.DEVNULL if command[0] == blender else None
+                    found = subprocess.run([*command, folder], stdout=output, check=False)
+                    good &= found.returncode == 0
+    return good
+
+
+if __name__ == "__main__":
+    sys.exit(not main(sys.argv[1]))
