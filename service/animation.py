@@ -47,7 +47,9 @@ class Animation(BaseModel):
         json_schema_extra={"examples": [{"keyframes": [[0, 0, 0, 0], [1, 2, 3, 4]], "frames": 30}]},
     )
 
-    keyframes: list[list[Number]] = Field(min_length=2, description="At least two latent codes.")
+    keyframes: list[Annotated[list[Number], Field(json_schema_extra={"minItems": 1})]] = Field(
+        min_length=2, description="At least two latent codes."
+    )
     times: list[Number] | None = Field(
         None,
         description="Increasing times of the keyframes, in any unit; by default equally far apart. With "

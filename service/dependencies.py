@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Annotated
 
 from fastapi import Depends, Path, Query, Request
+from pydantic import WithJsonSchema
 
 from service.metrics import Metrics
 from service.problems import ProblemError
@@ -52,6 +54,11 @@ async def _model(service: ServiceDependency, name: ModelName, version: Version =
 
 
 Model = Annotated[ShapeModel, Depends(_model)]
+
+
+def one_of(names: Iterable[str]) -> WithJsonSchema:
+    """Names that a parameter takes, for the description only: any other gets an answer that lists them."""
+    return WithJsonSchema({"type": "string", "enum": [*names]})
 
 
 async def require_json(request: Request) -> None:

@@ -10,13 +10,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from itertools import chain
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import orjson
 from fastapi.exceptions import RequestValidationError
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, NonNegativeInt, ValidationError
+from pydantic.json_schema import SkipJsonSchema
 
 from service.animation import Number
 from service.encodings import dump_json
@@ -40,17 +41,28 @@ class _Message(BaseModel):
 class InputParameters(_Message):
     """What may go with the input."""
 
-    binary_data_size: NonNegativeInt | None = Field(None, description="Its bytes, where they follow the JSON.")
+    binary_data_size: SkipJsonSchema[NonNegativeInt | None] = Field(None, description="Its bytes after the JSON.")
+
+
+def _as_json(schema: dict[str, Any]) -> None:
+    """Numbers are required in JSON: where bytes follow it, the body has another media type and no schema."""
+    schema["required"].append("data")
+    del schema["properties"]["data"]["default"]
 
 
 class InputTensor(_Message):
     """The codes."""
 
+    model_config = ConfigDict(json_schema_extra=_as_json)
+
     name: Literal["latent"]
-    shape: Annotated[list[NonNegativeInt], Field(min_length=2, max_length=2, description="[n, m]")]
+    shape: Annotated[
+        list[Annotated[int, Field(ge=0, json_schema_extra={"minimum": 1})]],
+        Field(min_length=2, max_length=2, description="[n, m]"),
+    ]
     datatype: Literal["FP32"]
     parameters: InputParameters = InputParameters(binary_data_size=None)
-    data: list[Number] | list[list[Number]] | None = Field(
+    data: list[Number] | list[list[Number]] | SkipJsonSchema[None] = Field(
         None, description="The numbers, row by row or flat; absent where bytes follow."
     )
 
@@ -58,7 +70,7 @@ class InputTensor(_Message):
 class OutputParameters(_Message):
     """How an output is to come."""
 
-    binary_data: bool | None = Field(None, description="As bytes after the JSON.")
+    binary_data: bool | None = Field(None, strict=True, description="As bytes after the JSON.")
 
 
 class RequestedOutput(_Message):
@@ -71,7 +83,7 @@ class RequestedOutput(_Message):
 class InferenceParameters(_Message):
     """What holds for the whole request."""
 
-    binary_data_output: bool = Field(False, description="All outputs as bytes, unless one says otherwise.")
+    binary_data_output: bool = Field(False, strict=True, description="All outputs as bytes, unless one says otherwise.")
     mesh: MeshChoice = Field(MeshChoice.FINE, description="Which mesh's vertices, where the model has a finer one.")
     bounds: Bounds = Field(
         Bounds.ALLOW, description="Outside the bounds: extrapolate, clamp to the nearest bound, or reject."
@@ -80,6 +92,17 @@ class InferenceParameters(_Message):
 
 class InferenceRequest(_Message):
     """A request to infer."""
+
+    model_config = ConfigDict(
+        json_schema_extra={
+            "examples": [
+                {
+                    "inputs": [{"name": "latent", "shape": [1, 4], "datatype": "FP32", "data": [1, 2, 3, 4]}],
+                    "outputs": [{"name": "nric"}],
+                }
+            ]
+        }
+    )
 
     id: str | None = Field(None, description="Comes back in the answer.")
     inputs: Annotated[list[InputTensor], Field(min_length=1, max_length=1)]

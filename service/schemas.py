@@ -16,10 +16,16 @@ Latent = Annotated[
     Field(
         description="One latent code: as many numbers as the card's `latent_dimension`.",
         examples=[[1, 2, 3, 4]],
+        json_schema_extra={"minItems": 1},
     ),
 ]
 Latents = Annotated[
-    list[Latent], Field(description="Latent codes, one shape each.", examples=[[[1, 2, 3, 4], [0, 0, 0, 0]]])
+    list[Latent],
+    Field(
+        description="Latent codes, one shape each.",
+        examples=[[[1, 2, 3, 4], [0, 0, 0, 0]]],
+        json_schema_extra={"minItems": 1},
+    ),
 ]
 
 

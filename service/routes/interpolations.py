@@ -13,8 +13,8 @@ from fastapi.responses import StreamingResponse
 
 from service.animation import Animation, UnknownInterpolationError
 from service.comparison import NO_COLOR, ColorQuery, choose_mesh
-from service.dependencies import Format, Model, Service, ServiceDependency, limit_frames, require_json
-from service.encodings import worst
+from service.dependencies import Format, Model, Service, ServiceDependency, limit_frames, one_of, require_json
+from service.encodings import SHAPE_FORMATS, worst
 from service.latent_space import Codes
 from service.negotiation import choose
 from service.problems import ProblemError
@@ -72,7 +72,12 @@ async def create_interpolation(
     responses=binary(MEDIA_TYPES, "The animation.") | problems(404, 406, 422, 503, 504),
     response_class=Response,
 )
-async def get_interpolation(service: ServiceDependency, request: Request, id: Id, format: Format = None) -> Response:
+async def get_interpolation(
+    service: ServiceDependency,
+    request: Request,
+    id: Id,
+    format: Annotated[Format, one_of([*MEDIA_TYPES, "obj"])] = None,
+) -> Response:
     """The animation: GLB, arrays, a zip of OBJ files, a point cache, USD, or JSON lines as they get ready."""
     # Who asks for OBJ gets one a frame, in a zip.
     accept = request.headers.get("accept")
@@ -107,9 +112,9 @@ async def get_frame(
     service: ServiceDependency,
     request: Request,
     id: Id,
-    k: Annotated[int, Path(description="Number of the frame, from 0.")],
+    k: Annotated[int, Path(description="Number of the frame, from 0.", json_schema_extra={"minimum": 0})],
     color: ColorQuery = NO_COLOR,
-    format: Format = None,
+    format: Annotated[Format, one_of(SHAPE_FORMATS)] = None,
 ) -> Response:
     """One frame of an animation in any mesh format."""
     chosen = choose_mesh(format, request, color)

@@ -13,7 +13,9 @@ router = APIRouter(tags=["operation"])
 @router.get(
     "/metrics",
     response_class=Response,
-    responses={200: {"description": "Prometheus's text format.", "content": {"text/plain": {}}}},
+    responses={
+        200: {"description": "Prometheus's text format.", "content": {"text/plain": {"schema": {"type": "string"}}}}
+    },
 )
 async def metrics(service: ServiceDependency) -> Response:
     """What the server has counted and measured since its start."""

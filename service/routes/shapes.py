@@ -11,8 +11,8 @@ from fastapi import APIRouter, Depends, Query, Request, Response
 
 from geometry.formats import OCTET_STREAM, npz
 from service.comparison import NO_COLOR, ColorQuery, choose_mesh, numbers
-from service.dependencies import Format, Model, ServiceDependency, limit_codes, require_json
-from service.encodings import diagnostics_arrays, dump_json, float32, worst
+from service.dependencies import Format, Model, ServiceDependency, limit_codes, one_of, require_json
+from service.encodings import SHAPE_FORMATS, diagnostics_arrays, dump_json, float32, worst
 from service.latent_space import Bounds
 from service.negotiation import choose
 from service.responses import (
@@ -49,7 +49,7 @@ async def get_mesh(
     mesh: Annotated[MeshChoice, Query(description="Which mesh, where the model has a finer one.")] = MeshChoice.FINE,
     bounds: Annotated[Bounds, Query(description="What to do with a code outside the bounds.")] = Bounds.ALLOW,
     color: ColorQuery = NO_COLOR,
-    format: Format = None,
+    format: Annotated[Format, one_of(SHAPE_FORMATS)] = None,
 ) -> Response:
     """The shape of a code as a mesh file, for a link or a browser."""
     chosen = choose_mesh(format, request, color)
@@ -72,7 +72,7 @@ async def post_mesh(
     model: Model,
     body: MeshRequest,
     color: ColorQuery = NO_COLOR,
-    format: Format = None,
+    format: Annotated[Format, one_of(SHAPE_FORMATS)] = None,
 ) -> Response:
     """The shape of a code as a mesh file."""
     chosen = choose_mesh(format, request, color)
@@ -89,7 +89,11 @@ async def post_mesh(
     dependencies=[Depends(require_json)],
 )
 async def post_vertices(
-    service: ServiceDependency, request: Request, model: Model, body: VerticesRequest, format: Format = None
+    service: ServiceDependency,
+    request: Request,
+    model: Model,
+    body: VerticesRequest,
+    format: Annotated[Format, one_of(_VERTICES_TYPES)] = None,
 ) -> Response:
     """The positions of many shapes at once."""
     chosen = choose(_VERTICES_TYPES, format, request.headers.get("accept"))

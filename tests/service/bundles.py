@@ -77,8 +77,8 @@ def network(nodes: list[Any], weights: dict[str, np.ndarray], row_in: tuple, row
     return model
 
 
-def networks() -> dict[str, onnx.ModelProto]:
-    """Factor 0 takes ``size``; factor 1 takes ``turn``, an angle, and ``twist``; the combiner adds up."""
+def networks(idle: int = 0) -> dict[str, onnx.ModelProto]:
+    """Factor 0 takes ``size``; factor 1 takes ``turn``, an angle, ``twist``, and idle ones; the combiner adds up."""
     mesh = reference()
     z = nric(mesh.vertices, mesh.connectivity)
     d = directions(mesh)
@@ -104,8 +104,13 @@ def networks() -> dict[str, onnx.ModelProto]:
         ),
         "factor-1.onnx": network(
             periodic,
-            {"first": np.array([1, 0]), "second": np.array([0, 1]), "D": d[1:], "z": z},
-            (2,),
+            {
+                "first": np.eye(2 + idle)[0],
+                "second": np.eye(2 + idle)[1],
+                "D": np.pad(d[1:], [(0, idle), (0, 0)]),
+                "z": z,
+            },
+            (2 + idle,),
             (wide,),
         ),
         "combiner.onnx": network(
@@ -149,7 +154,7 @@ def network_with_shape(nodes: list[Any], weights: dict[str, np.ndarray], mesh: T
     return helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=9)
 
 
-def manifest(name: str, version: str, *, start: bool = False) -> dict[str, Any]:
+def manifest(name: str, version: str, *, start: bool = False, idle: int = 0) -> dict[str, Any]:
     """Everything but ``files``."""
     mesh = reference()
     return {
@@ -159,8 +164,8 @@ def manifest(name: str, version: str, *, start: bool = False) -> dict[str, Any]:
         "licence": "CC0-1.0",
         "title": "Small torus",
         "description": "A torus for tests.",
-        "latent_dimension": 3,
-        "latent_names": list(LATENTS),
+        "latent_dimension": 3 + idle,
+        "latent_names": [*LATENTS, *(f"idle-{k}" for k in range(idle))],
         "factors": [
             {
                 "name": "size",
@@ -173,15 +178,15 @@ def manifest(name: str, version: str, *, start: bool = False) -> dict[str, Any]:
             {
                 "name": "form",
                 "start": 1,
-                "stop": 3,
+                "stop": 3 + idle,
                 "file": "factor-1.onnx",
                 "input": "latent",
                 "output": "nric",
             },
         ],
-        "lower": [-0.2, -np.pi, 0.0],
-        "upper": [0.2, np.pi, 1.0],
-        "period": [None, 2 * np.pi, None],
+        "lower": [-0.2, -np.pi, 0.0, *[-1.0] * idle],
+        "upper": [0.2, np.pi, 1.0, *[1.0] * idle],
+        "period": [None, 2 * np.pi, None, *[None] * idle],
         "edges": mesh.connectivity.edge_count,
         "vertices": len(mesh.vertices),
         "faces": len(mesh.faces),
@@ -212,19 +217,19 @@ def fine_arrays() -> dict[str, np.ndarray]:
 
 
 def write_bundle(
-    models: Path, name: str = "small", version: str = "1", *, start: bool = False, fine: bool = False
+    models: Path, name: str = "small", version: str = "1", *, start: bool = False, fine: bool = False, idle: int = 0
 ) -> Path:
-    """Write a whole bundle and return its folder."""
+    """Write a whole bundle and return its folder; idle coordinates come last and change nothing."""
     folder = models / name / version
     folder.mkdir(parents=True)
     mesh = reference()
-    for file, model in networks().items():
+    for file, model in networks(idle).items():
         (folder / file).write_bytes(model.SerializeToString())
     if start:
         (folder / "start.onnx").write_bytes(start_network().SerializeToString())
     arrays = {"vertices": mesh.vertices, "faces": mesh.faces, "edges": mesh.edges}
     (folder / "geometry.npz").write_bytes(npz(**arrays, **(fine_arrays() if fine else {})))
-    seal(folder, manifest(name, version, start=start))
+    seal(folder, manifest(name, version, start=start, idle=idle))
     return folder
 
 
