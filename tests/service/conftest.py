@@ -28,8 +28,8 @@ class Server:
         self._log = models.parent / f"{uuid4().hex}.log"  # a pipe would fill up
         environment = {key: value for key, value in os.environ.items() if not key.startswith("SHAPESPACE_")}
         settings = {"drain": 0, "watch": 0} | settings  # so that tests neither wait nor reload unasked
-        environment |= {f"SHAPESPACE_{key.upper()}": str(value) for key, value in settings.items()}
         environment |= {"SHAPESPACE_MODELS_DIR": str(models), "SHAPESPACE_PORT": "0"}
+        environment |= {f"SHAPESPACE_{key.upper()}": str(value) for key, value in settings.items()}
         with self._log.open("w") as log:
             self.process = subprocess.Popen(
                 [sys.executable, "-m", "service"],

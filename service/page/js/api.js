@@ -4,6 +4,7 @@ import { readNpz } from "./npz.js";
 
 export const origin = new URL(".", document.baseURI).href.replace(/\/$/, "");
 const PATIENCE = 3;
+const KEY = "shapespace-key";
 
 /** What the server said went wrong, by RFC 9457; status 0 stands for no answer at all. */
 export class Problem extends Error {
@@ -19,11 +20,16 @@ export class Problem extends Error {
 
 const wait = (seconds) => new Promise((resolve) => { setTimeout(resolve, 1000 * seconds); });
 
+/** Send a key with every call from now on, as long as the tab is open. */
+export const useKey = (key) => sessionStorage.setItem(KEY, key);
+
 async function call(path, options = {}) {
   for (let tries = 1; ; tries += 1) {
     let response;
     try {
-      response = await fetch(origin + path, options);
+      const key = sessionStorage.getItem(KEY);
+      const headers = { ...options.headers, ...(key && { "X-API-Key": key }) };
+      response = await fetch(origin + path, { ...options, headers });
     } catch (error) {
       if (error.name === "AbortError") throw error;
       throw new Problem("The server does not answer.", 0);

@@ -146,11 +146,17 @@ async function restore() {
   await openModel(asked.model ? asked : { model: models.find(({ name }) => name === PREFERRED) ?? models[0] });
 }
 
+find("#key form").addEventListener("submit", () => {
+  api.useKey(find("#key input").value);
+  location.reload();
+});
+
 try {
   models = await api.models();
   picker.replaceChildren(...models.map(({ name, title }) => element("option", { value: name, textContent: title })));
   if (models.length === 0) throw new Error("No model is served. Put a bundle into the models folder and start again.");
   await restore();
 } catch (error) {
-  report(error);
+  if (error.status === 401) find("#key").showModal();
+  else report(error);
 }

@@ -1,0 +1,71 @@
+"""One server and one browser for all tests of the page; each test gets a fresh window."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from playwright.sync_api import Browser, sync_playwright
+
+from tests.page.studio import Studio
+from tests.service.bundles import write_bundle
+from tests.service.conftest import ROOT, Server, starting
+
+CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+#: WebGL in software, so that it is there on every machine.
+FLAGS = ["--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+
+Open = Callable[..., Studio]
+
+
+@pytest.fixture(scope="session")
+def models(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The bundled figure, and a small torus with an angle among its coordinates and a finer mesh."""
+    folder = tmp_path_factory.mktemp("page") / "models"
+    shutil.copytree(ROOT / "models" / "figure", folder / "figure")
+    write_bundle(folder, "with-fine", fine=True)
+    return folder
+
+
+@pytest.fixture(scope="session")
+def server(models: Path) -> Iterator[Server]:
+    with starting() as start:
+        yield start(models, workers=2)
+
+
+@pytest.fixture(scope="session")
+def browser() -> Iterator[Browser]:
+    """Chromium of the system; where there is none, the one that `playwright install chromium` fetches."""
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
+        yield browser
+        browser.close()
+
+
+@pytest.fixture
+def window(browser: Browser, server: Server) -> Iterator[Open]:
+    """Open windows, and see at the end that none of them complained or asked another host for anything."""
+    windows: list[tuple[Studio, bool]] = []
+
+    def open(url: str = server.url, *, complains: bool = False, **options: Any) -> Studio:
+        context = browser.new_context(
+            **{"viewport": {"width": 1000, "height": 640}, "reduced_motion": "reduce", **options}
+        )
+        studio = Studio(context.new_page(), url)
+        windows.append((studio, complains))
+        return studio
+
+    yield open
+    for studio, complains in windows:
+        studio.page.context.close()
+        assert studio.foreign == []
+        assert complains or studio.complaints == []
+
+
+@pytest.fixture
+def studio(window: Open) -> Studio:
+    """The page with the small torus, at rest."""
+    return window().open()

@@ -1,0 +1,160 @@
+"""The page in a real browser, as a person sees and moves it."""
+
+from __future__ import annotations
+
+import io
+import json
+import time
+from collections.abc import Callable
+from typing import Any, TypeVar
+from urllib.parse import parse_qs, urlsplit
+
+import numpy as np
+from PIL import Image
+from playwright.sync_api import ConsoleMessage, Locator, Page, Request
+
+T = TypeVar("T")
+PATIENCE = 30.0
+
+
+class Studio:
+    """A page that is open, and what happened to it.
+
+    Playwright's own waiting for conditions would need `eval`, which the page forbids.
+
+    Attributes:
+        complaints: of the console, and errors that nobody caught.
+        foreign: addresses on other hosts that it asked for.
+        asked: bodies of the requests for vertices.
+    """
+
+    def __init__(self, page: Page, url: str) -> None:
+        self.page, self.url = page, url
+        self.complaints: list[str] = []
+        self.foreign: list[str] = []
+        self.addresses: list[str] = []
+        self.asked: list[dict[str, Any]] = []
+        page.on(
+            "console", lambda message: message.type in {"error", "warning"} and self.complaints.append(message.text)
+        )
+        page.on("pageerror", lambda error: self.complaints.append(str(error)))
+        page.on("request", self._requested)
+        page.set_default_timeout(1000 * PATIENCE)
+
+    def _said(self, message: ConsoleMessage) -> None:
+        if message.type in {"error", "warning"}:
+            self.complaints.append(message.text)
+
+    def _requested(self, request: Request) -> None:
+        self.addresses.append(request.url)
+        if not request.url.startswith((self.url, "blob:", "data:")):
+            self.foreign.append(request.url)
+        if urlsplit(request.url).path.endswith("/vertices"):
+            self.asked.append(request.post_data_json)
+
+    def eventually(self, what: Callable[[], T], patience: float = PATIENCE) -> T:
+        """The first value of `what` that is neither None nor False."""
+        end = time.monotonic() + patience
+        while (value := what()) is None or value is False:
+            assert time.monotonic() < end, "it never came true"
+            self.page.wait_for_timeout(30)  # lets what happens in the browser be heard of
+        return value
+
+    def open(self, hash: str = "#model=with-fine") -> Studio:
+        """Load the page and wait until its shape rests."""
+        self.page.goto(f"{self.url}/{hash}")
+        self.rest()
+        return self
+
+    def rest(self) -> None:
+        """Wait until the fine mesh is shown, or that of a model with one only."""
+        fine = "document.querySelector('#fine')"
+        script = f"{fine}.disabled || {fine}.getAttribute('aria-pressed') === 'false' ? 'coarse' : 'fine'"
+        self.eventually(lambda: self.shown == self.page.evaluate(script))
+
+    @property
+    def shown(self) -> str | None:
+        """The mesh in the picture."""
+        return self.page.locator(".stage").get_attribute("data-shown")
+
+    def __getitem__(self, selector: str) -> Locator:
+        return self.page.locator(selector)
+
+    @property
+    def hash(self) -> dict[str, str]:
+        """The state as the address has it."""
+        return {key: values[0] for key, values in parse_qs(urlsplit(self.page.url).fragment).items()}
+
+    @property
+    def code(self) -> list[float]:
+        """The code as the address has it."""
+        return [float(part) for part in self.hash["z"].split(",")] if "z" in self.hash else []
+
+    def until_code(self, expected: Any, tolerance: float = 1e-4) -> None:
+        """Wait until the address holds a code."""
+        try:
+            self.eventually(
+                lambda: len(self.code) == len(expected) and np.allclose(self.code, expected, atol=tolerance), 10
+            )
+        except AssertionError:
+            raise AssertionError(f"the code is {self.code}, not {expected}") from None
+
+    def coordinate(self, k: int) -> Locator:
+        """The row of a coordinate."""
+        return self.page.locator(".coordinate").nth(k)
+
+    def slide(self, k: int, value: float) -> None:
+        """Move a slider as a hand does, and let go."""
+        script = """(slider, value) => {
+            slider.dispatchEvent(new PointerEvent('pointerdown', {bubbles: true}));
+            slider.value = value;
+            slider.dispatchEvent(new Event('input', {bubbles: true}));
+            slider.dispatchEvent(new PointerEvent('pointerup', {bubbles: true}));
+        }"""
+        self.coordinate(k).locator("input[type=range]").evaluate(script, value)
+
+    def type(self, k: int, value: float) -> None:
+        """Type a number into a coordinate's box."""
+        self.coordinate(k).locator("input[type=number]").fill(str(value))
+
+    def tab(self, name: str) -> None:
+        """Open one of the panel's tabs."""
+        self.page.get_by_role("tab", name=name).click()
+
+    def picture(self) -> np.ndarray:
+        """Pixels (h, w, 3) of the middle of the stage, without the buttons and words around it."""
+        box = self.page.locator("#canvas").bounding_box()
+        assert box
+        clip = {"x": box["x"], "y": box["y"] + 60, "width": box["width"], "height": box["height"] - 110}
+        return pixels(self.page.screenshot(clip=clip))
+
+    def until_different(self, before: np.ndarray, share: float = 0.002) -> np.ndarray:
+        """The next picture that isn't the same as another."""
+
+        def changed() -> np.ndarray | None:
+            now = self.picture()
+            return now if difference(before, now) > share else None
+
+        return self.eventually(changed)
+
+    @property
+    def messages(self) -> str:
+        """What the page says to people."""
+        return self.page.locator("#messages").inner_text()
+
+
+def pixels(png: bytes) -> np.ndarray:
+    """(h, w, 3)."""
+    return np.asarray(Image.open(io.BytesIO(png)).convert("RGB")).astype(int)
+
+
+def difference(a: np.ndarray, b: np.ndarray) -> float:
+    """Share of pixels that differ visibly."""
+    return float((np.abs(a - b).max(axis=2) > 12).mean())
+
+
+def body(canvas: Locator) -> np.ndarray:
+    """Pixels (h, w, 4) of a small picture."""
+    script = """c => JSON.stringify(Array.from(c.getContext('2d').getImageData(0, 0, c.width, c.height).data))"""
+    size = canvas.evaluate("c => [c.height, c.width]")
+    return np.array(json.loads(canvas.evaluate(script))).reshape(*size, 4)

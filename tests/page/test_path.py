@@ -1,0 +1,169 @@
+"""Keyframes, the path through them, and colours that compare shapes."""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+import pytest
+
+from tests.page.studio import Studio, body, difference
+
+
+def keyframes(studio: Studio, *codes: tuple[float, float, float]) -> None:
+    """Make shapes the keyframes, one after the other."""
+    for i, code in enumerate(codes):
+        for k, value in enumerate(code):
+            studio.type(k, value)
+        studio.until_code(code)
+        studio.tab("Path")
+        studio["#add-keyframe"].click()
+        studio.tab("Shape")
+        studio.eventually(lambda i=i: studio["#keyframes canvas.drawn"].count() == i + 1)
+    studio.tab("Path")
+
+
+def test_play_pause_and_the_sliders_follow(studio: Studio) -> None:
+    studio.tab("Path")
+    assert studio["#play"].is_disabled()
+    studio.tab("Shape")
+    keyframes(studio, (-0.2, 0, 0), (0.2, 0, 1))
+    before = studio.picture()
+    studio["#play"].click()
+    studio.eventually(lambda: "Pause" in studio["#play"].inner_text())
+    studio.until_different(before)
+    studio["#play"].click()
+    assert "Play" in studio["#play"].inner_text()
+    studio.eventually(lambda: studio.code[2] not in {0, 1})
+    size, angle, twist = studio.code
+    assert angle == 0
+    assert size == pytest.approx(-0.2 + 0.4 * twist, abs=1e-3), "off the line between the keyframes"
+    t = float(studio["#time"].inner_text().removeprefix("t = "))
+    assert twist == pytest.approx(t, abs=0.03)
+    studio.rest()
+    asked = len(studio.asked)
+    studio["#play"].click()
+    studio.eventually(lambda: "Play" in studio["#play"].inner_text())
+    assert studio["#time"].inner_text() == "t = 1.00"
+    studio.until_code([0.2, 0, 1])
+    assert len(studio.asked) <= asked + 2, "frames come in one go"
+
+
+def test_a_loop_goes_on_and_back_to_the_start(studio: Studio) -> None:
+    keyframes(studio, (0, 0, 0), (0.1, 0, 1))
+    studio["#loop"].check()
+    assert studio["#beyond"].is_disabled()
+    studio["#play"].click()
+    times: list[float] = []
+
+    def round_again() -> bool:
+        times.append(float(studio["#time"].inner_text().removeprefix("t = ")))
+        return any(b < a for a, b in zip(times, times[1:], strict=False))
+
+    studio.eventually(round_again)
+    assert "Pause" in studio["#play"].inner_text()
+    studio["#play"].click()
+    studio["#timeline"].fill("0.5")
+    studio.until_code([0.1, 0, 1])
+
+
+def test_past_the_ends_and_the_shorter_way_round(studio: Studio) -> None:
+    keyframes(studio, (0, 3, 0), (0.1, -3, 0))
+    studio["#beyond"].select_option("0.5")
+    timeline = studio["#timeline"]
+    assert [float(timeline.get_attribute(end) or 0) for end in ("min", "max")] == [-0.5, 1.5]
+    for t in (-0.5, 0.5, 1.5):
+        timeline.fill(str(t))
+        step = 2 * np.pi - 6
+        angle = 3 + t * step
+        studio.until_code([0.1 * t, angle if angle < np.pi else angle - 2 * np.pi, 0], 0.01)
+
+
+def test_keyframes_can_be_visited_replaced_and_removed(studio: Studio) -> None:
+    keyframes(studio, (0, 0, 0), (0.1, 0, 0), (0.2, 1, 0))
+    studio.page.get_by_role("button", name="Go to keyframe 1").click()
+    studio.until_code([0, 0, 0])
+    studio.page.get_by_role("button", name="Take the shape as it is for keyframe 2").click()
+    studio.eventually(lambda: studio.hash["keys"] == "0,0,0;0,0,0;0.2,1,0")
+    studio.page.get_by_role("button", name="Remove keyframe 1").click()
+    studio.eventually(lambda: studio.hash["keys"] == "0,0,0;0.2,1,0")
+    assert studio["#keyframes > li"].count() == 2
+
+
+def test_the_strip_shows_each_factor_alone(studio: Studio) -> None:
+    keyframes(studio, (-0.2, 0, 1), (0.2, 0, 1))
+    studio["#draw-strip"].click()
+    studio.eventually(lambda: studio["#strip canvas.drawn"].count() == 15)
+    assert studio["#strip tbody th"].all_inner_texts() == ["all factors", "size", "form"]
+    assert studio["#strip thead th"].all_inner_texts() == ["0.00", "0.25", "0.50", "0.75", "1.00"]
+    rows = [[body(studio["#strip tbody tr"].nth(i).locator("canvas").nth(k)) for k in (0, 4)] for i in range(3)]
+    changes = [np.abs(first - last).mean() for first, last in rows]
+    assert changes[0] > 1
+    assert changes[1] > 1
+    assert changes[2] == 0, "this factor rests on this path"
+    assert np.abs(rows[2][0] - rows[1][0]).mean() > 1, "and it isn't where the other's is"
+
+
+def test_colours_by_stretch_and_bending(studio: Studio) -> None:
+    assert studio["#legend"].is_hidden()
+    studio.type(0, 0.2)
+    studio.until_code([0.2, 0, 0])
+    studio.rest()
+    studio.tab("Colour")
+    plain = studio.picture()
+    studio.page.get_by_label("stretch").check()
+    studio.until_different(plain, 0.01)
+    assert studio["#legend .title"].inner_text().startswith("Stretch")
+    average, low, high = numbers(studio)
+    assert average == low == high == 20, "lengths of the first factor grow alike"
+    studio.page.get_by_label("bending").check()
+    studio.eventually(lambda: studio["#legend .title"].inner_text().startswith("Bending"))
+    assert max(map(abs, numbers(studio))) < 0.1
+    assert studio.hash["colour"] == "bending"
+
+    studio.tab("Path")
+    studio["#add-keyframe"].click()
+    studio.tab("Shape")
+    studio.type(0, 0.08)
+    studio.tab("Colour")
+    studio.page.get_by_label("stretch").check()
+    studio["#against"].select_option("keyframe 1")
+    studio.eventually(lambda: numbers(studio) == [10, -10, -10])
+    studio.page.get_by_label("nothing").check()
+    studio.eventually(lambda: studio["#legend"].is_hidden())
+
+
+def numbers(studio: Studio) -> list[float]:
+    """Average, least and most, of the legend."""
+    text = studio["#legend .numbers"].inner_text().replace("−", "-")
+    return [float(part) for part in re.findall(r"[-+]?\d+\.?\d*(?:e-?\d+)?", text)]
+
+
+def test_lengths_and_angles_in_the_page_are_those_of_the_server(studio: Studio) -> None:
+    from geometry.mesh import TriangleMesh
+    from geometry.nric import nric
+
+    script = """async () => {
+        const [{ Surface }, api] = await Promise.all([import('/page/js/surface.js'), import('/page/js/api.js')]);
+        const model = (await api.models()).find(({ name }) => name === 'with-fine');
+        const { faces, vertices } = await api.reference(model, 'coarse');
+        const { shapes: [x] } = await api.shapes(model, [[0.1, 1, 0.5]], 'coarse');
+        const surface = new Surface(faces, vertices.length / 3);
+        const { lengths, angles } = surface.measure(x);
+        return [faces, x, lengths, angles].map((a) => Array.from(a)).concat([surface.edges]);
+    }"""
+    faces, x, lengths, angles, edges = studio.page.evaluate(script)
+    mesh = TriangleMesh.from_arrays(np.reshape(x, (-1, 3)), np.reshape(faces, (-1, 3)))
+    expected = nric(mesh.vertices, mesh.connectivity)
+    pairs = np.sort(np.array(edges)[:, :2], axis=1)
+    order = np.lexsort((pairs[:, 1], pairs[:, 0]))
+    assert np.array_equal(pairs[order], mesh.edges)
+    half = mesh.connectivity.edge_count
+    assert np.allclose(np.array(lengths)[order], expected[:half], atol=1e-5)
+    assert np.allclose(np.array(angles)[order], expected[half:], atol=1e-4)
+
+
+def test_pictures_of_keyframes_differ(studio: Studio) -> None:
+    keyframes(studio, (-0.2, 0, 0), (0.2, 0, 0))
+    first, second = (body(studio["#keyframes canvas"].nth(i))[..., :3] for i in range(2))
+    assert difference(first.astype(int), second.astype(int)) > 0.05

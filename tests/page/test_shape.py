@@ -1,0 +1,279 @@
+"""The view and the sliders."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from playwright.sync_api import Request
+
+from tests.page.conftest import Open
+from tests.page.studio import Studio, body, difference
+
+BACKGROUND = 12  # how far the paper's own colours reach
+
+
+def test_the_figure_is_there_first_and_follows_a_slider(window: Open) -> None:
+    studio = window().open("")
+    assert studio["#model"].input_value() == "figure"
+    assert studio["h1"].inner_text() == "shapespace"
+    before = studio.picture()
+    paper = before[:8].reshape(-1, 3)
+    drawn = (np.abs(before - paper.mean(axis=0)).max(axis=2) > 4 * BACKGROUND).mean()
+    assert 0.05 < drawn < 0.6, "the canvas is blank, or all covered"
+    studio.slide(4, 0.9)
+    after = studio.until_different(before, 0.01)
+    assert 0.01 < difference(before, after) < 0.6
+    assert studio.code[4] == pytest.approx(0.9, abs=1e-3)
+    words = studio["#diagnostics"].inner_text()
+    assert "Fits its lengths and angles to" in words
+    assert "Inside the range" in words
+    assert "ms to the picture" in studio["#frame-time"].inner_text()
+
+
+def test_several_coordinates_at_once_number_lock_and_reset(studio: Studio) -> None:
+    start = studio.picture()
+    studio.type(0, 0.15)
+    studio.type(2, 0.5)
+    studio.until_code([0.15, 0, 0.5])
+    assert float(studio.coordinate(0).locator("input[type=range]").input_value()) == pytest.approx(0.15)
+    studio.until_different(start)
+
+    studio.coordinate(0).locator("[data-do=lock]").click()
+    assert studio.coordinate(0).locator("input[type=range]").is_disabled()
+    studio["#reset-all"].click()
+    studio.until_code([0.15, 0, 0])
+    assert studio.hash["locked"] == "0"
+    studio.coordinate(0).locator("[data-do=lock]").click()
+    studio.coordinate(0).locator("[data-do=reset]").click()
+    studio.until_code([0, 0, 0])
+    studio["#canvas"].hover()  # away from the factor, which colours what it moves
+    studio.eventually(lambda: difference(start, studio.picture()) < 0.001)
+
+    studio.type(1, 1)
+    studio.type(2, 0.4)
+    studio.type(0, 0.1)
+    studio.until_code([0.1, 1, 0.4])
+    studio[".factor"].nth(1).get_by_role("button", name="Reset all of form").click()
+    studio.until_code([0.1, 0, 0])
+
+
+def test_the_range_of_the_training_data_is_marked_and_leaving_it_is_said(studio: Studio) -> None:
+    slider = studio.coordinate(2).locator("input[type=range]")
+    low, high = (
+        float(slider.evaluate(f"s => s.style.getPropertyValue('--{end}')").rstrip("%")) for end in ("low", "high")
+    )
+    lowest, highest = float(slider.get_attribute("min") or 0), float(slider.get_attribute("max") or 0)
+    assert lowest + low / 100 * (highest - lowest) == pytest.approx(0, abs=1e-6)
+    assert lowest + high / 100 * (highest - lowest) == pytest.approx(1)
+    assert "outside" not in (studio.coordinate(2).get_attribute("class") or "")
+    studio.slide(2, 1.2)
+    assert "outside" in (studio.coordinate(2).get_attribute("class") or "")
+    studio.eventually(lambda: "Outside the range" in studio["#diagnostics"].inner_text())
+
+
+def test_an_angle_goes_round(studio: Studio) -> None:
+    studio.type(1, 4)
+    studio.until_code([0, 4 - 2 * np.pi, 0])
+    slider = studio.coordinate(1).locator("input[type=range]")
+    step = 2 * np.pi / 100
+    studio.type(1, 3.14)
+    slider.press("ArrowRight")
+    studio.until_code([0, 3.14 + step - 2 * np.pi, 0], 1e-3)
+    slider.press("ArrowLeft")
+    studio.until_code([0, 3.14, 0], 1e-3)
+
+
+def test_coarse_as_it_moves_fine_as_it_rests_and_nothing_queues(studio: Studio) -> None:
+    box = studio.coordinate(0).locator("input[type=range]").bounding_box()
+    assert box
+    # A slow server, so that more is asked for than it answers.
+    studio.page.route("**/vertices*", lambda route: (studio.page.wait_for_timeout(60), route.continue_()))
+    studio.asked.clear()
+    under_way, most = 0, 0
+
+    def count(change: int) -> Callable[[Request], None]:
+        def changed(request: Request) -> None:
+            nonlocal under_way, most
+            under_way += change * request.url.endswith("/vertices?format=npz")
+            most = max(most, under_way)
+
+        return changed
+
+    studio.page.on("request", count(1))
+    for end in ("requestfinished", "requestfailed"):
+        studio.page.on(end, count(-1))
+    mouse = studio.page.mouse
+    mouse.move(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
+    mouse.down()
+    moves = 40
+    for i in range(moves):
+        mouse.move(box["x"] + box["width"] / 2 + 2 * i, box["y"] + box["height"] / 2)
+    moving = [asked["mesh"] for asked in studio.asked]
+    mouse.up()
+    studio.eventually(lambda: studio.asked[-1]["mesh"] == "fine" and studio.shown == "fine")
+    studio.page.unroute("**/vertices*")
+    assert most == 1
+    assert moving.count("coarse") == len(moving) > 1
+    assert len(studio.asked) < moves
+    # The last thing asked for is where the hand let go.
+    studio.eventually(lambda: np.allclose(studio.asked[-1]["latents"][0], studio.code, atol=1e-4))
+    assert studio.code[0] > 0.05
+
+
+def test_a_shape_that_is_already_old_is_dropped(studio: Studio) -> None:
+    dropped: list[str] = []
+    studio.page.on("requestfailed", lambda request: dropped.append(request.post_data or ""))
+    studio.page.route("**/vertices*", lambda route: '"fine"' in (route.request.post_data or "") or route.continue_())
+    studio.type(0, 0.1)
+    studio.eventually(lambda: any(asked["mesh"] == "fine" and asked["latents"][0][0] == 0.1 for asked in studio.asked))
+    studio.type(0, 0.12)
+    studio.eventually(lambda: any('"fine"' in text and "0.1," in text for text in dropped))
+    studio.page.unroute("**/vertices*")
+    studio.type(0, 0.13)
+    studio.rest()
+    assert studio.messages == ""
+
+
+def test_undo_and_redo(studio: Studio) -> None:
+    assert studio["#undo"].is_disabled()
+    start = studio.picture()
+    studio.slide(0, 0.1)
+    studio.until_code([0.1, 0, 0])
+    studio.slide(2, 0.6)
+    studio.until_code([0.1, 0, 0.6])
+    studio["#undo"].click()
+    studio.until_code([0.1, 0, 0])
+    studio.page.keyboard.press("Control+z")
+    studio.until_code([0, 0, 0])
+    assert studio["#undo"].is_disabled()
+    studio.eventually(lambda: difference(start, studio.picture()) < 0.001)
+    studio.page.keyboard.press("Control+Shift+z")
+    studio["#redo"].click()
+    studio.until_code([0.1, 0, 0.6])
+    studio["#undo"].click()
+    studio.type(1, 1)
+    studio.until_code([0.1, 1, 0])
+    assert studio["#redo"].is_disabled(), "a new step ends what could be done again"
+
+
+def test_turn_and_zoom_by_mouse_and_keyboard(studio: Studio) -> None:
+    start = studio.picture()
+    box = studio["#canvas"].bounding_box()
+    assert box
+    x, y = box["x"] + 30, box["y"] + box["height"] - 100
+    studio.page.mouse.move(x, y)
+    studio.page.mouse.down()
+    studio.page.mouse.move(x + 120, y - 40, steps=4)
+    studio.page.mouse.up()
+    turned = studio.until_different(start, 0.01)
+    studio.page.mouse.wheel(0, -600)
+    zoomed = studio.until_different(turned, 0.01)
+    studio["#canvas"].focus()
+    for key in ("ArrowLeft", "ArrowUp", "-"):
+        studio.page.keyboard.press(key)
+        zoomed = studio.until_different(zoomed, 0.005)
+    studio.eventually(lambda: "view" in studio.hash)
+    studio.page.keyboard.press("0")
+    studio["#wireframe"].focus()  # no ring around the canvas
+    studio.eventually(lambda: difference(start, studio.picture()) < 0.001)
+    assert studio.code == [0, 0, 0]
+
+
+def test_wireframe_normals_and_the_coarse_mesh(studio: Studio) -> None:
+    start = studio.picture()
+    for switch in ("wireframe", "normals", "fine"):
+        before = studio.picture()
+        studio[f"#{switch}"].click()
+        assert studio[f"#{switch}"].get_attribute("aria-pressed") == str(switch != "fine").lower()
+        studio.until_different(before, 0.005)
+        if switch == "fine":
+            studio.eventually(lambda: studio.shown == "coarse")
+            assert "64 vertices" in studio["#frame-time"].inner_text()
+    for switch in ("wireframe", "normals", "fine"):
+        studio[f"#{switch}"].click()
+    studio.eventually(lambda: difference(start, studio.picture()) < 0.001)
+
+
+def test_pointing_at_a_factor_colours_what_it_moves(window: Open) -> None:
+    studio = window().open("#model=figure")
+    studio.eventually(lambda: studio[".pictures canvas.drawn"].count() == 60)
+
+    def orange(picture: np.ndarray) -> np.ndarray:
+        return (picture[..., 0] - picture[..., 2]) > 50
+
+    studio["#canvas"].hover()
+    assert not orange(studio.picture()).any()
+    studio[".factor h3"].nth(2).hover()  # an arm, in the left half of the picture
+    coloured = orange(studio.eventually(lambda: p if orange(p := studio.picture()).any() else None))
+    half = coloured.shape[1] // 2
+    assert coloured[:, :half].sum() > 1000
+    assert coloured[:, half:].sum() < 0.05 * coloured[:, :half].sum()
+    studio["#canvas"].hover()
+    studio.eventually(lambda: not orange(studio.picture()).any())
+
+
+def test_pictures_of_each_coordinate(studio: Studio) -> None:
+    studio.eventually(lambda: studio[".pictures canvas.drawn"].count() == 9)
+    less, mean, more = (body(studio.coordinate(0).locator("canvas").nth(i)) for i in range(3))
+    covered = [(picture[..., 3] > 0).mean() for picture in (less, mean, more)]
+    assert covered[0] < covered[1] < covered[2], "this coordinate is the size"
+    studio.coordinate(0).locator(".pictures button").nth(2).click()
+    studio.until_code([0.2, 0, 0])
+
+
+def test_the_view_fits_every_window(studio: Studio) -> None:
+    for width, height in ((1400, 500), (700, 900), (390, 700)):
+        studio.page.set_viewport_size({"width": width, "height": height})
+        studio.eventually(
+            lambda: studio["#canvas"].evaluate("c => Math.abs(c.width - c.clientWidth * devicePixelRatio) < 2")
+        )
+        assert studio.page.evaluate("document.documentElement.scrollWidth <= innerWidth")
+        picture = studio.picture()
+        edges = np.concatenate([picture[:, :3].reshape(-1, 3), picture[:, -3:].reshape(-1, 3)])
+        assert np.ptp(edges, axis=0).max() < 2 * BACKGROUND, "the shape is cut off"
+        assert np.ptp(picture.reshape(-1, 3), axis=0).max() > 60, "the shape is gone"
+
+
+def test_a_phone_and_a_finger(window: Open) -> None:
+    studio = window(
+        viewport={"width": 390, "height": 760}, has_touch=True, is_mobile=True, device_scale_factor=2
+    ).open()
+    assert studio.page.evaluate("document.documentElement.scrollWidth <= innerWidth")
+    start = studio.picture()
+    box = studio["#canvas"].bounding_box()
+    assert box
+    devtools = studio.page.context.new_cdp_session(studio.page)
+
+    def touch(kind: str, *points: tuple[float, float]) -> None:
+        places = [{"x": x, "y": y, "id": i} for i, (x, y) in enumerate(points)]
+        devtools.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": places})
+
+    x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+    touch("touchStart", (x, y))
+    for i in range(1, 6):
+        touch("touchMove", (x + 12 * i, y))
+    touch("touchEnd")
+    turned = studio.until_different(start, 0.01)
+    touch("touchStart", (x - 20, y), (x + 20, y))
+    for i in range(1, 6):
+        touch("touchMove", (x - 20 - 8 * i, y), (x + 20 + 8 * i, y))
+    touch("touchEnd")
+    larger = studio.until_different(turned, 0.01)
+    slider = studio.coordinate(0).locator("input[type=range]")
+    slider.scroll_into_view_if_needed()
+    slider.tap(position={"x": 200, "y": 12})
+    studio.until_different(larger)
+    assert studio.code[0] > 0
+    studio.page.get_by_role("tab", name="Path").tap()
+    assert studio["#add-keyframe"].is_visible()
+
+
+def test_dark_and_light(window: Open) -> None:
+    light, dark = (window(color_scheme=scheme).open().picture()[:5].mean() for scheme in ("light", "dark"))
+    assert light > 200
+    assert dark < 60
+    studio = window(color_scheme="dark").open()
+    studio["#theme"].click()
+    assert studio.picture()[:5].mean() > 200
