@@ -25,7 +25,7 @@ train: $(VENV)/.train ## train the bundled models from their generators
 	$(BIN)/shapespace-train run examples/freaky-torus.toml
 	$(BIN)/shapespace-train run examples/figure.toml
 
-test: $(VENV)/.all $(MODULES) ## run the whole suite (ARGS="-k glb" for a part of it)
+test: $(VENV)/.all $(MODULES) $(VENV)/.browser ## run the whole suite (ARGS="-k glb" for a part of it)
 	PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/python -m pytest $(ARGS)
 
 lint: $(VENV)/.all $(BIN)/hadolint ## check style, types, doors between packages and the Dockerfile
@@ -76,6 +76,11 @@ $(VENV)-blender/.bpy:
 		echo "Blender's package needs Python 3.11: name one with 'make clients BPY_PYTHON=/path/to/python3.11'." >&2; exit 1; }
 	$(VENV)-blender/bin/python -m pip install $(BPY)
 	@touch $@
+
+# The page is tested in Chromium: the system's, or where there is none the one that Playwright fetches.
+$(VENV)/.browser: | $(VENV)/.all
+	@for name in chromium chromium-browser google-chrome; do command -v $$name >/dev/null && touch $@ && exit; done; \
+		$(BIN)/playwright install --with-deps --only-shell chromium && touch $@
 
 # Not in the dev extra: its wheels cover fewer platforms than the tests do.
 $(BIN)/hadolint: | $(VENV)/.created

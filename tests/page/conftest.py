@@ -12,7 +12,7 @@ from playwright.sync_api import Browser, sync_playwright
 
 from tests.page.studio import Studio
 from tests.service.bundles import write_bundle
-from tests.service.conftest import ROOT, Server, starting
+from tests.service.conftest import ROOT, Server, Start, starting
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 #: WebGL in software, so that it is there on every machine.
@@ -34,6 +34,13 @@ def models(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def server(models: Path) -> Iterator[Server]:
     with starting() as start:
         yield start(models, workers=2)
+
+
+@pytest.fixture
+def start() -> Iterator[Start]:
+    """Start servers that end with the test."""
+    with starting() as start:
+        yield start
 
 
 @pytest.fixture(scope="session")

@@ -14,7 +14,7 @@ from PIL import Image
 from playwright.sync_api import ConsoleMessage, Locator, Page, Request
 
 T = TypeVar("T")
-PATIENCE = 30.0
+PATIENCE = 12.0
 
 
 class Studio:

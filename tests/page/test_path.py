@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -58,7 +59,7 @@ def test_a_loop_goes_on_and_back_to_the_start(studio: Studio) -> None:
 
     def round_again() -> bool:
         times.append(float(studio["#time"].inner_text().removeprefix("t = ")))
-        return any(b < a for a, b in zip(times, times[1:], strict=False))
+        return any(b < a for a, b in pairwise(times))
 
     studio.eventually(round_again)
     assert "Pause" in studio["#play"].inner_text()
@@ -119,7 +120,7 @@ def test_colours_by_stretch_and_bending(studio: Studio) -> None:
     studio.page.get_by_label("bending").check()
     studio.eventually(lambda: studio["#legend .title"].inner_text().startswith("Bending"))
     assert max(map(abs, numbers(studio))) < 0.1
-    assert studio.hash["colour"] == "bending"
+    studio.eventually(lambda: studio.hash["colour"] == "bending")
 
     studio.tab("Path")
     studio["#add-keyframe"].click()
@@ -130,7 +131,7 @@ def test_colours_by_stretch_and_bending(studio: Studio) -> None:
     studio["#against"].select_option("keyframe 1")
     studio.eventually(lambda: numbers(studio) == [10, -10, -10])
     studio.page.get_by_label("nothing").check()
-    studio.eventually(lambda: studio["#legend"].is_hidden())
+    studio.eventually(studio["#legend"].is_hidden)
 
 
 def numbers(studio: Studio) -> list[float]:

@@ -205,7 +205,7 @@ def test_pointing_at_a_factor_colours_what_it_moves(window: Open) -> None:
 
     studio["#canvas"].hover()
     assert not orange(studio.picture()).any()
-    studio[".factor h3"].nth(2).hover()  # an arm, in the left half of the picture
+    studio[".factor h2"].nth(2).hover()  # an arm, in the left half of the picture
     coloured = orange(studio.eventually(lambda: p if orange(p := studio.picture()).any() else None))
     half = coloured.shape[1] // 2
     assert coloured[:, :half].sum() > 1000

@@ -25,7 +25,7 @@ export class Sliders {
     this.#rows = [];
     this.list.replaceChildren(...model.factors.map((factor, j) => {
       const group = clone("factor");
-      find("h3", group).textContent = factor.name;
+      find("h2", group).textContent = factor.name;
       const rows = [];
       for (let k = factor.start; k < factor.stop; k += 1) rows.push(this.#row(k, factor));
       find(".rows", group).append(...rows);
@@ -72,7 +72,7 @@ export class Sliders {
     slider.addEventListener("pointerdown", () => this.store.set({ moving: true }));
     slider.addEventListener("input", () => this.#set(k, Number(slider.value)));
     slider.addEventListener("keydown", (event) => this.#wrapAtTheEnd(event, k, slider));
-    box.addEventListener("input", () => { if (box.value !== "" && box.validity.valid) this.#set(k, Number(box.value)); });
+    box.addEventListener("input", () => { if (box.value !== "") this.#set(k, Number(box.value)); });
     box.addEventListener("change", () => this.#show());
     reset.addEventListener("click", () => this.#set(k, space.home[k]));
     lock.addEventListener("click", () => {

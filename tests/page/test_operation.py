@@ -1,0 +1,175 @@
+"""What holds for the whole page: models, errors, a server that comes and goes, accessibility, weight."""
+
+from __future__ import annotations
+
+import re
+import socket
+from pathlib import Path
+
+import httpx
+import numpy as np
+import pytest
+
+from tests.page.conftest import Open
+from tests.page.studio import Studio, difference
+from tests.service.conftest import ROOT, Server, Start
+
+AXE = ROOT / "tests" / "node_modules" / "axe-core" / "axe.min.js"
+
+
+def test_the_models_and_their_cards(studio: Studio) -> None:
+    assert studio["#model option"].all_inner_texts() == ["Figure", "Small torus"]
+    studio["#about"].click()
+    studio.eventually(studio["#card"].is_visible)
+    card = studio["#card"].inner_text()
+    for fact in ("A torus for tests.", "with-fine · version 1 · CC0-1.0", "composite", "64", "Digest"):
+        assert fact in card
+    studio.page.keyboard.press("Escape")
+    small = studio.picture()
+    studio["#model"].select_option("Figure")
+    studio.eventually(lambda: studio.hash["model"] == "figure" and studio[".factor"].count() == 9)
+    studio.until_different(small, 0.02)
+    assert studio["#undo"].is_disabled()
+    assert "Figure" in studio.page.title()
+
+
+def test_errors_of_the_server_are_said_in_the_page(window: Open) -> None:
+    studio = window(complains=True).open()
+    before = studio.picture()
+    studio.type(0, 1e30)
+    message = studio.eventually(lambda: studio["#messages .error"].first.inner_text() or None)
+    assert "so far outside the bounds" in message
+    assert studio["#messages"].get_attribute("aria-live") == "polite"
+    studio["#messages .error button"].first.click()
+    assert studio["#messages .error"].count() == 0
+    studio.type(0, 0.1)
+    studio.until_different(before)
+
+
+def test_a_server_that_went_away_and_comes_back(window: Open, start: Start, models: Path) -> None:
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    server = start(models, port=port)
+    studio = window(server.url, complains=True).open()
+    before = studio.picture()
+    server.stop()
+    studio.slide(0, 0.15)
+    studio.eventually(lambda: "does not answer" in studio.messages)
+    studio.slide(0, -0.15)
+    start(models, port=port)
+    studio.eventually(lambda: "is back" in studio.messages and "does not answer" not in studio.messages)
+    assert studio.code[0] == pytest.approx(-0.15, abs=1e-3)
+    studio["#messages button"].click()
+    studio.eventually(lambda: covered(studio.picture()) < 0.9 * covered(before))
+
+
+def covered(picture: np.ndarray) -> float:
+    """Share of pixels that the shape covers."""
+    return float((np.abs(picture - picture[0, 0]).max(axis=2) > 40).mean())
+
+
+def test_a_server_with_a_key(window: Open, start: Start, models: Path) -> None:
+    server = start(models, api_key="open-sesame")
+    studio = window(server.url, complains=True)
+    studio.page.goto(server.url)
+    studio["#key input"].fill("open-sesame")
+    studio["#key input"].press("Enter")
+    studio.rest()
+    assert studio["#key"].is_hidden()
+
+
+def test_no_model_is_said(window: Open, start: Start, tmp_path: Path) -> None:
+    (tmp_path / "none").mkdir()
+    studio = window(start(tmp_path / "none").url, complains=True)
+    studio.page.goto(studio.url)
+    studio.eventually(lambda: "No model is served" in studio.messages)
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_axe_finds_no_fault(window: Open, scheme: str) -> None:
+    studio = window(color_scheme=scheme).open()
+    studio.page.evaluate(AXE.read_text())
+    studio["#about"].click()
+    studio.eventually(studio["#card"].is_visible)
+    check(studio, "card")
+    studio.page.keyboard.press("Escape")
+    for tab in ("Shape", "Path", "Colour", "Files"):
+        studio.tab(tab)
+        if tab == "Path":
+            studio["#add-keyframe"].click()
+            studio["#add-keyframe"].click()
+            studio["#draw-strip"].click()
+            studio.eventually(lambda: studio["#strip canvas.drawn"].count() == 15)
+        if tab == "Colour":
+            studio.page.get_by_label("stretch").check()
+            studio.eventually(studio["#legend"].is_visible)
+        check(studio, tab)
+
+
+def check(studio: Studio, where: str) -> None:
+    found = studio.page.evaluate("async () => (await axe.run()).violations")
+    serious = [(fault["id"], fault["impact"], fault["nodes"][0]["html"]) for fault in found]
+    assert serious == [], where
+
+
+def test_everything_is_reached_by_keyboard(studio: Studio) -> None:
+    def focused() -> str:
+        return studio.page.evaluate("document.activeElement.id || document.activeElement.dataset.do || ''")
+
+    reached = set()
+    studio["#model"].focus()
+    for _ in range(40):
+        reached.add(focused())
+        studio.page.keyboard.press("Tab")
+    assert {
+        "model",
+        "about",
+        "random",
+        "seed",
+        "share",
+        "theme",
+        "canvas",
+        "fine",
+        "wireframe",
+        "normals",
+        "pull",
+    } <= reached
+    assert {"reset-view", "to-shape", "reset-all", "z0", "lock", "reset", "z2"} <= reached
+    studio["#to-shape"].focus()
+    studio.page.keyboard.press("ArrowRight")
+    assert studio["#tab-path"].is_visible()
+    assert focused() == "to-path"
+    studio.page.keyboard.press("End")
+    assert studio["#tab-files"].is_visible()
+
+
+def test_the_page_is_light_and_all_from_here(window: Open, server: Server) -> None:
+    studio = window().open()
+    needed = {address for address in studio.addresses if "/v1/" not in address and "/v2/" not in address}
+    assert any("three.core" in address for address in needed)
+    weight = 0
+    with httpx.Client(headers={"Accept-Encoding": "gzip"}) as client:
+        for address in needed:
+            with client.stream("GET", address) as answer:
+                assert answer.status_code == 200, address
+                weight += sum(map(len, answer.iter_raw())) + len(str(answer.headers))
+    assert weight <= 1.5e6
+
+    with httpx.Client(base_url=server.url) as client:
+        page = client.get("/")
+        policy = page.headers["Content-Security-Policy"]
+        assert "default-src 'self'" in policy
+        assert "unsafe" not in policy
+        assert not re.findall(r"""(?:src|href)=["'](?:https?:)?//""", page.text)
+        script = client.get("/page/js/main.js")
+        again = client.get("/page/js/main.js", headers={"If-None-Match": script.headers["ETag"]})
+        assert again.status_code == 304
+        assert client.get("/page/js/none.js").status_code == 404
+        assert client.get("/page/%2e%2e/app.py").status_code == 404
+
+
+def test_pixels_stay_when_nothing_happens(studio: Studio) -> None:
+    first = studio.picture()
+    studio.page.wait_for_timeout(300)
+    assert difference(first, studio.picture()) == 0
