@@ -129,8 +129,8 @@ def test_colours_by_stretch_and_bending(studio: Studio) -> None:
     studio.tab("Colour")
     studio.page.get_by_label("stretch").check()
     studio["#against"].select_option("keyframe 1")
-    studio.eventually(lambda: numbers(studio) == [10, -10, -10])
-    studio.page.get_by_label("nothing").check()
+    studio.eventually(lambda: numbers(studio) == [11, -10, -10])
+    studio.page.locator("[name=colour][value=none]").check()
     studio.eventually(studio["#legend"].is_hidden)
 
 

@@ -7,11 +7,23 @@ import { report } from "./messages.js";
 import { nearest } from "./modes.js";
 import { Surface } from "./surface.js";
 
+/** The measures and the legend are those of the server's coloured files; here they are told in units for people. */
 const KINDS = {
-  stretch: { factor: 100, unit: " %", ends: ["shorter", "longer"], title: "Stretch: change of length" },
-  bending: { factor: 180 / Math.PI, unit: "°", ends: ["concave", "convex"], title: "Bending: change of angle" },
+  stretch: {
+    shown: (value) => 100 * Math.expm1(value),
+    unit: " %",
+    ends: ["shorter", "longer"],
+    title: "Stretch: change of length",
+  },
+  bending: {
+    shown: (value) => (180 / Math.PI) * value,
+    unit: "°",
+    ends: ["concave", "convex"],
+    title: "Bending: change of angle",
+  },
 };
-const signed = (value) => `${value > 0 ? "+" : ""}${readable(value, 2)}`.replace("-", "−");
+
+const SMALLEST = 0.01; // end of the legend, in either measure
 
 export class Colouring {
   #surfaces = new Map();
@@ -43,11 +55,11 @@ export class Colouring {
     const surface = this.#surface(mesh);
     const base = this.#base(mesh, surface);
     if (!base) return null;
-    const edges = surface[this.store.colour](base, surface.measure(positions)).map((value) => kind.factor * value);
-    const values = surface.atVertices(edges);
-    const most = Math.max(1, percentile(values.map(Math.abs), 0.98));
+    const edges = surface[this.store.colour](base, surface.measure(positions));
+    const values = surface.atVertices(edges, base, this.store.colour === "bending");
+    const most = nice(Math.max(SMALLEST, percentile(values.map(Math.abs), 0.98)));
     // While something moves the scale only grows: colours that change their meaning can't be read.
-    this.#limit = this.store.moving || this.store.playing ? Math.max(this.#limit, nice(most)) : nice(most);
+    this.#limit = this.store.moving || this.store.playing ? Math.max(this.#limit, most) : most;
     this.#tell(kind, edges);
     return values;
   }
@@ -82,14 +94,16 @@ export class Colouring {
     return Float32Array.from(this.#nearest, (vertex) => region[vertex]);
   }
 
-  #tell({ unit, ends, title }, edges) {
+  #tell({ shown, unit, ends, title }, edges) {
     const size = edges.reduce((sum, value) => sum + Math.abs(value), 0) / edges.length;
     const [low, high] = [edges.reduce((a, b) => Math.min(a, b)), edges.reduce((a, b) => Math.max(a, b))];
+    const text = (value) => readable(shown(value), 2).replace("-", "−");
+    const signed = (value) => `${value > 0 ? "+" : ""}${text(value)}`;
     find(".title", this.legend).textContent = title;
     find(".low", this.legend).textContent = `${signed(-this.#limit)}${unit} ${ends[0]}`;
     find(".high", this.legend).textContent = `${signed(this.#limit)}${unit} ${ends[1]}`;
     find(".numbers", this.legend).textContent =
-      `On average ${readable(size, 2)}${unit}, from ${signed(low)} to ${signed(high)}${unit}`;
+      `On average ${text(size)}${unit}, from ${signed(low)} to ${signed(high)}${unit}`;
   }
 
   #choices() {

@@ -19,10 +19,11 @@ export function inWords(diagnostics) {
   return words;
 }
 
+/** By the distance to the nearest training shape, in multiples of what these have from each other. */
 function plausible(distance) {
-  if (distance < 1) return ["good", "As plausible as the training shapes."];
-  if (distance < 2) return ["fair", `Rarer than the training shapes (${readable(distance, 2)} times their distance).`];
-  return ["poor", `Far from every training shape (${readable(distance, 2)} times their distance).`];
+  if (distance <= 1) return ["good", "As near to the training shapes as they are to each other."];
+  const times = `${readable(distance, 2)} times as far from the training shapes as they are from each other`;
+  return distance <= 2 ? ["fair", `Plausible: ${times}.`] : ["poor", `Hardly plausible: ${times}.`];
 }
 
 const percent = (share) => `${readable(100 * share, 2)} %`;

@@ -6,7 +6,8 @@ import { report, reporting, say } from "./messages.js";
 
 /** What the server offers for one shape. */
 export const SHAPE_FORMATS = ["glb", "gltf", "obj", "ply", "stl", "npz", "json"];
-const EXTENSIONS = { jsonl: "jsonl", zip: "zip" };
+
+const rounded = (code) => code.map((value) => Number(value.toFixed(6)));
 
 export async function copy(text, what) {
   try {
@@ -29,12 +30,12 @@ export class Files {
     this.format = find("#format", root);
     this.format.append(...SHAPE_FORMATS.map((name) => element("option", { textContent: name })));
     this.curl = find("#curl", root);
-    this.animation = find("#animation-format", root);
-    store.on(["code", "model", "fine", "colour"], () => this.#tell());
+    this.animation = find("#animation-format");
+    store.on(["code", "model", "fine", "colour", "against", "keyframes"], () => this.#tell());
     this.format.addEventListener("change", () => this.#tell());
     find("#download", root).addEventListener("click", reporting(() => this.#shape()));
     find("#download-animation").addEventListener("click", reporting(() => this.#animation()));
-    store.on(["keyframes"], () => { find("#download-animation").disabled = store.keyframes.length < 2; });
+    store.on(["keyframes"], reporting(() => this.#animationFormats()));
     find("#copy-curl", root).addEventListener("click", () => copy(this.curl.textContent, "the call"));
 
     const input = find("#mesh-file", root);
@@ -54,10 +55,13 @@ export class Files {
 
   /** Path and body of the call that answers the shape as a file. */
   get #call() {
-    const { model, code, fine, colour } = this.store;
+    const { model, code, fine, colour, against, keyframes } = this.store;
     const query = new URLSearchParams({ format: this.format.value });
-    if (colour !== "none") query.set("color", colour);
-    const latent = code.map((value) => Number(value.toFixed(6)));
+    if (colour !== "none" && this.format.value !== "stl") { // which has no place for colours
+      query.set("color", colour);
+      if (keyframes[against]) query.set("against", rounded(keyframes[against]));
+    }
+    const latent = rounded(code);
     return { path: `${model.links.mesh}?${query}`, body: fine ? { latent } : { latent, mesh: "coarse" } };
   }
 
@@ -73,14 +77,23 @@ export class Files {
     keep(await api.file(path, body), `${this.store.model.name}.${this.format.value}`);
   }
 
+  /** Offer what the server has for a path: that depends on what is installed with it. */
+  async #animationFormats() {
+    const { keyframes, model } = this.store;
+    find("#download-animation").disabled = keyframes.length < 2;
+    if (keyframes.length < 2 || this.animation.options.length) return;
+    const { links } = await api.interpolation(model, { keyframes });
+    const names = Object.keys(links).filter((name) => !["self", "frames"].includes(name));
+    this.animation.replaceChildren(...names.map((name) => element("option", { textContent: name })));
+  }
+
   async #animation() {
     const { model, fine } = this.store;
     const format = this.animation.value;
     say("The server makes the animation …", { key: "animation" });
     try {
       const { links } = await api.interpolation(model, { ...this.path.request, mesh: fine ? "fine" : "coarse" });
-      const path = links[format] ?? `${links.self}?format=${format}`;
-      keep(await api.file(path), `${model.name}-animation.${EXTENSIONS[format] ?? format}`);
+      keep(await api.file(links[format]), `${model.name}-animation.${format}`);
       say("The animation is saved.", { key: "animation" });
     } catch (error) {
       say(error.message, { kind: "error", key: "animation" });

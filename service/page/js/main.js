@@ -59,7 +59,7 @@ store.on(["wireframe", "normals"], () => viewer.style(store));
 
 // What is said about it.
 let timed = null;
-viewer.addEventListener("drawn", () => {
+viewer.canvas.addEventListener("drawn", () => {
   const { shape } = store;
   if (!shape || shape === timed) return;
   timed = shape;
@@ -138,7 +138,7 @@ function remember() {
 }
 const rememberSoon = () => { clearTimeout(soon); soon = setTimeout(remember, 250); };
 store.on(["model", "code", "locked", "keyframes", "loop", "beyond", "colour", "against", "wireframe", "normals", "fine", "playing"], rememberSoon);
-viewer.addEventListener("turned", () => { turned = true; rememberSoon(); });
+viewer.canvas.addEventListener("turned", () => { turned = true; rememberSoon(); });
 addEventListener("hashchange", reporting(restore));
 
 async function restore() {

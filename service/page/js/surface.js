@@ -36,9 +36,9 @@ export class Surface {
     return { lengths, angles };
   }
 
-  /** Relative change of length of each edge. */
+  /** Logarithm of each edge's length by what it was. */
   stretch(from, to) {
-    return to.lengths.map((length, i) => length / from.lengths[i] - 1);
+    return to.lengths.map((length, i) => Math.log(length / from.lengths[i]));
   }
 
   /** Change of angle of each edge, in radians. */
@@ -49,17 +49,18 @@ export class Surface {
     });
   }
 
-  /** The mean of the values at each vertex's edges. */
-  atVertices(values) {
+  /** The mean of the values at each vertex's edges, weighted by what their lengths were. */
+  atVertices(values, { lengths }, interiorOnly) {
     const sums = new Float32Array(this.vertexCount);
-    const counts = new Uint16Array(this.vertexCount);
-    this.edges.forEach(([a, b], i) => {
+    const weights = new Float32Array(this.vertexCount);
+    this.edges.forEach(([a, b, , d], i) => {
+      if (interiorOnly && d < 0) return;
       for (const vertex of [a, b]) {
-        sums[vertex] += values[i];
-        counts[vertex] += 1;
+        sums[vertex] += lengths[i] * values[i];
+        weights[vertex] += lengths[i];
       }
     });
-    return sums.map((sum, vertex) => sum / Math.max(counts[vertex], 1));
+    return sums.map((sum, vertex) => sum / (weights[vertex] || 1));
   }
 }
 

@@ -1,4 +1,8 @@
-/** The large view: draws the shape when something has changed, and only then. */
+/**
+ * The large view: draws the shape when something has changed, and only then.
+ *
+ * Its canvas fires `drawn` after each picture, in the same task, and `turned` when a hand has moved the view.
+ */
 
 import * as THREE from "three";
 import { OrbitControls } from "three/addons/OrbitControls.js";
@@ -6,11 +10,10 @@ import { frame, geometryOf, litCamera, move, paint, sphereOf, surfaceMaterial } 
 
 const TURN = Math.PI / 24;
 
-export class Viewer extends EventTarget {
+export class Viewer {
   #scheduled = false;
 
   constructor(canvas) {
-    super();
     this.canvas = canvas;
     this.renderer = new THREE.WebGLRenderer({ canvas, antialias: true, alpha: true });
     this.renderer.setPixelRatio(Math.min(devicePixelRatio, 2));
@@ -19,7 +22,7 @@ export class Viewer extends EventTarget {
     this.scene.add(this.camera);
     this.controls = new OrbitControls(this.camera, canvas);
     this.controls.addEventListener("change", () => this.draw());
-    this.controls.addEventListener("end", () => this.dispatchEvent(new Event("turned")));
+    this.controls.addEventListener("end", () => this.canvas.dispatchEvent(new Event("turned")));
 
     this.materials = { surface: surfaceMaterial(), normals: new THREE.MeshNormalMaterial({ side: THREE.DoubleSide }) };
     this.mesh = new THREE.Mesh(new THREE.BufferGeometry(), this.materials.surface);
@@ -103,9 +106,8 @@ export class Viewer extends EventTarget {
     this.#scheduled = true;
     requestAnimationFrame(() => {
       this.#scheduled = false;
-      const began = performance.now();
       this.renderer.render(this.scene, this.camera);
-      this.dispatchEvent(new CustomEvent("drawn", { detail: performance.now() - began }));
+      this.canvas.dispatchEvent(new Event("drawn"));
     });
   }
 
@@ -175,6 +177,6 @@ export class Viewer extends EventTarget {
     this.camera.position.copy(this.controls.target).add(offset);
     this.controls.update();
     this.draw();
-    this.dispatchEvent(new Event("turned"));
+    this.canvas.dispatchEvent(new Event("turned"));
   }
 }

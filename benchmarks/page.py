@@ -1,0 +1,88 @@
+"""How fast the page answers the hand: ``python -m benchmarks.page``.
+
+Starts the server with the bundled models and opens its page in Chromium without a screen, WebGL in software. Measured
+in the page: from the ``input`` event of a slider until the next frame after new pixels have been read back from the
+canvas (reading forces the renderer to finish). Beside it the page's weight as it travels, and the time from a ready
+server to the first shape.
+"""
+
+from __future__ import annotations
+
+import argparse
+import shutil
+import statistics
+import time
+from pathlib import Path
+
+from playwright.sync_api import Page, sync_playwright
+
+from benchmarks.serving import server
+
+CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+FLAGS = ["--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+#: Time from a slider's event to new pixels, in ms.
+SLIDE = """async ([k, value]) => {
+    const canvas = document.querySelector('#canvas');
+    const gl = canvas.getContext('webgl2');
+    const slider = document.querySelectorAll('.coordinate input[type=range]')[k];
+    const read = () => {
+        const pixels = new Uint32Array(gl.drawingBufferWidth * gl.drawingBufferHeight);
+        const bytes = new Uint8Array(pixels.buffer);
+        gl.readPixels(0, 0, gl.drawingBufferWidth, gl.drawingBufferHeight, gl.RGBA, gl.UNSIGNED_BYTE, bytes);
+        return pixels.filter((_, i) => i % 7 === 0);
+    };
+    slider.value = value;
+    const began = performance.now();
+    slider.dispatchEvent(new Event('input', { bubbles: true }));
+    for (;;) {
+        // The buffer can be read in the task that has drawn it.
+        await new Promise((resolve) => {
+            canvas.addEventListener('drawn', () => resolve(window.pixels = read()), { once: true });
+        });
+        if (!window.before || window.pixels.some((value, i) => value !== window.before[i])) break;
+    }
+    window.before = window.pixels;
+    await new Promise(requestAnimationFrame);
+    return performance.now() - began;
+}"""
+
+
+def slides(page: Page, count: int) -> list[float]:
+    """Times of moves of one slider to and fro, the first ones left out."""
+    times = []
+    for i in range(count + 3):
+        times.append(page.evaluate(SLIDE, [4, 0.5 * (-1) ** i + 0.001 * i]))
+        page.wait_for_timeout(60)
+    return times[3:]
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--models", type=Path, default=Path("models"), help="folder of bundles")
+    parser.add_argument("--count", type=int, default=60, help="moves of a slider")
+    arguments = parser.parse_args()
+    with server(arguments.models) as (client, _), sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
+        page = browser.new_page(viewport={"width": 1280, "height": 800})
+        weights: list[float] = []
+        devtools = page.context.new_cdp_session(page)
+        devtools.send("Network.enable")
+        devtools.on("Network.loadingFinished", lambda event: weights.append(event["encodedDataLength"]))
+        began = time.perf_counter()
+        page.goto(str(client.base_url))
+        page.wait_for_selector(".stage[data-shown]")
+        first = time.perf_counter() - began
+        while page.locator(".pictures canvas.drawn").count() < page.locator(".pictures canvas").count():
+            page.wait_for_timeout(100)
+        times = sorted(slides(page, arguments.count))
+        print(
+            f"First shape {first:.2f} s after the address was entered; {sum(weights) / 1e6:.2f} MB with all pictures."
+        )
+        p50, p95 = statistics.median(times), times[int(0.95 * len(times))]
+        print(f"Slider to new pixels: median {p50:.0f} ms, 95 % {p95:.0f} ms, of {len(times)} moves.")
+        browser.close()
+
+
+if __name__ == "__main__":
+    main()
