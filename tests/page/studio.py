@@ -139,8 +139,8 @@ class Studio:
 
     @property
     def messages(self) -> str:
-        """What the page says to people."""
-        return self.page.locator("#messages").inner_text()
+        """What the page has said to people, also what is out of sight by now."""
+        return self.page.locator("#messages").text_content() or ""
 
 
 def pixels(png: bytes) -> np.ndarray:

@@ -133,7 +133,7 @@ def test_the_address_restores_everything(studio: Studio, window: Open) -> None:
     assert other["#keyframes > li"].count() == 2
     assert other["#beyond"].input_value() == "0.25"
     assert other["#against"].input_value() == "0"
-    studio.eventually(lambda: studio.messages == "")
+    studio.eventually(lambda: studio["#messages .message:visible"].count() == 0)
     studio["#theme"].hover()
     studio["#theme"].focus()
     other.eventually(lambda: difference(studio.picture(), other.picture()) < 0.01)

@@ -60,7 +60,6 @@ def test_a_server_that_went_away_and_comes_back(window: Open, start: Start, mode
     start(models, port=port)
     studio.eventually(lambda: "is back" in studio.messages and "does not answer" not in studio.messages)
     assert studio.code[0] == pytest.approx(-0.15, abs=1e-3)
-    studio["#messages button"].click()
     studio.eventually(lambda: covered(studio.picture()) < 0.9 * covered(before))
 
 

@@ -13,8 +13,10 @@ export function say(text, { kind = "note", key } = {}) {
   close.addEventListener("click", () => line.remove());
   line.append(Object.assign(document.createElement("p"), { textContent: text }), close);
   box.append(line);
-  while (box.children.length > 3) box.firstChild.remove();
-  if (!key && kind === "note") setTimeout(() => line.remove(), 6000);
+  for (const old of [...box.querySelectorAll(":scope > :not([hidden])")].slice(0, -3)) old.hidden = true;
+  // A log keeps what it has said, out of sight.
+  if (kind === "note") setTimeout(() => { line.hidden = true; }, 6000);
+  while (box.children.length > 30) box.firstChild.remove();
 }
 
 export function takeBack(key) {
