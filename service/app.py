@@ -16,6 +16,7 @@ from service.dependencies import Service
 from service.description import describe
 from service.metrics import Metrics
 from service.middleware import LimitBody, Observe, RequireKey
+from service.recent import RecentAnswers
 from service.reloading import Reloader
 from service.repository import ModelRepository
 from service.routes import health, inference, interpolations, models, operation, page, shapes
@@ -45,7 +46,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
             repository = ModelRepository(settings.models_dir, settings.workers)
             metrics = Metrics(repository, workers)
             reloader = Reloader(repository, metrics)
-            app.state.service = Service(settings, repository, workers, metrics, reloader)
+            app.state.service = Service(settings, repository, workers, metrics, reloader, RecentAnswers(settings.cache))
             watching = asyncio.create_task(reloader.watch(settings.watch)) if settings.watch else None
             yield
             if watching:

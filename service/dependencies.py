@@ -11,6 +11,7 @@ from pydantic import WithJsonSchema
 
 from service.metrics import Metrics
 from service.problems import ProblemError
+from service.recent import RecentAnswers
 from service.reloading import Reloader
 from service.repository import ModelRepository
 from service.settings import Settings
@@ -31,6 +32,7 @@ class Service:
     workers: Workers
     metrics: Metrics
     reloader: Reloader
+    recent: RecentAnswers
     draining: bool = False
 
 

@@ -20,11 +20,14 @@ from service.dependencies import Service
 from service.encodings import SHAPE_FORMATS, dump_json
 from service.latent_space import Codes
 from service.problems import KINDS, MEDIA_TYPE
+from service.recent import Answer
 from service.schemas import MeshAnswer
 from service.shape_model import MeshChoice, Shape, ShapeModel
 from service.workers import DisconnectedError, Workers
 
 Timings = dict[str, float]
+#: Of an answer that was there already.
+_NO_TIME = {"network": 0.0, "reconstruct": 0.0, "encode": 0.0}
 _HEADERS = {
     name: {"description": description, "schema": {"type": "string"}}
     for name, description in {
@@ -95,8 +98,8 @@ async def shape_response(
         format,
         *(comparison.key if comparison else ()),
     )
-    if answer := not_modified(request, tag):
-        return answer
+    if unchanged := not_modified(request, tag):
+        return unchanged
 
     def find(code: tuple[Codes, bool] | None, deadline: float) -> Shape:
         return model.reference_shape(mesh) if code is None else solve(service.workers, model, mesh, code, deadline)
@@ -115,8 +118,12 @@ async def shape_response(
         filename = f"{model.manifest.name}.{format}"
         return content, file_headers(asdict(found[0].diagnostics), seconds, filename) | legend
 
-    with service.workers.admit() as deadline:
-        content, headers = await service.workers.run(make, deadline)
+    if answer := service.recent.get(tag):
+        content, headers = answer.content, {**answer.headers, "Server-Timing": server_timing(_NO_TIME)}
+    else:
+        with service.workers.admit() as deadline:
+            content, headers = await service.workers.run(make, deadline)
+        service.recent.put(tag, Answer(content, headers))
     return Response(content, headers=cache_headers(tag) | headers, media_type=SHAPE_FORMATS[format].media_type)
 
 

@@ -52,6 +52,9 @@ class Settings(BaseSettings):
     max_upload: PositiveInt = Field(default=64 * 2**20, description="largest mesh file sent to be encoded, in bytes")
     max_codes: PositiveInt = Field(default=256, description="most latent codes in one request")
     max_frames: PositiveInt = Field(default=600, description="most frames of an interpolation")
+    cache: int = Field(
+        default=32 * 2**20, ge=0, description="bytes of recent answers kept for who asks again; 0 keeps none"
+    )
     watch: NonNegativeFloat = Field(
         default=2.0, description="seconds between looks at the models folder for changes; 0 never looks"
     )
