@@ -1,9 +1,11 @@
-"""A request's time by stage, for every bundled model: ``python -m benchmarks.serving``.
+"""What a request costs, by stage and as a whole: ``python -m benchmarks.serving [stages starts growth http]``.
 
-Prints a Markdown table. In process: networks, Gauss–Newton and encoding, once right after loading and then as medians
-over codes drawn from the model's bounds. Beside them, in the same run and on the same thread, one SuperLU factorisation
-of the model's own Gauss–Newton matrix, which is the yardstick that travels between machines. Then the same request over
-HTTP, from a server process on this machine.
+Prints Markdown tables. ``stages``, ``starts`` and ``growth`` run in this process on one thread and count its processor
+seconds, so that other programs on the machine matter little. Beside them, turn by turn, stand one SuperLU
+factorisation of the model's own Gauss–Newton matrix, which is the yardstick that travels between machines, and what one
+would run otherwise: linear blend shapes (a sum of m fields and the same file), which are the floor, and for
+collections with a tangent space the exact exponential, which is the ceiling. ``http`` asks a server process of its own,
+by the clock.
 """
 
 from __future__ import annotations
@@ -14,6 +16,8 @@ import re
 import statistics
 import subprocess
 import sys
+import tempfile
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -25,82 +29,222 @@ from scipy import sparse
 from scipy.sparse.linalg import splu
 from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
 
+from benchmarks import synthetic
+from geometry.calculus import ShellSpace
+from geometry.energy import Material
+from geometry.exponential import exponential
 from geometry.formats import MESH_FORMATS
-from geometry.mesh import FloatArray
+from geometry.mesh import FloatArray, align
 from geometry.nric import NRICJacobian, WeightedNorm
+from geometry.reconstruction import Reconstructor, Status
 from service.bundle import read_bundle
-from service.shape_model import ShapeModel
+from service.shape_model import TOLERANCE, MeshChoice, ShapeModel
 
 GLB = MESH_FORMATS["glb"].encode
+#: Two results of one code agree up to this fraction of the diagonal.
+AGREEMENT = 1e-4
 
 
 def seconds(work: Callable[[], object]) -> float:
-    """Time of one call."""
-    began = time.perf_counter()
+    """Processor time of one call on this thread."""
+    began = time.thread_time()
     work()
-    return time.perf_counter() - began
+    return time.thread_time() - began
 
 
-def normal_matrix(model: ShapeModel, vertices: FloatArray) -> sparse.csc_array:
-    """``JᵀWJ + εI`` at a normalised shape, as Gauss–Newton factorises it."""
+def table(*columns: str) -> None:
+    """The head of a Markdown table."""
+    row(*columns)
+    print("|" + "---|" * len(columns))
+
+
+def row(*cells: object) -> None:
+    """One of its rows; times are in ms."""
+    print(
+        f"| {' | '.join(f'{1e3 * cell:.1f}' if isinstance(cell, float) else str(cell) for cell in cells)} |", flush=True
+    )
+
+
+def superlu(model: ShapeModel, vertices: FloatArray) -> Callable[[], object]:
+    """One symbolic and numeric factorisation, in symmetric mode, of ``JᵀWJ + εI`` at a normalised shape."""
     weights = WeightedNorm.of(model.reference, model.manifest.eta_reconstruction).squared
     jacobian = NRICJacobian(model.reference.connectivity)(vertices)
     matrix = (jacobian.T @ sparse.diags_array(weights) @ jacobian).tocsc()
-    return sparse.csc_array(matrix + 1e-9 * matrix.diagonal().mean() * sparse.eye_array(matrix.shape[0], format="csc"))
-
-
-def superlu(matrix: sparse.csc_array) -> float:
-    """Time of one symbolic and numeric factorisation in symmetric mode."""
+    shift = 1e-9 * matrix.diagonal().mean() * sparse.eye_array(matrix.shape[0], format="csc")
+    matrix = sparse.csc_array(matrix + shift)
     options = {"SymmetricMode": True}
-    return seconds(lambda: splu(matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options))
+    return lambda: splu(matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)
 
 
-def codes(model: ShapeModel, count: int) -> FloatArray:
-    """Random codes (count, m) inside the bounds."""
-    return np.random.default_rng(0).uniform(model.latents.lower, model.latents.upper, (count, model.latents.dimension))
+def draw(model: ShapeModel, count: int, spread: float = 1.0) -> FloatArray:
+    """Random codes (count, m) in a box so many times as wide as the bounds."""
+    centre = (model.latents.lower + model.latents.upper) / 2
+    radius = spread * (model.latents.upper - model.latents.lower) / 2
+    codes = centre + radius * np.random.default_rng(0).uniform(-1, 1, (count, len(centre)))
+    return model.latents.codes(codes.tolist())[0]
 
 
-def stages(model: ShapeModel, code: FloatArray) -> dict[str, float]:
-    """Times of one request in process."""
-    checked, inside = model.latents.codes([code.tolist()])
-    shape = model.shape(checked[0], bool(inside[0]))
-    encode = seconds(lambda: GLB(shape.vertices, model.faces))
-    times = {**shape.seconds, "encode": encode}
-    return {**times, "sum": sum(times.values()), "iterations": shape.diagnostics.iterations}
+def bundles(folder: Path) -> list[Path]:
+    """Folders of bundles, by name and version."""
+    found = (path.parent for path in folder.glob("*/*/manifest.json"))
+    return sorted(found, key=lambda path: (path.parent.name, int(path.name)))
 
 
-def in_process(path: Path, count: int) -> list[str]:
-    """Rows of the table for one bundle."""
-    began = time.perf_counter()
-    model = ShapeModel(read_bundle(path))
-    loaded = time.perf_counter() - began
-    drawn = codes(model, count + 1)
-    cold = stages(model, drawn[0])
-    warm = [stages(model, code) for code in drawn[1:]]
-    median = {stage: statistics.median(times[stage] for times in warm) for stage in cold}
-    found = model.shape(model.latents.codes([drawn[1].tolist()])[0][0])
-    matrix = normal_matrix(model, found.vertices / model.manifest.scale)
-    yardstick = statistics.median(superlu(matrix) for _ in range(5))
-    title = f"{model.manifest.name}/{model.manifest.version}"
-    print(f"{title}: V = {model.manifest.vertices}, loaded in {1e3 * loaded:.0f} ms", file=sys.stderr)
-    rows = []
-    for kind, times in (("cold", cold), ("warm", median)):
-        network, reconstruct, encode, total = (
-            f"{1e3 * times[stage]:.1f}" for stage in ("network", "reconstruct", "encode", "sum")
+def measure(model: ShapeModel, codes: FloatArray) -> dict[str, list[float]]:
+    """Times of code → GLB by stage, and of the yardsticks in turn with them."""
+    fine = model.mesh(MeshChoice.FINE)
+    yardstick = superlu(model, model.shape(codes[0], mesh=MeshChoice.COARSE).vertices / model.manifest.scale)
+    fields = np.random.default_rng(1).standard_normal((model.latents.dimension, 3 * len(fine.vertices)))
+    times: dict[str, list[float]] = {}
+    for code in codes:
+
+        def blend(code: FloatArray = code) -> object:
+            return GLB(fine.vertices + (code @ fields).reshape(-1, 3), fine.faces, None)
+
+        network = seconds(lambda code=code: model._networks(code[None]))
+        began = time.thread_time()
+        shape = model.shape(code)
+        solved = time.thread_time() - began
+        encode = seconds(lambda shape=shape: GLB(shape.vertices, fine.faces, None))
+        found = {
+            "network": network,
+            "reconstruct": solved - network,
+            "encode": encode,
+            "sum": solved + encode,
+            "iterations": shape.diagnostics.iterations,
+            "SuperLU": seconds(yardstick),
+            "blend shapes": seconds(blend),
+        }
+        for name, value in found.items():
+            times.setdefault(name, []).append(value)
+    return times
+
+
+def stages(models: Path, count: int) -> None:
+    """Stage by stage, for every bundle of a folder."""
+    print("\nCode → GLB of the fine mesh in process, medians, ms; in brackets steps of Gauss–Newton.\n")
+    columns = "network", "reconstruct", "encode", "sum", "p95", "p99", "SuperLU", "sum / SuperLU", "blend shapes"
+    table("model", *columns, "exponential, K = 16")
+    for path in bundles(models):
+        model = ShapeModel(read_bundle(path))
+        codes = draw(model, count + 3)
+        times = measure(model, codes)
+        median = {name: statistics.median(values[3:]) for name, values in times.items()}
+        row(
+            f"{model.manifest.name}, V = {model.manifest.vertices}",
+            median["network"],
+            f"{1e3 * median['reconstruct']:.1f} ({statistics.mean(times['iterations'][3:]):.1f})",
+            median["encode"],
+            median["sum"],
+            *(float(np.quantile(times["sum"][3:], q)) for q in (0.95, 0.99)),
+            median["SuperLU"],
+            f"{median['sum'] / median['SuperLU']:.2f}",
+            median["blend shapes"],
+            ceiling(model, path, codes[:5]),
         )
-        iterations, ratio = f"{times['iterations']:g}", f"{times['sum'] / yardstick:.2f}"
-        cells = [title, kind, network, f"{reconstruct} ({iterations})", encode, total, f"{1e3 * yardstick:.1f}", ratio]
-        rows.append(f"| {' | '.join(cells)} |")
-    return rows
+
+
+def ceiling(model: ShapeModel, path: Path, codes: FloatArray) -> float | str:
+    """Time of the exact exponential, where the bundle has modes."""
+    with np.load(path / model.manifest.geometry.file) as geometry:
+        if "modes" not in geometry:
+            return "–"
+        modes = geometry["modes"].astype(np.float64)
+    facts = model.manifest
+    space = ShellSpace(model.reference, Material(facts.mu, facts.lambda_, facts.eta))
+    velocities = [np.tensordot(code.astype(np.float64), modes, 1) for code in codes]
+    return statistics.median(
+        seconds(lambda v=v: exponential(space, model.reference.vertices, v, 16)) for v in velocities
+    )
+
+
+def starts(models: Path, count: int) -> None:
+    """Steps of Gauss–Newton by start, and whether all starts of a code end in one shape."""
+    print(f"\nSteps (processor ms) by start, and codes at which two results are more than {AGREEMENT:g} of the")
+    print("diagonal apart; `ours` is what the product does. The neighbour is a shape a tenth of the box away.\n")
+    table("model, box", "ours", "frames", "learned", "neighbour", "reference", "codes", "apart", "status")
+    for path in bundles(models):
+        model = ShapeModel(read_bundle(path))
+        for spread in (1.0, 1.5):
+            row(f"{model.manifest.name} × {spread:g}", *_starts(model, draw(model, count, spread)))
+
+
+def _starts(model: ShapeModel, codes: FloatArray) -> list[object]:
+    reconstruct = Reconstructor(model.reference, model.manifest.eta_reconstruction)
+    radius = 0.1 * (model.latents.upper - model.latents.lower) / 2
+    rng = np.random.default_rng(1)
+    spent: dict[str, list[tuple[int, float]]] = {}
+    apart, statuses = 0, dict.fromkeys(Status, 0)
+    for code in codes:
+        target = model._networks(code[None])[1][0]
+        near = (code + radius * rng.uniform(-1, 1, len(code))).astype(np.float32)
+        beside = model._networks(near[None])[1][0]
+        learned = list(model._learned_start(code))
+        made: dict[str, Callable[[], FloatArray]] = {
+            "ours": lambda target=target, learned=learned: reconstruct.guess(target, *learned),
+            "frames": lambda target=target: reconstruct.integrate(target),
+            "reference": lambda: model.reference.vertices,
+        }
+        made |= dict(zip(["learned"], learned, strict=False))
+        neighbour = reconstruct(beside, reconstruct.guess(beside), tolerance=TOLERANCE).vertices
+        made["neighbour"] = lambda neighbour=neighbour: neighbour
+        found = {}
+        for name, start in made.items():
+            began = time.thread_time()
+            found[name] = reconstruct(target, start(), tolerance=TOLERANCE)
+            spent.setdefault(name, []).append((found[name].iterations, time.thread_time() - began))
+        statuses[found["ours"].status] += 1
+        ours = found["ours"].vertices
+        # Frames by themselves are no start of the product's: it looks whether they are any good.
+        others = (result.vertices for name, result in found.items() if name != "frames")
+        distance = max(np.abs(align(other, ours) - ours).max() for other in others)
+        apart += bool(distance > AGREEMENT * model.reference.diagonal)
+
+    def cell(name: str) -> str:
+        if name not in spent:
+            return "–"
+        steps, times = zip(*spent[name], strict=True)
+        return f"{statistics.mean(steps):.1f} ({1e3 * statistics.median(times):.0f})"
+
+    names = "ours", "frames", "learned", "neighbour", "reference"
+    said = ", ".join(f"{count} {status}" for status, count in statuses.items() if count)
+    return [*map(cell, names), len(codes), apart, said]
+
+
+def growth(count: int) -> None:
+    """How times grow with the number of vertices and with the dimension."""
+    with tempfile.TemporaryDirectory() as folder:
+        for kind, cases in (
+            ("V", [(v, 20) for v in (500, 1000, 2000, 5000, 10000)]),
+            ("m", [(1000, m) for m in (4, 20, 40, 80)]),
+        ):
+            print(f"\nSynthetic capsules, growing {kind}; medians, ms.\n")
+            table(
+                "V", "m", "network", "reconstruct (steps)", "encode", "sum", "SuperLU", "sum / SuperLU", "blend shapes"
+            )
+            sums = []
+            for vertices, latents in cases:
+                model = ShapeModel(read_bundle(synthetic.write(Path(folder) / kind, vertices, latents)))
+                times = measure(model, draw(model, count + 2))
+                median = {name: statistics.median(values[2:]) for name, values in times.items()}
+                steps = statistics.mean(times["iterations"][2:])
+                sums.append((vertices if kind == "V" else latents, median["sum"]))
+                reconstruct = f"{1e3 * median['reconstruct']:.1f} ({steps:.1f})"
+                ratio = f"{median['sum'] / median['SuperLU']:.2f}"
+                ends = median["encode"], median["sum"], median["SuperLU"], ratio, median["blend shapes"]
+                row(model.manifest.vertices, latents, median["network"], reconstruct, *ends)
+            exponent = np.polyfit(*np.log(np.array(sums).T), 1)[0]
+            print(f"\nThe sum grows with {kind}^{exponent:.2f} (least squares in logarithms).")
 
 
 @contextmanager
-def server(models: Path) -> Iterator[tuple[httpx.Client, float]]:
-    """A server process of its own with a client, and the time from its start until it was ready."""
+def server(models: Path, **settings: object) -> Iterator[tuple[httpx.Client, int, float]]:
+    """A server process of its own: a client, its process, and the time from its start until it was ready."""
     began = time.perf_counter()
+    more = {f"SHAPESPACE_{name.upper()}": str(value) for name, value in settings.items()}
     process = subprocess.Popen(
         [sys.executable, "-m", "service"],
-        env={**os.environ, "SHAPESPACE_MODELS_DIR": str(models), "SHAPESPACE_PORT": "0"},
+        env={**os.environ, "SHAPESPACE_MODELS_DIR": str(models), "SHAPESPACE_PORT": "0", **more},
         stdout=subprocess.PIPE,
         stderr=subprocess.DEVNULL,
         text=True,
@@ -110,49 +254,129 @@ def server(models: Path) -> Iterator[tuple[httpx.Client, float]]:
         if address is None:
             raise SystemExit("the server did not start")
         with httpx.Client(base_url=address.group(), timeout=120) as client:
-            yield client, time.perf_counter() - began
+            client.get("/v2/health/ready").raise_for_status()
+            yield client, process.pid, time.perf_counter() - began
     finally:
         process.terminate()
         process.communicate()
 
 
-def over_http(client: httpx.Client, model: ShapeModel, count: int) -> str:
-    """Row of the second table for one model."""
-    path = f"/v1/models/{model.manifest.name}/mesh"
-    drawn = codes(model, count + 1).tolist()
+def resident(pid: int) -> float:
+    """Resident memory of a process in MB."""
+    text = Path(f"/proc/{pid}/status").read_text()
+    return int(re.findall(r"VmRSS:\s+(\d+)", text)[0]) / 1024
 
-    def request(code: list[float]) -> float:
-        return seconds(lambda: client.post(path, json={"latent": code}).raise_for_status())
 
-    first = request(drawn[0])
-    times = sorted(request(code) for code in drawn[1:])
-    quantiles = [np.quantile(times, q) for q in (0.5, 0.95, 0.99)]
-    cells = " | ".join(f"{1e3 * value:.1f}" for value in (first, *quantiles))
-    return f"| {model.manifest.name} | {cells} |"
+def processor(pid: int) -> float:
+    """Processor seconds of a process so far."""
+    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
+def http(models: Path, count: int, duration: float) -> None:
+    """End to end, from a server process, with one client and with sixteen."""
+    names = {path.parent.name: ShapeModel(read_bundle(path)) for path in bundles(models)}
+    with server(models, cache=0) as (client, pid, ready):
+        used, memory = processor(pid), resident(pid)
+        print(
+            f"\nReady {ready:.1f} s ({used:.1f} processor s) after the start of the process; {memory:.0f} MB resident."
+        )
+        print(
+            "\nOver HTTP, no cache: GLB of the fine mesh, ms by the clock, and processor ms of the server a request.\n"
+        )
+        table("model", "clients", "requests", "errors", "p50", "p95", "p99", "p99 / p50", "processor", "MB after")
+        for name, model in names.items():
+            for clients, limit in ((1, count), (16, 10**9)):
+                began = processor(pid)
+                times, errors = load(client, name, model, clients, limit, duration if clients > 1 else 1e9)
+                spent = (processor(pid) - began) / len(times)
+                quantiles = [float(np.quantile(times, q)) for q in (0.5, 0.95, 0.99)]
+                ratio = f"{quantiles[2] / quantiles[0]:.1f}"
+                row(name, clients, len(times), errors, *quantiles, ratio, spent, f"{resident(pid):.0f}")
+        print("\nInterpolations of 60 frames, fine mesh, streamed as JSON lines and whole as GLB.\n")
+        table(
+            "model",
+            "first line, ms",
+            "one frame alone, ms",
+            "frames / s",
+            "frames / processor s",
+            "GLB, frames / processor s",
+        )
+        for name, model in names.items():
+            row(name, *interpolation(client, pid, name, model))
+
+
+def load(
+    client: httpx.Client, name: str, model: ShapeModel, clients: int, limit: int, duration: float
+) -> tuple[list[float], int]:
+    """Times of requests for codes never asked before, and how many failed."""
+    codes = iter(draw(model, min(clients * limit, 20_000)).tolist())
+    times: list[float] = []
+    errors = 0
+    lock, end = threading.Lock(), time.perf_counter() + duration
+
+    def work() -> None:
+        nonlocal errors
+        with httpx.Client(base_url=client.base_url, timeout=120) as own:
+            for _ in range(limit):
+                with lock:
+                    code = next(codes, None)
+                if code is None or time.perf_counter() > end:
+                    return
+                began = time.perf_counter()
+                answer = own.post(f"/v1/models/{name}/mesh", json={"latent": code})
+                times.append(time.perf_counter() - began)
+                errors += answer.status_code != 200
+
+    threads = [threading.Thread(target=work) for _ in range(clients)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    return times, errors
+
+
+def interpolation(client: httpx.Client, pid: int, name: str, model: ShapeModel) -> list[object]:
+    """Time to the first line, of a frame by itself, and rates."""
+    path = f"/v1/models/{name}/interpolations"
+    keyframes = draw(model, 4).tolist()
+    links = client.post(path, json={"keyframes": keyframes, "frames": 60}).raise_for_status().json()["links"]
+    alone = []
+    for k in range(8):
+        began = time.perf_counter()
+        client.get(links["frames"].replace("{k}", str(k)), params={"format": "json"}).raise_for_status()
+        alone.append(time.perf_counter() - began)
+    began, spent = time.perf_counter(), processor(pid)
+    with client.stream("GET", links["jsonl"]) as answer:
+        lines = answer.iter_lines()
+        next(lines)
+        first = time.perf_counter() - began
+        count = 1 + sum(1 for _ in lines)
+    rate, per_second = count / (time.perf_counter() - began), count / (processor(pid) - spent)
+    spent = processor(pid)
+    client.get(links["glb"]).raise_for_status()
+    whole = count / (processor(pid) - spent)
+    return [first, statistics.median(alone), f"{rate:.0f}", f"{per_second:.0f}", f"{whole:.0f}"]
 
 
 def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parts = ("stages", "starts", "growth", "http")
+    parser.add_argument("parts", nargs="*", choices=[*parts, []], default=list(parts), help="default: all")
     parser.add_argument("--models", type=Path, default=Path("models"), help="folder of bundles")
     parser.add_argument("--count", type=int, default=30, help="codes for each median")
+    parser.add_argument("--seconds", type=float, default=60, help="how long sixteen clients ask")
     arguments = parser.parse_args()
-    found = (path.parent for path in arguments.models.glob("*/*/manifest.json"))
-    paths = sorted(found, key=lambda path: (path.parent.name, int(path.name)))
-
     with threadpool_limits(1):
-        rows = [row for path in paths for row in in_process(path, arguments.count)]
-    print("\nIn process, one thread, ms; in brackets the iterations of Gauss–Newton.\n")
-    print("| model | | network | reconstruct | encode | sum | SuperLU | sum / SuperLU |")
-    print("|---|---|---|---|---|---|---|---|")
-    print("\n".join(rows))
-    with server(arguments.models) as (client, ready):
-        newest = {path.parent.name: ShapeModel(read_bundle(path)) for path in paths}
-        print(f"\nOver HTTP, one client, ms; ready {ready:.1f} s after the start of the process.\n")
-        print("| model | first | p50 | p95 | p99 |")
-        print("|---|---|---|---|---|")
-        for model in newest.values():
-            print(over_http(client, model, arguments.count))
+        if "stages" in arguments.parts:
+            stages(arguments.models, arguments.count)
+        if "starts" in arguments.parts:
+            starts(arguments.models, arguments.count)
+        if "growth" in arguments.parts:
+            growth(min(arguments.count, 10))
+    if "http" in arguments.parts:
+        http(arguments.models, arguments.count, arguments.seconds)
 
 
 if __name__ == "__main__":

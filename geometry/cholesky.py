@@ -9,8 +9,10 @@ from __future__ import annotations
 
 import ctypes
 import importlib.util
+import re
 import sys
 from functools import cache
+from importlib import metadata
 from typing import Literal, Protocol
 
 import numpy as np
@@ -129,10 +131,17 @@ class BandedCholesky:
 
 @cache
 def _mkl() -> ctypes.CDLL:
-    """The MKL library, which pypardiso knows how to find; looking for it takes most of a second."""
-    from pypardiso import PyPardisoSolver
+    """The MKL library. Its wheel's list of files tells where it is; pypardiso's search takes most of a second."""
+    try:
+        files = metadata.files("mkl") or []
+    except metadata.PackageNotFoundError:
+        files = []
+    if found := [file for file in files if re.fullmatch(r"(lib)?mkl_rt\b.*\.(so|dll)\b.*", file.name)]:
+        library = ctypes.CDLL(str(found[0].locate()))
+    else:
+        from pypardiso import PyPardisoSolver
 
-    library = PyPardisoSolver().libmkl
+        library = PyPardisoSolver().libmkl
     # One thread, as requests and samples run side by side. Left to itself MKL joins whatever OpenMP the process has
     # loaded already (PyTorch's, say), and rounds differently with each.
     library.MKL_Set_Threading_Layer(ctypes.c_int(_MKL_SEQUENTIAL))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -15,7 +16,7 @@ from geometry.cholesky import Backend, Cholesky, NotPositiveDefiniteError, analy
 from geometry.frames import FrameIntegration
 from geometry.mesh import FloatArray, TriangleMesh
 from geometry.normal_matrix import NormalMatrix, QuadraticForm
-from geometry.nric import NRICGradients, NRICJacobian, WeightedNorm, wrap
+from geometry.nric import NRICGradients, NRICJacobian, WeightedNorm
 from geometry.rigid import rigid_motions
 
 #: Weight of the angles in the reconstruction's norm. A parameter of its own: the metric's η is far too small here,
@@ -82,6 +83,13 @@ class Reconstructor:
         self._form = QuadraticForm.of(self.norm, reference.connectivity)
         self._cholesky = analyse(self.normal_matrix.pattern, backend)
         self._backend: Backend = backend
+
+    def another(self) -> Reconstructor:
+        """One more for another thread, which shares with this one all that never changes."""
+        twin = copy.copy(self)
+        twin._cholesky = analyse(self.normal_matrix.pattern, self._backend)
+        twin.__dict__.pop("integrate", None)
+        return twin
 
     @cached_property
     def integrate(self) -> FrameIntegration:
@@ -173,7 +181,7 @@ class Reconstructor:
         misfit, gradients = self.jacobian.linearise(vertices)
         misfit -= target
         half = len(misfit) // 2
-        misfit[half:] = wrap(misfit[half:])
+        misfit[half:] -= 2 * np.pi * np.rint(misfit[half:] / (2 * np.pi))
         return _Point(vertices, misfit, gradients, float(self.norm.square(misfit)))
 
     def _flipped(self, misfit: FloatArray) -> int:

@@ -113,8 +113,8 @@ class ShapeModel:
         if manifest.start:
             self._start = _Session(bundle, manifest.start, [manifest.latent_dimension], [manifest.vertices, 3])
         self._solvers: queue.SimpleQueue[Reconstructor] = queue.SimpleQueue()
-        for _ in range(threads):
-            solver = Reconstructor(self.reference, manifest.eta_reconstruction)
+        first = Reconstructor(self.reference, manifest.eta_reconstruction)
+        for solver in (first, *(first.another() for _ in range(threads - 1))):
             solver.guess(nric(self.reference.vertices, self.reference.connectivity))  # so that no request waits for it
             self._solvers.put(solver)
 

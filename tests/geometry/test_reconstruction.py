@@ -1,6 +1,7 @@
 """Vertices from lengths and angles: exact ones, noisy ones, hopeless ones."""
 
 import time
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -83,6 +84,17 @@ def test_one_reconstructor_serves_many_shapes(mesh, pose, reconstruct, target):
     again = reconstruct(target)
     assert np.array_equal(first.vertices, again.vertices)
     assert first.iterations == again.iterations > 1
+
+
+def test_another_one_gives_the_same_and_has_its_own_work_space(mesh, reconstruct, target):
+    other = reconstruct.another()
+    found = reconstruct(target, reconstruct.guess(target))
+    other(nric(mesh.vertices, mesh.connectivity))
+    assert np.array_equal(other(target, other.guess(target)).vertices, found.vertices)
+    with ThreadPoolExecutor(2) as pool:
+        both = pool.map(lambda solver: [solver(target).vertices for _ in range(5)], (reconstruct, other))
+    expected = reconstruct(target).vertices
+    assert all(np.array_equal(vertices, expected) for results in both for vertices in results)
 
 
 def test_where_it_starts_does_not_matter_up_to_a_rigid_motion(mesh, pose, reconstruct, target, move):
