@@ -163,7 +163,7 @@ class Client:
         return Interpolation(self, answer["id"], answer["frames"])
 
     def encode(
-        self, name: str, mesh: Mesh | bytes | Path, format: str | None = None, *, version: str | None = None
+        self, name: str, mesh: Mesh | bytes | Path, format: str | None = None, **options: Options
     ) -> dict[str, Any]:
         """The code whose shape is closest to a mesh in correspondence, however that one is turned and moved.
 
@@ -171,7 +171,7 @@ class Client:
             name: of the model.
             mesh: arrays, a file or its content.
             format: of the content; by default the file's suffix.
-            version: of the model.
+            options: version, bounds ("allow", "clamp" or "reject").
 
         Returns:
             ``latent``, ``residual``, ``vertex_error`` and more.
@@ -185,7 +185,7 @@ class Client:
         else:
             content = mesh
         headers = {"Content-Type": "application/octet-stream"}
-        params = {"version": version, "format": format}
+        params = {"format": format, **options}
         found: dict[str, Any] = self._send(
             "POST", f"/v1/models/{name}/encode", params=params, content=content, headers=headers
         ).json()
@@ -207,7 +207,7 @@ class Client:
             latent: (m,) to start from.
             targets: position (3,) by vertex.
             version: of the model.
-            options: prior, the weight that holds the code back.
+            options: prior, the weight that holds the code back; mesh, whose vertices are meant.
 
         Returns:
             ``latent``, ``residual`` and more.

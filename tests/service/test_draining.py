@@ -1,6 +1,13 @@
 """The end of a server: readiness first, and nothing that it has accepted is lost."""
 
+import fcntl
+import os
+import pty
 import signal
+import socket
+import subprocess
+import sys
+import termios
 import threading
 import time
 from collections import Counter
@@ -9,7 +16,7 @@ from pathlib import Path
 import httpx
 import pytest
 
-from tests.service.conftest import Server, Start
+from tests.service.conftest import ROOT, Server, Start
 
 MESH = "/v1/models/small/mesh"
 
@@ -77,8 +84,6 @@ def test_readiness_turns_first_and_everything_is_still_answered(models: Path, st
 
 
 def test_a_connection_opened_before_the_end_is_answered_after_it(models: Path, start: Start) -> None:
-    import socket
-
     server = start(models, drain=0)
     host, port = server.url.removeprefix("http://").split(":")
     with socket.create_connection((host, int(port))) as connection:
@@ -90,6 +95,29 @@ def test_a_connection_opened_before_the_end_is_answered_after_it(models: Path, s
             assert b"200" in answer.readline()
             assert b'"name":"small"' in answer.read()
     assert server.process.wait(60) == 0
+
+
+def test_it_ends_with_its_terminal(models: Path) -> None:
+    terminal, shell = pty.openpty()
+    process = subprocess.Popen(
+        [sys.executable, "-m", "service"],
+        cwd=ROOT,
+        env=os.environ | {"SHAPESPACE_MODELS_DIR": str(models), "SHAPESPACE_PORT": "0"},
+        stdin=shell,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        start_new_session=True,
+        preexec_fn=lambda: fcntl.ioctl(0, termios.TIOCSCTTY, 0),  # noqa: PLW1509 - what a login does
+    )
+    os.close(shell)
+    with process:
+        assert process.stdout
+        assert b"http://" in process.stdout.readline()
+        os.kill(process.pid, signal.SIGHUP)  # with the terminal still there, a reload
+        time.sleep(0.5)
+        assert process.poll() is None
+        os.close(terminal)
+        assert process.wait(60) == 0
 
 
 def test_an_interrupt_ends_it_at_once_and_cleanly(models: Path, start: Start) -> None:
