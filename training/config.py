@@ -123,7 +123,10 @@ class CombinerSettings(_Section):
     """Learn the difference to the affine sum of the factors instead of the shape itself; pass each layer's input on."""
     edge_channels: int = Field(4, ge=0)
     """Learned constants of each edge, given to the first convolution beside the factors."""
-    pairwise: int = Field(8, ge=0)
+    kernel: int = Field(12, ge=0)
+    """Principal coefficients of each factor, on which kernel ridge regression corrects what the convolutions
+    leave; 0 leaves it out, as the paper does."""
+    pairwise: int = Field(0, ge=0)
     """Principal coefficients of each factor whose products, two factors at a time, correct a residual's affine sum."""
     dropout: float = Field(0.0, ge=0, lt=1)
     symmetries: bool = True

@@ -20,10 +20,9 @@ from geometry.nric import WeightedNorm, nric
 from geometry.reconstruction import Reconstructor
 from training.config import Config, EvaluationSettings
 from training.coordinates import Coordinates
-from training.fitting import predict
 from training.gallery import extremes, strip
 from training.learning import Learner
-from training.networks import affine_sum
+from training.networks import affine_sum, predict
 from training.sampling import Collection
 
 

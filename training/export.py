@@ -24,8 +24,8 @@ from geometry.mesh import TriangleMesh
 from geometry.nric import WeightedNorm
 from training.config import Config
 from training.files import write_npz
-from training.fitting import predict
 from training.learning import Composite
+from training.networks import predict
 from training.sampling import Collection
 
 OPSET = 18

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +15,7 @@ from torch.optim.lr_scheduler import CosineAnnealingLR, ReduceLROnPlateau
 from tqdm import tqdm
 
 from training.config import FitSettings
-from training.networks import ShapeNetwork
+from training.networks import ShapeNetwork, predict
 
 CHECKPOINT_EPOCHS = 5
 
@@ -53,12 +52,6 @@ def finished(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]] | None:
         return None
     state, tensors, _ = read_network(path)
     return (state, tensors) if state["done"] else None
-
-
-def predict(network: Callable[[Tensor], Tensor], inputs: Tensor, batch_size: int = 32) -> Tensor:
-    """Apply a network batch by batch without gradients."""
-    with torch.no_grad():
-        return torch.cat([network(part) for part in inputs.split(batch_size)])
 
 
 def fit(

@@ -407,3 +407,117 @@ class PairwiseProducts(nn.Module):
 
     def forward(self, y: Tensor) -> Tensor:
         return self._features(y) @ self.weights @ self.basis
+
+
+class KernelCorrection(nn.Module):
+    """A smooth correction of the joint shape, (n, J, 2E) → (n, 2E): kernel ridge regression on the factors' shapes.
+
+    Two samples are as alike as their factors' shapes are near, ``exp(−½ Σ_j ‖x_j − x_j'‖² / (ℓ σ_j)²)`` with σ_j the
+    spread of factor j along its strongest direction. Each shape is brought to a few principal coefficients first. What
+    is predicted are principal coefficients of what is missed without it; a linear part says what happens far away from
+    all samples. Products of coefficients, two or three at a time, are among the functions that such a kernel spans, at
+    the weight that their smoothness deserves.
+    """
+
+    centre: Tensor
+    axes: Tensor
+    anchors: Tensor
+    gamma: Tensor
+    linear: Tensor
+    weights: Tensor
+    mean: Tensor
+    basis: Tensor
+    #: Samples that the kernel is centred at, at most; all of them decide the weights.
+    ANCHORS = 1600
+    #: Lengths ℓ, of which held-out samples choose one.
+    LENGTHS = (2.0, 4.0, 8.0, 16.0)
+    #: Samples that the principal axes are taken from, at most.
+    AXES = 500
+    #: Variance that the basis of the correction keeps, and its largest rank.
+    ENERGY, RANK = 0.995, 400
+
+    def __init__(self, factor_count: int, coefficients: int, size: int, anchors: int, rank: int) -> None:
+        super().__init__()
+        inputs = factor_count * coefficients
+        self.register_buffer("centre", torch.zeros(factor_count, size))
+        self.register_buffer("axes", torch.zeros(factor_count, size, coefficients))
+        self.register_buffer("anchors", torch.zeros(anchors, inputs))
+        self.register_buffer("gamma", torch.ones(()))
+        self.register_buffer("linear", torch.zeros(1 + inputs, rank))
+        self.register_buffer("weights", torch.zeros(anchors, rank))
+        self.register_buffer("mean", torch.zeros(size))
+        self.register_buffer("basis", torch.zeros(rank, size))
+
+    @classmethod
+    def blank(cls, tensors: dict[str, Tensor]) -> KernelCorrection:
+        """One of the sizes of a saved one, to load it into; ``tensors`` are the saved one's, by their own names."""
+        (factors, size, coefficients), anchors = tensors["axes"].shape, len(tensors["anchors"])
+        return cls(factors, coefficients, size, anchors, len(tensors["basis"]))
+
+    @classmethod
+    def fit(cls, coefficients: int, y: Tensor, residual: Tensor, held_out: tuple[Tensor, Tensor]) -> KernelCorrection:
+        """Fit to factor shapes (n, J, 2E) and what is missed so far (n, 2E), both as scaled differences."""
+        mean = residual.mean(dim=0)
+        _, s, vt = torch.linalg.svd(_some(residual - mean, 3 * cls.RANK), full_matrices=False)
+        energy = s.square().cumsum(0)
+        rank = min(int((energy < cls.ENERGY * energy[-1]).sum()) + 1, cls.RANK)
+        anchors = min(len(y), cls.ANCHORS)
+        result = cls(y.shape[1], coefficients, y.shape[2], anchors, rank)
+        result.mean.copy_(mean)
+        result.basis.copy_(vt[:rank])
+        result.centre.copy_(y.mean(dim=0))
+        for j in range(y.shape[1]):
+            some = _some(y[:, j] - result.centre[j], cls.AXES)
+            _, s, vt = torch.linalg.svd(some, full_matrices=False)
+            count = min(coefficients, len(s))
+            result.axes[j, :, :count] = vt[:count].T * (len(some) ** 0.5 / s[0].clamp_min(1e-12))
+        result._fit_weights(y, residual, held_out)
+        return result
+
+    def _fit_weights(self, y: Tensor, residual: Tensor, held_out: tuple[Tensor, Tensor]) -> None:
+        pairs = [
+            (self._inputs(factors), ((shape - self.mean) @ self.basis.T).double())
+            for factors, shape in ((y, residual), held_out)
+        ]
+        self.anchors.copy_(pairs[0][0][: len(self.anchors)])
+        best = float("inf")
+        for length in self.LENGTHS:
+            gamma = torch.tensor(0.5 / length**2)
+            # Columns of the kernel made orthonormal at the anchors (Nyström), so that one ridge suits them all.
+            value, vector = torch.linalg.eigh(self._kernel(self.anchors, gamma))
+            kept = value > 1e-7 * value[-1]
+            white = vector[:, kept] * value[kept].rsqrt()
+            (x, target), (other, wanted) = (
+                (torch.cat([_affine(c).double(), self._kernel(c, gamma) @ white * len(white) ** 0.5], dim=1), goal)
+                for c, goal in pairs
+            )
+            h, b = ridge_regression(x, target, (other, wanted))
+            solution = h @ b
+            error = float((other @ solution - wanted).square().mean())
+            if error < best:
+                best, split = error, self.linear.shape[0]
+                self.gamma.copy_(gamma)
+                self.linear.copy_(solution[:split])
+                self.weights.copy_(white @ solution[split:] * len(white) ** 0.5)
+
+    def _inputs(self, y: Tensor) -> Tensor:
+        return torch.einsum("njs,jsr->njr", y - self.centre, self.axes).flatten(1)
+
+    def _kernel(self, inputs: Tensor, gamma: Tensor) -> Tensor:
+        """(n, anchors), in double precision: used to fit."""
+        return torch.exp(-gamma.double() * torch.cdist(inputs.double(), self.anchors.double()).square())
+
+    def forward(self, y: Tensor) -> Tensor:
+        c = self._inputs(y)
+        squares = c.square().sum(dim=1, keepdim=True) - 2 * c @ self.anchors.T + self.anchors.square().sum(dim=1)
+        coefficients = _affine(c) @ self.linear + torch.exp(-self.gamma * squares) @ self.weights
+        return self.mean + coefficients @ self.basis
+
+
+def _affine(x: Tensor) -> Tensor:
+    return torch.cat([torch.ones_like(x[:, :1]), x], dim=1)
+
+
+def _some(x: Tensor, count: int) -> Tensor:
+    """At most so many rows. Codes are independent, so the first ones are as good as any."""
+    return x[:count]

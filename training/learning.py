@@ -19,7 +19,7 @@ from torch import Tensor
 from geometry.mesh import FloatArray, IntArray
 from geometry.nric import WeightedNorm, nric
 from training.config import CombinerSettings, Config, FitSettings, LatentNetworkSettings
-from training.fitting import finished, fit, predict
+from training.fitting import finished, fit, save_network
 from training.layers import PatchBasis
 from training.networks import (
     CombinerNetwork,
@@ -28,6 +28,7 @@ from training.networks import (
     Scaling,
     ShapeNetwork,
     edge_midpoints,
+    predict,
 )
 from training.sampling import Collection, Samples, read
 
@@ -119,7 +120,7 @@ class Learner:
     def _fit(
         self, network: ShapeNetwork, inputs: Tensor, z: NDArray, rows: dict[str, IntArray], fitting: FitSettings,
         path: Path,
-    ) -> None:  # fmt: skip
+    ) -> dict[str, Any]:  # fmt: skip
         title = path.stem.rpartition("-")[0]
         state = fit(
             network,
@@ -133,6 +134,7 @@ class Learner:
             self.config.networks.seed,
         )
         self._record(path, state)
+        return state
 
     def _load(self, network: ShapeNetwork, path: Path, state: dict[str, Any], tensors: dict[str, Tensor]) -> None:
         network.load_state_dict(tensors)
@@ -218,10 +220,16 @@ class Learner:
         z, rows = self.joint.nric, self.rows
         if combiner.symmetries:
             inputs, z, rows = self._with_images(inputs, rows)
-        if not path.exists():
-            pairs = [(inputs[part], torch.from_numpy(z[part])) for part in (rows["train"], rows["validation"])]
-            network.fit_pairwise(*pairs[0], pairs[1])
-        self._fit(network, inputs, z, rows, combiner.fit, path)
+        own, other = ((inputs[part], torch.from_numpy(z[part])) for part in (rows["train"], rows["validation"]))
+        convolutions = self._path("convolutions", combiner, *factors) if combiner.kernel else path
+        if not convolutions.exists():
+            network.fit_pairwise(*own, other)
+        state = self._fit(network, inputs, z, rows, combiner.fit, convolutions)
+        if combiner.kernel:
+            # Last, because on the samples it has learned from it leaves too little for others to learn.
+            network.fit_kernel(*own, other, combiner.kernel)
+            save_network(path, network, state)
+            self._record(path, state)
         return composite
 
     def _with_images(self, inputs: Tensor, rows: dict[str, IntArray]) -> tuple[Tensor, NDArray, dict[str, IntArray]]:

@@ -8,6 +8,8 @@ that a mean square over entries is the loss with both halves normalised.
 from __future__ import annotations
 
 import itertools
+from collections.abc import Callable, Mapping
+from typing import Any
 
 import numpy as np
 import torch
@@ -20,6 +22,7 @@ from training.coordinates import Coordinates
 from training.layers import (
     EdgeConvolution,
     FourierProducts,
+    KernelCorrection,
     LatentFeatures,
     PairwiseProducts,
     PatchBasis,
@@ -27,6 +30,12 @@ from training.layers import (
     perceptron,
     ridge_regression,
 )
+
+
+def predict(network: Callable[[Tensor], Tensor], inputs: Tensor, batch_size: int = 32) -> Tensor:
+    """Apply a network batch by batch without gradients."""
+    with torch.no_grad():
+        return torch.cat([network(part) for part in inputs.split(batch_size)])
 
 
 class Scaling(nn.Module):
@@ -168,6 +177,7 @@ class CombinerNetwork(ShapeNetwork):
         self.pairwise = None
         if settings.residual and settings.pairwise:
             self.pairwise = PairwiseProducts(factor_count, settings.pairwise, size)
+        self.kernel: KernelCorrection | None = None
         self.readout = nn.Linear(widths[-1], 2)
         if settings.residual:
             nn.init.zeros_(self.readout.weight)
@@ -191,6 +201,8 @@ class CombinerNetwork(ShapeNetwork):
         out = self.readout(x).permute(1, 2, 0).reshape(n, double)
         if self.pairwise is not None:
             out = out + self.pairwise(y)
+        if self.kernel is not None:
+            out = out + self.kernel(y)
         return out + y.sum(dim=1) if self.residual else out
 
     def fit_pairwise(self, factors: Tensor, z: Tensor, held_out: tuple[Tensor, Tensor]) -> None:
@@ -198,6 +210,20 @@ class CombinerNetwork(ShapeNetwork):
         if self.pairwise is not None:
             (y, residual), other = self._residual(factors, z), self._residual(*held_out)
             self.pairwise.fit(y, residual, other)
+
+    def fit_kernel(self, factors: Tensor, z: Tensor, held_out: tuple[Tensor, Tensor], coefficients: int) -> None:
+        """Fit a kernel correction to what this network, as it is, misses of the same samples."""
+        rests = [z - predict(self, factors) for factors, z in ((factors, z), held_out)]
+        y, other = (self.scaling.down(x) for x in (factors, held_out[0]))
+        first, second = (rest * self.scaling.factor for rest in rests)
+        self.kernel = KernelCorrection.fit(coefficients, y, first, (other, second))
+
+    def load_state_dict(self, state_dict: Mapping[str, Any], *args: Any, **options: Any) -> Any:
+        """The kernel correction, if there is one, has the size that its samples gave it."""
+        prefix = "kernel."
+        kernel = {k.removeprefix(prefix): v for k, v in state_dict.items() if k.startswith(prefix)}
+        self.kernel = KernelCorrection.blank(kernel) if kernel else None
+        return super().load_state_dict(state_dict, *args, **options)
 
     def _residual(self, factors: Tensor, z: Tensor) -> tuple[Tensor, Tensor]:
         y = self.scaling.down(factors)

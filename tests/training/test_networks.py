@@ -126,6 +126,28 @@ def test_pairwise_products_find_a_bilinear_interplay(ball: TriangleMesh) -> None
     assert after < 1e-4
 
 
+def test_a_kernel_finds_any_smooth_interplay_from_factors_alone(ball: TriangleMesh) -> None:
+    """Of third order and more, at codes it has not seen; and it comes back from a saved state as it was."""
+    rng = np.random.default_rng(0)
+    reference = nric(ball.vertices, ball.connectivity)
+    d, e, f = 0.01 * rng.normal(size=(3, len(reference)))
+    a, b = rng.uniform(-1, 1, (2, 260, 1))
+    factors = np.stack([reference + a * d, reference + b * e], axis=1).astype(np.float32)
+    z = (reference + a * d + b * e + np.sin(2 * a * b) * a * f).astype(np.float32)
+    settings, scale = CombinerSettings(width=4), scaling(ball, z)
+    network = CombinerNetwork(settings, ball.connectivity, scale, 2).eval()
+    x, y = torch.from_numpy(factors), torch.from_numpy(z)
+    unseen = slice(180, None)
+    with torch.no_grad():
+        before = (network(x[unseen]) - y[unseen]).square().mean()
+        network.fit_kernel(x[:150], y[:150], (x[150:180], y[150:180]), 3)
+        after = (network(x[unseen]) - y[unseen]).square().mean()
+        assert after < 1e-2 * before
+        again = CombinerNetwork(settings, ball.connectivity, scale, 2).eval()
+        again.load_state_dict(network.state_dict())
+        torch.testing.assert_close(again(x), network(x))
+
+
 def test_ridge_regression_takes_a_penalty_that_held_out_pairs_ask_for() -> None:
     torch.manual_seed(0)
     x, other = torch.randn(30, 25), torch.randn(200, 25)
