@@ -48,7 +48,13 @@ fit = { batch_size = 8, max_epochs = 3 }
 
 [variants.paper]
 title = "the paper's combiner"
-combiner = { residual = false, kernel = 0, edge_channels = 0, width = 4, layers = 2, fit = { batch_size = 8, max_epochs = 1 } }
+[variants.paper.combiner]
+residual = false
+kernel = 0
+edge_channels = 0
+width = 4
+layers = 2
+fit = { batch_size = 8, max_epochs = 1 }
 
 [evaluation]
 grid_nodes = 4
