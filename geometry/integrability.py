@@ -79,12 +79,16 @@ class Integrability:
 
     def __call__(self, z: FloatArray) -> FloatArray:
         """Q(z) (n,); zero where z (2E,) belongs to an immersed surface. Finite for all finite z."""
-        gamma, theta = self._angles(z)
-        product = _identity(len(self.vertices))
-        for turn_z, turn_x in self._turns(gamma, theta):
-            product = _multiply(_multiply(product, turn_z), turn_x)
+        gamma = self._angles(z)[0]
         loops = [self._around(moves, gamma, z)[0] for moves in self._loops]
-        return np.concatenate([product[1:].T.ravel(), *loops])
+        return np.concatenate([self.at_vertices(z).ravel(), *loops])
+
+    def at_vertices(self, z: FloatArray) -> FloatArray:
+        """Q(z) at the interior vertices, (n, 3): as long as the sine of half the angle left after a turn around."""
+        product = _identity(len(self.vertices))
+        for turn_z, turn_x in self._turns(*self._angles(z)):
+            product = _multiply(_multiply(product, turn_z), turn_x)
+        return product[1:].T
 
     def jacobian(self, z: FloatArray) -> sparse.csr_array:
         """DQ(z) (n, 2E)."""

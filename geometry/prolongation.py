@@ -88,10 +88,24 @@ class Prolongation:
         )
         return fine
 
+    def only(self, vertices: IntArray) -> Prolongation:
+        """The prolongation to some of the fine vertices (k,), in that order."""
+        return Prolongation(self.faces, self.weights[vertices])
+
     @property
     def vertex_count(self) -> int:
         """Vf."""
         return int(self.weights.shape[0])
+
+    @cached_property
+    def coarse_vertices(self) -> IntArray:
+        """(V,) the fine vertex that goes exactly with each coarse one, −1 where none does."""
+        alone = np.flatnonzero(np.diff(self.weights.indptr) == 1)[::-1]
+        column = self.weights.indices[self.weights.indptr[alone]]
+        found = np.full(self.weights.shape[1] // 2, -1)
+        vertices = (column < len(found)) & (self.weights.data[self.weights.indptr[alone]] == 1)
+        found[column[vertices]] = alone[vertices]
+        return found
 
     @cached_property
     def _around(self) -> sp.csr_array:

@@ -10,6 +10,7 @@ from enum import StrEnum
 from functools import cached_property
 
 import numpy as np
+from scipy import sparse
 
 from geometry.anderson import Anderson
 from geometry.cholesky import Backend, Cholesky, NotPositiveDefiniteError, analyse
@@ -183,6 +184,31 @@ class Reconstructor:
         half = len(misfit) // 2
         misfit[half:] -= 2 * np.pi * np.rint(misfit[half:] / (2 * np.pi))
         return _Point(vertices, misfit, gradients, float(self.norm.square(misfit)))
+
+    def differential(self, vertices: FloatArray, changes: FloatArray) -> FloatArray:
+        """How a reconstructed shape (V, 3) moves, (n, V, 3), where what it was asked for changes by (n, 2E).
+
+        ``dX = (JᵀWJ)⁻¹ JᵀW dz``, from the implicit function theorem at a minimum whose residual is small; without rigid
+        motion. Raises NotPositiveDefiniteError.
+        """
+        jacobian = self._factorised_at(vertices)
+        forces = jacobian.T @ (changes * self.norm.squared).T
+        return self._cholesky.solve(forces.T).reshape(len(changes), -1, 3)
+
+    def sensitivity(self, vertices: FloatArray, fields: FloatArray) -> FloatArray:
+        """The transpose of ``differential``.
+
+        How products of a reconstructed shape (V, 3) with vertex fields (n, V, 3) depend on what it was asked for,
+        (n, 2E).
+        """
+        jacobian = self._factorised_at(vertices)
+        solved = self._cholesky.solve(fields.reshape(len(fields), -1))
+        return (jacobian @ solved.T).T * self.norm.squared
+
+    def _factorised_at(self, vertices: FloatArray) -> sparse.csr_array:
+        gradients = self.jacobian.gradients(vertices)
+        self._cholesky.factorise(self.normal_matrix.entries(gradients, self._form))
+        return self.jacobian.matrix(gradients)
 
     def _flipped(self, misfit: FloatArray) -> int:
         connectivity = self.reference.connectivity

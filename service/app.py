@@ -19,7 +19,7 @@ from service.middleware import LimitBody, Observe, RequireKey
 from service.recent import RecentAnswers
 from service.reloading import Reloader
 from service.repository import ModelRepository
-from service.routes import health, inference, interpolations, models, operation, page, shapes
+from service.routes import codes, health, inference, interpolations, models, operation, page, shapes
 from service.settings import Settings
 from service.workers import Workers
 
@@ -66,7 +66,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         openapi_url=None,
     )
     problems.install(app)
-    for module in (models, shapes, interpolations, inference, health, operation, page):
+    for module in (models, shapes, codes, interpolations, inference, health, operation, page):
         app.include_router(module.router)
     app.router.routes.append(page.assets())
     describe(app)

@@ -16,7 +16,7 @@ import onnx
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
-from geometry.mesh import MeshError, TriangleMesh
+from geometry.mesh import FloatArray, IntArray, MeshError, TriangleMesh
 from geometry.prolongation import PREFIX, Prolongation, ProlongationError
 from service.manifest import NAME_PATTERN, VERSION_PATTERN, FileEntry, Manifest
 
@@ -54,6 +54,10 @@ class Bundle:
         reference: the reference shape, normalised.
         fine: the finer mesh, if there is one.
         networks: bytes of each ONNX file by its name.
+        modes: (m, V, 3) vertex fields d_j at the reference, where codes are coefficients of tangent vectors.
+        training_codes: (n, m) codes of the shapes that the model was made from, if there are any.
+        file_vertices: (N,) vertex of the finest mesh that each vertex of the user's files became, −1 for those in no
+            face; None where that is each by itself.
     """
 
     manifest: Manifest
@@ -61,6 +65,9 @@ class Bundle:
     reference: TriangleMesh
     fine: FineMesh | None
     networks: Mapping[str, bytes]
+    modes: FloatArray | None = None
+    training_codes: FloatArray | None = None
+    file_vertices: IntArray | None = None
 
 
 def read_bundle(folder: Path) -> Bundle:
@@ -89,10 +96,10 @@ def read_bundle(folder: Path) -> Bundle:
     for extra in sorted(present - manifest.files.keys() - {MANIFEST}):
         raise BundleError(f"{extra} is not in the manifest")
     files = {file: _verified(folder / file, entry) for file, entry in manifest.files.items()}
-    reference, fine = _geometry(files.pop(manifest.geometry.file), manifest)
+    reference, fine, more = _geometry(files.pop(manifest.geometry.file), manifest)
     for file, content in files.items():
         _check_network(file, content)
-    return Bundle(manifest, hashlib.sha256(text).hexdigest(), reference, fine, files)
+    return Bundle(manifest, hashlib.sha256(text).hexdigest(), reference, fine, files, **more)
 
 
 def _regular_files(folder: Path) -> set[str]:
@@ -126,7 +133,7 @@ def _verified(path: Path, entry: FileEntry) -> bytes:
     return content
 
 
-def _geometry(content: bytes, manifest: Manifest) -> tuple[TriangleMesh, FineMesh | None]:
+def _geometry(content: bytes, manifest: Manifest) -> tuple[TriangleMesh, FineMesh | None, dict[str, NDArray]]:
     file = manifest.geometry.file
     try:
         with np.load(io.BytesIO(content), allow_pickle=False) as arrays:
@@ -155,7 +162,23 @@ def _geometry(content: bytes, manifest: Manifest) -> tuple[TriangleMesh, FineMes
         ("training_codes", (None, m), f"(n, {m})"),
     ):
         _check_shape(file, geometry, array_name, wanted, text)
-    return reference, _fine(file, geometry, reference)
+    fine = _fine(file, geometry, reference)
+    more = {name: geometry[name].astype(np.float64) for name in ("modes", "training_codes") if name in geometry}
+    if "file_vertices" in geometry:
+        more["file_vertices"] = _file_vertices(file, geometry["file_vertices"], fine.reference if fine else reference)
+    return reference, fine, more
+
+
+def _file_vertices(file: str, places: NDArray, mesh: TriangleMesh) -> IntArray:
+    """Checked: whole numbers (N,) that name every vertex of the finest mesh."""
+    count = len(mesh.vertices)
+    if places.ndim != 1 or not np.issubdtype(places.dtype, np.integer) or len(places) < count:
+        raise BundleError(
+            f"{file}: file_vertices must be at least {count} whole numbers, not {places.dtype} {places.shape}"
+        )
+    if not np.array_equal(np.unique(places[places != -1]), np.arange(count)):
+        raise BundleError(f"{file}: file_vertices must name each of the vertices 0 to {count - 1}, or -1")
+    return places.astype(np.int64)
 
 
 def _check_shape(

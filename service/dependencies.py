@@ -77,15 +77,15 @@ async def require_json(request: Request) -> None:
         )
 
 
-def limit_codes(service: Service, count: int) -> None:
+def limit_codes(service: Service, count: int, field: str = "latents") -> None:
     """Refuse requests for no shape or too many; raises ProblemError, too-many-codes or invalid-request."""
     if count > service.settings.max_codes:
         raise ProblemError(
             "too-many-codes",
-            f"latents has {count} codes; the limit is {service.settings.max_codes}. Send several requests.",
+            f"{field} asks for {count} codes; the limit is {service.settings.max_codes}. Send several requests.",
         )
     if count == 0:
-        raise ProblemError("invalid-request", "latents is empty. Send at least one code.")
+        raise ProblemError("invalid-request", f"{field} asks for no code. Send at least one code.")
 
 
 def limit_frames(service: Service, frames: int) -> None:

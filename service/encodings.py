@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from geometry.colouring import Colouring
 from geometry.formats import MESH_FORMATS, MeshFormat
 from geometry.mesh import FloatArray, IntArray
+from service.exact import Exact
 from service.shape_model import Diagnostics
 
 
@@ -43,7 +44,30 @@ def diagnostics_arrays(diagnostics: Sequence[Diagnostics]) -> dict[str, NDArray]
         "iterations": np.array([d.iterations for d in diagnostics]),
         "residual": np.array([d.residual for d in diagnostics]),
         "flipped_faces": np.array([d.flipped_faces for d in diagnostics]),
+        "integrability": np.array([d.integrability for d in diagnostics]),
+        "plausibility": np.array([d.plausibility for d in diagnostics], dtype=np.float64),
         "inside_bounds": np.array([d.inside_bounds for d in diagnostics]),
+    }
+
+
+def exact_lists(exponentials: Sequence[Exact]) -> dict[str, Any]:
+    """Exponentials of n codes as lists (n,), for JSON."""
+    there = [e.vertices is not None for e in exponentials]
+    return {
+        "exact": [None if e.vertices is None else float32(e.vertices) for e in exponentials],
+        "distance": [{"mean": e.mean, "max": e.max} if ok else None for e, ok in zip(exponentials, there, strict=True)],
+        "exact_status": [e.status for e in exponentials],
+    }
+
+
+def exact_arrays(exponentials: Sequence[Exact], vertex_count: int) -> dict[str, NDArray]:
+    """Exponentials of n codes as arrays, for NPZ files; NaN where one failed."""
+    missing = np.full((vertex_count, 3), np.nan)
+    return {
+        "exact": float32(np.stack([missing if e.vertices is None else e.vertices for e in exponentials])),
+        "distance_mean": np.array([e.mean for e in exponentials], dtype=np.float64),
+        "distance_max": np.array([e.max for e in exponentials], dtype=np.float64),
+        "exact_status": np.array([str(e.status) for e in exponentials]),
     }
 
 
@@ -55,6 +79,8 @@ def worst(diagnostics: Sequence[Diagnostics]) -> dict[str, Any]:
         "iterations": max(d.iterations for d in diagnostics),
         "residual": max(d.residual for d in diagnostics),
         "flipped_faces": max(d.flipped_faces for d in diagnostics),
+        "integrability": max(d.integrability for d in diagnostics),
+        "plausibility": max((d.plausibility for d in diagnostics if d.plausibility is not None), default=None),
         "inside_bounds": all(d.inside_bounds for d in diagnostics),
         "model": diagnostics[0].model,
     }

@@ -7,6 +7,7 @@ from enum import StrEnum
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import ndtr, ndtri
 
 from geometry.mesh import FloatArray
 from service.manifest import Manifest
@@ -39,6 +40,13 @@ class Bounds(StrEnum):
     REJECT = "reject"
 
 
+class Distribution(StrEnum):
+    """How random codes are distributed in the bounds."""
+
+    UNIFORM = "uniform"
+    GAUSSIAN = "gaussian"
+
+
 class LatentSpace:
     """The coordinates of a model's codes.
 
@@ -52,6 +60,8 @@ class LatentSpace:
         self.lower, self.upper = np.array(manifest.lower), np.array(manifest.upper)
         self.periodic = np.array([period is not None for period in manifest.period])
         self._period = np.array([period or 1.0 for period in manifest.period])
+        #: (m,) what counts as equally far in each coordinate.
+        self.width = self.upper - self.lower
 
     @property
     def dimension(self) -> int:
@@ -101,11 +111,35 @@ class LatentSpace:
 
     def unroll(self, keyframes: FloatArray) -> FloatArray:
         """Shift angles of successive keyframes (K, m) by whole periods: each step becomes the shorter arc."""
-        steps = np.diff(keyframes, axis=0)
-        half = self._period / 2
-        shorter = half - np.mod(half - steps, self._period)
-        steps = np.where(self.periodic, shorter, steps)
+        steps = self.shorter(np.diff(keyframes, axis=0))
         return np.concatenate([keyframes[:1], keyframes[:1] + np.cumsum(steps, axis=0)])
+
+    def shorter(self, steps: FloatArray) -> FloatArray:
+        """Differences (…, m) of codes, angles taken the shorter way round."""
+        half = self._period / 2
+        return np.where(self.periodic, half - np.mod(half - steps, self._period), steps)
+
+    def box(self, margin: float = 0.0) -> tuple[FloatArray, FloatArray]:
+        """Lower and upper bounds (m,), wider by a fraction of the width on each side; an angle has none.
+
+        Angles that bounds restrict to less than a period keep to them.
+        """
+        free = self.periodic & (self.width >= self._period * (1 - 1e-9))
+        extra = margin * self.width
+        return np.where(free, -np.inf, self.lower - extra), np.where(free, np.inf, self.upper + extra)
+
+    def sample(self, count: int, seed: int, distribution: Distribution) -> Codes:
+        """Random codes (count, m) inside the bounds, the same on every machine.
+
+        Gaussian codes have their mean in the middle of the bounds and a standard deviation of a quarter of the width,
+        before they are cut off at the bounds.
+        """
+        shares = np.random.Generator(np.random.PCG64(seed)).random((count, self.dimension))
+        if distribution is Distribution.GAUSSIAN:
+            low, high = ndtr(-2.0), ndtr(2.0)
+            shares = 0.5 + ndtri(low + (high - low) * shares) / 4
+        values = self.lower + shares * self.width
+        return self.codes(values.tolist(), Bounds.CLAMP)[0]
 
     def _require_finite(self, x: Codes) -> None:
         bad = np.argwhere(~np.isfinite(x))
@@ -119,3 +153,27 @@ class LatentSpace:
         moved = self.lower + np.mod(x - self.lower, self._period)
         inside = (x >= self.lower) & (x < self.lower + self._period)
         return np.where(self.periodic & ~inside, moved, x)
+
+
+class TrainingCodes:
+    """Codes of the shapes that a model was made from, as a measure of what is plausible.
+
+    Args:
+        latents: the space they lie in.
+        codes: (n, m), n ≥ 1.
+    """
+
+    def __init__(self, latents: LatentSpace, codes: FloatArray) -> None:
+        self._latents, self._codes = latents, codes
+        others = np.array([np.sort(self._distances(code))[1:2] for code in codes])
+        #: How far a training code typically is from its nearest neighbour; without neighbours the bounds' width.
+        self.spacing = float(np.median(others)) if others.any() else 1.0
+
+    def plausibility(self, code: Codes) -> float:
+        """Distance of a code (m,) to the nearest of these, in multiples of their own spacing."""
+        return float(self._distances(code).min() / self.spacing)
+
+    def _distances(self, code: NDArray) -> FloatArray:
+        """(n,) root mean square over coordinates, as fractions of the bounds' width."""
+        steps = self._latents.shorter(self._codes - code) / self._latents.width
+        return np.sqrt((steps**2).mean(axis=1))

@@ -90,6 +90,8 @@ class Manifest(_Strict):
     lambda_: PositiveFloat = Field(alias="lambda")
     eta: PositiveFloat
     eta_reconstruction: PositiveFloat
+    #: K of the exponentials that a code stands for, where the bundle has modes.
+    exponential_steps: PositiveInt | None = None
     scale: PositiveFloat
     combiner: Network
     start: Network | None

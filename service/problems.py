@@ -14,7 +14,9 @@ from starlette.routing import Match
 from starlette.types import Scope
 
 from service.animation import PathTooLongError, UnknownInterpolationError
+from service.correspondence import InvalidMeshError
 from service.encodings import dump_json
+from service.exact import NoTangentSpaceError
 from service.latent_space import NotFiniteError, OutOfBoundsError, WrongLengthError
 from service.repository import UnknownModelError, UnknownVersionError
 from service.workers import BusyError, DeadlineError, DisconnectedError
@@ -48,6 +50,8 @@ KINDS = {
     "wrong-length": Kind(422, "Wrong number of latent coordinates"),
     "not-finite": Kind(422, "Not a finite number"),
     "out-of-bounds": Kind(422, "Code out of bounds"),
+    "invalid-mesh": Kind(422, "Mesh can't be used"),
+    "no-tangent-space": Kind(422, "Model without a tangent space"),
     "too-many-codes": Kind(422, "Too many codes"),
     "too-many-frames": Kind(422, "Too many frames"),
     "path-too-long": Kind(422, "Too many keyframes"),
@@ -67,6 +71,8 @@ _OF_EXCEPTION: dict[type[Exception], str] = {
     NotFiniteError: "not-finite",
     OutOfBoundsError: "out-of-bounds",
     PathTooLongError: "path-too-long",
+    InvalidMeshError: "invalid-mesh",
+    NoTangentSpaceError: "no-tangent-space",
     BusyError: "busy",
     DeadlineError: "deadline-passed",
     DisconnectedError: "client-closed",

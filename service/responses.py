@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import hashlib
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import aclosing
 from dataclasses import asdict
 from functools import partial
-from typing import Any
+from typing import Any, TypeVar
 
 from fastapi import Request, Response
 
@@ -28,11 +28,16 @@ from service.workers import DisconnectedError, Workers
 Timings = dict[str, float]
 #: Of an answer that was there already.
 _NO_TIME = {"network": 0.0, "reconstruct": 0.0, "encode": 0.0}
+S = TypeVar("S")
+T = TypeVar("T")
 _HEADERS = {
     name: {"description": description, "schema": {"type": "string"}}
     for name, description in {
         "ETag": "Strong; the same from every replica. Sent back as `If-None-Match` it saves the work.",
-        "Shape-Diagnostics": "JSON: `status`, `iterations`, `residual`, `flipped_faces`, `inside_bounds`, `model`.",
+        "Shape-Diagnostics": (
+            "JSON: `status`, `iterations`, `residual`, `flipped_faces`, `integrability`, `plausibility`, "
+            "`inside_bounds`, `model`."
+        ),
         "Server-Timing": "Milliseconds by stage: `network`, `reconstruct`, `encode`.",
     }.items()
 }
@@ -138,10 +143,17 @@ async def shapes(
 ) -> list[Shape]:
     """Shapes of codes (n, m), side by side; raises DisconnectedError where the client doesn't wait for them."""
     work = partial(solve, service.workers, model, mesh)
+    return await gather(service, request, work, zip(codes, map(bool, inside), strict=True), deadline)
+
+
+async def gather(
+    service: Service, request: Request, work: Callable[[S, float], T], items: Iterable[S], deadline: float
+) -> list[T]:
+    """Results of work on every item, side by side; raises DisconnectedError where the client doesn't wait for them."""
     found = []
-    async with aclosing(service.workers.map(work, zip(codes, map(bool, inside), strict=True), deadline)) as results:
-        async for shape in results:
-            found.append(shape)
+    async with aclosing(service.workers.map(work, items, deadline)) as results:
+        async for result in results:
+            found.append(result)
             if await request.is_disconnected():
                 raise DisconnectedError("The client closed the connection before its answer was ready.")
     return found

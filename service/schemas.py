@@ -8,7 +8,8 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from geometry.colouring import Quantity
 from service.animation import Number
-from service.latent_space import Bounds
+from service.edit import PRIOR
+from service.latent_space import Bounds, Distribution
 from service.shape_model import MeshChoice
 
 Latent = Annotated[
@@ -47,9 +48,51 @@ class VerticesRequest(_Request):
     """Several codes, and how to shape them."""
 
     latents: Latents
+    exact: bool = Field(
+        False,
+        strict=True,
+        description="Also answer the true discrete exponentials, of models with a tangent space, and their distances.",
+    )
     mesh: MeshChoice = Field(MeshChoice.FINE, description="Which mesh to answer, where the model has a finer one.")
     bounds: Bounds = Field(
         Bounds.ALLOW, description="Outside the bounds: extrapolate, clamp to the nearest bound, or reject."
+    )
+
+
+class TargetRequest(_Request):
+    """Where a vertex should be."""
+
+    vertex: int = Field(strict=True, description="Index in the mesh that `mesh` names, from 0.")
+    position: list[Number] = Field(
+        min_length=3, max_length=3, description="In the units and the frame that meshes are answered in."
+    )
+
+
+class EditRequest(_Request):
+    """A code to start from, and vertices that should be elsewhere."""
+
+    latent: Latent
+    targets: list[TargetRequest] = Field(
+        min_length=1, description="At least one.", examples=[[{"vertex": 0, "position": [0.3, 0.1, 0]}]]
+    )
+    prior: Number = Field(
+        PRIOR,
+        ge=0,
+        description="Weight of the mean square change of the code, as a fraction of the bounds' width, against the "
+        "mean square distance from the targets, as a fraction of the bounding box's diagonal.",
+    )
+    mesh: MeshChoice = Field(MeshChoice.FINE, description="Which mesh the targets' vertices belong to.")
+
+
+class SampleRequest(_Request):
+    """How many random codes, and which."""
+
+    count: int = Field(1, ge=1, strict=True, description="Number of codes.")
+    seed: int = Field(0, ge=0, lt=2**63, strict=True, description="The same codes for the same seed.")
+    distribution: Distribution = Field(
+        Distribution.UNIFORM,
+        description="In the bounds uniform, or gaussian: around their middle, with a standard deviation of a quarter "
+        "of their width, and cut off at them.",
     )
 
 
@@ -87,8 +130,23 @@ class DiagnosticsAnswer(BaseModel):
     iterations: int = Field(description="Its iterations.")
     residual: float = Field(description="Relative misfit of lengths and angles in the weighted norm.")
     flipped_faces: int = Field(description="Faces folded more than π/2 away from what the networks ask for.")
+    integrability: float = Field(
+        description="How far the predicted lengths and angles are from those of any surface: root mean square over "
+        "vertices of the sine of half the angle by which the faces around it fail to close."
+    )
+    plausibility: float | None = Field(
+        description="Distance to the nearest training shape's code, in multiples of the distance that these typically "
+        "have from each other; null where the model was not made from shapes."
+    )
     inside_bounds: bool = Field(description="Whether the code lies inside the model's bounds.")
     model: str = Field(description="SHA-256 of the model's manifest.")
+
+
+class VertexError(BaseModel):
+    """Distances over vertices, in the units of the training meshes."""
+
+    mean: float
+    max: float
 
 
 class VerticesAnswer(BaseModel):
@@ -96,6 +154,46 @@ class VerticesAnswer(BaseModel):
 
     vertices: list[list[list[float]]] = Field(description="n × V × 3 positions, in the units of the training meshes.")
     diagnostics: list[DiagnosticsAnswer] = Field(description="One for each shape.")
+    exact: list[list[list[float]] | None] | None = Field(
+        None, description="With `exact`: positions of the true exponentials, null where one could not be found."
+    )
+    distance: list[VertexError | None] | None = Field(
+        None, description="With `exact`: how far the vertices are from those, null where one could not be found."
+    )
+    exact_status: list[str] | None = Field(None, description="With `exact`: how each exponential's solver ended.")
+
+
+class EncodeAnswer(BaseModel):
+    """The code of a mesh."""
+
+    latent: list[float]
+    residual: float = Field(description="Relative misfit of the mesh's lengths and angles in the weighted norm.")
+    vertex_error: VertexError = Field(description="Between the mesh and the code's shape, after rigid alignment.")
+    vertex_errors: list[float] = Field(description="The same vertex by vertex.")
+    inside_bounds: bool = Field(description="Whether the code lies inside the model's bounds.")
+    status: str = Field(description="How the search ended: converged, stalled, iteration_limit.")
+    iterations: int = Field(description="Its evaluations of the networks.")
+    mesh: MeshChoice = Field(description="Which mesh of the model was sent.")
+    diagnostics: DiagnosticsAnswer = Field(description="Of the code's shape.")
+
+
+class EditAnswer(BaseModel):
+    """The code whose shape comes closest to the targets."""
+
+    latent: list[float]
+    residual: float = Field(
+        description="Root mean square distance from the targets, in the units of the training meshes."
+    )
+    distances: list[float] = Field(description="Distance from each target.")
+    status: str = Field(description="How the search ended: converged, stalled, iteration_limit.")
+    iterations: int = Field(description="Shapes that it looked at.")
+    diagnostics: DiagnosticsAnswer = Field(description="Of the code's shape.")
+
+
+class SampleAnswer(BaseModel):
+    """Random codes."""
+
+    latents: Latents
 
 
 class NRICAnswer(BaseModel):

@@ -8,17 +8,21 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from enum import StrEnum
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 import onnxruntime
 from numpy.typing import NDArray
 
+from geometry.calculus import ShellSpace
+from geometry.integrability import Integrability
 from geometry.mesh import FloatArray, TriangleMesh, align
 from geometry.nric import nric
 from geometry.reconstruction import Reconstruction, Reconstructor, Status
 from service.bundle import Bundle, BundleError
-from service.latent_space import Codes, LatentSpace, NotFiniteError
+from service.derivatives import FactorGrids
+from service.latent_space import Codes, LatentSpace, NotFiniteError, TrainingCodes
 from service.manifest import Network
 
 #: Gauss–Newton stops once no vertex moves further than this fraction of the diagonal: a fiftieth of a pixel where a
@@ -43,6 +47,10 @@ class Diagnostics:
         residual: distance between the lengths and angles asked for and those of the shape, relative,
             weighted norm.
         flipped_faces: faces at an edge that is folded more than π/2 away from what was asked for.
+        integrability: how far the lengths and angles asked for are from those of any surface: root mean square over
+            vertices of ``|Q(z)|``, the sine of half the angle by which faces around a vertex fail to close.
+        plausibility: distance to the nearest code of a training shape, in multiples of the distance that these
+            typically have from each other; None where the model has no such codes.
         inside_bounds: whether the code lies inside the model's bounds.
         model: digest of the model.
     """
@@ -51,6 +59,8 @@ class Diagnostics:
     iterations: int
     residual: float
     flipped_faces: int
+    integrability: float
+    plausibility: float | None
     inside_bounds: bool
     model: str
 
@@ -104,6 +114,9 @@ class ShapeModel:
         self.manifest, self.digest = manifest, bundle.digest
         self.latents = LatentSpace(manifest)
         self.reference, self.fine = bundle.reference, bundle.fine
+        self.modes, self.file_vertices = bundle.modes, bundle.file_vertices
+        codes = bundle.training_codes
+        self._training = None if codes is None else TrainingCodes(self.latents, codes)
         n_nric = 2 * manifest.edges
         self._factors = [
             _Session(bundle, factor, [factor.stop - factor.start], [n_nric]) for factor in manifest.factors
@@ -112,11 +125,19 @@ class ShapeModel:
         self._start = None
         if manifest.start:
             self._start = _Session(bundle, manifest.start, [manifest.latent_dimension], [manifest.vertices, 3])
+        self._integrability = Integrability(self.reference.connectivity)
+        #: Spaces for exact exponentials; who finds none makes one.
+        self.spaces: queue.SimpleQueue[ShellSpace] = queue.SimpleQueue()
         self._solvers: queue.SimpleQueue[Reconstructor] = queue.SimpleQueue()
         first = Reconstructor(self.reference, manifest.eta_reconstruction)
         for solver in (first, *(first.another() for _ in range(threads - 1))):
             solver.guess(nric(self.reference.vertices, self.reference.connectivity))  # so that no request waits for it
             self._solvers.put(solver)
+
+    @cached_property
+    def grids(self) -> FactorGrids:
+        """What ``encode`` looks for starts on."""
+        return FactorGrids.of(self)
 
     def mesh(self, choice: MeshChoice) -> TriangleMesh:
         """The reference, normalised, on the mesh of choice; its faces are those of every shape."""
@@ -124,7 +145,7 @@ class ShapeModel:
 
     def reference_shape(self, mesh: MeshChoice = MeshChoice.FINE) -> Shape:
         """The reference itself: the answer where there is no code."""
-        diagnostics = Diagnostics(Status.CONVERGED, 0, 0.0, 0, True, self.digest)
+        diagnostics = Diagnostics(Status.CONVERGED, 0, 0.0, 0, 0.0, None, True, self.digest)
         vertices = self.manifest.scale * self.mesh(mesh).vertices
         return Shape(vertices, diagnostics, {"network": 0.0, "reconstruct": 0.0})
 
@@ -149,19 +170,23 @@ class ShapeModel:
         began = time.perf_counter()
         _, target = self._networks(code[None])
         predicted = time.perf_counter()
-        with self._solver() as reconstruct:
+        with self.solver() as reconstruct:
             start = reconstruct.guess(target[0], *self._learned_start(code))
             found: Reconstruction = reconstruct(target[0], start, tolerance=TOLERANCE, deadline=deadline)
         vertices = align(found.vertices, self.reference.vertices)
         with np.errstate(over="ignore", invalid="ignore"):
-            # The fine mesh moves along with the coarse one, so that aligning this one aligns both.
-            if self.fine and mesh is MeshChoice.FINE:
-                vertices = self.fine.prolong(vertices)
-            vertices = self.manifest.scale * vertices
+            vertices = self.finish(vertices, mesh)
             if found.status is Status.NOT_FINITE or not np.isfinite(vertices.astype(np.float32)).all():
                 raise NotFiniteError(self._overflow)
         diagnostics = Diagnostics(
-            found.status, found.iterations, found.residual, found.flipped_faces, inside_bounds, self.digest
+            found.status,
+            found.iterations,
+            found.residual,
+            found.flipped_faces,
+            float(np.sqrt((self._integrability.at_vertices(target[0]) ** 2).sum(axis=1).mean())),
+            self._training.plausibility(code) if self._training else None,
+            inside_bounds,
+            self.digest,
         )
         seconds = {"network": predicted - began, "reconstruct": time.perf_counter() - predicted}
         return Shape(vertices, diagnostics, seconds)
@@ -178,6 +203,24 @@ class ShapeModel:
                     raise NotFiniteError(self._overflow)
         return LengthsAndAngles(z[:, :half], z[:, half:], factors)
 
+    def nric(self, code: FloatArray) -> FloatArray:
+        """What the networks say to a code (m,): (2E,), normalised, not finite where they overflow."""
+        return self._networks(code[None].astype(np.float32))[1][0]
+
+    def factor(self, j: int, parts: FloatArray) -> FloatArray:
+        """What factor j's network alone says to parts (n, m_j) of codes: (n, 2E), normalised."""
+        return self._factors[j](parts.astype(np.float32)).astype(np.float64)
+
+    def finish(self, aligned: FloatArray, mesh: MeshChoice) -> FloatArray:
+        """An aligned shape (V, 3) on the mesh of choice, in the units of the training meshes."""
+        # The fine mesh moves along with the coarse one, so that aligning this one aligns both.
+        vertices = self.fine.prolong(aligned) if self.fine and mesh is MeshChoice.FINE else aligned
+        return self.manifest.scale * vertices
+
+    def coarse(self, vertices: FloatArray, mesh: MeshChoice) -> FloatArray:
+        """The vertices (V, 3) of the coarse mesh among those of a mesh of choice."""
+        return vertices[self.fine.prolong.coarse_vertices] if self.fine and mesh is MeshChoice.FINE else vertices
+
     def _networks(self, codes: Codes) -> tuple[FloatArray, FloatArray]:
         """Factors (n, J, 2E) and combined NRIC (n, 2E), normalised."""
         parts = [
@@ -192,7 +235,8 @@ class ShapeModel:
             yield lambda: network(code[None])[0].astype(np.float64)
 
     @contextmanager
-    def _solver(self) -> Iterator[Reconstructor]:
+    def solver(self) -> Iterator[Reconstructor]:
+        """A solver for the time being; waits for one where all are in use."""
         solver = self._solvers.get()
         try:
             yield solver

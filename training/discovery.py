@@ -60,6 +60,8 @@ def ingest(folder: Path, config: Config) -> dict[str, Any]:
         more = {"fine_vertices": fine.vertices, "fine_faces": fine.faces, "fine_index": coarsening.fine_index}
         errors = Prolongation.of(reference, fine).errors(vertices, exact)
         facts |= {"coarse_vertices": vertices.shape[1], "prolongation": errors}
+    if meshes.file_vertices is not None and len(meshes.file_vertices) > len(fine.vertices):
+        more["file_vertices"] = meshes.file_vertices
     write_reference(folder, reference, scale, **more)
     write_npz(folder / "shapes.npz", names=np.array(meshes.names), vertices=vertices)
     write_json(folder / "ingest.json", facts)
@@ -185,12 +187,16 @@ def collection(folder: Path, config: Config) -> ShellCollection:
 
 
 def extras(folder: Path) -> dict[str, np.ndarray]:
-    """What a bundle's geometry holds beside its reference: fine mesh at the mean, modes, codes of the shapes."""
+    """What a bundle's geometry holds beside its reference: fine mesh at the mean, modes, codes of the shapes, and which
+    vertices those of the files became, where they aren't the same.
+    """
     if not (folder / "modes.npz").exists():
         return {}
     with np.load(folder / "modes.npz") as file:
         result = {"modes": file["vertices"].astype(np.float32), "training_codes": file["coefficients"]}
     with np.load(folder / "reference.npz") as file:
+        if "file_vertices" in file:
+            result["file_vertices"] = file["file_vertices"].astype(np.int32)
         if "fine_vertices" in file:
             fine = TriangleMesh.from_arrays(file["fine_vertices"], file["fine_faces"])
             prolong = Prolongation.of(TriangleMesh.from_mapping(file), fine)

@@ -133,7 +133,7 @@ def export(
         edges=reference.edges.astype(np.int32),
         **geometry,
     )
-    manifest = _manifest(composite, collection, config, figures, data_digest, difference)
+    manifest = _manifest(composite, collection, config, figures, data_digest, difference, "modes" in geometry)
     manifest["files"] = {path.name: _digest(path) for path in sorted(part.iterdir())}
     (part / "manifest.json").write_text(json.dumps(manifest, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
     shutil.rmtree(folder, ignore_errors=True)
@@ -151,7 +151,7 @@ def _portable(config: Config) -> dict[str, Any]:
 
 def _manifest(
     composite: Composite, collection: Collection, config: Config, figures: dict[str, Any], data_digest: str,
-    difference: float,
+    difference: float, tangent: bool,
 ) -> dict[str, Any]:  # fmt: skip
     settings, coordinates, material = config.export, collection.coordinates, config.material
     reference: TriangleMesh = collection.reference
@@ -185,6 +185,7 @@ def _manifest(
         "lambda": material.lambda_,
         "eta": material.eta,
         "eta_reconstruction": settings.eta_reconstruction,
+        "exponential_steps": config.samples.steps if tangent else None,
         "scale": collection.scale,
         "combiner": {"file": "combiner.onnx", "input": "factors", "output": "nric"},
         "start": None,

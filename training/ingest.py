@@ -42,8 +42,8 @@ class MeshCollection:
         names: of the n shapes: stems of their files in natural order (pose2 before pose10), or the NPZ's own.
         vertices: (n, V, 3) positions as in the files.
         faces: (F, 3) of every shape, in the order of the files.
-        file_vertices: (V,) which of a file's vertices each vertex is; the others are welded to one of these, or in no
-            face. None where there are no files.
+        file_vertices: (N,) which vertex each of a file's vertices has become, −1 for those in no face. None where there
+            are no files.
         notes: what was met and dealt with, a sentence each.
     """
 
@@ -118,7 +118,9 @@ def read_collection(path: Path) -> MeshCollection:
         notes.append(f"welded {len(used)} vertices into {len(kept)}: the others coincide with these in every shape")
     if connectivity.is_closed:
         notes += _orientation(vertices, faces, raw.labels)
-    return MeshCollection(tuple(raw.names), vertices, faces, used[kept], tuple(notes))
+    file_vertices = np.full(raw.vertices.shape[1], -1)
+    file_vertices[used] = np.searchsorted(kept, weld)
+    return MeshCollection(tuple(raw.names), vertices, faces, file_vertices, tuple(notes))
 
 
 def normalised(collection: MeshCollection, reference: int) -> tuple[FloatArray, float]:

@@ -30,7 +30,9 @@ def _facts(model: ShapeModel) -> dict[str, Any]:
     facts = model.manifest.model_dump(by_alias=True)
     path = f"/v1/models/{model.manifest.name}"
     links = {"self": path}
-    links |= {call: f"{path}/{call}" for call in ("mesh", "vertices", "nric", "interpolations")}
+    links |= {
+        call: f"{path}/{call}" for call in ("mesh", "vertices", "nric", "interpolations", "encode", "edit", "sample")
+    }
     wanted = ModelCard.model_fields
     names = [field.alias or name for name, field in wanted.items()]
     return {name: facts[name] for name in names if name in facts} | {"links": links}

@@ -11,13 +11,16 @@ from fastapi import APIRouter, Depends, Query, Request, Response
 
 from geometry.formats import OCTET_STREAM, npz
 from service.comparison import NO_COLOR, ColorQuery, choose_mesh, numbers
-from service.dependencies import Format, Model, ServiceDependency, limit_codes, one_of, require_json
-from service.encodings import SHAPE_FORMATS, diagnostics_arrays, dump_json, float32, worst
-from service.latent_space import Bounds
+from service.dependencies import Format, Model, Service, ServiceDependency, limit_codes, one_of, require_json
+from service.encodings import SHAPE_FORMATS, diagnostics_arrays, dump_json, exact_arrays, exact_lists, float32, worst
+from service.exact import Exact, require_tangent_space
+from service.exact import exact as exponential
+from service.latent_space import Bounds, Codes
 from service.negotiation import choose
 from service.responses import (
     binary,
     file_headers,
+    gather,
     mesh_answers,
     problems,
     server_timing,
@@ -26,7 +29,7 @@ from service.responses import (
     total_seconds,
 )
 from service.schemas import MeshRequest, NRICAnswer, NRICRequest, VerticesAnswer, VerticesRequest
-from service.shape_model import MeshChoice
+from service.shape_model import MeshChoice, Shape, ShapeModel
 
 router = APIRouter(prefix="/v1/models/{name}", tags=["shapes"])
 
@@ -93,28 +96,51 @@ async def post_vertices(
     request: Request,
     model: Model,
     body: VerticesRequest,
+    exact: Annotated[bool, Query(description="As in the body: also the true discrete exponentials.")] = False,
     format: Annotated[Format, one_of(_VERTICES_TYPES)] = None,
 ) -> Response:
     """The positions of many shapes at once."""
     chosen = choose(_VERTICES_TYPES, format, request.headers.get("accept"))
     limit_codes(service, len(body.latents))
+    wanted = exact or body.exact
+    if wanted:
+        require_tangent_space(model)
     codes, inside = model.latents.codes(body.latents, body.bounds)
     with service.workers.admit() as deadline:
         found = await shapes(service, request, model, codes, inside, body.mesh, deadline)
         diagnostics = [shape.diagnostics for shape in found]
+        true = await _exact(service, request, model, codes, found, body.mesh, deadline) if wanted else None
         began = time.perf_counter()
 
         def encode(_: float) -> bytes:
             vertices = float32(np.stack([shape.vertices for shape in found]))
             if chosen == "json":
-                return dump_json({"vertices": vertices, "diagnostics": list(map(asdict, diagnostics))})
-            faces = model.mesh(body.mesh).faces
-            return npz(vertices=vertices, faces=faces, latents=codes, **diagnostics_arrays(diagnostics))
+                more = exact_lists(true) if true else {}
+                return dump_json({"vertices": vertices, "diagnostics": list(map(asdict, diagnostics)), **more})
+            arrays = diagnostics_arrays(diagnostics) | (exact_arrays(true, vertices.shape[1]) if true else {})
+            return npz(vertices=vertices, faces=model.mesh(body.mesh).faces, latents=codes, **arrays)
 
         content = await service.workers.run(encode, deadline)
     seconds = {**total_seconds(found), "encode": time.perf_counter() - began}
     headers = file_headers(worst(diagnostics), seconds, f"{model.manifest.name}.{chosen}")
     return Response(content, headers={"Vary": "Accept", **headers}, media_type=_VERTICES_TYPES[chosen])
+
+
+async def _exact(
+    service: Service,
+    request: Request,
+    model: ShapeModel,
+    codes: Codes,
+    found: list[Shape],
+    mesh: MeshChoice,
+    deadline: float,
+) -> list[Exact]:
+    """Exponentials of codes (n, m), side by side."""
+
+    def work(item: tuple[Codes, Shape], _: float) -> Exact:
+        return exponential(model, *item, mesh)
+
+    return await gather(service, request, work, zip(codes, found, strict=True), deadline)
 
 
 @router.post(

@@ -211,7 +211,7 @@ def fine_arrays() -> dict[str, np.ndarray]:
         "fine_vertices": fine.vertices,
         "fine_faces": fine.faces.astype(np.int32),
         "modes": np.zeros((3, len(mesh.vertices), 3), np.float32),
-        "training_codes": np.zeros((5, 3)),
+        "training_codes": np.array([[0, 0, 0], [0, 0, 0.1], [0, 0, 0.2], [0.1, 3, 0.5], [0.1, -3, 0.5]]),
         **Prolongation.of(mesh, fine).arrays(),
     }
 

@@ -64,12 +64,14 @@ def test_the_summary_of_several_shapes_is_their_worst(tmp_path: Path) -> None:
     model = ShapeModel(read_bundle(write_bundle(tmp_path)))
     good = model.reference_shape().diagnostics
     bad = dataclasses.replace(good, status=Status.STALLED, iterations=9, residual=0.5, inside_bounds=False)
-    folded = dataclasses.replace(good, flipped_faces=4)
+    folded = dataclasses.replace(good, flipped_faces=4, integrability=0.2, plausibility=1.5)
     assert worst([good, bad, folded]) == {
         "status": "stalled",
         "iterations": 9,
         "residual": 0.5,
         "flipped_faces": 4,
+        "integrability": 0.2,
+        "plausibility": 1.5,
         "inside_bounds": False,
         "model": model.digest,
     }

@@ -41,7 +41,9 @@ def test_a_uniform_scaling_comes_out_exactly_in_the_users_units(client: httpx.Cl
     assert diagnostics["flipped_faces"] == 0
     assert diagnostics["inside_bounds"] is True
     assert diagnostics["model"] == client.get("/v1/models/small").json()["digest"]
-    assert set(diagnostics) == {"status", "iterations", "residual", "flipped_faces", "inside_bounds", "model"}
+    assert set(diagnostics) == {
+        "status", "iterations", "residual", "flipped_faces", "integrability", "plausibility", "inside_bounds", "model"
+    }  # fmt: skip
 
 
 def test_the_residual_is_that_of_the_answered_shape(client: httpx.Client) -> None:

@@ -1,0 +1,199 @@
+"""Uploaded meshes: which of a model's meshes one is, and its vertices in the model's order."""
+
+from __future__ import annotations
+
+import io
+import json
+import struct
+import zipfile
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import orjson
+from numpy.typing import NDArray
+
+from geometry.formats import read_arrays
+from geometry.mesh import FloatArray, IntArray, MeshError
+from service.shape_model import MeshChoice, ShapeModel
+
+#: What an archive may unpack to, as a multiple of the upload, or in bytes if that is more.
+_UNPACKED, _UNPACKED_BYTES = 20, 2**24
+
+
+class InvalidMeshError(ValueError):
+    """An uploaded mesh that can't be used, with a sentence that says what to do."""
+
+
+@dataclass(frozen=True)
+class Matched:
+    """An uploaded mesh in the model's order.
+
+    Attributes:
+        vertices: (V, 3) of the mesh of choice.
+        mesh: which one it is.
+    """
+
+    vertices: FloatArray
+    mesh: MeshChoice
+
+
+def match(model: ShapeModel, data: bytes, format: str) -> Matched:
+    """Read a file and find which of the model's meshes it holds.
+
+    Vertices count in their order and faces in any; JSON may leave these out. STL, which shares no vertices, counts by
+    the order of its faces. A file like those that the model was trained on may have the vertices that were welded then.
+
+    Args:
+        model: whose meshes come into question.
+        data: the file.
+        format: one of uploads.FORMATS.
+
+    Raises:
+        InvalidMeshError: unreadable, not finite, or none of the model's meshes.
+    """
+    try:
+        vertices, faces = _read(data, format)
+    except MeshError as error:
+        raise InvalidMeshError(f"The mesh can't be used: {str(error).rstrip('.')}. Send one {format} file.") from None
+    bad = np.flatnonzero(~(np.abs(vertices) < np.finfo(np.float32).max).all(axis=1))
+    if len(bad):
+        raise InvalidMeshError(f"Vertex {bad[0]} has a coordinate that is not a finite number. Send finite positions.")
+    soup = len(vertices) == faces.size and np.array_equal(faces.ravel(), np.arange(len(vertices)))
+    faults = []
+    for layout in _layouts(model):
+        if soup and len(faces) == len(layout.faces):
+            return _of_soup(layout, vertices[faces])
+        if len(vertices) == layout.count:
+            fault = layout.fault(faces)
+            if fault is None:
+                return Matched(vertices[layout.places], layout.mesh)
+            faults.append(fault)
+    if faults:
+        raise InvalidMeshError(f"{faults[0]} Send a mesh with the faces and the vertex order of the model's.")
+    known = " or ".join(f"{layout.count} vertices and {len(layout.faces)} faces" for layout in _layouts(model))
+    raise InvalidMeshError(
+        f"The mesh has {len(vertices)} vertices and {len(faces)} faces, but those of {model.manifest.name} have "
+        f"{known}. Send one in correspondence, with nothing welded, split or reordered."
+    )
+
+
+@dataclass(frozen=True)
+class _Layout:
+    """One way in which a mesh of the model lies in a file.
+
+    Attributes:
+        mesh: which mesh.
+        faces: (F, 3) of it.
+        of_file: (N,) vertex of the mesh that each vertex of the file is, −1 for none.
+        places: (V,) vertex of the file that each vertex of the mesh is.
+    """
+
+    mesh: MeshChoice
+    faces: IntArray
+    of_file: IntArray
+    places: IntArray
+
+    @property
+    def count(self) -> int:
+        """N."""
+        return len(self.of_file)
+
+    def fault(self, faces: IntArray) -> str | None:
+        """What distinguishes the faces of a file (F, 3) from those of the mesh, if there are any."""
+        if not len(faces):
+            return None
+        if faces.min() < 0 or faces.max() >= self.count:
+            return f"The faces name vertices {faces.min()} to {faces.max()}, but there are {self.count}."
+        if len(faces) != len(self.faces):
+            return f"The mesh has {len(faces)} faces, but the model's has {len(self.faces)}."
+        given, own = (_canonical(f) for f in (self.of_file[faces], self.faces))
+        differing = np.flatnonzero((given != own).any(axis=1))
+        if not len(differing):
+            return None
+        if np.array_equal(_canonical(self.of_file[faces][:, ::-1]), own):
+            return "The faces are turned inside out."
+        return f"No face joins vertices {tuple(self.places[own[differing[0]]].tolist())} as in the model."
+
+
+def _canonical(faces: IntArray) -> IntArray:
+    """Faces in an order that doesn't depend on the file's: each begins with its smallest vertex."""
+    first = faces.argmin(axis=1)[:, None]
+    turned = np.take_along_axis(faces, (first + np.arange(3)) % 3, axis=1)
+    return turned[np.lexsort(turned.T[::-1])]
+
+
+def _layouts(model: ShapeModel) -> list[_Layout]:
+    layouts = []
+    choices = [MeshChoice.FINE, MeshChoice.COARSE] if model.fine else [MeshChoice.FINE]
+    for choice in choices:
+        mesh = model.mesh(choice)
+        own = np.arange(len(mesh.vertices))
+        layouts.append(_Layout(choice, mesh.faces, own, own))
+    if model.file_vertices is not None:
+        of_file = model.file_vertices
+        places = np.zeros(len(layouts[0].of_file), np.int64)
+        # Backwards, so that the first of welded vertices stays.
+        there = np.flatnonzero(of_file >= 0)[::-1]
+        places[of_file[there]] = there
+        layouts.append(_Layout(choices[0], layouts[0].faces, of_file, places))
+    return layouts
+
+
+def _of_soup(layout: _Layout, corners: FloatArray) -> Matched:
+    """Vertices of triangles (F, 3, 3) in the order of the mesh's faces."""
+    vertices = np.zeros((layout.faces.max() + 1, 3))
+    vertices[layout.faces] = corners
+    apart = np.linalg.norm(vertices[layout.faces] - corners, axis=-1).max(axis=1)
+    torn = np.flatnonzero(apart > 1e-5 * np.linalg.norm(np.ptp(vertices, axis=0)))
+    if len(torn):
+        raise InvalidMeshError(
+            f"Face {torn[0]} does not meet its neighbours as in the model. Send STL with the faces in the model's "
+            "order, or a format that keeps vertices: glb, obj, ply, npz or json."
+        )
+    return Matched(vertices, layout.mesh)
+
+
+def _read(data: bytes, format: str) -> tuple[FloatArray, IntArray]:
+    """Vertices (V, 3) and faces (F, 3) of a file, none where it doesn't say; raises MeshError."""
+    if format == "json":
+        vertices, faces = _read_json(data)
+    else:
+        _refuse_bombs(data, format)
+        vertices, faces = read_arrays(data, format)
+    if vertices.ndim != 2 or vertices.shape[1] != 3 or vertices.dtype.kind not in "fiu" or not len(vertices):
+        raise MeshError(f"vertices must be (V, 3) numbers, not {vertices.dtype} of shape {vertices.shape}")
+    if faces.size and (faces.ndim != 2 or faces.shape[1] != 3 or faces.dtype.kind not in "iu"):
+        raise MeshError(f"faces must be (F, 3) whole numbers, not {faces.dtype} of shape {faces.shape}")
+    return vertices.astype(np.float64), faces.reshape(-1, 3).astype(np.int64)
+
+
+def _read_json(data: bytes) -> tuple[NDArray, NDArray]:
+    try:
+        content = orjson.loads(data)
+    except orjson.JSONDecodeError as error:
+        raise MeshError(f"not JSON: {error}") from None
+    if not isinstance(content, dict) or "vertices" not in content:
+        raise MeshError('not an object {"vertices": [[x, y, z], …], "faces": [[a, b, c], …]}')
+    try:
+        return np.array(content["vertices"]), np.array(content.get("faces") or np.zeros((0, 3), int))
+    except ValueError:
+        raise MeshError("vertices and faces must be lists of three numbers each") from None
+
+
+def _refuse_bombs(data: bytes, format: str) -> None:
+    """Refuse small files that would unpack to huge arrays; raises MeshError."""
+    if format == "npz" and zipfile.is_zipfile(io.BytesIO(data)):
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            size = sum(entry.file_size for entry in archive.infolist())
+        if size > max(_UNPACKED * len(data), _UNPACKED_BYTES):
+            raise MeshError(f"it unpacks to {size} bytes")
+    if format in ("glb", "gltf"):
+        try:
+            text = data[20 : 20 + struct.unpack_from("<I", data, 12)[0]] if format == "glb" else data
+            tree: Any = json.loads(text)
+            counts = [accessor["count"] for accessor in tree["accessors"]]
+        except (ValueError, KeyError, TypeError, struct.error):
+            return  # whoever reads it will say what is wrong
+        if not all(isinstance(count, int) and count <= len(data) for count in counts):
+            raise MeshError("an accessor counts more elements than the file has bytes")

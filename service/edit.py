@@ -1,0 +1,244 @@
+"""From a few vertices that should be elsewhere to the latent code that brings them there."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import sparse
+
+from geometry.least_squares import Fit, least_squares
+from geometry.mesh import FloatArray, IntArray, align
+from geometry.nric import wrap
+from geometry.reconstruction import Reconstructor, Status
+from geometry.rigid import without_rigid_motion
+from service.derivatives import batches, derivatives, factor_derivatives, nodes
+from service.latent_space import Bounds, Codes, NotFiniteError
+from service.shape_model import MeshChoice, Shape, ShapeModel
+
+#: Weight of the prior where none is given: a code half the bounds away costs as much as half a percent of the diagonal.
+PRIOR = 1e-4
+#: A shape is moved by this fraction of its derivative to see how it would be aligned and prolonged.
+DIFFERENCE = 1e-4
+#: Other starts at most, where the misfit is above this fraction of the diagonal, and what part of its square must be
+#: thought to remain there.
+STARTS, GOOD, PROMISING = 4, 2e-3, 0.9
+
+
+@dataclass(frozen=True)
+class Target:
+    """Where a vertex should be.
+
+    Attributes:
+        vertex: index in the mesh of choice.
+        position: (3,) in the frame and units of what the service answers.
+    """
+
+    vertex: int
+    position: Sequence[float]
+
+
+@dataclass(frozen=True)
+class Edited:
+    """The code whose shape comes closest to the targets.
+
+    Attributes:
+        code: (m,) inside the bounds.
+        status: how the iteration ended.
+        iterations: shapes that it looked at.
+        shape: what the service answers to the code, on the mesh of choice.
+        distances: (k,) of that shape's vertices to their targets.
+    """
+
+    code: Codes
+    status: Status
+    iterations: int
+    shape: Shape
+    distances: FloatArray
+
+
+class Editor:
+    """Finds codes for targets, for any number of threads.
+
+    Minimises over codes inside the bounds
+
+        ``1/k Σ_i ‖x_i(code) − p_i‖² / D² + prior · 1/m Σ_j ((code_j − start_j) / width_j)²``,
+
+    D being the reference's diagonal. A shape depends on its code by way of the least-squares problem that the
+    reconstruction solves; by the implicit function theorem ``dX = (JᵀWJ)⁻¹ JᵀW dz``, where its residual is small.
+    """
+
+    def __init__(self, model: ShapeModel) -> None:
+        self.model = model
+
+    def __call__(
+        self,
+        start: Codes,
+        targets: Sequence[Target],
+        prior: float = PRIOR,
+        mesh: MeshChoice = MeshChoice.FINE,
+        deadline: float | None = None,
+    ) -> Edited:
+        """The code inside the bounds whose shape comes closest.
+
+        Args:
+            start: (m,), where the search begins and what the prior holds on to.
+            targets: at least one.
+            prior: weight of the distance from the start.
+            mesh: which mesh the targets' vertices belong to.
+            deadline: time.monotonic() after which the status is Status.DEADLINE.
+
+        Raises:
+            NotFiniteError: a target out of all proportion.
+        """
+        model = self.model
+        positions = np.array([target.position for target in targets]) / model.manifest.scale
+        if not (np.abs(positions) < np.finfo(np.float32).max).all():
+            raise NotFiniteError("A target lies so far away that the numbers overflow. Send finite positions.")
+        with model.solver() as reconstruct:
+            chart = _Chart(model, reconstruct, np.array([t.vertex for t in targets]), mesh, deadline)
+            fit = self._fit(chart, start.astype(np.float64), positions, prior, deadline)
+        codes, _ = model.latents.codes([fit.x.tolist()], Bounds.CLAMP)
+        shape = model.shape(codes[0], True, mesh, deadline)
+        found = shape.vertices[[target.vertex for target in targets]]
+        distances = np.linalg.norm(found - model.manifest.scale * positions, axis=1)
+        status = Status.DEADLINE if shape.diagnostics.status is Status.DEADLINE else fit.status
+        return Edited(codes[0], status, chart.shapes, shape, distances)
+
+    def _fit(
+        self, chart: _Chart, start: FloatArray, positions: FloatArray, prior: float, deadline: float | None
+    ) -> Fit:
+        problem = _Problem(self.model, chart, start, positions, prior, deadline)
+        best = problem.solve(start)
+        for _ in range(STARTS):
+            if best.status is Status.DEADLINE or problem.misfit(best) < GOOD:
+                break
+            elsewhere = problem.elsewhere(best)
+            if elsewhere is None:
+                break
+            fit = problem.solve(elsewhere)
+            if not fit.cost < 0.9 * best.cost:
+                break
+            best = fit
+        return best
+
+
+class _Problem:
+    """The least-squares problem of one edit."""
+
+    def __init__(
+        self,
+        model: ShapeModel,
+        chart: _Chart,
+        start: FloatArray,
+        positions: FloatArray,
+        prior: float,
+        deadline: float | None,
+    ) -> None:
+        self._model, self._chart, self._start, self._positions = model, chart, start, positions
+        self._deadline = deadline
+        self._weight = 1 / (model.reference.diagonal * np.sqrt(len(positions)))
+        self._held = np.sqrt(prior / len(start)) / model.latents.width
+
+    def misfit(self, fit: Fit) -> float:
+        """Root mean square distance from the targets, as a fraction of the diagonal."""
+        return float(np.linalg.norm(fit.residual[: self._positions.size]))
+
+    def solve(self, start: FloatArray) -> Fit:
+        """From a start by the factors' derivatives, which are quick, and then by those of the whole composite."""
+        model, chart = self._model, self._chart
+        lower, upper = model.latents.box()
+        box = lower, upper, model.latents.width
+
+        rough = least_squares(
+            self._residual,
+            lambda x, _: self._jacobian(chart.derivatives(x, factor_derivatives(model, x))),
+            start, *box, tolerance=1e-3, gain_tolerance=0.05, secant=False, max_evaluations=20, deadline=self._deadline,
+        )  # fmt: skip
+        return least_squares(
+            self._residual,
+            lambda x, _: self._jacobian(chart.derivatives(x, derivatives(model, x))),
+            rough.x, *box, tolerance=1e-3, gain_tolerance=0.01, deadline=self._deadline,
+        )  # fmt: skip
+
+    def elsewhere(self, fit: Fit) -> FloatArray | None:
+        """Another start: the fit with one factor moved to where, to first order, the misfit shrinks most."""
+        model, chart = self._model, self._chart
+        sensitivity = chart.sensitivity(fit.x) * self._weight
+        missing = fit.residual[: self._positions.size]
+        best, found = PROMISING * float(missing @ missing), None
+        half = model.manifest.edges
+        for j, factor in enumerate(model.manifest.factors):
+            own = slice(factor.start, factor.stop)
+            here = model.factor(j, fit.x[None, own])
+            for part in batches(nodes(model, j)):
+                changes = model.factor(j, part) - here
+                changes[:, half:] = wrap(changes[:, half:])
+                left = ((missing + changes @ sensitivity.T) ** 2).sum(axis=1)
+                if left.min() < best:
+                    best, found = left.min(), fit.x.copy()
+                    found[own] = part[left.argmin()]
+        return found
+
+    def _residual(self, x: FloatArray) -> FloatArray:
+        away = self._held * self._model.latents.shorter(x - self._start)
+        return np.concatenate([self._weight * (self._chart.positions(x) - self._positions).ravel(), away])
+
+    def _jacobian(self, moves: FloatArray) -> FloatArray:
+        return np.concatenate([self._weight * moves.reshape(len(moves), -1).T, np.diag(self._held)])
+
+
+class _Chart:
+    """Positions of a few vertices as functions of the code, as the service answers them but for the scale.
+
+    Each shape is reconstructed from the last one.
+    """
+
+    def __init__(
+        self,
+        model: ShapeModel,
+        reconstruct: Reconstructor,
+        vertices: IntArray,
+        mesh: MeshChoice,
+        deadline: float | None,
+    ) -> None:
+        self._model, self._reconstruct, self._deadline = model, reconstruct, deadline
+        self._vertices = vertices
+        self._rows = model.fine.prolong.only(vertices) if model.fine and mesh is MeshChoice.FINE else None
+        self._code, self._shape = np.full(model.latents.dimension, np.nan), model.reference.vertices
+        self.shapes = 0
+
+    def positions(self, x: FloatArray) -> FloatArray:
+        """(k, 3) at a code (m,); not finite where the networks overflow."""
+        return self._placed(self._solved(x))
+
+    def derivatives(self, x: FloatArray, changes: FloatArray) -> FloatArray:
+        """(m, k, 3) at a code (m,), given those of lengths and angles (2E, m)."""
+        shape = self._solved(x)
+        fields = self._reconstruct.differential(shape, changes.T)
+        h = DIFFERENCE * self._model.reference.diagonal / max(np.abs(fields).max(), np.finfo(float).tiny)
+        here = self._placed(shape)
+        return np.stack([(self._placed(shape + h * field) - here) / h for field in fields])
+
+    def sensitivity(self, x: FloatArray) -> FloatArray:
+        """(3k, 2E) derivatives of the positions by lengths and angles at a code (m,), without those of normals."""
+        shape, count = self._solved(x), len(self._model.reference.vertices)
+        rows = (
+            sparse.eye_array(count, format="csr")[self._vertices]
+            if self._rows is None
+            else self._rows.weights[:, :count]
+        )
+        fields = np.einsum("kv,xy->kxvy", rows.toarray(), np.eye(3)).reshape(-1, count, 3)
+        aligned = align(shape, self._model.reference.vertices)
+        return self._reconstruct.sensitivity(aligned, without_rigid_motion(fields, aligned))
+
+    def _placed(self, shape: FloatArray) -> FloatArray:
+        aligned = align(shape, self._model.reference.vertices)
+        return aligned[self._vertices] if self._rows is None else self._rows(aligned)
+
+    def _solved(self, x: FloatArray) -> FloatArray:
+        if not np.array_equal(x, self._code):
+            found = self._reconstruct(self._model.nric(x), self._shape, tolerance=1e-5, deadline=self._deadline)
+            self._code, self._shape, self.shapes = x.copy(), found.vertices, self.shapes + 1
+        return self._shape

@@ -1,0 +1,74 @@
+"""The exponentials that the networks have learned to imitate, computed as they are defined."""
+
+from __future__ import annotations
+
+import queue
+from dataclasses import dataclass
+
+import numpy as np
+
+from geometry.calculus import ShellSpace
+from geometry.energy import Material
+from geometry.exponential import exponential
+from geometry.mesh import FloatArray, align
+from geometry.reconstruction import Status
+from service.latent_space import Codes
+from service.shape_model import MeshChoice, Shape, ShapeModel
+
+
+class NoTangentSpaceError(ValueError):
+    """A model whose codes are no tangent vectors."""
+
+
+@dataclass(frozen=True)
+class Exact:
+    """The discrete exponential of one code.
+
+    Attributes:
+        status: of its solver, see geometry.reconstruction.Status.
+        vertices: (V, 3) aligned like every shape, in the units of the training meshes; None where it failed.
+        mean, max: distance of the networks' answer from it, over vertices; None where it failed.
+    """
+
+    status: Status
+    vertices: FloatArray | None
+    mean: float | None
+    max: float | None
+
+
+def require_tangent_space(model: ShapeModel) -> None:
+    """Raise NoTangentSpaceError for models that have none."""
+    if model.modes is None or model.manifest.exponential_steps is None:
+        raise NoTangentSpaceError(
+            f"The codes of {model.manifest.name} are no tangent vectors: it is a product by design, without exact "
+            'exponentials. Leave out "exact".'
+        )
+
+
+def exact(model: ShapeModel, code: Codes, shape: Shape, mesh: MeshChoice) -> Exact:
+    """The exponential ``exp_z̄(Σ_j code_j u_j)`` in K steps, with the material and K of the model's manifest.
+
+    Args:
+        model: with a tangent space.
+        code: (m,).
+        shape: the networks' answer to it, on the mesh of choice.
+        mesh: fine or coarse.
+    """
+    require_tangent_space(model)
+    assert model.modes is not None  # noqa: S101 - has just been required
+    assert model.manifest.exponential_steps is not None  # noqa: S101 - as above
+    velocity = np.tensordot(code.astype(np.float64), model.modes, axes=1)
+    try:
+        space = model.spaces.get_nowait()
+    except queue.Empty:
+        manifest = model.manifest
+        space = ShellSpace(model.reference, Material(manifest.mu, manifest.lambda_, manifest.eta))
+    try:
+        path = exponential(space, model.reference.vertices, velocity, model.manifest.exponential_steps)
+    finally:
+        model.spaces.put(space)
+    if not path.converged:
+        return Exact(path.status, None, None, None)
+    vertices = model.finish(align(path.vertices[-1], model.reference.vertices), mesh)
+    distances = np.linalg.norm(vertices - shape.vertices, axis=1)
+    return Exact(path.status, vertices, float(distances.mean()), float(distances.max()))

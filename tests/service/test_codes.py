@@ -1,0 +1,213 @@
+"""``edit``, ``sample``, exact exponentials and what diagnostics say of a code."""
+
+import io
+import json
+from itertools import pairwise
+from typing import Any
+
+import httpx
+import numpy as np
+import pytest
+
+from geometry.calculus import ShellSpace
+from geometry.energy import Material
+from geometry.exponential import exponential
+from geometry.integrability import Integrability
+from geometry.mesh import TriangleMesh, align
+from tests.service.bundles import expected_nric, reference
+from tests.service.conftest import ROOT
+
+EDIT, SAMPLE = "/v1/models/with-fine/edit", "/v1/models/with-fine/sample"
+CODE = [0.1, 0.7, 0.4]
+LOWER, UPPER = np.array([-0.2, -np.pi, 0]), np.array([0.2, np.pi, 1])
+
+
+def positions(client: httpx.Client, code: Any, model: str = "with-fine", mesh: str = "fine") -> np.ndarray:
+    answer = client.post(f"/v1/models/{model}/vertices", json={"latents": [np.asarray(code).tolist()], "mesh": mesh})
+    return np.array(answer.raise_for_status().json()["vertices"][0])
+
+
+def edit(client: httpx.Client, places: np.ndarray, vertices: list[int], path: str = EDIT, **body: Any) -> Any:
+    targets = [{"vertex": v, "position": p} for v, p in zip(vertices, places.tolist(), strict=True)]
+    answer = client.post(path, json={"latent": CODE, "targets": targets} | body)
+    assert answer.status_code == 200, answer.text
+    return answer.json()
+
+
+@pytest.mark.parametrize(("name", "seed"), [("figure", 1), ("figure", 2), ("freaky-torus", 1)])
+def test_an_edit_reaches_what_can_be_reached(client: httpx.Client, name: str, seed: int) -> None:
+    sampled = client.post(f"/v1/models/{name}/sample", json={"count": 2, "seed": seed}).json()["latents"]
+    start, goal = sampled
+    shape = positions(client, goal, name)
+    rng = np.random.default_rng(seed)
+    vertices = rng.choice(len(shape), 4, replace=False).tolist()
+    found = edit(client, shape[vertices], vertices, f"/v1/models/{name}/edit", latent=start)
+    reached = positions(client, found["latent"], name)
+    diagonal = np.linalg.norm(np.ptp(shape, axis=0))
+    distances = np.linalg.norm(reached[vertices] - shape[vertices], axis=1)
+    assert distances.max() < 0.01 * diagonal
+    np.testing.assert_allclose(found["distances"], distances, atol=1e-5)
+    assert found["residual"] == pytest.approx(np.sqrt((distances**2).mean()), abs=1e-5)
+    card = client.get(f"/v1/models/{name}").json()
+    assert (np.array(card["lower"]) <= np.array(found["latent"]) + 1e-6).all()
+    assert (np.array(found["latent"]) <= np.array(card["upper"]) + 1e-6).all()
+    assert found["diagnostics"]["inside_bounds"]
+
+
+@pytest.mark.parametrize("mesh", ["fine", "coarse"])
+def test_an_edit_is_the_best_compromise_between_targets_and_prior(client: httpx.Client, mesh: str) -> None:
+    prior, vertices = 1e-3, [3, 20, 45]
+    shape = positions(client, [-0.1, 0.2, 0.8], mesh=mesh)
+    places = shape[vertices] + np.random.default_rng(1).normal(0, 0.03, (3, 3))
+    found = edit(client, places, vertices, prior=prior, mesh=mesh)
+    diagonal = 3 * reference().diagonal
+
+    def objective(code: np.ndarray) -> float:
+        misfit = ((positions(client, code, mesh=mesh)[vertices] - places) ** 2).sum(axis=1).mean() / diagonal**2
+        return float(misfit + prior * (((code - CODE) / (UPPER - LOWER)) ** 2).mean())
+
+    best = np.array(found["latent"])
+    assert objective(best) < 0.9 * objective(np.array(CODE))
+    for direction in np.vstack([np.diag(UPPER - LOWER), np.diag(LOWER - UPPER)]):
+        trial = np.clip(best + 0.03 * direction, LOWER, UPPER)
+        assert objective(trial) >= objective(best)
+
+
+def test_the_prior_holds_a_code_back_as_much_as_it_weighs(client: httpx.Client) -> None:
+    shape = positions(client, [-0.1, 0.2, 0.8])
+    vertices = [0, 100, 300]
+    found = [edit(client, shape[vertices], vertices, prior=prior) for prior in (0, 1e-2, 1, 1e6)]
+    assert all(more["residual"] < less["residual"] for more, less in pairwise(found))
+    assert found[0]["residual"] < 1e-3
+    np.testing.assert_allclose(found[-1]["latent"], CODE, atol=1e-4)
+
+
+def test_an_edit_stays_inside_the_bounds(client: httpx.Client) -> None:
+    shape = positions(client, CODE)
+    found = edit(client, 3 * shape[[5, 200]], [5, 200], latent=[5, 0.7, -3])
+    latent = np.array(found["latent"])
+    assert latent[0] == pytest.approx(0.2, abs=1e-6)
+    assert (latent >= LOWER - 1e-6).all()
+    assert (latent <= UPPER + 1e-6).all()
+    assert found["residual"] > 0.5
+
+
+def test_bad_edits_are_told_what_to_do(client: httpx.Client) -> None:
+    target = {"vertex": 0, "position": [0, 0, 0]}
+    for change, says in (
+        ({"latent": [0, 0]}, "Send exactly 3"),
+        ({"targets": []}, "at least 1 entries for targets"),
+        ({"targets": [target, target | {"vertex": 512}]}, "targets[1].vertex is 512, but the fine mesh has"),
+        ({"targets": [target | {"vertex": 64}], "mesh": "coarse"}, "vertices 0 to 63"),
+        ({"targets": [target | {"vertex": -1}]}, "vertex is -1"),
+        ({"targets": [target | {"vertex": 0.5}]}, "whole number"),
+        ({"targets": [target | {"position": [0, 0]}]}, "at least 3"),
+        ({"targets": [target | {"position": [0, 0, 1e300]}]}, "Send finite positions"),
+        ({"targets": [target | {"weight": 2}]}, "Remove 'targets[0].weight'"),
+        ({"prior": -1}, "at least 0"),
+    ):
+        answer = client.post(EDIT, json={"latent": CODE, "targets": [target]} | change)
+        assert answer.status_code == 422, answer.text
+        assert says in answer.json()["detail"]
+
+
+def test_samples_depend_on_their_seed_alone_and_lie_inside_the_bounds(client: httpx.Client) -> None:
+    def sample(**body: Any) -> np.ndarray:
+        return np.array(client.post(SAMPLE, json=body).raise_for_status().json()["latents"])
+
+    for distribution in ("uniform", "gaussian"):
+        codes = sample(count=20, seed=7, distribution=distribution)
+        assert codes.shape == (20, 3)
+        np.testing.assert_array_equal(codes, sample(count=20, seed=7, distribution=distribution))
+        np.testing.assert_array_equal(codes[:5], sample(count=5, seed=7, distribution=distribution))
+        assert not np.isin(codes, sample(count=20, seed=8, distribution=distribution)).any()
+        assert (codes >= LOWER - 1e-6).all()
+        assert (codes <= UPPER + 1e-6).all()
+    spread = {
+        kind: np.concatenate([sample(count=20, seed=s, distribution=kind) for s in range(20)]).std(axis=0)
+        for kind in ("uniform", "gaussian")
+    }
+    # Of the bounds' width: 1/√12, and 0.88/4 for a bell cut off at two standard deviations.
+    np.testing.assert_allclose(spread["uniform"] / (UPPER - LOWER), 0.2887, rtol=0.1)
+    np.testing.assert_allclose(spread["gaussian"] / (UPPER - LOWER), 0.2199, rtol=0.1)
+    np.testing.assert_array_equal(sample(), sample(count=1, seed=0, distribution="uniform"))
+
+
+def test_bad_samples_are_told_what_to_do(client: httpx.Client) -> None:
+    for body, says in (
+        ({"count": 21}, "the limit is 20"),
+        ({"count": 0}, "at least 1"),
+        ({"count": 2.5}, "whole number"),
+        ({"seed": -1}, "at least 0"),
+        ({"distribution": "cauchy"}, "'uniform' or 'gaussian'"),
+    ):
+        answer = client.post(SAMPLE, json=body)
+        assert answer.status_code == 422, answer.text
+        assert says in answer.json()["detail"]
+
+
+def test_exact_exponentials_stand_beside_the_networks_answer(client: httpx.Client) -> None:
+    codes = np.array(client.post("/v1/models/figure/sample", json={"count": 2, "seed": 1}).json()["latents"])
+    vertices = "/v1/models/figure/vertices"
+    body = {"latents": codes.tolist(), "mesh": "coarse", "exact": True}
+    answer = client.post(vertices, json=body).raise_for_status().json()
+    assert answer["exact_status"] == ["converged", "converged"]
+    folder = ROOT / "models" / "figure" / "1"
+    facts = json.loads((folder / "manifest.json").read_text())
+    with np.load(folder / "geometry.npz") as file:
+        mesh, modes = TriangleMesh.from_mapping(file), file["modes"].astype(float)
+    material = Material(facts["mu"], facts["lambda"], facts["eta"])
+    steps = facts["origin"]["config"]["samples"]["steps"]
+    path = exponential(ShellSpace(mesh, material), mesh.vertices, np.tensordot(codes[0], modes, axes=1), steps)
+    expected = facts["scale"] * align(path.vertices[-1], mesh.vertices)
+    np.testing.assert_allclose(answer["exact"][0], expected, atol=1e-5)
+    for found, exact, distance in zip(answer["vertices"], answer["exact"], answer["distance"], strict=True):
+        away = np.linalg.norm(np.array(found) - exact, axis=1)
+        assert distance["mean"] == pytest.approx(away.mean(), rel=1e-3)
+        assert distance["max"] == pytest.approx(away.max(), rel=1e-3)
+        assert 0 < distance["mean"] < 2e-3
+    plain = {"latents": codes.tolist(), "mesh": "fine"}
+    content = client.post(vertices, json=plain, params={"format": "npz", "exact": True}).raise_for_status().content
+    with np.load(io.BytesIO(content)) as arrays:
+        assert arrays["exact"].shape == arrays["vertices"].shape == (2, 4601, 3)
+        away = np.linalg.norm(arrays["exact"] - arrays["vertices"], axis=2)
+        np.testing.assert_allclose(arrays["distance_max"], away.max(axis=1), rtol=1e-3)
+        assert arrays["exact_status"].tolist() == ["converged"] * 2
+
+
+def test_an_exponential_that_fails_is_null(client: httpx.Client) -> None:
+    body = {"latents": [[30.0] * 20, [0.0] * 20], "mesh": "coarse", "exact": True}
+    answer = client.post("/v1/models/figure/vertices", json=body).raise_for_status().json()
+    assert answer["exact"][0] is None
+    assert answer["distance"][0] is None
+    assert answer["exact_status"][0] != "converged"
+    assert answer["distance"][1]["max"] < 0.01
+
+
+def test_a_product_by_design_has_no_exact_exponentials(client: httpx.Client) -> None:
+    for query, body in (({}, {"exact": True}), ({"exact": "true"}, {})):
+        answer = client.post("/v1/models/freaky-torus/vertices", params=query, json={"latents": [[0] * 4]} | body)
+        assert answer.status_code == 422
+        assert answer.json()["type"].endswith("no-tangent-space")
+        assert "Leave out" in answer.json()["detail"]
+
+
+def test_diagnostics_tell_how_plausible_a_code_and_how_integrable_its_lengths_and_angles_are(
+    client: httpx.Client,
+) -> None:
+    # Distances as fractions of the bounds' width, (0.4, 2π, 1); the nearest neighbours of five training codes are
+    # 0.1, 0.1, 0.1, and the shorter way from 3 to −3 for two of them.
+    turn = (2 * np.pi - 6) / (2 * np.pi)
+    spacing = np.median([0.1, 0.1, 0.1, turn, turn]) / np.sqrt(3)
+    latents = [[0, 0, 0.2], [0, 0, 0.5], CODE]
+    found = client.post("/v1/models/with-fine/vertices", json={"latents": latents}).json()["diagnostics"]
+    assert found[0]["plausibility"] == pytest.approx(0, abs=1e-6)
+    assert found[1]["plausibility"] == pytest.approx(0.3 / np.sqrt(3) / spacing, rel=1e-4)
+    mesh = reference()
+    conditions = Integrability(mesh.connectivity)
+    for code, diagnostics in zip(latents, found, strict=True):
+        q = conditions(expected_nric(np.array(code)))[: 3 * len(mesh.vertices)].reshape(-1, 3)
+        assert diagnostics["integrability"] == pytest.approx(np.sqrt((q**2).sum(axis=1).mean()), rel=1e-3)
+    size = client.post("/v1/models/small/mesh", json={"latent": [0.1, 0, 0]}).headers["Shape-Diagnostics"]
+    assert json.loads(size)["integrability"] < 1e-5, "a uniform scaling is a surface's"
+    assert json.loads(size)["plausibility"] is None
