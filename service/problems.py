@@ -77,6 +77,7 @@ _OF_EXCEPTION: dict[type[Exception], str] = {
     DeadlineError: "deadline-passed",
     DisconnectedError: "client-closed",
 }
+DOMAIN_ERRORS = tuple(_OF_EXCEPTION)
 _HEADERS = {
     "busy": {"Retry-After": "1"},
     "not-ready": {"Retry-After": "1"},
@@ -123,12 +124,13 @@ def problem(
 def install(app: FastAPI) -> None:
     """Make every error of an application a problem."""
     for exception in _OF_EXCEPTION:
-        app.add_exception_handler(exception, _domain)
+        app.add_exception_handler(exception, domain_problem)
     app.add_exception_handler(StarletteHTTPException, _http)
     app.add_exception_handler(RequestValidationError, _validation)
 
 
-async def _domain(request: Request, error: Exception) -> Response:
+async def domain_problem(request: Request, error: Exception) -> Response:
+    """One of the DOMAIN_ERRORS as a problem."""
     return problem(request.scope, _OF_EXCEPTION[type(error)], str(error))
 
 

@@ -17,7 +17,7 @@ from service.dependencies import Format, Model, Service, ServiceDependency, limi
 from service.encodings import SHAPE_FORMATS, worst
 from service.latent_space import Codes
 from service.negotiation import choose
-from service.problems import ProblemError
+from service.problems import DOMAIN_ERRORS, ProblemError, domain_problem
 from service.responses import (
     binary,
     cache_headers,
@@ -90,7 +90,7 @@ async def get_interpolation(
     if chosen == "jsonl":
         lines = _stream(service, model, animation, codes, inside)
         first = await anext(lines)  # what goes wrong up to here still has a status of its own
-        return StreamingResponse(_resume(first, lines), headers=cache_headers(tag), media_type=JSON_LINES)
+        return StreamingResponse(_resume(request, first, lines), headers=cache_headers(tag), media_type=JSON_LINES)
 
     with service.workers.admit() as deadline:
         found = await shapes(service, request, model, codes, inside, animation.mesh, deadline)
@@ -158,8 +158,11 @@ async def _stream(
                 yield ready
 
 
-async def _resume(first: bytes, rest: AsyncGenerator[bytes, None]) -> AsyncGenerator[bytes, None]:
+async def _resume(request: Request, first: bytes, rest: AsyncGenerator[bytes, None]) -> AsyncGenerator[bytes, None]:
     async with aclosing(rest):
         yield first
-        async for line in rest:
-            yield line
+        try:
+            async for line in rest:
+                yield line
+        except DOMAIN_ERRORS as error:  # too late for a status
+            yield b'{"problem":%b}\n' % bytes((await domain_problem(request, error)).body)

@@ -217,6 +217,15 @@ def test_frames_arrive_as_they_get_ready(models: Path, start: Start) -> None:
         assert client.get("/v1/models/small/mesh").status_code == 200
 
 
+def test_a_stream_that_can_not_go_on_ends_with_the_problem(client: httpx.Client) -> None:
+    links = create(client, keyframes=[[0, 0, 0], [3.4e38, 0, 3.4e38]], frames=3)["links"]
+    *frames, last = [json.loads(line) for line in client.get(links["jsonl"]).raise_for_status().iter_lines()]
+    assert [frame["frame"] for frame in frames] in ([0], [0, 1])
+    whole = client.get(links["npz"])
+    assert last == {"problem": whole.json()}
+    assert (whole.status_code, whole.json()["type"]) == (422, "urn:shapespace:problem:not-finite")
+
+
 def test_a_reader_who_leaves_gives_the_place_back(models: Path, start: Start) -> None:
     with httpx.Client(base_url=start(models, workers=1, queue=0).url, timeout=60) as client:
         links = create(client, keyframes=[A, B, C], frames=600)["links"]
