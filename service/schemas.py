@@ -87,7 +87,7 @@ class EditRequest(_Request):
 class SampleRequest(_Request):
     """How many random codes, and which."""
 
-    count: int = Field(1, ge=1, strict=True, description="Number of codes.")
+    count: int = Field(1, ge=1, strict=True, description="Number of codes.", examples=[3])
     seed: int = Field(0, ge=0, lt=2**63, strict=True, description="The same codes for the same seed.")
     distribution: Distribution = Field(
         Distribution.UNIFORM,

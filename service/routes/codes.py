@@ -18,7 +18,7 @@ from service.encodings import dump_json, float32
 from service.latent_space import Bounds
 from service.problems import ProblemError
 from service.responses import problems, server_timing
-from service.schemas import EditAnswer, EditRequest, EncodeAnswer, SampleAnswer, SampleRequest
+from service.schemas import EditAnswer, EditRequest, EncodeAnswer, MeshAnswer, SampleAnswer, SampleRequest
 from service.uploads import FORMATS, MEDIA_TYPES, read_upload
 
 router = APIRouter(prefix="/v1/models/{name}", tags=["codes"])
@@ -30,6 +30,7 @@ _UPLOAD = {
         "required": True,
         "content": {
             **{media_type: {"schema": _FILE} for media_type in (*MEDIA_TYPES, "application/octet-stream")},
+            "application/json": {"schema": {"$ref": f"#/components/schemas/{MeshAnswer.__name__}"}},
             "multipart/form-data": {"schema": _FORM},
         },
     }

@@ -4,6 +4,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 
 import httpx
@@ -60,6 +61,29 @@ def test_an_interpolation_comes_whole_by_frames_and_as_a_stream(shapes: Client) 
     np.testing.assert_array_equal(vertices[0], shapes.vertices("small", CODES[:1])[0])
     np.testing.assert_allclose(GLB(path.file()).key(3), vertices[3], atol=1e-6)
     np.testing.assert_allclose(GLB(path.frame(2)).positions, vertices[2], atol=1e-6)
+
+
+def test_codes_are_drawn_found_and_changed(shapes: Client, tmp_path: Path) -> None:
+    codes = shapes.sample("small", 4, seed=7, distribution="gaussian")
+    assert codes.shape == (4, 3)
+    np.testing.assert_array_equal(codes, shapes.sample("small", 4, seed=7, distribution="gaussian"))
+    shape = shapes.shape("small", codes[0])
+    turned = replace(shape, vertices=shape.vertices @ np.array([[0, 1, 0], [-1, 0, 0], [0, 0, 1]], np.float32) + 5)
+    (tmp_path / "shape.obj").write_bytes(shapes.mesh("small", codes[0], "obj"))
+    for mesh, format in (
+        (turned, None),
+        (tmp_path / "shape.obj", None),
+        (shapes.mesh("small", codes[0], "ply"), "ply"),
+    ):
+        found = shapes.encode("small", mesh, format)
+        np.testing.assert_allclose(shapes.shape("small", found["latent"]).vertices, shape.vertices, atol=0.01 * SCALE)
+    vertex = 5
+    wanted = shapes.shape("small", codes[1]).vertices[vertex]
+    before = np.linalg.norm(shape.vertices[vertex] - wanted)
+    edited = shapes.edit("small", codes[0], {vertex: wanted}, prior=0.0)
+    assert edited["residual"] < 0.2 * before
+    there = shapes.shape("small", edited["latent"]).vertices[vertex]
+    np.testing.assert_allclose(np.linalg.norm(there - wanted), edited["residual"], atol=1e-4)
 
 
 def test_problems_are_exceptions_that_say_what_to_do(shapes: Client) -> None:

@@ -61,6 +61,17 @@ def test_a_full_queue_is_busy_and_says_when_to_come_back(models: Path, start: St
     assert after.status_code == 200, "a place in the queue is given back"
 
 
+def test_a_mesh_file_has_a_limit_of_its_own(models: Path, start: Start) -> None:
+    with httpx.Client(base_url=start(models, max_body=1000, max_upload=2000).url) as client:
+        for path, most in (("mesh", 1000), ("encode?format=obj", 2000)):
+            for size in (most, most + 1):
+                answer = client.post(
+                    f"/v1/models/small/{path}", content=b" " * size, headers={"Content-Type": "application/json"}
+                )
+                assert (answer.status_code == 413) is (size > most), answer.text
+        assert f"limit of {most} bytes" in answer.json()["detail"]
+
+
 def test_a_passed_deadline_ends_the_work(models: Path, start: Start) -> None:
     with httpx.Client(base_url=start(models, deadline=1e-6).url, timeout=120) as client:
         for path, body in (("mesh", CODE), ("vertices", MANY), ("nric", {"latents": [CODE["latent"]]})):
