@@ -112,9 +112,10 @@ def measure(model: ShapeModel, codes: FloatArray) -> dict[str, list[float]]:
             "encode": encode,
             "sum": solved + encode,
             "iterations": shape.diagnostics.iterations,
-            "SuperLU": seconds(yardstick),
             "blend shapes": seconds(blend),
         }
+        if len(times.get("SuperLU", ())) < 5 or found["sum"] > times["SuperLU"][-1] / 10:
+            found["SuperLU"] = seconds(yardstick)  # of large meshes five have to do
         for name, value in found.items():
             times.setdefault(name, []).append(value)
     return times

@@ -65,9 +65,9 @@ class SymmetricPattern:
         """Row of each entry."""
         return np.repeat(np.arange(self.size), np.diff(self.indptr))
 
-    def scatter(self, contributions: FloatArray) -> FloatArray:
-        """Sum contributions (C,) into the entries of the pattern."""
-        sums = np.bincount(self.slots, weights=contributions, minlength=len(self))
+    def scatter(self, contributions: FloatArray, slots: IntArray | None = None) -> FloatArray:
+        """Sum contributions (C,) into the entries of the pattern; by default in the order of its making."""
+        sums = np.bincount(self.slots if slots is None else slots, weights=contributions, minlength=len(self))
         return np.asarray(sums, dtype=np.float64)
 
     def matrix(self, entries: FloatArray) -> sparse.csc_array:

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
 from geometry.cholesky import SymmetricPattern
-from geometry.mesh import Connectivity, FloatArray
+from geometry.mesh import Connectivity, FloatArray, IntArray
 from geometry.nric import NRICGradients, WeightedNorm
 
 
@@ -23,24 +24,14 @@ class QuadraticForm:
     faces: FloatArray
     angles: FloatArray
 
-    @classmethod
-    def of(cls, norm: WeightedNorm, connectivity: Connectivity) -> QuadraticForm:
-        """The square of a weighted norm; each edge's weight goes to one of its faces."""
-        lengths, angles = np.split(norm.squared, 2)
-        sides = connectivity.face_edges.T
-        edges, first = np.unique(sides, return_index=True)
-        side, face = np.unravel_index(first, sides.shape)
-        faces = np.zeros((3, 3, len(connectivity.faces)))
-        faces[side, side, face] = lengths[edges]
-        return cls(faces, angles)
-
 
 class NormalMatrix:
     """``JᵀHJ + εI`` as entries of a fixed symmetric pattern, by one scatter.
 
     The matrix is a sum of a 9×9 block per face, from lengths, and a 12×12 block per hinge, from angles; only
-    their upper triangles are formed. εI lifts the six rigid motions out of the null space: forces have no
-    part there. Sparse products would be as fast, but drop entries that cancel exactly: the pattern would change.
+    their upper triangles are formed. For a norm, which couples no lengths, a 6×6 block per edge does instead of
+    those per face. εI lifts the six rigid motions out of the null space: forces have no part there. Sparse products
+    would be as fast, but drop entries that cancel exactly: the pattern would change.
     """
 
     REGULARISATION = 1e-9
@@ -52,6 +43,7 @@ class NormalMatrix:
         tails = connectivity.faces.T[self._corners[:, 0]]
         self._signs = np.where(tails == connectivity.edges[self._sides, 0], 1.0, -1.0)
         self._interior = np.flatnonzero(connectivity.interior)
+        self._ends = connectivity.edge_ends
         rows, columns = [], []
         for vertices in (connectivity.faces, connectivity.hinges):
             unknowns = (3 * vertices[:, :, None] + np.arange(3)).reshape(len(vertices), -1).T
@@ -60,23 +52,58 @@ class NormalMatrix:
             columns.append(unknowns[b].ravel())
         self.pattern = SymmetricPattern(3 * connectivity.vertex_count, np.concatenate(rows), np.concatenate(columns))
 
-    def entries(self, gradients: NRICGradients, form: QuadraticForm) -> FloatArray:
+    def entries(self, gradients: NRICGradients, form: QuadraticForm | WeightedNorm) -> FloatArray:
         """Upper-triangle entries of ``JᵀHJ + εI`` for one shape's Jacobian."""
-        faces, hinges = form.faces.shape[-1], len(self._interior)
-        contributions = np.empty(45 * faces + 78 * hinges)
-        self._lengths(gradients.lengths, form.faces, contributions[: 45 * faces].reshape(45, faces))
-        angles = contributions[45 * faces :].reshape(78, hinges)
-        g = gradients.angles.reshape(12, hinges)
-        weighted = g * form.angles.take(self._interior)
-        start = 0
-        for a in range(12):
-            np.multiply(g[a], weighted[a:], out=angles[start : start + 12 - a])
-            start += 12 - a
-        entries = self.pattern.scatter(contributions)
+        if isinstance(form, WeightedNorm):
+            edges = gradients.lengths.shape[-1]
+            contributions, on_lengths = self._work_space(21 * edges)
+            self._edges(gradients.lengths, form.squared[:edges], on_lengths.reshape(21, edges))
+            self._angles(gradients.angles, form.squared[edges:], contributions[21 * edges :])
+            entries = self.pattern.scatter(contributions, self._slots_of_edges)
+        else:
+            faces = form.faces.shape[-1]
+            contributions, on_lengths = self._work_space(45 * faces)
+            self._faces(gradients.lengths, form.faces, on_lengths.reshape(45, faces))
+            self._angles(gradients.angles, form.angles, contributions[45 * faces :])
+            entries = self.pattern.scatter(contributions)
         entries[self.pattern.diagonal] += self.REGULARISATION * entries[self.pattern.diagonal].mean()
         return entries
 
-    def _lengths(self, directions: FloatArray, blocks: FloatArray, out: FloatArray) -> None:
+    def _work_space(self, lengths: int) -> tuple[FloatArray, FloatArray]:
+        """Contributions, and the part of them that comes from lengths."""
+        contributions = np.empty(lengths + 78 * len(self._interior))
+        return contributions, contributions[:lengths]
+
+    def _angles(self, gradients: FloatArray, weights: FloatArray, out: FloatArray) -> None:
+        g = gradients.reshape(12, -1)
+        weighted = g * weights.take(self._interior)
+        pieces, start = out.reshape(78, -1), 0
+        for a in range(12):
+            np.multiply(g[a], weighted[a:], out=pieces[start : start + 12 - a])
+            start += 12 - a
+
+    @cached_property
+    def _slots_of_edges(self) -> IntArray:
+        """Where the contributions of a norm go: those of `_edges`, then those of the hinges."""
+        size = self.pattern.size
+        a, b = np.triu_indices(3)
+        tails, heads = (3 * end[None] for end in self._ends)
+        rows = [tails + a[:, None], heads + a[:, None], *(tails + k for k in range(3) for _ in range(3))]
+        columns = [tails + b[:, None], heads + b[:, None], *(heads + k for _ in range(3) for k in range(3))]
+        keys = self.pattern.rows * size + self.pattern.indices
+        slots = np.searchsorted(keys, (np.concatenate(rows) * size + np.concatenate(columns)).ravel())
+        return np.concatenate([slots, self.pattern.slots[45 * self._sides.shape[1] :]])
+
+    def _edges(self, directions: FloatArray, weights: FloatArray, out: FloatArray) -> None:
+        weighted = directions * weights
+        start = 0
+        for a in range(3):
+            np.multiply(directions[a], weighted[a:], out=out[start : start + 3 - a])
+            np.multiply(-directions[a], weighted, out=out[12 + 3 * a : 15 + 3 * a])
+            start += 3 - a
+        out[6:12] = out[:6]
+
+    def _faces(self, directions: FloatArray, blocks: FloatArray, out: FloatArray) -> None:
         u = directions.take(self._sides, axis=1) * self._signs
         # (side, corner, xyz, face): derivative of each length by each corner, two of three not zero.
         corners = np.zeros((3, 3, 3, u.shape[-1]))

@@ -16,7 +16,7 @@ from geometry.anderson import Anderson
 from geometry.cholesky import Backend, Cholesky, NotPositiveDefiniteError, analyse
 from geometry.frames import FrameIntegration
 from geometry.mesh import FloatArray, TriangleMesh
-from geometry.normal_matrix import NormalMatrix, QuadraticForm
+from geometry.normal_matrix import NormalMatrix
 from geometry.nric import NRICGradients, NRICJacobian, WeightedNorm
 from geometry.rigid import rigid_motions
 
@@ -81,7 +81,6 @@ class Reconstructor:
         self.norm = WeightedNorm.of(reference, eta)
         self.jacobian = NRICJacobian(reference.connectivity)
         self.normal_matrix = NormalMatrix(reference.connectivity)
-        self._form = QuadraticForm.of(self.norm, reference.connectivity)
         self._cholesky = analyse(self.normal_matrix.pattern, backend)
         self._backend: Backend = backend
 
@@ -144,7 +143,7 @@ class Reconstructor:
                 break
             if new := factor is None:
                 try:
-                    self._cholesky.factorise(self.normal_matrix.entries(here.gradients, self._form))
+                    self._cholesky.factorise(self.normal_matrix.entries(here.gradients, self.norm))
                 except NotPositiveDefiniteError:
                     status = Status.STALLED
                     break
@@ -207,7 +206,7 @@ class Reconstructor:
 
     def _factorised_at(self, vertices: FloatArray) -> sparse.csr_array:
         gradients = self.jacobian.gradients(vertices)
-        self._cholesky.factorise(self.normal_matrix.entries(gradients, self._form))
+        self._cholesky.factorise(self.normal_matrix.entries(gradients, self.norm))
         return self.jacobian.matrix(gradients)
 
     def _flipped(self, misfit: FloatArray) -> int:

@@ -8,7 +8,7 @@ import sys
 
 from pydantic import ValidationError
 
-from service import logs
+from service import logs, memory
 from service.app import create_app
 from service.server import Server
 from service.settings import PREFIX, Settings, unknown_variables
@@ -22,6 +22,7 @@ def main() -> None:
         for fault in error.errors():
             print(f"{PREFIX}{str(fault['loc'][0]).upper()}: {fault['msg']}", file=sys.stderr)
         raise SystemExit(2) from None
+    memory.be_frugal()
     logs.configure(settings.log_format)
     for name in unknown_variables():
         logging.getLogger(__name__).warning("%s is no setting: the README lists those there are", name)

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import ctypes
 import logging
 import os
-import sys
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from service.bundle import BundleError, read_bundle
+from service.memory import give_back
 from service.shape_model import ShapeModel
 
 logger = logging.getLogger(__name__)
@@ -103,7 +102,7 @@ class ModelRepository:
             logger.info("bundle %s/%s is gone and no longer served", name, version)
         self._models, self.refused = models, changes.refused
         if changes.loaded or changes.removed:
-            _return_memory()
+            give_back()
         return changes
 
     def signature(self) -> Signature:
@@ -158,13 +157,6 @@ class ModelRepository:
             known = ", ".join(sorted(models)) or "none at the moment"
             raise UnknownModelError(f"There is no model {name!r}. Choose one of those that /v1/models lists: {known}.")
         return models[name]
-
-
-def _return_memory() -> None:
-    """Return what making models has left over to the system; glibc, which has this call, would keep it for ever."""
-    trim = getattr(ctypes.CDLL(None), "malloc_trim", None) if sys.platform == "linux" else None
-    if trim:
-        trim(0)
 
 
 def _versions(folder: Path) -> Iterator[Path]:

@@ -48,7 +48,7 @@ def positive(pattern, rng):
 def normal_matrix(name, form_of=None, pose=None):
     mesh = MESHES[name]()
     pose = bent(mesh.vertices, 0.7) if pose is None else pose
-    form = QuadraticForm.of(WeightedNorm.of(mesh, 1e-2), mesh.connectivity) if form_of is None else form_of(mesh)
+    form = WeightedNorm.of(mesh, 1e-2) if form_of is None else form_of(mesh)
     jacobian = NRICJacobian(mesh.connectivity)
     normal = NormalMatrix(mesh.connectivity)
     return normal, normal.entries(jacobian.gradients(pose), form), jacobian(pose), form, mesh
@@ -235,23 +235,12 @@ def test_the_normal_matrix_of_any_form_is_the_sparse_product(name):
     assert_is_product(entries, normal, jacobian, weights.tocsr())
 
 
-def test_each_length_of_a_norm_is_counted_once(mesh):
-    norm = WeightedNorm.of(mesh, 0.1)
-    form = QuadraticForm.of(norm, mesh.connectivity)
-    found = np.zeros(mesh.connectivity.edge_count)
-    for k in range(3):
-        np.add.at(found, mesh.connectivity.face_edges[:, k], form.faces[k, k])
-    np.testing.assert_allclose(found, norm.squared[: len(found)])
-    assert not form.faces[~np.eye(3, dtype=bool)].any()
-    assert np.array_equal(form.angles, norm.squared[len(found) :])
-
-
 def test_the_pattern_stays_where_entries_cancel(backend):
     """A flat square along the axes: angles feel z only, and sparse products would drop the rest."""
     flat = TriangleMesh.from_arrays([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], [[0, 1, 2], [0, 2, 3]])
     normal = NormalMatrix(flat.connectivity)
     jacobian = NRICJacobian(flat.connectivity)
-    form = QuadraticForm.of(WeightedNorm.of(flat, 1.0), flat.connectivity)
+    form = WeightedNorm.of(flat, 1.0)
     symmetric = normal.entries(jacobian.gradients(flat.vertices), form)
     assert len(symmetric) == len(normal.pattern) == 12 * 13 / 2
     assert (symmetric == 0).sum() > 20
