@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 from onnx import numpy_helper
 
-from geometry.reconstruction import Status
+from geometry.mesh import align
+from geometry.reconstruction import Reconstructor, Status
 from service.bundle import read_bundle
 from service.encodings import worst
 from service.latent_space import NotFiniteError
 from service.responses import solve
-from service.shape_model import MeshChoice, ShapeModel
+from service.shape_model import TOLERANCE, MeshChoice, ShapeModel
 from service.workers import DeadlineError, Workers
 from tests.service.bundles import networks, seal, start_network, write_bundle
 
@@ -76,3 +77,40 @@ def test_the_summary_of_several_shapes_is_their_worst(tmp_path: Path) -> None:
         "model": model.digest,
     }
     assert worst([good, good])["status"] == "converged"
+
+
+@pytest.fixture(scope="module", params=["figure", "freaky-torus"])
+def bundled(request: pytest.FixtureRequest) -> ShapeModel:
+    return ShapeModel(read_bundle(Path(__file__).parents[2] / "models" / request.param / "1"))
+
+
+def wide_codes(model: ShapeModel, count: int) -> np.ndarray:
+    """In a box 1.5 times as wide as the bounds."""
+    centre, radius = (model.latents.upper + model.latents.lower) / 2, (model.latents.upper - model.latents.lower) / 2
+    offsets = 1.5 * radius * np.random.default_rng(6).uniform(-1, 1, (count, len(radius)))
+    return model.latents.codes((centre + offsets).tolist())[0]
+
+
+def test_every_start_ends_in_one_shape(bundled: ShapeModel) -> None:
+    """To 1e-4 of the diagonal: the product's own, the reference, and the shape of another code."""
+    reference, codes = bundled.reference, wide_codes(bundled, 4)
+    solver = Reconstructor(reference, bundled.manifest.eta_reconstruction)
+    other = bundled.shape(codes[-1], mesh=MeshChoice.COARSE).vertices / bundled.manifest.scale
+    for code in codes[:-1]:
+        shape = bundled.shape(code, mesh=MeshChoice.COARSE)
+        assert shape.diagnostics.status is Status.CONVERGED
+        target = bundled._networks(code[None])[1][0]
+        for start in (reference.vertices, other):
+            found = solver(target, start, tolerance=TOLERANCE)
+            assert found.status is Status.CONVERGED
+            aligned = bundled.manifest.scale * align(found.vertices, reference.vertices)
+            assert np.abs(aligned - shape.vertices).max() < 1e-4 * bundled.manifest.scale * reference.diagonal
+
+
+def test_a_shape_does_not_depend_on_what_was_solved_before(bundled: ShapeModel) -> None:
+    first, second = wide_codes(bundled, 2)
+    fresh = bundled.shape(first)
+    bundled.shape(second)
+    again = bundled.shape(first)
+    assert np.array_equal(again.vertices, fresh.vertices)
+    assert again.diagnostics == fresh.diagnostics
