@@ -11,13 +11,19 @@ from typing import Annotated
 
 import numpy as np
 import orjson
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, field_validator, model_validator
 
 from geometry.mesh import FloatArray
 from service.latent_space import LatentSpace
 from service.shape_model import MeshChoice
 
 Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
+#: JSON knows one kind of number only, where 3.0 is as whole as 3.
+Whole = Annotated[
+    int,
+    Field(strict=True),
+    BeforeValidator(lambda given: int(given) if isinstance(given, float) and given.is_integer() else given),
+]
 #: Longest id: behind most proxies a whole URL may take 16 KiB at most.
 ID_LIMIT = 15_000
 _PAYLOAD_LIMIT = 2**20
@@ -55,10 +61,9 @@ class Animation(BaseModel):
         description="Increasing times of the keyframes, in any unit; by default equally far apart. With "
         "`loop` the way back to the first keyframe takes the average of the other segments.",
     )
-    frames: int = Field(
+    frames: Whole = Field(
         30,
         ge=2,
-        strict=True,
         description="n, the number of frames, both ends included; `loop` leaves the last one out.",
     )
     start: Number = Field(0.0, description="t of the first frame; below 0 extrapolates.")

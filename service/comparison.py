@@ -14,6 +14,9 @@ from service.negotiation import choose
 from service.problems import ProblemError
 
 #: Why a format isn't among those of a coloured mesh.
+_NUMBER = r"[-+]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][-+]?[0-9]+)?"
+#: What the description says of numbers in a query.
+NUMBERS = f"^{_NUMBER}(,{_NUMBER})*$"
 _UNCOLOURED = {
     name: f"{name.upper()} files can't carry colours" for name, format in SHAPE_FORMATS.items() if not format.coloured
 }
@@ -79,6 +82,7 @@ async def _query(
             description="With `color`: code of the other shape, coordinates separated by commas; without it the "
             "reference.",
             openapi_examples={"a code": {"value": "0,0,0,0"}},
+            json_schema_extra={"pattern": NUMBERS},
         ),
     ] = None,
 ) -> ComparisonQuery:

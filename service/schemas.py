@@ -7,7 +7,7 @@ from typing import Annotated, Any
 from pydantic import BaseModel, ConfigDict, Field
 
 from geometry.colouring import Quantity
-from service.animation import Number
+from service.animation import Number, Whole
 from service.edit import PRIOR
 from service.latent_space import Bounds, Distribution
 from service.shape_model import MeshChoice
@@ -62,7 +62,7 @@ class VerticesRequest(_Request):
 class TargetRequest(_Request):
     """Where a vertex should be."""
 
-    vertex: int = Field(strict=True, description="Index in the mesh that `mesh` names, from 0.")
+    vertex: Whole = Field(description="Index in the mesh that `mesh` names, from 0.")
     position: list[Number] = Field(
         min_length=3, max_length=3, description="In the units and the frame that meshes are answered in."
     )
@@ -87,8 +87,8 @@ class EditRequest(_Request):
 class SampleRequest(_Request):
     """How many random codes, and which."""
 
-    count: int = Field(1, ge=1, strict=True, description="Number of codes.", examples=[3])
-    seed: int = Field(0, ge=0, lt=2**63, strict=True, description="The same codes for the same seed.")
+    count: Whole = Field(1, ge=1, description="Number of codes.", examples=[3])
+    seed: Whole = Field(0, ge=0, lt=2**63, description="The same codes for the same seed.")
     distribution: Distribution = Field(
         Distribution.UNIFORM,
         description="In the bounds uniform, or gaussian: around their middle, with a standard deviation of a quarter "

@@ -10,7 +10,7 @@ import numpy as np
 from fastapi import APIRouter, Depends, Query, Request, Response
 
 from geometry.formats import OCTET_STREAM, npz
-from service.comparison import NO_COLOR, ColorQuery, choose_mesh, numbers
+from service.comparison import NO_COLOR, NUMBERS, ColorQuery, choose_mesh, numbers
 from service.dependencies import Format, Model, Service, ServiceDependency, limit_codes, one_of, require_json
 from service.encodings import SHAPE_FORMATS, diagnostics_arrays, dump_json, exact_arrays, exact_lists, float32, worst
 from service.exact import Exact, require_tangent_space
@@ -47,6 +47,7 @@ async def get_mesh(
         Query(
             description="Coordinates separated by commas; without them the reference shape.",
             openapi_examples={"a code": {"value": "1,2,3,4"}},
+            json_schema_extra={"pattern": NUMBERS},
         ),
     ] = None,
     mesh: Annotated[MeshChoice, Query(description="Which mesh, where the model has a finer one.")] = MeshChoice.FINE,

@@ -304,3 +304,11 @@ def test_moving_normals_follow_the_shape(client: httpx.Client) -> None:
         still = GLB(client.get(f"/v1/interpolations/{created['id']}/frames/{k}").content)
         expected = still.array(still.primitive["attributes"]["NORMAL"])
         np.testing.assert_allclose(animated.key(k, "NORMAL"), expected, atol=1e-5)
+
+
+def test_whole_numbers_may_have_a_fraction_of_zero(client: httpx.Client) -> None:
+    body = '{"keyframes": [[0, 0, 0], [0.1, 0.7, 0.4]], "frames": 3.0}'
+    headers = {"Content-Type": "application/json"}
+    answer = client.post("/v1/models/small/interpolations", content=body, headers=headers)
+    assert answer.status_code == 201
+    assert answer.json()["frames"] == 3
