@@ -32,6 +32,7 @@ def main() -> None:
 
         def open_page(hash: str, **options: object) -> Page:
             page = browser.new_page(**options)  # type: ignore[arg-type]
+            page.set_default_timeout(120_000)
             page.goto(f"{client.base_url}{hash}")
             return page
 
