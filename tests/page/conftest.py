@@ -7,9 +7,12 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import httpx
+import numpy as np
 import pytest
 from playwright.sync_api import Browser, sync_playwright
 
+from geometry.formats import read_arrays
 from tests.page.studio import Studio
 from tests.service.bundles import write_bundle
 from tests.service.conftest import ROOT, Server, Start, starting
@@ -17,6 +20,9 @@ from tests.service.conftest import ROOT, Server, Start, starting
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 #: WebGL in software, so that it is there on every machine.
 FLAGS = ["--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+
+#: A code of the small torus.
+CODE = (0.1, 1, 0.5)
 
 Open = Callable[..., Studio]
 
@@ -76,3 +82,10 @@ def window(browser: Browser, server: Server) -> Iterator[Open]:
 def studio(window: Open) -> Studio:
     """The page with the small torus, at rest."""
     return window().open()
+
+
+@pytest.fixture
+def expected(server: Server) -> np.ndarray:
+    """Positions of the code, as the server answers them."""
+    call = f"{server.url}/v1/models/with-fine/mesh?latent={','.join(map(str, CODE))}&format=npz"
+    return read_arrays(httpx.get(call, timeout=60).raise_for_status().content, "npz")[0]

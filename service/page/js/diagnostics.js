@@ -21,9 +21,9 @@ export function inWords(diagnostics) {
 
 /** By the distance to the nearest training shape, in multiples of what these have from each other. */
 function plausible(distance) {
-  if (distance <= 1) return ["good", "As near to the training shapes as they are to each other."];
-  const times = `${readable(distance, 2)} times as far from the training shapes as they are from each other`;
-  return distance <= 2 ? ["fair", `Plausible: ${times}.`] : ["poor", `Hardly plausible: ${times}.`];
+  if (distance <= 1) return ["good", "As near to the training shapes as these are to each other."];
+  const times = `${readable(distance, 2)} times as far from the training shapes as these lie apart`;
+  return distance <= 2 ? ["fair", `Unusual: ${times}.`] : ["poor", `Hardly plausible: ${times}.`];
 }
 
 const percent = (share) => `${readable(100 * share, 2)} %`;

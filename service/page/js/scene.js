@@ -22,14 +22,14 @@ export function litCamera() {
   return camera;
 }
 
-/** Put a camera where a sphere fills its view. */
-export function frame(camera, { center, radius }, direction = VIEW) {
+/** Put a camera where a sphere fills the width of its view, or a share of its height. */
+export function frame(camera, { center, radius }, share = 1) {
   const field = (camera.fov * Math.PI) / 360;
-  const narrow = Math.atan(Math.tan(field) * Math.min(camera.aspect, 1));
+  const narrow = Math.atan(Math.tan(field) * Math.min(camera.aspect, share));
   const distance = radius / Math.sin(narrow);
   camera.near = distance / 100;
   camera.far = distance * 20;
-  camera.position.copy(center).addScaledVector(direction, distance);
+  camera.position.copy(center).addScaledVector(VIEW, distance);
   camera.lookAt(center);
   camera.updateProjectionMatrix();
 }

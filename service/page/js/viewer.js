@@ -9,9 +9,11 @@ import { OrbitControls } from "three/addons/OrbitControls.js";
 import { frame, geometryOf, litCamera, move, paint, sphereOf, surfaceMaterial } from "./scene.js";
 
 const TURN = Math.PI / 24;
+const MARGIN = 110; // pixels of the height that buttons and words take
 
 export class Viewer {
   #scheduled = false;
+  #share = 1; // of the height that is free for the shape
 
   constructor(canvas) {
     this.canvas = canvas;
@@ -49,7 +51,6 @@ export class Viewer {
     this.geometries = {};
     this.addMesh("coarse", reference);
     this.sphere = sphereOf(reference.vertices);
-    this.sphere.radius *= 1.08; // room for poses that reach further, and for the buttons
     this.resetView();
   }
 
@@ -80,7 +81,7 @@ export class Viewer {
   }
 
   resetView() {
-    frame(this.camera, this.sphere);
+    frame(this.camera, this.sphere, this.#share);
     this.controls.target.copy(this.sphere.center);
     this.controls.minDistance = 0.2 * this.sphere.radius;
     this.controls.maxDistance = 20 * this.sphere.radius;
@@ -145,11 +146,12 @@ export class Viewer {
   #resize() {
     const { clientWidth: width, clientHeight: height } = this.canvas.parentElement;
     if (!width || !height) return;
-    const before = Math.min(this.camera.aspect, 1);
+    const before = Math.min(this.camera.aspect, this.#share);
     this.camera.aspect = width / height;
+    this.#share = Math.max(1 - MARGIN / height, 0.4);
     this.renderer.setSize(width, height, false);
-    // A narrower window must show as much: the distance follows.
-    const after = Math.min(this.camera.aspect, 1);
+    // A smaller window must show as much: the distance follows.
+    const after = Math.min(this.camera.aspect, this.#share);
     const { target } = this.controls;
     this.camera.position.sub(target).multiplyScalar(before / after).add(target);
     this.camera.updateProjectionMatrix();
