@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 import pytest
-from playwright.sync_api import Request
 
 from tests.page.conftest import Open
 from tests.page.studio import Studio, body, difference
@@ -86,40 +83,37 @@ def test_an_angle_goes_round(studio: Studio) -> None:
 
 
 def test_coarse_as_it_moves_fine_as_it_rests_and_nothing_queues(studio: Studio) -> None:
+    studio.asked.clear()
+    values = np.linspace(0.01, 0.15, 40).tolist()
+    studio.coordinate(0).locator("input[type=range]").evaluate(
+        """(slider, values) => {
+            for (slider.value of values) slider.dispatchEvent(new Event('input', { bubbles: true }));
+        }""",
+        values,
+    )
+    studio.eventually(lambda: studio.asked[-1]["mesh"] == "fine" and studio.shown == "fine")
+    # All that came while the first was under way is superseded by the last.
+    assert [asked["mesh"] for asked in studio.asked] == ["coarse", "coarse", "fine"]
+    assert [asked["latents"][0][0] for asked in studio.asked] == pytest.approx([0.01, 0.15, 0.15])
+
+
+def test_a_slider_is_dragged(studio: Studio) -> None:
+    before = studio.picture()
     box = studio.coordinate(0).locator("input[type=range]").bounding_box()
     assert box
-    # A slow server, so that more is asked for than it answers.
-    studio.page.route("**/vertices*", lambda route: (studio.page.wait_for_timeout(60), route.continue_()))
-    studio.asked.clear()
-    under_way, most = 0, 0
-
-    def count(change: int) -> Callable[[Request], None]:
-        def changed(request: Request) -> None:
-            nonlocal under_way, most
-            under_way += change * request.url.endswith("/vertices?format=npz")
-            most = max(most, under_way)
-
-        return changed
-
-    studio.page.on("request", count(1))
-    for end in ("requestfinished", "requestfailed"):
-        studio.page.on(end, count(-1))
-    mouse = studio.page.mouse
-    mouse.move(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
-    mouse.down()
-    moves = 40
-    for i in range(moves):
-        mouse.move(box["x"] + box["width"] / 2 + 2 * i, box["y"] + box["height"] / 2)
-    moving = [asked["mesh"] for asked in studio.asked]
-    mouse.up()
-    studio.eventually(lambda: studio.asked[-1]["mesh"] == "fine" and studio.shown == "fine")
-    studio.page.unroute("**/vertices*")
-    assert most == 1
-    assert moving.count("coarse") == len(moving) > 1
-    assert len(studio.asked) < moves
-    # The last thing asked for is where the hand let go.
-    studio.eventually(lambda: np.allclose(studio.asked[-1]["latents"][0], studio.code, atol=1e-4))
-    assert studio.code[0] > 0.05
+    x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+    studio.page.mouse.move(x, y)
+    studio.page.mouse.down()
+    for i in range(10):
+        studio.page.mouse.move(x + 8 * i, y)
+    during = studio.until_different(before)
+    assert studio["#undo"].is_disabled(), "a drag is one step, once it has ended"
+    studio.page.mouse.up()
+    studio.eventually(lambda: studio["#undo"].is_enabled() and studio.code[0] > 0.05)
+    studio["#undo"].click()
+    studio.until_code([0, 0, 0])
+    studio["#canvas"].hover()
+    studio.until_different(during)
 
 
 def test_a_shape_that_is_already_old_is_dropped(studio: Studio) -> None:
