@@ -23,7 +23,7 @@ class Studio:
     Playwright's own waiting for conditions would need `eval`, which the page forbids.
 
     Attributes:
-        complaints: of the console, and errors that nobody caught.
+        complaints: errors in the console, and those that nobody caught.
         foreign: addresses on other hosts that it asked for.
         asked: bodies of the requests for vertices.
     """
@@ -42,7 +42,7 @@ class Studio:
         page.set_default_timeout(1000 * PATIENCE)
 
     def _said(self, message: ConsoleMessage) -> None:
-        if message.type in {"error", "warning"}:
+        if message.type == "error":
             self.complaints.append(message.text)
 
     def _requested(self, request: Request) -> None:

@@ -6,13 +6,14 @@ const PICTURE = 44;
 
 export class Sliders {
   #rows = [];
+  #held = false; // whether a slider is being dragged
 
   constructor(store, list) {
     Object.assign(this, { store, list });
     store.on(["space"], () => this.#build());
     store.on(["code", "locked"], () => this.#show());
     // The end of a drag, wherever it ends.
-    for (const end of ["pointerup", "pointercancel", "blur"]) addEventListener(end, () => store.set({ moving: false }));
+    for (const end of ["pointerup", "pointercancel", "blur"]) addEventListener(end, () => this.#let());
   }
 
   /** The canvases of coordinate k for shapes at its three stations. */
@@ -69,7 +70,10 @@ export class Sliders {
     lock.setAttribute("aria-label", `Lock ${name}`);
     reset.setAttribute("aria-label", `Reset ${name}`);
 
-    slider.addEventListener("pointerdown", () => this.store.set({ moving: true }));
+    slider.addEventListener("pointerdown", () => {
+      this.#held = true;
+      this.store.set({ moving: true });
+    });
     slider.addEventListener("input", () => this.#set(k, Number(slider.value)));
     slider.addEventListener("keydown", (event) => this.#wrapAtTheEnd(event, k, slider));
     box.addEventListener("input", () => { if (box.value !== "") this.#set(k, Number(box.value)); });
@@ -88,6 +92,12 @@ export class Sliders {
     });
     this.#rows[k] = { root, slider, box, lock, controls: [slider, box, reset, ...root.querySelectorAll(".pictures button")] };
     return root;
+  }
+
+  #let() {
+    if (!this.#held) return;
+    this.#held = false;
+    this.store.set({ moving: false });
   }
 
   #set(k, value) {
