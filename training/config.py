@@ -143,6 +143,8 @@ class NetworkSettings(_Section):
     seed: int = 0
     fractions: list[Annotated[float, Field(gt=0, lt=1)]] = []
     """Shares of the training samples to learn from as well, for the study of their number."""
+    seeds: list[int] = []
+    """Further seeds, of split and networks, to learn with as well, for the spread of the figures."""
 
 
 class VariantSettings(_Section):

@@ -142,19 +142,19 @@ def grid_nodes(dimension: int, settings: EvaluationSettings) -> int:
 
 
 def evaluate(
-    learner: Callable[[float], Learner], config: Config, exact: Callable[[str, FloatArray], NDArray[np.float32]]
+    learner: Callable[..., Learner], config: Config, exact: Callable[[str, FloatArray], NDArray[np.float32]]
 ) -> tuple[dict[str, Any], dict[str, NDArray]]:
     """Every model on the test split, which is read here and nowhere before.
 
     Args:
-        learner: by the share of the training samples that it learns from.
+        learner: by the ``fraction`` of the training samples that it learns from, or another ``seed``.
         config: of the run.
         exact: NRIC (n, 2E) of a named set of codes (n, m), with NaN for a code whose shape couldn't be found.
 
     Returns:
         What goes into evaluation.json and into gallery.npz.
     """
-    settings, whole = config.evaluation, learner(1.0)
+    settings, whole = config.evaluation, learner()
     collection, reference = whole.collection, whole.collection.reference
     factors, coordinates = collection.factors, collection.coordinates
     norm = WeightedNorm.of(reference, settings.eta)
@@ -210,14 +210,25 @@ def evaluate(
                 "training_samples": len(some.rows["train"]),
                 "r2": {"composite": network_score(some.main()), "monolithic": network_score(some.monolithic())},
             }
-            for fraction, some in ((f, learner(f)) for f in config.networks.fractions)
+            for fraction, some in ((f, learner(fraction=f)) for f in config.networks.fractions)
         ],
+        "seeds": [_other_seed(learner(seed=seed), norm) for seed in config.networks.seeds],
         "vertex_error": found.figures(),
         "sizes": sizes,
         "times": model_times(collection, composite),
     }
     gallery = extremes(found.vertices, vertices[first], found.errors, test[first])
     return figures, gallery | strip(collection, composite, eta) | {"faces": reference.faces}
+
+
+def _other_seed(learner: Learner, norm: WeightedNorm) -> dict[str, Any]:
+    """R² of networks learned with another seed, on that seed's own test split."""
+    test = learner.split["test"]
+    codes, z = torch.as_tensor(learner.joint.latents[test], dtype=torch.float32), learner.joint.nric[test]
+    models: dict[str, Callable[[torch.Tensor], torch.Tensor]]
+    models = {"composite": learner.main(), "monolithic": learner.monolithic()}
+    r2 = {name: r_squared(predict(model, codes).numpy(), z, norm) for name, model in models.items()}
+    return {"seed": learner.seed, "r2": r2}
 
 
 def _exact_factor(learner: Learner, j: int, exact: Callable[[str, FloatArray], NDArray]) -> NDArray[np.float32]:

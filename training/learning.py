@@ -30,7 +30,7 @@ from training.networks import (
     edge_midpoints,
     predict,
 )
-from training.sampling import Collection, Samples, read
+from training.sampling import Collection, Samples, read, split
 
 
 @dataclass(frozen=True)
@@ -71,12 +71,20 @@ class Learner:
         data_key: names the samples.
         fraction: share of the training samples, joint and of factors, to learn from. With less the number of epochs
             grows, so that the number of steps stays.
+        seed: of the networks, by default the configuration's; another one splits the samples anew too.
     """
 
     def __init__(
-        self, collection: Collection, config: Config, folder: Path, data_key: str, fraction: float = 1.0
+        self,
+        collection: Collection,
+        config: Config,
+        folder: Path,
+        data_key: str,
+        fraction: float = 1.0,
+        seed: int | None = None,
     ) -> None:
         self.collection, self.config, self.run = collection, config, folder
+        self.seed = config.networks.seed if seed is None else seed
         self._data_key, self._fraction = data_key, fraction
         (folder / "networks").mkdir(exist_ok=True)
         self.histories: dict[str, Any] = {}
@@ -89,6 +97,9 @@ class Learner:
     @cached_property
     def split(self) -> dict[str, IntArray]:
         """Rows of the joint samples: train, validation, test."""
+        if self.seed != self.config.networks.seed:
+            settings, rng = self.config.samples, np.random.default_rng(self.seed)
+            return split(np.arange(len(self.joint.index)), settings.test_fraction, settings.validation_fraction, rng)
         with np.load(self.run / "samples" / "split.npz") as file:
             return {name: np.searchsorted(self.joint.index, index) for name, index in file.items()}
 
@@ -98,7 +109,7 @@ class Learner:
         return nric(reference.vertices, reference.connectivity)
 
     def _path(self, kind: str, *settings: BaseModel) -> Path:
-        decides = [self._data_key, self._fraction, self.config.networks.seed]
+        decides = [self._data_key, self._fraction, self.seed]
         text = json.dumps([*decides, [s.model_dump(mode="json") for s in settings]])
         return self.run / "networks" / f"{kind}-{hashlib.sha256(text.encode()).hexdigest()[:12]}.safetensors"
 
@@ -122,7 +133,7 @@ class Learner:
         path: Path,
     ) -> dict[str, Any]:  # fmt: skip
         title = path.stem.rpartition("-")[0]
-        state = fit(
+        return fit(
             network,
             inputs,
             torch.from_numpy(z),
@@ -131,10 +142,8 @@ class Learner:
             fitting.model_copy(update={"max_epochs": round(fitting.max_epochs / self._fraction)}),
             path,
             title,
-            self.config.networks.seed,
+            self.seed,
         )
-        self._record(path, state)
-        return state
 
     def _load(self, network: ShapeNetwork, path: Path, state: dict[str, Any], tensors: dict[str, Tensor]) -> None:
         network.load_state_dict(tensors)
@@ -155,8 +164,7 @@ class Learner:
             network = kind(settings, coordinates, Scaling.blank(len(self._reference)), blank)
             self._load(network, path, *saved)
             return network
-        seed = self.config.networks.seed
-        torch.manual_seed(seed)
+        torch.manual_seed(self.seed)
         samples, rows = data()
         rows = self._some(rows)
         train = rows["train"]
@@ -165,7 +173,7 @@ class Learner:
         if settings.energy < 1:
             y = scaling.down(torch.from_numpy(samples.nric[train])).numpy()
             midpoints = edge_midpoints(self.collection.reference)
-            basis_fitted = PatchBasis.fit(y, midpoints, settings.patches, settings.energy, seed)
+            basis_fitted = PatchBasis.fit(y, midpoints, settings.patches, settings.energy, self.seed)
         network = kind(settings, coordinates, scaling, basis_fitted)
         latents = torch.as_tensor(samples.latents[:, index], dtype=torch.float32)
         if not path.exists():
@@ -174,7 +182,7 @@ class Learner:
                 for part in (train, rows["validation"])
             ]
             network.fit_skip(*pairs[0], pairs[1])
-        self._fit(network, latents, samples.nric, rows, settings.fit, path)
+        self._record(path, self._fit(network, latents, samples.nric, rows, settings.fit, path))
         return network
 
     def factor_samples(self, j: int) -> Samples:
@@ -207,7 +215,7 @@ class Learner:
         if isinstance(factors, LatentNetworkSettings):
             factors = [factors] * len(self.collection.factors)
         networks = [self.factor(j, settings) for j, settings in enumerate(factors)]
-        torch.manual_seed(self.config.networks.seed)
+        torch.manual_seed(self.seed)
         path = self._path("combiner", combiner, *factors)
         saved = finished(path)
         scaling = Scaling.blank(len(self._reference)) if saved else self._scaling(self.joint.nric[self.rows["train"]])
@@ -229,7 +237,7 @@ class Learner:
             # Last, because on the samples it has learned from it leaves too little for others to learn.
             network.fit_kernel(*own, other, combiner.kernel)
             save_network(path, network, state)
-            self._record(path, state)
+        self._record(path, state)
         return composite
 
     def _with_images(self, inputs: Tensor, rows: dict[str, IntArray]) -> tuple[Tensor, NDArray, dict[str, IntArray]]:

@@ -129,9 +129,9 @@ def samples(run: Run) -> None:
     write_npz(folder / "split.npz", **split(there, settings.test_fraction, settings.validation_fraction, split_rng))
 
 
-def learner_of(run: Run, fraction: float = 1.0) -> Learner:
-    """The networks of a run whose samples are there, learned from a share of them."""
-    return Learner(run.collection, run.config, run.folder, run.stamp("samples")["key"], fraction)
+def learner_of(run: Run, fraction: float = 1.0, seed: int | None = None) -> Learner:
+    """The networks of a run whose samples are there, learned from a share of them, or with another seed."""
+    return Learner(run.collection, run.config, run.folder, run.stamp("samples")["key"], fraction, seed)
 
 
 def networks(run: Run) -> None:
@@ -141,8 +141,9 @@ def networks(run: Run) -> None:
     learner.monolithic()
     learner.variants()
     histories = learner.histories
-    for fraction in run.config.networks.fractions:
-        learner = learner_of(run, fraction)
+    more = [learner_of(run, fraction) for fraction in run.config.networks.fractions]
+    more += [learner_of(run, seed=seed) for seed in run.config.networks.seeds]
+    for learner in more:
         learner.main()
         learner.monolithic()
         histories |= learner.histories

@@ -41,6 +41,7 @@ part_size = 10
 
 [networks]
 fractions = [0.5]
+seeds = [1]
 
 [networks.factors]
 hidden = [16]
@@ -129,6 +130,9 @@ def test_a_run_leaves_what_the_contract_promises(run: Path) -> None:
     assert figures["r2"]["composite"]["total"] > 0.99
     assert figures["prolongation"]["mean"] < 0.02
     assert [row["fraction"] for row in figures["fractions"]] == [0.5]
+    (other,) = figures["seeds"]
+    assert other["seed"] == 1
+    assert 0 < abs(other["r2"]["composite"]["total"] - figures["r2"]["composite"]["total"]) < 0.02
     assert "<html" in (run / "report.html").read_text()
     events = [json.loads(line) for line in (run / "log.jsonl").read_text().splitlines()]
     assert [e["stage"] for e in events if e["event"] == "end"] == list(STAGES)
