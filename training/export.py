@@ -27,6 +27,7 @@ from training.files import write_npz
 from training.learning import Composite
 from training.networks import predict
 from training.sampling import Collection
+from training.start import StartNetwork
 
 OPSET = 18
 
@@ -89,6 +90,7 @@ def export(
     data_digest: str,
     destination: Path,
     geometry: Mapping[str, NDArray],
+    start: StartNetwork | None = None,
 ) -> Path:
     """Write ``destination/NAME/VERSION/``, replacing what is there.
 
@@ -101,6 +103,7 @@ def export(
         destination: the models directory.
         geometry: arrays of geometry.npz beside the reference's: a finer mesh with its prolongation, modes,
             training codes.
+        start: for start.onnx, where there is one.
 
     Raises:
         ExportError: ONNX and PyTorch differ by more than the tolerance on 64 random codes.
@@ -120,11 +123,19 @@ def export(
         composite.combiner, predict(composite.factor_shapes, latents[:2]), ("factors", "nric"), part / "combiner.onnx"
     )
 
+    if start:
+        _to_onnx(start, latents[:2], ("latent", "vertices"), part / "start.onnx")
+
     difference = parity(composite, part, latents, WeightedNorm.of(reference, config.evaluation.eta))
     if not difference <= settings.tolerance:
         raise ExportError(
             f"ONNX and PyTorch differ by {difference:.1e} in the weighted norm, over {settings.tolerance:.0e}"
         )
+    if start:
+        answer = _session(part / "start.onnx").run(None, {"latent": latents.numpy()})[0]
+        distance = float(np.abs(answer - predict(start, latents, 8).numpy()).max())
+        if not distance <= settings.tolerance * reference.diagonal:
+            raise ExportError(f"start.onnx and PyTorch differ by {distance:.1e}, over {settings.tolerance:.0e}")
 
     write_npz(
         part / "geometry.npz",
@@ -134,6 +145,8 @@ def export(
         **geometry,
     )
     manifest = _manifest(composite, collection, config, figures, data_digest, difference, "modes" in geometry)
+    if start:
+        manifest["start"] = {"file": "start.onnx", "input": "latent", "output": "vertices"}
     manifest["files"] = {path.name: _digest(path) for path in sorted(part.iterdir())}
     (part / "manifest.json").write_text(json.dumps(manifest, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
     shutil.rmtree(folder, ignore_errors=True)

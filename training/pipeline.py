@@ -27,6 +27,7 @@ from training.freaky_torus import FreakyTorus
 from training.learning import Learner
 from training.report import write_report
 from training.sampling import Collection, draw, read, split
+from training.start import fit_start
 
 GENERATORS: dict[str, Callable[[], Collection]] = {"freaky-torus": FreakyTorus}
 
@@ -175,8 +176,11 @@ def export_bundle(run: Run) -> None:
     digest = hashlib.sha256()
     for path in sorted((run.folder / "samples").rglob("*.npz")):
         digest.update(path.read_bytes())
-    composite, data = learner_of(run).main(), digest.hexdigest()
-    folder = export(composite, run.collection, run.config, figures, data, run.models, discovery.extras(run.folder))
+    learner = learner_of(run)
+    extras = discovery.extras(run.folder)
+    folder = export(
+        learner.main(), run.collection, run.config, figures, digest.hexdigest(), run.models, extras, fit_start(learner)
+    )
     run.log("exported", bundle=f"{folder.parent.name}/{folder.name}")
 
 
