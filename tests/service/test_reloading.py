@@ -130,12 +130,14 @@ def test_a_reload_under_load_mixes_no_versions(folder: Path, start: Start) -> No
     for thread in threads:
         thread.start()
     scales = [SCALE * (1 + k) for k in range(1, 5)]
-    for scale in scales:
-        time.sleep(0.3)
-        rescale(folder / "small" / "1", scale)
-        reload(server)
-    time.sleep(0.3)
-    stop.set()
+    try:
+        for k, scale in enumerate(scales):
+            eventually(lambda k=k: len(answers) > k)
+            rescale(folder / "small" / "1", scale)
+            reload(server)
+        eventually(lambda: len(answers) > len(scales))
+    finally:
+        stop.set()
     for thread in threads:
         thread.join(timeout=60)
     assert statuses == {200}, "a reload must fail no request"
