@@ -13,6 +13,7 @@ import shutil
 import statistics
 import time
 from pathlib import Path
+from typing import Any
 
 from playwright.sync_api import Page, sync_playwright
 
@@ -65,14 +66,26 @@ def main() -> None:
     with server(arguments.models) as (client, _), sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
         page = browser.new_page(viewport={"width": 1280, "height": 800})
-        weights: list[float] = []
+        page.set_default_timeout(120_000)
+        weights: dict[str, float] = {}  # by request; shapes, which are another matter, are left out
         devtools = page.context.new_cdp_session(page)
         devtools.send("Network.enable")
-        devtools.on("Network.loadingFinished", lambda event: weights.append(event["encodedDataLength"]))
+
+        def finished(event: dict[str, Any]) -> None:
+            if event["requestId"] in weights:
+                weights[event["requestId"]] += event["encodedDataLength"]
+
+        def asked(event: dict[str, Any]) -> None:
+            if "/v1/" not in event["request"]["url"]:
+                weights[event["requestId"]] = 0.0
+
+        devtools.on("Network.requestWillBeSent", asked)
+        devtools.on("Network.loadingFinished", finished)
         began = time.perf_counter()
         page.goto(str(client.base_url))
         page.wait_for_selector(".stage[data-shown]")
         first = time.perf_counter() - began
+        weight = sum(weights.values())
         while page.locator(".pictures canvas.drawn").count() < page.locator(".pictures canvas").count():
             page.wait_for_timeout(100)
         times = sorted(slides(page, arguments.count))
