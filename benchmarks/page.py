@@ -63,7 +63,7 @@ def main() -> None:
     parser.add_argument("--models", type=Path, default=Path("models"), help="folder of bundles")
     parser.add_argument("--count", type=int, default=60, help="moves of a slider")
     arguments = parser.parse_args()
-    with server(arguments.models) as (client, _), sync_playwright() as playwright:
+    with server(arguments.models) as (client, *_), sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
         page = browser.new_page(viewport={"width": 1280, "height": 800})
         page.set_default_timeout(120_000)
@@ -89,9 +89,7 @@ def main() -> None:
         while page.locator(".pictures canvas.drawn").count() < page.locator(".pictures canvas").count():
             page.wait_for_timeout(100)
         times = sorted(slides(page, arguments.count))
-        print(
-            f"First shape {first:.2f} s after the address was entered; {sum(weights) / 1e6:.2f} MB with all pictures."
-        )
+        print(f"First shape {first:.2f} s after the address was entered; the page weighs {weight / 1e6:.2f} MB.")
         p50, p95 = statistics.median(times), times[int(0.95 * len(times))]
         print(f"Slider to new pixels: median {p50:.0f} ms, 95 % {p95:.0f} ms, of {len(times)} moves.")
         browser.close()

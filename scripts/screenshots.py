@@ -27,7 +27,7 @@ def drawn(page: Page, pictures: str, count: int) -> None:
 def main() -> None:
     """Take them."""
     desktop, phone = {"width": 1280, "height": 800}, {"width": 390, "height": 844}
-    with server(Path("models")) as (client, _), sync_playwright() as playwright:
+    with server(Path("models")) as (client, *_), sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
 
         def open_page(hash: str, **options: object) -> Page:
