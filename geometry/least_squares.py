@@ -93,6 +93,8 @@ def least_squares(
     while evaluations < max_evaluations:
         if deadline is not None and time.monotonic() > deadline:
             return fit(Status.DEADLINE)
+        if not np.isfinite(J).all():
+            return fit(Status.STALLED)
         step = _step(J, r, low - u, high - u, damping)
         predicted = r @ r - np.sum((r + J @ step) ** 2)
         if np.abs(step).max() <= tolerance or predicted <= gain_tolerance * (r @ r):

@@ -90,7 +90,9 @@ class Prolongation:
 
     def only(self, vertices: IntArray) -> Prolongation:
         """The prolongation to some of the fine vertices (k,), in that order."""
-        return Prolongation(self.faces, self.weights[vertices])
+        weights, count = self.weights[vertices], self.weights.shape[1] // 2
+        normals = np.unique(weights.indices[weights.indices >= count]) - count
+        return Prolongation(self.faces[np.isin(self.faces, normals).any(axis=1)], weights)
 
     @property
     def vertex_count(self) -> int:

@@ -126,11 +126,13 @@ def _canonical(faces: IntArray) -> IntArray:
 def _layouts(model: ShapeModel) -> list[_Layout]:
     layouts = []
     choices = [MeshChoice.FINE, MeshChoice.COARSE] if model.fine else [MeshChoice.FINE]
+    if model.fine and (model.fine.prolong.coarse_vertices < 0).any():
+        choices = [MeshChoice.COARSE]  # nothing tells where the coarse vertices are on a fine mesh
     for choice in choices:
         mesh = model.mesh(choice)
         own = np.arange(len(mesh.vertices))
         layouts.append(_Layout(choice, mesh.faces, own, own))
-    if model.file_vertices is not None:
+    if model.file_vertices is not None and choices[0] is MeshChoice.FINE:
         of_file = model.file_vertices
         places = np.zeros(len(layouts[0].of_file), np.int64)
         # Backwards, so that the first of welded vertices stays.

@@ -211,15 +211,15 @@ class _Chart:
 
     def positions(self, x: FloatArray) -> FloatArray:
         """(k, 3) at a code (m,); not finite where the networks overflow."""
-        return self._placed(self._solved(x))
+        return self._placed(self._solved(x)[None])[0]
 
     def derivatives(self, x: FloatArray, changes: FloatArray) -> FloatArray:
         """(m, k, 3) at a code (m,), given those of lengths and angles (2E, m)."""
         shape = self._solved(x)
         fields = self._reconstruct.differential(shape, changes.T)
         h = DIFFERENCE * self._model.reference.diagonal / max(np.abs(fields).max(), np.finfo(float).tiny)
-        here = self._placed(shape)
-        return np.stack([(self._placed(shape + h * field) - here) / h for field in fields])
+        here, *there = self._placed(np.concatenate([shape[None], shape + h * fields]))
+        return np.stack([(places - here) / h for places in there])
 
     def sensitivity(self, x: FloatArray) -> FloatArray:
         """(3k, 2E) derivatives of the positions by lengths and angles at a code (m,), without those of normals."""
@@ -233,9 +233,10 @@ class _Chart:
         aligned = align(shape, self._model.reference.vertices)
         return self._reconstruct.sensitivity(aligned, without_rigid_motion(fields, aligned))
 
-    def _placed(self, shape: FloatArray) -> FloatArray:
-        aligned = align(shape, self._model.reference.vertices)
-        return aligned[self._vertices] if self._rows is None else self._rows(aligned)
+    def _placed(self, shapes: FloatArray) -> FloatArray:
+        """(n, k, 3) of shapes (n, V, 3)."""
+        aligned = align(shapes, self._model.reference.vertices)
+        return aligned[:, self._vertices] if self._rows is None else self._rows(aligned)
 
     def _solved(self, x: FloatArray) -> FloatArray:
         if not np.array_equal(x, self._code):

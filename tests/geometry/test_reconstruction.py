@@ -10,6 +10,7 @@ import trimesh
 from geometry.mesh import TriangleMesh, align
 from geometry.nric import NRICJacobian, nric
 from geometry.reconstruction import DEFAULT_ETA, Reconstructor, Status
+from geometry.rigid import without_rigid_motion
 from tests.geometry.conftest import bent
 from training.freaky_torus import FreakyTorus
 
@@ -280,3 +281,26 @@ def test_a_coarse_tolerance_ends_sooner(mesh, pose, reconstruct, target):
     assert coarse.status is Status.CONVERGED
     assert coarse.iterations < fine.iterations
     assert np.abs(align(coarse.vertices, pose) - pose).max() < 1e-2 * mesh.diagonal
+
+
+# ---------------------------------------------------------------- derivatives
+
+
+def test_the_differential_is_how_the_found_shape_moves(mesh, reconstruct, target, rng):
+    change = 1e-3 * rng.standard_normal((3, len(target)))  # of lengths and angles that need not be integrable
+    at = reconstruct(target, tolerance=1e-10).vertices
+    fields = reconstruct.differential(at, change)
+    h = 1e-2
+    for field, direction in zip(fields, change, strict=True):
+        ahead, behind = (reconstruct(target + s * direction, at, tolerance=1e-12).vertices for s in (h, -h))
+        expected = (align(ahead, at) - align(behind, at)) / (2 * h)
+        moved = (align(at + h * field, at) - align(at - h * field, at)) / (2 * h)
+        assert np.abs(moved - expected).max() < 1e-3 * np.abs(expected).max()
+
+
+def test_the_sensitivity_is_the_transposed_differential(mesh, pose, reconstruct, rng):
+    changes = rng.standard_normal((2, 2 * mesh.connectivity.edge_count))
+    fields = without_rigid_motion(rng.standard_normal((3, *pose.shape)), pose)
+    products = np.einsum("nvx,kvx->kn", reconstruct.differential(pose, changes), fields)
+    transposed = reconstruct.sensitivity(pose, fields) @ changes.T
+    np.testing.assert_allclose(transposed, products, rtol=1e-5, atol=1e-6 * np.abs(products).max())

@@ -257,6 +257,14 @@ def codes_too_long(folder: Path) -> None:
     geometry(folder, training_codes=np.zeros((5, 4)))
 
 
+def too_few_vertices_of_files(folder: Path) -> None:
+    geometry(folder, file_vertices=np.arange(63))
+
+
+def vertices_of_files_that_are_none(folder: Path) -> None:
+    geometry(folder, file_vertices=np.array([-1, *range(63), 64]))
+
+
 FAULTS: dict[Spoil, str] = {
     flip_a_bit: "factor-0.onnx does not have the digest",
     truncate: "geometry.npz has",
@@ -298,6 +306,8 @@ FAULTS: dict[Spoil, str] = {
     index_out_of_range: "prolongation_indices must lie in [0, 128)",
     infinite_prolongation: "prolongation_weights has an entry that is not finite",
     flat_modes: "modes must be real numbers (3, 64, 3), not float64 (3, 192)",
+    too_few_vertices_of_files: "file_vertices must be at least 64 whole numbers, not int64 (63,)",
+    vertices_of_files_that_are_none: "file_vertices must name each of the vertices 0 to 63, or -1",
     codes_too_long: "training_codes must be real numbers (n, 3), not float64 (5, 4)",
 }
 

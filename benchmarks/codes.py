@@ -1,0 +1,91 @@
+"""How well and how fast codes are found: ``python -m benchmarks.codes``.
+
+Prints a Markdown row for each bundled model and task, in process and on one thread, of processor time. ``encode``:
+random codes to shapes, moved rigidly, and back. ``edit``: from a random code to another one's shape, by one to ten of
+its vertices.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+from threadpoolctl import threadpool_limits
+
+from service.bundle import read_bundle
+from service.correspondence import Matched
+from service.edit import Editor, Target
+from service.encode import Encoder
+from service.latent_space import Codes, Distribution
+from service.shape_model import MeshChoice, ShapeModel
+
+T = TypeVar("T")
+
+
+def timed(times: list[float], work: Callable[[], T]) -> T:
+    """Do something and note its processor time."""
+    began = time.process_time()
+    result = work()
+    times.append(time.process_time() - began)
+    return result
+
+
+def codes(model: ShapeModel, count: int, seed: int) -> Codes:
+    """Random codes (count, m) inside the bounds."""
+    return model.latents.sample(count, seed, Distribution.UNIFORM)
+
+
+def encode(model: ShapeModel, count: int) -> str:
+    """Errors of coordinates as fractions of their range."""
+    rng, shape_times, times, errors = np.random.default_rng(0), [], [], []
+    for code in codes(model, count, 0):
+        shape = timed(shape_times, lambda code=code: model.shape(code))
+        turn = Rotation.random(rng=rng).as_matrix()
+        moved = (shape.vertices @ turn + rng.normal(size=3)).astype(np.float32).astype(np.float64)
+        found = timed(times, lambda moved=moved: Encoder(model)(Matched(moved, MeshChoice.FINE)))
+        errors.append(np.abs(model.latents.shorter(found.code.astype(np.float64) - code)) / model.latents.width)
+    worst = np.median(errors, axis=0).max()
+    return (
+        f"median {np.median(errors):.4%}, of the worst coordinate {worst:.4%}; over 1 % in "
+        f"{(np.max(errors, axis=1) > 0.01).sum()} of {count} | {np.median(times) / np.median(shape_times):.1f}"
+    )
+
+
+def edit(model: ShapeModel, count: int) -> str:
+    """Largest distance from a target as a fraction of the diagonal."""
+    rng, shape_times, times, errors = np.random.default_rng(0), [], [], []
+    diagonal = model.manifest.scale * model.mesh(MeshChoice.FINE).diagonal
+    for k, (start, goal) in enumerate(zip(codes(model, count, 1), codes(model, count, 2), strict=True)):
+        vertices = timed(shape_times, lambda goal=goal: model.shape(goal)).vertices
+        chosen = rng.choice(len(vertices), (1, 3, 5, 10)[k % 4], replace=False)
+        targets = [Target(int(v), vertices[v].tolist()) for v in chosen]
+        found = timed(times, lambda start=start, targets=targets: Editor(model)(start, targets))
+        errors.append(found.distances.max() / diagonal)
+    return (
+        f"median {np.median(errors):.3%}, largest {np.max(errors):.3%}; over 1 % in "
+        f"{(np.array(errors) > 0.01).sum()} of {count} | {np.median(times) / np.median(shape_times):.1f}"
+    )
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--models", type=Path, default=Path("models"), help="folder of bundles")
+    parser.add_argument("--count", type=int, default=200, help="codes to encode; a fifth as many edits")
+    given = parser.parse_args()
+    print("| model | | error | time / that of one shape |\n|---|---|---|---|")
+    with threadpool_limits(1):
+        for path in sorted(given.models.glob("*/*")):
+            model = ShapeModel(read_bundle(path))
+            _ = model.grids  # made once a model
+            print(f"| {path.parent.name} | encode | {encode(model, given.count)} |", flush=True)
+            print(f"| {path.parent.name} | edit | {edit(model, max(1, given.count // 5))} |", flush=True)
+
+
+if __name__ == "__main__":
+    main()
