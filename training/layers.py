@@ -434,7 +434,7 @@ class KernelCorrection(nn.Module):
     #: Samples that the principal axes are taken from, at most.
     AXES = 500
     #: Variance that the basis of the correction keeps, and its largest rank.
-    ENERGY, RANK = 0.995, 400
+    ENERGY, RANK = 0.99, 400
 
     def __init__(self, factor_count: int, coefficients: int, size: int, anchors: int, rank: int) -> None:
         super().__init__()
