@@ -18,8 +18,10 @@ BEYOND_SCHEMAS = {
 
 
 #: Further ones of calls whose parts depend on each other, or on the model: a header on the body's length, the number of
-#: a vertex on the mesh, a file on its format.
+#: a vertex on the mesh, a file on its format, one time on another; `{k}` comes from a link that is a template.
 OF_CALLS = {
+    "/interpolations": {"invalid-request"},
+    "/{k}": {"invalid-request"},
     "/infer": {"invalid-request", "malformed-request"},
     "/edit": {"invalid-request"},
     "/encode": {kind for kind in KINDS if KINDS[kind].status in {400, 422}},

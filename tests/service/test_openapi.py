@@ -116,7 +116,7 @@ def test_examples_are_as_described_and_answered_as_described(served: Server, nam
 def test_schemathesis_finds_nothing(served: Server, tmp_path: Path) -> None:
     """Every check of schemathesis over every call; `make fuzz-api` takes more examples of each."""
     count = os.environ.get("FUZZ_EXAMPLES")
-    share = ["--max-examples", count] if count else ["--max-examples", "5", "--phases", "examples,fuzzing,stateful"]
+    share = ["--max-examples", count] if count else ["--max-examples", "10", "--phases", "examples,fuzzing,stateful"]
     found = subprocess.run(
         ["schemathesis", "run", f"{served.url}/openapi.json", "--no-color", *share],
         cwd=ROOT,
