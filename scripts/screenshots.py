@@ -16,10 +16,11 @@ FIGURE = f"#model=figure&z={POSE}"
 TORUS = "#model=freaky-torus&z=1,2,0.4,1"
 
 
-def drawn(page: Page, pictures: str, count: int) -> None:
+def drawn(page: Page, pictures: str) -> None:
     """Wait until the shape rests and small pictures are there."""
     page.wait_for_selector(".stage[data-shown]")
-    while page.locator(f"{pictures} canvas.drawn").count() < count:
+    page.wait_for_selector(f"{pictures} canvas.drawn")
+    while page.locator(f"{pictures} canvas:not(.drawn)").count():
         page.wait_for_timeout(100)
     page.wait_for_timeout(1500)
 
@@ -37,18 +38,18 @@ def main() -> None:
             return page
 
         page = open_page(FIGURE, viewport=desktop)
-        drawn(page, ".pictures", 60)
+        drawn(page, ".pictures")
         page.screenshot(path=DOCS / "page-desktop.png")
 
         page = open_page(f"{FIGURE}&keys={POSE};{OTHER}&colour=stretch", viewport=desktop, color_scheme="dark")
         page.get_by_role("tab", name="Path").click()
-        drawn(page, "#keyframes", 2)
+        drawn(page, "#keyframes")
         page.locator("#draw-strip").click()
-        drawn(page, "#strip", 50)
+        drawn(page, "#strip")
         page.screenshot(path=DOCS / "page-dark.png")
 
         page = open_page(TORUS, viewport=phone, device_scale_factor=2, is_mobile=True, has_touch=True)
-        drawn(page, ".pictures", 12)
+        drawn(page, ".pictures")
         page.screenshot(path=DOCS / "page-phone.png")
         browser.close()
 

@@ -21,7 +21,7 @@ export function inWords(diagnostics) {
 
 /** By the distance to the nearest training shape, in multiples of what these have from each other. */
 function plausible(distance) {
-  if (distance <= 1) return ["good", "As near to the training shapes as these are to each other."];
+  if (distance < 1.05) return ["good", "As near to the training shapes as these are to each other."];
   const times = `${readable(distance, 2)} times as far from the training shapes as these lie apart`;
   return distance <= 2 ? ["fair", `Unusual: ${times}.`] : ["poor", `Hardly plausible: ${times}.`];
 }
