@@ -19,16 +19,14 @@ from torch import Tensor, nn
 from geometry.mesh import Connectivity, FloatArray, TriangleMesh
 from training.config import CombinerSettings, LatentNetworkSettings
 from training.coordinates import Coordinates
+from training.corrections import KernelCorrection, PairwiseProducts, ridge_regression
 from training.layers import (
     EdgeConvolution,
     FourierProducts,
-    KernelCorrection,
     LatentFeatures,
-    PairwiseProducts,
     PatchBasis,
     Polynomials,
     perceptron,
-    ridge_regression,
 )
 
 

@@ -9,7 +9,8 @@ from torch import Tensor, nn
 
 from geometry.mesh import FloatArray, align
 from training.coordinates import Coordinates
-from training.layers import LatentFeatures, Polynomials, ridge_regression
+from training.corrections import ridge_regression
+from training.layers import LatentFeatures, Polynomials
 from training.learning import Learner
 
 DEGREE, RANK = 2, 32

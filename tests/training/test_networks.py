@@ -11,6 +11,7 @@ from geometry.mesh import Connectivity, TriangleMesh
 from geometry.nric import WeightedNorm, nric
 from training.config import CombinerSettings, LatentNetworkSettings
 from training.coordinates import Coordinates
+from training.corrections import ridge_regression
 from training.layers import (
     EdgeConvolution,
     FourierProducts,
@@ -18,7 +19,6 @@ from training.layers import (
     PatchBasis,
     Polynomials,
     flaps,
-    ridge_regression,
 )
 from training.networks import CombinerNetwork, FactorNetwork, Scaling, affine_sum, edge_midpoints
 

@@ -1,0 +1,187 @@
+"""What is fitted in closed form to what a sum of factors, or the convolutions after it, miss of a joint shape."""
+
+from __future__ import annotations
+
+import itertools
+
+import torch
+from torch import Tensor, nn
+
+#: Weights of the penalty that `ridge_regression` chooses from, as shares of the mean square of a feature.
+RIDGES = tuple(10.0**k for k in range(-6, 3))
+
+
+def ridge_regression(x: Tensor, y: Tensor, held_out: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
+    """The linear map from features x (n, p) to y (n, q) whose penalty suits held-out pairs best.
+
+    Features ought to have a mean square of about one.
+
+    Returns:
+        H (p, p) and B (p, q), whose product is the map; the columns of x H are orthonormal but for the penalty.
+    """
+    x, y = x.double(), y.double()
+    value, vector = torch.linalg.eigh(x.T @ x / len(x))
+    right, other = vector.T @ (x.T @ y / len(x)), held_out[0].double() @ vector
+
+    def error(ridge: float) -> float:
+        return float((other @ (right / (value + ridge)[:, None]) - held_out[1]).square().mean())
+
+    scale = (value.clamp_min(0) + min(RIDGES, key=error)).rsqrt()
+    return vector * scale, right * scale[:, None]
+
+
+class PairwiseProducts(nn.Module):
+    """A bilinear correction of the affine sum, (n, J, 2E) → (n, 2E), fitted by ridge regression.
+
+    Each factor is brought to a few principal coefficients; a linear map of low rank takes these and their products
+    between every two factors to scaled differences. What two factors do to each other is smooth and global where they
+    overlap widely, and there a few products do what many convolutions would.
+    """
+
+    centre: Tensor
+    axes: Tensor
+    weights: Tensor
+    basis: Tensor
+    #: Largest rank of the linear map.
+    RANK = 64
+
+    def __init__(self, factor_count: int, rank: int, size: int) -> None:
+        super().__init__()
+        self.pairs = list(itertools.combinations(range(factor_count), 2))
+        self.register_buffer("centre", torch.zeros(factor_count, size))
+        self.register_buffer("axes", torch.zeros(factor_count, size, rank))
+        features = 1 + factor_count * rank + len(self.pairs) * rank**2
+        self.register_buffer("weights", torch.zeros(features, min(features, self.RANK)))
+        self.register_buffer("basis", torch.zeros(min(features, self.RANK), size))
+
+    def _features(self, y: Tensor) -> Tensor:
+        c = torch.einsum("njs,jsr->njr", y - self.centre, self.axes)
+        products = [(c[:, i, :, None] * c[:, j, None, :]).flatten(1) for i, j in self.pairs]
+        return torch.cat([torch.ones_like(c[:, 0, :1]), c.flatten(1), *products], dim=1)
+
+    def fit(self, y: Tensor, residual: Tensor, held_out: tuple[Tensor, Tensor]) -> None:
+        """Fit axes and weights to factor shapes (n, J, 2E) and what the affine sum misses (n, 2E)."""
+        self.centre.copy_(y.mean(dim=0))
+        for j in range(y.shape[1]):
+            _, s, vt = torch.linalg.svd(y[:, j] - self.centre[j], full_matrices=False)
+            rank = min(self.axes.shape[2], len(s))
+            # Coefficients of unit variance, so that one ridge suits all products; those that are hardly there stay
+            # small, or they would be made of rounding errors.
+            self.axes[j, :, :rank] = (vt[:rank] / s[:rank, None].clamp_min(1e-2 * s[0]) * len(y) ** 0.5).T
+        h, b = ridge_regression(self._features(y), residual, (self._features(held_out[0]), held_out[1]))
+        # The map of low rank whose values on these samples are nearest to the whole one's.
+        strongest = torch.linalg.eigh(b @ b.T)[1][:, -len(self.basis) :]
+        self.weights.copy_(h @ strongest)
+        self.basis.copy_(strongest.T @ b)
+
+    def forward(self, y: Tensor) -> Tensor:
+        return self._features(y) @ self.weights @ self.basis
+
+
+class KernelCorrection(nn.Module):
+    """A smooth correction of the joint shape, (n, J, 2E) → (n, 2E): kernel ridge regression on the factors' shapes.
+
+    Two samples are as alike as their factors' shapes are near, ``exp(−½ Σ_j ‖x_j − x_j'‖² / (ℓ σ_j)²)`` with σ_j the
+    spread of factor j along its strongest direction. Each shape is brought to a few principal coefficients first. What
+    is predicted are principal coefficients of what is missed without it; a linear part says what happens far away from
+    all samples. Products of coefficients, two or three at a time, are among the functions that such a kernel spans, at
+    the weight that their smoothness deserves.
+    """
+
+    centre: Tensor
+    axes: Tensor
+    anchors: Tensor
+    gamma: Tensor
+    linear: Tensor
+    weights: Tensor
+    mean: Tensor
+    basis: Tensor
+    #: Samples that the kernel is centred at, at most; all of them decide the weights.
+    ANCHORS = 1600
+    #: Lengths ℓ, of which held-out samples choose one.
+    LENGTHS = (2.0, 4.0, 8.0, 16.0)
+    #: Samples that the principal axes are taken from, at most.
+    AXES = 500
+    #: Variance that the basis of the correction keeps, and its largest rank.
+    ENERGY, RANK = 0.99, 400
+
+    def __init__(self, factor_count: int, coefficients: int, size: int, anchors: int, rank: int) -> None:
+        super().__init__()
+        inputs = factor_count * coefficients
+        self.register_buffer("centre", torch.zeros(factor_count, size))
+        self.register_buffer("axes", torch.zeros(factor_count, size, coefficients))
+        self.register_buffer("anchors", torch.zeros(anchors, inputs))
+        self.register_buffer("gamma", torch.ones(()))
+        self.register_buffer("linear", torch.zeros(1 + inputs, rank))
+        self.register_buffer("weights", torch.zeros(anchors, rank))
+        self.register_buffer("mean", torch.zeros(size))
+        self.register_buffer("basis", torch.zeros(rank, size))
+
+    @classmethod
+    def blank(cls, tensors: dict[str, Tensor]) -> KernelCorrection:
+        """One of the sizes of a saved one, to load it into; ``tensors`` are the saved one's, by their own names."""
+        (factors, size, coefficients), anchors = tensors["axes"].shape, len(tensors["anchors"])
+        return cls(factors, coefficients, size, anchors, len(tensors["basis"]))
+
+    @classmethod
+    def fit(cls, coefficients: int, y: Tensor, residual: Tensor, held_out: tuple[Tensor, Tensor]) -> KernelCorrection:
+        """Fit to factor shapes (n, J, 2E) and what is missed so far (n, 2E), both as scaled differences."""
+        mean = residual.mean(dim=0)
+        _, s, vt = torch.linalg.svd((residual - mean)[: 3 * cls.RANK], full_matrices=False)
+        energy = s.square().cumsum(0)
+        rank = min(int((energy < cls.ENERGY * energy[-1]).sum()) + 1, cls.RANK)
+        anchors = min(len(y), cls.ANCHORS)
+        result = cls(y.shape[1], coefficients, y.shape[2], anchors, rank)
+        result.mean.copy_(mean)
+        result.basis.copy_(vt[:rank])
+        result.centre.copy_(y.mean(dim=0))
+        for j in range(y.shape[1]):
+            some = y[: cls.AXES, j] - result.centre[j]
+            _, s, vt = torch.linalg.svd(some, full_matrices=False)
+            count = min(coefficients, len(s))
+            result.axes[j, :, :count] = vt[:count].T * (len(some) ** 0.5 / s[0].clamp_min(1e-12))
+        result._fit_weights(y, residual, held_out)
+        return result
+
+    def _fit_weights(self, y: Tensor, residual: Tensor, held_out: tuple[Tensor, Tensor]) -> None:
+        pairs = [
+            (self._inputs(factors), ((shape - self.mean) @ self.basis.T).double())
+            for factors, shape in ((y, residual), held_out)
+        ]
+        self.anchors.copy_(pairs[0][0][: len(self.anchors)])
+        best = float("inf")
+        for length in self.LENGTHS:
+            gamma = torch.tensor(0.5 / length**2)
+            # Columns of the kernel made orthonormal at the anchors (Nyström), so that one ridge suits them all.
+            value, vector = torch.linalg.eigh(self._kernel(self.anchors, gamma))
+            kept = value > 1e-7 * value[-1]
+            white = vector[:, kept] * value[kept].rsqrt()
+            (x, target), (other, wanted) = (
+                (torch.cat([_affine(c).double(), self._kernel(c, gamma) @ white * len(white) ** 0.5], dim=1), goal)
+                for c, goal in pairs
+            )
+            h, b = ridge_regression(x, target, (other, wanted))
+            solution = h @ b
+            error = float((other @ solution - wanted).square().mean())
+            if error < best:
+                best, split = error, self.linear.shape[0]
+                self.gamma.copy_(gamma)
+                self.linear.copy_(solution[:split])
+                self.weights.copy_(white @ solution[split:] * len(white) ** 0.5)
+
+    def _inputs(self, y: Tensor) -> Tensor:
+        return torch.einsum("njs,jsr->njr", y - self.centre, self.axes).flatten(1)
+
+    def _kernel(self, inputs: Tensor, gamma: Tensor) -> Tensor:
+        """(n, anchors), in double precision: used to fit."""
+        return torch.exp(-gamma.double() * torch.cdist(inputs.double(), self.anchors.double()).square())
+
+    def forward(self, y: Tensor) -> Tensor:
+        c = self._inputs(y)
+        squares = c.square().sum(dim=1, keepdim=True) - 2 * c @ self.anchors.T + self.anchors.square().sum(dim=1)
+        coefficients = _affine(c) @ self.linear + torch.exp(-self.gamma * squares) @ self.weights
+        return self.mean + coefficients @ self.basis
+
+
+def _affine(x: Tensor) -> Tensor:
+    return torch.cat([torch.ones_like(x[:, :1]), x], dim=1)
