@@ -129,6 +129,6 @@ def test_the_address_restores_everything(studio: Studio, window: Open) -> None:
 
     # Back in the first window, by hand in the address bar.
     studio.page.evaluate("location.hash = '#model=with-fine&z=0.05,0,0'")
-    studio.until_code([0.05, 0, 0])
+    studio.eventually(lambda: studio.coordinate(0).locator("input[type=number]").input_value() == "0.05")
     assert studio["#keyframes > li"].count() == 0
     assert studio["#wireframe"].get_attribute("aria-pressed") == "false"
