@@ -221,8 +221,10 @@ def _read_trimesh(data: bytes, format: str | None, beside: Path | None) -> tuple
             **options,
         )
     meshes = [g for g in scene.geometry.values() if isinstance(g, trimesh.Trimesh)]
+    if not meshes:  # where it can guess encodings, trimesh takes broken binary data for text that says nothing
+        raise MeshError(f"not a readable {format} file: damaged, or without a mesh")
     # A glTF mesh has a primitive for each of its materials.
-    if len(meshes) != 1 and not (meshes and all(m.metadata.get("from_gltf_primitive") for m in meshes)):
+    if len(meshes) != 1 and not all(m.metadata.get("from_gltf_primitive") for m in meshes):
         raise MeshError(f"holds {len(meshes)} meshes; a file needs exactly one")
     mesh = scene.to_mesh()
     return np.asarray(mesh.vertices), np.asarray(mesh.faces)
