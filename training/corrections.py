@@ -30,6 +30,12 @@ def ridge_regression(x: Tensor, y: Tensor, held_out: tuple[Tensor, Tensor]) -> t
     return vector * scale, right * scale[:, None]
 
 
+def low_rank(h: Tensor, b: Tensor, rank: int) -> tuple[Tensor, Tensor]:
+    """The map of low rank, as two factors, whose values are nearest to those of ``h b`` from `ridge_regression`."""
+    strongest = torch.linalg.eigh(b @ b.T)[1][:, -rank:]
+    return h @ strongest, strongest.T @ b
+
+
 class PairwiseProducts(nn.Module):
     """A bilinear correction of the affine sum, (n, J, 2E) → (n, 2E), fitted by ridge regression.
 
@@ -69,10 +75,9 @@ class PairwiseProducts(nn.Module):
             # small, or they would be made of rounding errors.
             self.axes[j, :, :rank] = (vt[:rank] / s[:rank, None].clamp_min(1e-2 * s[0]) * len(y) ** 0.5).T
         h, b = ridge_regression(self._features(y), residual, (self._features(held_out[0]), held_out[1]))
-        # The map of low rank whose values on these samples are nearest to the whole one's.
-        strongest = torch.linalg.eigh(b @ b.T)[1][:, -len(self.basis) :]
-        self.weights.copy_(h @ strongest)
-        self.basis.copy_(strongest.T @ b)
+        weights, basis = low_rank(h, b, len(self.basis))
+        self.weights.copy_(weights)
+        self.basis.copy_(basis)
 
     def forward(self, y: Tensor) -> Tensor:
         return self._features(y) @ self.weights @ self.basis

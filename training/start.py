@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from geometry.mesh import FloatArray, align
 from training.coordinates import Coordinates
-from training.corrections import ridge_regression
+from training.corrections import low_rank, ridge_regression
 from training.layers import LatentFeatures, Polynomials
 from training.learning import Learner
 
@@ -48,10 +48,9 @@ class StartNetwork(nn.Module):
             return self.polynomials(self.features(latents)), torch.as_tensor(offsets).flatten(1)
 
         h, b = ridge_regression(*pair(latents, vertices), pair(*held_out))
-        # The map of low rank whose values on these samples are nearest to the whole one's.
-        strongest = torch.linalg.eigh(b @ b.T)[1][:, -len(self.basis) :]
-        self.weights.copy_(h @ strongest)
-        self.basis.copy_(strongest.T @ b)
+        weights, basis = low_rank(h, b, len(self.basis))
+        self.weights.copy_(weights)
+        self.basis.copy_(basis)
 
     def forward(self, latent: Tensor) -> Tensor:  # noqa: D102 - see the class
         offsets = self.polynomials(self.features(latent)) @ self.weights @ self.basis
