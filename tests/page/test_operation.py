@@ -27,7 +27,7 @@ def test_the_models_and_their_cards(studio: Studio) -> None:
     studio.page.keyboard.press("Escape")
     small = studio.picture()
     studio["#model"].select_option("Figure")
-    studio.eventually(lambda: studio.hash["model"] == "figure" and studio[".factor"].count() > 3)
+    studio.eventually(lambda: studio.hash.get("model") == "figure" and studio[".factor"].count() > 3)
     studio.until_different(small, 0.02)
     assert studio["#undo"].is_disabled()
     assert "Figure" in studio.page.title()

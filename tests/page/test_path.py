@@ -92,9 +92,9 @@ def test_keyframes_can_be_visited_replaced_and_removed(studio: Studio) -> None:
     studio.page.get_by_role("button", name="Go to keyframe 1").click()
     studio.until_code([0, 0, 0])
     studio.page.get_by_role("button", name="Take the shape as it is for keyframe 2").click()
-    studio.eventually(lambda: studio.hash["keys"] == "0,0,0;0,0,0;0.2,1,0")
+    studio.eventually(lambda: studio.hash.get("keys") == "0,0,0;0,0,0;0.2,1,0")
     studio.page.get_by_role("button", name="Remove keyframe 1").click()
-    studio.eventually(lambda: studio.hash["keys"] == "0,0,0;0.2,1,0")
+    studio.eventually(lambda: studio.hash.get("keys") == "0,0,0;0.2,1,0")
     assert studio["#keyframes > li"].count() == 2
 
 
@@ -127,7 +127,7 @@ def test_colours_by_stretch_and_bending(studio: Studio) -> None:
     studio.page.get_by_label("bending").check()
     studio.eventually(lambda: studio["#legend .title"].inner_text().startswith("Bending"))
     assert max(map(abs, numbers(studio))) < 0.1
-    studio.eventually(lambda: studio.hash["colour"] == "bending")
+    studio.eventually(lambda: studio.hash.get("colour") == "bending")
 
     studio.tab("Path")
     studio["#add-keyframe"].click()
