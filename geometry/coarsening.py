@@ -24,7 +24,7 @@ HEALING_SHARE = 0.1
 QUADRIC_SHAPES = 16
 #: Weight of a plane across the boundary, and of the squared distance that the vertex moves, against that of
 #: the planes of the faces.
-BOUNDARY_WEIGHT, MOTION_WEIGHT = 10.0, 1e-2
+BOUNDARY_WEIGHT, MOTION_WEIGHT = 10.0, 1.0
 
 _Face = tuple[int, int, int]
 _Pairs = list[tuple[int, int]]

@@ -75,12 +75,18 @@ class SampleSettings(_Section):
     steps: int = Field(16, ge=2)
     """K of the exponentials."""
     factor_counts: list[int] | int | None = None
-    """Samples of each factor alone; None takes the factor's part of the joint codes, as the paper does."""
+    """Samples of each factor alone, at its part of the first codes; where there are more than ``count``, further codes
+    are drawn for the factor only. None takes as many as there are joint ones, as the paper does."""
     part_size: int = Field(50, ge=1)
     test_fraction: float = Field(0.2, gt=0, lt=1)
     validation_fraction: float = Field(0.1, gt=0, lt=1)
     """Part of the training codes that chooses the learning rate and the best epoch."""
     seed: int = 0
+
+    def own(self, factors: int) -> list[int]:
+        """Samples of each factor alone."""
+        counts = self.count if self.factor_counts is None else self.factor_counts
+        return counts if isinstance(counts, list) else [counts] * factors
 
 
 class FitSettings(_Section):
@@ -142,7 +148,8 @@ class NetworkSettings(_Section):
     combiner: CombinerSettings = CombinerSettings()
     seed: int = 0
     fractions: list[Annotated[float, Field(gt=0, lt=1)]] = []
-    """Shares of the training samples to learn from as well, for the study of their number."""
+    """Shares of the training codes to learn from as well, for the study of their number: each once with the factors'
+    parts of these codes only, as the paper does, and once with all the samples of the factors."""
     seeds: list[int] = []
     """Further seeds, of split and networks, to learn with as well, for the spread of the figures."""
 

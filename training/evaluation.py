@@ -204,13 +204,21 @@ def evaluate(
             name: {"title": config.variants[name].title, "r2": network_score(variant)}
             for name, variant in whole.variants().items()
         },
+        "exponentials": whole.exponentials(),
         "fractions": [
             {
                 "fraction": fraction,
                 "training_samples": len(some.rows["train"]),
-                "r2": {"composite": network_score(some.main()), "monolithic": network_score(some.monolithic())},
+                "exponentials": {"composite": some.exponentials(), "all of factors": free.exponentials()},
+                "r2": {
+                    "composite": network_score(some.main()),
+                    "all of factors": network_score(free.main()),
+                    "monolithic": network_score(some.monolithic()),
+                },
             }
-            for fraction, some in ((f, learner(fraction=f)) for f in config.networks.fractions)
+            for fraction, some, free in (
+                (f, learner(fraction=f), learner(fraction=f, all_of_factors=True)) for f in config.networks.fractions
+            )
         ],
         "seeds": [_other_seed(learner(seed=seed), norm) for seed in config.networks.seeds],
         "vertex_error": found.figures(),
@@ -234,13 +242,13 @@ def _other_seed(learner: Learner, norm: WeightedNorm) -> dict[str, Any]:
 def _exact_factor(learner: Learner, j: int, exact: Callable[[str, FloatArray], NDArray]) -> NDArray[np.float32]:
     """Exact shapes (n, 2E) of a factor's part alone of the test codes, NaN where there is none."""
     index, test = list(learner.collection.factors.values())[j], learner.split["test"]
-    if learner.config.samples.factor_counts is not None:
-        return exact(f"factor-{j}", alone(learner.joint.latents[test], index))
-    samples = learner.factor_samples(j)
+    codes, samples = learner.joint.index[test], learner.factor_samples(j)
     result = np.full((len(test), samples.nric.shape[1]), np.nan, dtype=np.float32)
-    rows = np.searchsorted(samples.index, learner.joint.index[test])
-    there = np.isin(learner.joint.index[test], samples.index)
-    result[there] = samples.nric[rows[there]]
+    there = np.isin(codes, samples.index)
+    result[there] = samples.nric[np.searchsorted(samples.index, codes[there])]
+    beyond = codes >= learner.config.samples.own(len(learner.collection.factors))[j]
+    if beyond.any():
+        result[beyond] = exact(f"factor-{j}", alone(learner.joint.latents[test[beyond]], index))
     return result
 
 

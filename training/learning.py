@@ -69,8 +69,9 @@ class Learner:
         config: of the run.
         folder: of the run.
         data_key: names the samples.
-        fraction: share of the training samples, joint and of factors, to learn from. With less the number of epochs
-            grows, so that the number of steps stays.
+        fraction: share of the training codes to learn from. With less the number of epochs grows, so that the number of
+            steps stays.
+        all_of_factors: whether the factors learn from all of their own samples all the same.
         seed: of the networks, by default the configuration's; another one splits the samples anew too.
     """
 
@@ -81,11 +82,13 @@ class Learner:
         folder: Path,
         data_key: str,
         fraction: float = 1.0,
+        all_of_factors: bool = False,
         seed: int | None = None,
     ) -> None:
         self.collection, self.config, self.run = collection, config, folder
         self.seed = config.networks.seed if seed is None else seed
         self._data_key, self._fraction = data_key, fraction
+        self._factor_fraction = 1.0 if all_of_factors else fraction
         (folder / "networks").mkdir(exist_ok=True)
         self.histories: dict[str, Any] = {}
 
@@ -108,8 +111,8 @@ class Learner:
         reference = self.collection.reference
         return nric(reference.vertices, reference.connectivity)
 
-    def _path(self, kind: str, *settings: BaseModel) -> Path:
-        decides = [self._data_key, self._fraction, self.seed]
+    def _path(self, kind: str, fractions: Sequence[float], *settings: BaseModel) -> Path:
+        decides = [self._data_key, fractions, self.seed]
         text = json.dumps([*decides, [s.model_dump(mode="json") for s in settings]])
         return self.run / "networks" / f"{kind}-{hashlib.sha256(text.encode()).hexdigest()[:12]}.safetensors"
 
@@ -118,19 +121,15 @@ class Learner:
 
     @property
     def rows(self) -> dict[str, IntArray]:
-        """The split, with the share of it to learn from."""
-        return self._some(self.split)
-
-    def _some(self, rows: dict[str, IntArray]) -> dict[str, IntArray]:
-        """The share of the rows to learn from. Codes are independent, so the first ones are as good as any."""
+        """The split, with the share of it to learn from. Codes are independent, so the first are as good as any."""
         return {
             name: index if name == "test" else index[: max(4, round(self._fraction * len(index)))]
-            for name, index in rows.items()
+            for name, index in self.split.items()
         }
 
     def _fit(
         self, network: ShapeNetwork, inputs: Tensor, z: NDArray, rows: dict[str, IntArray], fitting: FitSettings,
-        path: Path,
+        path: Path, fraction: float,
     ) -> dict[str, Any]:  # fmt: skip
         title = path.stem.rpartition("-")[0]
         return fit(
@@ -139,7 +138,7 @@ class Learner:
             torch.from_numpy(z),
             torch.from_numpy(rows["train"]),
             torch.from_numpy(rows["validation"]),
-            fitting.model_copy(update={"max_epochs": round(fitting.max_epochs / self._fraction)}),
+            fitting.model_copy(update={"max_epochs": round(fitting.max_epochs / fraction)}),
             path,
             title,
             self.seed,
@@ -154,7 +153,7 @@ class Learner:
         self.histories[path.stem] = {k: state[k] for k in ("epoch", "best", "history")}
 
     def _latent_network(
-        self, kind: type[FactorNetwork], settings: LatentNetworkSettings, index: list[int], path: Path,
+        self, kind: type[FactorNetwork], settings: LatentNetworkSettings, index: list[int], path: Path, fraction: float,
         data: Callable[[], tuple[Samples, dict[str, IntArray]]],
     ) -> FactorNetwork:  # fmt: skip
         coordinates = self.collection.coordinates[index]
@@ -166,7 +165,6 @@ class Learner:
             return network
         torch.manual_seed(self.seed)
         samples, rows = data()
-        rows = self._some(rows)
         train = rows["train"]
         scaling = self._scaling(samples.nric[train])
         basis_fitted = None
@@ -182,7 +180,7 @@ class Learner:
                 for part in (train, rows["validation"])
             ]
             network.fit_skip(*pairs[0], pairs[1])
-        self._record(path, self._fit(network, latents, samples.nric, rows, settings.fit, path))
+        self._record(path, self._fit(network, latents, samples.nric, rows, settings.fit, path, fraction))
         return network
 
     def factor_samples(self, j: int) -> Samples:
@@ -190,23 +188,31 @@ class Learner:
         return read(self.run / "samples" / f"factor-{j}")
 
     def factor(self, j: int, settings: LatentNetworkSettings) -> FactorNetwork:
-        """ψ_j, on the factor's own samples, or on the joint ones' subvectors where there are no others."""
+        """ψ_j, on the factor's own samples; parts of test codes are never among them."""
         index = list(self.collection.factors.values())[j]
 
         def data() -> tuple[Samples, dict[str, IntArray]]:
             samples = self.factor_samples(j)
-            if self.config.samples.factor_counts is not None:
-                count = len(samples.latents)
-                held_out = round(self.config.samples.validation_fraction * count)
-                return samples, {"validation": np.arange(held_out), "train": np.arange(held_out, count)}
-            # One sample of the factor for each joint sample, in the same order: the same split keeps test codes out.
-            rows = {
-                name: np.flatnonzero(np.isin(samples.index, self.joint.index[part]))
-                for name, part in self.split.items()
-            }
-            return samples, rows
+            return samples, self.factor_rows(samples.index)
 
-        return self._latent_network(FactorNetwork, settings, index, self._path(f"factor-{j}", settings), data)
+        path = self._path(f"factor-{j}", [self._factor_fraction], settings)
+        return self._latent_network(FactorNetwork, settings, index, path, self._factor_fraction, data)
+
+    def factor_rows(self, index: IntArray) -> dict[str, IntArray]:
+        """Which of a factor's samples, at codes of this index, it learns from and is chosen by."""
+        rows = self.rows if self._factor_fraction < 1 else self.split
+        held_out = np.isin(index, self.joint.index[rows["validation"]])
+        if self._factor_fraction < 1:
+            train = np.isin(index, self.joint.index[rows["train"]])
+        else:
+            # Codes beyond the joint ones, and those that have no joint shape, are the factor's own.
+            train = ~np.isin(index, self.joint.index[np.concatenate([rows["test"], rows["validation"]])])
+        return {"train": np.flatnonzero(train), "validation": np.flatnonzero(held_out)}
+
+    def exponentials(self) -> int:
+        """Samples that the composite is learned from and chosen by, joint ones and those of the factors."""
+        own = (self.factor_rows(self.factor_samples(j).index) for j in range(len(self.collection.factors)))
+        return sum(len(rows[part]) for rows in (self.rows, *own) for part in ("train", "validation"))
 
     def composite(
         self, factors: Sequence[LatentNetworkSettings] | LatentNetworkSettings, combiner: CombinerSettings
@@ -216,7 +222,8 @@ class Learner:
             factors = [factors] * len(self.collection.factors)
         networks = [self.factor(j, settings) for j, settings in enumerate(factors)]
         torch.manual_seed(self.seed)
-        path = self._path("combiner", combiner, *factors)
+        fractions = [self._fraction, self._factor_fraction]
+        path = self._path("combiner", fractions, combiner, *factors)
         saved = finished(path)
         scaling = Scaling.blank(len(self._reference)) if saved else self._scaling(self.joint.nric[self.rows["train"]])
         network = CombinerNetwork(combiner, self.collection.reference.connectivity, scaling, len(networks))
@@ -229,10 +236,10 @@ class Learner:
         if combiner.symmetries:
             inputs, z, rows = self._with_images(inputs, rows)
         own, other = ((inputs[part], torch.from_numpy(z[part])) for part in (rows["train"], rows["validation"]))
-        convolutions = self._path("convolutions", combiner, *factors) if combiner.kernel else path
+        convolutions = self._path("convolutions", fractions, combiner, *factors) if combiner.kernel else path
         if not convolutions.exists():
             network.fit_pairwise(*own, other)
-        state = self._fit(network, inputs, z, rows, combiner.fit, convolutions)
+        state = self._fit(network, inputs, z, rows, combiner.fit, convolutions, self._fraction)
         if combiner.kernel:
             # Last, because on the samples it has learned from it leaves too little for others to learn.
             network.fit_kernel(*own, other, combiner.kernel)
@@ -266,6 +273,7 @@ class Learner:
         """The fully connected baseline on the joint samples."""
         settings = self.config.monolithic
         index = list(range(len(self.collection.coordinates)))
+        path = self._path("monolithic", [self._fraction], settings)
         return self._latent_network(
-            MonolithicNetwork, settings, index, self._path("monolithic", settings), lambda: (self.joint, self.split)
+            MonolithicNetwork, settings, index, path, self._fraction, lambda: (self.joint, self.rows)
         )

@@ -249,6 +249,22 @@ def spga(
     return problem.modes(D, converged, history)
 
 
+def projected(space: ShellSpace, mean: FloatArray, fields: FloatArray, span: FloatArray) -> tuple[FloatArray, float]:
+    """The parts (n, V, 3) of fields (n, V, 3) in the span of others (k, V, 3), orthogonal in the metric.
+
+    Returns:
+        The parts, and the share of ``Σ ‖v^i‖_g²`` that they keep.
+
+    Raises:
+        ModeError: fields that can't be used.
+    """
+    problem = _Problem(space, mean, fields, 1)
+    D = without_rigid_motion(span, problem.point.vertices).reshape(len(span), -1)
+    B = D @ problem.MD
+    W = np.linalg.lstsq(D @ (problem.M @ D.T), B, rcond=NEGLIGIBLE)[0]
+    return (W.T @ D).reshape(fields.shape), float(np.vdot(W, B)) / problem.total
+
+
 def edge_magnitudes(nric: FloatArray, norm: WeightedNorm) -> FloatArray:
     """How much each edge (…, E) has of a change (…, 2E) of lengths and angles, in a weighted norm."""
     lengths, angles = np.split(nric**2 * norm.squared, 2, axis=-1)

@@ -112,27 +112,19 @@ def samples(run: Run) -> None:
     """samples/: joint codes with their shapes, each factor's own, and the split."""
     settings, coordinates = run.config.samples, run.collection.coordinates
     folder = run.folder / "samples"
-    # Independent streams: more samples of one kind don't change another's.
-    joint_rng, split_rng, *factor_rngs = (
-        np.random.default_rng(s) for s in np.random.SeedSequence(settings.seed).spawn(2 + len(run.collection.factors))
-    )
-    joint = coordinates.uniform(settings.count, joint_rng)
-    _draw(run, folder, joint, "joint samples")
-    for j, (index, rng) in enumerate(zip(run.collection.factors.values(), factor_rngs, strict=True)):
-        counts = settings.factor_counts
-        if counts is None:
-            own = alone(joint, index)
-        else:
-            own = np.zeros((counts if isinstance(counts, int) else counts[j], len(coordinates)))
-            own[:, index] = coordinates[index].uniform(len(own), rng)
-        _draw(run, folder / f"factor-{j}", own, f"samples of factor {j}")
+    code_rng, split_rng = (np.random.default_rng(s) for s in np.random.SeedSequence(settings.seed).spawn(2))
+    own = settings.own(len(run.collection.factors))
+    codes = coordinates.uniform(max(settings.count, *own), code_rng)
+    _draw(run, folder, codes[: settings.count], "joint samples")
+    for j, (index, count) in enumerate(zip(run.collection.factors.values(), own, strict=True)):
+        _draw(run, folder / f"factor-{j}", alone(codes[:count], index), f"samples of factor {j}")
     there = read(folder).index
     write_npz(folder / "split.npz", **split(there, settings.test_fraction, settings.validation_fraction, split_rng))
 
 
-def learner_of(run: Run, fraction: float = 1.0, seed: int | None = None) -> Learner:
+def learner_of(run: Run, **how: Any) -> Learner:
     """The networks of a run whose samples are there, learned from a share of them, or with another seed."""
-    return Learner(run.collection, run.config, run.folder, run.stamp("samples")["key"], fraction, seed)
+    return Learner(run.collection, run.config, run.folder, run.stamp("samples")["key"], **how)
 
 
 def networks(run: Run) -> None:
@@ -142,9 +134,15 @@ def networks(run: Run) -> None:
     learner.monolithic()
     learner.variants()
     histories = learner.histories
-    more = [learner_of(run, fraction) for fraction in run.config.networks.fractions]
-    more += [learner_of(run, seed=seed) for seed in run.config.networks.seeds]
-    for learner in more:
+    for fraction in run.config.networks.fractions:
+        learner = learner_of(run, fraction=fraction)
+        learner.main()
+        learner.monolithic()
+        free = learner_of(run, fraction=fraction, all_of_factors=True)
+        free.main()
+        histories |= learner.histories | free.histories
+    for seed in run.config.networks.seeds:
+        learner = learner_of(run, seed=seed)
         learner.main()
         learner.monolithic()
         histories |= learner.histories

@@ -61,6 +61,33 @@ def test_a_run_leaves_what_the_contract_promises(tiny_run: Path) -> None:
     assert all(e["time"] for e in events)
 
 
+def test_no_factor_learns_from_parts_of_test_codes(tiny_run: Path) -> None:
+    run = Run(tiny_run, *load(tiny_run / "config.toml"), tiny_run / "models")
+    learner, half, free = (
+        learner_of(run, **how) for how in ({}, {"fraction": 0.5}, {"fraction": 0.5, "all_of_factors": True})
+    )
+    joint = {name: learner.joint.index[rows] for name, rows in learner.split.items()}
+    with (
+        np.load(tiny_run / "samples" / "factor-2" / "part-00001.npz") as part,
+        np.load(tiny_run / "samples" / "part-00001.npz") as other,
+    ):
+        np.testing.assert_array_equal(part["latents"][:, 2:], other["latents"][:, 2:])
+    total = {learner: len(joint["train"]) + len(joint["validation"]), half: 22 + 4, free: 22 + 4}
+    for count in (40, 40, 120):
+        index = np.arange(count)
+        rows = {name: set(index[chosen]) for name, chosen in learner.factor_rows(index).items()}
+        assert rows["train"] == set(index) - set(joint["test"]) - set(joint["validation"])
+        assert rows["validation"] == set(index) & set(joint["validation"])
+        some = {name: set(index[chosen]) for name, chosen in half.factor_rows(index).items()}
+        assert some["train"] == set(index) & set(joint["train"][:22])
+        assert free.factor_rows(index)["train"].tolist() == learner.factor_rows(index)["train"].tolist()
+        for each, parts in ((learner, rows), (half, some), (free, rows)):
+            total[each] += len(parts["train"]) + len(parts["validation"])
+    assert {each: each.exponentials() for each in total} == total
+    figures = json.loads((tiny_run / "evaluation.json").read_text())
+    assert figures["exponentials"] == learner.exponentials()
+
+
 def test_the_bundle_is_one_the_server_takes_and_computes_the_same(tiny_run: Path) -> None:
     folder = tiny_run / "models" / "tiny-torus" / "1"
     bundle = read_bundle(folder)
