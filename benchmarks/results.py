@@ -1,52 +1,178 @@
 """docs/results.md: every collection from its meshes to the figures of the paper's tables, in one command.
 
-Each collection is a run of its own under ``--out``, so that what is done is not done again, and a killed call goes on
-where it was. The bundles go beside the runs: they hold the collections' geometry.
+Each collection is a run of its own under ``--out``, so what is done is not done again, and a killed call goes on where
+it was. Bundles are written beside the runs: they hold the collections' geometry.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Callable
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import jinja2
+import matplotlib.pyplot as plt
 import numpy as np
 
 from benchmarks import limits, space
-from training.config import Config, load
+from training.config import load
 from training.files import write_json
 from training.pipeline import Run, execute, learner_of
+from training.sampling import DONE
 
-ROOT = Path(__file__).parents[1]
-CONFIGS = ROOT / "examples"
-#: Collections of real meshes, in the order of the tables.
+ROOT = Path(__file__).resolve().parents[1]
+#: Collections of real meshes, in the order of the tables; then the hand without what the method rests on.
 COLLECTIONS = ("hand", "faces", "samba", "makehuman", "horse", "hippocampus")
+CONTRASTS = ("hand-pga", "hand-one-factor")
 #: Models of our own, whose runs leave the bundles that are committed.
 OWN = ("freaky-torus", "figure")
-#: The hand once more without what the method rests on.
-CONTRASTS = ("hand-pga", "hand-one-factor")
-SPECIAL = {"limits": ("hand", "samba")}
+#: Runs whose extrapolation is measured: one that is easy and one that isn't.
+EXTRAPOLATED = ("hand", "samba")
 
 
 class Row:
     """A run with everything that was measured on it."""
 
     def __init__(self, name: str, run: Run) -> None:
-        self.name, self.run = name, run
+        self.name, self.run, self.config = name, run, run.config
 
-    def __getattr__(self, name: str) -> Any:
-        """What a stage or a study left as JSON: ``ingest``, ``modes``, ``factors``, ``evaluation``, ``space``, ``limits``."""
+    def read(self, name: str) -> Any:
+        """What a stage or a study left as JSON, or None."""
         path = self.run.folder / f"{name}.json"
-        if not path.exists():
-            raise AttributeError(name)
-        value = json.loads(path.read_text())
-        setattr(self, name, value)
-        return value
+        return json.loads(path.read_text()) if path.exists() else None
+
+    @cached_property
+    def evaluation(self) -> dict[str, Any]:
+        """Of the networks."""
+        return dict(self.read("evaluation"))
+
+    @cached_property
+    def sizes(self) -> list[int]:
+        """Modes of each factor."""
+        return [len(members) for members in self.read("factors")["factors"]]
+
+    @cached_property
+    def samples(self) -> dict[str, int]:
+        """Exponentials drawn: ``joint`` and of the ``factors``, and how many of each ``failed``."""
+        found = {"joint": 0, "factors": 0, "joint failed": 0, "factors failed": 0}
+        for path in (self.run.folder / "samples").rglob("part-*.npz"):
+            with np.load(path) as part:
+                kind = "joint" if path.parent.name == "samples" else "factors"
+                found[kind] += len(part["status"])
+                found[f"{kind} failed"] += int((part["status"] != DONE).sum())
+        return found
+
+    def seconds(self, stage: str) -> float:
+        """That a stage took."""
+        return float(self.run.stamp(stage)["seconds"])
+
+    def spread(self, model: str) -> tuple[float, float, float]:
+        """R² of a model over the seeds: mean, smallest, largest."""
+        values = [r2[model]["total"] for r2 in (self.evaluation["r2"], *(s["r2"] for s in self.evaluation["seeds"]))]
+        return sum(values) / len(values), min(values), max(values)
+
+    @cached_property
+    def localisation(self) -> tuple[float, float]:
+        """Share of the edges that carry 95 % of a mode's energy, mean over modes of PGA and of SPGA."""
+        with np.load(self.run.folder / "modes.npz") as modes:
+            return float(modes["pga_localisation"].mean()), float(modes["localisation"].mean())
+
+    @cached_property
+    def overlaps(self) -> tuple[float, float]:
+        """Of supports of different factors: mean and largest."""
+        shared = np.array(self.read("factors")["overlap"])
+        apart = shared[~np.eye(len(shared), dtype=bool)]
+        return (float(apart.mean()), float(apart.max())) if len(apart) else (0.0, 0.0)
 
 
-def config_path(name: str) -> Path:
-    """Of a collection or of a model of our own."""
-    return CONFIGS / f"{name}.toml" if name in OWN else CONFIGS / "collections" / f"{name}.toml"
+def open_run(name: str, data: Path, out: Path) -> Run:
+    """The run of a collection, or of a model of our own."""
+    if name in OWN:
+        path, folder, models = ROOT / "examples" / f"{name}.toml", ROOT / "runs" / name, ROOT / "models"
+        return Run(folder, *load(path), models)
+    path = ROOT / "examples" / "collections" / f"{name}.toml"
+    relative = load(path)[0].collection.data
+    assert relative is not None
+    return Run(out / name, *load(path, data / relative.relative_to(path.parent)), out / "models")
+
+
+def study(name: str, run: Run) -> None:
+    """Everything of one run that isn't there yet."""
+    print(f"\n{name}")
+    execute(run, "evaluation" if name in CONTRASTS else None)
+    if name in COLLECTIONS and not (run.folder / "space.json").exists():
+        print("space …")
+        write_json(run.folder / "space.json", space.measure(run.folder, run.config))
+    if name in EXTRAPOLATED and not (run.folder / "limits.json").exists():
+        print("limits …")
+        write_json(run.folder / "limits.json", {"extrapolation": limits.extrapolation(learner_of(run))})
+
+
+def plot_samples(rows: list[Row], path: Path) -> None:
+    """R² by the share of the samples, of the three ways to learn from them."""
+    figure, axes = plt.subplots(1, len(rows), figsize=(2.4 * len(rows), 2.6), sharey=True, layout="constrained")
+    for axis, row in zip(axes, rows, strict=True):
+        whole = {"fraction": 1.0, "r2": row.evaluation["r2"] | {"all of factors": row.evaluation["r2"]["composite"]}}
+        every = sorted([whole, *row.evaluation["fractions"]], key=lambda each: each["fraction"])
+        at = [100 * each["fraction"] for each in every]
+        for model, style in (("composite", "o-"), ("all of factors", "s--"), ("monolithic", "^:")):
+            label = {"all of factors": "composite, all factor samples"}.get(model, model)
+            axis.plot(at, [1 - each["r2"][model]["total"] for each in every], style, label=label)
+        axis.set(title=row.name, xscale="log", yscale="log", xlabel="share of the joint samples (%)")
+        axis.set_xticks(at, [f"{a:g}" for a in at], minor=False)
+        axis.minorticks_off()
+    axes[0].set_ylabel("1 − R²")
+    axes[0].legend(fontsize="x-small")
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
+
+
+def plot_space(rows: list[Row], path: Path) -> None:
+    """Generalisation by the number of modes, beside principal components of vertices."""
+    figure, axes = plt.subplots(1, len(rows), figsize=(2.4 * len(rows), 2.6), layout="constrained")
+    for axis, row in zip(axes, rows, strict=True):
+        found = row.read("space")
+        for kind, style in (("modes", "o-"), ("components", "s--")):
+            values = [100 * value for value in found["generalisation"][kind]]
+            axis.plot(found["modes"], values, style, label={"modes": "sparse geodesic modes"}.get(kind, kind))
+        axis.set(title=row.name, xscale="log", xlabel="modes", ylim=(0, None))
+        axis.set_xticks(found["modes"], [str(k) for k in found["modes"]], minor=False)
+        axis.minorticks_off()
+    axes[0].set_ylabel("error of an unseen shape (% of diagonal)")
+    axes[0].legend(fontsize="x-small")
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
+
+
+def main() -> None:
+    """Do what is missing, then write the page with all that is there."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--data", type=Path, required=True, help="folder of the collections, each NAME/fine.npz")
+    parser.add_argument("--out", type=Path, default=ROOT / "runs" / "results", help="folder of the runs")
+    parser.add_argument("--only", nargs="*", choices=(*COLLECTIONS, *CONTRASTS, *OWN), help="runs to work on")
+    parser.add_argument("--page", action="store_true", help="write the page from what is there, and compute nothing")
+    arguments = parser.parse_args()
+    runs = {name: open_run(name, arguments.data, arguments.out) for name in (*COLLECTIONS, *CONTRASTS, *OWN)}
+    if not arguments.page:
+        for name in arguments.only or runs:
+            study(name, runs[name])
+    rows = {name: Row(name, run) for name, run in runs.items() if (run.folder / "evaluation.json").exists()}
+    real = [rows[name] for name in COLLECTIONS if name in rows]
+    docs = ROOT / "docs"
+    plot_samples([row for row in real if row.evaluation["fractions"]], docs / "results-samples.png")
+    plot_space([row for row in real if row.read("space")], docs / "results-space.png")
+    environment = jinja2.Environment(
+        loader=jinja2.FileSystemLoader(Path(__file__).parent),
+        trim_blocks=True,
+        lstrip_blocks=True,
+        undefined=jinja2.StrictUndefined,
+    )
+    page = environment.get_template("results.md.jinja").render(rows=rows, real=real)
+    (docs / "results.md").write_text(page, encoding="utf-8")
+    print(f"\n{docs / 'results.md'}")
+
+
+if __name__ == "__main__":
+    main()

@@ -22,9 +22,11 @@ SMALL = 1.0
 HEALING_SHARE = 0.1
 #: Shapes, spread evenly over the collection, whose quadrics are summed; every shape is checked.
 QUADRIC_SHAPES = 16
-#: Weight of a plane across the boundary, and of the squared distance that the vertex moves, against that of
-#: the planes of the faces.
-BOUNDARY_WEIGHT, MOTION_WEIGHT = 10.0, 1.0
+#: Weight of a plane across the boundary against that of the planes of the faces.
+BOUNDARY_WEIGHT = 10.0
+#: The same of the squared distance that the vertex moves. A large one makes faces even, on which exponentials go
+#: further and networks learn better; where it leaves a fold in some shape, the next is tried.
+MOTION_WEIGHTS = (1.0, 0.1, 0.01)
 
 _Face = tuple[int, int, int]
 _Pairs = list[tuple[int, int]]
@@ -38,12 +40,14 @@ class Coarsening:
         fine_index: (V,) which fine vertex each coarse one is, increasing.
         faces: (F, 3) in coarse indices.
         smallest_angle: over all faces of all shapes, radians.
+        folds: pairs of neighbouring faces that are folded onto one another in some shape.
         reason: why there are more vertices than asked for, in words; empty if there are not.
     """
 
     fine_index: IntArray
     faces: IntArray
     smallest_angle: float
+    folds: int
     reason: str = ""
 
 
@@ -72,8 +76,18 @@ def coarsen(fine: TriangleMesh, target: int, shapes: FloatArray) -> Coarsening:
     bad = np.flatnonzero(~np.isfinite(shapes).all(axis=(1, 2)))
     if len(bad):
         raise MeshError(f"shape {bad[0]} has a coordinate that is not finite")
+    shapes = np.concatenate([fine.vertices[None], shapes])
+    found = []
+    for weight in MOTION_WEIGHTS:
+        found.append(_coarsen(fine, target, shapes, weight))
+        if not found[-1].folds:
+            break
+    return min(found, key=lambda coarsening: coarsening.folds)
+
+
+def _coarsen(fine: TriangleMesh, target: int, shapes: FloatArray, motion_weight: float) -> Coarsening:
     edge = np.sqrt(2 / np.sqrt(3) * fine.area / target)
-    decimation = _Decimation(fine.connectivity, np.concatenate([fine.vertices[None], shapes]), SMALL * edge)
+    decimation = _Decimation(fine.connectivity, shapes, SMALL * edge, motion_weight)
     sines = np.sin(np.deg2rad(ANGLE_LIMITS))
     spare = int((1 + HEALING_SHARE) * target)
     if any(decimation.run(spare, sine) for sine in sines):
@@ -105,10 +119,11 @@ class _Decimation:
         connectivity: fine.
         shapes: (n, Vf, 3).
         small: see SMALL, as a length.
+        motion_weight: one of MOTION_WEIGHTS.
     """
 
-    def __init__(self, connectivity: Connectivity, shapes: FloatArray, small: float) -> None:
-        self.small = small
+    def __init__(self, connectivity: Connectivity, shapes: FloatArray, small: float, motion_weight: float) -> None:
+        self.small, self.motion_weight = small, motion_weight
         centred = shapes - shapes.mean(axis=1, keepdims=True)
         # Vertex first: a check gathers a few vertices of every shape.
         self.points = np.ascontiguousarray(np.moveaxis(centred, 0, 1))
@@ -164,14 +179,16 @@ class _Decimation:
         """The mesh as it is now."""
         fine_index, local = np.unique(list(self.faces.values()), return_inverse=True)
         faces = Connectivity(local.reshape(-1, 3), len(fine_index)).faces
-        sine = np.sqrt(_squared_sines(*_sides(self.points[fine_index[faces.T]])).min())
+        normals, squares = _sides(self.points[fine_index[faces.T]])
+        sine = np.sqrt(_squared_sines(normals, squares).min())
+        folds = len(_folded(Connectivity(faces, len(fine_index)), normals))
         reason = ""
         if len(fine_index) > target:
             reason = (
                 f"{len(fine_index)} vertices instead of {target}: any other collapse would change the topology, or "
                 "leave a sliver or a fold in some shape"
             )
-        return Coarsening(fine_index, faces, float(np.arcsin(min(sine, 1.0))), reason)
+        return Coarsening(fine_index, faces, float(np.arcsin(min(sine, 1.0))), folds, reason)
 
     def _faulty(self, sine: float) -> list[int]:
         """Vertices of slivers and folds in any shape."""
@@ -180,10 +197,7 @@ class _Decimation:
         connectivity = Connectivity(local.reshape(-1, 3), len(used))
         normals, squares = _sides(self.points[faces.T])
         bad = np.asarray((_squared_sines(normals, squares) < sine**2).any(axis=1))
-        normals = _unit(normals)
-        i, j = connectivity.edge_faces[connectivity.interior].T
-        folded = (_dots(normals[i], normals[j]) < FOLD_LIMIT).any(axis=1)
-        bad[np.concatenate([i[folded], j[folded]])] = True
+        bad[_folded(connectivity, normals).ravel()] = True
         vertices: list[int] = np.unique(faces[bad]).tolist()
         return vertices
 
@@ -192,7 +206,7 @@ class _Decimation:
     def _costs(self, pairs: IntArray) -> FloatArray:
         u, v = pairs.T
         costs: FloatArray = _dots(self.quadrics[u] + self.quadrics[v], self.monomials[v])
-        return costs + MOTION_WEIGHT * self.areas[u] * ((self.sample[u] - self.sample[v]) ** 2).sum(axis=(1, 2))
+        return costs + self.motion_weight * self.areas[u] * ((self.sample[u] - self.sample[v]) ** 2).sum(axis=(1, 2))
 
     def _offer(self, pairs: IntArray) -> None:
         """Put half-edges (k, 2), u → v, on the heap."""
@@ -374,6 +388,14 @@ def _quality(sines: FloatArray, normals: FloatArray, faces: list[int], pairs: _P
 def _unit(normals: FloatArray) -> FloatArray:
     unit: FloatArray = normals / np.maximum(np.sqrt(_dots(normals, normals)), 1e-300)[..., None]
     return unit
+
+
+def _folded(connectivity: Connectivity, normals: FloatArray) -> IntArray:
+    """(k, 2) neighbouring faces that are folded onto one another in some shape; normals (F, n, 3) of any length."""
+    normals = _unit(normals)
+    pairs = connectivity.edge_faces[connectivity.interior]
+    folded: IntArray = pairs[(_dots(normals[pairs[:, 0]], normals[pairs[:, 1]]) < FOLD_LIMIT).any(axis=1)]
+    return folded
 
 
 def _sides(corners: FloatArray) -> tuple[FloatArray, FloatArray]:

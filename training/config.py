@@ -120,10 +120,11 @@ class LatentNetworkSettings(_Section):
 
 
 class CombinerSettings(_Section):
-    """Graph convolutions on edges from J factor shapes to the joint one."""
+    """From J factor shapes to the joint one: graph convolutions on edges, a kernel correction, or both."""
 
     width: int = Field(24, ge=1)
-    layers: int = Field(3, ge=1)
+    layers: int = Field(0, ge=0)
+    """Graph convolutions; 0 leaves all to the kernel."""
     neighbourhood: Neighbourhood = "star"
     residual: bool = True
     """Learn the difference to the affine sum of the factors instead of the shape itself; pass each layer's input on."""
@@ -138,6 +139,12 @@ class CombinerSettings(_Section):
     symmetries: bool = True
     """Learn from the training samples' images under the collection's symmetries too, where it has any."""
     fit: FitSettings = FitSettings(schedule="cosine", learning_rate=2e-3, batch_size=16, max_epochs=12)
+
+    @model_validator(mode="after")
+    def _something(self) -> CombinerSettings:
+        if not self.layers and not (self.residual and (self.kernel or self.pairwise)):
+            raise ValueError("without convolutions there must be a residual with a kernel or pairwise products")
+        return self
 
 
 class NetworkSettings(_Section):

@@ -7,6 +7,8 @@ import itertools
 import torch
 from torch import Tensor, nn
 
+from training.layers import half_precision
+
 #: Weights of the penalty that `ridge_regression` chooses from, as shares of the mean square of a feature.
 RIDGES = tuple(10.0**k for k in range(-6, 3))
 
@@ -88,36 +90,33 @@ class KernelCorrection(nn.Module):
 
     Two samples are as alike as their factors' shapes are near, ``exp(−½ Σ_j ‖x_j − x_j'‖² / (ℓ σ_j)²)`` with σ_j the
     spread of factor j along its strongest direction. Each shape is brought to a few principal coefficients first. What
-    is predicted are principal coefficients of what is missed without it; a linear part says what happens far away from
-    all samples. Products of coefficients, two or three at a time, are among the functions that such a kernel spans, at
-    the weight that their smoothness deserves.
+    is predicted are principal coefficients of what is missed without it. Products of coefficients, two or three at a
+    time, are among the functions that such a kernel spans, at the weight that their smoothness deserves.
     """
 
     centre: Tensor
     axes: Tensor
     anchors: Tensor
     gamma: Tensor
-    linear: Tensor
     weights: Tensor
     mean: Tensor
     basis: Tensor
-    #: Samples that the kernel is centred at, at most; all of them decide the weights.
-    ANCHORS = 1600
-    #: Lengths ℓ, of which held-out samples choose one.
+    #: Samples that it is fitted to, at most.
+    ANCHORS = 4000
+    #: Lengths ℓ and penalties, as shares of the kernel's value at no distance, of which held-out samples choose one.
     LENGTHS = (2.0, 4.0, 8.0, 16.0)
-    #: Samples that the principal axes are taken from, at most.
+    RIDGES = tuple(10.0 ** (k / 2) for k in range(-12, 1))
+    #: Samples that the principal axes of factors are taken from, at most.
     AXES = 500
     #: Variance that the basis of the correction keeps, and its largest rank.
-    ENERGY, RANK = 0.99, 400
+    ENERGY, RANK = 0.995, 512
 
     def __init__(self, factor_count: int, coefficients: int, size: int, anchors: int, rank: int) -> None:
         super().__init__()
-        inputs = factor_count * coefficients
         self.register_buffer("centre", torch.zeros(factor_count, size))
         self.register_buffer("axes", torch.zeros(factor_count, size, coefficients))
-        self.register_buffer("anchors", torch.zeros(anchors, inputs))
+        self.register_buffer("anchors", torch.zeros(anchors, factor_count * coefficients))
         self.register_buffer("gamma", torch.ones(()))
-        self.register_buffer("linear", torch.zeros(1 + inputs, rank))
         self.register_buffer("weights", torch.zeros(anchors, rank))
         self.register_buffer("mean", torch.zeros(size))
         self.register_buffer("basis", torch.zeros(rank, size))
@@ -131,48 +130,40 @@ class KernelCorrection(nn.Module):
     @classmethod
     def fit(cls, coefficients: int, y: Tensor, residual: Tensor, held_out: tuple[Tensor, Tensor]) -> KernelCorrection:
         """Fit to factor shapes (n, J, 2E) and what is missed so far (n, 2E), both as scaled differences."""
+        y, residual = y[: cls.ANCHORS], residual[: cls.ANCHORS]
         mean = residual.mean(dim=0)
         _, s, vt = torch.linalg.svd((residual - mean)[: 3 * cls.RANK], full_matrices=False)
         energy = s.square().cumsum(0)
         rank = min(int((energy < cls.ENERGY * energy[-1]).sum()) + 1, cls.RANK)
-        anchors = min(len(y), cls.ANCHORS)
-        result = cls(y.shape[1], coefficients, y.shape[2], anchors, rank)
+        result = cls(y.shape[1], coefficients, y.shape[2], len(y), rank)
         result.mean.copy_(mean)
-        result.basis.copy_(vt[:rank])
+        result.basis.copy_(half_precision(vt[:rank]))
         result.centre.copy_(y.mean(dim=0))
         for j in range(y.shape[1]):
             some = y[: cls.AXES, j] - result.centre[j]
             _, s, vt = torch.linalg.svd(some, full_matrices=False)
             count = min(coefficients, len(s))
-            result.axes[j, :, :count] = vt[:count].T * (len(some) ** 0.5 / s[0].clamp_min(1e-12))
-        result._fit_weights(y, residual, held_out)
+            result.axes[j, :, :count] = half_precision(vt[:count].T * (len(some) ** 0.5 / s[0].clamp_min(1e-12)))
+        result.anchors.copy_(result._inputs(y))
+        result._fit_weights(result._wanted(residual), result._inputs(held_out[0]), result._wanted(held_out[1]))
         return result
 
-    def _fit_weights(self, y: Tensor, residual: Tensor, held_out: tuple[Tensor, Tensor]) -> None:
-        pairs = [
-            (self._inputs(factors), ((shape - self.mean) @ self.basis.T).double())
-            for factors, shape in ((y, residual), held_out)
-        ]
-        self.anchors.copy_(pairs[0][0][: len(self.anchors)])
+    def _fit_weights(self, target: Tensor, held_out: Tensor, wanted: Tensor) -> None:
         best = float("inf")
         for length in self.LENGTHS:
             gamma = torch.tensor(0.5 / length**2)
-            # Columns of the kernel made orthonormal at the anchors (Nyström), so that one ridge suits them all.
             value, vector = torch.linalg.eigh(self._kernel(self.anchors, gamma))
-            kept = value > 1e-7 * value[-1]
-            white = vector[:, kept] * value[kept].rsqrt()
-            (x, target), (other, wanted) = (
-                (torch.cat([_affine(c).double(), self._kernel(c, gamma) @ white * len(white) ** 0.5], dim=1), goal)
-                for c, goal in pairs
-            )
-            h, b = ridge_regression(x, target, (other, wanted))
-            solution = h @ b
-            error = float((other @ solution - wanted).square().mean())
-            if error < best:
-                best, split = error, self.linear.shape[0]
-                self.gamma.copy_(gamma)
-                self.linear.copy_(solution[:split])
-                self.weights.copy_(white @ solution[split:] * len(white) ** 0.5)
+            right, other = vector.T @ target, self._kernel(held_out, gamma) @ vector
+            for ridge in self.RIDGES:
+                solution = right / (value.clamp_min(0) + ridge)[:, None]
+                error = float((other @ solution - wanted).square().mean())
+                if error < best:
+                    best = error
+                    self.gamma.copy_(gamma)
+                    self.weights.copy_(vector @ solution)
+
+    def _wanted(self, residual: Tensor) -> Tensor:
+        return ((residual - self.mean) @ self.basis.T).double()
 
     def _inputs(self, y: Tensor) -> Tensor:
         return torch.einsum("njs,jsr->njr", y - self.centre, self.axes).flatten(1)
@@ -184,9 +175,4 @@ class KernelCorrection(nn.Module):
     def forward(self, y: Tensor) -> Tensor:
         c = self._inputs(y)
         squares = c.square().sum(dim=1, keepdim=True) - 2 * c @ self.anchors.T + self.anchors.square().sum(dim=1)
-        coefficients = _affine(c) @ self.linear + torch.exp(-self.gamma * squares) @ self.weights
-        return self.mean + coefficients @ self.basis
-
-
-def _affine(x: Tensor) -> Tensor:
-    return torch.cat([torch.ones_like(x[:, :1]), x], dim=1)
+        return self.mean + torch.exp(-self.gamma * squares) @ self.weights @ self.basis

@@ -15,6 +15,19 @@ from geometry.mesh import Connectivity, FloatArray, IntArray
 from training.config import Neighbourhood
 from training.coordinates import Coordinates
 
+#: Entries from which a tensor that 16 bits hold as it is takes half the room in a bundle.
+HALVED_SIZE = 1024
+
+
+def half_precision(x: Tensor) -> Tensor:
+    """The nearest values of 16 bits, in the same type."""
+    return x.half().to(x.dtype)
+
+
+def is_halved(x: Tensor) -> bool:
+    """Whether a tensor goes into a bundle in 16 bits."""
+    return x.dtype == torch.float32 and x.numel() >= HALVED_SIZE and torch.equal(x, half_precision(x))
+
 
 class LatentFeatures(nn.Module):
     """The functions of the latents that a network starts from, (n, m) → (n, size).
@@ -137,7 +150,7 @@ class PatchBasis(nn.Module):
         self.ranks = [basis.shape[1] for basis in bases]
         self.register_buffer("mean", torch.as_tensor(mean, dtype=torch.float32))
         for i, basis in enumerate(bases):
-            self.register_buffer(f"basis{i}", torch.as_tensor(basis.T.copy(), dtype=torch.float32))
+            self.register_buffer(f"basis{i}", half_precision(torch.as_tensor(basis.T.copy(), dtype=torch.float32)))
         order = np.concatenate(entries)
         self.register_buffer("order", torch.as_tensor(order))
         self.register_buffer("place", torch.as_tensor(np.argsort(order)))

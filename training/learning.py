@@ -239,7 +239,10 @@ class Learner:
         convolutions = self._path("convolutions", fractions, combiner, *factors) if combiner.kernel else path
         if not convolutions.exists():
             network.fit_pairwise(*own, other)
-        state = self._fit(network, inputs, z, rows, combiner.fit, convolutions, self._fraction)
+        state: dict[str, Any] = {"done": True, "epoch": 0, "best": None, "history": []}
+        if combiner.layers:
+            state = self._fit(network, inputs, z, rows, combiner.fit, convolutions, self._fraction)
+        network.eval()
         if combiner.kernel:
             # Last, because on the samples it has learned from it leaves too little for others to learn.
             network.fit_kernel(*own, other, combiner.kernel)

@@ -149,7 +149,7 @@ class MonolithicNetwork(FactorNetwork):
 
 
 class CombinerNetwork(ShapeNetwork):
-    """Ψ: J factor shapes (n, J, 2E) → the joint shape's NRIC (n, 2E), by graph convolutions on edges.
+    """Ψ: J factor shapes (n, J, 2E) → the joint shape's NRIC (n, 2E), by graph convolutions on edges and a kernel.
 
     ELU, batch normalisation and dropout after each convolution. It sees nothing but the factors' outputs.
     """
@@ -161,21 +161,25 @@ class CombinerNetwork(ShapeNetwork):
     ) -> None:
         super().__init__()
         self.scaling, self.residual = scaling, settings.residual
+        self.pairwise: PairwiseProducts | None = None
+        self.kernel: KernelCorrection | None = None
+        self.convolutions, self.norms = nn.ModuleList(), nn.ModuleList()
+        if settings.layers:
+            self._add_convolutions(settings, connectivity, factor_count)
+        if settings.residual and settings.pairwise:
+            self.pairwise = PairwiseProducts(factor_count, settings.pairwise, 2 * connectivity.edge_count)
+
+    def _add_convolutions(self, settings: CombinerSettings, connectivity: Connectivity, factor_count: int) -> None:
         # Differences alone would not tell what an edge is like at rest.
-        rest = scaling.mean.view(2, -1).T
+        rest = self.scaling.mean.view(2, -1).T
         self.register_buffer("rest", (rest - rest.mean(dim=0)) / rest.std(dim=0).clamp_min(1e-6))
         self.edge_constants = nn.Parameter(0.1 * torch.randn(connectivity.edge_count, settings.edge_channels))
         widths = [2 * factor_count + 2 + settings.edge_channels] + [settings.width] * settings.layers
-        self.convolutions = nn.ModuleList(
+        self.convolutions.extend(
             EdgeConvolution(connectivity, a, b, settings.neighbourhood) for a, b in itertools.pairwise(widths)
         )
-        self.norms = nn.ModuleList(nn.BatchNorm1d(width) for width in widths[1:])
+        self.norms.extend(nn.BatchNorm1d(width) for width in widths[1:])
         self.dropout = nn.Dropout(settings.dropout)
-        size = 2 * connectivity.edge_count
-        self.pairwise = None
-        if settings.residual and settings.pairwise:
-            self.pairwise = PairwiseProducts(factor_count, settings.pairwise, size)
-        self.kernel: KernelCorrection | None = None
         self.readout = nn.Linear(widths[-1], 2)
         if settings.residual:
             nn.init.zeros_(self.readout.weight)
@@ -188,6 +192,15 @@ class CombinerNetwork(ShapeNetwork):
     def coefficients(self, inputs: Tensor) -> Tensor:
         """Scaled differences (n, 2E) for factor shapes (n, J, 2E)."""
         y = self.scaling.down(inputs)
+        out = self._convolved(y) if self.convolutions else torch.zeros_like(y[:, 0])
+        if self.pairwise is not None:
+            out = out + self.pairwise(y)
+        if self.kernel is not None:
+            out = out + self.kernel(y)
+        return out + y.sum(dim=1) if self.residual else out
+
+    def _convolved(self, y: Tensor) -> Tensor:
+        """(n, 2E) of scaled differences (n, J, 2E)."""
         n, j, double = y.shape
         # Edges come first: a neighbour sum then adds whole rows.
         channels = y.view(n, 2 * j, double // 2).permute(2, 0, 1)
@@ -196,12 +209,7 @@ class CombinerNetwork(ShapeNetwork):
         for convolution, norm in zip(self.convolutions, self.norms, strict=True):
             new = self.dropout(nn.functional.elu(norm(convolution(x).flatten(0, 1))).view(double // 2, n, -1))
             x = x + new if self.residual and x.shape == new.shape else new
-        out = self.readout(x).permute(1, 2, 0).reshape(n, double)
-        if self.pairwise is not None:
-            out = out + self.pairwise(y)
-        if self.kernel is not None:
-            out = out + self.kernel(y)
-        return out + y.sum(dim=1) if self.residual else out
+        return self.readout(x).permute(1, 2, 0).reshape(n, double)
 
     def fit_pairwise(self, factors: Tensor, z: Tensor, held_out: tuple[Tensor, Tensor]) -> None:
         """Fit the bilinear correction, where there is one, to samples (n, J, 2E) and (n, 2E), and others held out."""
