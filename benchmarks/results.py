@@ -93,9 +93,8 @@ def open_run(name: str, data: Path, out: Path) -> Run:
         path, folder, models = ROOT / "examples" / f"{name}.toml", ROOT / "runs" / name, ROOT / "models"
         return Run(folder, *load(path), models)
     path = ROOT / "examples" / "collections" / f"{name}.toml"
-    relative = load(path)[0].collection.data
-    assert relative is not None
-    return Run(out / name, *load(path, data / relative.relative_to(path.parent)), out / "models")
+    meshes = load(path)[0].collection.data.relative_to(path.parent)
+    return Run(out / name, *load(path, data / meshes), out / "models")
 
 
 def study(name: str, run: Run) -> None:
@@ -163,7 +162,7 @@ def main() -> None:
     docs = ROOT / "docs"
     plot_samples([row for row in real if row.evaluation["fractions"]], docs / "results-samples.png")
     plot_space([row for row in real if row.read("space")], docs / "results-space.png")
-    environment = jinja2.Environment(
+    environment = jinja2.Environment(  # noqa: S701 - Markdown
         loader=jinja2.FileSystemLoader(Path(__file__).parent),
         trim_blocks=True,
         lstrip_blocks=True,

@@ -13,6 +13,9 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 #: Which edges a convolution hears of, see networks.EdgeConvolution.
 Neighbourhood = Literal["star", "flaps"]
 
+#: Of each factor, where the configuration doesn't say: a factor has few modes.
+FACTOR_SAMPLES = 1000
+
 
 class ConfigError(ValueError):
     """A configuration that can't be used, with a line for each fault."""
@@ -76,7 +79,7 @@ class SampleSettings(_Section):
     """K of the exponentials."""
     factor_counts: list[int] | int | None = None
     """Samples of each factor alone, at its part of the first codes; where there are more than ``count``, further codes
-    are drawn for the factor only. None takes as many as there are joint ones, as the paper does."""
+    are drawn for the factor only. The paper takes ``count``; None takes FACTOR_SAMPLES of them, which are enough."""
     part_size: int = Field(50, ge=1)
     test_fraction: float = Field(0.2, gt=0, lt=1)
     validation_fraction: float = Field(0.1, gt=0, lt=1)
@@ -85,7 +88,7 @@ class SampleSettings(_Section):
 
     def own(self, factors: int) -> list[int]:
         """Samples of each factor alone."""
-        counts = self.count if self.factor_counts is None else self.factor_counts
+        counts = min(self.count, FACTOR_SAMPLES) if self.factor_counts is None else self.factor_counts
         return counts if isinstance(counts, list) else [counts] * factors
 
 

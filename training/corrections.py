@@ -104,8 +104,8 @@ class KernelCorrection(nn.Module):
     #: Samples that it is fitted to, at most.
     ANCHORS = 4000
     #: Lengths ℓ and penalties, as shares of the kernel's value at no distance, of which held-out samples choose one.
-    LENGTHS = (2.0, 4.0, 8.0, 16.0)
-    RIDGES = tuple(10.0 ** (k / 2) for k in range(-12, 1))
+    LENGTHS = (4.0, 8.0, 16.0)
+    RIDGES = tuple(10.0 ** (k / 2) for k in range(-12, -2))
     #: Samples that the principal axes of factors are taken from, at most.
     AXES = 500
     #: Variance that the basis of the correction keeps, and its largest rank.
@@ -132,7 +132,7 @@ class KernelCorrection(nn.Module):
         """Fit to factor shapes (n, J, 2E) and what is missed so far (n, 2E), both as scaled differences."""
         y, residual = y[: cls.ANCHORS], residual[: cls.ANCHORS]
         mean = residual.mean(dim=0)
-        _, s, vt = torch.linalg.svd((residual - mean)[: 3 * cls.RANK], full_matrices=False)
+        s, vt = _principal((residual - mean)[: 3 * cls.RANK])
         energy = s.square().cumsum(0)
         rank = min(int((energy < cls.ENERGY * energy[-1]).sum()) + 1, cls.RANK)
         result = cls(y.shape[1], coefficients, y.shape[2], len(y), rank)
@@ -141,7 +141,7 @@ class KernelCorrection(nn.Module):
         result.centre.copy_(y.mean(dim=0))
         for j in range(y.shape[1]):
             some = y[: cls.AXES, j] - result.centre[j]
-            _, s, vt = torch.linalg.svd(some, full_matrices=False)
+            s, vt = _principal(some)
             count = min(coefficients, len(s))
             result.axes[j, :, :count] = half_precision(vt[:count].T * (len(some) ** 0.5 / s[0].clamp_min(1e-12)))
         result.anchors.copy_(result._inputs(y))
@@ -152,15 +152,14 @@ class KernelCorrection(nn.Module):
         best = float("inf")
         for length in self.LENGTHS:
             gamma = torch.tensor(0.5 / length**2)
-            value, vector = torch.linalg.eigh(self._kernel(self.anchors, gamma))
-            right, other = vector.T @ target, self._kernel(held_out, gamma) @ vector
+            kernel, other = self._kernel(self.anchors, gamma), self._kernel(held_out, gamma)
             for ridge in self.RIDGES:
-                solution = right / (value.clamp_min(0) + ridge)[:, None]
-                error = float((other @ solution - wanted).square().mean())
+                weights = torch.cholesky_solve(target, torch.linalg.cholesky(kernel + ridge * torch.eye(len(kernel))))
+                error = float((other @ weights - wanted).square().mean())
                 if error < best:
                     best = error
                     self.gamma.copy_(gamma)
-                    self.weights.copy_(vector @ solution)
+                    self.weights.copy_(weights)
 
     def _wanted(self, residual: Tensor) -> Tensor:
         return ((residual - self.mean) @ self.basis.T).double()
@@ -176,3 +175,10 @@ class KernelCorrection(nn.Module):
         c = self._inputs(y)
         squares = c.square().sum(dim=1, keepdim=True) - 2 * c @ self.anchors.T + self.anchors.square().sum(dim=1)
         return self.mean + torch.exp(-self.gamma * squares) @ self.weights @ self.basis
+
+
+def _principal(x: Tensor) -> tuple[Tensor, Tensor]:
+    """Singular values, falling, and right singular vectors of x (n, p), by the Gram matrix of its n < p rows."""
+    value, vector = torch.linalg.eigh(x.double() @ x.double().T)
+    s = value.flip(0).clamp_min(1e-30).sqrt()
+    return s.to(x.dtype), (vector.flip(1).T @ x.double() / s[:, None]).to(x.dtype)

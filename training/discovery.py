@@ -110,10 +110,11 @@ def modes(folder: Path, config: Config) -> dict[str, Any]:
     norm = WeightedNorm.of(centre, config.material.eta)
     logarithms = tangents(space, centre.vertices, shapes, settings.log_steps)
     count = min(settings.count, len(shapes) - 1)
-    sparse = spga(
-        space, centre.vertices, logarithms.fields, count, settings.sparsity, max_iterations=settings.max_iterations
-    )
-    dense = pga(space, centre.vertices, logarithms.fields, count)
+    dense = sparse = pga(space, centre.vertices, logarithms.fields, count)
+    if settings.sparsity:
+        sparse = spga(
+            space, centre.vertices, logarithms.fields, count, settings.sparsity, max_iterations=settings.max_iterations
+        )
     write_npz(
         folder / "modes.npz",
         nric=sparse.nric,

@@ -9,6 +9,7 @@ import unicodedata
 from pathlib import Path
 
 from training.config import (
+    FACTOR_SAMPLES,
     CollectionSettings,
     CombinerSettings,
     ConfigError,
@@ -40,13 +41,14 @@ count = {modes}    # numbers that describe a shape, {most} at most; more keep fi
 
 [samples]
 # count = {sample.count}    # shapes computed to learn from, most of a run's time; a tenth does for a first try
+# factor_counts = {own}    # shapes of each factor alone; a factor of many modes wants more
 # seed = {sample.seed}    # another number draws others
 
 [networks.factors]
 # hidden = {factor.hidden}    # layers of each factor's network; wider where the report shows a low R² of factors
 
 [networks.combiner]
-# width = {combiner.width}    # channels of the network that joins the factors; more learn more and serve slower
+# kernel = {combiner.kernel}    # principal coefficients of each factor that decide how the factors join
 
 [export]
 name = {name}    # in addresses and file names: small letters, digits and hyphens
@@ -83,6 +85,7 @@ def configuration(collection: MeshCollection, data: str, title: str) -> str:
         most=count - 1,
         mode=ModeSettings(),
         sample=SampleSettings(),
+        own=FACTOR_SAMPLES,
         factor=LatentNetworkSettings(),
         combiner=CombinerSettings(),
         name=_string(slug(title)),

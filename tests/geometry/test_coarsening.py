@@ -255,19 +255,32 @@ def test_bad_shapes_are_refused(fine):
         coarsen(fine, 10, shapes)
 
 
-@pytest.mark.parametrize(("folds", "count", "fewest"), [([0, 5, 5], 1, 0), ([2, 0, 5], 2, 0), ([3, 1, 2], 3, 1)])
-def test_even_faces_are_given_up_where_they_leave_a_fold(monkeypatch, folds, count, fewest):
-    """The first weight that folds no shape is taken; where each does, the one that folds the fewest."""
-    tried = []
-
+@pytest.mark.parametrize(
+    ("folds", "shrinkage", "taken"),
+    [
+        ((0, 0, 0), (0.5, 0.5, 0.5), 0),
+        ((0, 0, 0), (0.46, 0.5, 0.4), 0),
+        ((0, 0, 0), (0.2, 0.5, 0.6), 2),
+        ((1, 0, 0), (0.9, 0.3, 0.2), 1),
+        ((3, 2, 4), (0.9, 0.1, 0.9), 1),
+    ],
+)
+def test_the_evenest_is_taken_whose_faces_keep_their_areas(monkeypatch, folds, shrinkage, taken):
     def pretended(fine, target, shapes, weight):
-        tried.append(weight)
-        return Coarsening(np.arange(3), np.array([[0, 1, 2]]), 1.0, folds[len(tried) - 1])
+        k = coarsening.MOTION_WEIGHTS.index(weight)
+        return Coarsening(np.full(3, k), np.array([[0, 1, 2]]), 1.0, folds[k], shrinkage[k])
 
     monkeypatch.setattr(coarsening, "_coarsen", pretended)
     mesh, ridge = sheet_with_a_wrinkle()
-    assert coarsen(mesh, 30, ridge[None]).folds == fewest
-    assert tried == list(coarsening.MOTION_WEIGHTS[:count])
+    assert coarsen(mesh, 30, ridge[None]).fine_index[0] == taken
+
+
+def test_what_is_left_of_the_smallest_face_is_told(fine):
+    shapes = np.stack([fine.vertices, 0.5 * fine.vertices])
+    found = coarsen(fine, 40, shapes)
+    areas = face_areas(np.concatenate([fine.vertices[None], shapes])[:, found.fine_index], found.faces)
+    assert found.shrinkage == pytest.approx((areas / np.exp(np.log(areas).mean(axis=0))).min())
+    assert found.shrinkage == pytest.approx(4 ** (-2 / 3))
 
 
 def test_the_folds_that_are_left_are_counted():

@@ -14,7 +14,7 @@ generator = "freaky-torus"
 
 [samples]
 count = 60
-factor_counts = [40, 40, 120]
+factor_counts = [60, 60, 120]
 part_size = 20
 
 [[networks.factors]]

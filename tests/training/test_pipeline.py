@@ -73,7 +73,7 @@ def test_no_factor_learns_from_parts_of_test_codes(tiny_run: Path) -> None:
     ):
         np.testing.assert_array_equal(part["latents"][:, 2:], other["latents"][:, 2:])
     total = {learner: len(joint["train"]) + len(joint["validation"]), half: 22 + 4, free: 22 + 4}
-    for count in (40, 40, 120):
+    for count in (60, 60, 120):
         index = np.arange(count)
         rows = {name: set(index[chosen]) for name, chosen in learner.factor_rows(index).items()}
         assert rows["train"] == set(index) - set(joint["test"]) - set(joint["validation"])
