@@ -180,6 +180,8 @@ class EvaluationSettings(_Section):
     """Nodes per coordinate of the multilinear grid of Sassen et al. 2020, at most."""
     grid_size: int = Field(1000, ge=1)
     """Nodes of the grid of one factor, at most; where that leaves fewer than 3 per coordinate there is no grid."""
+    exact_factors: int = Field(200, ge=2)
+    """Test codes whose factors' own exponentials are computed, for the affine sum of exact factors."""
     reconstructions: int = Field(100, ge=1)
     """Test shapes whose vertices are reconstructed."""
 

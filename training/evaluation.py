@@ -15,7 +15,7 @@ import torch
 from numpy.typing import NDArray
 from torch import nn
 
-from geometry.mesh import FloatArray, TriangleMesh, align
+from geometry.mesh import FloatArray, IntArray, TriangleMesh, align
 from geometry.nric import WeightedNorm, nric
 from geometry.reconstruction import Reconstructor
 from training.config import Config, EvaluationSettings
@@ -162,15 +162,16 @@ def evaluate(
     z_reference = nric(reference.vertices, reference.connectivity)
     composite, monolithic, test = whole.main(), whole.monolithic(), whole.split["test"]
 
-    shapes = np.stack([_exact_factor(whole, j, exact) for j in range(len(factors))], axis=1)
+    some = test[: settings.exact_factors]
+    shapes = np.stack([_exact_factor(whole, some, j, exact) for j in range(len(factors))], axis=1)
     # A joint shape can be found where a factor's own can't.
-    there = np.isfinite(shapes).all(axis=(1, 2))
-    test, shapes = test[there], shapes[there]
+    there = np.flatnonzero(np.isfinite(shapes).all(axis=(1, 2)))
+    shapes = shapes[there]
     latents, z, vertices = (getattr(whole.joint, name)[test] for name in ("latents", "nric", "vertices"))
     codes = torch.as_tensor(latents, dtype=torch.float32)
 
-    def score(predicted: NDArray) -> dict[str, float]:
-        return r_squared(predicted, z, norm)
+    def score(predicted: NDArray, rows: IntArray | slice = slice(None)) -> dict[str, float]:
+        return r_squared(predicted, z[rows], norm)
 
     def network_score(network: Callable[[torch.Tensor], torch.Tensor]) -> dict[str, float]:
         return score(predict(network, codes).numpy())
@@ -179,7 +180,7 @@ def evaluate(
     r2 = {
         "composite": score(answer),
         "monolithic": network_score(monolithic),
-        "affine": score(affine_sum(z_reference, shapes)),
+        "affine": score(affine_sum(z_reference, shapes), there),
         "affine of learned factors": score(affine_sum(z_reference, learned)),
     }
     sizes = {"composite": size_bytes(*composite.networks, composite.combiner), "monolithic": size_bytes(monolithic)}
@@ -200,7 +201,8 @@ def evaluate(
         "eta": settings.eta,
         "test_samples": len(test),
         "r2": r2,
-        "r2_factors": {name: r_squared(learned[:, j], shapes[:, j], norm) for j, name in enumerate(factors)},
+        "affine_samples": len(there),
+        "r2_factors": {name: r_squared(learned[there, j], shapes[:, j], norm) for j, name in enumerate(factors)},
         "variants": {
             name: {"title": config.variants[name].title, "r2": network_score(variant)}
             for name, variant in whole.variants().items()
@@ -240,9 +242,11 @@ def _other_seed(learner: Learner, norm: WeightedNorm) -> dict[str, Any]:
     return {"seed": learner.seed, "r2": r2}
 
 
-def _exact_factor(learner: Learner, j: int, exact: Callable[[str, FloatArray], NDArray]) -> NDArray[np.float32]:
-    """Exact shapes (n, 2E) of a factor's part alone of the test codes, NaN where there is none."""
-    index, test = list(learner.collection.factors.values())[j], learner.split["test"]
+def _exact_factor(
+    learner: Learner, test: IntArray, j: int, exact: Callable[[str, FloatArray], NDArray]
+) -> NDArray[np.float32]:
+    """Exact shapes (n, 2E) of a factor's part alone of joint samples (n,), NaN where there is none."""
+    index = list(learner.collection.factors.values())[j]
     codes, samples = learner.joint.index[test], learner.factor_samples(j)
     result = np.full((len(test), samples.nric.shape[1]), np.nan, dtype=np.float32)
     there = np.isin(codes, samples.index)
