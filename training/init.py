@@ -9,7 +9,6 @@ import unicodedata
 from pathlib import Path
 
 from training.config import (
-    FACTOR_SAMPLES,
     CollectionSettings,
     CombinerSettings,
     ConfigError,
@@ -41,7 +40,6 @@ count = {modes}    # numbers that describe a shape, {most} at most; more keep fi
 
 [samples]
 # count = {sample.count}    # shapes computed to learn from, most of a run's time; a tenth does for a first try
-# factor_counts = {own}    # shapes of each factor alone; a factor of many modes wants more
 # seed = {sample.seed}    # another number draws others
 
 [networks.factors]
@@ -85,7 +83,6 @@ def configuration(collection: MeshCollection, data: str, title: str) -> str:
         most=count - 1,
         mode=ModeSettings(),
         sample=SampleSettings(),
-        own=FACTOR_SAMPLES,
         factor=LatentNetworkSettings(),
         combiner=CombinerSettings(),
         name=_string(slug(title)),
