@@ -102,11 +102,15 @@ class Reconstructor:
         Frames first, which are exact for integrable z*. Where they go astray, for errors of z* add up along them,
         the start with the smallest misfit among them, the others, called only then, and the reference.
         """
-        scale = self.norm.square(target)
-        best = self._point(self.integrate(target), target)
-        if best.energy <= GOOD_GUESS**2 * scale:
-            return best.vertices
-        for vertices in (*(other() for other in others), self.reference.vertices):
+        framed = self.integrate(target)
+        if self._point(framed, target).energy <= GOOD_GUESS**2 * self.norm.square(target):
+            return framed
+        return self.nearest(target, framed, *(other() for other in others), self.reference.vertices)
+
+    def nearest(self, target: FloatArray, *shapes: FloatArray) -> FloatArray:
+        """The shape (V, 3) among some whose misfit is the smallest; the last where none has a finite one."""
+        best = self._point(shapes[0], target)
+        for vertices in shapes[1:]:
             point = self._point(vertices, target)
             if not best.energy <= point.energy < np.inf:
                 best = point

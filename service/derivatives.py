@@ -14,8 +14,9 @@ from geometry.nric import WeightedNorm, nric
 if TYPE_CHECKING:
     from service.shape_model import ShapeModel
 
-#: Step of a difference quotient, as a fraction of the coordinate's range.
-DIFFERENCE = 1e-3
+#: Step of a difference quotient, as a fraction of the coordinate's range: what an angle moves may be as small as a bump
+#: on its way round, and elsewhere smaller steps drown in the networks' rounding.
+PERIODIC_DIFFERENCE, DIFFERENCE = 1e-3, 1e-2
 #: Nodes for each periodic coordinate of a factor, and all of them at most.
 NODES, MOST_NODES = 32, 1024
 #: Random sums of lengths and angles that stand for all of them on the grids.
@@ -28,7 +29,7 @@ def derivatives(model: ShapeModel, x: FloatArray) -> FloatArray:
     One code at a time: the combiner is quicker so than on many at once, which don't fit into the cache.
     """
     z = model.nric(x)
-    steps = np.diag(DIFFERENCE * model.latents.width)
+    steps = np.diag(_steps(model))
     return np.stack([(model.nric(x + step) - z) / step.max() for step in steps], axis=1)
 
 
@@ -37,10 +38,16 @@ def factor_derivatives(model: ShapeModel, x: FloatArray) -> FloatArray:
     columns = []
     for j, factor in enumerate(model.manifest.factors):
         own = x[factor.start : factor.stop]
-        steps = np.diag(DIFFERENCE * model.latents.width[factor.start : factor.stop])
+        steps = np.diag(_steps(model)[factor.start : factor.stop])
         ahead, behind = np.split(model.factor(j, np.concatenate([own + steps, own - steps])), 2)
         columns.append((ahead - behind) / (2 * steps.diagonal()[:, None]))
     return np.concatenate(columns).T
+
+
+def _steps(model: ShapeModel) -> FloatArray:
+    latents = model.latents
+    steps: FloatArray = np.where(latents.periodic, PERIODIC_DIFFERENCE, DIFFERENCE) * latents.width
+    return steps
 
 
 def nodes(model: ShapeModel, j: int) -> FloatArray:

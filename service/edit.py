@@ -21,9 +21,11 @@ from service.shape_model import MeshChoice, Shape, ShapeModel
 PRIOR = 1e-4
 #: A shape is moved by this fraction of its derivative to see how it would be aligned and prolonged.
 DIFFERENCE = 1e-4
-#: Other starts at most, where the misfit is above this fraction of the diagonal, and what part of its square must be
-#: thought to remain there.
-STARTS, GOOD, PROMISING = 4, 2e-3, 0.9
+#: Other starts at most, where the misfit is above one of these fractions of the diagonal: with rough shapes, with those
+#: that are answered. And what part of its square must be thought to remain there.
+STARTS, GOOD_ROUGHLY, GOOD, PROMISING = 4, 2e-2, 2e-3, 0.9
+#: Shapes at most that a fit is refined with. What takes longer follows a valley that hardly falls.
+REFINEMENTS = 8
 
 
 @dataclass(frozen=True)
@@ -97,8 +99,12 @@ class Editor:
         if not (np.abs(positions) < np.finfo(np.float32).max).all():
             raise NotFiniteError("A target lies so far away that the numbers overflow. Send finite positions.")
         with model.solver() as reconstruct:
-            chart = _Chart(model, reconstruct, np.array([t.vertex for t in targets]), mesh, deadline)
-            fit = self._fit(chart, start.astype(np.float64), positions, prior, deadline)
+            vertices = np.array([target.vertex for target in targets])
+            rough, chart = (
+                _Chart(model, reconstruct, vertices, mesh, deadline, rough=rough) for rough in (True, False)
+            )
+            problem = _Problem(model, rough, chart, start.astype(np.float64), positions, prior, deadline)
+            fit = _best(problem)
         codes, _ = model.latents.codes([fit.x.tolist()], Bounds.CLAMP)
         shape = model.shape(codes[0], True, mesh, deadline)
         found = shape.vertices[[target.vertex for target in targets]]
@@ -106,38 +112,44 @@ class Editor:
         status = Status.DEADLINE if shape.diagnostics.status is Status.DEADLINE else fit.status
         return Edited(codes[0], status, chart.shapes, shape, distances)
 
-    def _fit(
-        self, chart: _Chart, start: FloatArray, positions: FloatArray, prior: float, deadline: float | None
-    ) -> Fit:
-        problem = _Problem(self.model, chart, start, positions, prior, deadline)
-        best = problem.solve(start)
-        for _ in range(STARTS):
-            if best.status is Status.DEADLINE or problem.misfit(best) < GOOD:
-                break
-            elsewhere = problem.elsewhere(best)
-            if elsewhere is None:
-                break
-            fit = problem.solve(elsewhere)
-            if not fit.cost < 0.9 * best.cost:
-                break
-            best = fit
-        return best
+
+def _best(problem: _Problem) -> Fit:
+    """The best that a few starts lead to."""
+    rough = problem.search(problem.start)
+    best = problem.refine(rough.x)
+    for _ in range(STARTS):
+        if best.status is Status.DEADLINE or problem.misfit(best) < GOOD:
+            break
+        elsewhere = problem.elsewhere(best, problem.chart)
+        if elsewhere is None or not (other := problem.search(elsewhere)).cost < rough.cost:
+            break
+        fit = problem.refine(other.x)
+        if not fit.cost < PROMISING * best.cost:
+            break
+        rough, best = other, fit
+    return best
 
 
 class _Problem:
-    """The least-squares problem of one edit."""
+    """The least-squares problem of one edit.
+
+    First with rough shapes, which cost a third of those that are answered or less, and lie about half a percent of the
+    diagonal from them; from there a few of the others do.
+    """
 
     def __init__(
         self,
         model: ShapeModel,
+        rough: _Chart,
         chart: _Chart,
         start: FloatArray,
         positions: FloatArray,
         prior: float,
         deadline: float | None,
     ) -> None:
-        self._model, self._chart, self._start, self._positions = model, chart, start, positions
-        self._deadline = deadline
+        self.rough, self.chart, self.start = rough, chart, start
+        self._model, self._positions, self._deadline = model, positions, deadline
+        self._box = *model.latents.box(), model.latents.width
         self._weight = 1 / (model.reference.diagonal * np.sqrt(len(positions)))
         self._held = np.sqrt(prior / len(start)) / model.latents.width
 
@@ -145,26 +157,40 @@ class _Problem:
         """Root mean square distance from the targets, as a fraction of the diagonal."""
         return float(np.linalg.norm(fit.residual[: self._positions.size]))
 
-    def solve(self, start: FloatArray) -> Fit:
-        """From a start by the factors' derivatives, which are quick, and then by those of the whole composite."""
-        model, chart = self._model, self._chart
-        lower, upper = model.latents.box()
-        box = lower, upper, model.latents.width
+    def search(self, start: FloatArray) -> Fit:
+        """From a start by rough shapes and the factors' derivatives, which are quick, and from others if it fails."""
+        best = self._search(start)
+        for _ in range(STARTS):
+            if best.status is Status.DEADLINE or self.misfit(best) < GOOD_ROUGHLY:
+                break
+            elsewhere = self.elsewhere(best, self.rough)
+            if elsewhere is None or not (fit := self._search(elsewhere)).cost < PROMISING * best.cost:
+                break
+            best = fit
+        return best
 
-        rough = least_squares(
-            self._residual,
-            lambda x, _: self._jacobian(chart.derivatives(x, factor_derivatives(model, x))),
-            start, *box, tolerance=1e-3, gain_tolerance=0.05, secant=False, max_evaluations=20, deadline=self._deadline,
-        )  # fmt: skip
+    def _search(self, start: FloatArray) -> Fit:
+        chart = self.rough
         return least_squares(
-            self._residual,
-            lambda x, _: self._jacobian(chart.derivatives(x, derivatives(model, x))),
-            rough.x, *box, tolerance=1e-3, gain_tolerance=0.01, deadline=self._deadline,
+            lambda x: self._residual(x, chart),
+            lambda x, _: self._jacobian(chart.derivatives(x, factor_derivatives(self._model, x))),
+            start, *self._box, tolerance=1e-3, gain_tolerance=0.05, secant=False, max_evaluations=20,
+            deadline=self._deadline,
         )  # fmt: skip
 
-    def elsewhere(self, fit: Fit) -> FloatArray | None:
+    def refine(self, start: FloatArray) -> Fit:
+        """From nearby by the shapes that are answered and the whole composite's derivatives."""
+        chart = self.chart
+        return least_squares(
+            lambda x: self._residual(x, chart),
+            lambda x, _: self._jacobian(chart.derivatives(x, derivatives(self._model, x))),
+            start, *self._box, tolerance=1e-3, gain_tolerance=0.002, max_evaluations=REFINEMENTS,
+            deadline=self._deadline,
+        )  # fmt: skip
+
+    def elsewhere(self, fit: Fit, chart: _Chart) -> FloatArray | None:
         """Another start: the fit with one factor moved to where, to first order, the misfit shrinks most."""
-        model, chart = self._model, self._chart
+        model = self._model
         sensitivity = chart.sensitivity(fit.x) * self._weight
         missing = fit.residual[: self._positions.size]
         best, found = PROMISING * float(missing @ missing), None
@@ -181,9 +207,9 @@ class _Problem:
                     found[own] = part[left.argmin()]
         return found
 
-    def _residual(self, x: FloatArray) -> FloatArray:
-        away = self._held * self._model.latents.shorter(x - self._start)
-        return np.concatenate([self._weight * (self._chart.positions(x) - self._positions).ravel(), away])
+    def _residual(self, x: FloatArray, chart: _Chart) -> FloatArray:
+        away = self._held * self._model.latents.shorter(x - self.start)
+        return np.concatenate([self._weight * (chart.positions(x) - self._positions).ravel(), away])
 
     def _jacobian(self, moves: FloatArray) -> FloatArray:
         return np.concatenate([self._weight * moves.reshape(len(moves), -1).T, np.diag(self._held)])
@@ -192,7 +218,8 @@ class _Problem:
 class _Chart:
     """Positions of a few vertices as functions of the code, as the service answers them but for the scale.
 
-    Each shape is reconstructed from the last one.
+    Each shape is reconstructed from the last one, or from frames where these are nearer; a rough one is that of the
+    frames (geometry/frames.py), without Gauss–Newton.
     """
 
     def __init__(
@@ -202,8 +229,10 @@ class _Chart:
         vertices: IntArray,
         mesh: MeshChoice,
         deadline: float | None,
+        *,
+        rough: bool,
     ) -> None:
-        self._model, self._reconstruct, self._deadline = model, reconstruct, deadline
+        self._model, self._reconstruct, self._deadline, self._rough = model, reconstruct, deadline, rough
         self._vertices = vertices
         self._rows = model.fine.prolong.only(vertices) if model.fine and mesh is MeshChoice.FINE else None
         self._code, self._shape = np.full(model.latents.dimension, np.nan), model.reference.vertices
@@ -240,6 +269,13 @@ class _Chart:
 
     def _solved(self, x: FloatArray) -> FloatArray:
         if not np.array_equal(x, self._code):
-            found = self._reconstruct(self._model.nric(x), self._shape, tolerance=1e-5, deadline=self._deadline)
-            self._code, self._shape, self.shapes = x.copy(), found.vertices, self.shapes + 1
+            self._code, self._shape = x.copy(), self._solve(self._model.nric(x))
         return self._shape
+
+    def _solve(self, target: FloatArray) -> FloatArray:
+        framed, reconstruct = self._reconstruct.integrate(target), self._reconstruct
+        if self._rough:
+            return reconstruct.nearest(target, framed, self._model.reference.vertices)
+        self.shapes += 1
+        start = reconstruct.nearest(target, framed, self._shape)
+        return reconstruct(target, start, tolerance=1e-5, deadline=self._deadline).vertices
