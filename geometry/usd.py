@@ -28,14 +28,18 @@ def animated_usd(frames: FloatArray, faces: IntArray, name: str = "animation") -
 
     Raises:
         ImportError: ``usd-core`` is not installed.
+        OSError: there is no room for a temporary file.
     """
-    from pxr import Gf, Sdf, Usd, UsdGeom, Vt
+    from pxr import Gf, Sdf, Tf, Usd, UsdGeom, Vt
 
     frames = frames.astype(np.float32)
     # The writer of binary layers takes nothing but a path.
     with TemporaryDirectory(prefix="shapespace-") as folder:
         path = Path(folder, "animation.usdc")
-        stage = Usd.Stage.CreateNew(str(path))
+        try:
+            stage = Usd.Stage.CreateNew(str(path))
+        except Tf.ErrorException as error:
+            raise OSError(f"can't write {path}") from error
         UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
         UsdGeom.SetStageMetersPerUnit(stage, 1.0)
         stage.SetTimeCodesPerSecond(FRAMES_PER_SECOND)
@@ -59,5 +63,8 @@ def animated_usd(frames: FloatArray, faces: IntArray, name: str = "animation") -
                 around = vertex_normals(frame.astype(np.float64), faces).astype(np.float32)
                 for attribute, rows in ((points, frame), (normals, around), (extent, box)):
                     attribute.Set(Vt.Vec3fArray.FromNumpy(rows), k)
-        stage.GetRootLayer().Save()
+        try:
+            stage.GetRootLayer().Save()
+        except Tf.ErrorException as error:
+            raise OSError(f"can't write {path}") from error
         return path.read_bytes()

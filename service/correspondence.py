@@ -2,12 +2,7 @@
 
 from __future__ import annotations
 
-import io
-import json
-import struct
-import zipfile
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import orjson
@@ -15,10 +10,8 @@ from numpy.typing import NDArray
 
 from geometry.formats import read_arrays
 from geometry.mesh import FloatArray, IntArray, MeshError
+from service.bombs import refuse_bombs
 from service.shape_model import MeshChoice, ShapeModel
-
-#: What an archive may unpack to, as a multiple of the upload, or in bytes if that is more.
-_UNPACKED, _UNPACKED_BYTES = 20, 2**24
 
 
 class InvalidMeshError(ValueError):
@@ -52,7 +45,10 @@ def match(model: ShapeModel, data: bytes, format: str) -> Matched:
     Raises:
         InvalidMeshError: unreadable, not finite, or none of the model's meshes.
     """
+    layouts = _layouts(model)
     try:
+        largest = max(layout.count for layout in layouts), max(len(layout.faces) for layout in layouts)
+        refuse_bombs(data, format, *largest)
         vertices, faces = _read(data, format)
     except MeshError as error:
         raise InvalidMeshError(f"The mesh can't be used: {str(error).rstrip('.')}. Send one {format} file.") from None
@@ -61,7 +57,7 @@ def match(model: ShapeModel, data: bytes, format: str) -> Matched:
         raise InvalidMeshError(f"Vertex {bad[0]} has a coordinate that is not a finite number. Send finite positions.")
     soup = len(vertices) == faces.size and np.array_equal(faces.ravel(), np.arange(len(vertices)))
     faults = []
-    for layout in _layouts(model):
+    for layout in layouts:
         if soup and len(faces) == len(layout.faces):
             return _of_soup(layout, vertices[faces])
         if len(vertices) == layout.count:
@@ -71,7 +67,7 @@ def match(model: ShapeModel, data: bytes, format: str) -> Matched:
             faults.append(fault)
     if faults:
         raise InvalidMeshError(f"{faults[0]} Send a mesh with the faces and the vertex order of the model's.")
-    known = " or ".join(f"{layout.count} vertices and {len(layout.faces)} faces" for layout in _layouts(model))
+    known = " or ".join(f"{layout.count} vertices and {len(layout.faces)} faces" for layout in layouts)
     raise InvalidMeshError(
         f"The mesh has {len(vertices)} vertices and {len(faces)} faces, but those of {model.manifest.name} have "
         f"{known}. Send one in correspondence, with nothing welded, split or reordered."
@@ -161,7 +157,6 @@ def _read(data: bytes, format: str) -> tuple[FloatArray, IntArray]:
     if format == "json":
         vertices, faces = _read_json(data)
     else:
-        _refuse_bombs(data, format)
         vertices, faces = read_arrays(data, format)
     if vertices.ndim != 2 or vertices.shape[1] != 3 or vertices.dtype.kind not in "fiu" or not len(vertices):
         raise MeshError(f"vertices must be (V, 3) numbers, not {vertices.dtype} of shape {vertices.shape}")
@@ -181,21 +176,3 @@ def _read_json(data: bytes) -> tuple[NDArray, NDArray]:
         return np.array(content["vertices"]), np.array(content.get("faces") or np.zeros((0, 3), int))
     except ValueError:
         raise MeshError("vertices and faces must be lists of three numbers each") from None
-
-
-def _refuse_bombs(data: bytes, format: str) -> None:
-    """Refuse small files that would unpack to huge arrays; raises MeshError."""
-    if format == "npz" and zipfile.is_zipfile(io.BytesIO(data)):
-        with zipfile.ZipFile(io.BytesIO(data)) as archive:
-            size = sum(entry.file_size for entry in archive.infolist())
-        if size > max(_UNPACKED * len(data), _UNPACKED_BYTES):
-            raise MeshError(f"it unpacks to {size} bytes")
-    if format in ("glb", "gltf"):
-        try:
-            text = data[20 : 20 + struct.unpack_from("<I", data, 12)[0]] if format == "glb" else data
-            tree: Any = json.loads(text)
-            counts = [accessor["count"] for accessor in tree["accessors"]]
-        except (ValueError, KeyError, TypeError, struct.error):
-            return  # whoever reads it will say what is wrong
-        if not all(isinstance(count, int) and count <= len(data) for count in counts):
-            raise MeshError("an accessor counts more elements than the file has bytes")

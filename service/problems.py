@@ -19,6 +19,7 @@ from service.encodings import dump_json
 from service.exact import NoTangentSpaceError
 from service.latent_space import NotFiniteError, OutOfBoundsError, WrongLengthError
 from service.repository import UnknownModelError, UnknownVersionError
+from service.sequences import NoRoomError
 from service.workers import BusyError, DeadlineError, DisconnectedError
 
 MEDIA_TYPE = "application/problem+json"
@@ -60,6 +61,7 @@ KINDS = {
     "busy": Kind(503, "Busy"),
     "not-ready": Kind(503, "Not ready"),
     "deadline-passed": Kind(504, "Deadline passed"),
+    "no-room": Kind(507, "No room for a temporary file"),
 }
 
 #: What the domain raises, by kind; the message becomes the detail.
@@ -75,6 +77,7 @@ _OF_EXCEPTION: dict[type[Exception], str] = {
     NoTangentSpaceError: "no-tangent-space",
     BusyError: "busy",
     DeadlineError: "deadline-passed",
+    NoRoomError: "no-room",
     DisconnectedError: "client-closed",
 }
 DOMAIN_ERRORS = tuple(_OF_EXCEPTION)

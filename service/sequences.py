@@ -20,6 +20,10 @@ from service.latent_space import Codes
 from service.shape_model import Shape
 
 
+class NoRoomError(OSError):
+    """No room for a temporary file."""
+
+
 @dataclass(frozen=True)
 class Frames:
     """The frames of an animation, ready to be encoded.
@@ -85,7 +89,13 @@ def _point_cache(frames: Frames) -> tuple[bytes, dict[str, Any]]:
 
 
 def _usd(frames: Frames) -> tuple[bytes, dict[str, Any]]:
-    return animated_usd(frames.vertices, frames.faces), {}
+    try:
+        return animated_usd(frames.vertices, frames.faces), {}
+    except OSError:
+        raise NoRoomError(
+            "The server has no room for the temporary file that USD takes. Ask for another format, or give it a folder "
+            "for such files that can be written to (TMPDIR)."
+        ) from None
 
 
 def _zip(frames: Frames) -> tuple[bytes, dict[str, Any]]:

@@ -1,0 +1,39 @@
+"""What faults are inflicted on: one steady server, and one training run that nothing happens to."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import cache
+from pathlib import Path
+
+import pytest
+
+from tests.faults.catalogue import OUTCOMES, Arena, table
+from tests.faults.serving import Steady
+from tests.faults.training import Undisturbed
+from tests.service.conftest import starting
+
+
+@pytest.fixture(scope="session")
+def steady(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Steady]:
+    with starting() as start:
+        steady = Steady(tmp_path_factory.mktemp("steady"), start)
+        yield steady
+        steady.close()
+
+
+@pytest.fixture(scope="session")
+def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> object:
+    return cache(lambda: Undisturbed(tmp_path_factory.mktemp("undisturbed")))
+
+
+@pytest.fixture
+def arena(tmp_path: Path, steady: Steady, undisturbed: object) -> Iterator[Arena]:
+    with starting() as start:
+        yield Arena(tmp_path, steady, start, undisturbed)
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    if OUTCOMES:
+        terminalreporter.section("what faults came to")
+        terminalreporter.write_line(table())

@@ -1,0 +1,151 @@
+"""Faults of machines that train: the same command goes on, and ends with the same bits."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+
+from tests.faults.catalogue import Arena, fault
+from tests.faults.clock import jumping_clock
+from tests.faults.training import LAST, train
+from tests.training.conftest import command
+
+
+def stage_at_work(run: Path) -> str:
+    log = run / "log.jsonl"
+    begun = [json.loads(line) for line in log.read_text().splitlines()] if log.exists() else []
+    return next((event["stage"] for event in reversed(begun) if event["event"] == "begin"), "the start")
+
+
+@fault("training is killed (SIGKILL, with its workers) at random moments")
+def kill(arena: Arena, rng: np.random.Generator) -> str:
+    whole, run = arena.undisturbed(), arena.folder / "run"
+    kills = 0
+    for moment in rng.uniform(0, whole.seconds, 2):
+        process = subprocess.Popen(
+            command(whole.config, run, "--until", LAST),
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+            start_new_session=True,
+        )
+        try:
+            process.wait(moment)
+        except subprocess.TimeoutExpired:
+            kills += 1
+        finally:
+            os.killpg(process.pid, signal.SIGKILL)
+            process.wait()
+    done = train(whole.config, run, "--until", LAST)
+    assert done.returncode == 0, done.stderr
+    whole.require_the_same(run)
+    return f"killed {kills} times, it went on and ended bit for bit as an undisturbed run"
+
+
+@contextmanager
+def small_disk(folder: Path, size: int) -> Iterator[list[str]]:
+    """A folder with room for so many bytes; gives what a command needs in front of it to feel that.
+
+    A file system of that size where mounting is permitted. Elsewhere a limit on the size of each file, which root is
+    bound to as well.
+    """
+    folder.mkdir()
+    mounted = subprocess.run(
+        ["mount", "-t", "tmpfs", "-o", f"size={size}", "none", str(folder)], capture_output=True, check=False
+    )
+    if mounted.returncode:
+        limit = f"import os, resource, sys; resource.setrlimit(resource.RLIMIT_FSIZE, ({size // 20}, -1)); "
+        yield [sys.executable, "-c", limit + "os.execvp(sys.argv[1], sys.argv[1:])"]
+        return
+    try:
+        yield []
+    finally:
+        subprocess.run(["umount", "--lazy", str(folder)], check=True)
+
+
+@fault("the disk is full while training")
+def full_disk(arena: Arena, rng: np.random.Generator) -> str:
+    whole, disk = arena.undisturbed(), arena.folder / "disk"
+    size = int(rng.uniform(0.02, 0.4) * whole.bytes)
+    with small_disk(disk, size) as prefix:
+        arguments = [*prefix, *command(whole.config, disk / "run", "--until", "samples")]
+        full = subprocess.run(arguments, capture_output=True, text=True, check=False)
+        stage = stage_at_work(disk / "run")
+        assert full.returncode == 1, full.stderr
+        assert "No space left on device" in full.stderr or "File too large" in full.stderr, full.stderr
+        if not prefix:
+            subprocess.run(["mount", "-o", f"remount,size={10 * whole.bytes}", str(disk)], check=True)
+        done = train(whole.config, disk / "run", "--until", "samples")
+        assert done.returncode == 0, done.stderr
+        whole.require_the_same(disk / "run", "samples")
+    return f"stopped in {stage}, status 1 and the reason; with room again it went on to the same bits"
+
+
+@contextmanager
+def read_only(folder: Path) -> Iterator[str]:
+    """A folder that can't be written to, by root either: mounted so, or by its mode, or with a file in its place."""
+    bind = ["mount", "--bind", str(folder), str(folder)]
+    if subprocess.run(bind, capture_output=True, check=False).returncode == 0:
+        subprocess.run(["mount", "-o", "remount,bind,ro", str(folder)], check=True)
+        try:
+            yield "Read-only file system"
+        finally:
+            subprocess.run(["umount", "--lazy", str(folder)], check=True)
+    elif os.geteuid():
+        mode = folder.stat().st_mode
+        folder.chmod(0o555)
+        try:
+            yield "Permission denied"
+        finally:
+            folder.chmod(mode)
+    else:
+        away = folder.rename(folder.with_name("away"))
+        folder.touch()
+        try:
+            yield "Not a directory"
+        finally:
+            folder.unlink()
+            away.rename(folder)
+
+
+@fault("the run directory is read-only")
+def read_only_run(arena: Arena, rng: np.random.Generator) -> str:
+    whole, run = arena.undisturbed(), arena.folder / "run"
+    before = str(rng.choice(["ingest", "mean", "modes", "factors"]))
+    assert train(whole.config, run, "--until", before).returncode == 0
+    with read_only(run) as reason:
+        refused = train(whole.config, run, "--until", "samples")
+        assert refused.returncode == 1
+        assert reason in refused.stderr or "File exists" in refused.stderr, refused.stderr
+    done = train(whole.config, run, "--until", "samples")
+    assert done.returncode == 0, done.stderr
+    whole.require_the_same(run, "samples")
+    return f"status 1 and the reason after {before}; writable again it went on to the same bits"
+
+
+@fault("the clock jumps while training")
+def clock_while_training(arena: Arena, rng: np.random.Generator) -> str:
+    whole, run = arena.undisturbed(), arena.folder / "run"
+    with jumping_clock(arena.folder) as clock:
+        process = subprocess.Popen(
+            command(whole.config, run, "--until", "samples"),
+            env=clock.environment,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        while process.poll() is None:
+            clock.jump(rng.uniform(-10, 10))
+            time.sleep(0.1)
+        _, errors = process.communicate()
+    assert process.returncode == 0, errors
+    whole.require_the_same(run, "samples")
+    return "back and forth by years; the same bits"

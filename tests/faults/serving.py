@@ -1,0 +1,78 @@
+"""A server that faults are inflicted on, and that must be as it was once they are over."""
+
+from __future__ import annotations
+
+import re
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import httpx
+import numpy as np
+
+from tests.service.bundles import write_bundle
+from tests.service.conftest import Server, Start
+from tests.service.truth import Truth, bad_calls, good_calls
+
+
+def eventually(holds: Callable[[], bool], seconds: float = 60) -> None:
+    end = time.monotonic() + seconds
+    while not holds():
+        assert time.monotonic() < end, "it never came true"
+        time.sleep(0.05)
+
+
+def peak_memory(server: Server) -> int:
+    """Most bytes that the process ever had in memory at once."""
+    status = Path(f"/proc/{server.process.pid}/status").read_text()
+    found = re.search(r"VmHWM:\s+(\d+) kB", status)
+    assert found
+    return int(found[1]) * 1024
+
+
+def figure(client: httpx.Client, name: str) -> float:
+    """One number of ``/metrics``."""
+    found = re.search(rf"^{name} (\S+)$", client.get("/metrics").text, re.MULTILINE)
+    assert found
+    return float(found[1])
+
+
+class Steady:
+    """A server whose answers were written down before anything happened to it."""
+
+    def __init__(self, folder: Path, start: Start, **settings: object) -> None:
+        self.models = folder / "models"
+        write_bundle(self.models, "small")
+        write_bundle(self.models, "with-fine", fine=True)
+        self.server = start(self.models, workers=2, **settings)
+        self.url = self.server.url
+        self.place = httpx.URL(self.url)
+        self.client = httpx.Client(base_url=self.url, timeout=120)
+        rng = np.random.default_rng(0)
+        calls = good_calls(self.client, "small", rng, 2) + good_calls(self.client, "with-fine", rng, 1)
+        self.truth = Truth(self.client, calls + bad_calls("small"))
+        statuses = {call: answer[0] for call, answer in self.truth.answers.items()}
+        assert all(status < 500 for status in statuses.values()), statuses
+        self._handles, self._threads = self.handles, self.threads
+
+    @property
+    def handles(self) -> int:
+        """Files and sockets that the process has open."""
+        return len(list(Path(f"/proc/{self.server.process.pid}/fd").iterdir()))
+
+    @property
+    def threads(self) -> int:
+        return len(list(Path(f"/proc/{self.server.process.pid}/task").iterdir()))
+
+    def close(self) -> None:
+        self.client.close()
+
+    def check(self) -> None:
+        """It runs, answers as it did, is busy with nothing, holds no more than before, and has met no mistake."""
+        assert self.server.process.poll() is None, self.server.log
+        assert self.truth.differing() == []
+        eventually(lambda: figure(self.client, "shapespace_admitted") == 0)
+        eventually(lambda: self.handles <= self._handles + 2)
+        # Workers' threads begin one by one, as work comes.
+        assert self.threads <= self._threads + 2
+        assert "Traceback" not in self.server.log, self.server.log
