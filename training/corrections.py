@@ -104,8 +104,9 @@ class KernelCorrection(nn.Module):
     #: Samples that it is fitted to, at most.
     ANCHORS = 4000
     #: Lengths ℓ and penalties, as shares of the kernel's value at no distance, of which held-out samples choose one.
+    #: Below 1e-4 the weights become so large that single precision shows (3e-4 of a figure's lengths, 7e-6 from there).
     LENGTHS = (4.0, 8.0, 16.0)
-    RIDGES = tuple(10.0 ** (k / 2) for k in range(-12, -2))
+    RIDGES = tuple(10.0 ** (k / 2) for k in range(-8, -1))
     #: Samples that the principal axes of factors are taken from, at most.
     AXES = 500
     #: Variance that the basis of the correction keeps, and its largest rank.
