@@ -65,8 +65,8 @@ class Row:
         return found
 
     def seconds(self, stage: str) -> float:
-        """That a stage took."""
-        return float(self.run.stamp(stage)["seconds"])
+        """That a stage took, NaN where it is not finished."""
+        return float(self.run.stamp(stage).get("seconds", "nan"))
 
     def spread(self, model: str) -> tuple[float, float, float]:
         """R² of a model over the seeds: mean, smallest, largest."""
@@ -111,8 +111,10 @@ def study(name: str, run: Run) -> None:
 
 def plot_samples(rows: list[Row], path: Path) -> None:
     """R² by the share of the samples, of the three ways to learn from them."""
-    figure, axes = plt.subplots(1, len(rows), figsize=(2.4 * len(rows), 2.6), sharey=True, layout="constrained")
-    for axis, row in zip(axes, rows, strict=True):
+    figure, axes = plt.subplots(
+        1, len(rows), figsize=(2.4 * len(rows), 2.6), sharey=True, layout="constrained", squeeze=False
+    )
+    for axis, row in zip(axes[0], rows, strict=True):
         whole = {"fraction": 1.0, "r2": row.evaluation["r2"] | {"all of factors": row.evaluation["r2"]["composite"]}}
         every = sorted([whole, *row.evaluation["fractions"]], key=lambda each: each["fraction"])
         at = [100 * each["fraction"] for each in every]
@@ -122,16 +124,16 @@ def plot_samples(rows: list[Row], path: Path) -> None:
         axis.set(title=row.name, xscale="log", yscale="log", xlabel="share of the joint samples (%)")
         axis.set_xticks(at, [f"{a:g}" for a in at], minor=False)
         axis.minorticks_off()
-    axes[0].set_ylabel("1 − R²")
-    axes[0].legend(fontsize="x-small")
+    axes[0, 0].set_ylabel("1 − R²")
+    axes[0, 0].legend(fontsize="x-small")
     figure.savefig(path, dpi=110)
     plt.close(figure)
 
 
 def plot_space(rows: list[Row], path: Path) -> None:
     """Generalisation by the number of modes, beside principal components of vertices."""
-    figure, axes = plt.subplots(1, len(rows), figsize=(2.4 * len(rows), 2.6), layout="constrained")
-    for axis, row in zip(axes, rows, strict=True):
+    figure, axes = plt.subplots(1, len(rows), figsize=(2.4 * len(rows), 2.6), layout="constrained", squeeze=False)
+    for axis, row in zip(axes[0], rows, strict=True):
         found = row.read("space")
         for kind, style in (("modes", "o-"), ("components", "s--")):
             values = [100 * value for value in found["generalisation"][kind]]
@@ -139,8 +141,8 @@ def plot_space(rows: list[Row], path: Path) -> None:
         axis.set(title=row.name, xscale="log", xlabel="modes", ylim=(0, None))
         axis.set_xticks(found["modes"], [str(k) for k in found["modes"]], minor=False)
         axis.minorticks_off()
-    axes[0].set_ylabel("error of an unseen shape (% of diagonal)")
-    axes[0].legend(fontsize="x-small")
+    axes[0, 0].set_ylabel("error of an unseen shape (% of diagonal)")
+    axes[0, 0].legend(fontsize="x-small")
     figure.savefig(path, dpi=110)
     plt.close(figure)
 
@@ -160,15 +162,19 @@ def main() -> None:
     rows = {name: Row(name, run) for name, run in runs.items() if (run.folder / "evaluation.json").exists()}
     real = [rows[name] for name in COLLECTIONS if name in rows]
     docs = ROOT / "docs"
-    plot_samples([row for row in real if row.evaluation["fractions"]], docs / "results-samples.png")
-    plot_space([row for row in real if row.read("space")], docs / "results-space.png")
+    if some := [row for row in real if row.evaluation["fractions"]]:
+        plot_samples(some, docs / "results-samples.png")
+    if some := [row for row in real if row.read("space")]:
+        plot_space(some, docs / "results-space.png")
     environment = jinja2.Environment(  # noqa: S701 - Markdown
         loader=jinja2.FileSystemLoader(Path(__file__).parent),
         trim_blocks=True,
         lstrip_blocks=True,
         undefined=jinja2.StrictUndefined,
     )
-    page = environment.get_template("results.md.jinja").render(rows=rows, real=real)
+    page = environment.get_template("results.md.jinja").render(
+        rows=rows, real=real, spaces=any(row.read("space") for row in real)
+    )
     (docs / "results.md").write_text(page, encoding="utf-8")
     print(f"\n{docs / 'results.md'}")
 

@@ -103,7 +103,7 @@ def main() -> int:
     arguments = parser().parse_args()
     try:
         arguments.do(arguments)
-    except (ConfigError, ExportError, FactorError, IngestError, ModeError, ReportError, WorkersError) as error:
+    except (ConfigError, ExportError, FactorError, IngestError, ModeError, ReportError, WorkersError, OSError) as error:
         print(f"shapespace-train: {error}", file=sys.stderr)
         return FAILURE
     except KeyboardInterrupt:
