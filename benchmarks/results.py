@@ -172,8 +172,9 @@ def main() -> None:
         lstrip_blocks=True,
         undefined=jinja2.StrictUndefined,
     )
+    spaces, extrapolated = (any(row.read(name) for row in real) for name in ("space", "limits"))
     page = environment.get_template("results.md.jinja").render(
-        rows=rows, real=real, spaces=any(row.read("space") for row in real)
+        rows=rows, real=real, spaces=spaces, extrapolated=extrapolated
     )
     (docs / "results.md").write_text(page, encoding="utf-8")
     print(f"\n{docs / 'results.md'}")
