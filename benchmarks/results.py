@@ -112,7 +112,7 @@ def study(name: str, run: Run) -> None:
 def plot_samples(rows: list[Row], path: Path) -> None:
     """R² by the share of the samples, of the three ways to learn from them."""
     figure, axes = plt.subplots(
-        1, len(rows), figsize=(2.4 * len(rows), 2.6), sharey=True, layout="constrained", squeeze=False
+        1, len(rows), figsize=(1.6 + 2.2 * len(rows), 2.9), sharey=True, layout="constrained", squeeze=False
     )
     for axis, row in zip(axes[0], rows, strict=True):
         whole = {"fraction": 1.0, "r2": row.evaluation["r2"] | {"all of factors": row.evaluation["r2"]["composite"]}}
@@ -121,18 +121,18 @@ def plot_samples(rows: list[Row], path: Path) -> None:
         for model, style in (("composite", "o-"), ("all of factors", "s--"), ("monolithic", "^:")):
             label = {"all of factors": "composite, all factor samples"}.get(model, model)
             axis.plot(at, [1 - each["r2"][model]["total"] for each in every], style, label=label)
-        axis.set(title=row.name, xscale="log", yscale="log", xlabel="share of the joint samples (%)")
+        axis.set(title=row.name, xscale="log", yscale="log", xlabel="joint samples (%)")
         axis.set_xticks(at, [f"{a:g}" for a in at], minor=False)
         axis.minorticks_off()
     axes[0, 0].set_ylabel("1 − R²")
-    axes[0, 0].legend(fontsize="x-small")
+    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=3, fontsize="x-small")
     figure.savefig(path, dpi=110)
     plt.close(figure)
 
 
 def plot_space(rows: list[Row], path: Path) -> None:
     """Generalisation by the number of modes, beside principal components of vertices."""
-    figure, axes = plt.subplots(1, len(rows), figsize=(2.4 * len(rows), 2.6), layout="constrained", squeeze=False)
+    figure, axes = plt.subplots(1, len(rows), figsize=(1.6 + 2.2 * len(rows), 2.9), layout="constrained", squeeze=False)
     for axis, row in zip(axes[0], rows, strict=True):
         found = row.read("space")
         for kind, style in (("modes", "o-"), ("components", "s--")):
@@ -142,7 +142,7 @@ def plot_space(rows: list[Row], path: Path) -> None:
         axis.set_xticks(found["modes"], [str(k) for k in found["modes"]], minor=False)
         axis.minorticks_off()
     axes[0, 0].set_ylabel("error of an unseen shape (% of diagonal)")
-    axes[0, 0].legend(fontsize="x-small")
+    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=3, fontsize="x-small")
     figure.savefig(path, dpi=110)
     plt.close(figure)
 

@@ -11,6 +11,7 @@ import ctypes
 import importlib.util
 import re
 import sys
+from collections.abc import Callable
 from functools import cache
 from importlib import metadata
 from typing import Literal, Protocol
@@ -215,9 +216,9 @@ class PardisoCholesky:
             raise RuntimeError("factorise first")
         return self._run(33, entries, np.ascontiguousarray(right, dtype=np.float64), factor)
 
-    def __del__(self) -> None:
-        # MKL keeps the factors outside Python's memory until told otherwise.
-        if hasattr(self, "_entries") and not sys.is_finalizing():
+    def __del__(self, finalizing: Callable[[], bool] = sys.is_finalizing) -> None:
+        # MKL keeps the factors outside Python's memory until told otherwise. At the end `sys` itself may be gone.
+        if hasattr(self, "_entries") and not finalizing():
             self._run(-1, np.zeros(1))
 
 
