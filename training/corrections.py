@@ -105,7 +105,7 @@ class KernelCorrection(nn.Module):
     ANCHORS = 4000
     #: Lengths ℓ and penalties, as shares of the kernel's value at no distance, of which held-out samples choose one.
     #: Below 1e-4 the weights become so large that single precision shows (3e-4 of a figure's lengths, 7e-6 from there).
-    LENGTHS = (4.0, 8.0, 16.0)
+    LENGTHS = (2.0, 4.0, 8.0, 16.0)
     RIDGES = tuple(10.0 ** (k / 2) for k in range(-8, -1))
     #: Samples that the principal axes of factors are taken from, at most.
     AXES = 500
