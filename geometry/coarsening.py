@@ -180,10 +180,11 @@ class _Decimation:
     def result(self, target: int) -> Coarsening:
         """The mesh as it is now."""
         fine_index, local = np.unique(list(self.faces.values()), return_inverse=True)
-        faces = Connectivity(local.reshape(-1, 3), len(fine_index)).faces
+        connectivity = Connectivity(local.reshape(-1, 3), len(fine_index))
+        faces = connectivity.faces
         normals, squares = _sides(self.points[fine_index[faces.T]])
         sine = np.sqrt(_squared_sines(normals, squares).min())
-        folds = len(_folded(Connectivity(faces, len(fine_index)), normals))
+        folds = len(_folded(connectivity, normals))
         areas = np.log(_dots(normals, normals).clip(1e-300)) / 2
         shrinkage = float(np.exp((areas - areas.mean(axis=1, keepdims=True)).min()))
         reason = ""

@@ -260,9 +260,8 @@ def projected(space: ShellSpace, mean: FloatArray, fields: FloatArray, span: Flo
     """
     problem = _Problem(space, mean, fields, 1)
     D = without_rigid_motion(span, problem.point.vertices).reshape(len(span), -1)
-    B = D @ problem.MD
-    W = np.linalg.lstsq(D @ (problem.M @ D.T), B, rcond=NEGLIGIBLE)[0]
-    return (W.T @ D).reshape(fields.shape), float(np.vdot(W, B)) / problem.total
+    W, explained = problem.project(D)
+    return (W.T @ D).reshape(fields.shape), explained
 
 
 def edge_magnitudes(nric: FloatArray, norm: WeightedNorm) -> FloatArray:
@@ -343,14 +342,18 @@ class _Problem:
         energies = (W**2).sum(axis=1) * np.einsum("jx,xj->j", D, self.M @ D.T)
         return float((2 * energies / self.one_norms(D)).max())
 
+    def project(self, D: FloatArray) -> tuple[NDArray, float]:
+        """Coefficients (m, n) of the logarithms' projections to the span of fields (m, 3V), and the share explained."""
+        B = D @ self.MD
+        W = np.linalg.lstsq(D @ (self.M @ D.T), B, rcond=NEGLIGIBLE)[0]
+        return W, float(np.vdot(W, B)) / self.total
+
     def modes(self, D: FloatArray, converged: bool = True, history: list[dict[str, float]] | None = None) -> Modes:
         """Project the logarithms to the span, drop what carries nothing, scale, orient and sort."""
         D = D[np.einsum("jx,xj->j", D, self.M @ D.T) > NEGLIGIBLE * self.total / len(self.D)]
         if not len(D):
             raise ModeError("the sparsity is too high: no mode is left")
-        B = D @ self.MD
-        W = np.linalg.lstsq(D @ (self.M @ D.T), B, rcond=NEGLIGIBLE)[0]
-        explained = float(np.vdot(W, B)) / self.total
+        W, explained = self.project(D)
         peaks = W[np.arange(len(W)), np.abs(W).argmax(axis=1)]
         D, W = D * peaks[:, None], W / peaks[:, None]
         energies = (W**2).sum(axis=1) * np.einsum("jx,xj->j", D, self.M @ D.T)

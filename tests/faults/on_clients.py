@@ -10,7 +10,8 @@ import time
 import numpy as np
 
 from tests.faults.catalogue import Arena, fault
-from tests.faults.serving import Steady, eventually, figure
+from tests.faults.serving import Steady, eventually
+from tests.service.watching import admitted
 
 MODEL = "/v1/models/small"
 CODE = b'{"latent": [0.1, 0.7, 0.4]}'
@@ -60,7 +61,7 @@ def slow(arena: Arena, rng: np.random.Generator) -> str:
         with readers[0].makefile("rb") as rest:
             while b'"frame":599' not in rest.readline():
                 pass
-    eventually(lambda: figure(steady.client, "shapespace_admitted") == 0)
+    eventually(lambda: admitted(steady.client) == 0)
     steady.check()
     return f"{others} other requests answered right meanwhile, and the slow ones in the end"
 

@@ -3,23 +3,19 @@
 from __future__ import annotations
 
 import re
-import time
-from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import httpx
 import numpy as np
 
+from tests.service import watching
 from tests.service.bundles import write_bundle
 from tests.service.conftest import Server, Start
 from tests.service.truth import Truth, bad_calls, good_calls
 
-
-def eventually(holds: Callable[[], bool], seconds: float = 60) -> None:
-    end = time.monotonic() + seconds
-    while not holds():
-        assert time.monotonic() < end, "it never came true"
-        time.sleep(0.05)
+#: Longer than elsewhere: what is waited for comes after a fault.
+eventually = partial(watching.eventually, seconds=60)
 
 
 def peak_memory(server: Server) -> int:
@@ -28,13 +24,6 @@ def peak_memory(server: Server) -> int:
     found = re.search(r"VmHWM:\s+(\d+) kB", status)
     assert found
     return int(found[1]) * 1024
-
-
-def figure(client: httpx.Client, name: str) -> float:
-    """One number of ``/metrics``."""
-    found = re.search(rf"^{name} (\S+)$", client.get("/metrics").text, re.MULTILINE)
-    assert found
-    return float(found[1])
 
 
 class Steady:
@@ -71,7 +60,7 @@ class Steady:
         """It runs, answers as it did, is busy with nothing, holds no more than before, and has met no mistake."""
         assert self.server.process.poll() is None, self.server.log
         assert self.truth.differing() == []
-        eventually(lambda: figure(self.client, "shapespace_admitted") == 0)
+        eventually(lambda: watching.admitted(self.client) == 0)
         eventually(lambda: self.handles <= self._handles + 2)
         # Workers' threads begin one by one, as work comes.
         assert self.threads <= self._threads + 2

@@ -5,7 +5,6 @@ import hashlib
 import io
 import json
 import os
-import re
 import select
 import socket
 import zipfile
@@ -24,6 +23,7 @@ from service.latent_space import LatentSpace
 from tests.sequences import read_point_cache, read_usd
 from tests.service.conftest import Start
 from tests.service.glb import GLB, khronos_report
+from tests.service.watching import admitted
 
 A, B, C = [-0.1, 0.5, 0.0], [0.1, 1.5, 1.0], [0.2, -2.0, 0.5]
 
@@ -237,13 +237,6 @@ def test_a_reader_who_leaves_gives_the_place_back(models: Path, start: Start) ->
         while client.get("/v1/models/small/mesh").status_code == 503:
             while_waiting += 1
             assert while_waiting < 200, "all of the frames would take that long"
-
-
-def admitted(client: httpx.Client) -> int:
-    """Requests at work, as told without taking a place."""
-    found = re.search(r"^shapespace_admitted (\S+)$", client.get("/metrics").text, re.MULTILINE)
-    assert found
-    return int(float(found[1]))
 
 
 def test_work_ends_when_nobody_waits_for_it(models: Path, start: Start) -> None:

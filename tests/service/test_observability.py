@@ -6,23 +6,12 @@ from pathlib import Path
 
 import httpx
 import pytest
-from prometheus_client.parser import text_string_to_metric_families
 
 from tests.service.conftest import Start
+from tests.service.watching import samples, value
 
 MESH = "/v1/models/small/mesh"
 CODE = {"latent": [0.1, 0.7, 0.4]}
-Samples = dict[tuple[str, frozenset[tuple[str, str]]], float]
-
-
-def samples(client: httpx.Client) -> Samples:
-    text = client.get("/metrics").raise_for_status().text
-    families = text_string_to_metric_families(text)
-    return {(s.name, frozenset(s.labels.items())): s.value for family in families for s in family.samples}
-
-
-def value(found: Samples, name: str, **labels: str) -> float:
-    return found.get((name, frozenset(labels.items())), 0)
 
 
 def test_requests_are_counted_by_route_method_and_status(models: Path, start: Start) -> None:

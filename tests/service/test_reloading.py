@@ -5,7 +5,7 @@ import shutil
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -16,6 +16,7 @@ import pytest
 from tests.service.bundles import SCALE, reference, rescale, write_bundle
 from tests.service.conftest import Server, Start
 from tests.service.test_bundles import flip_a_bit
+from tests.service.watching import eventually
 
 CODES = [[0.1, 0.7, 0.4], [0.0, 0.0, 0.0], [0.05, 1.0, 0.2]]
 
@@ -30,13 +31,6 @@ def folder(tmp_path: Path) -> Path:
 def connected(server: Server) -> Iterator[httpx.Client]:
     with httpx.Client(base_url=server.url, timeout=60) as client:
         yield client
-
-
-def eventually(holds: Callable[[], bool], seconds: float = 30) -> None:
-    end = time.monotonic() + seconds
-    while not holds():
-        assert time.monotonic() < end, "it never came true"
-        time.sleep(0.02)
 
 
 def reload(server: Server) -> None:

@@ -1,0 +1,34 @@
+"""What is seen of a server from outside: what comes true in time, and its metrics."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+import httpx
+from prometheus_client.parser import text_string_to_metric_families
+
+Samples = dict[tuple[str, frozenset[tuple[str, str]]], float]
+
+
+def eventually(holds: Callable[[], bool], seconds: float = 30) -> None:
+    end = time.monotonic() + seconds
+    while not holds():
+        assert time.monotonic() < end, "it never came true"
+        time.sleep(0.02)
+
+
+def samples(client: httpx.Client) -> Samples:
+    """What ``/metrics`` says, which takes no place in the queue."""
+    text = client.get("/metrics").raise_for_status().text
+    families = text_string_to_metric_families(text)
+    return {(s.name, frozenset(s.labels.items())): s.value for family in families for s in family.samples}
+
+
+def value(found: Samples, name: str, **labels: str) -> float:
+    return found.get((name, frozenset(labels.items())), 0)
+
+
+def admitted(client: httpx.Client) -> float:
+    """Requests at work or waiting."""
+    return samples(client)["shapespace_admitted", frozenset()]
