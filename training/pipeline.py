@@ -190,11 +190,23 @@ class Stage:
         run: does it; finds and continues what an interrupted call has left.
         settings: the part of the configuration that it reads.
         results: what is removed where that part, or an earlier stage, has changed.
+        amounts: settings that may change without it, since the stage knows what is there and what is missing.
     """
 
     run: Callable[[Run], None]
     settings: Callable[[Config], Sequence[BaseModel]]
     results: tuple[str, ...]
+    amounts: frozenset[str] = frozenset()
+
+    def keys(self, name: str, config: Config, before: str) -> dict[str, str]:
+        """Digests of what the stage depends on: ``key`` of everything, ``basis`` of all but its amounts."""
+        settings = [s.model_dump(mode="json") for s in self.settings(config)]
+        rest = [{k: v for k, v in s.items() if k not in self.amounts} for s in settings]
+
+        def digest(read: list[dict[str, Any]]) -> str:
+            return hashlib.sha256(json.dumps([name, read, before]).encode()).hexdigest()
+
+        return {"key": digest(settings), "basis": digest(rest)}
 
 
 STAGES: dict[str, Stage] = {
@@ -202,7 +214,7 @@ STAGES: dict[str, Stage] = {
     "mean": Stage(_discovered(discovery.mean), lambda c: [c.material], ("mean.npz",)),
     "modes": Stage(_discovered(discovery.modes), lambda c: [c.modes], ("modes.npz", "modes.json")),
     "factors": Stage(_discovered(discovery.factors, given_factors), lambda c: [c.factors], ("factors.json",)),
-    "samples": Stage(samples, lambda c: [c.samples], ("samples",)),
+    "samples": Stage(samples, lambda c: [c.samples], ("samples",), frozenset({"count", "factor_counts"})),
     # Files of networks are named by samples and settings, so a change leaves those alone that it doesn't touch.
     "networks": Stage(networks, lambda c: [c.networks, c.monolithic, *c.variants.values()], ()),
     "evaluation": Stage(
@@ -216,23 +228,22 @@ def execute(run: Run, until: str | None = None, *, show: Callable[[str], None] =
     """Do the stages that are not done yet, up to and including ``until``; in the end, report.html."""
     key, news = "", False
     for name, stage in STAGES.items():
-        settings = [s.model_dump(mode="json") for s in stage.settings(run.config)]
-        key = hashlib.sha256(json.dumps([name, settings, key]).encode()).hexdigest()
-        stamp = run.stamp(name)
+        keys = stage.keys(name, run.config, key)
+        key, stamp = keys["key"], run.stamp(name)
         if stamp.get("key") == key and "seconds" in stamp:
             show(f"{name}: done before ({stamp['seconds']:.0f} s)")
         else:
-            if stamp and stamp["key"] != key:
+            if stamp and stamp["key"] != key and stamp.get("basis") != keys["basis"]:
                 for result in stage.results:
                     path = run.folder / result
                     shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
-            run.set_stamp(name, key=key)
+            run.set_stamp(name, **keys)
             run.log("begin", stage=name)
             show(f"{name} …")
             start = time.monotonic()
             stage.run(run)
             seconds = time.monotonic() - start
-            run.set_stamp(name, key=key, seconds=seconds)
+            run.set_stamp(name, **keys, seconds=seconds)
             run.log("end", stage=name, seconds=round(seconds, 3))
             show(f"{name}: {seconds:.0f} s")
             news = True

@@ -23,6 +23,7 @@ from training.config import load, parse
 from training.export import ExportError, export
 from training.freaky_torus import FreakyTorus, vertices
 from training.pipeline import STAGES, Run, learner_of
+from training.sampling import read
 
 
 def seconds(run: Path) -> dict[str, float]:
@@ -135,6 +136,23 @@ def test_the_same_command_again_does_nothing_and_a_changed_setting_only_its_stag
     assert {name for name in STAGES if before[name] != after[name]} == {"export"}
     manifest = json.loads((copy / "models" / "tiny-torus" / "1" / "manifest.json").read_text())
     assert manifest["description"] == "Another description."
+
+
+def test_more_samples_are_drawn_beside_those_that_are_there(tiny_run: Path, tmp_path: Path) -> None:
+    copy, config = tmp_path / "run", tmp_path / "tiny.toml"
+    shutil.copytree(tiny_run, copy)
+    files = sorted(copy.glob("samples/**/part-*.npz"))
+    before = {path: path.stat().st_mtime_ns for path in files}
+
+    def draw(text: str) -> None:
+        config.write_text(text)
+        subprocess.run(command(config, copy, "--until", "samples"), check=True, capture_output=True)
+
+    draw(TINY.replace("\ncount = 60", "\ncount = 80"))
+    assert len(read(copy / "samples").index) == 80
+    assert {path: path.stat().st_mtime_ns for path in files} == before
+    draw(TINY.replace("\ncount = 60", "\ncount = 80\nsteps = 5"))
+    assert all(path.stat().st_mtime_ns != before[path] for path in files)
 
 
 def test_a_run_killed_in_samples_and_in_networks_ends_with_the_same_figures(tiny_run: Path, tmp_path: Path) -> None:
