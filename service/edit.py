@@ -120,8 +120,8 @@ def _best(problem: _Problem) -> Fit:
     for _ in range(STARTS):
         if best.status is Status.DEADLINE or problem.misfit(best) < GOOD:
             break
-        elsewhere = problem.elsewhere(best, problem.chart)
-        if elsewhere is None or not (other := problem.search(elsewhere)).cost < rough.cost:
+        other = problem.search(problem.elsewhere(best, problem.chart))
+        if not other.cost < rough.cost:
             break
         fit = problem.refine(other.x)
         if not fit.cost < PROMISING * best.cost:
@@ -163,8 +163,8 @@ class _Problem:
         for _ in range(STARTS):
             if best.status is Status.DEADLINE or self.misfit(best) < GOOD_ROUGHLY:
                 break
-            elsewhere = self.elsewhere(best, self.rough)
-            if elsewhere is None or not (fit := self._search(elsewhere)).cost < PROMISING * best.cost:
+            fit = self._search(self.elsewhere(best, self.rough))
+            if not fit.cost < PROMISING * best.cost:
                 break
             best = fit
         return best
@@ -188,12 +188,15 @@ class _Problem:
             deadline=self._deadline,
         )  # fmt: skip
 
-    def elsewhere(self, fit: Fit, chart: _Chart) -> FloatArray | None:
-        """Another start: the fit with one factor moved to where, to first order, the misfit shrinks most."""
+    def elsewhere(self, fit: Fit, chart: _Chart) -> FloatArray:
+        """Another start: the fit with one factor moved to where, to first order, the misfit shrinks most.
+
+        That is the reference where no such move promises enough.
+        """
         model = self._model
         sensitivity = chart.sensitivity(fit.x) * self._weight
         missing = fit.residual[: self._positions.size]
-        best, found = PROMISING * float(missing @ missing), None
+        best, found = PROMISING * float(missing @ missing), np.clip(np.zeros_like(fit.x), *model.latents.box())
         half = model.manifest.edges
         for j, factor in enumerate(model.manifest.factors):
             own = slice(factor.start, factor.stop)

@@ -54,6 +54,17 @@ def test_an_edit_reaches_what_can_be_reached(client: httpx.Client, name: str, se
     assert found["diagnostics"]["inside_bounds"]
 
 
+def test_an_edit_leaves_a_valley_that_ends_above_its_targets(client: httpx.Client) -> None:
+    # From this start the descent ends 1.4 % from them, and no single factor's move promises less.
+    path = "/v1/models/figure"
+    start, goal = (
+        client.post(f"{path}/sample", json={"count": 14, "seed": seed}).json()["latents"][13] for seed in (1, 2)
+    )
+    shape, vertices = positions(client, goal, "figure"), [3641, 4032, 1100]
+    found = edit(client, shape[vertices], vertices, f"{path}/edit", latent=start)
+    assert found["residual"] < 0.002 * np.linalg.norm(np.ptp(shape, axis=0))
+
+
 @pytest.mark.parametrize("mesh", ["fine", "coarse"])
 def test_an_edit_is_the_best_compromise_between_targets_and_prior(client: httpx.Client, mesh: str) -> None:
     prior, vertices = 1e-3, [3, 20, 45]
