@@ -1,0 +1,170 @@
+"""Every block of code in the documentation does what it says; the README's list of settings is whole.
+
+Calls and Python run as they stand, against a real server. Commands that take minutes or other machines are held against
+what would read them: the Makefile, the command line's parser, a program's own help.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import os
+import re
+import shlex
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import httpx
+import pytest
+
+from service.settings import PREFIX, Settings
+from tests.service.conftest import ROOT, Server, starting
+from tests.test_docs import PAGES, text_of
+from training.__main__ import parser
+
+MAKEFILE = (ROOT / "Makefile").read_text(encoding="utf-8")
+
+#: First lines of the blocks that nothing here tries, by page, and why.
+UNTRIED = {
+    ("README.md", "docker build -t shapespace . && docker run --rm --read-only -p 8000:8000 shapespace"): (
+        "needs a container engine; `make image-test` builds and tries the same"
+    ),
+}
+
+
+@dataclass(frozen=True)
+class Block:
+    page: str
+    language: str
+    text: str
+
+    @property
+    def place(self) -> tuple[str, str]:
+        return self.page, self.text.split("\n")[0]
+
+    def __str__(self) -> str:
+        return f"{self.page}: {self.text.split(chr(10))[0][:60]}"
+
+
+BLOCKS = [
+    Block(page.name, language, text)
+    for page in PAGES
+    for language, text in re.findall(
+        r"^ *```(.*?)\n(.*?)^ *```$", page.read_text(encoding="utf-8"), re.DOTALL | re.MULTILINE
+    )
+]
+
+
+def run(command: list[str], server: Server, folder: Path) -> None:
+    (folder / ".curlrc").write_text("fail-with-body\nsilent\nshow-error\n")
+    environment = os.environ | {"CURL_HOME": str(folder), "PYTHONPATH": str(ROOT)}
+    command[-1] = command[-1].replace("localhost:8000", server.url.removeprefix("http://"))
+    found = subprocess.run(
+        command, cwd=folder, env=environment, capture_output=True, text=True, check=False, timeout=600
+    )
+    assert found.returncode == 0, found.stdout + found.stderr
+
+
+def try_command(line: str) -> None:
+    """Hold a command against what would read it."""
+    program, *words = shlex.split(line)
+    match Path(program).name:
+        case "make":
+            for word in words:
+                variable, is_variable, _ = word.partition("=")
+                known = rf"\$\([^)]*\b{variable}\b" if is_variable else rf"^{word}:.*##"
+                assert re.search(known, MAKEFILE, re.MULTILINE), f"the Makefile has no {word}"
+        case "shapespace-train" if len(words) == 1:
+            with pytest.raises(SystemExit, match=r"^0$"):
+                parser().parse_args([*words, "--help"])
+        case "shapespace-train":
+            parser().parse_args(words)
+        case "python" if words[0] == "-m":
+            assert importlib.util.find_spec(words[1]), words[1]
+        case "dask":
+            dask = Path(sys.executable).with_name("dask")
+            told = subprocess.run([dask, words[0], "--help"], capture_output=True, text=True, check=True).stdout
+            assert {word for word in words if word.startswith("--")} <= set(re.findall(r"--[\w-]+", told))
+        case other:
+            pytest.fail(f"say here how {other} is tried, or list the block in UNTRIED")
+
+
+def try_shell(text: str, server: Server, folder: Path) -> None:
+    if "curl " in text:
+        run(["bash", "-euo", "pipefail", "-c", text], server, folder)
+        for file in re.findall(r"-o (\S+\.glb)", text):
+            assert (folder / file).read_bytes()[:4] == b"glTF"
+    else:
+        for line in text.splitlines():
+            try_command(line.partition("#")[0])
+
+
+def try_python(text: str, server: Server, folder: Path) -> None:
+    run([sys.executable, "-c", text], server, folder)
+
+
+def try_log_line(text: str, server: Server, folder: Path) -> None:
+    """The one kind of JSON that the pages show: what a server with SHAPESPACE_LOG_FORMAT=json writes of a request."""
+    shown = json.loads(text)
+    (folder / "models").mkdir()
+    with starting() as start:
+        asked = start(folder / "models", log_format="json")
+        httpx.request(shown["method"], asked.url + shown["path"])
+        lines = [json.loads(line) for line in asked.stop().splitlines()]
+    written = next(line for line in lines if line.get("path") == shown["path"])
+    assert {key: type(value) for key, value in shown.items()} == {key: type(value) for key, value in written.items()}
+    assert (shown["logger"], shown["route"]) == (written["logger"], written["route"])
+
+
+def try_map(text: str, server: Server, folder: Path) -> None:
+    """A block in no language shows places of the repository, one a line."""
+    for line in text.splitlines():
+        assert (ROOT / line.split()[0]).exists(), line
+
+
+TRIALS: dict[str, Callable[[str, Server, Path], None]] = {
+    "sh": try_shell,
+    "python": try_python,
+    "json": try_log_line,
+    "": try_map,
+}
+
+
+@pytest.mark.parametrize("block", [block for block in BLOCKS if block.place not in UNTRIED], ids=str)
+def test_blocks_do_what_they_say(server: Server, tmp_path: Path, block: Block) -> None:
+    assert block.language in TRIALS, "say here how it is tried, or list it in UNTRIED"
+    TRIALS[block.language](block.text, server, tmp_path)
+
+
+def test_no_block_is_overlooked() -> None:
+    assert set(UNTRIED) <= {block.place for block in BLOCKS}
+    fences = sum(page.read_text(encoding="utf-8").count("```") for page in PAGES)
+    assert fences == 2 * len(BLOCKS) >= 24
+
+
+COMMANDS = sorted(
+    {
+        command.replace("\n", " ")
+        for page in PAGES
+        for command in re.findall(r"`((?:make|shapespace-train|python -m|dask) [^`]+)`", text_of(page))
+    }
+)
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_commands_within_the_text_exist(command: str) -> None:
+    try_command(command)
+
+
+def test_options_within_the_text_exist() -> None:
+    for page in PAGES:
+        for variable in re.findall(r"`([A-Z]+)=[^`]*`", text_of(page)):
+            assert f"$({variable})" in MAKEFILE or f"$(or $({variable})" in MAKEFILE, variable
+
+
+def test_every_setting_is_listed_and_none_else() -> None:
+    listed = set(re.findall(rf"`({PREFIX}[A-Z_]+)`", (ROOT / "README.md").read_text(encoding="utf-8")))
+    assert listed == {(PREFIX + name).upper() for name in Settings.model_fields}
