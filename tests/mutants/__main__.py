@@ -1,0 +1,138 @@
+"""How many small mistakes in geometry/ its tests notice: ``python -m tests.mutants [COUNT] [--seed N] [--only TEXT]``.
+
+Cosmic Ray makes the mistakes, one at a time, in a copy of the code. Of all that are possible a random sample is tried,
+spread over the modules by their lines, no two at one place. A mutant meets the tests that import its module first, then
+those that reach it through others. What survived ends as diffs in build/mutants.diff, to be read.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import os
+import random
+import shlex
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections import Counter, defaultdict
+from pathlib import Path
+
+import grimp
+from cosmic_ray.commands.init import init
+from cosmic_ray.mutating import mutate_and_test
+from cosmic_ray.work_db import WorkDB
+from cosmic_ray.work_item import MutationSpec, TestOutcome
+
+ROOT = Path(__file__).parents[2]
+PYTEST = [sys.executable, "-m", "pytest", "-q", "-x", "--no-header", "-p", "no:cacheprovider"]
+#: A mutant may take this many times what all tests take without one.
+PATIENCE = 1.5
+
+#: Mistakes that may go unnoticed. Left out is what no test could miss (a sum that becomes a shift), what is nearly the
+#: same twice (seven ways to turn a comparison), and `|`, which stands mostly in annotations.
+OPERATORS = {
+    *(f"ReplaceBinaryOperator_{pair}" for pair in ("Add_Sub", "Sub_Add", "Mul_Div", "Div_Mul", "Pow_Mul", "Mod_Mul")),
+    *(f"ReplaceBinaryOperator_{pair}" for pair in ("FloorDiv_Mul", "BitAnd_BitOr")),
+    *(f"ReplaceComparisonOperator_{pair}" for pair in ("Lt_LtE", "Lt_GtE", "LtE_Lt", "LtE_Gt", "Gt_GtE", "Gt_LtE")),
+    *(f"ReplaceComparisonOperator_{pair}" for pair in ("GtE_Gt", "GtE_Lt", "Eq_NotEq", "NotEq_Eq")),
+    *("ReplaceComparisonOperator_Is_IsNot", "ReplaceComparisonOperator_IsNot_Is"),
+    *(f"ReplaceUnaryOperator_{change}" for change in ("USub_UAdd", "Delete_Not", "Delete_Invert")),
+    *("ReplaceTrueWithFalse", "ReplaceFalseWithTrue", "ReplaceAndWithOr", "ReplaceOrWithAnd"),
+    *("ReplaceBreakWithContinue", "ReplaceContinueWithBreak", "ZeroIterationForLoop"),
+    *("AddNot", "ExceptionReplacer", "NumberReplacer", "RemoveDecorator"),
+}
+
+
+def name_of(mutation: MutationSpec) -> str:
+    line, column = mutation.start_pos
+    operator = mutation.operator_name.removeprefix("core/")
+    return f"{mutation.module_path.stem}:{line}:{column} {operator} {mutation.occurrence}"
+
+
+def sample(modules: list[Path], count: int, seed: int) -> tuple[int, list[MutationSpec]]:
+    """How many mutants there are, and some of them, in an order in which every beginning is a sample too."""
+    possible: dict[Path, list[MutationSpec]] = defaultdict(list)
+    with tempfile.TemporaryDirectory() as folder:
+        database = WorkDB(Path(folder) / "all.sqlite", WorkDB.Mode.create)
+        init(modules, database, {})
+        for item in database.work_items:
+            mutation = item.mutations[0]
+            if mutation.operator_name.removeprefix("core/") in OPERATORS:
+                possible[mutation.module_path].append(mutation)
+        database.close()
+    lines = {module: len(module.read_text(encoding="utf-8").splitlines()) for module in sorted(possible)}
+    rng = random.Random(seed)
+    chosen = []
+    for module, length in lines.items():
+        places = defaultdict(list)
+        for mutation in sorted(possible[module], key=lambda m: (m.start_pos, m.operator_name, m.occurrence)):
+            places[mutation.start_pos].append(mutation)
+        share = max(1, round(count * length / sum(lines.values())))
+        chosen += [rng.choice(places[at]) for at in rng.sample(list(places), min(share, len(places)))]
+    rng.shuffle(chosen)
+    return sum(map(len, possible.values())), chosen
+
+
+def tests_by_module() -> dict[str, tuple[list[str], list[str]]]:
+    """For each module the test files that import it, and those that reach it through other modules."""
+    graph = grimp.build_graph("geometry", cache_dir=None)
+    imports = {}
+    for path in sorted(Path("tests/geometry").glob("test_*.py")):
+        nodes = ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        imports[str(path)] = {node.module for node in nodes if isinstance(node, ast.ImportFrom)}
+    found = {}
+    for module in graph.modules:
+        own = f"tests/geometry/test_{module.rpartition('.')[2]}.py"
+        first = sorted((path for path in imports if module in imports[path]), key=lambda path: path != own)
+        above = graph.find_downstream_modules(module)
+        found[module] = first, [path for path in imports if path not in first and imports[path] & above]
+    return found
+
+
+def command_for(first: list[str], then: list[str]) -> str:
+    return shlex.join(["sh", "-ec", "\n".join(shlex.join([*PYTEST, *paths]) for paths in (first, then) if paths)])
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(prog="python -m tests.mutants", description="Mutation testing of geometry/.")
+    parser.add_argument("count", nargs="?", type=int, default=160, help="how many mutants")
+    parser.add_argument("--seed", type=int, default=9)
+    parser.add_argument("--only", default="", metavar="TEXT", help="of the sample, those with this in their names")
+    options = parser.parse_args()
+    report = ROOT / "build" / "mutants.diff"
+    report.parent.mkdir(exist_ok=True)
+    outcomes: Counter[str] = Counter()
+    with tempfile.TemporaryDirectory() as copy:
+        unneeded = shutil.ignore_patterns("node_modules", "__pycache__")
+        for package in ("geometry", "service", "training", "tests"):
+            shutil.copytree(ROOT / package, Path(copy) / package, ignore=unneeded)
+        shutil.copy(ROOT / "pyproject.toml", copy)
+        os.chdir(copy)
+        os.environ["PYTHONPATH"] = copy
+        start = time.monotonic()
+        subprocess.run([*PYTEST, "tests/geometry"], check=True)
+        timeout = PATIENCE * (time.monotonic() - start)
+        total, chosen = sample(sorted(Path("geometry").glob("[a-z]*.py")), options.count, options.seed)
+        print(f"{len(chosen)} of {total} mutants, seed {options.seed}, at most {timeout:.0f} s each", flush=True)
+        tests = tests_by_module()
+        with report.open("w", encoding="utf-8") as survivors:
+            for mutation in chosen:
+                name = name_of(mutation)
+                if options.only not in name:
+                    continue
+                command = command_for(*tests[f"geometry.{mutation.module_path.stem}"])
+                result = mutate_and_test([mutation], command, timeout)
+                outcome = "timed out" if result.output == "timeout" else str(result.test_outcome.value)
+                outcomes[outcome] += 1
+                print(f"{outcome:9} {name}", flush=True)
+                if result.test_outcome is not TestOutcome.KILLED:
+                    print(name, result.diff or result.output, sep="\n", file=survivors, flush=True)
+    print(", ".join(f"{number} {outcome}" for outcome, number in sorted(outcomes.items())))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
