@@ -13,6 +13,7 @@ from scipy import sparse
 from scipy.sparse.csgraph import connected_components, dijkstra
 from scipy.spatial.transform import Rotation
 
+from geometry import quaternions
 from geometry.cholesky import Backend, SymmetricPattern, analyse
 from geometry.mesh import FloatArray, IntArray, TriangleMesh, face_normals
 
@@ -145,7 +146,7 @@ class FrameIntegration:
         across[1:] *= self._turn
         # Products along the paths from the roots, twice as long in each round.
         for first, ancestors in self._rounds:
-            q[:, first:] = _product(q.take(ancestors, axis=1), q[:, first:])
+            q[:, first:] = quaternions.product(q.take(ancestors, axis=1), q[:, first:])
         return q.take(self._place, axis=1)
 
 
@@ -173,17 +174,3 @@ def _quaternions(mesh: TriangleMesh, faces: IntArray) -> FloatArray:
     normal = face_normals(mesh.vertices, mesh.faces[faces])
     matrices = np.stack([along, np.cross(normal, along), normal], axis=2)
     return Rotation.from_matrix(matrices).as_quat(scalar_first=True).T
-
-
-def _product(p: FloatArray, q: FloatArray) -> FloatArray:
-    """Products (4, n) of quaternions (4, n)."""
-    w, x, y, z = p
-    a, b, c, d = q
-    return np.stack(
-        [
-            w * a - x * b - y * c - z * d,
-            w * b + x * a + y * d - z * c,
-            w * c - x * d + y * a + z * b,
-            w * d + x * c - y * b + z * a,
-        ]
-    )

@@ -15,8 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geometry.colouring import Colouring
-from geometry.mesh import FloatArray, IntArray
-from geometry.nric import components, cross
+from geometry.mesh import FloatArray, IntArray, face_normals
 
 FLOAT, UNSIGNED_INT = 5126, 5125
 ARRAY_BUFFER, ELEMENT_ARRAY_BUFFER = 34962, 34963
@@ -39,11 +38,8 @@ WHITE = MATERIAL | {
 
 def vertex_normals(vertices: FloatArray, faces: IntArray) -> FloatArray:
     """Unit normals (V, 3) at the vertices of a shape (V, 3): means of the face normals, weighted by area."""
-    x, corners = components(vertices), np.ascontiguousarray(faces.T)
-    a = x.take(corners[0], axis=1)
-    by_face = cross(x.take(corners[1], axis=1) - a, x.take(corners[2], axis=1) - a)
-    flat = corners.ravel()
-    normals = np.stack([np.bincount(flat, np.tile(n, 3), minlength=len(vertices)) for n in by_face], axis=1)
+    by_face, corners = face_normals(vertices, faces, normalised=False), faces.T.ravel()
+    normals = np.stack([np.bincount(corners, np.tile(n, 3), minlength=len(vertices)) for n in by_face.T], axis=1)
     length = np.linalg.norm(normals, axis=1, keepdims=True)
     # A vertex whose faces cancel out has no normal, but the format insists on a unit vector.
     return np.where(length > 0, normals / np.where(length > 0, length, 1), [0.0, 0.0, 1.0])

@@ -18,6 +18,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy import sparse
 
+from geometry import quaternions
 from geometry.mesh import Connectivity, FloatArray, IntArray
 
 
@@ -85,21 +86,25 @@ class Integrability:
 
     def at_vertices(self, z: FloatArray) -> FloatArray:
         """Q(z) at the interior vertices, (n, 3): as long as the sine of half the angle left after a turn around."""
-        product = _identity(len(self.vertices))
-        for turn_z, turn_x in self._turns(*self._angles(z)):
-            product = _multiply(_multiply(product, turn_z), turn_x)
-        return product[1:].T
+        gamma, theta = self._angles(z)
+        cos_z, sin_z = np.cos(gamma / 2), np.sin(gamma / 2)
+        cos_x, sin_x = (f(theta / 2).take(self._exit) for f in (np.cos, np.sin))
+        # By a corner's angle about z, then back by its edge's about x; an identity where a fan is complete.
+        turns = np.zeros((4, len(gamma) + 1))
+        turns[:, :-1] = cos_z * cos_x, -cos_z * sin_x, -sin_z * sin_x, sin_z * cos_x
+        turns[0, -1] = 1
+        return quaternions.chain(turns.take(self._fans, axis=1))[1:].T
 
     def jacobian(self, z: FloatArray) -> sparse.csr_array:
         """DQ(z) (n, 2E)."""
         gamma, theta = self._angles(z)
         by_length = self._angle_derivatives(z)
         e, n = self.connectivity.edge_count, len(self.vertices)
-        before, axes = _identity(n), []
+        before, axes = quaternions.identity(n), []
         for turn_z, turn_x in self._turns(gamma, theta):
-            before = _multiply(before, turn_z)
-            axes.append((_rotate(before, 2), -_rotate(before, 0)))
-            before = _multiply(before, turn_x)
+            before = quaternions.product(before, turn_z)
+            axes.append((quaternions.axis(before, 2), -quaternions.axis(before, 0)))
+            before = quaternions.product(before, turn_x)
         scalar, vector = before[0], before[1:]
 
         rows, columns, values = [], [], []
@@ -156,7 +161,7 @@ class Integrability:
             there = corners >= 0
             turn_z = np.where(there, gamma[corners], 0.0)
             turn_x = np.where(there, -theta[self._exit[corners]], 0.0)
-            turns.append((_turn(turn_z, 2), _turn(turn_x, 0)))
+            turns.append((quaternions.turn(turn_z, 2), quaternions.turn(turn_x, 0)))
         return turns
 
     def _around(
@@ -164,20 +169,20 @@ class Integrability:
     ) -> tuple[FloatArray, float, list[tuple[FloatArray, FloatArray]]]:
         """The six conditions of a loop, the product's scalar part, and the twist (ω, v) of each move."""
         e = self.connectivity.edge_count
-        rotation, place = _identity(1), np.zeros(3)
+        rotation, place = quaternions.identity(1), np.zeros(3)
         twists = []
         for kind, parameter, sign in moves:
             if kind == "slide":
-                direction = _rotate(rotation, 0)[:, 0]
+                direction = quaternions.axis(rotation, 0)[:, 0]
                 twists.append((np.zeros(3), direction))
                 place = place + z[parameter] * direction
-                rotation = _multiply(rotation, _turn(np.array([np.pi]), 2))
+                rotation = quaternions.product(rotation, quaternions.turn(np.array([np.pi]), 2))
                 continue
             axis = 2 if kind == "corner" else 0
             angle = gamma[parameter] if kind == "corner" else z[e + parameter]
-            direction = sign * _rotate(rotation, axis)[:, 0]
+            direction = sign * quaternions.axis(rotation, axis)[:, 0]
             twists.append((direction, np.cross(place, direction)))
-            rotation = _multiply(rotation, _turn(np.array([sign * angle]), axis))
+            rotation = quaternions.product(rotation, quaternions.turn(np.array([sign * angle]), axis))
         return np.concatenate([rotation[1:, 0], place]), float(rotation[0, 0]), twists
 
     def _around_derivative(
@@ -196,32 +201,6 @@ class Integrability:
             else:
                 derivative[:, parameter + (e if kind == "edge" else 0)] += column
         return derivative
-
-
-def _identity(n: int) -> FloatArray:
-    out = np.zeros((4, n))
-    out[0] = 1
-    return out
-
-
-def _turn(angle: FloatArray, axis: int) -> FloatArray:
-    """Quaternions (4, n) of turns about a coordinate axis."""
-    out = np.zeros((4, len(angle)))
-    out[0], out[1 + axis] = np.cos(angle / 2), np.sin(angle / 2)
-    return out
-
-
-def _multiply(p: FloatArray, q: FloatArray) -> FloatArray:
-    scalar = p[0] * q[0] - (p[1:] * q[1:]).sum(axis=0)
-    return np.concatenate([scalar[None], p[0] * q[1:] + q[0] * p[1:] + np.cross(p[1:], q[1:], axis=0)])
-
-
-def _rotate(q: FloatArray, axis: int) -> FloatArray:
-    """A coordinate axis (3, n) turned by quaternions."""
-    unit = np.zeros_like(q)
-    unit[1 + axis] = 1
-    conjugate = q * np.array([[1], [-1], [-1], [-1]])
-    return _multiply(_multiply(q, unit), conjugate)[1:]
 
 
 def _generators(connectivity: Connectivity) -> list[list[int]]:

@@ -212,8 +212,11 @@ def face_areas(vertices: FloatArray, faces: IntArray) -> FloatArray:
 
 def face_normals(vertices: FloatArray, faces: IntArray, *, normalised: bool = True) -> FloatArray:
     """Normals (…, F, 3) of shapes (…, V, 3); of length twice the area unless ``normalised``."""
-    a, b, c = (vertices[..., faces[:, k], :] for k in range(3))
-    n = np.cross(b - a, c - a)
+    a, b, c = (vertices.take(faces[:, k], axis=-2) for k in range(3))
+    b, c = b - a, c - a
+    n = np.empty_like(b)
+    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):  # a third of the time of np.cross
+        n[..., i] = b[..., j] * c[..., k] - b[..., k] * c[..., j]
     return n / np.linalg.norm(n, axis=-1, keepdims=True) if normalised else n
 
 
