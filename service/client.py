@@ -34,12 +34,12 @@ class ClientError(Exception):
         request_id: by which the server's log names the request.
     """
 
-    def __init__(self, answer: httpx.Response) -> None:
+    def __init__(self, answer: httpx.Response, problem: Mapping[str, Any] | None = None) -> None:
         try:
-            problem = answer.json()
+            problem = problem or answer.json()
         except ValueError:  # it comes from a proxy
             problem = {}
-        self.status, self.type = answer.status_code, problem.get("type", "about:blank")
+        self.status, self.type = problem.get("status", answer.status_code), problem.get("type", "about:blank")
         self.detail = problem.get("detail", answer.reason_phrase)
         self.request_id = answer.headers.get("X-Request-ID")
         super().__init__(f"{self.status}: {self.detail}")
@@ -234,7 +234,8 @@ class Client:
             answer = self._http.request(method, path, params=given, **sent)
             if answer.status_code != httpx.codes.SERVICE_UNAVAILABLE or attempt == self._retries:
                 break
-            time.sleep(float(answer.headers.get("Retry-After", 1)))
+            wait = answer.headers.get("Retry-After", "")
+            time.sleep(int(wait) if wait.isdecimal() else 1)  # a proxy may send a date
         if answer.is_error:
             raise ClientError(answer)
         return answer
@@ -261,7 +262,10 @@ class Interpolation:
                 answer.read()
                 raise ClientError(answer)
             for line in answer.iter_lines():
-                yield np.array(json.loads(line)["vertices"], dtype=np.float32)
+                frame = json.loads(line)
+                if problem := frame.get("problem"):
+                    raise ClientError(answer, problem)
+                yield np.array(frame["vertices"], dtype=np.float32)
 
     def file(self, format: str = "glb") -> bytes:
         """The whole animation."""

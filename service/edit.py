@@ -24,6 +24,8 @@ DIFFERENCE = 1e-4
 #: Other starts at most, where the misfit is above one of these fractions of the diagonal: with rough shapes, with those
 #: that are answered. And what part of its square must be thought to remain there.
 STARTS, GOOD_ROUGHLY, GOOD, PROMISING = 4, 2e-2, 2e-3, 0.9
+#: Targets at most that another start is chosen by: each costs three solves, and as many fields.
+RANKED = 32
 #: Shapes at most that a fit is refined with. What takes longer follows a valley that hardly falls.
 REFINEMENTS = 8
 
@@ -194,8 +196,10 @@ class _Problem:
         That is the reference where no such move promises enough.
         """
         model = self._model
-        sensitivity = chart.sensitivity(fit.x) * self._weight
-        missing = fit.residual[: self._positions.size]
+        count = len(self._positions)
+        some = np.linspace(0, count - 1, min(count, RANKED)).astype(np.int64)
+        sensitivity = chart.sensitivity(fit.x, some) * self._weight
+        missing = fit.residual[: self._positions.size].reshape(-1, 3)[some].ravel()
         best, found = PROMISING * float(missing @ missing), np.clip(np.zeros_like(fit.x), *model.latents.box())
         half = model.manifest.edges
         for j, factor in enumerate(model.manifest.factors):
@@ -253,13 +257,13 @@ class _Chart:
         here, *there = self._placed(np.concatenate([shape[None], shape + h * fields]))
         return np.stack([(places - here) / h for places in there])
 
-    def sensitivity(self, x: FloatArray) -> FloatArray:
-        """(3k, 2E) derivatives of the positions by lengths and angles at a code (m,), without those of normals."""
+    def sensitivity(self, x: FloatArray, some: IntArray) -> FloatArray:
+        """(3k, 2E) derivatives of some positions (k,) by lengths and angles at a code (m,), without normals'."""
         shape, count = self._solved(x), len(self._model.reference.vertices)
         rows = (
-            sparse.eye_array(count, format="csr")[self._vertices]
+            sparse.eye_array(count, format="csr")[self._vertices[some]]
             if self._rows is None
-            else self._rows.weights[:, :count]
+            else self._rows.weights[some, :count]
         )
         fields = np.einsum("kv,xy->kxvy", rows.toarray(), np.eye(3)).reshape(-1, count, 3)
         aligned = align(shape, self._model.reference.vertices)

@@ -22,7 +22,7 @@ from service.latent_space import Codes
 from service.problems import KINDS, MEDIA_TYPE
 from service.recent import Answer
 from service.schemas import MeshAnswer
-from service.shape_model import MeshChoice, Shape, ShapeModel
+from service.shape_model import LengthsAndAngles, MeshChoice, Shape, ShapeModel
 from service.workers import DisconnectedError, Workers
 
 Timings = dict[str, float]
@@ -144,6 +144,13 @@ async def shapes(
     """Shapes of codes (n, m), side by side; raises DisconnectedError where the client doesn't wait for them."""
     work = partial(solve, service.workers, model, mesh)
     return await gather(service, request, work, zip(codes, map(bool, inside), strict=True), deadline)
+
+
+async def predictions(
+    service: Service, request: Request, model: ShapeModel, codes: Codes, deadline: float
+) -> list[LengthsAndAngles]:
+    """What the networks say to codes (n, m), side by side; raises DisconnectedError as ``shapes`` does."""
+    return await gather(service, request, lambda code, _: model.lengths_and_angles(code), codes, deadline)
 
 
 async def gather(

@@ -85,8 +85,8 @@ class LengthsAndAngles:
     """NRIC in the units of the training meshes.
 
     Attributes:
-        lengths, angles: (n, E) each, angles in radians.
-        factors: (n, J, 2E), the factors' own lengths and angles.
+        lengths, angles: (E,) each, angles in radians.
+        factors: (J, 2E), the factors' own lengths and angles.
     """
 
     lengths: FloatArray
@@ -191,17 +191,16 @@ class ShapeModel:
         seconds = {"network": predicted - began, "reconstruct": time.perf_counter() - predicted}
         return Shape(vertices, diagnostics, seconds)
 
-    def lengths_and_angles(self, codes: Codes) -> LengthsAndAngles:
-        """What the networks say to codes (n, m), before any reconstruction; raises NotFiniteError."""
-        pairs = [self._networks(code[None]) for code in codes]
-        factors, z = (np.concatenate(arrays) for arrays in zip(*pairs, strict=True))
+    def lengths_and_angles(self, code: Codes) -> LengthsAndAngles:
+        """What the networks say to a code (m,), before any reconstruction; raises NotFiniteError."""
+        factors, z = (array[0] for array in self._networks(code[None]))
         half = self.manifest.edges
         for array in (factors, z):
             array[..., :half] *= self.manifest.scale
             with np.errstate(over="ignore"):
                 if not np.isfinite(array.astype(np.float32)).all():
                     raise NotFiniteError(self._overflow)
-        return LengthsAndAngles(z[:, :half], z[:, half:], factors)
+        return LengthsAndAngles(z[:half], z[half:], factors)
 
     def nric(self, code: FloatArray) -> FloatArray:
         """What the networks say to a code (m,): (2E,), normalised, not finite where they overflow."""

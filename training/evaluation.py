@@ -226,7 +226,7 @@ def evaluate(
         "seeds": [_other_seed(learner(seed=seed), norm) for seed in config.networks.seeds],
         "vertex_error": found.figures(),
         "sizes": sizes,
-        "times": model_times(collection, composite),
+        "times": model_times(collection, composite, eta),
     }
     gallery = extremes(found.vertices, vertices[first], found.errors, test[first])
     return figures, gallery | strip(collection, composite, eta) | {"faces": reference.faces}
@@ -274,12 +274,14 @@ def median_seconds(function: Callable[[], Any], repeat: int = 20) -> float:
     return float(np.median(times))
 
 
-def model_times(collection: Collection, composite: Callable[[torch.Tensor], torch.Tensor]) -> dict[str, float]:
+def model_times(
+    collection: Collection, composite: Callable[[torch.Tensor], torch.Tensor], eta: float
+) -> dict[str, float]:
     """Median seconds for one code: exact shape, composite network, reconstruction from the reference (one thread)."""
     rng = np.random.default_rng(0)
     latents = collection.coordinates.uniform(1, rng)
     z = collection.shapes(latents).nric[0]
-    reconstruct = Reconstructor(collection.reference)
+    reconstruct = Reconstructor(collection.reference, eta)
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:

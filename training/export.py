@@ -122,7 +122,7 @@ def export(
     """
     settings, reference = config.export, collection.reference
     folder = destination / settings.name / str(settings.version)
-    part = folder.with_name(folder.name + ".part")
+    part = folder.with_name(f".{folder.name}.part")  # hidden from a server that watches
     shutil.rmtree(part, ignore_errors=True)
     part.mkdir(parents=True)
 

@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 import json
-import os
 from pathlib import Path
 from typing import Any
 
 import torch
 from safetensors import safe_open
-from safetensors.torch import save_file
+from safetensors.torch import save
 from torch import Tensor, nn
 from torch.optim.lr_scheduler import CosineAnnealingLR, ReduceLROnPlateau
 from tqdm import tqdm
 
 from training.config import FitSettings
+from training.files import whole
 from training.networks import ShapeNetwork, predict
 
 CHECKPOINT_EPOCHS = 5
@@ -24,9 +24,8 @@ def save_network(path: Path, network: nn.Module, state: dict[str, Any], extra: d
     """Write parameters, buffers and a JSON state as one safetensors file, whole or not at all."""
     tensors = {f"network.{k}": v for k, v in network.state_dict().items()} | (extra or {})
     tensors = {k: v.contiguous().clone() for k, v in tensors.items()}
-    part = path.with_suffix(".part")
-    save_file(tensors, part, metadata={"state": json.dumps(state)})
-    os.replace(part, path)
+    with whole(path) as file:
+        file.write(save(tensors, metadata={"state": json.dumps(state)}))
 
 
 def load_network(path: Path, network: nn.Module) -> tuple[dict[str, Any], dict[str, Tensor]]:

@@ -22,7 +22,7 @@ from training import discovery
 from training.config import Config
 from training.evaluation import alone, evaluate
 from training.export import export
-from training.files import write_json, write_npz
+from training.files import write_json, write_npz, write_text
 from training.freaky_torus import FreakyTorus
 from training.learning import Learner
 from training.report import write_report
@@ -37,10 +37,12 @@ class Run:
 
     def __init__(self, folder: Path, config: Config, source: str, models: Path, scheduler: str | None = None) -> None:
         self.folder, self.config, self.models, self.scheduler = folder, config, models, scheduler
-        folder.mkdir(parents=True, exist_ok=True)
-        self._stamps = folder / "stages"
-        self._stamps.mkdir(exist_ok=True)
-        (folder / "config.toml").write_text(source, encoding="utf-8")
+        self._source, self._stamps = source, folder / "stages"
+
+    def begin(self) -> None:
+        """Make the directory, with a copy of the configuration."""
+        self._stamps.mkdir(parents=True, exist_ok=True)
+        write_text(self.folder / "config.toml", self._source)
 
     @property
     def by_design(self) -> bool:
@@ -210,7 +212,7 @@ class Stage:
 
 
 STAGES: dict[str, Stage] = {
-    "ingest": Stage(ingest, lambda c: [c.collection], ("reference.npz", "shapes.npz")),
+    "ingest": Stage(ingest, lambda c: [c.collection], ("reference.npz", "shapes.npz", "ingest.json")),
     "mean": Stage(_discovered(discovery.mean), lambda c: [c.material], ("mean.npz",)),
     "modes": Stage(_discovered(discovery.modes), lambda c: [c.modes], ("modes.npz", "modes.json")),
     "factors": Stage(_discovered(discovery.factors, given_factors), lambda c: [c.factors], ("factors.json",)),
@@ -226,6 +228,7 @@ STAGES: dict[str, Stage] = {
 
 def execute(run: Run, until: str | None = None, *, show: Callable[[str], None] = print) -> None:
     """Do the stages that are not done yet, up to and including ``until``; in the end, report.html."""
+    run.begin()
     key, news = "", False
     for name, stage in STAGES.items():
         keys = stage.keys(name, run.config, key)

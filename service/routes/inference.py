@@ -24,7 +24,7 @@ from service.inference import (
     model_metadata,
     parse,
 )
-from service.responses import problems, server_timing, shapes, total_seconds
+from service.responses import predictions, problems, server_timing, shapes, total_seconds
 from service.shape_model import ShapeModel
 
 router = APIRouter(prefix="/v2", tags=["inference"])
@@ -135,8 +135,8 @@ async def _infer(service: Service, request: Request, model: ShapeModel) -> Respo
                 headers["Shape-Diagnostics"] = dump_json(worst([shape.diagnostics for shape in found])).decode()
                 seconds |= total_seconds(found)
             else:
-                z = await service.workers.run(lambda _: model.lengths_and_angles(codes), deadline)
-                outputs[name] = float32(np.concatenate([z.lengths, z.angles], axis=1))
+                predicted = await predictions(service, request, model, codes, deadline)
+                outputs[name] = float32(np.stack([np.concatenate([z.lengths, z.angles]) for z in predicted]))
         began = time.perf_counter()
         content, length = await service.workers.run(lambda _: answer(message, model, outputs), deadline)
     headers["Server-Timing"] = server_timing(seconds | {"encode": time.perf_counter() - began})

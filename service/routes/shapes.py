@@ -22,6 +22,7 @@ from service.responses import (
     file_headers,
     gather,
     mesh_answers,
+    predictions,
     problems,
     server_timing,
     shape_response,
@@ -151,21 +152,19 @@ async def _exact(
     response_model_exclude_none=True,
     dependencies=[Depends(require_json)],
 )
-async def post_nric(service: ServiceDependency, model: Model, body: NRICRequest) -> Response:
+async def post_nric(service: ServiceDependency, request: Request, model: Model, body: NRICRequest) -> Response:
     """Lengths and angles as the networks predict them, before any reconstruction."""
     limit_codes(service, len(body.latents))
     codes, _ = model.latents.codes(body.latents, body.bounds)
-
-    def make(_: float) -> tuple[bytes, dict[str, float]]:
-        began = time.perf_counter()
-        z = model.lengths_and_angles(codes)
-        predicted = time.perf_counter()
-        answer = {"lengths": float32(z.lengths), "angles": float32(z.angles)}
-        if body.factors:
-            answer["factors"] = float32(z.factors)
-        content = dump_json(answer)
-        return content, {"network": predicted - began, "encode": time.perf_counter() - predicted}
-
     with service.workers.admit() as deadline:
-        content, seconds = await service.workers.run(make, deadline)
+        began = time.perf_counter()
+        found = await predictions(service, request, model, codes, deadline)
+        predicted = time.perf_counter()
+
+        def encode(_: float) -> bytes:
+            names = ("lengths", "angles", *(("factors",) if body.factors else ()))
+            return dump_json({name: float32(np.stack([getattr(z, name) for z in found])) for name in names})
+
+        content = await service.workers.run(encode, deadline)
+    seconds = {"network": predicted - began, "encode": time.perf_counter() - predicted}
     return Response(content, headers={"Server-Timing": server_timing(seconds)}, media_type="application/json")

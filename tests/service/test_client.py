@@ -109,6 +109,24 @@ def test_problems_are_exceptions_that_say_what_to_do(shapes: Client) -> None:
         next(iter(Interpolation(shapes, "abc", 3)))
 
 
+def test_a_stream_that_ends_in_a_problem_is_an_exception_too(shapes: Client) -> None:
+    path = shapes.interpolate("small", [CODES[0], [3.4e38, 0, 3.4e38]], frames=4)
+    with pytest.raises(ClientError, match="nearer to the bounds") as caught:
+        list(path)
+    assert caught.value.status == 422
+    assert caught.value.type == "urn:shapespace:problem:not-finite"
+
+
+def test_a_proxy_that_names_a_date_to_ask_again_is_asked_again() -> None:
+    answers = [
+        httpx.Response(503, headers={"Retry-After": "Sat, 21 Nov 2026 18:00:00 GMT"}),
+        httpx.Response(200, json={"models": []}),
+    ]
+    with Client("http://proxy") as client:
+        client._http = httpx.Client(base_url="http://proxy", transport=httpx.MockTransport(lambda _: answers.pop(0)))
+        assert client.models() == []
+
+
 def test_a_busy_server_is_asked_again(models: Path, start: Start) -> None:
     url = start(models, workers=1, queue=0).url
     codes = np.tile(CODES[:1], (60, 1))

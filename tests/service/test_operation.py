@@ -84,6 +84,17 @@ def test_a_passed_deadline_ends_the_work(models: Path, start: Start) -> None:
             assert client.get(id["links"][name]).status_code == 504, name
 
 
+def test_a_deadline_holds_between_codes_before_any_reconstruction_too(models: Path, start: Start) -> None:
+    many = [CODE["latent"]] * 5000
+    with httpx.Client(base_url=start(models, deadline=0.1, max_codes=len(many)).url, timeout=120) as client:
+        tensor = {"name": "latent", "shape": [len(many), 3], "datatype": "FP32", "data": many}
+        for path, body in (
+            ("/v1/models/small/nric", {"latents": many}),
+            ("/v2/models/small/infer", {"inputs": [tensor], "outputs": [{"name": "nric"}]}),
+        ):
+            assert client.post(path, json=body).status_code == 504
+
+
 def test_sigterm_ends_it_cleanly_after_the_running_request(models: Path, start: Start) -> None:
     server = start(models, workers=1)
     with httpx.Client(base_url=server.url, timeout=120) as client:

@@ -38,7 +38,7 @@ def steep(tmp_path: Path) -> ShapeModel:
 
 def test_codes_at_which_the_networks_overflow_are_refused(steep: ShapeModel) -> None:
     codes, _ = steep.latents.codes([[1e30, 0, 0]])
-    for ask in (lambda: steep.shape(codes[0]), lambda: steep.lengths_and_angles(codes)):
+    for ask in (lambda: steep.shape(codes[0]), lambda: steep.lengths_and_angles(codes[0])):
         with pytest.raises(NotFiniteError, match="nearer to the bounds"):
             ask()
 

@@ -101,12 +101,15 @@ find("#share").addEventListener("click", () => { remember(); copy(location.href,
 // Models.
 const picker = find("#model");
 let models = [];
+let opening;
 let turned = false;
 picker.addEventListener("change", reporting(() => openModel({ model: models.find(({ name }) => name === picker.value) })));
 
 async function openModel({ model, code, keyframes = [], locked, view, state = {} }) {
   const space = new LatentSpace(model);
+  opening = model;
   const coarse = await api.reference(model, "coarse");
+  if (opening !== model) return;
   picker.value = model.name;
   store.set({ shape: null, playing: false });
   viewer.open(coarse);

@@ -97,7 +97,9 @@ export class Path {
     this.#loading = loading;
     this.status.textContent = `Computing ${request.frames} frames …`;
     try {
-      this.#frames = await api.frames(this.store.model, { ...request, mesh: "coarse" }, loading.signal);
+      const frames = await api.frames(this.store.model, { ...request, mesh: "coarse" }, loading.signal);
+      loading.signal.throwIfAborted();
+      this.#frames = frames;
     } finally {
       if (this.#loading === loading) this.status.textContent = "";
     }
