@@ -107,9 +107,9 @@ def least_squares(
         evaluations += 1
         gain = (r @ r - trial_r @ trial_r) / predicted
         taken = bool(gain > 1e-3)  # not where it isn't a number
-        if secant and np.isfinite(trial_r).all():
-            J += np.outer(trial_r - r - J @ step, step / (step @ step))
         if taken:
+            if secant:  # a step that failed may have met a cliff, whose slope is nobody else's
+                J += np.outer(trial_r - r - J @ step, step / (step @ step))
             u, r = trial, trial_r
             damping = damping if gain < 0.5 else damping / 10 if damping > FIRST_DAMPING else 0.0
         elif not updates:

@@ -18,6 +18,7 @@ from geometry.reconstruction import Status
 from geometry.rigid import without_rigid_motion
 from geometry.sampling import exponentials
 from geometry.transport import parallel_transport
+from tests.geometry.conftest import bent
 
 K = 4
 
@@ -123,12 +124,29 @@ def test_every_step_of_the_exponential_solves_its_equation(space, mesh, velocity
     assert true_residuals(space, path).max() <= 1e-9
 
 
+def test_standing_still_needs_no_iteration(space, mesh):
+    path = exponential(space, mesh.vertices, np.zeros_like(mesh.vertices), K)
+    assert path.iterations == (0,) * (K - 1)
+    np.testing.assert_allclose(path.vertices[-1], mesh.vertices, atol=1e-12 * mesh.diagonal)
+
+
 def test_every_shape_of_a_geodesic_solves_its_equation_between_its_endpoints(space, mesh, pose, move):
     path = geodesic(space, mesh.vertices, move(pose), 5)
     assert path.converged
     assert true_residuals(space, path).max() <= 1e-9
     np.testing.assert_array_equal(path.vertices[0], mesh.vertices)
     assert distance(space, path.vertices[-1], pose) < 1e-12
+
+
+@pytest.mark.parametrize("mesh", ["closed", "sheet"], indirect=True)
+def test_shapes_too_far_apart_for_a_straight_start_are_connected(space, mesh):
+    start, end = bent(mesh.vertices, -4), bent(mesh.vertices, 4)
+    path = geodesic(space, start, end, 3)
+    assert path.converged
+    assert true_residuals(space, path).max() <= 1e-9
+    assert distance(space, path.vertices[-1], end) < 1e-12
+    half = [space.energy.rest(a).value(b) for a, b in pairwise(path.nric)]
+    assert max(half) < 1.5 * min(half), "equal times"
 
 
 def test_a_geodesic_has_less_energy_than_paths_beside_it(space, mesh, pose, rng):

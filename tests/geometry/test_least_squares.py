@@ -105,3 +105,19 @@ def test_failures_are_values() -> None:
     assert 0.4 < stopped.x[0] <= 0.5
     edge = solve(cliff, [0.5], [-np.inf], [np.inf])
     assert edge.status is Status.STALLED, "there is no Jacobian"
+
+
+@pytest.mark.parametrize("secant", [True, False])
+@pytest.mark.parametrize("height", [1e3, 1e7, 1e160])  # the last one's square overflows
+def test_a_cliff_on_the_way_is_no_minimum(height: float, secant: bool) -> None:
+    stopped = least_squares(
+        lambda x: np.where(x > 0.5, height, 3 - x),
+        lambda x, _: np.array([[-1.0]]),
+        np.zeros(1),
+        np.full(1, -np.inf),
+        np.full(1, np.inf),
+        np.ones(1),
+        secant=secant,
+    )
+    assert stopped.status is not Status.NOT_FINITE
+    assert 0.4 < stopped.x[0] <= 0.5

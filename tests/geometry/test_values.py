@@ -1,0 +1,24 @@
+"""Meshes, shapes and results are values: nobody changes one that another holds."""
+
+import dataclasses
+import importlib
+import pkgutil
+
+import pytest
+
+import geometry
+
+MODULES = [importlib.import_module(f"geometry.{module.name}") for module in pkgutil.iter_modules(geometry.__path__)]
+VALUES = [
+    kind
+    for module in MODULES
+    for kind in vars(module).values()
+    if dataclasses.is_dataclass(kind) and kind.__module__ == module.__name__
+]
+
+
+@pytest.mark.parametrize("kind", VALUES, ids=lambda kind: kind.__name__)
+def test_values_stay_as_they_are(kind: type) -> None:
+    value = object.__new__(kind)
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        setattr(value, dataclasses.fields(kind)[0].name, None)
