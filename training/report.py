@@ -9,7 +9,7 @@ import json
 import math
 import tomllib
 import zipfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import cycle
@@ -92,9 +92,9 @@ class Record:
         self.base = self.reference.get("vertices") if self.mean is None else self.mean
         grouping = self._json("factors.json")
         groups = grouping.get("factors", [])
-        names = grouping.get("names") or [f"Factor {j}" for j in range(len(groups))]
         self.factors = [
-            Factor(str(name), hue, group) for name, hue, group in zip(names, cycle(HUES), groups, strict=False)
+            Factor(name, hue, group)
+            for name, hue, group in zip(grouping.get("names", []), cycle(HUES), groups, strict=False)
         ]
         self.overlap = np.array(grouping.get("overlap", []))
         stamps = {path.stem: self._json(f"stages/{path.name}") for path in (folder / "stages").glob("*.json")}
@@ -124,7 +124,7 @@ class Record:
             except json.JSONDecodeError:
                 continue  # the last line of a run that was killed
             if event.get("event") == "progress":
-                return f"{event.get('what', event.get('stage'))}: {event.get('done', '?')} of {event.get('total', '?')}"
+                return f"{event['what']}: {event['done']} of {event['total']}"
             return ""
         return ""
 
@@ -230,14 +230,12 @@ def shapes(record: Record, studio: Studio) -> Iterator[tuple[Markup, str]]:
 def mode_cards(record: Record, studio: Studio) -> Iterator[dict[str, Any]]:
     """For each index the SPGA mode beside the PGA mode, moved along it and coloured by its support."""
     modes = record.modes
-    names = modes.get("names", np.empty(0))
     factor_of = {i: factor for factor in record.factors for i in factor.modes}
     kinds = [(kind, prefix) for kind, prefix in (("SPGA", ""), ("PGA", "pga_")) if f"{prefix}vertices" in modes]
     support = {kind: record.supports(modes[f"{prefix}nric"]) for kind, prefix in kinds}
     reach = MODE_REACH * np.linalg.norm(np.ptp(studio.base, axis=0))
     for i in range(min(len(modes["vertices"]), MODES_SHOWN)):
-        title = str(names[i]) if len(names) == len(modes["vertices"]) else f"Mode {i}"
-        factor = factor_of.get(i)
+        title, factor = f"Mode {i}", factor_of.get(i)
         pictures = []
         for kind, prefix in kinds:
             if i < len(support[kind]):
@@ -251,24 +249,20 @@ def mode_cards(record: Record, studio: Studio) -> Iterator[dict[str, Any]]:
 
 
 def mode_plots(record: Record) -> Iterator[tuple[str, Markup]]:
-    """The course of the SPGA, what its modes explain, and how local they are."""
-    found, modes = record.decomposition, record.modes
-    history = found.get("history", [])
-    for key in ("objective", "sparsity"):
-        if any(key in step for step in history):
-            at = [step.get("iteration", k) for k, step in enumerate(history)]
-            line = Line(at, [step.get(key, math.nan) for step in history], HUES[1])
-            yield f"SPGA: {key}", lines(f"{key} of the SPGA by iteration", "iteration", [line])
-    for title, spga, pga in (
-        ("Variance explained", found.get("explained"), found.get("pga_explained")),
-        ("Localisation", modes.get("localisation"), modes.get("pga_localisation")),
-    ):
-        kinds = [(np.array(y), hue, name) for y, hue, name in ((spga, HUES[0], "SPGA"), (pga, HUES[1], "PGA"))
-                 if y is not None and np.ndim(y) == 1]  # fmt: skip
-        if kinds:
-            style = ".-" if title == "Variance explained" else "."
-            rows = [Line(np.arange(1, len(y) + 1), y, hue, name, style) for y, hue, name in kinds]
-            yield title, lines(f"{title} by mode, SPGA and PGA", "mode", rows)
+    """The course of the SPGA, and how local its modes are."""
+    history = record.decomposition.get("history", [])
+    for key in ("objective", "support") if history else ():
+        line = Line([step["iteration"] for step in history], [step[key] for step in history], HUES[1])
+        yield f"SPGA: {key}", lines(f"{key} of the SPGA by iteration", "iteration", [line])
+    if "localisation" in record.modes:
+        rows = [
+            Line(np.arange(len(y)), y, hue, kind, ".")
+            for kind, y, hue in (
+                ("SPGA", record.modes["localisation"], HUES[0]),
+                ("PGA", record.modes["pga_localisation"], HUES[1]),
+            )
+        ]
+        yield "Localisation", lines("Localisation by mode, SPGA and PGA", "mode", rows)
 
 
 def factor_cards(record: Record, studio: Studio | None) -> Iterator[dict[str, Any]]:
@@ -289,19 +283,18 @@ def factor_cards(record: Record, studio: Studio | None) -> Iterator[dict[str, An
 
 
 def overlap_plot(record: Record) -> Markup | None:
-    """How much the supports of modes have in common; modes of a factor stand together, so that factors are blocks."""
-    order = [i for factor in record.factors for i in factor.modes]
-    if not order or record.overlap.shape != (len(order),) * 2:
+    """How much the supports of modes have in common, on average over the modes of two factors."""
+    if not len(record.overlap):
         return None
 
     def draw(axes: Axes) -> None:
-        axes.figure.colorbar(axes.imshow(record.overlap[np.ix_(order, order)], cmap="magma_r", vmin=0), ax=axes)
-        ticks = range(0, len(order), 1 + len(order) // 20)
-        for axis in (axes.xaxis, axes.yaxis):
-            axis.set_ticks(ticks, [str(order[k]) for k in ticks])
+        axes.figure.colorbar(axes.imshow(record.overlap, cmap="magma_r", vmin=0), ax=axes)
+        axes.set_xticks([])
+        names = [factor.name for factor in record.factors]
+        axes.set_yticks(range(len(names)), names, parse_math=False)
         axes.grid(visible=False)
 
-    return plot("Overlap of the modes' supports, factor by factor", draw, size=(3.4, 2.7))
+    return plot("Overlap of the factors' supports", draw, size=(3.4, 2.7))
 
 
 def loss_plots(record: Record) -> Iterator[tuple[str, Markup]]:
@@ -370,23 +363,20 @@ def fraction_plot(record: Record) -> Markup | None:
     rows = sorted(record.evaluation.get("fractions", []), key=lambda row: row["fraction"])
     if not rows:
         return None
-    models = list(rows[0]["r2"])
-    flat = not isinstance(rows[0]["r2"][models[0]], Mapping)  # one model: its total, lengths and angles
     at = [row["fraction"] for row in rows]
     drawn = [
-        Line(at, [row["r2"].get(m, math.nan) if flat else row["r2"].get(m, {}).get("total", math.nan) for row in rows],
-             hue, m, ".-")
-        for m, hue in zip(models, HUES, strict=False)
-    ]  # fmt: skip
+        Line(at, [row["r2"][model]["total"] for row in rows], hue, model, ".-")
+        for model, hue in zip(rows[0]["r2"], HUES, strict=False)
+    ]
     return lines("R² by the fraction of samples", "fraction of the samples", drawn)
 
 
 def flatten(value: Any, name: str = "") -> Iterator[tuple[str, Any]]:
     """Figures that the page knows nothing of, each under its path."""
-    if isinstance(value, Mapping):
-        for key, inner in value.items():
+    if isinstance(value, dict | list):
+        for key, inner in value.items() if isinstance(value, dict) else enumerate(value):
             yield from flatten(inner, f"{name} · {key}" if name else str(key))
-    elif not isinstance(value, list):
+    else:
         yield name, value
 
 
@@ -450,9 +440,9 @@ def page(record: Record) -> str:
         modes_count=len(modes.get("vertices", ())),
         mode_plots=list(mode_plots(record)),
         explained={
-            kind: value
+            kind: record.decomposition[key]
             for kind, key in (("SPGA", "explained"), ("PGA", "pga_explained"))
-            if isinstance(value := record.decomposition.get(key), int | float)
+            if key in record.decomposition
         },
         support_bar=colour_bar(ramp(NEUTRAL), "unchanged", "changes most"),
         factors=list(factor_cards(record, close)),

@@ -21,6 +21,7 @@ from PIL import Image
 from geometry.gltf import vertex_normals
 from geometry.mesh import TriangleMesh
 from training.__main__ import main
+from training.pipeline import STAGES as PIPELINE
 from training.rendering import Camera
 from training.report import STAGES, Record, ReportError, duration, write_report
 
@@ -73,7 +74,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
         folder / "modes.npz",
         nric=tangents, vertices=bumps, coefficients=np.zeros((9, m)), lower=-np.ones(m), upper=np.ones(m),
         localisation=np.full(m, 0.2), pga_nric=tangents[::-1], pga_vertices=bumps[::-1],
-        pga_localisation=np.full(m, 0.9), names=np.array([NASTY, "b", "c", "d"]),
+        pga_localisation=np.full(m, 0.9), rank=np.arange(m),
     )  # fmt: skip
     np.savez(
         folder / "gallery.npz",
@@ -84,25 +85,44 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     losses = [[0.5**k, 0.7**k + 0.1 * (k == 7)] for k in range(8)]
     documents: dict[str, Any] = {
         "modes.json": {
-            "history": [{"iteration": k, "objective": 2.0**-k, "sparsity": 0.1} for k in range(5)],
-            "explained": [0.4, 0.6, 0.7, 0.75],
-            "pga_explained": [0.5, 0.7, 0.8, 0.85],
+            "modes": m,
+            "converged": True,
+            "explained": 0.7531,
+            "pga_explained": 0.8531,
+            "linearised_logarithms": 0,
+            "reasons": [""] * 9,
+            "history": [
+                {"iteration": k, "objective": 2.0**-k, "misfit": 0.0, "penalty": 2.0**-k, "support": 0.1}
+                for k in range(5)
+            ],
         },
-        "factors.json": {"factors": [[0, 2], [1, 3]], "names": ["head", NASTY], "overlap": np.eye(4).tolist()},
+        "factors.json": {"factors": [[0, 1], [2, 3]], "names": ["head", NASTY], "overlap": [[0.4, 0.1], [0.1, 0.5]]},
         "networks/histories.json": {
             stem: {"epoch": 8, "best": 0.1, "history": losses}
             for stem in ("factor-0-abc", "factor-1-abc", "combiner-abc", "combiner-def", "monolithic-abc")
-        },
+        }
+        | {"combiner-fed": {"epoch": 0, "best": None, "history": []}},
         "evaluation.json": {
             "eta": 0.01,
             "test_samples": 80,
             "r2": {"composite": score(0.9876), "monolithic": score(0.8765)},
-            "r2_factors": {"head": score(0.9)},
+            "affine_samples": 80,
+            "r2_factors": {"head": score(0.9), NASTY: score(0.8)},
             "variants": {"v": {"title": "without <i>this</i>", "r2": score(0.7)}},
             "vertex_error": {"mean": 0.0123, "max": 0.2, "iterations": 3.5, "status": {"converged": 3}},
             "sizes": {"composite": 12_300_000},
-            "times": {"exact": 1.5, "networks": 0.0042},
-            "fractions": [{"fraction": f, "r2": score(0.9 * f)} for f in (0.2, 1.0)],
+            "times": {"exact": 1.5, "networks": 0.0042, "reconstruction": 0.2},
+            "exponentials": 5603,
+            "fractions": [
+                {
+                    "fraction": f,
+                    "training_samples": 100,
+                    "exponentials": {"composite": 300, "all of factors": 400},
+                    "r2": {name: score(0.9 * f) for name in ("composite", "all of factors", "monolithic")},
+                }
+                for f in (0.2, 0.5)
+            ],
+            "seeds": [{"seed": 3, "r2": {"composite": score(0.5432), "monolithic": score(0.5)}}],
             "prolongation": {"mean": 0.001, "max": 0.004},
             "surprise": {"deep": 4321},
         },
@@ -187,13 +207,17 @@ def partial(run: Path, folder: Path, *names: str) -> Page:
 def test_every_section_is_there_with_its_figures(page: Page) -> None:
     assert page.sections == SECTIONS
     words = page.words.replace("\N{NO-BREAK SPACE}", " ")
-    for said in ("Sphere & Co <b>", "0.9876", "0.8765", "0.7765", "1.2 %", "4.2 ms", "12.3 MB", "without <i>this</i>"):
+    for said in ("Sphere & Co <b>", "0.9876", "0.8765", "0.7765", "1.2 %", "4.2 ms", "12.3 MB", "without <i>this</i>",
+                 "SPGA 0.7531, PGA 0.8531"):  # fmt: skip
         assert said in words
     assert "4,321" in words  # a figure the page has never heard of
+    assert "seeds · 0 · r2 · composite · total" in words
+    assert "0.5432" in words
     labels = {attributes["aria-label"] for attributes in page.all("svg")}
     assert {f"Losses of {name} by epoch" for name in ("head", NASTY, "combiner", "monolithic")} <= labels
-    assert {"objective of the SPGA by iteration", "Variance explained by mode, SPGA and PGA"} <= labels
-    assert "R² by the fraction of samples" in labels
+    assert {f"{key} of the SPGA by iteration" for key in ("objective", "support")} <= labels
+    assert "Localisation by mode, SPGA and PGA" in labels
+    assert {"Overlap of the factors' supports", "R² by the fraction of samples"} <= labels
     assert len(page.pictures) == 3 + 2 * 4 + 3 + 3 + 2 * 3  # shapes, modes, factors, strip, tests
 
 
@@ -215,7 +239,7 @@ def test_the_page_asks_nothing_of_the_network_and_runs_nothing(page: Page) -> No
 
 def test_names_are_text_whatever_is_in_them(page: Page) -> None:
     assert NASTY not in page.source
-    assert page.words.count(NASTY) >= 3  # a mode, a factor, a plot of losses
+    assert page.words.count(NASTY) >= 3  # a factor, its network's row, a plot of losses
     assert not page.all("b")
     assert f"Losses of {NASTY} by epoch" in {attributes["aria-label"] for attributes in page.all("svg")}
 
@@ -240,7 +264,7 @@ def test_pictures_show_something_and_different_shapes_differ(page: Page) -> None
         assert pixels[covered][:, :3].std(axis=0).max() > 8, alt
         assert pixels[0, :, 3].max() == pixels[:, 0, 3].max() == 0, alt  # nothing is cut off
     for one, other in (("Best test shape, exact", "Median test shape, exact"),
-                       (f"{NASTY} of SPGA by its support", "b of SPGA by its support"),
+                       ("Mode 0 of SPGA by its support", "Mode 1 of SPGA by its support"),
                        ("Support of head", f"Support of {NASTY}")):  # fmt: skip
         assert np.abs(pictures[one] - pictures[other]).mean() > 2
 
@@ -272,6 +296,10 @@ def test_a_run_on_its_way_makes_a_partial_report(run: Path, tmp_path: Path) -> N
     assert page.sections == {"shapes", "factors", "configuration"}
     page = partial(run, tmp_path / "c", "reference.npz", "modes.npz", "evaluation.json")
     assert page.sections == {"shapes", "modes", "figures", "configuration"}
+
+
+def test_the_page_knows_the_stages() -> None:
+    assert tuple(PIPELINE) == STAGES
 
 
 def test_stages_say_how_far_the_run_is(run: Path, tmp_path: Path) -> None:
