@@ -5,7 +5,7 @@ of immersed meshes is parametrised by ``X ↦ z(X)`` instead: its tangent space 
 Jacobian ``J = Dz(X)``, so an equation that has to hold on tangent vectors becomes ``Jᵀ(…) = 0``, 3V
 equations in 3V unknowns with only the six rigid motions left over. Integrability is exact, the genus doesn't
 matter, and the matrices are symmetric positive definite and nine times smaller in work than the indefinite
-ones of the constrained form (``geometry.constrained``, which the tests compare with).
+ones of the constrained form (which the tests compare with).
 
 The modules that do something with this space: ``exponential`` (shooting), ``geodesic`` (connecting,
 logarithm), ``transport``, ``mean`` and ``sampling`` (many exponentials at once).

@@ -13,7 +13,7 @@ import numpy as np
 
 from geometry.colouring import Colouring
 from geometry.gltf import Document
-from geometry.mesh import FloatArray, IntArray, MeshError, TriangleMesh
+from geometry.mesh import FloatArray, IntArray, MeshError
 
 #: Formats that IANA doesn't know.
 OCTET_STREAM = "application/octet-stream"
@@ -118,25 +118,15 @@ def npz(**arrays: np.ndarray) -> bytes:
     return buffer.getvalue()
 
 
-def read_mesh(source: bytes | Path, format: str | None = None) -> TriangleMesh:
-    """Read one triangle mesh, vertices and faces in the order of the file, nothing merged.
+def read_arrays(source: bytes | Path, format: str | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """Read one mesh as it stands in its file: vertices (V, 3) and faces (F, 3), nothing merged and nothing checked.
+
+    STL has three vertices a face. A path also finds the buffers that lie beside a glTF file.
 
     Args:
         source: the file's bytes, or its path.
         format: ``glb``, ``gltf``, ``obj``, ``ply``, ``stl``, ``off`` or ``npz``; by default the path's
             extension.
-
-    Raises:
-        MeshError: unreadable, not exactly one mesh, or not a valid TriangleMesh; with the reason.
-    """
-    return TriangleMesh.from_arrays(*read_arrays(source, format))
-
-
-def read_arrays(source: bytes | Path, format: str | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """Read one mesh as it stands in its file: vertices (V, 3) and faces (F, 3), nothing merged and nothing checked.
-
-    STL has three vertices a face. A path also finds the buffers that lie beside a glTF file. Arguments as for
-    ``read_mesh``.
 
     Raises:
         MeshError: unreadable, or not exactly one mesh; with the reason.

@@ -73,11 +73,6 @@ class Integrability:
         self._fans = np.stack(fans)
         self._loops = [_moves(connectivity, crossing) for crossing in _generators(connectivity)]
 
-    @property
-    def loop_count(self) -> int:
-        """How many loops have conditions of their own; 0 on simply connected surfaces."""
-        return len(self._loops)
-
     def __call__(self, z: FloatArray) -> FloatArray:
         """Q(z) (n,); zero where z (2E,) belongs to an immersed surface. Finite for all finite z."""
         gamma = self._angles(z)[0]

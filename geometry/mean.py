@@ -149,7 +149,10 @@ def centre_of_mass(
         point, chord = space.point(vertices), space.chord
         first = np.stack([log.path.nric[1] for log in logarithms])
         forces = -steps * point.pull_back(w @ point.rest.gradient_rest(first))
-        chord.factorise(point)
+        try:
+            chord.factorise(point)
+        except NotPositiveDefiniteError as error:
+            return Mean(best, Status.DEGENERATE, iteration, residual, str(error))
         step = chord.solve(forces)
         before, residual = residual, float(np.sqrt(abs(np.vdot(forces, step))))
         if residual <= tolerance:

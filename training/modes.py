@@ -39,8 +39,7 @@ a hand (57 poses, m = 12), a captured dancer (60, m = 20) and a posed body (44, 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import partial
 
 import numpy as np
@@ -181,18 +180,6 @@ class Modes:
 
     def __len__(self) -> int:
         return len(self.vertices)
-
-    def reordered(self, order: Sequence[int]) -> Modes:
-        """The same modes in another order, such as factor by factor."""
-        k = list(order)
-        return replace(
-            self,
-            nric=self.nric[k],
-            vertices=self.vertices[k],
-            coefficients=self.coefficients[:, k],
-            lower=self.lower[k],
-            upper=self.upper[k],
-        )
 
 
 def pga(space: ShellSpace, mean: FloatArray, fields: FloatArray, count: int) -> Modes:

@@ -7,7 +7,6 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from geometry.calculus import ShellSpace, fault_between
-from geometry.constrained import constrained_exponential
 from geometry.energy import Material
 from geometry.exponential import exponential, extrapolate
 from geometry.geodesic import geodesic, logarithm
@@ -19,6 +18,7 @@ from geometry.rigid import without_rigid_motion
 from geometry.sampling import exponentials
 from geometry.transport import parallel_transport
 from tests.geometry.conftest import bent
+from tests.geometry.constrained import constrained_exponential
 
 K = 4
 
@@ -391,7 +391,9 @@ def test_what_is_not_finite_is_told(space, mesh, velocity, where):
 
 
 @pytest.mark.parametrize("pose", [1.3], indirect=True)
-@pytest.mark.parametrize("operation", ["exponential", "geodesic", "elastic_mean", "centre_of_mass"])
+@pytest.mark.parametrize(
+    "operation", ["exponential", "geodesic", "elastic_mean", "centre_of_mass", "centre_of_mass from there"]
+)
 def test_a_degenerate_face_is_told(space, mesh, velocity, operation):
     flat = mesh.vertices.copy()
     a, b, c = mesh.faces[0]
@@ -402,8 +404,10 @@ def test_a_degenerate_face_is_told(space, mesh, velocity, operation):
         result = geodesic(space, mesh.vertices, flat, K)
     elif operation == "elastic_mean":
         result = elastic_mean(space, np.stack([flat, flat]))
-    else:
+    elif operation == "centre_of_mass":
         result = centre_of_mass(space, np.stack([mesh.vertices, flat]), start=mesh.vertices)
+    else:
+        result = centre_of_mass(space, np.stack([mesh.vertices]), start=flat, steps=1)
     assert result.status is not Status.CONVERGED
     assert result.reason
     assert np.isfinite(result.vertices).all()

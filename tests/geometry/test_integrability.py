@@ -61,7 +61,6 @@ def test_immersed_surfaces_meet_all_conditions_and_others_do_not(surface, condit
 def test_there_are_loops_for_handles_and_for_boundaries(surface, conditions):
     connectivity = surface.connectivity
     generators = (2 if connectivity.is_closed else 1) - connectivity.euler_characteristic
-    assert conditions.loop_count == generators
     assert len(conditions(np.ones(2 * connectivity.edge_count))) == 3 * len(conditions.vertices) + 6 * generators
 
 

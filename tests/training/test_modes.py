@@ -229,16 +229,6 @@ def test_sparsity_means_the_same_in_other_units_and_for_twice_the_shapes(bumps, 
     assert modes.history[-1]["objective"] == pytest.approx(sparse.history[-1]["objective"], rel=1e-4)
 
 
-def test_another_order_of_modes(sparse):
-    turned = sparse.reordered([2, 0, 1])
-    assert (turned.nric == sparse.nric[[2, 0, 1]]).all()
-    assert (turned.vertices == sparse.vertices[[2, 0, 1]]).all()
-    assert (turned.coefficients == sparse.coefficients[:, [2, 0, 1]]).all()
-    assert (turned.lower == sparse.lower[[2, 0, 1]]).all()
-    assert (turned.upper == sparse.upper[[2, 0, 1]]).all()
-    assert turned.explained == sparse.explained
-
-
 def test_localisation_counts_edges(bumps):
     e = bumps.space.connectivity.edge_count
     nric = np.zeros((2, 2 * e))

@@ -9,10 +9,6 @@ export class LatentSpace {
     this.home = lower.map((low, k) => (low <= 0 && upper[k] >= 0 ? 0 : (low + upper[k]) / 2));
   }
 
-  get dimension() {
-    return this.lower.length;
-  }
-
   /** A coordinate in its one form: an angle within one period from its lower bound. */
   wrap(k, value) {
     if (!this.period[k] || (value >= this.lower[k] && value < this.lower[k] + this.period[k])) return value;

@@ -136,13 +136,6 @@ export class Viewer {
     ).unproject(this.camera);
   }
 
-  /** Where a point appears in the window. */
-  project(point) {
-    const box = this.canvas.getBoundingClientRect();
-    const { x, y } = new THREE.Vector3().fromArray(point).project(this.camera);
-    return { clientX: box.left + ((x + 1) / 2) * box.width, clientY: box.top + ((1 - y) / 2) * box.height };
-  }
-
   #resize() {
     const { clientWidth: width, clientHeight: height } = this.canvas.parentElement;
     if (!width || !height) return;

@@ -1,7 +1,7 @@
 """The exponential as the paper writes it: lengths and angles under integrability constraints, with multipliers.
 
-Plain, dense and slow: the reference that tests hold ``geometry.exponential`` against, on small simply
-connected meshes. It shares with it the energy and nothing of the parametrisation by vertices.
+Plain, dense and slow: the reference to hold ``geometry.exponential`` against, on small simply connected meshes. It
+shares with it the energy and nothing of the parametrisation by vertices.
 """
 
 from __future__ import annotations
