@@ -33,7 +33,7 @@ class AnimatedGLB:
     max_vertex_error: float
 
 
-def animated_glb(frames: FloatArray, faces: IntArray, name: str = "animation") -> AnimatedGLB:
+def animated_glb(frames: FloatArray, faces: IntArray) -> AnimatedGLB:
     """Encode shapes (n, V, 3) so that key k, at ``k / FRAMES_PER_SECOND`` seconds, shows frame k.
 
     The mesh at rest is frame 0. Up to DENSE_FRAMES each later frame is a target of its own, so that keys are
@@ -61,7 +61,7 @@ def animated_glb(frames: FloatArray, faces: IntArray, name: str = "animation") -
     shown = np.tensordot(weights[1:].astype(np.float64), targets, 1)
     error = float(np.linalg.norm(shown - displacements, axis=-1).max(initial=0))
 
-    document = Document(frames[0], faces, name)
+    document = Document(frames[0], faces, "animation")
     if len(targets):
         document.primitive["targets"] = [
             {
@@ -74,7 +74,7 @@ def animated_glb(frames: FloatArray, faces: IntArray, name: str = "animation") -
         times = np.arange(len(frames)) / FRAMES_PER_SECOND
         document.tree["animations"] = [
             {
-                "name": name,
+                "name": "animation",
                 "samplers": [
                     {
                         "input": document.add(times, bounds=True),

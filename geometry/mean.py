@@ -47,7 +47,6 @@ def elastic_mean(
     weights: ArrayLike | None = None,
     *,
     start: FloatArray | None = None,
-    tolerance: float = TOLERANCE,
 ) -> Mean:
     """The shape into which all are deformed with least energy: ``min_X Σ w_i W[z_i, z(X)]``.
 
@@ -60,7 +59,6 @@ def elastic_mean(
         shapes: n shapes (V, 3), in any position.
         weights: n positive weights, equal by default; only their ratios count.
         start: (V, 3) first guess, the shape of least total energy by default.
-        tolerance: of ``sqrt(Fᵀ A⁻¹ F)``.
     """
     shapes, w = _checked(space, shapes, weights)
     fault = _not_finite(shapes)
@@ -85,7 +83,7 @@ def elastic_mean(
                 return Mean(point.vertices, Status.DEGENERATE, iterations, residual, str(error))
         step = chord.solve(forces)
         residual = float(np.sqrt(abs(np.vdot(forces, step))))
-        if residual <= tolerance:
+        if residual <= TOLERANCE:
             return Mean(point.vertices, Status.CONVERGED, iterations, residual)
         if residual <= RENEW_ABOVE:
             point = space.point(mixing(point.vertices, forces, step))

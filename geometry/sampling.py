@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from geometry.calculus import TOLERANCE, Path, ShellSpace
+from geometry.calculus import Path, ShellSpace
 from geometry.exponential import exponential
 from geometry.mesh import FloatArray
 
@@ -19,7 +19,6 @@ def exponentials(
     *,
     workers: int = -1,
     chunk: int = 8,
-    tolerance: float = TOLERANCE,
 ) -> Iterator[Path]:
     """Shoot from one shape with many velocities, yielding paths in their order as they are finished.
 
@@ -34,26 +33,25 @@ def exponentials(
         steps: K.
         workers: processes, by default one a core; 1 computes here.
         chunk: velocities sent to a process at a time, to share its analysis among them.
-        tolerance: of every step.
     """
     from joblib import Parallel, delayed
 
     velocities = np.asarray(velocities, dtype=np.float64)
     parts = [velocities[i : i + chunk] for i in range(0, len(velocities), chunk)]
     if workers == 1:
-        finished = (_shoot(space, start, part, steps, tolerance) for part in parts)
+        finished = (_shoot(space, start, part, steps) for part in parts)
     else:
         parallel = Parallel(n_jobs=workers, return_as="generator", inner_max_num_threads=1, backend="loky")
-        finished = parallel(delayed(_shoot)(space, start, part, steps, tolerance) for part in parts)
+        finished = parallel(delayed(_shoot)(space, start, part, steps) for part in parts)
     for paths in finished:
         for vertices, status, *rest in paths:
             yield Path(vertices, status, space, *rest)
 
 
-def _shoot(space: ShellSpace, start: FloatArray, velocities: FloatArray, steps: int, tolerance: float) -> list[tuple]:
+def _shoot(space: ShellSpace, start: FloatArray, velocities: FloatArray, steps: int) -> list[tuple]:
     """Paths as plain tuples: sent with their space, each would carry the mesh home."""
     from threadpoolctl import threadpool_limits
 
     with threadpool_limits(1):
-        paths = [exponential(space, start, v, steps, tolerance=tolerance) for v in velocities]
+        paths = [exponential(space, start, v, steps) for v in velocities]
     return [(p.vertices, p.status, p.reason, p.iterations, p.residuals) for p in paths]

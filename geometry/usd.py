@@ -21,7 +21,7 @@ def usd_installed() -> bool:
     return find_spec("pxr") is not None
 
 
-def animated_usd(frames: FloatArray, faces: IntArray, name: str = "animation") -> bytes:
+def animated_usd(frames: FloatArray, faces: IntArray) -> bytes:
     """Encode shapes (n, V, 3) as a binary USD layer whose time code k shows frame k, y up and in metres as glTF is.
 
     Points are float32. Normals at the vertices and extents are sampled with them.
@@ -46,7 +46,7 @@ def animated_usd(frames: FloatArray, faces: IntArray, name: str = "animation") -
         stage.SetFramesPerSecond(FRAMES_PER_SECOND)
         stage.SetStartTimeCode(0)
         stage.SetEndTimeCode(len(frames) - 1)
-        mesh = UsdGeom.Mesh.Define(stage, f"/{name}")
+        mesh = UsdGeom.Mesh.Define(stage, "/animation")
         stage.SetDefaultPrim(mesh.GetPrim())
         mesh.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(len(faces), 3, np.int32)))
         mesh.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(faces.astype(np.int32).ravel()))

@@ -36,7 +36,7 @@ def extremes(predicted: NDArray, exact: NDArray, errors: NDArray, index: NDArray
     }
 
 
-def strip(collection: Collection, composite: Composite, eta: float, seed: int = 0) -> dict[str, NDArray]:
+def strip(collection: Collection, composite: Composite, eta: float) -> dict[str, NDArray]:
     """An interpolation between two codes and its factor elements, as the paper's figure of SCAPE shows them.
 
     Each frame's reconstruction starts from the one before.
@@ -45,7 +45,7 @@ def strip(collection: Collection, composite: Composite, eta: float, seed: int = 
         ``strip_joint`` (T, V, 3) and ``strip_factors`` (J, T, V, 3), aligned to the reference.
     """
     coordinates = collection.coordinates
-    ends = coordinates.uniform(2, np.random.default_rng(seed))
+    ends = coordinates.uniform(2, np.random.default_rng(0))
     codes = torch.as_tensor(np.linspace(ends[0], ends[1], STRIP_FRAMES), dtype=torch.float32)
     with torch.no_grad():
         factors = composite.factor_shapes(codes)

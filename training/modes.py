@@ -67,10 +67,14 @@ CHUNK = 4
 #: ADMM iterations on a mode before the next has its turn, and their over-relaxation.
 INNER_ITERATIONS = 10
 OVERRELAXATION = 1.6
+#: Most rounds of the rotation at the start, and of coordinate descent on the coefficients.
+VARIMAX_ITERATIONS, SWEEPS = 200, 100
 #: The objective is compared with that of so many iterations ago.
 PATIENCE = 10
 #: A mode that carries less than this of all energy is none.
 NEGLIGIBLE = 1e-9
+#: Of a mode's square, the share whose edges say how local it is.
+LOCAL = 0.95
 #: Each side of a coefficient's range reaches at least this share of the other side.
 MARGIN = 0.1
 
@@ -257,19 +261,18 @@ def edge_magnitudes(nric: FloatArray, norm: WeightedNorm) -> FloatArray:
     return np.sqrt(lengths + angles)
 
 
-def localisation(nric: FloatArray, norm: WeightedNorm, share: float = 0.95) -> FloatArray:
-    """The smallest part of all edges that carries a share of each mode's square.
+def localisation(nric: FloatArray, norm: WeightedNorm) -> FloatArray:
+    """The smallest part of all edges that carries LOCAL of each mode's square ``‖u_j‖²``.
 
     Args:
         nric: (m, 2E) modes.
         norm: at their mean.
-        share: of ``‖u_j‖²``.
 
     Returns:
         (m,) between 1/E and 1.
     """
     squares = np.sort(edge_magnitudes(nric, norm) ** 2, axis=1)[:, ::-1].cumsum(axis=1)
-    return ((squares < share * squares[:, -1:]).sum(axis=1) + 1) / squares.shape[1]
+    return ((squares < LOCAL * squares[:, -1:]).sum(axis=1) + 1) / squares.shape[1]
 
 
 class _Problem:
@@ -374,10 +377,10 @@ def _normalised(D: FloatArray, W: FloatArray) -> tuple[FloatArray, FloatArray]:
     return D * largest, W / largest
 
 
-def _varimax(loadings: FloatArray, iterations: int = 200) -> FloatArray:
+def _varimax(loadings: FloatArray) -> FloatArray:
     """The rotation (m, m) that makes the squares of loadings (p, m) differ most (Kaiser 1958), by SVD."""
     rotation, before = np.eye(loadings.shape[1]), 0.0
-    for _ in range(iterations):
+    for _ in range(VARIMAX_ITERATIONS):
         turned = loadings @ rotation
         left, values, right = np.linalg.svd(loadings.T @ (turned**3 - turned * (turned**2).mean(axis=0)))
         rotation = left @ right
@@ -459,9 +462,9 @@ def _alternate(
     return False, history
 
 
-def _fit_in_box(gram: FloatArray, B: FloatArray, W: FloatArray, sweeps: int = 100) -> None:
+def _fit_in_box(gram: FloatArray, B: FloatArray, W: FloatArray) -> None:
     """Minimise ``wᵀ gram w − 2 wᵀ b`` over |w|_∞ ≤ 1 for each column of B (m, n), in place, by coordinate descent."""
-    for _ in range(sweeps):
+    for _ in range(SWEEPS):
         before = W.copy()
         for j in np.flatnonzero(gram.diagonal()):
             W[j] = np.clip(W[j] + (B[j] - gram[j] @ W) / gram[j, j], -1, 1)

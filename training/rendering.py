@@ -27,6 +27,8 @@ OCCLUSION_RAYS = 96
 #: Rays for a pixel along each side: what smooths the outlines.
 SUPERSAMPLING = 2
 GAMMA = 2.2
+#: Around the shapes, a fraction of the picture's longer side.
+MARGIN = 0.03
 
 
 @dataclass(frozen=True)
@@ -44,7 +46,7 @@ class Camera:
     window: tuple[float, float, float, float]
 
     @classmethod
-    def facing(cls, reference: FloatArray, faces: IntArray, shapes: ArrayLike = (), margin: float = 0.03) -> Camera:
+    def facing(cls, reference: FloatArray, faces: IntArray, shapes: ArrayLike = ()) -> Camera:
         """Choose a view of a reference shape (V, 3) whose picture holds all points of ``shapes`` (…, 3) as well.
 
         Collections come with any axis up. A shape is looked at along the coordinate axis in which it is thinnest,
@@ -65,7 +67,7 @@ class Camera:
         points = np.concatenate([reference, np.reshape(shapes, (-1, 3))])
         low, high = points.min(axis=0), points.max(axis=0)
         eye = (low + high) / 2 + DISTANCE * np.linalg.norm(high - low) * back
-        return cls(axes, eye, (-1.0, 1.0, -1.0, 1.0)).framing(points, margin)
+        return cls(axes, eye, (-1.0, 1.0, -1.0, 1.0)).framing(points, MARGIN)
 
     def framing(self, points: FloatArray, margin: float) -> Camera:
         """The same view, cut to points (n, 3) and a margin around them, a fraction of the picture's longer side."""
