@@ -10,6 +10,10 @@ from typing import Annotated, Any, Literal
 import tomlkit
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
+from geometry.energy import Material
+from geometry.reconstruction import DEFAULT_ETA
+from training.modes import ITERATIONS, SPARSITY
+
 #: Which edges a convolution hears of, see networks.EdgeConvolution.
 Neighbourhood = Literal["star", "flaps"]
 
@@ -47,9 +51,9 @@ class CollectionSettings(_Section):
 class MaterialSettings(_Section):
     """Of the shell, at unit area of the reference; see geometry.energy.Material."""
 
-    mu: float = Field(1.0, gt=0)
-    lambda_: float = Field(1.0, ge=0, alias="lambda")
-    eta: float = Field(1e-4, gt=0)
+    mu: float = Field(Material.mu, gt=0)
+    lambda_: float = Field(Material.lambda_, ge=0, alias="lambda")
+    eta: float = Field(Material.eta, gt=0)
 
 
 class ModeSettings(_Section):
@@ -57,11 +61,11 @@ class ModeSettings(_Section):
 
     count: int = Field(20, ge=1)
     """m; at most the number of shapes less one."""
-    sparsity: float = Field(0.1, ge=0, lt=1)
+    sparsity: float = Field(SPARSITY, ge=0, lt=1)
     """λ as a share of the price at which the principal modes stop paying; 0 is principal geodesic analysis."""
     log_steps: int = Field(16, ge=2)
     """K of the logarithms, best that of the exponentials, whose inverse they are."""
-    max_iterations: int = Field(200, ge=1)
+    max_iterations: int = Field(ITERATIONS, ge=1)
 
 
 class FactorSettings(_Section):
@@ -194,7 +198,7 @@ class ExportSettings(_Section):
     title: str
     description: str
     licence: str
-    eta_reconstruction: float = Field(1e-2, gt=0)
+    eta_reconstruction: float = Field(DEFAULT_ETA, gt=0)
     tolerance: float = Field(1e-4, gt=0)
     """Largest relative difference of ONNX and PyTorch, in the weighted norm."""
 

@@ -58,6 +58,8 @@ from training.workers import run
 
 #: λ as a share of the price at which the strongest mode of the plain analysis is no longer worth having.
 SPARSITY = 0.1
+#: Most rounds through all sparse modes.
+ITERATIONS = 200
 #: Of the geodesics to the shapes, as a length; far below what modes leave unexplained.
 LOGARITHM_TOLERANCE = 1e-6
 #: A logarithm of fewer steps is further from one of many than the linearised one is (measured on three collections).
@@ -105,7 +107,7 @@ class Tangents:
         return [i for i, steps in enumerate(self.steps) if steps == 0]
 
 
-def tangents(space: ShellSpace, mean: FloatArray, shapes: ArrayLike, steps: int = 8, workers: int = -1) -> Tangents:
+def tangents(space: ShellSpace, mean: FloatArray, shapes: ArrayLike, steps: int, workers: int = -1) -> Tangents:
     """The discrete logarithms of shapes at their mean.
 
     Between far poses of real meshes a geodesic may not be found. One with half as many steps often is, as its shapes
@@ -207,9 +209,9 @@ def spga(
     mean: FloatArray,
     fields: FloatArray,
     count: int,
-    sparsity: float = SPARSITY,
+    sparsity: float,
     *,
-    max_iterations: int = 200,
+    max_iterations: int = ITERATIONS,
     tolerance: float = 1e-3,
 ) -> Modes:
     """Sparse principal geodesic analysis: localised modes that still come close to the logarithms.

@@ -291,4 +291,4 @@ def test_where_there_is_no_geodesic_the_logarithm_is_linearised(bumps, rng):
 def test_a_shape_that_is_not_finite_has_no_logarithm(bumps):
     shapes = np.stack([bumps.mean, np.where(np.arange(3) == 1, np.nan, bumps.mean)])
     with pytest.raises(ModeError, match="shape 1 has a coordinate that is not finite"):
-        tangents(bumps.space, bumps.mean, shapes, workers=1)
+        tangents(bumps.space, bumps.mean, shapes, 4, workers=1)
