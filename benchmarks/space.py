@@ -101,9 +101,7 @@ def measure(folder: Path, config: Config) -> dict[str, Any]:
 
 def distances(shapes: FloatArray, others: FloatArray, diagonal: float) -> FloatArray:
     """(n,) between shapes (n, V, 3) and others (n, V, 3) or one (V, 3)."""
-    others = np.broadcast_to(others, shapes.shape)
-    aligned = np.array([align(a, b) for a, b in zip(shapes, others, strict=True)])
-    result: FloatArray = np.linalg.norm(aligned - others, axis=2).mean(axis=1) / diagonal
+    result: FloatArray = np.linalg.norm(align(shapes, others) - others, axis=2).mean(axis=1) / diagonal
     return result
 
 

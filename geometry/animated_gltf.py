@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from geometry.gltf import ARRAY_BUFFER, Document, vertex_normals
-from geometry.mesh import FloatArray, IntArray
+from geometry.mesh import FloatArray, IntArray, diagonal
 
 #: Up to this many frames each frame has a target of its own; beyond it, a basis of this many vectors at most. Keying
 #: every target in every frame takes N² weights, and viewers keep targets in a texture of at most 256 layers.
@@ -47,8 +47,7 @@ def animated_glb(frames: FloatArray, faces: IntArray) -> AnimatedGLB:
         weights, targets = np.eye(len(frames) - 1), displacements
         normal_targets = normals[1:] - normals[0]
     else:
-        diagonal = float(np.linalg.norm(np.ptp(frames.reshape(-1, 3), axis=0)))
-        weights = _basis_weights(displacements, BASIS_TOLERANCE * diagonal)
+        weights = _basis_weights(displacements, BASIS_TOLERANCE * float(diagonal(frames.reshape(-1, 3))))
         fit = np.linalg.pinv(weights)
         targets = np.tensordot(fit, displacements, 1)
         normal_targets = np.tensordot(fit, normals[1:] - normals[0], 1)

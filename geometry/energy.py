@@ -75,7 +75,7 @@ class ShellEnergy:
         self.mu, self.lambda_, self.eta = material.mu / area, material.lambda_ / area, material.eta
         self.kappa = self.mu / 2 + self.lambda_ / 4
         #: (3, F) the edge on each side of each face.
-        self.sides: IntArray = np.ascontiguousarray(connectivity.face_edges.T)
+        self.sides: IntArray = connectivity.face_sides
         # Where an edge finds its first and second face among the 3F sides; a boundary edge has no second.
         order = np.argsort(self.sides.ravel(), kind="stable")
         starts = np.searchsorted(self.sides.ravel()[order], np.arange(connectivity.edge_count))

@@ -35,7 +35,6 @@ class FrameIntegration:
     def __init__(self, reference: TriangleMesh, backend: Backend = "auto") -> None:
         c = reference.connectivity
         self._connectivity, self._count = c, len(c.faces)
-        self._face_edges = np.ascontiguousarray(c.face_edges.T)
         self._plant(reference)
         # Side k runs from corner k + 1 to corner k + 2.
         tails, heads = c.faces.T[[1, 2, 0]].ravel(), c.faces.T[[2, 0, 1]].ravel()
@@ -102,7 +101,7 @@ class FrameIntegration:
     def __call__(self, z: FloatArray) -> FloatArray:
         """Vertices (V, 3) for lengths and angles (2E,); not finite where lengths are 0 or not finite."""
         c = self._connectivity
-        a, b, side = z.take(self._face_edges)
+        a, b, side = z.take(self._connectivity.face_sides)
         # Corner 0 is the origin of a face's plane, corner 1 lies on its first axis. Half angles at both, by cosines.
         cosine = (b * b + side * side - a * a) / (2 * b * side)
         sin_0, cos_0 = _half(cosine)

@@ -205,7 +205,7 @@ def _generators(connectivity: Connectivity) -> list[list[int]]:
     crosses none of its edges; each interior edge in neither tree closes one loop through the tree over
     faces. A loop is given as alternating faces and edges crossed.
     """
-    inner = np.flatnonzero(connectivity.interior)
+    inner = connectivity.hinge_edges
     parent: dict[int, tuple[int, int]] = {0: (-1, -1)}
     by_face: dict[int, list[int]] = {}
     for edge in inner.tolist():

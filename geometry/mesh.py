@@ -118,6 +118,16 @@ class Connectivity:
         return np.ascontiguousarray(self.hinges.T)
 
     @cached_property
+    def face_corners(self) -> IntArray:
+        """(3, F): the columns of ``faces``, each contiguous."""
+        return np.ascontiguousarray(self.faces.T)
+
+    @cached_property
+    def face_sides(self) -> IntArray:
+        """(3, F): the columns of ``face_edges``, each contiguous."""
+        return np.ascontiguousarray(self.face_edges.T)
+
+    @cached_property
     def hinge_edges(self) -> IntArray:
         """(H,): the interior edges."""
         return np.flatnonzero(self.interior)
@@ -202,12 +212,22 @@ class TriangleMesh:
     @property
     def diagonal(self) -> float:
         """Length of the bounding box's diagonal."""
-        return float(np.linalg.norm(np.ptp(self.vertices, axis=0)))
+        return float(diagonal(self.vertices))
+
+    @property
+    def edge_midpoints(self) -> FloatArray:
+        """(E, 3)."""
+        return self.vertices[self.edges].mean(axis=1)
 
 
 def face_areas(vertices: FloatArray, faces: IntArray) -> FloatArray:
     """Areas (…, F) of the faces of shapes (…, V, 3)."""
     return 0.5 * np.linalg.norm(face_normals(vertices, faces, normalised=False), axis=-1)
+
+
+def diagonal(vertices: FloatArray) -> FloatArray:
+    """Lengths (…) of the bounding boxes' diagonals of shapes (…, V, 3)."""
+    return np.linalg.norm(np.ptp(vertices, axis=-2), axis=-1)
 
 
 def face_normals(vertices: FloatArray, faces: IntArray, *, normalised: bool = True) -> FloatArray:
@@ -221,12 +241,12 @@ def face_normals(vertices: FloatArray, faces: IntArray, *, normalised: bool = Tr
 
 
 def align(vertices: FloatArray, target: FloatArray) -> FloatArray:
-    """Move shapes (…, V, 3) rigidly to come closest to ``target`` (V, 3) in least squares over vertices.
+    """Move shapes (…, V, 3) rigidly to come closest to targets (…, V, 3) in least squares over vertices.
 
     Kabsch's method: rotation and translation, no reflection, no scaling.
     """
-    centre = vertices.mean(axis=-2, keepdims=True)
-    x, y = vertices - centre, target - target.mean(axis=0)
+    centre, middle = (shapes.mean(axis=-2, keepdims=True) for shapes in (vertices, target))
+    x, y = vertices - centre, target - middle
     u, _, vt = np.linalg.svd(np.swapaxes(x, -1, -2) @ y)
     u[..., :, -1] *= np.sign(np.linalg.det(u @ vt))[..., None]
-    return x @ (u @ vt) + target.mean(axis=0)
+    return x @ (u @ vt) + middle

@@ -37,12 +37,12 @@ class NormalMatrix:
     REGULARISATION = 1e-9
 
     def __init__(self, connectivity: Connectivity) -> None:
-        self._sides = np.ascontiguousarray(connectivity.face_edges.T)
+        self._sides = connectivity.face_sides
         # Side k runs from corner k+1 to corner k+2; stored edges run from the smaller to the larger vertex.
         self._corners = np.array([[1, 2], [2, 0], [0, 1]])
         tails = connectivity.faces.T[self._corners[:, 0]]
         self._signs = np.where(tails == connectivity.edges[self._sides, 0], 1.0, -1.0)
-        self._interior = np.flatnonzero(connectivity.interior)
+        self._interior = connectivity.hinge_edges
         self._ends = connectivity.edge_ends
         rows, columns = [], []
         for vertices in (connectivity.faces, connectivity.hinges):

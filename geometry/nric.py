@@ -163,7 +163,6 @@ class NRICJacobian:
     def __init__(self, connectivity: Connectivity) -> None:
         self.connectivity = connectivity
         e = connectivity.edge_count
-        interior = np.flatnonzero(connectivity.interior)
         self.columns = np.concatenate(
             [
                 (3 * connectivity.edges[:, :, None] + np.arange(3)).ravel(),
@@ -173,7 +172,7 @@ class NRICJacobian:
         self.shape = (2 * e, 3 * connectivity.vertex_count)
         starts = np.zeros(2 * e + 1, dtype=np.int64)
         starts[1 : e + 1] = 6
-        starts[e + 1 :][interior] = 12
+        starts[e + 1 :][connectivity.hinge_edges] = 12
         self._indptr = np.cumsum(starts).astype(np.int32)
         #: Vertex of each term of a pull-back: tails, heads, then the four of every hinge.
         self._vertices = np.concatenate([connectivity.edges.T.ravel(), connectivity.hinges.T.ravel()])

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import cKDTree
 
-from geometry.mesh import Connectivity, FloatArray, IntArray, MeshError, TriangleMesh, align, face_normals
+from geometry.mesh import Connectivity, FloatArray, IntArray, MeshError, TriangleMesh, align, diagonal, face_normals
 
 #: Weight of a vertex normal against that of an edge in the fit of a vertex' local affine map.
 NORMAL_WEIGHT = 0.1
@@ -123,12 +123,7 @@ class Prolongation:
         Returns:
             Distances as fractions of the diagonal of each shape's bounding box, over all vertices and shapes.
         """
-        distances = np.array(
-            [
-                np.linalg.norm(align(self(y), x) - x, axis=1) / np.linalg.norm(np.ptp(x, axis=0))
-                for y, x in zip(coarse, fine, strict=True)
-            ]
-        )
+        distances = np.linalg.norm(align(self(coarse), fine) - fine, axis=-1) / diagonal(fine)[:, None]
         return {"mean": float(distances.mean()), "max": float(distances.max())}
 
     def arrays(self) -> dict[str, NDArray]:

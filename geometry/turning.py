@@ -23,7 +23,7 @@ class Turning:
     ROUNDS = 6
 
     def __init__(self, connectivity: Connectivity) -> None:
-        self._corners = np.ascontiguousarray(connectivity.faces.T)
+        self._corners = connectivity.face_corners
         faces = len(connectivity.faces)
         corner = (self._corners.ravel(), np.tile(np.arange(faces), 3))
         self._around = sparse.csr_array((np.ones(3 * faces), corner), shape=(connectivity.vertex_count, faces))

@@ -9,7 +9,7 @@ import orjson
 from numpy.typing import NDArray
 
 from geometry.formats import read_arrays
-from geometry.mesh import FloatArray, IntArray, MeshError
+from geometry.mesh import FloatArray, IntArray, MeshError, diagonal
 from service.bombs import refuse_bombs
 from service.shape_model import MeshChoice, ShapeModel
 
@@ -143,7 +143,7 @@ def _of_soup(layout: _Layout, corners: FloatArray) -> Matched:
     vertices = np.zeros((layout.faces.max() + 1, 3))
     vertices[layout.faces] = corners
     apart = np.linalg.norm(vertices[layout.faces] - corners, axis=-1).max(axis=1)
-    torn = np.flatnonzero(apart > 1e-5 * np.linalg.norm(np.ptp(vertices, axis=0)))
+    torn = np.flatnonzero(apart > 1e-5 * diagonal(vertices))
     if len(torn):
         raise InvalidMeshError(
             f"Face {torn[0]} does not meet its neighbours as in the model. Send STL with the faces in the model's "

@@ -123,7 +123,7 @@ class Reconstructions:
         """Reconstruct NRIC (n, 2E) and compare with vertices (n, V, 3) after rigid alignment."""
         reconstruct = Reconstructor(reference, eta)
         found = [reconstruct(z, tolerance=1e-6) for z in predicted]
-        vertices = np.array([align(f.vertices, x) for f, x in zip(found, exact, strict=True)])
+        vertices = align(np.array([f.vertices for f in found]), exact)
         errors = np.linalg.norm(vertices - exact, axis=2) / reference.diagonal
         return cls(vertices, errors, [f.iterations for f in found], [str(f.status) for f in found])
 

@@ -119,7 +119,7 @@ def names(groups: Sequence[Sequence[int]], nric: FloatArray, norm: WeightedNorm,
         norm: at the mean.
         mean: the shape.
     """
-    middles = mean.vertices[mean.edges].mean(axis=1)
+    middles = mean.edge_midpoints
     centre, spread = middles.mean(axis=0), middles.std(axis=0)
     telling = spread >= THIN * spread.max()
     squares = edge_magnitudes(nric, norm) ** 2

@@ -17,7 +17,7 @@ from scipy import sparse
 from scipy.spatial import KDTree
 
 from geometry.formats import load_npz, read_arrays
-from geometry.mesh import Connectivity, EdgeError, FloatArray, IntArray, MeshError, TriangleMesh, face_areas
+from geometry.mesh import Connectivity, EdgeError, FloatArray, IntArray, MeshError, TriangleMesh, diagonal, face_areas
 
 FORMATS = ("obj", "ply", "stl", "off", "gltf", "glb", "npz")
 MIN_SHAPES = 3
@@ -262,17 +262,12 @@ def _on_shared_vertices(corners: FloatArray, faces: IntArray, vertex_count: int,
     vertices = np.zeros((vertex_count, 3))
     vertices[faces] = corners
     apart = np.linalg.norm(vertices[faces] - corners, axis=-1).max(axis=1)
-    torn = np.flatnonzero(apart > WELD_TOLERANCE * _diagonals(corners.reshape(1, -1, 3)))
+    torn = np.flatnonzero(apart > WELD_TOLERANCE * diagonal(corners.reshape(-1, 3)))
     if len(torn):
         raise MeshError(
             f"face {torn[0]} is not where it is in {other}: STL files must list the faces in the same order"
         )
     return vertices
-
-
-def _diagonals(vertices: FloatArray) -> FloatArray:
-    """Lengths (n,) of the bounding boxes' diagonals of shapes (n, V, 3)."""
-    return np.linalg.norm(np.ptp(vertices, axis=1), axis=1)
 
 
 def _welding(vertices: FloatArray, labels: Sequence[str]) -> tuple[IntArray, FloatArray, list[str]]:
@@ -282,7 +277,7 @@ def _welding(vertices: FloatArray, labels: Sequence[str]) -> tuple[IntArray, Flo
         For each vertex the first one that it coincides with, (V,); the part of the first shape's coinciding pairs that
         coincide in each shape too, (n,); and a note on those that don't in every shape.
     """
-    tolerance = WELD_TOLERANCE * _diagonals(vertices)
+    tolerance = WELD_TOLERANCE * diagonal(vertices)
     pairs = KDTree(vertices[0]).query_pairs(tolerance[0], output_type="ndarray")
     near = np.ones(len(pairs), dtype=bool)
     kept = np.ones(len(vertices))

@@ -27,7 +27,6 @@ from training.networks import (
     MonolithicNetwork,
     Scaling,
     ShapeNetwork,
-    edge_midpoints,
     predict,
 )
 from training.sampling import Collection, Samples, read, split
@@ -170,7 +169,7 @@ class Learner:
         basis_fitted = None
         if settings.energy < 1:
             y = scaling.down(torch.from_numpy(samples.nric[train])).numpy()
-            midpoints = edge_midpoints(self.collection.reference)
+            midpoints = self.collection.reference.edge_midpoints
             basis_fitted = PatchBasis.fit(y, midpoints, settings.patches, settings.energy, self.seed)
         network = kind(settings, coordinates, scaling, basis_fitted)
         latents = torch.as_tensor(samples.latents[:, index], dtype=torch.float32)

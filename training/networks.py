@@ -16,7 +16,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from geometry.mesh import Connectivity, FloatArray, TriangleMesh
+from geometry.mesh import Connectivity, FloatArray
 from training.config import CombinerSettings, LatentNetworkSettings
 from training.coordinates import Coordinates
 from training.corrections import KernelCorrection, PairwiseProducts, ridge_regression
@@ -237,11 +237,6 @@ class CombinerNetwork(ShapeNetwork):
 
     def forward(self, factors: Tensor) -> Tensor:
         return self.scaling.up(self.coefficients(factors))
-
-
-def edge_midpoints(mesh: TriangleMesh) -> FloatArray:
-    """(E, 3) midpoints of the edges, which patches are made of."""
-    return mesh.vertices[mesh.edges].mean(axis=1)
 
 
 def affine_sum(reference: NDArray, factors: NDArray) -> NDArray:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from geometry.gltf import vertex_normals
-from geometry.mesh import FloatArray, IntArray, face_normals
+from geometry.mesh import FloatArray, IntArray, diagonal, face_normals
 
 #: Degrees from which a shape is seen, to the right of its front and above it.
 AZIMUTH, ELEVATION = 25.0, 18.0
@@ -153,7 +153,7 @@ def _ambient(scene: object, vertices: FloatArray, normals: FloatArray) -> FloatA
     weight = normals @ directions.T
     vertex, direction = np.nonzero(weight > 0.1)
     weight = weight[vertex, direction]
-    origins = vertices + 2e-3 * np.linalg.norm(np.ptp(vertices, axis=0)) * normals
+    origins = vertices + 2e-3 * diagonal(vertices) * normals
     free = scene.run(  # type: ignore[attr-defined]
         origins[vertex].astype(np.float32), directions[direction].astype(np.float32), query="OCCLUDED"
     )

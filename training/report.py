@@ -24,7 +24,7 @@ from matplotlib.colors import Colormap, LinearSegmentedColormap, to_hex, to_rgb
 from numpy.typing import NDArray
 from PIL import Image
 
-from geometry.mesh import FloatArray, IntArray, TriangleMesh, align
+from geometry.mesh import FloatArray, IntArray, TriangleMesh, align, diagonal
 from geometry.nric import WeightedNorm
 from training.files import write_text
 from training.modes import edge_magnitudes
@@ -233,7 +233,7 @@ def mode_cards(record: Record, studio: Studio) -> Iterator[dict[str, Any]]:
     factor_of = {i: factor for factor in record.factors for i in factor.modes}
     kinds = [(kind, prefix) for kind, prefix in (("SPGA", ""), ("PGA", "pga_")) if f"{prefix}vertices" in modes]
     support = {kind: record.supports(modes[f"{prefix}nric"]) for kind, prefix in kinds}
-    reach = MODE_REACH * np.linalg.norm(np.ptp(studio.base, axis=0))
+    reach = MODE_REACH * diagonal(studio.base)
     for i in range(min(len(modes["vertices"]), MODES_SHOWN)):
         title, factor = f"Mode {i}", factor_of.get(i)
         pictures = []

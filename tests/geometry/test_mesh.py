@@ -227,3 +227,6 @@ def test_aligning_many_is_aligning_each(mesh, pose, move):
     together = align(shapes, mesh.vertices)
     for shape, found in zip(shapes, together, strict=True):
         np.testing.assert_allclose(found, align(shape, mesh.vertices), atol=1e-13)
+    # To a target each, as well.
+    for shape, target, found in zip(shapes, shapes[::-1], align(shapes, shapes[::-1]), strict=True):
+        np.testing.assert_allclose(found, align(shape, target), atol=1e-13)

@@ -31,7 +31,7 @@ def norm(mesh: TriangleMesh) -> WeightedNorm:
 def modes(mesh: TriangleMesh) -> FloatArray:
     """(7, 2E), each somewhere in its region and a little everywhere."""
     rng = np.random.default_rng(2)
-    x = mesh.vertices[mesh.edges].mean(axis=1)[:, 0]
+    x = mesh.edge_midpoints[:, 0]
     region = np.digitize(x, [9, 11])
     e = len(mesh.edges)
     fields = 1e-3 * rng.standard_normal((len(REGIONS), 2, e))
@@ -124,7 +124,7 @@ def test_names_say_where_and_are_unique(modes, norm, mesh):
 
 
 def test_names_know_every_side_but_not_of_a_thin_axis(norm, mesh):
-    middles = mesh.vertices[mesh.edges].mean(axis=1) - [10, 20, 30]
+    middles = mesh.edge_midpoints - [10, 20, 30]
     corner = (middles[:, 0] > 1) & (middles[:, 1] < -0.4)
     behind = middles[:, 2] < -0.4
     nric = np.concatenate([[corner, behind], np.zeros((2, len(corner)))], axis=1)

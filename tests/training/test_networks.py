@@ -20,7 +20,7 @@ from training.layers import (
     Polynomials,
     flaps,
 )
-from training.networks import CombinerNetwork, FactorNetwork, Scaling, affine_sum, edge_midpoints
+from training.networks import CombinerNetwork, FactorNetwork, Scaling, affine_sum
 
 TORUS = Coordinates(np.zeros(2), np.full(2, 2 * np.pi), np.full(2, 2 * np.pi))
 
@@ -175,7 +175,7 @@ def test_scaled_differences_go_both_ways_and_have_unit_size(sheet: TriangleMesh)
 def test_a_patch_basis_keeps_the_variance_it_promises(ball: TriangleMesh, patches: int) -> None:
     y = noisy(ball, 40).astype(np.float32)
     for energy in (0.6, 0.95):
-        basis = PatchBasis.fit(y, edge_midpoints(ball), patches, energy, seed=0)
+        basis = PatchBasis.fit(y, ball.edge_midpoints, patches, energy, seed=0)
         x = torch.from_numpy(y)
         kept = basis(basis.encode(x))
         lost = ((x - kept).square().sum() / (x - x.mean(dim=0)).square().sum()).item()
