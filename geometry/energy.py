@@ -137,6 +137,7 @@ class RestShape:
         s /= self._S
         s += t
         turn = angles - self._angles
+        # As `wrap`, in place and ten times faster; half a turn counts the same either way round.
         turn -= 2 * np.pi * np.rint(turn / (2 * np.pi))
         return gamma, t, s, turn
 

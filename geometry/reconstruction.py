@@ -185,6 +185,7 @@ class Reconstructor:
         misfit, gradients = self.jacobian.linearise(vertices)
         misfit -= target
         half = len(misfit) // 2
+        # As `wrap`, in place and ten times faster; half a turn counts the same either way round.
         misfit[half:] -= 2 * np.pi * np.rint(misfit[half:] / (2 * np.pi))
         return _Point(vertices, misfit, gradients, float(self.norm.square(misfit)))
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -20,7 +21,8 @@ class Transport:
 
     Attributes:
         velocities: (n, V, 3) vertex fields without rigid motion, one at each shape reached, the given one
-        first. status: CONVERGED if it got to the end.
+            first.
+        status: CONVERGED if it got to the end.
         reason: what happened otherwise, in words.
     """
 
@@ -57,7 +59,7 @@ def parallel_transport(
         return Transport(np.zeros_like(path.vertices), Status.CONVERGED)
     stride = np.sqrt(path.energy) / steps
     shrink = (stride if stride > 0 else size) / size
-    for x, y in zip(path.vertices, path.vertices[1:], strict=False):
+    for x, y in pairwise(path.vertices):
         middle = geodesic(space, x + shrink * carried[-1], y, 2, tolerance=tolerance)
         rung = middle
         if middle.converged:

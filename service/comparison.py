@@ -9,14 +9,14 @@ from fastapi import Depends, Query, Request
 
 from geometry.colouring import Quantity
 from service.encodings import SHAPE_FORMATS
-from service.latent_space import Bounds, Codes, LatentSpace
+from service.latent_space import Bounds, CheckedCode, LatentSpace
 from service.negotiation import choose
 from service.problems import ProblemError
 
-#: Why a format isn't among those of a coloured mesh.
 _NUMBER = r"[-+]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][-+]?[0-9]+)?"
 #: What the description says of numbers in a query.
 NUMBERS = f"^{_NUMBER}(,{_NUMBER})*$"
+#: Why a format isn't among those of a coloured mesh.
 _UNCOLOURED = {
     name: f"{name.upper()} files can't carry colours" for name, format in SHAPE_FORMATS.items() if not format.coloured
 }
@@ -32,7 +32,7 @@ class Comparison:
     """
 
     quantity: Quantity
-    code: tuple[Codes, bool] | None
+    code: CheckedCode | None
 
     @property
     def key(self) -> tuple[str, bytes]:
@@ -53,8 +53,7 @@ class ComparisonQuery:
             return None
         if self.against is None:
             return Comparison(self.quantity, None)
-        codes, inside = latents.codes([self.against], bounds)
-        return Comparison(self.quantity, (codes[0], bool(inside[0])))
+        return Comparison(self.quantity, latents.code(self.against, bounds))
 
 
 def numbers(text: str, name: str) -> list[float]:

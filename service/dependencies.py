@@ -10,6 +10,7 @@ from fastapi import Depends, Path, Query, Request
 from pydantic import WithJsonSchema
 
 from service.metrics import Metrics
+from service.negotiation import declared_type
 from service.problems import ProblemError
 from service.recent import RecentAnswers
 from service.reloading import Reloader
@@ -65,14 +66,11 @@ def one_of(names: Iterable[str]) -> WithJsonSchema:
 
 async def require_json(request: Request) -> None:
     """Refuse bodies that aren't declared as JSON; raises ProblemError, unsupported-media-type."""
-    declared = request.headers.get("content-type", "")
-    media_type = declared.split(";")[0].strip().lower()
-    if media_type != "application/json" and not (
-        media_type.startswith("application/") and media_type.endswith("+json")
-    ):
+    declared = declared_type(request.headers)
+    if declared != "application/json" and not (declared.startswith("application/") and declared.endswith("+json")):
         raise ProblemError(
             "unsupported-media-type",
-            f"The body is {declared or 'of no declared type'}. Send JSON, and the header "
+            f"The body is {request.headers.get('content-type') or 'of no declared type'}. Send JSON, and the header "
             "Content-Type: application/json with it.",
         )
 

@@ -83,12 +83,12 @@ class Encoder:
             raise InvalidMeshError("The mesh is a single point: no edge has a length. Send a surface.")
         lower, upper = latents.box(MARGIN if bounds is not Bounds.CLAMP else 0.0)
         fit = self._fit(target, lower, upper, deadline)
-        codes, inside = latents.codes([fit.x.tolist()], bounds)
-        shape = model.shape(codes[0], bool(inside[0]), given.mesh, deadline)
+        code, inside = latents.code(fit.x.tolist(), bounds)
+        shape = model.shape(code, inside, given.mesh, deadline)
         distances = np.linalg.norm(align(shape.vertices, given.vertices) - given.vertices, axis=1)
         residual = float(np.sqrt(fit.cost / self._norm.square(target)))
         status = Status.DEADLINE if shape.diagnostics.status is Status.DEADLINE else fit.status
-        return Encoded(codes[0], bool(inside[0]), status, fit.evaluations, residual, shape, distances, given.mesh)
+        return Encoded(code, inside, status, fit.evaluations, residual, shape, distances, given.mesh)
 
     def _fit(self, target: FloatArray, lower: FloatArray, upper: FloatArray, deadline: float | None) -> Fit:
         latents, root = self.model.latents, self._root

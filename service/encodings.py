@@ -52,10 +52,9 @@ def diagnostics_arrays(diagnostics: Sequence[Diagnostics]) -> dict[str, NDArray]
 
 def exact_lists(exponentials: Sequence[Exact]) -> dict[str, Any]:
     """Exponentials of n codes as lists (n,), for JSON."""
-    there = [e.vertices is not None for e in exponentials]
     return {
         "exact": [None if e.vertices is None else float32(e.vertices) for e in exponentials],
-        "distance": [{"mean": e.mean, "max": e.max} if ok else None for e, ok in zip(exponentials, there, strict=True)],
+        "distance": [None if e.vertices is None else {"mean": e.mean, "max": e.max} for e in exponentials],
         "exact_status": [e.status for e in exponentials],
     }
 

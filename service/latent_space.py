@@ -14,6 +14,8 @@ from service.manifest import Manifest
 
 #: (n, m) codes as the networks take them; everything that identifies a shape is derived from this form.
 Codes = NDArray[np.float32]
+#: One of them (m,), and whether it is inside the bounds.
+CheckedCode = tuple[Codes, bool]
 
 
 class LatentError(ValueError):
@@ -108,6 +110,11 @@ class LatentSpace:
         # Adding zero turns −0 into 0: the same shape must not have two names.
         inside = np.logical_not(outside.any(axis=1))
         return x + np.float32(0), inside
+
+    def code(self, value: Sequence[float], bounds: Bounds = Bounds.ALLOW) -> CheckedCode:
+        """One code (m,) and whether it is inside the bounds; as ``codes``."""
+        codes, inside = self.codes([value], bounds)
+        return codes[0], bool(inside[0])
 
     def unroll(self, keyframes: FloatArray) -> FloatArray:
         """Shift angles of successive keyframes (K, m) by whole periods: each step becomes the shorter arc."""

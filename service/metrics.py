@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, ProcessCollector
 from prometheus_client.core import GaugeMetricFamily, Metric
@@ -84,10 +84,7 @@ class _Models(Collector):
     def __init__(self, repository: ModelRepository) -> None:
         self._repository = repository
 
-    def collect(self) -> Iterable[Metric]:
-        return self._collect()
-
-    def _collect(self) -> Iterator[Metric]:
+    def collect(self) -> Iterator[Metric]:
         family = GaugeMetricFamily("shapespace_model_info", "Always 1.", labels=["model", "version", "digest"])
         for model in self._repository.all():
             family.add_metric([model.manifest.name, model.manifest.version, model.digest], 1)

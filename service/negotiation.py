@@ -1,4 +1,4 @@
-"""Choosing a format: ``?format=`` wins, then ``Accept`` with its weights, then the default."""
+"""Formats: that of a body, and choosing one to answer in: ``?format=``, ``Accept`` with its weights, the default."""
 
 from __future__ import annotations
 
@@ -6,6 +6,11 @@ from collections.abc import Mapping
 from types import MappingProxyType
 
 from service.problems import ProblemError
+
+
+def declared_type(headers: Mapping[str, str]) -> str:
+    """What a body is declared to be, without parameters; empty where nothing is said."""
+    return headers.get("content-type", "").split(";")[0].strip().lower()
 
 
 def choose(

@@ -18,7 +18,7 @@ from service import __version__
 from service.comparison import Comparison
 from service.dependencies import Service
 from service.encodings import SHAPE_FORMATS, dump_json
-from service.latent_space import Codes
+from service.latent_space import CheckedCode, Codes
 from service.problems import KINDS, MEDIA_TYPE
 from service.recent import Answer
 from service.schemas import MeshAnswer
@@ -77,8 +77,8 @@ def file_headers(diagnostics: Mapping[str, Any], seconds: Timings, filename: str
     }
 
 
-def solve(workers: Workers, model: ShapeModel, mesh: MeshChoice, code: tuple[Codes, bool], deadline: float) -> Shape:
-    """A code (m,) and whether it is inside the bounds to its shape; raises DeadlineError."""
+def solve(workers: Workers, model: ShapeModel, mesh: MeshChoice, code: CheckedCode, deadline: float) -> Shape:
+    """A code to its shape; raises DeadlineError."""
     shape = model.shape(*code, mesh, deadline)
     if shape.diagnostics.status is Status.DEADLINE:
         raise workers.late()
@@ -89,7 +89,7 @@ async def shape_response(
     service: Service,
     request: Request,
     model: ShapeModel,
-    code: tuple[Codes, bool] | None,
+    code: CheckedCode | None,
     mesh: MeshChoice,
     format: str,
     comparison: Comparison | None = None,
@@ -106,7 +106,7 @@ async def shape_response(
     if unchanged := not_modified(request, tag):
         return unchanged
 
-    def find(code: tuple[Codes, bool] | None, deadline: float) -> Shape:
+    def find(code: CheckedCode | None, deadline: float) -> Shape:
         return model.reference_shape(mesh) if code is None else solve(service.workers, model, mesh, code, deadline)
 
     def make(deadline: float) -> tuple[bytes, dict[str, str]]:

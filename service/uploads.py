@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from pathlib import PurePath
-from typing import Any
 
 from fastapi import Request
-from starlette.datastructures import Headers, UploadFile
+from starlette.datastructures import UploadFile
 from starlette.formparsers import MultiPartException, MultiPartParser
 
 from geometry.formats import MESH_FORMATS, OCTET_STREAM
+from service.negotiation import declared_type
 from service.problems import ProblemError
 
 #: Formats that can be read, by media type.
@@ -42,10 +42,10 @@ async def read_upload(request: Request, format: str | None) -> tuple[bytes, str]
     Raises:
         ProblemError: no file, a form that can't be read, or a format that nothing tells or nobody knows.
     """
-    declared = _media_type(request.headers)
+    declared = declared_type(request.headers)
     if declared == "multipart/form-data":
         file = await _part(request)
-        data, declared = await file.read(), _media_type(file.headers)
+        data, declared = await file.read(), declared_type(file.headers)
         suffix = PurePath(file.filename or "").suffix.lstrip(".").lower()
     else:
         data, suffix = await request.body(), ""
@@ -78,8 +78,3 @@ async def _part(request: Request) -> UploadFile:
     if not files:
         raise ProblemError("invalid-mesh", "The form holds no file. Send the mesh file as one of its fields.")
     return files[0]
-
-
-def _media_type(headers: Headers) -> str:
-    declared: Any = headers.get("content-type", "")
-    return str(declared).split(";")[0].strip().lower()

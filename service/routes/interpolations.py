@@ -121,11 +121,8 @@ async def get_frame(
     animation, model = _find(service, id)
     if not 0 <= k < animation.frame_count:
         raise ProblemError("unknown-frame", f"There is no frame {k}. Choose one from 0 to {animation.frame_count - 1}.")
-    codes, inside = model.latents.codes([animation.codes(model.latents)[k]])
-    comparison = color.on(model.latents)
-    return await shape_response(
-        service, request, model, (codes[0], bool(inside[0])), animation.mesh, chosen, comparison
-    )
+    code = model.latents.code(animation.codes(model.latents)[k])
+    return await shape_response(service, request, model, code, animation.mesh, chosen, color.on(model.latents))
 
 
 def _find(service: Service, id: str) -> tuple[Animation, ShapeModel]:

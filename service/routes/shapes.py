@@ -58,10 +58,7 @@ async def get_mesh(
 ) -> Response:
     """The shape of a code as a mesh file, for a link or a browser."""
     chosen = choose_mesh(format, request, color)
-    code = None
-    if latent is not None:
-        codes, inside = model.latents.codes([numbers(latent, "latent")], bounds)
-        code = codes[0], bool(inside[0])
+    code = None if latent is None else model.latents.code(numbers(latent, "latent"), bounds)
     return await shape_response(service, request, model, code, mesh, chosen, color.on(model.latents, bounds))
 
 
@@ -81,9 +78,9 @@ async def post_mesh(
 ) -> Response:
     """The shape of a code as a mesh file."""
     chosen = choose_mesh(format, request, color)
-    codes, inside = model.latents.codes([body.latent], body.bounds)
+    code = model.latents.code(body.latent, body.bounds)
     comparison = color.on(model.latents, body.bounds)
-    return await shape_response(service, request, model, (codes[0], bool(inside[0])), body.mesh, chosen, comparison)
+    return await shape_response(service, request, model, code, body.mesh, chosen, comparison)
 
 
 @router.post(

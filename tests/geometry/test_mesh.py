@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from geometry.mesh import Connectivity, MeshError, TriangleMesh, align, face_areas, face_normals
+from geometry.mesh import Connectivity, MeshError, TriangleMesh, align, diagonal, face_areas, face_normals
 from tests.geometry.conftest import MESHES
 
 TETRAHEDRON = [[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]]
@@ -162,6 +162,7 @@ def test_meshes_come_from_mappings_and_share_their_connectivity():
     assert other.connectivity is mesh.connectivity
     assert other.area == pytest.approx(4 * mesh.area)
     assert other.diagonal == pytest.approx(2 * np.sqrt(3))
+    assert diagonal(np.stack([mesh.vertices, other.vertices])) == pytest.approx([np.sqrt(3), 2 * np.sqrt(3)])
 
 
 def test_areas_and_normals_follow_the_orientation():
