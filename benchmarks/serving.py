@@ -36,7 +36,8 @@ from geometry.exponential import exponential
 from geometry.formats import MESH_FORMATS
 from geometry.mesh import FloatArray, align
 from geometry.nric import NRICJacobian, WeightedNorm
-from geometry.reconstruction import Reconstructor, Status
+from geometry.reconstruction import Reconstructor
+from geometry.status import Status
 from service.bundle import read_bundle
 from service.shape_model import TOLERANCE, MeshChoice, ShapeModel
 

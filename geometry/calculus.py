@@ -24,8 +24,8 @@ from geometry.energy import Material, RestShape, ShellEnergy
 from geometry.mesh import FloatArray, TriangleMesh
 from geometry.normal_matrix import NormalMatrix, QuadraticForm
 from geometry.nric import NRICGradients, NRICJacobian, nric, wrap
-from geometry.reconstruction import Status
 from geometry.rigid import rigid_motions, without_rigid_motion
+from geometry.status import Status
 from geometry.turning import Turning
 
 #: Solved to here: ``sqrt(Fᵀ A⁻¹ F)``, the distance that a Newton step would still go, as a length in the metric.

@@ -14,8 +14,8 @@ from geometry.calculus import TOLERANCE, Path, Point, ShellSpace, fault_between
 from geometry.cholesky import NotPositiveDefiniteError
 from geometry.mesh import FloatArray
 from geometry.normal_matrix import NormalMatrix
-from geometry.reconstruction import Status
 from geometry.rigid import without_rigid_motion
+from geometry.status import Status
 
 #: Shapes behind a start value: a polynomial through eight of them leaves an error of eighth order in the step.
 EXTRAPOLATED = 8

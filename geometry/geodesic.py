@@ -13,7 +13,8 @@ from geometry.cholesky import NotPositiveDefiniteError
 from geometry.energy import RestShape
 from geometry.mesh import FloatArray, align
 from geometry.nric import unwrap
-from geometry.reconstruction import Reconstructor, Status
+from geometry.reconstruction import Reconstructor
+from geometry.status import Status
 
 #: Iterations from one set of factors, and how often the factors are renewed before it is given up.
 ITERATIONS = 40

@@ -11,7 +11,7 @@ from scipy.linalg import cholesky, solve_triangular
 from scipy.optimize import lsq_linear
 
 from geometry.mesh import FloatArray
-from geometry.reconstruction import Status
+from geometry.status import Status
 
 #: A Jacobian is renewed once the point has moved this far, as a fraction of the scale, before it is believed.
 TRUSTED = 0.05

@@ -13,7 +13,7 @@ from geometry.calculus import TOLERANCE, ShellSpace, fault_between
 from geometry.cholesky import NotPositiveDefiniteError
 from geometry.geodesic import Logarithm, logarithm
 from geometry.mesh import FloatArray
-from geometry.reconstruction import Status
+from geometry.status import Status
 
 #: Most iterations of either mean.
 ITERATIONS = 100

@@ -6,7 +6,6 @@ import copy
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from enum import StrEnum
 from functools import cached_property
 
 import numpy as np
@@ -19,6 +18,7 @@ from geometry.mesh import FloatArray, TriangleMesh
 from geometry.normal_matrix import NormalMatrix
 from geometry.nric import NRICGradients, NRICJacobian, WeightedNorm
 from geometry.rigid import rigid_motions
+from geometry.status import Status
 
 #: Weight of the angles in the reconstruction's norm. A parameter of its own: the metric's η is far too small here,
 #: because this norm is dimensionless and sums over edges.
@@ -28,17 +28,6 @@ DEFAULT_ETA = 1e-2
 REACH, LIFE = 1e-2, 16
 #: A first guess from frames with a smaller relative misfit is good enough not to look for another.
 GOOD_GUESS = 0.05
-
-
-class Status(StrEnum):
-    """How an iteration ended; anything but CONVERGED still comes with finite vertices."""
-
-    CONVERGED = "converged"
-    STALLED = "stalled"
-    ITERATION_LIMIT = "iteration_limit"
-    DEADLINE = "deadline"
-    NOT_FINITE = "not_finite"
-    DEGENERATE = "degenerate"
 
 
 @dataclass(frozen=True)

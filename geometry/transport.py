@@ -11,8 +11,8 @@ from geometry.calculus import TOLERANCE, Path, ShellSpace
 from geometry.exponential import extrapolate
 from geometry.geodesic import geodesic
 from geometry.mesh import FloatArray, align
-from geometry.reconstruction import Status
 from geometry.rigid import without_rigid_motion
+from geometry.status import Status
 
 
 @dataclass(frozen=True)

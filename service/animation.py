@@ -11,19 +11,13 @@ from typing import Annotated
 
 import numpy as np
 import orjson
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, field_validator, model_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
 from geometry.mesh import FloatArray
 from service.latent_space import LatentSpace
+from service.schemas import Number, Whole
 from service.shape_model import MeshChoice
 
-Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
-#: JSON knows one kind of number only, where 3.0 is as whole as 3.
-Whole = Annotated[
-    int,
-    Field(strict=True),
-    BeforeValidator(lambda given: int(given) if isinstance(given, float) and given.is_integer() else given),
-]
 #: Longest id: behind most proxies a whole URL may take 16 KiB at most.
 ID_LIMIT = 15_000
 _PAYLOAD_LIMIT = 2**20

@@ -11,8 +11,9 @@ from scipy import sparse
 from geometry.least_squares import Fit, least_squares
 from geometry.mesh import FloatArray, IntArray, align
 from geometry.nric import wrap
-from geometry.reconstruction import Reconstructor, Status
+from geometry.reconstruction import Reconstructor
 from geometry.rigid import without_rigid_motion
+from geometry.status import Status
 from service.derivatives import batches, derivatives, factor_derivatives, nodes
 from service.latent_space import Bounds, Codes, NotFiniteError
 from service.shape_model import MeshChoice, Shape, ShapeModel

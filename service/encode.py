@@ -9,7 +9,7 @@ import numpy as np
 from geometry.least_squares import Fit, least_squares
 from geometry.mesh import FloatArray, align
 from geometry.nric import WeightedNorm, nric, wrap
-from geometry.reconstruction import Status
+from geometry.status import Status
 from service.correspondence import InvalidMeshError, Matched
 from service.derivatives import derivatives, factor_derivatives, nodes
 from service.latent_space import Bounds, Codes, NotFiniteError

@@ -11,7 +11,7 @@ from geometry.calculus import ShellSpace
 from geometry.energy import Material
 from geometry.exponential import exponential
 from geometry.mesh import FloatArray, align
-from geometry.reconstruction import Status
+from geometry.status import Status
 from service.latent_space import Codes
 from service.shape_model import MeshChoice, Shape, ShapeModel
 

@@ -19,10 +19,10 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, NonNegativeInt, ValidationError
 from pydantic.json_schema import SkipJsonSchema
 
-from service.animation import Number
 from service.encodings import dump_json
 from service.latent_space import Bounds
 from service.problems import ProblemError
+from service.schemas import BoundsField, Number
 from service.shape_model import MeshChoice, ShapeModel
 
 #: How long the JSON part of a body is, where bytes follow it.
@@ -85,9 +85,7 @@ class InferenceParameters(_Message):
 
     binary_data_output: bool = Field(False, strict=True, description="All outputs as bytes, unless one says otherwise.")
     mesh: MeshChoice = Field(MeshChoice.FINE, description="Which mesh's vertices, where the model has a finer one.")
-    bounds: Bounds = Field(
-        Bounds.ALLOW, description="Outside the bounds: extrapolate, clamp to the nearest bound, or reject."
-    )
+    bounds: BoundsField = Bounds.ALLOW
 
 
 class InferenceRequest(_Message):

@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 from fastapi import Request, Response
 
 from geometry.colouring import Colouring
-from geometry.reconstruction import Status
+from geometry.status import Status
 from service import __version__
 from service.comparison import Comparison
 from service.dependencies import Service

@@ -4,14 +4,20 @@ from __future__ import annotations
 
 from typing import Annotated, Any
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 
 from geometry.colouring import Quantity
-from service.animation import Number, Whole
 from service.edit import PRIOR
 from service.latent_space import Bounds, Distribution
 from service.shape_model import MeshChoice
 
+Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
+#: JSON knows one kind of number only, where 3.0 is as whole as 3.
+Whole = Annotated[
+    int,
+    Field(strict=True),
+    BeforeValidator(lambda given: int(given) if isinstance(given, float) and given.is_integer() else given),
+]
 Latent = Annotated[
     list[Number],
     Field(
@@ -28,6 +34,10 @@ Latents = Annotated[
         json_schema_extra={"minItems": 1},
     ),
 ]
+MeshField = Annotated[MeshChoice, Field(description="Which mesh to answer, where the model has a finer one.")]
+BoundsField = Annotated[
+    Bounds, Field(description="Outside the bounds: extrapolate, clamp to the nearest bound, or reject.")
+]
 
 
 class _Request(BaseModel):
@@ -38,10 +48,8 @@ class MeshRequest(_Request):
     """One code, and how to shape it."""
 
     latent: Latent
-    mesh: MeshChoice = Field(MeshChoice.FINE, description="Which mesh to answer, where the model has a finer one.")
-    bounds: Bounds = Field(
-        Bounds.ALLOW, description="Outside the bounds: extrapolate, clamp to the nearest bound, or reject."
-    )
+    mesh: MeshField = MeshChoice.FINE
+    bounds: BoundsField = Bounds.ALLOW
 
 
 class VerticesRequest(_Request):
@@ -53,10 +61,8 @@ class VerticesRequest(_Request):
         strict=True,
         description="Also answer the true discrete exponentials, of models with a tangent space, and their distances.",
     )
-    mesh: MeshChoice = Field(MeshChoice.FINE, description="Which mesh to answer, where the model has a finer one.")
-    bounds: Bounds = Field(
-        Bounds.ALLOW, description="Outside the bounds: extrapolate, clamp to the nearest bound, or reject."
-    )
+    mesh: MeshField = MeshChoice.FINE
+    bounds: BoundsField = Bounds.ALLOW
 
 
 class TargetRequest(_Request):
@@ -101,9 +107,7 @@ class NRICRequest(_Request):
 
     latents: Latents
     factors: bool = Field(False, strict=True, description="Also answer ψ_j of each factor j.")
-    bounds: Bounds = Field(
-        Bounds.ALLOW, description="Outside the bounds: extrapolate, clamp to the nearest bound, or reject."
-    )
+    bounds: BoundsField = Bounds.ALLOW
 
 
 class ColorAnswer(BaseModel):

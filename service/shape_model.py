@@ -19,7 +19,8 @@ from geometry.calculus import ShellSpace
 from geometry.integrability import Integrability
 from geometry.mesh import FloatArray, TriangleMesh, align
 from geometry.nric import nric
-from geometry.reconstruction import Reconstruction, Reconstructor, Status
+from geometry.reconstruction import Reconstruction, Reconstructor
+from geometry.status import Status
 from service.bundle import Bundle, BundleError
 from service.derivatives import FactorGrids
 from service.latent_space import Codes, LatentSpace, NotFiniteError, TrainingCodes

@@ -52,8 +52,8 @@ from geometry.geodesic import logarithm
 from geometry.mesh import FloatArray
 from geometry.normal_matrix import NormalMatrix, QuadraticForm
 from geometry.nric import WeightedNorm, unwrap
-from geometry.reconstruction import Status
 from geometry.rigid import without_rigid_motion
+from geometry.status import Status
 from training.workers import run
 
 #: λ as a share of the price at which the strongest mode of the plain analysis is no longer worth having.

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import numpy as np
 from fastapi import APIRouter, Depends, Query, Request, Response
 
-from geometry.reconstruction import Status
+from geometry.status import Status
 from service.correspondence import match
 from service.dependencies import Model, ServiceDependency, limit_codes, one_of, require_json
 from service.edit import Editor, Target

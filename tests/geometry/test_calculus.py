@@ -13,9 +13,9 @@ from geometry.geodesic import geodesic, logarithm
 from geometry.integrability import Integrability
 from geometry.mean import centre_of_mass, elastic_mean
 from geometry.mesh import TriangleMesh, align
-from geometry.reconstruction import Status
 from geometry.rigid import without_rigid_motion
 from geometry.sampling import exponentials
+from geometry.status import Status
 from geometry.transport import parallel_transport
 from tests.geometry.conftest import bent
 from tests.geometry.constrained import constrained_exponential

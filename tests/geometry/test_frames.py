@@ -6,7 +6,8 @@ import pytest
 from geometry.frames import FrameIntegration
 from geometry.mesh import TriangleMesh, align
 from geometry.nric import nric
-from geometry.reconstruction import Reconstructor, Status
+from geometry.reconstruction import Reconstructor
+from geometry.status import Status
 from tests.geometry.conftest import bent, closed, sheet
 
 

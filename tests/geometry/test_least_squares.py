@@ -7,7 +7,7 @@ import pytest
 from scipy import optimize
 
 from geometry.least_squares import Fit, least_squares
-from geometry.reconstruction import Status
+from geometry.status import Status
 
 RNG = np.random.default_rng(0)
 TIMES = np.linspace(0, 1, 40)

@@ -9,8 +9,9 @@ import trimesh
 
 from geometry.mesh import TriangleMesh, align
 from geometry.nric import NRICJacobian, nric
-from geometry.reconstruction import DEFAULT_ETA, Reconstructor, Status
+from geometry.reconstruction import DEFAULT_ETA, Reconstructor
 from geometry.rigid import without_rigid_motion
+from geometry.status import Status
 from tests.geometry.conftest import bent
 from training.freaky_torus import FreakyTorus
 

@@ -9,7 +9,8 @@ import pytest
 from onnx import numpy_helper
 
 from geometry.mesh import align
-from geometry.reconstruction import Reconstructor, Status
+from geometry.reconstruction import Reconstructor
+from geometry.status import Status
 from service.bundle import read_bundle
 from service.encodings import worst
 from service.latent_space import NotFiniteError

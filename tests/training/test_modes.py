@@ -13,8 +13,8 @@ from geometry.calculus import ShellSpace
 from geometry.exponential import exponential
 from geometry.mesh import FloatArray, TriangleMesh, align
 from geometry.nric import WeightedNorm, unwrap
-from geometry.reconstruction import Status
 from geometry.rigid import rigid_motions, without_rigid_motion
+from geometry.status import Status
 from training.modes import ModeError, Modes, _fit_in_box, localisation, pga, spga, tangents
 
 
