@@ -67,6 +67,8 @@ def test_faces_that_collapse_have_finite_colours() -> None:
             found = between(quantity, a, b, HINGE)
             assert np.isfinite(found.values).all()
             assert np.isfinite(found.linear).all()
+            if quantity is Quantity.STRETCH:
+                np.testing.assert_array_equal(found.values, 0)
 
 
 def test_colours_are_those_of_the_map_that_the_legend_names() -> None:

@@ -211,6 +211,9 @@ def test_weights_of_what_goes_both_ways_lie_between_0_and_1() -> None:
     error = np.linalg.norm(shown - frames, axis=-1).max()
     assert error == pytest.approx(animated.max_vertex_error, rel=1e-2)
     assert error < 1.1e-4 * np.linalg.norm(np.ptp(frames.reshape(-1, 3), axis=0))
+    for k in (0, 1, count // 2, count - 1):
+        off = glb.key(k, "NORMAL") - vertex_normals(frames[k], freaky_torus.connectivity().faces)
+        assert np.abs(off).max() < 0.02, "normals move along"
 
 
 def test_frames_that_stand_still_make_a_file_too() -> None:
