@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from geometry.calculus import ShellSpace, fault_between
+from geometry.calculus import Path, ShellSpace, fault_between
 from geometry.energy import Material
 from geometry.exponential import exponential, extrapolate
 from geometry.geodesic import geodesic, logarithm
@@ -279,6 +279,16 @@ def test_transport_keeps_lengths_and_angles_between_vectors(space, mesh, velocit
 
     before, after = products(mesh.vertices, velocity, other), products(path.vertices[-1], *carried)
     np.testing.assert_allclose(after, before, atol=0.1 * np.sqrt(before[0] * before[1]), rtol=0.1)
+
+
+def test_transport_takes_one_step_and_not_none(space, mesh, velocity):
+    path = exponential(space, mesh.vertices, 0.1 * velocity, 1)
+    carried = parallel_transport(space, path, velocity)
+    assert carried.status is Status.CONVERGED
+    length = space.norm(mesh.vertices, velocity)
+    assert space.norm(path.vertices[1], carried.velocities[1]) == pytest.approx(length, rel=0.1)
+    with pytest.raises(ValueError, match="two shapes"):
+        parallel_transport(space, Path(path.vertices[:1], Status.CONVERGED, space), velocity)
 
 
 # ---------------------------------------------------------------- means

@@ -147,6 +147,15 @@ def test_two_analyses_do_not_meet(backend, pattern, positive, rng):
     np.testing.assert_allclose(first.solve(right), expected, rtol=1e-10, atol=1e-13)
 
 
+def test_at_the_end_of_python_mkl_is_left_alone(pattern, positive):
+    """Its library may be gone before the factors are."""
+    cholesky = PardisoCholesky(pattern)
+    entries = positive()
+    cholesky.factorise(entries)
+    cholesky.__del__(finalizing=lambda: True)
+    np.testing.assert_allclose(pattern.matrix(entries) @ cholesky.solve(np.ones(40)), 1, rtol=1e-10)
+
+
 # ---------------------------------------------------------------- refusals
 
 

@@ -99,6 +99,25 @@ def test_faulty_files_are_refused_with_the_reason(data: bytes, format: str, faul
         TriangleMesh.from_arrays(*read_arrays(data, format))
 
 
+class Intruder:
+    """Something that does harm when it is unpickled."""
+
+    def __init__(self, mark: Path) -> None:
+        self.mark = mark
+
+    def __reduce__(self) -> tuple:
+        return Path.touch, (self.mark,)
+
+
+def test_pickles_are_refused_and_not_run(tmp_path: Path) -> None:
+    file = io.BytesIO()
+    harm = np.array([Intruder(tmp_path / "harm")], dtype=object)
+    np.savez(file, vertices=CUBE, faces=SIDES[:, :3], more=harm)
+    with pytest.raises(MeshError, match="pickled objects"):
+        read_arrays(file.getvalue(), "npz")
+    assert not (tmp_path / "harm").exists()
+
+
 def test_a_file_that_is_not_there_is_refused(tmp_path: Path) -> None:
     with pytest.raises(MeshError, match="No such file"):
         read_arrays(tmp_path / "none.obj")
