@@ -7,12 +7,12 @@ from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from itertools import product
 from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.interpolate import RegularGridInterpolator
 from torch import nn
 
 from geometry.mesh import FloatArray, IntArray, TriangleMesh, align
@@ -51,19 +51,17 @@ def alone(latents: FloatArray, factor: list[int]) -> FloatArray:
     return result
 
 
-@dataclass
+@dataclass(frozen=True)
 class MultilinearGrid:
     """Multilinear interpolation of exact shapes on a regular grid of one factor (Sassen et al. 2020).
 
     Attributes:
-        axes: nodes of each coordinate; periodic ones leave out the last, which is the first.
-        values: (nodes…, 2E) NRIC.
-        coordinates: of the factor.
+        interpolate: NRIC (n, 2E) of the factor's latents (n, m_j).
+        size: bytes of the values at the nodes.
     """
 
-    axes: list[FloatArray]
-    values: NDArray[np.float32]
-    coordinates: Coordinates
+    interpolate: RegularGridInterpolator
+    size: int
 
     @classmethod
     def of(
@@ -74,32 +72,19 @@ class MultilinearGrid:
         Args:
             coordinates: of all latents.
             factor: indices of its own.
-            nodes: of each of its coordinates.
+            nodes: of each of its coordinates; the end of a period, which is its beginning, is none.
             shapes: exact NRIC of codes (n, m).
         """
         own = coordinates[factor]
-        axes = [
-            np.linspace(low, high, nodes, endpoint=bool(np.isnan(period)))
-            for low, high, period in zip(own.lower, own.upper, own.period, strict=True)
-        ]
+        ends = np.isfinite(own.period).astype(int)
+        axes = [np.linspace(a, b, nodes + end) for a, b, end in zip(own.lower, own.upper, ends, strict=True)]
         latents = np.zeros((nodes ** len(factor), len(coordinates)))
-        latents[:, factor] = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, len(factor))
-        return cls(axes, shapes(latents).reshape(*[nodes] * len(factor), -1), own)
-
-    def __call__(self, latents: FloatArray) -> NDArray:
-        """NRIC (n, 2E) of the factor's latents (n, m_j)."""
-        nodes = len(self.axes[0])
-        step = np.array([axis[1] - axis[0] for axis in self.axes])
-        position = (latents - self.coordinates.lower) / step
-        periodic = np.isfinite(self.coordinates.period)
-        cell = np.floor(position).astype(int)
-        cell = np.where(periodic, cell, np.clip(cell, 0, nodes - 2))
-        fraction = position - cell
-        result = np.zeros((len(latents), self.values.shape[-1]))
-        for corner in product((0, 1), repeat=len(self.axes)):
-            weight = np.prod(np.where(corner, fraction, 1 - fraction), axis=1)
-            result += weight[:, None] * self.values[tuple(((cell + corner) % nodes).T)]
-        return result
+        at_nodes = np.meshgrid(*(axis[:nodes] for axis in axes), indexing="ij")
+        latents[:, factor] = np.stack(at_nodes, axis=-1).reshape(-1, len(factor))
+        values = shapes(latents).reshape(*[nodes] * len(factor), -1)
+        closed = np.pad(values, [*((0, end) for end in ends), (0, 0)], mode="wrap")
+        # Rounding may leave a code a little outside.
+        return cls(RegularGridInterpolator(axes, closed, bounds_error=False, fill_value=None), values.nbytes)
 
 
 @dataclass(frozen=True)
@@ -190,10 +175,10 @@ def evaluate(
             MultilinearGrid.of(coordinates, index, n, partial(exact, f"grid-{j}"))
             for j, (index, n) in enumerate(zip(factors.values(), nodes, strict=True))
         ]
-        values = [grid(latents[:, index]) for grid, index in zip(grids, factors.values(), strict=True)]
+        values = [grid.interpolate(latents[:, index]) for grid, index in zip(grids, factors.values(), strict=True)]
         if np.isfinite(values).all():
             r2["grid"] = score(affine_sum(z_reference, np.stack(values, axis=1)))
-            sizes["grid"] = sum(grid.values.nbytes for grid in grids)
+            sizes["grid"] = sum(grid.size for grid in grids)
     first = slice(settings.reconstructions)
     eta = config.export.eta_reconstruction
     found = Reconstructions.of(reference, eta, answer[first], vertices[first])
