@@ -14,18 +14,18 @@ from collections.abc import Callable
 from functools import partial
 
 import numpy as np
-from scipy import sparse
-from scipy.sparse.linalg import splu
 from scipy.spatial import ConvexHull
 from threadpoolctl import threadpool_limits
 
+from benchmarks.yardstick import superlu
 from geometry.calculus import Path, ShellSpace
 from geometry.energy import Material
 from geometry.exponential import exponential
 from geometry.geodesic import geodesic
-from geometry.mesh import FloatArray, TriangleMesh
+from geometry.mesh import TriangleMesh
 from geometry.nric import nric, unwrap
 from geometry.reconstruction import Reconstructor
+from tests.geometry.conftest import bent
 
 MATERIAL = Material(eta=4e-4)
 
@@ -48,13 +48,6 @@ def capsule(count: int, radius: float = 1.0, length: float = 2.0) -> TriangleMes
     inward = np.einsum("fc,fc->f", np.cross(b - a, c - a), a) < 0
     faces[inward] = faces[inward, ::-1]
     return TriangleMesh.from_arrays(np.stack([x, rho * np.cos(phi), rho * np.sin(phi)], axis=1), faces)
-
-
-def bent(vertices: FloatArray, angle: float) -> FloatArray:
-    """Roll the x axis onto an arc of this angle."""
-    x, y, z = vertices.T
-    radius = np.ptp(x) / angle
-    return np.stack([(radius - z) * np.sin(x / radius), y, radius - (radius - z) * np.cos(x / radius)], axis=1)
 
 
 def timed(task: Callable[[], object], yardstick: Callable[[], object], repeats: int) -> tuple[float, float, float]:
@@ -97,18 +90,8 @@ class Case:
         self.velocity = self.space.project(self.mesh.vertices, unwrap(self.space.nric(self.end), z) - z)
         self.analysis = time.perf_counter() - t
         jacobian = self.space.jacobian(self.mesh.vertices)
-        square = sparse.csc_matrix(jacobian.T @ jacobian)
-        shift = 1e-9 * square.diagonal().mean()
-        self._square = sparse.csc_matrix(square + shift * sparse.identity(square.shape[0]))
-
-    def superlu(self) -> object:
-        """One factorisation of JᵀJ."""
-        return splu(
-            self._square,
-            permc_spec="MMD_AT_PLUS_A",
-            diag_pivot_thresh=0.0,
-            options={"SymmetricMode": True},
-        )
+        #: One factorisation of JᵀJ.
+        self.superlu = superlu(jacobian.T @ jacobian)
 
     def shoot(self, steps: int) -> Path:
         """The exponential."""

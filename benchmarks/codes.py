@@ -17,6 +17,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from threadpoolctl import threadpool_limits
 
+from benchmarks.serving import bundles
 from service.bundle import read_bundle
 from service.correspondence import Matched
 from service.edit import Editor, Target
@@ -80,7 +81,7 @@ def main() -> None:
     given = parser.parse_args()
     print("| model | | error | time / that of one shape |\n|---|---|---|---|")
     with threadpool_limits(1):
-        for path in sorted(given.models.glob("*/*")):
+        for path in bundles(given.models):
             model = ShapeModel(read_bundle(path))
             _ = model.grids  # made once a model
             print(f"| {path.parent.name} | encode | {encode(model, given.count)} |", flush=True)

@@ -9,7 +9,6 @@ server to the first shape.
 from __future__ import annotations
 
 import argparse
-import shutil
 import statistics
 import time
 from pathlib import Path
@@ -18,9 +17,8 @@ from typing import Any
 from playwright.sync_api import Page, sync_playwright
 
 from benchmarks.serving import server
+from tests.page.conftest import CHROMIUM, FLAGS
 
-CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
-FLAGS = ["--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
 #: Time from a slider's event to new pixels, in ms.
 SLIDE = """async ([k, value]) => {
     const canvas = document.querySelector('#canvas');

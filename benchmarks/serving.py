@@ -26,10 +26,10 @@ from pathlib import Path
 import httpx
 import numpy as np
 from scipy import sparse
-from scipy.sparse.linalg import splu
 from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
 
 from benchmarks import synthetic
+from benchmarks.yardstick import superlu
 from geometry.calculus import ShellSpace
 from geometry.energy import Material
 from geometry.exponential import exponential
@@ -66,15 +66,11 @@ def row(*cells: object) -> None:
     )
 
 
-def superlu(model: ShapeModel, vertices: FloatArray) -> Callable[[], object]:
-    """One symbolic and numeric factorisation, in symmetric mode, of ``JᵀWJ + εI`` at a normalised shape."""
+def normal_matrix(model: ShapeModel, vertices: FloatArray) -> sparse.csr_array:
+    """``JᵀWJ`` at a normalised shape."""
     weights = WeightedNorm.of(model.reference, model.manifest.eta_reconstruction).squared
     jacobian = NRICJacobian(model.reference.connectivity)(vertices)
-    matrix = (jacobian.T @ sparse.diags_array(weights) @ jacobian).tocsc()
-    shift = 1e-9 * matrix.diagonal().mean() * sparse.eye_array(matrix.shape[0], format="csc")
-    matrix = sparse.csc_array(matrix + shift)
-    options = {"SymmetricMode": True}
-    return lambda: splu(matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)
+    return sparse.csr_array(jacobian.T @ sparse.diags_array(weights) @ jacobian)
 
 
 def draw(model: ShapeModel, count: int, spread: float = 1.0) -> FloatArray:
@@ -94,7 +90,8 @@ def bundles(folder: Path) -> list[Path]:
 def measure(model: ShapeModel, codes: FloatArray) -> dict[str, list[float]]:
     """Times of code → GLB by stage, and of the yardsticks in turn with them."""
     fine = model.mesh(MeshChoice.FINE)
-    yardstick = superlu(model, model.shape(codes[0], mesh=MeshChoice.COARSE).vertices / model.manifest.scale)
+    shape = model.shape(codes[0], mesh=MeshChoice.COARSE)
+    yardstick = superlu(normal_matrix(model, shape.vertices / model.manifest.scale))
     fields = np.random.default_rng(1).standard_normal((model.latents.dimension, 3 * len(fine.vertices)))
     times: dict[str, list[float]] = {}
     for code in codes:

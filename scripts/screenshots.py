@@ -6,8 +6,8 @@ from pathlib import Path
 
 from playwright.sync_api import Page, sync_playwright
 
-from benchmarks.page import CHROMIUM, FLAGS
 from benchmarks.serving import server
+from tests.page.conftest import CHROMIUM, FLAGS
 
 DOCS = Path("docs")
 POSE = "0.3,-0.2,0.5,0.1,-0.6,0.3,0.2,0.4,0,0.7,-0.3,0.2,0.5,0.6,-0.4,0.2,0.3,-0.2,0.6,0.3"

@@ -47,11 +47,6 @@ def bent(vertices: FloatArray, angle: float) -> FloatArray:
     return np.stack([(radius - z) * np.sin(x / radius), y, radius - (radius - z) * np.cos(x / radius)], axis=1)
 
 
-@pytest.fixture
-def rng() -> np.random.Generator:
-    return np.random.default_rng(7)
-
-
 @pytest.fixture(params=MESHES)
 def mesh(request: pytest.FixtureRequest, rng: np.random.Generator) -> TriangleMesh:
     """Without symmetries, which hide mistakes, and of an area that is not 1."""

@@ -16,7 +16,7 @@ import pytest
 from tests.service.bundles import SCALE, reference, rescale, write_bundle
 from tests.service.conftest import Server, Start
 from tests.service.test_bundles import flip_a_bit
-from tests.service.watching import eventually
+from tests.service.watching import eventually, samples, value
 
 CODES = [[0.1, 0.7, 0.4], [0.0, 0.0, 0.0], [0.05, 1.0, 0.2]]
 
@@ -70,12 +70,12 @@ def test_a_bad_bundle_is_refused_and_what_was_loaded_stays(folder: Path, start: 
         assert after.content == before.content
         assert after.headers["ETag"] == before.headers["ETag"]
         assert client.get("/v1/models/small").json()["versions"] == ["1"]
-        metrics = client.get("/metrics").text
+        found = samples(client)
     refusals = [line for line in server.log.splitlines() if "factor-0.onnx does not have the digest" in line]
     assert len(refusals) == 2
     assert "bundle small/1 is refused, and what was loaded before stays" in refusals[0]
     assert "bundle small/2 is not served" in refusals[1]
-    assert "shapespace_bundles_refused 2.0" in metrics
+    assert value(found, "shapespace_bundles_refused") == 2
 
 
 def test_models_out_of_reach_stay_loaded(folder: Path, start: Start) -> None:
@@ -161,11 +161,10 @@ def test_a_running_stream_keeps_the_model_it_began_with(folder: Path, start: Sta
         assert "not served here any more" in gone.json()["detail"]
 
 
-def resident(server: Server) -> int:
+def resident(server: Server) -> float:
     """Bytes of memory in use by a server."""
     with connected(server) as client:
-        lines = client.get("/metrics").text.splitlines()
-    return int(float(next(line.split()[1] for line in lines if line.startswith("process_resident_memory_bytes"))))
+        return samples(client)["process_resident_memory_bytes", frozenset()]
 
 
 def test_reloads_leave_no_memory_behind(folder: Path, start: Start) -> None:

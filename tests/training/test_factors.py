@@ -131,8 +131,3 @@ def test_names_know_every_side_but_not_of_a_thin_axis(norm, mesh):
     assert names([[0], [1]], nric, norm, mesh) == ["lower right", "middle"]
     deep = mesh.with_vertices(mesh.vertices * [1, 1, 2])
     assert names([[0], [1]], nric, norm, deep) == ["lower right", "back"]
-
-
-@pytest.fixture
-def rng() -> np.random.Generator:
-    return np.random.default_rng(7)

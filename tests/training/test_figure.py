@@ -40,11 +40,6 @@ def some(rng: np.random.Generator) -> FloatArray:
     return rng.uniform(lower, upper, (20, len(lower)))
 
 
-@pytest.fixture
-def rng() -> np.random.Generator:
-    return np.random.default_rng(7)
-
-
 def test_surface_is_a_closed_sphere_in_one_piece_facing_outward(rest: TriangleMesh) -> None:
     directed = rest.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
     assert len(np.unique(directed, axis=0)) == len(directed)

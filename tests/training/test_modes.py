@@ -45,11 +45,6 @@ def ellipsoid() -> TriangleMesh:
     return TriangleMesh.from_arrays(ball.vertices * [2, 1, 1] * bumpy[:, None], ball.faces)
 
 
-@pytest.fixture
-def rng() -> np.random.Generator:
-    return np.random.default_rng(7)
-
-
 @pytest.fixture(scope="module")
 def bumps() -> Bumps:
     mesh = ellipsoid()
