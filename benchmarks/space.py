@@ -20,6 +20,7 @@ from training import modes
 from training.config import Config
 from training.discovery import material
 from training.sampling import read
+from training.tangents import tangents
 
 FOLDS = 5
 #: Random codes whose shapes are compared with the collection.
@@ -79,7 +80,7 @@ def measure(folder: Path, config: Config) -> dict[str, Any]:
     others = linear.random(min(m, len(shapes) - 1), CODES, np.random.default_rng(0))
     energy = (linear.coefficients**2).sum(axis=0)
     space = ShellSpace(reference.with_vertices(mean), material(config))
-    fields = modes.tangents(space, mean, shapes, config.modes.log_steps).fields
+    fields = tangents(space, mean, shapes, config.modes.log_steps).fields
 
     def explained(span: FloatArray) -> list[float]:
         return [modes.projected(space, mean, fields, span[:k])[1] for k in counts]
@@ -123,7 +124,7 @@ def generalisation(reference: TriangleMesh, shapes: FloatArray, config: Config, 
         kept = np.setdiff1d(np.arange(len(shapes)), held_out)
         mean = elastic_mean(ShellSpace(reference, material(config)), shapes[kept]).vertices
         space = ShellSpace(reference.with_vertices(mean), material(config))
-        fields = modes.tangents(space, mean, shapes, config.modes.log_steps).fields
+        fields = tangents(space, mean, shapes, config.modes.log_steps).fields
         most = min(counts[-1], len(kept) - 1)
         sparse = modes.spga(space, mean, fields[kept], most, config.modes.sparsity).vertices
         linear = PrincipalComponents.of(shapes[kept], reference.vertices)

@@ -8,13 +8,23 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from geometry.mesh import Connectivity, FloatArray, IntArray, MeshError, TriangleMesh, face_normals
+from geometry.mesh import Connectivity, FloatArray, IntArray, MeshError, TriangleMesh
+from geometry.quadrics import monomials, quadrics_of
+from geometry.triangle_quality import (
+    FOLD_LIMIT,
+    dots,
+    folded_pairs,
+    normals_and_sides,
+    quality,
+    squared_sines,
+    unit,
+)
 
 #: Smallest angle (degrees) that a collapse may leave in any shape: the first limit until no collapse is left,
 #: then the next. Stricter ones cost accuracy: the cheap collapses wait while dear ones are made.
 ANGLE_LIMITS = (10.0, 6.0, 3.0, 1.5)
-#: Largest turn of a face's normal in one collapse, and largest angle between the normals of two neighbours.
-TURN_LIMIT, FOLD_LIMIT = np.cos(np.deg2rad(60)), np.cos(np.deg2rad(140))
+#: Largest turn of a face's normal in one collapse.
+TURN_LIMIT = np.cos(np.deg2rad(60))
 #: Where the fine mesh is crumpled already and no side of a face at a vertex is longer than this share of the coarse
 #: mesh's edges, anything goes that makes neither slivers nor folds more: the place is about to become a point.
 SMALL = 1.0
@@ -22,15 +32,12 @@ SMALL = 1.0
 HEALING_SHARE = 0.1
 #: Shapes, spread evenly over the collection, whose quadrics are summed; every shape is checked.
 QUADRIC_SHAPES = 16
-#: Weight of a plane across the boundary against that of the planes of the faces.
-BOUNDARY_WEIGHT = 10.0
-#: The same of the squared distance that the vertex moves. A large one makes faces even, which networks learn better,
-#: but a geodesic ends where a face collapses: of the meshes with the fewest folds the first is taken whose worst face
-#: keeps nearly as much of its area, as a share of the most that one of them keeps.
+#: Weight of the squared distance that a vertex moves against that of the planes of the faces. A large one makes faces
+#: even, which networks learn better, but a geodesic ends where a face collapses: of the meshes with the fewest folds
+#: the first is taken whose worst face keeps nearly as much of its area, as a share of the most that one of them keeps.
 MOTION_WEIGHTS, NEARLY = (1.0, 0.1, 0.01), 0.9
 
 _Face = tuple[int, int, int]
-_Pairs = list[tuple[int, int]]
 
 
 @dataclass(frozen=True)
@@ -100,20 +107,6 @@ def _coarsen(fine: TriangleMesh, target: int, shapes: FloatArray, motion_weight:
     return decimation.result(target)
 
 
-@dataclass(frozen=True)
-class _Quality:
-    """Of a few faces: smallest sin² of an angle, smallest cosine between neighbours, and how many are beyond limits."""
-
-    sine: float
-    fold: float
-    slivers: int
-    folds: int
-
-    @property
-    def faults(self) -> int:
-        return self.slivers + self.folds
-
-
 class _Decimation:
     """The mesh while it is being decimated.
 
@@ -131,8 +124,8 @@ class _Decimation:
         self.points = np.ascontiguousarray(np.moveaxis(centred, 0, 1))
         chosen = np.unique(np.linspace(0, len(shapes) - 1, QUADRIC_SHAPES).astype(int))
         self.sample = np.ascontiguousarray(self.points[:, chosen])
-        self.monomials = _monomials(self.sample)
-        self.quadrics, self.areas = _quadrics(connectivity, centred[chosen])
+        self.monomials = monomials(self.sample)
+        self.quadrics, self.areas = quadrics_of(connectivity, centred[chosen])
         self.faces: dict[int, _Face] = {f: (a, b, c) for f, (a, b, c) in enumerate(connectivity.faces.tolist())}
         self.count = connectivity.vertex_count
         self.star: list[set[int]] = [set() for _ in range(self.count)]
@@ -182,10 +175,10 @@ class _Decimation:
         fine_index, local = np.unique(list(self.faces.values()), return_inverse=True)
         connectivity = Connectivity(local.reshape(-1, 3), len(fine_index))
         faces = connectivity.faces
-        normals, squares = _sides(self.points[fine_index[faces.T]])
-        sine = np.sqrt(_squared_sines(normals, squares).min())
-        folds = len(_folded(connectivity, normals))
-        areas = np.log(_dots(normals, normals).clip(1e-300)) / 2
+        normals, squares = normals_and_sides(self.points[fine_index[faces.T]])
+        sine = np.sqrt(squared_sines(normals, squares).min())
+        folds = len(folded_pairs(connectivity, normals))
+        areas = np.log(dots(normals, normals).clip(1e-300)) / 2
         shrinkage = float(np.exp((areas - areas.mean(axis=1, keepdims=True)).min()))
         reason = ""
         if len(fine_index) > target:
@@ -200,9 +193,9 @@ class _Decimation:
         faces = np.array(list(self.faces.values()))
         used, local = np.unique(faces, return_inverse=True)
         connectivity = Connectivity(local.reshape(-1, 3), len(used))
-        normals, squares = _sides(self.points[faces.T])
-        bad = np.asarray((_squared_sines(normals, squares) < sine**2).any(axis=1))
-        bad[_folded(connectivity, normals).ravel()] = True
+        normals, squares = normals_and_sides(self.points[faces.T])
+        bad = np.asarray((squared_sines(normals, squares) < sine**2).any(axis=1))
+        bad[folded_pairs(connectivity, normals).ravel()] = True
         vertices: list[int] = np.unique(faces[bad]).tolist()
         return vertices
 
@@ -210,7 +203,7 @@ class _Decimation:
 
     def _costs(self, pairs: IntArray) -> FloatArray:
         u, v = pairs.T
-        costs: FloatArray = _dots(self.quadrics[u] + self.quadrics[v], self.monomials[v])
+        costs: FloatArray = dots(self.quadrics[u] + self.quadrics[v], self.monomials[v])
         return costs + self.motion_weight * self.areas[u] * ((self.sample[u] - self.sample[v]) ** 2).sum(axis=(1, 2))
 
     def _offer(self, pairs: IntArray) -> None:
@@ -298,17 +291,17 @@ class _Decimation:
         for i in range(k):
             if gone[i]:
                 rows[k + i] = rows[i]
-        normals, squares = _sides(self.points[np.array(rows).T])
-        sines, normals = _squared_sines(normals, squares), _unit(normals)
+        normals, squares = normals_and_sides(self.points[np.array(rows).T])
+        sines, normals = squared_sines(normals, squares), unit(normals)
         kept = [(i, j) for i, j in after if i is not None and j is not None]
-        was = _quality(sines, normals, list(range(k)), before, sine)
-        becomes = _quality(sines, normals, [k + i for i in stays], kept, sine)
+        was = quality(sines, normals, list(range(k)), before, sine)
+        becomes = quality(sines, normals, [k + i for i in stays], kept, sine)
         if heal:
             return becomes.faults < was.faults
         no_more = becomes.slivers <= was.slivers and becomes.folds <= was.folds
         if was.faults and no_more and squares[:, :k].max() <= self.small**2:
             return True
-        turns = _dots(normals[stays], normals[[k + i for i in stays]])
+        turns = dots(normals[stays], normals[[k + i for i in stays]])
         return (
             becomes.sine >= min(sine**2, was.sine)
             and becomes.fold >= min(FOLD_LIMIT, was.fold)
@@ -364,10 +357,10 @@ class _Decimation:
                     before.append((i, len(rows)))
                     after.append((j, len(rows)))
                     rows.append(self.faces[h])
-            normals, squares = _sides(self.points[np.array(rows).T])
-            sines, normals = _squared_sines(normals, squares), _unit(normals)
-            was = _quality(sines, normals, [0, 1], before, sine)
-            if _quality(sines, normals, [2, 3], after, sine).faults < was.faults:
+            normals, squares = normals_and_sides(self.points[np.array(rows).T])
+            sines, normals = squared_sines(normals, squares), unit(normals)
+            was = quality(sines, normals, [0, 1], before, sine)
+            if quality(sines, normals, [2, 3], after, sine).faults < was.faults:
                 self.faces[f], self.faces[g] = new
                 self.star[u].discard(g)
                 self.star[w].discard(f)
@@ -376,92 +369,3 @@ class _Decimation:
                 self._offer_again([u, w, c, d])
                 return True
         return False
-
-
-def _quality(sines: FloatArray, normals: FloatArray, faces: list[int], pairs: _Pairs, sine: float) -> _Quality:
-    """Quality of some faces and neighbours, numbered in arrays (k, n) of sin² and (k, n, 3) of unit normals."""
-    angles = sines[faces]
-    folds = _dots(normals[[i for i, _ in pairs]], normals[[j for _, j in pairs]])
-    return _Quality(
-        float(angles.min(initial=1)),
-        float(folds.min(initial=1)),
-        int(np.count_nonzero(angles < sine**2)),
-        int(np.count_nonzero(folds < FOLD_LIMIT)),
-    )
-
-
-def _unit(normals: FloatArray) -> FloatArray:
-    unit: FloatArray = normals / np.maximum(np.sqrt(_dots(normals, normals)), 1e-300)[..., None]
-    return unit
-
-
-def _folded(connectivity: Connectivity, normals: FloatArray) -> IntArray:
-    """(k, 2) neighbouring faces that are folded onto one another in some shape; normals (F, n, 3) of any length."""
-    normals = _unit(normals)
-    pairs = connectivity.edge_faces[connectivity.interior]
-    folded: IntArray = pairs[(_dots(normals[pairs[:, 0]], normals[pairs[:, 1]]) < FOLD_LIMIT).any(axis=1)]
-    return folded
-
-
-def _sides(corners: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Normals (…, 3), as long as twice the area, and squared sides (3, …) of triangles with corners (3, …, 3)."""
-    p, q = corners[1] - corners[0], corners[2] - corners[0]
-    normals = np.empty_like(p)
-    normals[..., 0] = p[..., 1] * q[..., 2] - p[..., 2] * q[..., 1]
-    normals[..., 1] = p[..., 2] * q[..., 0] - p[..., 0] * q[..., 2]
-    normals[..., 2] = p[..., 0] * q[..., 1] - p[..., 1] * q[..., 0]
-    r = q - p
-    return normals, np.stack([_dots(side, side) for side in (p, q, r)])
-
-
-def _squared_sines(normals: FloatArray, squares: FloatArray) -> FloatArray:
-    """sin² of the smallest angle: twice the area over the product of the two longer sides."""
-    product = squares.prod(axis=0)
-    return _dots(normals, normals) * squares.min(axis=0) / np.maximum(product, 1e-300)
-
-
-def _monomials(points: FloatArray) -> FloatArray:
-    """(Vf, 10n) products of the homogeneous coordinates of points (Vf, n, 3); the mixed ones twice."""
-    h = np.concatenate([points, np.ones_like(points[..., :1])], axis=-1)
-    i, j = np.triu_indices(4)
-    return (h[..., i] * h[..., j] * np.where(i == j, 1.0, 2.0)).reshape(len(points), -1)
-
-
-def _quadrics(connectivity: Connectivity, shapes: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Squared distances to the planes at a vertex in all shapes (n, Vf, 3), by area.
-
-    Returns:
-        (Vf, 10n) so that the sum over the shapes is a dot product with ``_monomials``, and (Vf,) the areas
-        around the vertices, both averaged over the shapes.
-    """
-    count, (i, j) = connectivity.vertex_count, np.triu_indices(4)
-
-    def gather(normals: FloatArray, points: FloatArray, weights: FloatArray, corners: IntArray) -> FloatArray:
-        plane = np.concatenate([normals, -(normals * points).sum(axis=-1, keepdims=True)], axis=-1)
-        values = plane[..., i] * plane[..., j] * weights[..., None] / len(shapes)
-        values = np.moveaxis(values, 0, 1).reshape(len(corners), -1)
-        out = np.zeros((count, values.shape[1]))
-        for column in corners.T:
-            np.add.at(out, column, values)
-        return out
-
-    faces = connectivity.faces
-    normals = face_normals(shapes, faces, normalised=False)
-    doubled = np.linalg.norm(normals, axis=-1)
-    normals /= np.maximum(doubled, 1e-300)[..., None]
-    quadrics = gather(normals, shapes[:, faces[:, 0]], doubled / 2, faces)
-    areas = np.bincount(faces.ravel(), np.repeat(doubled.mean(axis=0) / 2, 3), minlength=count)
-
-    rim = connectivity.edges[~connectivity.interior]
-    if len(rim):
-        face = connectivity.edge_faces[~connectivity.interior].max(axis=1)
-        along = shapes[:, rim[:, 1]] - shapes[:, rim[:, 0]]
-        squared = (along**2).sum(axis=-1)
-        across = np.cross(normals[:, face], along) / np.sqrt(np.maximum(squared, 1e-300))[..., None]
-        quadrics += gather(across, shapes[:, rim[:, 0]], BOUNDARY_WEIGHT * squared, rim)
-    return quadrics, areas / len(shapes)
-
-
-def _dots(a: FloatArray, b: FloatArray) -> FloatArray:
-    dots: FloatArray = np.einsum("...i,...i->...", a, b)
-    return dots

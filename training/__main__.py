@@ -14,7 +14,8 @@ from training.factors import FactorError
 from training.ingest import IngestError
 from training.modes import ModeError
 from training.pipeline import STAGES, Run, execute
-from training.report import ReportError, write_report
+from training.record import ReportError
+from training.report import write_report
 from training.workers import WorkersError
 
 FAILURE = 1

@@ -24,8 +24,9 @@ from training.config import Config, ConfigError
 from training.factors import between, group, names, overlap
 from training.files import write_json, write_npz
 from training.ingest import MeshCollection, normalised, read_collection
-from training.modes import localisation, pga, spga, tangents
+from training.modes import localisation, pga, spga
 from training.shell_collection import ShellCollection
+from training.tangents import tangents
 
 
 def material(config: Config) -> Material:

@@ -2,17 +2,8 @@
 
 from __future__ import annotations
 
-import base64
-import importlib.util
-import io
-import json
 import math
-import tomllib
-import zipfile
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
-from functools import cached_property
-from itertools import cycle
 from pathlib import Path
 from typing import Any
 
@@ -20,28 +11,19 @@ import jinja2
 import numpy as np
 from markupsafe import Markup
 from matplotlib.axes import Axes
-from matplotlib.colors import Colormap, LinearSegmentedColormap, to_hex, to_rgb
+from matplotlib.colors import to_rgb
 from numpy.typing import NDArray
-from PIL import Image
 
-from geometry.mesh import FloatArray, IntArray, TriangleMesh, align, diagonal
-from geometry.nric import WeightedNorm
+from geometry.mesh import align, diagonal
 from training.files import write_text
-from training.modes import edge_magnitudes
 from training.plots import Line, lines, plot
-from training.rendering import Camera
+from training.record import HUES, STAGES, Record
+from training.studio import CLAY, COMPOSITE, ERROR, MODE_REACH, NEUTRAL, Studio, colour_bar, ramp, tint
 
-STAGES = ("ingest", "mean", "modes", "factors", "samples", "networks", "evaluation", "export")
 #: Pixels of a picture's longer side; shown at half of it or less, so that it is sharp on a phone.
 LARGE, SMALL = 480, 300
 #: More modes than these aren't drawn.
 MODES_SHOWN = 40
-#: Largest displacement at which a mode is shown, in diagonals.
-MODE_REACH = 0.1
-#: What shapes are made of: as they are, as the networks have them (yellow in the paper too), and without a factor.
-CLAY, COMPOSITE, NEUTRAL = "#d3ccc1", "#e3b23c", "#4b5a6b"
-HUES = ("#d1495b", "#2a7fba", "#3a9d5d", "#8e5bb5", "#e08a1e", "#1a9aa0", "#b5651d", "#d45fa0", "#7b9a24", "#5560c9")
-ERROR = LinearSegmentedColormap.from_list("error", [CLAY, "#f2c14e", "#e4572e", "#8f1440"])
 #: What the keys of R² in evaluation.json stand for.
 MODELS = {
     "composite": "Composite network",
@@ -53,159 +35,6 @@ MODELS = {
 #: Keys of evaluation.json that have their place on the page; the others come into a table of their own.
 PLACED = {"eta", "test_samples", "r2", "r2_factors", "variants", "vertex_error", "sizes", "times", "fractions"}
 PLACED |= {"prolongation"}
-
-
-class ReportError(ValueError):
-    """A folder that no report can be made of, with the reason in one line."""
-
-
-@dataclass(frozen=True)
-class Factor:
-    """A group of modes, and the hue that stands for it throughout the page."""
-
-    name: str
-    hue: str
-    modes: list[int]
-
-
-class Record:
-    """What a run has left so far; what isn't there is empty or None.
-
-    Raises:
-        ReportError: the folder is no run directory; or, on reading, a file of it is broken.
-    """
-
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
-        if not (folder / "config.toml").is_file():
-            raise ReportError(f"{folder} is no run directory: it holds no config.toml")
-        self.text = self._read("config.toml", "", lambda path: path.read_text(encoding="utf-8"))
-        self.config: dict[str, Any] = self._read("config.toml", {}, lambda path: tomllib.loads(self.text))
-        self.reference, self.modes, self.gallery = (
-            self._arrays(f"{name}.npz") for name in ("reference", "modes", "gallery")
-        )
-        self.decomposition, self.evaluation, self.histories = (
-            self._json(name) for name in ("modes.json", "evaluation.json", "networks/histories.json")
-        )
-        self.mean: FloatArray | None = self._arrays("mean.npz").get("vertices")
-        #: (V, 3) what tangent vectors start from: the mean, or the reference where there is none.
-        self.base = self.reference.get("vertices") if self.mean is None else self.mean
-        grouping = self._json("factors.json")
-        groups = grouping.get("factors", [])
-        self.factors = [
-            Factor(name, hue, group)
-            for name, hue, group in zip(grouping.get("names", []), cycle(HUES), groups, strict=False)
-        ]
-        self.overlap = np.array(grouping.get("overlap", []))
-        stamps = {path.stem: self._json(f"stages/{path.name}") for path in (folder / "stages").glob("*.json")}
-        #: Seconds of the stages that are done, None for one at work.
-        self.seconds = {name: stamps[name].get("seconds") for name in STAGES if name in stamps}
-
-    def _read(self, name: str, missing: Any, how: Any) -> Any:
-        path = self.folder / name
-        try:
-            return how(path) if path.exists() else missing
-        except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
-            raise ReportError(f"{path} can't be read: {str(error).splitlines()[0]}") from error
-
-    def _json(self, name: str) -> dict[str, Any]:
-        return self._read(name, {}, lambda path: dict(json.loads(path.read_text(encoding="utf-8"))))
-
-    def _arrays(self, name: str) -> dict[str, NDArray]:
-        return self._read(name, {}, lambda path: dict(np.load(path)))
-
-    @cached_property
-    def at_work(self) -> str:
-        """What the log says last of a stage that isn't done."""
-        path = self.folder / "log.jsonl"
-        for line in reversed(path.read_text(encoding="utf-8").splitlines() if path.exists() else []):
-            try:
-                event = json.loads(line)
-            except json.JSONDecodeError:
-                continue  # the last line of a run that was killed
-            if event.get("event") == "progress":
-                return f"{event['what']}: {event['done']} of {event['total']}"
-            return ""
-        return ""
-
-    def supports(self, tangents: FloatArray) -> FloatArray:
-        """Where tangent vectors (m, 2E) act: (m, V) between 0 and 1.
-
-        The root of the mean of the weighted norm's terms over the edges at a vertex. Displacements would tell less: a
-        bent knee moves the whole lower leg, but lengths and angles change at the knee (paper, figure of SPGA modes).
-        """
-        mesh = TriangleMesh.from_arrays(self.base, self.reference["faces"])  # type: ignore[arg-type]
-        norm = WeightedNorm.of(mesh, self.evaluation.get("eta", 1e-2))
-        density = edge_magnitudes(tangents, norm) ** 2
-        ends, count = mesh.edges.T.ravel(), len(mesh.vertices)
-        degree = np.bincount(ends, minlength=count).clip(1)
-        result = np.sqrt([np.bincount(ends, np.tile(row, 2), count) / degree for row in density])
-        # The very largest value may sit on a single sliver.
-        return (result / np.percentile(result, 99, axis=1, keepdims=True).clip(1e-300)).clip(0, 1)
-
-
-@dataclass(frozen=True)
-class Studio:
-    """Draws the shapes of one run, all with one camera.
-
-    Attributes:
-        camera: sees every shape of the run.
-        base: (V, 3) shape that the others are aligned to.
-        faces: (F, 3).
-    """
-
-    camera: Camera
-    base: FloatArray
-    faces: IntArray
-
-    @classmethod
-    def of(cls, record: Record) -> Studio | None:
-        """Set up the camera; None where there is no shape to draw, or nothing to draw with."""
-        if record.base is None or importlib.util.find_spec("embreex") is None:
-            return None
-        base, faces = record.base.astype(np.float64), record.reference["faces"]
-        names = {"test_exact", "test_predicted", "strip_joint", "strip_factors"} & record.gallery.keys()
-        shapes = [align(record.gallery[name].reshape(-1, *base.shape), base) for name in sorted(names)]
-        return cls(Camera.facing(base, faces, np.concatenate([base[None], *shapes])), base, faces)
-
-    def closer(self, reference: FloatArray) -> Studio:
-        """The same view without the room that far-reaching shapes need: for the base, the reference and modes."""
-        points = np.concatenate([self.base, align(reference, self.base)])
-        return replace(self, camera=self.camera.framing(points, 1.2 * MODE_REACH))
-
-    def draw(
-        self, shape: FloatArray, alt: str, size: int, colours: Any = CLAY, faces: IntArray | None = None,
-        *, smooth: bool = True,
-    ) -> Markup:  # fmt: skip
-        """An image element of a shape (V, 3) or of several (T, V, 3) side by side; colours are a name or (…, V, 3)."""
-        faces = self.faces if faces is None else faces
-        shapes = shape.reshape(-1, *shape.shape[-2:])
-        tints = np.broadcast_to(to_rgb(colours) if isinstance(colours, str) else colours, shapes.shape)
-        pictures = [self.camera.render(x, faces, c, size, smooth=smooth) for x, c in zip(shapes, tints, strict=True)]
-        pixels = np.concatenate(pictures, axis=1)
-        file = io.BytesIO()
-        Image.fromarray(pixels).save(file, format="WEBP", quality=84)
-        height, width = pixels.shape[:2]
-        return Markup('<img src="data:image/webp;base64,{}" width="{}" height="{}" alt="{}">').format(
-            base64.b64encode(file.getvalue()).decode(), width, height, alt
-        )
-
-
-def ramp(hue: str) -> Colormap:
-    """Colours from clay to a hue; in the middle more of it than on a straight line, where it would look muddy."""
-    middle = 0.35 * np.array(to_rgb(CLAY)) + 0.65 * np.array(to_rgb(hue))
-    return LinearSegmentedColormap.from_list(hue, [to_rgb(CLAY), tuple(middle), to_rgb(hue)])
-
-
-def tint(colours: Colormap, values: FloatArray) -> FloatArray:
-    """Colours (…, 3) of values between 0 and 1."""
-    return np.asarray(colours(np.nan_to_num(values).clip(0, 1)))[..., :3]
-
-
-def colour_bar(colours: Colormap, *labels: str) -> dict[str, Any]:
-    """A legend: a CSS gradient, and labels evenly along it."""
-    stops = ", ".join(to_hex(colours(x)) for x in np.linspace(0, 1, 9))
-    return {"gradient": f"linear-gradient(90deg, {stops})", "labels": labels}
 
 
 def shapes(record: Record, studio: Studio) -> Iterator[tuple[Markup, str]]:

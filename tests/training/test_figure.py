@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from geometry.mesh import FloatArray, TriangleMesh
-from training import figure
+from training import figure, mannequin
 
 
 def smallest_angles(vertices: FloatArray, faces: np.ndarray) -> FloatArray:
@@ -25,7 +25,7 @@ def angles(**values: float) -> FloatArray:
 
 @pytest.fixture(scope="module")
 def rest() -> TriangleMesh:
-    return figure.rest()
+    return mannequin.rest()
 
 
 @pytest.fixture(scope="module")
@@ -82,8 +82,8 @@ def test_left_is_the_mirror_image_of_right(rest: TriangleMesh) -> None:
 
 
 def test_meshing_again_gives_the_same_bits(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(figure, "RELAXATIONS", 1)
-    once, again = figure.rest.__wrapped__(), figure.rest.__wrapped__()
+    monkeypatch.setattr(mannequin, "RELAXATIONS", 1)
+    once, again = mannequin.rest.__wrapped__(), mannequin.rest.__wrapped__()
     assert np.array_equal(again.vertices, once.vertices)
     assert np.array_equal(again.faces, once.faces)
 
@@ -154,8 +154,8 @@ def test_positive_angles_turn_the_way_their_names_say(
 
 
 def test_beyond_the_joints_the_motion_is_rigid(rest: TriangleMesh, some: FloatArray) -> None:
-    hand = (rest.vertices - figure.ELBOW) @ figure.ARM > 0.07
-    hand &= rest.vertices[:, 0] > figure.ELBOW[0]
+    hand = (rest.vertices - mannequin.ELBOW) @ mannequin.ARM > 0.07
+    hand &= rest.vertices[:, 0] > mannequin.ELBOW[0]
     shin = (rest.vertices[:, 1] < 0.37) & (rest.vertices[:, 0] > 0)
     for part in (hand, shin, rest.vertices[:, 1] > 1.6):
         inside = part[rest.edges].all(axis=1)

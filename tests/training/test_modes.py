@@ -15,7 +15,8 @@ from geometry.mesh import FloatArray, TriangleMesh, align
 from geometry.nric import WeightedNorm, unwrap
 from geometry.rigid import rigid_motions, without_rigid_motion
 from geometry.status import Status
-from training.modes import ModeError, Modes, _fit_in_box, localisation, pga, spga, tangents
+from training.modes import ModeError, Modes, _fit_in_box, localisation, pga, spga
+from training.tangents import tangents
 
 
 @dataclass(frozen=True)

@@ -22,8 +22,9 @@ from geometry.gltf import vertex_normals
 from geometry.mesh import TriangleMesh
 from training.__main__ import main
 from training.pipeline import STAGES as PIPELINE
+from training.record import STAGES, Record, ReportError
 from training.rendering import Camera
-from training.report import STAGES, Record, ReportError, duration, write_report
+from training.report import duration, write_report
 
 NASTY = "<script>alert('thumb')</script>"
 SECTIONS = {"shapes", "modes", "factors", "strip", "tests", "figures", "losses", "stages", "configuration"}
