@@ -54,6 +54,7 @@ def least_squares(
     *,
     tolerance: float = 1e-4,
     gain_tolerance: float = 1e-6,
+    large: float = np.inf,
     secant: bool = True,
     max_evaluations: int = 40,
     deadline: float | None = None,
@@ -73,7 +74,8 @@ def least_squares(
         upper: (m,) the opposite ones.
         scale: (m,) lengths that count as equally long in each coordinate.
         tolerance: stop once no coordinate would move further than this fraction of its scale,
-        gain_tolerance: or ``‖r‖²`` would not shrink by more than this fraction of itself.
+        gain_tolerance: or ``‖r‖²`` would not shrink by more than this fraction of itself,
+        large: where ``‖r‖`` is less; above, of ``‖r‖`` times this: most of such a residual can't vanish.
         secant: whether Jacobians are worth saving; otherwise one is made at each step.
         max_evaluations: of the residual.
         deadline: time.monotonic() after which no evaluation begins.
@@ -97,7 +99,7 @@ def least_squares(
             return fit(Status.STALLED)
         step = _step(J, r, low - u, high - u, damping)
         predicted = r @ r - np.sum((r + J @ step) ** 2)
-        if np.abs(step).max() <= tolerance or predicted <= gain_tolerance * (r @ r):
+        if np.abs(step).max() <= tolerance or predicted <= gain_tolerance * shrinkable(float(r @ r), large):
             if updates and np.abs(u - made_at).max() > TRUSTED:
                 J, made_at, updates = jacobian(u * scale, r) * scale, u, 0
                 continue
@@ -121,6 +123,11 @@ def least_squares(
         else:
             updates += taken
     return fit(Status.ITERATION_LIMIT)
+
+
+def shrinkable(cost: float, large: float) -> float:
+    """What gains of a cost ``‖r‖²`` are compared with: itself, or ``large · ‖r‖`` where ``‖r‖`` is larger."""
+    return float(min(cost, large * np.sqrt(cost)))
 
 
 def _step(J: FloatArray, r: FloatArray, low: FloatArray, high: FloatArray, damping: float) -> FloatArray:

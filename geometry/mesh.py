@@ -240,13 +240,14 @@ def face_normals(vertices: FloatArray, faces: IntArray, *, normalised: bool = Tr
     return n / np.linalg.norm(n, axis=-1, keepdims=True) if normalised else n
 
 
-def align(vertices: FloatArray, target: FloatArray) -> FloatArray:
+def align(vertices: FloatArray, target: FloatArray, carried: FloatArray | None = None) -> FloatArray:
     """Move shapes (…, V, 3) rigidly to come closest to targets (…, V, 3) in least squares over vertices.
 
-    Kabsch's method: rotation and translation, no reflection, no scaling.
+    Kabsch's method: rotation and translation, no reflection, no scaling. Instead of the shapes themselves other points
+    (…, n, 3) can be moved as they are, ``carried``.
     """
     centre, middle = (shapes.mean(axis=-2, keepdims=True) for shapes in (vertices, target))
     x, y = vertices - centre, target - middle
     u, _, vt = np.linalg.svd(np.swapaxes(x, -1, -2) @ y)
     u[..., :, -1] *= np.sign(np.linalg.det(u @ vt))[..., None]
-    return x @ (u @ vt) + middle
+    return (x if carried is None else carried - centre) @ (u @ vt) + middle

@@ -88,12 +88,6 @@ class Prolongation:
         )
         return fine
 
-    def only(self, vertices: IntArray) -> Prolongation:
-        """The prolongation to some of the fine vertices (k,), in that order."""
-        weights, count = self.weights[vertices], self.weights.shape[1] // 2
-        normals = np.unique(weights.indices[weights.indices >= count]) - count
-        return Prolongation(self.faces[np.isin(self.faces, normals).any(axis=1)], weights)
-
     @property
     def vertex_count(self) -> int:
         """Vf."""

@@ -15,7 +15,7 @@ from service import __version__, problems
 from service.dependencies import Service
 from service.description import describe
 from service.metrics import Metrics
-from service.middleware import LimitBody, Observe, RequireKey
+from service.middleware import AnswerHead, LimitBody, Observe, RequireKey
 from service.recent import RecentAnswers
 from service.reloading import Reloader
 from service.repository import ModelRepository
@@ -75,9 +75,13 @@ def create_app(settings: Settings | None = None) -> FastAPI:
 
 def _middleware(settings: Settings) -> list[Middleware]:
     """From the outside in."""
-    stack = [Middleware(Observe), Middleware(LimitBody, limit=settings.max_body, upload=settings.max_upload)]
+    stack = [
+        Middleware(AnswerHead),
+        Middleware(Observe),
+        Middleware(LimitBody, limit=settings.max_body, upload=settings.max_upload),
+    ]
     if settings.api_key:
-        stack.insert(1, Middleware(RequireKey, key=settings.api_key))
+        stack.insert(2, Middleware(RequireKey, key=settings.api_key))
     if settings.cors_origins:
         # Outermost, so that pages can read every refusal; a preflight brings no key.
         cors = Middleware(

@@ -59,6 +59,8 @@ class ComparisonQuery:
 def numbers(text: str, name: str) -> list[float]:
     """A code in a query; raises ProblemError, invalid-request."""
     try:
+        if "_" in text or not text.isascii():  # Python reads more as a number than others
+            raise ValueError
         return [float(part) for part in text.split(",")] if text else []
     except ValueError:
         raise ProblemError(

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import sparse
 
-from geometry.least_squares import Fit, least_squares
-from geometry.mesh import FloatArray, IntArray, align
+from geometry.least_squares import Fit, least_squares, shrinkable
+from geometry.mesh import FloatArray, IntArray
 from geometry.nric import wrap
 from geometry.reconstruction import Reconstructor
 from geometry.rigid import without_rigid_motion
@@ -23,7 +23,7 @@ PRIOR = 1e-4
 #: A shape is moved by this fraction of its derivative to see how it would be aligned and prolonged.
 DIFFERENCE = 1e-4
 #: Other starts at most, where the misfit is above one of these fractions of the diagonal: with rough shapes, with those
-#: that are answered. And what part of its square must be thought to remain there.
+#: that are answered. And what part of its square, as far as it is that small, must be thought to remain there.
 STARTS, GOOD_ROUGHLY, GOOD, PROMISING = 4, 2e-2, 2e-3, 0.9
 #: Targets at most that another start is chosen by: each costs three solves, and as many fields.
 RANKED = 32
@@ -127,10 +127,15 @@ def _best(problem: _Problem) -> Fit:
         if not other.cost < rough.cost:
             break
         fit = problem.refine(other.x)
-        if not fit.cost < PROMISING * best.cost:
+        if not fit.cost < _worthwhile(best.cost):
             break
         rough, best = other, fit
     return best
+
+
+def _worthwhile(cost: float) -> float:
+    """What another fit's cost must be below."""
+    return cost - (1 - PROMISING) * shrinkable(cost, GOOD_ROUGHLY)
 
 
 class _Problem:
@@ -167,7 +172,7 @@ class _Problem:
             if best.status is Status.DEADLINE or self.misfit(best) < GOOD_ROUGHLY:
                 break
             fit = self._search(self.elsewhere(best, self.rough))
-            if not fit.cost < PROMISING * best.cost:
+            if not fit.cost < _worthwhile(best.cost):
                 break
             best = fit
         return best
@@ -177,8 +182,8 @@ class _Problem:
         return least_squares(
             lambda x: self._residual(x, chart),
             lambda x, _: self._jacobian(chart.derivatives(x, factor_derivatives(self._model, x))),
-            start, *self._box, tolerance=1e-3, gain_tolerance=0.05, secant=False, max_evaluations=20,
-            deadline=self._deadline,
+            start, *self._box, tolerance=1e-3, gain_tolerance=0.05, large=GOOD_ROUGHLY, secant=False,
+            max_evaluations=20, deadline=self._deadline,
         )  # fmt: skip
 
     def refine(self, start: FloatArray) -> Fit:
@@ -187,7 +192,7 @@ class _Problem:
         return least_squares(
             lambda x: self._residual(x, chart),
             lambda x, _: self._jacobian(chart.derivatives(x, derivatives(self._model, x))),
-            start, *self._box, tolerance=1e-3, gain_tolerance=0.002, max_evaluations=REFINEMENTS,
+            start, *self._box, tolerance=1e-3, gain_tolerance=0.002, large=GOOD_ROUGHLY, max_evaluations=REFINEMENTS,
             deadline=self._deadline,
         )  # fmt: skip
 
@@ -201,7 +206,7 @@ class _Problem:
         some = np.linspace(0, count - 1, min(count, RANKED)).astype(np.int64)
         sensitivity = chart.sensitivity(fit.x, some) * self._weight
         missing = fit.residual[: self._positions.size].reshape(-1, 3)[some].ravel()
-        best, found = PROMISING * float(missing @ missing), np.clip(np.zeros_like(fit.x), *model.latents.box())
+        best, found = _worthwhile(float(missing @ missing)), np.clip(np.zeros_like(fit.x), *model.latents.box())
         half = model.manifest.edges
         for j, factor in enumerate(model.manifest.factors):
             own = slice(factor.start, factor.stop)
@@ -241,39 +246,38 @@ class _Chart:
         rough: bool,
     ) -> None:
         self._model, self._reconstruct, self._deadline, self._rough = model, reconstruct, deadline, rough
-        self._vertices = vertices
-        self._rows = model.fine.prolong.only(vertices) if model.fine and mesh is MeshChoice.FINE else None
+        self._vertices, self._mesh = vertices, mesh
         self._code, self._shape = np.full(model.latents.dimension, np.nan), model.reference.vertices
         self.shapes = 0
 
     def positions(self, x: FloatArray) -> FloatArray:
         """(k, 3) at a code (m,); not finite where the networks overflow."""
-        return self._placed(self._solved(x)[None])[0]
+        return self._places(self._solved(x))
 
     def derivatives(self, x: FloatArray, changes: FloatArray) -> FloatArray:
         """(m, k, 3) at a code (m,), given those of lengths and angles (2E, m)."""
         shape = self._solved(x)
         fields = self._reconstruct.differential(shape, changes.T)
         h = DIFFERENCE * self._model.reference.diagonal / max(np.abs(fields).max(), np.finfo(float).tiny)
-        here, *there = self._placed(np.concatenate([shape[None], shape + h * fields]))
+        here, *there = self._places(np.concatenate([shape[None], shape + h * fields]))
         return np.stack([(places - here) / h for places in there])
 
     def sensitivity(self, x: FloatArray, some: IntArray) -> FloatArray:
         """(3k, 2E) derivatives of some positions (k,) by lengths and angles at a code (m,), without normals'."""
-        shape, count = self._solved(x), len(self._model.reference.vertices)
+        model, shape = self._model, self._solved(x)
+        count, vertices = len(shape), self._vertices[some]
         rows = (
-            sparse.eye_array(count, format="csr")[self._vertices[some]]
-            if self._rows is None
-            else self._rows.weights[some, :count]
+            model.fine.prolong.weights[vertices, :count]
+            if model.fine and self._mesh is MeshChoice.FINE
+            else sparse.eye_array(count, format="csr")[vertices]
         )
         fields = np.einsum("kv,xy->kxvy", rows.toarray(), np.eye(3)).reshape(-1, count, 3)
-        aligned = align(shape, self._model.reference.vertices)
+        aligned = model.placed(shape, self._mesh, carried=shape)
         return self._reconstruct.sensitivity(aligned, without_rigid_motion(fields, aligned))
 
-    def _placed(self, shapes: FloatArray) -> FloatArray:
-        """(n, k, 3) of shapes (n, V, 3)."""
-        aligned = align(shapes, self._model.reference.vertices)
-        return aligned[:, self._vertices] if self._rows is None else self._rows(aligned)
+    def _places(self, shapes: FloatArray) -> FloatArray:
+        """(…, k, 3) of shapes (…, V, 3)."""
+        return self._model.placed(shapes, self._mesh)[..., self._vertices, :]
 
     def _solved(self, x: FloatArray) -> FloatArray:
         if not np.array_equal(x, self._code):

@@ -10,7 +10,7 @@ import numpy as np
 from geometry.calculus import ShellSpace
 from geometry.energy import Material
 from geometry.exponential import exponential
-from geometry.mesh import FloatArray, align
+from geometry.mesh import FloatArray
 from geometry.status import Status
 from service.latent_space import Codes
 from service.shape_model import MeshChoice, Shape, ShapeModel
@@ -69,6 +69,6 @@ def exact(model: ShapeModel, code: Codes, shape: Shape, mesh: MeshChoice) -> Exa
         model.spaces.put(space)
     if not path.converged:
         return Exact(path.status, None, None, None)
-    vertices = model.finish(align(path.vertices[-1], model.reference.vertices), mesh)
+    vertices = model.finish(path.vertices[-1], mesh)
     distances = np.linalg.norm(vertices - shape.vertices, axis=1)
     return Exact(path.status, vertices, float(distances.mean()), float(distances.max()))

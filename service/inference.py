@@ -223,7 +223,7 @@ def parse(body: bytes, header: str | None) -> tuple[InferenceRequest, list[list[
         raise _invalid(f"The bytes of {INPUT} are no whole number of FP32 values. Send {_FLOAT.itemsize} for each")
     else:
         values = np.frombuffer(body[length:], _FLOAT)
-    if values.size != n * m:
+    if m == 0 or values.size != n * m:  # any number of codes without coordinates would fit
         raise _invalid(f"{INPUT} has {values.size} numbers, but its shape is {tensor.shape}. Send {n * m}")
     return request, values.reshape(n, m).tolist()
 

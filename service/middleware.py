@@ -24,6 +24,19 @@ OPEN = re.compile(r"/|/page/.*|/openapi\.json|/v2/health/(live|ready)")
 QUIET = frozenset({"/v2/health/live", "/v2/health/ready", "/metrics"})
 
 
+class AnswerHead:
+    """Lets ``HEAD`` be asked wherever ``GET`` is; the server that runs the application leaves out the body."""
+
+    def __init__(self, app: ASGIApp) -> None:
+        self.app = app
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Pass a request on, as GET if need be."""
+        if scope["type"] == "http" and scope["method"] == "HEAD":
+            scope = {**scope, "method": "GET"}
+        await self.app(scope, receive, send)
+
+
 class Observe:
     """Gives each request an id, counts and times it, logs one line about it, and answers where nobody else did."""
 
@@ -109,7 +122,7 @@ def _digest(key: str) -> bytes:
 
 
 class LimitBody:
-    """Refuses request bodies over a limit, announced or not.
+    """Refuses request bodies over a limit, announced or not, and compressed ones.
 
     Starlette has one of its own, but that answers in plain text.
 
@@ -130,12 +143,16 @@ class LimitBody:
         limit = self.upload if scope["path"].endswith("/encode") else self.limit
         announced = Headers(scope=scope).get("content-length", "")
         length = int(announced) if announced.isdecimal() else 0
+        encoding = Headers(scope=scope).get("content-encoding", "identity")
         received = 0
 
         async def limited() -> Message:
             nonlocal received
             if length > limit:
                 raise _too_large(limit)
+            if encoding.lower() != "identity":
+                detail = f"The body is encoded as {encoding}. Send it as it is, without Content-Encoding."
+                raise ProblemError("unsupported-media-type", detail)
             message = await receive()
             received += len(message.get("body", b""))
             if received > limit:

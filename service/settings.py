@@ -38,7 +38,7 @@ def cpu_quota(cgroup: Path = Path("/sys/fs/cgroup")) -> int:
 class Settings(BaseSettings):
     """Settings of the server; the README lists them."""
 
-    model_config = SettingsConfigDict(env_prefix=PREFIX, env_ignore_empty=True, frozen=True)
+    model_config = SettingsConfigDict(env_prefix=PREFIX, env_ignore_empty=True, frozen=True, allow_inf_nan=False)
 
     models_dir: Path = Field(default=Path("models"), description="folder of bundles, NAME/VERSION/")
     host: str = Field(default="127.0.0.1", description="address to listen on")

@@ -174,9 +174,11 @@ class ShapeModel:
         with self.solver() as reconstruct:
             start = reconstruct.guess(target[0], *self._learned_start(code))
             found: Reconstruction = reconstruct(target[0], start, tolerance=TOLERANCE, deadline=deadline)
-        vertices = align(found.vertices, self.reference.vertices)
         with np.errstate(over="ignore", invalid="ignore"):
-            vertices = self.finish(vertices, mesh)
+            try:
+                vertices = self.finish(found.vertices, mesh)
+            except np.linalg.LinAlgError:  # aligned, what isn't finite
+                raise NotFiniteError(self._overflow) from None
             if found.status is Status.NOT_FINITE or not np.isfinite(vertices.astype(np.float32)).all():
                 raise NotFiniteError(self._overflow)
         diagnostics = Diagnostics(
@@ -211,11 +213,14 @@ class ShapeModel:
         """What factor j's network alone says to parts (n, m_j) of codes: (n, 2E), normalised."""
         return self._factors[j](parts.astype(np.float32)).astype(np.float64)
 
-    def finish(self, aligned: FloatArray, mesh: MeshChoice) -> FloatArray:
-        """An aligned shape (V, 3) on the mesh of choice, in the units of the training meshes."""
-        # The fine mesh moves along with the coarse one, so that aligning this one aligns both.
-        vertices = self.fine.prolong(aligned) if self.fine and mesh is MeshChoice.FINE else aligned
-        return self.manifest.scale * vertices
+    def finish(self, shape: FloatArray, mesh: MeshChoice) -> FloatArray:
+        """A shape (V, 3) in any pose as it leaves: on the mesh of choice, aligned, in the training meshes' units."""
+        return self.manifest.scale * self.placed(shape, mesh)
+
+    def placed(self, shapes: FloatArray, mesh: MeshChoice, carried: FloatArray | None = None) -> FloatArray:
+        """Shapes (…, V, 3) on the mesh of choice, aligned to its reference; instead of them what is carried along."""
+        found = self.fine.prolong(shapes) if self.fine and mesh is MeshChoice.FINE else shapes
+        return align(found, self.mesh(mesh).vertices, carried)
 
     def coarse(self, vertices: FloatArray, mesh: MeshChoice) -> FloatArray:
         """The vertices (V, 3) of the coarse mesh among those of a mesh of choice."""

@@ -161,8 +161,12 @@ def export(
         manifest["start"] = {"file": "start.onnx", "input": "latent", "output": "vertices"}
     manifest["files"] = {path.name: _digest(path) for path in sorted(part.iterdir())}
     (part / "manifest.json").write_text(json.dumps(manifest, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
-    shutil.rmtree(folder, ignore_errors=True)
+    old = folder.with_name(f".{folder.name}.old")
+    shutil.rmtree(old, ignore_errors=True)
+    if folder.exists():
+        os.replace(folder, old)
     os.replace(part, folder)
+    shutil.rmtree(old, ignore_errors=True)
     return folder
 
 

@@ -17,7 +17,17 @@ from scipy import sparse
 from scipy.spatial import KDTree
 
 from geometry.formats import load_npz, read_arrays
-from geometry.mesh import Connectivity, EdgeError, FloatArray, IntArray, MeshError, TriangleMesh, diagonal, face_areas
+from geometry.mesh import (
+    Connectivity,
+    EdgeError,
+    FloatArray,
+    IntArray,
+    MeshError,
+    TriangleMesh,
+    align,
+    diagonal,
+    face_areas,
+)
 
 FORMATS = ("obj", "ply", "stl", "off", "gltf", "glb", "npz")
 MIN_SHAPES = 3
@@ -93,10 +103,10 @@ def read_collection(path: Path) -> MeshCollection:
     for label, shape in zip(raw.labels, vertices, strict=True):
         with _refusing(label, used):
             TriangleMesh(shape, connectivity)
-    if not np.ptp(vertices, axis=0).any():
+    if np.ptp(align(vertices, vertices[0]), axis=0).max() <= WELD_TOLERANCE * diagonal(vertices[0]):
         raise IngestError(
-            f"{path}: all {len(vertices)} shapes are equal; poses and morph targets inside a file are not read, export "
-            "each shape as a mesh of its own"
+            f"{path}: all {len(vertices)} shapes are equal but for where they stand; poses and morph targets inside a "
+            "file are not read, export each shape as a mesh of its own"
         )
 
     weld, kept_pairs, notes = _welding(vertices, raw.labels)

@@ -60,7 +60,7 @@ _INFER: dict[str, Any] = {
             },
         }
     }
-    | problems(400, 404, 413, 422, 503, 504),
+    | problems(400, 404, 413, 415, 422, 503, 504),
     "openapi_extra": {
         "requestBody": {
             "required": True,

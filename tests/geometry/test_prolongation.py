@@ -46,11 +46,6 @@ def test_it_knows_which_fine_vertices_the_coarse_ones_are(pair):
     np.testing.assert_array_equal(pair.prolong.coarse_vertices, pair.index)
 
 
-def test_it_can_be_restricted_to_some_vertices(pair, shape):
-    chosen, coarse = [5, 2, 2, 9], shape[pair.index]
-    np.testing.assert_array_equal(pair.prolong.only(np.array(chosen))(coarse), pair.prolong(coarse)[chosen])
-
-
 def test_moves_rigidly_and_grows_with_the_shape(pair, shape, move):
     coarse = shape[pair.index]
     both = move(np.concatenate([coarse, pair.prolong(coarse)]))

@@ -67,6 +67,7 @@ REQUESTS = {
     "text in a link": get(f"{MESH}?latent=a,b,c", 422, "invalid-request", "separated by commas"),
     "NaN in a link": get(f"{MESH}?latent=nan,0,0", 422, "not-finite", "Send finite numbers"),
     "short code in a link": get(f"{MESH}?latent=1,2", 422, "wrong-length", "Send exactly 3"),
+    "digits of another kind in a link": get(f"{MESH}?latent=1_0,0,0", 422, "invalid-request", "separated by commas"),
     "empty code in a link": get(f"{MESH}?latent=", 422, "wrong-length", "Send exactly 3"),
     "no code": post(VERTICES, {"latents": []}, 422, "invalid-request", "Send at least one code"),
     "one code for many": post(VERTICES, {"latents": OK}, 422, "invalid-request", "Send a list for latents[0]"),
@@ -115,6 +116,10 @@ REQUESTS = {
     "form as body": Bad(
         "POST", MESH, 415, "unsupported-media-type", "Content-Type: application/json", "latent=1",
         {"Content-Type": "application/x-www-form-urlencoded"},
+    ),
+    "compressed body": Bad(
+        "POST", MESH, 415, "unsupported-media-type", "without Content-Encoding", "{}",
+        {"Content-Type": "application/json", "Content-Encoding": "gzip"},
     ),
     "body of no type": Bad("POST", MESH, 415, "unsupported-media-type", "Content-Type: application/json", "{}"),
 }  # fmt: skip

@@ -145,6 +145,7 @@ FAULTS: dict[str, tuple[Any, int, str]] = {
     "three dimensions": (body(shape=[2, 3, 1]), 422, "inputs[0].shape"),
     "a negative shape": (body(shape=[-2, -3]), 422, "at least 0 for inputs[0].shape[0]"),
     "too few numbers": (body(data=[1, 2, 3]), 422, "has 3 numbers, but its shape is [2, 3]. Send 6"),
+    "many codes of no coordinate": (body(shape=[10**12, 0], data=[]), 422, "has 0 numbers, but its shape is"),
     "an empty shape": (body(shape=[0, 3], data=[]), 422, "at least one code"),
     "no data": (body(data=None), 422, "either as data"),
     "another output": (body() | {"outputs": [{"name": "faces"}]}, 422, "'nric' or 'vertices' for outputs[0].name"),

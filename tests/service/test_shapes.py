@@ -61,6 +61,23 @@ def test_every_mesh_is_rigidly_aligned_to_the_reference(client: httpx.Client) ->
     for code in ([0.2, 1.5, 1.0], [-0.2, -3.0, 0.3], [0.5, 2.0, 2.0]):
         found = positions(client.post(MESH, json={"latent": code}, params={"format": "json"}))
         np.testing.assert_allclose(found, align(found, target), atol=2e-6)
+    # Over its own vertices, which are denser here than there.
+    for mesh in ("coarse", "fine"):
+        answer = client.post(
+            "/v1/models/figure/vertices", json={"latents": [[0.6] * 20], "mesh": mesh}
+        ).raise_for_status()
+        found = np.array(answer.json()["vertices"][0])
+        rest = positions(client.get("/v1/models/figure/mesh", params={"format": "json", "mesh": mesh}))
+        np.testing.assert_allclose(found, align(found, rest), atol=1e-5)
+
+
+def test_head_is_answered_wherever_get_is_without_a_body(client: httpx.Client) -> None:
+    for path in ("/v1/models", MESH, "/v2/health/live", "/openapi.json", "/metrics"):
+        head, get = client.head(path), client.get(path)
+        assert (head.status_code, head.content) == (200, b"")
+        assert head.headers["Content-Type"] == get.headers["Content-Type"]
+    assert client.head(MESH).headers["ETag"] == client.get(MESH).headers["ETag"]
+    assert client.head("/v1/models/none").status_code == 404
 
 
 def test_lengths_and_angles_are_those_of_the_networks(client: httpx.Client) -> None:

@@ -387,6 +387,10 @@ REFUSALS: dict[str, tuple[Callable[[Path], Path], str]] = {
     ),
     "parts that share one vertex": (ball_and([[9, 0, 0], [9, 1, 0]], [[A, 42, 43]]), r"has 2 separate parts"),
     "equal shapes": (written(SHAPES[[0, 0, 0]]), r"all 3 shapes are equal"),
+    "one shape at several places": (
+        written(SHAPES[[0, 0, 0]] @ [[0, 1, 0], [-1, 0, 0], [0, 0, 1]] + [[[0, 0, 0]], [[3, 0, 0]], [[0, 0.5, 7]]]),
+        r"all 3 shapes are equal but for where they stand",
+    ),
     "a mirror image": (
         written(SHAPES * [[[1, 1, 1]], [[1, -1, 1]], [[1, 1, 1]]]),
         r"pose2\.obj: is inside out, compared with .*pose1\.obj",
