@@ -328,6 +328,15 @@ def test_the_centre_of_two_shapes_is_half_way(space, mesh, velocity):
     assert space.norm(half, without_rigid_motion(align(found.vertices, half) - half, half)) < 0.1 * whole
 
 
+@pytest.mark.parametrize("weights", [[0, 0], [1, -1], [1], [np.nan, 1], [np.inf, 1]])
+def test_weights_that_make_no_mean_are_refused(space, mesh, pose, weights):
+    for mean in (elastic_mean, centre_of_mass):
+        with pytest.raises(ValueError, match="weights"):
+            mean(space, [mesh.vertices, pose], weights)
+        with pytest.raises(ValueError, match="no shapes"):
+            mean(space, [])
+
+
 # ---------------------------------------------------------------- many at once
 
 

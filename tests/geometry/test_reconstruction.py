@@ -118,6 +118,13 @@ def test_a_start_at_the_solution_ends_at_once(mesh, pose, reconstruct, target):
     np.testing.assert_allclose(found.vertices, pose, atol=1e-9 * mesh.diagonal)
 
 
+def test_a_tolerance_beyond_rounding_ends_soon_and_as_stalled(mesh, pose, reconstruct, target):
+    found = reconstruct(target, tolerance=1e-17)
+    assert found.status is Status.STALLED
+    assert found.iterations < 60
+    assert np.abs(align(found.vertices, pose) - pose).max() < 1e-6 * mesh.diagonal
+
+
 def test_angles_count_modulo_full_turns_and_not_at_all_on_the_boundary(mesh, pose, reconstruct, target, rng):
     c = mesh.connectivity
     target[c.edge_count :] += 2 * np.pi * rng.integers(-3, 4, c.edge_count)
