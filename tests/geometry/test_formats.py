@@ -214,6 +214,14 @@ def test_few_frames_are_exact_and_many_are_within_the_tolerance() -> None:
             assert animated.max_vertex_error < 1.1e-4 * diagonal
 
 
+def test_where_an_animation_takes_place_does_not_matter() -> None:
+    codes = np.linspace([0, 0, 1, 1], [0.5, 0.3, 1.1, 1], DENSE_FRAMES + 1)
+    frames, faces = freaky_torus.vertices(codes), freaky_torus.connectivity().faces
+    here, there = animated_glb(frames, faces), animated_glb(frames + [16, 0, 0], faces)
+    assert there.targets == here.targets
+    assert there.max_vertex_error == pytest.approx(here.max_vertex_error, rel=0.1)
+
+
 def test_weights_of_what_goes_both_ways_lie_between_0_and_1() -> None:
     # Others cut them off, as Blender does.
     count = DENSE_FRAMES + 6
