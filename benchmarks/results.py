@@ -15,12 +15,16 @@ from typing import Any
 import jinja2
 import matplotlib.pyplot as plt
 import numpy as np
+from PIL import Image
 
 from benchmarks import limits, space
+from geometry.mesh import align
 from training.config import load
 from training.files import write_json
 from training.pipeline import Run, execute, learner_of
+from training.record import Record
 from training.sampling import DONE
+from training.studio import COMPOSITE, Studio
 
 ROOT = Path(__file__).resolve().parents[1]
 #: Collections of real meshes, in the order of the tables; then the hand without what the method rests on.
@@ -28,6 +32,8 @@ COLLECTIONS = ("hand", "faces", "samba", "makehuman", "horse", "hippocampus")
 CONTRASTS = ("hand-pga", "hand-one-factor")
 #: Models of our own, whose runs leave the bundles that are committed.
 OWN = ("freaky-torus", "figure")
+#: Those whose terms let their pictures be shown, and our own.
+PICTURED = ("hand", "faces", "makehuman", "figure", "freaky-torus")
 #: Runs whose extrapolation is measured: one that is easy and one that isn't.
 EXTRAPOLATED = ("hand", "samba")
 
@@ -109,6 +115,24 @@ def study(name: str, run: Run) -> None:
         write_json(run.folder / "limits.json", {"extrapolation": limits.extrapolation(learner_of(run))})
 
 
+def draw_strips(rows: list[Row], path: Path) -> None:
+    """Between two random codes of each, all factors together, reconstructed from what the networks say."""
+    strips = []
+    for row in rows:
+        record = Record(row.run.folder)
+        if studio := Studio.of(record):
+            strips.append(
+                Image.fromarray(studio.pixels(align(record.gallery["strip_joint"], studio.base), 170, COMPOSITE))
+            )
+    width = max(strip.width for strip in strips)
+    page = Image.new("RGB", (width, sum(strip.height for strip in strips)), "white")
+    top = 0
+    for strip in strips:
+        page.paste(strip, ((width - strip.width) // 2, top), strip)
+        top += strip.height
+    page.save(path, optimize=True)
+
+
 def plot_samples(rows: list[Row], path: Path) -> None:
     """R² by the share of the samples, of the three ways to learn from them."""
     figure, axes = plt.subplots(
@@ -162,6 +186,7 @@ def main() -> None:
     rows = {name: Row(name, run) for name, run in runs.items() if (run.folder / "evaluation.json").exists()}
     real = [rows[name] for name in COLLECTIONS if name in rows]
     docs = ROOT / "docs"
+    draw_strips([rows[name] for name in PICTURED if name in rows], docs / "results-shapes.png")
     if some := [row for row in real if row.evaluation["fractions"]]:
         plot_samples(some, docs / "results-samples.png")
     if some := [row for row in real if row.read("space")]:

@@ -122,9 +122,7 @@ SEQUENCE_FORMATS = {
 #: Media types of all formats of a whole animation by name.
 MEDIA_TYPES = {name: format.media_type for name, format in SEQUENCE_FORMATS.items()} | {"jsonl": JSON_LINES}
 #: Why a format may be missing.
-UNAVAILABLE = {
-    "usd": "This server can't write USD, for which it needs the package usd-core: pip install 'shapespace[usd]'"
-}
+UNAVAILABLE = {"usd": "This server can't write USD, for which it needs the package usd-core: pip install usd-core"}
 
 
 def sequence_types() -> dict[str, str]:

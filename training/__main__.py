@@ -14,7 +14,7 @@ from training.factors import FactorError
 from training.ingest import IngestError
 from training.modes import ModeError
 from training.pipeline import STAGES, Run, execute
-from training.record import ReportError
+from training.record import Record, ReportError
 from training.report import write_report
 from training.workers import WorkersError
 
@@ -45,9 +45,10 @@ def _run(arguments: argparse.Namespace) -> None:
 
 def _status(arguments: argparse.Namespace) -> None:
     run = _open(arguments.run, arguments.models)
+    begun = ": ".join(filter(None, ("begun", Record(run.folder).at_work)))
     for name in STAGES:
         stamp = run.stamp(name)
-        state = f"done in {stamp['seconds']:.0f} s" if "seconds" in stamp else "begun" if stamp else "to do"
+        state = f"done in {stamp['seconds']:.0f} s" if "seconds" in stamp else begun if stamp else "to do"
         print(f"{name:12} {state}")
 
 

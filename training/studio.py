@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from markupsafe import Markup
 from matplotlib.colors import Colormap, LinearSegmentedColormap, to_hex, to_rgb
+from numpy.typing import NDArray
 from PIL import Image
 
 from geometry.mesh import FloatArray, IntArray, align
@@ -53,16 +54,19 @@ class Studio:
         points = np.concatenate([self.base, align(reference, self.base)])
         return replace(self, camera=self.camera.framing(points, 1.2 * MODE_REACH))
 
-    def draw(
-        self, shape: FloatArray, alt: str, size: int, colours: Any = CLAY, faces: IntArray | None = None,
-        *, smooth: bool = True,
-    ) -> Markup:  # fmt: skip
-        """An image element of a shape (V, 3) or of several (T, V, 3) side by side; colours are a name or (…, V, 3)."""
+    def pixels(
+        self, shape: FloatArray, size: int, colours: Any = CLAY, faces: IntArray | None = None, *, smooth: bool = True
+    ) -> NDArray[np.uint8]:
+        """A picture (h, w, 4) of a shape (V, 3), or several (T, V, 3) side by side; colours are a name or (…, V, 3)."""
         faces = self.faces if faces is None else faces
         shapes = shape.reshape(-1, *shape.shape[-2:])
         tints = np.broadcast_to(to_rgb(colours) if isinstance(colours, str) else colours, shapes.shape)
         pictures = [self.camera.render(x, faces, c, size, smooth=smooth) for x, c in zip(shapes, tints, strict=True)]
-        pixels = np.concatenate(pictures, axis=1)
+        return np.concatenate(pictures, axis=1)
+
+    def draw(self, shape: FloatArray, alt: str, size: int, *how: Any, **more: Any) -> Markup:
+        """The same as an image element."""
+        pixels = self.pixels(shape, size, *how, **more)
         file = io.BytesIO()
         Image.fromarray(pixels).save(file, format="WEBP", quality=84)
         height, width = pixels.shape[:2]

@@ -265,7 +265,7 @@ def test_a_server_without_usd_says_how_to_get_it(
         assert "usd" not in links
         answer = client.get(links["self"], params={"format": "usd"})
         assert (answer.status_code, answer.json()["type"]) == (406, "urn:shapespace:problem:not-acceptable")
-        assert "pip install 'shapespace[usd]'" in answer.json()["detail"]
+        assert "pip install usd-core" in answer.json()["detail"]
         choices = [choice["format"] for choice in answer.json()["choices"]]
         assert choices == ["glb", "npz", "zip", "pc2", "jsonl"]
 

@@ -200,6 +200,18 @@ def test_status_tells_how_far_a_run_is(tiny_run: Path) -> None:
     assert all(state.startswith("done in") for state in lines.values())
 
 
+def test_status_of_a_stage_at_work_tells_its_samples(tiny_run: Path, tmp_path: Path) -> None:
+    copy = tmp_path / "run"
+    shutil.copytree(tiny_run, copy)
+    (copy / "stages" / "samples.json").write_text('{"key": "", "basis": ""}')
+    log = (copy / "log.jsonl").read_text().splitlines()
+    at = max(k for k, line in enumerate(log) if '"samples of factor 1"' in line)
+    (copy / "log.jsonl").write_text("\n".join(log[: at + 1]))
+    command = [sys.executable, "-m", "training", "status", str(copy)]
+    answer = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    assert "samples      begun: samples of factor 1: 60 of 60" in answer.splitlines()
+
+
 def test_samples_keep_lengths_and_angles_of_the_formula(tiny_run: Path) -> None:
     torus = FreakyTorus()
     with np.load(tiny_run / "samples" / "part-00000.npz") as part:
