@@ -217,7 +217,7 @@ def test_few_frames_are_exact_and_many_are_within_the_tolerance() -> None:
 def test_where_an_animation_takes_place_does_not_matter() -> None:
     codes = np.linspace([0, 0, 1, 1], [0.5, 0.3, 1.1, 1], DENSE_FRAMES + 1)
     frames, faces = freaky_torus.vertices(codes), freaky_torus.connectivity().faces
-    here, there = animated_glb(frames, faces), animated_glb(frames + [16, 0, 0], faces)
+    here, there = animated_glb(frames, faces), animated_glb(frames + np.array([16, 0, 0]), faces)
     assert there.targets == here.targets
     assert there.max_vertex_error == pytest.approx(here.max_vertex_error, rel=0.1)
 
