@@ -190,6 +190,21 @@ def test_wireframe_normals_and_the_coarse_mesh(studio: Studio) -> None:
     studio.eventually(lambda: difference(start, studio.picture()) < 0.001)
 
 
+def test_the_fine_shape_lies_where_the_coarse_one_does(window: Open) -> None:
+    # Each is aligned over its own vertices: by 5 degrees about the figure's height, and more elsewhere, they differ.
+    studio = window().open(f"#model=figure&z={','.join(['0.6'] * 20)}")
+
+    def ink() -> np.ndarray:
+        picture = studio.picture()
+        return np.abs(picture - picture[0, 0]).max(axis=2) > 2 * BACKGROUND
+
+    fine = ink()
+    studio["#fine"].click()
+    studio.rest()
+    coarse = ink()
+    assert (fine & coarse).sum() > 0.97 * (fine | coarse).sum()
+
+
 def test_pointing_at_a_factor_colours_what_it_moves(window: Open) -> None:
     studio = window().open("#model=figure")
     every = studio[".pictures canvas"].count()

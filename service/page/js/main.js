@@ -12,6 +12,7 @@ import { report, reporting } from "./messages.js";
 import { Modes } from "./modes.js";
 import { Path } from "./path.js";
 import { Pictures } from "./pictures.js";
+import { Pose } from "./pose.js";
 import { Pull } from "./pull.js";
 import { ShapeLoop } from "./shape-loop.js";
 import { Sliders } from "./sliders.js";
@@ -127,7 +128,7 @@ async function openModel({ model, code, keyframes = [], locked, view, state = {}
   if (store.model !== model) return;
   if (fine.vertices.length !== coarse.vertices.length) {
     viewer.addMesh("fine", fine);
-    store.set({ references: { coarse, fine }, hasFine: true });
+    store.set({ references: { coarse, fine }, pose: new Pose(coarse.vertices, fine.vertices), hasFine: true });
   }
   find("#fine").disabled = !store.hasFine;
   await modes.draw();

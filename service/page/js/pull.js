@@ -31,7 +31,9 @@ export class Pull {
     if (!hit) return;
     event.stopImmediatePropagation();
     this.viewer.canvas.setPointerCapture(event.pointerId);
-    this.#held = { ...hit, mesh: this.store.shape.mesh, pointer: event.pointerId, code: this.store.code };
+    const { mesh, motion } = this.store.shape;
+    const back = motion.clone().invert(); // to where the server has the shape
+    this.#held = { ...hit, mesh, back, pointer: event.pointerId, code: this.store.code };
     this.store.set({ moving: true });
     this.dot.scale.setScalar(0.018 * this.viewer.sphere.radius);
     this.#mark(hit.position);
@@ -55,8 +57,8 @@ export class Pull {
   async #solve() {
     this.#busy = true;
     while (this.#wanted) {
-      const { code, vertex, mesh } = this.#held ?? this.last;
-      const target = this.#wanted;
+      const { code, vertex, mesh, back } = this.#held ?? this.last;
+      const target = this.#wanted.clone().applyMatrix4(back);
       this.#wanted = null;
       const { model } = this.store;
       try {

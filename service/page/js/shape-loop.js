@@ -6,8 +6,10 @@
  * that is quick is let finish: dropping it for each pixel of a drag would show nothing until the hand rests.
  */
 
+import { Matrix4 } from "three";
 import * as api from "./api.js";
 import { report, say, takeBack } from "./messages.js";
+import { moved } from "./pose.js";
 
 const REST = 160; // ms without movement until the fine mesh is asked for
 const TOO_LONG = 400; // ms after which a coarse shape is given up for a newer one
@@ -57,7 +59,7 @@ export class ShapeLoop {
       try {
         const { shapes, diagnostics } = await api.shapes(asked.model, [asked.code], asked.mesh, this.#current.abort.signal);
         if (asked.model === this.store.model && !this.store.playing) {
-          this.store.set({ shape: { ...asked, positions: shapes[0], diagnostics } });
+          this.store.set({ shape: { ...asked, ...this.#placed(shapes[0], asked), diagnostics } });
         }
         if (asked.mesh === "coarse") this.#rest();
       } catch (error) {
@@ -66,6 +68,14 @@ export class ShapeLoop {
       }
       this.#current = null;
     }
+  }
+
+  /** Positions, and the motion that brought them to where the coarse shape of the same code is. */
+  #placed(positions, { mesh, code }) {
+    const { shape, pose } = this.store;
+    if (mesh === "coarse" || shape?.mesh !== "coarse" || shape.code !== code) return { positions, motion: new Matrix4() };
+    const motion = pose.motion(positions, shape.positions);
+    return { positions: moved(positions, motion), motion };
   }
 
   async #untilReady(asked) {

@@ -1,0 +1,46 @@
+/** How a fine shape is moved to lie where the coarse one of the same code does. */
+
+import { BufferAttribute, Matrix4, Vector3 } from "three";
+import { nearest } from "./modes.js";
+
+const at = (positions, vertex) => new Vector3().fromArray(positions, 3 * vertex);
+
+/**
+ * Every mesh that the server answers is aligned to its own reference, over its own vertices, which are denser here than
+ * there. Shown one after the other, the coarse and the fine shape of one code would jump.
+ */
+export class Pose {
+  #coarse;
+  #fine;
+
+  /** From the positions of both references: three vertices far apart tell where a shape is. */
+  constructor(coarse, fine) {
+    const farthest = (distance) => {
+      let best = 0;
+      for (let v = 1; v < coarse.length / 3; v += 1) if (distance(at(coarse, v)) > distance(at(coarse, best))) best = v;
+      return best;
+    };
+    const a = farthest((x) => x.distanceTo(at(coarse, 0)));
+    const b = farthest((x) => x.distanceTo(at(coarse, a)));
+    const side = at(coarse, b).sub(at(coarse, a));
+    const c = farthest((x) => x.sub(at(coarse, a)).cross(side).length());
+    this.#coarse = [a, b, c];
+    const corners = new Float32Array(this.#coarse.flatMap((v) => at(coarse, v).toArray()));
+    this.#fine = nearest(corners, fine);
+  }
+
+  /** The motion (Matrix4) from a fine shape to the coarse one of its code. */
+  motion(fine, coarse) {
+    return frame(coarse, this.#coarse).multiply(frame(fine, this.#fine).invert());
+  }
+}
+
+/** Positions after a motion, in place. */
+export const moved = (positions, motion) => new BufferAttribute(positions, 3).applyMatrix4(motion).array;
+
+function frame(positions, corners) {
+  const [a, b, c] = Array.from(corners, (v) => at(positions, v));
+  const x = b.sub(a).normalize();
+  const z = x.clone().cross(c.sub(a)).normalize();
+  return new Matrix4().makeBasis(x, z.clone().cross(x), z).setPosition(a);
+}
