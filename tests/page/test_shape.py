@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import time
+
 import numpy as np
 import pytest
+from playwright.sync_api import Route
 
 from tests.page.conftest import Open
 from tests.page.studio import Studio, body, difference
@@ -95,6 +98,21 @@ def test_coarse_as_it_moves_fine_as_it_rests_and_nothing_queues(studio: Studio) 
     # All that came while the first was under way is superseded by the last.
     assert [asked["mesh"] for asked in studio.asked] == ["coarse", "coarse", "fine"]
     assert [asked["latents"][0][0] for asked in studio.asked] == pytest.approx([0.01, 0.15, 0.15])
+
+
+def test_a_fine_shape_that_takes_its_time_is_asked_for_once(studio: Studio) -> None:
+    def late(route: Route) -> None:
+        if '"fine"' in (route.request.post_data or ""):
+            time.sleep(0.6)
+        route.continue_()
+
+    studio.page.route("**/vertices*", late)
+    studio.asked.clear()
+    studio.type(0, 0.11)
+    studio.eventually(lambda: studio.asked and studio.asked[-1]["mesh"] == "fine")
+    studio.rest()
+    studio.page.wait_for_timeout(500)
+    assert [asked["mesh"] for asked in studio.asked] == ["coarse", "fine"]
 
 
 def test_a_slider_is_dragged(studio: Studio) -> None:

@@ -42,7 +42,8 @@ export class ShapeLoop {
       return;
     }
     this.#timer = setTimeout(() => {
-      if (this.store.hasFine && this.store.shape?.mesh !== "fine") this.#want("fine");
+      const onItsWay = this.#current?.mesh === "fine"; // of this code: another would have dropped it
+      if (this.store.hasFine && this.store.shape?.mesh !== "fine" && !onItsWay) this.#want("fine");
     }, REST);
   }
 
