@@ -2,6 +2,8 @@
 
 import io
 import json
+import resource
+import struct
 from pathlib import Path
 
 import numpy as np
@@ -200,6 +202,7 @@ def test_usd_holds_every_frame_with_its_normals(tmp_path: Path) -> None:
 
 
 def test_few_frames_are_exact_and_many_are_within_the_tolerance() -> None:
+    assert DENSE_FRAMES == 64, "as the README says"
     faces = freaky_torus.connectivity().faces
     for count in (DENSE_FRAMES, DENSE_FRAMES + 1):
         codes = np.linspace([0, 0, 1, 1], [0.5, 0.3, 1.1, 1], count)
@@ -212,6 +215,26 @@ def test_few_frames_are_exact_and_many_are_within_the_tolerance() -> None:
         else:
             assert 1 < animated.targets < 20
             assert animated.max_vertex_error < 1.1e-4 * diagonal
+
+
+@pytest.mark.parametrize("size", [1.0, 1.25, 1.125, 1.0625])  # each makes the JSON three bytes longer
+def test_both_parts_of_a_glb_begin_at_multiples_of_four_bytes(size: float) -> None:
+    data = animated_glb(size * CUBE[None], cube().faces).data
+    (json_length,) = struct.unpack_from("<I", data, 12)
+    assert json_length % 4 == 0
+    assert len(data) % 4 == 0
+    np.testing.assert_array_equal(GLB(data).positions, size * CUBE)
+
+
+def test_usd_without_room_for_its_file_is_an_error_of_the_disk() -> None:
+    frames = np.repeat(cube().vertices[None], 20, axis=0)
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100, hard))
+    try:
+        with pytest.raises(OSError, match="can't write"):
+            animated_usd(frames, cube().faces)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
 
 
 def test_where_an_animation_takes_place_does_not_matter() -> None:
