@@ -291,6 +291,16 @@ def test_transport_takes_one_step_and_not_none(space, mesh, velocity):
         parallel_transport(space, Path(path.vertices[:1], Status.CONVERGED, space), velocity)
 
 
+def test_transport_does_not_depend_on_the_length_of_the_vector(space, mesh, velocity):
+    path = exponential(space, mesh.vertices, 0.5 * velocity, 2)
+    plain, long = (parallel_transport(space, path, s * velocity).velocities for s in (1, 50))
+    np.testing.assert_allclose(long, 50 * plain, atol=1e-4 * np.abs(long).max())
+    assert not parallel_transport(space, path, 0 * velocity).velocities.any()
+    lost = parallel_transport(space, path, np.nan * velocity)
+    assert lost.status is Status.NOT_FINITE
+    assert len(lost.velocities) == 0
+
+
 # ---------------------------------------------------------------- means
 
 
@@ -406,6 +416,7 @@ def test_what_is_not_finite_is_told(space, mesh, velocity, where):
     assert np.isfinite(found.velocity).all()
     mean = elastic_mean(space, np.stack([mesh.vertices, start + velocity]))
     assert mean.status is Status.NOT_FINITE
+    assert mean.iterations == 0
     assert np.isfinite(mean.vertices).all()
 
 
