@@ -108,10 +108,11 @@ def test_shapes_that_take_their_time_are_asked_for_once(studio: Studio) -> None:
     studio.page.route("**/vertices*", late)
     studio.asked.clear()
     studio.type(0, 0.11)
+    studio.type(0, 0.12)
     studio.eventually(lambda: bool(studio.asked) and studio.asked[-1]["mesh"] == "fine")
     studio.rest()
     studio.page.wait_for_timeout(1000)
-    assert [asked["mesh"] for asked in studio.asked] == ["coarse", "fine"]
+    assert [asked["mesh"] for asked in studio.asked] == ["coarse", "coarse", "fine"]
 
 
 def test_a_slider_is_dragged(studio: Studio) -> None:
