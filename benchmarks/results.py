@@ -163,9 +163,10 @@ def plot_space(rows: list[Row], path: Path) -> None:
             values = [100 * value for value in found["generalisation"][kind]]
             axis.plot(found["modes"], values, style, label={"modes": "sparse geodesic modes"}.get(kind, kind))
         axis.set(title=row.name, xscale="log", xlabel="modes", ylim=(0, None))
-        axis.set_xticks(found["modes"], [str(k) for k in found["modes"]], minor=False)
+        ticks = [k for k in found["modes"] if 1.5 * k <= found["modes"][-1]] + found["modes"][-1:]
+        axis.set_xticks(ticks, [str(k) for k in ticks], minor=False)
         axis.minorticks_off()
-    axes[0, 0].set_ylabel("error of an unseen shape (% of diagonal)")
+    axes[0, 0].set_ylabel("unseen shape, % of diagonal")
     figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=3, fontsize="x-small")
     figure.savefig(path, dpi=110)
     plt.close(figure)
