@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from geometry.formats import MESH_FORMATS, read_arrays
-from geometry.mesh import TriangleMesh
+from geometry.mesh import TriangleMesh, align
 from tests.service.bundles import SCALE, fine_reference, reference
 from tests.service.glb import GLB
 
@@ -96,15 +96,18 @@ def test_animations(client: httpx.Client, choice: dict[str, str], rest: Triangle
     assert np.array_equal(frame["faces"], rest.faces)
 
 
-def test_both_meshes_lie_at_the_same_place(client: httpx.Client) -> None:
-    on_fine = shape(client, "fine", CODE).reshape(32, 16, 3)[::4, ::2].reshape(-1, 3)
-    coarse = shape(client, "coarse", CODE)
-    np.testing.assert_allclose(on_fine, coarse, atol=1e-6)
+def test_both_meshes_are_one_shape_each_aligned_over_its_own_vertices(client: httpx.Client) -> None:
+    fine, coarse = (shape(client, mesh, CODE) for mesh in ("fine", "coarse"))
+    on_fine = fine.reshape(32, 16, 3)[::4, ::2].reshape(-1, 3)
+    np.testing.assert_allclose(align(on_fine, coarse), coarse, atol=1e-6)
+    for found, rest in ((fine, fine_reference()), (coarse, reference())):
+        np.testing.assert_allclose(align(found, SCALE * rest.vertices), found, atol=1e-6)
     assert np.abs(coarse - SCALE * reference().vertices).max() > 0.05, "a shape that doesn't move proves nothing"
 
 
 def test_the_fine_mesh_grows_with_the_coarse_one(client: httpx.Client) -> None:
-    x, centre = SCALE * fine_reference().vertices, SCALE * reference().vertices.mean(axis=0)
+    x = SCALE * fine_reference().vertices
+    centre = x.mean(axis=0)
     np.testing.assert_allclose(shape(client, "fine", [0.15, 0, 0]), centre + 1.15 * (x - centre), atol=1e-5)
 
 
