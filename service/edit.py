@@ -108,12 +108,12 @@ class Editor:
             )
             problem = _Problem(model, rough, chart, start.astype(np.float64), positions, prior, deadline)
             fit = _best(problem)
-        codes, _ = model.latents.codes([fit.x.tolist()], Bounds.CLAMP)
-        shape = model.shape(codes[0], True, mesh, deadline)
+        code, _ = model.latents.code(fit.x.tolist(), Bounds.CLAMP)
+        shape = model.shape(code, True, mesh, deadline)
         found = shape.vertices[[target.vertex for target in targets]]
         distances = np.linalg.norm(found - model.manifest.scale * positions, axis=1)
         status = Status.DEADLINE if shape.diagnostics.status is Status.DEADLINE else fit.status
-        return Edited(codes[0], status, chart.shapes, shape, distances)
+        return Edited(code, status, chart.shapes, shape, distances)
 
 
 def _best(problem: _Problem) -> Fit:

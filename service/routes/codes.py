@@ -105,12 +105,12 @@ async def edit(service: ServiceDependency, model: Model, body: EditRequest) -> R
                 "invalid-request",
                 f"targets[{i}].vertex is {target.vertex}, but the {body.mesh} mesh has vertices 0 to {count - 1}.",
             )
-    codes, _ = model.latents.codes([body.latent], Bounds.CLAMP)
+    start, _ = model.latents.code(body.latent, Bounds.CLAMP)
     targets = [Target(target.vertex, target.position) for target in body.targets]
 
     def make(deadline: float) -> tuple[bytes, dict[str, float]]:
         began = time.perf_counter()
-        found = Editor(model)(codes[0], targets, body.prior, body.mesh, deadline)
+        found = Editor(model)(start, targets, body.prior, body.mesh, deadline)
         if found.status is Status.DEADLINE:
             raise service.workers.late()
         answer = {
