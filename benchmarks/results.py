@@ -124,6 +124,8 @@ def draw_strips(rows: list[Row], path: Path) -> None:
             strips.append(
                 Image.fromarray(studio.pixels(align(record.gallery["strip_joint"], studio.base), 170, COMPOSITE))
             )
+    if not strips:  # there are platforms without what draws them
+        return
     width = max(strip.width for strip in strips)
     page = Image.new("RGB", (width, sum(strip.height for strip in strips)), "white")
     top = 0

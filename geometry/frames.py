@@ -101,7 +101,7 @@ class FrameIntegration:
     def __call__(self, z: FloatArray) -> FloatArray:
         """Vertices (V, 3) for lengths and angles (2E,); not finite where lengths are 0 or not finite."""
         c = self._connectivity
-        a, b, side = z.take(self._connectivity.face_sides)
+        a, b, side = z.take(c.face_sides)
         # Corner 0 is the origin of a face's plane, corner 1 lies on its first axis. Half angles at both, by cosines.
         cosine = (b * b + side * side - a * a) / (2 * b * side)
         sin_0, cos_0 = _half(cosine)

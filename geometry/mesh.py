@@ -233,11 +233,16 @@ def diagonal(vertices: FloatArray) -> FloatArray:
 def face_normals(vertices: FloatArray, faces: IntArray, *, normalised: bool = True) -> FloatArray:
     """Normals (…, F, 3) of shapes (…, V, 3); of length twice the area unless ``normalised``."""
     a, b, c = (vertices.take(faces[:, k], axis=-2) for k in range(3))
-    b, c = b - a, c - a
-    n = np.empty_like(b)
-    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):  # a third of the time of np.cross
-        n[..., i] = b[..., j] * c[..., k] - b[..., k] * c[..., j]
+    n = cross(b - a, c - a)
     return n / np.linalg.norm(n, axis=-1, keepdims=True) if normalised else n
+
+
+def cross(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Vector products (…, 3), in a third of the time of np.cross; those of `nric` are by components (3, …)."""
+    n = np.empty_like(a)
+    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        n[..., i] = a[..., j] * b[..., k] - a[..., k] * b[..., j]
+    return n
 
 
 def align(vertices: FloatArray, target: FloatArray, carried: FloatArray | None = None) -> FloatArray:

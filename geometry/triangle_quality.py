@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from geometry.mesh import Connectivity, FloatArray, IntArray
+from geometry.mesh import Connectivity, FloatArray, IntArray, cross
 
 #: Largest angle between the normals of two neighbours, as a cosine.
 FOLD_LIMIT = np.cos(np.deg2rad(140))
@@ -58,12 +58,7 @@ def folded_pairs(connectivity: Connectivity, normals: FloatArray) -> IntArray:
 def normals_and_sides(corners: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Normals (…, 3), as long as twice the area, and squared sides (3, …) of triangles with corners (3, …, 3)."""
     p, q = corners[1] - corners[0], corners[2] - corners[0]
-    normals = np.empty_like(p)
-    normals[..., 0] = p[..., 1] * q[..., 2] - p[..., 2] * q[..., 1]
-    normals[..., 1] = p[..., 2] * q[..., 0] - p[..., 0] * q[..., 2]
-    normals[..., 2] = p[..., 0] * q[..., 1] - p[..., 1] * q[..., 0]
-    r = q - p
-    return normals, np.stack([dots(side, side) for side in (p, q, r)])
+    return cross(p, q), np.stack([dots(side, side) for side in (p, q, q - p)])
 
 
 def squared_sines(normals: FloatArray, squares: FloatArray) -> FloatArray:

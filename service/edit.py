@@ -265,12 +265,9 @@ class _Chart:
     def sensitivity(self, x: FloatArray, some: IntArray) -> FloatArray:
         """(3k, 2E) derivatives of some positions (k,) by lengths and angles at a code (m,), without normals'."""
         model, shape = self._model, self._solved(x)
-        count, vertices = len(shape), self._vertices[some]
-        rows = (
-            model.fine.prolong.weights[vertices, :count]
-            if model.fine and self._mesh is MeshChoice.FINE
-            else sparse.eye_array(count, format="csr")[vertices]
-        )
+        count, fine = len(shape), model.finer(self._mesh)
+        weights = fine.prolong.weights if fine else sparse.eye_array(count, format="csr")
+        rows = weights[self._vertices[some]][:, :count]
         fields = np.einsum("kv,xy->kxvy", rows.toarray(), np.eye(3)).reshape(-1, count, 3)
         aligned = model.placed(shape, self._mesh, carried=shape)
         return self._reconstruct.sensitivity(aligned, without_rigid_motion(fields, aligned))

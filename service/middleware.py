@@ -141,9 +141,10 @@ class LimitBody:
             await self.app(scope, receive, send)
             return
         limit = self.upload if scope["path"].endswith("/encode") else self.limit
-        announced = Headers(scope=scope).get("content-length", "")
+        headers = Headers(scope=scope)
+        announced = headers.get("content-length", "")
         length = int(announced) if announced.isdecimal() else 0
-        encoding = Headers(scope=scope).get("content-encoding", "identity")
+        encoding = headers.get("content-encoding", "identity")
         received = 0
 
         async def limited() -> Message:

@@ -21,7 +21,7 @@ from geometry.mesh import FloatArray, TriangleMesh, align
 from geometry.nric import nric
 from geometry.reconstruction import Reconstruction, Reconstructor
 from geometry.status import Status
-from service.bundle import Bundle, BundleError
+from service.bundle import Bundle, BundleError, FineMesh
 from service.derivatives import FactorGrids
 from service.latent_space import Codes, LatentSpace, NotFiniteError, TrainingCodes
 from service.manifest import Network
@@ -142,7 +142,12 @@ class ShapeModel:
 
     def mesh(self, choice: MeshChoice) -> TriangleMesh:
         """The reference, normalised, on the mesh of choice; its faces are those of every shape."""
-        return self.fine.reference if self.fine and choice is MeshChoice.FINE else self.reference
+        fine = self.finer(choice)
+        return fine.reference if fine else self.reference
+
+    def finer(self, choice: MeshChoice) -> FineMesh | None:
+        """The finer mesh, where there is one and it is the choice."""
+        return self.fine if choice is MeshChoice.FINE else None
 
     def reference_shape(self, mesh: MeshChoice = MeshChoice.FINE) -> Shape:
         """The reference itself: the answer where there is no code."""
@@ -219,12 +224,13 @@ class ShapeModel:
 
     def placed(self, shapes: FloatArray, mesh: MeshChoice, carried: FloatArray | None = None) -> FloatArray:
         """Shapes (…, V, 3) on the mesh of choice, aligned to its reference; instead of them what is carried along."""
-        found = self.fine.prolong(shapes) if self.fine and mesh is MeshChoice.FINE else shapes
-        return align(found, self.mesh(mesh).vertices, carried)
+        fine = self.finer(mesh)
+        return align(fine.prolong(shapes) if fine else shapes, self.mesh(mesh).vertices, carried)
 
     def coarse(self, vertices: FloatArray, mesh: MeshChoice) -> FloatArray:
         """The vertices (V, 3) of the coarse mesh among those of a mesh of choice."""
-        return vertices[self.fine.prolong.coarse_vertices] if self.fine and mesh is MeshChoice.FINE else vertices
+        fine = self.finer(mesh)
+        return vertices[fine.prolong.coarse_vertices] if fine else vertices
 
     def _networks(self, codes: Codes) -> tuple[FloatArray, FloatArray]:
         """Factors (n, J, 2E) and combined NRIC (n, 2E), normalised."""

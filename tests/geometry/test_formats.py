@@ -18,6 +18,7 @@ from geometry.gltf import vertex_normals
 from geometry.mesh import MeshError, TriangleMesh
 from geometry.point_cache import point_cache
 from geometry.usd import animated_usd
+from tests.meshes import read_mesh
 from tests.sequences import read_point_cache, read_usd
 from tests.service.glb import GLB
 from training import freaky_torus
@@ -59,8 +60,8 @@ def test_we_read_what_we_write(format: str, tmp_path: Path) -> None:
     path = tmp_path / f"torus.{format}"
     path.write_bytes(MESH_FORMATS[format].encode(mesh.vertices, mesh.faces))
     for found in (
-        TriangleMesh.from_arrays(*read_arrays(path)),
-        TriangleMesh.from_arrays(*read_arrays(path.read_bytes(), format)),
+        read_mesh(path),
+        read_mesh(path.read_bytes(), format),
     ):
         np.testing.assert_allclose(found.vertices, mesh.vertices, atol=1e-6)
         assert np.array_equal(found.faces, mesh.faces)
@@ -70,7 +71,7 @@ def test_we_read_what_we_write(format: str, tmp_path: Path) -> None:
 def test_we_read_what_others_write(format: str) -> None:
     mesh = cube()
     data = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).export(file_type=format)
-    found = TriangleMesh.from_arrays(*read_arrays(data if isinstance(data, bytes) else data.encode(), format))
+    found = read_mesh(data if isinstance(data, bytes) else data.encode(), format)
     np.testing.assert_allclose(found.vertices, mesh.vertices, atol=1e-6)
     assert np.array_equal(found.faces, mesh.faces)
 
@@ -78,7 +79,7 @@ def test_we_read_what_others_write(format: str) -> None:
 def test_texture_coordinates_do_not_shuffle_vertices() -> None:
     lines = ["mtllib none.mtl", *(f"v {x} {y} {z}" for x, y, z in CUBE), "vt 0 0", "vt 1 0", "vt 1 1", "vt 0 1"]
     lines += ["f " + " ".join(f"{v + 1}/{k + 1}" for k, v in enumerate(side)) for side in SIDES]
-    found = TriangleMesh.from_arrays(*read_arrays("\n".join(lines).encode(), "obj"))
+    found = read_mesh("\n".join(lines).encode(), "obj")
     np.testing.assert_array_equal(found.vertices, CUBE)
     assert len(found.faces) == 12
     relative = "\n".join(["v 0 0 0", "v 1 0 0", "v 0 1 0", "f -3//1 -2//1 -1//1"])
@@ -98,7 +99,7 @@ def test_texture_coordinates_do_not_shuffle_vertices() -> None:
 )
 def test_faulty_files_are_refused_with_the_reason(data: bytes, format: str, fault: str) -> None:
     with pytest.raises(MeshError, match=fault):
-        TriangleMesh.from_arrays(*read_arrays(data, format))
+        read_mesh(data, format)
 
 
 class Intruder:
@@ -278,7 +279,7 @@ def test_seams_of_texture_and_material_do_not_shuffle_vertices(tmp_path: Path) -
     mesh = cube()
     uv = np.random.default_rng(0).random((8, 2))
     textured = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False, visual=trimesh.visual.TextureVisuals(uv=uv))
-    found = TriangleMesh.from_arrays(*read_arrays(textured.export(file_type="ply"), "ply"))
+    found = read_mesh(textured.export(file_type="ply"), "ply")
     np.testing.assert_array_equal(found.vertices, CUBE)
     assert np.array_equal(found.faces, mesh.faces)
 

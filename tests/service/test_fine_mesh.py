@@ -9,8 +9,9 @@ import httpx
 import numpy as np
 import pytest
 
-from geometry.formats import MESH_FORMATS, read_arrays
+from geometry.formats import MESH_FORMATS
 from geometry.mesh import TriangleMesh, align
+from tests.meshes import read_mesh
 from tests.service.bundles import SCALE, fine_reference, reference
 from tests.service.glb import GLB
 
@@ -52,7 +53,7 @@ def test_files(client: httpx.Client, choice: dict[str, str], rest: TriangleMesh,
     if format == "json":
         assert np.array_equal(link.json()["faces"], rest.faces)
         return
-    mesh = TriangleMesh.from_arrays(*read_arrays(link.content, format))
+    mesh = read_mesh(link.content, format)
     if format == "stl":
         np.testing.assert_allclose(mesh.vertices, expected[rest.faces].reshape(-1, 3), atol=1e-6)
     else:
@@ -85,7 +86,7 @@ def test_animations(client: httpx.Client, choice: dict[str, str], rest: Triangle
     assert np.array_equal(animated.faces, rest.faces)
     np.testing.assert_allclose(animated.key(2), last, atol=1e-6)
     with zipfile.ZipFile(io.BytesIO(get("zip"))) as archive:
-        mesh = TriangleMesh.from_arrays(*read_arrays(archive.read(archive.namelist()[2]), "obj"))
+        mesh = read_mesh(archive.read(archive.namelist()[2]), "obj")
     np.testing.assert_allclose(mesh.vertices, last, atol=1e-6)
     assert np.array_equal(mesh.faces, rest.faces)
     lines = [json.loads(line) for line in get("jsonl").splitlines()]

@@ -9,9 +9,10 @@ import httpx
 import numpy as np
 import pytest
 
-from geometry.formats import MESH_FORMATS, read_arrays
-from geometry.mesh import TriangleMesh, align
+from geometry.formats import MESH_FORMATS
+from geometry.mesh import align
 from geometry.nric import WeightedNorm, nric
+from tests.meshes import read_mesh
 from tests.service.bundles import SCALE, expected_nric, reference
 from tests.service.conftest import Start
 
@@ -125,7 +126,7 @@ def test_formats_hold_the_same_mesh(client: httpx.Client, format: str) -> None:
     assert f".{format}" in answer.headers["Content-Disposition"]
     if format == "json":
         return
-    mesh = TriangleMesh.from_arrays(*read_arrays(answer.content, format))
+    mesh = read_mesh(answer.content, format)
     if format == "stl":  # a soup of triangles
         np.testing.assert_allclose(mesh.vertices, expected[reference().faces].reshape(-1, 3), atol=1e-6)
     else:

@@ -191,11 +191,13 @@ def test_faults_of_the_user_s_making_are_one_message(tmp_path: Path) -> None:
         assert "Traceback" not in result.stderr
 
 
+def status(run: Path) -> list[str]:
+    words = [sys.executable, "-m", "training", "status", str(run)]
+    return subprocess.run(words, capture_output=True, text=True, check=True).stdout.splitlines()
+
+
 def test_status_tells_how_far_a_run_is(tiny_run: Path) -> None:
-    result = subprocess.run(
-        [sys.executable, "-m", "training", "status", str(tiny_run)], capture_output=True, text=True, check=True
-    )
-    lines = dict(line.split(maxsplit=1) for line in result.stdout.splitlines())
+    lines = dict(line.split(maxsplit=1) for line in status(tiny_run))
     assert list(lines) == list(STAGES)
     assert all(state.startswith("done in") for state in lines.values())
 
@@ -207,9 +209,7 @@ def test_status_of_a_stage_at_work_tells_its_samples(tiny_run: Path, tmp_path: P
     log = (copy / "log.jsonl").read_text().splitlines()
     at = max(k for k, line in enumerate(log) if '"samples of factor 1"' in line)
     (copy / "log.jsonl").write_text("\n".join(log[: at + 1]))
-    command = [sys.executable, "-m", "training", "status", str(copy)]
-    answer = subprocess.run(command, capture_output=True, text=True, check=True).stdout
-    assert "samples      begun: samples of factor 1: 60 of 60" in answer.splitlines()
+    assert "samples      begun: samples of factor 1: 60 of 60" in status(copy)
 
 
 def test_samples_keep_lengths_and_angles_of_the_formula(tiny_run: Path) -> None:
