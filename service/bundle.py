@@ -121,7 +121,7 @@ def _read(path: Path, limit: int) -> bytes:
         status = os.fstat(descriptor)
         if not stat.S_ISREG(status.st_mode) or status.st_size > limit:
             raise BundleError(f"{path.name} is longer than {limit} bytes")
-        return file.read(limit + 1)
+        return file.read(status.st_size + 1)  # not the limit: a manifest may promise a terabyte
 
 
 def _verified(path: Path, entry: FileEntry) -> bytes:

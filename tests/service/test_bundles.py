@@ -45,6 +45,12 @@ def append(folder: Path) -> None:
         file.write(b"more")
 
 
+def promise_a_petabyte(folder: Path) -> None:
+    files = json.loads((folder / "manifest.json").read_text())["files"]
+    files["geometry.npz"]["bytes"] = 2**50
+    rewrite(folder, files=files)
+
+
 def add_a_file(folder: Path) -> None:
     (folder / "run.sh").write_text("echo")
 
@@ -267,6 +273,7 @@ def vertices_of_files_that_are_none(folder: Path) -> None:
 
 FAULTS: dict[Spoil, str] = {
     flip_a_bit: "factor-0.onnx does not have the digest",
+    promise_a_petabyte: "not 1125899906842624 as the manifest says",
     truncate: "geometry.npz has",
     append: "geometry.npz is longer than",
     add_a_file: "run.sh is not in the manifest",
