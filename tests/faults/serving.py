@@ -64,5 +64,6 @@ class Steady:
         eventually(lambda: self.handles <= self._handles + 2)
         # Workers' threads begin one by one, as work comes.
         assert self.threads <= self._threads + 2
-        log, self._read = self.server.log[self._read :], len(self.server.log)  # one fault's mistake is not the next one's
+        # One fault's mistake is not the next one's.
+        log, self._read = self.server.log[self._read :], len(self.server.log)
         assert "Traceback" not in log, log
