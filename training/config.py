@@ -127,21 +127,24 @@ class LatentNetworkSettings(_Section):
 
 
 class CombinerSettings(_Section):
-    """From J factor shapes to the joint one: graph convolutions on edges, a kernel correction, or both."""
+    """From J factor shapes to the joint one: graph convolutions on edges, polynomials in patches of edges, or both."""
 
     width: int = Field(24, ge=1)
     layers: int = Field(0, ge=0)
-    """Graph convolutions; 0 leaves all to the kernel."""
+    """Graph convolutions; 0 leaves all to the polynomials."""
     neighbourhood: Neighbourhood = "star"
     residual: bool = True
     """Learn the difference to the affine sum of the factors instead of the shape itself; pass each layer's input on."""
     edge_channels: int = Field(4, ge=0)
     """Learned constants of each edge, given to the first convolution beside the factors."""
-    kernel: int = Field(12, ge=0)
-    """Principal coefficients of each factor, on which kernel ridge regression corrects what the convolutions
-    leave; 0 leaves it out, as the paper does."""
+    coefficients: int = Field(12, ge=0)
+    """Principal coefficients of each factor in a patch, of which a polynomial corrects what the convolutions leave; 0
+    leaves it out, as the paper does."""
+    monomials: int = Field(1000, ge=1)
+    """Of second and third degree that such a polynomial has."""
     pairwise: int = Field(0, ge=0)
-    """Principal coefficients of each factor whose products, two factors at a time, correct a residual's affine sum."""
+    """Principal coefficients of each factor whose products, two factors at a time, correct a residual's affine sum
+    before the convolutions do."""
     dropout: float = Field(0.0, ge=0, lt=1)
     symmetries: bool = True
     """Learn from the training samples' images under the collection's symmetries too, where it has any."""
@@ -149,8 +152,8 @@ class CombinerSettings(_Section):
 
     @model_validator(mode="after")
     def _something(self) -> CombinerSettings:
-        if not self.layers and not (self.residual and (self.kernel or self.pairwise)):
-            raise ValueError("without convolutions there must be a residual with a kernel or pairwise products")
+        if not self.layers and not (self.residual and (self.coefficients or self.pairwise)):
+            raise ValueError("without convolutions there must be a residual with polynomials or pairwise products")
         return self
 
 

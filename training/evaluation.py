@@ -21,7 +21,7 @@ from geometry.reconstruction import Reconstructor
 from training.config import Config, EvaluationSettings
 from training.coordinates import Coordinates
 from training.gallery import extremes, strip
-from training.layers import is_halved
+from training.layers import narrowest
 from training.learning import Learner
 from training.networks import affine_sum, predict
 from training.sampling import Collection
@@ -245,7 +245,7 @@ def _exact_factor(
 def size_bytes(*networks: nn.Module) -> int:
     """Bytes of the floating-point parameters and buffers, as a bundle has them."""
     tensors = (t for n in networks for t in n.state_dict().values() if t.is_floating_point())
-    return sum(t.numel() * (2 if is_halved(t) else t.element_size()) for t in tensors)
+    return sum(t.numel() * narrowest(t).itemsize for t in tensors)
 
 
 def median_seconds(function: Callable[[], Any], repeat: int = 20) -> float:

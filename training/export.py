@@ -24,7 +24,7 @@ from geometry.mesh import TriangleMesh
 from geometry.nric import WeightedNorm
 from training.config import Config
 from training.files import write_npz
-from training.layers import is_halved
+from training.layers import narrowest
 from training.learning import Composite
 from training.networks import predict
 from training.sampling import Collection
@@ -59,18 +59,19 @@ def _to_onnx(network: nn.Module, example: Tensor, names: tuple[str, str], path: 
         node.ClearField("metadata_props")
         node.ClearField("doc_string")
     model.ClearField("metadata_props")
-    _halve(model.graph)
+    _narrow(model.graph)
     onnx.checker.check_model(model, full_check=True)
     onnx.save(model, path)
 
 
-def _halve(graph: onnx.GraphProto) -> None:
-    """Keep large constants that 16 bits hold as they are in 16 bits; the runtime widens them when it loads the file."""
+def _narrow(graph: onnx.GraphProto) -> None:
+    """Keep large constants in as few bits as hold them as they are; the runtime widens them when it loads the file."""
     for tensor in graph.initializer:
-        values = onnx.numpy_helper.to_array(tensor)
-        if is_halved(torch.tensor(values)):
-            wide, narrow = tensor.name, f"{tensor.name}.half"
-            tensor.CopyFrom(onnx.numpy_helper.from_array(values.astype(np.float16), narrow))
+        values = torch.tensor(onnx.numpy_helper.to_array(tensor))
+        kind = narrowest(values)
+        if kind != values.dtype:
+            wide, narrow = tensor.name, f"{tensor.name}.narrow"
+            tensor.CopyFrom(onnx.numpy_helper.from_array(values.to(kind).numpy(), narrow))
             graph.node.insert(0, onnx.helper.make_node("Cast", [narrow], [wide], to=onnx.TensorProto.FLOAT))
 
 

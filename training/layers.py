@@ -15,8 +15,8 @@ from geometry.mesh import Connectivity, FloatArray, IntArray
 from training.config import Neighbourhood
 from training.coordinates import Coordinates
 
-#: Entries from which a tensor that 16 bits hold as it is takes half the room in a bundle.
-HALVED_SIZE = 1024
+#: Entries from which a tensor that 8 or 16 bits hold as it is takes less room in a bundle.
+NARROWED_SIZE = 1024
 
 
 def half_precision(x: Tensor) -> Tensor:
@@ -24,9 +24,13 @@ def half_precision(x: Tensor) -> Tensor:
     return x.half().to(x.dtype)
 
 
-def is_halved(x: Tensor) -> bool:
-    """Whether a tensor goes into a bundle in 16 bits."""
-    return x.dtype == torch.float32 and x.numel() >= HALVED_SIZE and torch.equal(x, half_precision(x))
+def narrowest(x: Tensor) -> torch.dtype:
+    """The type that a tensor goes into a bundle in: of 8 or 16 bits where they hold all of a large one."""
+    if x.dtype == torch.float32 and x.numel() >= NARROWED_SIZE:
+        for narrow in (torch.int8, torch.float16):
+            if torch.equal(x, x.to(narrow).to(x.dtype)):
+                return narrow
+    return x.dtype
 
 
 class LatentFeatures(nn.Module):
@@ -134,6 +138,14 @@ class Polynomials(nn.Module):
         return result * self.sizes
 
 
+def patch_entries(midpoints: FloatArray, count: int, seed: int) -> list[IntArray]:
+    """Entries of NRIC, lengths and then angles, of each patch of neighbouring edges; at most ``count`` patches."""
+    edges = len(midpoints)
+    labels = kmeans2(midpoints, count, seed=seed, minit="++")[1] if count > 1 else np.zeros(edges, dtype=int)
+    members = (np.flatnonzero(labels == label) for label in np.unique(labels))
+    return [np.concatenate([own, edges + own]) for own in members]
+
+
 class PatchBasis(nn.Module):
     """A linear last layer of low rank: an orthonormal principal basis for each patch of neighbouring edges.
 
@@ -166,13 +178,9 @@ class PatchBasis(nn.Module):
     @classmethod
     def fit(cls, y: NDArray, midpoints: FloatArray, patches: int, energy: float, seed: int) -> PatchBasis:
         """Principal bases of scaled differences y (n, 2E), sharing the kept variance over the patches as it pays."""
-        edges = len(midpoints)
-        labels = kmeans2(midpoints, patches, seed=seed, minit="++")[1] if patches > 1 else np.zeros(edges, dtype=int)
         mean = y.mean(axis=0)
-        entries, values, vectors = [], [], []
-        for label in np.unique(labels):
-            members = np.flatnonzero(labels == label)
-            columns = np.concatenate([members, edges + members])
+        entries, values, vectors = patch_entries(midpoints, patches, seed), [], []
+        for columns in entries:
             # Right singular vectors by whichever Gram matrix is smaller.
             d = (y[:, columns] - mean[columns]).astype(np.float64)
             if len(d) < len(columns):
@@ -181,7 +189,6 @@ class PatchBasis(nn.Module):
             else:
                 value, vector = np.linalg.eigh(d.T @ d)
                 value, vector = value[::-1], vector[:, ::-1]
-            entries.append(columns)
             values.append(value)
             vectors.append(vector)
         every = np.sort(np.concatenate(values))[::-1]

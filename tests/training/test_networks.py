@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from torch import nn
 
 from geometry.mesh import Connectivity, TriangleMesh
 from geometry.nric import WeightedNorm, nric
 from training.config import CombinerSettings, LatentNetworkSettings
 from training.coordinates import Coordinates
-from training.corrections import ridge_regression
+from training.corrections import PatchPolynomials, learned_metric, ridge_regression
 from training.layers import (
     EdgeConvolution,
     FourierProducts,
@@ -19,6 +20,7 @@ from training.layers import (
     PatchBasis,
     Polynomials,
     flaps,
+    narrowest,
 )
 from training.networks import CombinerNetwork, FactorNetwork, Scaling, affine_sum
 
@@ -126,26 +128,66 @@ def test_pairwise_products_find_a_bilinear_interplay(ball: TriangleMesh) -> None
     assert after < 1e-4
 
 
-def test_a_kernel_finds_any_smooth_interplay_from_factors_alone(ball: TriangleMesh) -> None:
-    """Of third order and more, at codes it has not seen; and it comes back from a saved state as it was."""
+def interplay(ball: TriangleMesh, count: int) -> tuple[torch.Tensor, torch.Tensor]:
+    """Shapes of two factors, and joint ones that miss their affine sum by products of second and third order."""
     rng = np.random.default_rng(0)
     reference = nric(ball.vertices, ball.connectivity)
-    d, e, f = 0.01 * rng.normal(size=(3, len(reference)))
-    a, b = rng.uniform(-1, 1, (2, 260, 1))
+    d, e, f, g = 0.01 * rng.normal(size=(4, len(reference)))
+    a, b = rng.uniform(-1, 1, (2, count, 1))
     factors = np.stack([reference + a * d, reference + b * e], axis=1).astype(np.float32)
-    z = (reference + a * d + b * e + np.sin(2 * a * b) * a * f).astype(np.float32)
-    settings, scale = CombinerSettings(width=4), scaling(ball, z)
+    z = (reference + a * d + b * e + a * b * f + a**2 * b * g).astype(np.float32)
+    return torch.from_numpy(factors), torch.from_numpy(z)
+
+
+def test_polynomials_find_an_interplay_of_third_order_from_factors_alone(ball: TriangleMesh) -> None:
+    """At codes they have not seen; and they come back from a saved state as they were."""
+    x, z = interplay(ball, 260)
+    settings, scale = CombinerSettings(coefficients=3, monomials=20), scaling(ball, z.numpy())
     network = CombinerNetwork(settings, ball.connectivity, scale, 2).eval()
-    x, y = torch.from_numpy(factors), torch.from_numpy(z)
     unseen = slice(180, None)
     with torch.no_grad():
-        before = (network(x[unseen]) - y[unseen]).square().mean()
-        network.fit_kernel(x[:150], y[:150], (x[150:180], y[150:180]), 3)
-        after = (network(x[unseen]) - y[unseen]).square().mean()
-        assert after < 1e-2 * before
+        before = (network(x[unseen]) - z[unseen]).square().mean()
+        network.fit_polynomials(settings, ball.edge_midpoints, (x[:150], z[:150]), (x[150:180], z[150:180]), 0)
+        after = (network(x[unseen]) - z[unseen]).square().mean()
+        assert after < 1e-3 * before
         again = CombinerNetwork(settings, ball.connectivity, scale, 2).eval()
         again.load_state_dict(network.state_dict())
         torch.testing.assert_close(again(x), network(x))
+
+
+def test_polynomials_look_at_no_other_patch(ball: TriangleMesh) -> None:
+    x, z = interplay(ball, 60)
+    y = x - x.mean(dim=0)
+    fitted = PatchPolynomials.fit(2, 10, ball.edge_midpoints, (y[:40], z[:40]), (y[40:], z[40:]), 0)
+    here = fitted.entries[0][fitted.entries[0] < z.shape[1]]
+    other = torch.ones(z.shape[1], dtype=torch.bool)
+    other[here] = False
+    changed = y[40:].clone()
+    changed[:, :, here] += 0.1
+    with torch.no_grad():
+        moved = (fitted(changed) - fitted(y[40:])).abs().amax(dim=0)
+    assert len(fitted.entries) > 1
+    assert moved[other].max() == 0 < moved[here].min()
+
+
+def test_a_learned_metric_finds_the_direction_that_matters() -> None:
+    """Of twenty, from samples too few to tell a quadratic in twenty variables."""
+    rng = torch.Generator().manual_seed(0)
+    x, other = (torch.randn(n, 20, generator=rng, dtype=torch.float64) for n in (120, 200))
+    direction = nn.functional.normalize(torch.randn(20, generator=rng, dtype=torch.float64), dim=0)
+    y, wanted = ((v @ direction)[:, None] ** 2 for v in (x, other))
+    metric, _ = learned_metric(x, y, (other, wanted))
+    value, vector = torch.linalg.eigh(metric @ metric.T)
+    assert (vector[:, -1] @ direction).abs() > 0.999
+    assert value[-1] > 20 * value[-2]
+
+
+def test_weights_of_polynomials_take_a_byte_each(ball: TriangleMesh) -> None:
+    x, z = interplay(ball, 60)
+    y = x - x.mean(dim=0)
+    fitted = PatchPolynomials.fit(3, 60, ball.edge_midpoints, (y[:40], z[:40]), (y[40:], z[40:]), 0)
+    assert narrowest(fitted.weights) == torch.int8
+    assert narrowest(fitted.axes) == torch.float16
 
 
 def test_ridge_regression_takes_a_penalty_that_held_out_pairs_ask_for() -> None:
