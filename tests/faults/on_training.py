@@ -9,7 +9,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import numpy as np
@@ -42,7 +42,8 @@ def kill(arena: Arena, rng: np.random.Generator) -> str:
         except subprocess.TimeoutExpired:
             kills += 1
         finally:
-            os.killpg(process.pid, signal.SIGKILL)
+            with suppress(ProcessLookupError):  # it was done before
+                os.killpg(process.pid, signal.SIGKILL)
             process.wait()
     done = train(whole.config, run, "--until", LAST)
     assert done.returncode == 0, done.stderr
