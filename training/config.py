@@ -127,20 +127,23 @@ class LatentNetworkSettings(_Section):
 
 
 class CombinerSettings(_Section):
-    """From J factor shapes to the joint one: graph convolutions on edges, polynomials in patches of edges, or both."""
+    """From J factor shapes to the joint one: graph convolutions on edges, a kernel, polynomials in patches of edges."""
 
     width: int = Field(24, ge=1)
     layers: int = Field(0, ge=0)
-    """Graph convolutions; 0 leaves all to the polynomials."""
+    """Graph convolutions; 0 leaves all to the corrections below."""
     neighbourhood: Neighbourhood = "star"
     residual: bool = True
     """Learn the difference to the affine sum of the factors instead of the shape itself; pass each layer's input on."""
     edge_channels: int = Field(4, ge=0)
     """Learned constants of each edge, given to the first convolution beside the factors."""
-    coefficients: int = Field(12, ge=0)
-    """Principal coefficients of each factor in a patch, of which a polynomial corrects what the convolutions leave; 0
-    leaves it out, as the paper does."""
-    monomials: int = Field(1000, ge=1)
+    kernel: int = Field(12, ge=0)
+    """Principal coefficients of each factor, on which kernel ridge regression corrects what the convolutions
+    leave; 0 leaves it out, as the paper does."""
+    polynomial: int = Field(0, ge=0)
+    """Principal coefficients of each factor in a patch of edges, of which a polynomial corrects it instead: for many
+    factors that do little to each other, each for itself."""
+    monomials: int = Field(1800, ge=1)
     """Of second and third degree that such a polynomial has."""
     pairwise: int = Field(0, ge=0)
     """Principal coefficients of each factor whose products, two factors at a time, correct a residual's affine sum
@@ -152,8 +155,10 @@ class CombinerSettings(_Section):
 
     @model_validator(mode="after")
     def _something(self) -> CombinerSettings:
-        if not self.layers and not (self.residual and (self.coefficients or self.pairwise)):
-            raise ValueError("without convolutions there must be a residual with polynomials or pairwise products")
+        if not self.layers and not (self.residual and (self.kernel or self.polynomial or self.pairwise)):
+            raise ValueError("without convolutions there must be a residual with a kernel, polynomials or products")
+        if self.kernel and self.polynomial:
+            raise ValueError("either a kernel or polynomials, the other 0")
         return self
 
 

@@ -46,7 +46,7 @@ count = {modes}    # numbers that describe a shape, {most} at most; more keep fi
 # hidden = {factor.hidden}    # layers of each factor's network; wider where the report shows a low R² of factors
 
 [networks.combiner]
-# monomials = {combiner.monomials}    # of which each part's correction is made; fewer make a smaller and quicker model
+# kernel = {combiner.kernel}    # principal coefficients of each factor that decide how the factors join
 
 [export]
 name = {name}    # in addresses and file names: small letters, digits and hyphens

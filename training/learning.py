@@ -235,17 +235,18 @@ class Learner:
         if combiner.symmetries:
             inputs, z, rows = self._with_images(inputs, rows)
         own, other = ((inputs[part], torch.from_numpy(z[part])) for part in (rows["train"], rows["validation"]))
-        convolutions = self._path("convolutions", fractions, combiner, *factors) if combiner.coefficients else path
+        corrected = combiner.kernel or combiner.polynomial
+        convolutions = self._path("convolutions", fractions, combiner, *factors) if corrected else path
         if not convolutions.exists():
             network.fit_pairwise(*own, other)
         state: dict[str, Any] = {"done": True, "epoch": 0, "best": None, "history": []}
         if combiner.layers:
             state = self._fit(network, inputs, z, rows, combiner.fit, convolutions, self._fraction)
         network.eval()
-        if combiner.coefficients:
-            # Last, because on the samples they have learned from they leave too little for others to learn.
+        if corrected:
+            # Last, because on the samples it has learned from it leaves too little for others to learn.
             midpoints = self.collection.reference.edge_midpoints
-            network.fit_polynomials(combiner, midpoints, own, other, self.seed)
+            network.fit_correction(combiner, midpoints, own, other, self.seed)
             save_network(path, network, state)
         self._record(path, state)
         return composite

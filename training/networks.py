@@ -19,7 +19,7 @@ from torch import Tensor, nn
 from geometry.mesh import Connectivity, FloatArray
 from training.config import CombinerSettings, LatentNetworkSettings
 from training.coordinates import Coordinates
-from training.corrections import Pairs, PairwiseProducts, PatchPolynomials, ridge_regression
+from training.corrections import KernelCorrection, PairwiseProducts, ridge_regression
 from training.layers import (
     EdgeConvolution,
     FourierProducts,
@@ -28,6 +28,7 @@ from training.layers import (
     Polynomials,
     perceptron,
 )
+from training.polynomials import Pairs, PatchPolynomials
 
 
 def predict(network: Callable[[Tensor], Tensor], inputs: Tensor, batch_size: int = 32) -> Tensor:
@@ -149,7 +150,7 @@ class MonolithicNetwork(FactorNetwork):
 
 
 class CombinerNetwork(ShapeNetwork):
-    """Ψ: J factor shapes (n, J, 2E) → the joint shape's NRIC (n, 2E), by graph convolutions on edges and polynomials.
+    """Ψ: J factor shapes (n, J, 2E) → the joint shape's NRIC (n, 2E), by graph convolutions on edges and a correction.
 
     ELU, batch normalisation and dropout after each convolution. It sees nothing but the factors' outputs.
     """
@@ -162,7 +163,7 @@ class CombinerNetwork(ShapeNetwork):
         super().__init__()
         self.scaling, self.residual = scaling, settings.residual
         self.pairwise: PairwiseProducts | None = None
-        self.polynomials: PatchPolynomials | None = None
+        self.correction: KernelCorrection | PatchPolynomials | None = None
         self.convolutions, self.norms = nn.ModuleList(), nn.ModuleList()
         if settings.layers:
             self._add_convolutions(settings, connectivity, factor_count)
@@ -195,8 +196,8 @@ class CombinerNetwork(ShapeNetwork):
         out = self._convolved(y) if self.convolutions else torch.zeros_like(y[:, 0])
         if self.pairwise is not None:
             out = out + self.pairwise(y)
-        if self.polynomials is not None:
-            out = out + self.polynomials(y)
+        if self.correction is not None:
+            out = out + self.correction(y)
         return out + y.sum(dim=1) if self.residual else out
 
     def _convolved(self, y: Tensor) -> Tensor:
@@ -217,23 +218,28 @@ class CombinerNetwork(ShapeNetwork):
             (y, residual), other = self._residual(factors, z), self._residual(*held_out)
             self.pairwise.fit(y, residual, other)
 
-    def fit_polynomials(
+    def fit_correction(
         self, settings: CombinerSettings, midpoints: FloatArray, own: Pairs, held_out: Pairs, seed: int
     ) -> None:
-        """Fit a correction to what this network, as it is, misses of samples, (n, J, 2E) and (n, 2E)."""
+        """Fit a kernel or polynomials to what this network, as it is, misses of samples, (n, J, 2E) and (n, 2E)."""
 
         def missed(factors: Tensor, z: Tensor) -> Pairs:
             return self.scaling.down(factors), (z - predict(self, factors)) * self.scaling.factor
 
-        self.polynomials = PatchPolynomials.fit(
-            settings.coefficients, settings.monomials, midpoints, missed(*own), missed(*held_out), seed
-        )
+        first, other = missed(*own), missed(*held_out)
+        if settings.polynomial:
+            self.correction = PatchPolynomials.fit(
+                settings.polynomial, settings.monomials, midpoints, first, other, seed
+            )
+        else:
+            self.correction = KernelCorrection.fit(settings.kernel, *first, other)
 
     def load_state_dict(self, state_dict: Mapping[str, Any], *args: Any, **options: Any) -> Any:
-        """The polynomials, if there are any, have the sizes that their samples gave them."""
-        prefix = "polynomials."
+        """The correction, if there is one, has the sizes that its samples gave it."""
+        prefix = "correction."
         saved = {k.removeprefix(prefix): v for k, v in state_dict.items() if k.startswith(prefix)}
-        self.polynomials = PatchPolynomials.blank(saved) if saved else None
+        kind = PatchPolynomials if "metric" in saved else KernelCorrection
+        self.correction = kind.blank(saved) if saved else None
         return super().load_state_dict(state_dict, *args, **options)
 
     def _residual(self, factors: Tensor, z: Tensor) -> tuple[Tensor, Tensor]:

@@ -50,7 +50,7 @@ fit = { batch_size = 8, max_epochs = 3 }
 title = "the paper's combiner"
 [variants.paper.combiner]
 residual = false
-coefficients = 0
+kernel = 0
 edge_channels = 0
 width = 4
 layers = 2
