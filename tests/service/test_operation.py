@@ -8,6 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import httpx
+import pytest
 
 import service
 from service.settings import cpu_quota
@@ -134,17 +135,21 @@ asyncio.run(main())
     assert "Traceback" not in found.stdout
 
 
-def test_settings_that_make_no_sense_are_named(models: Path) -> None:
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("PORT", "http"), ("CORS_ORIGINS", "a.example"), ("CORS_ORIGINS", "https://a.example/page"), ("DEADLINE", "inf")],
+)
+def test_settings_that_make_no_sense_are_named(models: Path, name: str, value: str) -> None:
     found = subprocess.run(
         [sys.executable, "-m", "service"],
         cwd=ROOT,
-        env={"SHAPESPACE_PORT": "http", "SHAPESPACE_MODELS_DIR": str(models)},
+        env={f"SHAPESPACE_{name}": value, "SHAPESPACE_MODELS_DIR": str(models)},
         capture_output=True,
         text=True,
         check=False,
     )
     assert found.returncode == 2
-    assert found.stderr.startswith("SHAPESPACE_PORT: ")
+    assert found.stderr.startswith(f"SHAPESPACE_{name}: ")
     assert "Traceback" not in found.stderr
 
 
