@@ -38,6 +38,7 @@ class PatchPolynomials(nn.Module):
     pairs: Tensor
     triples: Tensor
     weights: Tensor
+    gains: Tensor
     basis: Tensor
     mean: Tensor
     #: Edges of a patch, on average.
@@ -96,17 +97,17 @@ class PatchPolynomials(nn.Module):
         entries = torch.full((len(patches), widest), size)
         axes = torch.zeros(len(patches), factors, coefficients, widest)
         weights = torch.zeros(len(patches), count, rank + len(pairs) + len(triples))
+        gains = torch.zeros(len(patches), count)
         basis = torch.zeros(len(patches), widest, count)
         mean = torch.zeros(size)
         for p, patch in enumerate(patches):
             columns, own = patch.columns, patch.basis[:, :count]
             found = own.T @ patch.weights
-            # One unit for each output, in which its weights are numbers of a byte.
-            unit = found.abs().amax(dim=1).clamp_min(1e-30) / 127
             entries[p, : len(columns)] = torch.as_tensor(columns)
             axes[p, :, :, : len(columns)] = patch.axes
-            weights[p, : len(found)] = (found / unit[:, None]).round()
-            basis[p, : len(columns), : len(found)] = own * unit
+            weights[p, : len(found)], first = in_bytes(found, dim=1)
+            basis[p, : len(columns), : len(found)], second = in_bytes(own, dim=0)
+            gains[p, : len(found)] = first.flatten() * second.flatten()
             mean[columns] = patch.mean.float()
         tensors = {
             "entries": entries,
@@ -118,7 +119,8 @@ class PatchPolynomials(nn.Module):
             "pairs": torch.as_tensor(pairs.T.copy()),
             "triples": torch.as_tensor(triples.T.copy()),
             "weights": weights,
-            "basis": half_precision(basis),
+            "gains": gains,
+            "basis": basis,
             "mean": mean,
         }
         result = cls.blank(tensors)
@@ -133,8 +135,14 @@ class PatchPolynomials(nn.Module):
         u = (self.metric @ c).transpose(0, 1)
         parts = u, _products(u, self.pairs), _products(u, self.triples)
         found = torch.cat([part.transpose(0, 1) for part in parts], dim=1)
-        out = (self.basis @ (self.weights @ found)).flatten(0, 1)
+        out = (self.basis @ (self.weights @ found * self.gains[:, :, None])).flatten(0, 1)
         return out.index_select(0, self.place).T + self.mean
+
+
+def in_bytes(x: Tensor, dim: int) -> tuple[Tensor, Tensor]:
+    """Whole numbers from −127 to 127, and the unit along ``dim`` in which they are x."""
+    unit = x.abs().amax(dim=dim, keepdim=True).clamp_min(1e-30) / 127
+    return (x / unit).round(), unit
 
 
 def _products(u: Tensor, factors: Tensor) -> Tensor:
@@ -187,10 +195,9 @@ class _Patch:
             axes.append(vt)
             centre.append(vt @ middle)
             widest = max(widest, float(s[0]) / len(y) ** 0.5)
-        every = torch.stack(axes)
-        size = every.abs().amax(dim=2, keepdim=True).clamp_min(1e-30) / 127
-        self.axes = (every / size).round().float()
-        self.units = size.flatten() / max(widest, 1e-12)
+        whole, unit = in_bytes(torch.stack(axes), dim=2)
+        self.axes = whole.float()
+        self.units = unit.flatten() / max(widest, 1e-12)
         self.centre = torch.cat(centre) / max(widest, 1e-12)
 
     def _inputs(self, y: Tensor) -> Tensor:

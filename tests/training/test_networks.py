@@ -210,7 +210,7 @@ def test_weights_of_polynomials_take_a_byte_each(ball: TriangleMesh) -> None:
     y = x - x.mean(dim=0)
     fitted = PatchPolynomials.fit(3, 60, ball.edge_midpoints, (y[:40], z[:40]), (y[40:], z[40:]), 0)
     assert narrowest(fitted.weights) == torch.int8
-    assert narrowest(fitted.axes) == torch.int8
+    assert narrowest(fitted.axes) == narrowest(fitted.basis) == torch.int8
 
 
 def test_ridge_regression_takes_a_penalty_that_held_out_pairs_ask_for() -> None:
