@@ -52,6 +52,9 @@ fit = { batch_size = 16, max_epochs = 8 }
 width = 4
 layers = 1
 pairwise = 2
+kernel = 0
+polynomial = 4
+monomials = 60
 fit = { batch_size = 16, max_epochs = 6 }
 
 [monolithic]
