@@ -73,8 +73,8 @@ class PatchPolynomials(nn.Module):
             held_out: what chooses penalties and metrics.
             seed: of the patches.
         """
-        patches = [_Patch(columns, coefficients, own[0][: cls.AXES]) for columns in patch_entries(
-            midpoints, math.ceil(len(midpoints) / cls.EDGES), seed)]  # fmt: skip
+        entries = patch_entries(midpoints, math.ceil(len(midpoints) / cls.EDGES), seed)
+        patches = [_Patch(columns, coefficients, own[0][: cls.AXES]) for columns in entries]
         for patch in tqdm(patches, desc="metrics", unit="patch", disable=None, leave=False):
             patch.learn_metric(own, held_out)
         spread = torch.stack([patch.spread for patch in patches]).clamp_min(1e-30).log().mean(dim=0)
@@ -88,8 +88,8 @@ class PatchPolynomials(nn.Module):
     def _of(cls, patches: list[_Patch], rank: int, pairs: NDArray, triples: NDArray, size: int) -> PatchPolynomials:
         energy = nn.utils.rnn.pad_sequence([patch.energy for patch in patches], batch_first=True).sum(dim=0)
         lost = energy.sum() - energy.cumsum(0)
-        count = int((lost > cls.SLACK * sum(patch.error for patch in patches)).sum()) + 1
-        count = min(count, len(energy))
+        allowed = cls.SLACK * sum(patch.error for patch in patches)
+        count = min(int((lost > allowed).sum()) + 1, len(energy))
 
         # Short patches are filled up with an entry that isn't there, which counts for nothing.
         widest = max(len(patch.columns) for patch in patches)
