@@ -170,6 +170,27 @@ def one_code_only(folder: Path) -> None:
     replace_network(folder, "factor-0.onnx", model)
 
 
+def weight_of_no_type(folder: Path) -> None:
+    model = networks()["combiner.onnx"]
+    model.graph.initializer[0].data_type = TensorProto.UNDEFINED
+    replace_network(folder, "combiner.onnx", model)
+
+
+def too_few_weights(folder: Path) -> None:
+    model = networks()["combiner.onnx"]
+    model.graph.initializer[0].dims[0] += 1
+    replace_network(folder, "combiner.onnx", model)
+
+
+def long_name_inside(folder: Path) -> None:
+    """The first array's header says that its name has 1500 bytes, and zipfile quotes them all."""
+    path = folder / "geometry.npz"
+    data = bytearray(path.read_bytes())
+    data[26:28] = (1500).to_bytes(2, "little")
+    path.write_bytes(data)
+    seal(folder)
+
+
 def no_network(folder: Path) -> None:
     (folder / "factor-0.onnx").write_bytes(b"not a network")
     seal(folder)
@@ -299,6 +320,9 @@ FAULTS: dict[Spoil, str] = {
     wrong_output_name: "factor-0.onnx must have one output",
     one_code_only: "factor-0.onnx must have one input",
     no_network: "factor-0.onnx is not a readable ONNX file",
+    weight_of_no_type: "can't be read: The element type in the input tensor is UNDEFINED",
+    too_few_weights: "can't be read: cannot reshape array",
+    long_name_inside: "geometry.npz is not a readable NPZ file",
     nan_vertex: "vertex 5 has a coordinate that is not finite",
     unsorted_edges: "edges are not those of the faces",
     turned_face: "oriented oppositely",
@@ -331,6 +355,7 @@ def test_bundles_that_are_not_what_they_say_are_refused(tmp_path: Path, spoil: S
     with pytest.raises(BundleError) as refusal:
         load(folder)
     assert FAULTS[spoil] in str(refusal.value)
+    assert len(str(refusal.value)) < 400
 
 
 def test_a_bad_bundle_is_left_out_with_one_line(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
