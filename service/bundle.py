@@ -24,12 +24,15 @@ MANIFEST = "manifest.json"
 MANIFEST_LIMIT = 4 * 2**20
 #: The fine mesh lies this close to what the reference is prolonged to, as a fraction of the diagonal: float32.
 FINE_TOLERANCE = 1e-5
-#: Characters of what a library says of a file it can't read.
-LONGEST_REASON = 200
+#: Characters of a reason: libraries quote what they can't read, and names in a file are as long as it says.
+LONGEST_REASON = 300
 
 
 class BundleError(ValueError):
     """A bundle that must not be served, with one line that says why."""
+
+    def __init__(self, reason: str) -> None:
+        super().__init__(reason if len(reason) <= LONGEST_REASON else f"{reason[:LONGEST_REASON]} …")
 
 
 @dataclass(frozen=True)
@@ -147,7 +150,7 @@ def _geometry(content: bytes, manifest: Manifest) -> tuple[TriangleMesh, FineMes
     except MeshError as error:
         raise BundleError(f"{file}: {error}") from None
     except Exception as error:  # zip and array headers fail in many ways
-        raise BundleError(f"{file} is not a readable NPZ file: {_brief(error)}") from None
+        raise BundleError(f"{file} is not a readable NPZ file: {error}") from None
     for array_name, array in geometry.items():
         if np.issubdtype(array.dtype, np.floating) and not np.isfinite(array).all():
             raise BundleError(f"{file}: {array_name} has an entry that is not finite")
@@ -223,27 +226,22 @@ def _fine(file: str, geometry: Mapping[str, NDArray], reference: TriangleMesh) -
     return FineMesh(fine, prolong)
 
 
-def _brief(error: Exception) -> str:
-    """What a library says, without the bytes of the file that it may quote."""
-    text = " ".join(str(error).split())
-    return text if len(text) <= LONGEST_REASON else f"{text[:LONGEST_REASON]} …"
-
-
 def _check_network(file: str, content: bytes) -> None:
     try:
         model = onnx.load_model_from_string(content)
     except Exception as error:  # protobuf's errors have no common public class
-        raise BundleError(f"{file} is not a readable ONNX file: {_brief(error)}") from None
+        raise BundleError(f"{file} is not a readable ONNX file: {error}") from None
     functions = (node for function in model.functions for node in function.node)
     for tensor in [*_tensors_of_graph(model.graph), *_tensors_of_nodes(functions)]:
+        name = tensor.name or "a tensor"
         if tensor.data_location == onnx.TensorProto.EXTERNAL or tensor.external_data:
-            raise BundleError(f"{file}: {tensor.name or 'a tensor'} keeps its data in another file")
+            raise BundleError(f"{file}: {name} keeps its data in another file")
         try:
             values = onnx.numpy_helper.to_array(tensor)
         except Exception as error:  # of an unknown type, or too little for its shape
-            raise BundleError(f"{file}: {tensor.name or 'a tensor'} can't be read: {_brief(error)}") from None
+            raise BundleError(f"{file}: {name} can't be read: {error}") from None
         if not _is_finite(values):
-            raise BundleError(f"{file}: {tensor.name or 'a tensor'} has a weight that is not finite")
+            raise BundleError(f"{file}: {name} has a weight that is not finite")
 
 
 def _tensors_of_graph(graph: onnx.GraphProto) -> Iterator[onnx.TensorProto]:

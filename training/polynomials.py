@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import torch
@@ -80,8 +80,9 @@ class PatchPolynomials(nn.Module):
         spread = torch.stack([patch.spread for patch in patches]).clamp_min(1e-30).log().mean(dim=0)
         pairs, triples = _strongest(spread.numpy(), monomials)
         rank = 1 + int(np.concatenate([pairs.ravel(), triples.ravel()]).max(initial=0))
+        roots = torch.cat([torch.ones(rank), _roots(pairs), _roots(triples)])
         for patch in tqdm(patches, desc="polynomials", unit="patch", disable=None, leave=False):
-            patch.fit(own, held_out, rank, pairs, triples)
+            patch.fit(own, held_out, rank, pairs, triples, roots)
         return cls._of(patches, rank, pairs, triples, own[1].shape[1])
 
     @classmethod
@@ -153,6 +154,11 @@ def _products(u: Tensor, factors: Tensor) -> Tensor:
     return result
 
 
+def _factorial(index: Sequence[int] | NDArray) -> int:
+    """``β!`` of the monomial ``x^β`` that is the product of these coordinates."""
+    return math.prod(map(math.factorial, np.bincount(index)))
+
+
 def _strongest(spread: NDArray, count: int) -> tuple[NDArray, NDArray]:
     """The pairs (k, 2) and triples (l, 3) of coordinates whose monomials the kernel gives most weight.
 
@@ -160,7 +166,7 @@ def _strongest(spread: NDArray, count: int) -> tuple[NDArray, NDArray]:
     their mean squares, falling.
     """
     found = [
-        (sum(spread[list(index)]) - math.log(math.prod(map(math.factorial, np.bincount(index)))), index)
+        (sum(spread[list(index)]) - math.log(_factorial(index)), index)
         for degree in (2, 3)
         for index in itertools.combinations_with_replacement(range(len(spread)), degree)
     ]
@@ -216,15 +222,15 @@ class _Patch:
         value, axes = torch.linalg.eigh(z.T @ z / len(z))
         self.metric, self.spread = half_precision((metric @ axes.flip(1)).T.float()), value.flip(0)
 
-    def _features(self, y: Tensor, rank: int, pairs: NDArray, triples: NDArray) -> Tensor:
+    def _features(self, y: Tensor, rank: int, pairs: NDArray, triples: NDArray, roots: Tensor) -> Tensor:
         """(n, 1 + r + …) monomials, weighted as the kernel does."""
         u = self.metric[:rank].double() @ self._inputs(y).T
-        products = (_products(u, torch.as_tensor(index.T)) * _roots(index)[:, None] for index in (pairs, triples))
-        return torch.cat([torch.ones_like(u[:1]), u, *products]).T
+        products = (_products(u, torch.as_tensor(index.T)) for index in (pairs, triples))
+        return torch.cat([torch.ones_like(u[:1]), torch.cat([u, *products]) * roots[:, None]]).T
 
-    def fit(self, own: Pairs, held_out: Pairs, rank: int, pairs: NDArray, triples: NDArray) -> None:
-        """Ridge regression on the monomials."""
-        x, other = (self._features(y, rank, pairs, triples) for y in (own[0], held_out[0]))
+    def fit(self, own: Pairs, held_out: Pairs, rank: int, pairs: NDArray, triples: NDArray, roots: Tensor) -> None:
+        """Ridge regression on the monomials, whose weights in the kernel have these square roots."""
+        x, other = (self._features(y, rank, pairs, triples, roots) for y in (own[0], held_out[0]))
         wanted, theirs = (residual[:, self.columns].double() - self.mean for _, residual in (own, held_out))
         dual = len(x) < x.shape[1]
         square, right = (x @ x.T, wanted) if dual else (x.T @ x, x.T @ wanted)
@@ -241,14 +247,12 @@ class _Patch:
         self.error = best / len(other)
         value, vector = torch.linalg.eigh(told.T @ told / len(told))
         self.energy, self.basis = value.flip(0).clamp_min(0), vector.flip(1).float()
-        roots = torch.cat([torch.ones(rank), _roots(pairs), _roots(triples)])
         self.weights = (weights[1:] * roots[:, None]).T.float()
 
 
 def _roots(index: NDArray) -> Tensor:
     """(k,) ``1 / √β!`` of monomials ``x^β`` given as rows of coordinates."""
-    counts = [math.prod(map(math.factorial, np.bincount(row))) for row in index]
-    return torch.tensor(counts, dtype=torch.float64).rsqrt()
+    return torch.tensor([_factorial(row) for row in index], dtype=torch.float64).rsqrt()
 
 
 #: Penalties that held-out samples choose from.
@@ -262,6 +266,11 @@ STEPS, POWER = 4, 0.25
 OUTPUTS = 16
 #: Root mean square of the strongest coefficient in the kernel's coordinates, to begin with.
 SCALE = 1 / 8
+
+
+def _kernel(s: Tensor) -> Tensor:
+    """``κ(s)``, the exponential's first terms."""
+    return 1 + s + s**2 / 2 + s**3 / 6
 
 
 def learned_metric(x: Tensor, y: Tensor, held_out: tuple[Tensor, Tensor]) -> tuple[Tensor, float]:
@@ -283,10 +292,9 @@ def learned_metric(x: Tensor, y: Tensor, held_out: tuple[Tensor, Tensor]) -> tup
     for step in range(STEPS + 1):
         z = x @ metric
         s = z @ z.T
-        value, vector = torch.linalg.eigh(1 + s + s**2 / 2 + s**3 / 6)
+        value, vector = torch.linalg.eigh(_kernel(s))
         right = vector.T @ y
-        t = held_out[0] @ metric @ z.T
-        other = (1 + t + t**2 / 2 + t**3 / 6) @ vector
+        other = _kernel(held_out[0] @ metric @ z.T) @ vector
         found = {p: right / (value.clamp_min(0) + p)[:, None] for p in PENALTIES}
         errors = {p: float((other @ spectrum - held_out[1]).square().sum()) for p, spectrum in found.items()}
         penalty = min(errors, key=errors.__getitem__)

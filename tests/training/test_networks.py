@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 import torch
 import trimesh
+from numpy.typing import NDArray
 from torch import nn
 
 from geometry.mesh import Connectivity, TriangleMesh
@@ -109,18 +112,34 @@ def test_a_residual_combiner_begins_as_the_affine_sum(ball: TriangleMesh) -> Non
     np.testing.assert_allclose(answer, affine_sum(reference, factors), atol=2e-5)
 
 
-def test_pairwise_products_find_a_bilinear_interplay(ball: TriangleMesh) -> None:
-    """z = z̄ + a d + b e + a b f is out of reach of the affine sum and exact with one product."""
+Missed = Callable[[NDArray, NDArray, NDArray, NDArray], NDArray]
+
+
+def interplay(ball: TriangleMesh, count: int, missed: Missed) -> tuple[torch.Tensor, torch.Tensor]:
+    """Shapes z̄ + a d and z̄ + b e of two factors, and joint ones that miss their sum by ``missed(a, b, f, g)``."""
     rng = np.random.default_rng(0)
     reference = nric(ball.vertices, ball.connectivity)
-    d, e, f = 0.01 * rng.normal(size=(3, len(reference)))
-    a, b = rng.uniform(-1, 1, (2, 60, 1))
+    d, e, f, g = 0.01 * rng.normal(size=(4, len(reference)))
+    a, b = rng.uniform(-1, 1, (2, count, 1))
     factors = np.stack([reference + a * d, reference + b * e], axis=1).astype(np.float32)
-    z = (reference + a * d + b * e + a * b * f).astype(np.float32)
+    z = (reference + a * d + b * e + missed(a, b, f, g)).astype(np.float32)
+    return torch.from_numpy(factors), torch.from_numpy(z)
+
+
+def cubic(a: NDArray, b: NDArray, f: NDArray, g: NDArray) -> NDArray:
+    return a * b * f + a**2 * b * g
+
+
+def beyond_cubic(a: NDArray, b: NDArray, f: NDArray, g: NDArray) -> NDArray:
+    return np.sin(2 * a * b) * a * f
+
+
+def test_pairwise_products_find_a_bilinear_interplay(ball: TriangleMesh) -> None:
+    """a b f is out of reach of the affine sum and exact with one product."""
+    x, y = interplay(ball, 60, lambda a, b, f, g: a * b * f)
     network = CombinerNetwork(
-        CombinerSettings(width=4, pairwise=1), ball.connectivity, scaling(ball, z), 2
+        CombinerSettings(width=4, pairwise=1), ball.connectivity, scaling(ball, y.numpy()), 2
     ).eval()  # fmt: skip
-    x, y = torch.from_numpy(factors), torch.from_numpy(z)
     with torch.no_grad():
         before = (network(x) - y).abs().max()
         network.fit_pairwise(x[:40], y[:40], (x[40:], y[40:]))
@@ -129,57 +148,34 @@ def test_pairwise_products_find_a_bilinear_interplay(ball: TriangleMesh) -> None
     assert after < 1e-4
 
 
-def test_a_kernel_finds_any_smooth_interplay_from_factors_alone(ball: TriangleMesh) -> None:
-    """Of third order and more, at codes it has not seen; and it comes back from a saved state as it was."""
-    rng = np.random.default_rng(0)
-    reference = nric(ball.vertices, ball.connectivity)
-    d, e, f = 0.01 * rng.normal(size=(3, len(reference)))
-    a, b = rng.uniform(-1, 1, (2, 260, 1))
-    factors = np.stack([reference + a * d, reference + b * e], axis=1).astype(np.float32)
-    z = (reference + a * d + b * e + np.sin(2 * a * b) * a * f).astype(np.float32)
-    settings, scale = CombinerSettings(kernel=3), scaling(ball, z)
+@pytest.mark.parametrize(
+    ("settings", "missed", "left"),
+    [
+        (CombinerSettings(kernel=3), beyond_cubic, 1e-2),
+        (CombinerSettings(kernel=0, polynomial=3, monomials=20), cubic, 1e-3),
+    ],
+    ids=["kernel", "polynomials"],
+)
+def test_corrections_find_an_interplay_from_factors_alone(
+    ball: TriangleMesh, settings: CombinerSettings, missed: Missed, left: float
+) -> None:
+    """At codes they have not seen; and they come back from a saved state as they were."""
+    x, y = interplay(ball, 260, missed)
+    scale = scaling(ball, y.numpy())
     network = CombinerNetwork(settings, ball.connectivity, scale, 2).eval()
-    x, y = torch.from_numpy(factors), torch.from_numpy(z)
     unseen = slice(180, None)
     with torch.no_grad():
         before = (network(x[unseen]) - y[unseen]).square().mean()
         network.fit_correction(settings, ball.edge_midpoints, (x[:150], y[:150]), (x[150:180], y[150:180]), 0)
         after = (network(x[unseen]) - y[unseen]).square().mean()
-        assert after < 1e-2 * before
-        again = CombinerNetwork(settings, ball.connectivity, scale, 2).eval()
-        again.load_state_dict(network.state_dict())
-        torch.testing.assert_close(again(x), network(x))
-
-
-def interplay(ball: TriangleMesh, count: int) -> tuple[torch.Tensor, torch.Tensor]:
-    """Shapes of two factors, and joint ones that miss their affine sum by products of second and third order."""
-    rng = np.random.default_rng(0)
-    reference = nric(ball.vertices, ball.connectivity)
-    d, e, f, g = 0.01 * rng.normal(size=(4, len(reference)))
-    a, b = rng.uniform(-1, 1, (2, count, 1))
-    factors = np.stack([reference + a * d, reference + b * e], axis=1).astype(np.float32)
-    z = (reference + a * d + b * e + a * b * f + a**2 * b * g).astype(np.float32)
-    return torch.from_numpy(factors), torch.from_numpy(z)
-
-
-def test_polynomials_find_an_interplay_of_third_order_from_factors_alone(ball: TriangleMesh) -> None:
-    """At codes they have not seen; and they come back from a saved state as they were."""
-    x, z = interplay(ball, 260)
-    settings, scale = CombinerSettings(kernel=0, polynomial=3, monomials=20), scaling(ball, z.numpy())
-    network = CombinerNetwork(settings, ball.connectivity, scale, 2).eval()
-    unseen = slice(180, None)
-    with torch.no_grad():
-        before = (network(x[unseen]) - z[unseen]).square().mean()
-        network.fit_correction(settings, ball.edge_midpoints, (x[:150], z[:150]), (x[150:180], z[150:180]), 0)
-        after = (network(x[unseen]) - z[unseen]).square().mean()
-        assert after < 1e-3 * before
+        assert after < left * before
         again = CombinerNetwork(settings, ball.connectivity, scale, 2).eval()
         again.load_state_dict(network.state_dict())
         torch.testing.assert_close(again(x), network(x))
 
 
 def test_polynomials_look_at_no_other_patch(ball: TriangleMesh) -> None:
-    x, z = interplay(ball, 60)
+    x, z = interplay(ball, 60, cubic)
     y = x - x.mean(dim=0)
     fitted = PatchPolynomials.fit(2, 10, ball.edge_midpoints, (y[:40], z[:40]), (y[40:], z[40:]), 0)
     here = fitted.entries[0][fitted.entries[0] < z.shape[1]]
@@ -206,7 +202,7 @@ def test_a_learned_metric_finds_the_direction_that_matters() -> None:
 
 
 def test_weights_of_polynomials_take_a_byte_each(ball: TriangleMesh) -> None:
-    x, z = interplay(ball, 60)
+    x, z = interplay(ball, 60, cubic)
     y = x - x.mean(dim=0)
     fitted = PatchPolynomials.fit(3, 60, ball.edge_midpoints, (y[:40], z[:40]), (y[40:], z[40:]), 0)
     assert narrowest(fitted.weights) == torch.int8
