@@ -8,7 +8,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import cholesky, solve_triangular
-from scipy.optimize import lsq_linear
 
 from geometry.mesh import FloatArray
 from geometry.status import Status
@@ -138,6 +137,8 @@ def _step(J: FloatArray, r: FloatArray, low: FloatArray, high: FloatArray, dampi
     b = -solve_triangular(R, g, trans="T")
     d: FloatArray = solve_triangular(R, b)
     if ((d < low) | (d > high)).any():
+        from scipy.optimize import lsq_linear  # 9 MB and a tenth of a second that most servers never need
+
         # A side of no length is one that the solver doesn't take.
         d = lsq_linear(R, b, (low, np.maximum(high, low + np.finfo(float).eps)), method="bvls").x
     return d

@@ -292,6 +292,8 @@ class _Session:
             if [node.name for node in nodes] != [name] or not _fits(nodes[0], row):
                 have = ", ".join(f"{node.name} {node.type} {node.shape}" for node in nodes)
                 raise BundleError(f"{network.file} must have one {role}, {name} float32 [n, {row}], but has {have}")
+        # It keeps the file for a change of providers, which there is none of here: 20 MB with both bundled models.
+        self._session._model_bytes = None
         self._input, self._output, self._shape = network.input, network.output, tuple(outputs)
         result = self(np.zeros((2, *inputs), np.float32))
         if result.shape != (2, *outputs) or not np.isfinite(result).all():
