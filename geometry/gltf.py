@@ -15,7 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geometry.colouring import Colouring
-from geometry.mesh import FloatArray, IntArray, face_normals
+from geometry.mesh import FloatArray, IntArray
+from geometry.nric import components, cross, dot
 
 FLOAT, UNSIGNED_INT = 5126, 5125
 ARRAY_BUFFER, ELEMENT_ARRAY_BUFFER = 34962, 34963
@@ -38,11 +39,17 @@ WHITE = MATERIAL | {
 
 def vertex_normals(vertices: FloatArray, faces: IntArray) -> FloatArray:
     """Unit normals (V, 3) at the vertices of a shape (V, 3): means of the face normals, weighted by area."""
-    by_face, corners = face_normals(vertices, faces, normalised=False), faces.T.ravel()
-    normals = np.stack([np.bincount(corners, np.tile(n, 3), minlength=len(vertices)) for n in by_face.T], axis=1)
-    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    x, corners = components(vertices), np.ascontiguousarray(faces.T)
+    a, b, c = (x.take(corner, axis=1) for corner in corners)
+    by_face = cross(b - a, c - a)
+    normals = np.empty((len(vertices), 3))
+    for axis, normal in enumerate(by_face):
+        normals[:, axis] = np.bincount(corners.ravel(), np.tile(normal, 3), minlength=len(vertices))
+    length = np.sqrt(dot(normals.T, normals.T))
     # A vertex whose faces cancel out has no normal, but the format insists on a unit vector.
-    return np.where(length > 0, normals / np.where(length > 0, length, 1), [0.0, 0.0, 1.0])
+    normals[length == 0] = 0.0, 0.0, 1.0
+    normals /= np.where(length > 0, length, 1)[:, None]
+    return normals
 
 
 class Document:

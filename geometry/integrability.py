@@ -81,11 +81,11 @@ class Integrability:
 
     def at_vertices(self, z: FloatArray) -> FloatArray:
         """Q(z) at the interior vertices, (n, 3): as long as the sine of half the angle left after a turn around."""
-        gamma, theta = self._angles(z)
-        cos_z, sin_z = np.cos(gamma / 2), np.sin(gamma / 2)
+        cos_gamma, theta = self._cosines(z), z[self.connectivity.edge_count :]
+        cos_z, sin_z = np.sqrt((1 + cos_gamma) / 2), np.sqrt((1 - cos_gamma) / 2)
         cos_x, sin_x = (f(theta / 2).take(self._exit) for f in (np.cos, np.sin))
         # By a corner's angle about z, then back by its edge's about x; an identity where a fan is complete.
-        turns = np.zeros((4, len(gamma) + 1))
+        turns = np.zeros((4, len(cos_gamma) + 1))
         turns[:, :-1] = cos_z * cos_x, -cos_z * sin_x, -sin_z * sin_x, sin_z * cos_x
         turns[0, -1] = 1
         return quaternions.chain(turns.take(self._fans, axis=1))[1:].T
@@ -134,6 +134,14 @@ class Integrability:
         # 2 l_j l_k cos γ_i = c_i and 2 l_j l_k sin γ_i = √S; impossible triangles count as flat ones.
         S = np.maximum((c * q).sum(axis=1, keepdims=True), 0)
         return np.arctan2(np.sqrt(S), c).ravel(), theta
+
+    def _cosines(self, z: FloatArray) -> FloatArray:
+        """Cosines of ``_angles``' inner angles, in a fifth of the time that angles and their cosines take."""
+        q = z.take(self.connectivity.face_sides) ** 2
+        c = q.sum(axis=0) - 2 * q
+        S = np.maximum((c * q).sum(axis=0), 0)
+        cosines: FloatArray = (c / np.sqrt(np.maximum(c * c + S, np.finfo(float).tiny))).T.ravel()
+        return cosines
 
     def _angle_derivatives(self, z: FloatArray) -> FloatArray:
         """(3F, 3): derivative of each inner angle by the three lengths of its face."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -16,7 +16,7 @@ from geometry.cholesky import Backend, Cholesky, NotPositiveDefiniteError, analy
 from geometry.frames import FrameIntegration
 from geometry.mesh import FloatArray, TriangleMesh
 from geometry.normal_matrix import NormalMatrix
-from geometry.nric import NRICGradients, NRICJacobian, WeightedNorm
+from geometry.nric import Frame, NRICGradients, NRICJacobian, WeightedNorm
 from geometry.rigid import rigid_motions
 from geometry.status import Status
 
@@ -67,6 +67,7 @@ class Reconstructor:
 
     def __init__(self, reference: TriangleMesh, eta: float = DEFAULT_ETA, backend: Backend = "auto") -> None:
         self.reference = reference
+        self._diagonal = reference.diagonal
         self.norm = WeightedNorm.of(reference, eta)
         self.jacobian = NRICJacobian(reference.connectivity)
         self.normal_matrix = NormalMatrix(reference.connectivity)
@@ -91,21 +92,25 @@ class Reconstructor:
         Frames first, which are exact for integrable z*. Where they go astray, for errors of z* add up along them,
         the start with the smallest misfit among them, the others, called only then, and the reference.
         """
-        framed = self.integrate(target)
-        if self._point(framed, target).energy <= GOOD_GUESS**2 * self.norm.square(target):
+        return self._guess(target, others).vertices
+
+    def _guess(self, target: FloatArray, others: Iterable[Callable[[], FloatArray]]) -> _Point:
+        framed = self._point(self.integrate(target), target)
+        if framed.energy <= GOOD_GUESS**2 * self.norm.square(target):
             return framed
-        return self.nearest(target, framed, *(other() for other in others), self.reference.vertices)
+        return self._nearest(target, framed, [*(other() for other in others), self.reference.vertices])
 
     def nearest(self, target: FloatArray, *shapes: FloatArray) -> FloatArray:
         """The shape (V, 3) among some whose misfit is the smallest; the last where none has a finite one."""
-        best = self._point(shapes[0], target)
-        for vertices in shapes[1:]:
+        return self._nearest(target, self._point(shapes[0], target), shapes[1:]).vertices
+
+    def _nearest(self, target: FloatArray, best: _Point, shapes: Iterable[FloatArray]) -> _Point:
+        for vertices in shapes:
             point = self._point(vertices, target)
             if not best.energy <= point.energy < np.inf:
                 best = point
-        return best.vertices
+        return best
 
-    @np.errstate(divide="ignore", over="ignore", invalid="ignore")
     def __call__(
         self,
         target: FloatArray,
@@ -115,7 +120,7 @@ class Reconstructor:
         max_iterations: int = 200,
         deadline: float | None = None,
     ) -> Reconstruction:
-        """Reconstruct one shape.
+        """Reconstruct one shape from a given start.
 
         Args:
             target: z*, (2E,); need not be integrable.
@@ -124,8 +129,25 @@ class Reconstructor:
             max_iterations: most steps.
             deadline: time.monotonic() after which no iteration begins.
         """
-        limit, reach = (share * self.reference.diagonal for share in (tolerance, REACH))
         here = self._point(self.reference.vertices if start is None else np.asarray(start, np.float64), target)
+        return self._iterate(target, here, tolerance, max_iterations, deadline)
+
+    def from_guess(
+        self,
+        target: FloatArray,
+        *others: Callable[[], FloatArray],
+        tolerance: float = 1e-8,
+        max_iterations: int = 200,
+        deadline: float | None = None,
+    ) -> Reconstruction:
+        """Reconstruct one shape from its own ``guess``, whose misfit is then known already; otherwise as a call."""
+        return self._iterate(target, self._guess(target, others), tolerance, max_iterations, deadline)
+
+    @np.errstate(divide="ignore", over="ignore", invalid="ignore")
+    def _iterate(
+        self, target: FloatArray, here: _Point, tolerance: float, max_iterations: int, deadline: float | None
+    ) -> Reconstruction:
+        limit, reach = (share * self._diagonal for share in (tolerance, REACH))
         if not np.isfinite(here.energy):
             return Reconstruction(self.reference.vertices, Status.NOT_FINITE, 0, np.inf, 0)
         status, iterations = Status.ITERATION_LIMIT, 0
@@ -170,13 +192,15 @@ class Reconstructor:
         residual = float(np.sqrt(here.energy / self.norm.square(target)))
         return Reconstruction(here.vertices, status, iterations, residual, self._flipped(here.misfit))
 
+    @np.errstate(divide="ignore", over="ignore", invalid="ignore")
     def _point(self, vertices: FloatArray, target: FloatArray) -> _Point:
-        misfit, gradients = self.jacobian.linearise(vertices)
+        frame = Frame(vertices, self.reference.connectivity)
+        misfit = frame.nric()
         misfit -= target
         half = len(misfit) // 2
         # As `wrap`, in place and ten times faster; half a turn counts the same either way round.
         misfit[half:] -= 2 * np.pi * np.rint(misfit[half:] / (2 * np.pi))
-        return _Point(vertices, misfit, gradients, float(self.norm.square(misfit)))
+        return _Point(vertices, misfit, float(self.norm.square(misfit)), frame)
 
     def differential(self, vertices: FloatArray, changes: FloatArray) -> FloatArray:
         """How a reconstructed shape (V, 3) moves, (n, V, 3), where what it was asked for changes by (n, 2E).
@@ -211,12 +235,17 @@ class Reconstructor:
 
 @dataclass(frozen=True)
 class _Point:
-    """A shape on the way: the misfit ``z(X) − z*`` (2E,), the derivatives of z, and the squared norm of the misfit."""
+    """A shape on the way: the misfit ``z(X) − z*`` (2E,), its squared norm, and what derivatives are made of."""
 
     vertices: FloatArray
     misfit: FloatArray
-    gradients: NRICGradients
     energy: float
+    frame: Frame
+
+    @cached_property
+    def gradients(self) -> NRICGradients:
+        """The derivatives, which the last shape doesn't need."""
+        return self.frame.gradients()
 
 
 class _Factor:

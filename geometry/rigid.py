@@ -9,15 +9,15 @@ from geometry.mesh import FloatArray
 
 def rigid_motions(vertices: FloatArray) -> FloatArray:
     """(6, 3V) orthonormal basis of the infinitesimal rigid motions of a shape (V, 3)."""
-    x = (vertices - vertices.mean(axis=0)).T
+    count = len(vertices)
+    x = vertices - vertices.mean(axis=0)
     # About the principal axes rotations are orthogonal to each other.
-    moments, axes = np.linalg.eigh(x @ x.T)
-    along = axes.T @ x
-    motions = np.zeros((6, x.shape[1], 3))
+    moments, axes = np.linalg.eigh(x.T @ x)
+    motions = np.zeros((6, count, 3))
     for k, (i, j) in enumerate(((1, 2), (2, 0), (0, 1))):
-        motions[k, :, k] = x.shape[1] ** -0.5
-        rotation = np.outer(along[i], axes[:, j]) - np.outer(along[j], axes[:, i])
-        np.multiply(rotation, (moments[i] + moments[j]) ** -0.5, out=motions[3 + k])
+        motions[k, :, k] = count**-0.5
+        turn = np.outer(axes[:, i], axes[:, j])
+        np.matmul(x, (turn - turn.T) * (moments[i] + moments[j]) ** -0.5, out=motions[3 + k])
     return motions.reshape(6, -1)
 
 

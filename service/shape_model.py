@@ -177,8 +177,9 @@ class ShapeModel:
         _, target = self._networks(code[None])
         predicted = time.perf_counter()
         with self.solver() as reconstruct:
-            start = reconstruct.guess(target[0], *self._learned_start(code))
-            found: Reconstruction = reconstruct(target[0], start, tolerance=TOLERANCE, deadline=deadline)
+            found: Reconstruction = reconstruct.from_guess(
+                target[0], *self._learned_start(code), tolerance=TOLERANCE, deadline=deadline
+            )
         with np.errstate(over="ignore", invalid="ignore"):
             try:
                 vertices = self.finish(found.vertices, mesh)
@@ -201,7 +202,7 @@ class ShapeModel:
 
     def lengths_and_angles(self, code: Codes) -> LengthsAndAngles:
         """What the networks say to a code (m,), before any reconstruction; raises NotFiniteError."""
-        factors, z = (array[0] for array in self._networks(code[None]))
+        factors, z = (array[0].astype(np.float64) for array in self._networks(code[None]))
         half = self.manifest.edges
         for array in (factors, z):
             array[..., :half] *= self.manifest.scale
@@ -232,14 +233,14 @@ class ShapeModel:
         fine = self.finer(mesh)
         return vertices[fine.prolong.coarse_vertices] if fine else vertices
 
-    def _networks(self, codes: Codes) -> tuple[FloatArray, FloatArray]:
+    def _networks(self, codes: Codes) -> tuple[NDArray[np.float32], FloatArray]:
         """Factors (n, J, 2E) and combined NRIC (n, 2E), normalised."""
         parts = [
             session(codes[:, factor.start : factor.stop])
             for session, factor in zip(self._factors, self.manifest.factors, strict=True)
         ]
         factors = np.stack(parts, axis=1)
-        return factors.astype(np.float64), self._combiner(factors).astype(np.float64)
+        return factors, self._combiner(factors).astype(np.float64)
 
     def _learned_start(self, code: Codes) -> Iterator[Callable[[], FloatArray]]:
         if network := self._start:
