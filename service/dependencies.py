@@ -52,8 +52,9 @@ Format = Annotated[
 ]
 
 
-async def _model(service: ServiceDependency, name: ModelName, version: Version = None) -> ShapeModel:
-    return service.repository.get(name, version)
+# Not by ServiceDependency: FastAPI goes through a dependency's own ones every time, also where it knows the result.
+async def _model(request: Request, name: ModelName, version: Version = None) -> ShapeModel:
+    return (await _service(request)).repository.get(name, version)
 
 
 Model = Annotated[ShapeModel, Depends(_model)]

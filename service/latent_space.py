@@ -62,6 +62,8 @@ class LatentSpace:
         self.lower, self.upper = np.array(manifest.lower), np.array(manifest.upper)
         self.periodic = np.array([period is not None for period in manifest.period])
         self._period = np.array([period or 1.0 for period in manifest.period])
+        # As codes are compared, so that a bound itself is inside on every way through.
+        self._low, self._high = self.lower.astype(np.float32), self.upper.astype(np.float32)
         #: (m,) what counts as equally far in each coordinate.
         self.width = self.upper - self.lower
 
@@ -95,17 +97,16 @@ class LatentSpace:
         with np.errstate(over="ignore"):
             x = np.array(values, dtype=np.float64).reshape(-1, self.dimension).astype(np.float32)
         self._require_finite(x)
-        x = self._remainder(x.astype(np.float64)).astype(np.float32)
-        # Compared as float32, so that a bound itself is inside on every way through.
-        lower, upper = self.lower.astype(np.float32), self.upper.astype(np.float32)
+        if self.periodic.any():
+            x = self._remainder(x.astype(np.float64)).astype(np.float32)
         if bounds is Bounds.CLAMP:
-            x = np.clip(x, lower, upper)
-        outside = (x < lower) | (x > upper)
+            x = np.clip(x, self._low, self._high)
+        outside = (x < self._low) | (x > self._high)
         if bounds is Bounds.REJECT and outside.any():
             i, k = np.argwhere(outside)[0]
             raise OutOfBoundsError(
                 f"Coordinate {k} ({self.names[k]}) of code {i} is {x[i, k]:g}, outside "
-                f'[{lower[k]:g}, {upper[k]:g}]. Move it inside, or send "bounds": "clamp" or "allow".'
+                f'[{self._low[k]:g}, {self._high[k]:g}]. Move it inside, or send "bounds": "clamp" or "allow".'
             )
         # Adding zero turns −0 into 0: the same shape must not have two names.
         inside = np.logical_not(outside.any(axis=1))
@@ -149,8 +150,9 @@ class LatentSpace:
         return self.codes(values.tolist(), Bounds.CLAMP)[0]
 
     def _require_finite(self, x: Codes) -> None:
-        bad = np.argwhere(~np.isfinite(x))
-        if len(bad):
+        finite = np.isfinite(x)
+        if not finite.all():
+            bad = np.argwhere(~finite)
             raise NotFiniteError(
                 f"Coordinate {bad[0, 1]} of code {bad[0, 0]} is not a finite number. Send finite numbers."
             )
