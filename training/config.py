@@ -133,6 +133,9 @@ class CombinerSettings(_Section):
     layers: int = Field(0, ge=0)
     """Graph convolutions; 0 leaves all to the corrections below."""
     neighbourhood: Neighbourhood = "star"
+    crop: int = Field(0, ge=0)
+    """Edges of the part of each shape that the convolutions learn on, drawn anew in each epoch by what is missed there
+    without them: a network that mends details learns faster so. 0 for whole shapes. Needs ``flaps``."""
     residual: bool = True
     """Learn the difference to the affine sum of the factors instead of the shape itself; pass each layer's input on."""
     edge_channels: int = Field(4, ge=0)
@@ -159,6 +162,8 @@ class CombinerSettings(_Section):
             raise ValueError("without convolutions there must be a residual with a kernel, polynomials or products")
         if self.kernel and self.polynomial:
             raise ValueError("either a kernel or polynomials, the other 0")
+        if self.crop and self.neighbourhood != "flaps":
+            raise ValueError("crops need the neighbourhood flaps")
         return self
 
 

@@ -114,7 +114,7 @@ def fit(
         # The last batch is left out where it is short: batch normalisation of one sample has no variance.
         batches = [b for b in order.split(settings.batch_size) if len(b) == settings.batch_size] or [order]
         for batch in batches:
-            loss = nn.functional.mse_loss(network.coefficients(inputs[batch]), target[batch])
+            loss = network.loss(inputs[batch], target[batch])
             optimiser.zero_grad()
             loss.backward()
             optimiser.step()

@@ -246,8 +246,10 @@ class EdgeConvolution(nn.Module):
                 # About ten neighbours: without this their sum outweighs the edge itself at the start.
                 self.other.weight /= 10
 
-    def forward(self, x: Tensor) -> Tensor:
-        return self.own(x) + self.other(self.around(x))
+    def forward(self, x: Tensor, neighbours: Tensor | None = None) -> Tensor:
+        """On the whole mesh, or on a part of it with a table of its own, see `crops.Crop`."""
+        around = self.around(x) if neighbours is None else _side_by_side(_gather(x, neighbours))
+        return self.own(x) + self.other(around)
 
 
 class Star(nn.Module):
@@ -295,7 +297,7 @@ class Flaps(nn.Module):
             around = _gather(x, self.neighbours)
         else:
             around = _FlapGather.apply(x, self.neighbours, self.targets, self.offsets)
-        return around.transpose(1, 2).flatten(2)
+        return _side_by_side(around)
 
 
 def edges_at_vertices(connectivity: Connectivity) -> IntArray:
@@ -325,6 +327,11 @@ def _gather(x: Tensor, neighbours: Tensor) -> Tensor:
     """(E, k, n, C) features of the neighbours of each edge, zero where there is none."""
     padded = torch.cat([x, torch.zeros_like(x[:1])])
     return padded.index_select(0, neighbours.flatten()).unflatten(0, neighbours.shape)
+
+
+def _side_by_side(around: Tensor) -> Tensor:
+    """(E, k, n, C) → (E, n, k C)."""
+    return around.transpose(1, 2).flatten(2)
 
 
 class _FlapGather(torch.autograd.Function):

@@ -19,8 +19,9 @@ from torch import Tensor
 from geometry.mesh import FloatArray, IntArray
 from geometry.nric import WeightedNorm, nric
 from training.config import CombinerSettings, Config, FitSettings, LatentNetworkSettings
+from training.crops import Crops
 from training.fitting import finished, fit, save_network
-from training.layers import PatchBasis
+from training.layers import PatchBasis, flaps
 from training.networks import (
     CombinerNetwork,
     FactorNetwork,
@@ -225,7 +226,8 @@ class Learner:
         path = self._path("combiner", fractions, combiner, *factors)
         saved = finished(path)
         scaling = Scaling.blank(len(self._reference)) if saved else self._scaling(self.joint.nric[self.rows["train"]])
-        network = CombinerNetwork(combiner, self.collection.reference.connectivity, scaling, len(networks))
+        reference = self.collection.reference
+        network = CombinerNetwork(combiner, reference.connectivity, scaling, len(networks))
         composite = Composite(list(self.collection.factors.values()), networks, network)
         if saved:
             self._load(network, path, *saved)
@@ -241,12 +243,15 @@ class Learner:
             network.fit_pairwise(*own, other)
         state: dict[str, Any] = {"done": True, "epoch": 0, "best": None, "history": []}
         if combiner.layers:
+            if combiner.crop:
+                network.crops = Crops(
+                    reference.edge_midpoints, flaps(reference.connectivity), combiner.crop, combiner.layers
+                )
             state = self._fit(network, inputs, z, rows, combiner.fit, convolutions, self._fraction)
         network.eval()
         if corrected:
             # Last, because on the samples it has learned from it leaves too little for others to learn.
-            midpoints = self.collection.reference.edge_midpoints
-            network.fit_correction(combiner, midpoints, own, other, self.seed)
+            network.fit_correction(combiner, reference.edge_midpoints, own, other, self.seed)
             save_network(path, network, state)
         self._record(path, state)
         return composite

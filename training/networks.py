@@ -20,6 +20,7 @@ from geometry.mesh import Connectivity, FloatArray
 from training.config import CombinerSettings, LatentNetworkSettings
 from training.coordinates import Coordinates
 from training.corrections import KernelCorrection, PairwiseProducts, ridge_regression
+from training.crops import Crops
 from training.layers import (
     EdgeConvolution,
     FourierProducts,
@@ -90,6 +91,10 @@ class ShapeNetwork(nn.Module):
     def target(self, z: Tensor) -> Tensor:
         """What `coefficients` ought to be for NRIC (n, 2E)."""
         raise NotImplementedError
+
+    def loss(self, inputs: Tensor, target: Tensor) -> Tensor:
+        """Mean square of what is missed, or an estimate of it while the network learns."""
+        return nn.functional.mse_loss(self.coefficients(inputs), target)
 
 
 class FactorNetwork(ShapeNetwork):
@@ -165,6 +170,7 @@ class CombinerNetwork(ShapeNetwork):
         self.pairwise: PairwiseProducts | None = None
         self.correction: KernelCorrection | PatchPolynomials | None = None
         self.convolutions, self.norms = nn.ModuleList(), nn.ModuleList()
+        self.crops: Crops | None = None
         if settings.layers:
             self._add_convolutions(settings, connectivity, factor_count)
         if settings.residual and settings.pairwise:
@@ -193,12 +199,33 @@ class CombinerNetwork(ShapeNetwork):
     def coefficients(self, inputs: Tensor) -> Tensor:
         """Scaled differences (n, 2E) for factor shapes (n, J, 2E)."""
         y = self.scaling.down(inputs)
-        out = self._convolved(y) if self.convolutions else torch.zeros_like(y[:, 0])
+        out = self._without_convolutions(y)
+        return out + self._convolved(y) if self.convolutions else out
+
+    def _without_convolutions(self, y: Tensor) -> Tensor:
+        """What there is to (n, 2E) beside the convolutions, of scaled differences (n, J, 2E)."""
+        out = y.sum(dim=1) if self.residual else torch.zeros_like(y[:, 0])
         if self.pairwise is not None:
             out = out + self.pairwise(y)
-        if self.correction is not None:
-            out = out + self.correction(y)
-        return out + y.sum(dim=1) if self.residual else out
+        return out if self.correction is None else out + self.correction(y)
+
+    def loss(self, inputs: Tensor, target: Tensor) -> Tensor:
+        """On crops, where the network has any, the mean square over their inner edges."""
+        if self.crops is None:
+            return super().loss(inputs, target)
+        y = self.scaling.down(inputs)
+        n, j, double = y.shape
+        missed = (target - self._without_convolutions(y)).view(n, 2, double // 2)
+        crop = self.crops.draw(missed.square().sum(dim=1))
+
+        def at(channels: Tensor) -> Tensor:
+            """(n, c, E) → (nK, c)."""
+            return channels.take_along_dim(crop.edges[:, None], dim=2).transpose(1, 2).flatten(0, 1)
+
+        constants = torch.cat([self.rest, self.edge_constants], dim=1)[crop.edges.flatten()]
+        x = torch.cat([at(y.view(n, 2 * j, double // 2)), constants], dim=1)[:, None]
+        inner = crop.inner.flatten()
+        return nn.functional.mse_loss(self._layers(x, crop.neighbours)[inner, 0], at(missed)[inner])
 
     def _convolved(self, y: Tensor) -> Tensor:
         """(n, 2E) of scaled differences (n, J, 2E)."""
@@ -206,11 +233,15 @@ class CombinerNetwork(ShapeNetwork):
         # Edges come first: a neighbour sum then adds whole rows.
         channels = y.view(n, 2 * j, double // 2).permute(2, 0, 1)
         constants = torch.cat([self.rest, self.edge_constants], dim=1)[:, None, :].expand(-1, n, -1)
-        x = torch.cat([channels, constants], dim=2)
+        return self._layers(torch.cat([channels, constants], dim=2)).permute(1, 2, 0).reshape(n, double)
+
+    def _layers(self, x: Tensor, neighbours: Tensor | None = None) -> Tensor:
+        """(E, n, 2) of features (E, n, C) of edges."""
         for convolution, norm in zip(self.convolutions, self.norms, strict=True):
-            new = self.dropout(nn.functional.elu(norm(convolution(x).flatten(0, 1))).view(double // 2, n, -1))
+            new = norm(convolution(x, neighbours).flatten(0, 1))
+            new = self.dropout(nn.functional.elu(new)).view(*x.shape[:2], -1)
             x = x + new if self.residual and x.shape == new.shape else new
-        return self.readout(x).permute(1, 2, 0).reshape(n, double)
+        return self.readout(x)
 
     def fit_pairwise(self, factors: Tensor, z: Tensor, held_out: tuple[Tensor, Tensor]) -> None:
         """Fit the bilinear correction, where there is one, to samples (n, J, 2E) and (n, 2E), and others held out."""
