@@ -55,6 +55,9 @@ def test_a_guess_from_frames_saves_steps(mesh, rng):
     assert near.status is far.status is Status.CONVERGED
     assert near.iterations < far.iterations
     assert np.abs(align(near.vertices, far.vertices) - far.vertices).max() < 1e-4 * mesh.diagonal
+    whole = reconstruct.from_guess(z, tolerance=1e-5)
+    assert np.array_equal(whole.vertices, near.vertices)
+    assert (whole.iterations, whole.residual) == (near.iterations, near.residual)
 
 
 def test_where_frames_go_astray_the_nearest_start_is_taken(mesh, monkeypatch):
@@ -73,4 +76,7 @@ def test_where_frames_go_astray_the_nearest_start_is_taken(mesh, monkeypatch):
         assert np.array_equal(reconstruct.guess(z), mesh.vertices)
         assert reconstruct.guess(z, other(shape)) is shape
         assert np.array_equal(reconstruct.guess(z, other(3 * shape), other(np.full_like(shape, np.nan))), mesh.vertices)
-    assert len(asked) == 6
+        whole, given = reconstruct.from_guess(z, other(shape)), reconstruct(z, shape)
+        assert np.array_equal(whole.vertices, given.vertices)
+        assert whole.residual == given.residual < 1e-8
+    assert len(asked) == 8
