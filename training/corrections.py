@@ -166,7 +166,8 @@ class KernelCorrection(nn.Module):
         return ((residual - self.mean) @ self.basis.T).double()
 
     def _inputs(self, y: Tensor) -> Tensor:
-        return torch.einsum("njs,jsr->njr", y - self.centre, self.axes).flatten(1)
+        # Not einsum, which would transpose the axes anew for every code once it is exported.
+        return torch.matmul((y - self.centre)[:, :, None], self.axes).flatten(1)
 
     def _kernel(self, inputs: Tensor, gamma: Tensor) -> Tensor:
         """(n, anchors), in double precision: used to fit."""

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.polynomial import legendre
 from numpy.typing import NDArray
 from scipy.cluster.vq import kmeans2
 from torch import Tensor, nn
@@ -56,12 +57,12 @@ class LatentFeatures(nn.Module):
         self.size = len(self.bounded) + 2 * wave.size
 
     def forward(self, latent: Tensor) -> Tensor:
-        parts = []
+        if not self.periodic:
+            return (latent - self.centre) / self.radius
+        angle = (latent[:, self.periodic, None] * self.wave).flatten(1)
+        parts = [torch.cos(angle), torch.sin(angle)]
         if self.bounded:
-            parts.append((latent[:, self.bounded] - self.centre) / self.radius)
-        if self.periodic:
-            angle = (latent[:, self.periodic, None] * self.wave).flatten(1)
-            parts += [torch.cos(angle), torch.sin(angle)]
+            parts.insert(0, (latent[:, self.bounded] - self.centre) / self.radius)
         return torch.cat(parts, dim=1)
 
 
@@ -95,7 +96,7 @@ class FourierProducts(nn.Module):
         for i, column in enumerate(self.columns):
             angle = latent[:, i, None] * self.wave[i] * self.get_buffer(f"frequency{i}")
             waves = torch.stack([torch.cos(angle), torch.sin(angle)], dim=2).flatten(1)
-            waves = torch.cat([torch.ones_like(latent[:, :1]), waves], dim=1)[:, column]
+            waves = torch.cat([torch.ones_like(latent[:, :1]), waves], dim=1).index_select(1, column)
             result = result * waves
         return result
 
@@ -114,6 +115,9 @@ class Polynomials(nn.Module):
     radius: Tensor
     exponents: Tensor
     sizes: Tensor
+    power: Tensor
+    legendre: Tensor
+    columns: Tensor
 
     def __init__(self, coordinates: Coordinates, degree: int) -> None:
         super().__init__()
@@ -124,18 +128,19 @@ class Polynomials(nn.Module):
         exponents = [[c.count(i) for i in range(m)] for c in chosen]
         self.register_buffer("exponents", torch.tensor(exponents).T.contiguous())
         self.register_buffer("sizes", self.DECAY ** self.exponents.sum(dim=0))
-        self.degree, self.size = degree, len(exponents)
+        self.size = len(exponents)
+        orders = range(degree + 1)
+        rows = [np.pad(legendre.leg2poly([0] * k + [(2 * k + 1) ** 0.5]), (0, degree - k)) for k in orders]
+        columns = self.exponents + (degree + 1) * torch.arange(m)[:, None]
+        self.register_buffer("power", torch.arange(degree + 1).float(), persistent=False)
+        self.register_buffer("legendre", torch.as_tensor(np.stack(rows, axis=1)).float(), persistent=False)
+        self.register_buffer("columns", columns.flatten(), persistent=False)
 
     def forward(self, latent: Tensor) -> Tensor:
         x = (latent - self.centre) / self.radius
-        powers = [torch.ones_like(x), x]
-        for k in range(1, self.degree):
-            powers.append(((2 * k + 1) * x * powers[k] - k * powers[k - 1]) / (k + 1))
-        legendre = torch.stack([(2 * k + 1) ** 0.5 * p for k, p in enumerate(powers)], dim=2)
-        result = torch.ones_like(latent[:, :1])
-        for i, exponent in enumerate(self.exponents):
-            result = result * legendre[:, i, exponent]
-        return result * self.sizes
+        values = (x[:, :, None] ** self.power @ self.legendre).flatten(1)
+        # One gather and one product for all coordinates: in a small network every operation counts.
+        return values.index_select(1, self.columns).unflatten(1, self.exponents.shape).prod(dim=1) * self.sizes
 
 
 def patch_entries(midpoints: FloatArray, count: int, seed: int) -> list[IntArray]:
@@ -215,9 +220,11 @@ class PatchBasis(nn.Module):
 
     def forward(self, coefficients: Tensor) -> Tensor:
         """Scaled differences (n, 2E) of coefficients (n, rank)."""
+        if len(self.ranks) == 1:
+            return coefficients @ self._bases()[0] + self.mean
         parts = coefficients.split(self.ranks, dim=1)
         y = torch.cat([part @ basis for part, basis in zip(parts, self._bases(), strict=True)], dim=1)
-        return y[:, self.place] + self.mean
+        return y.index_select(1, self.place) + self.mean
 
 
 def perceptron(sizes: list[int]) -> nn.Sequential:
