@@ -13,7 +13,6 @@ from scipy.cluster.vq import kmeans2
 from torch import Tensor, nn
 
 from geometry.mesh import Connectivity, FloatArray, IntArray
-from training.config import Neighbourhood
 from training.coordinates import Coordinates
 
 #: Entries from which a tensor that 8 or 16 bits hold as it is takes less room in a bundle.
@@ -243,12 +242,12 @@ class EdgeConvolution(nn.Module):
     at e, in the order that e's direction and the faces' orientation fix: ``W₁ x_e + Σ_k W_{2,k} x_{e_k} + b``.
     """
 
-    def __init__(self, connectivity: Connectivity, n_in: int, n_out: int, neighbourhood: Neighbourhood) -> None:
+    def __init__(self, around: Star | Flaps, n_in: int, n_out: int) -> None:
         super().__init__()
         self.own = nn.Linear(n_in, n_out)
-        self.around = Star(connectivity) if neighbourhood == "star" else Flaps(connectivity)
-        self.other = nn.Linear(self.around.count * n_in, n_out, bias=False)
-        if neighbourhood == "star":
+        self.around = around
+        self.other = nn.Linear(around.count * n_in, n_out, bias=False)
+        if isinstance(around, Star):
             with torch.no_grad():
                 # About ten neighbours: without this their sum outweighs the edge itself at the start.
                 self.other.weight /= 10

@@ -23,10 +23,12 @@ from training.corrections import KernelCorrection, PairwiseProducts, ridge_regre
 from training.crops import Crops
 from training.layers import (
     EdgeConvolution,
+    Flaps,
     FourierProducts,
     LatentFeatures,
     PatchBasis,
     Polynomials,
+    Star,
     perceptron,
 )
 from training.polynomials import Pairs, PatchPolynomials
@@ -182,9 +184,8 @@ class CombinerNetwork(ShapeNetwork):
         self.register_buffer("rest", (rest - rest.mean(dim=0)) / rest.std(dim=0).clamp_min(1e-6))
         self.edge_constants = nn.Parameter(0.1 * torch.randn(connectivity.edge_count, settings.edge_channels))
         widths = [2 * factor_count + 2 + settings.edge_channels] + [settings.width] * settings.layers
-        self.convolutions.extend(
-            EdgeConvolution(connectivity, a, b, settings.neighbourhood) for a, b in itertools.pairwise(widths)
-        )
+        around = Star(connectivity) if settings.neighbourhood == "star" else Flaps(connectivity)
+        self.convolutions.extend(EdgeConvolution(around, a, b) for a, b in itertools.pairwise(widths))
         self.norms.extend(nn.BatchNorm1d(width) for width in widths[1:])
         self.dropout = nn.Dropout(settings.dropout)
         self.readout = nn.Linear(widths[-1], 2)

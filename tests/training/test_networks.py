@@ -18,16 +18,19 @@ from training.coordinates import Coordinates
 from training.corrections import ridge_regression
 from training.layers import (
     EdgeConvolution,
+    Flaps,
     FourierProducts,
     LatentFeatures,
     PatchBasis,
     Polynomials,
+    Star,
     flaps,
     narrowest,
 )
 from training.networks import CombinerNetwork, FactorNetwork, Scaling, affine_sum
 from training.polynomials import PatchPolynomials, learned_metric
 
+AROUND = {"star": Star, "flaps": Flaps}
 TORUS = Coordinates(np.zeros(2), np.full(2, 2 * np.pi), np.full(2, 2 * np.pi))
 
 
@@ -80,7 +83,7 @@ def test_a_convolution_is_the_paper_s_sum_in_training_and_as_exported(
 ) -> None:
     connectivity: Connectivity = request.getfixturevalue(mesh).connectivity
     torch.manual_seed(0)
-    convolution = EdgeConvolution(connectivity, 3, 5, neighbourhood).double()
+    convolution = EdgeConvolution(AROUND[neighbourhood](connectivity), 3, 5).double()
     x = torch.randn(connectivity.edge_count, 2, 3, dtype=torch.float64)
     if neighbourhood == "star":
         shared = torch.from_numpy(star(connectivity)).double()
@@ -97,7 +100,7 @@ def test_a_convolution_is_the_paper_s_sum_in_training_and_as_exported(
 
 @pytest.mark.parametrize("neighbourhood", ["star", "flaps"])
 def test_the_gradient_of_a_convolution_is_right(sheet: TriangleMesh, neighbourhood: str) -> None:
-    convolution = EdgeConvolution(sheet.connectivity, 2, 2, neighbourhood).double()
+    convolution = EdgeConvolution(AROUND[neighbourhood](sheet.connectivity), 2, 2).double()
     x = torch.randn(sheet.connectivity.edge_count, 2, 2, dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradcheck(convolution, (x,))
 
