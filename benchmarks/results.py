@@ -191,7 +191,7 @@ def main() -> None:
         for name in arguments.only or runs:
             study(name, runs[name])
     rows = {name: Row(name, run) for name, run in runs.items() if (run.folder / "evaluation.json").exists()}
-    real = [rows[name] for name in COLLECTIONS if name in rows]
+    real, ours = ([rows[name] for name in names if name in rows] for names in (COLLECTIONS, OWN))
     docs = ROOT / "docs"
     draw_strips([rows[name] for name in PICTURED if name in rows], docs / "results-shapes.png")
     if some := [row for row in real if row.evaluation["fractions"]]:
@@ -206,7 +206,7 @@ def main() -> None:
     )
     spaces, extrapolated = (any(row.read(name) for row in real) for name in ("space", "limits"))
     page = environment.get_template("results.md.jinja").render(
-        rows=rows, real=real, spaces=spaces, extrapolated=extrapolated
+        rows=rows, real=real, ours=ours, spaces=spaces, extrapolated=extrapolated
     )
     (docs / "results.md").write_text(page, encoding="utf-8")
     print(f"\n{docs / 'results.md'}")
