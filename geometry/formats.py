@@ -5,15 +5,18 @@ from __future__ import annotations
 import io
 import json
 from dataclasses import dataclass
-from itertools import pairwise
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
-from geometry.colouring import Colouring
-from geometry.gltf import Document
+from geometry.gltf_reading import read_gltf
 from geometry.mesh import FloatArray, IntArray, MeshError
+from geometry.npz_reading import load_npz
+from geometry.reading import UNLIMITED, Limits, clipped, read_obj, read_off, read_ply, read_stl
+
+if TYPE_CHECKING:
+    from geometry.colouring import Colouring
 
 #: Formats that IANA doesn't know.
 OCTET_STREAM = "application/octet-stream"
@@ -42,10 +45,14 @@ class MeshFormat:
 
 
 def _glb(vertices: FloatArray, faces: IntArray, colouring: Colouring | None = None) -> bytes:
+    from geometry.gltf import Document
+
     return Document(vertices, faces, colouring=colouring).glb()
 
 
 def _gltf(vertices: FloatArray, faces: IntArray, colouring: Colouring | None = None) -> bytes:
+    from geometry.gltf import Document
+
     return Document(vertices, faces, colouring=colouring).gltf()
 
 
@@ -118,7 +125,9 @@ def npz(**arrays: np.ndarray) -> bytes:
     return buffer.getvalue()
 
 
-def read_arrays(source: bytes | Path, format: str | None = None) -> tuple[np.ndarray, np.ndarray]:
+def read_arrays(
+    source: bytes | bytearray | memoryview | Path, format: str | None = None, limits: Limits = UNLIMITED
+) -> tuple[np.ndarray, np.ndarray]:
     """Read one mesh as it stands in its file: vertices (V, 3) and faces (F, 3), nothing merged and nothing checked.
 
     STL has three vertices a face. A path also finds the buffers that lie beside a glTF file.
@@ -127,9 +136,10 @@ def read_arrays(source: bytes | Path, format: str | None = None) -> tuple[np.nda
         source: the file's bytes, or its path.
         format: ``glb``, ``gltf``, ``obj``, ``ply``, ``stl``, ``off`` or ``npz``; by default the path's
             extension.
+        limits: where reading ends without a mesh; they bound its time and memory, whatever the bytes are.
 
     Raises:
-        MeshError: unreadable, or not exactly one mesh; with the reason.
+        MeshError: unreadable, too large, or not exactly one mesh; with the reason.
     """
     beside = source if isinstance(source, Path) else None
     if isinstance(source, Path):
@@ -138,83 +148,22 @@ def read_arrays(source: bytes | Path, format: str | None = None) -> tuple[np.nda
             source = source.read_bytes()
         except OSError as error:
             raise MeshError(f"can't be read: {error.strerror}") from error
+    data = memoryview(source)
     try:
-        return _READERS[format](source) if format in _READERS else _read_trimesh(source, format, beside)
+        # What isn't finite is for the caller to judge.
+        with np.errstate(all="ignore"):
+            match format:
+                case "glb" | "gltf":
+                    return read_gltf(data, limits, binary=format == "glb", beside=beside)
+                case "npz":
+                    arrays = load_npz(data, limits=limits)
+                    return arrays["vertices"], arrays["faces"]
+                case _:
+                    return _READERS[str(format)](data, limits)
     except MeshError:
         raise
-    except Exception as error:  # parsers of foreign bytes fail in every way there is
-        why = " ".join(str(error).split())
-        if isinstance(error, ImportError):  # trimesh took broken binary data for text in some encoding, to be guessed
-            why = "damaged, or another kind of file"
-        elif isinstance(error, FileNotFoundError):
-            why = f"it needs {why}, which is not beside it"
-        raise MeshError(f"not a readable {format} file: {why}") from error
+    except Exception as error:  # foreign bytes fail in every way there is
+        raise MeshError(f"not a readable {format} file: {clipped(error, 300)}") from error
 
 
-def _read_npz(data: bytes) -> tuple[np.ndarray, np.ndarray]:
-    arrays = load_npz(data)
-    return arrays["vertices"], arrays["faces"]
-
-
-def load_npz(data: bytes) -> dict[str, np.ndarray]:
-    """The arrays of an NPZ file that holds at least ``vertices`` and ``faces``.
-
-    Raises:
-        MeshError: no NPZ file, pickled objects (which could run code), or without those two; with the reason.
-    """
-    try:
-        with np.load(io.BytesIO(data), allow_pickle=False) as file:
-            arrays = dict(file)
-    except Exception as error:  # NumPy, zipfile and zlib each have their own
-        pickled = "pickle" in str(error) and data[:2] == b"PK"
-        why = "it holds pickled objects, save plain arrays instead" if pickled else "damaged, or another kind of file"
-        raise MeshError(f"not a readable npz file: {why}") from error
-    missing = {"vertices", "faces"} - arrays.keys()
-    if missing:
-        raise MeshError(f"holds no array '{min(missing)}', only {', '.join(sorted(arrays)) or 'nothing'}")
-    return arrays
-
-
-def _read_obj(data: bytes) -> tuple[np.ndarray, np.ndarray]:
-    # By hand: where there are texture coordinates, trimesh splits and shuffles the vertices.
-    vertices: list[list[float]] = []
-    faces: list[list[int]] = []
-    for line in data.decode(errors="replace").splitlines():
-        keyword, *values = line.split() or [""]
-        if keyword == "v":
-            vertices.append([float(value) for value in values[:3]])
-        elif keyword == "f":
-            numbers = [int(value.split("/")[0]) for value in values]
-            first, *others = (n - 1 if n > 0 else len(vertices) + n for n in numbers)
-            faces += [[first, a, b] for a, b in pairwise(others)]
-    return np.array(vertices).reshape(-1, 3), np.array(faces, dtype=np.int64).reshape(-1, 3)
-
-
-_READERS = {"npz": _read_npz, "obj": _read_obj}
-
-
-def _read_trimesh(data: bytes, format: str | None, beside: Path | None) -> tuple[np.ndarray, np.ndarray]:
-    import trimesh
-
-    # PLY with texture coordinates would be split along its seams, and shuffled.
-    options: dict[str, Any] = {"fix_texture": False} if format == "ply" else {}
-    if format == "gltf":
-        json.loads(data)  # where that fails, trimesh looks for other files and complains about those
-    # Coordinates that aren't finite are for the caller to judge.
-    with np.errstate(all="ignore"):
-        scene = trimesh.load_scene(
-            io.BytesIO(data),
-            file_type=format,
-            resolver=trimesh.resolvers.FilePathResolver(str(beside)) if beside else None,
-            process=False,
-            skip_materials=True,
-            **options,
-        )
-    meshes = [g for g in scene.geometry.values() if isinstance(g, trimesh.Trimesh)]
-    if not meshes:  # where it can guess encodings, trimesh takes broken binary data for text that says nothing
-        raise MeshError(f"not a readable {format} file: damaged, or without a mesh")
-    # A glTF mesh has a primitive for each of its materials.
-    if len(meshes) != 1 and not all(m.metadata.get("from_gltf_primitive") for m in meshes):
-        raise MeshError(f"holds {len(meshes)} meshes; a file needs exactly one")
-    mesh = scene.to_mesh()
-    return np.asarray(mesh.vertices), np.asarray(mesh.faces)
+_READERS = {"obj": read_obj, "off": read_off, "ply": read_ply, "stl": read_stl}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -17,15 +17,30 @@ class MeshError(ValueError):
     """A mesh that can't be used, with a sentence that says why."""
 
 
-class EdgeError(MeshError):
-    """A fault at one edge: a sentence with ``{edge}`` in it, and the edge, for those who number vertices otherwise."""
+class PlaceError(MeshError):
+    """A fault at vertices or faces, for those who number them otherwise.
 
-    def __init__(self, sentence: str, edge: tuple[int, int]) -> None:
-        super().__init__(sentence, edge)
-        self.sentence, self.edge = sentence, edge
+    Args:
+        sentence: with a field for each of the numbers; faces' fields begin with ``face``.
+        numbers: from 0; several are written as ``(2, 48)``.
+    """
+
+    def __init__(self, sentence: str, numbers: Mapping[str, Sequence[int]]) -> None:
+        super().__init__(sentence, numbers)
+        self.sentence, self.numbers = sentence, numbers
+
+    def numbered(self, first: int = 0, vertices: IntArray | None = None) -> str:
+        """The sentence with numbers from ``first``, and of the vertices by what they are elsewhere, (V,)."""
+        shown = self.sentence
+        for name, numbers in self.numbers.items():
+            known = numbers if vertices is None or name.startswith("face") else vertices[list(numbers)].tolist()
+            text = ", ".join(str(number + first) for number in known)
+            # Once, as the name of a file may have braces too.
+            shown = shown.replace(f"{{{name}}}", f"({text})" if len(known) > 1 else text, 1)
+        return shown
 
     def __str__(self) -> str:
-        return self.sentence.format(edge=self.edge)
+        return self.numbered()
 
 
 class Connectivity:
@@ -54,7 +69,7 @@ class Connectivity:
             raise MeshError(f"faces name vertices {f.min()} to {f.max()}, but there are {vertex_count} vertices")
         repeated = np.flatnonzero((f[:, 0] == f[:, 1]) | (f[:, 1] == f[:, 2]) | (f[:, 2] == f[:, 0]))
         if len(repeated):
-            raise MeshError(f"face {repeated[0]} names the same vertex twice")
+            raise PlaceError("face {face} names the same vertex twice", {"face": [int(repeated[0])]})
         unused = np.setdiff1d(np.arange(vertex_count), f)
         if len(unused):
             raise MeshError(f"vertex {unused[0]} belongs to no face ({len(unused)} such vertices)")
@@ -72,12 +87,12 @@ class Connectivity:
         """(F, 3): edge k is opposite to corner k of the face."""
         if count.max() > 2:
             i, j = self.edges[count.argmax()].tolist()
-            raise EdgeError(f"edge {{edge}} has {count.max()} faces; at most two are allowed", (i, j))
+            raise PlaceError(f"edge {{edge}} has {count.max()} faces; at most two are allowed", {"edge": (i, j)})
         forward = tail < head
         if np.bincount(side_edge[forward]).max(initial=0) > 1 or np.bincount(side_edge[~forward]).max(initial=0) > 1:
             twice = np.bincount(side_edge, weights=np.where(forward, 1, -1), minlength=len(unique))
             i, j = self.edges[int(np.flatnonzero(np.abs(twice) > 1)[0])].tolist()
-            raise EdgeError("the two faces at edge {edge} are oriented oppositely", (i, j))
+            raise PlaceError("the two faces at edge {edge} are oriented oppositely", {"edge": (i, j)})
 
         # The face to the left of i -> j, then the one to the right; -1 on the boundary.
         side_face = np.tile(np.arange(len(f)), 3)
@@ -164,13 +179,13 @@ class TriangleMesh:
             raise MeshError(f"vertices must be ({self.connectivity.vertex_count}, 3), not {v.shape}")
         bad = np.flatnonzero(~np.isfinite(v).all(axis=1))
         if len(bad):
-            raise MeshError(f"vertex {bad[0]} has a coordinate that is not finite")
+            raise PlaceError("vertex {vertex} has a coordinate that is not finite", {"vertex": [int(bad[0])]})
         v.setflags(write=False)
         object.__setattr__(self, "vertices", v)
         areas = self.face_areas
         flat = np.flatnonzero(areas <= 1e-12 * areas.mean())
         if len(flat):
-            raise MeshError(f"face {flat[0]} has no area ({len(flat)} such faces)")
+            raise PlaceError(f"face {{face}} has no area ({len(flat)} such faces)", {"face": [int(flat[0])]})
 
     @classmethod
     def from_arrays(cls, vertices: ArrayLike, faces: ArrayLike) -> TriangleMesh:

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from importlib.util import find_spec
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
+from numpy.typing import NDArray
 
 from geometry.animated_gltf import FRAMES_PER_SECOND
 from geometry.gltf import vertex_normals
-from geometry.mesh import FloatArray, IntArray
+from geometry.mesh import IntArray
 
+_PIECE, _FRAMES_AT_ONCE = 2**20, 32
 #: As glTF's clay.
 _COLOUR = (0.72, 0.76, 0.82)
 
@@ -21,10 +24,11 @@ def usd_installed() -> bool:
     return find_spec("pxr") is not None
 
 
-def animated_usd(frames: FloatArray, faces: IntArray) -> bytes:
-    """Encode shapes (n, V, 3) as a binary USD layer whose time code k shows frame k, y up and in metres as glTF is.
+def animated_usd(frames: NDArray[np.floating], faces: IntArray) -> Iterator[bytes]:
+    """Encode shapes (n, V, 3) as a binary USD layer, in pieces.
 
-    Points are float32. Normals at the vertices and extents are sampled with them.
+    Time code k shows frame k, y up and in metres as glTF is. Points are float32. Normals
+    at the vertices and extents are sampled with them.
 
     Raises:
         ImportError: ``usd-core`` is not installed.
@@ -32,7 +36,6 @@ def animated_usd(frames: FloatArray, faces: IntArray) -> bytes:
     """
     from pxr import Gf, Sdf, Tf, Usd, UsdGeom, Vt
 
-    frames = frames.astype(np.float32)
     # The writer of binary layers takes nothing but a path.
     with TemporaryDirectory(prefix="shapespace-") as folder:
         path = Path(folder, "animation.usdc")
@@ -56,15 +59,19 @@ def animated_usd(frames: FloatArray, faces: IntArray) -> bytes:
         mesh.CreateDisplayColorAttr([Gf.Vec3f(*_COLOUR)])
         mesh.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
         points, normals, extent = mesh.CreatePointsAttr(), mesh.CreateNormalsAttr(), mesh.CreateExtentAttr()
-        # One change at the end, rather than three a frame that all listeners hear of.
-        with Sdf.ChangeBlock():
-            for k, frame in enumerate(frames):
-                box = np.stack([frame.min(axis=0), frame.max(axis=0)])
-                around = vertex_normals(frame.astype(np.float64), faces).astype(np.float32)
-                for attribute, rows in ((points, frame), (normals, around), (extent, box)):
-                    attribute.Set(Vt.Vec3fArray.FromNumpy(rows), k)
-        try:
-            stage.GetRootLayer().Save()
-        except Tf.ErrorException as error:
-            raise OSError(f"can't write {path}") from error
-        return path.read_bytes()
+        frames = frames.astype(np.float32, copy=False)
+        for start in range(0, len(frames), _FRAMES_AT_ONCE):
+            # One change at the end, rather than three a frame that all listeners hear of.
+            with Sdf.ChangeBlock():
+                for k, frame in enumerate(frames[start : start + _FRAMES_AT_ONCE], start):
+                    box = np.stack([frame.min(axis=0), frame.max(axis=0)])
+                    around = vertex_normals(frame.astype(np.float64), faces).astype(np.float32)
+                    for attribute, rows in ((points, frame), (normals, around), (extent, box)):
+                        attribute.Set(Vt.Vec3fArray.FromNumpy(rows), k)
+            try:
+                stage.GetRootLayer().Save()  # what is saved is in the file and no longer in memory
+            except Tf.ErrorException as error:
+                raise OSError(f"can't write {path}") from error
+        del stage, mesh, points, normals, extent
+        with path.open("rb") as file:
+            yield from iter(lambda: file.read(_PIECE), b"")

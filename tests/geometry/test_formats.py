@@ -179,14 +179,14 @@ def test_others_read_our_colours(format: str) -> None:
 
 def test_a_point_cache_holds_every_frame() -> None:
     frames = freaky_torus.vertices(np.linspace([0, 0, 1, 1], [1, 2, 3, 1], 7))
-    np.testing.assert_array_equal(read_point_cache(point_cache(frames)), frames.astype(np.float32))
+    np.testing.assert_array_equal(read_point_cache(b"".join(point_cache(frames))), frames.astype(np.float32))
 
 
 def test_usd_holds_every_frame_with_its_normals(tmp_path: Path) -> None:
     faces = freaky_torus.connectivity().faces
     frames = freaky_torus.vertices(np.linspace([0, 0, 1, 1], [1, 2, 3, 1], 7))
     path = tmp_path / "animation.usdc"
-    path.write_bytes(animated_usd(frames, faces))
+    path.write_bytes(b"".join(animated_usd(frames, faces)))
     found, stage = read_usd(path)
     mesh = UsdGeom.Mesh(stage.GetDefaultPrim())
     np.testing.assert_array_equal(found, frames.astype(np.float32))
@@ -199,7 +199,7 @@ def test_usd_holds_every_frame_with_its_normals(tmp_path: Path) -> None:
     for k, frame in enumerate(frames):
         np.testing.assert_allclose(mesh.GetNormalsAttr().Get(k), vertex_normals(frame, faces), atol=1e-5)
         np.testing.assert_allclose(mesh.GetExtentAttr().Get(k), [frame.min(axis=0), frame.max(axis=0)], atol=1e-6)
-    assert path.read_bytes() == animated_usd(frames, faces)
+    assert path.read_bytes() == b"".join(animated_usd(frames, faces))
 
 
 def test_few_frames_are_exact_and_many_are_within_the_tolerance() -> None:
@@ -233,7 +233,7 @@ def test_usd_without_room_for_its_file_is_an_error_of_the_disk() -> None:
     resource.setrlimit(resource.RLIMIT_FSIZE, (100, hard))
     try:
         with pytest.raises(OSError, match="can't write"):
-            animated_usd(frames, cube().faces)
+            next(animated_usd(frames, cube().faces))
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
 

@@ -1,0 +1,532 @@
+"""Mesh files that would cost far more than a mesh: bodies up to the limit of an upload, made to need time or memory.
+
+A body is made when it is asked for; each says which reader it is for, and what it may hope for.
+"""
+
+from __future__ import annotations
+
+import base64
+import io
+import json
+import struct
+import zipfile
+from collections.abc import Callable
+
+import numpy as np
+
+MIB = 2**20
+#: What an upload may weigh.
+MOST = 64 * MIB
+#: A mesh of a few faces.
+VERTICES = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], "<f4")
+FACES = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]], "<u4")
+FORM = "multipart/form-data; boundary=b"
+
+#: Makes the format, or the content type, and a body of that size at most.
+Make = Callable[[int], tuple[str, bytes]]
+HOSTILE: dict[str, Make] = {}
+
+
+def hostile(make: Make) -> Make:
+    HOSTILE[make.__name__] = make
+    return make
+
+
+def filled(size: int, start: bytes, repeated: bytes, end: bytes = b"") -> bytes:
+    """As many repetitions as go into that many bytes."""
+    return start + repeated * ((size - len(start) - len(end)) // len(repeated)) + end
+
+
+def glb(tree: object, data: bytes = b"") -> bytes:
+    text = tree if isinstance(tree, bytes) else json.dumps(tree, separators=(",", ":")).encode()
+    text += b" " * (-len(text) % 4)
+    chunks = struct.pack("<I4s", len(text), b"JSON") + text
+    if data:
+        chunks += struct.pack("<I4s", len(data), b"BIN\0") + data
+    return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
+
+
+def document(**more: object) -> dict[str, object]:
+    """A glTF document with one mesh in a buffer; its scene has the nodes that are given, and begins with the first."""
+    return {
+        "asset": {"version": "2.0"},
+        "buffers": [{"byteLength": VERTICES.nbytes + FACES.nbytes}],
+        "bufferViews": [
+            {"buffer": 0, "byteOffset": 0, "byteLength": VERTICES.nbytes},
+            {"buffer": 0, "byteOffset": VERTICES.nbytes, "byteLength": FACES.nbytes},
+        ],
+        "accessors": [
+            {"bufferView": 0, "componentType": 5126, "type": "VEC3", "count": len(VERTICES)},
+            {"bufferView": 1, "componentType": 5125, "type": "SCALAR", "count": FACES.size},
+        ],
+        "meshes": [{"primitives": [{"attributes": {"POSITION": 0}, "indices": 1}]}],
+        "nodes": [{"mesh": 0}],
+        "scenes": [{"nodes": [0]}],
+        "scene": 0,
+    } | more
+
+
+BINARY = VERTICES.tobytes() + FACES.tobytes()
+MATRIX = [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 1, 0, 0, 1]
+
+
+def chain(count: int, matrices: bool = True) -> bytes:
+    """Nodes one inside the other, the last of which has the mesh."""
+    extra = {"matrix": MATRIX} if matrices else {}
+    nodes = [{"children": [k + 1], **extra} for k in range(count - 1)]
+    return glb(document(nodes=[*nodes, {"mesh": 0}]), BINARY)
+
+
+def doubling(deep: int) -> bytes:
+    """Nodes that hold the next one twice: a thousand million places in a kilobyte."""
+    return glb(document(nodes=[*({"children": [k + 1, k + 1]} for k in range(deep)), {"mesh": 0}]), BINARY)
+
+
+def ring() -> bytes:
+    """A node among its own descendants."""
+    return glb(document(nodes=[{"children": [1], "mesh": 0}, {"children": [0]}]), BINARY)
+
+
+def graph(count: int) -> bytes:
+    """Half of the nodes hold all of the other half: as many ways as a quarter of the square of the nodes."""
+    half = count // 2
+    nodes = [
+        {"children": list(range(1, half))},
+        *({"children": list(range(half, count)), "matrix": MATRIX} for _ in range(1, half)),
+        *({} for _ in range(half, count - 1)),
+        {"mesh": 0},
+    ]
+    return glb(document(nodes=nodes), BINARY)
+
+
+@hostile
+def obj_of_vertices(size: int) -> tuple[str, bytes]:
+    return "obj", filled(size, b"", b"v 1 2 3\n", b"f 1 2 3\n")
+
+
+@hostile
+def obj_of_faces(size: int) -> tuple[str, bytes]:
+    return "obj", filled(size, b"v 1 2 3\n", b"f 1 1 1\n")
+
+
+@hostile
+def obj_of_one_polygon(size: int) -> tuple[str, bytes]:
+    return "obj", filled(size, b"v 1 2 3\n" * 3 + b"f", b" 1")
+
+
+@hostile
+def obj_of_long_polygons(size: int) -> tuple[str, bytes]:
+    return "obj", filled(size, b"v 1 2 3\n" * 3, filled(MIB, b"f", b" 1", b"\n"))
+
+
+@hostile
+def obj_of_long_texture_lines(size: int) -> tuple[str, bytes]:
+    return "obj", filled(size, b"v 1 2 3\n" * 3, filled(MIB, b"vt", b" 1", b"\n"))
+
+
+@hostile
+def obj_of_empty_lines(size: int) -> tuple[str, bytes]:
+    return "obj", b"\n" * size
+
+
+@hostile
+def obj_of_short_lines(size: int) -> tuple[str, bytes]:
+    return "obj", filled(size, b"", b"g\r")
+
+
+@hostile
+def obj_of_remarks(size: int) -> tuple[str, bytes]:
+    return "obj", filled(size, b"", b"#\n")
+
+
+@hostile
+def obj_of_spaces(size: int) -> tuple[str, bytes]:
+    return "obj", b" " * size
+
+
+@hostile
+def obj_of_nothing_but_digits(size: int) -> tuple[str, bytes]:
+    return "obj", filled(size, b"v 1 2 ", b"9")
+
+
+@hostile
+def obj_of_long_numbers(size: int) -> tuple[str, bytes]:
+    return "obj", filled(size, b"", filled(MIB, b"v 1 2 0.", b"9", b"\n"))
+
+
+@hostile
+def obj_of_long_whole_numbers(size: int) -> tuple[str, bytes]:
+    return "obj", filled(size, b"v 1 2 3\n", filled(MIB, b"f 1 1 ", b"1", b"\n"))
+
+
+@hostile
+def off_of_remarks(size: int) -> tuple[str, bytes]:
+    return "off", filled(size, b"OFF\n", b"# \n")
+
+
+@hostile
+def off_that_boasts(size: int) -> tuple[str, bytes]:
+    return "off", filled(size, b"OFF 1000000000000 1000000000000 0\n", b"1 2 3\n")
+
+
+@hostile
+def off_of_long_lines(size: int) -> tuple[str, bytes]:
+    return "off", filled(size, b"OFF 1000 1 0\n", filled(MIB, b"1 2 3", b" 4", b"\n"))
+
+
+@hostile
+def off_of_polygons(size: int) -> tuple[str, bytes]:
+    return "off", filled(size, b"OFF 1 60000 0\n1 2 3\n", b"30" + b" 0" * 30 + b"\n")
+
+
+def ply_head(kind: str, *lines: str) -> bytes:
+    return "\n".join(["ply", f"format {kind} 1.0", *lines, "end_header", ""]).encode()
+
+
+XYZ = ("property float x", "property float y", "property float z")
+INDICES = "property list uchar int vertex_indices"
+
+
+@hostile
+def ply_that_boasts(size: int) -> tuple[str, bytes]:
+    head = ply_head("binary_little_endian", f"element vertex {10**15}", *XYZ, f"element face {10**15}", INDICES)
+    return "ply", filled(size, head, b"\0")
+
+
+@hostile
+def ply_that_boasts_in_text(size: int) -> tuple[str, bytes]:
+    head = ply_head("ascii", f"element vertex {10**15}", *XYZ, f"element face {10**15}", INDICES)
+    return "ply", filled(size, head, b"1 2 3\n")
+
+
+@hostile
+def ply_of_other_rows(size: int) -> tuple[str, bytes]:
+    head = ply_head("ascii", f"element camera {10**15}", "property int x", "element vertex 1", *XYZ)
+    return "ply", filled(size, head, b"1\n")
+
+
+@hostile
+def ply_of_lists(size: int) -> tuple[str, bytes]:
+    """Faces of different lengths, which have to be looked at one by one, with lists of other things."""
+    lists = [f"property list uchar uchar l{k}" for k in range(3)]
+    scalars = [f"property uchar s{k}" for k in range(250)]
+    head = ply_head("binary_big_endian", "element vertex 1", *XYZ, "element face 65000", *lists, *scalars, INDICES)
+    row = bytes(3 + 250)
+    return "ply", filled(size, head + bytes(12) + row + b"\4" + bytes(16), row + b"\3" + bytes(12))
+
+
+@hostile
+def ply_of_one_list(size: int) -> tuple[str, bytes]:
+    head = ply_head(
+        "binary_little_endian", "element vertex 1", *XYZ, "element face 1", "property list uint uchar vertex_indices"
+    )
+    return "ply", filled(size, head + bytes(12) + struct.pack("<I", size - 500), b"\0")
+
+
+@hostile
+def ply_of_many_properties(size: int) -> tuple[str, bytes]:
+    lines = [f"property list uchar int l{k}" for k in range(1500)]
+    head = ply_head("ascii", "element vertex 1", *XYZ, "element face 65000", *lines, INDICES)
+    return "ply", filled(size, head + b"0 0 0\n", b"0 " * 1500 + b"3 0 0 0\n")
+
+
+@hostile
+def ply_without_end(size: int) -> tuple[str, bytes]:
+    return "ply", filled(size, b"ply\nformat ascii 1.0\n", b"comment x\n")
+
+
+@hostile
+def stl_of_triangles(size: int) -> tuple[str, bytes]:
+    count = (size - 84) // 50
+    return "stl", bytes(80) + struct.pack("<I", count) + bytes(50 * count)
+
+
+@hostile
+def stl_that_boasts(size: int) -> tuple[str, bytes]:
+    return "stl", bytes(80) + struct.pack("<I", 2**32 - 1) + bytes(size - 84)
+
+
+@hostile
+def stl_of_text(size: int) -> tuple[str, bytes]:
+    return "stl", filled(size, b"solid\n", b"vertex 0 0 0\n", b"endsolid\n")
+
+
+@hostile
+def stl_of_solids(size: int) -> tuple[str, bytes]:
+    return "stl", filled(size, b"", b"solid\nendsolid\n")
+
+
+@hostile
+def stl_of_one_line(size: int) -> tuple[str, bytes]:
+    return "stl", filled(size, b"solid", b" vertex 0 0 0")
+
+
+def archive(
+    members: dict[str, bytes], method: int = zipfile.ZIP_DEFLATED, patch: tuple[int, int, str] | None = None
+) -> bytes:
+    """An archive; all entries of its directory may get another value of a field: place, value, type."""
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", method, compresslevel=1) as file:
+        for name, content in members.items():
+            file.writestr(name, content)
+    data = bytearray(buffer.getvalue())
+    place = data.find(b"PK\x01\x02") if patch else -1
+    while patch and place >= 0:
+        struct.pack_into(patch[2], data, place + patch[0], patch[1])
+        place = data.find(b"PK\x01\x02", place + 4)
+    return bytes(data)
+
+
+def npy(shape: str, data: bytes = b"", kind: str = "<f8") -> bytes:
+    text = f"{{'descr': '{kind}', 'fortran_order': False, 'shape': {shape}, }}\n".encode()
+    return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(text)) + text + data
+
+
+ZEROS = npy("(2796202, 3)", bytes(64 * MIB))
+
+
+@hostile
+def npz_of_zeros(size: int) -> tuple[str, bytes]:
+    """Sixty-four MiB of nothing, which deflate to sixty-four KiB."""
+    return "npz", archive({"vertices.npy": ZEROS, "faces.npy": ZEROS})
+
+
+@hostile
+def npz_whose_directory_lies(size: int) -> tuple[str, bytes]:
+    """The same, said to be of a few bytes."""
+    return "npz", archive({"vertices.npy": ZEROS, "faces.npy": ZEROS}, patch=(24, 1000, "<I"))
+
+
+@hostile
+def npz_whose_array_boasts(size: int) -> tuple[str, bytes]:
+    member = npy(f"({10**17}, 3)", bytes(24))
+    return "npz", archive({"vertices.npy": member, "faces.npy": member})
+
+
+@hostile
+def npz_of_long_text(size: int) -> tuple[str, bytes]:
+    """A few entries of half a MiB each, which deflate well."""
+    member = npy("(64, 3)", bytes(96 * MIB), f"<U{MIB // 8}")
+    return "npz", archive({"vertices.npy": member, "faces.npy": member})
+
+
+@hostile
+def npz_with_a_long_head(size: int) -> tuple[str, bytes]:
+    """A head of 96 MiB, which deflates to half a MiB."""
+    member = b"\x93NUMPY\x02\x00" + struct.pack("<I", 96 * MIB) + bytes(96 * MIB)
+    return "npz", archive({"vertices.npy": member, "faces.npy": member})
+
+
+@hostile
+def npz_of_many_members(size: int) -> tuple[str, bytes]:
+    """As many entries as its directory has room for."""
+    entry = struct.pack("<4s4B4HL2L5H2L", b"PK\1\2", 20, 3, 20, 0, 0, 0, 0, 0, 0, 0, 0, 1, 0, 0, 0, 0, 0, 0) + b"a"
+    directory = entry * ((size - 100) // len(entry))
+    return "npz", directory + struct.pack("<4s4H2LH", b"PK\5\6", 0, 0, 65535, 65535, len(directory), 0, 0)
+
+
+@hostile
+def npz_of_a_thousand_members(size: int) -> tuple[str, bytes]:
+    """Each of which unpacks to a head and a quarter of a MiB."""
+    more = {f"{k}.npy": npy("(32768,)", bytes(MIB // 4)) for k in range(990)}
+    small = {"vertices.npy": npy("(4, 3)", bytes(96)), "faces.npy": npy("(4, 3)", bytes(96), "<i8")}
+    return "npz", archive(more | small)
+
+
+@hostile
+def npz_by_another_method(size: int) -> tuple[str, bytes]:
+    """LZMA takes as much memory as its head says."""
+    member = npy("(10922, 3)", bytes(MIB // 4))
+    return "npz", archive({"vertices.npy": member, "faces.npy": member}, zipfile.ZIP_LZMA)
+
+
+@hostile
+def npz_that_is_encrypted(size: int) -> tuple[str, bytes]:
+    return "npz", archive({"vertices.npy": ZEROS, "faces.npy": ZEROS}, patch=(8, 1, "<H"))
+
+
+@hostile
+def json_of_vertices(size: int) -> tuple[str, bytes]:
+    return "json", filled(size, b'{"vertices": [', b"[1,2,3],", b"[1,2,3]]}")
+
+
+@hostile
+def json_of_numbers(size: int) -> tuple[str, bytes]:
+    return "json", filled(size, b'{"vertices": [', b"1.5,", b"1]}")
+
+
+@hostile
+def json_of_objects(size: int) -> tuple[str, bytes]:
+    return "json", filled(size, b'{"vertices": [', b'{"a":1},', b"1]}")
+
+
+@hostile
+def json_of_names(size: int) -> tuple[str, bytes]:
+    return "json", filled(size, b'{"vertices": [', b'"a",', b"1]}")
+
+
+@hostile
+def json_of_spaces(size: int) -> tuple[str, bytes]:
+    return "json", filled(size, b'{"vertices": [[1, 2, 3]]', b" ", b"}")
+
+
+@hostile
+def json_of_one_wide_string(size: int) -> tuple[str, bytes]:
+    """One character beyond the first plane, and every other takes four bytes too."""
+    return "json", filled(min(size, 13 * MIB), b'{"name": "\xf0\x9f\x98\x80', b"a", b'"}')
+
+
+@hostile
+def json_with_an_escape(size: int) -> tuple[str, bytes]:
+    """The same in ASCII, and wrong at its end, where the error holds all of it."""
+    return "json", filled(min(size, 13 * MIB), b'{"name": "\\ud83d\\ude00', b"a", b'"}}')
+
+
+@hostile
+def json_of_nesting(size: int) -> tuple[str, bytes]:
+    return "json", b"[" * size
+
+
+@hostile
+def json_as_large_as_it_may_be(size: int) -> tuple[str, bytes]:
+    rows, faces = b",".join([b"[1.23456789,2.3456789,3.456789]"] * 32_768), b",".join([b"[3234,3235,3236]"] * 65_536)
+    return "json", b'{"name": "\xf0\x9f\x98\x80", "vertices": [' + rows + b'], "faces": [' + faces + b"]}"
+
+
+@hostile
+def glb_of_nodes(size: int) -> tuple[str, bytes]:
+    return "glb", glb(document(nodes=[{"mesh": 0}] * 10**6, scenes=[{"nodes": list(range(10**6))}]), BINARY)
+
+
+@hostile
+def glb_of_many_places(size: int) -> tuple[str, bytes]:
+    """As many nodes as its JSON may have values, each with a transformation."""
+    nodes: list[dict[str, object]] = [{"scale": [1, 2, 1], "translation": [k, 1, 2]} for k in range(24_000)]
+    return "glb", glb(document(nodes=nodes, scenes=[{"nodes": list(range(len(nodes)))}]), BINARY)
+
+
+@hostile
+def glb_of_long_chain(size: int) -> tuple[str, bytes]:
+    return "glb", chain(9_990)
+
+
+@hostile
+def glb_of_deep_json(size: int) -> tuple[str, bytes]:
+    return "glb", glb(b"[" * (size - 100))
+
+
+@hostile
+def glb_of_small_values(size: int) -> tuple[str, bytes]:
+    return "glb", glb(filled(min(size, 4 * MIB), b'{"extras": [', b'{"a":1},', b"1]}"))
+
+
+@hostile
+def glb_of_as_many_values_as_it_may_have(size: int) -> tuple[str, bytes]:
+    text = json.dumps(document(extras=[{f"{k}": k / 7} for k in range(124_000)]), separators=(",", ":"))
+    return "glb", glb(text.encode(), BINARY)
+
+
+@hostile
+def glb_of_a_wide_name(size: int) -> tuple[str, bytes]:
+    return "glb", glb(filled(4 * MIB, b'{"extras": "\xf0\x9f\x98\x80', b"a", b'"}'), bytes(max(0, size - 5 * MIB)))
+
+
+@hostile
+def glb_of_vertices(size: int) -> tuple[str, bytes]:
+    """An accessor onto all there is, with a thousand primitives."""
+    data = bytes(size - 3000)
+    count = len(data) // 12
+    tree = document(
+        buffers=[{"byteLength": len(data)}],
+        bufferViews=[{"buffer": 0, "byteLength": len(data)}],
+        accessors=[{"bufferView": 0, "componentType": 5126, "type": "VEC3", "count": count // 3 * 3}],
+        meshes=[{"primitives": [{"attributes": {"POSITION": 0}}]}],
+    )
+    return "glb", glb(tree, data)
+
+
+@hostile
+def glb_of_nothing(size: int) -> tuple[str, bytes]:
+    """Matrices without any data behind them."""
+    tree = document(accessors=[{"componentType": 5126, "type": "MAT4", "count": 10**9}] * 2)
+    return "glb", glb(tree, bytes(size - 3000))
+
+
+def embedded(data: bytes, **more: object) -> bytes:
+    tree = document(**more)
+    uri = "data:application/octet-stream;base64," + base64.b64encode(data).decode()
+    tree["buffers"] = [{"byteLength": len(data), "uri": uri}]
+    return json.dumps(tree, separators=(",", ":")).encode()
+
+
+@hostile
+def gltf_of_one_buffer(size: int) -> tuple[str, bytes]:
+    """A mesh at both ends of as much data as there can be."""
+    data = VERTICES.tobytes() + bytes((size - 3000) // 4 * 3 - len(BINARY)) + FACES.tobytes()
+    places = (0, VERTICES.nbytes), (len(data) - FACES.nbytes, FACES.nbytes)
+    return "gltf", embedded(data, bufferViews=[{"buffer": 0, "byteOffset": a, "byteLength": b} for a, b in places])
+
+
+@hostile
+def gltf_of_strides(size: int) -> tuple[str, bytes]:
+    """Vertices as far from each other as they may be."""
+    count = 32_000
+    data = bytes(252 * count)
+    return "gltf", embedded(
+        data,
+        bufferViews=[{"buffer": 0, "byteLength": len(data), "byteStride": 252}],
+        accessors=[{"bufferView": 0, "componentType": 5126, "type": "VEC3", "count": count // 3 * 3}],
+        meshes=[{"primitives": [{"attributes": {"POSITION": 0}}]}],
+    )
+
+
+@hostile
+def gltf_of_many_buffers(size: int) -> tuple[str, bytes]:
+    return "gltf", filled(size, b'{"buffers": [', b'{"uri":"data:,"},', b"{}]}")
+
+
+@hostile
+def gltf_of_escapes(size: int) -> tuple[str, bytes]:
+    return "gltf", filled(size, b'{"buffers": [{"uri": "data:;base64,\\/', b"A", b'"}]}')
+
+
+@hostile
+def gltf_of_spaces(size: int) -> tuple[str, bytes]:
+    return "gltf", filled(size, b"{", b" ", b"}")
+
+
+@hostile
+def form_of_parts(size: int) -> tuple[str, bytes]:
+    part = b'--b\r\nContent-Disposition: form-data; name="a"\r\n\r\n\r\n'
+    return FORM, filled(size, b"", part, b"--b--\r\n")
+
+
+@hostile
+def form_of_almost_boundaries(size: int) -> tuple[str, bytes]:
+    return FORM, filled(size, b'--b\r\nContent-Disposition: form-data; name="f"; filename="a.obj"\r\n\r\n', b"\r\n--bX")
+
+
+@hostile
+def form_of_line_ends(size: int) -> tuple[str, bytes]:
+    return FORM, filled(size, b'--b\r\nContent-Disposition: form-data; name="f"; filename="a.obj"\r\n\r\n', b"\r\n-")
+
+
+@hostile
+def form_of_headers(size: int) -> tuple[str, bytes]:
+    return FORM, filled(size, b"--b\r\n", b"a: b\r\n")
+
+
+@hostile
+def form_with_a_long_header(size: int) -> tuple[str, bytes]:
+    return FORM, filled(size, b"--b\r\nContent-Disposition: ", b";a=b")
+
+
+@hostile
+def form_of_nothing(size: int) -> tuple[str, bytes]:
+    return FORM, b"\r\n" * (size // 2)
+
+
+@hostile
+def form_with_an_obj(size: int) -> tuple[str, bytes]:
+    head = b'--b\r\nContent-Disposition: form-data; name="f"; filename="a.obj"\r\n\r\n'
+    return FORM, filled(size, head, b"v 1 2 3\n", b"\r\n--b--\r\n")
