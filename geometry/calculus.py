@@ -21,9 +21,9 @@ from numpy.typing import ArrayLike
 
 from geometry.cholesky import Backend, Cholesky, analyse
 from geometry.energy import Material, RestShape, ShellEnergy
-from geometry.mesh import FloatArray, TriangleMesh
+from geometry.mesh import FloatArray, TriangleMesh, face_areas
 from geometry.normal_matrix import NormalMatrix, QuadraticForm
-from geometry.nric import NRICGradients, NRICJacobian, nric, wrap
+from geometry.nric import NRICGradients, NRICJacobian, edge_lengths, nric, wrap
 from geometry.rigid import rigid_motions, without_rigid_motion
 from geometry.status import Status
 from geometry.turning import Turning
@@ -32,6 +32,8 @@ from geometry.turning import Turning
 TOLERANCE = 1e-9
 #: A face below this part of its area after one step has collapsed; the energy's barrier is near.
 SMALLEST_AREA_RATIO = 1e-3
+#: Most of its area that a face may lose in a step of a descent.
+LARGEST_LOSS = 0.8
 #: An angle that changes by more than this in one step has passed through a fold or a collapsed face.
 LARGEST_TURN = 0.75 * np.pi
 
@@ -99,6 +101,20 @@ def fault_between(old: Point, new: Point) -> str | None:
         i, j = new.space.connectivity.edges[worst]
         return f"the faces at edge ({i}, {j}) turn by {np.degrees(turn[worst]):.0f}° in one step"
     return None
+
+
+def keeps_faces(space: ShellSpace, old: FloatArray, new: FloatArray) -> bool:
+    """Whether no face (F,) of shapes (…, V, 3) loses more than LARGEST_LOSS of its area from old to new.
+
+    The energy is infinite where a face has no area, but a step may pass over that and leave the face turned over.
+    """
+    before, after = (face_areas(x, space.connectivity.faces) for x in (old, new))
+    return bool((after >= (1 - LARGEST_LOSS) * before).all())
+
+
+def edge_length(space: ShellSpace) -> float:
+    """Mean length of the reference's edges."""
+    return float(edge_lengths(space.reference.vertices, space.connectivity).mean())
 
 
 class ChordSolver:

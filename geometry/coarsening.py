@@ -4,20 +4,18 @@ from __future__ import annotations
 
 import heapq
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from geometry.mesh import Connectivity, FloatArray, IntArray, MeshError, TriangleMesh
+from geometry.mesh import Connectivity, FloatArray, IntArray, MeshError, TriangleMesh, face_areas
 from geometry.quadrics import monomials, quadrics_of
+from geometry.thinning import thin
 from geometry.triangle_quality import (
     FOLD_LIMIT,
+    Triangles,
     dots,
     folded_pairs,
-    normals_and_sides,
-    quality,
-    squared_sines,
-    unit,
 )
 
 #: Smallest angle (degrees) that a collapse may leave in any shape: the first limit until no collapse is left,
@@ -30,12 +28,20 @@ TURN_LIMIT = np.cos(np.deg2rad(60))
 SMALL = 1.0
 #: Share of the vertices kept back to heal slivers and folds that the fine mesh has already.
 HEALING_SHARE = 0.1
+#: Share of the vertices that remain, whatever thin parts lose that can't be had without slivers.
+LEAST_SHARE = 0.5
 #: Shapes, spread evenly over the collection, whose quadrics are summed; every shape is checked.
 QUADRIC_SHAPES = 16
 #: Weight of the squared distance that a vertex moves against that of the planes of the faces. A large one makes faces
 #: even, which networks learn better, but a geodesic ends where a face collapses: of the meshes with the fewest folds
 #: the first is taken whose worst face keeps nearly as much of its area, as a share of the most that one of them keeps.
 MOTION_WEIGHTS, NEARLY = (1.0, 0.1, 0.01), 0.9
+
+#: A mesh of more vertices than that, and than so many times the target's, is thinned first; and to how many.
+LARGE, PLENTY = 20_000, 20
+THINNED, ENOUGH = 5000, 8
+#: Shapes, spread evenly, that thinning looks at.
+THINNED_SHAPES = 4
 
 _Face = tuple[int, int, int]
 
@@ -50,7 +56,9 @@ class Coarsening:
         smallest_angle: over all faces of all shapes, radians.
         folds: pairs of neighbouring faces that are folded onto one another in some shape.
         shrinkage: smallest area of a face in a shape, as a share of the face's geometric mean over all shapes.
-        reason: why there are more vertices than asked for, in words; empty if there are not.
+        smallest_area: of a face in a shape, as a share of the mean over the faces of that shape.
+        specks: faces that in some shape are below the least area or angle (``triangle_quality``).
+        reason: why there are more or fewer vertices than asked for, or specks, in words; empty if there are none.
     """
 
     fine_index: IntArray
@@ -58,6 +66,8 @@ class Coarsening:
     smallest_angle: float
     folds: int
     shrinkage: float
+    smallest_area: float = 1.0
+    specks: int = 0
     reason: str = ""
 
 
@@ -68,9 +78,14 @@ def coarsen(fine: TriangleMesh, target: int, shapes: FloatArray) -> Coarsening:
     coarse vertex is a fine one and the coarse faces are faces of any shape. The cheapest goes first, by the
     quadrics of several shapes together, so that bent poses count too. Refused is what changes the topology
     (link condition, boundary loops stay) and what would leave, in the reference or any shape, a sliver, a
-    face turned over, or two neighbours folded onto one another, unless it was worse there before. The limit on
-    slivers is relaxed only once nothing else is left. Slivers and folds of the fine mesh itself are healed
-    where a collapse or an edge flip makes them fewer, over all shapes; ``smallest_angle`` says what is left.
+    face turned over, two neighbours folded onto one another, or a speck: a face whose area is next to nothing beside
+    the others', or next to nothing in one shape of what it is in the others; unless it was worse there before. The
+    limit on slivers is relaxed only once nothing else is left. Slivers, folds and specks of the fine mesh itself are
+    healed where a collapse or an edge flip makes them fewer, over all shapes. In the end thin parts that can't be had
+    without slivers or specks lose vertices, and are left to the fine mesh; the result says what remains.
+
+    Each collapse costs a part of a millisecond, so a large mesh is thinned by many at once first, with an eye on a few
+    shapes; in time about linear in its vertices.
 
     Args:
         fine: the reference.
@@ -83,28 +98,69 @@ def coarsen(fine: TriangleMesh, target: int, shapes: FloatArray) -> Coarsening:
     shapes = np.asarray(shapes, dtype=np.float64)
     if shapes.ndim != 3 or shapes.shape[1:] != fine.vertices.shape:
         raise MeshError(f"shapes must be (n, {len(fine.vertices)}, 3), not {shapes.shape}")
-    bad = np.flatnonzero(~np.isfinite(shapes).all(axis=(1, 2)))
-    if len(bad):
+    bad = [k for k, shape in enumerate(shapes) if not np.isfinite(shape).all()]
+    if bad:
         raise MeshError(f"shape {bad[0]} has a coordinate that is not finite")
+    if len(fine.vertices) <= max(LARGE, PLENTY * target):
+        return _best(fine, target, shapes)
+    some = np.unique(np.linspace(0, len(shapes) - 1, THINNED_SHAPES).astype(int)) if len(shapes) else ()
+    few = np.stack([fine.vertices, *(shapes[k] for k in some)])
+    kept, faces = thin(fine.connectivity, few, max(THINNED, ENOUGH * target))
+    found = _best(TriangleMesh.from_arrays(fine.vertices[kept], faces), target, shapes[:, kept])
+    return replace(found, fine_index=kept[found.fine_index])
+
+
+def _best(fine: TriangleMesh, target: int, shapes: FloatArray) -> Coarsening:
+    """The best that one of the weights of motion leads to."""
     shapes = np.concatenate([fine.vertices[None], shapes])
     found = [_coarsen(fine, target, shapes, weight) for weight in MOTION_WEIGHTS]
-    fewest = min(coarsening.folds for coarsening in found)
-    found = [coarsening for coarsening in found if coarsening.folds == fewest]
+    fewest = min((coarsening.specks, coarsening.folds) for coarsening in found)
+    found = [coarsening for coarsening in found if (coarsening.specks, coarsening.folds) == fewest]
     most = max(coarsening.shrinkage for coarsening in found)
     return next(coarsening for coarsening in found if coarsening.shrinkage >= NEARLY * most)
 
 
 def _coarsen(fine: TriangleMesh, target: int, shapes: FloatArray, motion_weight: float) -> Coarsening:
+    first = _decimated(fine, target, target, shapes, motion_weight)
+    lost = target - first.count
+    # What thin parts have lost goes to the others.
+    return (_decimated(fine, target, target + lost, shapes, motion_weight) if lost > 0 else first).result(target)
+
+
+def _decimated(fine: TriangleMesh, target: int, wanted: int, shapes: FloatArray, motion_weight: float) -> _Decimation:
+    """The mesh with ``target`` vertices left, or fewer, of which thin parts lose some once there are ``wanted``."""
     edge = np.sqrt(2 / np.sqrt(3) * fine.area / target)
-    decimation = _Decimation(fine.connectivity, shapes, SMALL * edge, motion_weight)
+    # A closed surface has twice as many faces as vertices, and the others hardly fewer.
+    areas = face_areas(shapes, fine.faces).sum(axis=1) / (2 * target)
+    decimation = _Decimation(fine.connectivity, shapes, areas, SMALL * edge, motion_weight)
     sines = np.sin(np.deg2rad(ANGLE_LIMITS))
-    spare = int((1 + HEALING_SHARE) * target)
+    spare = int((1 + HEALING_SHARE) * wanted)
     if any(decimation.run(spare, sine) for sine in sines):
         for sine in sines[:0:-1]:  # the worst first
-            decimation.heal(target, sine)
+            decimation.heal(wanted, sine)
+        any(decimation.run(wanted, sine) for sine in sines)
+        decimation.heal(wanted, sines[-1])
+        decimation.heal(int(LEAST_SHARE * target), sines[-1], folds=False)
         any(decimation.run(target, sine) for sine in sines)
-        decimation.heal(target, sines[-1])
-    return decimation.result(target)
+    return decimation
+
+
+def _reason(count: int, target: int, specks: int) -> str:
+    """What isn't as it was asked for, and why."""
+    parts = []
+    if count > target:
+        parts.append(
+            f"{count} vertices instead of {target}: any other collapse would change the topology, or leave a sliver or "
+            "a fold in some shape"
+        )
+    elif count < target:
+        parts.append(
+            f"{count} vertices instead of {target}: thin parts that could only be had with slivers are left to the "
+            "fine mesh"
+        )
+    if specks:
+        parts.append(f"{specks} faces have next to no area or height in some shape, and no collapse or flip mends that")
+    return "; ".join(parts)
 
 
 class _Decimation:
@@ -113,12 +169,15 @@ class _Decimation:
     Args:
         connectivity: fine.
         shapes: (n, Vf, 3).
+        areas: (n,) what a coarse face will have on average.
         small: see SMALL, as a length.
         motion_weight: one of MOTION_WEIGHTS.
     """
 
-    def __init__(self, connectivity: Connectivity, shapes: FloatArray, small: float, motion_weight: float) -> None:
-        self.small, self.motion_weight = small, motion_weight
+    def __init__(
+        self, connectivity: Connectivity, shapes: FloatArray, areas: FloatArray, small: float, motion_weight: float
+    ) -> None:
+        self.small, self.motion_weight, self.mean_areas = small, motion_weight, areas
         centred = shapes - shapes.mean(axis=1, keepdims=True)
         # Vertex first: a check gathers a few vertices of every shape.
         self.points = np.ascontiguousarray(np.moveaxis(centred, 0, 1))
@@ -159,9 +218,9 @@ class _Decimation:
                 self.refused.setdefault(u, []).append(entry)
         return self.count <= target
 
-    def heal(self, target: int, sine: float) -> None:
-        """Make slivers and folds fewer by flips, and by collapses as long as there are over ``target`` vertices."""
-        while vertices := self._faulty(sine):
+    def heal(self, target: int, sine: float, *, folds: bool = True) -> None:
+        """Make slivers, specks and folds fewer by flips, and by collapses while there are over ``target`` vertices."""
+        while vertices := self._faulty(sine, folds=folds):
             changed = [self._flip_one(u, sine) or self._collapse_one([u], target, sine, heal=True) for u in vertices]
             if any(changed):
                 continue
@@ -175,27 +234,33 @@ class _Decimation:
         fine_index, local = np.unique(list(self.faces.values()), return_inverse=True)
         connectivity = Connectivity(local.reshape(-1, 3), len(fine_index))
         faces = connectivity.faces
-        normals, squares = normals_and_sides(self.points[fine_index[faces.T]])
-        sine = np.sqrt(squared_sines(normals, squares).min())
-        folds = len(folded_pairs(connectivity, normals))
-        areas = np.log(dots(normals, normals).clip(1e-300)) / 2
-        shrinkage = float(np.exp((areas - areas.mean(axis=1, keepdims=True)).min()))
-        reason = ""
-        if len(fine_index) > target:
-            reason = (
-                f"{len(fine_index)} vertices instead of {target}: any other collapse would change the topology, or "
-                "leave a sliver or a fold in some shape"
-            )
-        return Coarsening(fine_index, faces, float(np.arcsin(min(sine, 1.0))), folds, shrinkage, reason)
+        triangles = self._triangles(fine_index[faces])
+        areas = (triangles.areas * self.mean_areas).clip(1e-300)
+        shrinkage = float(np.exp((np.log(areas) - np.log(areas).mean(axis=1, keepdims=True)).min()))
+        specks = int((triangles.sizes < 1).any(axis=1).sum())
+        return Coarsening(
+            fine_index,
+            faces,
+            float(np.arcsin(min(np.sqrt(triangles.sines.min()), 1.0))),
+            len(folded_pairs(connectivity, triangles.normals)),
+            shrinkage,
+            float((areas / areas.mean(axis=0)).min()),
+            specks,
+            _reason(len(fine_index), target, specks),
+        )
 
-    def _faulty(self, sine: float) -> list[int]:
-        """Vertices of slivers and folds in any shape."""
+    def _triangles(self, faces: IntArray) -> Triangles:
+        return Triangles.of(self.points[faces.T], self.mean_areas)
+
+    def _faulty(self, sine: float, *, folds: bool) -> list[int]:
+        """Vertices of slivers, specks and, where asked for, folds in any shape."""
         faces = np.array(list(self.faces.values()))
         used, local = np.unique(faces, return_inverse=True)
         connectivity = Connectivity(local.reshape(-1, 3), len(used))
-        normals, squares = normals_and_sides(self.points[faces.T])
-        bad = np.asarray((squared_sines(normals, squares) < sine**2).any(axis=1))
-        bad[folded_pairs(connectivity, normals).ravel()] = True
+        triangles = self._triangles(faces)
+        bad = np.asarray(((triangles.sines < sine**2) | (triangles.sizes < 1)).any(axis=1))
+        if folds:
+            bad[folded_pairs(connectivity, triangles.normals).ravel()] = True
         vertices: list[int] = np.unique(faces[bad]).tolist()
         return vertices
 
@@ -291,17 +356,18 @@ class _Decimation:
         for i in range(k):
             if gone[i]:
                 rows[k + i] = rows[i]
-        normals, squares = normals_and_sides(self.points[np.array(rows).T])
-        sines, normals = squared_sines(normals, squares), unit(normals)
+        triangles = self._triangles(np.array(rows))
         kept = [(i, j) for i, j in after if i is not None and j is not None]
-        was = quality(sines, normals, list(range(k)), before, sine)
-        becomes = quality(sines, normals, [k + i for i in stays], kept, sine)
+        was = triangles.quality(list(range(k)), before, sine)
+        becomes = triangles.quality([k + i for i in stays], kept, sine)
+        if becomes.size < min(1, was.size):
+            return False
         if heal:
             return becomes.faults < was.faults
         no_more = becomes.slivers <= was.slivers and becomes.folds <= was.folds
-        if was.faults and no_more and squares[:, :k].max() <= self.small**2:
+        if was.slivers + was.folds and no_more and triangles.squares[:, :k].max() <= self.small**2:
             return True
-        turns = dots(normals[stays], normals[[k + i for i in stays]])
+        turns = dots(triangles.normals[stays], triangles.normals[[k + i for i in stays]])
         return (
             becomes.sine >= min(sine**2, was.sine)
             and becomes.fold >= min(FOLD_LIMIT, was.fold)
@@ -357,10 +423,9 @@ class _Decimation:
                     before.append((i, len(rows)))
                     after.append((j, len(rows)))
                     rows.append(self.faces[h])
-            normals, squares = normals_and_sides(self.points[np.array(rows).T])
-            sines, normals = squared_sines(normals, squares), unit(normals)
-            was = quality(sines, normals, [0, 1], before, sine)
-            if quality(sines, normals, [2, 3], after, sine).faults < was.faults:
+            triangles = self._triangles(np.array(rows))
+            was = triangles.quality([0, 1], before, sine)
+            if triangles.quality([2, 3], after, sine).faults < was.faults:
                 self.faces[f], self.faces[g] = new
                 self.star[u].discard(g)
                 self.star[w].discard(f)

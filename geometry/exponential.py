@@ -12,6 +12,7 @@ from scipy.sparse.linalg import splu
 from geometry.anderson import Anderson
 from geometry.calculus import TOLERANCE, Path, Point, ShellSpace, fault_between
 from geometry.cholesky import NotPositiveDefiniteError
+from geometry.deadline import Deadline
 from geometry.mesh import FloatArray
 from geometry.normal_matrix import NormalMatrix
 from geometry.rigid import without_rigid_motion
@@ -28,7 +29,7 @@ PATIENCE = 1
 SLOW = 0.5
 #: Iterations of exact Newton, and the smallest step tried. Those that converge need 4 to 8; where it takes more, a face
 #: is collapsing, and a path that is dragged on ends a few steps later (measured on posed bodies).
-NEWTON_ITERATIONS = 10
+NEWTON_ITERATIONS = 12
 SMALLEST_STEP = 1 / 16
 
 
@@ -39,6 +40,7 @@ def exponential(
     steps: int = 16,
     *,
     tolerance: float = TOLERANCE,
+    deadline: Deadline | None = None,
 ) -> Path:
     """Shoot the discrete geodesic of K steps: ``X_1 = X_0 + d/K``, then one equation after the other.
 
@@ -53,6 +55,7 @@ def exponential(
             through it with this velocity, which agree with ``−velocity`` to first order in 1/K, and exactly
             continue a path that was shot forwards.
         tolerance: of ``sqrt(Fᵀ A⁻¹ F)`` at every step.
+        deadline: after which the status is Status.DEADLINE, looked at before every step.
 
     Returns:
         |K| + 1 shapes from X_0 on, fewer where a step failed.
@@ -65,9 +68,9 @@ def exponential(
         return Path(start[None], Status.NOT_FINITE, space, "start or velocity has an entry that is not finite")
     second = start + without_rigid_motion(velocity, start) / abs(steps)
     if steps < 0:
-        path = extrapolate(space, second, start, -steps, forward=False, tolerance=tolerance)
+        path = extrapolate(space, second, start, -steps, forward=False, tolerance=tolerance, deadline=deadline)
         return Path(path.vertices[1:], path.status, space, path.reason, path.iterations, path.residuals)
-    return extrapolate(space, start, second, steps - 1, tolerance=tolerance)
+    return extrapolate(space, start, second, steps - 1, tolerance=tolerance, deadline=deadline)
 
 
 @np.errstate(divide="ignore", over="ignore", invalid="ignore")
@@ -79,6 +82,7 @@ def extrapolate(
     *,
     forward: bool = True,
     tolerance: float = TOLERANCE,
+    deadline: Deadline | None = None,
 ) -> Path:
     """Continue two neighbouring shapes of a discrete geodesic by more of its shapes.
 
@@ -90,6 +94,7 @@ def extrapolate(
         forward: whether time runs forward. W isn't symmetric, so going back is another equation, whose solution
             is exactly the shape that a forward step would have come from.
         tolerance: of ``sqrt(Fᵀ A⁻¹ F)`` at every step.
+        deadline: after which the status is Status.DEADLINE, looked at before every step.
 
     Returns:
         2 + steps shapes, the given ones first; fewer where a step failed.
@@ -105,6 +110,9 @@ def extrapolate(
     # Iterations that the factor took when new, and that it has taken more since then.
     fresh, more, turning = 0, COST, False
     for _ in range(steps):
+        if deadline is not None and deadline.passed:
+            status, reason = Status.DEADLINE, f"step {len(shapes)}: the time was over"
+            break
         equation = _Step(previous, current, forward)
         start = _extrapolated(shapes[-EXTRAPOLATED:])
         wasted, solution = 0, None
@@ -242,6 +250,8 @@ def _newton(equation: _Step, tolerance: float) -> _Solution:
     for iteration in range(NEWTON_ITERATIONS + 1):
         if residual <= tolerance:
             return _checked(equation, point, iteration, residual)
+        if iteration == NEWTON_ITERATIONS:
+            break
         try:
             step = -splu(equation.derivative(point)).solve(forces.ravel()).reshape(-1, 3)
         except RuntimeError:

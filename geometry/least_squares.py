@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import cholesky, solve_triangular
 
+from geometry.deadline import Deadline
 from geometry.mesh import FloatArray
 from geometry.status import Status
 
@@ -56,7 +56,7 @@ def least_squares(
     large: float = np.inf,
     secant: bool = True,
     max_evaluations: int = 40,
-    deadline: float | None = None,
+    deadline: Deadline | None = None,
 ) -> Fit:
     """Minimise ``‖r(x)‖²`` over a box by Gauss–Newton with damping (Levenberg and Marquardt).
 
@@ -77,7 +77,7 @@ def least_squares(
         large: where ``‖r‖`` is less; above, of ``‖r‖`` times this: most of such a residual can't vanish.
         secant: whether Jacobians are worth saving; otherwise one is made at each step.
         max_evaluations: of the residual.
-        deadline: time.monotonic() after which no evaluation begins.
+        deadline: after which no evaluation begins.
     """
     low, high = lower / scale, upper / scale
     u = np.clip(start / scale, low, high)
@@ -92,7 +92,7 @@ def least_squares(
     if not np.isfinite(r).all():
         return fit(Status.NOT_FINITE)
     while evaluations < max_evaluations:
-        if deadline is not None and time.monotonic() > deadline:
+        if deadline is not None and deadline.passed:
             return fit(Status.DEADLINE)
         if not np.isfinite(J).all():
             return fit(Status.STALLED)

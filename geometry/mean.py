@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from geometry.anderson import Anderson
-from geometry.calculus import TOLERANCE, ShellSpace, fault_between
+from geometry.calculus import TOLERANCE, Point, ShellSpace, edge_length, fault_between, keeps_faces
 from geometry.cholesky import NotPositiveDefiniteError
 from geometry.geodesic import Logarithm, logarithm
 from geometry.mesh import FloatArray
+from geometry.newton import descend
 from geometry.status import Status
 
 #: Most iterations of either mean.
@@ -29,6 +30,8 @@ class Mean:
         iterations: shapes tried.
         residual: ``sqrt(Fᵀ A⁻¹ F)``, the length of the step still to go.
         reason: what happened if it did not converge, in words.
+        worst: of the elastic mean, where it did not converge: number of the shape and of the face whose areas in shape
+            and mean are furthest apart.
         logarithms: for the centre of mass, those of the shapes at it, in their order.
     """
 
@@ -38,6 +41,7 @@ class Mean:
     residual: float
     reason: str = ""
     logarithms: tuple[Logarithm, ...] = ()
+    worst: tuple[int, int] | None = None
 
 
 @np.errstate(divide="ignore", over="ignore", invalid="ignore")
@@ -52,7 +56,8 @@ def elastic_mean(
 
     Quasi-Newton with the metric of the current shape: ``Σ w_i ∂₂∂₂W[z_i, z]`` is close to ``Hess₂W[z, z]``,
     whose J-pull-back is positive definite, so that its steps always lower the energy if short enough;
-    Anderson acceleration takes over where full steps do. A first guess of the centre of mass, and cheap.
+    Anderson acceleration takes over where full steps do. Where faces differ so much between the shapes that this is
+    no longer close, Newton's steps go on. A first guess of the centre of mass, and cheap.
 
     Args:
         space: where.
@@ -64,27 +69,84 @@ def elastic_mean(
     fault = _not_finite(shapes)
     if fault:
         return Mean(space.reference.vertices, Status.NOT_FINITE, 0, np.inf, fault)
-    rest = space.energy.rest(space.nric(shapes))
-
-    def value(z: FloatArray) -> float:
-        return float(w @ rest.value(z))
-
+    energy = _MeanEnergy(space, shapes, w)
     if start is None:
-        start = shapes[int(np.argmin([value(space.nric(x)) for x in shapes]))]
-    point, energy = space.point(start), value(space.nric(start))
+        start = shapes[int(np.argmin([energy.value(x) for x in shapes]))]
+    found = _quasi_newton(energy, start)
+    if found.status is Status.CONVERGED:
+        return found
+    iterations, residual, reason = found.iterations, found.residual, found.reason
+    vertices, status = found.vertices, found.status
+    if np.isfinite(energy.value(vertices)):
+        try:
+            more = descend(energy, vertices, TOLERANCE, ITERATIONS)
+        except NotPositiveDefiniteError as error:
+            status, reason = Status.DEGENERATE, str(error)
+        else:
+            iterations, residual, vertices = iterations + more.iterations, more.residual, more.x
+            if more.converged:
+                return Mean(vertices, Status.CONVERGED, iterations, residual)
+            status, reason = Status.STALLED, f"residual {residual:.1e} after {iterations} iterations"
+    else:
+        status, reason = Status.DEGENERATE, "a shape has a face without area"
+    return Mean(vertices, status, iterations, residual, reason, worst=energy.worst(vertices))
+
+
+class _MeanEnergy:
+    """``Σ w_i W[z_i, z(X)]`` of shapes (n, V, 3) with weights (n,); see newton.Energy."""
+
+    def __init__(self, space: ShellSpace, shapes: FloatArray, weights: FloatArray) -> None:
+        self.space, self._weights = space, weights
+        self._rest = space.energy.rest(space.nric(shapes))
+        self.length = edge_length(space)
+
+    def value_of(self, z: FloatArray) -> float:
+        """Of lengths and angles (2E,)."""
+        return float(self._weights @ self._rest.value(z))
+
+    def forces_at(self, point: Point) -> FloatArray:
+        """(V, 3)."""
+        return -point.pull_back(self._weights @ self._rest.gradient_deformed(point.z))
+
+    def value(self, x: FloatArray) -> float:
+        return self.value_of(self.space.nric(x))
+
+    def forces(self, x: FloatArray) -> FloatArray:
+        return self.forces_at(self.space.point(x))
+
+    def admits(self, x: FloatArray, step: FloatArray) -> bool:
+        return keeps_faces(self.space, x, x + step)
+
+    def precondition(self, x: FloatArray) -> Callable[[FloatArray], FloatArray]:
+        self.space.chord.factorise(self.space.point(x))
+        return self.space.chord.solve
+
+    def worst(self, x: FloatArray) -> tuple[int, int]:
+        """The shape and the face whose area is furthest from that in a mean."""
+        ratios = np.abs(np.log(self._rest.areas / self.space.point(x).rest.areas))
+        shape, face = np.unravel_index(np.nan_to_num(ratios, nan=np.inf).argmax(), ratios.shape)
+        return int(shape), int(face)
+
+
+def _quasi_newton(mean: _MeanEnergy, start: FloatArray) -> Mean:
+    space = mean.space
+    point, energy = space.point(start), mean.value(start)
+    best, lowest = start, np.inf
     mixing, residual, iterations = Anderson(), np.inf, 0
     chord = space.chord
     for iterations in range(ITERATIONS):
-        forces = -point.pull_back(w @ rest.gradient_deformed(point.z))
+        forces = mean.forces_at(point)
         if residual > RENEW_ABOVE:
             try:
                 chord.factorise(point)
             except NotPositiveDefiniteError as error:
-                return Mean(point.vertices, Status.DEGENERATE, iterations, residual, str(error))
+                return Mean(best, Status.DEGENERATE, iterations, residual, str(error))
         step = chord.solve(forces)
         residual = float(np.sqrt(abs(np.vdot(forces, step))))
         if residual <= TOLERANCE:
             return Mean(point.vertices, Status.CONVERGED, iterations, residual)
+        if residual < lowest:
+            best, lowest = point.vertices, residual
         if residual <= RENEW_ABOVE:
             point = space.point(mixing(point.vertices, forces, step))
             if np.isfinite(point.z).all():
@@ -93,15 +155,14 @@ def elastic_mean(
         t = 1.0
         while t > 1e-4:
             trial = space.point(point.vertices + t * step)
-            trial_energy = value(trial.z)
+            trial_energy = mean.value_of(trial.z)
             if trial_energy <= energy - 1e-4 * t * residual**2:
                 break
             t /= 2
         else:
             break
         point, energy = trial, trial_energy
-    reason = f"residual {residual:.1e} after {iterations} iterations"
-    return Mean(point.vertices, Status.STALLED, iterations, residual, reason)
+    return Mean(best, Status.STALLED, iterations, lowest)
 
 
 @np.errstate(divide="ignore", over="ignore", invalid="ignore")

@@ -17,6 +17,8 @@ from geometry.mesh import Connectivity, FloatArray, IntArray, MeshError, Triangl
 #: Weight of a vertex normal against that of an edge in the fit of a vertex' local affine map.
 NORMAL_WEIGHT = 0.1
 PREFIX = "prolongation_"
+#: Fine vertices that are bound together: each looks at dozens of faces.
+CHUNK = 10_000
 
 
 class ProlongationError(ValueError):
@@ -117,8 +119,12 @@ class Prolongation:
         Returns:
             Distances as fractions of the diagonal of each shape's bounding box, over all vertices and shapes.
         """
-        distances = np.linalg.norm(align(self(coarse), fine) - fine, axis=-1) / diagonal(fine)[:, None]
-        return {"mean": float(distances.mean()), "max": float(distances.max())}
+        means, largest = [], []
+        for y, x in zip(coarse, fine, strict=True):
+            distances = np.linalg.norm(align(self(y), x) - x, axis=1) / diagonal(x)
+            means.append(distances.mean())
+            largest.append(distances.max())
+        return {"mean": float(np.mean(means)), "max": float(np.max(largest))}
 
     def arrays(self) -> dict[str, NDArray]:
         """What a file holds; names begin with ``prolongation_``."""
@@ -211,12 +217,23 @@ def _bind(coarse: TriangleMesh, fine: TriangleMesh) -> tuple[IntArray, FloatArra
     near = _closest_along_surface(coarse, fine)
     around = _around(coarse.faces, len(coarse.vertices))
     two_rings = sp.csr_array((around @ around.T) @ around)
+    found = [
+        _over(coarse, fine.vertices[k : k + CHUNK], near[k : k + CHUNK], two_rings) for k in range(0, len(near), CHUNK)
+    ]
+    corners, barycentric = zip(*found, strict=True)
+    return np.concatenate(corners), np.concatenate(barycentric)
+
+
+def _over(
+    coarse: TriangleMesh, points: FloatArray, near: IntArray, two_rings: sp.csr_array
+) -> tuple[IntArray, FloatArray]:
+    """The same for points (k, 3), whose closest coarse vertices (k,) have faces around them, as rows of (V, F)."""
     counts = np.diff(two_rings.indptr)[near]
     rows = np.repeat(np.arange(len(near)), counts)
     starts = np.cumsum(counts) - counts
     candidates = two_rings.indices[np.arange(len(rows)) - (starts - two_rings.indptr[near])[rows]]
     corners = coarse.faces[candidates]
-    barycentric, squared = _closest_in_triangle(fine.vertices[rows], coarse.vertices[corners])
+    barycentric, squared = _closest_in_triangle(points[rows], coarse.vertices[corners])
     # Ties, at corners and edges, go to the first face.
     chosen = np.lexsort((candidates, squared, rows))[starts]
     return corners[chosen], barycentric[chosen]

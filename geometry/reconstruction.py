@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cached_property
@@ -13,8 +12,9 @@ from scipy import sparse
 
 from geometry.anderson import Anderson
 from geometry.cholesky import Backend, Cholesky, NotPositiveDefiniteError, analyse
+from geometry.deadline import Deadline
 from geometry.frames import FrameIntegration
-from geometry.mesh import FloatArray, TriangleMesh
+from geometry.mesh import FloatArray, TriangleMesh, face_areas
 from geometry.normal_matrix import NormalMatrix
 from geometry.nric import Frame, NRICGradients, NRICJacobian, WeightedNorm
 from geometry.rigid import rigid_motions
@@ -26,6 +26,12 @@ DEFAULT_ETA = 1e-2
 #: A factor serves shapes around its own up to this distance of any vertex, a fraction of the diagonal; and this many
 #: steps, which is about what a new one costs.
 REACH, LIFE = 1e-2, 16
+#: Where Gauss–Newton stalls, damping as a share of each diagonal entry: the first, the factor by which it rises where a
+#: step fails and falls where one succeeds, and the largest. A step as short as the tolerance is a minimum's up to the
+#: last: that is felt by no motion but the softest (the matrix of a torus of 2048 vertices has entries of 1e-6).
+FIRST_DAMPING, DAMPING_FACTOR, LARGEST_DAMPING, DAMPING_AT_A_MINIMUM = 1e-6, 10, 1e3, 1e-4
+#: Least share of its area that a damped step leaves to a face.
+LEAST_AREA = 0.1
 #: A first guess from frames with a smaller relative misfit is good enough not to look for another.
 GOOD_GUESS = 0.05
 
@@ -56,7 +62,9 @@ class Reconstructor:
     backtracking line search. The normal matrix is symmetric positive definite with a fixed pattern, so its symbolic
     analysis happens here, once. Near the shape at which it was made a factor is used again (a modified Newton method),
     with Anderson acceleration: where z* is no shape's, Gauss–Newton itself converges only linearly, and a step with
-    an old factor costs an eighth of one with a new factor. Works for any genus and with boundary, because it never asks
+    an old factor costs an eighth of one with a new factor. Where not even a short step with a new factor helps, a face
+    has all but collapsed, and angles change too fast for any linearisation: Levenberg and Marquardt's damped steps
+    lead on from there, past the collapse or along it. Works for any genus and with boundary, because it never asks
     that z* be integrable. Holds work space: use one per thread.
 
     Args:
@@ -118,7 +126,7 @@ class Reconstructor:
         *,
         tolerance: float = 1e-8,
         max_iterations: int = 200,
-        deadline: float | None = None,
+        deadline: Deadline | None = None,
     ) -> Reconstruction:
         """Reconstruct one shape from a given start.
 
@@ -127,7 +135,7 @@ class Reconstructor:
             start: (V, 3) first guess, the reference by default.
             tolerance: stop once no vertex moves further than this fraction of the reference's diagonal.
             max_iterations: most steps.
-            deadline: time.monotonic() after which no iteration begins.
+            deadline: after which no iteration begins.
         """
         here = self._point(self.reference.vertices if start is None else np.asarray(start, np.float64), target)
         return self._iterate(target, here, tolerance, max_iterations, deadline)
@@ -138,14 +146,14 @@ class Reconstructor:
         *others: Callable[[], FloatArray],
         tolerance: float = 1e-8,
         max_iterations: int = 200,
-        deadline: float | None = None,
+        deadline: Deadline | None = None,
     ) -> Reconstruction:
         """Reconstruct one shape from its own ``guess``, whose misfit is then known already; otherwise as a call."""
         return self._iterate(target, self._guess(target, others), tolerance, max_iterations, deadline)
 
     @np.errstate(divide="ignore", over="ignore", invalid="ignore")
     def _iterate(
-        self, target: FloatArray, here: _Point, tolerance: float, max_iterations: int, deadline: float | None
+        self, target: FloatArray, here: _Point, tolerance: float, max_iterations: int, deadline: Deadline | None
     ) -> Reconstruction:
         limit, reach = (share * self._diagonal for share in (tolerance, REACH))
         if not np.isfinite(here.energy):
@@ -153,7 +161,7 @@ class Reconstructor:
         status, iterations = Status.ITERATION_LIMIT, 0
         factor: _Factor | None = None
         while iterations < max_iterations:
-            if deadline is not None and time.monotonic() > deadline:
+            if deadline is not None and deadline.passed:
                 status = Status.DEADLINE
                 break
             if new := factor is None:
@@ -189,8 +197,50 @@ class Reconstructor:
                 break
             if t < 1 or factor.steps == LIFE or np.abs(here.vertices - factor.at).max() > reach:
                 factor = None
+        if status is Status.STALLED and iterations:
+            here, status, iterations = self._damped(target, here, limit, iterations, max_iterations, deadline)
         residual = float(np.sqrt(here.energy / self.norm.square(target)))
         return Reconstruction(here.vertices, status, iterations, residual, self._flipped(here.misfit))
+
+    def _damped(
+        self,
+        target: FloatArray,
+        here: _Point,
+        limit: float,
+        iterations: int,
+        max_iterations: int,
+        deadline: Deadline | None,
+    ) -> tuple[_Point, Status, int]:
+        """Levenberg and Marquardt's iteration (Marquardt 1963), from where Gauss–Newton stalled.
+
+        A step is taken if it lowers the energy and lets no face collapse. The angles asked for may be those of no
+        shape, and then the least energy may belong to a face without height: there the steps end at its edge.
+        """
+        damping, diagonal = FIRST_DAMPING, self.normal_matrix.pattern.diagonal
+        areas = face_areas(here.vertices, self.reference.faces)
+        while iterations < max_iterations:
+            if deadline is not None and deadline.passed:
+                return here, Status.DEADLINE, iterations
+            entries = self.normal_matrix.entries(here.gradients, self.norm)
+            entries[diagonal] *= 1 + damping
+            forces = -self.jacobian.pull_back(here.gradients, self.norm.squared * here.misfit)
+            try:
+                self._cholesky.factorise(entries)
+                step = self._cholesky.solve(forces.ravel()).reshape(-1, 3)
+            except NotPositiveDefiniteError:
+                return here, Status.STALLED, iterations
+            iterations += 1
+            trial = self._point(here.vertices + step, target)
+            left = face_areas(trial.vertices, self.reference.faces)
+            helps = trial.energy < here.energy and bool((left >= LEAST_AREA * areas).all())
+            if helps:
+                here, areas = trial, left
+            if np.abs(step).max() <= limit and damping <= DAMPING_AT_A_MINIMUM:
+                return here, Status.CONVERGED, iterations
+            damping = damping / DAMPING_FACTOR if helps else max(damping * DAMPING_FACTOR, FIRST_DAMPING)
+            if not damping <= LARGEST_DAMPING:
+                return here, Status.STALLED, iterations
+        return here, Status.ITERATION_LIMIT, iterations
 
     @np.errstate(divide="ignore", over="ignore", invalid="ignore")
     def _point(self, vertices: FloatArray, target: FloatArray) -> _Point:

@@ -14,31 +14,72 @@ FOLD_LIMIT = np.cos(np.deg2rad(140))
 Pairs = list[tuple[int, int]]
 
 
+#: Least area of a face, as a share of the mean area of the coarse mesh's faces in the same shape.
+SMALLEST_AREA = 0.01
+#: Least area and sine of a face in a shape, as shares of their means over all shapes.
+SMALLEST_SHARE = 0.1
+
+
 @dataclass(frozen=True)
 class Quality:
-    """Of a few faces: smallest sin² of an angle, smallest cosine between neighbours, and how many are beyond limits."""
+    """Of a few faces: smallest sin² of an angle, cosine between neighbours and size, and how many are beyond limits."""
 
     sine: float
     fold: float
+    size: float
     slivers: int
     folds: int
+    specks: int
 
     @property
     def faults(self) -> int:
-        """Slivers and folds."""
-        return self.slivers + self.folds
+        """Slivers, folds and specks."""
+        return self.slivers + self.folds + self.specks
 
 
-def quality(sines: FloatArray, normals: FloatArray, faces: list[int], pairs: Pairs, sine: float) -> Quality:
-    """Quality of some faces and neighbours, numbered in arrays (k, n) of sin² and (k, n, 3) of unit normals."""
-    angles = sines[faces]
-    folds = dots(normals[[i for i, _ in pairs]], normals[[j for _, j in pairs]])
-    return Quality(
-        float(angles.min(initial=1)),
-        float(folds.min(initial=1)),
-        int(np.count_nonzero(angles < sine**2)),
-        int(np.count_nonzero(folds < FOLD_LIMIT)),
-    )
+@dataclass(frozen=True)
+class Triangles:
+    """Some faces in all shapes.
+
+    Attributes:
+        sines: (k, n) sin² of the smallest angle.
+        normals: (k, n, 3) of length 1.
+        squares: (3, k, n) squared sides.
+        areas: (k, n) as shares of the mean area of a coarse face.
+        sizes: (k, n) area and smallest sine, whichever is less, as a multiple of the least that a face ought to have:
+            geodesics between the shapes end at a face that is a speck in one of them.
+    """
+
+    sines: FloatArray
+    normals: FloatArray
+    squares: FloatArray
+    areas: FloatArray
+    sizes: FloatArray
+
+    @classmethod
+    def of(cls, corners: FloatArray, mean_areas: FloatArray) -> Triangles:
+        """Faces with corners (3, k, n, 3), of shapes whose coarse faces will have these areas (n,) on average."""
+        normals, squares = normals_and_sides(corners)
+        sines = squared_sines(normals, squares)
+        doubled = np.sqrt(dots(normals, normals))
+        areas, angles = doubled / (2 * mean_areas), np.sqrt(sines)
+        least = np.maximum(SMALLEST_AREA, SMALLEST_SHARE * areas.mean(axis=1, keepdims=True))
+        least_angles = np.maximum(SMALLEST_SHARE * angles.mean(axis=1, keepdims=True), 1e-300)
+        sizes = np.minimum(areas / least, angles / least_angles)
+        return cls(sines, normals / np.maximum(doubled, 1e-300)[..., None], squares, areas, sizes)
+
+    def quality(self, faces: list[int], pairs: Pairs, sine: float) -> Quality:
+        """Quality of some of the faces and of some neighbours among them, all by number."""
+        angles, sizes = self.sines[faces], self.sizes[faces]
+        folds = dots(self.normals[[i for i, _ in pairs]], self.normals[[j for _, j in pairs]])
+        return Quality(
+            float(angles.min(initial=1)),
+            float(folds.min(initial=1)),
+            float(sizes.min(initial=1)),
+            int(np.count_nonzero(angles < sine**2)),
+            int(np.count_nonzero(folds < FOLD_LIMIT)),
+            int(np.count_nonzero(sizes < 1)),
+        )
 
 
 def unit(normals: FloatArray) -> FloatArray:

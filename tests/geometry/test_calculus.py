@@ -4,12 +4,14 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+import trimesh
 from scipy.spatial.transform import Rotation
 
 from geometry.calculus import Path, ShellSpace, fault_between
+from geometry.deadline import Deadline
 from geometry.energy import Material
 from geometry.exponential import exponential, extrapolate
-from geometry.geodesic import geodesic, logarithm
+from geometry.geodesic import geodesic, halved, logarithm, towards
 from geometry.integrability import Integrability
 from geometry.mean import centre_of_mass, elastic_mean
 from geometry.mesh import TriangleMesh, align
@@ -17,7 +19,7 @@ from geometry.rigid import without_rigid_motion
 from geometry.sampling import exponentials
 from geometry.status import Status
 from geometry.transport import parallel_transport
-from tests.geometry.conftest import bent
+from tests.geometry.conftest import MESHES, bent
 from tests.geometry.constrained import constrained_exponential
 
 K = 4
@@ -115,6 +117,15 @@ def test_turning_a_factor_along_brings_it_nearer(space, mesh, pose, velocity):
 
 
 # ---------------------------------------------------------------- exponential, geodesic, logarithm
+
+
+def test_the_exponential_ends_when_its_deadline_passes(space, mesh, velocity):
+    deadline = Deadline(60)
+    assert len(exponential(space, mesh.vertices, velocity, 4, deadline=deadline).vertices) == 5
+    deadline.call_off()
+    path = exponential(space, mesh.vertices, velocity, 4, deadline=deadline)
+    assert path.status is Status.DEADLINE
+    assert len(path.vertices) == 2
 
 
 def test_every_step_of_the_exponential_solves_its_equation(space, mesh, velocity):
@@ -319,6 +330,59 @@ def test_forces_balance_at_the_elastic_mean(space, mesh, pose):
     point = space.point(found.vertices)
     pulls = [point.pull_back(p) for p in space.energy.rest(space.nric(shapes)).gradient_deformed(point.z)]
     assert np.abs(weights @ np.reshape(pulls, (2, -1))).max() < 1e-6 * np.abs(pulls).max()
+
+
+@pytest.mark.parametrize(("name", "seed", "size"), [("sheet", 1, 0.25), ("closed", 3, 0.35), ("torus", 2, 0.35)])
+def test_faces_that_differ_much_between_shapes_have_a_mean(name, seed, size):
+    """With the metric alone the steps stall: it knows of one shape, and here each face is another in every shape."""
+    mesh = MESHES[name]()
+    edge = np.linalg.norm(mesh.vertices[mesh.edges[:, 0]] - mesh.vertices[mesh.edges[:, 1]], axis=1).mean()
+    noise = np.random.default_rng(seed).standard_normal((5, *mesh.vertices.shape))
+    shapes, space = mesh.vertices + size * edge * noise, ShellSpace(mesh)
+    assert elastic_mean(space, shapes[:2]).status is Status.CONVERGED
+    found = elastic_mean(space, shapes)
+    assert found.status is Status.CONVERGED
+    point = space.point(found.vertices)
+    pulls = [point.pull_back(p) for p in space.energy.rest(space.nric(shapes)).gradient_deformed(point.z)]
+    assert np.abs(np.sum(pulls, axis=0)).max() < 1e-6 * np.abs(pulls).max()
+
+
+def test_without_a_mean_the_worst_face_is_named(space, mesh, pose):
+    i, j, _ = mesh.faces[7]
+    flat = pose.copy()
+    flat[i] = flat[j]
+    found = elastic_mean(space, np.stack([mesh.vertices, pose, flat]))
+    assert found.status is not Status.CONVERGED
+    assert found.reason
+    assert found.worst is not None
+    shape, face = found.worst
+    assert shape == 2
+    assert {i, j} <= set(mesh.faces[face])
+
+
+@pytest.mark.parametrize("pose", [1.3], indirect=True)
+def test_a_geodesic_begins_as_one_to_a_neighbour_or_in_fewer_steps(space, mesh, pose):
+    path = geodesic(space, mesh.vertices, pose, 4)
+    for near, end in ((halved(space, path), pose), (path, bent(mesh.vertices, 1.5))):
+        steps = len(near.vertices) - 1
+        first = towards(space, near, end)
+        found = geodesic(space, mesh.vertices, end, steps, first=first)
+        assert found.converged
+        expected = geodesic(space, mesh.vertices, end, steps)
+        assert distance(space, found.vertices, expected.vertices) < 1e-5
+        # As near as one could hope for, and exact at the ends.
+        assert distance(space, first, expected.vertices) < 0.3 * distance(space, mesh.vertices, end)
+        assert distance(space, found.vertices[-1], end) < 1e-12
+    assert len(halved(space, path).vertices) == 9
+
+
+def test_a_path_that_passes_over_a_fold_in_one_step_is_no_geodesic():
+    ball = trimesh.creation.icosphere(subdivisions=2)
+    rod = TriangleMesh.from_arrays(ball.vertices * [4, 0.3, 0.3], ball.faces)
+    space, start, end = ShellSpace(rod), bent(rod.vertices, -7), bent(rod.vertices, 7)
+    found = geodesic(space, start, end, 8, tolerance=1e-6, bisect=False)
+    assert not found.converged
+    assert found.reason.endswith("a jump")
 
 
 def test_logarithms_at_the_centre_of_mass_balance(space, mesh, velocity):

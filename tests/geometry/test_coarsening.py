@@ -214,6 +214,52 @@ def test_a_crumpled_place_smaller_than_a_coarse_face_is_cleared_away(seed):
     assert np.rad2deg(found.smallest_angle) > 5
 
 
+def whiskered() -> tuple[TriangleMesh, np.ndarray]:
+    """A ball that ends in a long whisker, of rings with twelve vertices, and shapes whose whisker bends and thins."""
+    polar = np.linspace(0, np.pi, 32)[1:-1]
+    profile = np.stack([np.cos(polar), np.sin(polar)], axis=1)[::-1]
+    thread = np.stack([np.linspace(1.02, 3, 40), np.full(40, 4e-3)], axis=1)
+    profile = np.concatenate([profile, thread])
+    turn = np.arange(12) * np.pi / 6
+    rings = np.stack(
+        [
+            np.repeat(profile[:, :1], 12, axis=1),
+            profile[:, 1:] * np.cos(turn),
+            profile[:, 1:] * np.sin(turn),
+        ],
+        axis=-1,
+    ).reshape(-1, 3)
+    vertices = np.concatenate([rings, [[-1, 0, 0], [3.01, 0, 0]]])
+    n, tips = len(profile), len(rings)
+    tube = grid_faces(n, 12, around_u=False, around_v=True)[:, ::-1]
+    k = np.arange(12)
+    first = np.stack([np.full(12, tips), (k + 1) % 12, k], axis=1)
+    last = np.stack([np.full(12, tips + 1), (n - 1) * 12 + k, (n - 1) * 12 + (k + 1) % 12], axis=1)
+    mesh = TriangleMesh.from_arrays(vertices, np.concatenate([tube, first, last]))
+    shapes = []
+    for bend, width in ((0.2, 1.0), (-0.1, 0.3), (0.3, 0.5)):
+        shape, beyond = vertices.copy(), np.maximum(vertices[:, 0] - 1, 0)
+        shape[:, 1:] *= np.where(beyond > 0, width, 1)[:, None]
+        shape[:, 2] += bend * beyond**2
+        shapes.append(shape)
+    return mesh, np.stack(shapes)
+
+
+def test_a_thin_part_is_left_to_the_fine_mesh_where_it_would_be_all_slivers():
+    mesh, shapes = whiskered()
+    found = coarsen(mesh, 150, shapes)
+    kept = np.concatenate([mesh.vertices[None], shapes])[:, found.fine_index]
+    areas = face_areas(kept, found.faces)
+    assert found.specks == 0
+    assert found.smallest_area == pytest.approx((areas / areas.mean(axis=1, keepdims=True)).min())
+    assert found.smallest_area > 0.009
+    assert (areas / areas.mean(axis=0)).min() > 0.09
+    assert angles(kept, found.faces).min() > np.deg2rad(1.4)
+    # Few vertices are lost for it, and that is said.
+    assert 130 <= len(found.fine_index) <= 150
+    assert bool(found.reason) == (len(found.fine_index) != 150)
+
+
 def test_what_cannot_be_reached_is_said():
     tetrahedron = trimesh.creation.icosphere(subdivisions=1)
     mesh = TriangleMesh.from_arrays(tetrahedron.vertices, tetrahedron.faces)
