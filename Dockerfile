@@ -1,18 +1,23 @@
-# Named once, so that `--from` can put another base in its place where no registry is reachable.
-FROM python:3.11-slim-bookworm AS base
+# Python 3.11.17. The digest is that of the index, which has an image for every processor; a newer one is found by
+# `docker buildx imagetools inspect python:3.11-slim-bookworm`. Named once, so that `--from` can put another base in its
+# place where no registry is reachable.
+FROM python:3.11-slim-bookworm@sha256:0a310eeecf4e1f5a0743f9a6520c90c88d089c903ca5fd283f501e3a805f5f89 AS base
 
 FROM base AS build
-RUN python -m venv /opt/shapespace
-ENV PATH=/opt/shapespace/bin:$PATH PIP_NO_CACHE_DIR=1 PIP_DISABLE_PIP_VERSION_CHECK=1
+# Two environments: what builds stays here, and what serves has neither pip nor setuptools.
+RUN python -m venv /opt/build && python -m venv --without-pip /opt/shapespace
+ENV PATH=/opt/build/bin:$PATH PIP_NO_CACHE_DIR=1 PIP_DISABLE_PIP_VERSION_CHECK=1
 WORKDIR /src
-# Dependencies first: they are large and change seldom. The secret is an optional pip.conf for private indexes;
-# versions are pyproject.toml's to state.
+# Dependencies first: they are large and change seldom. The secret is an optional pip.conf for private indexes.
+COPY requirements/build.txt requirements/serve.txt requirements/
+RUN --mount=type=secret,id=pip,target=/etc/pip.conf \
+    pip install --require-hashes --requirement requirements/build.txt && \
+    pip --python /opt/shapespace install --require-hashes --requirement requirements/serve.txt
 COPY pyproject.toml README.md LICENSE ./
-# hadolint ignore=DL3013
-RUN --mount=type=secret,id=pip,target=/etc/pip.conf pip install '.[serve]'
 COPY geometry geometry
 COPY service service
-RUN --mount=type=secret,id=pip,target=/etc/pip.conf pip install --no-deps --force-reinstall .
+RUN pip wheel --no-deps --no-index --no-build-isolation --wheel-dir wheels . && \
+    pip --python /opt/shapespace install --no-deps --no-index wheels/*.whl
 
 FROM base
 COPY --from=build /opt/shapespace /opt/shapespace

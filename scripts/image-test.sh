@@ -1,5 +1,7 @@
 #!/usr/bin/env bash
-# Build the container image, run it as it should be run (read-only, no privileges) and check what it promises.
+# Build the container image, run it as it should be run (read-only, no privileges, 2 GB) and check what it promises:
+# what it holds, a shape, an end, and that it goes on through each of tests/attacks.py for a minute (SECONDS_EACH=60),
+# with a key and without.
 #
 # Uses Docker where an engine answers. Elsewhere, as root on Debian: buildah, on a base image that mmdebstrap makes
 # to stand in for python:3.11-slim-bookworm, and podman. Pip inside the build gets this machine's pip configuration.
@@ -13,7 +15,7 @@ engine=(:)
 trap 'status=$?; "${engine[@]}" rm --force "$container" &>/dev/null || true; rm -rf "$scratch"; exit $status' EXIT
 
 say() { printf '\033[1m%s\033[0m\n' "$*"; }
-fail() { echo "image-test: $*" >&2; "${engine[@]}" logs "$container" >&2 2>/dev/null || true; exit 1; }
+fail() { echo "image-test: $*" >&2; "${engine[@]}" logs "$container" 2>&1 | tail -n 50 >&2 || true; exit 1; }
 
 # The environment's settings come first in pip's list and win over files.
 pip_settings() {
@@ -78,15 +80,30 @@ running() { [ "$("${engine[@]}" inspect --format '{{.State.Running}}' "$containe
 say "Building"
 if docker info &>/dev/null; then build_with_docker; else build_with_buildah; fi
 
+# Starts the image with further options, and waits until it is healthy.
+start() {
+  "${engine[@]}" rm --force "$container" &>/dev/null || true
+  "${engine[@]}" run --detach --name "$container" --read-only --cap-drop ALL --security-opt no-new-privileges \
+    "${memory[@]}" "${run_options[@]}" "$@" "$image" >/dev/null
+  for ((i = 0; i < 90; i++)); do
+    running || fail "the server stopped by itself"
+    if healthy; then break; fi
+    sleep 1
+  done
+  healthy || fail "not healthy after 90 seconds"
+  address=127.0.0.1:$(inside printenv SHAPESPACE_PORT)
+  [ "${engine[0]}" = podman ] || address=$(docker port "$container" 8000)
+}
+
+# Not every machine lets an engine bound memory.
+memory=(--memory 2g)
+if ! "${engine[@]}" run --rm "${memory[@]}" "${run_options[@]}" "$image" true &>/dev/null; then
+  echo "NOT tried: this machine bounds no memory" >&2
+  memory=()
+fi
+
 say "Starting, read-only and without privileges"
-"${engine[@]}" run --detach --name "$container" --read-only --cap-drop ALL \
-  --security-opt no-new-privileges "${run_options[@]}" "$image" >/dev/null
-for ((i = 0; i < 90; i++)); do
-  running || fail "the server stopped by itself"
-  if healthy; then break; fi
-  sleep 1
-done
-healthy || fail "not healthy after 90 seconds"
+start
 echo "ok: healthy"
 
 [ "$(inside id -u)" -ne 0 ] || fail "the server runs as root"
@@ -99,10 +116,9 @@ for tool in gcc cc make; do
   ! inside sh -c "command -v $tool" >/dev/null || fail "the image holds a build tool: $tool"
 done
 ! inside python -c 'import torch' 2>/dev/null || fail "the image holds torch"
+! inside python -c 'import pip' 2>/dev/null || fail "the server's environment holds pip"
 echo "ok: neither build tools nor torch"
 
-address=127.0.0.1:$(inside printenv SHAPESPACE_PORT)
-[ "${engine[0]}" = podman ] || address=$(docker port "$container" 8000)
 python3 - "http://$address" "$scratch/torus.glb" <<'PYTHON' || fail "no mesh came back"
 import json, struct, sys, urllib.request
 
@@ -127,10 +143,32 @@ if [ -d tests/node_modules/gltf-validator ]; then
   echo "ok: the Khronos validator finds no error"
 fi
 
-started=$SECONDS
-"${engine[@]}" stop --time 10 "$container" >/dev/null
-status=$("${engine[@]}" inspect --format '{{.State.ExitCode}}' "$container")
-[ "$status" -eq 0 ] || fail "SIGTERM ended it with status $status after $((SECONDS - started)) s"
-echo "ok: SIGTERM ended it in $((SECONDS - started)) s with status 0"
+end() {
+  local started=$SECONDS status
+  "${engine[@]}" stop --time 10 "$container" >/dev/null
+  status=$("${engine[@]}" inspect --format '{{.State.ExitCode}}' "$container")
+  [ "$status" -eq 0 ] || fail "SIGTERM ended it with status $status after $((SECONDS - started)) s"
+  echo "ok: SIGTERM ended it in $((SECONDS - started)) s with status 0"
+}
+end
+
+# Attackers have another address than those who go on asking, where the engine leaves addresses as they are.
+attacks() {
+  python3 -m tests.attacks "http://$address" --seconds "${SECONDS_EACH:-60}" "$@" \
+    $([ "${engine[0]}" = docker ] || echo "--source 127.0.0.2") || fail "an attack made it fall"
+  running || fail "an attack ended it"
+  end
+}
+say "Attacking it"
+start
+attacks
+say "Attacking it, with a key that the attackers don't have"
+SHAPESPACE_API_KEY=$(head -c 16 /dev/urandom | od -An -tx1 | tr -d ' \n')
+export SHAPESPACE_API_KEY
+start --env SHAPESPACE_API_KEY
+attacks --stranger
+say "Attacking it, with a key that the attackers have as well"
+start --env SHAPESPACE_API_KEY
+attacks
 
 "${engine[@]}" image inspect --format 'ok: image of {{.Size}} bytes' "$image"

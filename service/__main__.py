@@ -5,33 +5,58 @@ from __future__ import annotations
 import logging
 import signal
 import sys
+from contextlib import suppress
 
-from pydantic import ValidationError
+from service import memory
+from service.candidates import Trials, bundle_folders
 
-from service import logs, memory
-from service.app import create_app
-from service.server import Server
-from service.settings import PREFIX, Settings, unknown_variables
+#: Characters that a key should have.
+SHORT_KEY = 16
 
 
 def main() -> None:
     """Serve until SIGTERM or SIGINT; running requests are finished."""
+    memory.be_frugal()
+    trials = Trials()
+    try:
+        trials.prepare()  # another process imports and tries while this one imports
+        _serve(trials)
+    finally:
+        trials.close()
+
+
+def _serve(trials: Trials) -> None:
+    from pydantic import ValidationError
+
+    from service.settings import PREFIX, Settings, is_loopback, unknown_variables
+
     try:
         settings = Settings()
     except ValidationError as error:
         for fault in error.errors():
             print(f"{PREFIX}{str(fault['loc'][0]).upper()}: {fault['msg']}", file=sys.stderr)
         raise SystemExit(2) from None
-    memory.be_frugal()
+    with suppress(OSError):  # the first look will say what is the matter
+        trials.begin(bundle_folders(settings.models_dir)[0])
+
+    from service import logs
+    from service.app import create_app
+    from service.server import Server
+
     logs.configure(settings.log_format)
+    log = logging.getLogger(__name__)
     for name in unknown_variables():
-        logging.getLogger(__name__).warning("%s is no setting: the README lists those there are", name)
+        log.warning("%s is no setting: the README lists those there are", name)
     if hasattr(signal, "SIGHUP"):
         signal.signal(signal.SIGHUP, signal.SIG_IGN)  # until the server can reload
     # Uvicorn raises the signal once more when everything is finished: that is a success.
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: sys.exit(0))
-    Server(create_app(settings), settings).run()
+    if settings.api_key is None and not is_loopback(settings.host):
+        log.warning("there is no key (SHAPESPACE_API_KEY): whoever reaches %s may call", settings.host)
+    elif settings.api_key is not None and len(settings.api_key.get_secret_value()) < SHORT_KEY:
+        log.warning("SHAPESPACE_API_KEY is short: a good one is what `openssl rand -hex 16` prints")
+    Server(create_app(settings, trials), settings).run()
 
 
 if __name__ == "__main__":

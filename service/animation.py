@@ -11,16 +11,18 @@ from typing import Annotated
 
 import numpy as np
 import orjson
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+from pydantic import ConfigDict, Field, ValidationError, field_validator, model_validator
 
 from geometry.mesh import FloatArray
+from service.encodings import holds_more_values
 from service.latent_space import LatentSpace
-from service.schemas import Number, Whole
+from service.schemas import Body, Number, Whole
 from service.shape_model import MeshChoice
 
 #: Longest id: behind most proxies a whole URL may take 16 KiB at most.
 ID_LIMIT = 15_000
-_PAYLOAD_LIMIT = 2**20
+#: Bytes that an id may unpack to, and values in them: reading one takes a few milliseconds at most.
+_PAYLOAD_LIMIT, _VALUES_LIMIT = 2**16, 2**13
 _CHECKSUM_BYTES = 9
 _DIGEST_DIGITS = 32
 
@@ -33,7 +35,7 @@ class PathTooLongError(ValueError):
     """Keyframes that don't fit into an id."""
 
 
-class Animation(BaseModel):
+class Animation(Body):
     """A piecewise linear path through latent codes, sampled at equal steps.
 
     Frame k of n lies at ``t = start + k (stop − start) / (n − 1)``, where 0 is the first keyframe and 1 the
@@ -42,15 +44,15 @@ class Animation(BaseModel):
     """
 
     model_config = ConfigDict(
-        extra="forbid",
         frozen=True,
         json_schema_extra={"examples": [{"keyframes": [[0, 0, 0, 0], [1, 2, 3, 4]], "frames": 30}]},
     )
 
-    keyframes: list[Annotated[list[Number], Field(json_schema_extra={"minItems": 1})]] = Field(
-        min_length=2, description="At least two latent codes."
-    )
-    times: list[Number] | None = Field(
+    keyframes: Annotated[
+        list[Annotated[list[Number], Field(fail_fast=True, json_schema_extra={"minItems": 1})]],
+        Field(fail_fast=True),
+    ] = Field(min_length=2, description="At least two latent codes.")
+    times: Annotated[list[Number], Field(fail_fast=True)] | None = Field(
         None,
         description="Increasing times of the keyframes, in any unit; by default equally far apart. With "
         "`loop` the way back to the first keyframe takes the average of the other segments.",
@@ -95,15 +97,15 @@ class Animation(BaseModel):
         """T of each answered frame."""
         return (self.start + np.arange(self.frames) * (self.stop - self.start) / (self.frames - 1))[: self.frame_count]
 
-    def codes(self, latents: LatentSpace) -> list[list[float]]:
-        """Code of each frame, (n, m), angles not yet reduced; raises LatentError."""
+    def codes(self, latents: LatentSpace, which: slice = slice(None)) -> list[list[float]]:
+        """Code of each frame, or of some, (n, m), angles not yet reduced; raises LatentError."""
         keyframes = latents.codes(self.keyframes)[0].astype(np.float64)
         knots = np.arange(len(keyframes), dtype=np.float64) if self.times is None else np.array(self.times)
         if self.loop:
             keyframes = np.concatenate([keyframes, keyframes[:1]])
             knots = np.append(knots, knots[-1] + (knots[-1] - knots[0]) / (len(knots) - 1))
         keyframes = latents.unroll(keyframes)
-        t = knots[0] + self.positions * (knots[-1] - knots[0])
+        t = knots[0] + self.positions[which] * (knots[-1] - knots[0])
         segment = np.clip(np.searchsorted(knots, t, side="right") - 1, 0, len(knots) - 2)
         share = ((t - knots[segment]) / (knots[segment + 1] - knots[segment]))[:, None]
         # This form gives both keyframes exactly, at 0 and at 1.
@@ -119,17 +121,20 @@ class Animation(BaseModel):
             LatentError: a keyframe that is no code of the model.
             PathTooLongError: too many keyframes for a URL.
         """
+        too_long = PathTooLongError(
+            f"{len(self.keyframes)} keyframes of {latents.dimension} numbers don't fit into an "
+            "interpolation's address. Send fewer keyframes, or the parts of the path one by one."
+        )
+        if len(self.keyframes) + sum(map(len, self.keyframes)) > _VALUES_LIMIT:
+            raise too_long  # before anything is worked out from them
         content = self.model_dump(mode="json", exclude_none=True)
         content["keyframes"] = latents.codes(self.keyframes)[0]
         content["model"] = model_digest[:_DIGEST_DIGITS]
         payload = orjson.dumps(content, option=orjson.OPT_SERIALIZE_NUMPY | orjson.OPT_SORT_KEYS)
         packed = _checksum(payload) + zlib.compress(payload, 9)
         name = base64.urlsafe_b64encode(packed).rstrip(b"=").decode()
-        if len(name) > ID_LIMIT or len(payload) > _PAYLOAD_LIMIT:
-            raise PathTooLongError(
-                f"{len(self.keyframes)} keyframes of {latents.dimension} numbers don't fit into an "
-                "interpolation's address. Send fewer keyframes, or the parts of the path one by one."
-            )
+        if len(name) > ID_LIMIT or len(payload) > _PAYLOAD_LIMIT or holds_more_values(payload, _VALUES_LIMIT):
+            raise too_long
         return name
 
     @classmethod
@@ -149,6 +154,8 @@ class Animation(BaseModel):
             if not inflate.eof or inflate.unused_data or packed[:_CHECKSUM_BYTES] != _checksum(payload):
                 raise ValueError
             if base64.urlsafe_b64encode(packed).rstrip(b"=").decode() != name:
+                raise ValueError
+            if holds_more_values(payload, _VALUES_LIMIT):
                 raise ValueError
             content = orjson.loads(payload)
             digest = content.pop("model")

@@ -4,23 +4,28 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import AsyncIterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import asynccontextmanager
 
-from fastapi import FastAPI
+from fastapi import Depends, FastAPI
 from starlette.middleware import Middleware
 from starlette.middleware.cors import CORSMiddleware
 from threadpoolctl import threadpool_limits
 
 from service import __version__, problems
-from service.dependencies import Service
+from service.candidates import Trials
+from service.connections import Connections
+from service.dependencies import Service, known_query
 from service.description import describe
 from service.metrics import Metrics
-from service.middleware import AnswerHead, LimitBody, Observe, RequireKey
+from service.middleware import AnswerHead, LimitBody, Observe, PaceAnswers, RequireHost, RequireKey
+from service.quota import UPLOADS
 from service.recent import RecentAnswers
 from service.reloading import Reloader
 from service.repository import ModelRepository
 from service.routes import codes, health, inference, interpolations, models, operation, page, shapes
-from service.settings import Settings
+from service.sandbox import Sandbox
+from service.settings import Settings, is_loopback
 from service.workers import Workers
 
 #: What pages of other origins may send, and see in answers.
@@ -28,13 +33,16 @@ CORS_REQUEST = ["Authorization", "Content-Type", "If-None-Match", "Inference-Hea
 CORS_REQUEST += ["X-API-Key", "X-Request-ID"]
 CORS_ANSWER = ["Content-Disposition", "ETag", "Inference-Header-Content-Length", "Location", "Retry-After"]
 CORS_ANSWER += ["Server-Timing", "Shape-Color", "Shape-Diagnostics", "X-Request-ID"]
+#: What a machine calls itself.
+LOOPBACK = ("localhost", "127.0.0.1", "[::1]")
 
 
-def create_app(settings: Settings | None = None) -> FastAPI:
+def create_app(settings: Settings | None = None, trials: Trials | None = None) -> FastAPI:
     """The service as an ASGI application; bundles are loaded when it starts.
 
     Args:
         settings: by default from the environment.
+        trials: of these bundles, where they have begun already.
     """
     settings = settings or Settings()
 
@@ -43,14 +51,24 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         # The workers are the only threads: those of BLAS would multiply with them.
         with threadpool_limits(1):
             workers = Workers(settings.workers, settings.queue, settings.deadline)
-            repository = ModelRepository(settings.models_dir, settings.workers)
-            metrics = Metrics(repository, workers)
+            connections = Connections(settings.max_connections, settings.deadline, settings.trusted_proxies)
+            repository = ModelRepository(settings.models_dir, settings.workers, trials)
+            metrics = Metrics(repository, workers, connections)
             reloader = Reloader(repository, metrics)
-            app.state.service = Service(settings, repository, workers, metrics, reloader, RecentAnswers(settings.cache))
-            watching = asyncio.create_task(reloader.watch(settings.watch)) if settings.watch else None
+            recent = RecentAnswers(settings.cache)
+            sandbox = Sandbox(min(settings.workers, UPLOADS))
+            sandbox.prepare("read")
+            app.state.service = Service(settings, repository, workers, connections, metrics, reloader, recent, sandbox)
+            # For what reads bodies and folders, beside the threads that compute.
+            asyncio.get_running_loop().set_default_executor(ThreadPoolExecutor(2, thread_name_prefix="reading"))
+            chores = [asyncio.create_task(connections.sweep())]
+            if settings.watch:
+                chores.append(asyncio.create_task(reloader.watch(settings.watch)))
             yield
-            if watching:
-                watching.cancel()
+            for chore in chores:
+                chore.cancel()
+            repository.close()
+            sandbox.close()
             workers.close()
 
     app = FastAPI(
@@ -59,6 +77,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         summary="A handful of numbers in, a shape out.",
         lifespan=lifespan,
         middleware=_middleware(settings),
+        dependencies=[Depends(known_query)],
         generate_unique_id_function=lambda route: route.name,
         # Their pages load scripts from elsewhere.
         docs_url=None,
@@ -66,10 +85,11 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         openapi_url=None,
     )
     problems.install(app)
-    for module in (models, shapes, codes, interpolations, inference, health, operation, page):
-        app.include_router(module.router)
+    routers = [module.router for module in (models, shapes, codes, interpolations, inference, health, operation, page)]
+    for router in routers:
+        app.include_router(router)
     app.router.routes.append(page.assets())
-    describe(app)
+    describe(app, routers)
     return app
 
 
@@ -78,10 +98,11 @@ def _middleware(settings: Settings) -> list[Middleware]:
     stack = [
         Middleware(AnswerHead),
         Middleware(Observe),
+        Middleware(PaceAnswers),
+        Middleware(RequireHost, hosts=_hosts(settings)),
+        *([Middleware(RequireKey, key=settings.api_key)] if settings.api_key else []),
         Middleware(LimitBody, limit=settings.max_body, upload=settings.max_upload),
     ]
-    if settings.api_key:
-        stack.insert(2, Middleware(RequireKey, key=settings.api_key))
     if settings.cors_origins:
         # Outermost, so that pages can read every refusal; a preflight brings no key.
         cors = Middleware(
@@ -93,3 +114,13 @@ def _middleware(settings: Settings) -> list[Middleware]:
         )
         stack.insert(0, cors)
     return stack
+
+
+def _hosts(settings: Settings) -> tuple[str, ...]:
+    """Names that requests may be for; none stands for any."""
+    given = tuple(host.lower() for host in settings.hosts)
+    if "*" in given:
+        return ()
+    # With a key no stranger's page gets an answer, and a server for others has names that it can't know.
+    open_to_all = settings.api_key is not None or not is_loopback(settings.host)
+    return given or (() if open_to_all else (*LOOPBACK, settings.host.lower()))

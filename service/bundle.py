@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import hashlib
 import io
+import math
 import os
 import re
 import stat
+import zipfile
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,6 +26,11 @@ MANIFEST = "manifest.json"
 MANIFEST_LIMIT = 4 * 2**20
 #: The fine mesh lies this close to what the reference is prolonged to, as a fraction of the diagonal: float32.
 FINE_TOLERANCE = 1e-5
+#: Bytes of a bundle's files together.
+LARGEST = 2**30
+#: What the arrays of an NPZ file may come to: so many times its own length, and so many bytes beside. Packed meshes are
+#: a half to a sixth as long; what packs much better is no mesh.
+UNPACKED, BESIDE = 16, 2**20
 #: Characters of a reason: libraries quote what they can't read, and names in a file are as long as it says.
 LONGEST_REASON = 300
 
@@ -75,19 +82,32 @@ class Bundle:
     file_vertices: IntArray | None = None
 
 
-def read_bundle(folder: Path) -> Bundle:
+def check_place(folder: Path) -> None:
+    """Refuse folders that aren't called NAME/VERSION; raises BundleError."""
+    if not re.fullmatch(NAME_PATTERN, folder.parent.name) or not re.fullmatch(VERSION_PATTERN, folder.name):
+        raise BundleError("a bundle lies in NAME/VERSION: a name in small letters, a version that is a whole number")
+
+
+def manifest_digest(folder: Path) -> str:
+    """The digest of the bundle that lies there at the moment; raises BundleError or OSError."""
+    return hashlib.sha256(_manifest(folder)).hexdigest()
+
+
+def read_bundle(folder: Path, digest: str | None = None) -> Bundle:
     """Read and verify ``models/NAME/VERSION``.
+
+    Args:
+        folder: of the bundle.
+        digest: that it must have; by default any.
 
     Raises:
         BundleError: anything that isn't exactly as the manifest and the contract say.
     """
+    check_place(folder)
     name, version = folder.parent.name, folder.name
-    if not re.fullmatch(NAME_PATTERN, name) or not re.fullmatch(VERSION_PATTERN, version):
-        raise BundleError("a bundle lies in NAME/VERSION: a name in small letters, a version that is a whole number")
-    present = _regular_files(folder)
-    if MANIFEST not in present:
-        raise BundleError(f"{MANIFEST} is missing")
-    text = _read(folder / MANIFEST, MANIFEST_LIMIT)
+    text = _manifest(folder)
+    if digest not in (None, hashlib.sha256(text).hexdigest()):
+        raise BundleError("it changed while it was tried")
     try:
         manifest = Manifest.model_validate_json(text)
     except ValidationError as error:
@@ -96,15 +116,29 @@ def read_bundle(folder: Path) -> Bundle:
         raise BundleError(f"{MANIFEST}: {place + ': ' if place else ''}{first['msg']}") from None
     if (manifest.name, manifest.version) != (name, version):
         raise BundleError(f"{MANIFEST} is of {manifest.name}/{manifest.version}, not of {name}/{version}")
-    for missing in sorted(manifest.files.keys() - present):
-        raise BundleError(f"{missing} is missing")
-    for extra in sorted(present - manifest.files.keys() - {MANIFEST}):
-        raise BundleError(f"{extra} is not in the manifest")
-    files = {file: _verified(folder / file, entry) for file, entry in manifest.files.items()}
+    files = read_files(folder, manifest)
     reference, fine, more = _geometry(files.pop(manifest.geometry.file), manifest)
     for file, content in files.items():
         _check_network(file, content)
     return Bundle(manifest, hashlib.sha256(text).hexdigest(), reference, fine, files, **more)
+
+
+def read_files(folder: Path, manifest: Manifest) -> dict[str, bytes]:
+    """The files of a bundle, which are what its manifest says; raises BundleError or OSError."""
+    present = _regular_files(folder)
+    for missing in sorted(manifest.files.keys() - present):
+        raise BundleError(f"{missing} is missing")
+    for extra in sorted(present - manifest.files.keys() - {MANIFEST}):
+        raise BundleError(f"{extra} is not in the manifest")
+    if sum((folder / file).lstat().st_size for file in present) > LARGEST:
+        raise BundleError(f"its files have more than {LARGEST >> 20} MiB")
+    return {file: _verified(folder / file, entry) for file, entry in manifest.files.items()}
+
+
+def _manifest(folder: Path) -> bytes:
+    if MANIFEST not in _regular_files(folder):
+        raise BundleError(f"{MANIFEST} is missing")
+    return _read(folder / MANIFEST, MANIFEST_LIMIT)
 
 
 def _regular_files(folder: Path) -> set[str]:
@@ -120,8 +154,8 @@ def _regular_files(folder: Path) -> set[str]:
 
 
 def _read(path: Path, limit: int) -> bytes:
-    # O_NOFOLLOW closes the gap between looking at the folder and opening the file.
-    descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_NOFOLLOW", 0))
+    # The flags close the gap between looking at the folder and opening the file: no link, no waiting for a pipe.
+    descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0))
     with os.fdopen(descriptor, "rb") as file:
         status = os.fstat(descriptor)
         if not stat.S_ISREG(status.st_mode) or status.st_size > limit:
@@ -130,7 +164,7 @@ def _read(path: Path, limit: int) -> bytes:
 
 
 def _verified(path: Path, entry: FileEntry) -> bytes:
-    content = _read(path, entry.bytes)
+    content = _read(path, min(entry.bytes, LARGEST))
     if len(content) != entry.bytes:
         raise BundleError(f"{path.name} has {len(content)} bytes, not {entry.bytes} as the manifest says")
     if hashlib.sha256(content).hexdigest() != entry.sha256:
@@ -141,13 +175,12 @@ def _verified(path: Path, entry: FileEntry) -> bytes:
 def _geometry(content: bytes, manifest: Manifest) -> tuple[TriangleMesh, FineMesh | None, dict[str, NDArray]]:
     file = manifest.geometry.file
     try:
-        with np.load(io.BytesIO(content), allow_pickle=False) as arrays:
-            geometry = dict(arrays)
+        geometry = _arrays(content)
         reference = TriangleMesh.from_mapping(geometry)
         edges = geometry["edges"]
     except KeyError as error:
         raise BundleError(f"{file} has no array {error}") from None
-    except MeshError as error:
+    except (BundleError, MeshError) as error:
         raise BundleError(f"{file}: {error}") from None
     except Exception as error:  # zip and array headers fail in many ways
         raise BundleError(f"{file} is not a readable NPZ file: {error}") from None
@@ -168,10 +201,40 @@ def _geometry(content: bytes, manifest: Manifest) -> tuple[TriangleMesh, FineMes
     ):
         _check_shape(file, geometry, array_name, wanted, text)
     fine = _fine(file, geometry, reference)
-    more = {name: geometry[name].astype(np.float64) for name in ("modes", "training_codes") if name in geometry}
+    more: dict[str, NDArray] = {
+        name: geometry[name].astype(np.float64) for name in ("modes", "training_codes") if name in geometry
+    }
     if "file_vertices" in geometry:
         more["file_vertices"] = _file_vertices(file, geometry["file_vertices"], fine.reference if fine else reference)
     return reference, fine, more
+
+
+def _arrays(content: bytes) -> dict[str, NDArray]:
+    """The arrays of an NPZ file; none is made before it is known how long it is, and that it is so long."""
+    with zipfile.ZipFile(io.BytesIO(content)) as archive:
+        entries = archive.infolist()
+        most = UNPACKED * len(content) + BESIDE
+        if (total := sum(entry.file_size for entry in entries)) > most:
+            raise BundleError(f"its arrays would come to {total} bytes, where {most} are the most")
+        return {entry.filename.removesuffix(".npy"): _array(archive, entry) for entry in entries}
+
+
+def _array(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> NDArray:
+    if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):  # others unpack all at once
+        raise ValueError(f"{entry.filename} is packed in a way that NumPy doesn't")
+    with archive.open(entry) as file:
+        match np.lib.format.read_magic(file):
+            case (1, 0):
+                shape, fortran, dtype = np.lib.format.read_array_header_1_0(file)
+            case (2, 0):
+                shape, fortran, dtype = np.lib.format.read_array_header_2_0(file)
+            case version:
+                raise ValueError(f"{entry.filename} is of version {version}")
+        size = math.prod(shape) * dtype.itemsize
+        if dtype.hasobject or not 0 <= size <= entry.file_size:
+            raise ValueError(f"{entry.filename} can't be {dtype} {shape}")
+        array = np.frombuffer(bytearray(file.read(size)), dtype)
+        return array.reshape(shape, order="F" if fortran else "C")
 
 
 def _file_vertices(file: str, places: NDArray, mesh: TriangleMesh) -> IntArray:
@@ -192,6 +255,8 @@ def _check_shape(
     if name not in geometry:
         return
     array = geometry[name]
+    if not array.size:
+        raise BundleError(f"{file}: {name} is empty")
     fits = len(array.shape) == len(wanted) and all(
         want in (None, size) for size, want in zip(array.shape, wanted, strict=True)
     )

@@ -5,13 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import orjson
-from numpy.typing import NDArray
 
-from geometry.formats import read_arrays
-from geometry.mesh import FloatArray, IntArray, MeshError, diagonal
-from service.bombs import refuse_bombs
+from geometry.mesh import FloatArray, IntArray, diagonal
+from geometry.reading import Limits
 from service.shape_model import MeshChoice, ShapeModel
+
+#: Larger meshes than the model's are read up to these, so that their sizes can be told.
+_VERTICES_READ, _FACES_READ = 2**15, 2**16
 
 
 class InvalidMeshError(ValueError):
@@ -31,27 +31,28 @@ class Matched:
     mesh: MeshChoice
 
 
-def match(model: ShapeModel, data: bytes, format: str) -> Matched:
-    """Read a file and find which of the model's meshes it holds.
+def limits(model: ShapeModel) -> Limits:
+    """How large a file has to be read to tell whether it holds one of the model's meshes."""
+    layouts = _layouts(model)
+    vertices, faces = max(layout.count for layout in layouts), max(len(layout.faces) for layout in layouts)
+    return Limits(max(vertices, 3 * faces, _VERTICES_READ), max(faces, _FACES_READ))
+
+
+def match(model: ShapeModel, vertices: FloatArray, faces: IntArray) -> Matched:
+    """Find which of the model's meshes a file holds.
 
     Vertices count in their order and faces in any; JSON may leave these out. STL, which shares no vertices, counts by
     the order of its faces. A file like those that the model was trained on may have the vertices that were welded then.
 
     Args:
         model: whose meshes come into question.
-        data: the file.
-        format: one of uploads.FORMATS.
+        vertices: (V, 3) as they stand in the file.
+        faces: (F, 3) there, or none.
 
     Raises:
-        InvalidMeshError: unreadable, not finite, or none of the model's meshes.
+        InvalidMeshError: not finite, or none of the model's meshes.
     """
     layouts = _layouts(model)
-    try:
-        largest = max(layout.count for layout in layouts), max(len(layout.faces) for layout in layouts)
-        refuse_bombs(data, format, *largest)
-        vertices, faces = _read(data, format)
-    except MeshError as error:
-        raise InvalidMeshError(f"The mesh can't be used: {str(error).rstrip('.')}. Send one {format} file.") from None
     bad = np.flatnonzero(~(np.abs(vertices) < np.finfo(np.float32).max).all(axis=1))
     if len(bad):
         raise InvalidMeshError(f"Vertex {bad[0]} has a coordinate that is not a finite number. Send finite positions.")
@@ -150,29 +151,3 @@ def _of_soup(layout: _Layout, corners: FloatArray) -> Matched:
             "order, or a format that keeps vertices: glb, obj, ply, npz or json."
         )
     return Matched(vertices, layout.mesh)
-
-
-def _read(data: bytes, format: str) -> tuple[FloatArray, IntArray]:
-    """Vertices (V, 3) and faces (F, 3) of a file, none where it doesn't say; raises MeshError."""
-    if format == "json":
-        vertices, faces = _read_json(data)
-    else:
-        vertices, faces = read_arrays(data, format)
-    if vertices.ndim != 2 or vertices.shape[1] != 3 or vertices.dtype.kind not in "fiu" or not len(vertices):
-        raise MeshError(f"vertices must be (V, 3) numbers, not {vertices.dtype} of shape {vertices.shape}")
-    if faces.size and (faces.ndim != 2 or faces.shape[1] != 3 or faces.dtype.kind not in "iu"):
-        raise MeshError(f"faces must be (F, 3) whole numbers, not {faces.dtype} of shape {faces.shape}")
-    return vertices.astype(np.float64), faces.reshape(-1, 3).astype(np.int64)
-
-
-def _read_json(data: bytes) -> tuple[NDArray, NDArray]:
-    try:
-        content = orjson.loads(data)
-    except orjson.JSONDecodeError as error:
-        raise MeshError(f"not JSON: {error}") from None
-    if not isinstance(content, dict) or "vertices" not in content:
-        raise MeshError('not an object {"vertices": [[x, y, z], …], "faces": [[a, b, c], …]}')
-    try:
-        return np.array(content["vertices"]), np.array(content.get("faces") or np.zeros((0, 3), int))
-    except ValueError:
-        raise MeshError("vertices and faces must be lists of three numbers each") from None

@@ -9,14 +9,15 @@ from typing import Annotated
 from fastapi import Depends, Path, Query, Request
 from pydantic import WithJsonSchema
 
+from service.connections import Connections
 from service.metrics import Metrics
-from service.negotiation import declared_type
 from service.problems import ProblemError
 from service.recent import RecentAnswers
 from service.reloading import Reloader
 from service.repository import ModelRepository
+from service.sandbox import Sandbox
 from service.settings import Settings
-from service.shape_model import ShapeModel
+from service.shape_model import MeshChoice, ShapeModel
 from service.workers import Workers
 
 
@@ -31,9 +32,11 @@ class Service:
     settings: Settings
     repository: ModelRepository
     workers: Workers
+    connections: Connections
     metrics: Metrics
     reloader: Reloader
     recent: RecentAnswers
+    sandbox: Sandbox
     draining: bool = False
 
 
@@ -46,6 +49,9 @@ async def _service(request: Request) -> Service:
 ServiceDependency = Annotated[Service, Depends(_service)]
 
 ModelName = Annotated[str, Path(description="Name of a model.", examples=["freaky-torus"])]
+MeshQuery = Annotated[
+    MeshChoice | None, Query(alias="mesh", description="As in the body, over which it wins: `fine` or `coarse`.")
+]
 Version = Annotated[str | None, Query(description="Version of the model; by default the newest.")]
 Format = Annotated[
     str | None, Query(description="Format of the answer, which wins over `Accept`; 406 lists the choices.")
@@ -65,15 +71,14 @@ def one_of(names: Iterable[str]) -> WithJsonSchema:
     return WithJsonSchema({"type": "string", "enum": [*names]})
 
 
-async def require_json(request: Request) -> None:
-    """Refuse bodies that aren't declared as JSON; raises ProblemError, unsupported-media-type."""
-    declared = declared_type(request.headers)
-    if declared != "application/json" and not (declared.startswith("application/") and declared.endswith("+json")):
-        raise ProblemError(
-            "unsupported-media-type",
-            f"The body is {request.headers.get('content-type') or 'of no declared type'}. Send JSON, and the header "
-            "Content-Type: application/json with it.",
-        )
+async def known_query(request: Request) -> None:
+    """Refuse parameters that the description of a call doesn't list; raises ProblemError, invalid-request."""
+    known: dict[tuple[str, str], list[str]] = request.app.state.query_parameters
+    listed = known.get((request.scope["route"].path, request.method))
+    unknown = [] if listed is None else [name for name in request.query_params if name not in listed]
+    if unknown:
+        choice = f"choose among {', '.join(listed)}" if listed else "this call has none"
+        raise ProblemError("invalid-request", f"There is no query parameter {unknown[0]!r} here: {choice}.")
 
 
 def limit_codes(service: Service, count: int, field: str = "latents") -> None:

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from typing import Any
 
-from fastapi import FastAPI
+from fastapi import APIRouter, FastAPI
 from fastapi.openapi.utils import get_openapi
+from fastapi.routing import APIRoute
 from pydantic import BaseModel
 from pydantic.json_schema import models_json_schema
 
+from service.bodies import JSONBody
 from service.inference import InferenceRequest
 from service.middleware import OPEN
 from service.responses import problems
@@ -23,7 +26,7 @@ model's reference. Every error is a problem (RFC 9457) whose `detail` says what 
 """
 
 
-#: Bodies that FastAPI doesn't read itself, or only answers with.
+#: Bodies that routes read by themselves or only answer with, beside those of JSONBody.
 _MODELS: tuple[type[BaseModel], ...] = (InferenceRequest, Problem)
 _KEYS = {
     "bearer": {"type": "http", "scheme": "bearer"},
@@ -31,8 +34,9 @@ _KEYS = {
 }
 
 
-def describe(app: FastAPI) -> None:
-    """Have an application generate its description."""
+def describe(app: FastAPI, routers: Iterable[APIRouter]) -> None:
+    """Have an application of some routers generate its description, and know each call's query parameters by it."""
+    bodies = dict(_bodies(routers))
 
     def generate() -> dict[str, Any]:
         if app.openapi_schema is None:
@@ -43,8 +47,9 @@ def describe(app: FastAPI) -> None:
                 description=DESCRIPTION,
                 routes=app.routes,
             )
+            models = dict.fromkeys((*_MODELS, *bodies.values()))
             _, definitions = models_json_schema(
-                [(model, "validation") for model in _MODELS], ref_template="#/components/schemas/{model}"
+                [(model, "validation") for model in models], ref_template="#/components/schemas/{model}"
             )
             components = schema["components"]
             for superfluous in ("HTTPValidationError", "ValidationError"):
@@ -54,12 +59,28 @@ def describe(app: FastAPI) -> None:
             # The empty one: a server without a key, which is the default.
             schema["security"] = [{}, *({name: []} for name in _KEYS)]
             for path, calls in schema["paths"].items():
-                for call in calls.values():
+                for method, call in calls.items():
                     _correct(path, call)
+                    if model := bodies.get((path, method)):
+                        schema_of = {"schema": {"$ref": f"#/components/schemas/{model.__name__}"}}
+                        call["requestBody"] = {"required": True, "content": {"application/json": schema_of}}
             app.openapi_schema = schema
         return app.openapi_schema
 
     app.openapi = generate  # type: ignore[method-assign]
+    app.state.query_parameters = {
+        (path, method.upper()): [p["name"] for p in call.get("parameters", ()) if p["in"] == "query"]
+        for path, calls in generate()["paths"].items()
+        for method, call in calls.items()
+    }
+
+
+def _bodies(routers: Iterable[APIRouter]) -> Iterator[tuple[tuple[str, str], type[BaseModel]]]:
+    """The model of each call's body, by path and method."""
+    for route in (route for router in routers for route in router.routes if isinstance(route, APIRoute)):
+        for dependency in route.dependant.dependencies:
+            if isinstance(dependency.call, JSONBody):
+                yield from (((route.path, method.lower()), dependency.call.model) for method in route.methods or ())
 
 
 def _correct(path: str, call: dict[str, Any]) -> None:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import sparse
 
+from geometry.deadline import Deadline
 from geometry.least_squares import Fit, least_squares, shrinkable
 from geometry.mesh import FloatArray, IntArray
 from geometry.nric import wrap
@@ -83,7 +84,7 @@ class Editor:
         targets: Sequence[Target],
         prior: float = PRIOR,
         mesh: MeshChoice = MeshChoice.FINE,
-        deadline: float | None = None,
+        deadline: Deadline | None = None,
     ) -> Edited:
         """The code inside the bounds whose shape comes closest.
 
@@ -92,7 +93,7 @@ class Editor:
             targets: at least one.
             prior: weight of the distance from the start.
             mesh: which mesh the targets' vertices belong to.
-            deadline: time.monotonic() after which the status is Status.DEADLINE.
+            deadline: after which the status is Status.DEADLINE.
 
         Raises:
             NotFiniteError: a target out of all proportion.
@@ -153,7 +154,7 @@ class _Problem:
         start: FloatArray,
         positions: FloatArray,
         prior: float,
-        deadline: float | None,
+        deadline: Deadline | None,
     ) -> None:
         self.rough, self.chart, self.start = rough, chart, start
         self._model, self._positions, self._deadline = model, positions, deadline
@@ -241,7 +242,7 @@ class _Chart:
         reconstruct: Reconstructor,
         vertices: IntArray,
         mesh: MeshChoice,
-        deadline: float | None,
+        deadline: Deadline | None,
         *,
         rough: bool,
     ) -> None:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from geometry.deadline import Deadline
 from geometry.least_squares import Fit, least_squares
 from geometry.mesh import FloatArray, align
 from geometry.nric import WeightedNorm, nric, wrap
@@ -61,13 +62,13 @@ class Encoder:
         self._root = np.sqrt(self._norm.squared)
         self._centre = nric(model.reference.vertices, model.reference.connectivity)
 
-    def __call__(self, given: Matched, bounds: Bounds = Bounds.ALLOW, deadline: float | None = None) -> Encoded:
+    def __call__(self, given: Matched, bounds: Bounds = Bounds.ALLOW, deadline: Deadline | None = None) -> Encoded:
         """The code of a mesh.
 
         Args:
             given: in the model's order, in the units of the training meshes and in any rigid pose.
             bounds: REJECT refuses a code outside the bounds, CLAMP looks for one inside only.
-            deadline: time.monotonic() after which the status is Status.DEADLINE.
+            deadline: after which the status is Status.DEADLINE.
 
         Raises:
             InvalidMeshError: edges without any length.
@@ -90,7 +91,7 @@ class Encoder:
         status = Status.DEADLINE if shape.diagnostics.status is Status.DEADLINE else fit.status
         return Encoded(code, inside, status, fit.evaluations, residual, shape, distances, given.mesh)
 
-    def _fit(self, target: FloatArray, lower: FloatArray, upper: FloatArray, deadline: float | None) -> Fit:
+    def _fit(self, target: FloatArray, lower: FloatArray, upper: FloatArray, deadline: Deadline | None) -> Fit:
         latents, root = self.model.latents, self._root
         box = lower, upper, latents.width
 

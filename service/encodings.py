@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -15,10 +15,24 @@ from geometry.mesh import FloatArray, IntArray
 from service.exact import Exact
 from service.shape_model import Diagnostics
 
+#: Bytes that are counted at once: where there are too many values, few of these pieces are looked at.
+_PIECE = 2**16
+
 
 def dump_json(content: Any) -> bytes:
     """JSON, with NumPy arrays as nested lists; what isn't finite becomes null."""
     return orjson.dumps(content, option=orjson.OPT_SERIALIZE_NUMPY)
+
+
+def holds_more_values(text: bytes, most: int) -> bool:
+    """Whether JSON holds more values than that, going by what separates them, before any of it is parsed."""
+    count = 0
+    for start in range(0, len(text), _PIECE):
+        piece = text[start : start + _PIECE]
+        count += sum(map(piece.count, (b",", b":", b"[", b"{")))
+        if count > most:
+            return True
+    return False
 
 
 def float32(array: NDArray) -> NDArray[np.float32]:
@@ -50,10 +64,21 @@ def diagnostics_arrays(diagnostics: Sequence[Diagnostics]) -> dict[str, NDArray]
     }
 
 
-def exact_lists(exponentials: Sequence[Exact]) -> dict[str, Any]:
+def json_pieces(members: Mapping[str, Iterable[Any]]) -> Iterator[bytes]:
+    """An object of lists as JSON, an element at a time: together they may be large."""
+    opening = b"{"
+    for name, elements in members.items():
+        yield opening + dump_json(name) + b":["
+        for k, element in enumerate(elements):
+            yield (b"," if k else b"") + dump_json(element)
+        opening = b"],"
+    yield b"]}"
+
+
+def exact_lists(exponentials: Sequence[Exact]) -> dict[str, list[Any]]:
     """Exponentials of n codes as lists (n,), for JSON."""
     return {
-        "exact": [None if e.vertices is None else float32(e.vertices) for e in exponentials],
+        "exact": [e.vertices for e in exponentials],
         "distance": [None if e.vertices is None else {"mean": e.mean, "max": e.max} for e in exponentials],
         "exact_status": [e.status for e in exponentials],
     }
@@ -61,9 +86,9 @@ def exact_lists(exponentials: Sequence[Exact]) -> dict[str, Any]:
 
 def exact_arrays(exponentials: Sequence[Exact], vertex_count: int) -> dict[str, NDArray]:
     """Exponentials of n codes as arrays, for NPZ files; NaN where one failed."""
-    missing = np.full((vertex_count, 3), np.nan)
+    missing = np.full((vertex_count, 3), np.nan, np.float32)
     return {
-        "exact": float32(np.stack([missing if e.vertices is None else e.vertices for e in exponentials])),
+        "exact": np.stack([missing if e.vertices is None else e.vertices for e in exponentials]),
         "distance_mean": np.array([e.mean for e in exponentials], dtype=np.float64),
         "distance_max": np.array([e.max for e in exponentials], dtype=np.float64),
         "exact_status": np.array([str(e.status) for e in exponentials]),

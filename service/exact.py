@@ -6,14 +6,15 @@ import queue
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from geometry.calculus import ShellSpace
+from geometry.deadline import Deadline
 from geometry.energy import Material
 from geometry.exponential import exponential
-from geometry.mesh import FloatArray
 from geometry.status import Status
 from service.latent_space import Codes
-from service.shape_model import MeshChoice, Shape, ShapeModel
+from service.shape_model import MeshChoice, ShapeModel
 
 
 class NoTangentSpaceError(ValueError):
@@ -26,12 +27,12 @@ class Exact:
 
     Attributes:
         status: of its solver, see geometry.reconstruction.Status.
-        vertices: (V, 3) aligned like every shape, in the units of the training meshes; None where it failed.
+        vertices: (V, 3) float32, aligned like every shape, in the units of the training meshes; None where it failed.
         mean, max: distance of the networks' answer from it, over vertices; None where it failed.
     """
 
     status: Status
-    vertices: FloatArray | None
+    vertices: NDArray[np.float32] | None
     mean: float | None
     max: float | None
 
@@ -45,14 +46,17 @@ def require_tangent_space(model: ShapeModel) -> None:
         )
 
 
-def exact(model: ShapeModel, code: Codes, shape: Shape, mesh: MeshChoice) -> Exact:
+def exact(
+    model: ShapeModel, code: Codes, answer: NDArray[np.float32], mesh: MeshChoice, deadline: Deadline | None = None
+) -> Exact:
     """The exponential ``exp_z̄(Σ_j code_j u_j)`` in K steps, with the material and K of the model's manifest.
 
     Args:
         model: with a tangent space.
         code: (m,).
-        shape: the networks' answer to it, on the mesh of choice.
+        answer: (V, 3) what the networks say to it, on the mesh of choice.
         mesh: fine or coarse.
+        deadline: after which the status is Status.DEADLINE.
     """
     require_tangent_space(model)
     assert model.modes is not None  # noqa: S101 - has just been required
@@ -64,11 +68,13 @@ def exact(model: ShapeModel, code: Codes, shape: Shape, mesh: MeshChoice) -> Exa
         manifest = model.manifest
         space = ShellSpace(model.reference, Material(manifest.mu, manifest.lambda_, manifest.eta))
     try:
-        path = exponential(space, model.reference.vertices, velocity, model.manifest.exponential_steps)
+        path = exponential(
+            space, model.reference.vertices, velocity, model.manifest.exponential_steps, deadline=deadline
+        )
     finally:
         model.spaces.put(space)
     if not path.converged:
         return Exact(path.status, None, None, None)
     vertices = model.finish(path.vertices[-1], mesh)
-    distances = np.linalg.norm(vertices - shape.vertices, axis=1)
-    return Exact(path.status, vertices, float(distances.mean()), float(distances.max()))
+    distances = np.linalg.norm(vertices - answer, axis=1)
+    return Exact(path.status, vertices.astype(np.float32), float(distances.mean()), float(distances.max()))

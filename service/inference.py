@@ -8,17 +8,18 @@ https://github.com/triton-inference-server/server/blob/main/docs/protocol/extens
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import re
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import chain
 from typing import Annotated, Any, Literal
 
 import numpy as np
-import orjson
-from fastapi.exceptions import RequestValidationError
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, NonNegativeInt, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, NonNegativeInt, field_validator
 from pydantic.json_schema import SkipJsonSchema
 
+from geometry.archives import Buffer
+from service import bodies
 from service.encodings import dump_json
 from service.latent_space import Bounds
 from service.problems import ProblemError
@@ -44,6 +45,9 @@ class InputParameters(_Message):
     binary_data_size: SkipJsonSchema[NonNegativeInt | None] = Field(None, description="Its bytes after the JSON.")
 
 
+_Numbers = Annotated[list[Number], Field(fail_fast=True)]
+
+
 def _as_json(schema: dict[str, Any]) -> None:
     """Numbers are required in JSON: where bytes follow it, the body has another media type and no schema."""
     schema["required"].append("data")
@@ -62,7 +66,7 @@ class InputTensor(_Message):
     ]
     datatype: Literal["FP32"]
     parameters: InputParameters = InputParameters(binary_data_size=None)
-    data: list[Number] | list[list[Number]] | SkipJsonSchema[None] = Field(
+    data: _Numbers | Annotated[list[_Numbers], Field(fail_fast=True)] | SkipJsonSchema[None] = Field(
         None, description="The numbers, row by row or flat; absent where bytes follow."
     )
 
@@ -104,8 +108,21 @@ class InferenceRequest(_Message):
 
     id: str | None = Field(None, description="Comes back in the answer.")
     inputs: Annotated[list[InputTensor], Field(min_length=1, max_length=1)]
-    outputs: Annotated[list[RequestedOutput], Field(description="By default both.")] = []
+    outputs: Annotated[list[RequestedOutput], Field(fail_fast=True, description="By default both; each once.")] = []
     parameters: InferenceParameters = InferenceParameters()
+
+    @field_validator("outputs", mode="before")
+    @classmethod
+    def _each_once(cls, given: object) -> object:
+        # Before they are looked at: there may be any number, and each would be computed.
+        if isinstance(given, list):
+            names = [output.get("name") for output in given[: len(OUTPUTS) + 1] if isinstance(output, dict)]
+            for name in OUTPUTS:
+                if names.count(name) > 1:
+                    raise ProblemError("malformed-request", f"outputs names {name} twice. Name each output once.")
+            if len(given) > len(OUTPUTS):
+                raise ProblemError("malformed-request", f"outputs has {len(given)} entries. Name each output once.")
+        return given
 
     @property
     def wanted(self) -> list[OutputName]:
@@ -186,8 +203,8 @@ def model_metadata(model: ShapeModel, versions: Sequence[str]) -> ModelMetadata:
     )
 
 
-def parse(body: bytes, header: str | None) -> tuple[InferenceRequest, list[list[float]]]:
-    """A body to the request, and the codes that it holds.
+def parse(body: bytes, header: str | None) -> tuple[InferenceRequest, bytes]:
+    """A body to the request, and the bytes that follow its JSON.
 
     Args:
         body: JSON, and after it the input's bytes if they aren't in it.
@@ -199,15 +216,14 @@ def parse(body: bytes, header: str | None) -> tuple[InferenceRequest, list[list[
     """
     length = len(body)
     if header is not None:
-        if not header.isascii() or not header.isdecimal() or int(header) > length:
+        if not re.fullmatch("[0-9]{1,12}", header) or int(header) > length:
             raise ProblemError(
                 "malformed-request",
                 f"{HEADER} is {header!r}, but the body has {length} bytes. Send the length of its JSON part.",
             )
         length = int(header)
-    request = _request(body[:length])
+    request = bodies.read(body[:length], InferenceRequest)
     tensor = request.inputs[0]
-    n, m = tensor.shape
     size = tensor.parameters.binary_data_size
     if (size is None) == (tensor.data is None):
         raise _invalid(f"Send {INPUT} either as data, or with binary_data_size and its bytes after the JSON part")
@@ -216,56 +232,60 @@ def parse(body: bytes, header: str | None) -> tuple[InferenceRequest, list[list[
             f"{len(body) - length} bytes follow the JSON part, not {size or 0} as binary_data_size says. "
             f"Send {HEADER}, the length of the JSON part, and then the bytes of {INPUT}"
         )
+    return request, body[length:]
+
+
+def codes(request: InferenceRequest, tail: bytes) -> NDArray[np.floating]:
+    """The codes (n, m) of a request, given the bytes that followed it; raises ProblemError."""
+    tensor = request.inputs[0]
+    n, m = tensor.shape
     if tensor.data is not None:
         rows = (row if isinstance(row, list) else [row] for row in tensor.data)
         values = np.array(list(chain.from_iterable(rows)), dtype=np.float64)
-    elif len(body[length:]) % _FLOAT.itemsize:
+    elif len(tail) % _FLOAT.itemsize:
         raise _invalid(f"The bytes of {INPUT} are no whole number of FP32 values. Send {_FLOAT.itemsize} for each")
     else:
-        values = np.frombuffer(body[length:], _FLOAT)
+        values = np.frombuffer(tail, _FLOAT)
     if m == 0 or values.size != n * m:  # any number of codes without coordinates would fit
         raise _invalid(f"{INPUT} has {values.size} numbers, but its shape is {tensor.shape}. Send {n * m}")
-    return request, values.reshape(n, m).tolist()
+    return values.reshape(n, m)
 
 
 def _invalid(detail: str) -> ProblemError:
     return ProblemError("invalid-request", detail + ".")
 
 
-def _request(text: bytes) -> InferenceRequest:
-    try:
-        message = orjson.loads(text)
-    except orjson.JSONDecodeError as error:
-        fault = {"type": "json_invalid", "loc": ("body", error.pos), "ctx": {"error": error.msg}}
-        raise RequestValidationError([fault]) from None
-    try:
-        return InferenceRequest.model_validate(message)
-    except ValidationError as error:
-        faults = error.errors(include_url=False, include_input=False)
-        raise RequestValidationError([{**fault, "loc": ("body", *fault["loc"])} for fault in faults]) from None
-
-
 def answer(
     request: InferenceRequest, model: ShapeModel, outputs: Mapping[OutputName, NDArray[np.float32]]
-) -> tuple[bytes, int | None]:
-    """The body of an answer, and how long its JSON part is where bytes follow.
+) -> tuple[Iterator[Buffer], int | None]:
+    """The body of an answer in pieces, and how long its JSON part is where bytes follow.
 
     Args:
         request: says how each output is to come.
         model: that inferred.
         outputs: those that are wanted.
     """
-    described, tail = [], []
-    for name, array in outputs.items():
+    text = _text(request, model, outputs)
+    tail = [array.astype(_FLOAT, copy=False).data for name, array in outputs.items() if request.binary(name)]
+    if not tail:
+        return text, None
+    whole = b"".join(text)  # whose length comes first
+    return chain([whole], (flat.cast("B") for flat in tail)), len(whole)
+
+
+def _text(
+    request: InferenceRequest, model: ShapeModel, outputs: Mapping[OutputName, NDArray[np.float32]]
+) -> Iterator[bytes]:
+    facts = {"model_name": model.manifest.name, "model_version": model.manifest.version}
+    yield dump_json(facts)[:-1] + b',"outputs":['
+    for k, (name, array) in enumerate(outputs.items()):
         tensor: dict[str, object] = {"name": name, "shape": list(array.shape), "datatype": "FP32"}
         if request.binary(name):
-            tail.append(array.astype(_FLOAT).tobytes())
-            tensor["parameters"] = {"binary_data_size": len(tail[-1])}
-        else:
-            tensor["data"] = array.ravel()
-        described.append(tensor)
-    message = {"model_name": model.manifest.name, "model_version": model.manifest.version, "outputs": described}
-    if request.id is not None:
-        message["id"] = request.id
-    text = dump_json(message)
-    return b"".join([text, *tail]), len(text) if tail else None
+            tensor["parameters"] = {"binary_data_size": _FLOAT.itemsize * array.size}
+        yield (b"," if k else b"") + dump_json(tensor)[:-1]
+        if not request.binary(name):
+            for i, row in enumerate(array):  # a code at a time: all together may be large
+                yield (b"," if i else b',"data":[') + dump_json(row.ravel())[1:-1]
+            yield b"]"
+        yield b"}"
+    yield b"]" + (b',"id":' + dump_json(request.id) if request.id is not None else b"") + b"}"

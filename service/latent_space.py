@@ -73,12 +73,12 @@ class LatentSpace:
         return len(self.names)
 
     def codes(
-        self, values: Sequence[Sequence[float]], bounds: Bounds = Bounds.ALLOW
+        self, values: Sequence[Sequence[float]] | NDArray[np.floating], bounds: Bounds = Bounds.ALLOW
     ) -> tuple[Codes, NDArray[np.bool_]]:
         """Check codes and bring them into the one form that identifies a shape.
 
         Args:
-            values: n lists of m numbers.
+            values: n lists of m numbers, or an array of them.
             bounds: what to do outside the bounds.
 
         Returns:

@@ -10,6 +10,7 @@ from prometheus_client.core import GaugeMetricFamily, Metric
 from prometheus_client.registry import Collector
 
 from service import __version__
+from service.connections import Connections
 from service.repository import Changes, ModelRepository
 from service.workers import Workers
 
@@ -23,7 +24,7 @@ _STAGE = re.compile(rf"({'|'.join(STAGES)});dur=([0-9.]+)")
 class Metrics:
     """What a server counts and measures, with a registry of its own."""
 
-    def __init__(self, repository: ModelRepository, workers: Workers) -> None:
+    def __init__(self, repository: ModelRepository, workers: Workers, connections: Connections) -> None:
         self.registry = registry = CollectorRegistry()
         ProcessCollector(registry=registry)
         registry.register(_Models(repository))
@@ -45,12 +46,24 @@ class Metrics:
             registry=registry,
         )
         self._reloads = Counter(
-            "shapespace_reloaded_bundles", "Bundles that reloads found changed.", ["result"], registry=registry
+            "shapespace_reloaded_bundles",
+            "Bundles that reloads loaded, removed or refused, and reloads that failed whole.",
+            ["result"],
+            registry=registry,
         )
+        refusals = Counter(
+            "shapespace_refusals", "Connections that were refused without a whole request.", ["kind"], registry=registry
+        )
+        connections.refused = lambda kind: refusals.labels(kind).inc()
         for name, text, value in (
             ("bundles_refused", "Bundles that the latest look refused.", lambda: len(repository.refused)),
-            ("admitted", "Requests at work or waiting for a worker.", lambda: workers.admitted),
-            ("admitted_limit", "Requests that may be; more get 503.", lambda: workers.limit),
+            ("admitted", "Requests at work or waiting for a worker.", lambda: workers.places.used),
+            ("admitted_limit", "Requests that may be; more get 503.", lambda: workers.places.limit),
+            ("streams", "Answers that are read while they are computed.", lambda: workers.streams.used),
+            ("streams_limit", "Such answers that may be; more get 503.", lambda: workers.streams.limit),
+            ("lost_threads", "Threads still at work long after their deadline.", lambda: workers.lost),
+            ("connections", "Open connections.", lambda: connections.quota.used),
+            ("connections_limit", "Connections that may be open.", lambda: connections.quota.limit),
             ("workers", "Shapes computed at once.", lambda: workers.threads),
         ):
             Gauge(f"shapespace_{name}", text, registry=registry).set_function(value)
@@ -76,6 +89,7 @@ class Metrics:
         """Count a look at the models folder."""
         for result in ("loaded", "removed", "refused"):
             self._reloads.labels(result).inc(len(getattr(changes, result)))
+        self._reloads.labels("failed").inc(changes.failed)
 
 
 class _Models(Collector):

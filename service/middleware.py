@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import asyncio
 import hashlib
 import hmac
 import logging
 import re
 import time
+from collections import OrderedDict
+from collections.abc import Collection
 from uuid import uuid4
 
 from pydantic import SecretStr
@@ -15,13 +18,22 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from service import logs
 from service.problems import ProblemError, internal_error, problem
+from service.quota import UPLOADS, Quota, QuotaError, client_name
 
 logger = logging.getLogger(__name__)
 REQUEST_ID = re.compile(r"[A-Za-z0-9._-]{1,64}")
 #: What answers without a key: orchestrators ask for health, and the others say nothing about the models.
 OPEN = re.compile(r"/|/page/.*|/openapi\.json|/v2/health/(live|ready)")
+#: Bytes of answers that are held while they are read, and bytes that are sent at once.
+ANSWERS, PIECE = 256 * 2**20, 2**18
+#: Characters of a path that go into the log.
+LONGEST_PATH = 1000
+#: Seconds from a wrong key to the next key of the same address that is looked at, seconds that one waits for its turn,
+#: and addresses kept.
+KEY_INTERVAL, KEY_WAIT, KEY_ADDRESSES = 0.1, 1.0, 10_000
+HEALTH = frozenset({"/v2/health/live", "/v2/health/ready"})
 #: Called every few seconds, so that their lines are of no interest.
-QUIET = frozenset({"/v2/health/live", "/v2/health/ready", "/metrics"})
+QUIET = HEALTH | {"/metrics"}
 
 
 class AnswerHead:
@@ -33,12 +45,15 @@ class AnswerHead:
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Pass a request on, as GET if need be."""
         if scope["type"] == "http" and scope["method"] == "HEAD":
-            scope = {**scope, "method": "GET"}
+            scope = {**scope, "method": "GET", "asked": "HEAD"}
         await self.app(scope, receive, send)
 
 
 class Observe:
-    """Gives each request an id, counts and times it, logs one line about it, and answers where nobody else did."""
+    """Gives each request an id, counts and times it, logs one line about it, and answers where nobody else did.
+
+    Every answer also tells browsers to take it for what it says it is.
+    """
 
     def __init__(self, app: ASGIApp) -> None:
         self.app = app
@@ -51,7 +66,7 @@ class Observe:
         given = Headers(scope=scope).get("x-request-id", "")
         id = given if REQUEST_ID.fullmatch(given) else uuid4().hex
         context = logs.request_id.set(id)
-        service = scope["app"].state.service
+        service, method = scope["app"].state.service, scope.get("asked", scope["method"])
         status, timing = 499, ""  # nginx's number for a client that went away
         answered = False
         began = time.perf_counter()
@@ -63,6 +78,7 @@ class Observe:
                 headers = MutableHeaders(scope=message)
                 status, timing = message["status"], headers.get("server-timing", "")
                 headers["X-Request-ID"] = id
+                headers["X-Content-Type-Options"] = "nosniff"
                 if service.draining:  # the next request is for another server
                     headers["Connection"] = "close"
             await send(message)
@@ -77,13 +93,13 @@ class Observe:
         finally:
             seconds = time.perf_counter() - began
             route = _template(scope)
-            service.metrics.answered(route, scope["method"], status, seconds, timing)
+            service.metrics.answered(route, method, status, seconds, timing)
             # As it came, percent-encoded: a path can't break a line.
-            path = scope.get("raw_path", b"").decode("ascii", "replace")
-            facts = {"method": scope["method"], "path": path, "route": route, "status": status}
+            path = scope.get("raw_path", b"")[:LONGEST_PATH].decode("ascii", "replace")
+            facts = {"method": method, "path": path, "route": route, "status": status}
             facts |= {"seconds": round(seconds, 6), "client": (scope.get("client") or ["-"])[0]}
             level = logging.DEBUG if route in QUIET else logging.INFO
-            logger.log(level, "%s %s %d in %.3f s", scope["method"], path, status, seconds, extra=facts)
+            logger.log(level, "%s %s %d in %.3f s", method, path, status, seconds, extra=facts)
             logs.request_id.reset(context)
 
 
@@ -95,26 +111,83 @@ def _template(scope: Scope) -> str:
     return f"{scope['root_path']}/*" if scope.get("root_path") else "unmatched"
 
 
+class RequireHost:
+    """Refuses requests that don't say whom they are for, or are for another server.
+
+    A page of a stranger may call a server on the machine of who looks at it, once the stranger has his own name
+    resolve to that machine (DNS rebinding); the name in ``Host`` is still the stranger's.
+
+    Args:
+        app: what comes next.
+        hosts: names that are meant, without ports and in small letters; none stands for any.
+    """
+
+    def __init__(self, app: ASGIApp, hosts: Collection[str]) -> None:
+        self.app, self._hosts = app, frozenset(hosts)
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Pass on what is for this server."""
+        # Orchestrators ask for health by whatever address they know.
+        if scope["type"] == "http" and scope["path"] not in HEALTH and (refusal := self._refusal(scope)):
+            await problem(scope, *refusal)(scope, receive, send)
+        else:
+            await self.app(scope, receive, send)
+
+    def _refusal(self, scope: Scope) -> tuple[str, str] | None:
+        given = Headers(scope=scope).getlist("host")
+        if len(given) > 1 or (not given and scope["http_version"] != "1.0"):
+            return "no-host", f"The request has {len(given)} headers Host. Send one."
+        if self._hosts and given and re.sub(r":[0-9]*$", "", given[0]).lower() not in self._hosts:
+            detail = f"This server isn't called {given[0]!r}. Use one of its names"
+            return "misdirected", f"{detail}: {', '.join(sorted(self._hosts))}; SHAPESPACE_HOSTS adds others."
+        return None
+
+
 class RequireKey:
-    """Refuses requests without the key, in ``Authorization: Bearer`` or ``X-API-Key``."""
+    """Refuses requests without the key, in ``Authorization: Bearer`` or ``X-API-Key``.
+
+    After a wrong key the next of its address has to wait, right or wrong, so that none is found by trying; where too
+    many wait, a key isn't looked at.
+    """
 
     def __init__(self, app: ASGIApp, key: SecretStr) -> None:
         self.app, self._digest = app, _digest(key.get_secret_value())
+        #: When the next key of an address may be looked at.
+        self._next: OrderedDict[str, float] = OrderedDict()
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Pass on what has the key or needs none."""
-        if scope["type"] != "http" or OPEN.fullmatch(scope["path"]) or self._has_key(Headers(scope=scope)):
+        if scope["type"] != "http" or OPEN.fullmatch(scope["path"]):
             await self.app(scope, receive, send)
             return
+        if given := _given_key(Headers(scope=scope)):
+            client = client_name((scope.get("client") or [""])[0])
+            wait = self._next.get(client, 0.0) - time.monotonic()
+            if wait > KEY_WAIT:
+                detail = "Too many wrong keys came from this address. Try again after the time in Retry-After."
+                await problem(scope, "busy", detail)(scope, receive, send)
+                return
+            if wait > 0:
+                self._postpone(client)
+                await asyncio.sleep(wait)
+            # Digests have one length, and comparing them takes the same time wherever they differ.
+            if hmac.compare_digest(_digest(given), self._digest):
+                await self.app(scope, receive, send)
+                return
+            if wait <= 0:
+                self._postpone(client)
         detail = "Send the server's API key: Authorization: Bearer KEY, or X-API-Key: KEY."
         await problem(scope, "unauthorized", detail)(scope, receive, send)
 
-    def _has_key(self, headers: Headers) -> bool:
-        scheme, _, given = headers.get("authorization", "").partition(" ")
-        if scheme.lower() != "bearer":
-            given = headers.get("x-api-key", "")
-        # Digests have one length, and comparing them takes the same time wherever they differ.
-        return hmac.compare_digest(_digest(given.strip()), self._digest)
+    def _postpone(self, client: str) -> None:
+        self._next[client] = max(time.monotonic(), self._next.pop(client, 0.0)) + KEY_INTERVAL
+        if len(self._next) > KEY_ADDRESSES:
+            self._next.popitem(last=False)
+
+
+def _given_key(headers: Headers) -> str:
+    scheme, _, given = headers.get("authorization", "").partition(" ")
+    return (given if scheme.lower() == "bearer" else headers.get("x-api-key", "")).strip()
 
 
 def _digest(key: str) -> bytes:
@@ -124,7 +197,8 @@ def _digest(key: str) -> bytes:
 class LimitBody:
     """Refuses request bodies over a limit, announced or not, and compressed ones.
 
-    Starlette has one of its own, but that answers in plain text.
+    All bodies that are held at one time have a limit together as well. Starlette has one of its own for a single
+    body, but that answers in plain text.
 
     Args:
         app: what comes next.
@@ -134,6 +208,7 @@ class LimitBody:
 
     def __init__(self, app: ASGIApp, limit: int, upload: int) -> None:
         self.app, self.limit, self.upload = app, limit, upload
+        self._held = Quota(UPLOADS * max(limit, upload))
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Pass a request on, counting its body as it is read."""
@@ -145,6 +220,7 @@ class LimitBody:
         announced = headers.get("content-length", "")
         length = int(announced) if announced.isdecimal() else 0
         encoding = headers.get("content-encoding", "identity")
+        client = client_name((scope.get("client") or [""])[0])
         received = 0
 
         async def limited() -> Message:
@@ -155,12 +231,73 @@ class LimitBody:
                 detail = f"The body is encoded as {encoding}. Send it as it is, without Content-Encoding."
                 raise ProblemError("unsupported-media-type", detail)
             message = await receive()
-            received += len(message.get("body", b""))
-            if received > limit:
+            size = len(message.get("body", b""))
+            if received + size > limit:
                 raise _too_large(limit)
+            try:
+                self._held.take(client, size)
+            except QuotaError:
+                raise ProblemError("busy", "The server holds too many bodies. Try again after Retry-After.") from None
+            received += size
             return message
 
-        await self.app(scope, limited, send)
+        try:
+            await self.app(scope, limited, send)
+        finally:
+            self._held.give_back(client, received)
+
+
+class PaceAnswers:
+    """Sends large answers as fast as they are read, and holds so many bytes of them at most.
+
+    Uvicorn takes the body of an answer as a whole, and keeps it until a client has read it.
+
+    Args:
+        app: what comes next.
+    """
+
+    def __init__(self, app: ASGIApp) -> None:
+        self.app, self._held = app, Quota(ANSWERS)
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Pass a request on, and its answer in pieces."""
+        if scope["type"] != "http":
+            await self.app(scope, receive, send)
+            return
+        client, held = client_name((scope.get("client") or [""])[0]), 0
+        start: Message | None = None
+        refused = False
+
+        async def paced(message: Message) -> None:
+            nonlocal start, held, refused
+            if message["type"] != "http.response.body":
+                start = message
+                return
+            if refused:
+                return
+            body, more = message.get("body", b""), message.get("more_body", False)
+            if start is not None:
+                if len(body) > PIECE:
+                    try:
+                        self._held.take(client, len(body))
+                    except QuotaError:
+                        refused = True
+                        detail = "Too many answers are being read slowly. Try again after the time in Retry-After."
+                        await problem(scope, "busy", detail)(scope, receive, send)
+                        return
+                    held = len(body)
+                await send(start)
+                start = None
+            view = memoryview(body)
+            for place in range(0, max(len(view), 1), PIECE):
+                last = place + PIECE >= len(view)
+                piece = body if len(view) <= PIECE else bytes(view[place : place + PIECE])
+                await send({"type": "http.response.body", "body": piece, "more_body": more or not last})
+
+        try:
+            await self.app(scope, receive, paced)
+        finally:
+            self._held.give_back(client, held)
 
 
 def _too_large(limit: int) -> ProblemError:

@@ -7,6 +7,9 @@ from types import MappingProxyType
 
 from service.problems import ProblemError
 
+#: Ranges of an ``Accept`` that are looked at, the first ones; browsers send less than ten.
+MOST_RANGES = 100
+
 
 def declared_type(headers: Mapping[str, str]) -> str:
     """What a body is declared to be, without parameters; empty where nothing is said."""
@@ -37,7 +40,7 @@ def choose(
         raise _not_acceptable(formats, unavailable.get(format, f"There is no format {format!r} here"))
     if accept is None or not accept.strip():
         return next(iter(formats))
-    ranges = [_parse(part) for part in accept.split(",") if part.strip()]
+    ranges = [_parse(part) for part in accept.split(",", maxsplit=MOST_RANGES)[:MOST_RANGES] if part.strip()]
     weights = {name: _weight(media_type, ranges) for name, media_type in formats.items()}
     best = max(weights, key=lambda name: weights[name])  # the first of equals
     if weights[best] <= 0:

@@ -10,6 +10,7 @@ from typing import Any
 from fastapi import FastAPI, HTTPException, Request, Response
 from fastapi.exceptions import RequestValidationError
 from starlette.exceptions import HTTPException as StarletteHTTPException
+from starlette.requests import ClientDisconnect
 from starlette.routing import Match
 from starlette.types import Scope
 
@@ -20,7 +21,8 @@ from service.exact import NoTangentSpaceError
 from service.latent_space import NotFiniteError, OutOfBoundsError, WrongLengthError
 from service.repository import UnknownModelError, UnknownVersionError
 from service.sequences import NoRoomError
-from service.workers import BusyError, DeadlineError, DisconnectedError
+from service.shape_model import ModelFailedError, NetworkTimeError
+from service.workers import BusyError, DeadlineError, DisconnectedError, EndingError
 
 MEDIA_TYPE = "application/problem+json"
 TYPE_PREFIX = "urn:shapespace:problem:"
@@ -38,6 +40,7 @@ class Kind:
 KINDS = {
     "malformed-request": Kind(400, "The request can't be read"),
     "unauthorized": Kind(401, "No valid API key"),
+    "no-host": Kind(400, "No Host, or several"),
     "not-found": Kind(404, "Nothing is here"),
     "unknown-model": Kind(404, "Unknown model"),
     "unknown-version": Kind(404, "Unknown version of the model"),
@@ -45,8 +48,10 @@ KINDS = {
     "unknown-frame": Kind(404, "Unknown frame"),
     "method-not-allowed": Kind(405, "Method not allowed"),
     "not-acceptable": Kind(406, "No such format"),
+    "request-timeout": Kind(408, "The request came too slowly"),
     "body-too-large": Kind(413, "Body too large"),
     "unsupported-media-type": Kind(415, "Unsupported media type"),
+    "misdirected": Kind(421, "Another server's name"),
     "invalid-request": Kind(422, "Invalid request"),
     "wrong-length": Kind(422, "Wrong number of latent coordinates"),
     "not-finite": Kind(422, "Not a finite number"),
@@ -56,10 +61,12 @@ KINDS = {
     "too-many-codes": Kind(422, "Too many codes"),
     "too-many-frames": Kind(422, "Too many frames"),
     "path-too-long": Kind(422, "Too many keyframes"),
+    "head-too-large": Kind(431, "Head too large"),
     "client-closed": Kind(499, "The client closed the connection"),
     "internal-error": Kind(500, "Internal error"),
     "busy": Kind(503, "Busy"),
     "not-ready": Kind(503, "Not ready"),
+    "model-failed": Kind(503, "Model failed"),
     "deadline-passed": Kind(504, "Deadline passed"),
     "no-room": Kind(507, "No room for a temporary file"),
 }
@@ -78,9 +85,15 @@ _OF_EXCEPTION: dict[type[Exception], str] = {
     BusyError: "busy",
     DeadlineError: "deadline-passed",
     NoRoomError: "no-room",
+    ModelFailedError: "model-failed",
+    NetworkTimeError: "model-failed",
     DisconnectedError: "client-closed",
+    ClientDisconnect: "client-closed",
+    EndingError: "not-ready",
 }
 DOMAIN_ERRORS = tuple(_OF_EXCEPTION)
+#: Longest sentence in an answer: what was sent may stand in it.
+_LONGEST = 1000
 _HEADERS = {
     "busy": {"Retry-After": "1"},
     "not-ready": {"Retry-After": "1"},
@@ -108,20 +121,27 @@ def problem(
     scope: Scope, kind: str, detail: str, headers: Mapping[str, str] | None = None, **extensions: Any
 ) -> Response:
     """A problem as the answer to the request of a scope."""
+    if scope["path"].startswith(_INFERENCE_PATHS):
+        extensions["error"] = shortened(detail)
+    content, own = description(kind, detail, **extensions)
+    return Response(content, KINDS[kind].status, {**own, **(headers or {})}, MEDIA_TYPE)
+
+
+def description(kind: str, detail: str, **extensions: Any) -> tuple[bytes, dict[str, str]]:
+    """Body and headers of a problem."""
     content = {
         "type": TYPE_PREFIX + kind,
         "title": KINDS[kind].title,
         "status": KINDS[kind].status,
-        "detail": detail,
+        "detail": shortened(detail),
     }
-    if scope["path"].startswith(_INFERENCE_PATHS):
-        content["error"] = detail
-    return Response(
-        dump_json(content | extensions),
-        KINDS[kind].status,
-        {**_HEADERS.get(kind, {}), **(headers or {})},
-        MEDIA_TYPE,
-    )
+    return dump_json(content | extensions), dict(_HEADERS.get(kind, {}))
+
+
+def shortened(text: str) -> str:
+    """A text that isn't as long as what it quotes, and is Unicode even where that isn't."""
+    start = text[:_LONGEST].encode(errors="replace").decode()
+    return start if len(text) <= _LONGEST else f"{start} …"
 
 
 def install(app: FastAPI) -> None:
@@ -185,7 +205,9 @@ async def _validation(request: Request, error: Exception) -> Response:
             f"The body is not JSON (character {where}: {reason}). Send one valid JSON object.",
         )
     kind = "not-finite" if all(fault["type"] == "finite_number" for fault in faults) else "invalid-request"
-    errors = [{"pointer": _pointer(fault["loc"]), "detail": _advice(fault)} for fault in faults[:10]]
+    errors = [
+        {"pointer": shortened(_pointer(fault["loc"])), "detail": shortened(_advice(fault))} for fault in faults[:10]
+    ]
     more = f" ({len(faults) - 1} more under errors.)" if len(faults) > 1 else ""
     return problem(request.scope, kind, errors[0]["detail"] + more, errors=errors)
 

@@ -6,7 +6,7 @@ import asyncio
 import logging
 
 from service.metrics import Metrics
-from service.repository import ModelRepository
+from service.repository import Changes, ModelRepository
 
 logger = logging.getLogger(__name__)
 
@@ -25,7 +25,7 @@ class Reloader:
                 changes = await asyncio.to_thread(self._repository.reload)
             except Exception:
                 logger.exception("the reload failed, so that nothing changes")
-                return
+                changes = Changes(failed=True)
             self._metrics.reloaded(changes)
             logger.info(
                 "reloaded: %d bundles loaded, %d removed, %d refused",

@@ -5,11 +5,23 @@ from __future__ import annotations
 import logging
 import os
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from service.bundle import BundleError, read_bundle
+from service.bundle import BundleError, check_place, manifest_digest, read_bundle, read_files
+from service.candidates import Trials, bundle_folders
+from service.logs import printable
 from service.memory import give_back
+from service.sandbox import (
+    ClosedError,
+    DiedError,
+    FailedError,
+    LateError,
+    OutOfMemoryError,
+    SandboxError,
+    in_a_line,
+)
 from service.shape_model import ShapeModel
 
 logger = logging.getLogger(__name__)
@@ -34,69 +46,93 @@ class Changes:
         loaded: bundles that are new, or other than before.
         removed: bundles that are no longer there.
         refused: bundles that can't be trusted.
+        failed: whether the folder could not be looked at, so that nothing changed.
     """
 
     loaded: list[str] = field(default_factory=list)
     removed: list[str] = field(default_factory=list)
     refused: list[str] = field(default_factory=list)
+    failed: bool = False
 
 
 class ModelRepository:
     """Every bundle of a folder that can be trusted.
 
-    A bundle that can't is left out with one line in the log, and the others are served. A model in use is never
-    altered: a reload builds what is new beside it and then puts another list of models in the place of the whole
+    A bundle is read only when it has been loaded and run once in a process of its own, and if it is still the same
+    then. One that can't be trusted is left out with one line in the log, and the others are served. A model in use is
+    never altered: a reload builds what is new beside it and then puts another list of models in the place of the whole
     list, so that a request which holds a model keeps it, and none sees one half of a change.
 
     Args:
         folder: holds NAME/VERSION/; hidden entries and plain files beside the names are passed over.
         threads: shapes that a model may work on at once.
+        trials: for the first look, where they have begun already.
 
     Attributes:
         refused: bundles that the latest look refused.
         seen: the folder's signature before that look.
     """
 
-    def __init__(self, folder: Path, threads: int = 1) -> None:
+    def __init__(self, folder: Path, threads: int = 1, trials: Trials | None = None) -> None:
         self._folder, self._threads = folder, threads
         self._models: Mapping[str, Mapping[int, ShapeModel]] = {}
+        self._trials, self._closed = trials or Trials(), False
         self.refused: list[str] = []
         self.seen: Signature = ()
         self.reload()
 
     def reload(self) -> Changes:
-        """Read and verify every bundle again; not to be called twice at once.
+        """Take up the folder as it is; not to be called twice at once, and never raises for a bundle's sake.
 
         A model whose bundle is the same byte for byte stays as it is. Where a bundle can't be trusted any more, or
         the whole folder is out of reach, what was loaded before stays.
         """
-        changes = Changes()
+        try:
+            return self._reload(self._trials)
+        finally:
+            self._trials.close()
+            self._trials = Trials()  # which has no process before there is something to try
+            if self._closed:
+                self._trials.close()
+
+    def _reload(self, trials: Trials) -> Changes:
         self.seen = self.signature()  # first, so that what changes from now on makes a difference
         try:
-            paths = list(_versions(self._folder))
+            folders, unreadable = bundle_folders(self._folder)
         except OSError as error:
             logger.error("the models folder can't be read, so that nothing changes: %s", error)
-            return changes
-        before = {(m.manifest.name, m.manifest.version): m for m in self.all()}
+            return Changes(failed=True)
+        changes = Changes()
+        before = {(model.manifest.name, model.manifest.version): model for model in self.all()}
         models: dict[str, dict[int, ShapeModel]] = {}
-        for path in paths:
-            place = f"{path.parent.name}/{path.name}"
-            model = before.pop((path.parent.name, path.name), None)
+
+        def serve(model: ShapeModel) -> None:
+            models.setdefault(model.manifest.name, {})[int(model.manifest.version)] = model
+
+        trials.begin(folder for folder in folders if _is_new(folder, before.get((folder.parent.name, folder.name))))
+        for folder in folders:
+            place = printable(f"{folder.parent.name}/{folder.name}")
+            model = before.pop((folder.parent.name, folder.name), None)
             try:
-                bundle = read_bundle(path)
-                if model is None or bundle.digest != model.digest:
-                    model = ShapeModel(bundle, self._threads)
+                new = self._take_up(folder, model, trials)
+                if new is not model:
                     changes.loaded.append(place)
                     logger.info("bundle %s is served", place)
-            except (BundleError, OSError) as error:
-                reason = " ".join(str(error).split())
+                serve(new)
+            except ClosedError:
+                return Changes()
+            except Exception as error:  # one bundle must not keep the others from being served
                 changes.refused.append(place)
                 if model is None:
-                    logger.error("bundle %s is not served: %s", place, reason)
+                    logger.error("bundle %s is not served: %s", place, _reason(error))
                 else:
-                    logger.error("bundle %s is refused, and what was loaded before stays: %s", place, reason)
-            if model is not None:
-                models.setdefault(model.manifest.name, {})[int(model.manifest.version)] = model
+                    logger.error("bundle %s is refused, and what was loaded before stays: %s", place, _reason(error))
+                    serve(model)
+        for folder, fault in unreadable.items():
+            changes.refused.append(printable(folder.name))
+            logger.error("%s can't be read, so that it stays as it was: %s", printable(folder.name), fault)
+            for key in [key for key in before if key[0] == folder.name]:
+                serve(before.pop(key))
         for name, version in before:
             changes.removed.append(f"{name}/{version}")
             logger.info("bundle %s/%s is gone and no longer served", name, version)
@@ -105,18 +141,29 @@ class ModelRepository:
             give_back()
         return changes
 
+    def close(self) -> None:
+        """End trials that still run; what they were for stays as it is."""
+        self._closed = True
+        self._trials.close()
+
+    def _take_up(self, folder: Path, model: ShapeModel | None, trials: Trials) -> ShapeModel:
+        """The model of a bundle: the one there is, or a new one where the bundle has changed."""
+        check_place(folder)
+        if model is not None and manifest_digest(folder) == model.digest:
+            read_files(folder, model.manifest)
+            return model
+        return ShapeModel(read_bundle(folder, trials.digest(folder)), self._threads)
+
     def signature(self) -> Signature:
         """Something that differs once any bundle does, without reading one."""
         found = []
-        try:
-            for version in _versions(self._folder):
-                with os.scandir(version) as entries:
+        with suppress(OSError):  # being changed at this moment: the next look will tell
+            for version in bundle_folders(self._folder)[0]:
+                found.append((str(version), 0, 0, 0))
+                with suppress(OSError), os.scandir(version) as entries:
                     for entry in entries:
                         status = entry.stat(follow_symlinks=False)
                         found.append((entry.path, status.st_size, status.st_mtime_ns, status.st_ino))
-                found.append((str(version), 0, 0, 0))
-        except OSError:
-            pass  # it is being changed at this moment: the next look will tell
         return tuple(sorted(found))
 
     def __iter__(self) -> Iterator[ShapeModel]:
@@ -159,11 +206,22 @@ class ModelRepository:
         return models[name]
 
 
-def _versions(folder: Path) -> Iterator[Path]:
-    """Folders NAME/VERSION; raises OSError."""
-    for name in sorted(folder.iterdir()):
-        if name.name.startswith(".") or not name.is_dir():
-            continue
-        for version in sorted(name.iterdir()):
-            if not version.name.startswith(".") and version.is_dir():
-                yield version
+def _is_new(folder: Path, model: ShapeModel | None) -> bool:
+    """Whether there is a bundle to try, other than the one that is served."""
+    try:
+        check_place(folder)
+        return model is None or manifest_digest(folder) != model.digest
+    except (BundleError, OSError):
+        return False  # whoever takes it up says why
+
+
+def _reason(error: Exception) -> str:
+    """What is wrong with a bundle, in one line."""
+    match error:
+        case FailedError(kind=FailedError.UNEXPECTED) | DiedError() | LateError() | OutOfMemoryError():
+            text = f"tried in a process of its own, {error}"
+        case SandboxError() | BundleError() | OSError():
+            text = str(error)
+        case _:
+            text = in_a_line(error)
+    return " ".join(text.split())

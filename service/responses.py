@@ -4,28 +4,39 @@ from __future__ import annotations
 
 import hashlib
 import time
-from collections.abc import Callable, Iterable, Mapping
-from contextlib import aclosing
-from dataclasses import asdict
+from collections.abc import AsyncGenerator, Callable, Iterable, Iterator, Mapping
+from contextlib import ExitStack, aclosing
+from dataclasses import asdict, dataclass
 from functools import partial
+from itertools import chain
 from typing import Any, TypeVar
 
+import numpy as np
 from fastapi import Request, Response
+from fastapi.responses import StreamingResponse
+from numpy.typing import NDArray
+from starlette.types import Receive, Scope, Send
 
+from geometry.archives import Buffer
 from geometry.colouring import Colouring
+from geometry.deadline import Deadline
 from geometry.status import Status
 from service import __version__
 from service.comparison import Comparison
 from service.dependencies import Service
 from service.encodings import SHAPE_FORMATS, dump_json
 from service.latent_space import CheckedCode, Codes
-from service.problems import KINDS, MEDIA_TYPE
+from service.problems import KINDS, MEDIA_TYPE, ProblemError
 from service.recent import Answer
 from service.schemas import MeshAnswer
-from service.shape_model import LengthsAndAngles, MeshChoice, Shape, ShapeModel
-from service.workers import DisconnectedError, Workers
+from service.shape_model import Diagnostics, MeshChoice, Shape, ShapeModel
+from service.workers import Call, Workers
 
 Timings = dict[str, float]
+#: Vertices of all shapes of one answer together: 48 MiB of positions.
+MOST_VERTICES = 2**22
+#: Bytes of what an answer is made from, up to which it is made whole.
+WHOLE = 2**22
 #: Of an answer that was there already.
 _NO_TIME = {"network": 0.0, "reconstruct": 0.0, "encode": 0.0}
 S = TypeVar("S")
@@ -59,8 +70,9 @@ def cache_headers(tag: str) -> dict[str, str]:
 
 def not_modified(request: Request, tag: str) -> Response | None:
     """304 where the client has the answer already."""
+    # Not where it is "*": whether there is a shape at all is known only once it has been found.
     known = {part.strip().removeprefix("W/") for part in request.headers.get("if-none-match", "").split(",")}
-    return Response(status_code=304, headers=cache_headers(tag)) if tag in known or "*" in known else None
+    return Response(status_code=304, headers=cache_headers(tag)) if tag in known else None
 
 
 def server_timing(seconds: Timings) -> str:
@@ -68,16 +80,15 @@ def server_timing(seconds: Timings) -> str:
     return ", ".join(f"{stage};dur={1e3 * duration:.3f}" for stage, duration in seconds.items())
 
 
-def file_headers(diagnostics: Mapping[str, Any], seconds: Timings, filename: str) -> dict[str, str]:
+def file_headers(diagnostics: Mapping[str, Any], filename: str) -> dict[str, str]:
     """Headers of an answer that is a file."""
     return {
         "Shape-Diagnostics": dump_json(diagnostics).decode(),
-        "Server-Timing": server_timing(seconds),
         "Content-Disposition": f'inline; filename="{filename}"',
     }
 
 
-def solve(workers: Workers, model: ShapeModel, mesh: MeshChoice, code: CheckedCode, deadline: float) -> Shape:
+def solve(workers: Workers, model: ShapeModel, mesh: MeshChoice, code: CheckedCode, deadline: Deadline) -> Shape:
     """A code to its shape; raises DeadlineError."""
     shape = model.shape(*code, mesh, deadline)
     if shape.diagnostics.status is Status.DEADLINE:
@@ -106,10 +117,10 @@ async def shape_response(
     if unchanged := not_modified(request, tag):
         return unchanged
 
-    def find(code: CheckedCode | None, deadline: float) -> Shape:
+    def find(code: CheckedCode | None, deadline: Deadline) -> Shape:
         return model.reference_shape(mesh) if code is None else solve(service.workers, model, mesh, code, deadline)
 
-    def make(deadline: float) -> tuple[bytes, dict[str, str]]:
+    def make(deadline: Deadline) -> tuple[bytes, dict[str, str]]:
         found = [find(code, deadline)]
         began, colouring, legend = time.perf_counter(), None, {}
         if comparison:
@@ -119,56 +130,173 @@ async def shape_response(
             colouring = Colouring.between(comparison.quantity, vertices, against, model.mesh(mesh).connectivity)
             legend = {"Shape-Color": dump_json(colouring.legend).decode()}
         content = SHAPE_FORMATS[format].encode(found[0].vertices, model.mesh(mesh).faces, colouring)
-        seconds = {**total_seconds(found), "encode": time.perf_counter() - began}
+        seconds = {**total_seconds([shape.seconds for shape in found]), "encode": time.perf_counter() - began}
         filename = f"{model.manifest.name}.{format}"
-        return content, file_headers(asdict(found[0].diagnostics), seconds, filename) | legend
+        headers = file_headers(asdict(found[0].diagnostics), filename) | {"Server-Timing": server_timing(seconds)}
+        return content, headers | legend
 
     if answer := service.recent.get(tag):
         content, headers = answer.content, {**answer.headers, "Server-Timing": server_timing(_NO_TIME)}
     else:
-        with service.workers.admit() as deadline:
+        async with service.workers.admit(request) as deadline:
             content, headers = await service.workers.run(make, deadline)
         service.recent.put(tag, Answer(content, headers))
     return Response(content, headers=cache_headers(tag) | headers, media_type=SHAPE_FORMATS[format].media_type)
 
 
+@dataclass(frozen=True)
+class Shapes:
+    """Several shapes as they leave.
+
+    Attributes:
+        vertices: (n, V, 3) float32, in the units of the training meshes.
+        diagnostics: how well each was found.
+        seconds: time of all of them by stage.
+    """
+
+    vertices: NDArray[np.float32]
+    diagnostics: list[Diagnostics]
+    seconds: Timings
+
+
+def size_of(model: ShapeModel, count: int, mesh: MeshChoice) -> int:
+    """Bytes of that many shapes; raises ProblemError, too-many-codes, where they are more than one request may hold."""
+    vertices = len(model.mesh(mesh).vertices)
+    if count * vertices > MOST_VERTICES:
+        raise ProblemError(
+            "too-many-codes",
+            f"{count} shapes of {vertices} vertices are too many for one answer. Ask for {MOST_VERTICES // vertices} "
+            "at most, for the coarse mesh, or for an animation's frames as JSON lines or one by one.",
+        )
+    return 12 * count * vertices
+
+
 async def shapes(
-    service: Service,
-    request: Request,
-    model: ShapeModel,
-    codes: Codes,
-    inside: Any,
-    mesh: MeshChoice,
-    deadline: float,
-) -> list[Shape]:
-    """Shapes of codes (n, m), side by side; raises DisconnectedError where the client doesn't wait for them."""
-    work = partial(solve, service.workers, model, mesh)
-    return await gather(service, request, work, zip(codes, map(bool, inside), strict=True), deadline)
+    service: Service, model: ShapeModel, codes: Codes, inside: Any, mesh: MeshChoice, call: Call
+) -> Shapes:
+    """Shapes of codes (n, m), side by side; raises as ``Workers.run``."""
+    vertices = np.empty((len(codes), *model.mesh(mesh).vertices.shape), np.float32)
+
+    def find(item: tuple[int, CheckedCode], call: Call) -> tuple[Diagnostics, Timings]:
+        k, code = item
+        shape = solve(service.workers, model, mesh, code, call)
+        vertices[k] = shape.vertices
+        return shape.diagnostics, shape.seconds
+
+    found = await gather(service, find, enumerate(zip(codes, map(bool, inside), strict=True)), call)
+    return Shapes(vertices, [diagnostics for diagnostics, _ in found], total_seconds([s for _, s in found]))
+
+
+@dataclass(frozen=True)
+class Predictions:
+    """Lengths and angles of several codes as they leave: in the units of the training meshes, angles in radians.
+
+    Attributes:
+        nric: (n, 2E) float32.
+        factors: (n, J, 2E) float32, where they are wanted.
+    """
+
+    nric: NDArray[np.float32]
+    factors: NDArray[np.float32] | None
+
+
+def nric_size_of(model: ShapeModel, count: int, *, factors: bool = False) -> int:
+    """Bytes of predictions for that many codes; raises ProblemError as ``size_of``."""
+    size = 8 * model.manifest.edges * (1 + (len(model.manifest.factors) if factors else 0))
+    # Networks with convolutions need more room beside their answers than shapes do.
+    if count * size > 8 * MOST_VERTICES:
+        most = 8 * MOST_VERTICES // size
+        raise ProblemError("too-many-codes", f"{count} codes are too many for one answer. Ask for {most} at most.")
+    return count * size
 
 
 async def predictions(
-    service: Service, request: Request, model: ShapeModel, codes: Codes, deadline: float
-) -> list[LengthsAndAngles]:
-    """What the networks say to codes (n, m), side by side; raises DisconnectedError as ``shapes`` does."""
-    return await gather(service, request, lambda code, _: model.lengths_and_angles(code), codes, deadline)
+    service: Service, model: ShapeModel, codes: Codes, call: Call, *, factors: bool = False
+) -> Predictions:
+    """What the networks say to codes (n, m), side by side; raises as ``Workers.run``."""
+    n, wide = len(codes), 2 * model.manifest.edges
+    found = np.empty((n, wide), np.float32)
+    parts = np.empty((n, len(model.manifest.factors), wide), np.float32) if factors else None
+
+    def predict(item: tuple[int, Codes], _: Call) -> None:
+        k, code = item
+        z = model.lengths_and_angles(code)
+        found[k] = np.concatenate([z.lengths, z.angles])
+        if parts is not None:
+            parts[k] = z.factors
+
+    await gather(service, predict, enumerate(codes), call)
+    return Predictions(found, parts)
 
 
-async def gather(
-    service: Service, request: Request, work: Callable[[S, float], T], items: Iterable[S], deadline: float
-) -> list[T]:
-    """Results of work on every item, side by side; raises DisconnectedError where the client doesn't wait for them."""
-    found = []
-    async with aclosing(service.workers.map(work, items, deadline)) as results:
-        async for result in results:
-            found.append(result)
-            if await request.is_disconnected():
-                raise DisconnectedError("The client closed the connection before its answer was ready.")
-    return found
+async def gather(service: Service, work: Callable[[S, Call], T], items: Iterable[S], call: Call) -> list[T]:
+    """Results of work on every item, side by side; raises as ``Workers.run``."""
+    async with aclosing(service.workers.map(work, items, call)) as results:
+        return [result async for result in results]
 
 
-def total_seconds(shapes: list[Shape]) -> Timings:
+def total_seconds(seconds: list[Timings]) -> Timings:
     """Time of several shapes by stage."""
-    return {stage: sum(shape.seconds[stage] for shape in shapes) for stage in ("network", "reconstruct")}
+    return {stage: sum(each[stage] for each in seconds) for stage in ("network", "reconstruct")}
+
+
+async def in_pieces(
+    service: Service,
+    call: Call,
+    pieces: Iterator[Buffer],
+    size: int,
+    held: ExitStack,
+    headers: Mapping[str, str],
+    seconds: Timings,
+    media_type: str,
+) -> Response:
+    """An answer from its pieces: whole where it is small, otherwise as fast as it is read.
+
+    Args:
+        service: the running one.
+        call: of the request.
+        pieces: of the body.
+        size: bytes of what they are made from.
+        held: what the answer takes until it is over.
+        headers: of the answer.
+        seconds: time so far, by stage; to the first piece counts as encoding.
+        media_type: of the answer.
+    """
+    began = time.perf_counter()
+    make = partial(next, pieces) if size > WHOLE else partial(b"".join, pieces)
+    start = await service.workers.run(lambda _: make(), call)
+    headers = {**headers, "Server-Timing": server_timing({**seconds, "encode": time.perf_counter() - began})}
+    if size <= WHOLE:
+        return Response(start, headers=headers, media_type=media_type)
+    return PiecewiseResponse(chain([start], pieces), service.workers, held.pop_all(), headers, media_type)
+
+
+class PiecewiseResponse(StreamingResponse):
+    """An answer that is made piece by piece, in a thread, as fast as it is read.
+
+    Args:
+        pieces: of the body.
+        workers: whose threads make them.
+        held: what the answer takes until it is over.
+        headers: of the answer.
+        media_type: of the answer.
+    """
+
+    def __init__(
+        self, pieces: Iterator[Buffer], workers: Workers, held: ExitStack, headers: Mapping[str, str], media_type: str
+    ) -> None:
+        super().__init__(_made(pieces, workers), headers=dict(headers), media_type=media_type)
+        self._held = held
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Send it."""
+        with self._held:
+            await super().__call__(scope, receive, send)
+
+
+async def _made(pieces: Iterator[Buffer], workers: Workers) -> AsyncGenerator[bytes | memoryview, None]:
+    while (piece := await workers.piece(lambda _: next(pieces, None), None)) is not None:
+        yield piece if isinstance(piece, bytes) else memoryview(piece)
 
 
 def binary(media_types: Mapping[str, str], description: str, *, cached: bool = True) -> dict[int | str, dict[str, Any]]:

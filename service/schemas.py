@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Any
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
 from geometry.colouring import Quantity
 from service.edit import PRIOR
@@ -18,9 +18,11 @@ Whole = Annotated[
     Field(strict=True),
     BeforeValidator(lambda given: int(given) if isinstance(given, float) and given.is_integer() else given),
 ]
+#: Each list fails at its first fault: there may be as many as elements.
 Latent = Annotated[
     list[Number],
     Field(
+        fail_fast=True,
         description="One latent code: as many numbers as the card's `latent_dimension`.",
         examples=[[1, 2, 3, 4]],
         json_schema_extra={"minItems": 1},
@@ -29,6 +31,7 @@ Latent = Annotated[
 Latents = Annotated[
     list[Latent],
     Field(
+        fail_fast=True,
         description="Latent codes, one shape each.",
         examples=[[[1, 2, 3, 4], [0, 0, 0, 0]]],
         json_schema_extra={"minItems": 1},
@@ -40,11 +43,24 @@ BoundsField = Annotated[
 ]
 
 
-class _Request(BaseModel):
+#: Members that an object of a body may have: each unknown one is a fault.
+_MEMBERS = 32
+
+
+class Body(BaseModel):
+    """A body of a request, or an object in it."""
+
     model_config = ConfigDict(extra="forbid")
 
+    @model_validator(mode="before")
+    @classmethod
+    def _of_few_members(cls, given: object) -> object:
+        if isinstance(given, dict) and len(given) > _MEMBERS:
+            raise ValueError(f"it has {len(given)} members; /openapi.json lists those there are")
+        return given
 
-class MeshRequest(_Request):
+
+class MeshRequest(Body):
     """One code, and how to shape it."""
 
     latent: Latent
@@ -52,7 +68,7 @@ class MeshRequest(_Request):
     bounds: BoundsField = Bounds.ALLOW
 
 
-class VerticesRequest(_Request):
+class VerticesRequest(Body):
     """Several codes, and how to shape them."""
 
     latents: Latents
@@ -65,20 +81,20 @@ class VerticesRequest(_Request):
     bounds: BoundsField = Bounds.ALLOW
 
 
-class TargetRequest(_Request):
+class TargetRequest(Body):
     """Where a vertex should be."""
 
     vertex: Whole = Field(description="Index in the mesh that `mesh` names, from 0.")
-    position: list[Number] = Field(
+    position: Annotated[list[Number], Field(fail_fast=True)] = Field(
         min_length=3, max_length=3, description="In the units and the frame that meshes are answered in."
     )
 
 
-class EditRequest(_Request):
+class EditRequest(Body):
     """A code to start from, and vertices that should be elsewhere."""
 
     latent: Latent
-    targets: list[TargetRequest] = Field(
+    targets: Annotated[list[TargetRequest], Field(fail_fast=True)] = Field(
         min_length=1, description="At least one.", examples=[[{"vertex": 0, "position": [0.3, 0.1, 0]}]]
     )
     prior: Number = Field(
@@ -90,7 +106,7 @@ class EditRequest(_Request):
     mesh: MeshChoice = Field(MeshChoice.FINE, description="Which mesh the targets' vertices belong to.")
 
 
-class SampleRequest(_Request):
+class SampleRequest(Body):
     """How many random codes, and which."""
 
     count: Whole = Field(1, ge=1, description="Number of codes.", examples=[3])
@@ -102,7 +118,7 @@ class SampleRequest(_Request):
     )
 
 
-class NRICRequest(_Request):
+class NRICRequest(Body):
     """Several codes, and whether to answer each factor's own lengths and angles too."""
 
     latents: Latents

@@ -2,22 +2,22 @@
 
 from __future__ import annotations
 
-import io
-import zipfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from geometry.animated_gltf import animated_glb
-from geometry.formats import OCTET_STREAM, npz, obj_faces, obj_vertices
+from geometry.archives import Buffer, npz_pieces, zip_pieces
+from geometry.formats import OCTET_STREAM, obj_faces, obj_vertices
 from geometry.mesh import FloatArray, IntArray
 from geometry.point_cache import point_cache
 from geometry.usd import animated_usd, usd_installed
 from service.encodings import diagnostics_arrays, dump_json, float32
 from service.latent_space import Codes
-from service.shape_model import Shape
+from service.shape_model import Diagnostics, Shape
 
 
 class NoRoomError(OSError):
@@ -29,21 +29,18 @@ class Frames:
     """The frames of an animation, ready to be encoded.
 
     Attributes:
-        shapes: one a frame.
+        vertices: (n, V, 3) float32.
+        diagnostics: one a frame.
         faces: (F, 3).
         positions: (n,) where on the path each frame lies.
         codes: (n, m).
     """
 
-    shapes: Sequence[Shape]
+    vertices: NDArray[np.float32]
+    diagnostics: Sequence[Diagnostics]
     faces: IntArray
     positions: FloatArray
     codes: Codes
-
-    @property
-    def vertices(self) -> FloatArray:
-        """(n, V, 3)."""
-        return np.stack([shape.vertices for shape in self.shapes])
 
 
 @dataclass(frozen=True)
@@ -52,11 +49,11 @@ class SequenceFormat:
 
     Attributes:
         media_type: as IANA has it.
-        encode: a sequence to the file's bytes, and facts for the diagnostics.
+        encode: a sequence to the pieces of the file, and facts for the diagnostics.
     """
 
     media_type: str
-    encode: Callable[[Frames], tuple[bytes, dict[str, Any]]]
+    encode: Callable[[Frames], tuple[Iterator[Buffer], dict[str, Any]]]
 
 
 def json_line(k: int, t: float, shape: Shape, faces: IntArray | None) -> bytes:
@@ -68,15 +65,15 @@ def json_line(k: int, t: float, shape: Shape, faces: IntArray | None) -> bytes:
     return dump_json(line) + b"\n"
 
 
-def _glb(frames: Frames) -> tuple[bytes, dict[str, Any]]:
+def _glb(frames: Frames) -> tuple[Iterator[Buffer], dict[str, Any]]:
     animated = animated_glb(frames.vertices, frames.faces)
-    return animated.data, {"targets": animated.targets, "max_vertex_error": animated.max_vertex_error}
+    return iter([animated.data]), {"targets": animated.targets, "max_vertex_error": animated.max_vertex_error}
 
 
-def _npz(frames: Frames) -> tuple[bytes, dict[str, Any]]:
-    arrays = diagnostics_arrays([shape.diagnostics for shape in frames.shapes])
-    return npz(
-        vertices=float32(frames.vertices),
+def _npz(frames: Frames) -> tuple[Iterator[Buffer], dict[str, Any]]:
+    arrays = diagnostics_arrays(frames.diagnostics)
+    return npz_pieces(
+        vertices=frames.vertices,
         faces=frames.faces.astype(np.int32),
         t=frames.positions,
         latents=frames.codes,
@@ -84,30 +81,27 @@ def _npz(frames: Frames) -> tuple[bytes, dict[str, Any]]:
     ), {}
 
 
-def _point_cache(frames: Frames) -> tuple[bytes, dict[str, Any]]:
+def _point_cache(frames: Frames) -> tuple[Iterator[Buffer], dict[str, Any]]:
     return point_cache(frames.vertices), {}
 
 
-def _usd(frames: Frames) -> tuple[bytes, dict[str, Any]]:
-    try:
-        return animated_usd(frames.vertices, frames.faces), {}
-    except OSError:
-        raise NoRoomError(
-            "The server has no room for the temporary file that USD takes. Ask for another format, or give it a folder "
-            "for such files that can be written to (TMPDIR)."
-        ) from None
+def _usd(frames: Frames) -> tuple[Iterator[Buffer], dict[str, Any]]:
+    def pieces() -> Iterator[Buffer]:
+        try:
+            yield from animated_usd(frames.vertices, frames.faces)
+        except OSError:
+            raise NoRoomError(
+                "The server has no room for the temporary file that USD takes. Ask for another format, or give it a "
+                "folder for such files that can be written to (TMPDIR)."
+            ) from None
+
+    return pieces(), {}
 
 
-def _zip(frames: Frames) -> tuple[bytes, dict[str, Any]]:
-    buffer = io.BytesIO()
-    with zipfile.ZipFile(buffer, "w") as archive:
-        faces = obj_faces(frames.faces)
-        for k, shape in enumerate(frames.shapes):
-            # ZipInfo's default date keeps the bytes the same from day to day.
-            entry = zipfile.ZipInfo(f"frame-{k:04d}.obj")
-            # Harder compression takes longer than the shapes themselves, for a tenth of the size.
-            archive.writestr(entry, obj_vertices(shape.vertices) + faces, zipfile.ZIP_DEFLATED, compresslevel=1)
-    return buffer.getvalue(), {}
+def _zip(frames: Frames) -> tuple[Iterator[Buffer], dict[str, Any]]:
+    faces = obj_faces(frames.faces)
+    objs = ([(obj_vertices(vertices) + faces).encode()] for vertices in frames.vertices)
+    return zip_pieces((f"frame-{k:04d}.obj", obj) for k, obj in enumerate(objs)), {}
 
 
 JSON_LINES = "application/jsonl"

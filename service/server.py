@@ -5,21 +5,27 @@ from __future__ import annotations
 import asyncio
 import ctypes
 import logging
+import os
 import signal
 import socket
 import struct
 import sys
-import time
+import threading
 from types import FrameType
+from typing import Any
 
 import uvicorn
 from fastapi import FastAPI
 
+from service.connections import Connection, Listener
 from service.settings import Settings
 
 logger = logging.getLogger(__name__)
-#: Seconds for a client to send the request for which it has opened a connection or kept one open.
-LINGER = 1.0
+#: Seconds for a client to send the request for which it has opened a connection or kept one open; for what runs then;
+#: and for the process to be gone, all from the end of the drain on.
+LINGER, FINISH, GONE = 1.0, 1.5, 2.3
+#: Status of a process that could not start; uvicorn's own.
+STARTUP_FAILURE = 3
 #: A classic BPF program (code, jt, jf, k) that drops TCP segments with SYN, and its socket option on Linux.
 _DROP_SYN = ((0x30, 0, 0, 13), (0x45, 0, 1, 0x02), (0x06, 0, 0, 0), (0x06, 0, 0, 0xFFFFFFFF))
 _SO_ATTACH_FILTER = 26
@@ -31,21 +37,23 @@ class Server(uvicorn.Server):
     Uvicorn alone closes its port and every connection between two requests at once, in the face of whoever is
     sending (uvicorn#2414). Here SIGTERM first makes readiness 503 and each answer the last of its connection, while
     everything is still answered; after a time no new connections are taken; and the old ones are closed when they
-    have been silent. SIGHUP reloads the models.
+    have been silent. What runs then gets a moment, and a 503 after that: whatever anything is busy with, the process
+    ends. SIGHUP reloads the models.
     """
 
     def __init__(self, app: FastAPI, settings: Settings) -> None:
-        # What then still runs has had its deadline.
-        timeout = round(settings.deadline) + 1
         super().__init__(
             uvicorn.Config(
                 app,
-                host=settings.host,
-                port=settings.port,
+                http=self._connection,  # type: ignore[arg-type]
+                ws="none",
+                loop="asyncio",
                 log_config=None,
                 access_log=False,
                 server_header=False,
-                timeout_graceful_shutdown=timeout,
+                proxy_headers=bool(settings.trusted_proxies),
+                forwarded_allow_ips=list(settings.trusted_proxies),
+                timeout_graceful_shutdown=1,
             )
         )
         self._app, self._settings = app, settings
@@ -54,9 +62,12 @@ class Server(uvicorn.Server):
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
         """Begin to listen, and say where."""
-        await super().startup(sockets=sockets)
-        if not self.started:
-            return
+        try:
+            listeners = Listener.bound(self._settings.host, self._settings.port)
+        except OSError as error:
+            logger.error("can't listen on %s, port %d: %s", self._settings.host, self._settings.port, error.strerror)
+            raise SystemExit(STARTUP_FAILURE) from None
+        await super().startup(sockets=list(listeners))
         if hasattr(signal, "SIGHUP"):
             asyncio.get_running_loop().add_signal_handler(signal.SIGHUP, self._hang_up)
         # The port may have been left to the system.
@@ -74,28 +85,41 @@ class Server(uvicorn.Server):
 
     def handle_exit(self, sig: int, frame: FrameType | None) -> None:
         """Begin the end; the second time, hurry."""
+        if not self.started:
+            os._exit(0)  # nothing has begun, and what loads models may take its time
         super().handle_exit(sig, frame)
-        if self.started:
-            self._app.state.service.draining = True
+        self._app.state.service.draining = True
+        drain = self._settings.drain if sig == signal.SIGTERM and len(self._captured_signals) == 1 else 0.0
+        leave = threading.Timer(drain + GONE, os._exit, [0])
+        leave.daemon = True
+        leave.start()
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
         """Drain, then finish what runs."""
-        if signal.SIGINT not in self._captured_signals:  # a person doesn't want to wait
-            await self._drain()
+        loop = asyncio.get_running_loop()
+        # A person doesn't want to wait.
+        drained = loop.time() if signal.SIGINT in self._captured_signals else await self._drain()
+        loop.call_at(drained + FINISH, self._app.state.service.workers.end)
         await super().shutdown(sockets)
 
-    async def _drain(self) -> None:
+    def _connection(self, **arguments: Any) -> Connection:
+        return Connection(self._app.state.service.connections, **arguments)
+
+    async def _drain(self) -> float:
+        """Wait for the end of the drain and for the last requests of open connections; gives the first of the two."""
         logger.info("no longer ready, and still answering for %g s", self._settings.drain)
-        end = time.monotonic() + self._settings.drain
-        while time.monotonic() < end and len(self._captured_signals) < 2:
+        time = asyncio.get_running_loop().time
+        end = time() + self._settings.drain
+        while time() < end and len(self._captured_signals) < 2:
             await asyncio.sleep(0.05)
+        drained = time()
         for server in self.servers:
             for listener in server.sockets:
                 _greet_nobody(listener)
         await asyncio.sleep(0.05)  # whoever was half-way through is accepted
-        end = time.monotonic() + LINGER
-        while self.server_state.connections and time.monotonic() < end:
+        while self.server_state.connections and time() < drained + LINGER:
             await asyncio.sleep(0.05)
+        return drained
 
 
 def _greet_nobody(listener: socket.socket) -> None:

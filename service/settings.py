@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import ipaddress
 import os
 import re
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
-from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt, SecretStr, field_validator
+from pydantic import BeforeValidator, Field, NonNegativeFloat, PositiveFloat, PositiveInt, SecretStr, field_validator
 from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict
 
 PREFIX = "SHAPESPACE_"
@@ -34,6 +35,14 @@ def cpu_quota(cgroup: Path = Path("/sys/fs/cgroup")) -> int:
         except (OSError, ValueError):
             share = -1.0
     return max(1, min(count, round(share))) if share > 0 else count
+
+
+def _split(value: object) -> object:
+    return tuple(filter(None, map(str.strip, value.split(",")))) if isinstance(value, str) else value
+
+
+#: Several values, separated by commas.
+Names = Annotated[tuple[str, ...], NoDecode, BeforeValidator(_split)]
 
 
 class Settings(BaseSettings):
@@ -62,16 +71,31 @@ class Settings(BaseSettings):
     drain: NonNegativeFloat = Field(
         default=2.0, description="seconds after SIGTERM in which new requests are still answered, and readiness is 503"
     )
-    api_key: SecretStr | None = Field(default=None, description="key that requests must bring; by default none")
-    cors_origins: Annotated[tuple[str, ...], NoDecode] = Field(
-        default=(), description="origins whose pages may call, separated by commas, or *"
+    max_connections: PositiveInt = Field(default=512, description="most connections at once")
+    hosts: Names = Field(
+        default=(),
+        description="names that requests may call it by, separated by commas, or *; by default any, and without a key "
+        "on loopback that machine's own",
     )
+    trusted_proxies: Names = Field(
+        default=(), description="addresses or networks of proxies whose X-Forwarded-For is believed"
+    )
+    api_key: SecretStr | None = Field(default=None, description="key that requests must bring; by default none")
+    cors_origins: Names = Field(default=(), description="origins whose pages may call, separated by commas, or *")
     log_format: LogFormat = Field(default=LogFormat.TEXT, description="text, or json for one object a line")
 
-    @field_validator("cors_origins", mode="before")
+    @field_validator("api_key")
     @classmethod
-    def _split(cls, value: object) -> object:
-        return tuple(filter(None, map(str.strip, value.split(",")))) if isinstance(value, str) else value
+    def _as_a_header_can_say_it(cls, key: SecretStr | None) -> SecretStr | None:
+        if key is not None and not re.fullmatch(r"[!-~]([ -~]*[!-~])?", key.get_secret_value()):
+            raise ValueError("a key has printable ASCII characters only, without line breaks or spaces around it")
+        return key
+
+    @field_validator("trusted_proxies")
+    @classmethod
+    def _networks(cls, proxies: tuple[str, ...]) -> tuple[str, ...]:
+        # With host bits set a network would be taken for a name.
+        return tuple(str(ipaddress.ip_network(proxy, strict=False)) for proxy in proxies)
 
     @field_validator("cors_origins")
     @classmethod
@@ -80,6 +104,14 @@ class Settings(BaseSettings):
             if origin != "*" and not re.fullmatch(r"https?://[^/\s]+", origin):
                 raise ValueError(f"an origin is like https://a.example, without a path, or *, not {origin}")
         return origins
+
+
+def is_loopback(host: str) -> bool:
+    """Whether only this machine reaches what listens on an address or name."""
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"
 
 
 def unknown_variables() -> list[str]:

@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
+import logging
 import queue
+import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from enum import StrEnum
 from functools import cached_property
-from typing import Any
 
 import numpy as np
-import onnxruntime
 from numpy.typing import NDArray
 
 from geometry.calculus import ShellSpace
+from geometry.deadline import Deadline
 from geometry.integrability import Integrability
 from geometry.mesh import FloatArray, TriangleMesh, align
 from geometry.nric import nric
@@ -23,12 +24,26 @@ from geometry.reconstruction import Reconstruction, Reconstructor
 from geometry.status import Status
 from service.bundle import Bundle, BundleError, FineMesh
 from service.derivatives import FactorGrids
-from service.latent_space import Codes, LatentSpace, NotFiniteError, TrainingCodes
-from service.manifest import Network
+from service.latent_space import Bounds, Codes, Distribution, LatentSpace, NotFiniteError, TrainingCodes
+from service.network import PATIENCE, NetworkError, Session, TerminatedError
 
+logger = logging.getLogger(__name__)
 #: Gauss–Newton stops once no vertex moves further than this fraction of the diagonal: a fiftieth of a pixel where a
 #: shape fills a screen, and less than the residual that the diagnostics tell changes by.
 TOLERANCE = 2e-5
+#: A model that has taken too long gets half the time from then on, but this at least: whoever asks for such codes again
+#: and again should not keep the workers from the other models.
+LEAST_PATIENCE, RECOVERY = 0.5, 1.1
+#: Random codes at which a model is rehearsed.
+REHEARSED = 2
+
+
+class ModelFailedError(RuntimeError):
+    """A model whose networks fail at a code, with a sentence that says what to do; the cause says which, and how."""
+
+
+class NetworkTimeError(ModelFailedError):
+    """A model whose networks take too long at a code."""
 
 
 class MeshChoice(StrEnum):
@@ -103,8 +118,8 @@ class ShapeModel:
 
     Args:
         bundle: verified.
-        threads: shapes that may be reconstructed at once; each gets a solver, analysed here and not in a
-            request.
+        threads: shapes that may be reconstructed at once; each gets a solver, the first one here and the others when
+            they are first needed, which takes about as long as a shape.
 
     Raises:
         BundleError: a network that doesn't load, or has other inputs or outputs than the manifest says.
@@ -119,21 +134,21 @@ class ShapeModel:
         codes = bundle.training_codes
         self._training = None if codes is None else TrainingCodes(self.latents, codes)
         n_nric = 2 * manifest.edges
-        self._factors = [
-            _Session(bundle, factor, [factor.stop - factor.start], [n_nric]) for factor in manifest.factors
-        ]
-        self._combiner = _Session(bundle, manifest.combiner, [len(manifest.factors), n_nric], [n_nric])
+        self._factors = [Session(bundle, factor, [factor.stop - factor.start], [n_nric]) for factor in manifest.factors]
+        self._combiner = Session(bundle, manifest.combiner, [len(manifest.factors), n_nric], [n_nric])
         self._start = None
         if manifest.start:
-            self._start = _Session(bundle, manifest.start, [manifest.latent_dimension], [manifest.vertices, 3])
+            self._start = Session(bundle, manifest.start, [manifest.latent_dimension], [manifest.vertices, 3])
         self._integrability = Integrability(self.reference.connectivity)
         #: Spaces for exact exponentials; who finds none makes one.
         self.spaces: queue.SimpleQueue[ShellSpace] = queue.SimpleQueue()
         self._solvers: queue.SimpleQueue[Reconstructor] = queue.SimpleQueue()
-        first = Reconstructor(self.reference, manifest.eta_reconstruction)
-        for solver in (first, *(first.another() for _ in range(threads - 1))):
-            solver.guess(nric(self.reference.vertices, self.reference.connectivity))  # so that no request waits for it
-            self._solvers.put(solver)
+        self._first = Reconstructor(self.reference, manifest.eta_reconstruction)
+        self._first.guess(nric(self.reference.vertices, self.reference.connectivity))  # so that no request waits for it
+        self._solvers.put(self._first)
+        #: Solvers that may still be made: a server of many threads rarely needs them all.
+        self._more, self._counting = threads - 1, threading.Lock()
+        self._patience = PATIENCE
 
     @cached_property
     def grids(self) -> FactorGrids:
@@ -160,7 +175,7 @@ class ShapeModel:
         code: Codes,
         inside_bounds: bool = True,
         mesh: MeshChoice = MeshChoice.FINE,
-        deadline: float | None = None,
+        deadline: Deadline | None = None,
     ) -> Shape:
         """The shape of one code (m,), whatever Gauss–Newton's status.
 
@@ -168,10 +183,12 @@ class ShapeModel:
             code: checked by ``latents.codes``.
             inside_bounds: goes into the diagnostics.
             mesh: fine or coarse.
-            deadline: time.monotonic() after which Gauss–Newton gives up with Status.DEADLINE.
+            deadline: after which Gauss–Newton gives up with Status.DEADLINE.
 
         Raises:
             NotFiniteError: the code is so far out that the numbers overflow.
+            ModelFailedError: the networks failed at this code, or took too long.
+            DeadlineError: the deadline passed while they were at work.
         """
         began = time.perf_counter()
         _, target = self._networks(code[None])
@@ -217,7 +234,32 @@ class ShapeModel:
 
     def factor(self, j: int, parts: FloatArray) -> FloatArray:
         """What factor j's network alone says to parts (n, m_j) of codes: (n, 2E), normalised."""
-        return self._factors[j](parts.astype(np.float32)).astype(np.float64)
+        with self._limited() as until:
+            return self._factors[j](parts.astype(np.float32), until).astype(np.float64)
+
+    def rehearse(self) -> None:
+        """Do once what serving does: every network, at the ends of its bounds and elsewhere, and one shape.
+
+        Raises:
+            BundleError: it must not be served.
+        """
+        for network in (*self._factors, self._combiner, *([self._start] if self._start else [])):
+            network.check()
+        try:
+            middle, *others = self._middle_and_ends()
+            for code in (*others, *self.latents.sample(REHEARSED, 0, Distribution.UNIFORM)):
+                self._networks(code[None])
+            for start in self._learned_start(middle):
+                start()
+            self.shape(middle)
+        except ModelFailedError as error:
+            raise BundleError(f"{error.__cause__}, at a code inside its bounds") from None
+        except NotFiniteError:
+            raise BundleError("the shape in the middle of its bounds is not finite") from None
+
+    def _middle_and_ends(self) -> Codes:
+        lower, upper = self.latents.lower, self.latents.upper
+        return self.latents.codes([x.tolist() for x in (lower + (upper - lower) / 2, lower, upper)], Bounds.CLAMP)[0]
 
     def finish(self, shape: FloatArray, mesh: MeshChoice) -> FloatArray:
         """A shape (V, 3) in any pose as it leaves: on the mesh of choice, aligned, in the training meshes' units."""
@@ -235,25 +277,56 @@ class ShapeModel:
 
     def _networks(self, codes: Codes) -> tuple[NDArray[np.float32], FloatArray]:
         """Factors (n, J, 2E) and combined NRIC (n, 2E), normalised."""
-        parts = [
-            session(codes[:, factor.start : factor.stop])
-            for session, factor in zip(self._factors, self.manifest.factors, strict=True)
-        ]
-        factors = np.stack(parts, axis=1)
-        return factors, self._combiner(factors).astype(np.float64)
+        with self._limited() as until:
+            parts = [
+                session(codes[:, factor.start : factor.stop], until)
+                for session, factor in zip(self._factors, self.manifest.factors, strict=True)
+            ]
+            factors = np.stack(parts, axis=1)
+            return factors, self._combiner(factors, until).astype(np.float64)
 
     def _learned_start(self, code: Codes) -> Iterator[Callable[[], FloatArray]]:
         if network := self._start:
-            yield lambda: network(code[None])[0].astype(np.float64)
+
+            def start() -> FloatArray:
+                with self._limited() as until:
+                    return network(code[None], until)[0].astype(np.float64)
+
+            yield start
+
+    @contextmanager
+    def _limited(self) -> Iterator[float]:
+        """The moment by which networks must have answered; what they raise becomes what callers know."""
+        patience = self._patience
+        try:
+            yield time.monotonic() + patience
+            self._patience = min(PATIENCE, RECOVERY * self._patience)
+        except NetworkError as error:
+            logger.error("model %s/%s: %s", self.manifest.name, self.manifest.version, error)
+            what_to_do = "Choose another code or model, and tell whoever runs the server."
+            if isinstance(error, TerminatedError):
+                self._patience = max(patience / 2, LEAST_PATIENCE)
+                raise NetworkTimeError(
+                    f"The model's networks did not answer within {patience:g} s at this code. {what_to_do}"
+                ) from error
+            raise ModelFailedError(f"The model's networks failed at this code. {what_to_do}") from error
 
     @contextmanager
     def solver(self) -> Iterator[Reconstructor]:
         """A solver for the time being; waits for one where all are in use."""
-        solver = self._solvers.get()
+        solver = self._spare_solver()
         try:
             yield solver
         finally:
             self._solvers.put(solver)
+
+    def _spare_solver(self) -> Reconstructor:
+        with suppress(queue.Empty):
+            return self._solvers.get_nowait()
+        with self._counting:
+            make = self._more > 0
+            self._more -= make
+        return self._first.another() if make else self._solvers.get()
 
     @property
     def _overflow(self) -> str:
@@ -261,56 +334,3 @@ class ShapeModel:
             "The code lies so far outside the bounds that the model's numbers overflow. Choose one "
             f'nearer to the bounds, which the card of {self.manifest.name} lists, or send "bounds": "clamp".'
         )
-
-
-class _Session:
-    """One ONNX network, checked once against what the manifest says of it.
-
-    Args:
-        bundle: holds its bytes.
-        network: names of file, input and output.
-        inputs, outputs: expected shape of one row.
-    """
-
-    def __init__(self, bundle: Bundle, network: Network, inputs: list[int], outputs: list[int]) -> None:
-        options = onnxruntime.SessionOptions()
-        # The workers run side by side, a network inside one of them: a second layer of threads would only
-        # get in the way. The arena keeps the memory of the largest run for ever.
-        options.intra_op_num_threads = options.inter_op_num_threads = 1
-        options.add_session_config_entry("session.intra_op.allow_spinning", "0")
-        options.enable_cpu_mem_arena = False
-        options.log_severity_level = 3
-        try:
-            self._session = onnxruntime.InferenceSession(
-                bundle.networks[network.file], options, providers=["CPUExecutionProvider"]
-            )
-        except Exception as error:  # ONNX Runtime's exceptions have no common public class
-            raise BundleError(f"{network.file} does not load: {str(error).splitlines()[0]}") from None
-        for role, nodes, name, row in (
-            ("input", self._session.get_inputs(), network.input, inputs),
-            ("output", self._session.get_outputs(), network.output, outputs),
-        ):
-            if [node.name for node in nodes] != [name] or not _fits(nodes[0], row):
-                have = ", ".join(f"{node.name} {node.type} {node.shape}" for node in nodes)
-                raise BundleError(f"{network.file} must have one {role}, {name} float32 [n, {row}], but has {have}")
-        # It keeps the file for a change of providers, which there is none of here: 20 MB with both bundled models.
-        self._session._model_bytes = None
-        self._input, self._output, self._shape = network.input, network.output, tuple(outputs)
-        result = self(np.zeros((2, *inputs), np.float32))
-        if result.shape != (2, *outputs) or not np.isfinite(result).all():
-            raise BundleError(f"{network.file} does not give finite [n, {outputs}] for zeros")
-
-    def __call__(self, rows: NDArray[np.float32]) -> NDArray[np.float32]:
-        result: Any = self._session.run([self._output], {self._input: rows})[0]
-        return result
-
-
-def _fits(node: Any, row: list[int]) -> bool:
-    """Whether a value is float32 with a free first dimension, and the known others as wanted."""
-    shape = node.shape
-    return (
-        node.type == "tensor(float)"
-        and len(shape) == 1 + len(row)
-        and not isinstance(shape[0], int)
-        and all(size == want or not isinstance(size, int) for size, want in zip(shape[1:], row, strict=True))
-    )

@@ -9,17 +9,21 @@ from typing import Annotated, Any
 import numpy as np
 from fastapi import APIRouter, Depends, Query, Request, Response
 
+from geometry.deadline import Deadline
 from geometry.status import Status
-from service.correspondence import match
-from service.dependencies import Model, ServiceDependency, limit_codes, one_of, require_json
+from service.bodies import JSONBody
+from service.correspondence import limits, match
+from service.dependencies import MeshQuery, Model, ServiceDependency, limit_codes, one_of
 from service.edit import Editor, Target
 from service.encode import Encoder
 from service.encodings import dump_json, float32
 from service.latent_space import Bounds
 from service.problems import ProblemError
+from service.reading import gather
+from service.reading import read as read_upload
 from service.responses import problems, server_timing
 from service.schemas import EditAnswer, EditRequest, EncodeAnswer, MeshAnswer, SampleAnswer, SampleRequest
-from service.uploads import FORMATS, MEDIA_TYPES, read_upload
+from service.uploads import FORMATS, MEDIA_TYPES
 
 router = APIRouter(prefix="/v1/models/{name}", tags=["codes"])
 
@@ -61,11 +65,12 @@ async def encode(
     The file holds the fine or the coarse mesh of the model in its vertex order (STL: in its order of faces), in the
     units of the training meshes.
     """
-    data, format = await read_upload(request, format)
+    body, content_type = await gather(request), request.headers.get("content-type", "")
 
-    def make(deadline: float) -> tuple[bytes, dict[str, float]]:
+    def make(deadline: Deadline) -> tuple[bytes, dict[str, float]]:
         began = time.perf_counter()
-        given = match(model, data, format)
+        mesh = read_upload(service.sandbox, body, content_type, format, limits(model), deadline)
+        given = match(model, *mesh)
         read = time.perf_counter()
         found = Encoder(model)(given, bounds, deadline)
         if found.status is Status.DEADLINE:
@@ -83,7 +88,7 @@ async def encode(
         }
         return dump_json(answer), {"read": read - began, "encode": time.perf_counter() - read}
 
-    with service.workers.admit() as deadline:
+    async with service.workers.admit(request) as deadline:
         content, seconds = await service.workers.run(make, deadline)
     return Response(content, headers={"Server-Timing": server_timing(seconds)}, media_type="application/json")
 
@@ -92,25 +97,31 @@ async def encode(
     "/edit",
     responses=problems(400, 404, 413, 415, 422, 503, 504),
     response_model=EditAnswer,
-    dependencies=[Depends(require_json)],
 )
-async def edit(service: ServiceDependency, model: Model, body: EditRequest) -> Response:
+async def edit(
+    service: ServiceDependency,
+    request: Request,
+    model: Model,
+    body: Annotated[EditRequest, Depends(JSONBody(EditRequest))],
+    mesh: MeshQuery = None,
+) -> Response:
     """The code inside the bounds whose shape comes closest to having some vertices at some places."""
-    count = len(model.mesh(body.mesh).vertices)
+    which = mesh or body.mesh
+    count = len(model.mesh(which).vertices)
     if len(body.targets) > count:
         raise ProblemError("invalid-request", f"targets has {len(body.targets)} entries. Send {count} at most.")
     for i, target in enumerate(body.targets):
         if not 0 <= target.vertex < count:
             raise ProblemError(
                 "invalid-request",
-                f"targets[{i}].vertex is {target.vertex}, but the {body.mesh} mesh has vertices 0 to {count - 1}.",
+                f"targets[{i}].vertex is {target.vertex}, but the {which} mesh has vertices 0 to {count - 1}.",
             )
     start, _ = model.latents.code(body.latent, Bounds.CLAMP)
     targets = [Target(target.vertex, target.position) for target in body.targets]
 
-    def make(deadline: float) -> tuple[bytes, dict[str, float]]:
+    def make(deadline: Deadline) -> tuple[bytes, dict[str, float]]:
         began = time.perf_counter()
-        found = Editor(model)(start, targets, body.prior, body.mesh, deadline)
+        found = Editor(model)(start, targets, body.prior, which, deadline)
         if found.status is Status.DEADLINE:
             raise service.workers.late()
         answer = {
@@ -123,7 +134,7 @@ async def edit(service: ServiceDependency, model: Model, body: EditRequest) -> R
         }
         return dump_json(answer), {"edit": time.perf_counter() - began}
 
-    with service.workers.admit() as deadline:
+    async with service.workers.admit(request) as deadline:
         content, seconds = await service.workers.run(make, deadline)
     return Response(content, headers={"Server-Timing": server_timing(seconds)}, media_type="application/json")
 
@@ -132,9 +143,10 @@ async def edit(service: ServiceDependency, model: Model, body: EditRequest) -> R
     "/sample",
     responses=problems(400, 404, 413, 415, 422),
     response_model=SampleAnswer,
-    dependencies=[Depends(require_json)],
 )
-async def sample(service: ServiceDependency, model: Model, body: SampleRequest) -> Response:
+async def sample(
+    service: ServiceDependency, model: Model, body: Annotated[SampleRequest, Depends(JSONBody(SampleRequest))]
+) -> Response:
     """Random codes inside the bounds; one seed gives the same from every replica."""
     limit_codes(service, body.count, "count")
     codes: Any = model.latents.sample(body.count, body.seed, body.distribution)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import time
+import asyncio
 from typing import Annotated, Any
 
 import numpy as np
@@ -11,7 +11,7 @@ from fastapi import APIRouter, Depends, Path, Request, Response
 from geometry.formats import OCTET_STREAM
 from service import __version__
 from service.dependencies import ModelName, Service, ServiceDependency, limit_codes
-from service.encodings import dump_json, float32, worst
+from service.encodings import dump_json, worst
 from service.inference import (
     HEADER,
     InferenceAnswer,
@@ -24,7 +24,8 @@ from service.inference import (
     model_metadata,
     parse,
 )
-from service.responses import predictions, problems, server_timing, shapes, total_seconds
+from service.inference import codes as codes_of
+from service.responses import in_pieces, nric_size_of, predictions, problems, shapes, size_of
 from service.shape_model import ShapeModel
 
 router = APIRouter(prefix="/v2", tags=["inference"])
@@ -121,25 +122,27 @@ async def versioned_infer(service: ServiceDependency, request: Request, model: V
 
 
 async def _infer(service: Service, request: Request, model: ShapeModel) -> Response:
-    message, values = parse(await request.body(), request.headers.get(HEADER))
-    limit_codes(service, len(values))
+    message, tail = await asyncio.to_thread(parse, await request.body(), request.headers.get(HEADER))
+    limit_codes(service, message.inputs[0].shape[0])
+    values = codes_of(message, tail)
     codes, inside = model.latents.codes(values, message.parameters.bounds)
     headers: dict[str, str] = {}
     seconds: dict[str, float] = {}
     outputs: dict[OutputName, np.ndarray] = {}
-    with service.workers.admit() as deadline:
-        for name in message.wanted:
-            if name == "vertices":
-                found = await shapes(service, request, model, codes, inside, message.parameters.mesh, deadline)
-                outputs[name] = float32(np.stack([shape.vertices for shape in found]))
-                headers["Shape-Diagnostics"] = dump_json(worst([shape.diagnostics for shape in found])).decode()
-                seconds |= total_seconds(found)
-            else:
-                predicted = await predictions(service, request, model, codes, deadline)
-                outputs[name] = float32(np.stack([np.concatenate([z.lengths, z.angles]) for z in predicted]))
-        began = time.perf_counter()
-        content, length = await service.workers.run(lambda _: answer(message, model, outputs), deadline)
-    headers["Server-Timing"] = server_timing(seconds | {"encode": time.perf_counter() - began})
-    if length is not None:
-        headers[HEADER] = str(length)
-    return Response(content, headers=headers, media_type="application/json" if length is None else OCTET_STREAM)
+    mesh = message.parameters.mesh
+    size = size_of(model, len(codes), mesh) + nric_size_of(model, len(codes))
+    with service.workers.holding(request, size) as held:
+        async with service.workers.admit(request) as call:
+            for name in message.wanted:
+                if name == "vertices":
+                    found = await shapes(service, model, codes, inside, mesh, call)
+                    outputs[name] = found.vertices
+                    headers["Shape-Diagnostics"] = dump_json(worst(found.diagnostics)).decode()
+                    seconds |= found.seconds
+                else:
+                    outputs[name] = (await predictions(service, model, codes, call)).nric
+            pieces, length = answer(message, model, outputs)
+            if length is not None:
+                headers[HEADER] = str(length)
+            media_type = "application/json" if length is None else OCTET_STREAM
+            return await in_pieces(service, call, pieces, size, held, headers, seconds, media_type)

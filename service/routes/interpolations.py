@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import AsyncGenerator
 from contextlib import aclosing
 from functools import partial
@@ -12,9 +11,11 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Depends, Path, Request, Response
 from fastapi.responses import StreamingResponse
 
+from geometry.deadline import Deadline
 from service.animation import Animation, UnknownInterpolationError
+from service.bodies import JSONBody
 from service.comparison import NO_COLOR, ColorQuery, choose_mesh
-from service.dependencies import Format, Model, Service, ServiceDependency, limit_frames, one_of, require_json
+from service.dependencies import Format, MeshQuery, Model, Service, ServiceDependency, limit_frames, one_of
 from service.encodings import SHAPE_FORMATS, worst
 from service.latent_space import Codes
 from service.negotiation import choose
@@ -24,13 +25,14 @@ from service.responses import (
     cache_headers,
     entity_tag,
     file_headers,
+    in_pieces,
     mesh_answers,
     not_modified,
     problems,
     shape_response,
     shapes,
+    size_of,
     solve,
-    total_seconds,
 )
 from service.schemas import InterpolationAnswer
 from service.sequences import (
@@ -53,15 +55,19 @@ Id = Annotated[str, Path(description="An interpolation's id.")]
     "/models/{name}/interpolations",
     status_code=201,
     responses=problems(400, 404, 413, 415, 422),
-    dependencies=[Depends(require_json)],
 )
 async def create_interpolation(
-    service: ServiceDependency, model: Model, body: Animation, response: Response
+    service: ServiceDependency,
+    model: Model,
+    body: Annotated[Animation, Depends(JSONBody(Animation))],
+    response: Response,
+    mesh: MeshQuery = None,
 ) -> InterpolationAnswer:
     """An address for the animation along a path of codes. Nothing is stored: the id holds it all."""
     limit_frames(service, body.frames)
-    model.latents.codes(body.codes(model.latents))  # every frame must be a code
+    body = body.model_copy(update={"mesh": mesh or body.mesh})
     id = body.to_id(model.digest, model.latents)
+    model.latents.codes(body.codes(model.latents))  # every frame must be a code
     path = f"/v1/interpolations/{id}"
     response.headers["Location"] = path
     links = {"self": path} | {name: f"{path}?format={name}" for name in sequence_types()}
@@ -89,19 +95,20 @@ async def get_interpolation(
         return answer
     codes, inside = model.latents.codes(animation.codes(model.latents))
     if chosen == "jsonl":
-        lines = _stream(service, model, animation, codes, inside)
+        lines = _stream(service, request, model, animation, codes, inside)
         first = await anext(lines)  # what goes wrong up to here still has a status of its own
         return StreamingResponse(_resume(request, first, lines), headers=cache_headers(tag), media_type=JSON_LINES)
 
-    with service.workers.admit() as deadline:
-        found = await shapes(service, request, model, codes, inside, animation.mesh, deadline)
-        frames = Frames(found, model.mesh(animation.mesh).faces, animation.positions, codes)
-        began = time.perf_counter()
-        content, facts = await service.workers.run(lambda _: SEQUENCE_FORMATS[chosen].encode(frames), deadline)
-    diagnostics = worst([shape.diagnostics for shape in found]) | facts
-    seconds = {**total_seconds(found), "encode": time.perf_counter() - began}
-    headers = file_headers(diagnostics, seconds, f"{model.manifest.name}-animation.{chosen}")
-    return Response(content, headers=cache_headers(tag) | headers, media_type=MEDIA_TYPES[chosen])
+    size = size_of(model, len(codes), animation.mesh)
+    with service.workers.holding(request, size) as held:
+        async with service.workers.admit(request) as call:
+            found = await shapes(service, model, codes, inside, animation.mesh, call)
+            faces = model.mesh(animation.mesh).faces
+            frames = Frames(found.vertices, found.diagnostics, faces, animation.positions, codes)
+            pieces, facts = await service.workers.run(lambda _: SEQUENCE_FORMATS[chosen].encode(frames), call)
+            headers = file_headers(worst(found.diagnostics) | facts, f"{model.manifest.name}-animation.{chosen}")
+            headers |= cache_headers(tag)
+            return await in_pieces(service, call, pieces, size, held, headers, found.seconds, MEDIA_TYPES[chosen])
 
 
 @router.get(
@@ -122,7 +129,7 @@ async def get_frame(
     animation, model = _find(service, id)
     if not 0 <= k < animation.frame_count:
         raise ProblemError("unknown-frame", f"There is no frame {k}. Choose one from 0 to {animation.frame_count - 1}.")
-    code = model.latents.code(animation.codes(model.latents)[k])
+    code = model.latents.code(animation.codes(model.latents, slice(k, k + 1))[0])
     return await shape_response(service, request, model, code, animation.mesh, chosen, color.on(model.latents))
 
 
@@ -139,20 +146,20 @@ def _find(service: Service, id: str) -> tuple[Animation, ShapeModel]:
 
 
 async def _stream(
-    service: Service, model: ShapeModel, animation: Animation, codes: Codes, inside: Any
+    service: Service, request: Request, model: ShapeModel, animation: Animation, codes: Codes, inside: Any
 ) -> AsyncGenerator[bytes, None]:
     faces = model.mesh(animation.mesh).faces
 
-    def line(frame: tuple[int, float, Codes, bool], deadline: float) -> bytes:
+    def line(frame: tuple[int, float, Codes, bool], deadline: Deadline) -> bytes:
         k, t, code, inside = frame
         shape = solve(service.workers, model, animation.mesh, (code, inside), deadline)
         return json_line(k, t, shape, None if k else faces)
 
     frames = zip(count(), animation.positions.tolist(), codes, map(bool, inside))
     # Each frame has the deadline to itself: a stream may take as long as its reader likes.
-    with service.workers.admit() as deadline:
+    with service.workers.stream(request):
         # The first alone: beside the second, with which it would share the interpreter, it takes half as long again.
-        yield await service.workers.run(partial(line, next(frames)), deadline)
+        yield await service.workers.piece(partial(line, next(frames)), None)
         async with aclosing(service.workers.map(line, frames, None)) as lines:
             async for ready in lines:
                 yield ready

@@ -3,34 +3,50 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Iterable, Iterator
 from dataclasses import asdict
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 from fastapi import APIRouter, Depends, Query, Request, Response
+from numpy.typing import NDArray
 
-from geometry.formats import OCTET_STREAM, npz
+from geometry.archives import Buffer, npz_pieces
+from geometry.deadline import Deadline
+from geometry.formats import OCTET_STREAM
+from service.bodies import JSONBody
 from service.comparison import NO_COLOR, NUMBERS, ColorQuery, choose_mesh, numbers
-from service.dependencies import Format, Model, Service, ServiceDependency, limit_codes, one_of, require_json
-from service.encodings import SHAPE_FORMATS, diagnostics_arrays, dump_json, exact_arrays, exact_lists, float32, worst
+from service.dependencies import Format, MeshQuery, Model, Service, ServiceDependency, limit_codes, one_of
+from service.encodings import (
+    SHAPE_FORMATS,
+    diagnostics_arrays,
+    exact_arrays,
+    exact_lists,
+    float32,
+    json_pieces,
+    worst,
+)
 from service.exact import Exact, require_tangent_space
 from service.exact import exact as exponential
 from service.latent_space import Bounds, Codes
 from service.negotiation import choose
 from service.responses import (
+    Shapes,
     binary,
     file_headers,
     gather,
+    in_pieces,
     mesh_answers,
+    nric_size_of,
     predictions,
     problems,
-    server_timing,
     shape_response,
     shapes,
-    total_seconds,
+    size_of,
 )
 from service.schemas import MeshRequest, NRICAnswer, NRICRequest, VerticesAnswer, VerticesRequest
-from service.shape_model import MeshChoice, Shape, ShapeModel
+from service.shape_model import MeshChoice, ShapeModel
+from service.workers import Call
 
 router = APIRouter(prefix="/v1/models/{name}", tags=["shapes"])
 
@@ -66,13 +82,13 @@ async def get_mesh(
     "/mesh",
     responses=_MESH_RESPONSES | problems(400, 404, 406, 413, 415, 422, 503, 504),
     response_class=Response,
-    dependencies=[Depends(require_json)],
 )
 async def post_mesh(
     service: ServiceDependency,
     request: Request,
     model: Model,
-    body: MeshRequest,
+    body: Annotated[MeshRequest, Depends(JSONBody(MeshRequest))],
+    mesh: MeshQuery = None,
     color: ColorQuery = NO_COLOR,
     format: Annotated[Format, one_of(SHAPE_FORMATS)] = None,
 ) -> Response:
@@ -80,7 +96,7 @@ async def post_mesh(
     chosen = choose_mesh(format, request, color)
     code = model.latents.code(body.latent, body.bounds)
     comparison = color.on(model.latents, body.bounds)
-    return await shape_response(service, request, model, code, body.mesh, chosen, comparison)
+    return await shape_response(service, request, model, code, mesh or body.mesh, chosen, comparison)
 
 
 @router.post(
@@ -88,58 +104,56 @@ async def post_mesh(
     responses=binary(_VERTICES_TYPES, "Positions and diagnostics of every shape.", cached=False)
     | problems(400, 404, 406, 413, 415, 422, 503, 504),
     response_model=VerticesAnswer,
-    dependencies=[Depends(require_json)],
 )
 async def post_vertices(
     service: ServiceDependency,
     request: Request,
     model: Model,
-    body: VerticesRequest,
+    body: Annotated[VerticesRequest, Depends(JSONBody(VerticesRequest))],
+    mesh: MeshQuery = None,
     exact: Annotated[bool, Query(description="As in the body: also the true discrete exponentials.")] = False,
     format: Annotated[Format, one_of(_VERTICES_TYPES)] = None,
 ) -> Response:
     """The positions of many shapes at once."""
     chosen = choose(_VERTICES_TYPES, format, request.headers.get("accept"))
     limit_codes(service, len(body.latents))
-    wanted = exact or body.exact
+    wanted, which = exact or body.exact, mesh or body.mesh
     if wanted:
         require_tangent_space(model)
     codes, inside = model.latents.codes(body.latents, body.bounds)
-    with service.workers.admit() as deadline:
-        found = await shapes(service, request, model, codes, inside, body.mesh, deadline)
-        diagnostics = [shape.diagnostics for shape in found]
-        true = await _exact(service, request, model, codes, found, body.mesh, deadline) if wanted else None
-        began = time.perf_counter()
-
-        def encode(_: float) -> bytes:
-            vertices = float32(np.stack([shape.vertices for shape in found]))
+    size = size_of(model, (2 if wanted else 1) * len(codes), which)
+    with service.workers.holding(request, size) as held:
+        async with service.workers.admit(request) as call:
+            found = await shapes(service, model, codes, inside, which, call)
+            true = await _exact(service, model, codes, found, which, call) if wanted else None
+            pieces: Iterator[Buffer]
             if chosen == "json":
-                more = exact_lists(true) if true else {}
-                return dump_json({"vertices": vertices, "diagnostics": list(map(asdict, diagnostics)), **more})
-            arrays = diagnostics_arrays(diagnostics) | (exact_arrays(true, vertices.shape[1]) if true else {})
-            return npz(vertices=vertices, faces=model.mesh(body.mesh).faces, latents=codes, **arrays)
-
-        content = await service.workers.run(encode, deadline)
-    seconds = {**total_seconds(found), "encode": time.perf_counter() - began}
-    headers = file_headers(worst(diagnostics), seconds, f"{model.manifest.name}.{chosen}")
-    return Response(content, headers={"Vary": "Accept", **headers}, media_type=_VERTICES_TYPES[chosen])
+                diagnostics = map(asdict, found.diagnostics)
+                lists: dict[str, Iterable[Any]] = {"vertices": found.vertices, "diagnostics": diagnostics}
+                pieces = json_pieces(lists | (exact_lists(true) if true else {}))
+            else:
+                arrays = diagnostics_arrays(found.diagnostics)
+                arrays |= exact_arrays(true, found.vertices.shape[1]) if true else {}
+                pieces = npz_pieces(vertices=found.vertices, faces=model.mesh(which).faces, latents=codes, **arrays)
+            headers = {"Vary": "Accept", **file_headers(worst(found.diagnostics), f"{model.manifest.name}.{chosen}")}
+            media_type = _VERTICES_TYPES[chosen]
+            return await in_pieces(service, call, pieces, size, held, headers, found.seconds, media_type)
 
 
 async def _exact(
     service: Service,
-    request: Request,
     model: ShapeModel,
     codes: Codes,
-    found: list[Shape],
+    found: Shapes,
     mesh: MeshChoice,
-    deadline: float,
+    deadline: Call,
 ) -> list[Exact]:
     """Exponentials of codes (n, m), side by side."""
 
-    def work(item: tuple[Codes, Shape], _: float) -> Exact:
-        return exponential(model, *item, mesh)
+    def work(item: tuple[Codes, NDArray[np.float32]], deadline: Deadline) -> Exact:
+        return exponential(model, *item, mesh, deadline)
 
-    return await gather(service, request, work, zip(codes, found, strict=True), deadline)
+    return await gather(service, work, zip(codes, found.vertices, strict=True), deadline)
 
 
 @router.post(
@@ -147,21 +161,24 @@ async def _exact(
     responses=problems(400, 404, 413, 415, 422, 503, 504),
     response_model=NRICAnswer,
     response_model_exclude_none=True,
-    dependencies=[Depends(require_json)],
 )
-async def post_nric(service: ServiceDependency, request: Request, model: Model, body: NRICRequest) -> Response:
+async def post_nric(
+    service: ServiceDependency,
+    request: Request,
+    model: Model,
+    body: Annotated[NRICRequest, Depends(JSONBody(NRICRequest))],
+) -> Response:
     """Lengths and angles as the networks predict them, before any reconstruction."""
     limit_codes(service, len(body.latents))
     codes, _ = model.latents.codes(body.latents, body.bounds)
-    with service.workers.admit() as deadline:
-        began = time.perf_counter()
-        found = await predictions(service, request, model, codes, deadline)
-        predicted = time.perf_counter()
-
-        def encode(_: float) -> bytes:
-            names = ("lengths", "angles", *(("factors",) if body.factors else ()))
-            return dump_json({name: float32(np.stack([getattr(z, name) for z in found])) for name in names})
-
-        content = await service.workers.run(encode, deadline)
-    seconds = {"network": predicted - began, "encode": time.perf_counter() - predicted}
-    return Response(content, headers={"Server-Timing": server_timing(seconds)}, media_type="application/json")
+    size = nric_size_of(model, len(codes), factors=body.factors)
+    with service.workers.holding(request, size) as held:
+        async with service.workers.admit(request) as call:
+            began = time.perf_counter()
+            found = await predictions(service, model, codes, call, factors=body.factors)
+            seconds = {"network": time.perf_counter() - began}
+            lengths, angles = np.split(found.nric, 2, axis=1)
+            lists: dict[str, Iterable[Any]] = {"lengths": map(float32, lengths), "angles": map(float32, angles)}
+            if found.factors is not None:
+                lists["factors"] = found.factors
+            return await in_pieces(service, call, json_pieces(lists), size, held, {}, seconds, "application/json")

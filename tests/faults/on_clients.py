@@ -15,9 +15,8 @@ from tests.service.watching import admitted
 
 MODEL = "/v1/models/small"
 CODE = b'{"latent": [0.1, 0.7, 0.4]}'
-REQUEST = b"POST %s/mesh HTTP/1.1\r\nHost: x\r\nContent-Type: application/json\r\nContent-Length: %d\r\n\r\n%s" % (
-    MODEL.encode(), len(CODE), CODE,
-)  # fmt: skip
+REQUEST = b"POST %s/mesh HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\n" % MODEL.encode()
+REQUEST += b"Content-Length: %d\r\n\r\n%s" % (len(CODE), CODE)
 
 
 def connect(steady: Steady) -> socket.socket:
@@ -39,9 +38,9 @@ def slow(arena: Arena, rng: np.random.Generator) -> str:
         readers = [stack.enter_context(connect(steady)) for _ in range(4)]
         for reader in readers:
             reader.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
-            reader.sendall(f"GET {link} HTTP/1.1\r\nHost: x\r\n\r\n".encode())
-        # Each has stopped somewhere else: in the head, between head and body, in the body.
-        places = [int(rng.integers(1, len(REQUEST) - 1)) for _ in writers]
+            reader.sendall(f"GET {link} HTTP/1.1\r\nHost: localhost\r\n\r\n".encode())
+        # Each has stopped somewhere else, behind its head: for that one has ten seconds only.
+        places = [int(rng.integers(len(REQUEST) - len(CODE), len(REQUEST) - 1)) for _ in writers]
         for writer, place in zip(writers, places, strict=True):
             writer.sendall(REQUEST[:place])
         others = 0
@@ -79,7 +78,7 @@ def vanishing(arena: Arena, rng: np.random.Generator) -> str:
             elif k % 4 == 1:  # while it waits for the answer
                 client.sendall(long)
             elif k % 4 == 2:  # after a part of a stream
-                client.sendall(f"GET {link} HTTP/1.1\r\nHost: x\r\n\r\n".encode())
+                client.sendall(f"GET {link} HTTP/1.1\r\nHost: localhost\r\n\r\n".encode())
                 client.recv(int(rng.integers(1, 10_000)))
             else:  # behind its own back
                 client.sendall(REQUEST * 3)

@@ -62,8 +62,8 @@ class Steady:
         assert self.truth.differing() == []
         eventually(lambda: watching.admitted(self.client) == 0)
         eventually(lambda: self.handles <= self._handles + 2)
-        # Workers' threads begin one by one, as work comes.
-        assert self.threads <= self._threads + 2
+        # Workers' threads, and those that read bodies, begin one by one as work comes.
+        assert self.threads <= self._threads + 4
         # One fault's mistake is not the next one's.
         log, self._read = self.server.log[self._read :], len(self.server.log)
         assert "Traceback" not in log, log

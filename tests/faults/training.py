@@ -49,7 +49,6 @@ energy = 1.0
 fit = { batch_size = 16, max_epochs = 3 }
 
 [evaluation]
-grid_size = 12
 reconstructions = 2
 
 [export]

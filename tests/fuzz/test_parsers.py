@@ -8,11 +8,14 @@ from __future__ import annotations
 import base64
 import json
 import os
+import sys
+import tracemalloc
 from collections.abc import Callable, Iterator
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 import numpy as np
 import pytest
@@ -22,15 +25,17 @@ from pydantic import ValidationError
 
 from geometry.formats import MESH_FORMATS, read_arrays
 from geometry.mesh import MeshError
+from geometry.reading import Limits
 from service.animation import Animation, UnknownInterpolationError
 from service.bundle import BundleError, read_bundle
-from service.correspondence import InvalidMeshError, match
+from service.correspondence import InvalidMeshError, Matched, limits, match
 from service.latent_space import LatentError
 from service.manifest import Manifest
 from service.negotiation import choose
 from service.problems import ProblemError
 from service.shape_model import ShapeModel
-from service.uploads import FORMATS
+from service.uploads import FORMATS, UploadError, read_mesh_file
+from tests.hostile import BINARY, MATRIX, document, glb
 from tests.service.bundles import reference, seal, write_bundle
 from training.ingest import IngestError, read_collection
 
@@ -83,11 +88,43 @@ def damaged(draw: st.DrawFn, sound: bytes) -> bytes:
     return bytes(data)
 
 
+JSON = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=8) | st.sampled_from(["../x", "1" * 99]),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=5), inner, max_size=3),
+    max_leaves=6,
+)
+
+
 def one_line(error: Exception) -> None:
     text = str(error)
     assert text
     assert "\n" not in text
     assert len(text) < 1000, text
+
+
+@contextmanager
+def at_most(steps: int, memory: int) -> Iterator[None]:
+    """Counts calls, of C too, and bytes, which are the same on every machine, however busy it is."""
+    count = 0
+
+    def call(*_: object) -> None:
+        nonlocal count
+        count += 1
+
+    tracemalloc.start()
+    sys.setprofile(call)
+    try:
+        yield
+    finally:
+        sys.setprofile(None)
+        peak = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+    assert count <= steps
+    assert peak <= memory
+
+
+#: What a mesh as small as ours can need, whatever its bytes say.
+SMALL, MEMORY = Limits(3 * len(MESH.faces), len(MESH.faces)), 2**21
 
 
 @pytest.mark.parametrize("format", sorted(SOUND.keys() - {"json"}))
@@ -96,7 +133,8 @@ def test_mesh_files(format: str) -> None:
     @given(damaged(SOUND[format]))
     def read(data: bytes) -> None:
         try:
-            vertices, faces = read_arrays(data, format)
+            with at_most(1000 + 10 * len(data), MEMORY):
+                vertices, faces = read_arrays(data, format, SMALL)
         except MeshError as error:
             one_line(error)
         else:
@@ -104,6 +142,67 @@ def test_mesh_files(format: str) -> None:
             assert isinstance(faces, np.ndarray)
 
     read()
+
+
+def numbers(count: int) -> st.SearchStrategy[list[Any]]:
+    odd = st.sampled_from([0, -1, 1e300, "1", None, [1]])
+    return st.lists(st.floats(-2, 2) | odd, min_size=count, max_size=count)
+
+
+@st.composite
+def scenes(draw: st.DrawFn) -> dict[str, Any]:
+    """Scenes with nodes inside each other in any way, and accessors that say anything."""
+    count = draw(st.integers(1, 60))
+    shape = draw(st.sampled_from(["chain", "double", "tree", "any"]))
+    nodes: list[dict[str, Any]] = []
+    for k in range(count):
+        ways = {
+            "chain": [k + 1],
+            "double": [k + 1, k + 1],
+            "tree": [c for c in (2 * k + 1, 2 * k + 2) if c < count],
+            "any": draw(st.lists(st.integers(-1, count), max_size=4)) if shape == "any" else [],
+        }
+        node: dict[str, Any] = {"children": ways[shape] if k < count - 1 or shape == "any" else []}
+        if draw(st.booleans()):
+            node |= draw(
+                st.fixed_dictionaries(
+                    {},
+                    optional={
+                        "matrix": st.just(MATRIX) | numbers(16),
+                        "translation": numbers(3),
+                        "rotation": numbers(4),
+                        "scale": numbers(3),
+                        "mesh": st.integers(0, 1) | st.just(0),
+                    },
+                )
+            )
+        nodes.append(node)
+    nodes[-1]["mesh"] = 0
+    tree = document(nodes=nodes, scenes=[{"nodes": draw(st.just([0]) | st.lists(st.integers(0, count), max_size=3))}])
+    for kind in ("accessors", "bufferViews", "buffers"):
+        for entry in draw(st.just([]) | st.just(tree[kind])):
+            key = draw(st.sampled_from([*entry, "byteOffset", "byteStride", "normalized", "sparse"]))
+            entry[key] = draw(JSON | st.integers(-1, 300) | st.sampled_from([10**9, 2**31, 5121, 5126, "VEC4", "MAT4"]))
+    modes = st.fixed_dictionaries({}, optional={"mode": st.integers(0, 7), "indices": st.integers(0, 2)})
+    primitives = draw(st.lists(modes, min_size=1, max_size=3))
+    tree["meshes"] = [{"primitives": [{"attributes": {"POSITION": 0}} | primitive for primitive in primitives]}]
+    return tree
+
+
+@fuzz
+@given(scenes())
+def test_scenes(tree: dict[str, Any]) -> None:
+    """Every node once: the steps are in proportion to what is written, where the ways through it may be millions."""
+    data = glb(tree, BINARY)
+    try:
+        with at_most(2000 + 5 * len(data), MEMORY):
+            vertices, faces = read_arrays(data, "glb", SMALL)
+    except MeshError as error:
+        one_line(error)
+    else:
+        assert vertices.shape[1] == faces.shape[1] == 3
+        assert len(vertices) <= SMALL.vertices
+        assert 0 <= faces.min() <= faces.max() < len(vertices)
 
 
 @cache
@@ -125,12 +224,41 @@ def test_uploads(format: str) -> None:
     @given(damaged(SOUND[format]))
     def upload(data: bytes) -> None:
         try:
-            found = match(model(), data, format)
-        except InvalidMeshError as error:
+            found = matched(data, format)
+        except (UploadError, InvalidMeshError) as error:
             one_line(error)
         else:
             assert found.vertices.shape == MESH.vertices.shape
             assert np.isfinite(found.vertices).all()
+
+    upload()
+
+
+def matched(data: bytes, format: str | None, content_type: str = "") -> Matched:
+    vertices, faces, _ = read_mesh_file(data, content_type, format, limits(model()))
+    return match(model(), vertices, faces)
+
+
+FORM = b"\r\n".join(
+    [
+        *(b"--b", b'Content-Disposition: form-data; name="note"', b"", b"a torus", b"--b"),
+        b'Content-Disposition: form-data; name="file"; filename="torus.obj"',
+        *(b"Content-Type: model/obj", b"", SOUND["obj"], b"--b--", b""),
+    ]
+)
+
+
+def test_forms() -> None:
+    assert matched(FORM, None, "multipart/form-data; boundary=b").vertices.shape == MESH.vertices.shape
+
+    @fuzz
+    @given(damaged(FORM), damaged(b"multipart/form-data; boundary=b"))
+    def upload(data: bytes, content_type: bytes) -> None:
+        with suppress(InvalidMeshError):
+            try:
+                matched(data, None, content_type.decode("latin-1"))
+            except UploadError as error:
+                one_line(error)
 
     upload()
 
@@ -144,8 +272,8 @@ def test_an_upload_opens_no_other_file(uri: str, tmp_path: Path, monkeypatch: py
     (tmp_path / "shape.bin").write_bytes(data)  # what it asks for is even there
     monkeypatch.chdir(tmp_path)
     tree["buffers"][0]["uri"] = uri
-    with pytest.raises(InvalidMeshError) as refusal:
-        match(model(), json.dumps(tree).encode(), "gltf")
+    with pytest.raises(UploadError) as refusal:
+        matched(json.dumps(tree).encode(), "gltf")
     one_line(refusal.value)
     assert "root:" not in str(refusal.value)
 
@@ -176,13 +304,6 @@ def test_one_npz_for_a_collection(data: st.DataObject) -> None:
             read_collection(path)
         except IngestError as error:
             one_line(error)
-
-
-JSON = st.recursive(
-    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=8) | st.sampled_from(["../x", "1" * 99]),
-    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=5), inner, max_size=3),
-    max_leaves=6,
-)
 
 
 @cache
@@ -238,7 +359,7 @@ def as_bundle(spoil: Callable[[Path], object]) -> None:
             (place / name).write_bytes(content)
         spoil(place)
         try:
-            ShapeModel(read_bundle(place))
+            ShapeModel(read_bundle(place)).rehearse()
         except BundleError as error:
             one_line(ValueError(" ".join(str(error).split())))
 

@@ -1,4 +1,4 @@
-"""One server and one browser for all tests of the page; each test gets a fresh window."""
+"""One server for all tests of the page, a browser for each file of them, and a fresh window for each test."""
 
 from __future__ import annotations
 
@@ -49,9 +49,12 @@ def start() -> Iterator[Start]:
         yield start
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def browser() -> Iterator[Browser]:
-    """Chromium of the system; where there is none, the one that `playwright install chromium` fetches."""
+    """Chromium of the system; where there is none, the one that `playwright install chromium` fetches.
+
+    It ends with the file, since no other event loop runs in this thread while it is there.
+    """
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
         yield browser

@@ -290,12 +290,11 @@ def test_a_phone_and_a_finger(window: Open) -> None:
     for i in range(1, 6):
         touch("touchMove", (x - 20 - 8 * i, y), (x + 20 + 8 * i, y))
     touch("touchEnd")
-    larger = studio.until_different(turned, 0.01)
+    studio.until_different(turned, 0.01)
     slider = studio.coordinate(0).locator("input[type=range]")
     slider.scroll_into_view_if_needed()
     slider.tap(position={"x": 200, "y": 12})
-    studio.until_different(larger)
-    assert studio.code[0] > 0
+    studio.eventually(lambda: bool(studio.code) and studio.code[0] > 0)  # the picture may still change by the fingers
     studio.page.get_by_role("tab", name="Path").tap()
     assert studio["#add-keyframe"].is_visible()
 

@@ -8,6 +8,8 @@ import shutil
 import signal
 import subprocess
 import sys
+import tempfile
+import weakref
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -24,15 +26,19 @@ ROOT = Path(__file__).parents[2]
 class Server:
     """A running ``python -m service``."""
 
+    #: What Python is started with.
+    program: tuple[str, ...] = ("-m", "service")
+
     def __init__(self, models: Path, **settings: object) -> None:
-        self._log = models.parent / f"{uuid4().hex}.log"  # a pipe would fill up
+        self._log = Path(tempfile.gettempdir(), f"shapespace-{uuid4().hex}.log")  # a pipe would fill up
+        weakref.finalize(self, self._log.unlink, missing_ok=True)
         environment = {key: value for key, value in os.environ.items() if not key.startswith("SHAPESPACE_")}
         settings = {"drain": 0, "watch": 0} | settings  # so that tests neither wait nor reload unasked
         environment |= {"SHAPESPACE_MODELS_DIR": str(models), "SHAPESPACE_PORT": "0"}
         environment |= {f"SHAPESPACE_{key.upper()}": str(value) for key, value in settings.items()}
         with self._log.open("w") as log:
             self.process = subprocess.Popen(
-                [sys.executable, "-m", "service"],
+                [sys.executable, *self.program],
                 cwd=ROOT,
                 env=environment,
                 stdout=subprocess.PIPE,

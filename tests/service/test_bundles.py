@@ -1,9 +1,12 @@
 """What the loader refuses, and that one bad bundle takes nothing else down."""
 
+import io
 import json
 import logging
 import os
 import shutil
+import sys
+import zipfile
 from collections.abc import Callable
 from pathlib import Path
 
@@ -13,12 +16,19 @@ import onnx
 import pytest
 from onnx import TensorProto, helper, numpy_helper
 
+from benchmarks import synthetic
 from geometry.formats import npz
+from geometry.prolongation import Prolongation
+from service import candidates, sandbox
 from service.bundle import BundleError, read_bundle
-from service.repository import ModelRepository
+from service.candidates import Trials
+from service.repository import Changes, ModelRepository
 from service.shape_model import ShapeModel
-from tests.service.bundles import fine_arrays, network, networks, reference, seal, write_bundle
+from tests.faults.serving import peak_memory
+from tests.service import hostile
+from tests.service.bundles import SCALE, fine_arrays, network, networks, reference, rescale, seal, write_bundle
 from tests.service.conftest import Start
+from tests.service.watching import samples, value
 
 Spoil = Callable[[Path], None]
 
@@ -165,8 +175,8 @@ def wrong_output_name(folder: Path) -> None:
 
 def one_code_only(folder: Path) -> None:
     model = networks()["factor-0.onnx"]
-    for value in (*model.graph.input, *model.graph.output):
-        value.type.tensor_type.shape.dim[0].dim_value = 1
+    for end in (*model.graph.input, *model.graph.output):
+        end.type.tensor_type.shape.dim[0].dim_value = 1
     replace_network(folder, "factor-0.onnx", model)
 
 
@@ -288,6 +298,47 @@ def too_few_vertices_of_files(folder: Path) -> None:
     geometry(folder, file_vertices=np.arange(63))
 
 
+def no_training_codes(folder: Path) -> None:
+    geometry(folder, training_codes=np.zeros((0, 3)))
+
+
+def too_large_for_its_file(folder: Path) -> None:
+    hostile.unpacks(folder, 2**22)
+
+
+def repack(folder: Path, change: Callable[[bytearray, int], None]) -> None:
+    """Alter the directory of the geometry, from the place of its first entry."""
+    path = folder / "geometry.npz"
+    data = bytearray(path.read_bytes())
+    change(data, data.index(b"PK\x01\x02"))
+    path.write_bytes(data)
+    seal(folder)
+
+
+def less_than_it_unpacks_to(folder: Path) -> None:
+    def change(data: bytearray, entry: int) -> None:
+        data[entry + 24 : entry + 28] = (200).to_bytes(4, "little")
+
+    repack(folder, change)
+
+
+def more_than_it_holds(folder: Path) -> None:
+    """An array whose header promises a thousand million rows."""
+    header = io.BytesIO()
+    promise = {"descr": "<f8", "fortran_order": False, "shape": (999_999_999, 3)}
+    np.lib.format.write_array_header_1_0(header, promise)
+    with zipfile.ZipFile(folder / "geometry.npz", "w") as archive:
+        archive.writestr("vertices.npy", header.getvalue() + bytes(24))
+    seal(folder)
+
+
+def packed_in_another_way(folder: Path) -> None:
+    def change(data: bytearray, entry: int) -> None:
+        data[entry + 10 : entry + 12] = (14).to_bytes(2, "little")  # LZMA
+
+    repack(folder, change)
+
+
 def vertices_of_files_that_are_none(folder: Path) -> None:
     geometry(folder, file_vertices=np.array([-1, *range(63), 64]))
 
@@ -339,6 +390,11 @@ FAULTS: dict[Spoil, str] = {
     flat_modes: "modes must be real numbers (3, 64, 3), not float64 (3, 192)",
     too_few_vertices_of_files: "file_vertices must be at least 64 whole numbers, not int64 (63,)",
     vertices_of_files_that_are_none: "file_vertices must name each of the vertices 0 to 63, or -1",
+    no_training_codes: "geometry.npz: training_codes is empty",
+    too_large_for_its_file: "geometry.npz: its arrays would come to",
+    less_than_it_unpacks_to: "geometry.npz is not a readable NPZ file",
+    more_than_it_holds: "geometry.npz is not a readable NPZ file: vertices.npy can't be float64 (999999999, 3)",
+    packed_in_another_way: "geometry.npz is not a readable NPZ file: vertices.npy is packed in a way",
     codes_too_long: "training_codes must be real numbers (n, 3), not float64 (5, 4)",
 }
 
@@ -382,3 +438,158 @@ def test_a_server_starts_without_models_and_says_so(tmp_path: Path, start: Start
         assert ready.status_code == 503
         assert "models folder" in ready.json()["detail"]
     assert "bundle small/1 is not served: factor-0.onnx" in server.stop()
+
+
+def test_a_fine_mesh_of_a_hundred_and_sixty_thousand_vertices_is_no_bomb(tmp_path: Path) -> None:
+    folder = synthetic.write(tmp_path, 500, 4)
+    coarse, fine = synthetic.capsule(500), synthetic.capsule(160_000)
+    prolong = Prolongation.of(coarse, fine)
+    arrays = {"fine_vertices": prolong(coarse.vertices), "fine_faces": fine.faces.astype(np.int32), **prolong.arrays()}
+    with np.load(folder / "geometry.npz") as known:
+        arrays |= known
+    for write in (np.savez, np.savez_compressed):
+        with (folder / "geometry.npz").open("wb") as file:
+            write(file, **arrays)
+        seal(folder)
+        repository = ModelRepository(tmp_path)
+        assert repository.refused == []
+        model = next(iter(repository))
+        assert model.fine
+        assert len(model.fine.reference.vertices) > 150_000
+
+
+def name_with_a_line_break(models: Path) -> None:
+    write_bundle(models, "bad").parent.rename(models / "bad\nINFO service.repository: bundle forged is served")
+
+
+def of(harm: Callable[..., None], **options: object) -> Callable[[Path], object]:
+    return lambda models: hostile.hostile(models, "bad", harm, **options)
+
+
+#: Bundles that are what they say, and what the log says of them.
+ATTACKS: dict[str, tuple[Callable[[Path], object], str]] = {
+    "loops": (of(hostile.loops), "bad/1 is not served: factor-0.onnx does not answer in time, for zeros"),
+    "loops, with an if": (of(hostile.loops, nest="if"), "does not answer in time"),
+    "loops, with a scan": (of(hostile.loops, nest="scan"), "does not answer in time"),
+    "loops at its upper bounds": (of(hostile.loops, beyond=0.15), "does not answer in time, at a code inside"),
+    "fails": (of(hostile.fails), "factor-0.onnx fails: "),
+    "fails at its upper bounds": (of(hostile.fails, beyond=0.15), "indices element out of data bounds"),
+    "allocates": (of(hostile.allocates), "std::bad_alloc"),
+    "gives another shape": (of(hostile.changes_shape), "factor-0.onnx gives (2, 384), not (1, 384)"),
+    "is not finite": (of(hostile.not_finite), "does not give finite numbers for zeros"),
+    "has no training codes": (of(hostile.no_codes), "training_codes is empty"),
+    "unpacks": (of(hostile.unpacks), "its arrays would come to 1700008"),
+    "forges a line": (name_with_a_line_break, r"bad\nINFO service.repository: bundle forged is served/1 is not served"),
+}
+
+
+@pytest.mark.parametrize("attack", ATTACKS)
+def test_a_server_starts_beside_any_bundle(tmp_path: Path, start: Start, attack: str) -> None:
+    make, line = ATTACKS[attack]
+    models = tmp_path / "models"
+    write_bundle(models, "good")
+    make(models)
+    server = start(models, workers=2)
+    with httpx.Client(base_url=server.url, timeout=60) as client:
+        assert [model["name"] for model in client.get("/v1/models").json()["models"]] == ["good"]
+        assert client.get("/v1/models/good/mesh", params={"latent": "0.1,0.7,0.4"}).status_code == 200
+        assert value(samples(client), "shapespace_bundles_refused") == 1
+    assert peak_memory(server) < 300 * 2**20
+    log = server.stop().splitlines()
+    assert sum(line in entry for entry in log) == 1, log
+    assert not [entry for entry in log if entry.startswith("INFO service.repository: bundle forged")]
+    assert len([entry for entry in log if entry.startswith("ERROR ")]) == 1, log
+
+
+def messages(caplog: pytest.LogCaptureFixture) -> list[str]:
+    found = [record.getMessage() for record in caplog.records if record.levelno >= logging.ERROR]
+    caplog.clear()
+    return found
+
+
+def test_a_trial_that_never_ends_or_dies_is_no_reason_to_try_no_others(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    hostile.hostile(tmp_path, "a", hostile.doubles)
+    write_bundle(tmp_path, "b")
+    monkeypatch.setattr(candidates, "SECONDS", 8)
+    repository = ModelRepository(tmp_path)
+    assert [model.manifest.name for model in repository] == ["b"]
+    assert messages(caplog) == ["bundle a/1 is not served: tried in a process of its own, it took longer than 8 s"]
+
+    write_bundle(tmp_path, "c")
+    monkeypatch.setitem(sandbox.TASKS, "try", "tests.service.tasks:crash_at_c")
+    assert repository.reload() == Changes(refused=["a/1", "c/1"])
+    assert messages(caplog)[-1] == "bundle c/1 is not served: tried in a process of its own, it died of SIGSEGV"
+
+    monkeypatch.undo()
+    shutil.rmtree(tmp_path / "a")
+    assert repository.reload() == Changes(loaded=["c/1"])
+
+
+class Swapping(Trials):
+    """Changes each bundle in the moment between its trial and its use."""
+
+    def digest(self, folder: Path) -> str:
+        digest = super().digest(folder)
+        rescale(folder, 2 * SCALE)
+        return digest
+
+
+def test_only_the_bundle_that_was_tried_is_served(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    write_bundle(tmp_path, "small")
+    repository = ModelRepository(tmp_path, trials=Swapping())
+    assert list(repository) == []
+    assert messages(caplog) == ["bundle small/1 is not served: it changed while it was tried"]
+    assert repository.reload() == Changes(loaded=["small/1"])
+    assert repository.get("small").manifest.scale == 2 * SCALE
+
+
+def test_what_nobody_expected_is_a_line_as_well(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("a", "b", "c"):
+        write_bundle(tmp_path, name)
+    real = ModelRepository._take_up
+
+    def broken(self: ModelRepository, folder: Path, *more: object) -> ShapeModel:
+        if folder.parent.name == "b":
+            raise RuntimeError("surprise\nINFO forged")
+        return real(self, folder, *more)  # type: ignore[arg-type]
+
+    with monkeypatch.context() as patch:
+        patch.setattr(ModelRepository, "_take_up", broken)
+        repository = ModelRepository(tmp_path)
+    assert [model.manifest.name for model in repository] == ["a", "c"]
+    (line,) = messages(caplog)
+    assert line.startswith("bundle b/1 is not served: RuntimeError: surprise INFO forged (test_bundles.py, line ")
+    assert repository.reload() == Changes(loaded=["b/1"])
+
+    listed = Path.iterdir
+
+    def unreadable(path: Path) -> object:
+        if path == tmp_path / "b":
+            raise PermissionError(13, "Permission denied", str(path))
+        return listed(path)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "iterdir", unreadable)
+        assert repository.reload() == Changes(refused=["b"])
+        assert [model.manifest.name for model in repository] == ["a", "b", "c"]
+        assert repository.signature()
+    assert "Permission denied" in messages(caplog)[0]
+    assert repository.reload() == Changes()
+
+
+def test_a_bundle_that_is_served_already_is_not_tried_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_bundle(tmp_path, "small")
+    repository = ModelRepository(tmp_path)
+    model = repository.get("small")
+    monkeypatch.setattr(sys, "executable", "/nowhere/python")
+    assert repository.reload() == Changes()
+    assert repository.get("small") is model
+    flip_a_bit(tmp_path / "small" / "1")
+    assert repository.reload() == Changes(refused=["small/1"])
+    no_manifest(tmp_path / "small" / "1")
+    assert repository.reload() == Changes(refused=["small/1"])
+    assert repository.get("small") is model

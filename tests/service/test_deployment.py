@@ -1,17 +1,29 @@
-"""The compose file and the Kubernetes manifest say nothing that the server doesn't know."""
+"""What others run the service with: manifests that the server understands, and nothing that isn't pinned."""
 
 import json
+import re
+import tomllib
 from pathlib import Path
 from typing import Any
 
+import pytest
 import yaml
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
+from packaging.version import Version
 
 from service.openapi import TARGET
 from service.settings import PREFIX, Settings
 from tests.service.conftest import ROOT
+from tests.service.watching import ENDING
 
 NAMES = {(PREFIX + name).upper() for name in Settings.model_fields}
-DEADLINE = Settings.model_fields["deadline"].default
+DIGEST = re.compile(r"[a-z0-9./-]+:[\w.-]+@sha256:[0-9a-f]{64}")
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
+EXTRAS = PROJECT["project"]["optional-dependencies"]
+#: Of what is locked, the extras. Torch is not: its builds differ between indexes, and so do their hashes.
+LOCKED = {"serve": {"serve"}, "dev": EXTRAS.keys(), "lowest": {"serve", "client", "usd", "dev"}}
+UNLOCKED = {"torch"}
 
 
 def manifests() -> dict[str, Any]:
@@ -25,7 +37,7 @@ def test_the_kubernetes_manifest_fits_the_server() -> None:
     (container,) = pod["containers"]
     environment = {entry["name"]: entry.get("value") for entry in container["env"]}
     assert environment.keys() <= NAMES
-    assert pod["terminationGracePeriodSeconds"] > float(environment["SHAPESPACE_DRAIN"]) + DEADLINE + 1
+    assert pod["terminationGracePeriodSeconds"] > float(environment["SHAPESPACE_DRAIN"]) + ENDING
     served = json.loads(TARGET.read_text())["paths"]
     for probe in ("startupProbe", "readinessProbe", "livenessProbe"):
         assert container[probe]["httpGet"]["path"] in served
@@ -48,16 +60,75 @@ def test_the_kubernetes_manifest_fits_the_server() -> None:
     assert 2 <= scaler["minReplicas"] < scaler["maxReplicas"]
 
 
+def test_kubernetes_starts_nothing_without_its_key() -> None:
+    (container,) = manifests()["Deployment"]["spec"]["template"]["spec"]["containers"]
+    (key,) = (entry for entry in container["env"] if entry["name"] == "SHAPESPACE_API_KEY")
+    assert not key["valueFrom"]["secretKeyRef"].get("optional")
+
+
 def test_the_compose_file_fits_the_server() -> None:
     services = yaml.safe_load((ROOT / "compose.yaml").read_text())["services"]
     server = services["shapespace"]
     assert server["environment"].keys() <= NAMES
     grace = float(server["stop_grace_period"].removesuffix("s"))
-    assert grace > float(server["environment"]["SHAPESPACE_DRAIN"]) + DEADLINE + 1
+    assert grace > float(server["environment"]["SHAPESPACE_DRAIN"]) + ENDING
     assert server["deploy"]["replicas"] >= 2
     for service in services.values():
         for volume in service.get("volumes", []):
             assert Path(ROOT, volume.split(":")[0]).exists(), volume
+
+
+def test_images_of_others_are_named_by_their_digest() -> None:
+    lines = (ROOT / "Dockerfile").read_text().splitlines()
+    stages = {line.split()[-1] for line in lines if line.startswith("FROM ") and " AS " in line}
+    bases = {line.split()[1] for line in lines if line.startswith("FROM ")} - stages
+    services = yaml.safe_load((ROOT / "compose.yaml").read_text())["services"].values()
+    named = [*bases, *(service["image"] for service in services if "build" not in service)]
+    assert len(named) == 2
+    for image in named:
+        assert DIGEST.fullmatch(image), image
+
+
+def locked(name: str) -> dict[str, set[Version]]:
+    """Versions by package of a file of ``requirements/``, which names nothing else than these and their hashes."""
+    found: dict[str, set[Version]] = {}
+    for line in (ROOT / "requirements" / f"{name}.txt").read_text().replace("\\\n", " ").splitlines():
+        if line.startswith("#"):
+            continue
+        package, *hashes = re.split(r"\s+--hash=", line)
+        assert hashes
+        assert all(re.fullmatch("sha256:[0-9a-f]{64}", hash) for hash in hashes)
+        requirement = Requirement(package)
+        assert requirement.url is None
+        (pin,) = requirement.specifier
+        assert pin.operator == "=="
+        found.setdefault(canonicalize_name(requirement.name), set()).add(Version(pin.version))
+    return found
+
+
+def declared(extras: Any) -> list[Requirement]:
+    lines = [*PROJECT["project"]["dependencies"], *(line for extra in extras for line in EXTRAS[extra])]
+    return [requirement for requirement in map(Requirement, lines) if requirement.name not in UNLOCKED]
+
+
+@pytest.mark.parametrize("name", LOCKED)
+def test_every_dependency_is_locked_in_its_range(name: str) -> None:
+    versions = locked(name)
+    for requirement in declared(LOCKED[name]):
+        assert all(map(requirement.specifier.contains, versions[canonicalize_name(requirement.name)])), requirement
+
+
+def test_the_lowest_versions_are_those_that_are_tried() -> None:
+    versions = locked("lowest")
+    for requirement in declared(LOCKED["lowest"]):
+        (least,) = requirement.specifier
+        assert min(versions[canonicalize_name(requirement.name)]) == Version(least.version), requirement
+
+
+def test_the_image_has_what_is_tested() -> None:
+    tested = locked("dev")
+    for name in ("serve", "build"):
+        assert all(versions <= tested[package] for package, versions in locked(name).items())
 
 
 def user() -> str:

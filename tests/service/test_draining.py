@@ -90,7 +90,7 @@ def test_a_connection_opened_before_the_end_is_answered_after_it(models: Path, s
         assert httpx.get(f"{server.url}/v2/health/live").status_code == 200  # by now it is accepted
         server.process.send_signal(signal.SIGTERM)
         time.sleep(0.5)
-        connection.sendall(b"GET /v1/models/small HTTP/1.1\r\nHost: x\r\n\r\n")
+        connection.sendall(b"GET /v1/models/small HTTP/1.1\r\nHost: localhost\r\n\r\n")
         with connection.makefile("rb") as answer:
             assert b"200" in answer.readline()
             assert b'"name":"small"' in answer.read()

@@ -207,16 +207,17 @@ def test_an_animation_has_an_entity_tag(client: httpx.Client) -> None:
 
 
 def test_frames_arrive_as_they_get_ready(models: Path, start: Start) -> None:
-    # A place in the queue is held as long as there is work: the only one is taken when the first frame arrives.
+    # A stream has its place among streams, and one among others only while it computes.
     with httpx.Client(base_url=start(models, workers=1, queue=0).url, timeout=60) as client:
         links = create(client, keyframes=[A, B, C], frames=400)["links"]
         with client.stream("GET", links["jsonl"]) as stream:
             assert stream.headers["Content-Type"] == "application/jsonl"
             lines = stream.iter_lines()
             assert json.loads(next(lines))["frame"] == 0
-            assert client.get("/v1/models/small/mesh").status_code == 503
+            assert client.get("/v1/models/small/mesh").status_code == 200
+            assert client.get(links["jsonl"]).status_code == 503
             assert [json.loads(line)["frame"] for line in lines] == list(range(1, 400))
-        assert client.get("/v1/models/small/mesh").status_code == 200
+        assert client.get(links["jsonl"]).status_code == 200
 
 
 def test_a_stream_that_can_not_go_on_ends_with_the_problem(client: httpx.Client) -> None:
@@ -234,9 +235,15 @@ def test_a_reader_who_leaves_gives_the_place_back(models: Path, start: Start) ->
         with client.stream("GET", links["jsonl"]) as stream:
             next(stream.iter_lines())
         while_waiting = 0
-        while client.get("/v1/models/small/mesh").status_code == 503:
+        while status(client, links["jsonl"]) == 503:
             while_waiting += 1
             assert while_waiting < 200, "all of the frames would take that long"
+
+
+def status(client: httpx.Client, link: str) -> int:
+    """Of an answer that isn't read."""
+    with client.stream("GET", link) as answer:
+        return answer.status_code
 
 
 def test_work_ends_when_nobody_waits_for_it(models: Path, start: Start) -> None:

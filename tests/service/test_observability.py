@@ -2,12 +2,14 @@
 
 import json
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import httpx
 import pytest
 
-from tests.service.conftest import Start
+from tests.service.conftest import ROOT, Start
 from tests.service.watching import samples, value
 
 MESH = "/v1/models/small/mesh"
@@ -70,7 +72,7 @@ def test_a_log_in_json_has_one_object_a_line(models: Path, start: Start) -> None
     server = start(models, log_format="json")
     with httpx.Client(base_url=server.url) as client:
         client.post(MESH, json=CODE, headers={"X-Request-ID": "mine"})
-        client.get("/v1/models/la%0Arge?latent=1")
+        client.get("/v1/models/la%0Arge?version=1")
         client.get("/v2/health/live")
     lines = [json.loads(line) for line in server.stop().splitlines()]
     assert all({"time", "level", "logger", "message"} <= line.keys() for line in lines)
@@ -133,3 +135,37 @@ def test_pages_of_named_origins_may_call(models: Path, start: Start) -> None:
 def test_by_default_no_other_origin_may_call(client: httpx.Client) -> None:
     answer = client.get("/v1/models", headers={"Origin": "https://a.example"})
     assert not [name for name in answer.headers if name.lower().startswith("access-control")]
+
+
+FORGERY = "a name\nINFO service.app: forged\r\x1b[31m\u2028\u202e \udcff é"
+QUOTING = f"""
+import logging, sys
+from service import logs
+from service.settings import LogFormat
+logs.configure(LogFormat(sys.argv[1]))
+text = {FORGERY!r}
+logging.getLogger(text).error("refused: %s", text)
+try:
+    raise ValueError(text)
+except ValueError:
+    logging.getLogger("service").exception("a mistake: %s", text)
+"""
+
+
+@pytest.mark.parametrize("format", ["text", "json"])
+def test_nothing_that_is_quoted_makes_a_line_of_the_log(format: str) -> None:
+    found = subprocess.run(
+        [sys.executable, "-c", QUOTING, format], cwd=ROOT, capture_output=True, encoding="utf-8", check=True
+    ).stderr
+    lines = found.rstrip("\n").split("\n")
+    if format == "json":
+        first, second = map(json.loads, lines)
+        assert first["message"] == "refused: " + FORGERY.replace("\udcff", "\\udcff")
+        assert "Traceback" in second["exc_info"]
+        return
+    assert not set(found) & set("\r\x1b\u2028\u202e\udcff")
+    escaped = r"a name\nINFO service.app: forged\r\x1b[31m\u2028\u202e \udcff é"
+    assert lines[0] == f"ERROR {escaped}: refused: {escaped}"
+    assert lines[1] == f"ERROR service: a mistake: {escaped}"
+    assert lines[2] == "    Traceback (most recent call last):"
+    assert all(line.startswith("    ") for line in lines[2:])

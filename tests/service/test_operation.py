@@ -122,7 +122,7 @@ app = create_app(Settings())
 def broken(): raise RuntimeError("a secret path")
 async def main():
     transport = httpx.ASGITransport(app, raise_app_exceptions=False)
-    client = httpx.AsyncClient(transport=transport, base_url="http://test")
+    client = httpx.AsyncClient(transport=transport, base_url="http://localhost")
     async with app.router.lifespan_context(app), client:
         answer = await client.get("/broken")
         print(answer.status_code, answer.headers["content-type"], answer.text)
@@ -154,7 +154,7 @@ def test_settings_that_make_no_sense_are_named(models: Path, name: str, value: s
 
 
 def test_serving_needs_no_torch_and_no_training() -> None:
-    program = "import sys, service.__main__; print([m for m in ('torch', 'training') if m in sys.modules])"
+    program = "import sys, service.app, service.server; print([m for m in ('torch', 'training') if m in sys.modules])"
     found = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, check=True)
     assert found.stdout.strip() == "[]"
 

@@ -1,8 +1,12 @@
 """Bundles that come, change and go while requests run."""
 
+import asyncio
 import json
+import os
 import shutil
 import signal
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -13,8 +17,15 @@ import httpx
 import numpy as np
 import pytest
 
+from service.connections import Connections
+from service.metrics import Metrics
+from service.reloading import Reloader
+from service.repository import Changes, ModelRepository
+from service.workers import Workers
+from tests.faults.serving import peak_memory
+from tests.service import hostile
 from tests.service.bundles import SCALE, reference, rescale, write_bundle
-from tests.service.conftest import Server, Start
+from tests.service.conftest import ROOT, Server, Start
 from tests.service.test_bundles import flip_a_bit
 from tests.service.watching import eventually, samples, value
 
@@ -84,7 +95,93 @@ def test_models_out_of_reach_stay_loaded(folder: Path, start: Start) -> None:
     with connected(server) as client:
         reload(server)
         assert client.get("/v1/models/small/mesh").status_code == 200
+        assert value(samples(client), "shapespace_reloaded_bundles_total", result="failed") == 1
+        folder.with_name("elsewhere").rename(folder)
+        reload(server)
+        assert value(samples(client), "shapespace_reloaded_bundles_total", result="failed") == 1
     assert "can't be read, so that nothing changes" in server.log
+
+
+def test_bundles_that_do_harm_are_refused_while_the_others_are_served(folder: Path, start: Start) -> None:
+    server = start(folder, workers=2)
+    for harm in (hostile.loops, hostile.fails, hostile.allocates, hostile.changes_shape, hostile.no_codes):
+        hostile.hostile(folder, harm.__name__.replace("_", "-"), harm)
+    write_bundle(folder, "small", "2")
+    with connected(server) as client:
+        server.process.send_signal(signal.SIGHUP)
+        while "reloaded:" not in server.log:
+            assert client.get("/v1/models/small/mesh", params={"latent": "0.1,0.7,0.4"}).status_code == 200
+        assert [model["name"] for model in client.get("/v1/models").json()["models"]] == ["small"]
+        assert client.get("/v1/models/small").json()["versions"] == ["1", "2"]
+        found = samples(client)
+        assert value(found, "shapespace_bundles_refused") == 5
+        assert value(found, "shapespace_reloaded_bundles_total", result="refused") == 5
+        assert value(found, "shapespace_reloaded_bundles_total", result="loaded") == 1
+        # The next one works as well.
+        shutil.rmtree(folder / "loops")
+        write_bundle(folder, "small", "3")
+        reload(server)
+        assert client.get("/v1/models/small").json()["versions"] == ["1", "2", "3"]
+        assert value(samples(client), "shapespace_bundles_refused") == 4
+    assert peak_memory(server) < 300 * 2**20
+    assert len(children(server)) <= 1, "the one that waits for uploads"
+    assert "Traceback" not in server.log
+
+
+def test_a_reload_that_fails_whole_is_counted(tmp_path: Path) -> None:
+    # No way is known to bring this about from outside.
+    write_bundle(tmp_path, "small")
+    repository = ModelRepository(tmp_path)
+    metrics = Metrics(repository, Workers(1, 0, 1), Connections(10, 1))
+
+    def broken() -> Changes:
+        raise RuntimeError
+
+    repository.reload = broken  # type: ignore[method-assign]
+    asyncio.run(Reloader(repository, metrics).reload())
+    assert metrics.registry.get_sample_value("shapespace_reloaded_bundles_total", {"result": "failed"}) == 1
+    assert len(repository) == 1
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
+def test_the_end_of_a_server_ends_the_trial_of_a_bundle(folder: Path, start: Start, number: signal.Signals) -> None:
+    server = start(folder)
+    hostile.hostile(folder, "endless", hostile.doubles)
+    server.process.send_signal(signal.SIGHUP)
+    eventually(lambda: len(children(server)) == 2)  # with the one that waits for uploads
+    pids = children(server)
+    server.process.send_signal(number)
+    assert server.process.wait(20) == (0 if number == signal.SIGTERM else -number)
+    eventually(lambda: not any(Path(f"/proc/{pid}").exists() for pid in pids))
+    assert "is not served" not in server.log
+    assert "Traceback" not in server.log
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
+def test_a_server_can_be_ended_before_it_has_started(folder: Path, number: signal.Signals) -> None:
+    hostile.hostile(folder, "endless", hostile.doubles)
+    environment = os.environ | {"SHAPESPACE_MODELS_DIR": str(folder), "SHAPESPACE_PORT": "0", "SHAPESPACE_DRAIN": "0"}
+    with subprocess.Popen(
+        [sys.executable, "-m", "service"], cwd=ROOT, env=environment, stderr=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stderr
+        while "Waiting for application startup" not in process.stderr.readline():
+            pass
+        pids = children_of(process.pid)
+        assert len(pids) == 1
+        process.send_signal(number)
+        assert process.wait(20) == (0 if number == signal.SIGTERM else -number)
+    eventually(lambda: not any(Path(f"/proc/{pid}").exists() for pid in pids))
+
+
+def children(server: Server) -> list[int]:
+    return children_of(server.process.pid)
+
+
+def children_of(pid: int) -> list[int]:
+    """Processes that a process has, zombies among them."""
+    tasks = Path(f"/proc/{pid}/task").iterdir()
+    return [int(child) for task in tasks for child in (task / "children").read_text().split()]
 
 
 def test_watching_takes_up_a_bundle_once_it_is_whole(folder: Path, start: Start, tmp_path: Path) -> None:

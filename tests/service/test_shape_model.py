@@ -1,13 +1,13 @@
 """A bundle at work, without HTTP in between."""
 
 import dataclasses
-import time
 from pathlib import Path
 
 import numpy as np
 import pytest
 from onnx import numpy_helper
 
+from geometry.deadline import Deadline
 from geometry.mesh import align
 from geometry.reconstruction import Reconstructor
 from geometry.status import Status
@@ -54,7 +54,7 @@ def test_a_start_that_is_not_finite_is_not_used(steep: ShapeModel) -> None:
 def test_a_deadline_ends_gauss_newton(tmp_path: Path) -> None:
     model = ShapeModel(read_bundle(write_bundle(tmp_path)))
     codes, _ = model.latents.codes([[0.2, 1.0, 1.0]])
-    past = time.monotonic() - 1
+    past = Deadline(-1)
     assert model.shape(codes[0], deadline=past).diagnostics.status is Status.DEADLINE
     workers = Workers(1, 0, deadline=1)
     with pytest.raises(DeadlineError, match="within 1 s"):

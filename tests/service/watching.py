@@ -11,6 +11,10 @@ from prometheus_client.parser import text_string_to_metric_families
 Samples = dict[tuple[str, frozenset[tuple[str, str]]], float]
 
 
+#: Seconds in which a server ends after its drain.
+ENDING = 3
+
+
 def eventually(holds: Callable[[], bool], seconds: float = 30) -> None:
     end = time.monotonic() + seconds
     while not holds():

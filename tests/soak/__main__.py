@@ -1,45 +1,65 @@
-"""A mixed load for some minutes: ``python -m tests.soak [MINUTES] [--bad SHARE] [--clients N]``.
+"""A mixed load for some minutes: ``python -m tests.soak [MINUTES] [--bad SHARE] [--clients N] [--attacks NAME …]``.
 
-Calls of every kind about every bundled model, a share of them bad, in random order from several clients. Each answer
-is held against that of another server, asked alone beforehand, byte for byte. Ends by itself, with status 1 where an
-answer was wrong or memory, threads or file handles grew.
+Calls of every kind about every bundled model, a share of them bad, in random order from several clients, while
+strangers from another address attack the server every other minute. Each answer is held against that of another
+server, asked alone beforehand, byte for byte. Ends by itself, with status 1 where an answer was wrong, an attack was
+felt by others, health took longer than a second, or memory, threads or file handles grew.
 """
 
 from __future__ import annotations
 
 import argparse
+import contextlib
+import itertools
 import re
 import shutil
+import subprocess
 import sys
 import tempfile
 import threading
 import time
 from collections import Counter
+from collections.abc import Iterator
 from pathlib import Path
 
 import httpx
 import numpy as np
 
+from tests.attacks import ATTACKS, PROMPT
 from tests.service.bundles import write_bundle
 from tests.service.conftest import ROOT, Server, starting
 from tests.service.truth import Truth, bad_calls, fingerprint, good_calls
 
-#: What may come on top between the second quarter of the time and the last.
+#: What may come on top between the second quarter of the time and the last, while nobody attacks.
 GROWTH = {"MiB": 16.0, "threads": 0.0, "handles": 4.0}
 #: Answers that say nothing about the call.
 BUSY = 503
+#: Seconds within which SIGTERM ends a server that doesn't drain.
+ENDING = 3.0
+#: Longest attack in seconds, and where it comes from: what a server allows one address is for all others to use.
+ATTACK, STRANGER = 60.0, "127.0.0.2"
+
+
+def processes(server: Server) -> list[Path]:
+    """Where the system tells of a server's process, and of those that it has started."""
+    found = [Path(f"/proc/{server.process.pid}")]
+    for place in found:
+        with contextlib.suppress(OSError):
+            for task in (place / "task").iterdir():
+                found += [Path("/proc", pid) for pid in (task / "children").read_text().split()]
+    return found
 
 
 def measure(server: Server) -> dict[str, float]:
-    """Memory, threads and file handles of a server."""
-    place = Path(f"/proc/{server.process.pid}")
-    resident = re.search(r"VmRSS:\s+(\d+)", (place / "status").read_text())
-    assert resident
-    return {
-        "MiB": int(resident[1]) / 1024,
-        "threads": len(list((place / "task").iterdir())),
-        "handles": len(list((place / "fd").iterdir())),
-    }
+    """Memory, threads and file handles of a server and its child processes; pages that they share count once."""
+    total = dict.fromkeys(GROWTH, 0.0)
+    for place in processes(server):
+        with contextlib.suppress(OSError):  # a child may just have ended
+            proportional = re.search(r"Pss:\s+(\d+)", (place / "smaps_rollup").read_text())
+            total["MiB"] += int(proportional[1]) / 1024 if proportional else 0
+            total["threads"] += len(list((place / "task").iterdir()))
+            total["handles"] += len(list((place / "fd").iterdir()))
+    return total
 
 
 def truth_of(url: str) -> tuple[Truth, int]:
@@ -74,11 +94,59 @@ def load(url: str, truth: Truth, good: int, share: float, end: float, seed: int,
                 outcomes[f"wrong: {call.method} {call.path[:100]} {now[0]}"] += 1
 
 
+def ask_health(url: str, end: float, outcomes: Counter[str]) -> None:
+    """Ask for health twice a second, each time on a new connection."""
+    while time.monotonic() < end:
+        try:
+            slow = (
+                httpx.get(f"{url}/v2/health/live", timeout=PROMPT).raise_for_status().elapsed.total_seconds() > PROMPT
+            )
+        except httpx.HTTPError:
+            slow = True
+        outcomes["wrong: health not within a second" if slow else "healthy"] += 1
+        time.sleep(0.5)
+
+
+class Strangers:
+    """Attacks, one after the other, with as long a pause before each.
+
+    Attributes:
+        at_work: whether one is going on.
+    """
+
+    def __init__(self, url: str, names: list[str], end: float, outcomes: Counter[str]) -> None:
+        self._url, self._names, self._end, self._outcomes = url, names, end, outcomes
+        self.at_work = False
+
+    def run(self) -> None:
+        """Until the time is over; each attack is tried twice at least."""
+        seconds = min(ATTACK, (self._end - time.monotonic()) / (4 * len(self._names) + 1))
+        for name in itertools.cycle(self._names):
+            time.sleep(seconds)
+            if time.monotonic() + seconds > self._end:
+                break
+            with self._attacking():
+                try:
+                    outcome = ATTACKS[name](self._url, seconds, source=STRANGER)
+                except httpx.HTTPError as error:
+                    self._outcomes[f"wrong: no {name} any more: {error!r}"] += 1
+                    continue
+            print(f"  {name} for {seconds:.0f} s: {'held' if outcome.held else 'FELL'}: {outcome}", flush=True)
+            self._outcomes[f"attack held: {name}" if outcome.held else f"wrong: {name} was felt by others"] += 1
+
+    @contextlib.contextmanager
+    def _attacking(self) -> Iterator[None]:
+        self.at_work = True
+        yield
+        self.at_work = False
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("minutes", type=float, nargs="?", default=30)
     parser.add_argument("--bad", type=float, default=0.2, help="share of bad requests")
     parser.add_argument("--clients", type=int, default=6)
+    parser.add_argument("--attacks", nargs="+", choices=[*ATTACKS, "none"], default=[*ATTACKS], metavar="NAME")
     given = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder, starting() as start:
         models = Path(folder, "models")
@@ -87,21 +155,36 @@ def main() -> int:
         other = start(models, workers=1, cache=0, deadline=300)
         truth, good = truth_of(other.url)
         other.stop()
-        server = start(models, workers=2, deadline=300, watch=1)
+        # A small cache is full before memory is compared.
+        server = start(models, workers=2, deadline=300, watch=1, cache=2**22)
         end, outcomes = time.monotonic() + 60 * given.minutes, Counter[str]()
+        strangers = Strangers(server.url, [name for name in given.attacks if name != "none"], end, outcomes)
         clients = [
             threading.Thread(target=load, args=(server.url, truth, good, given.bad, end, k, outcomes))
             for k in range(given.clients)
         ]
+        clients.append(threading.Thread(target=ask_health, args=(server.url, end, outcomes)))
+        clients.append(threading.Thread(target=strangers.run))
         for client in clients:
             client.start()
-        readings = []
+        readings, peaks = [], Counter[str]()
         while time.monotonic() < end:
             time.sleep(1)
-            readings.append(measure(server))
+            reading = measure(server)
+            peaks |= Counter(reading)
+            if not strangers.at_work:
+                readings.append(reading)
         for client in clients:
             client.join()
-        log = server.log
+        began = time.monotonic()
+        try:
+            log = server.stop()
+        except subprocess.TimeoutExpired:
+            server.process.kill()
+            log = server.log
+        outcomes[
+            "ended when asked to" if time.monotonic() - began < ENDING else "wrong: it doesn't end when asked to"
+        ] += 1
     quarter = len(readings) // 4
     pace = outcomes.total() / given.minutes / 60
     print(f"{given.minutes:g} minutes, {given.clients} clients, {pace:.1f} requests a second")
@@ -111,8 +194,7 @@ def main() -> int:
     for name, most in GROWTH.items():
         parts = readings[quarter : 2 * quarter], readings[-quarter:]
         second, last = (float(np.median([reading[name] for reading in part])) for part in parts)
-        peak = max(r[name] for r in readings)
-        print(f"  {name}: {second:.0f} in the second quarter, {last:.0f} in the last, {peak:.0f} at most")
+        print(f"  {name}: {second:.0f} in the second quarter, {last:.0f} in the last, {peaks[name]:.0f} at most")
         ok = ok and last <= second + most
     print("flat, and every answer right" if ok else "NOT as it should be")
     return 0 if ok else 1

@@ -1,0 +1,13 @@
+"""The table of what requests have cost, at the end."""
+
+from __future__ import annotations
+
+import pytest
+
+from tests.fuzz.cost import COSTS, summary
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    if COSTS:
+        terminalreporter.section("what requests cost")
+        terminalreporter.write_line(summary(COSTS))

@@ -1,0 +1,468 @@
+"""What one request costs a server: time of its event loop, memory, and time until there is an answer."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import re
+import select
+import shutil
+import signal
+import socket
+import threading
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import httpx
+
+from tests.service.bundles import write_bundle
+from tests.service.conftest import ROOT, Server
+
+MIB = 2**20
+#: What a request may cost: seconds of the loop in one piece, and bytes at the peak beyond those that it sends.
+LOOP, MEMORY = 0.05, 64 * MIB
+#: Seconds for which something else may keep the loop from running: a thread that computes asks for the interpreter's
+#: lock as well, and holds it for a while.
+STALL = 0.1
+#: Seconds that a request may take, by the setting of the server that is tried.
+DEADLINE = 8.0
+#: Seconds after its deadline in which an answer still counts as on time.
+LATE = 4.0
+#: Further tries of a request that is over a budget.
+AGAIN = 5
+#: Seconds that the longest answer may take.
+LONGEST = 600.0
+#: Seconds for which a server may go on working after its answer.
+SETTLING = 5.0
+#: Seconds within which SIGTERM ends a server that doesn't drain.
+ENDING = 3.0
+_STATUS = re.compile(rb"HTTP/1\.1 (\d{3}) ")
+#: Statuses of a server's own that are answers to a request all the same.
+_BUSY = {503, 504, 507}
+_KEPT = 2**16
+
+
+@dataclass(frozen=True)
+class Request:
+    """Bytes for one connection, of one request or several.
+
+    Attributes:
+        parts: what is sent, one after the other; a number is a pause in seconds.
+        broken: whether it isn't sound HTTP, so that the connection may be closed without an answer.
+        half_closed: whether the client closes its own direction when it has sent everything.
+        wrong: whether it has to be refused.
+    """
+
+    parts: Iterable[bytes | float]
+    broken: bool = False
+    half_closed: bool = False
+    wrong: bool = False
+
+
+@dataclass
+class Cost:
+    """What a request came to.
+
+    Attributes:
+        name: what kind of request.
+        seed: that made it.
+        line: method and target, as far as it is short.
+        sent: bytes.
+        received: bytes.
+        seconds: until the last byte of the answer.
+        statuses: of the answers.
+        loop: longest callback of the loop, in seconds of CPU time.
+        where: which that was.
+        stall: longest time for which the loop could not run.
+        collecting: longest run of the garbage collector within a callback, which ``loop`` includes.
+        memory: bytes at the peak beyond those that were there before and those that were sent.
+        computing: seconds of CPU time of all threads and child processes.
+        faults: what went wrong, beside a budget.
+    """
+
+    name: str
+    seed: int
+    line: str = ""
+    sent: int = 0
+    received: int = 0
+    seconds: float = 0.0
+    statuses: list[int] = field(default_factory=list)
+    loop: float = 0.0
+    where: str = ""
+    stall: float = 0.0
+    collecting: float = 0.0
+    memory: int = 0
+    computing: float = 0.0
+    faults: list[str] = field(default_factory=list)
+
+    @property
+    def over(self) -> list[str]:
+        """Everything that is not as it should be."""
+        found = list(self.faults)
+        if self.loop > LOOP:
+            found.append(f"{1e3 * self.loop:.0f} ms of the loop in {self.where}")
+        if self.stall > max(STALL, 1.2 * self.loop):
+            found.append(f"{1e3 * self.stall:.0f} ms in which the loop could not run")
+        if self.memory > MEMORY:
+            found.append(f"{self.memory / MIB:.0f} MiB")
+        return found
+
+    @property
+    def badness(self) -> float:
+        """How many budgets it takes, to put the worst first."""
+        return max(self.loop / LOOP, self.stall / STALL, self.memory / MEMORY, 1e3 * len(self.faults))
+
+
+class Measured(Server):
+    """A server with a meter.
+
+    Args:
+        models: folder of bundles.
+        deadline: seconds that a request may take.
+        settings: as of Server.
+    """
+
+    #: Bytes of the smallest child process that was ever seen between two requests.
+    children = 0
+
+    def __init__(self, models: Path, deadline: float, **settings: object) -> None:
+        self._folder = TemporaryDirectory()
+        self._meter = str(Path(self._folder.name, "meter"))
+        self.program = ("-m", "tests.fuzz.measured", self._meter)
+        super().__init__(models, deadline=deadline, **settings)
+        self.deadline = deadline
+        url = httpx.URL(self.url)
+        self.place = (url.host, url.port)
+        self._logged = 0
+
+    def kill(self) -> None:
+        """End it at once, children included."""
+        for pid in reversed(self.pids):
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGKILL)
+        self.process.communicate(timeout=60)
+        self._folder.cleanup()
+
+    def stop(self) -> str:
+        log = super().stop()
+        self._folder.cleanup()
+        return log
+
+    def ask(self, word: str) -> dict[str, float | str]:
+        """Ask the meter; raises TimeoutError where the interpreter doesn't come to it."""
+        with socket.socket(socket.AF_UNIX) as connection:
+            connection.settimeout(10)
+            connection.connect(self._meter)
+            connection.sendall(word.encode())
+            answer: dict[str, float | str] = json.loads(connection.makefile("rb").read())
+            return answer
+
+    @property
+    def pids(self) -> list[int]:
+        """The server's process and those that it has started, parents first."""
+        found = [self.process.pid]
+        for pid in found:
+            with contextlib.suppress(OSError):
+                for task in Path(f"/proc/{pid}/task").iterdir():
+                    found += map(int, (task / "children").read_text().split())
+        return found
+
+    def computing(self) -> float:
+        """Seconds of CPU time that the processes have taken so far."""
+        total = 0.0
+        for pid in self.pids:
+            with contextlib.suppress(OSError):
+                total += time.clock_gettime((~pid << 3) | 2)  # CPUCLOCK_SCHED: what clock_getcpuclockid(3) gives
+        return total
+
+    @property
+    def busy(self) -> bool:
+        """Whether any thread computes, or would if it had a processor."""
+        for pid in self.pids:
+            for place in Path(f"/proc/{pid}/task").glob("*/stat"):
+                with contextlib.suppress(OSError):
+                    if place.read_text().rpartition(")")[2].split()[0] in "RD":
+                        return True
+        return False
+
+    def settle(self) -> bool:
+        """Wait until nothing computes any more, but for a beat; gives whether that is so."""
+        clock = Clock(self.process.pid)
+        while clock.seconds < SETTLING:
+            looks = []
+            for _ in range(5):
+                time.sleep(0.01)
+                looks.append(self.busy)
+            if sum(looks) <= 1:
+                return True
+        return False
+
+    def new_log(self) -> str:
+        """What has been logged since the last call."""
+        log = self.log[self._logged :]
+        self._logged += len(log)
+        return log
+
+    def cost(self, name: str, seed: int, request: Request) -> Cost:
+        """Send a request and measure everything, alone."""
+        cost = Cost(name, seed)
+        self.ask("reset")
+        computing, peaks = self.computing(), Peaks(self)
+        with peaks.watching():
+            self.exchange(request, cost)
+            if not self.settle():
+                cost.faults.append(f"still computing {SETTLING:g} s after its answer")
+        cost.computing = max(0.0, self.computing() - computing)
+        cost.memory = max(0, peaks.growth - cost.sent)
+        try:
+            facts = self.ask("read")
+        except OSError:
+            cost.faults.append("the interpreter is stuck, or gone")
+            return cost
+        for key, value in facts.items():
+            if hasattr(cost, key):
+                setattr(cost, key, value)
+        log = self.new_log()
+        if "Traceback" in log:
+            errors = re.findall(r"^Traceback .*?^(\S+.*?)$", log, re.DOTALL | re.MULTILINE)
+            cost.faults.append(f"{log.count('Traceback')} tracebacks in the log, of {(errors or [log])[-1][-1000:]}")
+        return cost
+
+    def exchange(self, request: Request, cost: Cost) -> None:
+        """Send a request, and read until the server closes the connection."""
+        clock, began, patience = Clock(self.process.pid), time.monotonic(), self.deadline + LATE
+        answer = bytearray()
+        with socket.create_connection(self.place, timeout=10) as connection:
+            connection.setblocking(False)
+            pieces = iter(request.parts)
+            piece, resume, open, heard = memoryview(b""), 0.0, True, 0.0
+            while True:
+                now = clock.seconds
+                # A stream has its deadline for each frame.
+                if now - heard > patience or now > LONGEST:
+                    fault = "no answer" if not answer else "its answer has no end"
+                    cost.faults.append(f"{fault} {now:.0f} s later")
+                    break
+                if open and not piece and now >= resume:
+                    match next(pieces, None):
+                        case None:
+                            open = False
+                            if request.half_closed:
+                                with contextlib.suppress(OSError):
+                                    connection.shutdown(socket.SHUT_WR)
+                        case float(pause):
+                            resume = now + pause
+                        case bytes(data):
+                            piece = memoryview(data)
+                            cost.line = cost.line or " ".join(data[:60].decode("latin-1").split()[:2])
+                wait = max(0.0, min(0.5, resume - now)) if open and not piece else 0.5
+                readable, writable, _ = select.select([connection], [connection] if piece else [], [], wait)
+                try:
+                    if readable:
+                        data = connection.recv(2**20)
+                        if not data:
+                            break
+                        cost.received += len(data)
+                        heard = clock.seconds
+                        answer += data[: _KEPT - len(answer)] if len(answer) < _KEPT else b""
+                    if writable:
+                        count = connection.send(piece[: 2**20])
+                        cost.sent += count
+                        piece = piece[count:]
+                except OSError:  # it may refuse without reading on, and what it had said is read first
+                    piece, open = memoryview(b""), False
+                    if not readable:
+                        continue
+                    break
+        cost.seconds = time.monotonic() - began
+        cost.statuses = [status for status in map(int, _STATUS.findall(bytes(answer))) if status >= 200]
+        if not cost.faults and not cost.statuses and not request.broken:
+            cost.faults.append("the connection was closed without an answer")
+        if request.wrong and not all(400 <= status < 500 for status in cost.statuses):
+            cost.faults.append("it was not refused")
+        cost.faults += [f"status {status}" for status in cost.statuses if status >= 500 and status not in _BUSY]
+
+
+class Clock:
+    """Seconds since now, but for those for which this thread or a server's loop stood ready without a processor."""
+
+    def __init__(self, pid: int) -> None:
+        self._places = ("/proc/thread-self/schedstat", f"/proc/{pid}/schedstat")
+        self._began, self._waited = time.monotonic(), [0.0, 0.0]
+        self._waited = self._waiting()
+
+    def _waiting(self) -> list[float]:
+        waited = []
+        for place, before in zip(self._places, self._waited, strict=True):
+            try:
+                waited.append(int(Path(place).read_text().split()[1]) / 1e9)
+            except OSError:  # it has ended
+                waited.append(before)
+        return waited
+
+    @property
+    def seconds(self) -> float:
+        """Nearly always one of the two waits for the other, so that the longer wait counts."""
+        waited = max(now - before for now, before in zip(self._waiting(), self._waited, strict=True))
+        return time.monotonic() - self._began - waited
+
+
+class Peaks:
+    """The largest memory of a group of processes since now, together, beyond what they have now.
+
+    The kernel keeps the peak of each (VmHWM), which is set to the present size at every look: the sum of the peaks
+    between two looks is never less than what all had at one time, and hardly more. A process that begins later counts
+    from the smallest that others had before a request, or without those from the first that is seen of it.
+    """
+
+    def __init__(self, server: Measured) -> None:
+        self._server = server
+        self._before: dict[int, int] = {}
+        #: Bytes, of all processes together.
+        self.growth = 0
+        for pid in server.pids:
+            with contextlib.suppress(OSError):
+                self._before[pid] = self._read(pid)["VmRSS"]
+        children = [size for pid, size in self._before.items() if pid != server.process.pid]
+        Measured.children = min([*children, Measured.children]) if Measured.children else min(children, default=0)
+
+    @staticmethod
+    def _read(pid: int) -> dict[str, int]:
+        status = Path(f"/proc/{pid}/status").read_text()
+        Path(f"/proc/{pid}/clear_refs").write_text("5")
+        found = re.findall(r"(VmHWM|VmRSS):\s+(\d+) kB", status)
+        return {name: int(size) * 1024 for name, size in found} or {"VmHWM": 0, "VmRSS": 0}
+
+    @contextlib.contextmanager
+    def watching(self) -> Iterator[None]:
+        """Look every now and then meanwhile: of a process that ends nothing is left."""
+        done = threading.Event()
+
+        def look() -> None:
+            while not done.wait(0.002):
+                self._look()
+
+        thread = threading.Thread(target=look)
+        thread.start()
+        try:
+            yield
+        finally:
+            done.set()
+            thread.join()
+            self._look()
+
+    def _look(self) -> None:
+        total = 0
+        for pid in self._server.pids:
+            with contextlib.suppress(OSError):
+                now = self._read(pid)
+                before = self._before.setdefault(pid, max(now["VmRSS"], self._server.children))
+                total += max(0, now["VmHWM"] - before)
+        self.growth = max(self.growth, total)
+
+
+class Arena:
+    """A server that is there whatever the requests before have done to it.
+
+    Args:
+        start: starts one.
+    """
+
+    def __init__(self, start: Callable[[], Measured]) -> None:
+        self._start = start
+        self.server = start()
+
+    def try_out(self, name: str, seed: int, make: Callable[[], Request]) -> Cost:
+        """Measure a request; a server that it brought down is replaced, which counts as a fault.
+
+        What is over a budget is measured again, as a busy machine makes the measures too large and never too small.
+        """
+        cost = self.server.cost(name, seed, make())
+        for _ in range(AGAIN):
+            if cost.faults or not cost.over:
+                break
+            cost = min(cost, self.server.cost(name, seed, make()), key=lambda cost: cost.badness)
+        if self.server.process.poll() is not None:
+            cost.faults.append(f"the server ended with {self.server.process.returncode}")
+            self._replace()
+        elif any("still" in fault or "stuck" in fault or "later" in fault for fault in cost.faults):
+            cost.faults += self._end()
+            self._replace()
+        return cost
+
+    def _end(self) -> list[str]:
+        """Ask it to end, which it has to do whatever it computes."""
+        self.server.process.terminate()
+        clock = Clock(self.server.process.pid)
+        while self.server.process.poll() is None:
+            if clock.seconds > ENDING:
+                return [f"SIGTERM is ignored for {ENDING:g} s"]
+            time.sleep(0.05)
+        return []
+
+    def _replace(self) -> None:
+        self.server.kill()
+        self.server = self._start()
+
+
+def warm_up(url: str) -> None:
+    """Have everything made that is made once: what each worker keeps of each model, exact shapes too, a process for
+    uploads, and the library for USD.
+    """
+    with httpx.Client(base_url=url, timeout=300) as client:
+        for model in client.get("/v1/models").raise_for_status().json()["models"]:
+            path = f"/v1/models/{model['name']}"
+            codes = {"latents": [model["lower"], model["upper"]] * 4}
+            client.post(f"{path}/vertices", json=codes)  # it may be late
+            client.post(f"{path}/vertices", json=codes | {"exact": True})  # so may this be, or refused
+            animation = client.post(f"{path}/interpolations", json={"keyframes": codes["latents"][:2], "frames": 2})
+            client.get(animation.raise_for_status().json()["links"]["usd"]).raise_for_status()
+        mesh = client.get("/v1/models/small/mesh?format=obj").raise_for_status().content
+        client.post("/v1/models/small/encode?format=obj", content=mesh).raise_for_status()
+
+
+@contextlib.contextmanager
+def serving(deadline: float = DEADLINE, **settings: object) -> Iterator[Arena]:
+    """A server with the bundled models and two small ones, for as long as it is wanted."""
+    with TemporaryDirectory() as folder:
+        models = Path(folder, "models")
+        shutil.copytree(ROOT / "models", models)
+        write_bundle(models, "small")
+        write_bundle(models, "with-fine", fine=True)
+
+        def start() -> Measured:
+            server = Measured(models, deadline, workers=2, **settings)
+            warm_up(server.url)
+            return server
+
+        arena = Arena(start)
+        try:
+            yield arena
+        finally:
+            arena.server.kill()
+
+
+#: What has been measured in this run.
+COSTS: list[Cost] = []
+
+
+def summary(costs: Sequence[Cost], most: int = 20) -> str:
+    """How many requests were over a budget, and the worst of all as Markdown."""
+    rows = [
+        f"{len(costs)} requests, {sum(bool(cost.over) for cost in costs)} of them over a budget; the worst:",
+        "",
+        "| request | seed | sent | loop, ms | stall, ms | collecting, ms | MiB | s | CPU s | status | what is over |",
+        "|---|---|---|---|---|---|---|---|---|---|---|",
+    ]
+    for cost in sorted(costs, key=lambda cost: -cost.badness)[:most]:
+        times = " | ".join(f"{1e3 * seconds:.0f}" for seconds in (cost.loop, cost.stall, cost.collecting))
+        statuses = " ".join(map(str, sorted(set(cost.statuses)))) or "—"
+        rows.append(
+            f"| {cost.name}: `{cost.line}` | {cost.seed} | {cost.sent:,} | {times} | {cost.memory / MIB:.0f} "
+            f"| {cost.seconds:.2f} | {cost.computing:.2f} | {statuses} | {'; '.join(cost.over) or '—'} |"
+        )
+    return "\n".join(rows)

@@ -1,0 +1,1125 @@
+"""Requests that are made up to be expensive, kind by kind.
+
+Each kind is a function of a random generator and of what the server has, entered by ``kind``; one seed always gives
+the same bytes.
+"""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import io
+import json
+import math
+import struct
+import zipfile
+import zlib
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, field
+from typing import Any
+from urllib.parse import quote
+
+import httpx
+import numpy as np
+
+from tests.fuzz.cost import MIB, Request
+from tests.service.conftest import ROOT
+
+#: Most bytes of a body in JSON, and of an upload.
+BODY, UPLOAD = 8 * MIB, 64 * MIB
+JSON_TYPE = {"Content-Type": "application/json"}
+#: The page's largest file, by its address.
+LARGEST = max(
+    ("/" + path.relative_to(ROOT / "service").as_posix() for path in (ROOT / "service" / "page").rglob("*.*")),
+    key=lambda address: (ROOT / "service" / address[1:]).stat().st_size,
+)
+Rng = np.random.Generator
+
+
+@dataclass(frozen=True)
+class Model:
+    """What is known of a model.
+
+    Attributes:
+        card: as the server gives it.
+        counts: vertices of the fine and of the coarse mesh.
+        files: its fine mesh by format.
+    """
+
+    card: dict[str, Any] = field(repr=False)
+    counts: dict[str, int]
+    files: dict[str, bytes] = field(repr=False)
+
+    @property
+    def name(self) -> str:
+        return str(self.card["name"])
+
+    @property
+    def dimension(self) -> int:
+        return int(self.card["latent_dimension"])
+
+    def code(self, rng: Rng) -> list[float]:
+        code: list[float] = rng.uniform(self.card["lower"], self.card["upper"]).round(5).tolist()
+        return code
+
+    def codes(self, rng: Rng, count: int) -> list[list[float]]:
+        return [self.code(rng) for _ in range(count)]
+
+
+@dataclass(frozen=True)
+class World:
+    """What is known of a server.
+
+    Attributes:
+        models: those whose shapes take milliseconds first.
+    """
+
+    models: list[Model]
+
+    @classmethod
+    def of(cls, url: str) -> World:
+        """Ask a server."""
+        with httpx.Client(base_url=url, timeout=120) as client:
+            models = []
+            for summary in client.get("/v1/models").raise_for_status().json()["models"]:
+                path = f"/v1/models/{summary['name']}"
+                files = {
+                    format: client.get(f"{path}/mesh", params={"format": format}).raise_for_status().content
+                    for format in ("glb", "gltf", "obj", "ply", "stl", "npz", "json")
+                }
+                fine = len(json.loads(files["json"])["vertices"])
+                card = client.get(path).raise_for_status().json()
+                models.append(Model(card, {"fine": fine, "coarse": card["vertices"]}, files))
+        return cls(sorted(models, key=lambda model: model.counts["fine"]))
+
+    def quick(self, rng: Rng) -> Model:
+        """A model of a test."""
+        return self.models[int(rng.integers(len(self.models) // 2))]
+
+    def any(self, rng: Rng) -> Model:
+        return self.models[int(rng.integers(len(self.models)))]
+
+    @property
+    def largest(self) -> Model:
+        return self.models[-1]
+
+
+Make = Callable[[Rng, World], Request]
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A kind of request.
+
+    Attributes:
+        make: makes one up.
+        long: whether it may take the server its whole deadline, or the client seconds to send.
+        limit: whether it asks for as much as one may.
+    """
+
+    make: Make
+    long: bool = False
+    limit: bool = False
+
+
+KINDS: dict[str, Kind] = {}
+
+
+def kind(name: str, *, long: bool = False, limit: bool = False) -> Callable[[Make], Make]:
+    """Enter a kind into the list."""
+
+    def enter(make: Make) -> Make:
+        KINDS[name] = Kind(make, long or limit, limit)
+        return make
+
+    return enter
+
+
+def head(method: str, target: str, headers: Iterable[tuple[str, str]] | dict[str, str] = ()) -> bytes:
+    """The head of a request that is the last of its connection."""
+    pairs = headers.items() if isinstance(headers, dict) else headers
+    lines = [f"{method} {target} HTTP/1.1", "Host: localhost", "Connection: close", *(f"{k}: {v}" for k, v in pairs)]
+    return "\r\n".join([*lines, "", ""]).encode("utf-8", "surrogateescape")
+
+
+def get(target: str, headers: Iterable[tuple[str, str]] | dict[str, str] = ()) -> Request:
+    return Request([head("GET", target, headers)])
+
+
+def post(target: str, body: bytes, headers: dict[str, str] = JSON_TYPE, *, wrong: bool = False) -> Request:
+    return Request([head("POST", target, {**headers, "Content-Length": str(len(body))}), body], wrong=wrong)
+
+
+def size(rng: Rng, most: int = BODY) -> int:
+    """A hundred bytes to the limit; the limit itself every third time."""
+    return most if rng.random() < 1 / 3 else int(math.exp(rng.uniform(math.log(100), math.log(most))))
+
+
+def pick(rng: Rng, *choices: Any) -> Any:
+    return choices[int(rng.integers(len(choices)))]
+
+
+# The falls of the first attack, at their sizes.
+
+
+@kind("eight MiB of empty strings for a latent")
+def empty_strings(rng: Rng, world: World) -> Request:
+    target, body = calls(world.quick(rng), rng)["mesh"]
+    return post(target, spliced(body, "latent", repeated(b'""', BODY - 300)), wrong=True)
+
+
+#: A node's matrix that no parser can leave out.
+ROTATION = [0.8, 0.6, 0, 0, -0.6, 0.8, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]
+
+
+@kind("a scene graph that is a chain of thousands of nodes")
+def chain_of_nodes(rng: Rng, world: World) -> Request:
+    model = world.quick(rng)
+    tree = json.loads(model.files["gltf"])
+    count, node = int(rng.integers(3000, 9990)), {"matrix": ROTATION}
+    tree |= {"scene": 0, "scenes": [{"nodes": [0]}]}
+    tree["nodes"] = [{**node, "children": [k + 1]} for k in range(count)] + [{"mesh": 0}]
+    return post(f"/v1/models/{model.name}/encode?format=gltf", json.dumps(tree).encode(), wrong=True)
+
+
+@kind("one output a thousand times")
+def one_output(rng: Rng, world: World) -> Request:
+    model = world.largest
+    target, body = calls(model, rng)["infer"]
+    return post(target, json.dumps({**body, "outputs": [{"name": "vertices"}] * 1000}).encode(), wrong=True)
+
+
+@kind("an id of 349,500 empty keyframes")
+def empty_keyframes(rng: Rng, world: World) -> Request:
+    facts = {"frames": 2, "model": world.quick(rng).card["digest"][:32]}
+    return get(f"/v1/interpolations/{forged(spliced(facts, 'keyframes', repeated(b'[]', MIB - 100)))}")
+
+
+@kind("two hundred thousand header lines")
+def header_lines(rng: Rng, world: World) -> Request:
+    return Request([head("GET", "/v2/health/live")[:-2], b"a: bbbbbbbbbbbbbbbb\r\n" * 200_000, b"\r\n"], broken=True)
+
+
+# Bodies in JSON.
+
+
+def calls(model: Model, rng: Rng) -> dict[str, tuple[str, dict[str, Any]]]:
+    """Every call that takes JSON: its target, and a small body that it answers."""
+    path, code = f"/v1/models/{model.name}", model.code(rng)
+    infer = {"inputs": [{"name": "latent", "shape": [1, len(code)], "datatype": "FP32", "data": code}]}
+    version = model.card["version"]
+    return {
+        "mesh": (f"{path}/mesh", {"latent": code, "mesh": "coarse", "bounds": "allow"}),
+        "vertices": (f"{path}/vertices", {"latents": [code], "exact": False, "mesh": "coarse", "bounds": "allow"}),
+        "nric": (f"{path}/nric", {"latents": [code], "factors": True, "bounds": "allow"}),
+        "interpolations": (
+            f"{path}/interpolations",
+            {"keyframes": [code, code], "times": [0, 1], "frames": 2, "start": 0, "stop": 1, "loop": False},
+        ),
+        "edit": (f"{path}/edit", {"latent": code, "targets": [{"vertex": 0, "position": [0, 0, 0]}], "prior": 1e-4}),
+        "sample": (f"{path}/sample", {"count": 1, "seed": 1, "distribution": "uniform"}),
+        "encode": (f"{path}/encode", {"vertices": [[0, 0, 0]], "faces": [[0, 0, 0]]}),
+        "infer": (f"/v2/models/{model.name}/infer", {**infer, "id": "x", "outputs": [], "parameters": {}}),
+        "infer-version": (f"/v2/models/{model.name}/versions/{version}/infer", infer),
+    }
+
+
+def a_call(world: World, rng: Rng) -> tuple[str, dict[str, Any]]:
+    found = calls(world.quick(rng), rng)
+    return found[list(found)[int(rng.integers(len(found)))]]
+
+
+_PLACE = "\ue000"
+
+
+def spliced(body: dict[str, Any], member: str, text: bytes) -> bytes:
+    """A body as JSON with raw text for a member."""
+    whole = json.dumps({**body, member: _PLACE}, ensure_ascii=False).encode()
+    return whole.replace(f'"{_PLACE}"'.encode(), text, 1)
+
+
+def a_member(rng: Rng, body: dict[str, Any]) -> str:
+    return str(rng.choice(list(body)))
+
+
+def repeated(element: bytes, size: int, before: bytes = b"[", after: bytes = b"]") -> bytes:
+    """As many elements with commas between them as come to a size."""
+    count = max(1, (size - len(before) - len(after)) // (len(element) + 1))
+    return before + b",".join([element] * count) + after
+
+
+#: Elements that are right nowhere, right somewhere, or as short as can be.
+ELEMENTS = (
+    b'""', b"null", b"true", b"{}", b"[]", b"0", b"-1", b"1e400", b"0.1", b"NaN", b"Infinity", b'"\\ud800"', b'"a"',
+    b"[0]", b"[0,0,0]", b'{"a":0}', b"[[]]", b"1e-400", b"9007199254740993", b'"\\u0000"', b"[null]", b'{"":{}}',
+    b'{"vertex":0,"position":[0,0,0]}', b'{"vertex":"","position":["","",""]}', b"{\"name\":\"vertices\"}",
+)  # fmt: skip
+
+
+@kind("JSON: a member with very many elements")
+def many_elements(rng: Rng, world: World) -> Request:
+    target, body = a_call(world, rng)
+    text = repeated(pick(rng, *ELEMENTS), size(rng) - 300)
+    return post(target, spliced(body, a_member(rng, body), text))
+
+
+@kind("JSON: the list that the call takes, with very many elements")
+def many_right_elements(rng: Rng, world: World) -> Request:
+    """What gets through the first checks."""
+    model = world.quick(rng)
+    found = calls(model, rng)
+    code = json.dumps(model.code(rng)).encode()
+    numbers, wrong = pick(rng, b"0", b"0.5", b"1e9", b"-0.0"), pick(rng, b'""', b"null", b"{}", b"[]", b"[[]]", b"true")
+    element = {
+        "mesh latent": numbers, "edit latent": numbers, "vertices latents": code, "nric latents": code,
+        "interpolations keyframes": code, "interpolations times": numbers, "encode vertices": b"[0,0,0]",
+        "encode faces": b"[0,0,0]", "edit targets": b'{"vertex":0,"position":[0,0,0]}',
+        "infer outputs": b'{"name":"nric"}',
+    }  # fmt: skip
+    place = pick(rng, *element)
+    call, member = place.split()
+    target, body = found[call]
+    text = repeated(element[place] if rng.random() < 0.5 else wrong, size(rng) - 300)
+    return post(target, spliced(body, member, text))
+
+
+@kind("JSON: infer with very much data")
+def much_data(rng: Rng, world: World) -> Request:
+    model = world.quick(rng)
+    target, body = calls(model, rng)["infer"]
+    code = json.dumps(model.code(rng)).encode()
+    text = repeated(pick(rng, b"0", b"0.25", b'""', b"[0]", b"null", b"[]", code, b"[[0]]"), size(rng) - 300)
+    count = int(rng.integers(1, 10**7))
+    tensor = {**body["inputs"][0], "shape": [count, model.dimension]}
+    inner = spliced(tensor, "data", text)
+    return post(target, spliced(body, "inputs", b"[" + inner + b"]"))
+
+
+@kind("JSON: depth")
+def deep(rng: Rng, world: World) -> Request:
+    target, body = a_call(world, rng)
+    open, close = pick(rng, (b"[", b"]"), (b'{"a":', b"}"), (b'[{"latent":', b"}]"), (b'{"inputs":[', b"]}"))
+    count = (size(rng) - 300) // (len(open) + len(close))
+    text = open * count + b"0" + (close * count if rng.random() < 0.7 else b"")
+    return post(target, text if rng.random() < 0.3 else spliced(body, a_member(rng, body), text))
+
+
+@kind("JSON: very many members")
+def many_members(rng: Rng, world: World) -> Request:
+    target, body = a_call(world, rng)
+    value, most = pick(rng, b"0", b"[]", b'""', b"{}"), size(rng) - 300
+    if rng.random() < 0.5:
+        name = json.dumps(a_member(rng, body)).encode() if rng.random() < 0.5 else b'"x"'
+        text = repeated(name + b":" + value, most, b"{", b"}")
+    else:
+        count = most // (9 + len(value))
+        text = b"{" + b",".join(b'"%x":' % k + value for k in range(count)) + b"}"
+    return post(target, text if rng.random() < 0.6 else spliced(body, a_member(rng, body), text))
+
+
+@kind("JSON: numbers of a million digits")
+def long_numbers(rng: Rng, world: World) -> Request:
+    target, body = a_call(world, rng)
+    digits = pick(rng, b"1", b"9", b"0") * min(size(rng) - 300, 2 * 10**6)
+    number = pick(rng, digits, b"1" + digits, b"-1" + digits, b"0." + digits, b"1e" + digits, b"1e-" + digits,
+                  b"1." + digits + b"e5", b"1" + digits + b".0")  # fmt: skip
+    member = a_member(rng, body)
+    if isinstance(body[member], list) and rng.random() < 0.7:
+        number = repeated(number[: len(number) // 3 + 2], size(rng) - 300)
+    return post(target, spliced(body, member, number))
+
+
+@kind("JSON: long strings")
+def long_strings(rng: Rng, world: World) -> Request:
+    target, body = a_call(world, rng)
+    unit = pick(rng, b"a", b"\\u00e9", b"\\ud800", b"\\ud83d\\ude00", b"\\n", b"\\\\", "é".encode(), "🔺".encode(),
+                b"\\u0000", b"\xff", b"\xed\xa0\x80", b"%s", b"\x01")  # fmt: skip
+    text = b'"' + unit * ((size(rng) - 300) // len(unit)) + pick(rng, b'"', b"", b"\\")
+    place = rng.random()
+    if place < 0.3:
+        return post(target, b"{" + text + b":0}")
+    return post(target, text if place < 0.4 else spliced(body, a_member(rng, body), text))
+
+
+@kind("JSON: other encodings, marks and spaces")
+def other_text(rng: Rng, world: World) -> Request:
+    target, body = a_call(world, rng)
+    text, most = json.dumps(body), size(rng) - 300
+    space = pick(rng, " ", "\n", "\t", "\r\n", "\u00a0", "\ufeff")
+    long = pick(rng, space * most + text, text + space * most, text[:1] + space * most + text[1:])[:most]
+    name = pick(rng, "utf-8", "utf-8-sig", "utf-16", "utf-16-le", "utf-32", "utf-16-be")
+    content = long.encode(name)[:BODY]
+    return post(target, content, {"Content-Type": f"application/json; charset={name}"})
+
+
+@kind("JSON: cut off, or with more behind it")
+def cut_off(rng: Rng, world: World) -> Request:
+    target, body = a_call(world, rng)
+    whole = spliced(body, a_member(rng, body), repeated(pick(rng, *ELEMENTS), size(rng) - 300))
+    cut = whole[: int(rng.integers(len(whole)))]
+    return post(target, pick(rng, cut, whole + b"}", (whole + b"\n") * max(1, BODY // 2 // len(whole)))[:BODY])
+
+
+@kind("JSON: over the limit")
+def over_the_limit(rng: Rng, world: World) -> Request:
+    target, _ = a_call(world, rng)
+    content = b" " * (BODY + int(rng.integers(1, 4 * MIB)))
+    if rng.random() < 0.5:
+        return Request([head("POST", target, {**JSON_TYPE, "Transfer-Encoding": "chunked"}), *chunks(content, 2**16)])
+    return post(target, content)
+
+
+@kind("JSON: noise")
+def noise(rng: Rng, world: World) -> Request:
+    target, _ = a_call(world, rng)
+    return post(target, rng.bytes(size(rng)))
+
+
+# Sound requests that are as large as may be.
+
+
+@kind("edit with a target at every vertex", limit=True)
+def every_vertex(rng: Rng, world: World) -> Request:
+    model = world.any(rng)
+    mesh = pick(rng, "fine", "coarse")
+    vertices = np.array(json.loads(model.files["json"])["vertices"])
+    count = model.counts[mesh]
+    places = vertices[:count] + rng.normal(0, 0.01 * np.ptp(vertices), (min(count, len(vertices)), 3))
+    targets = [{"vertex": k, "position": place} for k, place in enumerate(places.tolist())]
+    if rng.random() < 0.3:  # as many as may be, all alike
+        targets = targets[:1] * count
+    body = {"latent": model.code(rng), "targets": targets, "mesh": mesh, "prior": float(rng.uniform(0, 1e-3))}
+    return post(f"/v1/models/{model.name}/edit", json.dumps(body).encode())
+
+
+@kind("edit with targets far away")
+def far_targets(rng: Rng, world: World) -> Request:
+    model = world.quick(rng)
+    scale = 10.0 ** rng.uniform(-300, 300)
+    targets = [
+        {"vertex": k, "position": (rng.normal(size=3) * scale).tolist()} for k in range(int(rng.integers(1, 50)))
+    ]
+    body = {"latent": model.code(rng), "targets": targets, "prior": float(10.0 ** rng.uniform(-300, 300))}
+    return post(f"/v1/models/{model.name}/edit", json.dumps(body).encode())
+
+
+@kind("infer with as many codes as may be", limit=True)
+def many_codes_inferred(rng: Rng, world: World) -> Request:
+    model = world.any(rng)
+    codes = np.array(model.codes(rng, 256))
+    outputs = [{"name": name, "parameters": {"binary_data": bool(rng.random() < 0.5)}} for name in ("nric", "vertices")]
+    tensor = {"name": "latent", "shape": list(codes.shape), "datatype": "FP32"}
+    headers, tail = {"Content-Type": "application/octet-stream"}, b""
+    if rng.random() < 0.5:
+        tail = codes.astype("<f4").tobytes()
+        tensor["parameters"] = {"binary_data_size": len(tail)}
+    else:
+        tensor["data"] = codes.tolist()
+    text = json.dumps({"inputs": [tensor], "outputs": outputs[: int(rng.integers(3))]}).encode()
+    headers["Inference-Header-Content-Length"] = str(len(text))
+    return post(f"/v2/models/{model.name}/infer", text + tail, headers)
+
+
+@kind("infer with outputs named again and again", long=True)
+def repeated_outputs(rng: Rng, world: World) -> Request:
+    model = world.any(rng)
+    target, body = calls(model, rng)["infer"]
+    count = int(10 ** rng.uniform(0.5, 5))
+    return post(target, json.dumps({**body, "outputs": [{"name": pick(rng, "nric", "vertices")}] * count}).encode())
+
+
+@kind("infer with megabytes of bytes")
+def many_bytes_inferred(rng: Rng, world: World) -> Request:
+    model = world.quick(rng)
+    length = max(0, size(rng) - 500)
+    length -= length % (4 * model.dimension)
+    shape = [length // 4 // model.dimension, model.dimension]
+    tensor = {"name": "latent", "shape": pick(rng, shape, shape[::-1], [1, length // 4]), "datatype": "FP32"}
+    tensor["parameters"] = {"binary_data_size": length}
+    text = json.dumps({"inputs": [tensor]}).encode()
+    headers = {"Content-Type": "application/octet-stream", "Inference-Header-Content-Length": str(len(text))}
+    return post(f"/v2/models/{model.name}/infer", text + bytes(length), headers)
+
+
+@kind("infer with a length of the JSON part that can't be")
+def odd_parts(rng: Rng, world: World) -> Request:
+    target, body = calls(world.quick(rng), rng)["infer"]
+    text = json.dumps(body).encode()
+    length = pick(
+        rng, "9" * int(rng.integers(1, 30_000)), "-1", "\u0663", "1e3", "0", str(len(text) - 1), "", " 5", "0x5"
+    )
+    return post(target, text + bytes(int(10 ** rng.uniform(0, 6))), {"Inference-Header-Content-Length": length})
+
+
+def many_vertices(format: str, exact: bool) -> Make:
+    def make(rng: Rng, world: World) -> Request:
+        model = world.any(rng)
+        body = {"latents": model.codes(rng, 256), "exact": exact}
+        return post(f"/v1/models/{model.name}/vertices?format={format}", json.dumps(body).encode())
+
+    return make
+
+
+for _format in ("json", "npz"):
+    kind(f"vertices of as many codes as may be, as {_format}", limit=True)(many_vertices(_format, exact=False))
+    kind(f"exact vertices of as many codes as may be, as {_format}", limit=True)(many_vertices(_format, exact=True))
+
+
+@kind("nric of as many codes as may be", limit=True)
+def many_nric(rng: Rng, world: World) -> Request:
+    model = world.any(rng)
+    body = {"latents": model.codes(rng, 256), "factors": True}
+    return post(f"/v1/models/{model.name}/nric", json.dumps(body).encode())
+
+
+@kind("sample as many codes as may be")
+def many_samples(rng: Rng, world: World) -> Request:
+    body = {"count": 256, "seed": int(rng.integers(2**62)), "distribution": pick(rng, "uniform", "gaussian")}
+    return post(f"/v1/models/{world.any(rng).name}/sample", json.dumps(body).encode())
+
+
+@kind("interpolation with thousands of keyframes")
+def many_keyframes(rng: Rng, world: World) -> Request:
+    model = world.any(rng)
+    most = size(rng) - 300
+    codes = [json.dumps(code).encode() for code in model.codes(rng, 1 if rng.random() < 0.3 else 1000)]
+    count = max(2, most // (len(codes[0]) + 20))
+    body: dict[str, Any] = {"frames": pick(rng, 2, 600), "loop": bool(rng.random() < 0.5)}
+    if rng.random() < 0.5:
+        body["times"] = list(range(count))
+    keyframes = b"[" + b",".join(codes[k % len(codes)] for k in range(count)) + b"]"
+    return post(f"/v1/models/{model.name}/interpolations", spliced(body, "keyframes", keyframes))
+
+
+@kind("interpolation with numbers at their limits")
+def extreme_path(rng: Rng, world: World) -> Request:
+    """By an address that was made up where it would not be given out."""
+    model = world.quick(rng)
+
+    def number() -> float:
+        return float(pick(rng, 0.0, 1.0, 1e308, -1e308, 5e-324, 1e-300, 1e38, 3.5e38, 1 / 3, -1e-9))
+
+    times = sorted({number(), number(), number()})
+    keyframes = [[number() for _ in range(model.dimension)] if rng.random() < 0.5 else model.code(rng) for _ in times]
+    body = {"keyframes": keyframes, "times": times, "frames": 3, "start": number(), "stop": number(), "loop": False}
+    if rng.random() < 0.5:
+        return post(f"/v1/models/{model.name}/interpolations", json.dumps(body).encode())
+    body |= {"mesh": "fine", "model": model.card["digest"][:32], "loop": bool(rng.random() < 0.5)}
+    return get(f"/v1/interpolations/{forged(json.dumps(body).encode())}{pick(rng, '/frames/0', '', '?format=jsonl')}")
+
+
+# Ids of interpolations that nobody gave out.
+
+
+def forged(content: bytes) -> str:
+    """An id with a checksum that is right, as it is given out by version 0.1."""
+    packed = hashlib.sha256(content).digest()[:9] + zlib.compress(content, 9)
+    return base64.urlsafe_b64encode(packed).rstrip(b"=").decode()
+
+
+@kind("animation with a forged id")
+def forged_id(rng: Rng, world: World) -> Request:
+    model = world.any(rng)
+    most = MIB - 200 if rng.random() < 0.5 else int(10 ** rng.uniform(3, 6))
+    code = json.dumps(model.code(rng)).encode()
+    zero = json.dumps([0] * model.dimension).encode()
+    facts = {"frames": 2, "keyframes": [], "loop": False, "mesh": "fine", "start": 0.0, "stop": 1.0}
+    facts |= {"model": model.card["digest"][:32], "times": []}
+    variants = [
+        ("keyframes", repeated(pick(rng, b"[]", code, zero, b"[0]", b'""', b"{}", b"[[]]", b"null"), most)),
+        ("times", repeated(pick(rng, b"0", b'""', b"[]", b"1e9"), most)),
+        ("frames", pick(rng, b"600", b"1000000000", b"1" * min(most, 10**6), b"1e400", b"-1")),
+        ("loop", b"[" * (most // 2) + b"]" * (most // 2)),
+        ("start", b"1" * most),
+        ("mesh", b'"' + b"a" * most + b'"'),
+        ("model", b'"' + b"a" * most + b'"'),
+    ]
+    member, text = variants[0 if rng.random() < 0.5 else int(rng.integers(len(variants)))]
+    facts["keyframes"] = [model.code(rng)] * 2
+    if member == "times" or rng.random() < 0.7:
+        del facts["times"]
+    target = f"/v1/interpolations/{forged(spliced(facts, member, text))}"
+    return get(target + pick(rng, "", "/frames/0", "?format=jsonl", "?format=npz"))
+
+
+@kind("animation with a forged id that holds keyframes by the ten thousand")
+def forged_keyframes(rng: Rng, world: World) -> Request:
+    model = world.quick(rng)
+    count = int(10 ** rng.uniform(2, 6)) // (3 * model.dimension)
+    keyframes = [[0] * model.dimension] * max(2, count)
+    facts: dict[str, Any] = {"frames": 600, "keyframes": keyframes, "model": model.card["digest"][:32]}
+    if rng.random() < 0.5:
+        facts["times"] = list(range(len(keyframes)))
+    text = json.dumps(facts, separators=(",", ":")).encode()
+    return get(f"/v1/interpolations/{forged(text)}/frames/{pick(rng, 0, 599)}")
+
+
+def link(model: Model, frames: int, codes: list[list[float]], mesh: str = "fine") -> str:
+    """The address of an animation."""
+    facts = {
+        "frames": frames, "keyframes": codes, "loop": False, "mesh": mesh, "model": model.card["digest"][:32],
+        "start": 0.0, "stop": 1.0,
+    }  # fmt: skip
+    return f"/v1/interpolations/{forged(json.dumps(facts, separators=(',', ':')).encode())}"
+
+
+def many_frames(format: str) -> Make:
+    def make(rng: Rng, world: World) -> Request:
+        model = world.any(rng)
+        return get(f"{link(model, 600, model.codes(rng, 2))}?format={format}")
+
+    return make
+
+
+for _format in ("glb", "npz", "zip", "pc2", "usd", "jsonl"):
+    kind(f"animation of as many frames as may be, as {_format}", limit=True)(many_frames(_format))
+
+
+# Shapes.
+
+
+@kind("mesh in any format and colour")
+def a_mesh(rng: Rng, world: World) -> Request:
+    model = world.any(rng)
+    query = f"latent={','.join(map(str, model.code(rng)))}"
+    format = pick(rng, "glb", "gltf", "obj", "ply", "stl", "npz", "json")
+    query += f"&format={format}&mesh={pick(rng, 'fine', 'coarse')}"
+    if rng.random() < 0.5:
+        query += f"&color={pick(rng, 'stretch', 'bending')}&against={','.join(map(str, model.code(rng)))}"
+    return get(f"/v1/models/{model.name}/mesh?{query}")
+
+
+@kind("mesh far outside the bounds")
+def far_mesh(rng: Rng, world: World) -> Request:
+    model = world.any(rng)
+    code = (rng.normal(size=model.dimension) * 10 ** rng.uniform(0, 39)).tolist()
+    return get(f"/v1/models/{model.name}/mesh?latent={','.join(map(str, code))}&mesh=coarse")
+
+
+# Heads.
+
+
+def a_get(world: World, rng: Rng) -> str:
+    model = world.quick(rng)
+    path = f"/v1/models/{model.name}"
+    address = link(model, 2, model.codes(rng, 2))
+    return str(
+        pick(
+            rng, "/", "/page/js/main.js", "/openapi.json", "/metrics", "/v1/models", path, f"{path}/mesh", address,
+            f"{address}/frames/1", "/v2", "/v2/health/live", "/v2/health/ready", f"/v2/models/{model.name}",
+            f"/v2/models/{model.name}/ready", "/nowhere",
+        )
+    )  # fmt: skip
+
+
+HEADERS = (
+    "Accept", "If-None-Match", "Cookie", "Range", "Expect", "Authorization", "Origin", "X-Request-ID", "Content-Type",
+    "Accept-Encoding", "Content-Encoding", "Inference-Header-Content-Length", "X-API-Key", "Forwarded", "X", "Upgrade",
+    "Access-Control-Request-Headers", "If-Range", "If-Modified-Since", "Content-Length", "Transfer-Encoding",
+)  # fmt: skip
+VALUES = (
+    "a/b,", "*/*;q=0.1,", "model/obj;q=0,", ",", '"x",', 'W/"0123456789abcdef0123456789abcdef",', "a=b; ", "0-0,", ";",
+    "bytes=0-,", " ", "a", "é", "100-continue,", "gzip;q=0.001,", "9", "\t", "(", "%41", "=", "a;a=",
+)  # fmt: skip
+
+
+@kind("a head with long values")
+def long_headers(rng: Rng, world: World) -> Request:
+    names = rng.choice(HEADERS, int(rng.integers(1, 4)), replace=False)
+    most = int(10 ** rng.uniform(2, 6.6)) if rng.random() < 0.3 else 30_000 // len(names)
+    pairs = [(str(name), (value := str(rng.choice(VALUES))) * (most // len(value))) for name in names]
+    return Request([head(pick(rng, "GET", "GET", "HEAD", "OPTIONS", "POST"), a_get(world, rng), pairs)], broken=True)
+
+
+@kind("Accept with ten thousand ranges")
+def long_accept(rng: Rng, world: World) -> Request:
+    model = world.quick(rng)
+    most = pick(rng, 30_000, 30_000, 300_000, 4_000_000)
+    value = pick(rng, "a/b,", "*/*;q=0,", "a;q=1,", ",", "model/gltf-binary;a=b;c=d;q=0.001,", "a/b;;;;;;;;;;;;")
+    target = pick(rng, f"/v1/models/{model.name}/mesh", link(model, 2, model.codes(rng, 2)))
+    return Request([head("GET", target, {"Accept": value * (most // len(value))})], broken=most > 30_000)
+
+
+@kind("If-None-Match with thousands of tags")
+def long_match(rng: Rng, world: World) -> Request:
+    model = world.quick(rng)
+    most = pick(rng, 30_000, 30_000, 300_000, 4_000_000)
+    value = pick(rng, '"x",', ",", 'W/"a",', "W/" * 50 + ",", '"0123456789abcdef0123456789abcdef", ')
+    target = pick(rng, f"/v1/models/{model.name}/mesh", link(model, 2, model.codes(rng, 2)), "/", "/page/page.css")
+    return Request([head("GET", target, {"If-None-Match": value * (most // len(value))})], broken=most > 30_000)
+
+
+@kind("a head with very many lines")
+def many_headers(rng: Rng, world: World) -> Request:
+    count = int(10 ** rng.uniform(1, 6))
+    line = pick(rng, b"a:\r\n", b"Cookie: a=b\r\n", b"Host: x\r\n", b"Accept: */*\r\n", b"X-Request-ID: a\r\n")
+    return Request([head("GET", a_get(world, rng))[:-2], line * count, b"\r\n"], broken=count > 50)
+
+
+@kind("Range with thousands of ranges")
+def many_ranges(rng: Rng, world: World) -> Request:
+    model = world.quick(rng)
+    target = pick(rng, "/", LARGEST, "/openapi.json", f"/v1/models/{model.name}/mesh?format=json")
+    parts, text = (
+        pick(rng, lambda k: f"{2 * k}-{2 * k}", lambda k: f"{k}-", lambda k: "0-", lambda k: "-1", lambda k: ""),
+        [],
+    )
+    most = pick(rng, 30_000, 30_000, 300_000)
+    while most > 0:
+        text.append(parts(len(text)))
+        most -= len(text[-1]) + 1
+    return Request([head("GET", target, {"Range": "bytes=" + ",".join(text)})], broken=len(text) > 30_000)
+
+
+@kind("the page's largest file, compressed")
+def largest_asset(rng: Rng, world: World) -> Request:
+    return get(LARGEST, {"Accept-Encoding": "gzip"})
+
+
+@kind("a body that nobody asked for")
+def unasked(rng: Rng, world: World) -> Request:
+    body = bytes(size(rng, UPLOAD))
+    return Request(
+        [head(pick(rng, "GET", "HEAD", "DELETE"), a_get(world, rng), {"Content-Length": str(len(body))}), body]
+    )
+
+
+@kind("small odd headers")
+def odd_headers(rng: Rng, world: World) -> Request:
+    pairs = [
+        pick(
+            rng, ("Host", ""), ("Host", "a b"), ("Host", "[::1"), ("Host", "x" * 300), ("Range", "bytes=0-0"),
+            ("Range", "bytes=" + ",".join(f"{k}-{k}" for k in range(500))), ("Expect", "100-continue"),
+            ("Upgrade", "websocket"), ("Connection", "Upgrade"), ("Origin", "null"), ("Origin", "http://x" * 99),
+            ("Authorization", "Bearer " + "a" * 9999), ("Authorization", "Basic \xff"), ("X-Request-ID", "a" * 64),
+            ("Accept-Encoding", "gzip"), ("If-None-Match", "*"), ("Content-Length", "0"), ("TE", "trailers"),
+            ("Forwarded", "for=" + '"[::1]"' * 500), ("X-Forwarded-For", "1," * 5000), ("Content-Encoding", "gzip"),
+        )
+        for _ in range(int(rng.integers(1, 6)))
+    ]  # fmt: skip
+    method = pick(rng, "GET", "GET", "HEAD", "POST", "OPTIONS", "DELETE", "PATCH", "TRACE", "CONNECT", "GETT")
+    return Request([head(method, a_get(world, rng), pairs)], broken=True)
+
+
+@kind("a path with very many percent escapes")
+def long_paths(rng: Rng, world: World) -> Request:
+    model = world.quick(rng)
+    unit = pick(
+        rng, "%41", "%2e%2e%2f", "%00", "/", "%ff", "a", "../", "%25", "%", "é", "//", "{k}", "%f0%9f%94%ba", "."
+    )
+    most = int(10 ** rng.uniform(2, 6.3)) if rng.random() < 0.3 else 30_000
+    long = unit * (most // len(unit))
+    targets = (
+        f"/v1/models/{long}", f"/v1/models/{long}/mesh", f"/v1/models/{model.name}/{long}", f"/page/{long}", f"/{long}",
+        f"/v1/interpolations/{long}", f"/v1/interpolations/{long}/frames/1", f"/v2/models/{long}/versions/{long}/ready",
+        f"/v1/interpolations/x/frames/{long}", f"http://{long}/", long,
+    )  # fmt: skip
+    return Request([head(pick(rng, "GET", "HEAD", "POST"), pick(rng, *targets))], broken=True)
+
+
+@kind("a query with very many members")
+def long_queries(rng: Rng, world: World) -> Request:
+    model = world.any(rng)
+    most = int(10 ** rng.uniform(2, 6.3)) if rng.random() < 0.3 else 30_000
+    unit = pick(rng, "a=b&", "&", "=", "latent=1&", "a;", "%41=%41&", "format=obj&", "+", "a&", "mesh=coarse&", "é=")
+    target = pick(rng, f"/v1/models/{model.name}/mesh", f"/v1/models/{model.name}", "/", "/v1/models", "/metrics")
+    return Request([head("GET", f"{target}?{unit * (most // len(unit))}")], broken=True)
+
+
+@kind("a latent of very many numbers in the query")
+def long_latent(rng: Rng, world: World) -> Request:
+    model = world.any(rng)
+    most = int(10 ** rng.uniform(2, 6.3)) if rng.random() < 0.3 else 30_000
+    unit = pick(rng, "0,", "1e9,", ",", "nan,", "-", "1", "9" * 400 + ",", "0.1,", "%30%2c", " ", "1_0,", "٣,")
+    name = pick(rng, "latent", "color=stretch&against")
+    query = quote(unit * (most // len(unit)), safe=",%")
+    return Request([head("GET", f"/v1/models/{model.name}/mesh?{name}={query[:most]}")], broken=True)
+
+
+# Uploads.
+
+
+def upload(world: World, rng: Rng, format: str, data: bytes) -> Request:
+    """A file to be encoded, in one of the ways to send it."""
+    target = f"/v1/models/{world.any(rng).name}/encode"
+    data = data[:UPLOAD]
+    way = rng.random()
+    if way < 0.6:
+        return post(f"{target}?format={format}", data, {"Content-Type": "application/octet-stream"})
+    if way < 0.8:
+        start = head("POST", f"{target}?format={format}", {"Transfer-Encoding": "chunked"})
+        return Request([start, *chunks(data, 2**16)])
+    boundary = "b" * 30
+    return post(
+        target, form(boundary, f"x.{format}", data), {"Content-Type": f"multipart/form-data; boundary={boundary}"}
+    )
+
+
+def chunks(data: bytes, each: int) -> Iterator[bytes]:
+    """A body in chunks."""
+    view = memoryview(data)
+    for start in range(0, len(view), each):
+        piece = view[start : start + each]
+        yield b"%x\r\n%b\r\n" % (len(piece), piece)
+    yield b"0\r\n\r\n"
+
+
+def form(boundary: str, name: str, data: bytes) -> bytes:
+    before = f'--{boundary}\r\nContent-Disposition: form-data; name="file"; filename="{name}"\r\n\r\n'
+    return before.encode() + data + f"\r\n--{boundary}--\r\n".encode()
+
+
+TEXTS = {
+    "obj": (b"v 1 2 3\n", b"f 1 2 3\n", b"v 1e999 nan -\n", b"o x\n", b"#\n", b"\\\n", b"f 1/1/1 2/2/2 3/3/3\n", b"g\n",
+            b"usemtl x\n", b"mtllib /etc/passwd\n", b"vt 0 0\n", b"vn 0 0 1\n", b"f -1 -2 -3\n", b"v 0 0 0 1 1 1\n"),
+    "ply": (b"0 0 0\n", b"3 0 1 2\n", b"\n", b"property float x\n", b"element vertex 9\n", b"comment x\n", b"0 "),
+    "stl": (b"facet normal 0 0 0\nouter loop\nvertex 0 0 0\nvertex 0 0 0\nvertex 0 0 0\nendloop\nendfacet\n",
+            b"solid x\n", b"vertex 0 0 0\n", b" ", b"endsolid\n"),
+    "json": (b"[1,2,3],", b"[", b'"",', b"[1],", b"1,", b"null,", b'{"a":', b"[[[]]],", b'{"":[]},'),
+    "gltf": (b"{},", b"[", b'{"mesh":0},', b'{"children":[0]},', b'"",', b'{"count":9,"type":"VEC3"},', b"0,"),
+    "npz": (b"PK\x03\x04", b"\0", b"PK\x01\x02", b"PK\x05\x06", b"\x93NUMPY"),
+    "glb": (b"\0", b" ", b"BIN\0", b"JSON", b"{}"),
+}  # fmt: skip
+STARTS = {
+    "obj": b"", "npz": b"", "json": b'{"vertices": [',
+    "ply": b"ply\nformat ascii 1.0\nelement vertex 8000000\nproperty float x\nproperty float y\nproperty float z\n"
+           b"element face 1\nproperty list uchar int vertex_indices\nend_header\n",
+    "stl": b"solid x\n", "gltf": b'{"asset":{"version":"2.0"},"scene":0,"nodes":[', "glb": b"glTF\2\0\0\0\0\0\0\4",
+}  # fmt: skip
+
+
+@kind("an upload of very many lines")
+def long_upload(rng: Rng, world: World) -> Request:
+    format = pick(rng, *TEXTS)
+    units = rng.choice(np.array(TEXTS[format], dtype=object), int(rng.integers(1, 4)))
+    unit = b"".join(units)
+    most = size(rng, UPLOAD)
+    sound = world.any(rng).files[format] if rng.random() < 0.2 else STARTS[format]
+    return upload(world, rng, format, sound + unit * (most // len(unit)))
+
+
+@kind("an upload that is as long as a line")
+def one_line(rng: Rng, world: World) -> Request:
+    format, unit = pick(rng, ("obj", b" 1"), ("obj", b"v 1 2 3 "), ("ply", b" 0"), ("stl", b"vertex "), ("json", b"1"),
+                        ("gltf", b"a"), ("obj", b"f 1 "), ("json", b"["), ("gltf", b"["))  # fmt: skip
+    start = pick(rng, STARTS[format], b"f", b'"', b"")
+    return upload(world, rng, format, start + unit * (size(rng, UPLOAD) // len(unit)))
+
+
+@kind("an upload with more than its mesh")
+def padded_upload(rng: Rng, world: World) -> Request:
+    """A mesh in correspondence, and what a parser doesn't need."""
+    model = world.any(rng)
+    format = pick(rng, "obj", "ply", "stl", "npz", "glb", "gltf", "json")
+    data, most = model.files[format], size(rng, UPLOAD)
+    if format == "json":
+        data = data.rstrip()[:-1] + b',"x":' + repeated(pick(rng, b"0", b'""', b"[]"), most) + b"}"
+    elif format == "npz":
+        data = archive({"x.npy": bytes(most)}, data)
+    elif format == "gltf":
+        data = data.rstrip()[:-1] + b',"extras":' + repeated(pick(rng, b"0", b'""', b"[]", b"{}"), most) + b"}"
+    else:
+        data += {"obj": b"#\n", "ply": b"\n", "stl": b"\0", "glb": b"\0"}[format] * most
+    return upload(world, rng, format, data)
+
+
+@kind("encode of a sound mesh", long=True)
+def sound_upload(rng: Rng, world: World) -> Request:
+    model = world.any(rng)
+    format = pick(rng, "obj", "ply", "stl", "npz", "glb", "gltf", "json")
+    return post(f"/v1/models/{model.name}/encode?format={format}", model.files[format], {"Content-Type": "x/y"})
+
+
+def archive(members: dict[str, bytes], old: bytes = b"") -> bytes:
+    """A zip, deflated, with further members in an old one."""
+    buffer = io.BytesIO(old)
+    with zipfile.ZipFile(buffer, "a", zipfile.ZIP_DEFLATED) as file:
+        for name, data in members.items():
+            file.writestr(name, data)
+    return buffer.getvalue()
+
+
+def npy(shape: str, data: bytes, kind: str = "<f8") -> bytes:
+    text = f"{{'descr': {kind!r}, 'fortran_order': False, 'shape': {shape}, }}\n".encode()
+    return b"\x93NUMPY\x02\x00" + struct.pack("<I", len(text)) + text + data
+
+
+@kind("an NPZ that unpacks to much")
+def npz_bomb(rng: Rng, world: World) -> Request:
+    most = int(rng.integers(2**20, 2**27))
+    variants = (
+        lambda: {"vertices.npy": npy(f"({most // 24}, 3)", bytes(most // 24 * 24))},
+        lambda: {"vertices.npy": npy(f"({10 ** int(rng.integers(6, 18))}, 3)", b"")},
+        lambda: {"vertices.npy": npy("(" + "1," * 100_000 + ")", b"")},
+        lambda: {"vertices.npy": npy("(" * 5000 + ")" * 5000, b"")},
+        lambda: {f"{k}.npy": npy("(3,)", bytes(24)) for k in range(20_000)},
+        lambda: {"vertices.npy": npy("(1000, 3)", bytes(24_000), "O"), "faces.npy": b""},
+        lambda: {"vertices.npy": npy(f"({most // 24}, 3)", bytes(most // 24 * 24)), "faces.npy": npy("(9,3)", b"")},
+        lambda: {"vertices.npy": npy(f"({most}, 0, 3)", b"")},
+        lambda: {"vertices.npy": npy("(10000, 3)", bytes(240_000)), "a" * 60_000 + ".npy": b""},
+        lambda: {"vertices.npy": b"\x93NUMPY\x02\x00" + struct.pack("<I", most) + b" " * most},
+    )
+    data = bytearray(archive(variants[int(rng.integers(len(variants)))]()))
+    if rng.random() < 0.3:  # the directory tells a lie
+        place = data.find(b"PK\x01\x02")
+        while place >= 0:
+            struct.pack_into("<I", data, place + 24, 1000)
+            place = data.find(b"PK\x01\x02", place + 4)
+    return upload(world, rng, "npz", bytes(data))
+
+
+@kind("an upload with a head that lies")
+def lying_upload(rng: Rng, world: World) -> Request:
+    rows = 10 ** int(rng.integers(4, 19))
+    form = pick(rng, "ascii", "binary_little_endian", "binary_big_endian")
+    kind = pick(rng, "float x", "double x", "list uchar int x", "list uint int x", "list double double x", "x")
+    more = int(rng.integers(1, 20_000))
+    ply = f"ply\nformat {form} 1.0\n" + f"element vertex {rows}\nproperty {kind}\n" * more + "end_header\n"
+    format, data = pick(
+        rng, ("ply", ply.encode() + bytes(int(rng.integers(10**6)))),
+        ("stl", bytes(80) + struct.pack("<I", int(rng.integers(2**32))) + bytes(int(rng.integers(10**6)))),
+        ("glb", struct.pack("<4sIII4s", b"glTF", 2, 2**32 - 1, 2**31, b"JSON") + b" " * int(rng.integers(10**6))),
+    )  # fmt: skip
+    return upload(world, rng, format, data)
+
+
+def gltf(tree: dict[str, Any], data: bytes = b"") -> bytes:
+    """A GLB."""
+    text = json.dumps(tree, separators=(",", ":")).encode()
+    text += b" " * (-len(text) % 4)
+    parts = struct.pack("<I4s", len(text), b"JSON") + text
+    if data:
+        parts += struct.pack("<I4s", len(data), b"BIN\0") + data
+    return struct.pack("<4sII", b"glTF", 2, 12 + len(parts)) + parts
+
+
+@kind("a glTF scene that is large, deep or woven", long=True)
+def gltf_scene(rng: Rng, world: World) -> Request:
+    count = int(10 ** rng.uniform(1, 4))
+    matrix = {"matrix": ROTATION}
+    points = bytes(12 * 30)
+    tree: dict[str, Any] = {
+        "asset": {"version": "2.0"}, "scene": 0, "scenes": [{"nodes": [0]}],
+        "buffers": [{"byteLength": len(points)}], "bufferViews": [{"buffer": 0, "byteLength": len(points)}],
+        "accessors": [{"bufferView": 0, "componentType": 5126, "type": "VEC3", "count": 30}],
+        "meshes": [{"primitives": [{"attributes": {"POSITION": 0}}]}],
+    }  # fmt: skip
+
+    def chain() -> list[dict[str, Any]]:
+        return [{**matrix, "children": [k + 1]} for k in range(count - 1)] + [{"mesh": 0}]
+
+    def woven() -> list[dict[str, Any]]:
+        return [{"children": [k + 1, k + 1]} for k in range(min(count, 60))] + [{"mesh": 0}]
+
+    def star() -> list[dict[str, Any]]:
+        return [{"children": list(range(1, count))}] + [{**matrix, "mesh": 0}] * (count - 1)
+
+    def comb() -> list[dict[str, Any]]:
+        return [{**matrix, "mesh": 0, "children": [k + 1]} for k in range(count - 1)] + [{"mesh": 0}]
+
+    def dense() -> list[dict[str, Any]]:
+        some = min(count, 1000)
+        return [{"children": list(range(k + 1, some))} for k in range(some - 1)] + [{"mesh": 0}]
+
+    def ring() -> list[dict[str, Any]]:
+        return [{"children": [(k + 1) % count], "mesh": 0} for k in range(count)]
+
+    def named() -> list[dict[str, Any]]:
+        return [{"children": [1], "name": "x"}] + [{"name": "x", "mesh": 0}] * (count - 1)
+
+    tree["nodes"] = pick(rng, chain, woven, star, comb, dense, ring, named)()
+    many = int(10 ** rng.uniform(0, 5))
+    extra = pick(
+        rng, {}, {"skins": [{"joints": list(range(many))}]}, {"animations": [{"channels": [{}] * many}]},
+        {"materials": [{}] * many}, {"images": [{"uri": "data:image/png;base64,AAAA"}] * many},
+        {"textures": [{}] * many}, {"cameras": [{}] * many}, {"extensionsUsed": ["x"] * many},
+        {"extensionsRequired": ["KHR_draco_mesh_compression"]}, {"bufferViews": tree["bufferViews"] * many},
+    )  # fmt: skip
+    if rng.random() < 0.2:
+        sparse = {"count": many, "indices": {"bufferView": 0, "componentType": 5123}, "values": {"bufferView": 0}}
+        tree["accessors"][0] = {"componentType": 5126, "type": "VEC3", "count": 30, "sparse": sparse}
+    if rng.random() < 0.2:
+        tree["accessors"][0]["count"] = pick(rng, 2**31, 10**18, -1, 10**5)
+    return upload(world, rng, "glb", gltf(tree | extra, points))
+
+
+@kind("a sound glTF file with an image")
+def gltf_image(rng: Rng, world: World) -> Request:
+    """A picture of a few kilobytes that would be gigapixels."""
+    side = int(rng.integers(1000, 30_000))
+    row = zlib.compress(bytes(min(10**8, (side // 8 + 1) * side)), 9)
+
+    def chunk(name: bytes, data: bytes) -> bytes:
+        return struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
+
+    picture = b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", struct.pack(">IIBBBBB", side, side, 1, 0, 0, 0, 0))
+    picture += chunk(b"IDAT", row) + chunk(b"IEND", b"")
+    tree = json.loads(world.any(rng).files["gltf"])
+    uri = "data:image/png;base64," + base64.b64encode(picture).decode()
+    tree |= {"images": [{"uri": uri}] * int(rng.integers(1, 50)), "textures": [{"source": 0}], "samplers": [{}]}
+    tree["materials"] = [{"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}}}]
+    for mesh in tree["meshes"]:
+        for primitive in mesh["primitives"]:
+            primitive["material"] = 0
+    return upload(world, rng, "gltf", json.dumps(tree).encode())
+
+
+# Forms.
+
+
+@kind("a form that is hard to take apart")
+def odd_form(rng: Rng, world: World) -> Request:
+    boundary = pick(rng, "b", "b" * 70, "-" * 70, "\r\n"[:0] + "a" * 69 + "b", "b" * 2000)
+    line = f"--{boundary}\r\n".encode()
+    most = size(rng, UPLOAD)
+    start = line + b'Content-Disposition: form-data; name="file"; filename="x.obj"\r\n'
+
+    def fill(unit: bytes) -> bytes:
+        return unit * max(1, most // len(unit))
+
+    partial = b"\r\n--" + boundary[: int(rng.integers(len(boundary)))].encode()
+    variants = (
+        lambda: start + b"\r\n" + fill(partial),
+        lambda: start + b"\r\n" + fill(b"\r\n--"),
+        lambda: start + b"\r\n" + fill(b"\r"),
+        lambda: start + b"\r\n" + fill(b"\r\n"),
+        lambda: start + b"\r\n" + fill(b"-"),
+        lambda: fill(line),
+        lambda: fill(line + b"\r\n\r\n"),
+        lambda: fill(start + b"\r\n\r\n"),
+        lambda: fill(line + b'Content-Disposition: form-data; name="a"\r\n\r\nb\r\n'),
+        lambda: line + fill(b"a: b\r\n"),
+        lambda: line + b"a" + fill(b"a"),
+        lambda: line + b'Content-Disposition: form-data; name="' + fill(b"a"),
+        lambda: line + b"Content-Disposition: form-data" + fill(b";a=b") + b"\r\n\r\n",
+        lambda: line + b"Content-Disposition: form-data; name=" + fill(b'"\\"') + b"\r\n\r\n",
+        lambda: fill(b"\r\n"),
+        lambda: fill(b"x"),
+        lambda: start + b"Content-Type: multipart/mixed; boundary=c\r\n\r\n" + fill(b"--c\r\n\r\n"),
+    )
+    body = variants[int(rng.integers(len(variants)))]()[:UPLOAD]
+    if rng.random() < 0.5:
+        body = body[: UPLOAD - len(boundary) - 8] + f"\r\n--{boundary}--\r\n".encode()
+    target = f"/v1/models/{world.quick(rng).name}/encode"
+    return post(target, body, {"Content-Type": f"multipart/form-data; boundary={boundary}"})
+
+
+@kind("a form whose type is hard to take apart")
+def odd_form_type(rng: Rng, world: World) -> Request:
+    unit = pick(rng, ";", "; boundary=b", ";a=b", '; boundary="', "\\", '"', ";boundary*0=", " ", "; charset=utf-7")
+    target = f"/v1/models/{world.quick(rng).name}/encode"
+    type = "multipart/form-data" + unit * (30_000 // len(unit))
+    return post(target, form("b", "x.obj", b"v 0 0 0\n"), {"Content-Type": type})
+
+
+# The wire.
+
+
+@kind("a body in chunks of a byte")
+def tiny_chunks(rng: Rng, world: World) -> Request:
+    target, body = a_call(world, rng)
+    most = int(10 ** rng.uniform(2, 6.3))
+    content = json.dumps(body).encode().ljust(most)
+    extension = pick(rng, b"", b"", b";a=b", b";" + b"a" * 50)
+    pieces = b"".join(b"1%b\r\n%b\r\n" % (extension, content[k : k + 1]) for k in range(len(content)))
+    trailers = pick(rng, b"", b"A: b\r\n", b"A: b\r\n" * 50, b"A: " + b"b" * 10_000 + b"\r\n")
+    start = head("POST", target, {**JSON_TYPE, "Transfer-Encoding": "chunked"})
+    return Request([start, pieces, b"0\r\n" + trailers + b"\r\n"], broken=len(trailers) > 1000)
+
+
+@kind("chunks, trailers or extensions without end")
+def endless_chunks(rng: Rng, world: World) -> Request:
+    target, _ = a_call(world, rng)
+    most = int(10 ** rng.uniform(4, 7.3))
+    unit, before = pick(
+        rng, (b"A: b\r\n", b"0\r\n"), (b"a", b"1;"), (b"0", b""), (b"a" * 100 + b": b\r\n", b"0\r\n"),
+        (b"b", b"0\r\nA: "), (b"f", b""), (b";a", b"1"),
+    )  # fmt: skip
+    start = head("POST", target, {**JSON_TYPE, "Transfer-Encoding": "chunked"})
+    return Request([start, before, unit * (most // len(unit)), b"\r\n\r\n"], broken=True, half_closed=True)
+
+
+@kind("very many requests in one go")
+def pipelined(rng: Rng, world: World) -> Request:
+    """A part of them may be left unanswered."""
+    targets = ("/v2/health/live", "/nowhere", "/v2", "/metrics", "/v1/models", f"/v1/models/{world.models[0].name}")
+    one, count = f"GET {pick(rng, *targets)} HTTP/1.1\r\n", pick(rng, 14_000, 10, 100, 300)
+    return Request([(one + "Host: x\r\n\r\n").encode() * count, head("GET", "/v2/health/live")], broken=True)
+
+
+@kind("a request a byte at a time")
+def byte_by_byte(rng: Rng, world: World) -> Request:
+    target, body = a_call(world, rng)
+    content = json.dumps(body).encode()
+    whole = head("POST", target, {**JSON_TYPE, "Content-Length": str(len(content))}) + content
+    return Request(part for k in range(len(whole)) for part in (whole[k : k + 1], 0.001))
+
+
+@kind("half a head, and the end")
+def half_a_head(rng: Rng, world: World) -> Request:
+    whole = head("GET", a_get(world, rng), {"Accept": "a" * int(10 ** rng.uniform(1, 4))})
+    return Request([whole[: int(rng.integers(1, len(whole)))]], broken=True, half_closed=True)
+
+
+@kind("half a body, and the end")
+def half_a_body(rng: Rng, world: World) -> Request:
+    target, body = a_call(world, rng)
+    content = json.dumps(body).encode().ljust(int(10 ** rng.uniform(2, 6)))
+    start = head("POST", target, {**JSON_TYPE, "Content-Length": str(len(content))})
+    return Request([start, content[: int(rng.integers(len(content)))]], broken=True, half_closed=True)
+
+
+@kind("a whole request, and the end")
+def half_closed(rng: Rng, world: World) -> Request:
+    target, body = a_call(world, rng)
+    # The server's protocol takes the end of one direction for that of both.
+    return Request(post(target, json.dumps(body).encode()).parts, broken=True, half_closed=True)
+
+
+@kind("a head that never ends", long=True)
+def slow_head(rng: Rng, world: World) -> Request:
+    whole = head("GET", a_get(world, rng), {"Accept": "a" * 3000})
+    drip = (part for k in range(len(whole) - 10) for part in (whole[k : k + 1], 0.05))
+    return Request(pick(rng, drip, [whole[:100]], []), broken=True)
+
+
+@kind("a body that never ends", long=True)
+def slow_body(rng: Rng, world: World) -> Request:
+    target, _ = a_call(world, rng)
+    start = head("POST", target, {**JSON_TYPE, "Content-Length": "1000"})
+    drip = (part for _ in range(900) for part in (b" ", 0.05))
+    return Request(pick(rng, [start], (part for parts in ([start], drip) for part in parts)))
+
+
+@kind("not HTTP at all")
+def not_http(rng: Rng, world: World) -> Request:
+    most = int(10 ** rng.uniform(0, 6))
+    data = pick(
+        rng, rng.bytes(most), b"\r\n" * most, b"GET " + b"a" * most, b"\x16\x03\x01" + rng.bytes(most), b"\0" * most,
+        b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n" + rng.bytes(most), b"GET / HTTP/1.1\n\n" * (most // 16 + 1),
+        b"GET / HTTP/9.9\r\n\r\n",
+    )  # fmt: skip
+    return Request([data], broken=True, half_closed=True)
+
+
+@kind("a length that can't be")
+def odd_lengths(rng: Rng, world: World) -> Request:
+    target, _ = a_call(world, rng)
+    pairs = [("Content-Type", "application/json")]
+    for _ in range(int(rng.integers(1, 3))):
+        length = pick(rng, "-1", "1" * 5000, "+5", "5, 5", "5;", "0x5", "\u0665", "1e3", "", "18446744073709551616")
+        pairs.append(("Content-Length", length))
+    if rng.random() < 0.3:
+        pairs.append(("Transfer-Encoding", pick(rng, "chunked", "chunked, chunked", "gzip, chunked", "identity", "x")))
+    return Request([head("POST", target, pairs), b"{}"], broken=True, half_closed=True)
+
+
+def made(name: str, seed: int, world: World) -> Request:
+    """The request of a kind and a seed."""
+    return KINDS[name].make(np.random.default_rng([seed, zlib.crc32(name.encode())]), world)
+
+
+def shares(examples: int) -> dict[str, int]:
+    """How many examples of each kind make up a number of them; those that take long are a quarter as many."""
+    whole = sum(0.25 if kind.long else 1 for kind in KINDS.values())
+    return {name: math.ceil(examples / whole * (0.25 if kind.long else 1)) for name, kind in KINDS.items()}

@@ -1,0 +1,148 @@
+"""The server with a meter beside it: ``python -m tests.fuzz.measured SOCKET``.
+
+It answers as ``python -m service`` does. Over a unix socket it takes two words, each on a connection of its own:
+``reset`` gives garbage and free memory back and sets the meter to nought, ``read`` answers with it as JSON.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import gc
+import json
+import os
+import socket
+import sys
+import threading
+import time
+from asyncio import AbstractEventLoop, events
+from pathlib import Path
+
+#: Seconds between two beats of the loop while something is measured.
+BEAT = 0.01
+
+
+class Meter:
+    """What the event loop of this process has done since the last reset.
+
+    ``loop`` is the longest single callback in seconds of CPU time of the loop's own thread: neither neighbours on the
+    machine nor other threads of the process count. ``wall`` is the longest by the clock. ``stall`` is how long the
+    loop was kept from running at most, whoever it was: a callback of its own, or a thread that held the interpreter's
+    lock. It is the delay of a beat, less the time for which the loop's thread stood ready and the machine gave it no
+    processor, and no more than the CPU time that all threads of this process took meanwhile.
+    """
+
+    def __init__(self) -> None:
+        self.watching = False
+        self._resets = 0
+        self._loop: AbstractEventLoop | None = None
+        self._times: dict[str, float] = {}
+        self._name = ""
+        self._clock = time.pthread_getcpuclockid(threading.main_thread().ident or 0)
+        self._running: tuple[object, float, float] | None = None
+        self._run = events.Handle._run
+
+    def install(self) -> None:
+        """Time every callback of every loop; to be called before there is one."""
+        run, meter = self._run, self
+
+        def timed(handle: events.Handle) -> None:
+            if not meter.watching:
+                if meter._loop is None:
+                    meter._loop = handle._loop  # type: ignore[attr-defined]
+                run(handle)
+                return
+            # The callback itself: a handle may be cancelled meanwhile, and forgets it then.
+            meter._running = handle._callback, time.perf_counter(), time.thread_time()
+            run(handle)
+            meter._took(*meter._running)
+            meter._running = None
+
+        events.Handle._run = timed  # type: ignore[method-assign]
+        gc.callbacks.append(self._collected)
+
+    def reset(self) -> None:
+        gc.collect()
+        if sys.platform == "linux":
+            ctypes.CDLL(None).malloc_trim(0)
+        self._times, self._name = {"loop": 0.0, "wall": 0.0, "stall": 0.0, "collecting": 0.0}, ""
+        self.watching = True
+        self._resets += 1
+        if self._loop is not None:
+            self._loop.call_soon_threadsafe(self._beat, self._resets, None)
+
+    def read(self) -> dict[str, float | str]:
+        self.watching = False
+        if running := self._running:  # for who knows how long
+            self._took(*running)
+        return {**self._times, "where": self._name}
+
+    def _took(self, callback: object, wall: float, cpu: float) -> None:
+        self._note("wall", time.perf_counter() - wall)
+        if self._note("loop", time.clock_gettime(self._clock) - cpu):
+            self._name = _name(callback)
+
+    def _note(self, name: str, seconds: float) -> bool:
+        largest = seconds > self._times[name]
+        if largest:
+            self._times[name] = seconds
+        return largest
+
+    def _beat(self, resets: int, before: tuple[float, float, float] | None) -> None:
+        if not self.watching or resets != self._resets:
+            return
+        now = time.perf_counter(), time.process_time(), _kept_waiting()
+        if before:
+            late, busy, waited = (b - a for a, b in zip(before, now, strict=True))
+            self._note("stall", min(late - BEAT - waited, busy))
+        if self._loop is not None:
+            self._loop.call_later(BEAT, self._beat, resets, now)
+
+    def _collected(self, phase: str, _: dict[str, int]) -> None:
+        if phase == "start":
+            self._began = time.thread_time()
+        elif self.watching and threading.current_thread() is threading.main_thread():
+            self._note("collecting", time.thread_time() - self._began)
+
+
+def _kept_waiting() -> float:
+    """Seconds for which the main thread stood ready without a processor."""
+    return int(Path("/proc/self/schedstat").read_text().split()[1]) / 1e9
+
+
+def _name(callback: object) -> str:
+    """Whose step it was: the coroutine of a task, or the function."""
+    task = getattr(callback, "__self__", None)
+    if hasattr(task, "get_coro"):
+        return str(getattr(task.get_coro(), "__qualname__", task))
+    return str(getattr(callback, "__qualname__", callback))
+
+
+def attend(meter: Meter, place: str) -> None:
+    """Answer over the socket for ever."""
+    with socket.socket(socket.AF_UNIX) as listener:
+        listener.bind(place)
+        listener.listen()
+        while True:
+            connection, _ = listener.accept()
+            with connection:
+                if connection.recv(16) == b"read":
+                    connection.sendall(json.dumps(meter.read()).encode())
+                else:
+                    meter.reset()
+                    connection.sendall(b"{}")
+
+
+def main() -> None:
+    place = sys.argv[1]
+    meter = Meter()
+    meter.install()
+    threading.Thread(target=attend, args=(meter, place), daemon=True).start()
+    # Imported only now, so that nothing of it escapes the meter.
+    from service.__main__ import main as serve
+
+    serve()
+
+
+if __name__ == "__main__":
+    os.umask(0o077)
+    main()

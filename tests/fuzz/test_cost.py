@@ -1,0 +1,55 @@
+"""What requests cost that are made up to be expensive: none is over its budget, whatever it asks for.
+
+One of each kind that is quick, the same each time, in the whole suite; ``make fuzz`` tries thousands of new ones, and
+prints the worst. ``python -m tests.fuzz`` tries single kinds and seeds.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Iterable, Iterator
+from functools import partial
+
+import pytest
+
+from tests.fuzz.cost import COSTS, Arena, serving
+from tests.fuzz.kinds import KINDS, World, made, shares
+
+EXAMPLES = int(os.environ.get("FUZZ_EXAMPLES", "0"))
+COUNTS = shares(EXAMPLES) if EXAMPLES else {name: 1 for name, kind in KINDS.items() if not kind.long}
+FIRST = int(time.time()) if EXAMPLES else 0
+
+
+@pytest.fixture(scope="module")
+def arena() -> Iterator[Arena]:
+    with serving() as arena:
+        yield arena
+
+
+@pytest.fixture(scope="module")
+def world(arena: Arena) -> World:
+    return World.of(arena.server.url)
+
+
+def try_out(name: str, seeds: Iterable[int], arena: Arena, world: World) -> None:
+    costs = [arena.try_out(name, seed, partial(made, name, seed, world)) for seed in seeds]
+    COSTS.extend(costs)
+    assert not [f"{cost.name}, seed {cost.seed}: {'; '.join(cost.over)}" for cost in costs if cost.over]
+
+
+@pytest.mark.parametrize("name", COUNTS)
+def test_no_request_is_over_its_budget(name: str, arena: Arena, world: World) -> None:
+    try_out(name, range(FIRST, FIRST + COUNTS[name]), arena, world)
+
+
+if EXAMPLES:  # these take minutes each
+
+    @pytest.fixture(scope="module")
+    def patient() -> Iterator[Arena]:
+        with serving(deadline=600) as arena:
+            yield arena
+
+    @pytest.mark.parametrize("name", [name for name, kind in KINDS.items() if kind.limit])
+    def test_what_may_be_asked_for_is_within_the_budget(name: str, patient: Arena, world: World) -> None:
+        try_out(name, [FIRST], patient, World([world.largest]))

@@ -1,0 +1,109 @@
+"""Tasks for a sandbox: good ones, and such as break what they run in."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import signal
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from service.sandbox import FailedError
+
+Answer = tuple[dict[str, Any], dict[str, np.ndarray]]
+_kept: list[bytes] = []
+
+
+def echo(body: bytearray, **facts: Any) -> Answer:
+    return facts | {"pid": os.getpid()}, {"body": np.frombuffer(body, np.uint8)}
+
+
+def double(body: bytearray) -> Answer:
+    numbers = np.frombuffer(body, "<f8").reshape(-1, 2)
+    return {}, {"twice": 2 * numbers, "turned": np.asfortranarray(numbers), "none": np.zeros((0, 3), np.int32)}
+
+
+def about(body: bytearray, file: str) -> Answer:
+    try:
+        Path(file).write_text("x")
+        written = bool(Path(file).stat().st_size)
+    except OSError:
+        written = False
+    settings = [name for name in os.environ if name.startswith("SHAPESPACE_")]
+    streams = [os.readlink(f"/proc/self/fd/{k}") for k in range(3)]
+    return {"settings": settings, "streams": streams, "written": written, "path": sys.path}, {}
+
+
+def refuse(body: bytearray) -> Answer:
+    raise FailedError("nonsense", "It is\nno mesh.")
+
+
+def mistake(body: bytearray) -> Answer:
+    return {}["missing"], {}
+
+
+def wait(body: bytearray) -> Answer:
+    time.sleep(1e6)
+    return {}, {}
+
+
+def spin(body: bytearray) -> Answer:
+    while True:
+        pass
+
+
+def hold(body: bytearray) -> Answer:
+    """Never let go of the interpreter."""
+    ctypes.PyDLL(None).pause()
+    return {}, {}
+
+
+def crash(body: bytearray) -> Answer:
+    ctypes.string_at(0)
+    return {}, {}
+
+
+def leave(body: bytearray) -> Answer:
+    sys.exit(3)
+
+
+def kill(body: bytearray) -> Answer:
+    os.kill(os.getpid(), signal.SIGKILL)
+    return {}, {}
+
+
+def take(body: bytearray, size: int) -> Answer:
+    return {"taken": len(bytearray(size))}, {}
+
+
+def keep(body: bytearray, size: int) -> Answer:
+    _kept.append(os.urandom(size))
+    return {"pid": os.getpid()}, {}
+
+
+def objects(body: bytearray) -> Answer:
+    return {}, {"pickled": np.array([{}, None], dtype=object)}
+
+
+def babble(body: bytearray) -> Answer:
+    return {"long": "x" * 2**21}, {}
+
+
+def lie(body: bytearray) -> Answer:
+    """Write into the connection, whichever handle it has."""
+    for handle in range(3, 1000):
+        try:
+            os.write(handle, b"\0\0\0\x0bnot JSON ..")
+        except OSError:
+            continue
+    return {}, {}
+
+
+def crash_at_c(body: bytearray, folder: str) -> Answer:
+    from service.trial import try_bundle
+
+    return crash(body) if Path(folder).parent.name == "c" else try_bundle(body, folder)

@@ -1,0 +1,89 @@
+"""Uploads that are made to cost: none takes more than 64 MiB beyond itself, and all are over in seconds."""
+
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import httpx
+import pytest
+
+from tests.cost import SECONDS, Costs, costs
+from tests.faults.serving import peak_memory
+from tests.hostile import BINARY, HOSTILE, MIB, MOST, chain, document, doubling, glb, graph, ring
+from tests.service.bundles import write_bundle
+from tests.service.conftest import Server, starting
+
+ENCODE = "/v1/models/small/encode"
+
+
+@pytest.fixture(scope="module")
+def cost() -> Iterator[Costs]:
+    with costs() as ask:
+        yield ask
+
+
+@pytest.mark.parametrize("name", HOSTILE)
+def test_what_reading_costs(name: str, cost: Costs) -> None:
+    said, body = HOSTILE[name](MOST)
+    assert len(body) <= MOST
+    answer = cost(body, said)
+    assert "ended" not in answer, f"more than {SECONDS} seconds of a processor, or a crash: {answer}"
+    assert answer["memory"] <= 64 * MIB, answer
+    assert "\n" not in answer["said"]
+    assert len(answer["said"]) < 400
+
+
+def test_the_reader_is_light() -> None:
+    """A process that does nothing else has no use for a server, for networks or for sparse matrices."""
+    heavy = ("fastapi", "starlette", "pydantic", "onnxruntime", "torch", "trimesh", "scipy")
+    program = f"import sys, service.uploads; print([name for name in {heavy} if name in sys.modules])"
+    told = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert told.stdout.strip() == "[]"
+
+
+@pytest.fixture(scope="module")
+def small(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
+    models = tmp_path_factory.mktemp("hostile") / "models"
+    write_bundle(models, "small")
+    with starting() as start:
+        yield start(models, workers=2)
+
+
+def processor_seconds(server: Server) -> float:
+    fields = Path(f"/proc/{server.process.pid}/stat").read_text().rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")  # user's and system's
+
+
+SPARSE = {"count": 1, "indices": {"bufferView": 1, "componentType": 5125}, "values": {"bufferView": 0}}
+ACCESSORS = [
+    {"bufferView": 0, "componentType": 5126, "type": "VEC3", "count": 4, "sparse": SPARSE},
+    {"bufferView": 1, "componentType": 5125, "type": "SCALAR", "count": 12},
+]
+#: As they were found, with their sizes in bytes, and what is said.
+GRAPHS = {
+    "a chain of 3000 nodes with matrices": (lambda: chain(3000), 230_000, "more than 100 deep"),
+    "a chain of 9,990 nodes with matrices": (lambda: chain(9990), 780_000, "more than 100 deep"),
+    "a graph of nodes": (lambda: graph(2400), 7_000_000, "bytes without data, where 4194304 are the most"),
+    "a smaller graph of nodes": (lambda: graph(800), 800_000, "lies in two others"),
+    "nodes that double": (lambda: doubling(30), 2000, "lies in two others"),
+    "a ring": (ring, 1000, "lies in another one"),
+    "a sparse accessor": (lambda: glb(document(accessors=ACCESSORS), BINARY), 1000, "sparse"),
+    "an extension": (lambda: glb(document(extensionsRequired=["EXT_x"]), BINARY), 1000, "it requires EXT_x, which"),
+}
+
+
+@pytest.mark.parametrize("name", GRAPHS)
+def test_scenes_that_brought_the_server_down(name: str, small: Server) -> None:
+    make, size, says = GRAPHS[name]
+    body = make()
+    assert 0.5 * size < len(body) < 1.2 * size
+    memory, seconds = peak_memory(small), processor_seconds(small)
+    with httpx.Client(base_url=small.url, timeout=30) as client:
+        answer = client.post(ENCODE, params={"format": "glb"}, content=body)
+        assert answer.status_code == 422
+        assert answer.json()["type"] == "urn:shapespace:problem:invalid-mesh"
+        assert says in answer.json()["detail"]
+    assert peak_memory(small) < memory + len(body) + 64 * MIB
+    assert processor_seconds(small) < seconds + 5

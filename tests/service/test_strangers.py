@@ -1,0 +1,549 @@
+"""What a stranger can send, at the sizes that once stopped the server: refused, and others are answered meanwhile."""
+
+import base64
+import contextlib
+import hashlib
+import json
+import os
+import resource
+import select
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+import zlib
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import httpx
+import pytest
+
+from service.animation import Animation, UnknownInterpolationError
+from service.connections import HEAD_BYTES, HEAD_LINES, HEAD_SECONDS, STALL_SECONDS
+from tests.faults.serving import peak_memory
+from tests.service.conftest import ROOT, Server, Start
+from tests.service.watching import ENDING, eventually, samples, value
+from tests.service.wire import connect, exchange, rest, status_and_problem
+
+MIB = 2**20
+MODEL = "/v1/models/small"
+JSON = {"Content-Type": "application/json"}
+CODE = [0.1, 0.7, 0.4]
+
+
+@pytest.fixture
+def quiet(models: Path, start: Start) -> Server:
+    """A server of its own, so that its memory is its own."""
+    server = start(models, workers=2)
+    httpx.post(f"{server.url}{MODEL}/mesh", json={"latent": CODE}, timeout=60).raise_for_status()
+    return server
+
+
+@contextlib.contextmanager
+def cheap(server: Server, most: int = 64 * MIB) -> Iterator[None]:
+    """Memory doesn't grow by more than that, and nothing goes wrong."""
+    before = peak_memory(server)
+    yield
+    assert peak_memory(server) - before < most
+    assert httpx.get(f"{server.url}/v2/health/live").status_code == 200
+    assert "Traceback" not in server.log
+
+
+# Heads and trailers
+
+
+@pytest.mark.parametrize("line", [b"a: b\r\n", b"a" * 1000, b"a: " + b"b" * 1000, b"\r\n"])
+def test_a_head_without_end_is_refused(quiet: Server, line: bytes) -> None:
+    with cheap(quiet), connect(quiet) as connection:
+        connection.sendall(b"GET / HTTP/1.1\r\nHost: localhost\r\n" if line != b"\r\n" else b"")
+        told = keep_sending(connection, line * 100, 200 * MIB)
+    if line != b"\r\n":
+        status, problem = status_and_problem(told)
+        assert (status, problem["type"]) == (431, "urn:shapespace:problem:head-too-large")
+        with httpx.Client(base_url=quiet.url) as client:
+            assert value(samples(client), "shapespace_refusals_total", kind="head-too-large") == 1
+        assert "refused without a whole request: The head" in quiet.log
+
+
+def keep_sending(connection: socket.socket, block: bytes, most: int) -> bytes:
+    """Send without looking, until the server closes; what it said."""
+    with contextlib.suppress(ConnectionError):
+        for _ in range(most // len(block)):
+            connection.sendall(block)
+            if select.select([connection], [], [], 0)[0]:
+                break
+        else:
+            raise AssertionError("all of it was taken")
+    return rest(connection)
+
+
+@pytest.mark.parametrize("line", [b"x: y\r\n", b"x", b""])
+def test_trailers_without_end_are_refused(quiet: Server, line: bytes) -> None:
+    head = b"POST %s/mesh HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\n" % MODEL.encode()
+    head += b"Transfer-Encoding: chunked\r\n\r\n"
+    with cheap(quiet), connect(quiet) as connection:
+        connection.sendall(head + (b"0\r\n" if line else b"2;x="))
+        told = keep_sending(connection, (line or b"extension") * 1000, 200 * MIB)
+    assert told.startswith(b"HTTP/1.1 431")
+
+
+def test_requests_that_wait_on_one_connection_are_limited(quiet: Server) -> None:
+    request = b"GET /v1/models HTTP/1.1\r\nHost: localhost\r\n\r\n"
+    with connect(quiet) as connection:
+        connection.sendall(request * 20 + request.replace(b"\r\n\r\n", b"\r\nConnection: close\r\n\r\n"))
+        assert rest(connection).count(b"HTTP/1.1 200") == 21
+    with cheap(quiet, 16 * MIB), connect(quiet) as connection:
+        last = request.replace(b"\r\n\r\n", b"\r\nConnection: close\r\n\r\n")
+        connection.sendall(request * 3000 + last)
+        assert rest(connection).count(b"HTTP/1.1 200") == 3001, "each in its turn"
+
+
+def test_trailers_are_no_headers(quiet: Server) -> None:
+    body = b'{"latent":[0.1,0.7,0.4]}'
+    head = b"POST %s/mesh HTTP/1.1\r\nHost: localhost\r\nTransfer-Encoding: chunked\r\n\r\n" % MODEL.encode()
+    chunk = b"%x\r\n%s\r\n0\r\nContent-Type: application/json\r\nConnection: close\r\n\r\n" % (len(body), body)
+    with connect(quiet) as connection:
+        connection.sendall(head + chunk)
+        assert connection.recv(12) == b"HTTP/1.1 415"
+
+
+def test_a_head_within_the_limits_is_read(quiet: Server) -> None:
+    lines = {f"X-{k}": "y" * ((HEAD_BYTES - 4000) // (HEAD_LINES - 10)) for k in range(HEAD_LINES - 10)}
+    assert httpx.get(f"{quiet.url}/v1/models", headers=lines).status_code == 200
+
+
+def test_what_is_not_http_gets_a_problem(quiet: Server) -> None:
+    status, problem = status_and_problem(exchange(quiet, b"\x16\x03\x01\x02\x00\x01\x00\x01\xfc\x03\x03\r\n\r\n"))
+    assert (status, problem["type"]) == (400, "urn:shapespace:problem:malformed-request")
+
+
+@pytest.mark.parametrize("hosts", [[], ["localhost", "localhost"], ["a.example"], ["a.example:80"]])
+def test_a_request_says_once_whom_it_is_for(quiet: Server, hosts: list[str]) -> None:
+    lines = "".join(f"Host: {host}\r\n" for host in hosts)
+    answer = exchange(quiet, f"GET /v1/models HTTP/1.1\r\n{lines}Connection: close\r\n\r\n".encode())
+    status, problem = status_and_problem(answer)
+    assert status == (421 if len(hosts) == 1 else 400), problem
+
+
+def test_hosts_can_be_named(models: Path, start: Start) -> None:
+    server = start(models, hosts="shapes.example, localhost")
+    for host, status in (("shapes.example", 200), ("Shapes.example:8000", 200), ("a.example", 421)):
+        assert httpx.get(f"{server.url}/v1/models", headers={"Host": host}).status_code == status
+        assert httpx.get(f"{server.url}/v2/health/live", headers={"Host": host}).status_code == 200
+
+
+def test_with_a_key_any_name_will_do(models: Path, start: Start) -> None:
+    server = start(models, api_key="open sesame")
+    headers = {"Host": "a.example", "X-API-Key": "open sesame"}
+    assert httpx.get(f"{server.url}/v1/models", headers=headers).status_code == 200
+
+
+# Connections
+
+
+def test_connections_are_limited_and_one_address_leaves_some(models: Path, start: Start) -> None:
+    server = start(models, max_connections=8)
+    with contextlib.ExitStack() as stack:
+        taken = [stack.enter_context(connect(server)) for _ in range(6)]
+        status, problem = status_and_problem(rest(stack.enter_context(connect(server))))
+        assert (status, problem["type"]) == (503, "urn:shapespace:problem:busy")
+        with connect(server, "127.0.0.2") as other:
+            other.sendall(b"GET /v1/models HTTP/1.1\r\nHost: localhost\r\n\r\n")
+            assert other.recv(15) == b"HTTP/1.1 200 OK"
+        for connection in taken:
+            connection.close()
+    eventually(lambda: httpx.get(f"{server.url}/v1/models").status_code == 200)
+    with httpx.Client(base_url=server.url) as client:
+        assert value(samples(client), "shapespace_connections_limit") == 8
+
+
+def test_the_end_of_file_handles_is_told_once_a_second(models: Path) -> None:
+    environment = os.environ | {"SHAPESPACE_MODELS_DIR": str(models), "SHAPESPACE_PORT": "0", "SHAPESPACE_WATCH": "0"}
+    log = models.parent / "handles.log"
+    with (
+        log.open("w") as lines,
+        subprocess.Popen(
+            [sys.executable, "-m", "service"],
+            cwd=ROOT,
+            env=environment | {"SHAPESPACE_MAX_CONNECTIONS": "100000"},
+            stdout=subprocess.PIPE,
+            stderr=lines,
+            text=True,
+        ) as process,
+    ):
+        assert process.stdout
+        address = process.stdout.readline().split()[-1].rstrip("/")
+        # Lowered only now: the limit on connections, which goes by it, would not let it come to that.
+        resource.prlimit(process.pid, resource.RLIMIT_NOFILE, (handles(process.pid) + 20, 4096))
+        began = time.monotonic()
+        place = httpx.URL(address)
+        with contextlib.ExitStack() as stack:
+            for _ in range(300):
+                with contextlib.suppress(OSError):
+                    stack.enter_context(socket.create_connection((place.host, place.port), timeout=5))
+            time.sleep(2)
+            seconds = time.monotonic() - began
+        eventually(lambda: answers(address))
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(60) == 0
+    text = log.read_text()
+    told = text.count("out of file handles")
+    assert 1 <= told <= seconds + 2
+    assert "Traceback" not in text
+    assert len(text) < 10_000
+
+
+def handles(pid: int) -> int:
+    return max(int(name) for name in os.listdir(f"/proc/{pid}/fd"))
+
+
+def answers(address: str) -> bool:
+    with contextlib.suppress(httpx.HTTPError):
+        return httpx.get(f"{address}/v2/health/live", timeout=5).status_code == 200
+    return False
+
+
+def test_who_sends_no_head_is_let_go(quiet: Server) -> None:
+    """But for those whose last request is still being answered."""
+    card = httpx.get(f"{quiet.url}/v1/models/figure").json()
+    path = {"keyframes": [card["lower"], card["upper"]], "frames": 600}
+    link = httpx.post(f"{quiet.url}/v1/models/figure/interpolations", json=path).json()["links"]["jsonl"]
+    began = time.monotonic()
+    with connect(quiet) as silent, connect(quiet) as slow, connect(quiet) as reading:
+        reading.sendall(b"GET %s HTTP/1.1\r\nHost: localhost\r\n\r\n\r\nGET /" % link.encode())
+        slow.sendall(b"GET / HTTP/1.1\r\nHo")
+        assert rest(silent) == b""
+        status, problem = status_and_problem(rest(slow))
+        assert (status, problem["type"]) == (408, "urn:shapespace:problem:request-timeout")
+        assert time.monotonic() - began > HEAD_SECONDS - 1
+        time.sleep(3)
+        assert b" 408 " not in reading.recv(MIB)
+        select.select([reading], [], [], 10)
+        assert reading.recv(MIB), "it goes on"
+
+
+def test_who_sends_no_body_is_let_go_by_the_deadline(models: Path, start: Start) -> None:
+    server = start(models, deadline=2)
+    with connect(server) as slow:
+        slow.sendall(b"POST %s/mesh HTTP/1.1\r\nHost: localhost\r\n" % MODEL.encode())
+        slow.sendall(b"Content-Type: application/json\r\nContent-Length: 100\r\n\r\n{")
+        status, problem = status_and_problem(rest(slow))
+    assert (status, problem["type"]) == (408, "urn:shapespace:problem:request-timeout")
+    assert "Traceback" not in server.log
+
+
+# Bodies
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        b'{"latent":[' + b'"",' * (8 * MIB // 3 - 10) + b'""]}',
+        b'{"latent":[' + b"[]," * (8 * MIB // 3 - 10) + b"[]]}",
+        b"{" + b",".join(b'"%07d":{}' % k for k in range(600_000)) + b"}",
+        b'{"latents":' + b"[" * 4_000_000 + b"]" * 4_000_000 + b"}",
+        b'{"latent":[0.1,0.7,0.4],"mesh":"' + b"\\u00e4" * 1_300_000 + b'"}',
+        b'{"latent":["' + b'","' * 80_000 + b'"]}',
+        b"{" + b",".join(b'"%07d":0' % k for k in range(80_000)) + b"}",
+        b'{"latent":[' + b"9" * MIB + b"]}",
+        b'{"latent":[0,' + b" " * 8_000_000 + b'"a"]}',
+    ],
+    ids=["texts", "lists", "members", "nested", "escapes", "short texts", "few members", "digits", "blanks"],
+)
+def test_a_body_of_many_faults_costs_little(quiet: Server, body: bytes) -> None:
+    with cheap(quiet), httpx.Client(base_url=quiet.url, timeout=60) as client:
+        for path in (f"{MODEL}/mesh", f"{MODEL}/vertices", f"{MODEL}/interpolations", f"{MODEL}/edit"):
+            answer = client.post(path, content=body, headers=JSON)
+            assert answer.status_code in {400, 413, 422}
+            assert len(answer.json().get("errors", [])) <= 10
+            assert len(answer.content) < 40_000
+        assert client.post("/v2/models/small/infer", content=body, headers=JSON).status_code in {400, 413, 422}
+
+
+def test_health_answers_while_large_bodies_are_read(quiet: Server) -> None:
+    body = b'{"latent":[' + b'"",' * (8 * MIB // 3 - 10) + b'""]}'
+    stop, slowest = threading.Event(), [0.0]
+
+    def look() -> None:
+        with httpx.Client(base_url=quiet.url, timeout=60) as client:
+            while not stop.is_set():
+                began = time.monotonic()
+                assert client.get("/v2/health/live").status_code == 200
+                slowest[0] = max(slowest[0], time.monotonic() - began)
+
+    with cheap(quiet, 256 * MIB), ThreadPoolExecutor(5) as pool:
+        looking = pool.submit(look)
+        posts = [pool.submit(httpx.post, f"{quiet.url}{MODEL}/mesh", content=body, headers=JSON) for _ in range(8)]
+        assert {post.result().status_code for post in posts} <= {413, 503}
+        stop.set()
+        looking.result()
+    # It took half a minute; a second is what orchestrators wait.
+    assert slowest[0] < 1
+
+
+def test_inference_of_eight_mebibytes_of_numbers_is_refused_by_its_shape(quiet: Server) -> None:
+    numbers = [0.5] * 600_000
+    for data, shape in ((numbers[:60_000], [20_000, 3]), (numbers, [200_000, 3]), (numbers[:9], [1, 3])):
+        tensor = {"name": "latent", "shape": shape, "datatype": "FP32", "data": data}
+        with cheap(quiet):
+            answer = httpx.post(f"{quiet.url}/v2/models/small/infer", json={"inputs": [tensor]}, timeout=60)
+        assert answer.status_code in {413, 422}
+
+
+def test_codes_of_another_length_are_refused_as_bytes(quiet: Server) -> None:
+    for shape in ([1, 2_000_000], [256, 8000]):
+        length = 4 * shape[0] * shape[1]
+        tensor = {"name": "latent", "shape": shape, "datatype": "FP32", "parameters": {"binary_data_size": length}}
+        text = json.dumps({"inputs": [tensor]}).encode()
+        headers = {"Inference-Header-Content-Length": str(len(text)), "Content-Type": "application/octet-stream"}
+        with cheap(quiet, 32 * MIB):
+            url = f"{quiet.url}/v2/models/small/infer"
+            answer = httpx.post(url, content=text + bytes(length), headers=headers, timeout=60)
+        assert (answer.status_code, answer.json()["type"]) == (422, "urn:shapespace:problem:wrong-length")
+
+
+def test_bodies_are_limited_together(models: Path, start: Start) -> None:
+    server = start(models, max_upload=4 * MIB, max_body=1000)
+    head = b"POST %s/encode?format=obj HTTP/1.1\r\nHost: localhost\r\nContent-Length: %d\r\n\r\n"
+    with contextlib.ExitStack() as stack:
+        senders = [stack.enter_context(connect(server)) for _ in range(6)]
+        for sender in senders:
+            sender.sendall(head % (MODEL.encode(), 4 * MIB))
+            sender.sendall(bytes(4 * MIB - 1))
+        refused = select.select(senders, [], [], 10)[0]
+        assert refused, "24 MiB are over the limit of 16, of which one address has 12"
+        assert {sender.recv(12) for sender in refused} == {b"HTTP/1.1 503"}
+
+
+# Streams
+
+
+def test_readers_who_do_not_read_keep_nobody_waiting(models: Path, start: Start) -> None:
+    server = start(models, workers=2)
+    with httpx.Client(base_url=server.url, timeout=60) as client, contextlib.ExitStack() as stack:
+        card = client.get("/v1/models/figure").json()  # whose frames are larger than what the system keeps for a socket
+        path = {"keyframes": [card["lower"], card["upper"]], "frames": 200}
+        link = client.post("/v1/models/figure/interpolations", json=path).json()["links"]["jsonl"]
+        for _ in range(34):
+            reader = stack.enter_context(connect(server))
+            reader.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+            reader.sendall(f"GET {link} HTTP/1.1\r\nHost: localhost\r\n\r\n".encode())
+        eventually(lambda: value(samples(client), "shapespace_streams") == 26)  # three quarters, for one address
+        for _ in range(20):
+            assert client.post(f"{MODEL}/mesh", json={"latent": CODE}).status_code == 200
+        with connect(server, "127.0.0.2") as other:
+            other.sendall(f"GET {link} HTTP/1.1\r\nHost: localhost\r\n\r\n".encode())
+            assert other.recv(15) == b"HTTP/1.1 200 OK"
+        # And in the end they are let go.
+        eventually(lambda: value(samples(client), "shapespace_streams") == 0, STALL_SECONDS + 40)
+    assert "Traceback" not in server.log
+
+
+# Ids
+
+
+def forged(payload: bytes) -> str:
+    packed = hashlib.sha256(payload).digest()[:9] + zlib.compress(payload, 9)
+    return base64.urlsafe_b64encode(packed).rstrip(b"=").decode()
+
+
+@pytest.mark.parametrize(
+    "keyframes",
+    ["[" + "[]," * 349_500 + "[]]", "[" + "[1,2,3]," * 5000 + "[1,2,3]]", "[" * 60_000 + "]" * 60_000],
+    ids=["empty", "many", "deep"],
+)
+def test_a_forged_id_is_not_unpacked_further_than_ids_go(quiet: Server, keyframes: str) -> None:
+    id = forged(b'{"frames":30,"keyframes":%s,"model":"%s"}' % (keyframes.encode(), b"0" * 32))
+    assert len(id) < 15_000
+    with cheap(quiet, 8 * MIB):
+        assert httpx.get(f"{quiet.url}/v1/interpolations/{id}").status_code == 404
+    began = time.thread_time()
+    for _ in range(20):
+        with pytest.raises(UnknownInterpolationError):
+            Animation.from_id(id)
+    assert (time.thread_time() - began) / 20 < 0.005, "an id costs 5 ms of the event loop at most"
+
+
+def test_the_costliest_id_costs_little() -> None:
+    numbers = ",".join(f"[{k % 10}.5,{k % 7}.25,{k % 3}.125,0]" for k in range(1000))
+    id = forged(b'{"frames":30,"keyframes":[%s],"model":"%s"}' % (numbers.encode(), b"0" * 32))
+    began = time.thread_time()
+    for _ in range(20):
+        assert len(Animation.from_id(id)[0].keyframes) == 1000
+    assert (time.thread_time() - began) / 20 < 0.005
+
+
+# The rest
+
+
+@pytest.mark.parametrize(
+    ("method", "path"),
+    [
+        ("GET", f"{MODEL}/mesh?formt=obj"),
+        ("POST", f"{MODEL}/mesh?latent=1,2,3"),
+        ("POST", f"{MODEL}/nric?mesh=coarse"),
+        ("GET", "/v1/models?page=2"),
+        ("POST", "/v2/models/small/infer?x"),
+        ("GET", "/metrics?name=a"),
+        ("HEAD", f"{MODEL}?versoin=1"),
+    ],
+)
+def test_unknown_query_parameters_are_named(client: httpx.Client, method: str, path: str) -> None:
+    answer = client.request(method, path, json={} if method == "POST" else None)
+    assert answer.status_code == 422
+    if method != "HEAD":
+        unknown = path.partition("?")[2].partition("=")[0]
+        assert f"no query parameter {unknown!r}" in answer.json()["detail"]
+
+
+def test_the_mesh_of_a_post_may_stand_in_the_query(client: httpx.Client) -> None:
+    model = "/v1/models/with-fine"
+    for path, body in (("mesh", {"latent": CODE}), ("vertices", {"latents": [CODE]})):
+        asked = client.post(
+            f"{model}/{path}?mesh=coarse&format=json" if path == "mesh" else f"{model}/{path}?mesh=coarse", json=body
+        )
+        told = client.post(f"{model}/{path}", params={"format": "json"}, json=body | {"mesh": "coarse"})
+        assert asked.json() == told.json()
+    answer = client.post(f"{model}/interpolations?mesh=coarse", json={"keyframes": [CODE, CODE], "frames": 2})
+    assert len(client.get(answer.json()["links"]["jsonl"]).text.splitlines()) == 2
+    coarse = client.get(f"{answer.json()['links']['self']}/frames/0?format=json").json()["vertices"]
+    assert len(coarse) < len(client.get(f"{model}/mesh?format=json").json()["vertices"])
+    edit = {"latent": CODE, "targets": [{"vertex": len(coarse), "position": [0, 0, 0]}]}
+    assert client.post(f"{model}/edit", json=edit).status_code == 200
+    assert client.post(f"{model}/edit?mesh=coarse", json=edit).status_code == 422
+
+
+def test_any_star_matches_nothing(client: httpx.Client) -> None:
+    star = {"If-None-Match": "*"}
+    assert client.post(f"{MODEL}/mesh", json={"latent": CODE}, headers=star).status_code == 200
+    assert client.get(f"{MODEL}/mesh?latent=0.1,1e30,0.4", headers=star).status_code in {200, 422}
+    assert client.get(f"{MODEL}/mesh?latent=3.4e38,0,3.4e38", headers=star).status_code == 422
+
+
+def test_answers_are_what_they_say(client: httpx.Client) -> None:
+    for path in ("/", "/page/page.css", "/v1/models", "/nothing", f"{MODEL}/mesh"):
+        assert client.get(path).headers["X-Content-Type-Options"] == "nosniff"
+
+
+def test_a_problem_does_not_repeat_what_it_was_sent(client: httpx.Client) -> None:
+    long = "x/" + "y" * 20_000
+    for answer in (
+        client.get(f"{MODEL}/mesh", headers={"Accept": long}),
+        client.get(f"{MODEL}/mesh", params={"format": long}),
+        client.get(f"{MODEL}/mesh", params={long: "1"}),
+        client.get(f"/v1/models/{'y' * 20_000}"),
+        client.post(f"{MODEL}/mesh", content=b"{}", headers={"Content-Type": long}),
+        client.post(f"{MODEL}/mesh", json={"latent": CODE, long: 1}),
+        client.post(f"{MODEL}/mesh", content=b'{"latent":[1],"\\ud800":1}', headers=JSON),
+    ):
+        assert 400 <= answer.status_code < 500
+        assert len(answer.content) < 6000
+
+
+def test_an_accept_of_thousands_of_ranges_is_read_in_part(client: httpx.Client) -> None:
+    many = ",".join(["a/b;q=0.1"] * 2500)
+    assert client.get(f"{MODEL}/mesh", headers={"Accept": f"model/obj,{many}"}).headers["Content-Type"] == "model/obj"
+    assert client.get(f"{MODEL}/mesh", headers={"Accept": f"{many},model/obj"}).status_code == 406
+
+
+def test_a_head_is_logged_as_one(models: Path, start: Start) -> None:
+    server = start(models)
+    assert httpx.head(f"{server.url}/v1/models").status_code == 200
+    assert "HEAD /v1/models 200" in server.stop()
+
+
+@pytest.mark.parametrize("key", ["line\nbreak", "schlüssel", " padded"])
+def test_a_key_that_no_header_can_carry_is_refused_at_the_start(models: Path, key: str) -> None:
+    found = subprocess.run(
+        [sys.executable, "-m", "service"],
+        cwd=ROOT,
+        env=os.environ | {"SHAPESPACE_API_KEY": key, "SHAPESPACE_MODELS_DIR": str(models)},
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=60,
+    )
+    assert found.returncode == 2
+    assert found.stderr.startswith("SHAPESPACE_API_KEY: ")
+    assert key not in found.stderr
+
+
+def test_a_server_for_all_says_that_it_has_no_key(models: Path, start: Start) -> None:
+    assert "there is no key" in start(models, host="0.0.0.0").stop()  # noqa: S104 - that is what is tried
+    assert "no key" not in start(models).stop()
+
+
+def test_keys_after_a_wrong_one_wait_their_turn(models: Path, start: Start) -> None:
+    server = start(models, api_key="open sesame")
+
+    def ask(key: str) -> int:
+        return httpx.get(f"{server.url}/v1/models", headers={"X-API-Key": key}, timeout=60).status_code
+
+    with ThreadPoolExecutor(40) as pool:
+        began = time.monotonic()
+        found = list(pool.map(ask, [f"guess {k}" for k in range(200)]))
+        seconds = time.monotonic() - began
+        assert set(found) == {401, 503}
+        assert found.count(401) < 10 * seconds + 15, "ten a second, and those of the first second"
+    # Who doesn't wait for answers finds out no sooner, even with the right key.
+    for key in [b"guess"] * 50 + [b"open sesame"]:
+        with connect(server) as impatient:
+            impatient.sendall(b"GET /v1/models HTTP/1.1\r\nHost: localhost\r\nX-API-Key: %s\r\n\r\n" % key)
+            readable, _, _ = select.select([impatient], [], [], 0.02)
+            assert not readable or b" 200 " not in impatient.recv(100)
+    eventually(lambda: ask("open sesame") == 200)
+    assert ask("") == 401
+
+
+def test_an_edit_ends_when_its_client_leaves(models: Path, start: Start) -> None:
+    server = start(models, workers=1, queue=0)
+    card = httpx.get(f"{server.url}/v1/models/figure").json()
+    targets = [{"vertex": k, "position": [k % 7, -3.0, 5.0]} for k in range(0, card["vertices"] // 2, 3)]
+    body = json.dumps({"latent": card["upper"], "targets": targets, "prior": 0}).encode()
+    head = b"POST /v1/models/figure/edit HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\n"
+    with httpx.Client(base_url=server.url, timeout=60) as client:
+        with connect(server) as leaving:
+            leaving.sendall(head + b"Content-Length: %d\r\n\r\n" % len(body) + body)
+            eventually(lambda: value(samples(client), "shapespace_admitted") == 1)
+        eventually(lambda: value(samples(client), "shapespace_admitted") == 0, 5)
+        assert client.post(f"{MODEL}/mesh", json={"latent": CODE}).status_code == 200
+    log = server.stop()
+    assert "/v1/models/figure/edit 499" in log
+    assert "Traceback" not in log
+
+
+@pytest.mark.parametrize("busy", ["shapes", "streams", "nothing"])
+def test_sigterm_ends_it_soon_whatever_it_is_doing(models: Path, start: Start, busy: str) -> None:
+    server = start(models, workers=2, max_codes=1000)
+    card = httpx.get(f"{server.url}/v1/models/figure").json()
+    calls: list[Callable[[], object]] = []
+    if busy == "shapes":
+        calls = [
+            lambda: httpx.post(
+                f"{server.url}/v1/models/figure/vertices", json={"latents": [card["upper"]] * 700}, timeout=60
+            )
+        ] * 4
+    elif busy == "streams":
+        path = {"keyframes": [card["lower"], card["upper"]], "frames": 600}
+        answer = httpx.post(f"{server.url}/v1/models/figure/interpolations", json=path)
+        link = server.url + answer.json()["links"]["jsonl"]
+        calls = [lambda: httpx.get(link, timeout=60)] * 4
+    with ThreadPoolExecutor(4) as pool:
+        asked = [pool.submit(call) for call in calls]
+        time.sleep(2)
+        began = time.monotonic()
+        server.process.send_signal(signal.SIGTERM)
+        assert server.process.wait(60) == 0
+        assert time.monotonic() - began < 2 * ENDING, "there is no drain here; a busy machine is given as long again"
+        for call in asked:
+            answer = call.result()
+            assert isinstance(answer, httpx.Response)
+            if busy == "shapes":
+                assert (answer.status_code, answer.json()["type"]) == (503, "urn:shapespace:problem:not-ready")
+                assert "Retry-After" in answer.headers
+            else:
+                assert json.loads(answer.text.splitlines()[-1])["problem"]["status"] == 503
+    assert "Traceback" not in server.log
