@@ -110,7 +110,7 @@ def open_run(name: str, data: Path, out: Path) -> Run:
 def study(name: str, run: Run) -> None:
     """Everything of one run that isn't there yet."""
     print(f"\n{name}")
-    execute(run, "evaluation" if name in CONTRASTS else None)
+    execute(run, "evaluation" if name in CONTRASTS else None, keep_going=True)
     if name in COLLECTIONS and not (run.folder / "space.json").exists():
         print("space …")
         write_json(run.folder / "space.json", space.measure(run.folder, run.config))

@@ -3,22 +3,70 @@
 from __future__ import annotations
 
 import argparse
+import os
 import shlex
+import shutil
 import sys
+import tempfile
+import traceback
 from pathlib import Path
 
 from training import init
 from training.config import ConfigError, load
+from training.discovery import MeanError
 from training.export import ExportError
 from training.factors import FactorError
 from training.ingest import IngestError
+from training.losses import LostTooMuchError
 from training.modes import ModeError
-from training.pipeline import STAGES, Run, execute
+from training.pipeline import STAGES, OldRunError, Run, execute
 from training.record import Record, ReportError
 from training.report import write_report
+from training.sampling import SamplesError
 from training.workers import WorkersError
 
-FAILURE = 1
+#: Exit codes: a fault of the input or of the machine, one of ours (EX_SOFTWARE), and Ctrl+C as shells have it.
+FAILURE, DEFECT, STOPPED = 1, 70, 130
+#: What is a sentence already.
+EXPECTED = (
+    ConfigError,
+    ExportError,
+    FactorError,
+    IngestError,
+    LostTooMuchError,
+    MeanError,
+    ModeError,
+    OldRunError,
+    ReportError,
+    SamplesError,
+    WorkersError,
+    OSError,
+)
+#: The folder that holds the Makefile, where this is no installed package.
+HOME = Path(__file__).parents[1]
+
+
+def _here(path: Path) -> str:
+    """A path for the command line of who stands in the working directory."""
+    near = os.path.relpath(path)
+    return shlex.quote(str(path.resolve()) if near.startswith(os.path.join("..", "..")) else near)
+
+
+def _program() -> str:
+    """This command, so that it can be called again from here."""
+    called = Path(sys.argv[0])
+    if called.name != "shapespace-train":
+        return f"{shlex.quote(sys.executable)} -m training"
+    return called.name if shutil.which(called.name) else _here(called)
+
+
+def _serving(models: Path) -> str:
+    """The command that serves a folder of bundles."""
+    setting = f"SHAPESPACE_MODELS_DIR={shlex.quote(str(models.resolve()))} "
+    if not (HOME / "Makefile").is_file():
+        return f"{setting}shapespace-serve"
+    where = "" if Path.cwd() == HOME else f" -C {_here(HOME)}"
+    return f"{'' if models.resolve() == HOME / 'models' else setting}make{where} serve"
 
 
 def _open(folder: Path, models: Path) -> Run:
@@ -32,15 +80,31 @@ def _init(arguments: argparse.Namespace) -> None:
     out, collection = init.write(arguments.meshes, arguments.out, force=arguments.force)
     shapes, vertices = collection.vertices.shape[:2]
     print(f"{out}: for {shapes} shapes of {vertices} vertices and {len(collection.faces)} faces")
-    for note in collection.notes:
+    for note in (*collection.notes, *(warned.sentence for warned in collection.warnings)):
         print(f"  {note}")
-    print(f"Next: shapespace-train run {shlex.quote(str(out))}")
+    accept = " ".join(shlex.quote(warned.name) for warned in collection.warnings if warned.grave)
+    if accept:
+        print(f"A run would stop at {accept}: mend or remove these, or take them as they are with --accept {accept}")
+    print(f"Next: {_program()} run {_here(out)}")
 
 
 def _run(arguments: argparse.Namespace) -> None:
     config, source = load(arguments.config, arguments.data, arguments.fractions)
-    folder = arguments.out or Path("runs") / arguments.config.stem
-    execute(Run(folder, config, source, arguments.models, arguments.scheduler), arguments.until)
+    folder = _folder(arguments)
+    run = Run(folder, config, source, arguments.models, arguments.scheduler, arguments.accept)
+    again = " ".join([_program(), *map(shlex.quote, sys.argv[1:])])
+    execute(run, arguments.until, keep_going=arguments.keep_going, command=again)
+    if arguments.until not in (None, "export"):
+        print(f"Done up to {arguments.until}; the same command without --until goes on from there")
+    else:
+        print(f"{_here(run.bundle)} is ready. Next: {_serving(run.models)}")
+
+
+def _folder(arguments: argparse.Namespace) -> Path:
+    """The run directory of a command line; of ``init`` there is none."""
+    if "run" in arguments:
+        return Path(arguments.run)
+    return Path(arguments.out or Path("runs") / arguments.config.stem)
 
 
 def _status(arguments: argparse.Namespace) -> None:
@@ -57,7 +121,9 @@ def _report(arguments: argparse.Namespace) -> None:
 
 
 def _export(arguments: argparse.Namespace) -> None:
-    execute(_open(arguments.run, arguments.models))
+    run = _open(arguments.run, arguments.models)
+    execute(run, keep_going=True)
+    print(f"{_here(run.bundle)} is ready. Next: {_serving(run.models)}")
 
 
 def parser() -> argparse.ArgumentParser:
@@ -85,6 +151,17 @@ def parser() -> argparse.ArgumentParser:
     run.add_argument("--out", type=Path, metavar="DIR", help="run directory (default: runs/ and the config's name)")
     run.add_argument("--until", choices=list(STAGES), metavar="STAGE", help=f"last stage to do: {', '.join(STAGES)}")
     run.add_argument("--scheduler", metavar="ADDRESS", help="Dask scheduler whose workers draw the samples")
+    run.add_argument(
+        "--accept",
+        nargs="+",
+        action="extend",
+        default=[],
+        metavar="FILE",
+        help="take these shapes though their size or the order of their vertices is another than that of the others",
+    )
+    run.add_argument(
+        "--keep-going", action="store_true", help="go on where more than a quarter of logarithms or samples are lost"
+    )
     run.set_defaults(do=_run)
 
     status = commands.add_parser("status", help="which stages of a run are done")
@@ -100,17 +177,38 @@ def parser() -> argparse.ArgumentParser:
     return top
 
 
+def _keep_traceback(arguments: argparse.Namespace) -> Path:
+    """Write the traceback of what is being handled into the run directory, or where there is none elsewhere."""
+    text = traceback.format_exc()
+    try:
+        path = (Path(tempfile.mkdtemp()) if "meshes" in arguments else _folder(arguments)) / "traceback.txt"
+        path.write_text(text, encoding="utf-8")
+    except OSError:
+        path = Path(tempfile.mkdtemp()) / "traceback.txt"
+        path.write_text(text, encoding="utf-8")
+    return path
+
+
 def main() -> int:
-    """Run the command; faults of the user's making are one message, not a traceback."""
+    """Run the command; whatever happens, the end is a message and not a traceback."""
     arguments = parser().parse_args()
     try:
         arguments.do(arguments)
-    except (ConfigError, ExportError, FactorError, IngestError, ModeError, ReportError, WorkersError, OSError) as error:
+    except EXPECTED as error:
         print(f"shapespace-train: {error}", file=sys.stderr)
         return FAILURE
     except KeyboardInterrupt:
         print("\nshapespace-train: stopped; the same command continues here", file=sys.stderr)
-        return 130
+        return STOPPED
+    except Exception as error:
+        what = " ".join(str(error).split())[:300]
+        print(
+            f"shapespace-train: something went wrong that should not have: {type(error).__name__}: {what}\n"
+            f"Please report it with {_here(_keep_traceback(arguments))}, which says where; the same command tries the "
+            "stage again",
+            file=sys.stderr,
+        )
+        return DEFECT
     return 0
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import tomlkit
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from geometry.energy import Material
 from geometry.reconstruction import DEFAULT_ETA
@@ -19,6 +19,12 @@ Neighbourhood = Literal["star", "flaps"]
 
 #: Of each factor, where the configuration doesn't say: a factor has few modes.
 FACTOR_SAMPLES = 1000
+
+
+def _grid(nodes: int) -> int:
+    if 0 < nodes < 3:
+        raise ValueError("a grid has at least 3 nodes per coordinate, and 0 leaves it out")
+    return nodes
 
 
 class ConfigError(ValueError):
@@ -37,7 +43,7 @@ class CollectionSettings(_Section):
     """Folder of OBJ, PLY, STL, OFF or glTF files, or one NPZ file with ``vertices`` (n, V, 3) and ``faces``; relative
     to the configuration's own folder. The command's ``--data`` goes before."""
     reference: str | None = None
-    """Name of the mesh whose area becomes 1 and whose connectivity is coarsened; None takes the first."""
+    """Name of the mesh whose area becomes 1 and where served shapes stand; None takes the most central one."""
     coarse_vertices: int = Field(1000, ge=0)
     """Vertices to compute with, where the meshes have more; 0 computes with all of them."""
 
@@ -193,10 +199,11 @@ class EvaluationSettings(_Section):
     """How the test split is measured."""
 
     eta: float = Field(1e-2, gt=0)
-    grid_nodes: int = Field(16, ge=2)
-    """Nodes per coordinate of the multilinear grid of Sassen et al. 2020, at most."""
+    grid_nodes: Annotated[int, Field(ge=0), AfterValidator(_grid)] = 0
+    """Nodes per coordinate, at most, of the multilinear grid of Sassen et al. 2020, a baseline whose nodes may take as
+    long as all samples; 0 leaves it out."""
     grid_size: int = Field(1000, ge=1)
-    """Nodes of the grid of one factor, at most; where that leaves fewer than 3 per coordinate there is no grid."""
+    """Nodes of the grid of one factor, at most; where that leaves fewer than 3 per coordinate there is none."""
     exact_factors: int = Field(200, ge=2)
     """Test codes whose factors' own exponentials are computed, for the affine sum of exact factors."""
     reconstructions: int = Field(100, ge=1)

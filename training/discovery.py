@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import itertools
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,16 +16,18 @@ import numpy as np
 from geometry.calculus import ShellSpace
 from geometry.coarsening import coarsen
 from geometry.energy import Material
-from geometry.mean import elastic_mean
-from geometry.mesh import TriangleMesh
+from geometry.mean import Mean, elastic_mean
+from geometry.mesh import TriangleMesh, align, face_areas
 from geometry.nric import WeightedNorm
 from geometry.prolongation import Prolongation
+from geometry.status import Status
 from training import figure
 from training.config import Config, ConfigError
 from training.factors import between, group, names, overlap
 from training.files import write_json, write_npz
 from training.ingest import MeshCollection, normalised, read_collection
 from training.modes import localisation, pga, spga
+from training.progress import waiting
 from training.shell_collection import ShellCollection
 from training.tangents import tangents
 
@@ -38,33 +41,56 @@ def material(config: Config) -> Material:
 def _meshes(config: Config) -> MeshCollection:
     if config.collection.generator == "figure":
         labels, vertices, faces = figure.poses()
-        return MeshCollection(tuple(labels), vertices, faces)
+        return MeshCollection(tuple(labels), vertices, faces)  # the first is the one at rest
     if config.collection.data is None:
         raise ConfigError("collection.data: say where the meshes are, here or with --data")
     return read_collection(config.collection.data)
 
 
-def ingest(folder: Path, config: Config) -> dict[str, Any]:
-    """``reference.npz``, and in ``shapes.npz`` names and normalised vertices (n, V, 3), coarsened where asked for."""
+def ingest(folder: Path, config: Config, accepted: Sequence[str] = ()) -> dict[str, Any]:
+    """``reference.npz``, and in ``shapes.npz`` names and normalised vertices (n, V, 3), coarsened where asked for.
+
+    Args:
+        folder: of the run.
+        config: of the run.
+        accepted: names or files of shapes that are taken though they are in another unit or order.
+
+    Raises:
+        IngestError: the collection can't be used, or shapes of it have to be accepted first.
+    """
     settings = config.collection
     meshes = _meshes(config)
+    meshes.require_accepted(accepted)
     chosen = meshes.index(settings.reference)
     vertices, scale = normalised(meshes, chosen)
     fine = TriangleMesh.from_arrays(vertices[chosen], meshes.faces)
     facts: dict[str, Any] = {"shapes": len(vertices), "vertices": vertices.shape[1], "reference": meshes.names[chosen]}
     facts["notes"] = list(meshes.notes)
+    facts["warnings"] = [warned.sentence for warned in meshes.warnings]
     reference, more = fine, {}
     if 0 < settings.coarse_vertices < vertices.shape[1]:
-        coarsening = coarsen(fine, settings.coarse_vertices, vertices)
+        with waiting("coarse mesh"):
+            coarsening = coarsen(fine, settings.coarse_vertices, vertices)
         exact, vertices = vertices, vertices[:, coarsening.fine_index]
         reference = TriangleMesh.from_arrays(vertices[chosen], coarsening.faces)
         more = {"fine_vertices": fine.vertices, "fine_faces": fine.faces, "fine_index": coarsening.fine_index}
         errors = Prolongation.of(reference, fine).errors(vertices, exact)
-        facts |= {"coarse_vertices": vertices.shape[1], "prolongation": errors}
+        facts |= {
+            "coarse_vertices": vertices.shape[1],
+            "asked_vertices": settings.coarse_vertices,
+            "smallest_angle": float(np.degrees(coarsening.smallest_angle)),
+            "smallest_area": coarsening.smallest_area,
+            "specks": coarsening.specks,
+            "folds": coarsening.folds,
+            "reason": coarsening.reason,
+            "prolongation": errors,
+        }
     if meshes.file_vertices is not None and len(meshes.file_vertices) > len(fine.vertices):
         more["file_vertices"] = meshes.file_vertices
     write_reference(folder, reference, scale, **more)
-    write_npz(folder / "shapes.npz", names=np.array(meshes.names), vertices=vertices)
+    places = meshes.places or [(name, 0) for name in meshes.names]
+    files, first = map(np.array, zip(*places, strict=True))
+    write_npz(folder / "shapes.npz", names=np.array(meshes.names), vertices=vertices, files=files, first=first)
     write_json(folder / "ingest.json", facts)
     return facts
 
@@ -96,12 +122,50 @@ def _mean(folder: Path) -> TriangleMesh:
         return _reference(folder).with_vertices(file["vertices"])
 
 
+class MeanError(ValueError):
+    """A collection without a mean, with a sentence that says where and what to do."""
+
+
 def mean(folder: Path, config: Config) -> dict[str, Any]:
-    """``mean.npz``: the elastic mean of all shapes, where the tangent space is attached."""
-    found = elastic_mean(ShellSpace(_reference(folder), material(config)), _shapes(folder))
+    """``mean.npz``: the elastic mean of all shapes, where the tangent space is attached.
+
+    Raises:
+        MeanError: it isn't found.
+    """
+    reference, shapes = _reference(folder), _shapes(folder)
+    with waiting("elastic mean"):
+        found = elastic_mean(ShellSpace(reference, material(config)), shapes)
+    if found.status is not Status.CONVERGED:
+        raise MeanError(_where(folder, shapes, found))
     facts = {"status": str(found.status), "iterations": found.iterations, "residual": found.residual}
-    write_npz(folder / "mean.npz", vertices=found.vertices, **{k: np.array(v) for k, v in facts.items()})
-    return facts | {"reason": found.reason}
+    # Where the mean stands shapes are served: there where the reference's file has it.
+    vertices = align(found.vertices, reference.vertices)
+    write_npz(folder / "mean.npz", vertices=vertices, **{k: np.array(v) for k, v in facts.items()})
+    return facts
+
+
+def _where(folder: Path, shapes: np.ndarray, found: Mean) -> str:
+    """Which place of which shape keeps a mean from being found, and what to do about it."""
+    with np.load(folder / "shapes.npz") as file:
+        files, first = file["files"], file["first"]
+    if found.worst is None:
+        return f"the shapes have no mean: {found.reason}"
+    shape, face = found.worst
+    reference = _reference(folder)
+    vertex = int(reference.faces[face, 0])
+    with np.load(folder / "reference.npz") as file:
+        position = float(file["scale"]) * shapes[shape, vertex]
+        number = int(file["fine_index"][vertex]) if "fine_index" in file else vertex
+        if "file_vertices" in file:
+            number = int(np.flatnonzero(file["file_vertices"] == number)[0])
+    here, there = (face_areas(x, reference.faces)[face] for x in (shapes[shape], found.vertices))
+    return (
+        f"the shapes have no mean: {found.reason}. Of all faces, one of {files[shape]} at its vertex "
+        f"{number + first[shape]} (counted from {first[shape]}), at ({', '.join(f'{x:.6g}' for x in position)}), is "
+        "furthest from the others' with "
+        f"{here / there if there else np.inf:.1e} of the area in the mean so far. Mend the mesh there, take this shape "
+        "out of the folder, or change coarse_vertices in the configuration so that another vertex is kept"
+    )
 
 
 def modes(folder: Path, config: Config) -> dict[str, Any]:
@@ -135,6 +199,10 @@ def modes(folder: Path, config: Config) -> dict[str, Any]:
         "explained": sparse.explained,
         "pga_explained": dense.explained,
         "linearised_logarithms": len(logarithms.fallbacks),
+        "asked": settings.count,
+        "log_steps": settings.log_steps,
+        "steps": list(logarithms.steps),
+        "via": list(logarithms.via),
     }
     write_json(folder / "modes.json", facts | {"reasons": list(logarithms.reasons), "history": sparse.history})
     return facts

@@ -51,6 +51,10 @@ def alone(latents: FloatArray, factor: list[int]) -> FloatArray:
     return result
 
 
+#: A coarser grid isn't worth its exponentials.
+FEWEST_NODES = 3
+
+
 @dataclass(frozen=True)
 class MultilinearGrid:
     """Multilinear interpolation of exact shapes on a regular grid of one factor (Sassen et al. 2020).
@@ -123,7 +127,7 @@ class Reconstructions:
 
 
 def grid_nodes(dimension: int, settings: EvaluationSettings) -> int:
-    """Nodes of each coordinate of a factor's grid; below 3 it isn't worth its exponentials."""
+    """Nodes of each coordinate of a factor's grid; below FEWEST_NODES there is none."""
     return min(settings.grid_nodes, int(settings.grid_size ** (1 / dimension) + 1e-9))
 
 
@@ -170,7 +174,7 @@ def evaluate(
     }
     sizes = {"composite": size_bytes(*composite.networks, composite.combiner), "monolithic": size_bytes(monolithic)}
     nodes = [grid_nodes(len(index), settings) for index in factors.values()]
-    if min(nodes) >= 3:
+    if min(nodes) >= FEWEST_NODES:
         grids = [
             MultilinearGrid.of(coordinates, index, n, partial(exact, f"grid-{j}"))
             for j, (index, n) in enumerate(zip(factors.values(), nodes, strict=True))
@@ -234,7 +238,8 @@ def _exact_factor(
     index = list(learner.collection.factors.values())[j]
     codes, samples = learner.joint.index[test], learner.factor_samples(j)
     result = np.full((len(test), samples.nric.shape[1]), np.nan, dtype=np.float32)
-    there = np.isin(codes, samples.index)
+    # A part whose own shape is that of a shorter one says nothing of the joint code.
+    there = np.isin(codes, samples.index[~samples.shortened])
     result[there] = samples.nric[np.searchsorted(samples.index, codes[there])]
     beyond = codes >= learner.config.samples.own(len(learner.collection.factors))[j]
     if beyond.any():

@@ -11,11 +11,11 @@ from safetensors import safe_open
 from safetensors.torch import save
 from torch import Tensor, nn
 from torch.optim.lr_scheduler import CosineAnnealingLR, ReduceLROnPlateau
-from tqdm import tqdm
 
 from training.config import FitSettings
 from training.files import whole
 from training.networks import ShapeNetwork, predict
+from training.progress import bar
 
 CHECKPOINT_EPOCHS = 5
 
@@ -106,7 +106,7 @@ def fit(
         network.eval()
         state["best"] = _error(network, inputs[validation], target[validation], settings.batch_size)
 
-    bar = tqdm(total=settings.max_epochs, initial=state["epoch"], desc=title, unit="epoch", disable=None, leave=False)
+    epochs = bar(title, "epoch", settings.max_epochs, initial=state["epoch"])
     while not state["done"]:
         network.train()
         order = train[torch.randperm(len(train))]
@@ -131,12 +131,12 @@ def fit(
             state["best"] = error
             best = {k: v.clone() for k, v in network.state_dict().items()}
         rate = optimiser.param_groups[0]["lr"]
-        bar.set_postfix(train=f"{total:.2e}", validation=f"{error:.2e}", rate=f"{rate:.0e}")
-        bar.update()
+        epochs.set_postfix(train=f"{total:.2e}", validation=f"{error:.2e}", rate=f"{rate:.0e}")
+        epochs.update()
         state["done"] = state["epoch"] >= settings.max_epochs or rate < settings.final_rate
         if not state["done"] and state["epoch"] % CHECKPOINT_EPOCHS == 0:
             _checkpoint(path, network, optimiser, schedule, state, best)
-    bar.close()
+    epochs.close()
     network.load_state_dict(best)
     network.eval()
     save_network(path, network, state)

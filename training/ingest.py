@@ -6,8 +6,11 @@ corners. Faces keep their winding, even where it is inside out: what leaves the 
 
 from __future__ import annotations
 
+import os
 import re
-from collections.abc import Iterator, Sequence
+import shlex
+import tempfile
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,25 +19,35 @@ import numpy as np
 from scipy import sparse
 from scipy.spatial import KDTree
 
-from geometry.formats import load_npz, read_arrays
+from geometry.formats import read_arrays
 from geometry.mesh import (
     Connectivity,
-    EdgeError,
     FloatArray,
     IntArray,
     MeshError,
+    PlaceError,
     TriangleMesh,
     align,
     diagonal,
     face_areas,
 )
+from geometry.npz_reading import load_npz
+from training.progress import progress
+from training.suspicions import Placements, suspicions
 
 FORMATS = ("obj", "ply", "stl", "off", "gltf", "glb", "npz")
 MIN_SHAPES = 3
+#: Between the name of an NPZ and that of a shape in it.
+_SHAPE = ": shape "
 TOO_FEW = f"has {{}} shapes; at least {MIN_SHAPES} are needed"
 
 #: Vertices nearer than this part of the bounding box's diagonal coincide; float32 keeps 6e-8 of a coordinate.
 WELD_TOLERANCE = 1e-6
+#: Borders nearer than this part of it were meant to be one, in all likelihood.
+SEAM_TOLERANCE = 1e-4
+
+#: Bytes of vertices up to which a collection is kept in memory.
+IN_MEMORY = 2**28
 
 #: Volumes below this part of area^(3/2) (a ball: 0.094) say nothing about inside and outside.
 CLEAR_VOLUME = 1e-3
@@ -44,17 +57,35 @@ class IngestError(ValueError):
     """A collection that can't be used: one line with the file, the fault and, where there is one, the remedy."""
 
 
+@dataclass(frozen=True)
+class Warned:
+    """One oddity of one shape; see suspicions.Suspicion.
+
+    Attributes:
+        name: of the shape.
+        sentence: with its file in front.
+        grave: whether it has to be accepted by name.
+    """
+
+    name: str
+    sentence: str
+    grave: bool
+
+
 @dataclass(frozen=True, eq=False)
 class MeshCollection:
     """Shapes in correspondence, each a valid TriangleMesh of one component, in the user's units.
 
     Attributes:
         names: of the n shapes: stems of their files in natural order (pose2 before pose10), or the NPZ's own.
-        vertices: (n, V, 3) positions as in the files.
+        vertices: (n, V, 3) positions as in the files; may lie on disk, so take them shape by shape.
         faces: (F, 3) of every shape, in the order of the files.
         file_vertices: (N,) which vertex each of a file's vertices has become, −1 for those in no face. None where there
             are no files.
         notes: what was met and dealt with, a sentence each.
+        warnings: what is odd about single shapes.
+        central: the shape with the least mean square distance from the others, after rigid alignment.
+        places: of each shape, its file and what that calls its first vertex; none where there are no files.
     """
 
     names: tuple[str, ...]
@@ -62,12 +93,35 @@ class MeshCollection:
     faces: IntArray
     file_vertices: IntArray | None = None
     notes: tuple[str, ...] = ()
+    warnings: tuple[Warned, ...] = ()
+    central: int = 0
+    places: tuple[tuple[str, int], ...] = ()
 
     def index(self, name: str | None) -> int:
-        """Index of the shape of that name, or of the first for None; IngestError if there is none."""
+        """Index of the shape of that name, or of the most central one for None; IngestError if there is none."""
         if name is not None and name not in self.names:
             raise IngestError(f"no shape is called {name!r}; there are {', '.join(self.names[:8])} …")
-        return 0 if name is None else self.names.index(name)
+        return self.central if name is None else self.names.index(name)
+
+    def require_accepted(self, accepted: Sequence[str]) -> None:
+        """Refuse shapes that are in another unit or order, unless they are among those accepted.
+
+        Args:
+            accepted: names of shapes, or files of theirs.
+
+        Raises:
+            IngestError: naming each such shape, or a name that no shape has.
+        """
+        names = {name if name in self.names else Path(name).stem for name in accepted}
+        if unknown := names - set(self.names):
+            raise IngestError(f"--accept: no shape is called {', '.join(sorted(unknown))}")
+        grave = [warned for warned in self.warnings if warned.grave and warned.name not in names]
+        if grave:
+            files = " ".join(shlex.quote(warned.name) for warned in grave)
+            raise IngestError(
+                "\n  ".join(["these shapes would spoil the model:", *(warned.sentence for warned in grave)])
+                + f"\nMend or remove them; or take them as they are, with --accept {files}"
+            )
 
 
 @dataclass(frozen=True)
@@ -91,19 +145,21 @@ def read_collection(path: Path) -> MeshCollection:
     Raises:
         IngestError: nothing to read, fewer than 3 shapes, an unreadable file, different connectivity, an edge with more
             than two faces or with oppositely oriented ones, a face without area, a coordinate that isn't finite,
-            several components, or shapes that are all equal or partly mirrored. Vertices and faces count from 0.
+            several components, or shapes that are all equal or partly mirrored. Vertices and faces are numbered as the
+            file does, OBJ from 1.
     """
     if not path.exists():
         raise IngestError(f"{path}: no such file or folder")
     raw = _read_folder(path) if path.is_dir() else _read_npz(path)
     used = np.unique(raw.faces)
-    vertices, faces = raw.vertices[:, used], np.searchsorted(used, raw.faces)
+    vertices, faces = _some(raw.vertices, used), np.searchsorted(used, raw.faces)
     with _refusing(raw.labels[0], used):
         connectivity = Connectivity(faces, len(used))
     for label, shape in zip(raw.labels, vertices, strict=True):
         with _refusing(label, used):
             TriangleMesh(shape, connectivity)
-    if np.ptp(align(vertices, vertices[0]), axis=0).max() <= WELD_TOLERANCE * diagonal(vertices[0]):
+    tolerance = WELD_TOLERANCE * diagonal(vertices[0])
+    if all(np.abs(align(shape, vertices[0]) - vertices[0]).max() <= tolerance for shape in vertices):
         raise IngestError(
             f"{path}: all {len(vertices)} shapes are equal but for where they stand; poses and morph targets inside a "
             "file are not read, export each shape as a mesh of its own"
@@ -113,24 +169,77 @@ def read_collection(path: Path) -> MeshCollection:
     faces = weld[faces]
     thin = np.flatnonzero((faces == np.roll(faces, 1, axis=1)).any(axis=1))
     if len(thin):
-        raise IngestError(
-            f"{raw.labels[0]}: face {thin[0]} is degenerate: in every shape two of its vertices coincide (to "
-            f"{WELD_TOLERANCE:g} of the mesh's size); collapse that edge in all meshes"
-        )
+        with _refusing(raw.labels[0]):
+            raise PlaceError(
+                "face {face} is degenerate: in every shape two of its vertices coincide (to "
+                f"{WELD_TOLERANCE:g} of the mesh's size); collapse that edge in all meshes",
+                {"face": [int(thin[0])]},
+            )
     kept = np.unique(faces)
-    vertices, faces = vertices[:, kept], np.searchsorted(kept, faces)
+    vertices, faces = _some(vertices, kept), np.searchsorted(kept, faces)
     with _refusing(raw.labels[0], used[kept]):
         connectivity = Connectivity(faces, len(kept))
-    _refuse_components(raw, connectivity, kept_pairs)
+    seams = _seams(vertices, connectivity)
+    _refuse_components(raw, connectivity, kept_pairs, seams)
     if raw.vertices.shape[1] > len(used):
         notes.append(f"dropped {raw.vertices.shape[1] - len(used)} vertices that belong to no face")
     if len(kept) < len(used):
         notes.append(f"welded {len(used)} vertices into {len(kept)}: the others coincide with these in every shape")
+    if len(seams):
+        notes.append(
+            f"{len(seams)} pairs of border vertices almost coincide in every shape, to {SEAM_TOLERANCE:g} of the size, "
+            "and the surface stays open there: merge them in all meshes if it is meant to be closed"
+        )
     if connectivity.is_closed:
         notes += _orientation(vertices, faces, raw.labels)
     file_vertices = np.full(raw.vertices.shape[1], -1)
     file_vertices[used] = np.searchsorted(kept, weld)
-    return MeshCollection(tuple(raw.names), vertices, faces, file_vertices, tuple(notes))
+    placements = Placements(vertices)
+    warnings = []
+    for found in suspicions(vertices, connectivity, [Path(label).name for label in raw.labels], placements):
+        label = raw.labels[found.shape]
+        vertex = used[kept][found.vertex] + _first_number(label)
+        sentence = f"{label}: {found.sentence.replace('{vertex}', f'{vertex}{_counted(label)}')}"
+        warnings.append(Warned(raw.names[found.shape], sentence, found.grave))
+    places = tuple((Path(label).name, _first_number(label)) for label in raw.labels)
+    return MeshCollection(
+        tuple(raw.names), vertices, faces, file_vertices, tuple(notes), tuple(warnings), placements.central, places
+    )
+
+
+def data_files(path: Path) -> list[Path]:
+    """The files that a collection is read from, sorted; of a path that isn't there none."""
+    if not path.is_dir():
+        return [path] if path.exists() else []
+    # Buffers lie beside glTF files.
+    return sorted(p for p in path.iterdir() if _extension(p) in (*FORMATS, "bin") and p.is_file() and p.name[0] != ".")
+
+
+def _stacked(count: int, shapes: Iterable[FloatArray]) -> FloatArray:
+    """Shapes (V, 3) as one array (count, V, 3), a large one in a temporary file: it need not fit into memory."""
+    array: FloatArray = np.zeros(0)
+    for k, shape in enumerate(shapes):
+        if k == 0:
+            array = _room((count, *shape.shape))
+        array[k] = shape
+    return array
+
+
+def _room(shape: tuple[int, ...]) -> FloatArray:
+    size = int(np.prod(shape)) * np.dtype(np.float64).itemsize
+    if size <= IN_MEMORY:
+        return np.empty(shape)
+    with tempfile.TemporaryFile() as file:
+        # A full disk is an error here, and later the death of the process.
+        os.posix_fallocate(file.fileno(), 0, size) if hasattr(os, "posix_fallocate") else file.truncate(size)
+        return np.memmap(file, np.float64, "r+", shape=shape)
+
+
+def _some(vertices: FloatArray, chosen: IntArray) -> FloatArray:
+    """Some vertices of all shapes (n, V, 3)."""
+    if len(chosen) == vertices.shape[1]:
+        return vertices
+    return _stacked(len(vertices), (shape[chosen] for shape in vertices))
 
 
 def normalised(collection: MeshCollection, reference: int) -> tuple[FloatArray, float]:
@@ -140,7 +249,7 @@ def normalised(collection: MeshCollection, reference: int) -> tuple[FloatArray, 
         Vertices (n, V, 3) and the scale in the user's units: ``collection.vertices == scale * vertices``.
     """
     scale = float(np.sqrt(face_areas(collection.vertices[reference], collection.faces).sum()))
-    return collection.vertices / scale, scale
+    return _stacked(len(collection.vertices), (shape / scale for shape in collection.vertices)), scale
 
 
 def _natural(path: Path) -> tuple[list[str | int], str]:
@@ -170,23 +279,62 @@ def _read_folder(folder: Path) -> _Raw:
             raise IngestError(f"{path}: {by_name[path.stem].name} has the same name; remove or rename one of them")
         by_name[path.stem] = path
 
-    meshes = []
-    for path in paths:
-        with _refusing(str(path)):
-            meshes.append(_checked(*read_arrays(path)))
     # Triangles of an STL file fit on the shared vertices of any other format.
     soups = [_extension(path) == "stl" for path in paths]
     first = soups.index(False) if False in soups else 0
-    vertices, faces = meshes[first]
-    shapes = []
-    for path, soup, (v, f) in zip(paths, soups, meshes, strict=True):
+    vertices, faces = _read(paths[first])
+
+    def shapes() -> Iterator[FloatArray]:
+        for k, path in enumerate(progress(paths, "reading", "file")):
+            if k == first:
+                yield vertices
+                continue
+            v, f = _read(path, len(vertices), faces)
+            with _refusing(str(path)):
+                if soups[k] and not soups[first]:
+                    yield _on_shared_vertices(v[f], faces, len(vertices), paths[first].name)
+                else:
+                    _refuse_cut_short(paths[first], len(vertices), faces, len(v), f)
+                    _compare(v, f, vertices, faces, paths[first].name)
+                    yield v
+
+    return _Raw([str(path) for path in paths], list(by_name), _stacked(len(paths), shapes()), faces, all(soups))
+
+
+def _read(path: Path, vertex_count: int = 0, faces: IntArray | None = None) -> tuple[FloatArray, IntArray]:
+    """One file's mesh; the number of vertices and the faces of another file tell whether this one ends too early."""
+    try:
         with _refusing(str(path)):
-            if soup and not soups[first]:
-                shapes.append(_on_shared_vertices(v[f], faces, len(vertices), paths[first].name))
-            else:
-                _compare(v, f, vertices, faces, paths[first].name)
-                shapes.append(v)
-    return _Raw([str(path) for path in paths], list(by_name), np.stack(shapes), faces, all(soups))
+            found = _checked(*read_arrays(path))
+    except IngestError as error:
+        raise IngestError(f"{error}{_unfinished(path)}") from error
+    if faces is not None:
+        _refuse_cut_short(path, len(found[0]), found[1], vertex_count, faces)
+    return found
+
+
+def _unfinished(path: Path) -> str:
+    """The end of a sentence about an OBJ file whose last line isn't finished, as where a copy was cut short."""
+    if _extension(path) != "obj" or not path.is_file():
+        return ""
+    with path.open("rb") as file:
+        file.seek(max(0, path.stat().st_size - 200))
+        last = file.read().decode("latin-1")
+    if last[-1:] in ("\n", "\r", ""):
+        return ""
+    return f"; its last line, {last.splitlines()[-1][-60:]!r}, has no end: if the file is cut short, copy it again"
+
+
+def _refuse_cut_short(path: Path, count: int, faces: IntArray, other_count: int, others: IntArray) -> None:
+    """IngestError for an OBJ file that is the beginning of another: such files don't say how much they hold."""
+    if _extension(path) != "obj" or not path.is_file():
+        return
+    # The last face may have lost digits.
+    if count <= other_count and len(faces) < len(others) and np.array_equal(faces[:-1], others[: len(faces) - 1]):
+        raise IngestError(
+            f"{path}: is cut short, it seems: it ends after {count} of {other_count} vertices and {len(faces)} of "
+            f"{len(others)} faces{_unfinished(path) or '; copy it again'}"
+        )
 
 
 def _read_npz(path: Path) -> _Raw:
@@ -194,7 +342,7 @@ def _read_npz(path: Path) -> _Raw:
         raise IngestError(f"{path}: one file is a collection only as .npz; name the folder that holds the meshes")
     with _refusing(str(path)):
         try:
-            arrays = load_npz(path.read_bytes())
+            arrays = load_npz(memoryview(path.read_bytes()), ("vertices", "faces", "names"))
         except OSError as error:
             raise MeshError(f"can't be read: {error.strerror}") from error
         shapes = arrays["vertices"]
@@ -209,7 +357,7 @@ def _read_npz(path: Path) -> _Raw:
         values, counts = np.unique(names, return_counts=True)
         if (counts > 1).any():
             raise MeshError(f"two shapes are called {values[counts.argmax()]!s}; each needs a name of its own")
-    labels = [f"{path}: shape {name}" for name in names]
+    labels = [f"{path}{_SHAPE}{name}" for name in names]
     checked = []
     for label, shape in zip(labels, shapes, strict=True):
         with _refusing(label):
@@ -217,14 +365,22 @@ def _read_npz(path: Path) -> _Raw:
     return _Raw(labels, names.tolist(), np.stack([vertices for vertices, _ in checked]), checked[0][1])
 
 
+def _first_number(label: str) -> int:
+    """What a file calls its first vertex and its first face."""
+    return int(_extension(Path(label.partition(_SHAPE)[0])) == "obj")
+
+
+def _counted(label: str) -> str:
+    return f" (counted from {_first_number(label)})"
+
+
 @contextmanager
 def _refusing(label: str, numbers: IntArray | None = None) -> Iterator[None]:
     """Turn a MeshError into an IngestError about that file; ``numbers`` are the vertices' indices there."""
     try:
         yield
-    except EdgeError as error:
-        i, j = error.edge if numbers is None else numbers[list(error.edge)].tolist()
-        raise IngestError(f"{label}: {EdgeError(error.sentence, (i, j))}") from error
+    except PlaceError as error:
+        raise IngestError(f"{label}: {error.numbered(_first_number(label), numbers)}{_counted(label)}") from error
     except MeshError as error:
         raise IngestError(f"{label}: {error}") from error
 
@@ -240,10 +396,11 @@ def _checked(vertices: np.ndarray, faces: np.ndarray) -> tuple[FloatArray, IntAr
     if faces.ndim != 2 or faces.shape[1] != 3 or faces.dtype.kind not in "iu":
         raise MeshError(f"faces must be an (F, 3) array of vertex indices, not {faces.dtype} of shape {faces.shape}")
     if faces.min() < 0 or faces.max() >= len(vertices):
-        raise MeshError(f"faces name vertices {faces.min()} to {faces.max()}, but there are {len(vertices)} vertices")
+        sentence = f"faces name vertices {{lowest}} to {{highest}}, but there are {len(vertices)} vertices"
+        raise PlaceError(sentence, {"lowest": [int(faces.min())], "highest": [int(faces.max())]})
     bad = np.flatnonzero(~np.isfinite(vertices).all(axis=1))
     if len(bad):
-        raise MeshError(f"vertex {bad[0]} has a coordinate that is not finite")
+        raise PlaceError("vertex {vertex} has a coordinate that is not finite", {"vertex": [int(bad[0])]})
     return vertices.astype(np.float64), faces.astype(np.int64)
 
 
@@ -255,10 +412,11 @@ def _compare(vertices: FloatArray, faces: IntArray, vertices_0: FloatArray, face
         )
     differing = np.flatnonzero((faces != faces_0).any(axis=1))
     if len(differing):
-        k = differing[0]
-        raise MeshError(
-            f"face {k} joins vertices {tuple(faces[k].tolist())}, but in {other} {tuple(faces_0[k].tolist())}; all "
-            "meshes need the same connectivity, in the same order"
+        k = int(differing[0])
+        raise PlaceError(
+            f"face {{face}} joins vertices {{here}}, but in {other} {{there}}; all meshes need the same connectivity, "
+            "in the same order",
+            {"face": [k], "here": faces[k].tolist(), "there": faces_0[k].tolist()},
         )
 
 
@@ -274,8 +432,9 @@ def _on_shared_vertices(corners: FloatArray, faces: IntArray, vertex_count: int,
     apart = np.linalg.norm(vertices[faces] - corners, axis=-1).max(axis=1)
     torn = np.flatnonzero(apart > WELD_TOLERANCE * diagonal(corners.reshape(-1, 3)))
     if len(torn):
-        raise MeshError(
-            f"face {torn[0]} is not where it is in {other}: STL files must list the faces in the same order"
+        raise PlaceError(
+            f"face {{face}} is not where it is in {other}: STL files must list the faces in the same order",
+            {"face": [int(torn[0])]},
         )
     return vertices
 
@@ -304,7 +463,22 @@ def _welding(vertices: FloatArray, labels: Sequence[str]) -> tuple[IntArray, Flo
     return first[group], kept, [] if near.all() else [note]
 
 
-def _refuse_components(raw: _Raw, connectivity: Connectivity, kept_pairs: FloatArray) -> None:
+def _seams(vertices: FloatArray, connectivity: Connectivity) -> IntArray:
+    """(k, 2) vertices of the border that no edge joins and that almost coincide in every shape (n, V, 3)."""
+    border = np.unique(connectivity.edges[~connectivity.interior])
+    if not len(border):
+        return np.zeros((0, 2), int)
+    tolerance = SEAM_TOLERANCE * diagonal(vertices)
+    pairs = border[KDTree(vertices[0][border]).query_pairs(tolerance[0], output_type="ndarray")].reshape(-1, 2)
+    for shape, radius in zip(vertices, tolerance, strict=True):
+        pairs = pairs[np.linalg.norm(shape[pairs[:, 0]] - shape[pairs[:, 1]], axis=1) <= radius]
+    joined = connectivity.edges @ [connectivity.vertex_count, 1]
+    pairs.sort(axis=1)
+    seams: IntArray = pairs[~np.isin(pairs @ [connectivity.vertex_count, 1], joined)]
+    return seams
+
+
+def _refuse_components(raw: _Raw, connectivity: Connectivity, kept_pairs: FloatArray, seams: IntArray) -> None:
     """Faces hang together where they share an edge: a common vertex alone is a hinge, not a surface."""
     left, right = connectivity.edge_faces[connectivity.interior].T
     count = len(connectivity.faces)
@@ -312,22 +486,33 @@ def _refuse_components(raw: _Raw, connectivity: Connectivity, kept_pairs: FloatA
     parts, part = sparse.csgraph.connected_components(graph, directed=False)
     if parts == 1:
         return
-    odd = int(kept_pairs.argmin())
+    odd, label = int(kept_pairs.argmin()), raw.labels[0]
     if raw.soup and kept_pairs[odd] < 0.5:
         raise IngestError(
-            f"{raw.labels[odd]}: its triangles don't meet where those of {raw.labels[0]} do; STL files must list the "
+            f"{raw.labels[odd]}: its triangles don't meet where those of {label} do; STL files must list the "
             "faces in the same order"
         )
-    raise IngestError(
-        f"{raw.labels[0]}: has {parts} separate parts, where one is required: faces 0 and {part.argmax()} are in "
-        f"different ones, and {np.bincount(part).max()} of {count} faces in the largest; join or delete the others"
-    )
+    of_vertex = np.zeros(connectivity.vertex_count, int)
+    of_vertex[connectivity.faces] = part[:, None]
+    across = of_vertex[seams[:, 0]] != of_vertex[seams[:, 1]]
+    if across.any():
+        raise IngestError(
+            f"{label}: has {parts} parts that almost meet, where one is required: {across.sum()} pairs of vertices on "
+            f"their borders are less than {SEAM_TOLERANCE:g} of the mesh's size apart; merge them in all meshes"
+        )
+    with _refusing(label):
+        raise PlaceError(
+            f"has {parts} separate parts, where one is required: faces {{faces}} are in different ones, and "
+            f"{np.bincount(part).max()} of {count} faces in the largest; join or delete the others",
+            {"faces": [0, int(part.argmax())]},
+        )
 
 
 def _orientation(vertices: FloatArray, faces: IntArray, labels: Sequence[str]) -> list[str]:
     """A note where closed shapes are wound inside out; IngestError where some are and others are not."""
     sides = []
-    for shape in vertices - vertices.mean(axis=1, keepdims=True):
+    for shape in vertices:
+        shape = shape - shape.mean(axis=0)
         a, b, c = (shape[faces[:, k]] for k in range(3))
         volume = np.einsum("fi,fi->", a, np.cross(b, c)) / 6
         sides.append(np.sign(volume) * (abs(volume) > CLEAR_VOLUME * face_areas(shape, faces).sum() ** 1.5))

@@ -25,7 +25,8 @@ TEMPLATE = """\
 
 [collection]
 data = {data}    # folder of meshes, or one NPZ; relative to this file
-reference = {reference}    # its area becomes 1 inside; take an undamaged shape in a middling pose
+# The shape whose area becomes 1 inside, and where served shapes stand: the most central one, {reference},
+# unless another is named here, as in: reference = {other}
 {coarse}
 
 [material]
@@ -76,7 +77,8 @@ def configuration(collection: MeshCollection, data: str, title: str) -> str:
         vertices=vertices,
         faces=len(collection.faces),
         data=_string(data),
-        reference=_string(collection.names[0]),
+        reference=_string(collection.names[collection.central]),
+        other=_string(collection.names[0]),
         coarse=coarse,
         material=MaterialSettings(),
         modes=min(ModeSettings().count, count - 1),

@@ -24,19 +24,44 @@ from training.evaluation import alone, evaluate
 from training.export import export
 from training.files import write_json, write_npz, write_text
 from training.freaky_torus import FreakyTorus
+from training.ingest import data_files
 from training.learning import Learner
+from training.losses import losses, refuse
 from training.report import write_report
-from training.sampling import Collection, draw, read, split
+from training.sampling import FEWEST, Collection, SamplesError, draw, indices, read, split, used
 from training.start import fit_start
+
+
+class OldRunError(ValueError):
+    """A run of another version that can't be continued."""
+
 
 GENERATORS: dict[str, Callable[[], Collection]] = {"freaky-torus": FreakyTorus}
 
 
 class Run:
-    """A run directory: configuration, log, and what the stages have left in it."""
+    """A run directory: configuration, log, and what the stages have left in it.
 
-    def __init__(self, folder: Path, config: Config, source: str, models: Path, scheduler: str | None = None) -> None:
+    Args:
+        folder: of the run.
+        config: of the run.
+        source: its text.
+        models: where bundles go.
+        scheduler: see workers.run.
+        accepted: see discovery.ingest.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        config: Config,
+        source: str,
+        models: Path,
+        scheduler: str | None = None,
+        accepted: Sequence[str] = (),
+    ) -> None:
         self.folder, self.config, self.models, self.scheduler = folder, config, models, scheduler
+        self.accepted = accepted
         self._source, self._stamps = source, folder / "stages"
 
     def begin(self) -> None:
@@ -55,6 +80,33 @@ class Run:
         if self.by_design:
             return GENERATORS[str(self.config.collection.generator)]()
         return discovery.collection(self.folder, self.config)
+
+    @property
+    def bundle(self) -> Path:
+        """Where the bundle goes."""
+        return self.models / self.config.export.name / str(self.config.export.version)
+
+    def data(self) -> dict[str, dict[str, Any]]:
+        """Size, time and SHA-256 of each file of the collection, by name; of a generator's none.
+
+        A file is read again only where its size or its time isn't that of ``data.json``.
+        """
+        source = self.config.collection.data
+        known, found = self.known_data(), {}
+        for path in data_files(source) if source else ():
+            stat = path.stat()
+            facts = {"bytes": stat.st_size, "time": stat.st_mtime_ns}
+            before = known.get(path.name, {})
+            if any(before.get(name) != value for name, value in facts.items()):
+                with path.open("rb") as file:
+                    before = {"sha256": hashlib.file_digest(file, "sha256").hexdigest()}
+            found[path.name] = {**facts, "sha256": before["sha256"]}
+        return found
+
+    def known_data(self) -> dict[str, dict[str, Any]]:
+        """The same of the files that `ingest` read last."""
+        path = self.folder / "data.json"
+        return json.loads(path.read_text()) if path.exists() else {}
 
     def log(self, event: str, **facts: Any) -> None:
         """Append one line to log.jsonl."""
@@ -77,7 +129,7 @@ def ingest(run: Run) -> None:
     if run.by_design:
         discovery.write_reference(run.folder, run.collection.reference, run.collection.scale)
     else:
-        run.log("ingested", **discovery.ingest(run.folder, run.config))
+        run.log("ingested", **discovery.ingest(run.folder, run.config, run.accepted))
 
 
 def _nothing_to_find(run: Run) -> None:
@@ -104,9 +156,10 @@ def given_factors(run: Run) -> None:
     write_json(run.folder / "factors.json", {"factors": list(lists.values()), "names": list(lists)})
 
 
-def _draw(run: Run, folder: Path, latents: FloatArray, title: str) -> None:
+def _draw(run: Run, folder: Path, latents: FloatArray, title: str, *, shorten: bool) -> None:
     size = run.config.samples.part_size
-    for done, total, failed in draw(run.collection, folder, latents, size, title, scheduler=run.scheduler):
+    parts = draw(run.collection, folder, latents, size, title, shorten=shorten, scheduler=run.scheduler)
+    for done, total, failed in parts:
         run.log("progress", what=title, done=done, total=total, failed=failed)
 
 
@@ -117,11 +170,13 @@ def samples(run: Run) -> None:
     code_rng, split_rng = (np.random.default_rng(s) for s in np.random.SeedSequence(settings.seed).spawn(2))
     own = settings.own(len(run.collection.factors))
     codes = coordinates.uniform(max(settings.count, *own), code_rng)
-    _draw(run, folder, codes[: settings.count], "joint samples")
+    _draw(run, folder, codes[: settings.count], "joint samples", shorten=True)
+    codes = used(folder, codes)
     for j, (index, count) in enumerate(zip(run.collection.factors.values(), own, strict=True)):
-        _draw(run, folder / f"factor-{j}", alone(codes[:count], index), f"samples of factor {j}")
-    there = read(folder).index
-    write_npz(folder / "split.npz", **split(there, settings.test_fraction, settings.validation_fraction, split_rng))
+        _draw(run, folder / f"factor-{j}", alone(codes[:count], index), f"samples of factor {j}", shorten=True)
+    write_npz(
+        folder / "split.npz", **split(indices(folder), settings.test_fraction, settings.validation_fraction, split_rng)
+    )
 
 
 def learner_of(run: Run, **how: Any) -> Learner:
@@ -130,7 +185,17 @@ def learner_of(run: Run, **how: Any) -> Learner:
 
 
 def networks(run: Run) -> None:
-    """networks/: one file for each fitted network, and the histories of all."""
+    """networks/: one file for each fitted network, and the histories of all.
+
+    Raises:
+        SamplesError: too few to learn from.
+    """
+    folder = run.folder / "samples"
+    kinds = {"joint samples": folder}
+    kinds |= {f"samples of factor {name!r}": folder / f"factor-{j}" for j, name in enumerate(run.collection.factors)}
+    for kind, path in kinds.items():
+        if (found := len(indices(path))) < FEWEST:
+            raise SamplesError(f"there are only {found} {kind}, and {FEWEST} are needed to learn from")
     learner = learner_of(run)
     learner.main()
     learner.monolithic()
@@ -156,7 +221,7 @@ def evaluation(run: Run) -> None:
 
     def exact(name: str, latents: FloatArray) -> NDArray[np.float32]:
         folder = run.folder / "exact" / name
-        _draw(run, folder, latents, f"exact shapes, {name}")
+        _draw(run, folder, latents, f"exact shapes, {name}", shorten=False)
         samples = read(folder)
         result = np.full((len(latents), samples.nric.shape[1]), np.nan, dtype=np.float32)
         result[samples.index] = samples.nric
@@ -211,6 +276,18 @@ class Stage:
         return {"key": digest(settings), "basis": digest(rest)}
 
 
+def _changes(before: dict[str, dict[str, Any]], now: dict[str, dict[str, Any]]) -> str:
+    """Which data files are new, gone or others, in words."""
+
+    def some(word: str, names: set[str]) -> str:
+        more = ", …" if len(names) > 3 else ""
+        return f"{len(names)} {word} ({', '.join(sorted(names)[:3])}{more})" if names else ""
+
+    changed = {name for name in before.keys() & now.keys() if before[name]["sha256"] != now[name]["sha256"]}
+    kinds = {"added": now.keys() - before.keys(), "removed": before.keys() - now.keys(), "changed": changed}
+    return ", ".join(filter(None, (some(word, set(names)) for word, names in kinds.items())))
+
+
 STAGES: dict[str, Stage] = {
     "ingest": Stage(ingest, lambda c: [c.collection], ("reference.npz", "shapes.npz", "ingest.json")),
     "mean": Stage(_discovered(discovery.mean), lambda c: [c.material], ("mean.npz",)),
@@ -226,10 +303,41 @@ STAGES: dict[str, Stage] = {
 }
 
 
-def execute(run: Run, until: str | None = None, *, show: Callable[[str], None] = print) -> None:
-    """Do the stages that are not done yet, up to and including ``until``; in the end, report.html."""
+def execute(
+    run: Run,
+    until: str | None = None,
+    *,
+    keep_going: bool = False,
+    command: str = "",
+    show: Callable[[str], None] = print,
+) -> None:
+    """Do the stages that are not done yet, up to and including ``until``; in the end, report.html.
+
+    Args:
+        run: what to do.
+        until: last stage.
+        keep_going: whatever is lost.
+        command: that goes on with this run, for messages.
+        show: gets a line at a time.
+
+    Raises:
+        LostTooMuchError: more than a quarter of the logarithms or samples are lost, and no ``keep_going``.
+    """
     run.begin()
-    key, news = "", False
+    data, known = run.data(), run.known_data()
+    source = run.config.collection.data
+    if data and not known and "seconds" in run.stamp("ingest"):
+        raise OldRunError(
+            f"{run.folder} is a run of version 0.1, which did not record its data files: status and report still read "
+            "it, but it can't be continued. Name another directory with --out"
+        )
+    if source and known and not source.exists():
+        show(f"data: {source} is not there any more; the run goes on with what ingest left")
+        data = known
+    elif known and (changes := _changes(known, data)):
+        show(f"data: {changes}; all that follows from them is done again, from ingest on")
+    key = json.dumps({name: facts["sha256"] for name, facts in data.items()}) if data else ""
+    news = False
     for name, stage in STAGES.items():
         keys = stage.keys(name, run.config, key)
         key, stamp = keys["key"], run.stamp(name)
@@ -250,6 +358,13 @@ def execute(run: Run, until: str | None = None, *, show: Callable[[str], None] =
             run.log("end", stage=name, seconds=round(seconds, 3))
             show(f"{name}: {seconds:.0f} s")
             news = True
+        if name == "ingest" and data != known:
+            write_json(run.folder / "data.json", data)
+        lost = losses(run.folder, name)
+        for loss in lost:
+            show(f"  {loss.sentence}")
+        if not keep_going:
+            refuse(name, lost, f"{command} --keep-going" if command else "")
         if name == until:
             break
     if (run.folder / "evaluation.json").exists() and (news or not (run.folder / "report.html").exists()):

@@ -10,10 +10,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
-from tqdm import tqdm
 
 from geometry.mesh import FloatArray
 from training.layers import half_precision, patch_entries
+from training.progress import progress
 
 #: What is fitted to, or chosen by: factor shapes (n, J, 2E) and what is missed of the joint one (n, 2E).
 Pairs = tuple[Tensor, Tensor]
@@ -75,13 +75,13 @@ class PatchPolynomials(nn.Module):
         """
         entries = patch_entries(midpoints, math.ceil(len(midpoints) / cls.EDGES), seed)
         patches = [_Patch(columns, coefficients, own[0][: cls.AXES]) for columns in entries]
-        for patch in tqdm(patches, desc="metrics", unit="patch", disable=None, leave=False):
+        for patch in progress(patches, "metrics", "patch"):
             patch.learn_metric(own, held_out)
         spread = torch.stack([patch.spread for patch in patches]).clamp_min(1e-30).log().mean(dim=0)
         pairs, triples = _strongest(spread.numpy(), monomials)
         rank = 1 + int(np.concatenate([pairs.ravel(), triples.ravel()]).max(initial=0))
         roots = torch.cat([torch.ones(rank), _roots(pairs), _roots(triples)])
-        for patch in tqdm(patches, desc="polynomials", unit="patch", disable=None, leave=False):
+        for patch in progress(patches, "polynomials", "patch"):
             patch.fit(own, held_out, rank, pairs, triples, roots)
         return cls._of(patches, rank, pairs, triples, own[1].shape[1])
 

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from geometry.mesh import FloatArray, TriangleMesh
 from geometry.nric import WeightedNorm
+from training.losses import losses
 from training.modes import edge_magnitudes
 
 #: In the pipeline's order.
@@ -82,6 +83,15 @@ class Record:
 
     def _arrays(self, name: str) -> dict[str, NDArray]:
         return self._read(name, {}, lambda path: dict(np.load(path)))
+
+    @cached_property
+    def given_up(self) -> list[tuple[str, str]]:
+        """Stage and sentence of all that the stages which are done gave up."""
+        found = []
+        for stage in (name for name in STAGES if self.seconds.get(name) is not None):
+            lost = self._read("", [], lambda folder, stage=stage: losses(folder, stage))
+            found += [(stage, loss.sentence) for loss in lost]
+        return found
 
     @cached_property
     def at_work(self) -> str:

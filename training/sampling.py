@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -11,14 +11,23 @@ from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import NDArray
-from tqdm import tqdm
 
 from geometry.mesh import FloatArray, IntArray, TriangleMesh
 from training.coordinates import Coordinates
 from training.files import write_npz
+from training.progress import bar
 from training.workers import run
 
 DONE, FAILED = "done", "failed"
+#: A code without a shape is shortened to this share of itself, so many times at most. Shapes end where a face
+#: collapses, mostly near the corners of the box, which is never smaller than the training shapes need.
+SHORTER, SHORTENINGS = 0.85, 3
+#: Samples, for without a few in each part of the split there is nothing to learn from.
+FEWEST = 10
+
+
+class SamplesError(RuntimeError):
+    """Samples that nothing can be learned from, with a sentence that says why."""
 
 
 @dataclass(frozen=True)
@@ -74,15 +83,23 @@ class Samples:
 
     Attributes:
         index: (n,) increasing; samples of two folders belong together where theirs agree.
-        latents: (n, m).
+        latents: (n, m) codes that the shapes have.
+        asked: (n, m) codes that were asked for, further out where they had no shape.
         nric: (n, 2E).
         vertices: (n, V, 3).
     """
 
     index: IntArray
     latents: FloatArray
+    asked: FloatArray
     nric: NDArray[np.float32]
     vertices: NDArray[np.float32]
+
+    @property
+    def shortened(self) -> NDArray[np.bool_]:
+        """(n,) which codes had to be shortened."""
+        found: NDArray[np.bool_] = (self.latents != self.asked).any(axis=1)
+        return found
 
 
 def draw(
@@ -92,6 +109,7 @@ def draw(
     part_size: int,
     title: str,
     *,
+    shorten: bool = False,
     scheduler: str | None = None,
     workers: int = -1,
 ) -> Iterator[tuple[int, int, int]]:
@@ -106,6 +124,7 @@ def draw(
         latents: (n, m).
         part_size: codes in a part: what a worker is given at a time, and what is lost with it.
         title: of the progress bar.
+        shorten: whether a code that has no shape is shortened until it has one, see SHORTER; its sample says so.
         scheduler: see workers.run.
         workers: see workers.run.
 
@@ -124,26 +143,40 @@ def draw(
     missing = [path for path, status in found.items() if status is None]
     statuses = [status for status in found.values() if status is not None]
     done, failed = sum(map(len, statuses)), sum(int((status != DONE).sum()) for status in statuses)
-    results = run(partial(_part, collection), [latents[parts[path]] for path in missing], scheduler, workers)
-    with tqdm(total=len(latents), initial=done, desc=title, unit="sample", disable=None, leave=False) as bar:
+    results = run(partial(_part, collection, shorten), [latents[parts[path]] for path in missing], scheduler, workers)
+    with bar(title, "sample", len(latents), initial=done) as drawn:
         for k, part in results:
             index = parts[missing[k]]
-            write_npz(missing[k], index=index, latents=latents[index], **part)
+            write_npz(missing[k], index=index, asked=latents[index], **part)
             done, failed = done + len(index), failed + int((part["status"] != DONE).sum())
-            bar.update(len(index))
+            drawn.update(len(index))
             yield done, len(latents), failed
     if not missing:
         yield done, len(latents), failed
 
 
-def _part(collection: Collection, latents: FloatArray) -> dict[str, NDArray]:
+def _part(collection: Collection, shorten: bool, asked: FloatArray) -> dict[str, NDArray]:
     """What a part holds of the shapes of its codes."""
-    shapes = collection.shapes(latents)
+    shapes, latents = collection.shapes(asked), asked.copy()
+    vertices, nric, reasons = shapes.vertices.copy(), shapes.nric.copy(), np.array(shapes.reasons, dtype=object)
+    for _ in range(SHORTENINGS if shorten else 0):
+        left = np.flatnonzero(reasons != "")
+        if not len(left):
+            break
+        shorter = latents[left] * SHORTER
+        again = collection.shapes(shorter)
+        latents[left] = shorter
+        found = np.array(again.reasons) == ""
+        vertices[left[found]], nric[left[found]] = again.vertices[found], again.nric[found]
+        reasons[left[found]] = ""
+    failed = reasons != ""
+    latents[failed] = asked[failed]
     return {
-        "nric": shapes.nric.astype(np.float32),
-        "vertices": shapes.vertices.astype(np.float32),
-        "status": np.array([FAILED if reason else DONE for reason in shapes.reasons]),
-        "reason": np.array(shapes.reasons),
+        "latents": latents,
+        "nric": nric.astype(np.float32),
+        "vertices": vertices.astype(np.float32),
+        "status": np.where(failed, FAILED, DONE),
+        "reason": reasons.astype(np.str_),
     }
 
 
@@ -152,22 +185,51 @@ def _status(path: Path, index: IntArray, latents: FloatArray) -> NDArray[np.str_
     try:
         # Opened here, because np.load leaves a damaged file open.
         with path.open("rb") as file, np.load(file) as part:
-            same = np.array_equal(part["index"], index) and np.array_equal(part["latents"], latents)
+            same = np.array_equal(part["index"], index) and np.array_equal(asked_for(part), latents)
             return part["status"] if same else None
     except (OSError, ValueError, KeyError, EOFError, BadZipFile):
         return None
 
 
+def asked_for(part: Mapping[str, NDArray]) -> NDArray:
+    """Codes that the samples of a part were asked for; parts of version 0.1 have no others than those used."""
+    return part["asked"] if "asked" in part else part["latents"]
+
+
+def columns(folder: Path, *names: str) -> dict[str, NDArray]:
+    """Some arrays of all samples of a folder, failed ones too; none of a folder without parts."""
+    found: dict[str, list[NDArray]] = {name: [] for name in names}
+    for path in sorted(folder.glob("part-*.npz")):
+        with np.load(path) as part:
+            for name, arrays in found.items():
+                arrays.append(asked_for(part) if name == "asked" else part[name])
+    return {name: np.concatenate(arrays) for name, arrays in found.items() if arrays}
+
+
+def indices(folder: Path) -> IntArray:
+    """Indices of the samples of a folder that have a shape."""
+    found = columns(folder, "index", "status")
+    return found["index"][found["status"] == DONE]
+
+
 def read(folder: Path) -> Samples:
     """Read all parts of a folder."""
-    fields = "index", "latents", "nric", "vertices"
+    fields = "index", "latents", "asked", "nric", "vertices"
     found: dict[str, list[NDArray]] = {name: [] for name in fields}
     for path in sorted(folder.glob("part-*.npz")):
         with np.load(path) as part:
             done = part["status"] == DONE
             for name in fields:
-                found[name].append(part[name][done])
+                found[name].append((asked_for(part) if name == "asked" else part[name])[done])
     return Samples(*(np.concatenate(found[name]) for name in fields))
+
+
+def used(folder: Path, asked: FloatArray) -> FloatArray:
+    """Codes (n, m) as asked for, but those shortened that a folder's samples had to shorten."""
+    found, codes = columns(folder, "index", "latents", "status"), asked.copy()
+    done = found["status"] == DONE
+    codes[found["index"][done]] = found["latents"][done]
+    return codes
 
 
 def split(index: IntArray, test: float, validation: float, rng: np.random.Generator) -> dict[str, IntArray]:

@@ -63,6 +63,7 @@ energy = 1.0
 fit = { batch_size = 16, max_epochs = 8 }
 
 [evaluation]
+grid_nodes = 5
 grid_size = 30
 reconstructions = 4
 
@@ -119,6 +120,9 @@ def test_a_run_leaves_what_the_contract_promises(run: Path) -> None:
         assert np.array_equal(fine.faces, faces)
         assert fine.area == pytest.approx(1)
         np.testing.assert_allclose(reference["scale"] * fine.vertices, vertices[0], atol=1e-4)
+    with np.load(run / "mean.npz") as mean:
+        # Shapes are served where the mean stands.
+        np.testing.assert_allclose(align(mean["vertices"], mesh.vertices), mean["vertices"], atol=1e-9)
     with np.load(run / "modes.npz") as modes:
         assert modes["nric"].shape == (3, 2 * len(mesh.edges))
         assert modes["vertices"].shape == (3, *mesh.vertices.shape)

@@ -63,7 +63,7 @@ def test_a_crop_of_everything_is_the_whole_mesh(mesh: TriangleMesh) -> None:
     whole = network.loss(inputs, target)
     network.crops = crops(mesh, 10**6)
     assert network.crops.about(torch.tensor([7])).inner.all()
-    torch.testing.assert_close(network.loss(inputs, target), whole)
+    torch.testing.assert_close(network.loss(inputs, target), whole, rtol=1e-4, atol=0)  # sums in another order
 
 
 def test_an_edge_is_inner_where_all_within_reach_is_in_the_crop(mesh: TriangleMesh) -> None:

@@ -40,8 +40,10 @@ def test_alone_keeps_one_factor_and_leaves_the_rest_at_the_reference() -> None:
 
 @pytest.mark.parametrize(("dimension", "nodes"), [(1, 16), (2, 16), (3, 10), (4, 5), (6, 3), (7, 2)])
 def test_a_grid_has_no_more_nodes_than_allowed(dimension: int, nodes: int) -> None:
-    assert grid_nodes(dimension, EvaluationSettings()) == nodes
-    assert nodes**dimension <= EvaluationSettings().grid_size
+    settings = EvaluationSettings(grid_nodes=16)
+    assert grid_nodes(dimension, settings) == nodes
+    assert nodes**dimension <= settings.grid_size
+    assert grid_nodes(dimension, EvaluationSettings()) == 0
 
 
 def test_the_grid_is_exact_at_its_nodes_linear_between_them_and_closes_up(torus: FreakyTorus) -> None:

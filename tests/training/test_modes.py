@@ -11,10 +11,12 @@ from scipy.optimize import lsq_linear
 
 from geometry.calculus import ShellSpace
 from geometry.exponential import exponential
+from geometry.geodesic import geodesic
 from geometry.mesh import FloatArray, TriangleMesh, align
 from geometry.nric import WeightedNorm, unwrap
 from geometry.rigid import rigid_motions, without_rigid_motion
 from geometry.status import Status
+from tests.geometry.conftest import bent
 from training.modes import ModeError, Modes, _fit_in_box, localisation, pga, spga
 from training.tangents import tangents
 
@@ -272,8 +274,33 @@ def test_processes_give_what_one_gives(bumps):
     assert here.reasons == there.reasons == ("",) * 5
 
 
+def test_far_shapes_are_reached_by_way_of_their_neighbours():
+    """From a rod rolled up one way to rods rolled up the other way; the straight line leads through what is no rod."""
+    ball = trimesh.creation.icosphere(subdivisions=2)
+    rod = TriangleMesh.from_arrays(ball.vertices * [4, 0.5, 0.5], ball.faces)
+    space, start = ShellSpace(rod), bent(rod.vertices, -7)
+    shapes = np.stack([bent(rod.vertices, angle) for angle in (4, -1, 1)])
+    straight = [geodesic(space, start, shape, 8, tolerance=1e-6, bisect=False) for shape in shapes]
+    assert [path.converged for path in straight] == [False, True, False]
+    found = tangents(space, start, shapes, 8, workers=1)
+    assert found.status == (Status.CONVERGED,) * 3
+    assert found.steps == (8, 8, 8)
+    assert found.via[1] == -1
+    assert found.via[0] >= 0 <= found.via[2]
+    assert [bool(reason) for reason in found.reasons] == [True, False, True]
+    for shape, field in zip(shapes, found.fields, strict=True):
+        end = exponential(space, start, field, 8)
+        assert end.converged
+        assert align(end.vertices[-1], shape) == pytest.approx(shape, abs=1e-3 * rod.diagonal)
+        # A path that takes a detour, or passes over a fold, is longer than what the shapes differ by.
+        whole = geodesic(space, start, shape, 8, tolerance=1e-6, first=end.vertices)
+        assert space.norm(start, field) == pytest.approx(np.sqrt(whole.energy), rel=0.3)
+
+
 def test_where_there_is_no_geodesic_the_logarithm_is_linearised(bumps, rng):
     crumpled = bumps.mean + 0.8 * rng.standard_normal(bumps.mean.shape)
+    i, j, k = bumps.space.connectivity.faces[7]
+    crumpled[[i, j, k]] = [[0, 0, 0], [1, 0, 0], [3, 0, 0]]  # a face without area
     found = tangents(bumps.space, bumps.mean, np.stack([crumpled, bumps.mean + 0.1 * bumps.fields[0]]), 4, workers=1)
     assert found.fallbacks == [0]
     assert found.steps == (0, 4)

@@ -21,7 +21,7 @@ from geometry.energy import Material
 from geometry.mesh import FloatArray, TriangleMesh
 from tests.training.conftest import TINY
 from training import workers
-from training.sampling import draw, read, split
+from training.sampling import draw, read, split, used
 from training.shell_collection import ShellCollection
 from training.workers import WorkersError
 
@@ -63,7 +63,7 @@ def assert_same(folder: Path, other: Path) -> None:
     """The same samples bit for bit, none missing and none twice."""
     a, b = read(folder), read(other)
     assert a.index.tolist() == list(range(20))
-    for name in ("index", "latents", "nric", "vertices"):
+    for name in ("index", "latents", "asked", "nric", "vertices"):
         assert np.array_equal(getattr(a, name), getattr(b, name)), name
     assert not list(folder.glob("*.part"))
 
@@ -279,3 +279,27 @@ def test_it_travels_without_its_analysis(collection: ShellCollection, latents: F
     pickled = pickle.dumps(collection)
     assert b"ShellSpace" not in pickled
     assert np.array_equal(pickle.loads(pickled).shapes(code).nric, expected.nric)  # noqa: S301
+
+
+def test_codes_without_a_shape_are_shortened_and_say_so(collection: ShellCollection, tmp_path: Path) -> None:
+    asked = collection.coordinates.uniform(6, np.random.default_rng(3))
+    reach = next(s for s in np.geomspace(1, 100, 60) if collection.shapes(s * asked[:1]).reasons[0])
+    asked[0] *= reach  # just beyond the last shape
+    asked[1] *= 20 * reach
+    assert list(draw(collection, tmp_path / "plain", asked, 3, "samples", workers=1))[-1] == (6, 6, 2)
+    assert list(draw(collection, tmp_path / "short", asked, 3, "samples", shorten=True, workers=1))[-1] == (6, 6, 1)
+    samples = read(tmp_path / "short")
+    assert samples.index.tolist() == [0, 2, 3, 4, 5]
+    assert samples.shortened.tolist() == [True, False, False, False, False]
+    assert np.array_equal(samples.asked, asked[samples.index])
+    share = samples.latents[0] / asked[0]
+    assert share == pytest.approx(share[0])
+    assert 0.5 < share[0] < 1
+    assert np.array_equal(samples.nric, collection.shapes(samples.latents).nric.astype(np.float32))
+    codes = used(tmp_path / "short", asked)
+    assert np.array_equal(codes[samples.index], samples.latents)
+    assert np.array_equal(codes[1], asked[1])
+    # What is there is not drawn again.
+    before = {path: path.stat().st_mtime_ns for path in (tmp_path / "short").iterdir()}
+    assert list(draw(collection, tmp_path / "short", asked, 3, "samples", shorten=True, workers=1)) == [(6, 6, 1)]
+    assert {path: path.stat().st_mtime_ns for path in (tmp_path / "short").iterdir()} == before

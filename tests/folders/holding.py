@@ -1,0 +1,142 @@
+"""Runs the command on a folder, and holds what must be: words, exit code, and a bundle that serves sound shapes."""
+
+from __future__ import annotations
+
+import io
+import re
+from collections.abc import Sequence
+from contextlib import redirect_stderr, redirect_stdout
+from pathlib import Path
+from unittest.mock import patch
+
+import numpy as np
+
+from geometry.mesh import Connectivity, diagonal, face_normals
+from geometry.triangle_quality import FOLD_LIMIT, dots
+from service.bundle import read_bundle
+from service.correspondence import Matched
+from service.encode import Encoder
+from service.shape_model import MeshChoice, ShapeModel
+from tests.folders.catalogue import Folder
+from training import __main__ as training
+from training.ingest import read_collection
+
+#: Codes that are served, and training shapes that are encoded, at most.
+CODES, ENCODED = 100, 10
+CONFIG = """
+[collection]
+data = "{data}"
+coarse_vertices = 250
+
+[modes]
+count = 4
+log_steps = 4
+max_iterations = 40
+
+[factors]
+count = 2
+
+[samples]
+count = 80
+steps = 4
+part_size = 20
+
+[networks.factors]
+hidden = [16]
+skip_degree = 3
+fit = {{ batch_size = 16, max_epochs = 10 }}
+
+[networks.combiner]
+kernel = 6
+
+[monolithic]
+hidden = [16]
+energy = 1.0
+fit = {{ batch_size = 16, max_epochs = 2 }}
+
+[evaluation]
+reconstructions = 4
+exact_factors = 4
+
+[export]
+name = "figure"
+title = "Figure"
+description = "A run for the tests."
+licence = "MIT"
+"""
+
+
+def command(arguments: Sequence[str]) -> tuple[int, str]:
+    """Exit code and words of ``shapespace-train``, in this process: most of a short run is the import of torch."""
+    words = io.StringIO()
+    with patch("sys.argv", ["shapespace-train", *arguments]), redirect_stdout(words), redirect_stderr(words):
+        return training.main(), words.getvalue()
+
+
+def hold(folder: Folder, place: Path) -> str:
+    """Build a folder, run the command on it and check what comes of it; what came, in a few words.
+
+    Raises:
+        AssertionError: with what isn't as it must be.
+    """
+    meshes = place / "meshes"
+    folder.build(meshes)
+    data = meshes if meshes.exists() else meshes.with_suffix(".npz")
+    code, first = command(["init", str(data), "--out", str(place / "init.toml")])
+    assert code in (0, 1), first
+    assert "Traceback" not in first, first
+    config = place / "figure.toml"
+    config.write_text(CONFIG.format(data=data.name), encoding="utf-8")
+    run = ["run", str(config), "--out", str(place / "run"), "--models", str(place / "models"), *folder.arguments]
+    if folder.later:
+        code, words = command([*run, "--until", "ingest"])
+        assert code == 0, words
+        folder.later(meshes)
+    code, words = command(run)
+    assert "Traceback" not in words, words
+    assert code in folder.codes, f"exit code {code}: {words}"
+    assert re.search(folder.says, words), words
+    if folder.quick:
+        assert len(words) < 1000, words
+        assert not (place / "models").exists()
+    if code:
+        return f"code {code}: {words.strip().splitlines()[-1][:100]}"
+    return sound(folder, place, data)
+
+
+def sound(folder: Folder, place: Path, data: Path) -> str:
+    """Whether the bundle serves sound shapes, and training shapes come back."""
+    model = ShapeModel(read_bundle(place / "models" / "figure" / "1"))
+    faces = Connectivity(model.reference.faces, len(model.reference.vertices))
+    left, right = faces.edge_faces[faces.interior].T
+
+    def bends(shape: np.ndarray) -> np.ndarray:
+        """Cosines between neighbouring normals."""
+        normals = face_normals(shape, faces.faces)
+        return dots(normals[left], normals[right])
+
+    with np.load(place / "run" / "shapes.npz") as file:
+        # Where the collection has a crease, a served shape may be folded.
+        crease = np.min([bends(shape) for shape in file["vertices"]], axis=0) < 0
+    codes = np.random.default_rng(0).uniform(
+        model.latents.lower, model.latents.upper, (CODES, len(model.latents.lower))
+    )
+    served = [model.shape(code.astype(np.float32), mesh=MeshChoice.COARSE) for code in codes]
+    stalled = [shape.diagnostics.status for shape in served if shape.diagnostics.status != "converged"]
+    assert not stalled, f"{len(stalled)} of {CODES} served codes end otherwise than converged: {set(stalled)}"
+    folds = sum(int(((bends(shape.vertices) < FOLD_LIMIT) & ~crease).sum()) for shape in served)
+    assert not folds, f"{folds} edges of {CODES} served shapes are folded where the collection has no crease"
+    flipped = sum(shape.diagnostics.flipped_faces for shape in served)
+    assert not flipped, f"{flipped} faces of {CODES} served shapes are flipped"
+
+    collection, encode = read_collection(data), Encoder(model)
+    errors = []
+    for name, shape in list(zip(collection.names, collection.vertices, strict=True))[:ENCODED]:
+        if name not in folder.odd:
+            found = encode(Matched(np.array(shape), MeshChoice.FINE))
+            errors.append(found.distances.mean() / diagonal(shape))
+    assert np.mean(errors) <= folder.back, f"training shapes come back to {np.mean(errors):.3f} of the diagonal"
+    centre = collection.vertices[collection.central]
+    away = np.linalg.norm((model.reference_shape().vertices - centre).mean(axis=0)) / diagonal(centre)
+    assert away < 0.02, f"the reference is served {away:.3f} of the diagonal from where its file has it"
+    return f"bundle: {CODES} codes without a fold, shapes to {100 * np.mean(errors):.2f} %"

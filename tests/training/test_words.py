@@ -1,0 +1,205 @@
+"""What a run says: which data are new, what each stage gave up, where a fault was written, and what comes next."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from geometry.formats import MESH_FORMATS
+from tests.faults.training import CONFIG, bars
+from training import __main__ as command
+from training.losses import losses
+from training.record import Record
+from training.report import page
+
+SHAPES, FACES = bars(6)
+
+
+def write(path: Path, vertices: np.ndarray) -> None:
+    path.write_bytes(MESH_FORMATS["obj"].encode(vertices, FACES))
+
+
+@pytest.fixture
+def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder to stand in, with a configuration and meshes."""
+    (tmp_path / "meshes").mkdir()
+    for k, shape in enumerate(SHAPES[:5]):
+        write(tmp_path / "meshes" / f"bar{k}.obj", shape)
+    (tmp_path / "bars.toml").write_text(CONFIG.replace("bars.npz", "meshes"))
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+class Said:
+    """Runs the command in this process, which needn't import torch again."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+        self._monkeypatch, self._capsys = monkeypatch, capsys
+
+    def __call__(self, *arguments: str, code: int = 0) -> str:
+        self._monkeypatch.setattr(sys, "argv", ["shapespace-train", *arguments])
+        assert command.main() == code
+        captured = self._capsys.readouterr()
+        assert "Traceback" not in captured.err
+        return captured.out + captured.err
+
+
+@pytest.fixture
+def said(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Said:
+    return Said(monkeypatch, capsys)
+
+
+def test_changed_data_are_read_again_and_it_is_said(place: Path, said: Said) -> None:
+    run = "run", "bars.toml", "--until", "ingest"
+    meshes = place / "meshes"
+    assert "done before" not in said(*run)
+
+    def read(says: str | None) -> None:
+        words = said(*run)
+        assert ("ingest: done before" in words) == (says is None)
+        assert "data:" not in words if says is None else f"data: {says};" in words
+
+    def names() -> list[str]:
+        with np.load(place / "runs" / "bars" / "shapes.npz") as file:
+            return file["names"].tolist()
+
+    read(None)
+    write(meshes / "bar9.obj", SHAPES[5])
+    read("1 added (bar9.obj)")
+    assert names() == ["bar0", "bar1", "bar2", "bar3", "bar4", "bar9"]
+    read(None)
+    os.utime(meshes / "bar2.obj", (0, 0))
+    read(None)  # another time alone is no change
+    size = (meshes / "bar2.obj").stat().st_size
+    write(meshes / "bar2.obj", SHAPES[5])
+    write(meshes / "bar9.obj", SHAPES[2])
+    read("2 changed (bar2.obj, bar9.obj)")
+    assert abs((meshes / "bar2.obj").stat().st_size - size) < 2000
+    (meshes / "bar4.obj").unlink()
+    (meshes / "notes.txt").write_text("no mesh")
+    read("1 removed (bar4.obj)")
+    meshes.rename(place / "elsewhere")
+    words = said(*run)
+    assert "is not there any more" in words
+    assert "ingest: done before" in words
+
+
+def test_a_run_of_version_0_1_is_not_continued_and_loses_nothing(place: Path, said: Said) -> None:
+    said("run", "bars.toml", "--until", "mean")
+    run = place / "runs" / "bars"
+    (run / "data.json").unlink()
+    words = said("run", "bars.toml", code=1)
+    assert "is a run of version 0.1" in words
+    assert "--out" in words
+    assert (run / "mean.npz").exists()
+
+
+def test_an_odd_shape_stops_the_run_until_it_is_accepted(place: Path, said: Said) -> None:
+    write(place / "meshes" / "bar3.obj", 1000 * SHAPES[3])
+    words = said("init", "meshes")
+    assert re.search(r"meshes/bar3\.obj: is of another size: its lengths are [\d,]+ times the median's", words)
+    assert "--accept bar3" in words
+    run = "run", "bars.toml", "--until", "ingest"
+    refused = said(*run, code=1)
+    assert re.search(r"meshes/bar3\.obj: is of another size: its lengths are [\d,]+ times the median's", refused)
+    assert refused.endswith("--accept bar3\n")
+    assert not (place / "runs" / "bars" / "reference.npz").exists()
+    assert "bar3.obj: is of another size" in said(*run, "--accept", "bar3.obj")
+    assert "bar3.obj: is of another size" in page(Record(place / "runs" / "bars"))
+
+
+def done_up_to_modes(place: Path, said: Said) -> Path:
+    said("run", "bars.toml", "--until", "modes")
+    return place / "runs" / "bars"
+
+
+def test_lost_logarithms_are_said_and_stop_the_run(place: Path, said: Said) -> None:
+    run = done_up_to_modes(place, said)
+    assert [loss.sentence for loss in losses(run, "modes")] == []
+    modes = json.loads((run / "modes.json").read_text())
+    for steps, says, stops in (
+        ([4, 4, 4, 8, 4], "twice as many steps for 1 of 5 logarithms: bar3", False),
+        ([4, 0, 4, 4, 4], "linearised 1 of 5 logarithms: bar1", False),
+        ([4, 0, 4, 0, 4], "linearised 2 of 5 logarithms: bar1, bar3", True),
+    ):
+        (run / "modes.json").write_text(json.dumps(modes | {"steps": steps, "log_steps": 4, "asked": 9}))
+        words = said("run", "bars.toml", "--until", "factors", code=int(stops))
+        assert f"  {says}\n" in words
+        assert "  m 2 of 9, because the others would be nought" in words
+        assert (says in page(Record(run))) is True
+        assert (run / "factors.json").exists() != stops
+        (run / "factors.json").unlink(missing_ok=True)
+        (run / "stages" / "factors.json").unlink(missing_ok=True)
+    assert "material.eta" in words
+    assert words.rstrip().endswith("shapespace-train run bars.toml --until factors --keep-going")
+    said("run", "bars.toml", "--until", "factors", "--keep-going")
+    assert (run / "factors.json").exists()
+
+
+def test_failed_samples_are_counted_by_factor(place: Path) -> None:
+    run = place / "run"
+    (run / "samples" / "factor-1").mkdir(parents=True)
+    (run / "factors.json").write_text('{"factors": [[0], [1]], "names": ["left", "upper right"]}')
+    latents = np.random.default_rng(0).uniform(-1, 1, (40, 2))
+    status = np.where(np.abs(latents[:, 1]) > 0.8, "failed", "done")
+    reason = np.where(status == "failed", "stalled: a face turns", "")
+    count = int((status == "failed").sum())
+    for folder in (run / "samples", run / "samples" / "factor-1"):
+        used = latents.copy()
+        used[:5] *= 0.85
+        np.savez(folder / "part-00000.npz", asked=latents, latents=used, status=status, reason=reason)
+    shortened, joint, own_shortened, own = losses(run, "samples")
+    assert shortened.sentence.startswith("shortened 5 of 40 codes of joint samples until they had a shape")
+    assert own_shortened.sentence == "shortened 5 of 40 codes of samples of factor 'upper right' until they had a shape"
+    lost = status == "failed"
+    lost[:5] = True
+    assert shortened.share == own_shortened.share == lost.mean()
+    assert joint.sentence == f"failed {count} of 40 joint samples (stalled), most in factor 'upper right'"
+    assert own.sentence == f"failed {count} of 40 samples of factor 'upper right' (stalled)"
+    assert joint.share == own.share == count / 40
+
+
+def test_a_traceback_is_written_and_not_shown(place: Path, said: Said) -> None:
+    said("run", "bars.toml", "--until", "ingest")
+    (place / "runs" / "bars" / "shapes.npz").write_bytes(b"PK damaged")
+    done = subprocess.run(
+        [sys.executable, "-m", "training", "run", "bars.toml"],
+        capture_output=True,
+        text=True,
+        check=False,
+        env={**os.environ, "PYTHONPATH": str(command.HOME)},
+    )
+    assert done.returncode == 70
+    assert "Traceback" not in done.stderr
+    assert "something went wrong" in done.stderr
+    assert "runs/bars/traceback.txt" in done.stderr
+    assert "Traceback" in (place / "runs" / "bars" / "traceback.txt").read_text()
+
+
+def test_the_next_command_works_from_where_one_stands(
+    tiny_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, said: Said
+) -> None:
+    from tests.training.conftest import TINY
+
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    (tmp_path / "tiny.toml").write_text(TINY)
+    shutil.copytree(tiny_run, tmp_path / "run")
+    words = said("run", "../tiny.toml", "--out", "../run", "--models", "../run/models").splitlines()[-1]
+    bundle, following = words.split(" is ready. Next: ")
+    assert bundle == "../run/models/tiny-torus/1"
+    assert (Path(bundle) / "manifest.json").is_file()
+    setting, *words_of = shlex.split(following)
+    name, _, value = setting.partition("=")
+    assert (name, Path(value).resolve()) == ("SHAPESPACE_MODELS_DIR", (tmp_path / "run" / "models").resolve())
+    assert words_of[0] == "make"
+    subprocess.run([*words_of, "--dry-run"], check=True, capture_output=True, env={**os.environ, name: value})
