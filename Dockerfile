@@ -14,7 +14,7 @@ RUN --mount=type=secret,id=pip,target=/etc/pip.conf \
     pip install --require-hashes --requirement requirements/build.txt && \
     pip --python /opt/shapespace install --require-hashes --requirement requirements/serve.txt
 COPY pyproject.toml README.md LICENSE ./
-COPY geometry geometry
+COPY shapespace shapespace
 COPY service service
 RUN pip wheel --no-deps --no-index --no-build-isolation --wheel-dir wheels . && \
     pip --python /opt/shapespace install --no-deps --no-index wheels/*.whl

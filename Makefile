@@ -34,7 +34,7 @@ help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-12s%s\n", $$1, $$2 }' $(MAKEFILE_LIST)
 
 serve: $(VENV)/.serve ## start the server with the bundled models (SHAPESPACE_HOST, SHAPESPACE_PORT)
-	@$(BIN)/python -m service
+	@$(BIN)/python -m shapespace.service
 
 install: $(VENV)/.train ## install the shapespace-train command
 	@echo $(BIN)/shapespace-train
@@ -55,7 +55,8 @@ lint: $(VENV)/.all $(BIN)/hadolint ## check style, types, doors between packages
 
 # What the libraries of serving take part in, and training doesn't.
 SERVING = $(filter-out $(foreach name,blocks bundled_files proxy reloading replicas,%/test_$(name).py), \
-	$(wildcard tests/service/test_*.py)) $(foreach name,formats reading gltf_reading reconstruction cholesky,tests/geometry/test_$(name).py)
+	$(wildcard tests/service/test_*.py)) $(foreach name,files/test_formats files/test_reading files/test_gltf_reading \
+	coordinates/test_reconstruction solve/test_cholesky,tests/shapespace/$(name).py)
 
 lowest: $(VENV)-lowest/.installed ## run the server's tests with the lowest versions that pyproject.toml allows
 	PATH="$(CURDIR)/$(VENV)-lowest/bin:$$PATH" $(VENV)-lowest/bin/python -m pytest --numprocesses $(JOBS) --dist loadfile $(or $(ARGS),$(SERVING))
@@ -87,16 +88,16 @@ fuzz: $(VENV)/.all ## try every parser with thousands of made-up files (EXAMPLES
 fuzz-api: $(VENV)/.all ## try every call with thousands of requests (EXAMPLES=100 for each call and phase)
 	PATH="$(CURDIR)/$(BIN):$$PATH" FUZZ_EXAMPLES=$(or $(EXAMPLES),100) $(BIN)/python -m pytest tests/service/test_openapi.py -k schemathesis
 
-mutants: $(VENV)/.all ## make 160 small mistakes in geometry/ and see which its tests miss (COUNT=160)
+mutants: $(VENV)/.all ## make 160 small mistakes in the library and see which its tests miss (COUNT=160)
 	$(BIN)/python -m pip install $(foreach package,$(MUTANTS),'$(package)')
 	PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/python -m tests.mutants $(or $(COUNT),160) $(ARGS)
 
-coverage: $(VENV)/.all $(MODULES) ## which lines of geometry/ and service/ their tests run, servers included
+coverage: $(VENV)/.all $(MODULES) ## which lines of the library and of the service their tests run, servers included
 	$(BIN)/python -m pip install '$(COVERAGE)'
-	PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/coverage run -m pytest tests/geometry tests/service $(ARGS)
+	PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/coverage run -m pytest tests/shapespace tests/service $(ARGS)
 	$(BIN)/coverage combine --quiet
-	$(BIN)/coverage report --include 'geometry/*' --fail-under 90
-	$(BIN)/coverage report --include 'service/*' --fail-under 90
+	$(BIN)/coverage report --omit 'shapespace/service/*,shapespace/training/*' --fail-under 90
+	$(BIN)/coverage report --include 'shapespace/service/*' --fail-under 90
 
 audit: $(VENV)/.serve ## look up known vulnerabilities of what serving needs (needs a vulnerability database)
 	$(BIN)/python -m pip install '$(AUDIT)'
@@ -117,7 +118,7 @@ clients: $(VENV)/.all $(MODULES) $(VENV)-blender/.bpy ## have Blender and three.
 	PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/python -m tests.clients $(VENV)-blender/bin/python
 
 openapi: $(VENV)/.serve ## write openapi/openapi.json from the app
-	$(BIN)/python -m service.openapi
+	$(BIN)/python -m shapespace.service.http.openapi
 
 image-test: $(VENV)/.client ## build the container image, try it for real, and attack it
 	PATH="$(CURDIR)/$(BIN):$$PATH" scripts/image-test.sh

@@ -18,14 +18,14 @@ from scipy.spatial import ConvexHull
 from threadpoolctl import threadpool_limits
 
 from benchmarks.yardstick import superlu
-from geometry.calculus import Path, ShellSpace
-from geometry.energy import Material
-from geometry.exponential import exponential
-from geometry.geodesic import geodesic
-from geometry.mesh import TriangleMesh
-from geometry.nric import nric, unwrap
-from geometry.reconstruction import Reconstructor
-from tests.geometry.conftest import bent
+from shapespace.coordinates.nric import nric, unwrap
+from shapespace.coordinates.reconstruction import Reconstructor
+from shapespace.mesh.triangle_mesh import TriangleMesh
+from shapespace.shell.energy import Material
+from shapespace.shell.exponential import exponential
+from shapespace.shell.geodesic import geodesic
+from shapespace.shell.space import Path, ShellSpace
+from tests.shapespace.conftest import bent
 
 MATERIAL = Material(eta=4e-4)
 

@@ -18,12 +18,12 @@ from scipy.spatial.transform import Rotation
 from threadpoolctl import threadpool_limits
 
 from benchmarks.serving import bundles
-from service.bundle import read_bundle
-from service.correspondence import Matched
-from service.edit import Editor, Target
-from service.encode import Encoder
-from service.latent_space import Codes, Distribution
-from service.shape_model import MeshChoice, ShapeModel
+from shapespace.bundle.reader import read_bundle
+from shapespace.model.correspondence import Matched
+from shapespace.model.edit import Editor, Target
+from shapespace.model.encode import Encoder
+from shapespace.model.latent_space import Codes, Distribution
+from shapespace.model.shape_model import MeshChoice, ShapeModel
 
 T = TypeVar("T")
 

@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 import torch
 
-from geometry.nric import WeightedNorm, nric
-from training.evaluation import alone, r_squared
-from training.learning import Learner
-from training.networks import affine_sum, predict
-from training.workers import run
+from shapespace.coordinates.nric import WeightedNorm, nric
+from shapespace.training.learning.evaluation import alone, r_squared
+from shapespace.training.learning.learning import Learner
+from shapespace.training.learning.networks import affine_sum, predict
+from shapespace.training.runs.workers import run
 
 #: How far beyond, in half widths of the hypercube, and codes drawn there.
 REACHES = (1.0, 1.25, 1.5)

@@ -18,13 +18,13 @@ import numpy as np
 from PIL import Image
 
 from benchmarks import limits, space
-from geometry.mesh import align
-from training.config import load
-from training.files import write_json
-from training.pipeline import Run, execute, learner_of
-from training.record import Record
-from training.sampling import DONE
-from training.studio import COMPOSITE, Studio
+from shapespace.mesh.rigid_motion import align
+from shapespace.training.pipeline import Run, execute, learner_of
+from shapespace.training.report.pictures import COMPOSITE, Studio
+from shapespace.training.report.record import Record
+from shapespace.training.runs.config import load
+from shapespace.training.runs.files import write_json
+from shapespace.training.runs.sampling import DONE
 
 ROOT = Path(__file__).resolve().parents[1]
 #: Collections of real meshes, in the order of the tables; then the hand without what the method rests on.

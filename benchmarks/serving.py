@@ -30,16 +30,17 @@ from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
 
 from benchmarks import synthetic
 from benchmarks.yardstick import superlu
-from geometry.calculus import ShellSpace
-from geometry.energy import Material
-from geometry.exponential import exponential
-from geometry.formats import MESH_FORMATS
-from geometry.mesh import FloatArray, align
-from geometry.nric import NRICJacobian, WeightedNorm
-from geometry.reconstruction import Reconstructor
-from geometry.status import Status
-from service.bundle import read_bundle
-from service.shape_model import TOLERANCE, MeshChoice, ShapeModel
+from shapespace.arrays import FloatArray
+from shapespace.bundle.reader import read_bundle
+from shapespace.coordinates.nric import NRICJacobian, WeightedNorm
+from shapespace.coordinates.reconstruction import Reconstructor
+from shapespace.files.formats import MESH_FORMATS
+from shapespace.mesh.rigid_motion import align
+from shapespace.model.shape_model import TOLERANCE, MeshChoice, ShapeModel
+from shapespace.shell.energy import Material
+from shapespace.shell.exponential import exponential
+from shapespace.shell.space import ShellSpace
+from shapespace.solve.status import Status
 
 GLB = MESH_FORMATS["glb"].encode
 #: Two results of one code agree up to this fraction of the diagonal.
@@ -242,7 +243,7 @@ def server(models: Path, **settings: object) -> Iterator[tuple[httpx.Client, int
     began = time.perf_counter()
     more = {f"SHAPESPACE_{name.upper()}": str(value) for name, value in settings.items()}
     process = subprocess.Popen(
-        [sys.executable, "-m", "service"],
+        [sys.executable, "-m", "shapespace.service"],
         env={**os.environ, "SHAPESPACE_MODELS_DIR": str(models), "SHAPESPACE_PORT": "0", **more},
         stdout=subprocess.PIPE,
         stderr=subprocess.DEVNULL,

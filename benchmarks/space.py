@@ -12,15 +12,17 @@ from typing import Any
 
 import numpy as np
 
-from geometry.calculus import ShellSpace
-from geometry.mean import elastic_mean
-from geometry.mesh import FloatArray, TriangleMesh, align
-from geometry.sampling import exponentials
-from training import modes
-from training.config import Config
-from training.discovery import material
-from training.sampling import read
-from training.tangents import tangents
+from shapespace.arrays import FloatArray
+from shapespace.mesh.rigid_motion import align
+from shapespace.mesh.triangle_mesh import TriangleMesh
+from shapespace.shell.many_exponentials import exponentials
+from shapespace.shell.mean import elastic_mean
+from shapespace.shell.space import ShellSpace
+from shapespace.training.runs.config import Config
+from shapespace.training.runs.sampling import read
+from shapespace.training.space import modes
+from shapespace.training.space.discovery import material
+from shapespace.training.space.tangents import tangents
 
 FOLDS = 5
 #: Random codes whose shapes are compared with the collection.

@@ -11,9 +11,10 @@ import onnx
 import trimesh
 from onnx import TensorProto, helper, numpy_helper
 
-from geometry.formats import npz
-from geometry.mesh import FloatArray, TriangleMesh
-from geometry.nric import nric
+from shapespace.arrays import FloatArray
+from shapespace.coordinates.nric import nric
+from shapespace.files.formats import npz
+from shapespace.mesh.triangle_mesh import TriangleMesh
 
 LATENTS_OF_A_FACTOR = 4
 

@@ -7,8 +7,8 @@ import signal
 import sys
 from contextlib import suppress
 
-from service import memory
-from service.candidates import Trials, bundle_folders
+from shapespace.service.limits import memory
+from shapespace.service.repository.candidates import Trials, bundle_folders
 
 #: Characters that a key should have.
 SHORT_KEY = 16
@@ -28,7 +28,7 @@ def main() -> None:
 def _serve(trials: Trials) -> None:
     from pydantic import ValidationError
 
-    from service.settings import PREFIX, Settings, is_loopback, unknown_variables
+    from shapespace.service.settings import PREFIX, Settings, is_loopback, unknown_variables
 
     try:
         settings = Settings()
@@ -39,9 +39,9 @@ def _serve(trials: Trials) -> None:
     with suppress(OSError):  # the first look will say what is the matter
         trials.begin(bundle_folders(settings.models_dir)[0])
 
-    from service import logs
-    from service.app import create_app
-    from service.server import Server
+    from shapespace.service import logs
+    from shapespace.service.http.app import create_app
+    from shapespace.service.http.server import Server
 
     logs.configure(settings.log_format)
     log = logging.getLogger(__name__)

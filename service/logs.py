@@ -9,7 +9,7 @@ from typing import Any
 
 from pythonjsonlogger.orjson import OrjsonFormatter
 
-from service.settings import LogFormat
+from shapespace.service.settings import LogFormat
 
 #: The id of the request at work, for every line that is logged on its behalf.
 request_id: ContextVar[str | None] = ContextVar("request_id", default=None)

@@ -17,10 +17,10 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from geometry.formats import read_arrays
-from geometry.mesh import MeshError
-from geometry.reading import Limits
-from service.uploads import UploadError, read_mesh_file
+from shapespace.files.formats import read_arrays
+from shapespace.files.reading import Limits
+from shapespace.mesh.triangle_mesh import MeshError
+from shapespace.service.http.messages.uploads import UploadError, read_mesh_file
 
 #: Seconds of a processor after which a child is ended.
 SECONDS = 30

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from geometry.formats import read_arrays
-from geometry.mesh import TriangleMesh
+from shapespace.files.formats import read_arrays
+from shapespace.mesh.triangle_mesh import TriangleMesh
 
 
 def read_mesh(source: bytes | Path, format: str | None = None) -> TriangleMesh:

@@ -5,7 +5,7 @@ import re
 from pathlib import Path
 
 PAGE = Path(__file__).parents[1] / "docs" / "mathematics.md"
-NAMED = re.findall(r"`((?:tests\.)?(?:geometry|training|service)\.\w+)\.(\w+)`", PAGE.read_text(encoding="utf-8"))
+NAMED = re.findall(r"`((?:tests\.)?shapespace(?:\.[a-z]\w*)+)\.(\w+)`", PAGE.read_text(encoding="utf-8"))
 
 
 def test_every_function_of_the_page_exists() -> None:

@@ -11,19 +11,19 @@ import tempfile
 import traceback
 from pathlib import Path
 
-from training import init
-from training.config import ConfigError, load
-from training.discovery import MeanError
-from training.export import ExportError
-from training.factors import FactorError
-from training.ingest import IngestError
-from training.losses import LostTooMuchError
-from training.modes import ModeError
-from training.pipeline import STAGES, OldRunError, Run, execute
-from training.record import Record, ReportError
-from training.report import write_report
-from training.sampling import SamplesError
-from training.workers import WorkersError
+from shapespace.training.collection import init
+from shapespace.training.collection.ingest import IngestError
+from shapespace.training.learning.export import ExportError
+from shapespace.training.pipeline import STAGES, OldRunError, Run, execute
+from shapespace.training.report.page import write_report
+from shapespace.training.report.record import Record, ReportError
+from shapespace.training.runs.config import ConfigError, load
+from shapespace.training.runs.losses import LostTooMuchError
+from shapespace.training.runs.sampling import SamplesError
+from shapespace.training.runs.workers import WorkersError
+from shapespace.training.space.discovery import MeanError
+from shapespace.training.space.factors import FactorError
+from shapespace.training.space.modes import ModeError
 
 #: Exit codes: a fault of the input or of the machine, one of ours (EX_SOFTWARE), and Ctrl+C as shells have it.
 FAILURE, DEFECT, STOPPED = 1, 70, 130
@@ -43,7 +43,7 @@ EXPECTED = (
     OSError,
 )
 #: The folder that holds the Makefile, where this is no installed package.
-HOME = Path(__file__).parents[1]
+HOME = Path(__file__).parents[2]
 
 
 def _here(path: Path) -> str:
@@ -56,7 +56,7 @@ def _program() -> str:
     """This command, so that it can be called again from here."""
     called = Path(sys.argv[0])
     if called.name != "shapespace-train":
-        return f"{shlex.quote(sys.executable)} -m training"
+        return f"{shlex.quote(sys.executable)} -m shapespace.training"
     return called.name if shutil.which(called.name) else _here(called)
 
 

@@ -17,19 +17,19 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel
 
-from geometry.mesh import FloatArray
-from training import discovery
-from training.config import Config
-from training.evaluation import alone, evaluate
-from training.export import export
-from training.files import write_json, write_npz, write_text
-from training.freaky_torus import FreakyTorus
-from training.ingest import data_files
-from training.learning import Learner
-from training.losses import losses, refuse
-from training.report import write_report
-from training.sampling import FEWEST, Collection, SamplesError, draw, indices, read, split, used
-from training.start import fit_start
+from shapespace.arrays import FloatArray
+from shapespace.training.collection.freaky_torus import FreakyTorus
+from shapespace.training.collection.ingest import data_files
+from shapespace.training.learning.evaluation import alone, evaluate
+from shapespace.training.learning.export import export
+from shapespace.training.learning.learning import Learner
+from shapespace.training.learning.start_network import fit_start
+from shapespace.training.report.page import write_report
+from shapespace.training.runs.config import Config
+from shapespace.training.runs.files import write_json, write_npz, write_text
+from shapespace.training.runs.losses import losses, refuse
+from shapespace.training.runs.sampling import FEWEST, Collection, SamplesError, draw, indices, read, split, used
+from shapespace.training.space import discovery
 
 
 class OldRunError(ValueError):

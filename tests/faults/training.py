@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 import trimesh
 
+from shapespace.training.pipeline import STAGES
 from tests.training.conftest import command
 from tests.training.test_collection import results
-from training.pipeline import STAGES
 
 CONFIG = """
 [collection]

@@ -11,15 +11,15 @@ from unittest.mock import patch
 
 import numpy as np
 
-from geometry.mesh import Connectivity, diagonal, face_normals
-from geometry.triangle_quality import FOLD_LIMIT, dots
-from service.bundle import read_bundle
-from service.correspondence import Matched
-from service.encode import Encoder
-from service.shape_model import MeshChoice, ShapeModel
+from shapespace.bundle.reader import read_bundle
+from shapespace.mesh.triangle_mesh import Connectivity, diagonal, face_normals
+from shapespace.mesh.triangle_quality import FOLD_LIMIT, dots
+from shapespace.model.correspondence import Matched
+from shapespace.model.encode import Encoder
+from shapespace.model.shape_model import MeshChoice, ShapeModel
+from shapespace.training import __main__ as training
+from shapespace.training.collection.ingest import read_collection
 from tests.folders.catalogue import Folder
-from training import __main__ as training
-from training.ingest import read_collection
 
 #: Codes that are served, and training shapes that are encoded, at most.
 CODES, ENCODED = 100, 10

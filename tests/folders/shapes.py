@@ -8,10 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
-from geometry.formats import MESH_FORMATS
-from geometry.mesh import Connectivity
-from geometry.thinning import thin
-from training import figure
+from shapespace.files.formats import MESH_FORMATS
+from shapespace.mesh.thinning import thin
+from shapespace.mesh.triangle_mesh import Connectivity
+from shapespace.training.collection import figure
 
 #: What bends, so that a few modes describe it all.
 BENDS = {"left elbow": 1.2, "right arm raise": 0.8, "head turn": 0.6, "left leg swing": 0.7}

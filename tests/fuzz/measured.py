@@ -1,6 +1,6 @@
 """The server with a meter beside it: ``python -m tests.fuzz.measured SOCKET``.
 
-It answers as ``python -m service`` does. Over a unix socket it takes two words, each on a connection of its own:
+It answers as ``python -m shapespace.service`` does. Over a unix socket it takes two words, each on its own connection:
 ``reset`` gives garbage and free memory back and sets the meter to nought, ``read`` answers with it as JSON.
 """
 
@@ -138,7 +138,7 @@ def main() -> None:
     meter.install()
     threading.Thread(target=attend, args=(meter, place), daemon=True).start()
     # Imported only now, so that nothing of it escapes the meter.
-    from service.__main__ import main as serve
+    from shapespace.service.__main__ import main as serve
 
     serve()
 

@@ -23,21 +23,21 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from geometry.formats import MESH_FORMATS, read_arrays
-from geometry.mesh import MeshError
-from geometry.reading import Limits
-from service.animation import Animation, UnknownInterpolationError
-from service.bundle import BundleError, read_bundle
-from service.correspondence import InvalidMeshError, Matched, limits, match
-from service.latent_space import LatentError
-from service.manifest import Manifest
-from service.negotiation import choose
-from service.problems import ProblemError
-from service.shape_model import ShapeModel
-from service.uploads import FORMATS, UploadError, read_mesh_file
+from shapespace.bundle.reader import BundleError, read_bundle
+from shapespace.bundle.schema import Manifest
+from shapespace.files.formats import MESH_FORMATS, read_arrays
+from shapespace.files.reading import Limits
+from shapespace.mesh.triangle_mesh import MeshError
+from shapespace.model.correspondence import InvalidMeshError, Matched, limits, match
+from shapespace.model.latent_space import LatentError
+from shapespace.model.shape_model import ShapeModel
+from shapespace.service.http.messages.uploads import FORMATS, UploadError, read_mesh_file
+from shapespace.service.http.negotiation import choose
+from shapespace.service.http.problems import ProblemError
+from shapespace.service.use_cases.animation import Animation, UnknownInterpolationError
+from shapespace.training.collection.ingest import IngestError, read_collection
 from tests.hostile import BINARY, MATRIX, document, glb
 from tests.service.bundles import reference, seal, write_bundle
-from training.ingest import IngestError, read_collection
 
 EXAMPLES = int(os.environ.get("FUZZ_EXAMPLES", "0"))
 fuzz = settings(

@@ -1,4 +1,4 @@
-"""How many small mistakes in geometry/ its tests notice: ``python -m tests.mutants [COUNT] [--seed N] [--only TEXT]``.
+"""How many small mistakes in the library its tests notice: ``python -m tests.mutants [COUNT] [--seed N] [--only T]``.
 
 Cosmic Ray makes the mistakes, one at a time, in a copy of the code. Of all that are possible a random sample is tried,
 spread over the modules by their lines, no two at one place. A mutant meets the tests that run its line, those of its
@@ -92,7 +92,7 @@ class Tests:
         found = functions(by_line.get(line, []) for line in lines)
         if not lines or any("" in by_line.get(line, []) for line in lines):  # it runs when the module is imported
             found = functions(by_line.values())
-        own = f"tests/geometry/test_{module.stem}.py"
+        own = f"tests/shapespace/test_{module.stem}.py"
         return sorted(found, key=lambda test: (not test.startswith(own), test))
 
 
@@ -112,7 +112,7 @@ def statements(module: Path) -> dict[int, range]:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(prog="python -m tests.mutants", description="Mutation testing of geometry/.")
+    parser = argparse.ArgumentParser(prog="python -m tests.mutants", description="Mutation testing of the library.")
     parser.add_argument("count", nargs="?", type=int, default=160, help="how many mutants")
     parser.add_argument("--seed", type=int, default=9)
     parser.add_argument("--only", default="", metavar="TEXT", help="of the sample, those with this in their names")
@@ -122,17 +122,17 @@ def main() -> int:
     outcomes: Counter[str] = Counter()
     with tempfile.TemporaryDirectory() as copy:
         unneeded = shutil.ignore_patterns("node_modules", "__pycache__")
-        for package in ("geometry", "service", "training", "tests"):
-            shutil.copytree(ROOT / package, Path(copy) / package, ignore=unneeded)
+        for package in ("shapespace", "service", "training", "tests"):
+            shutil.copytree(ROOT / package, Path(copy) / package, ignore=unneeded, symlinks=True)
         shutil.copy(ROOT / "pyproject.toml", copy)
         (Path(copy) / "build").mkdir()
         os.chdir(copy)
         os.environ["PYTHONPATH"] = copy
         start = time.monotonic()
-        measured = ["--cov=geometry", "--cov-context=test", "--cov-report="]
-        subprocess.run([*PYTEST, *measured, "tests/geometry"], check=True)
+        measured = ["--cov=shapespace", "--cov-context=test", "--cov-report="]
+        subprocess.run([*PYTEST, *measured, "tests/shapespace"], check=True)
         timeout = PATIENCE * (time.monotonic() - start)
-        total, chosen = sample(sorted(Path("geometry").glob("[a-z]*.py")), options.count, options.seed)
+        total, chosen = sample(sorted(Path("shapespace").glob("[a-z]*/[a-z]*.py")), options.count, options.seed)
         print(f"{len(chosen)} of {total} mutants, seed {options.seed}, at most {timeout:.0f} s each", flush=True)
         tests = Tests()
         with report.open("w", encoding="utf-8") as survivors:

@@ -148,8 +148,8 @@ def numbers(studio: Studio) -> list[float]:
 
 
 def test_lengths_and_angles_in_the_page_are_those_of_the_server(studio: Studio) -> None:
-    from geometry.mesh import TriangleMesh
-    from geometry.nric import nric
+    from shapespace.coordinates.nric import nric
+    from shapespace.mesh.triangle_mesh import TriangleMesh
 
     script = """async () => {
         const [{ Surface }, api] = await Promise.all([import('/page/js/surface.js'), import('/page/js/api.js')]);

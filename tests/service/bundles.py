@@ -11,11 +11,11 @@ import numpy as np
 import onnx
 from onnx import TensorProto, helper, numpy_helper
 
-from geometry.formats import npz
-from geometry.mesh import TriangleMesh
-from geometry.nric import nric
-from geometry.prolongation import Prolongation
-from training import freaky_torus
+from shapespace.coordinates.nric import nric
+from shapespace.files.formats import npz
+from shapespace.mesh.prolongation import Prolongation
+from shapespace.mesh.triangle_mesh import TriangleMesh
+from shapespace.training.collection import freaky_torus
 
 SCALE = 3.0
 LATENTS = ("size", "turn", "twist")

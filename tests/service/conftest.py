@@ -24,10 +24,10 @@ ROOT = Path(__file__).parents[2]
 
 
 class Server:
-    """A running ``python -m service``."""
+    """A running ``python -m shapespace.service``."""
 
     #: What Python is started with.
-    program: tuple[str, ...] = ("-m", "service")
+    program: tuple[str, ...] = ("-m", "shapespace.service")
 
     def __init__(self, models: Path, **settings: object) -> None:
         self._log = Path(tempfile.gettempdir(), f"shapespace-{uuid4().hex}.log")  # a pipe would fill up

@@ -3,7 +3,7 @@
 import schemathesis
 from schemathesis import Case, CheckContext, Response
 
-from service.problems import KINDS
+from shapespace.service.http.problems import KINDS
 
 #: Kinds of problems that a request may have although it is as openapi.json says.
 BEYOND_SCHEMAS = {

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from service.sandbox import FailedError
+from shapespace.service.limits.sandbox import FailedError
 
 Answer = tuple[dict[str, Any], dict[str, np.ndarray]]
 _kept: list[bytes] = []
@@ -104,6 +104,6 @@ def lie(body: bytearray) -> Answer:
 
 
 def crash_at_c(body: bytearray, folder: str) -> Answer:
-    from service.trial import try_bundle
+    from shapespace.service.repository.trial import try_bundle
 
     return crash(body) if Path(folder).parent.name == "c" else try_bundle(body, folder)

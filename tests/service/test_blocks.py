@@ -20,10 +20,10 @@ from pathlib import Path
 import httpx
 import pytest
 
-from service.settings import PREFIX, Settings
+from shapespace.service.settings import PREFIX, Settings
+from shapespace.training.__main__ import parser
 from tests.service.conftest import ROOT, Server, starting
 from tests.test_docs import PAGES, text_of
-from training.__main__ import parser
 
 MAKEFILE = (ROOT / "Makefile").read_text(encoding="utf-8")
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from geometry.formats import MESH_FORMATS
+from shapespace.files.formats import MESH_FORMATS
 from tests.service.conftest import ROOT
 from tests.service.glb import GLB, VALIDATOR
 

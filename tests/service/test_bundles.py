@@ -17,13 +17,14 @@ import pytest
 from onnx import TensorProto, helper, numpy_helper
 
 from benchmarks import synthetic
-from geometry.formats import npz
-from geometry.prolongation import Prolongation
-from service import candidates, sandbox
-from service.bundle import BundleError, read_bundle
-from service.candidates import Trials
-from service.repository import Changes, ModelRepository
-from service.shape_model import ShapeModel
+from shapespace.bundle.reader import BundleError, read_bundle
+from shapespace.files.formats import npz
+from shapespace.mesh.prolongation import Prolongation
+from shapespace.model.shape_model import ShapeModel
+from shapespace.service.limits import sandbox
+from shapespace.service.repository import candidates
+from shapespace.service.repository.candidates import Trials
+from shapespace.service.repository.repository import Changes, ModelRepository
 from tests.faults.serving import peak_memory
 from tests.service import hostile
 from tests.service.bundles import SCALE, fine_arrays, network, networks, reference, rescale, seal, write_bundle
@@ -459,7 +460,7 @@ def test_a_fine_mesh_of_a_hundred_and_sixty_thousand_vertices_is_no_bomb(tmp_pat
 
 
 def name_with_a_line_break(models: Path) -> None:
-    write_bundle(models, "bad").parent.rename(models / "bad\nINFO service.repository: bundle forged is served")
+    write_bundle(models, "bad").parent.rename(models / "bad\nINFO shapespace: bundle forged is served")
 
 
 def of(harm: Callable[..., None], **options: object) -> Callable[[Path], object]:
@@ -479,7 +480,7 @@ ATTACKS: dict[str, tuple[Callable[[Path], object], str]] = {
     "is not finite": (of(hostile.not_finite), "does not give finite numbers for zeros"),
     "has no training codes": (of(hostile.no_codes), "training_codes is empty"),
     "unpacks": (of(hostile.unpacks), "its arrays would come to 1700008"),
-    "forges a line": (name_with_a_line_break, r"bad\nINFO service.repository: bundle forged is served/1 is not served"),
+    "forges a line": (name_with_a_line_break, r"bad\nINFO shapespace: bundle forged is served/1 is not served"),
 }
 
 
@@ -497,7 +498,7 @@ def test_a_server_starts_beside_any_bundle(tmp_path: Path, start: Start, attack:
     assert peak_memory(server) < 300 * 2**20
     log = server.stop().splitlines()
     assert sum(line in entry for entry in log) == 1, log
-    assert not [entry for entry in log if entry.startswith("INFO service.repository: bundle forged")]
+    assert not [entry for entry in log if entry.startswith("INFO shapespace: bundle forged")]
     assert len([entry for entry in log if entry.startswith("ERROR ")]) == 1, log
 
 

@@ -11,7 +11,7 @@ import httpx
 import numpy as np
 import pytest
 
-from service.client import Client, ClientError, Interpolation
+from shapespace.client import Client, ClientError, Interpolation
 from tests.service.bundles import SCALE, expected_nric, reference
 from tests.service.conftest import ROOT, Server, Start
 from tests.service.glb import GLB
@@ -157,11 +157,11 @@ def test_it_needs_httpx_and_numpy_alone() -> None:
 import sys
 class Refuse:
     def find_spec(self, name, path=None, target=None):
-        if name.split(".")[0] in {"fastapi", "geometry", "onnxruntime", "orjson", "pydantic", "scipy", "starlette"}:
+        if name.split(".")[0] in {"fastapi", "onnxruntime", "orjson", "pydantic", "scipy", "starlette"}:
             raise ModuleNotFoundError(name)
 sys.meta_path.insert(0, Refuse())
-import service.client
-print(sorted(name for name in sys.modules if name.startswith("service")))
+import shapespace.client
+print(sorted(name for name in sys.modules if name.startswith("shapespace")))
 """
     found = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, check=True)
-    assert found.stdout.strip() == "['service', 'service.client']"
+    assert found.stdout.strip() == "['shapespace', 'shapespace.client']"

@@ -9,11 +9,12 @@ import httpx
 import numpy as np
 import pytest
 
-from geometry.calculus import ShellSpace
-from geometry.energy import Material
-from geometry.exponential import exponential
-from geometry.integrability import Integrability
-from geometry.mesh import TriangleMesh, align
+from shapespace.coordinates.integrability import Integrability
+from shapespace.mesh.rigid_motion import align
+from shapespace.mesh.triangle_mesh import TriangleMesh
+from shapespace.shell.energy import Material
+from shapespace.shell.exponential import exponential
+from shapespace.shell.space import ShellSpace
 from tests.service.bundles import expected_nric, reference
 from tests.service.conftest import ROOT
 

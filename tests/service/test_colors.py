@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from geometry.mesh import Connectivity
-from geometry.nric import dihedral_angles, edge_lengths
+from shapespace.coordinates.nric import dihedral_angles, edge_lengths
+from shapespace.mesh.triangle_mesh import Connectivity
 from tests.service.glb import GLB
 
 MODEL = "/v1/models/with-fine"

@@ -12,8 +12,8 @@ from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 from packaging.version import Version
 
-from service.openapi import TARGET
-from service.settings import PREFIX, Settings
+from shapespace.service.http.openapi import TARGET
+from shapespace.service.settings import PREFIX, Settings
 from tests.service.conftest import ROOT
 from tests.service.watching import ENDING
 

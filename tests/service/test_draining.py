@@ -100,7 +100,7 @@ def test_a_connection_opened_before_the_end_is_answered_after_it(models: Path, s
 def test_it_ends_with_its_terminal(models: Path) -> None:
     terminal, shell = pty.openpty()
     process = subprocess.Popen(
-        [sys.executable, "-m", "service"],
+        [sys.executable, "-m", "shapespace.service"],
         cwd=ROOT,
         env=os.environ | {"SHAPESPACE_MODELS_DIR": str(models), "SHAPESPACE_PORT": "0"},
         stdin=shell,

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from geometry.formats import MESH_FORMATS, npz
-from geometry.mesh import TriangleMesh
-from service.bundle import read_bundle
-from service.correspondence import InvalidMeshError, Matched, limits, match
-from service.shape_model import MeshChoice, ShapeModel
-from service.uploads import read_mesh_file
+from shapespace.bundle.reader import read_bundle
+from shapespace.files.formats import MESH_FORMATS, npz
+from shapespace.mesh.triangle_mesh import TriangleMesh
+from shapespace.model.correspondence import InvalidMeshError, Matched, limits, match
+from shapespace.model.shape_model import MeshChoice, ShapeModel
+from shapespace.service.http.messages.uploads import read_mesh_file
 from tests.hostile import HOSTILE, MIB
 from tests.service.bundles import SCALE, fine_reference, reference, seal, write_bundle
 

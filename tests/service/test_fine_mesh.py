@@ -9,8 +9,9 @@ import httpx
 import numpy as np
 import pytest
 
-from geometry.formats import MESH_FORMATS
-from geometry.mesh import TriangleMesh, align
+from shapespace.files.formats import MESH_FORMATS
+from shapespace.mesh.rigid_motion import align
+from shapespace.mesh.triangle_mesh import TriangleMesh
 from tests.meshes import read_mesh
 from tests.service.bundles import SCALE, fine_reference, reference
 from tests.service.glb import GLB

@@ -38,7 +38,8 @@ def test_what_reading_costs(name: str, cost: Costs) -> None:
 def test_the_reader_is_light() -> None:
     """A process that does nothing else has no use for a server, for networks or for sparse matrices."""
     heavy = ("fastapi", "starlette", "pydantic", "onnxruntime", "torch", "trimesh", "scipy")
-    program = f"import sys, service.uploads; print([name for name in {heavy} if name in sys.modules])"
+    module = "shapespace.service.http.messages.uploads"
+    program = f"import sys, {module}; print([name for name in {heavy} if name in sys.modules])"
     told = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert told.stdout.strip() == "[]"
 

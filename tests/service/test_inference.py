@@ -10,7 +10,7 @@ import pytest
 import tritonclient.http as triton
 from tritonclient.utils import InferenceServerException
 
-from service import __version__
+from shapespace import __version__
 from tests.service.bundles import SCALE, expected_nric, reference
 from tests.service.conftest import Server
 

@@ -16,10 +16,10 @@ import httpx
 import numpy as np
 import pytest
 
-from geometry.formats import read_arrays
-from service.animation import Animation
-from service.bundle import read_bundle
-from service.latent_space import LatentSpace
+from shapespace.bundle.reader import read_bundle
+from shapespace.files.formats import read_arrays
+from shapespace.model.latent_space import LatentSpace
+from shapespace.service.use_cases.animation import Animation
 from tests.sequences import read_point_cache, read_usd
 from tests.service.conftest import Start
 from tests.service.glb import GLB, khronos_report

@@ -76,7 +76,7 @@ def test_a_log_in_json_has_one_object_a_line(models: Path, start: Start) -> None
         client.get("/v2/health/live")
     lines = [json.loads(line) for line in server.stop().splitlines()]
     assert all({"time", "level", "logger", "message"} <= line.keys() for line in lines)
-    requests = [line for line in lines if line["logger"] == "service.middleware"]
+    requests = [line for line in lines if line["logger"] == "shapespace.service.http.middleware"]
     assert [line["path"] for line in requests] == [MESH, "/v1/models/la%0Arge"], "health checks say nothing"
     assert requests[0]["request_id"] == "mine"
     assert (requests[0]["method"], requests[0]["status"]) == ("POST", 200)
@@ -137,11 +137,11 @@ def test_by_default_no_other_origin_may_call(client: httpx.Client) -> None:
     assert not [name for name in answer.headers if name.lower().startswith("access-control")]
 
 
-FORGERY = "a name\nINFO service.app: forged\r\x1b[31m\u2028\u202e \udcff é"
+FORGERY = "a name\nINFO shapespace.service.http.app: forged\r\x1b[31m\u2028\u202e \udcff é"
 QUOTING = f"""
 import logging, sys
-from service import logs
-from service.settings import LogFormat
+from shapespace.service import logs
+from shapespace.service.settings import LogFormat
 logs.configure(LogFormat(sys.argv[1]))
 text = {FORGERY!r}
 logging.getLogger(text).error("refused: %s", text)
@@ -164,7 +164,7 @@ def test_nothing_that_is_quoted_makes_a_line_of_the_log(format: str) -> None:
         assert "Traceback" in second["exc_info"]
         return
     assert not set(found) & set("\r\x1b\u2028\u202e\udcff")
-    escaped = r"a name\nINFO service.app: forged\r\x1b[31m\u2028\u202e \udcff é"
+    escaped = r"a name\nINFO shapespace.service.http.app: forged\r\x1b[31m\u2028\u202e \udcff é"
     assert lines[0] == f"ERROR {escaped}: refused: {escaped}"
     assert lines[1] == f"ERROR service: a mistake: {escaped}"
     assert lines[2] == "    Traceback (most recent call last):"

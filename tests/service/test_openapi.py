@@ -12,7 +12,7 @@ import httpx
 import jsonschema
 import pytest
 
-from service.openapi import TARGET, document
+from shapespace.service.http.openapi import TARGET, document
 from tests.service.bundles import write_bundle
 from tests.service.conftest import ROOT, Server, starting
 

@@ -10,8 +10,8 @@ from pathlib import Path
 import httpx
 import pytest
 
-import service
-from service.settings import cpu_quota
+import shapespace
+from shapespace.service.settings import cpu_quota
 from tests.service.conftest import ROOT, Start
 
 CODE = {"latent": [0.1, 0.7, 0.4]}
@@ -115,8 +115,8 @@ def test_a_mistake_of_the_server_shows_no_traceback(models: Path, tmp_path: Path
     # A route that fails is not to be had from outside, so one is added to the real application.
     program = """
 import sys, httpx, asyncio
-from service.app import create_app
-from service.settings import Settings
+from shapespace.service.http.app import create_app
+from shapespace.service.settings import Settings
 app = create_app(Settings())
 @app.get("/broken")
 def broken(): raise RuntimeError("a secret path")
@@ -141,7 +141,7 @@ asyncio.run(main())
 )
 def test_settings_that_make_no_sense_are_named(models: Path, name: str, value: str) -> None:
     found = subprocess.run(
-        [sys.executable, "-m", "service"],
+        [sys.executable, "-m", "shapespace.service"],
         cwd=ROOT,
         env={f"SHAPESPACE_{name}": value, "SHAPESPACE_MODELS_DIR": str(models)},
         capture_output=True,
@@ -154,14 +154,15 @@ def test_settings_that_make_no_sense_are_named(models: Path, name: str, value: s
 
 
 def test_serving_needs_no_torch_and_no_training() -> None:
-    program = "import sys, service.app, service.server; print([m for m in ('torch', 'training') if m in sys.modules])"
+    modules = "shapespace.service.http.app, shapespace.service.http.server"
+    program = f"import sys, {modules}; print([m for m in ('torch', 'shapespace.training') if m in sys.modules])"
     found = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, check=True)
     assert found.stdout.strip() == "[]"
 
 
 def test_the_version_is_that_of_the_distribution() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    assert service.__version__ == project["version"]
+    assert shapespace.__version__ == project["version"]
 
 
 def test_the_processors_of_a_container_are_those_of_its_quota(tmp_path: Path) -> None:

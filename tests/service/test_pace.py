@@ -12,9 +12,9 @@ import pytest
 from starlette.responses import Response
 from starlette.types import Message, Receive, Scope, Send
 
-from geometry.archives import npz_pieces, zip_pieces
-from service import middleware
-from service.middleware import PIECE, PaceAnswers
+from shapespace.files.archives import npz_pieces, zip_pieces
+from shapespace.service.http import middleware
+from shapespace.service.http.middleware import PIECE, PaceAnswers
 from tests.service.conftest import Start
 
 MIB = 2**20

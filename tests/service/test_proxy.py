@@ -25,8 +25,8 @@ import numpy as np
 import pytest
 import uvicorn
 
-from service.animation import ID_LIMIT
-from service.problems import TYPE_PREFIX
+from shapespace.service.http.problems import TYPE_PREFIX
+from shapespace.service.use_cases.animation import ID_LIMIT
 from tests.service.bundles import write_bundle
 from tests.service.conftest import ROOT, Server, starting
 from tests.service.watching import admitted, eventually, samples, value

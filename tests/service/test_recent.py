@@ -6,7 +6,7 @@ from pathlib import Path
 import httpx
 import numpy as np
 
-from service.recent import Answer, RecentAnswers
+from shapespace.service.http.recent import Answer, RecentAnswers
 from tests.service.bundles import write_bundle
 from tests.service.conftest import Start
 

@@ -17,11 +17,11 @@ import httpx
 import numpy as np
 import pytest
 
-from service.connections import Connections
-from service.metrics import Metrics
-from service.reloading import Reloader
-from service.repository import Changes, ModelRepository
-from service.workers import Workers
+from shapespace.service.http.connections import Connections
+from shapespace.service.limits.workers import Workers
+from shapespace.service.operation.metrics import Metrics
+from shapespace.service.operation.reloading import Reloader
+from shapespace.service.repository.repository import Changes, ModelRepository
 from tests.faults.serving import peak_memory
 from tests.service import hostile
 from tests.service.bundles import SCALE, reference, rescale, write_bundle
@@ -162,7 +162,7 @@ def test_a_server_can_be_ended_before_it_has_started(folder: Path, number: signa
     hostile.hostile(folder, "endless", hostile.doubles)
     environment = os.environ | {"SHAPESPACE_MODELS_DIR": str(folder), "SHAPESPACE_PORT": "0", "SHAPESPACE_DRAIN": "0"}
     with subprocess.Popen(
-        [sys.executable, "-m", "service"], cwd=ROOT, env=environment, stderr=subprocess.PIPE, text=True
+        [sys.executable, "-m", "shapespace.service"], cwd=ROOT, env=environment, stderr=subprocess.PIPE, text=True
     ) as process:
         assert process.stderr
         while "Waiting for application startup" not in process.stderr.readline():

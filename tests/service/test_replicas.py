@@ -10,7 +10,7 @@ from pathlib import Path
 import httpx
 import pytest
 
-from service.client import Client
+from shapespace.client import Client
 from tests.service.conftest import Server, Start
 
 HOP = {"connection", "transfer-encoding", "keep-alive", "host", "content-length"}

@@ -13,9 +13,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from geometry.deadline import Deadline
-from service import sandbox
-from service.sandbox import (
+from shapespace.service.limits import sandbox
+from shapespace.service.limits.sandbox import (
     ClosedError,
     DiedError,
     FailedError,
@@ -25,6 +24,7 @@ from service.sandbox import (
     Sandbox,
     SandboxError,
 )
+from shapespace.solve.deadline import Deadline
 from tests.service import tasks
 from tests.service.conftest import ROOT
 from tests.service.watching import eventually
@@ -253,7 +253,7 @@ def test_a_process_that_does_not_begin_is_told(
 def test_nothing_survives_a_parent_that_is_killed(task: str) -> None:
     program = f"""
 import sys, threading, time
-from service import sandbox
+from shapespace.service.limits import sandbox
 sandbox.TASKS["task"] = "tests.service.tasks:{task}"
 box = sandbox.Sandbox(1)
 box.prepare("task")

@@ -7,16 +7,16 @@ import numpy as np
 import pytest
 from onnx import numpy_helper
 
-from geometry.deadline import Deadline
-from geometry.mesh import align
-from geometry.reconstruction import Reconstructor
-from geometry.status import Status
-from service.bundle import read_bundle
-from service.encodings import worst
-from service.latent_space import NotFiniteError
-from service.responses import solve
-from service.shape_model import TOLERANCE, MeshChoice, ShapeModel
-from service.workers import DeadlineError, Workers
+from shapespace.bundle.reader import read_bundle
+from shapespace.coordinates.reconstruction import Reconstructor
+from shapespace.mesh.rigid_motion import align
+from shapespace.model.latent_space import NotFiniteError
+from shapespace.model.shape_model import TOLERANCE, MeshChoice, ShapeModel
+from shapespace.service.http.responses import solve
+from shapespace.service.limits.workers import DeadlineError, Workers
+from shapespace.service.use_cases.shape_formats import worst
+from shapespace.solve.deadline import Deadline
+from shapespace.solve.status import Status
 from tests.service.bundles import networks, seal, start_network, write_bundle
 
 

@@ -9,9 +9,9 @@ import httpx
 import numpy as np
 import pytest
 
-from geometry.formats import MESH_FORMATS
-from geometry.mesh import align
-from geometry.nric import WeightedNorm, nric
+from shapespace.coordinates.nric import WeightedNorm, nric
+from shapespace.files.formats import MESH_FORMATS
+from shapespace.mesh.rigid_motion import align
 from tests.meshes import read_mesh
 from tests.service.bundles import SCALE, expected_nric, reference
 from tests.service.conftest import Start

@@ -21,8 +21,8 @@ from pathlib import Path
 import httpx
 import pytest
 
-from service.animation import Animation, UnknownInterpolationError
-from service.connections import HEAD_BYTES, HEAD_LINES, HEAD_SECONDS, STALL_SECONDS
+from shapespace.service.http.connections import HEAD_BYTES, HEAD_LINES, HEAD_SECONDS, STALL_SECONDS
+from shapespace.service.use_cases.animation import Animation, UnknownInterpolationError
 from tests.faults.serving import peak_memory
 from tests.service.conftest import ROOT, Server, Start
 from tests.service.watching import ENDING, eventually, samples, value
@@ -166,7 +166,7 @@ def test_the_end_of_file_handles_is_told_once_a_second(models: Path) -> None:
     with (
         log.open("w") as lines,
         subprocess.Popen(
-            [sys.executable, "-m", "service"],
+            [sys.executable, "-m", "shapespace.service"],
             cwd=ROOT,
             env=environment | {"SHAPESPACE_MAX_CONNECTIONS": "100000"},
             stdout=subprocess.PIPE,
@@ -458,7 +458,7 @@ def test_a_head_is_logged_as_one(models: Path, start: Start) -> None:
 @pytest.mark.parametrize("key", ["line\nbreak", "schlüssel", " padded"])
 def test_a_key_that_no_header_can_carry_is_refused_at_the_start(models: Path, key: str) -> None:
     found = subprocess.run(
-        [sys.executable, "-m", "service"],
+        [sys.executable, "-m", "shapespace.service"],
         cwd=ROOT,
         env=os.environ | {"SHAPESPACE_API_KEY": key, "SHAPESPACE_MODELS_DIR": str(models)},
         capture_output=True,

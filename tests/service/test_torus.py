@@ -6,9 +6,9 @@ from pathlib import Path
 import httpx
 import numpy as np
 
-from geometry.mesh import align
+from shapespace.mesh.rigid_motion import align
+from shapespace.training.collection import freaky_torus
 from tests.service.glb import GLB, khronos_report
-from training import freaky_torus
 
 MODEL = "/v1/models/freaky-torus"
 

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from service.bundle import read_bundle
-from training.config import Config, load
+from shapespace.bundle.reader import read_bundle
+from shapespace.training.runs.config import Config, load
 
 ROOT = Path(__file__).parents[2]
 MODELS = ["freaky-torus", "figure"]

@@ -17,10 +17,11 @@ import pytest
 import trimesh
 from safetensors.numpy import load_file
 
-from geometry.mesh import TriangleMesh, align
+from shapespace.mesh.rigid_motion import align
+from shapespace.mesh.triangle_mesh import TriangleMesh
+from shapespace.training.pipeline import STAGES
 from tests.service.conftest import starting
 from tests.training.conftest import command
-from training.pipeline import STAGES
 
 CONFIG = """
 [collection]
@@ -244,7 +245,7 @@ def test_a_run_killed_in_every_stage_ends_as_one_that_nobody_disturbed(run: Path
 
 def test_init_writes_a_configuration_that_the_command_takes(folder: Path, tmp_path: Path) -> None:
     out = tmp_path / "mine.toml"
-    shapespace = [sys.executable, "-m", "training"]
+    shapespace = [sys.executable, "-m", "shapespace.training"]
     subprocess.run([*shapespace, "init", str(folder / "meshes"), "--out", str(out)], check=True, capture_output=True)
     run = command(out, tmp_path / "run", "--until", "mean")
     done = subprocess.run(run, capture_output=True, text=True, check=False)

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
+from shapespace.training.runs.config import ConfigError, load, parse
 from tests.training.conftest import TINY
-from training.config import ConfigError, load, parse
 
 EXAMPLES = sorted((Path(__file__).parents[2] / "examples").glob("*.toml"))
 

@@ -7,12 +7,12 @@ import pytest
 import torch
 import trimesh
 
-from geometry.mesh import TriangleMesh
-from geometry.nric import WeightedNorm, nric
-from training.config import CombinerSettings
-from training.crops import UNIFORM, Crops
-from training.layers import flaps
-from training.networks import CombinerNetwork, Scaling
+from shapespace.coordinates.nric import WeightedNorm, nric
+from shapespace.mesh.triangle_mesh import TriangleMesh
+from shapespace.training.learning.crops import UNIFORM, Crops
+from shapespace.training.learning.layers import flaps
+from shapespace.training.learning.networks import CombinerNetwork, Scaling
+from shapespace.training.runs.config import CombinerSettings
 
 LAYERS = 3
 

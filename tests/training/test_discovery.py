@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import trimesh
 
-from geometry.mesh import TriangleMesh
-from training.config import parse
-from training.discovery import MeanError, mean, write_reference
-from training.files import write_npz
+from shapespace.mesh.triangle_mesh import TriangleMesh
+from shapespace.training.runs.config import parse
+from shapespace.training.runs.files import write_npz
+from shapespace.training.space.discovery import MeanError, mean, write_reference
 
 CONFIG = """
 [collection]

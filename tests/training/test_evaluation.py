@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from geometry.nric import WeightedNorm
-from training.config import EvaluationSettings
-from training.evaluation import MultilinearGrid, Reconstructions, alone, grid_nodes, r_squared
-from training.freaky_torus import FreakyTorus
+from shapespace.coordinates.nric import WeightedNorm
+from shapespace.training.collection.freaky_torus import FreakyTorus
+from shapespace.training.learning.evaluation import MultilinearGrid, Reconstructions, alone, grid_nodes, r_squared
+from shapespace.training.runs.config import EvaluationSettings
 
 
 @pytest.fixture(scope="module")

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 import trimesh
 
-from geometry.mesh import FloatArray, TriangleMesh
-from geometry.nric import WeightedNorm
-from training.factors import FactorError, between, group, names, overlap
+from shapespace.arrays import FloatArray
+from shapespace.coordinates.nric import WeightedNorm
+from shapespace.mesh.triangle_mesh import TriangleMesh
+from shapespace.training.space.factors import FactorError, between, group, names, overlap
 
 #: Which of three regions each of seven modes moves.
 REGIONS = [1, 0, 1, 2, 0, 1, 2]

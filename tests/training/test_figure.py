@@ -3,8 +3,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from geometry.mesh import FloatArray, TriangleMesh
-from training import figure, mannequin
+from shapespace.arrays import FloatArray
+from shapespace.mesh.triangle_mesh import TriangleMesh
+from shapespace.training.collection import figure, mannequin
 
 
 def smallest_angles(vertices: FloatArray, faces: np.ndarray) -> FloatArray:

@@ -9,12 +9,12 @@ import pytest
 import torch
 import trimesh
 
-from geometry.mesh import TriangleMesh
-from geometry.nric import WeightedNorm, nric
-from training import fitting
-from training.config import FitSettings, LatentNetworkSettings
-from training.coordinates import Coordinates
-from training.networks import FactorNetwork, Scaling
+from shapespace.coordinates.nric import WeightedNorm, nric
+from shapespace.mesh.triangle_mesh import TriangleMesh
+from shapespace.training.learning import fitting
+from shapespace.training.learning.networks import FactorNetwork, Scaling
+from shapespace.training.runs.config import FitSettings, LatentNetworkSettings
+from shapespace.training.runs.coordinates import Coordinates
 
 
 class Killed(Exception):  # noqa: N818 - not an error

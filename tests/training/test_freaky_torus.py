@@ -6,8 +6,8 @@ import math
 import numpy as np
 import pytest
 
-from geometry.nric import dihedral_angles, nric
-from training import freaky_torus
+from shapespace.coordinates.nric import dihedral_angles, nric
+from shapespace.training.collection import freaky_torus
 
 # The paper's choice, and how finely it is sampled.
 A_R = A_r = 1.0

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 import trimesh
 
-from geometry.formats import MESH_FORMATS
-from geometry.mesh import TriangleMesh, face_areas
-from training.ingest import FORMATS, IngestError, MeshCollection, normalised, read_collection
+from shapespace.files.formats import MESH_FORMATS
+from shapespace.mesh.triangle_mesh import TriangleMesh, face_areas
+from shapespace.training.collection.ingest import FORMATS, IngestError, MeshCollection, normalised, read_collection
 
 NAMES = ("pose1", "pose2", "pose10")
 BALL = trimesh.creation.icosphere(subdivisions=1)

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 import trimesh
 
-from geometry.formats import MESH_FORMATS
-from training import __main__ as command
-from training.config import Config, ConfigError, ModeSettings, load, parse
-from training.ingest import IngestError, read_collection
-from training.init import slug, write
+from shapespace.files.formats import MESH_FORMATS
+from shapespace.training import __main__ as command
+from shapespace.training.collection.ingest import IngestError, read_collection
+from shapespace.training.collection.init import slug, write
+from shapespace.training.runs.config import Config, ConfigError, ModeSettings, load, parse
 
 
 def meshes(folder: Path, count: int = 4, subdivisions: int = 1) -> Path:

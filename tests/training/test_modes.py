@@ -9,16 +9,17 @@ import pytest
 import trimesh
 from scipy.optimize import lsq_linear
 
-from geometry.calculus import ShellSpace
-from geometry.exponential import exponential
-from geometry.geodesic import geodesic
-from geometry.mesh import FloatArray, TriangleMesh, align
-from geometry.nric import WeightedNorm, unwrap
-from geometry.rigid import rigid_motions, without_rigid_motion
-from geometry.status import Status
-from tests.geometry.conftest import bent
-from training.modes import ModeError, Modes, _fit_in_box, localisation, pga, spga
-from training.tangents import tangents
+from shapespace.arrays import FloatArray
+from shapespace.coordinates.nric import WeightedNorm, unwrap
+from shapespace.mesh.rigid_motion import align, rigid_motions, without_rigid_motion
+from shapespace.mesh.triangle_mesh import TriangleMesh
+from shapespace.shell.exponential import exponential
+from shapespace.shell.geodesic import geodesic
+from shapespace.shell.space import ShellSpace
+from shapespace.solve.status import Status
+from shapespace.training.space.modes import ModeError, Modes, _fit_in_box, localisation, pga, spga
+from shapespace.training.space.tangents import tangents
+from tests.shapespace.conftest import bent
 
 
 @dataclass(frozen=True)

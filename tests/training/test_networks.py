@@ -11,12 +11,10 @@ import trimesh
 from numpy.typing import NDArray
 from torch import nn
 
-from geometry.mesh import Connectivity, TriangleMesh
-from geometry.nric import WeightedNorm, nric
-from training.config import CombinerSettings, LatentNetworkSettings
-from training.coordinates import Coordinates
-from training.corrections import ridge_regression
-from training.layers import (
+from shapespace.coordinates.nric import WeightedNorm, nric
+from shapespace.mesh.triangle_mesh import Connectivity, TriangleMesh
+from shapespace.training.learning.corrections import ridge_regression
+from shapespace.training.learning.layers import (
     EdgeConvolution,
     Flaps,
     FourierProducts,
@@ -27,8 +25,10 @@ from training.layers import (
     flaps,
     narrowest,
 )
-from training.networks import CombinerNetwork, FactorNetwork, Scaling, affine_sum
-from training.polynomials import PatchPolynomials, learned_metric
+from shapespace.training.learning.networks import CombinerNetwork, FactorNetwork, Scaling, affine_sum
+from shapespace.training.learning.polynomials import PatchPolynomials, learned_metric
+from shapespace.training.runs.config import CombinerSettings, LatentNetworkSettings
+from shapespace.training.runs.coordinates import Coordinates
 
 AROUND = {"star": Star, "flaps": Flaps}
 TORUS = Coordinates(np.zeros(2), np.full(2, 2 * np.pi), np.full(2, 2 * np.pi))

@@ -16,14 +16,14 @@ import onnxruntime
 import pytest
 import torch
 
-from geometry.nric import WeightedNorm, nric
-from service.bundle import read_bundle
+from shapespace.bundle.reader import read_bundle
+from shapespace.coordinates.nric import WeightedNorm, nric
+from shapespace.training.collection.freaky_torus import FreakyTorus, vertices
+from shapespace.training.learning.export import ExportError, export
+from shapespace.training.pipeline import STAGES, Run, learner_of
+from shapespace.training.runs.config import load, parse
+from shapespace.training.runs.sampling import read
 from tests.training.conftest import TINY, command
-from training.config import load, parse
-from training.export import ExportError, export
-from training.freaky_torus import FreakyTorus, vertices
-from training.pipeline import STAGES, Run, learner_of
-from training.sampling import read
 
 
 def seconds(run: Path) -> dict[str, float]:
@@ -184,7 +184,7 @@ def test_faults_of_the_user_s_making_are_one_message(tmp_path: Path) -> None:
         (["status", str(tmp_path / "nowhere")], "is no run directory"),
     ):
         result = subprocess.run(
-            [sys.executable, "-m", "training", *arguments], capture_output=True, text=True, check=False
+            [sys.executable, "-m", "shapespace.training", *arguments], capture_output=True, text=True, check=False
         )
         assert result.returncode == 1
         assert says in result.stderr
@@ -192,7 +192,7 @@ def test_faults_of_the_user_s_making_are_one_message(tmp_path: Path) -> None:
 
 
 def status(run: Path) -> list[str]:
-    words = [sys.executable, "-m", "training", "status", str(run)]
+    words = [sys.executable, "-m", "shapespace.training", "status", str(run)]
     return subprocess.run(words, capture_output=True, text=True, check=True).stdout.splitlines()
 
 

@@ -6,7 +6,7 @@ import time
 
 import pytest
 
-from training import progress
+from shapespace.training.runs import progress
 
 
 @pytest.fixture

@@ -18,13 +18,13 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from geometry.gltf import vertex_normals
-from geometry.mesh import TriangleMesh
-from training.__main__ import main
-from training.pipeline import STAGES as PIPELINE
-from training.record import STAGES, Record, ReportError
-from training.rendering import Camera
-from training.report import duration, write_report
+from shapespace.files.gltf_writing import vertex_normals
+from shapespace.mesh.triangle_mesh import TriangleMesh
+from shapespace.training.__main__ import main
+from shapespace.training.pipeline import STAGES as PIPELINE
+from shapespace.training.report.page import duration, write_report
+from shapespace.training.report.record import STAGES, Record, ReportError
+from shapespace.training.report.rendering import Camera
 
 NASTY = "<script>alert('thumb')</script>"
 SECTIONS = {"shapes", "modes", "factors", "strip", "tests", "figures", "losses", "stages", "configuration"}
@@ -186,8 +186,8 @@ class Page(HTMLParser):
 @pytest.fixture(scope="module", autouse=True)
 def small_pictures() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("training.report.LARGE", 100)
-        patch.setattr("training.report.SMALL", 100)
+        patch.setattr("shapespace.training.report.page.LARGE", 100)
+        patch.setattr("shapespace.training.report.page.SMALL", 100)
         yield
 
 
@@ -358,8 +358,8 @@ def test_the_command_says_where_the_page_is(
 
 def test_the_report_needs_no_torch(tmp_path: Path) -> None:
     (tmp_path / "config.toml").write_text(CONFIG)
-    write = f"from pathlib import Path; from training.report import write_report; write_report(Path({str(tmp_path)!r}))"
-    code = f"import sys; sys.modules['torch'] = None; {write}"
+    write = f"from shapespace.training.report.page import write_report; write_report(pathlib.Path({str(tmp_path)!r}))"
+    code = f"import pathlib, sys; sys.modules['torch'] = None; {write}"
     subprocess.run([sys.executable, "-c", code], check=True)
     assert (tmp_path / "report.html").is_file()
 

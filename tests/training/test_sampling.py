@@ -17,18 +17,19 @@ import numpy as np
 import pytest
 import trimesh
 
-from geometry.energy import Material
-from geometry.mesh import FloatArray, TriangleMesh
+from shapespace.arrays import FloatArray
+from shapespace.mesh.triangle_mesh import TriangleMesh
+from shapespace.shell.energy import Material
+from shapespace.training.runs import workers
+from shapespace.training.runs.sampling import draw, read, split, used
+from shapespace.training.runs.workers import WorkersError
+from shapespace.training.space.shell_collection import ShellCollection
 from tests.training.conftest import TINY
-from training import workers
-from training.sampling import draw, read, split, used
-from training.shell_collection import ShellCollection
-from training.workers import WorkersError
 
 DRAW = """
 import pickle, sys
 from pathlib import Path
-from training.sampling import draw
+from shapespace.training.runs.sampling import draw
 collection, latents = pickle.loads(Path(sys.argv[1]).read_bytes())
 for _ in draw(collection, Path(sys.argv[2]), latents, 2, "samples", workers=2):
     pass
@@ -209,7 +210,7 @@ def test_a_cluster_without_workers_is_given_up(dask: Callable, tmp_path: Path, m
 def test_a_scheduler_that_does_not_answer_is_one_line(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from training import __main__  # imports torch, which the processes of this module can do without
+    from shapespace.training import __main__  # imports torch, which the processes of this module can do without
 
     monkeypatch.setattr(workers, "CONNECT", 0.5)
     (tmp_path / "tiny.toml").write_text(TINY)

@@ -7,13 +7,13 @@ import numpy as np
 import onnxruntime
 import torch
 
-from geometry.mesh import align
-from service.bundle import read_bundle
-from tests.geometry.conftest import torus, turned
-from training.config import load
-from training.coordinates import Coordinates
-from training.pipeline import Run, learner_of
-from training.start import StartNetwork, fit_start
+from shapespace.bundle.reader import read_bundle
+from shapespace.mesh.rigid_motion import align
+from shapespace.training.learning.start_network import StartNetwork, fit_start
+from shapespace.training.pipeline import Run, learner_of
+from shapespace.training.runs.config import load
+from shapespace.training.runs.coordinates import Coordinates
+from tests.shapespace.conftest import torus, turned
 
 COORDINATES = Coordinates(np.array([-1.0, 0.0, 2.0]), np.array([1.0, 6.0, 5.0]), np.array([np.nan, 2 * np.pi, np.nan]))
 

@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from geometry.formats import MESH_FORMATS
+from shapespace.files.formats import MESH_FORMATS
+from shapespace.training.collection import figure, ingest
+from shapespace.training.collection.ingest import IngestError, MeshCollection, read_collection
 from tests.training.test_collection import bars
-from training import figure, ingest
-from training.ingest import IngestError, MeshCollection, read_collection
 
 SHAPES, FACES = bars(12)
 ODD = 4

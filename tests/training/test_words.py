@@ -14,12 +14,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from geometry.formats import MESH_FORMATS
+from shapespace.files.formats import MESH_FORMATS
+from shapespace.training import __main__ as command
+from shapespace.training.report.page import page
+from shapespace.training.report.record import Record
+from shapespace.training.runs.losses import losses
 from tests.faults.training import CONFIG, bars
-from training import __main__ as command
-from training.losses import losses
-from training.record import Record
-from training.report import page
 
 SHAPES, FACES = bars(6)
 
@@ -172,7 +172,7 @@ def test_a_traceback_is_written_and_not_shown(place: Path, said: Said) -> None:
     said("run", "bars.toml", "--until", "ingest")
     (place / "runs" / "bars" / "shapes.npz").write_bytes(b"PK damaged")
     done = subprocess.run(
-        [sys.executable, "-m", "training", "run", "bars.toml"],
+        [sys.executable, "-m", "shapespace.training", "run", "bars.toml"],
         capture_output=True,
         text=True,
         check=False,

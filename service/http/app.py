@@ -1,0 +1,127 @@
+"""The application: wiring and lifespan, nothing else."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import asynccontextmanager
+
+from fastapi import Depends, FastAPI
+from starlette.middleware import Middleware
+from starlette.middleware.cors import CORSMiddleware
+from threadpoolctl import threadpool_limits
+
+from shapespace import __version__
+from shapespace.service.http import problems
+from shapespace.service.http.connections import Connections
+from shapespace.service.http.dependencies import Service, known_query
+from shapespace.service.http.description import describe
+from shapespace.service.http.middleware import AnswerHead, LimitBody, Observe, PaceAnswers, RequireHost, RequireKey
+from shapespace.service.http.recent import RecentAnswers
+from shapespace.service.http.routes import codes, health, inference, interpolations, models, operation, page, shapes
+from shapespace.service.limits.quota import UPLOADS
+from shapespace.service.limits.sandbox import Sandbox
+from shapespace.service.limits.workers import Workers
+from shapespace.service.operation.metrics import Metrics
+from shapespace.service.operation.reloading import Reloader
+from shapespace.service.repository.candidates import Trials
+from shapespace.service.repository.repository import ModelRepository
+from shapespace.service.settings import Settings, is_loopback
+
+#: What pages of other origins may send, and see in answers.
+CORS_REQUEST = ["Authorization", "Content-Type", "If-None-Match", "Inference-Header-Content-Length"]
+CORS_REQUEST += ["X-API-Key", "X-Request-ID"]
+CORS_ANSWER = ["Content-Disposition", "ETag", "Inference-Header-Content-Length", "Location", "Retry-After"]
+CORS_ANSWER += ["Server-Timing", "Shape-Color", "Shape-Diagnostics", "X-Request-ID"]
+#: What a machine calls itself.
+LOOPBACK = ("localhost", "127.0.0.1", "[::1]")
+
+
+def create_app(settings: Settings | None = None, trials: Trials | None = None) -> FastAPI:
+    """The service as an ASGI application; bundles are loaded when it starts.
+
+    Args:
+        settings: by default from the environment.
+        trials: of these bundles, where they have begun already.
+    """
+    settings = settings or Settings()
+
+    @asynccontextmanager
+    async def lifespan(app: FastAPI) -> AsyncIterator[None]:
+        # The workers are the only threads: those of BLAS would multiply with them.
+        with threadpool_limits(1):
+            workers = Workers(settings.workers, settings.queue, settings.deadline)
+            connections = Connections(settings.max_connections, settings.deadline, settings.trusted_proxies)
+            repository = ModelRepository(settings.models_dir, settings.workers, trials)
+            metrics = Metrics(repository, workers, connections)
+            reloader = Reloader(repository, metrics)
+            recent = RecentAnswers(settings.cache)
+            sandbox = Sandbox(min(settings.workers, UPLOADS))
+            sandbox.prepare("read")
+            app.state.service = Service(settings, repository, workers, connections, metrics, reloader, recent, sandbox)
+            # For what reads bodies and folders, beside the threads that compute.
+            asyncio.get_running_loop().set_default_executor(ThreadPoolExecutor(2, thread_name_prefix="reading"))
+            chores = [asyncio.create_task(connections.sweep())]
+            if settings.watch:
+                chores.append(asyncio.create_task(reloader.watch(settings.watch)))
+            yield
+            for chore in chores:
+                chore.cancel()
+            repository.close()
+            sandbox.close()
+            workers.close()
+
+    app = FastAPI(
+        title="shapespace",
+        version=__version__,
+        summary="A handful of numbers in, a shape out.",
+        lifespan=lifespan,
+        middleware=_middleware(settings),
+        dependencies=[Depends(known_query)],
+        generate_unique_id_function=lambda route: route.name,
+        # Their pages load scripts from elsewhere.
+        docs_url=None,
+        redoc_url=None,
+        openapi_url=None,
+    )
+    problems.install(app)
+    routers = [module.router for module in (models, shapes, codes, interpolations, inference, health, operation, page)]
+    for router in routers:
+        app.include_router(router)
+    app.router.routes.append(page.assets())
+    describe(app, routers)
+    return app
+
+
+def _middleware(settings: Settings) -> list[Middleware]:
+    """From the outside in."""
+    stack = [
+        Middleware(AnswerHead),
+        Middleware(Observe),
+        Middleware(PaceAnswers),
+        Middleware(RequireHost, hosts=_hosts(settings)),
+        *([Middleware(RequireKey, key=settings.api_key)] if settings.api_key else []),
+        Middleware(LimitBody, limit=settings.max_body, upload=settings.max_upload),
+    ]
+    if settings.cors_origins:
+        # Outermost, so that pages can read every refusal; a preflight brings no key.
+        cors = Middleware(
+            CORSMiddleware,
+            allow_origins=settings.cors_origins,
+            allow_methods=["GET", "POST"],
+            allow_headers=CORS_REQUEST,
+            expose_headers=CORS_ANSWER,
+        )
+        stack.insert(0, cors)
+    return stack
+
+
+def _hosts(settings: Settings) -> tuple[str, ...]:
+    """Names that requests may be for; none stands for any."""
+    given = tuple(host.lower() for host in settings.hosts)
+    if "*" in given:
+        return ()
+    # With a key no stranger's page gets an answer, and a server for others has names that it can't know.
+    open_to_all = settings.api_key is not None or not is_loopback(settings.host)
+    return given or (() if open_to_all else (*LOOPBACK, settings.host.lower()))

@@ -1,0 +1,88 @@
+"""JSON bodies: counted before they are parsed, checked away from the event loop, and refused with a few faults."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from typing import Generic, TypeVar
+
+import orjson
+from fastapi import Request
+from fastapi.exceptions import RequestValidationError
+from pydantic import BaseModel, ValidationError
+
+from shapespace.service.http.negotiation import declared_type
+from shapespace.service.http.problems import ProblemError
+from shapespace.service.use_cases.shape_formats import holds_more_values
+
+M = TypeVar("M", bound=BaseModel)
+#: Values that a body may hold, counted by what separates them: parsed they take 20 MB at most.
+MOST_VALUES = 2**18
+#: Bytes of a body that is parsed on the event loop, where that is quicker than to have a thread do it.
+SMALL = 2**12
+#: Bytes up to which NaN is understood: the parser that knows it keeps all threads waiting, 40 ms for a MiB of escapes.
+LENIENT = 2**20
+
+
+class JSONBody(Generic[M]):
+    """A dependency of a route: its request's body as a model.
+
+    FastAPI's own would parse any number of values on the event loop, and describe each fault of millions.
+
+    Args:
+        model: whose lists fail at their first fault.
+    """
+
+    def __init__(self, model: type[M]) -> None:
+        self.model = model
+
+    async def __call__(self, request: Request) -> M:
+        """Read it.
+
+        Raises:
+            ProblemError: not declared as JSON, or too many values.
+            RequestValidationError: not JSON, or not of the model.
+        """
+        declared = declared_type(request.headers)
+        if declared != "application/json" and not (declared.startswith("application/") and declared.endswith("+json")):
+            raise ProblemError(
+                "unsupported-media-type",
+                f"The body is {request.headers.get('content-type') or 'of no declared type'}. Send JSON, and the "
+                "header Content-Type: application/json with it.",
+            )
+        body = await request.body()
+        return read(body, self.model) if len(body) <= SMALL else await asyncio.to_thread(read, body, self.model)
+
+
+def read(text: bytes, model: type[M]) -> M:
+    """JSON as a model; raises as ``JSONBody`` does."""
+    message = parse(text) if text.strip() else None
+    try:
+        return model.model_validate(message)
+    except ValidationError as error:
+        faults = error.errors(include_url=False, include_input=False)
+        raise RequestValidationError([{**fault, "loc": ("body", *fault["loc"])} for fault in faults]) from None
+
+
+def parse(text: bytes) -> object:
+    """JSON with a bounded number of values; NaN and infinities are for the model to refuse. Raises as ``JSONBody``."""
+    if holds_more_values(text, MOST_VALUES):
+        raise ProblemError(
+            "body-too-large", f"The body holds more than {MOST_VALUES} values. Send fewer in each request."
+        )
+    try:
+        return orjson.loads(text)
+    except orjson.JSONDecodeError as error:
+        where, why = error.pos, error.msg
+    try:
+        if len(text) <= LENIENT:
+            return json.loads(text)  # which knows NaN
+    except json.JSONDecodeError as error:
+        where, why = error.pos, error.msg
+    except UnicodeDecodeError as error:
+        where, why = error.start, "no UTF-8"
+    except RecursionError:
+        where, why = 0, "nested too deeply"
+    except ValueError:
+        where, why = 0, "a number of thousands of digits"
+    raise RequestValidationError([{"type": "json_invalid", "loc": ("body", where), "ctx": {"error": why}}])

@@ -1,0 +1,310 @@
+"""Bodies of requests and answers, as OpenAPI describes them."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
+
+from shapespace.files.colouring import Quantity
+from shapespace.model.edit import PRIOR
+from shapespace.model.latent_space import Bounds, Distribution
+from shapespace.model.shape_model import MeshChoice
+
+Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
+#: JSON knows one kind of number only, where 3.0 is as whole as 3.
+Whole = Annotated[
+    int,
+    Field(strict=True),
+    BeforeValidator(lambda given: int(given) if isinstance(given, float) and given.is_integer() else given),
+]
+#: Each list fails at its first fault: there may be as many as elements.
+Latent = Annotated[
+    list[Number],
+    Field(
+        fail_fast=True,
+        description="One latent code: as many numbers as the card's `latent_dimension`.",
+        examples=[[1, 2, 3, 4]],
+        json_schema_extra={"minItems": 1},
+    ),
+]
+Latents = Annotated[
+    list[Latent],
+    Field(
+        fail_fast=True,
+        description="Latent codes, one shape each.",
+        examples=[[[1, 2, 3, 4], [0, 0, 0, 0]]],
+        json_schema_extra={"minItems": 1},
+    ),
+]
+MeshField = Annotated[MeshChoice, Field(description="Which mesh to answer, where the model has a finer one.")]
+BoundsField = Annotated[
+    Bounds, Field(description="Outside the bounds: extrapolate, clamp to the nearest bound, or reject.")
+]
+
+
+#: Members that an object of a body may have: each unknown one is a fault.
+_MEMBERS = 32
+
+
+class Body(BaseModel):
+    """A body of a request, or an object in it."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _of_few_members(cls, given: object) -> object:
+        if isinstance(given, dict) and len(given) > _MEMBERS:
+            raise ValueError(f"it has {len(given)} members; /openapi.json lists those there are")
+        return given
+
+
+class MeshRequest(Body):
+    """One code, and how to shape it."""
+
+    latent: Latent
+    mesh: MeshField = MeshChoice.FINE
+    bounds: BoundsField = Bounds.ALLOW
+
+
+class VerticesRequest(Body):
+    """Several codes, and how to shape them."""
+
+    latents: Latents
+    exact: bool = Field(
+        False,
+        strict=True,
+        description="Also answer the true discrete exponentials, of models with a tangent space, and their distances.",
+    )
+    mesh: MeshField = MeshChoice.FINE
+    bounds: BoundsField = Bounds.ALLOW
+
+
+class TargetRequest(Body):
+    """Where a vertex should be."""
+
+    vertex: Whole = Field(description="Index in the mesh that `mesh` names, from 0.")
+    position: Annotated[list[Number], Field(fail_fast=True)] = Field(
+        min_length=3, max_length=3, description="In the units and the frame that meshes are answered in."
+    )
+
+
+class EditRequest(Body):
+    """A code to start from, and vertices that should be elsewhere."""
+
+    latent: Latent
+    targets: Annotated[list[TargetRequest], Field(fail_fast=True)] = Field(
+        min_length=1, description="At least one.", examples=[[{"vertex": 0, "position": [0.3, 0.1, 0]}]]
+    )
+    prior: Number = Field(
+        PRIOR,
+        ge=0,
+        description="Weight of the mean square change of the code, as a fraction of the bounds' width, against the "
+        "mean square distance from the targets, as a fraction of the bounding box's diagonal.",
+    )
+    mesh: MeshChoice = Field(MeshChoice.FINE, description="Which mesh the targets' vertices belong to.")
+
+
+class SampleRequest(Body):
+    """How many random codes, and which."""
+
+    count: Whole = Field(1, ge=1, description="Number of codes.", examples=[3])
+    seed: Whole = Field(0, ge=0, lt=2**63, description="The same codes for the same seed.")
+    distribution: Distribution = Field(
+        Distribution.UNIFORM,
+        description="In the bounds uniform, or gaussian: around their middle, with a standard deviation of a quarter "
+        "of their width, and cut off at them.",
+    )
+
+
+class NRICRequest(Body):
+    """Several codes, and whether to answer each factor's own lengths and angles too."""
+
+    latents: Latents
+    factors: bool = Field(False, strict=True, description="Also answer ψ_j of each factor j.")
+    bounds: BoundsField = Bounds.ALLOW
+
+
+class ColorAnswer(BaseModel):
+    """How a mesh differs from another one, vertex by vertex."""
+
+    quantity: Quantity
+    range: list[float] = Field(description="Values at the ends of the legend.", min_length=2, max_length=2)
+    map: str = Field(description="Name of the colour map that the other formats use.")
+    values: list[float] = Field(description="V values.")
+
+
+class MeshAnswer(BaseModel):
+    """A mesh as JSON, in the units of the training meshes."""
+
+    vertices: list[list[float]] = Field(description="V positions.")
+    faces: list[list[int]] = Field(description="F triples of vertex indices, from 0.")
+    color: ColorAnswer | None = Field(None, description="Only where `color` was asked for.")
+
+
+class DiagnosticsAnswer(BaseModel):
+    """How well a shape was found."""
+
+    status: str = Field(description="How Gauss–Newton ended: converged, stalled, iteration_limit.")
+    iterations: int = Field(description="Its iterations.")
+    residual: float = Field(description="Relative misfit of lengths and angles in the weighted norm.")
+    flipped_faces: int = Field(description="Faces folded more than π/2 away from what the networks ask for.")
+    integrability: float = Field(
+        description="How far the predicted lengths and angles are from those of any surface: root mean square over "
+        "vertices of the sine of half the angle by which the faces around it fail to close."
+    )
+    plausibility: float | None = Field(
+        description="Distance to the nearest training shape's code, in multiples of the distance that these typically "
+        "have from each other; null where the model was not made from shapes."
+    )
+    inside_bounds: bool = Field(description="Whether the code lies inside the model's bounds.")
+    model: str = Field(description="SHA-256 of the model's manifest.")
+
+
+class VertexError(BaseModel):
+    """Distances over vertices, in the units of the training meshes."""
+
+    mean: float
+    max: float
+
+
+class VerticesAnswer(BaseModel):
+    """Positions of n shapes."""
+
+    vertices: list[list[list[float]]] = Field(description="n × V × 3 positions, in the units of the training meshes.")
+    diagnostics: list[DiagnosticsAnswer] = Field(description="One for each shape.")
+    exact: list[list[list[float]] | None] | None = Field(
+        None, description="With `exact`: positions of the true exponentials, null where one could not be found."
+    )
+    distance: list[VertexError | None] | None = Field(
+        None, description="With `exact`: how far the vertices are from those, null where one could not be found."
+    )
+    exact_status: list[str] | None = Field(None, description="With `exact`: how each exponential's solver ended.")
+
+
+class EncodeAnswer(BaseModel):
+    """The code of a mesh."""
+
+    latent: list[float]
+    residual: float = Field(description="Relative misfit of the mesh's lengths and angles in the weighted norm.")
+    vertex_error: VertexError = Field(description="Between the mesh and the code's shape, after rigid alignment.")
+    vertex_errors: list[float] = Field(description="The same vertex by vertex.")
+    inside_bounds: bool = Field(description="Whether the code lies inside the model's bounds.")
+    status: str = Field(description="How the search ended: converged, stalled, iteration_limit.")
+    iterations: int = Field(description="Its evaluations of the networks.")
+    mesh: MeshChoice = Field(description="Which mesh of the model was sent.")
+    diagnostics: DiagnosticsAnswer = Field(description="Of the code's shape.")
+
+
+class EditAnswer(BaseModel):
+    """The code whose shape comes closest to the targets."""
+
+    latent: list[float]
+    residual: float = Field(
+        description="Root mean square distance from the targets, in the units of the training meshes."
+    )
+    distances: list[float] = Field(description="Distance from each target.")
+    status: str = Field(description="How the search ended: converged, stalled, iteration_limit.")
+    iterations: int = Field(description="Shapes that it looked at.")
+    diagnostics: DiagnosticsAnswer = Field(description="Of the code's shape.")
+
+
+class SampleAnswer(BaseModel):
+    """Random codes."""
+
+    latents: Latents
+
+
+class NRICAnswer(BaseModel):
+    """Lengths and angles as the networks predict them, edges in lexicographic order."""
+
+    lengths: list[list[float]] = Field(description="n × E edge lengths, in the units of the training meshes.")
+    angles: list[list[float]] = Field(description="n × E signed dihedral angles in radians, positive where convex.")
+    factors: list[list[list[float]]] | None = Field(
+        None, description="n × J × 2E: lengths, then angles, of each factor on its own."
+    )
+
+
+class FactorSummary(BaseModel):
+    """A factor and its range of latent coordinates, the last excluded."""
+
+    name: str
+    start: int
+    stop: int
+
+
+class ModelSummary(BaseModel):
+    """A model in the list."""
+
+    name: str
+    version: str
+    title: str
+    description: str
+    licence: str
+    latent_dimension: int
+    latent_names: list[str]
+    factors: list[FactorSummary]
+    lower: list[float] = Field(description="Lower bound of each coordinate.")
+    upper: list[float] = Field(description="Upper bound of each coordinate.")
+    period: list[float | None] = Field(description="Period of each coordinate that is an angle, else null.")
+    vertices: int
+    edges: int
+    faces: int
+    links: dict[str, str] = Field(description="Addresses of the model's calls.")
+
+
+class ModelList(BaseModel):
+    """The newest version of every model."""
+
+    models: list[ModelSummary]
+
+
+class ModelCard(ModelSummary):
+    """What a model is, how good it is, and where it comes from."""
+
+    model_config = ConfigDict(populate_by_name=True)
+
+    versions: list[str] = Field(description="Versions that are served, oldest first.")
+    digest: str = Field(description="SHA-256 of the manifest, which holds the digests of all its files.")
+    scale: float = Field(description="Length of one normalised unit in the units of the training meshes.")
+    mu: float
+    lambda_: float = Field(alias="lambda")
+    eta: float = Field(description="Weight of bending in the metric.")
+    eta_reconstruction: float = Field(description="Weight of the angles in Gauss–Newton.")
+    onnx_tolerance: dict[str, float]
+    figures: dict[str, Any] = Field(description="Evaluation figures on the test split.")
+    origin: dict[str, Any]
+
+
+class InterpolationAnswer(BaseModel):
+    """A new interpolation; its id holds all of it and stays valid as long as the model is served."""
+
+    id: str
+    frames: int = Field(description="Number of frames, from 0.")
+    links: dict[str, str]
+
+
+class Health(BaseModel):
+    """Open Inference Protocol: server live."""
+
+    live: bool
+
+
+class Readiness(BaseModel):
+    """Open Inference Protocol: server ready."""
+
+    ready: bool
+
+
+class Problem(BaseModel):
+    """Problem details, RFC 9457."""
+
+    model_config = ConfigDict(extra="allow")
+
+    type: str = Field(
+        description="Stable name of the kind of problem.", examples=["urn:shapespace:problem:wrong-length"]
+    )
+    title: str
+    status: int
+    detail: str = Field(description="A sentence that says what to do.")

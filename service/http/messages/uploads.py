@@ -1,0 +1,251 @@
+"""Mesh files in requests: as the body itself or as a part of a form, in a format that something says.
+
+Nothing here knows of servers or models, so that a process of its own can do it. Whatever the bytes are, reading them
+takes time in proportion to their number, and memory that the limits bound.
+"""
+
+from __future__ import annotations
+
+from array import array
+from collections.abc import Iterable
+from itertools import chain
+from pathlib import PurePath
+
+import numpy as np
+import orjson
+from python_multipart.exceptions import FormParserError
+from python_multipart.multipart import MultipartParser, parse_options_header
+
+from shapespace.arrays import FloatArray, IntArray
+from shapespace.files.formats import MESH_FORMATS, OCTET_STREAM, read_arrays
+from shapespace.files.reading import Limits, clipped, count
+from shapespace.mesh.triangle_mesh import MeshError
+from shapespace.service.limits.sandbox import Arrays, Facts, FailedError
+
+#: Formats that can be read, by media type.
+MEDIA_TYPES = {
+    "text/plain": "obj",
+    "model/x.stl-ascii": "stl",
+    "model/x.stl-binary": "stl",
+    "application/sla": "stl",
+    "application/ply": "ply",
+    "application/x-npz": "npz",
+    "application/json": "json",
+} | {format.media_type: name for name, format in MESH_FORMATS.items() if format.media_type != OCTET_STREAM}
+FORMATS = (*MESH_FORMATS, "json")
+_MAGIC = {b"glTF": "glb", b"ply": "ply", b"PK": "npz"}
+#: Characters of a header that says what a body or a part is.
+_LONGEST_HEADER = 1000
+_MOST_FIELDS = 16
+#: Of JSON: bytes for each vertex and face, with digits and spaces to spare; bytes, lists, objects and quotes beside.
+_BYTES_OF_EACH, _BYTES_BESIDE, _LISTS_BESIDE, _OBJECTS, _QUOTES = 128, 2**20, 1000, 1000, 4000
+#: What isn't ASCII stands in names only, which are of no interest, but would make every character take four bytes.
+_TO_ASCII = bytes(range(128)) + b"?" * 128
+_PIECE = 2**20
+
+
+class UploadError(ValueError):
+    """An upload that can't be used.
+
+    Args:
+        kind: of problem.
+        sentence: what is wrong, and what to do.
+    """
+
+    def __init__(self, kind: str, sentence: str) -> None:
+        super().__init__(kind, sentence)  # both, so that it can be sent to another process
+        self.kind, self.sentence = kind, sentence
+
+    def __str__(self) -> str:
+        return self.sentence
+
+
+def read_mesh_file(
+    body: bytes | bytearray, content_type: str, format: str | None, limits: Limits
+) -> tuple[FloatArray, IntArray, str]:
+    """The mesh in the body of a request.
+
+    Args:
+        body: a mesh file, or a ``multipart/form-data`` form with one.
+        content_type: the header, or nothing.
+        format: what ``?format=`` says, which wins; then the content type, the file's name, its first bytes.
+        limits: where reading ends without a mesh.
+
+    Returns:
+        Vertices (V, 3) as they stand in the file, faces (F, 3), none where it doesn't say, and its format.
+
+    Raises:
+        UploadError: no file, a form or a file that can't be read, or a format that nothing tells or nobody knows.
+    """
+    data, name = memoryview(body), ""
+    declared, options = parse_options_header(content_type[:_LONGEST_HEADER])
+    if declared == b"multipart/form-data":
+        data, name, declared = _Form(body, options.get(b"boundary")).file()
+    if not data:
+        raise UploadError("invalid-mesh", "The file is empty. Send a mesh file as the body, or as a file of a form.")
+    found = format or _guess(declared.decode("latin-1"), name, bytes(data[:4]))
+    if found not in FORMATS:
+        listed = ", ".join(f"{name} ({kind.media_type})" for name, kind in MESH_FORMATS.items())
+        told = clipped(declared.decode("latin-1")) or "No content type"
+        fault = f"There is no format {clipped(format)!r} here" if format else f"{told} tells no format"
+        raise UploadError(
+            "unsupported-media-type",
+            f"{fault}. Say by ?format= or Content-Type which: {listed}, json (application/json).",
+        )
+    try:
+        vertices, faces = _read_json(data, limits) if found == "json" else read_arrays(data, found, limits)
+        return *_checked(vertices, faces), found
+    except MeshError as error:
+        sentence = f"The mesh can't be used: {str(error).rstrip('.')}. Send one {found} file."
+        raise UploadError("invalid-mesh", sentence) from None
+
+
+def _guess(declared: str, name: str, start: bytes) -> str | None:
+    suffix = PurePath(name).suffix.lstrip(".").lower()
+    magic = next((format for magic, format in _MAGIC.items() if start.startswith(magic)), "")
+    return next((guess for guess in (MEDIA_TYPES.get(declared), suffix, magic) if guess in FORMATS), None)
+
+
+def read_in_sandbox(
+    body: bytearray, content_type: str, format: str | None, vertices: int, faces: int
+) -> tuple[Facts, Arrays]:
+    """``read_mesh_file`` as a task of a sandbox; raises FailedError."""
+    try:
+        found = read_mesh_file(body, content_type, format, Limits(vertices, faces))
+    except UploadError as error:
+        raise FailedError(error.kind, error.sentence) from None
+    return {"format": found[2]}, {"vertices": found[0], "faces": found[1]}
+
+
+class _Form:
+    """A form, in which the place of the only file is looked for.
+
+    Args:
+        body: all of it.
+        boundary: what stands between its parts.
+    """
+
+    def __init__(self, body: bytes | bytearray, boundary: bytes | None) -> None:
+        self._body, self._boundary = body, boundary
+        self._headers: dict[bytes, bytes] = {}
+        self._header, self._name = b"", ""
+        self._fields = self._files = 0
+        self._is_file, self._start, self._stop = False, 0, 0
+        self._found: tuple[memoryview, str, bytes] | None = None
+
+    def file(self) -> tuple[memoryview, str, bytes]:
+        """Its content, its name, and its declared type.
+
+        Raises:
+            UploadError: no form, more fields or files than one may send, or no file.
+        """
+        if self._boundary is None:
+            raise self._unreadable("Missing boundary in multipart.")
+        if self._body.count(b"\r\n--" + self._boundary) > 2 * _MOST_FIELDS:
+            raise self._unreadable("Too many parts.")
+        try:
+            parser = MultipartParser(
+                self._boundary,
+                {
+                    "on_part_begin": self._headers.clear,
+                    "on_header_field": self._on_header_field,
+                    "on_header_value": self._on_header_value,
+                    "on_headers_finished": self._on_headers_finished,
+                    "on_part_data": self._on_part_data,
+                    "on_part_end": self._on_part_end,
+                },
+            )
+            # At once, so that places are those in the body.
+            parser.write(self._body)  # type: ignore[arg-type]
+        except FormParserError:
+            raise self._unreadable("Invalid multipart data.") from None
+        if self._found is None:
+            raise UploadError("invalid-mesh", "The form holds no file. Send the mesh file as one of its fields.")
+        return self._found
+
+    def _unreadable(self, why: str) -> UploadError:
+        return UploadError("malformed-request", f"The form can't be read: {why} Send one file in it.")
+
+    def _on_header_field(self, data: bytes, start: int, stop: int) -> None:
+        self._header = bytes(data[start : min(stop, start + _LONGEST_HEADER)]).lower()
+
+    def _on_header_value(self, data: bytes, start: int, stop: int) -> None:
+        self._headers[self._header] = bytes(data[start : min(stop, start + _LONGEST_HEADER)])
+
+    def _on_headers_finished(self) -> None:
+        _, options = parse_options_header(self._headers.get(b"content-disposition"))
+        if b"name" not in options:
+            raise self._unreadable('The Content-Disposition header field "name" must be provided.')
+        self._is_file, self._start, self._stop = b"filename" in options, 0, 0
+        self._files += self._is_file
+        self._fields += not self._is_file
+        if self._files > 1:
+            raise self._unreadable("Too many files. Maximum number of files is 1.")
+        if self._fields > _MOST_FIELDS:
+            raise self._unreadable(f"Too many fields. Maximum number of fields is {_MOST_FIELDS}.")
+        self._name = options.get(b"filename", b"").decode(errors="replace")
+
+    def _on_part_data(self, data: bytes, start: int, stop: int) -> None:
+        self._start, self._stop = self._start or start, stop
+
+    def _on_part_end(self) -> None:
+        if self._is_file:
+            declared, _ = parse_options_header(self._headers.get(b"content-type"))
+            self._found = memoryview(self._body)[self._start : self._stop], self._name, declared
+
+
+def _read_json(data: memoryview, limits: Limits) -> tuple[FloatArray, IntArray]:
+    each = limits.vertices + limits.faces
+    # As many as there can be, before any of them is made.
+    for most, characters, name in (
+        (_OBJECTS, b"{", "objects"),
+        (_QUOTES, b'"', "quotes"),
+        (_LISTS_BESIDE + each, b"[", "lists"),
+        # Three in a vertex or face, one behind it, and one for its colour.
+        (_LISTS_BESIDE + 5 * each, b",", "commas"),
+    ):
+        if count(data, characters) > most:
+            raise MeshError(f"it has more than {most} {name}")
+    if len(data) > _BYTES_BESIDE + _BYTES_OF_EACH * each:
+        raise MeshError(f"it has {len(data)} bytes, where {_BYTES_BESIDE + _BYTES_OF_EACH * each} are enough")
+    try:
+        content = orjson.loads(_in_ascii(data))
+    except orjson.JSONDecodeError as error:
+        raise MeshError(f"not JSON: {clipped(error)}") from None
+    if not isinstance(content, dict) or "vertices" not in content:
+        raise MeshError('not an object {"vertices": [[x, y, z], …], "faces": [[a, b, c], …]}')
+    vertices = _triples("d", content["vertices"], "vertices must be lists of three numbers each")
+    faces = _triples("q", content.get("faces") or [], "faces must be lists of three whole numbers each")
+    return vertices, faces
+
+
+def _in_ascii(data: memoryview) -> bytes | memoryview:
+    """The same with other characters replaced: in its place, as there may be no room for a copy."""
+    if data.readonly:
+        return bytes(data).translate(_TO_ASCII)
+    for start in range(0, len(data), _PIECE):
+        piece = data[start : start + _PIECE]
+        piece[:] = bytes(piece).translate(_TO_ASCII)
+    return data
+
+
+def _triples(kind: str, rows: object, otherwise: str) -> np.ndarray:
+    """Rows of three numbers as an array; raises MeshError where they are something else."""
+    numbers = array(kind)
+    try:
+        if not isinstance(rows, list) or any(len(row) != 3 for row in rows):
+            raise MeshError(otherwise)
+        flat: Iterable = chain.from_iterable(rows)
+        numbers.extend(flat)
+    except (TypeError, OverflowError):
+        raise MeshError(otherwise) from None
+    return np.array(numbers).reshape(-1, 3)
+
+
+def _checked(vertices: np.ndarray, faces: np.ndarray) -> tuple[FloatArray, IntArray]:
+    if vertices.ndim != 2 or vertices.shape[1] != 3 or vertices.dtype.kind not in "fiu" or not len(vertices):
+        raise MeshError(f"vertices must be (V, 3) numbers, not {clipped(vertices.dtype)} of shape {vertices.shape}")
+    if faces.size and (faces.ndim != 2 or faces.shape[1] != 3 or faces.dtype.kind not in "iu"):
+        raise MeshError(f"faces must be (F, 3) whole numbers, not {clipped(faces.dtype)} of shape {faces.shape}")
+    with np.errstate(all="ignore"):  # a long double may be beyond doubles
+        return vertices.astype(np.float64, copy=False), faces.reshape(-1, 3).astype(np.int64, copy=False)

@@ -1,0 +1,75 @@
+"""Formats: that of a body, and choosing one to answer in: ``?format=``, ``Accept`` with its weights, the default."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from types import MappingProxyType
+
+from shapespace.service.http.problems import ProblemError
+
+#: Ranges of an ``Accept`` that are looked at, the first ones; browsers send less than ten.
+MOST_RANGES = 100
+
+
+def declared_type(headers: Mapping[str, str]) -> str:
+    """What a body is declared to be, without parameters; empty where nothing is said."""
+    return headers.get("content-type", "").split(";")[0].strip().lower()
+
+
+def choose(
+    formats: Mapping[str, str],
+    format: str | None,
+    accept: str | None,
+    unavailable: Mapping[str, str] = MappingProxyType({}),
+) -> str:
+    """Name of the format to answer in.
+
+    Args:
+        formats: media type of each format by name; the first is the default, and of two formats with one
+            media type ``Accept`` gets the first.
+        format: the query parameter.
+        accept: the header.
+        unavailable: why a format that one may expect is not among them, by name.
+
+    Raises:
+        ProblemError: not-acceptable, with the choices.
+    """
+    if format is not None:
+        if format in formats:
+            return format
+        raise _not_acceptable(formats, unavailable.get(format, f"There is no format {format!r} here"))
+    if accept is None or not accept.strip():
+        return next(iter(formats))
+    ranges = [_parse(part) for part in accept.split(",", maxsplit=MOST_RANGES)[:MOST_RANGES] if part.strip()]
+    weights = {name: _weight(media_type, ranges) for name, media_type in formats.items()}
+    best = max(weights, key=lambda name: weights[name])  # the first of equals
+    if weights[best] <= 0:
+        raise _not_acceptable(formats, f"Nothing here is {accept!r}")
+    return best
+
+
+def _parse(part: str) -> tuple[str, float]:
+    media_range, *parameters = (piece.strip().lower() for piece in part.split(";"))
+    for parameter in parameters:
+        key, _, value = parameter.partition("=")
+        if key.strip() == "q":
+            try:
+                return media_range, min(1.0, max(0.0, float(value)))
+            except ValueError:
+                return media_range, 0.0
+    return media_range, 1.0
+
+
+def _weight(media_type: str, ranges: list[tuple[str, float]]) -> float:
+    """Weight of the most specific range that covers a media type; 0 where none does (RFC 9110, 12.5.1)."""
+    for pattern in (media_type, media_type.split("/", maxsplit=1)[0] + "/*", "*/*"):
+        weights = [weight for media_range, weight in ranges if media_range == pattern]
+        if weights:
+            return max(weights)
+    return 0.0
+
+
+def _not_acceptable(formats: Mapping[str, str], fault: str) -> ProblemError:
+    choices = [{"format": name, "media_type": media_type} for name, media_type in formats.items()]
+    listed = ", ".join(f"{name} ({media_type})" for name, media_type in formats.items())
+    return ProblemError("not-acceptable", f"{fault}. Choose one of {listed} by ?format= or Accept.", choices=choices)

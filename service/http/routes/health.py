@@ -1,0 +1,29 @@
+"""Whether the server lives and can answer, by the Open Inference Protocol's paths."""
+
+from __future__ import annotations
+
+from fastapi import APIRouter
+
+from shapespace.service.http.dependencies import ServiceDependency
+from shapespace.service.http.messages.schemas import Health, Readiness
+from shapespace.service.http.problems import ProblemError
+from shapespace.service.http.responses import problems
+
+router = APIRouter(prefix="/v2/health", tags=["health"])
+
+
+@router.get("/live")
+async def live() -> Health:
+    """Whether the process answers at all."""
+    return Health(live=True)
+
+
+@router.get("/ready", responses=problems(503))
+async def ready(service: ServiceDependency) -> Readiness:
+    """Whether there is a model to serve, and the server isn't about to end."""
+    if service.draining:
+        raise ProblemError("not-ready", "The server is about to end. Send requests to another one.", ready=False)
+    if len(service.repository) == 0:
+        detail = "No model is served. Put a bundle into the models folder; the log says more."
+        raise ProblemError("not-ready", detail, ready=False)
+    return Readiness(ready=True)

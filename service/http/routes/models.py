@@ -1,0 +1,38 @@
+"""The models that are served, and the card of each."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from fastapi import APIRouter
+
+from shapespace.model.shape_model import ShapeModel
+from shapespace.service.http.dependencies import Model, ServiceDependency
+from shapespace.service.http.messages.schemas import ModelCard, ModelList, ModelSummary
+from shapespace.service.http.responses import problems
+
+router = APIRouter(prefix="/v1/models", tags=["models"])
+
+
+@router.get("")
+async def list_models(service: ServiceDependency) -> ModelList:
+    """The newest version of every model."""
+    return ModelList(models=[ModelSummary(**_facts(model)) for model in service.repository])
+
+
+@router.get("/{name}", responses=problems(404, 422))
+async def model_card(service: ServiceDependency, model: Model) -> ModelCard:
+    """What a model is, its bounds and figures, and where it comes from."""
+    return ModelCard(**_facts(model), digest=model.digest, versions=service.repository.versions(model.manifest.name))
+
+
+def _facts(model: ShapeModel) -> dict[str, Any]:
+    facts = model.manifest.model_dump(by_alias=True)
+    path = f"/v1/models/{model.manifest.name}"
+    links = {"self": path}
+    links |= {
+        call: f"{path}/{call}" for call in ("mesh", "vertices", "nric", "interpolations", "encode", "edit", "sample")
+    }
+    wanted = ModelCard.model_fields
+    names = [field.alias or name for name, field in wanted.items()]
+    return {name: facts[name] for name in names if name in facts} | {"links": links}

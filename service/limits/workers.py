@@ -1,0 +1,280 @@
+"""The threads that compute: as many as there are processors, with a bounded queue and a deadline.
+
+Whatever a thread does, the request that waits for it is answered from the event loop: by its deadline, once its client
+has left, or when the server ends. Work looks at its deadline by itself and ends soon after; a thread that doesn't is
+given up, and another one takes its place.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections import deque
+from collections.abc import AsyncGenerator, AsyncIterator, Awaitable, Callable, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import ExitStack, asynccontextmanager, contextmanager
+from functools import partial
+from typing import TypeVar
+
+from starlette.exceptions import HTTPException
+from starlette.requests import Request
+
+from shapespace.service.limits.quota import Quota, QuotaError, client_name
+from shapespace.solve.deadline import Deadline
+
+logger = logging.getLogger(__name__)
+S = TypeVar("S")
+T = TypeVar("T")
+#: Seconds in which a thread should notice that its deadline has passed, and threads that may be given up because they
+#: don't.
+PATIENCE, SPARE = 2.0, 16
+#: Bytes that all answers of many shapes may take together.
+MEMORY = 384 * 2**20
+
+
+class BusyError(RuntimeError):
+    """The queue is full."""
+
+
+class DeadlineError(TimeoutError):
+    """The time a request may take has passed."""
+
+
+class DisconnectedError(ConnectionError):
+    """Nobody is there to be answered any more."""
+
+
+class EndingError(RuntimeError):
+    """The server ends before the answer is ready."""
+
+
+class Call(Deadline):
+    """A deadline that a request on the event loop waits for as well.
+
+    Args:
+        seconds: from now.
+        late: the error where they have passed.
+    """
+
+    def __init__(self, seconds: float, late: Exception) -> None:
+        super().__init__(seconds)
+        loop = asyncio.get_running_loop()
+        self._over: asyncio.Future[None] = loop.create_future()
+        self._over.add_done_callback(lambda end: end.cancelled() or end.exception())  # it may be nobody's to look at
+        self._timer = loop.call_later(seconds, self.give_up, late)
+
+    def give_up(self, error: Exception) -> None:
+        """End it with an error."""
+        self.call_off()
+        if not self._over.done():
+            self._over.set_exception(error)
+
+    def close(self) -> None:
+        """It was in time."""
+        self._timer.cancel()
+
+    async def first(self, work: Awaitable[T]) -> T:
+        """The result of something, or the error that this ends with before."""
+        task = asyncio.ensure_future(work)
+        try:
+            await asyncio.wait((task, self._over), return_when=asyncio.FIRST_COMPLETED)
+            if not task.done():
+                self._over.result()
+            return task.result()
+        finally:
+            task.cancel()  # without effect where it is done
+
+
+class Workers:
+    """One long-lived pool of threads for everything that would block the event loop.
+
+    Requests are admitted up to a limit. An admitted request hands over one shape after the other, never more
+    at once than there are threads, so that a long animation doesn't keep a single shape waiting for its end.
+    Streams have a limit of their own: they wait for their readers most of the time, and then hold no thread.
+
+    Args:
+        threads: size of the pool.
+        queue: requests admitted beyond those at work.
+        deadline: seconds a request may take from its admission.
+
+    Attributes:
+        places: requests at work or waiting.
+        streams: answers that are read while they are computed.
+        memory: bytes of answers that many shapes are gathered for.
+        lost: threads given up, and still running.
+    """
+
+    def __init__(self, threads: int, queue: int, deadline: float) -> None:
+        self.threads, self.deadline = threads, deadline
+        self._pool = self._threads()
+        self._free = asyncio.Semaphore(threads)
+        self.places, self.streams = Quota(threads + queue), Quota(threads + queue)
+        self.memory = Quota(MEMORY)
+        self.lost = 0
+        self._calls: set[Call] = set()
+        self._ending = False
+
+    def _threads(self) -> ThreadPoolExecutor:
+        return ThreadPoolExecutor(self.threads, thread_name_prefix="shapespace")
+
+    @asynccontextmanager
+    async def admit(self, request: Request) -> AsyncIterator[Call]:
+        """Count a request in for the duration; gives its deadline.
+
+        Raises:
+            BusyError: too many requests are being worked on or waiting, of all clients or of this one.
+        """
+        with self._place(self.places, request), self._call() as call:
+            watching = asyncio.create_task(self._watch(request, call))
+            try:
+                yield call
+            finally:
+                watching.cancel()
+
+    @contextmanager
+    def stream(self, request: Request) -> Iterator[None]:
+        """Count in, for the duration, a request whose answer is read while it is computed; raises BusyError."""
+        with self._place(self.streams, request):
+            yield
+
+    @contextmanager
+    def holding(self, request: Request, size: int) -> Iterator[ExitStack]:
+        """Count in so many bytes of an answer, for the block or as long as who takes the stack keeps it.
+
+        Raises:
+            BusyError: all requests together hold too much, or those of one client.
+        """
+        with ExitStack() as held:
+            held.enter_context(self._place(self.memory, request, size))
+            yield held
+
+    async def run(self, function: Callable[[Call], T], call: Call) -> T:
+        """Run work in a thread, given its deadline.
+
+        Raises:
+            DeadlineError, DisconnectedError, EndingError: the call has ended before.
+        """
+        turn = asyncio.ensure_future(self._free.acquire())
+        try:
+            await call.first(turn)
+        except BaseException:
+            if turn.done() and not turn.cancelled():
+                self._free.release()
+            raise
+        work: Future[T] = self._pool.submit(function, call)
+        try:
+            return await call.first(asyncio.wrap_future(work))
+        finally:
+            if work.done() or work.cancel():
+                self._free.release()
+            else:
+                self._abandon(work)
+
+    async def map(
+        self, function: Callable[[S, Call], T], items: Iterable[S], call: Call | None
+    ) -> AsyncGenerator[T, None]:
+        """Run one piece of work for every item, side by side, and give the results in order.
+
+        Without a deadline for all of them each piece has its own, from the moment it is handed over.
+        """
+        running: deque[asyncio.Task[T]] = deque()
+        try:
+            for item in items:
+                if len(running) == self.threads:
+                    yield await running.popleft()
+                running.append(asyncio.create_task(self.piece(partial(function, item), call)))
+            while running:
+                yield await running.popleft()
+        finally:
+            for task in running:
+                task.cancel()
+            # What else went wrong is of no interest any more, but would be logged as never looked at.
+            await asyncio.gather(*running, return_exceptions=True)
+
+    async def piece(self, function: Callable[[Call], T], call: Call | None) -> T:
+        """``run`` with a deadline, or one of its own; raises as that does."""
+        if call is not None:
+            return await self.run(function, call)
+        with self._call() as own:
+            return await self.run(function, own)
+
+    def late(self) -> DeadlineError:
+        """The error for work whose deadline has passed."""
+        return DeadlineError(
+            f"The answer was not ready within {self.deadline:g} s. Ask for fewer shapes at once, "
+            "stream the frames as JSON lines, or try again when there is less to do."
+        )
+
+    def end(self) -> None:
+        """Answer everything that waits: nothing more will be computed."""
+        self._ending = True
+        for call in tuple(self._calls):
+            call.give_up(_ending())
+
+    def close(self) -> None:
+        """End the threads that have nothing to do; those that have are left alone."""
+        self._pool.shutdown(wait=False, cancel_futures=True)
+
+    @contextmanager
+    def _place(self, quota: Quota, request: Request, amount: int = 1) -> Iterator[None]:
+        client = client_name(request.client.host) if request.client else ""
+        try:
+            quota.take(client, amount)
+        except QuotaError:
+            whose = "" if quota.used + amount > quota.limit else " for this client"
+            raise BusyError(
+                f"All workers are busy and the queue is full{whose}. Try again after the time in Retry-After."
+            ) from None
+        try:
+            yield
+        finally:
+            quota.give_back(client, amount)
+
+    @contextmanager
+    def _call(self) -> Iterator[Call]:
+        call = Call(self.deadline, self.late())
+        self._calls.add(call)
+        if self._ending:
+            call.give_up(_ending())
+        try:
+            yield call
+        finally:
+            self._calls.discard(call)
+            call.close()
+
+    async def _watch(self, request: Request, call: Call) -> None:
+        try:
+            while (await request.receive())["type"] != "http.disconnect":
+                pass
+        except HTTPException as error:  # what still comes is too much
+            call.give_up(error)
+        else:
+            call.give_up(DisconnectedError("The client closed the connection before its answer was ready."))
+
+    def _abandon(self, work: Future[T]) -> None:
+        """Wait for a thread whose result nobody wants; if it goes on, another one takes its place."""
+        loop, free = asyncio.get_running_loop(), True
+
+        def lose() -> None:
+            nonlocal free
+            if self.lost < SPARE:
+                free = False
+                self.lost += 1
+                self._pool.shutdown(wait=False)  # what runs in it goes on
+                self._pool = self._threads()
+                self._free.release()
+                logger.error("a thread is still at work %g s after its deadline, and another takes its place", PATIENCE)
+
+        def find() -> None:
+            timer.cancel()
+            if free:
+                self._free.release()
+            else:
+                self.lost -= 1
+
+        timer = loop.call_later(PATIENCE, lose)
+        work.add_done_callback(lambda _: None if loop.is_closed() else loop.call_soon_threadsafe(find))
+
+
+def _ending() -> EndingError:
+    return EndingError("The server is about to end. Send the request to another one, or again in a moment.")

@@ -1,0 +1,1 @@
+"""Running the server: what it counts, and taking up changed bundles."""

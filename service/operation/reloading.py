@@ -1,0 +1,48 @@
+"""Taking up changed bundles while the server runs."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+
+from shapespace.service.operation.metrics import Metrics
+from shapespace.service.repository.repository import Changes, ModelRepository
+
+logger = logging.getLogger(__name__)
+
+
+class Reloader:
+    """Reloads the models when told to, or when their folder changes; one reload at a time."""
+
+    def __init__(self, repository: ModelRepository, metrics: Metrics) -> None:
+        self._repository, self._metrics = repository, metrics
+        self._lock = asyncio.Lock()
+
+    async def reload(self) -> None:
+        """Take up the folder as it is; requests go on in the meantime."""
+        async with self._lock:
+            try:
+                changes = await asyncio.to_thread(self._repository.reload)
+            except Exception:
+                logger.exception("the reload failed, so that nothing changes")
+                changes = Changes(failed=True)
+            self._metrics.reloaded(changes)
+            logger.info(
+                "reloaded: %d bundles loaded, %d removed, %d refused",
+                len(changes.loaded),
+                len(changes.removed),
+                len(changes.refused),
+            )
+
+    async def watch(self, seconds: float) -> None:
+        """Look at the folder again and again, and reload once a change has come to rest.
+
+        By looking and not by notifications, which network and container file systems don't deliver.
+        """
+        before = self._repository.seen
+        while True:
+            await asyncio.sleep(seconds)
+            now = await asyncio.to_thread(self._repository.signature)
+            if now == before != self._repository.seen:
+                await self.reload()
+            before = now

@@ -1,0 +1,1 @@
+"""The bundles that are served, how they are tried, and how they change."""

@@ -1,0 +1,227 @@
+"""The bundles that are served, by name and version, and how they change while requests run."""
+
+from __future__ import annotations
+
+import logging
+import os
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from shapespace.bundle.reader import BundleError, check_place, manifest_digest, read_bundle, read_files
+from shapespace.model.shape_model import ShapeModel
+from shapespace.service.limits.memory import give_back
+from shapespace.service.limits.sandbox import (
+    ClosedError,
+    DiedError,
+    FailedError,
+    LateError,
+    OutOfMemoryError,
+    SandboxError,
+    in_a_line,
+)
+from shapespace.service.logs import printable
+from shapespace.service.repository.candidates import Trials, bundle_folders
+
+logger = logging.getLogger(__name__)
+
+#: Changes when anything in a folder of bundles does: (path, size, time of change, inode) of each file.
+Signature = tuple[tuple[str, int, int, int], ...]
+
+
+class UnknownModelError(LookupError):
+    """No model of that name."""
+
+
+class UnknownVersionError(LookupError):
+    """The model has no such version."""
+
+
+@dataclass(frozen=True)
+class Changes:
+    """What a look at the folder found, as NAME/VERSION.
+
+    Attributes:
+        loaded: bundles that are new, or other than before.
+        removed: bundles that are no longer there.
+        refused: bundles that can't be trusted.
+        failed: whether the folder could not be looked at, so that nothing changed.
+    """
+
+    loaded: list[str] = field(default_factory=list)
+    removed: list[str] = field(default_factory=list)
+    refused: list[str] = field(default_factory=list)
+    failed: bool = False
+
+
+class ModelRepository:
+    """Every bundle of a folder that can be trusted.
+
+    A bundle is read only when it has been loaded and run once in a process of its own, and if it is still the same
+    then. One that can't be trusted is left out with one line in the log, and the others are served. A model in use is
+    never altered: a reload builds what is new beside it and then puts another list of models in the place of the whole
+    list, so that a request which holds a model keeps it, and none sees one half of a change.
+
+    Args:
+        folder: holds NAME/VERSION/; hidden entries and plain files beside the names are passed over.
+        threads: shapes that a model may work on at once.
+        trials: for the first look, where they have begun already.
+
+    Attributes:
+        refused: bundles that the latest look refused.
+        seen: the folder's signature before that look.
+    """
+
+    def __init__(self, folder: Path, threads: int = 1, trials: Trials | None = None) -> None:
+        self._folder, self._threads = folder, threads
+        self._models: Mapping[str, Mapping[int, ShapeModel]] = {}
+        self._trials, self._closed = trials or Trials(), False
+        self.refused: list[str] = []
+        self.seen: Signature = ()
+        self.reload()
+
+    def reload(self) -> Changes:
+        """Take up the folder as it is; not to be called twice at once, and never raises for a bundle's sake.
+
+        A model whose bundle is the same byte for byte stays as it is. Where a bundle can't be trusted any more, or
+        the whole folder is out of reach, what was loaded before stays.
+        """
+        try:
+            return self._reload(self._trials)
+        finally:
+            self._trials.close()
+            self._trials = Trials()  # which has no process before there is something to try
+            if self._closed:
+                self._trials.close()
+
+    def _reload(self, trials: Trials) -> Changes:
+        self.seen = self.signature()  # first, so that what changes from now on makes a difference
+        try:
+            folders, unreadable = bundle_folders(self._folder)
+        except OSError as error:
+            logger.error("the models folder can't be read, so that nothing changes: %s", error)
+            return Changes(failed=True)
+        changes = Changes()
+        before = {(model.manifest.name, model.manifest.version): model for model in self.all()}
+        models: dict[str, dict[int, ShapeModel]] = {}
+
+        def serve(model: ShapeModel) -> None:
+            models.setdefault(model.manifest.name, {})[int(model.manifest.version)] = model
+
+        trials.begin(folder for folder in folders if _is_new(folder, before.get((folder.parent.name, folder.name))))
+        for folder in folders:
+            place = printable(f"{folder.parent.name}/{folder.name}")
+            model = before.pop((folder.parent.name, folder.name), None)
+            try:
+                new = self._take_up(folder, model, trials)
+                if new is not model:
+                    changes.loaded.append(place)
+                    logger.info("bundle %s is served", place)
+                serve(new)
+            except ClosedError:
+                return Changes()
+            except Exception as error:  # one bundle must not keep the others from being served
+                changes.refused.append(place)
+                if model is None:
+                    logger.error("bundle %s is not served: %s", place, _reason(error))
+                else:
+                    logger.error("bundle %s is refused, and what was loaded before stays: %s", place, _reason(error))
+                    serve(model)
+        for folder, fault in unreadable.items():
+            changes.refused.append(printable(folder.name))
+            logger.error("%s can't be read, so that it stays as it was: %s", printable(folder.name), fault)
+            for key in [key for key in before if key[0] == folder.name]:
+                serve(before.pop(key))
+        for name, version in before:
+            changes.removed.append(f"{name}/{version}")
+            logger.info("bundle %s/%s is gone and no longer served", name, version)
+        self._models, self.refused = models, changes.refused
+        if changes.loaded or changes.removed:
+            give_back()
+        return changes
+
+    def close(self) -> None:
+        """End trials that still run; what they were for stays as it is."""
+        self._closed = True
+        self._trials.close()
+
+    def _take_up(self, folder: Path, model: ShapeModel | None, trials: Trials) -> ShapeModel:
+        """The model of a bundle: the one there is, or a new one where the bundle has changed."""
+        check_place(folder)
+        if model is not None and manifest_digest(folder) == model.digest:
+            read_files(folder, model.manifest)
+            return model
+        return ShapeModel(read_bundle(folder, trials.digest(folder)), self._threads)
+
+    def signature(self) -> Signature:
+        """Something that differs once any bundle does, without reading one."""
+        found = []
+        with suppress(OSError):  # being changed at this moment: the next look will tell
+            for version in bundle_folders(self._folder)[0]:
+                found.append((str(version), 0, 0, 0))
+                with suppress(OSError), os.scandir(version) as entries:
+                    for entry in entries:
+                        status = entry.stat(follow_symlinks=False)
+                        found.append((entry.path, status.st_size, status.st_mtime_ns, status.st_ino))
+        return tuple(sorted(found))
+
+    def __iter__(self) -> Iterator[ShapeModel]:
+        """The newest version of every model, by name."""
+        return (versions[max(versions)] for _, versions in sorted(self._models.items()))
+
+    def __len__(self) -> int:
+        return len(self._models)
+
+    def all(self) -> Iterator[ShapeModel]:
+        """Every version of every model."""
+        return (model for versions in self._models.values() for model in versions.values())
+
+    def versions(self, name: str) -> list[str]:
+        """Versions of a model, oldest first, by number; raises UnknownModelError."""
+        return [str(version) for version in sorted(self._named(name))]
+
+    def get(self, name: str, version: str | None = None) -> ShapeModel:
+        """A model, the newest version by default; raises UnknownModelError or UnknownVersionError."""
+        versions = self._named(name)
+        for number, model in versions.items():
+            if str(number) == version:
+                return model
+        if version is not None:
+            raise UnknownVersionError(
+                f"{name} has no version {version!r}. Choose one of {', '.join(map(str, sorted(versions)))}, or none "
+                "for the newest."
+            )
+        return versions[max(versions)]
+
+    def by_digest(self, prefix: str) -> ShapeModel | None:
+        """The model whose digest begins with ``prefix``."""
+        return next((model for model in self.all() if model.digest.startswith(prefix)), None)
+
+    def _named(self, name: str) -> Mapping[int, ShapeModel]:
+        models = self._models
+        if name not in models:
+            known = ", ".join(sorted(models)) or "none at the moment"
+            raise UnknownModelError(f"There is no model {name!r}. Choose one of those that /v1/models lists: {known}.")
+        return models[name]
+
+
+def _is_new(folder: Path, model: ShapeModel | None) -> bool:
+    """Whether there is a bundle to try, other than the one that is served."""
+    try:
+        check_place(folder)
+        return model is None or manifest_digest(folder) != model.digest
+    except (BundleError, OSError):
+        return False  # whoever takes it up says why
+
+
+def _reason(error: Exception) -> str:
+    """What is wrong with a bundle, in one line."""
+    match error:
+        case FailedError(kind=FailedError.UNEXPECTED) | DiedError() | LateError() | OutOfMemoryError():
+            text = f"tried in a process of its own, {error}"
+        case SandboxError() | BundleError() | OSError():
+            text = str(error)
+        case _:
+            text = in_a_line(error)
+    return " ".join(text.split())

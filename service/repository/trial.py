@@ -1,0 +1,39 @@
+"""Trying a bundle before it is served; runs in a sandbox's child."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from shapespace.bundle.reader import BundleError, read_bundle
+from shapespace.model.shape_model import ShapeModel
+from shapespace.service.limits.sandbox import Arrays, Facts, FailedError, allow
+from shapespace.solve.cholesky import SymmetricPattern, analyse
+
+#: Bytes that the solver may take for each vertex of the coarse mesh, about twice what it does, and for all of them.
+OF_A_VERTEX, MOST_OF_VERTICES = 64 * 2**10, 4 * 2**30
+# The library for factorisations takes time to load, and room: before the first bundle, and not at its expense.
+analyse(SymmetricPattern(1, np.array([0]), np.array([0])))
+
+
+def try_bundle(body: bytearray, folder: str) -> tuple[Facts, Arrays]:
+    """Load a bundle, and do once what serving does with it.
+
+    Args:
+        body: empty.
+        folder: of the bundle.
+
+    Returns:
+        Its ``digest``.
+
+    Raises:
+        FailedError: it must not be served, and why.
+    """
+    try:
+        bundle = read_bundle(Path(folder))
+        allow(min(OF_A_VERTEX * bundle.manifest.vertices, MOST_OF_VERTICES))
+        ShapeModel(bundle).rehearse()
+    except (BundleError, OSError) as error:
+        raise FailedError("refused", str(error)) from None
+    return {"digest": bundle.digest}, {}

@@ -1,0 +1,173 @@
+"""Paths through latent space, frame by frame, and the ids that hold them."""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import hashlib
+import zlib
+from itertools import pairwise
+from typing import Annotated
+
+import numpy as np
+import orjson
+from pydantic import ConfigDict, Field, ValidationError, field_validator, model_validator
+
+from shapespace.arrays import FloatArray
+from shapespace.model.latent_space import LatentSpace
+from shapespace.model.shape_model import MeshChoice
+from shapespace.service.http.messages.schemas import Body, Number, Whole
+from shapespace.service.use_cases.shape_formats import holds_more_values
+
+#: Longest id: behind most proxies a whole URL may take 16 KiB at most.
+ID_LIMIT = 15_000
+#: Bytes that an id may unpack to, and values in them: reading one takes a few milliseconds at most.
+_PAYLOAD_LIMIT, _VALUES_LIMIT = 2**16, 2**13
+_CHECKSUM_BYTES = 9
+_DIGEST_DIGITS = 32
+
+
+class UnknownInterpolationError(LookupError):
+    """An id that this server can't answer."""
+
+
+class PathTooLongError(ValueError):
+    """Keyframes that don't fit into an id."""
+
+
+class Animation(Body):
+    """A piecewise linear path through latent codes, sampled at equal steps.
+
+    Frame k of n lies at ``t = start + k (stop − start) / (n − 1)``, where 0 is the first keyframe and 1 the
+    last. Outside [0, 1] the first or the last segment goes on in a straight line. Angles take the shorter
+    arc.
+    """
+
+    model_config = ConfigDict(
+        frozen=True,
+        json_schema_extra={"examples": [{"keyframes": [[0, 0, 0, 0], [1, 2, 3, 4]], "frames": 30}]},
+    )
+
+    keyframes: Annotated[
+        list[Annotated[list[Number], Field(fail_fast=True, json_schema_extra={"minItems": 1})]],
+        Field(fail_fast=True),
+    ] = Field(min_length=2, description="At least two latent codes.")
+    times: Annotated[list[Number], Field(fail_fast=True)] | None = Field(
+        None,
+        description="Increasing times of the keyframes, in any unit; by default equally far apart. With "
+        "`loop` the way back to the first keyframe takes the average of the other segments.",
+    )
+    frames: Whole = Field(
+        30,
+        ge=2,
+        description="n, the number of frames, both ends included; `loop` leaves the last one out.",
+    )
+    start: Number = Field(0.0, description="t of the first frame; below 0 extrapolates.")
+    stop: Number = Field(1.0, description="t of the last frame; above 1 extrapolates.")
+    loop: bool = Field(
+        False,
+        strict=True,
+        description="Append the first keyframe, and drop the last of the n frames, so that the "
+        "animation repeats without a jump.",
+    )
+    mesh: MeshChoice = Field(MeshChoice.FINE, description="Which mesh the frames have.")
+
+    @field_validator("times")
+    @classmethod
+    def _increasing(cls, times: list[float] | None) -> list[float] | None:
+        if times is not None and not all(a < b for a, b in pairwise(times)):
+            raise ValueError("times must increase from each keyframe to the next; sort them and drop repetitions")
+        return times
+
+    @model_validator(mode="after")
+    def _one_time_each(self) -> Animation:
+        if self.times is not None and len(self.times) != len(self.keyframes):
+            raise ValueError(
+                f"times has {len(self.times)} entries for {len(self.keyframes)} keyframes; send as many, or none"
+            )
+        return self
+
+    @property
+    def frame_count(self) -> int:
+        """Frames that are answered: ``frames``, or one less with ``loop``."""
+        return self.frames - self.loop
+
+    @property
+    def positions(self) -> FloatArray:
+        """T of each answered frame."""
+        return (self.start + np.arange(self.frames) * (self.stop - self.start) / (self.frames - 1))[: self.frame_count]
+
+    def codes(self, latents: LatentSpace, which: slice = slice(None)) -> list[list[float]]:
+        """Code of each frame, or of some, (n, m), angles not yet reduced; raises LatentError."""
+        keyframes = latents.codes(self.keyframes)[0].astype(np.float64)
+        knots = np.arange(len(keyframes), dtype=np.float64) if self.times is None else np.array(self.times)
+        if self.loop:
+            keyframes = np.concatenate([keyframes, keyframes[:1]])
+            knots = np.append(knots, knots[-1] + (knots[-1] - knots[0]) / (len(knots) - 1))
+        keyframes = latents.unroll(keyframes)
+        t = knots[0] + self.positions[which] * (knots[-1] - knots[0])
+        segment = np.clip(np.searchsorted(knots, t, side="right") - 1, 0, len(knots) - 2)
+        share = ((t - knots[segment]) / (knots[segment + 1] - knots[segment]))[:, None]
+        # This form gives both keyframes exactly, at 0 and at 1.
+        codes: list[list[float]] = ((1 - share) * keyframes[segment] + share * keyframes[segment + 1]).tolist()
+        return codes
+
+    def to_id(self, model_digest: str, latents: LatentSpace) -> str:
+        """A name that holds the whole animation, so that any replica can answer it at any time.
+
+        The content is brought to its canonical form first: equal animations of a model have equal ids.
+
+        Raises:
+            LatentError: a keyframe that is no code of the model.
+            PathTooLongError: too many keyframes for a URL.
+        """
+        too_long = PathTooLongError(
+            f"{len(self.keyframes)} keyframes of {latents.dimension} numbers don't fit into an "
+            "interpolation's address. Send fewer keyframes, or the parts of the path one by one."
+        )
+        if len(self.keyframes) + sum(map(len, self.keyframes)) > _VALUES_LIMIT:
+            raise too_long  # before anything is worked out from them
+        content = self.model_dump(mode="json", exclude_none=True)
+        content["keyframes"] = latents.codes(self.keyframes)[0]
+        content["model"] = model_digest[:_DIGEST_DIGITS]
+        payload = orjson.dumps(content, option=orjson.OPT_SERIALIZE_NUMPY | orjson.OPT_SORT_KEYS)
+        packed = _checksum(payload) + zlib.compress(payload, 9)
+        name = base64.urlsafe_b64encode(packed).rstrip(b"=").decode()
+        if len(name) > ID_LIMIT or len(payload) > _PAYLOAD_LIMIT or holds_more_values(payload, _VALUES_LIMIT):
+            raise too_long
+        return name
+
+    @classmethod
+    def from_id(cls, name: str) -> tuple[Animation, str]:
+        """The animation of an id, and the digits that its model's digest begins with.
+
+        Raises:
+            UnknownInterpolationError: damaged, made up, or from another version of this software.
+        """
+        try:
+            if len(name) > ID_LIMIT:
+                raise ValueError
+            packed = base64.b64decode(name + "=" * (-len(name) % 4), altchars=b"-_", validate=True)
+            inflate = zlib.decompressobj()
+            # Bounded: a short id could otherwise unpack to gigabytes.
+            payload = inflate.decompress(packed[_CHECKSUM_BYTES:], _PAYLOAD_LIMIT)
+            if not inflate.eof or inflate.unused_data or packed[:_CHECKSUM_BYTES] != _checksum(payload):
+                raise ValueError
+            if base64.urlsafe_b64encode(packed).rstrip(b"=").decode() != name:
+                raise ValueError
+            if holds_more_values(payload, _VALUES_LIMIT):
+                raise ValueError
+            content = orjson.loads(payload)
+            digest = content.pop("model")
+            if not isinstance(digest, str) or len(digest) != _DIGEST_DIGITS:
+                raise ValueError
+            return cls.model_validate(content), digest
+        except (ValueError, KeyError, AttributeError, TypeError, binascii.Error, zlib.error, ValidationError):
+            raise UnknownInterpolationError(
+                "No interpolation has this id: it is damaged or was not given out by this server. "
+                "POST the keyframes to /v1/models/{name}/interpolations for a new one."
+            ) from None
+
+
+def _checksum(payload: bytes) -> bytes:
+    return hashlib.sha256(payload).digest()[:_CHECKSUM_BYTES]

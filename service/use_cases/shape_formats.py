@@ -1,0 +1,110 @@
+"""Shapes as bytes: the project's mesh formats, and JSON."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import orjson
+from numpy.typing import NDArray
+
+from shapespace.arrays import FloatArray, IntArray
+from shapespace.files.colouring import Colouring
+from shapespace.files.formats import MESH_FORMATS, MeshFormat
+from shapespace.model.exact_shapes import Exact
+from shapespace.model.shape_model import Diagnostics
+
+#: Bytes that are counted at once: where there are too many values, few of these pieces are looked at.
+_PIECE = 2**16
+
+
+def dump_json(content: Any) -> bytes:
+    """JSON, with NumPy arrays as nested lists; what isn't finite becomes null."""
+    return orjson.dumps(content, option=orjson.OPT_SERIALIZE_NUMPY)
+
+
+def holds_more_values(text: bytes, most: int) -> bool:
+    """Whether JSON holds more values than that, going by what separates them, before any of it is parsed."""
+    count = 0
+    for start in range(0, len(text), _PIECE):
+        piece = text[start : start + _PIECE]
+        count += sum(map(piece.count, (b",", b":", b"[", b"{")))
+        if count > most:
+            return True
+    return False
+
+
+def float32(array: NDArray) -> NDArray[np.float32]:
+    """Contiguous float32: the precision of everything that leaves."""
+    return np.ascontiguousarray(array, dtype=np.float32)
+
+
+def _mesh_json(vertices: FloatArray, faces: IntArray, colouring: Colouring | None = None) -> bytes:
+    content: dict[str, Any] = {"vertices": float32(vertices), "faces": np.ascontiguousarray(faces)}
+    if colouring:
+        content["color"] = {**colouring.legend, "values": float32(colouring.values)}
+    return dump_json(content)
+
+
+#: Formats of one shape; the first is the default.
+SHAPE_FORMATS = {**MESH_FORMATS, "json": MeshFormat("application/json", _mesh_json)}
+
+
+def diagnostics_arrays(diagnostics: Sequence[Diagnostics]) -> dict[str, NDArray]:
+    """Diagnostics of n shapes as arrays (n,), for NPZ files."""
+    return {
+        "status": np.array([str(d.status) for d in diagnostics]),
+        "iterations": np.array([d.iterations for d in diagnostics]),
+        "residual": np.array([d.residual for d in diagnostics]),
+        "flipped_faces": np.array([d.flipped_faces for d in diagnostics]),
+        "integrability": np.array([d.integrability for d in diagnostics]),
+        "plausibility": np.array([d.plausibility for d in diagnostics], dtype=np.float64),
+        "inside_bounds": np.array([d.inside_bounds for d in diagnostics]),
+    }
+
+
+def json_pieces(members: Mapping[str, Iterable[Any]]) -> Iterator[bytes]:
+    """An object of lists as JSON, an element at a time: together they may be large."""
+    opening = b"{"
+    for name, elements in members.items():
+        yield opening + dump_json(name) + b":["
+        for k, element in enumerate(elements):
+            yield (b"," if k else b"") + dump_json(element)
+        opening = b"],"
+    yield b"]}"
+
+
+def exact_lists(exponentials: Sequence[Exact]) -> dict[str, list[Any]]:
+    """Exponentials of n codes as lists (n,), for JSON."""
+    return {
+        "exact": [e.vertices for e in exponentials],
+        "distance": [None if e.vertices is None else {"mean": e.mean, "max": e.max} for e in exponentials],
+        "exact_status": [e.status for e in exponentials],
+    }
+
+
+def exact_arrays(exponentials: Sequence[Exact], vertex_count: int) -> dict[str, NDArray]:
+    """Exponentials of n codes as arrays, for NPZ files; NaN where one failed."""
+    missing = np.full((vertex_count, 3), np.nan, np.float32)
+    return {
+        "exact": np.stack([missing if e.vertices is None else e.vertices for e in exponentials]),
+        "distance_mean": np.array([e.mean for e in exponentials], dtype=np.float64),
+        "distance_max": np.array([e.max for e in exponentials], dtype=np.float64),
+        "exact_status": np.array([str(e.status) for e in exponentials]),
+    }
+
+
+def worst(diagnostics: Sequence[Diagnostics]) -> dict[str, Any]:
+    """One summary of several diagnostics: the largest numbers, and the first status that isn't good."""
+    bad = [d.status for d in diagnostics if d.status != "converged"]
+    return {
+        "status": bad[0] if bad else diagnostics[0].status,
+        "iterations": max(d.iterations for d in diagnostics),
+        "residual": max(d.residual for d in diagnostics),
+        "flipped_faces": max(d.flipped_faces for d in diagnostics),
+        "integrability": max(d.integrability for d in diagnostics),
+        "plausibility": max((d.plausibility for d in diagnostics if d.plausibility is not None), default=None),
+        "inside_bounds": all(d.inside_bounds for d in diagnostics),
+        "model": diagnostics[0].model,
+    }

@@ -1,0 +1,296 @@
+"""A client in one module, which needs httpx and NumPy and nothing else of this project.
+
+>>> from shapespace.client import Client
+>>> with Client("http://localhost:8000") as client:
+...     glb = client.mesh("freaky-torus", [1, 2, 3, 4])
+...     positions = client.vertices("freaky-torus", [[1, 2, 3, 4], [0, 0, 0, 0]])
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import httpx
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Options = str | int | float | bool | None
+
+
+class ClientError(Exception):
+    """A problem that the server answers with.
+
+    Attributes:
+        status: of the answer.
+        type: stable name of the kind of problem.
+        detail: what to do.
+        request_id: by which the server's log names the request.
+    """
+
+    def __init__(self, answer: httpx.Response, problem: Mapping[str, Any] | None = None) -> None:
+        try:
+            problem = problem or answer.json()
+        except ValueError:  # it comes from a proxy
+            problem = {}
+        self.status, self.type = problem.get("status", answer.status_code), problem.get("type", "about:blank")
+        self.detail = problem.get("detail", answer.reason_phrase)
+        self.request_id = answer.headers.get("X-Request-ID")
+        super().__init__(f"{self.status}: {self.detail}")
+
+
+@dataclass(frozen=True)
+class Mesh:
+    """A triangle mesh in the units of the training meshes.
+
+    Attributes:
+        vertices: (V, 3) float32.
+        faces: (F, 3), from 0.
+    """
+
+    vertices: NDArray[np.float32]
+    faces: NDArray[np.int64]
+
+
+class Client:
+    """Calls of a shapespace server, as functions.
+
+    Every call raises ClientError where the server answers with a problem, and httpx.HTTPError where it doesn't answer.
+
+    Args:
+        url: of the server.
+        api_key: where the server wants one.
+        timeout: seconds to wait for each answer.
+        retries: how often to ask again a server that is busy, after the time that it says.
+    """
+
+    def __init__(self, url: str, *, api_key: str | None = None, timeout: float = 120, retries: int = 3) -> None:
+        headers = {"Authorization": f"Bearer {api_key}"} if api_key else {}
+        self._http = httpx.Client(base_url=url, headers=headers, timeout=timeout)
+        self._retries = retries
+
+    def __enter__(self) -> Client:
+        return self
+
+    def __exit__(self, _: type[BaseException] | None, __: BaseException | None, ___: TracebackType | None) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close all connections."""
+        self._http.close()
+
+    def models(self) -> list[dict[str, Any]]:
+        """The newest version of every model."""
+        found: list[dict[str, Any]] = self._send("GET", "/v1/models").json()["models"]
+        return found
+
+    def model(self, name: str, version: str | None = None) -> dict[str, Any]:
+        """A model's card."""
+        card: dict[str, Any] = self._send("GET", f"/v1/models/{name}", params={"version": version}).json()
+        return card
+
+    def mesh(self, name: str, latent: ArrayLike | None = None, format: str = "glb", **options: Options) -> bytes:
+        """The file of one shape, or of the reference.
+
+        Args:
+            name: of the model.
+            latent: (m,).
+            format: glb, gltf, obj, ply, stl, npz or json.
+            options: version, mesh ("fine" or "coarse"), bounds ("allow", "clamp" or "reject"), color.
+        """
+        code = None if latent is None else ",".join(map(repr, _numbers(latent)))
+        return self._send("GET", f"/v1/models/{name}/mesh", params={"latent": code, "format": format} | options).content
+
+    def shape(self, name: str, latent: ArrayLike | None = None, **options: Options) -> Mesh:
+        """One shape, or the reference, as arrays; options as for ``mesh``."""
+        arrays = _arrays(self.mesh(name, latent, "npz", **options))
+        return Mesh(arrays["vertices"].astype(np.float32), arrays["faces"].astype(np.int64))
+
+    def vertices(
+        self, name: str, latents: ArrayLike, *, version: str | None = None, **options: Options
+    ) -> NDArray[np.float32]:
+        """Positions (n, V, 3) of codes (n, m).
+
+        Args:
+            name: of the model.
+            latents: (n, m).
+            version: of the model.
+            options: mesh ("fine" or "coarse"), bounds ("allow", "clamp" or "reject").
+        """
+        answer = self._send(
+            "POST",
+            f"/v1/models/{name}/vertices",
+            params={"version": version, "format": "npz"},
+            json={"latents": _numbers(latents), **options},
+        )
+        return _arrays(answer.content)["vertices"].astype(np.float32)
+
+    def nric(
+        self, name: str, latents: ArrayLike, *, version: str | None = None, **options: Options
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Edge lengths and dihedral angles, (n, E) each, of codes (n, m); options: bounds."""
+        answer = self._send(
+            "POST",
+            f"/v1/models/{name}/nric",
+            params={"version": version},
+            json={"latents": _numbers(latents), **options},
+        ).json()
+        return np.array(answer["lengths"]), np.array(answer["angles"])
+
+    def interpolate(
+        self, name: str, keyframes: ArrayLike, *, version: str | None = None, **options: Any
+    ) -> Interpolation:
+        """An animation along a path of codes.
+
+        Args:
+            name: of the model.
+            keyframes: (k, m), at least two.
+            version: of the model.
+            options: frames, times, start, stop, loop, mesh.
+        """
+        answer = self._send(
+            "POST",
+            f"/v1/models/{name}/interpolations",
+            params={"version": version},
+            json={"keyframes": _numbers(keyframes), **options},
+        ).json()
+        return Interpolation(self, answer["id"], answer["frames"])
+
+    def encode(
+        self, name: str, mesh: Mesh | bytes | Path, format: str | None = None, **options: Options
+    ) -> dict[str, Any]:
+        """The code whose shape is closest to a mesh in correspondence, however that one is turned and moved.
+
+        Args:
+            name: of the model.
+            mesh: arrays, a file or its content.
+            format: of the content; by default the file's suffix.
+            options: version, bounds ("allow", "clamp" or "reject").
+
+        Returns:
+            ``latent``, ``residual``, ``vertex_error`` and more.
+        """
+        if isinstance(mesh, Mesh):
+            buffer = io.BytesIO()
+            np.savez(buffer, vertices=mesh.vertices, faces=mesh.faces)
+            content, format = buffer.getvalue(), "npz"
+        elif isinstance(mesh, Path):
+            content, format = mesh.read_bytes(), format or mesh.suffix.lstrip(".")
+        else:
+            content = mesh
+        headers = {"Content-Type": "application/octet-stream"}
+        params = {"format": format, **options}
+        found: dict[str, Any] = self._send(
+            "POST", f"/v1/models/{name}/encode", params=params, content=content, headers=headers
+        ).json()
+        return found
+
+    def edit(
+        self,
+        name: str,
+        latent: ArrayLike,
+        targets: Mapping[int, Sequence[float]],
+        *,
+        version: str | None = None,
+        **options: Options,
+    ) -> dict[str, Any]:
+        """The code inside the hypercube whose shape comes closest to having some vertices at some places.
+
+        Args:
+            name: of the model.
+            latent: (m,) to start from.
+            targets: position (3,) by vertex.
+            version: of the model.
+            options: prior, the weight that holds the code back; mesh, whose vertices are meant.
+
+        Returns:
+            ``latent``, ``residual`` and more.
+        """
+        places = [{"vertex": int(vertex), "position": _numbers(position)} for vertex, position in targets.items()]
+        found: dict[str, Any] = self._send(
+            "POST",
+            f"/v1/models/{name}/edit",
+            params={"version": version},
+            json={"latent": _numbers(latent), "targets": places, **options},
+        ).json()
+        return found
+
+    def sample(self, name: str, count: int, *, version: str | None = None, **options: Options) -> NDArray[np.float64]:
+        """Random codes (count, m) in the hypercube; options: seed, distribution ("uniform" or "gaussian")."""
+        answer = self._send(
+            "POST", f"/v1/models/{name}/sample", params={"version": version}, json={"count": count, **options}
+        ).json()
+        return np.array(answer["latents"])
+
+    def _send(self, method: str, path: str, *, params: Mapping[str, Options] | None = None, **sent: Any) -> Any:
+        given = {key: value for key, value in (params or {}).items() if value is not None}
+        for attempt in range(self._retries + 1):
+            answer = self._http.request(method, path, params=given, **sent)
+            if answer.status_code != httpx.codes.SERVICE_UNAVAILABLE or attempt == self._retries:
+                break
+            wait = answer.headers.get("Retry-After", "")
+            time.sleep(int(wait) if wait.isdecimal() else 1)  # a proxy may send a date
+        if answer.is_error:
+            raise ClientError(answer)
+        return answer
+
+
+@dataclass(frozen=True)
+class Interpolation:
+    """An animation; iterating over it gives each frame's vertices (V, 3) as soon as it is ready.
+
+    Attributes:
+        client: that asked for it.
+        id: holds all of it, so that it can be asked for again, and of other replicas.
+        frames: how many.
+    """
+
+    client: Client
+    id: str
+    frames: int
+
+    def __iter__(self) -> Iterator[NDArray[np.float32]]:
+        path, http = f"/v1/interpolations/{self.id}", self.client._http
+        with http.stream("GET", path, params={"format": "jsonl"}) as answer:
+            if answer.is_error:
+                answer.read()
+                raise ClientError(answer)
+            for line in answer.iter_lines():
+                frame = json.loads(line)
+                if problem := frame.get("problem"):
+                    raise ClientError(answer, problem)
+                yield np.array(frame["vertices"], dtype=np.float32)
+
+    def file(self, format: str = "glb") -> bytes:
+        """The whole animation."""
+        return self._get("", format)
+
+    def frame(self, k: int, format: str = "glb") -> bytes:
+        """One frame, from 0."""
+        return self._get(f"/frames/{k}", format)
+
+    def vertices(self) -> NDArray[np.float32]:
+        """Positions (frames, V, 3)."""
+        return _arrays(self.file("npz"))["vertices"].astype(np.float32)
+
+    def _get(self, path: str, format: str) -> bytes:
+        content: bytes = self.client._send(
+            "GET", f"/v1/interpolations/{self.id}{path}", params={"format": format}
+        ).content
+        return content
+
+
+def _numbers(values: ArrayLike) -> Any:
+    """Nested lists, as JSON takes them."""
+    return np.asarray(values, dtype=np.float64).tolist()
+
+
+def _arrays(content: bytes) -> dict[str, NDArray]:
+    with np.load(io.BytesIO(content), allow_pickle=False) as arrays:
+        return dict(arrays)

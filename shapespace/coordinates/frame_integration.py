@@ -1,0 +1,177 @@
+"""Vertices straight from lengths and angles: frames along a spanning tree of the faces, then one linear solve.
+
+Lengths give every triangle its form and an angle the rotation between two neighbours, so that a tree gives a frame to
+each face, and with it the vectors of its sides; the vertices that fit these vectors best solve a Poisson equation with
+a fixed matrix (Lipman, Sorkine, Levin and Cohen-Or 2005). Exact where z is integrable. Where it isn't, each path
+through the tree adds up its errors: good as a start of Gauss–Newton, which sees all edges alike.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy import sparse
+from scipy.sparse.csgraph import connected_components, dijkstra
+from scipy.spatial.transform import Rotation
+
+from shapespace.arrays import FloatArray, IntArray
+from shapespace.coordinates import quaternions
+from shapespace.mesh.triangle_mesh import TriangleMesh, face_normals
+from shapespace.solve.cholesky import Backend, SymmetricPattern, analyse
+
+
+class FrameIntegration:
+    """Shapes from NRIC of one connectivity, without iterating.
+
+    Everything that depends on the connectivity is found here, once: the tree, the order in which rotations are
+    multiplied, and the factor of the Poisson matrix. Holds a factor: use one per thread.
+
+    Args:
+        reference: gives lengths to the tree, weights to the sides, and a place to each connected part.
+        backend: Cholesky backend.
+    """
+
+    #: Weight of the reference in the Poisson equation, which only fixes its translations.
+    ANCHOR = 1e-9
+
+    def __init__(self, reference: TriangleMesh, backend: Backend = "auto") -> None:
+        c = reference.connectivity
+        self._connectivity, self._count = c, len(c.faces)
+        self._plant(reference)
+        # Side k runs from corner k + 1 to corner k + 2.
+        tails, heads = c.faces.T[[1, 2, 0]].ravel(), c.faces.T[[2, 0, 1]].ravel()
+        weights = ((reference.vertices[heads] - reference.vertices[tails]) ** 2).sum(axis=1) ** -1.0
+        sides = np.arange(len(tails))
+        self._divergence = sparse.csr_array(
+            (np.concatenate([-weights, weights]), (np.concatenate([tails, heads]), np.tile(sides, 2))),
+            shape=(c.vertex_count, len(tails)),
+        )
+        pattern = SymmetricPattern(
+            c.vertex_count, np.concatenate([tails, heads, tails]), np.concatenate([tails, heads, heads])
+        )
+        entries = pattern.scatter(np.concatenate([weights, weights, -weights]))
+        anchor = self.ANCHOR * weights.mean()
+        entries[pattern.diagonal] += anchor
+        self._anchored = anchor * reference.vertices
+        self._cholesky = analyse(pattern, backend)
+        self._cholesky.factorise(entries)
+
+    def _plant(self, reference: TriangleMesh) -> None:
+        """A tree of short paths from a face in the middle of each part; faces in the order of their depth."""
+        centres = reference.vertices[reference.faces].mean(axis=1)
+        c, count = reference.connectivity, self._count
+        left, right = c.edge_faces[c.hinge_edges].T
+        steps = np.linalg.norm(centres[left] - centres[right], axis=1)
+        steps += steps.mean()  # errors come with every hinge, however near
+        graph = sparse.csr_array((steps, (left, right)), shape=(count, count))
+        parts = connected_components(graph, directed=False)[1]
+        roots = np.array([_middle(graph, np.flatnonzero(parts == part)) for part in range(parts.max() + 1)])
+        _, above, _ = dijkstra(graph, directed=False, indices=roots, min_only=True, return_predecessors=True)
+        parent: IntArray = above.astype(np.int64)
+        parent[roots] = roots
+        depth: IntArray = np.zeros(count, dtype=np.int64)
+        ancestor: IntArray = np.arange(count)
+        while (parent[ancestor] != ancestor).any():
+            depth += parent[ancestor] != ancestor
+            ancestor = parent[ancestor]
+        order: IntArray = np.argsort(depth, kind="stable")
+        self._place = np.argsort(order)
+        depth, ancestor = depth[order], self._place[parent[order]]
+
+        # The edge between each face and its parent, and the places of its sides in the two.
+        edge_of = {(a, b): e for a, b, e in zip(left.tolist(), right.tolist(), c.hinge_edges, strict=True)}
+        edge_of |= {(b, a): e for (a, b), e in edge_of.items()}
+        self._roots = int((depth == 0).sum())
+        children = order[self._roots :]
+        pairs = zip(parent[children].tolist(), children.tolist(), strict=True)
+        self._tree_edges: IntArray = np.array([edge_of[pair] for pair in pairs], dtype=np.int64)
+        self._left_sides, self._right_sides = (
+            (c.face_edges[faces] == self._tree_edges[:, None]).argmax(axis=1) * count + faces
+            for faces in c.edge_faces[self._tree_edges].T
+        )
+        self._turn = np.where(c.edge_faces[self._tree_edges, 0] == parent[children], 1.0, -1.0)
+        self._root_frames = _quaternions(reference, order[: self._roots])
+        #: The first face of each round of multiplications, and the ancestors of it and those after it.
+        self._rounds: list[tuple[int, IntArray]] = []
+        reach = 1
+        while reach <= depth[-1]:
+            first = int(np.searchsorted(depth, reach))
+            self._rounds.append((first, ancestor[first:]))
+            ancestor, reach = ancestor[ancestor], 2 * reach
+
+    @np.errstate(divide="ignore", over="ignore", invalid="ignore")
+    def __call__(self, z: FloatArray) -> FloatArray:
+        """Vertices (V, 3) for lengths and angles (2E,); not finite where lengths are 0 or not finite."""
+        c = self._connectivity
+        a, b, side = z.take(c.face_sides)
+        # Corner 0 is the origin of a face's plane, corner 1 lies on its first axis. Half angles at both, by cosines.
+        cosine = (b * b + side * side - a * a) / (2 * b * side)
+        sin_0, cos_0 = _half(cosine)
+        sin_1, cos_1 = _half((a * a + side * side - b * b) / (2 * a * side))
+        # Halves of the directions of the sides: (π − corner 1) / 2, (π + corner 0) / 2, 0.
+        halves = np.empty((2, 3, self._count))
+        halves[0] = sin_1, -sin_0, np.ones_like(sin_0)
+        halves[1] = cos_1, cos_0, np.zeros_like(sin_0)
+        w, x, y, n = self._frames(halves.reshape(2, -1), z.take(c.edge_count + self._tree_edges) / 2)
+        first = np.stack([1 - 2 * (y * y + n * n), 2 * (x * y + w * n), 2 * (x * n - w * y)])
+        second = np.stack([2 * (x * y - w * n), 1 - 2 * (x * x + n * n), 2 * (y * n + w * x)])
+        sides = np.empty((3, 3, self._count))
+        np.multiply(first, side, out=sides[:, 2])
+        np.multiply(first, -b * np.clip(cosine, -1, 1), out=sides[:, 1])
+        sides[:, 1] -= second * (2 * b * sin_0 * cos_0)
+        np.negative(sides[:, 1], out=sides[:, 0])
+        sides[:, 0] -= sides[:, 2]
+        right = self._divergence @ sides.reshape(3, -1).T + self._anchored
+        # One by one: Pardiso takes more than twice as long for three at once.
+        return np.stack([self._cholesky.solve(column) for column in right.T], axis=1)
+
+    def _frames(self, halves: FloatArray, angles: FloatArray) -> FloatArray:
+        """Unit quaternions (4, F) of the faces' planes.
+
+        Args:
+            halves: (2, 3F) cosines and sines of half the directions of their sides.
+            angles: (F − roots,) halves of the angles between each face and its parent.
+        """
+        # Across a hinge: turn its direction in the left face to the first axis, fold, turn to that in the right one,
+        # where it runs the other way.
+        a, b = halves.take(self._left_sides, axis=1)
+        d, c = halves.take(self._right_sides, axis=1)
+        np.negative(c, out=c)
+        cosine, sine = np.cos(angles), np.sin(angles)
+        q = np.empty((4, self._count))
+        q[:, : self._roots] = self._root_frames
+        across = q[:, self._roots :]
+        np.multiply(cosine, a * c + b * d, out=across[0])
+        np.multiply(sine, a * c - b * d, out=across[1])
+        np.multiply(sine, b * c + a * d, out=across[2])
+        np.multiply(cosine, b * c - a * d, out=across[3])
+        across[1:] *= self._turn
+        # Products along the paths from the roots, twice as long in each round.
+        for first, ancestors in self._rounds:
+            q[:, first:] = quaternions.product(q.take(ancestors, axis=1), q[:, first:])
+        return q.take(self._place, axis=1)
+
+
+def _half(cosine: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Sine and cosine of half the angle in [0, π] with this cosine, as near as there is one."""
+    cosine = np.clip(cosine, -1, 1)
+    return np.sqrt((1 - cosine) / 2), np.sqrt((1 + cosine) / 2)
+
+
+def _middle(graph: sparse.csr_array, part: IntArray) -> int:
+    """A face of a connected part from which no other is far: half way between two that are."""
+    far = part[0]
+    distances = []
+    for _ in range(3):
+        distances.append(dijkstra(graph, directed=False, indices=far)[part])
+        far = part[distances[-1].argmax()]
+    return int(part[np.maximum(distances[-1], distances[-2]).argmin()])
+
+
+def _quaternions(mesh: TriangleMesh, faces: IntArray) -> FloatArray:
+    """(4, n) rotations that take the axes to the frames of faces: along side 2, across it, and the normal."""
+    corners = mesh.vertices[mesh.faces[faces]]
+    along = corners[:, 1] - corners[:, 0]
+    along /= np.linalg.norm(along, axis=1, keepdims=True)
+    normal = face_normals(mesh.vertices, mesh.faces[faces])
+    matrices = np.stack([along, np.cross(normal, along), normal], axis=2)
+    return Rotation.from_matrix(matrices).as_quat(scalar_first=True).T

@@ -1,0 +1,121 @@
+"""``JᵀHJ``: quadratic forms on lengths and angles, pulled back to vertex positions, on a fixed pattern."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from shapespace.arrays import FloatArray, IntArray
+from shapespace.coordinates.nric import NRICGradients, WeightedNorm
+from shapespace.mesh.triangle_mesh import Connectivity
+from shapespace.solve.cholesky import SymmetricPattern
+
+
+@dataclass(frozen=True)
+class QuadraticForm:
+    """A quadratic form H on NRIC that couples no more than the three lengths of a face.
+
+    Attributes:
+        faces: (…, 3, 3, F) a symmetric block per face, on the lengths of its three sides.
+        angles: (…, E) the diagonal on the angles, 0 on the boundary.
+    """
+
+    faces: FloatArray
+    angles: FloatArray
+
+
+class NormalMatrix:
+    """``JᵀHJ + εI`` as entries of a fixed symmetric pattern, by one scatter.
+
+    The matrix is a sum of a 9×9 block per face, from lengths, and a 12×12 block per hinge, from angles; only
+    their upper triangles are formed. For a norm, which couples no lengths, a 6×6 block per edge does instead of
+    those per face. εI lifts the six rigid motions out of the null space: forces have no part there. Sparse products
+    would be as fast, but drop entries that cancel exactly: the pattern would change.
+    """
+
+    REGULARISATION = 1e-9
+
+    def __init__(self, connectivity: Connectivity) -> None:
+        self._sides = connectivity.face_sides
+        # Side k runs from corner k+1 to corner k+2; stored edges run from the smaller to the larger vertex.
+        self._corners = np.array([[1, 2], [2, 0], [0, 1]])
+        tails = connectivity.faces.T[self._corners[:, 0]]
+        self._signs = np.where(tails == connectivity.edges[self._sides, 0], 1.0, -1.0)
+        self._interior = connectivity.hinge_edges
+        self._ends = connectivity.edge_ends
+        rows, columns = [], []
+        for vertices in (connectivity.faces, connectivity.hinges):
+            unknowns = (3 * vertices[:, :, None] + np.arange(3)).reshape(len(vertices), -1).T
+            a, b = np.triu_indices(len(unknowns))
+            rows.append(unknowns[a].ravel())
+            columns.append(unknowns[b].ravel())
+        self.pattern = SymmetricPattern(3 * connectivity.vertex_count, np.concatenate(rows), np.concatenate(columns))
+
+    def entries(self, gradients: NRICGradients, form: QuadraticForm | WeightedNorm) -> FloatArray:
+        """Upper-triangle entries of ``JᵀHJ + εI`` for one shape's Jacobian."""
+        if isinstance(form, WeightedNorm):
+            edges = gradients.lengths.shape[-1]
+            contributions, on_lengths = self._work_space(21 * edges)
+            self._edges(gradients.lengths, form.squared[:edges], on_lengths.reshape(21, edges))
+            self._angles(gradients.angles, form.squared[edges:], contributions[21 * edges :])
+            entries = self.pattern.scatter(contributions, self._slots_of_edges)
+        else:
+            faces = form.faces.shape[-1]
+            contributions, on_lengths = self._work_space(45 * faces)
+            self._faces(gradients.lengths, form.faces, on_lengths.reshape(45, faces))
+            self._angles(gradients.angles, form.angles, contributions[45 * faces :])
+            entries = self.pattern.scatter(contributions)
+        entries[self.pattern.diagonal] += self.REGULARISATION * entries[self.pattern.diagonal].mean()
+        return entries
+
+    def _work_space(self, lengths: int) -> tuple[FloatArray, FloatArray]:
+        """Contributions, and the part of them that comes from lengths."""
+        contributions = np.empty(lengths + 78 * len(self._interior))
+        return contributions, contributions[:lengths]
+
+    def _angles(self, gradients: FloatArray, weights: FloatArray, out: FloatArray) -> None:
+        g = gradients.reshape(12, -1)
+        weighted = g * weights.take(self._interior)
+        pieces, start = out.reshape(78, -1), 0
+        for a in range(12):
+            np.multiply(g[a], weighted[a:], out=pieces[start : start + 12 - a])
+            start += 12 - a
+
+    @cached_property
+    def _slots_of_edges(self) -> IntArray:
+        """Where the contributions of a norm go: those of `_edges`, then those of the hinges."""
+        size = self.pattern.size
+        a, b = np.triu_indices(3)
+        tails, heads = (3 * end[None] for end in self._ends)
+        rows = [tails + a[:, None], heads + a[:, None], *(tails + k for k in range(3) for _ in range(3))]
+        columns = [tails + b[:, None], heads + b[:, None], *(heads + k for _ in range(3) for k in range(3))]
+        keys = self.pattern.rows * size + self.pattern.indices
+        slots = np.searchsorted(keys, (np.concatenate(rows) * size + np.concatenate(columns)).ravel())
+        return np.concatenate([slots, self.pattern.slots[45 * self._sides.shape[1] :]])
+
+    def _edges(self, directions: FloatArray, weights: FloatArray, out: FloatArray) -> None:
+        weighted = directions * weights
+        start = 0
+        for a in range(3):
+            np.multiply(directions[a], weighted[a:], out=out[start : start + 3 - a])
+            np.multiply(-directions[a], weighted, out=out[12 + 3 * a : 15 + 3 * a])
+            start += 3 - a
+        out[6:12] = out[:6]
+
+    def _faces(self, directions: FloatArray, blocks: FloatArray, out: FloatArray) -> None:
+        u = directions.take(self._sides, axis=1) * self._signs
+        # (side, corner, xyz, face): derivative of each length by each corner, two of three not zero.
+        corners = np.zeros((3, 3, 3, u.shape[-1]))
+        for k, (tail, head) in enumerate(self._corners):
+            corners[k, tail], corners[k, head] = -u[:, k], u[:, k]
+        g = corners.reshape(3, 9, -1)
+        weighted = np.einsum("kmf,mbf->kbf", blocks, g)
+        start = 0
+        for a in range(9):
+            i, j = self._corners[a // 3]
+            piece = out[start : start + 9 - a]
+            np.multiply(g[i, a], weighted[i, a:], out=piece)
+            piece += g[j, a] * weighted[j, a:]
+            start += 9 - a

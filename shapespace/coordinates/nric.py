@@ -1,0 +1,244 @@
+"""Nonlinear rotation-invariant coordinates: edge lengths and signed dihedral angles (paper, appendix C).
+
+A shape is ``z = (l, θ)`` of 2E entries: first every edge length, then every dihedral angle, both in edge
+order. θ is the angle between the two face normals in radians, in (−π, π], zero where flat and positive where
+the surface is convex seen from the side the normals point to. A boundary edge keeps its slot with θ = 0.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import sparse
+
+from shapespace.arrays import FloatArray
+from shapespace.mesh.triangle_mesh import Connectivity, TriangleMesh
+
+
+def components(vertices: FloatArray) -> FloatArray:
+    """(3, …, V): whole arrays of x, y and z are several times faster to work on than rows of three."""
+    return np.ascontiguousarray(np.moveaxis(vertices, -1, 0))
+
+
+def dot(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Scalar products of vectors by components (3, …)."""
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+def cross(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Vector products (3, …) of vectors by components (3, …)."""
+    out = np.empty_like(a)
+    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        np.multiply(a[j], b[k], out=out[i])
+        out[i] -= a[k] * b[j]
+    return out
+
+
+class Frame:
+    """Edge vectors, and at every hinge the vectors and normals that angles are made of, all (3, …).
+
+    What lengths and angles have in common with their derivatives, which is most of the work.
+
+    Args:
+        vertices: shapes (…, V, 3).
+        connectivity: theirs.
+    """
+
+    def __init__(self, vertices: FloatArray, connectivity: Connectivity) -> None:
+        self.connectivity = connectivity
+        # `take` on whole components: ten times as fast as indexing.
+        x = components(vertices)
+        i, j = connectivity.edge_ends
+        self.edges = x.take(j, axis=-1)
+        tails = x.take(i, axis=-1)
+        self.edges -= tails
+        self.lengths = np.sqrt(dot(self.edges, self.edges))
+        inner = connectivity.hinge_edges
+        closed = connectivity.is_closed
+        self.hinge_edges = self.edges if closed else self.edges.take(inner, axis=-1)
+        self.hinge_lengths = self.lengths if closed else self.lengths.take(inner, axis=-1)
+        tail, _, left, right = connectivity.hinge_corners
+        origin = tails if closed else x.take(tail, axis=-1)
+        self.to_left = x.take(left, axis=-1)
+        self.to_left -= origin
+        self.to_right = x.take(right, axis=-1)
+        self.to_right -= origin
+        self.left_normal = cross(self.hinge_edges, self.to_left)
+        self.right_normal = cross(self.to_right, self.hinge_edges)
+
+    def angles(self) -> FloatArray:
+        """(…, H) by atan2 of (sine, cosine), which stays accurate near 0 and π where arccos does not."""
+        sine = dot(self.left_normal, self.to_right)
+        sine *= -self.hinge_lengths
+        sine += 0.0  # never −0, which arctan2 takes from π to −π at a hinge folded flat
+        return np.arctan2(sine, dot(self.left_normal, self.right_normal))
+
+    def nric(self) -> FloatArray:
+        """(…, 2E) lengths and angles."""
+        connectivity = self.connectivity
+        e = connectivity.edge_count
+        z = np.zeros((*self.lengths.shape[:-1], 2 * e))
+        z[..., :e] = self.lengths
+        if connectivity.is_closed:
+            z[..., e:] = self.angles()
+        else:
+            z[..., e + connectivity.hinge_edges] = self.angles()
+        return z
+
+    def gradients(self) -> NRICGradients:
+        """The derivatives, of one shape."""
+        edge, length = self.hinge_edges, self.hinge_lengths
+        square = length**2
+        # The gradient at an opposite vertex is along its face's normal, with 1/height as size.
+        angles = np.empty((4, *edge.shape))
+        tail, head, left, right = angles
+        np.multiply(self.left_normal, -length / dot(self.left_normal, self.left_normal), out=left)
+        np.multiply(self.right_normal, -length / dot(self.right_normal, self.right_normal), out=right)
+        np.multiply(left, -dot(self.to_left, edge) / square, out=head)
+        head -= (dot(self.to_right, edge) / square) * right
+        # The four sum to zero: nothing changes when all move together.
+        np.negative(head, out=tail)
+        tail -= left
+        tail -= right
+        return NRICGradients(self.edges / self.lengths, angles)
+
+
+def edge_lengths(vertices: FloatArray, connectivity: Connectivity) -> FloatArray:
+    """Lengths (…, E) of the edges of shapes (…, V, 3)."""
+    x = components(vertices)
+    i, j = connectivity.edge_ends
+    edge = x.take(j, axis=-1) - x.take(i, axis=-1)
+    return np.sqrt(dot(edge, edge))
+
+
+def dihedral_angles(vertices: FloatArray, connectivity: Connectivity) -> FloatArray:
+    """Signed dihedral angles (…, E) of shapes (…, V, 3), in (−π, π], zero on boundary edges."""
+    angles = np.zeros((*vertices.shape[:-2], connectivity.edge_count))
+    angles[..., connectivity.hinge_edges] = Frame(vertices, connectivity).angles()
+    return angles
+
+
+def nric(vertices: FloatArray, connectivity: Connectivity) -> FloatArray:
+    """Lengths and angles ``z`` (…, 2E) of shapes (…, V, 3)."""
+    return Frame(vertices, connectivity).nric()
+
+
+def wrap(angles: FloatArray) -> FloatArray:
+    """Bring angles, or differences of angles, into (−π, π]."""
+    return np.pi - np.mod(np.pi - angles, 2 * np.pi)
+
+
+def unwrap(z: FloatArray, reference: FloatArray) -> FloatArray:
+    """Choose the representative of each angle in ``z`` (…, 2E) that lies within π of the reference's (2E)."""
+    half = z.shape[-1] // 2
+    angles = reference[..., half:] + wrap(z[..., half:] - reference[..., half:])
+    return np.concatenate([z[..., :half], angles], axis=-1)
+
+
+@dataclass(frozen=True)
+class WeightedNorm:
+    """The norm ``‖·‖_{2,z̄}`` of differences of NRIC (paper, section 3).
+
+    ``‖d‖² = Σ (d_l / l̄)² + η Σ (l̄ a^{-1/2} d_θ)²`` with lengths l̄ of the reference and ``a`` one third of
+    the area of the two faces at an edge. Boundary angles weigh nothing. Dimensionless.
+
+    Attributes:
+        squared: (2E,) weights of the squared differences, η included.
+        eta: η.
+    """
+
+    squared: FloatArray
+    eta: float
+
+    @classmethod
+    def of(cls, reference: TriangleMesh, eta: float) -> WeightedNorm:
+        """Weights of a reference shape."""
+        connectivity = reference.connectivity
+        lengths = edge_lengths(reference.vertices, connectivity)
+        angle = np.zeros(connectivity.edge_count)
+        inner = connectivity.interior
+        area = reference.face_areas[connectivity.edge_faces[inner]].sum(axis=1) / 3
+        angle[inner] = eta * lengths[inner] ** 2 / area
+        return cls(np.concatenate([lengths**-2, angle]), eta)
+
+    def square(self, difference: FloatArray) -> FloatArray:
+        """Squared norms (…) of differences (…, 2E); angles count as they stand, so unwrap them first."""
+        return np.einsum("...e,e,...e->...", difference, self.squared, difference)
+
+
+@dataclass(frozen=True)
+class NRICGradients:
+    """What ``Dz(X)`` is made of, as whole arrays that are quick to work on.
+
+    Attributes:
+        lengths: (3, E) derivative of each length by its head; by its tail it is the negative.
+        angles: (4, 3, H) derivative of each interior angle by tail, head, left and right opposite vertex.
+    """
+
+    lengths: FloatArray
+    angles: FloatArray
+
+
+class NRICJacobian:
+    """``Dz(X)``, the (2E, 3V) Jacobian of the NRIC of a shape, on a sparsity pattern found once.
+
+    Lengths depend on 2 vertices, angles on 4; an entry is kept even where it happens to vanish, so that every
+    Jacobian of a connectivity has the same pattern. Angle gradients after Tamstorf and Grinspun, "Discrete
+    bending forces and their Jacobians" (2013), which stay finite for any non-degenerate hinge.
+    """
+
+    def __init__(self, connectivity: Connectivity) -> None:
+        self.connectivity = connectivity
+        e = connectivity.edge_count
+        self.columns = np.concatenate(
+            [
+                (3 * connectivity.edges[:, :, None] + np.arange(3)).ravel(),
+                (3 * connectivity.hinges[:, :, None] + np.arange(3)).ravel(),
+            ]
+        ).astype(np.int32)
+        self.shape = (2 * e, 3 * connectivity.vertex_count)
+        starts = np.zeros(2 * e + 1, dtype=np.int64)
+        starts[1 : e + 1] = 6
+        starts[e + 1 :][connectivity.hinge_edges] = 12
+        self._indptr = np.cumsum(starts).astype(np.int32)
+        #: Vertex of each term of a pull-back: tails, heads, then the four of every hinge.
+        self._vertices = np.concatenate([connectivity.edges.T.ravel(), connectivity.hinges.T.ravel()])
+
+    def __call__(self, vertices: FloatArray) -> sparse.csr_array:
+        """The Jacobian at a shape (V, 3)."""
+        return self.matrix(self.gradients(vertices))
+
+    def matrix(self, gradients: NRICGradients) -> sparse.csr_array:
+        """The Jacobian made of these gradients."""
+        lengths = np.concatenate([-gradients.lengths, gradients.lengths])
+        angles = gradients.angles.reshape(12, -1)
+        data = np.concatenate([lengths.T.ravel(), angles.T.ravel()])
+        return sparse.csr_array((data, self.columns, self._indptr), shape=self.shape)
+
+    def push_forward(self, gradients: NRICGradients, displacement: FloatArray) -> FloatArray:
+        """``J d`` (2E,) of a vertex field (V, 3), without forming J."""
+        e = self.connectivity.edge_count
+        d = components(displacement)
+        i, j = self.connectivity.edge_ends
+        out = np.zeros(2 * e)
+        out[:e] = dot(gradients.lengths, d.take(j, axis=1) - d.take(i, axis=1))
+        hinges = d.take(self.connectivity.hinge_corners, axis=1)
+        out[e + self.connectivity.hinge_edges] = np.einsum("vch,cvh->h", gradients.angles, hinges)
+        return out
+
+    def pull_back(self, gradients: NRICGradients, covector: FloatArray) -> FloatArray:
+        """``Jᵀ p`` (V, 3) of a covector (2E,), without forming J."""
+        e = self.connectivity.edge_count
+        terms = np.empty((3, len(self._vertices)))
+        np.multiply(gradients.lengths, covector[:e], out=terms[:, e : 2 * e])
+        np.negative(terms[:, e : 2 * e], out=terms[:, :e])
+        on_hinges = terms[:, 2 * e :].reshape(3, 4, -1)
+        angles = covector.take(e + self.connectivity.hinge_edges)
+        np.multiply(gradients.angles.swapaxes(0, 1), angles, out=on_hinges)
+        v = self.connectivity.vertex_count
+        return np.stack([np.bincount(self._vertices, weights=t, minlength=v) for t in terms], axis=1)
+
+    def gradients(self, vertices: FloatArray) -> NRICGradients:
+        """The derivatives at a shape (V, 3)."""
+        return Frame(vertices, self.connectivity).gradients()

@@ -1,0 +1,51 @@
+"""Unit quaternions (4, …) as rotations, scalar part first, by whole components."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from shapespace.arrays import FloatArray
+
+
+def identity(n: int) -> FloatArray:
+    """(4, n)."""
+    out = np.zeros((4, n))
+    out[0] = 1
+    return out
+
+
+def turn(angle: FloatArray, axis: int) -> FloatArray:
+    """(4, n) turns by angles (n,) about a coordinate axis."""
+    out = np.zeros((4, len(angle)))
+    out[0], out[1 + axis] = np.cos(angle / 2), np.sin(angle / 2)
+    return out
+
+
+def product(p: FloatArray, q: FloatArray) -> FloatArray:
+    """P q (4, …)."""
+    w, x, y, z = p
+    a, b, c, d = q
+    return np.stack(
+        [
+            w * a - x * b - y * c - z * d,
+            w * b + x * a + y * d - z * c,
+            w * c - x * d + y * a + z * b,
+            w * d + x * c - y * b + z * a,
+        ]
+    )
+
+
+def chain(q: FloatArray) -> FloatArray:
+    """The products (4, n) of k quaternions each, (4, k, n), from first to last: neighbours, then their products."""
+    while q.shape[1] > 1:
+        even = q.shape[1] - q.shape[1] % 2
+        q = np.concatenate([product(q[:, 0:even:2], q[:, 1:even:2]), q[:, even:]], axis=1)
+    return q[:, 0]
+
+
+def axis(q: FloatArray, index: int) -> FloatArray:
+    """A coordinate axis (3, n) as the rotations turn it."""
+    unit = np.zeros_like(q)
+    unit[1 + index] = 1
+    conjugate = q * np.array([[1], [-1], [-1], [-1]])
+    return product(product(q, unit), conjugate)[1:]

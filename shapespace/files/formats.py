@@ -1,0 +1,170 @@
+"""Mesh files: writing every format the project offers, and reading them back with the vertices in order."""
+
+from __future__ import annotations
+
+import io
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Protocol
+
+import numpy as np
+
+from shapespace.arrays import FloatArray, IntArray
+from shapespace.files.gltf_reading import read_gltf
+from shapespace.files.npz_reading import load_npz
+from shapespace.files.reading import UNLIMITED, Limits, clipped, read_obj, read_off, read_ply, read_stl
+from shapespace.mesh.triangle_mesh import MeshError
+
+if TYPE_CHECKING:
+    from shapespace.files.colouring import Colouring
+
+#: Formats that IANA doesn't know.
+OCTET_STREAM = "application/octet-stream"
+
+
+class Encode(Protocol):
+    """Writes a file."""
+
+    def __call__(self, vertices: FloatArray, faces: IntArray, colouring: Colouring | None = None, /) -> bytes:
+        """Encode vertices (V, 3) in any unit and faces (F, 3); positions are float32."""
+
+
+@dataclass(frozen=True)
+class MeshFormat:
+    """A file format.
+
+    Attributes:
+        media_type: as IANA has it; OCTET_STREAM without a registration.
+        encode: a mesh, with the colours of its vertices or without, to the file's bytes.
+        coloured: whether files can carry colours; where not, ``encode`` leaves them out.
+    """
+
+    media_type: str
+    encode: Encode
+    coloured: bool = True
+
+
+def _glb(vertices: FloatArray, faces: IntArray, colouring: Colouring | None = None) -> bytes:
+    from shapespace.files.gltf_writing import Document
+
+    return Document(vertices, faces, colouring=colouring).glb()
+
+
+def _gltf(vertices: FloatArray, faces: IntArray, colouring: Colouring | None = None) -> bytes:
+    from shapespace.files.gltf_writing import Document
+
+    return Document(vertices, faces, colouring=colouring).gltf()
+
+
+def _obj(vertices: FloatArray, faces: IntArray, colouring: Colouring | None = None) -> bytes:
+    return (obj_vertices(vertices, colouring) + obj_faces(faces)).encode()
+
+
+def obj_vertices(vertices: FloatArray, colouring: Colouring | None = None) -> str:
+    """The positions (V, 3) of an OBJ file, with colours behind them as most readers know them."""
+    # Nine significant digits hold a float32 whatever the unit; trimesh writes a fixed number of decimals.
+    comment, line, rows = "", "v %.9g %.9g %.9g\n", vertices.astype(np.float32)
+    if colouring:
+        comment = f"# color {json.dumps(colouring.legend)}\n"
+        line, rows = "v %.9g %.9g %.9g %.4g %.4g %.4g\n", np.hstack([rows, colouring.srgb])
+    # All at once is twice as fast as line by line.
+    return comment + line * len(rows) % tuple(rows.ravel().tolist())
+
+
+def obj_faces(faces: IntArray) -> str:
+    """The faces (F, 3) of an OBJ file."""
+    return "f %d %d %d\n" * len(faces) % tuple((faces + 1).ravel().tolist())
+
+
+def _ply(vertices: FloatArray, faces: IntArray, colouring: Colouring | None = None) -> bytes:
+    return _exported("ply", vertices, faces, colouring)
+
+
+def _stl(vertices: FloatArray, faces: IntArray, colouring: Colouring | None = None) -> bytes:
+    return _exported("stl", vertices, faces, None)
+
+
+def _exported(extension: str, vertices: FloatArray, faces: IntArray, colouring: Colouring | None) -> bytes:
+    import trimesh
+
+    colours = {}
+    if colouring:
+        values = {str(colouring.quantity): colouring.values.astype(np.float32)}
+        colours = {"vertex_colors": colouring.srgb_bytes, "vertex_attributes": values}
+    mesh = trimesh.Trimesh(vertices.astype(np.float32), faces, process=False, **colours)  # type: ignore[arg-type]
+    content = mesh.export(file_type=extension)
+    return content if isinstance(content, bytes) else str(content).encode()
+
+
+def _npz(vertices: FloatArray, faces: IntArray, colouring: Colouring | None = None) -> bytes:
+    colours = {}
+    if colouring:
+        colours = {
+            "color_quantity": np.array(str(colouring.quantity)),
+            "color_range": np.array([-colouring.limit, colouring.limit]),
+            "color_values": colouring.values.astype(np.float32),
+        }
+    return npz(vertices=vertices.astype(np.float32), faces=faces.astype(np.int32), **colours)
+
+
+#: Every mesh format by its name, which is also the extension of its files. The first is the default.
+MESH_FORMATS: dict[str, MeshFormat] = {
+    "glb": MeshFormat("model/gltf-binary", _glb),
+    "gltf": MeshFormat("model/gltf+json", _gltf),
+    "obj": MeshFormat("model/obj", _obj),
+    "ply": MeshFormat(OCTET_STREAM, _ply),
+    "stl": MeshFormat("model/stl", _stl, coloured=False),
+    "npz": MeshFormat(OCTET_STREAM, _npz),
+}
+
+
+def npz(**arrays: np.ndarray) -> bytes:
+    """Arrays as the bytes of a compressed NPZ file; equal arrays give equal bytes."""
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, **arrays)  # type: ignore[arg-type]
+    return buffer.getvalue()
+
+
+def read_arrays(
+    source: bytes | bytearray | memoryview | Path, format: str | None = None, limits: Limits = UNLIMITED
+) -> tuple[np.ndarray, np.ndarray]:
+    """Read one mesh as it stands in its file: vertices (V, 3) and faces (F, 3), nothing merged and nothing checked.
+
+    STL has three vertices a face. A path also finds the buffers that lie beside a glTF file.
+
+    Args:
+        source: the file's bytes, or its path.
+        format: ``glb``, ``gltf``, ``obj``, ``ply``, ``stl``, ``off`` or ``npz``; by default the path's
+            extension.
+        limits: where reading ends without a mesh; they bound its time and memory, whatever the bytes are.
+
+    Raises:
+        MeshError: unreadable, too large, or not exactly one mesh; with the reason.
+    """
+    beside = source if isinstance(source, Path) else None
+    if isinstance(source, Path):
+        format = format or source.suffix.lstrip(".").lower()
+        try:
+            source = source.read_bytes()
+        except OSError as error:
+            raise MeshError(f"can't be read: {error.strerror}") from error
+    data = memoryview(source)
+    try:
+        # What isn't finite is for the caller to judge.
+        with np.errstate(all="ignore"):
+            match format:
+                case "glb" | "gltf":
+                    return read_gltf(data, limits, binary=format == "glb", beside=beside)
+                case "npz":
+                    arrays = load_npz(data, limits=limits)
+                    return arrays["vertices"], arrays["faces"]
+                case _:
+                    return _READERS[str(format)](data, limits)
+    except MeshError:
+        raise
+    except Exception as error:  # foreign bytes fail in every way there is
+        raise MeshError(f"not a readable {format} file: {clipped(error, 300)}") from error
+
+
+_READERS = {"obj": read_obj, "off": read_off, "ply": read_ply, "stl": read_stl}

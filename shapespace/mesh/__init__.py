@@ -1,0 +1,1 @@
+"""Triangle meshes: connectivity, quality, rigid motion, coarse meshes, and fine ones carried along with them."""

@@ -1,0 +1,199 @@
+"""Thinning a large mesh before it is coarsened with care: many half-edge collapses at once, in arrays.
+
+One collapse after the other, each checked in every shape, takes as long as it has to for the last few thousand vertices
+and far too long for the first hundred thousand, which lie so close together that hardly any choice among them matters.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+
+from shapespace.arrays import FloatArray, IntArray
+from shapespace.mesh.quadrics import monomials, quadrics_of
+from shapespace.mesh.triangle_mesh import Connectivity
+from shapespace.mesh.triangle_quality import FOLD_LIMIT, dots, normals_and_sides, squared_sines, unit
+
+#: Smallest angle that a collapse may leave, unless there was a smaller one around; largest turn of a face's normal.
+SINE, TURN = np.sin(np.deg2rad(10)), np.cos(np.deg2rad(45))
+#: Weight of the motion of a vertex against the planes of its faces: even triangles are a good start.
+MOTION_WEIGHT = 0.1
+#: Of the vertices that are tried in a round, the share whose collapses are cheapest and are done.
+CHEAPEST = 0.5
+#: How often more are chosen far from those that are.
+SWEEPS = 3
+#: Faces looked at together.
+CHUNK = 50_000
+#: A round that removes less than this share of the vertices is one too many, and so many of them are the last.
+FEWEST, VAIN = 0.001, 5
+
+
+def thin(connectivity: Connectivity, shapes: FloatArray, target: int) -> tuple[IntArray, IntArray]:
+    """Collapse edges until about ``target`` vertices are left, or until hardly any edge can be collapsed.
+
+    In each round vertices far enough from each other are drawn at random, so that no collapse changes the faces that
+    another looks at; those are collapsed whose quadrics, of all shapes, say that it costs least (Garland and Heckbert
+    1997). Vertices that locally cost least would lie too far apart for that.
+
+    Args:
+        connectivity: F faces on V vertices.
+        shapes: (n, V, 3) a few shapes, that a collapse must neither fold nor flatten; sizes should be alike.
+        target: number of vertices.
+
+    Returns:
+        Which vertices are left (V'), increasing, and the faces (F', 3) between them.
+    """
+    points = np.ascontiguousarray(np.moveaxis(shapes - shapes.mean(axis=1, keepdims=True), 0, 1))
+    quadrics, areas = quadrics_of(connectivity, np.moveaxis(points, 1, 0))
+    faces, kept, vain = connectivity.faces, np.arange(connectivity.vertex_count), 0
+    rng = np.random.default_rng(0)
+    while len(kept) > target and vain < VAIN:
+        collapses = _collapses(_Round(faces, points), quadrics, areas, len(kept) - target, rng)
+        vain += len(collapses) < FEWEST * len(kept)
+        u, v = collapses.T
+        goes = np.arange(len(kept))
+        goes[u] = v
+        faces = goes[faces]
+        faces = faces[_proper(faces)]
+        np.add.at(quadrics, v, quadrics[u])
+        np.add.at(areas, v, areas[u])
+        some = np.ones(len(kept), dtype=bool)
+        some[u] = False
+        faces, kept = (np.cumsum(some) - 1)[faces], kept[some]
+        points, quadrics, areas = points[some], quadrics[some], areas[some]
+    return kept, faces
+
+
+class _Round:
+    """The mesh at the beginning of a round: its faces, and who is next to whom.
+
+    Attributes:
+        sides: (V, V) of each half-edge the number of its face, from 1.
+        neighbours: (V, V) number of faces at each edge.
+    """
+
+    def __init__(self, faces: IntArray, points: FloatArray) -> None:
+        self.faces, self.points, self.count = faces, points, len(points)
+        tails, heads = faces.T.ravel(), np.roll(faces, -1, axis=1).T.ravel()
+        numbers = np.tile(np.arange(1, len(faces) + 1), 3)
+        shape = (self.count, self.count)
+        self.sides = sparse.csr_array((numbers, (tails, heads)), shape=shape)
+        half = sparse.csr_array((np.ones(len(tails), np.int32), (tails, heads)), shape=shape)
+        self.neighbours = sparse.csr_array(half + half.T)
+        degree = np.diff(self.neighbours.indptr)
+        self.valence = np.bincount(faces.ravel(), minlength=self.count)
+        self.rim = np.zeros(self.count, dtype=bool)
+        self.rim[np.repeat(np.arange(self.count), degree)[self.neighbours.data == 1]] = True
+        # Where sheets touch, a vertex has more edges than its one fan of faces needs.
+        self.touching = degree != self.valence + self.rim
+        self._corner = np.argsort(faces.ravel(), kind="stable") // 3
+
+    def apart(self, rng: np.random.Generator) -> IntArray:
+        """Vertices (k,) that may go, more than two edges from each other."""
+        rank = rng.permutation(self.count)
+        rank[self.touching] = self.count
+        chosen = np.zeros(self.count, dtype=bool)
+        for _ in range(SWEEPS):
+            lowest = rank
+            for _ in range(2):
+                of_face = lowest[self.faces].min(axis=1)
+                around = lowest.copy()
+                for corner in self.faces.T:
+                    np.minimum.at(around, corner, of_face)
+                lowest = around
+            wins = (lowest == rank) & (rank >= 0) & ~self.touching
+            chosen |= wins
+            rank[wins] = -1  # nothing near these can win any more
+        return np.flatnonzero(chosen)
+
+    def half_edges(self, tails: IntArray) -> IntArray:
+        """Half-edges (k, 2) from some vertices whose collapse keeps the topology (link condition, Dey et al. 1999)."""
+        rows = self.neighbours[tails]
+        u, v = np.repeat(tails, np.diff(rows.indptr)), rows.indices
+        others = sparse.csr_array(self.neighbours[u].multiply(self.neighbours[v]))
+        inner = rows.data == 2
+        common = np.diff(others.indptr)
+        few = self.valence <= np.where(self.rim, 1, 3)
+        allowed = (common == np.where(inner, 2, 1)) & (others @ few == 0) & ~(self.rim[u] & inner)
+        pairs: IntArray = np.stack([u, v], axis=1)[allowed].astype(np.int64)
+        return pairs
+
+    def stars(self, vertices: IntArray) -> tuple[IntArray, IntArray]:
+        """The faces around some vertices, and for each face which of these it is around."""
+        ends = np.cumsum(self.valence)
+        counts = self.valence[vertices]
+        which = np.repeat(np.arange(len(vertices)), counts)
+        offset = np.arange(len(which)) - np.repeat(np.cumsum(counts) - counts, counts)
+        return self._corner[(ends - self.valence)[vertices][which] + offset], which
+
+
+def _proper(faces: IntArray) -> NDArray[np.bool_]:
+    """Which faces have three different corners."""
+    a, b, c = faces.T
+    proper: NDArray[np.bool_] = (a != b) & (b != c) & (c != a)
+    return proper
+
+
+def _collapses(mesh: _Round, quadrics: FloatArray, areas: FloatArray, most: int, rng: np.random.Generator) -> IntArray:
+    """Half-edges (k, 2), u → v, that can be collapsed all at once, ``most`` at most."""
+    pairs = mesh.half_edges(mesh.apart(rng))
+    if not len(pairs):
+        return pairs
+    u, v = pairs.T
+    costs = dots(quadrics[u] + quadrics[v], monomials(mesh.points[v]))
+    costs += MOTION_WEIGHT * areas[u] * ((mesh.points[u] - mesh.points[v]) ** 2).sum(axis=(1, 2))
+    # The cheapest half-edge of each vertex, and of these the cheaper ones.
+    order = np.lexsort((costs, u))
+    first = order[np.flatnonzero(np.diff(u[order], prepend=-1))]
+    first = first[np.argsort(costs[first], kind="stable")][: max(1, int(CHEAPEST * len(first)))]
+    pairs = np.stack([u[first], v[first]], axis=1)
+    pairs = pairs[_keep_shape(mesh, pairs)][:most]
+    return _without_folds(mesh, pairs)
+
+
+def _keep_shape(mesh: _Round, pairs: IntArray) -> NDArray[np.bool_]:
+    """Which collapses (k, 2) leave no sliver and turn no face much, in any shape."""
+    u, v = pairs.T
+    star, which = mesh.stars(u)
+    old = mesh.faces[star]
+    new = np.where(old == u[which][:, None], v[which][:, None], old)
+    stays = _proper(new)
+    which, old, new = which[stays], old[stays], new[stays]
+    good = np.ones(len(pairs), dtype=bool)
+    # Some at a time: corners of all faces in all shapes take much memory.
+    for start in range(0, len(which), CHUNK):
+        part = slice(start, start + CHUNK)
+        before, was = normals_and_sides(mesh.points[old[part].T])
+        after, becomes = normals_and_sides(mesh.points[new[part].T])
+        floor = np.minimum(SINE**2, squared_sines(before, was))
+        bad = (squared_sines(after, becomes) < floor) | (dots(unit(before), unit(after)) < TURN)
+        good[which[part][bad.any(axis=1)]] = False
+    return good
+
+
+def _without_folds(mesh: _Round, pairs: IntArray) -> IntArray:
+    """Leave out collapses that would fold neighbouring faces onto each other, in any shape."""
+    while len(pairs):
+        star, _ = mesh.stars(pairs[:, 0])
+        corners = mesh.faces[star]
+        across = mesh.sides[np.roll(corners, -1, axis=1).ravel(), corners.ravel()]
+        near = np.union1d(star, np.asarray(across).ravel() - 1)
+        near = near[near >= 0]
+        goes, by = np.arange(mesh.count), np.full(mesh.count, -1)
+        goes[pairs[:, 0]], by[pairs[:, 0]] = pairs[:, 1], np.arange(len(pairs))
+        # A face has one corner that goes, at most.
+        cause, faces = by[mesh.faces[near]].max(axis=1), goes[mesh.faces[near]]
+        proper = _proper(faces)
+        cause, faces = cause[proper], faces[proper]
+        used, local = np.unique(faces, return_inverse=True)
+        after = Connectivity(local.reshape(-1, 3), len(used))
+        left, right = after.edge_faces[after.interior].T
+        normals = unit(normals_and_sides(mesh.points[faces.T])[0])
+        folded = (dots(normals[left], normals[right]) < FOLD_LIMIT).any(axis=1)
+        out = np.unique(np.concatenate([cause[left[folded]], cause[right[folded]]]))
+        out = out[out >= 0]
+        if not len(out):
+            break
+        pairs = np.delete(pairs, out, axis=0)
+    return pairs

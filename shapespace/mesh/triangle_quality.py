@@ -1,0 +1,115 @@
+"""How good the triangles of all shapes of a collection are: slivers, and folds between neighbours."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from shapespace.arrays import FloatArray, IntArray
+from shapespace.mesh.triangle_mesh import Connectivity, cross
+
+#: Largest angle between the normals of two neighbours, as a cosine.
+FOLD_LIMIT = np.cos(np.deg2rad(140))
+#: Numbers of neighbouring faces.
+Pairs = list[tuple[int, int]]
+
+
+#: Least area of a face, as a share of the mean area of the coarse mesh's faces in the same shape.
+SMALLEST_AREA = 0.01
+#: Least area and sine of a face in a shape, as shares of their means over all shapes.
+SMALLEST_SHARE = 0.1
+
+
+@dataclass(frozen=True)
+class Quality:
+    """Of a few faces: smallest sin² of an angle, cosine between neighbours and size, and how many are beyond limits."""
+
+    sine: float
+    fold: float
+    size: float
+    slivers: int
+    folds: int
+    specks: int
+
+    @property
+    def faults(self) -> int:
+        """Slivers, folds and specks."""
+        return self.slivers + self.folds + self.specks
+
+
+@dataclass(frozen=True)
+class Triangles:
+    """Some faces in all shapes.
+
+    Attributes:
+        sines: (k, n) sin² of the smallest angle.
+        normals: (k, n, 3) of length 1.
+        squares: (3, k, n) squared sides.
+        areas: (k, n) as shares of the mean area of a coarse face.
+        sizes: (k, n) area and smallest sine, whichever is less, as a multiple of the least that a face ought to have:
+            geodesics between the shapes end at a face that is a speck in one of them.
+    """
+
+    sines: FloatArray
+    normals: FloatArray
+    squares: FloatArray
+    areas: FloatArray
+    sizes: FloatArray
+
+    @classmethod
+    def of(cls, corners: FloatArray, mean_areas: FloatArray) -> Triangles:
+        """Faces with corners (3, k, n, 3), of shapes whose coarse faces will have these areas (n,) on average."""
+        normals, squares = normals_and_sides(corners)
+        sines = squared_sines(normals, squares)
+        doubled = np.sqrt(dots(normals, normals))
+        areas, angles = doubled / (2 * mean_areas), np.sqrt(sines)
+        least = np.maximum(SMALLEST_AREA, SMALLEST_SHARE * areas.mean(axis=1, keepdims=True))
+        least_angles = np.maximum(SMALLEST_SHARE * angles.mean(axis=1, keepdims=True), 1e-300)
+        sizes = np.minimum(areas / least, angles / least_angles)
+        return cls(sines, normals / np.maximum(doubled, 1e-300)[..., None], squares, areas, sizes)
+
+    def quality(self, faces: list[int], pairs: Pairs, sine: float) -> Quality:
+        """Quality of some of the faces and of some neighbours among them, all by number."""
+        angles, sizes = self.sines[faces], self.sizes[faces]
+        folds = dots(self.normals[[i for i, _ in pairs]], self.normals[[j for _, j in pairs]])
+        return Quality(
+            float(angles.min(initial=1)),
+            float(folds.min(initial=1)),
+            float(sizes.min(initial=1)),
+            int(np.count_nonzero(angles < sine**2)),
+            int(np.count_nonzero(folds < FOLD_LIMIT)),
+            int(np.count_nonzero(sizes < 1)),
+        )
+
+
+def unit(normals: FloatArray) -> FloatArray:
+    """Vectors (…, 3) of length 1; what has no length stays as it is."""
+    result: FloatArray = normals / np.maximum(np.sqrt(dots(normals, normals)), 1e-300)[..., None]
+    return result
+
+
+def folded_pairs(connectivity: Connectivity, normals: FloatArray) -> IntArray:
+    """(k, 2) neighbouring faces that are folded onto one another in some shape; normals (F, n, 3) of any length."""
+    normals = unit(normals)
+    pairs = connectivity.edge_faces[connectivity.interior]
+    folded: IntArray = pairs[(dots(normals[pairs[:, 0]], normals[pairs[:, 1]]) < FOLD_LIMIT).any(axis=1)]
+    return folded
+
+
+def normals_and_sides(corners: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Normals (…, 3), as long as twice the area, and squared sides (3, …) of triangles with corners (3, …, 3)."""
+    p, q = corners[1] - corners[0], corners[2] - corners[0]
+    return cross(p, q), np.stack([dots(side, side) for side in (p, q, q - p)])
+
+
+def squared_sines(normals: FloatArray, squares: FloatArray) -> FloatArray:
+    """sin² of the smallest angle: twice the area over the product of the two longer sides."""
+    product = squares.prod(axis=0)
+    return dots(normals, normals) * squares.min(axis=0) / np.maximum(product, 1e-300)
+
+
+def dots(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Scalar products (…) of vectors (…, n)."""
+    result: FloatArray = np.einsum("...i,...i->...", a, b)
+    return result

@@ -1,0 +1,1 @@
+"""One bundle at work: codes to shapes, and shapes back to codes."""

@@ -1,0 +1,105 @@
+"""How the networks answer to changes of the code: difference quotients, and factors on grids."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy import sparse
+
+from shapespace.arrays import FloatArray
+from shapespace.coordinates.nric import WeightedNorm, nric
+
+if TYPE_CHECKING:
+    from shapespace.model.shape_model import ShapeModel
+
+#: Step of a difference quotient, as a fraction of the coordinate's range: what an angle moves may be as small as a bump
+#: on its way round, and elsewhere smaller steps drown in the networks' rounding.
+PERIODIC_DIFFERENCE, DIFFERENCE = 1e-3, 1e-2
+#: Nodes for each periodic coordinate of a factor, and all of them at most.
+NODES, MOST_NODES = 32, 1024
+#: Random sums of lengths and angles that stand for all of them on the grids.
+SKETCH = 1024
+
+
+def derivatives(model: ShapeModel, x: FloatArray) -> FloatArray:
+    """(2E, m) of the networks at a code (m,), by differences.
+
+    One code at a time: the combiner is quicker so than on many at once, which don't fit into the cache.
+    """
+    z = model.nric(x)
+    steps = np.diag(_steps(model))
+    return np.stack([(model.nric(x + step) - z) / step.max() for step in steps], axis=1)
+
+
+def factor_derivatives(model: ShapeModel, x: FloatArray) -> FloatArray:
+    """(2E, m) of the sum of the factors at a code (m,), by central differences."""
+    columns = []
+    for j, factor in enumerate(model.manifest.factors):
+        own = x[factor.start : factor.stop]
+        steps = np.diag(_steps(model)[factor.start : factor.stop])
+        ahead, behind = np.split(model.factor(j, np.concatenate([own + steps, own - steps])), 2)
+        columns.append((ahead - behind) / (2 * steps.diagonal()[:, None]))
+    return np.concatenate(columns).T
+
+
+def _steps(model: ShapeModel) -> FloatArray:
+    latents = model.latents
+    steps: FloatArray = np.where(latents.periodic, PERIODIC_DIFFERENCE, DIFFERENCE) * latents.width
+    return steps
+
+
+def nodes(model: ShapeModel, j: int) -> FloatArray:
+    """Nodes (n, m_j) over the coordinates of a factor if all of them are periodic, otherwise none.
+
+    Where coordinates go round, a shape may have to move far before it comes nearer, and no descent finds the way.
+    """
+    factor, latents = model.manifest.factors[j], model.latents
+    own, size = slice(factor.start, factor.stop), factor.stop - factor.start
+    if not latents.periodic[own].all():
+        return np.zeros((0, size))
+    count = max(2, int(min(NODES, MOST_NODES ** (1 / size) + 1e-9)))
+    shares = np.stack(np.meshgrid(*[np.arange(count) / count] * size, indexing="ij"), axis=-1).reshape(-1, size)
+    return latents.lower[own] + shares * latents.width[own]
+
+
+def batches(nodes: FloatArray) -> list[FloatArray]:
+    """Nodes in parts whose shapes fit into the cache."""
+    return np.array_split(nodes, -(-len(nodes) // 16)) if len(nodes) else []
+
+
+@dataclass(frozen=True, eq=False)
+class FactorGrids:
+    """The shapes of a model's periodic factors on grids, in a form that keeps scalar products to a few percent.
+
+    Each length or angle, weighted by its norm, is added with a random sign to one of SKETCH sums (a count sketch:
+    Charikar, Chen and Farach-Colton 2002), which takes a tenth of the memory.
+
+    Attributes:
+        images: by factor, (n, SKETCH) sketches of ``ψ_j − z̄`` at its nodes.
+    """
+
+    images: dict[int, FloatArray]
+    _matrix: sparse.csr_array
+
+    @classmethod
+    def of(cls, model: ShapeModel) -> FactorGrids:
+        """Run the factors on their grids."""
+        reference = model.reference
+        centre = nric(reference.vertices, reference.connectivity)
+        root = np.sqrt(WeightedNorm.of(reference, model.manifest.eta_reconstruction).squared)
+        rng = np.random.default_rng(0)
+        signs, sums = rng.choice([-1.0, 1.0], len(root)), rng.integers(SKETCH, size=len(root))
+        matrix = sparse.csr_array((signs, (sums, np.arange(len(root)))), shape=(SKETCH, len(root)))
+        images = {}
+        for j in range(len(model.manifest.factors)):
+            parts = [(matrix @ (root * (model.factor(j, part) - centre)).T).T for part in batches(nodes(model, j))]
+            if parts:
+                images[j] = np.concatenate(parts)
+        return cls(images, matrix)
+
+    def sketch(self, weighted: FloatArray) -> FloatArray:
+        """(SKETCH,) of a difference of NRIC (2E,), weighted."""
+        sums: FloatArray = self._matrix @ weighted
+        return sums

@@ -1,0 +1,291 @@
+"""From a few vertices that should be elsewhere to the latent code that brings them there."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import sparse
+
+from shapespace.arrays import FloatArray, IntArray
+from shapespace.coordinates.nric import wrap
+from shapespace.coordinates.reconstruction import Reconstructor
+from shapespace.mesh.rigid_motion import without_rigid_motion
+from shapespace.model.derivatives import batches, derivatives, factor_derivatives, nodes
+from shapespace.model.latent_space import Bounds, Codes, NotFiniteError
+from shapespace.model.shape_model import MeshChoice, Shape, ShapeModel
+from shapespace.solve.deadline import Deadline
+from shapespace.solve.least_squares import Fit, least_squares, shrinkable
+from shapespace.solve.status import Status
+
+#: Weight of the prior where none is given: a code half the bounds away costs as much as half a percent of the diagonal.
+PRIOR = 1e-4
+#: A shape is moved by this fraction of its derivative to see how it would be aligned and prolonged.
+DIFFERENCE = 1e-4
+#: Other starts at most, where the misfit is above one of these fractions of the diagonal: with rough shapes, with those
+#: that are answered. And what part of its square, as far as it is that small, must be thought to remain there.
+STARTS, GOOD_ROUGHLY, GOOD, PROMISING = 4, 2e-2, 2e-3, 0.9
+#: Targets at most that another start is chosen by: each costs three solves, and as many fields.
+RANKED = 32
+#: Shapes at most that a fit is refined with. What takes longer follows a valley that hardly falls.
+REFINEMENTS = 8
+
+
+@dataclass(frozen=True)
+class Target:
+    """Where a vertex should be.
+
+    Attributes:
+        vertex: index in the mesh of choice.
+        position: (3,) in the frame and units of what the service answers.
+    """
+
+    vertex: int
+    position: Sequence[float]
+
+
+@dataclass(frozen=True)
+class Edited:
+    """The code whose shape comes closest to the targets.
+
+    Attributes:
+        code: (m,) inside the bounds.
+        status: how the iteration ended.
+        iterations: shapes that it looked at.
+        shape: what the service answers to the code, on the mesh of choice.
+        distances: (k,) of that shape's vertices to their targets.
+    """
+
+    code: Codes
+    status: Status
+    iterations: int
+    shape: Shape
+    distances: FloatArray
+
+
+class Editor:
+    """Finds codes for targets, for any number of threads.
+
+    Minimises over codes inside the bounds
+
+        ``1/k Σ_i ‖x_i(code) − p_i‖² / D² + prior · 1/m Σ_j ((code_j − start_j) / width_j)²``,
+
+    D being the reference's diagonal. A shape depends on its code by way of the least-squares problem that the
+    reconstruction solves; by the implicit function theorem ``dX = (JᵀWJ)⁻¹ JᵀW dz``, where its residual is small.
+    """
+
+    def __init__(self, model: ShapeModel) -> None:
+        self.model = model
+
+    def __call__(
+        self,
+        start: Codes,
+        targets: Sequence[Target],
+        prior: float = PRIOR,
+        mesh: MeshChoice = MeshChoice.FINE,
+        deadline: Deadline | None = None,
+    ) -> Edited:
+        """The code inside the bounds whose shape comes closest.
+
+        Args:
+            start: (m,), where the search begins and what the prior holds on to.
+            targets: at least one.
+            prior: weight of the distance from the start.
+            mesh: which mesh the targets' vertices belong to.
+            deadline: after which the status is Status.DEADLINE.
+
+        Raises:
+            NotFiniteError: a target out of all proportion.
+        """
+        model = self.model
+        positions = np.array([target.position for target in targets]) / model.manifest.scale
+        if not (np.abs(positions) < np.finfo(np.float32).max).all():
+            raise NotFiniteError("A target lies so far away that the numbers overflow. Send finite positions.")
+        with model.solver() as reconstruct:
+            vertices = np.array([target.vertex for target in targets])
+            rough, chart = (
+                _Chart(model, reconstruct, vertices, mesh, deadline, rough=rough) for rough in (True, False)
+            )
+            problem = _Problem(model, rough, chart, start.astype(np.float64), positions, prior, deadline)
+            fit = _best(problem)
+        code, _ = model.latents.code(fit.x.tolist(), Bounds.CLAMP)
+        shape = model.shape(code, True, mesh, deadline)
+        found = shape.vertices[[target.vertex for target in targets]]
+        distances = np.linalg.norm(found - model.manifest.scale * positions, axis=1)
+        status = Status.DEADLINE if shape.diagnostics.status is Status.DEADLINE else fit.status
+        return Edited(code, status, chart.shapes, shape, distances)
+
+
+def _best(problem: _Problem) -> Fit:
+    """The best that a few starts lead to."""
+    rough = problem.search(problem.start)
+    best = problem.refine(rough.x)
+    for _ in range(STARTS):
+        if best.status is Status.DEADLINE or problem.misfit(best) < GOOD:
+            break
+        other = problem.search(problem.elsewhere(best, problem.chart))
+        if not other.cost < rough.cost:
+            break
+        fit = problem.refine(other.x)
+        if not fit.cost < _worthwhile(best.cost):
+            break
+        rough, best = other, fit
+    return best
+
+
+def _worthwhile(cost: float) -> float:
+    """What another fit's cost must be below."""
+    return cost - (1 - PROMISING) * shrinkable(cost, GOOD_ROUGHLY)
+
+
+class _Problem:
+    """The least-squares problem of one edit.
+
+    First with rough shapes, which cost a third of those that are answered or less, and lie about half a percent of the
+    diagonal from them; from there a few of the others do.
+    """
+
+    def __init__(
+        self,
+        model: ShapeModel,
+        rough: _Chart,
+        chart: _Chart,
+        start: FloatArray,
+        positions: FloatArray,
+        prior: float,
+        deadline: Deadline | None,
+    ) -> None:
+        self.rough, self.chart, self.start = rough, chart, start
+        self._model, self._positions, self._deadline = model, positions, deadline
+        self._box = *model.latents.box(), model.latents.width
+        self._weight = 1 / (model.reference.diagonal * np.sqrt(len(positions)))
+        self._held = np.sqrt(prior / len(start)) / model.latents.width
+
+    def misfit(self, fit: Fit) -> float:
+        """Root mean square distance from the targets, as a fraction of the diagonal."""
+        return float(np.linalg.norm(fit.residual[: self._positions.size]))
+
+    def search(self, start: FloatArray) -> Fit:
+        """From a start by rough shapes and the factors' derivatives, which are quick, and from others if it fails."""
+        best = self._search(start)
+        for _ in range(STARTS):
+            if best.status is Status.DEADLINE or self.misfit(best) < GOOD_ROUGHLY:
+                break
+            fit = self._search(self.elsewhere(best, self.rough))
+            if not fit.cost < _worthwhile(best.cost):
+                break
+            best = fit
+        return best
+
+    def _search(self, start: FloatArray) -> Fit:
+        chart = self.rough
+        return least_squares(
+            lambda x: self._residual(x, chart),
+            lambda x, _: self._jacobian(chart.derivatives(x, factor_derivatives(self._model, x))),
+            start, *self._box, tolerance=1e-3, gain_tolerance=0.05, large=GOOD_ROUGHLY, secant=False,
+            max_evaluations=20, deadline=self._deadline,
+        )  # fmt: skip
+
+    def refine(self, start: FloatArray) -> Fit:
+        """From nearby by the shapes that are answered and the whole composite's derivatives."""
+        chart = self.chart
+        return least_squares(
+            lambda x: self._residual(x, chart),
+            lambda x, _: self._jacobian(chart.derivatives(x, derivatives(self._model, x))),
+            start, *self._box, tolerance=1e-3, gain_tolerance=0.002, large=GOOD_ROUGHLY, max_evaluations=REFINEMENTS,
+            deadline=self._deadline,
+        )  # fmt: skip
+
+    def elsewhere(self, fit: Fit, chart: _Chart) -> FloatArray:
+        """Another start: the fit with one factor moved to where, to first order, the misfit shrinks most.
+
+        That is the reference where no such move promises enough.
+        """
+        model = self._model
+        count = len(self._positions)
+        some = np.linspace(0, count - 1, min(count, RANKED)).astype(np.int64)
+        sensitivity = chart.sensitivity(fit.x, some) * self._weight
+        missing = fit.residual[: self._positions.size].reshape(-1, 3)[some].ravel()
+        best, found = _worthwhile(float(missing @ missing)), np.clip(np.zeros_like(fit.x), *model.latents.box())
+        half = model.manifest.edges
+        for j, factor in enumerate(model.manifest.factors):
+            own = slice(factor.start, factor.stop)
+            here = model.factor(j, fit.x[None, own])
+            for part in batches(nodes(model, j)):
+                changes = model.factor(j, part) - here
+                changes[:, half:] = wrap(changes[:, half:])
+                left = ((missing + changes @ sensitivity.T) ** 2).sum(axis=1)
+                if left.min() < best:
+                    best, found = left.min(), fit.x.copy()
+                    found[own] = part[left.argmin()]
+        return found
+
+    def _residual(self, x: FloatArray, chart: _Chart) -> FloatArray:
+        away = self._held * self._model.latents.shorter(x - self.start)
+        return np.concatenate([self._weight * (chart.positions(x) - self._positions).ravel(), away])
+
+    def _jacobian(self, moves: FloatArray) -> FloatArray:
+        return np.concatenate([self._weight * moves.reshape(len(moves), -1).T, np.diag(self._held)])
+
+
+class _Chart:
+    """Positions of a few vertices as functions of the code, as the service answers them but for the scale.
+
+    Each shape is reconstructed from the last one, or from frames where these are nearer; a rough one is that of the
+    frames (shapespace/coordinates/frame_integration.py), without Gauss–Newton.
+    """
+
+    def __init__(
+        self,
+        model: ShapeModel,
+        reconstruct: Reconstructor,
+        vertices: IntArray,
+        mesh: MeshChoice,
+        deadline: Deadline | None,
+        *,
+        rough: bool,
+    ) -> None:
+        self._model, self._reconstruct, self._deadline, self._rough = model, reconstruct, deadline, rough
+        self._vertices, self._mesh = vertices, mesh
+        self._code, self._shape = np.full(model.latents.dimension, np.nan), model.reference.vertices
+        self.shapes = 0
+
+    def positions(self, x: FloatArray) -> FloatArray:
+        """(k, 3) at a code (m,); not finite where the networks overflow."""
+        return self._places(self._solved(x))
+
+    def derivatives(self, x: FloatArray, changes: FloatArray) -> FloatArray:
+        """(m, k, 3) at a code (m,), given those of lengths and angles (2E, m)."""
+        shape = self._solved(x)
+        fields = self._reconstruct.differential(shape, changes.T)
+        h = DIFFERENCE * self._model.reference.diagonal / max(np.abs(fields).max(), np.finfo(float).tiny)
+        here, *there = self._places(np.concatenate([shape[None], shape + h * fields]))
+        return np.stack([(places - here) / h for places in there])
+
+    def sensitivity(self, x: FloatArray, some: IntArray) -> FloatArray:
+        """(3k, 2E) derivatives of some positions (k,) by lengths and angles at a code (m,), without normals'."""
+        model, shape = self._model, self._solved(x)
+        count, fine = len(shape), model.finer(self._mesh)
+        weights = fine.prolong.weights if fine else sparse.eye_array(count, format="csr")
+        rows = weights[self._vertices[some]][:, :count]
+        fields = np.einsum("kv,xy->kxvy", rows.toarray(), np.eye(3)).reshape(-1, count, 3)
+        aligned = model.placed(shape, self._mesh, carried=shape)
+        return self._reconstruct.sensitivity(aligned, without_rigid_motion(fields, aligned))
+
+    def _places(self, shapes: FloatArray) -> FloatArray:
+        """(…, k, 3) of shapes (…, V, 3)."""
+        return self._model.placed(shapes, self._mesh)[..., self._vertices, :]
+
+    def _solved(self, x: FloatArray) -> FloatArray:
+        if not np.array_equal(x, self._code):
+            self._code, self._shape = x.copy(), self._solve(self._model.nric(x))
+        return self._shape
+
+    def _solve(self, target: FloatArray) -> FloatArray:
+        framed, reconstruct = self._reconstruct.integrate(target), self._reconstruct
+        if self._rough:
+            return reconstruct.nearest(target, framed, self._model.reference.vertices)
+        self.shapes += 1
+        start = reconstruct.nearest(target, framed, self._shape)
+        return reconstruct(target, start, tolerance=1e-5, deadline=self._deadline).vertices

@@ -1,0 +1,167 @@
+"""From a mesh to its latent code: least squares on the networks, in lengths and angles, where poses don't matter."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from shapespace.arrays import FloatArray
+from shapespace.coordinates.nric import WeightedNorm, nric, wrap
+from shapespace.mesh.rigid_motion import align
+from shapespace.model.correspondence import InvalidMeshError, Matched
+from shapespace.model.derivatives import derivatives, factor_derivatives, nodes
+from shapespace.model.latent_space import Bounds, Codes, NotFiniteError
+from shapespace.model.shape_model import MeshChoice, Shape, ShapeModel
+from shapespace.solve.deadline import Deadline
+from shapespace.solve.least_squares import Fit, least_squares
+from shapespace.solve.status import Status
+
+#: Times that each factor is moved on its grid, given the others, and how much more it must explain then.
+SWEEPS, PROMISING = 4, 1.2
+#: A code may leave the bounds by this fraction of its range where that is allowed.
+MARGIN = 0.5
+
+
+@dataclass(frozen=True)
+class Encoded:
+    """The code whose lengths and angles come closest to a mesh's.
+
+    Attributes:
+        code: (m,), as the networks take it.
+        inside_bounds: whether it lies inside the bounds.
+        status: how the iteration ended.
+        iterations: evaluations of the networks' misfit.
+        residual: relative misfit of lengths and angles, in the weighted norm of the reconstruction.
+        shape: what the service answers to the code, on the mesh that was given.
+        distances: (V,) of the given vertices to that shape, after rigid alignment.
+        mesh: which mesh was given.
+    """
+
+    code: Codes
+    inside_bounds: bool
+    status: Status
+    iterations: int
+    residual: float
+    shape: Shape
+    distances: FloatArray
+    mesh: MeshChoice
+
+
+class Encoder:
+    """Finds codes of meshes, for any number of threads.
+
+    Minimises ``‖z(code) − z‖_{2,z̄}``, angles compared modulo 2π, in two rounds. The first takes the factors alone,
+    ``z̄ + Σ_j (ψ_j − z̄)``, which come within a few percent and cost little; where a factor has periodic coordinates it
+    begins at the best of a grid. The second takes the whole composite, and rarely needs more than a handful of
+    evaluations beside one Jacobian.
+    """
+
+    def __init__(self, model: ShapeModel) -> None:
+        self.model = model
+        self._norm = WeightedNorm.of(model.reference, model.manifest.eta_reconstruction)
+        self._root = np.sqrt(self._norm.squared)
+        self._centre = nric(model.reference.vertices, model.reference.connectivity)
+
+    def __call__(self, given: Matched, bounds: Bounds = Bounds.ALLOW, deadline: Deadline | None = None) -> Encoded:
+        """The code of a mesh.
+
+        Args:
+            given: in the model's order, in the units of the training meshes and in any rigid pose.
+            bounds: REJECT refuses a code outside the bounds, CLAMP looks for one inside only.
+            deadline: after which the status is Status.DEADLINE.
+
+        Raises:
+            InvalidMeshError: edges without any length.
+            NotFiniteError: lengths so large that the numbers overflow.
+            OutOfBoundsError: as ``bounds`` asks for.
+        """
+        model, latents = self.model, self.model.latents
+        with np.errstate(over="ignore", invalid="ignore"):
+            target = nric(model.coarse(given.vertices, given.mesh) / model.manifest.scale, model.reference.connectivity)
+            if not np.isfinite(self._norm.square(target)):
+                raise NotFiniteError("The mesh is so large that the numbers overflow. Send it in the model's units.")
+        if not target.any():
+            raise InvalidMeshError("The mesh is a single point: no edge has a length. Send a surface.")
+        lower, upper = latents.box(MARGIN if bounds is not Bounds.CLAMP else 0.0)
+        fit = self._fit(target, lower, upper, deadline)
+        code, inside = latents.code(fit.x.tolist(), bounds)
+        shape = model.shape(code, inside, given.mesh, deadline)
+        distances = np.linalg.norm(align(shape.vertices, given.vertices) - given.vertices, axis=1)
+        residual = float(np.sqrt(fit.cost / self._norm.square(target)))
+        status = Status.DEADLINE if shape.diagnostics.status is Status.DEADLINE else fit.status
+        return Encoded(code, inside, status, fit.evaluations, residual, shape, distances, given.mesh)
+
+    def _fit(self, target: FloatArray, lower: FloatArray, upper: FloatArray, deadline: Deadline | None) -> Fit:
+        latents, root = self.model.latents, self._root
+        box = lower, upper, latents.width
+
+        def affine(x: FloatArray) -> FloatArray:
+            return root * self._difference(self._affine(x), target)
+
+        def composite(x: FloatArray) -> FloatArray:
+            return root * self._difference(self.model.nric(x), target)
+
+        def from_composite(start: FloatArray) -> Fit:
+            return least_squares(
+                composite, lambda x, _: root[:, None] * derivatives(self.model, x), start, *box, deadline=deadline
+            )
+
+        x = (latents.lower + latents.upper) / 2
+        for _ in range(SWEEPS * len(self.model.grids.images)):
+            moved = self._elsewhere(x, affine(x))
+            if moved is None:
+                break
+            x = moved
+        rough = least_squares(
+            affine, lambda x, _: root[:, None] * factor_derivatives(self.model, x), x, *box, tolerance=1e-3,
+            secant=False, deadline=deadline,
+        )  # fmt: skip
+        best = from_composite(rough.x)
+        for _ in range(SWEEPS):
+            moved = self._elsewhere(best.x, best.residual)
+            if moved is None or best.status is Status.DEADLINE:
+                break
+            other = from_composite(moved)
+            if other.cost >= best.cost:
+                break
+            best = other
+        return best
+
+    def _elsewhere(self, x: FloatArray, residual: FloatArray) -> FloatArray | None:
+        """A code with one factor moved to the node that fits best, where that promises to be better than x.
+
+        What counts is the direction of a factor's shape from z̄, not its size, because the factors add up in direction
+        only roughly in size: a bump on the inner side of a torus is not as large as on the outer one.
+        """
+        grids = self.model.grids
+        missing = -grids.sketch(residual)
+        best, found = 0.0, None
+        for j, images in grids.images.items():
+            factor = self.model.manifest.factors[j]
+            own = slice(factor.start, factor.stop)
+            here = grids.sketch(self._root * (self.model.factor(j, x[None, own])[0] - self._centre))
+            explained = _explained(missing + here, images)
+            gain = explained.max() - PROMISING * _explained(missing + here, here[None])[0]
+            if gain > best:
+                best, found = float(gain), x.copy()
+                found[own] = nodes(self.model, j)[explained.argmax()]
+        return found
+
+    def _difference(self, z: FloatArray, target: FloatArray) -> FloatArray:
+        difference = z - target
+        half = len(z) // 2
+        difference[half:] = wrap(difference[half:])
+        return difference
+
+    def _affine(self, x: FloatArray) -> FloatArray:
+        z = self._centre.copy()
+        for j, factor in enumerate(self.model.manifest.factors):
+            z += self.model.factor(j, x[None, factor.start : factor.stop])[0] - self._centre
+        return z
+
+
+def _explained(missing: FloatArray, images: FloatArray) -> FloatArray:
+    """(n,) how much of the square of ``missing`` (k,) multiples of images (n, k) take away."""
+    along = np.maximum(images @ missing, 0)
+    return along**2 / np.maximum((images**2).sum(axis=1), np.finfo(float).tiny)

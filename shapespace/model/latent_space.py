@@ -1,0 +1,188 @@
+"""Latent codes: their coordinates, bounds and periods."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from enum import StrEnum
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import ndtr, ndtri
+
+from shapespace.arrays import FloatArray
+from shapespace.bundle.schema import Manifest
+
+#: (n, m) codes as the networks take them; everything that identifies a shape is derived from this form.
+Codes = NDArray[np.float32]
+#: One of them (m,), and whether it is inside the bounds.
+CheckedCode = tuple[Codes, bool]
+
+
+class LatentError(ValueError):
+    """A code that can't be used, with a sentence that says what to do."""
+
+
+class WrongLengthError(LatentError):
+    """A code with too few or too many coordinates."""
+
+
+class NotFiniteError(LatentError):
+    """A code with a coordinate that isn't a finite number, or from which none come out."""
+
+
+class OutOfBoundsError(LatentError):
+    """A code outside the bounds where the caller asked to refuse those."""
+
+
+class Bounds(StrEnum):
+    """What to do with a code outside the bounds: extrapolate, move it to the nearest bound, or refuse it."""
+
+    ALLOW = "allow"
+    CLAMP = "clamp"
+    REJECT = "reject"
+
+
+class Distribution(StrEnum):
+    """How random codes are distributed in the bounds."""
+
+    UNIFORM = "uniform"
+    GAUSSIAN = "gaussian"
+
+
+class LatentSpace:
+    """The coordinates of a model's codes.
+
+    A coordinate with a period is an angle: only its remainder counts, and it is out of bounds nowhere but
+    in the gap that bounds narrower than the period leave.
+    """
+
+    def __init__(self, manifest: Manifest) -> None:
+        self.model = manifest.name
+        self.names = manifest.latent_names
+        self.lower, self.upper = np.array(manifest.lower), np.array(manifest.upper)
+        self.periodic = np.array([period is not None for period in manifest.period])
+        self._period = np.array([period or 1.0 for period in manifest.period])
+        # As codes are compared, so that a bound itself is inside on every way through.
+        self._low, self._high = self.lower.astype(np.float32), self.upper.astype(np.float32)
+        #: (m,) what counts as equally far in each coordinate.
+        self.width = self.upper - self.lower
+
+    @property
+    def dimension(self) -> int:
+        """M."""
+        return len(self.names)
+
+    def codes(
+        self, values: Sequence[Sequence[float]] | NDArray[np.floating], bounds: Bounds = Bounds.ALLOW
+    ) -> tuple[Codes, NDArray[np.bool_]]:
+        """Check codes and bring them into the one form that identifies a shape.
+
+        Args:
+            values: n lists of m numbers, or an array of them.
+            bounds: what to do outside the bounds.
+
+        Returns:
+            (n, m) codes, angles within one period from ``lower``; and (n,) whether each is inside the bounds.
+
+        Raises:
+            WrongLengthError, NotFiniteError, OutOfBoundsError: with the place of the first fault.
+        """
+        for i, value in enumerate(values):
+            if len(value) != self.dimension:
+                names = f" ({', '.join(self.names)})" if self.dimension <= 12 else ""
+                raise WrongLengthError(
+                    f"Code {i} has {len(value)} numbers, but {self.model} takes {self.dimension}{names}. "
+                    f"Send exactly {self.dimension}."
+                )
+        with np.errstate(over="ignore"):
+            x = np.array(values, dtype=np.float64).reshape(-1, self.dimension).astype(np.float32)
+        self._require_finite(x)
+        if self.periodic.any():
+            x = self._remainder(x.astype(np.float64)).astype(np.float32)
+        if bounds is Bounds.CLAMP:
+            x = np.clip(x, self._low, self._high)
+        outside = (x < self._low) | (x > self._high)
+        if bounds is Bounds.REJECT and outside.any():
+            i, k = np.argwhere(outside)[0]
+            raise OutOfBoundsError(
+                f"Coordinate {k} ({self.names[k]}) of code {i} is {x[i, k]:g}, outside "
+                f'[{self._low[k]:g}, {self._high[k]:g}]. Move it inside, or send "bounds": "clamp" or "allow".'
+            )
+        # Adding zero turns −0 into 0: the same shape must not have two names.
+        inside = np.logical_not(outside.any(axis=1))
+        return x + np.float32(0), inside
+
+    def code(self, value: Sequence[float], bounds: Bounds = Bounds.ALLOW) -> CheckedCode:
+        """One code (m,) and whether it is inside the bounds; as ``codes``."""
+        codes, inside = self.codes([value], bounds)
+        return codes[0], bool(inside[0])
+
+    def unroll(self, keyframes: FloatArray) -> FloatArray:
+        """Shift angles of successive keyframes (K, m) by whole periods: each step becomes the shorter arc."""
+        steps = self.shorter(np.diff(keyframes, axis=0))
+        return np.concatenate([keyframes[:1], keyframes[:1] + np.cumsum(steps, axis=0)])
+
+    def shorter(self, steps: FloatArray) -> FloatArray:
+        """Differences (…, m) of codes, angles taken the shorter way round."""
+        half = self._period / 2
+        return np.where(self.periodic, half - np.mod(half - steps, self._period), steps)
+
+    def box(self, margin: float = 0.0) -> tuple[FloatArray, FloatArray]:
+        """Lower and upper bounds (m,), wider by a fraction of the width on each side; an angle has none.
+
+        Angles that bounds restrict to less than a period keep to them.
+        """
+        free = self.periodic & (self.width >= self._period * (1 - 1e-9))
+        extra = margin * self.width
+        return np.where(free, -np.inf, self.lower - extra), np.where(free, np.inf, self.upper + extra)
+
+    def sample(self, count: int, seed: int, distribution: Distribution) -> Codes:
+        """Random codes (count, m) inside the bounds, the same on every machine.
+
+        Gaussian codes have their mean in the middle of the bounds and a standard deviation of a quarter of the width,
+        before they are cut off at the bounds.
+        """
+        shares = np.random.Generator(np.random.PCG64(seed)).random((count, self.dimension))
+        if distribution is Distribution.GAUSSIAN:
+            low, high = ndtr(-2.0), ndtr(2.0)
+            shares = 0.5 + ndtri(low + (high - low) * shares) / 4
+        values = self.lower + shares * self.width
+        return self.codes(values.tolist(), Bounds.CLAMP)[0]
+
+    def _require_finite(self, x: Codes) -> None:
+        finite = np.isfinite(x)
+        if not finite.all():
+            bad = np.argwhere(~finite)
+            raise NotFiniteError(
+                f"Coordinate {bad[0, 1]} of code {bad[0, 0]} is not a finite number. Send finite numbers."
+            )
+
+    def _remainder(self, x: FloatArray) -> FloatArray:
+        # Codes already in range keep their exact value.
+        moved = self.lower + np.mod(x - self.lower, self._period)
+        inside = (x >= self.lower) & (x < self.lower + self._period)
+        return np.where(self.periodic & ~inside, moved, x)
+
+
+class TrainingCodes:
+    """Codes of the shapes that a model was made from, as a measure of what is plausible.
+
+    Args:
+        latents: the space they lie in.
+        codes: (n, m), n ≥ 1.
+    """
+
+    def __init__(self, latents: LatentSpace, codes: FloatArray) -> None:
+        self._latents, self._codes = latents, codes
+        others = np.array([np.sort(self._distances(code))[1:2] for code in codes])
+        #: How far a training code typically is from its nearest neighbour; without neighbours the bounds' width.
+        self.spacing = float(np.median(others)) if others.any() else 1.0
+
+    def plausibility(self, code: Codes) -> float:
+        """Distance of a code (m,) to the nearest of these, in multiples of their own spacing."""
+        return float(self._distances(code).min() / self.spacing)
+
+    def _distances(self, code: NDArray) -> FloatArray:
+        """(n,) root mean square over coordinates, as fractions of the bounds' width."""
+        steps = self._latents.shorter(self._codes - code) / self._latents.width
+        return np.sqrt((steps**2).mean(axis=1))

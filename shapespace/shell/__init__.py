@@ -1,0 +1,1 @@
+"""The Riemannian space of discrete shells: energy, exponential map, geodesics, means, parallel transport."""

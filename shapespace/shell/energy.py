@@ -1,0 +1,228 @@
+"""The elastic energy of a thin shell in lengths and angles, with the derivatives that the calculus uses.
+
+``W[z, z~] = W_mem + W_bend`` measures the deformation of a rest shape z into z~ (paper, appendix C). On each
+face, with the Cauchy–Green tensor A of the affine map between the two triangles and the rest area a,
+
+    W_mem = Σ_f a (μ/2 tr A + λ/4 det A − κ log det A − μ − λ/4),   κ = μ/2 + λ/4,
+
+and on each interior edge, with d_e = (a_f + a_f')/3,
+
+    W_bend = η Σ_e (θ_e − θ~_e)² l_e² / d_e.
+
+**The paper's misprint.** The paper prints the factor of the logarithm as μ + λ/2. Then the derivative of the
+density at A = I would be (μ/2 + λ/4 − μ − λ/2) I = −κ I: a shell under stress in its own rest shape, and W no
+squared distance to second order. With κ the density and its gradient vanish at A = I; a test holds that.
+
+**How it is computed.** With the squared lengths q_i of a rest face, c_i = q_j + q_k − q_i and
+S = Σ c_i q_i = 16 a² (Heron), tr A = 2/S Σ c_i q~_i and det A = S~/S: no inverse of a first fundamental form
+and no choice of a corner. In the change δ = q~ − q of the squared lengths and γ_i = δ_j + δ_k − δ_i,
+
+    t = tr A − 2 = 2/S Σ c_i δ_i,   s = det A − 1 = t + 1/S Σ γ_i δ_i,
+    W_mem/a = μ/2 t + λ/4 s − κ log(1 + s),
+
+so that energy and gradients of a small step are not differences of large numbers.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import sparse
+
+from shapespace.arrays import FloatArray, IntArray
+from shapespace.coordinates.normal_matrix import QuadraticForm
+from shapespace.mesh.triangle_mesh import Connectivity
+
+
+@dataclass(frozen=True)
+class Material:
+    """Elastic parameters of a shell of unit area; the defaults of the whole project.
+
+    Attributes:
+        mu: Lamé's μ of the membrane.
+        lambda_: Lamé's λ of the membrane.
+        eta: weight η of bending against stretching, about the squared thickness. At values much above the
+            default, geodesics of real collections run into collapsed triangles, whatever the solver.
+    """
+
+    mu: float = 1.0
+    lambda_: float = 1.0
+    eta: float = 1e-4
+
+    def __post_init__(self) -> None:
+        if not (0 < self.mu < np.inf and 0 <= self.lambda_ < np.inf and 0 < self.eta < np.inf):
+            raise ValueError(f"a material needs finite μ > 0, λ ≥ 0 and η > 0, not {self}")
+
+
+class ShellEnergy:
+    """``W`` on a connectivity.
+
+    W_mem scales with area and W_bend does not, so η means nothing without a size. Here it refers to a
+    collection whose reference has ``area``: the membrane part is divided by it. Meshes in any unit then give
+    the same numbers as the same meshes scaled to unit area, and nobody has to scale.
+
+    Args:
+        connectivity: shared combinatorics.
+        material: μ, λ and η at unit area.
+        area: surface area of the collection's reference shape.
+    """
+
+    def __init__(self, connectivity: Connectivity, material: Material | None = None, area: float = 1.0) -> None:
+        material = material or Material()
+        self.connectivity = connectivity
+        self.material = material
+        self.area = area
+        self.mu, self.lambda_, self.eta = material.mu / area, material.lambda_ / area, material.eta
+        self.kappa = self.mu / 2 + self.lambda_ / 4
+        #: (3, F) the edge on each side of each face.
+        self.sides: IntArray = connectivity.face_sides
+        # Where an edge finds its first and second face among the 3F sides; a boundary edge has no second.
+        order = np.argsort(self.sides.ravel(), kind="stable")
+        starts = np.searchsorted(self.sides.ravel()[order], np.arange(connectivity.edge_count))
+        self._first: IntArray = order[starts]
+        self._second: IntArray = order[np.minimum(starts + 1, len(order) - 1)]
+        self._boundary: IntArray = np.flatnonzero(~connectivity.interior)
+
+    def rest(self, z: FloatArray) -> RestShape:
+        """Prepare rest shapes z (…, 2E)."""
+        return RestShape(self, z)
+
+    def sum_over_faces(self, sides: FloatArray) -> FloatArray:
+        """Add to each edge (…, E) what its one or two faces have for it (…, 3, F)."""
+        flat = sides.reshape(*sides.shape[:-2], -1)
+        second = flat.take(self._second, axis=-1)
+        second[..., self._boundary] = 0
+        second += flat.take(self._first, axis=-1)
+        return second
+
+
+def _opposite(q: FloatArray) -> FloatArray:
+    """``q_j + q_k − q_i`` (…, 3, F) of values on the three sides of faces."""
+    return q.sum(axis=-2, keepdims=True) - 2 * q
+
+
+class RestShape:
+    """Rest shapes z (…, 2E) with all that the energy needs of them, to compare many deformed shapes with.
+
+    Leading dimensions broadcast: K rest shapes meet K deformed ones, or one meets many.
+
+    Attributes:
+        z: (…, 2E).
+        areas: (…, F) areas of the faces.
+    """
+
+    def __init__(self, energy: ShellEnergy, z: FloatArray) -> None:
+        connectivity = energy.connectivity
+        self._energy = energy
+        self.z = z
+        self._lengths, self._angles = np.split(z, 2, axis=-1)
+        self._sides = self._lengths.take(energy.sides, axis=-1)
+        self._q = self._sides**2
+        self._c = _opposite(self._q)
+        self._S = np.einsum("...if,...if->...f", self._c, self._q)
+        with np.errstate(invalid="ignore"):
+            self.areas: FloatArray = np.sqrt(self._S) / 4
+        sides = np.broadcast_to(self.areas[..., None, :], self._sides.shape)
+        self._edge_area = energy.sum_over_faces(sides)
+        self._beta = 3 * energy.eta * self._lengths**2 / self._edge_area * connectivity.interior
+
+    def _compare(self, z: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """γ (…, 3, F), t and s (…, F) of the faces, and the angles' change modulo 2π (…, E)."""
+        lengths, angles = np.split(z, 2, axis=-1)
+        delta = lengths.take(self._energy.sides, axis=-1) ** 2 - self._q
+        gamma = _opposite(delta)
+        t = np.einsum("...if,...if->...f", self._c, delta)
+        s = np.einsum("...if,...if->...f", gamma, delta)
+        t *= 2 / self._S
+        s /= self._S
+        s += t
+        turn = angles - self._angles
+        # As `wrap`, in place and ten times faster; half a turn counts the same either way round.
+        turn -= 2 * np.pi * np.rint(turn / (2 * np.pi))
+        return gamma, t, s, turn
+
+    def value(self, z: FloatArray) -> FloatArray:
+        """``W[rest, z]`` (…); infinite where a face of the deformed shape z has no area."""
+        m = self._energy
+        _, t, s, turn = self._compare(z)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            membrane = self.areas * (m.mu / 2 * t + m.lambda_ / 4 * s - m.kappa * np.log1p(s))
+        total = membrane.sum(axis=-1) + (turn**2 * self._beta).sum(axis=-1)
+        return np.where(np.isnan(total), np.inf, total)
+
+    def gradient_deformed(self, z: FloatArray) -> FloatArray:
+        """``∂₂W[rest, z]`` (…, 2E), the force on the deformed shape.
+
+        By q~_i it is ``1/(16a) (2κ s/(1+s) c_i + (λ/2 − 2κ/(1+s)) γ_i)``.
+        """
+        m = self._energy
+        gamma, _, s, turn = self._compare(z)
+        stiffness = 2 * m.kappa / (1 + s)
+        by_q = (stiffness * s)[..., None, :] * self._c + (m.lambda_ / 2 - stiffness)[..., None, :] * gamma
+        by_q /= 16 * self.areas[..., None, :]
+        lengths = m.sum_over_faces(by_q)
+        lengths *= 2 * z[..., : lengths.shape[-1]]
+        return np.concatenate([lengths, 2 * self._beta * turn], axis=-1)
+
+    def gradient_rest(self, z: FloatArray) -> FloatArray:
+        """``∂₁W[rest, z]`` (…, 2E), the derivative by the rest shape.
+
+        By q_i the membrane part is ``1/(16a) (μ γ_i − c_i (μ/2 t + λ/4 s + κ log(1+s)))``; the bending part
+        varies l_e and, by ``∂a/∂q_i = c_i/(16a)``, the areas in d_e.
+        """
+        m = self._energy
+        gamma, t, s, turn = self._compare(z)
+        bending = turn**2 * self._beta
+        by_area = (-bending / self._edge_area).take(m.sides, axis=-1).sum(axis=-2)
+        density = m.mu / 2 * t + m.lambda_ / 4 * s + m.kappa * np.log1p(s)
+        by_q = m.mu * gamma + (by_area - density)[..., None, :] * self._c
+        by_q /= 16 * self.areas[..., None, :]
+        lengths = m.sum_over_faces(by_q)
+        lengths *= 2 * self._lengths
+        lengths += 2 * bending / self._lengths
+        return np.concatenate([lengths, -2 * self._beta * turn], axis=-1)
+
+    def hessian(self) -> QuadraticForm:
+        """``Hess₂ W[rest, rest]``, twice the metric, which is also ``−∂₁∂₂W[rest, rest]``.
+
+        By the q of a face it is ``1/(16a) ((2μ+λ)/S c cᵀ + μ (2I − 11ᵀ))``.
+        """
+        m = self._energy
+        c = self._c
+        blocks = c[..., :, None, :] * (c * ((2 * m.mu + m.lambda_) / self._S)[..., None, :])[..., None, :, :]
+        blocks += m.mu * (2 * np.eye(3) - 1)[:, :, None]
+        # Chain rule for q = l², and 4/(16a) = 1/√S.
+        scaled = self._sides / np.sqrt(np.sqrt(self._S))[..., None, :]
+        blocks *= scaled[..., :, None, :]
+        blocks *= scaled[..., None, :, :]
+        return QuadraticForm(blocks, 2 * self._beta)
+
+    def mixed_hessian(self, z: FloatArray) -> sparse.csr_array:
+        """``∂₂∂₁W[rest, z]`` (2E, 2E): a row per rest and a column per deformed coordinate. One rest shape only.
+
+        By q_i and q~_m it is ``1/(16a) (μ (1 − 2δ_im) − c_i (μ c_m + (λ/2 + 2κ/(1+s)) c~_m)/S)``. Exact,
+        unlike ``−hessian()``, and not symmetric: bending depends on rest lengths but not on deformed ones.
+        """
+        m = self._energy
+        e = m.connectivity.edge_count
+        gamma, _, s, turn = self._compare(z)
+        slope = m.mu * self._c + (m.lambda_ / 2 + 2 * m.kappa / (1 + s)) * (self._c + gamma)
+        blocks = m.mu * (1 - 2 * np.eye(3))[:, :, None] - self._c[:, None] * (slope / self._S)[None]
+        blocks *= 4 * self._sides[:, None] * z[:e][m.sides][None] / (16 * self.areas)
+        rows = np.broadcast_to(m.sides[:, None], blocks.shape)
+        columns = np.broadcast_to(m.sides[None], blocks.shape)
+
+        # ∂₁W_bend by lengths is turn² times something of the rest shape; differentiate turn².
+        by_turn = 2 * turn * self._beta
+        by_area = (-by_turn / self._edge_area)[m.sides]
+        areas = by_area[None] * (self._c * self._sides / (8 * self.areas))[:, None]
+        edges = np.arange(e)
+        entries = [
+            (blocks, rows, columns),
+            (areas, rows, e + columns),
+            (2 * by_turn / self._lengths, edges, e + edges),
+            (-2 * self._beta, e + edges, e + edges),
+        ]
+        data, i, j = (np.concatenate([np.ravel(x[k]) for x in entries]) for k in range(3))
+        return sparse.csr_array((data, (i, j)), shape=(2 * e, 2 * e))

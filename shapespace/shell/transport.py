@@ -1,0 +1,71 @@
+"""Parallel transport along a path of shapes, by Schild's ladder (Rumpf and Wirth 2015)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from shapespace.arrays import FloatArray
+from shapespace.mesh.rigid_motion import align, without_rigid_motion
+from shapespace.shell.exponential import extrapolate
+from shapespace.shell.geodesic import geodesic
+from shapespace.shell.space import TOLERANCE, Path, ShellSpace
+from shapespace.solve.status import Status
+
+
+@dataclass(frozen=True)
+class Transport:
+    """A vector carried along a path.
+
+    Attributes:
+        velocities: (n, V, 3) vertex fields without rigid motion, one at each shape reached, the given one
+            first.
+        status: CONVERGED if it got to the end.
+        reason: what happened otherwise, in words.
+    """
+
+    velocities: FloatArray
+    status: Status
+    reason: str = ""
+
+
+def parallel_transport(
+    space: ShellSpace, path: Path, velocity: FloatArray, *, tolerance: float = TOLERANCE
+) -> Transport:
+    """Carry a tangent vector along a path, a geodesic parallelogram for each of its K steps.
+
+    With v_{k−1} scaled to the length of a step, p = X_{k−1} + v_{k−1}/s is the tip of the vector; c is the
+    middle of a two-step geodesic from p to X_k; the two-step geodesic from X_{k−1} through c ends in the tip
+    at X_k. Two small solves a rung, and no derivative of the metric. First-order in the length of path and
+    vector, exact where the space is flat.
+
+    Args:
+        space: where.
+        path: complete, with at least two shapes.
+        velocity: (V, 3) vertex field at its first shape.
+        tolerance: of each solve.
+    """
+    steps = len(path.vertices) - 1
+    if steps < 1:
+        raise ValueError("a path needs at least two shapes to carry a vector along")
+    first = path.vertices[0]
+    carried = [without_rigid_motion(space.shape(velocity), first)]
+    if not np.isfinite(carried[0]).all():
+        return Transport(np.zeros((0, *first.shape)), Status.NOT_FINITE, "the vector is not finite")
+    size = space.norm(first, carried[0])
+    if size == 0:
+        return Transport(np.zeros_like(path.vertices), Status.CONVERGED)
+    stride = np.sqrt(path.energy) / steps
+    shrink = (stride if stride > 0 else size) / size
+    for x, y in pairwise(path.vertices):
+        middle = geodesic(space, x + shrink * carried[-1], y, 2, tolerance=tolerance)
+        rung = middle
+        if middle.converged:
+            rung = extrapolate(space, x, align(middle.vertices[1], x), 1, tolerance=tolerance)
+        if not rung.converged:
+            return Transport(np.stack(carried), rung.status, f"step {len(carried)}: {rung.reason}")
+        tip = align(rung.vertices[-1], y)
+        carried.append((tip - y) / shrink)
+    return Transport(np.stack(carried), Status.CONVERGED)

@@ -1,0 +1,57 @@
+"""Rotations of vertices from one shape to another, smooth over the mesh."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy import sparse
+
+from shapespace.arrays import FloatArray
+from shapespace.coordinates.nric import components, cross, dot
+from shapespace.mesh.triangle_mesh import Connectivity
+
+
+class Turning:
+    """A rotation for each vertex: the mean of its faces', then of its neighbours' as many times as ROUNDS says.
+
+    Each rotation is a quaternion, and quaternions are summed over neighbourhoods. Between frames a and b it is
+    ``(1 + Σ_k a_k · b_k, Σ_k a_k × b_k)``, which is 4w times the unit quaternion (w, v): a sum doesn't depend on its
+    sign, and turns by nearly 180°, whose axis is uncertain, count little.
+
+    Neighbours have to turn nearly alike, because differences of rotation stretch a shell, which is much stiffer
+    against that than against bending: without rounds the matrix of a captured body is worse off turned than not.
+    """
+
+    ROUNDS = 6
+
+    def __init__(self, connectivity: Connectivity) -> None:
+        self._corners = connectivity.face_corners
+        faces = len(connectivity.faces)
+        corner = (self._corners.ravel(), np.tile(np.arange(faces), 3))
+        self._around = sparse.csr_array((np.ones(3 * faces), corner), shape=(connectivity.vertex_count, faces))
+        self._neighbours = sparse.csr_array((self._around @ self._around.T).astype(bool).astype(np.float64))
+
+    def frames(self, vertices: FloatArray) -> FloatArray:
+        """(xyz, 3, F): unit vectors along a side of each face, across it, and along its normal."""
+        a, b, c = (components(vertices).take(k, axis=1) for k in self._corners)
+        side = b - a
+        normal = cross(side, c - a)
+        side /= np.sqrt(dot(side, side))
+        normal /= np.sqrt(dot(normal, normal))
+        return np.stack([side, cross(normal, side), normal], axis=1)
+
+    def __call__(self, old: FloatArray, new: FloatArray) -> FloatArray:
+        """Rotations (V, 3, 3) from frames to frames; not finite where all around turn by 180° or a face has no area."""
+        quaternions = np.empty((4, old.shape[-1]))
+        quaternions[0] = 1 + np.einsum("xkf,xkf->f", old, new)
+        quaternions[1:] = cross(old, new).sum(axis=1)
+        means = np.asarray(self._around @ quaternions.T)
+        for _ in range(self.ROUNDS):
+            means = np.asarray(self._neighbours @ means)
+        means *= np.sqrt(2) / np.linalg.norm(means, axis=1, keepdims=True)
+        w, x, y, z = means.T
+        rows = [
+            [1 - y * y - z * z, x * y - w * z, x * z + w * y],
+            [x * y + w * z, 1 - x * x - z * z, y * z - w * x],
+            [x * z - w * y, y * z + w * x, 1 - x * x - y * y],
+        ]
+        return np.ascontiguousarray(np.moveaxis(np.array(rows), 2, 0))

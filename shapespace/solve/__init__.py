@@ -1,0 +1,1 @@
+"""What the nonlinear solvers are made of: factorisations, acceleration, descent, and how an iteration ended."""

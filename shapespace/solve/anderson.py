@@ -1,0 +1,36 @@
+"""Anderson acceleration of a preconditioned fixed-point iteration."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from shapespace.arrays import FloatArray
+
+
+class Anderson:
+    """Mixes the last iterates of ``x ← x + M⁻¹F(x)`` so that ``‖F‖`` in the norm of M⁻¹ is smallest.
+
+    For an affine F this is GMRES with preconditioner M in that norm; it costs a few dot products and needs no
+    derivative. The chord iteration it serves contracts by 0.03 to 0.3, and faster with every mixed iterate.
+    """
+
+    #: How many earlier iterates are mixed.
+    DEPTH = 5
+
+    def __init__(self) -> None:
+        self._count = 0
+        self._last: FloatArray | None = None
+        self._history = np.empty(0)
+
+    def __call__(self, x: FloatArray, forces: FloatArray, step: FloatArray) -> FloatArray:
+        """The next iterate from x, F(x) and M⁻¹F(x), all of one shape."""
+        now = np.concatenate([x, forces, step], axis=None).reshape(3, -1)
+        now[0] += now[2]
+        if self._last is None:
+            self._last, self._history = now, np.empty((3, self.DEPTH, x.size))
+            return now[0].reshape(x.shape)
+        np.subtract(now, self._last, out=self._history[:, self._count % self.DEPTH])
+        self._last, self._count = now, self._count + 1
+        images, df, ds = self._history[:, : self._count]
+        mix = np.linalg.lstsq(ds @ df.T, ds @ now[1], rcond=None)[0]
+        return (now[0] - mix @ images).reshape(x.shape)

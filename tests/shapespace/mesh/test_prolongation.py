@@ -1,0 +1,190 @@
+"""The fine surface, carried along with a coarse one."""
+
+import io
+
+import numpy as np
+import pytest
+import trimesh
+
+from shapespace.mesh.coarsening import coarsen
+from shapespace.mesh.prolongation import Prolongation, ProlongationError, _closest_in_triangle
+from shapespace.mesh.rigid_motion import align
+from shapespace.mesh.triangle_mesh import TriangleMesh
+from tests.shapespace.conftest import MESHES, bent, grid_faces
+from tests.shapespace.mesh.test_coarsening import fine_mesh
+
+
+class Pair:
+    """A fine mesh, a coarse one on some of its vertices, and the prolongation between them."""
+
+    def __init__(self, fine: TriangleMesh) -> None:
+        self.fine = fine
+        found = coarsen(fine, len(fine.vertices) // 4, bent(fine.vertices, 1.0)[None])
+        self.index = found.fine_index
+        self.coarse = TriangleMesh.from_arrays(fine.vertices[self.index], found.faces)
+        self.prolong = Prolongation.of(self.coarse, fine)
+
+
+@pytest.fixture(params=MESHES)
+def pair(request: pytest.FixtureRequest, rng: np.random.Generator) -> Pair:
+    return Pair(fine_mesh(request.param, rng))
+
+
+@pytest.fixture
+def shape(pair: Pair) -> np.ndarray:
+    return bent(pair.fine.vertices, 1.3)
+
+
+def test_exact_at_rest(pair):
+    np.testing.assert_allclose(pair.prolong(pair.coarse.vertices), pair.fine.vertices, atol=1e-12)
+
+
+def test_coarse_vertices_stay_themselves(pair, shape):
+    np.testing.assert_allclose(pair.prolong(shape[pair.index])[pair.index], shape[pair.index], atol=1e-12)
+
+
+def test_it_knows_which_fine_vertices_the_coarse_ones_are(pair):
+    np.testing.assert_array_equal(pair.prolong.coarse_vertices, pair.index)
+
+
+def test_moves_rigidly_and_grows_with_the_shape(pair, shape, move):
+    coarse = shape[pair.index]
+    both = move(np.concatenate([coarse, pair.prolong(coarse)]))
+    np.testing.assert_allclose(pair.prolong(both[: len(coarse)]), both[len(coarse) :], atol=1e-11)
+    np.testing.assert_allclose(pair.prolong(2.5 * coarse), 2.5 * pair.prolong(coarse), atol=1e-11)
+
+
+def test_follows_affine_maps_of_flat_places_exactly():
+    """In a plane the local maps are the map itself, stretch and shear included."""
+    mesh = MESHES["sheet"]()
+    flat = TriangleMesh.from_arrays(mesh.vertices * [1, 1, 0], mesh.faces)
+    pair = Pair(flat)
+    squeezed = flat.vertices @ [[1.4, 0, 0], [0.3, 0.8, 0], [0, 0, 1]]
+    np.testing.assert_allclose(pair.prolong(squeezed[pair.index]), squeezed, atol=1e-12)
+
+
+def test_the_closest_point_of_a_triangle_is_the_one_that_trimesh_finds(rng):
+    corners, points = rng.standard_normal((500, 3, 3)), 2 * rng.standard_normal((500, 3))
+    weights, squared = _closest_in_triangle(points, corners)
+    closest = trimesh.triangles.closest_point(corners, points)
+    np.testing.assert_allclose(np.einsum("ki,kix->kx", weights, corners), closest, atol=1e-9)
+    np.testing.assert_allclose(squared, ((points - closest) ** 2).sum(axis=1), atol=1e-9)
+    assert {int(count) for count in (weights > 0).sum(axis=1)} == {1, 2, 3}, "corners, sides and insides"
+
+
+def tube(around: int, along: int) -> TriangleMesh:
+    t, x = np.meshgrid(np.arange(around) * 2 * np.pi / around, np.linspace(-2, 2, along), indexing="ij")
+    t = t + 0.2 * x  # no vertex of the coarse one is above another
+    vertices = np.stack([x, 0.4 * np.cos(t), 0.4 * np.sin(t)], -1).reshape(-1, 3)
+    return TriangleMesh.from_arrays(vertices, grid_faces(around, along, around_u=True, around_v=False)[:, ::-1])
+
+
+def test_a_bent_limb_stays_round():
+    fine, coarse = tube(32, 65), tube(8, 17)
+    prolong = Prolongation.of(coarse, fine)
+    angle, radius = 2.0, 4 / 2.0
+    found, exact = prolong(bent(coarse.vertices, angle)), bent(fine.vertices, angle)
+    ring = np.hypot(found[:, 0], found[:, 2] - radius)  # distance from the centre of the bend
+    around = np.hypot(ring - radius, found[:, 1])  # and from the limb's axis
+    inner = np.abs(fine.vertices[:, 0]) < 1.7
+    np.testing.assert_allclose(around[inner], 0.4, atol=0.012)
+    assert np.linalg.norm(found - exact, axis=1)[inner].max() < 0.015
+    # Flat facets would be this far inside.
+    assert 0.4 * (1 - np.cos(np.pi / 8)) > 0.03
+
+
+def test_neighbours_in_space_that_are_far_on_the_surface_do_not_stick():
+    """A strip folded back onto itself, the ends almost touching, opens up."""
+    fine, coarse = strip(61, 7), strip(16, 4)
+    closed, opened = (fold(mesh, gap) for mesh, gap in ((fine, 0.02), (fine, 3.0)))
+    prolong = Prolongation.of(fold(coarse, 0.02), closed)
+    found = prolong(fold(coarse, 3.0).vertices)
+    halves = np.abs(fine.vertices[:, 0]) > 0.6
+    assert np.linalg.norm(found - opened.vertices, axis=1)[halves].max() < 0.2
+
+
+def strip(n: int, m: int) -> TriangleMesh:
+    x, y = np.meshgrid(np.linspace(-2, 2, n), np.linspace(0, 1, m), indexing="ij")
+    faces = grid_faces(n, m, around_u=False, around_v=False)
+    return TriangleMesh.from_arrays(np.stack([x, y, 0 * x], -1).reshape(-1, 3), faces)
+
+
+def fold(mesh: TriangleMesh, gap: float) -> TriangleMesh:
+    """Both halves of a strip lie above one another, ``gap`` apart; the bend is a step of that height."""
+    x, y, _ = mesh.vertices.T
+    # Waves that the coarse strip misses: to each half, the other one's coarse faces come closer than its own.
+    z = gap / 2 * np.tanh(8 * x) + 0.05 * np.sin(3 * np.pi * y)
+    return mesh.with_vertices(np.stack([np.sqrt(x**2 + 0.01), y, z], axis=1))
+
+
+def test_many_shapes_are_each_of_them(pair, shape):
+    shapes = np.stack([pair.fine.vertices, shape])[:, pair.index]
+    both = pair.prolong(shapes)
+    assert np.array_equal(both, np.stack([pair.prolong(x) for x in shapes]))
+
+
+def test_errors_are_distances_to_the_true_shapes(pair, shape, move):
+    fine = np.stack([pair.fine.vertices, shape])
+    coarse = fine[:, pair.index]
+    errors = pair.prolong.errors(coarse, np.stack([move(x) for x in fine]))
+    distances = np.linalg.norm(align(pair.prolong(coarse[1]), shape) - shape, axis=1)
+    distances = distances / np.linalg.norm(np.ptp(shape, axis=0))
+    assert 0 < errors["mean"] < 0.01
+    plain = pair.prolong.errors(coarse, fine)
+    assert plain["max"] == pytest.approx(distances.max(), rel=1e-9)
+    assert plain["mean"] == pytest.approx(distances.mean() / 2, rel=1e-9)
+
+
+def test_a_file_gives_it_back(pair, shape):
+    file = io.BytesIO()
+    np.savez(file, vertices=pair.coarse.vertices, **pair.prolong.arrays())
+    file.seek(0)
+    with np.load(file, allow_pickle=False) as arrays:
+        again = Prolongation.from_arrays(arrays)
+    assert all(name.startswith("prolongation_") for name in pair.prolong.arrays())
+    assert np.array_equal(again(shape[pair.index]), pair.prolong(shape[pair.index]))
+    assert again.vertex_count == len(pair.fine.vertices)
+
+
+def changed(**changes):
+    """Arrays of a small prolongation with functions applied to some of them."""
+    fine = MESHES["closed"]()
+    arrays = Pair(fine).prolong.arrays()
+    for name, change in changes.items():
+        change(arrays[f"prolongation_{name}"])
+    return arrays
+
+
+def put(index, value):
+    return lambda array: array.__setitem__(index, value)
+
+
+REFUSALS = {
+    "face out of place": ({"faces": put((0, 0), -1)}, "prolongation_faces: faces name vertices -1"),
+    "index too large": ({"indices": put(5, 80)}, r"prolongation_indices must lie in \[0, 80\), but reach 0 to 80"),
+    "index negative": ({"indices": put(5, -1)}, "but reach -1 to"),
+    "rows out of order": ({"indptr": put(1, 9999)}, "prolongation_indptr must rise from 0"),
+    "rows end early": ({"indptr": put(-1, 3)}, "prolongation_indptr must rise from 0"),
+    "weight not finite": ({"weights": put(4, np.nan)}, "prolongation_weights has an entry that is not finite"),
+    "weight too large": ({"weights": put(0, 7.0)}, "the weights of fine vertex 0 sum up to"),
+}
+
+
+@pytest.mark.parametrize("case", REFUSALS)
+def test_arrays_that_are_no_prolongation_are_refused(case):
+    changes, message = REFUSALS[case]
+    with pytest.raises(ProlongationError, match=message):
+        Prolongation.from_arrays(changed(**changes))
+
+
+def test_arrays_of_another_form_are_refused():
+    arrays = changed()
+    for name in arrays:
+        with pytest.raises(ProlongationError, match=f"there is no array {name}"):
+            Prolongation.from_arrays({key: array for key, array in arrays.items() if key != name})
+        with pytest.raises(ProlongationError, match=f"{name} must be a"):
+            Prolongation.from_arrays(arrays | {name: arrays[name][None]})
+        with pytest.raises(ProlongationError, match=f"{name} must be a"):
+            Prolongation.from_arrays(arrays | {name: arrays[name].astype(complex)})
+    with pytest.raises(ProlongationError, match="prolongation_indices for"):
+        Prolongation.from_arrays(arrays | {"prolongation_weights": arrays["prolongation_weights"][:-1]})

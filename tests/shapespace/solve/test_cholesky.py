@@ -1,0 +1,263 @@
+"""Both Cholesky backends beside dense algebra, on the normal matrices they are made for."""
+
+import importlib.util
+
+import numpy as np
+import pytest
+from scipy import sparse
+
+from shapespace.coordinates.normal_matrix import NormalMatrix, QuadraticForm
+from shapespace.coordinates.nric import NRICJacobian, WeightedNorm
+from shapespace.mesh.triangle_mesh import TriangleMesh
+from shapespace.solve.cholesky import (
+    BandedCholesky,
+    NotPositiveDefiniteError,
+    PardisoCholesky,
+    SymmetricPattern,
+    analyse,
+)
+from tests.shapespace.conftest import MESHES, bent
+
+BACKENDS = ["banded", "pardiso"]
+
+
+@pytest.fixture(params=BACKENDS)
+def backend(request):
+    return request.param
+
+
+@pytest.fixture
+def pattern(rng):
+    """About four entries a row, and rows of only a diagonal."""
+    rows, columns = rng.integers(0, 35, (2, 80))
+    return SymmetricPattern(40, rows, columns)
+
+
+@pytest.fixture
+def positive(pattern, rng):
+    """A function that draws entries of a positive definite matrix: by dominance of the diagonal."""
+
+    def draw():
+        entries = rng.standard_normal(len(pattern))
+        entries[pattern.diagonal] = 1 + np.abs(pattern.matrix(entries)).sum(axis=1)
+        return entries
+
+    return draw
+
+
+def normal_matrix(name, form_of=None, pose=None):
+    mesh = MESHES[name]()
+    pose = bent(mesh.vertices, 0.7) if pose is None else pose
+    form = WeightedNorm.of(mesh, 1e-2) if form_of is None else form_of(mesh)
+    jacobian = NRICJacobian(mesh.connectivity)
+    normal = NormalMatrix(mesh.connectivity)
+    return normal, normal.entries(jacobian.gradients(pose), form), jacobian(pose), form, mesh
+
+
+# ---------------------------------------------------------------- pattern
+
+
+def test_contributions_add_up_and_those_below_the_diagonal_are_mirrored():
+    pattern = SymmetricPattern(3, np.array([0, 1, 1, 0, 2]), np.array([1, 0, 1, 1, 2]))
+    entries = pattern.scatter(np.array([1.0, 10, 5, 100, 7]))
+    assert pattern.matrix(entries).toarray().tolist() == [[0, 111, 0], [111, 5, 0], [0, 0, 7]]
+    # (0, 0) is there although nothing was contributed.
+    assert len(pattern) == 4
+    assert pattern.rows.tolist() == [0, 0, 1, 2]
+    assert pattern.indices.tolist() == [0, 1, 1, 2]
+    assert pattern.indptr.tolist() == [0, 2, 3, 4]
+    assert pattern.diagonal.tolist() == [0, 2, 3]
+
+
+def test_scattering_is_the_sum_that_scipy_makes(pattern, rng):
+    rows, columns = rng.integers(0, 40, (2, 300))
+    pattern = SymmetricPattern(40, rows, columns)
+    values = rng.standard_normal(300)
+    one = sparse.coo_array((values, (rows, columns)), shape=(40, 40)).toarray()
+    expected = one + one.T - np.diag(np.diag(one))
+    np.testing.assert_allclose(pattern.matrix(pattern.scatter(values)).toarray(), expected, atol=1e-14)
+
+
+# ---------------------------------------------------------------- solving
+
+
+def test_solutions_are_those_of_dense_algebra(backend, pattern, positive, rng):
+    cholesky = analyse(pattern, backend)
+    for _ in range(5):
+        entries, right = positive(), rng.standard_normal(40)
+        kept = right.copy()
+        cholesky.factorise(entries)
+        expected = np.linalg.solve(pattern.matrix(entries).toarray(), right)
+        np.testing.assert_allclose(cholesky.solve(right), expected, rtol=1e-10, atol=1e-13)
+        assert np.array_equal(right, kept)
+
+
+def test_several_right_hand_sides_at_once(backend, pattern, positive, rng):
+    cholesky = analyse(pattern, backend)
+    entries, right = positive(), rng.standard_normal((3, 40))
+    cholesky.factorise(entries)
+    dense = pattern.matrix(entries).toarray()
+    for rows in (right, np.asfortranarray(right), right[:1], rng.integers(-5, 5, (2, 40))):
+        found = cholesky.solve(rows)
+        assert found.shape == rows.shape
+        np.testing.assert_allclose(found, np.linalg.solve(dense, rows.T).T, rtol=1e-10, atol=1e-13)
+
+
+@pytest.mark.parametrize("name", MESHES)
+def test_backends_agree_on_normal_matrices(name, rng):
+    normal, entries, *_ = normal_matrix(name)
+    # Orthogonal to translations, as forces are: what is left is well conditioned enough to compare.
+    right = rng.standard_normal((normal.pattern.size // 3, 3))
+    right = (right - right.mean(axis=0)).ravel()
+    entries[normal.pattern.diagonal] *= 1 + 1e-4
+    dense = np.linalg.solve(normal.pattern.matrix(entries).toarray(), right)
+    for backend in BACKENDS:
+        cholesky = analyse(normal.pattern, backend)
+        cholesky.factorise(entries)
+        assert np.linalg.norm(cholesky.solve(right) - dense) < 1e-8 * np.linalg.norm(dense)
+
+
+def test_one_analysis_serves_many_factors_side_by_side(backend, pattern, positive, rng):
+    cholesky = analyse(pattern, backend, factors=3)
+    matrices = [positive() for _ in range(3)]
+    right = rng.standard_normal(40)
+
+    def check():
+        for number, entries in enumerate(matrices):
+            expected = np.linalg.solve(pattern.matrix(entries).toarray(), right)
+            np.testing.assert_allclose(cholesky.solve(right, number), expected, rtol=1e-10, atol=1e-13)
+
+    for number, entries in enumerate(matrices):
+        given = entries.copy()
+        cholesky.factorise(given, number)
+        given[:] = np.nan  # a factor doesn't depend on what becomes of its matrix
+    check()
+    matrices[1] = positive()
+    cholesky.factorise(matrices[1], 1)
+    check()
+
+
+def test_two_analyses_do_not_meet(backend, pattern, positive, rng):
+    first, second = (analyse(pattern, backend) for _ in range(2))
+    a, b, right = positive(), positive(), rng.standard_normal(40)
+    first.factorise(a)
+    second.factorise(b)
+    expected = np.linalg.solve(pattern.matrix(a).toarray(), right)
+    del second
+    np.testing.assert_allclose(first.solve(right), expected, rtol=1e-10, atol=1e-13)
+
+
+def test_at_the_end_of_python_mkl_is_left_alone(pattern, positive):
+    """Its library may be gone before the factors are."""
+    cholesky = PardisoCholesky(pattern)
+    entries = positive()
+    cholesky.factorise(entries)
+    cholesky.__del__(finalizing=lambda: True)
+    np.testing.assert_allclose(pattern.matrix(entries) @ cholesky.solve(np.ones(40)), 1, rtol=1e-10)
+
+
+# ---------------------------------------------------------------- refusals
+
+
+@pytest.mark.parametrize("place", [0, 17, 39])
+@pytest.mark.parametrize("value", [-1.0, np.nan, np.inf], ids=["negative", "nan", "inf"])
+def test_what_has_no_factor_is_refused_and_harms_no_other(backend, pattern, positive, rng, place, value):
+    cholesky = analyse(pattern, backend, factors=2)
+    good, right = positive(), rng.standard_normal(40)
+    cholesky.factorise(good, 1)
+    bad = positive()
+    bad[pattern.diagonal[place]] = value
+    with pytest.raises(NotPositiveDefiniteError):
+        cholesky.factorise(bad, 0)
+    for number in (1, 0):
+        expected = np.linalg.solve(pattern.matrix(good).toarray(), right)
+        np.testing.assert_allclose(cholesky.solve(right, number), expected, rtol=1e-10, atol=1e-13)
+        cholesky.factorise(good, 0)
+
+
+def test_an_indefinite_matrix_of_positive_diagonal_is_refused(backend):
+    pattern = SymmetricPattern(2, np.array([0]), np.array([1]))
+    with pytest.raises(NotPositiveDefiniteError):
+        analyse(pattern, backend).factorise(np.array([1.0, 2.0, 1.0]))
+
+
+def test_a_hidden_entry_that_is_not_finite_is_named(backend, pattern, positive):
+    entries = positive()
+    entries[np.setdiff1d(np.arange(len(pattern)), pattern.diagonal)[3]] = np.nan
+    with pytest.raises(NotPositiveDefiniteError, match="not finite"):
+        analyse(pattern, backend).factorise(entries)
+
+
+def test_solving_comes_after_factorising(backend, pattern, positive):
+    cholesky = analyse(pattern, backend, factors=2)
+    with pytest.raises(RuntimeError, match="factorise first"):
+        cholesky.solve(np.ones(40))
+    cholesky.factorise(positive())
+    with pytest.raises(RuntimeError, match="factorise first"):
+        cholesky.solve(np.ones(40), 1)
+
+
+def test_pardiso_is_taken_where_it_is_installed(pattern, monkeypatch):
+    assert isinstance(analyse(pattern, "banded"), BandedCholesky)
+    assert isinstance(analyse(pattern, "pardiso"), PardisoCholesky)
+    assert isinstance(analyse(pattern), PardisoCholesky)
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    assert isinstance(analyse(pattern), BandedCholesky)
+
+
+# ---------------------------------------------------------------- JᵀHJ
+
+
+def any_form(mesh):
+    """Blocks that couple the lengths of a face, other weights everywhere."""
+    rng = np.random.default_rng(3)
+    c = mesh.connectivity
+    roots = rng.standard_normal((3, 3, len(c.faces)))
+    return QuadraticForm(
+        np.einsum("ikf,jkf->ijf", roots, roots), np.where(c.interior, rng.uniform(0.5, 2, c.edge_count), 0)
+    )
+
+
+def assert_is_product(entries, normal, jacobian, weights):
+    product = (jacobian.T @ weights @ jacobian).toarray()
+    found = normal.pattern.matrix(entries).toarray()
+    np.fill_diagonal(product, np.diag(product) + normal.REGULARISATION * np.diag(product).mean())
+    np.testing.assert_allclose(found, product, rtol=0, atol=1e-13 * np.abs(product).max())
+
+
+@pytest.mark.parametrize("name", MESHES)
+def test_the_normal_matrix_of_a_norm_is_the_sparse_product(name):
+    normal, entries, jacobian, _, mesh = normal_matrix(name)
+    assert_is_product(entries, normal, jacobian, sparse.diags_array(WeightedNorm.of(mesh, 1e-2).squared))
+
+
+@pytest.mark.parametrize("name", MESHES)
+def test_the_normal_matrix_of_any_form_is_the_sparse_product(name):
+    normal, entries, jacobian, form, mesh = normal_matrix(name, any_form)
+    e = mesh.connectivity.edge_count
+    weights = sparse.lil_array((2 * e, 2 * e))
+    for f, edges in enumerate(mesh.connectivity.face_edges):
+        for i in range(3):
+            for j in range(3):
+                weights[edges[i], edges[j]] += form.faces[i, j, f]
+    weights.setdiag(weights.diagonal() + np.concatenate([np.zeros(e), form.angles]))
+    assert_is_product(entries, normal, jacobian, weights.tocsr())
+
+
+def test_the_pattern_stays_where_entries_cancel(backend):
+    """A flat square along the axes: angles feel z only, and sparse products would drop the rest."""
+    flat = TriangleMesh.from_arrays([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], [[0, 1, 2], [0, 2, 3]])
+    normal = NormalMatrix(flat.connectivity)
+    jacobian = NRICJacobian(flat.connectivity)
+    form = WeightedNorm.of(flat, 1.0)
+    symmetric = normal.entries(jacobian.gradients(flat.vertices), form)
+    assert len(symmetric) == len(normal.pattern) == 12 * 13 / 2
+    assert (symmetric == 0).sum() > 20
+    # One analysis serves this and every other shape.
+    cholesky = analyse(normal.pattern, backend)
+    other = flat.vertices + 0.1 * np.random.default_rng(0).standard_normal((4, 3))
+    for shape in (flat.vertices, other, flat.vertices):
+        entries = normal.entries(jacobian.gradients(shape), form)
+        cholesky.factorise(entries)
+        right = normal.pattern.matrix(entries) @ np.arange(12.0)
+        assert np.abs(normal.pattern.matrix(entries) @ cholesky.solve(right) - right).max() < 1e-6

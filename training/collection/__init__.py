@@ -1,0 +1,1 @@
+"""Collections: mesh files read and checked, and synthetic ones generated."""

@@ -1,0 +1,125 @@
+"""The command's ``init``: a configuration with comments for a folder of meshes, with values chosen from them."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import unicodedata
+from pathlib import Path
+
+from shapespace.training.collection.ingest import MeshCollection, read_collection
+from shapespace.training.runs.config import (
+    CollectionSettings,
+    CombinerSettings,
+    ConfigError,
+    LatentNetworkSettings,
+    MaterialSettings,
+    ModeSettings,
+    SampleSettings,
+)
+
+TEMPLATE = """\
+# {title}: {shapes} shapes of {vertices} vertices and {faces} faces.
+# A line such as "# seed = 0" shows a default: take its # away to change it.
+
+[collection]
+data = {data}    # folder of meshes, or one NPZ; relative to this file
+# The shape whose area becomes 1 inside, and where served shapes stand: the most central one, {reference},
+# unless another is named here, as in: reference = {other}
+{coarse}
+
+[material]
+# eta = {material.eta:g}    # bending against stretching; larger makes stiffer shells, whose triangles may collapse
+
+[modes]
+count = {modes}    # numbers that describe a shape, {most} at most; more keep finer detail and take longer
+# sparsity = {mode.sparsity:g}    # larger makes each mode move a smaller part; 0 is principal geodesic analysis
+
+[factors]
+# count = 4    # groups of modes with a network each; left out, it follows from how much the modes overlap
+
+[samples]
+# count = {sample.count}    # shapes computed to learn from, most of a run's time; a tenth does for a first try
+# seed = {sample.seed}    # another number draws others
+
+[networks.factors]
+# hidden = {factor.hidden}    # layers of each factor's network; wider where the report shows a low R² of factors
+
+[networks.combiner]
+# kernel = {combiner.kernel}    # principal coefficients of each factor that decide how the factors join
+
+[export]
+name = {name}    # in addresses and file names: small letters, digits and hyphens
+title = {title}    # what people see
+description = {description}
+licence = "unspecified"    # of the meshes, and so of the model: say it before you pass the bundle on
+"""
+
+
+def configuration(collection: MeshCollection, data: str, title: str) -> str:
+    """TOML text for a collection.
+
+    Args:
+        collection: read from ``data``.
+        data: as the configuration names the meshes.
+        title: for people; the bundle's name is made from it.
+    """
+    count, vertices = collection.vertices.shape[:2]
+    target = CollectionSettings().coarse_vertices
+    coarse = (
+        f"coarse_vertices = {target}    # vertices to compute with; more take longer, 0 takes all {vertices}"
+        if vertices > target
+        else f"# coarse_vertices = {target}    # vertices to compute with, where there are more than that"
+    )
+    return TEMPLATE.format(
+        shapes=count,
+        vertices=vertices,
+        faces=len(collection.faces),
+        data=_string(data),
+        reference=_string(collection.names[collection.central]),
+        other=_string(collection.names[0]),
+        coarse=coarse,
+        material=MaterialSettings(),
+        modes=min(ModeSettings().count, count - 1),
+        most=count - 1,
+        mode=ModeSettings(),
+        sample=SampleSettings(),
+        factor=LatentNetworkSettings(),
+        combiner=CombinerSettings(),
+        name=_string(slug(title)),
+        title=_string(title),
+        description=_string(f"Learned from {count} shapes."),
+    )
+
+
+def write(meshes: Path, out: Path | None = None, *, force: bool = False) -> tuple[Path, MeshCollection]:
+    """Read a collection and write its configuration, by default under its name into the working directory.
+
+    Raises:
+        IngestError: the collection can't be used.
+        ConfigError: the file is there already, and no ``force``, or can't be written.
+    """
+    full = meshes.resolve()
+    title = (full.stem if full.is_file() else full.name) or "shapes"
+    out = out or Path(f"{title}.toml")
+    if out.exists() and not force:
+        raise ConfigError(f"{out}: is there already; --force replaces it, --out FILE.toml writes another")
+    collection = read_collection(meshes)
+    data = Path(os.path.relpath(full, out.parent.resolve())).as_posix()
+    try:
+        out.write_bytes(configuration(collection, data, title).encode())
+    except (OSError, UnicodeEncodeError) as error:
+        raise ConfigError(f"{out}: can't be written: {error}") from error
+    return out, collection
+
+
+def slug(title: str) -> str:
+    """A bundle's name from any text: small letters, digits and hyphens."""
+    plain = unicodedata.normalize("NFKD", title).encode("ascii", "ignore").decode().lower()
+    return re.sub(r"[^a-z0-9]+", "-", plain).strip("-") or "shapes"
+
+
+def _string(text: str) -> str:
+    # JSON's strings are TOML's too, save for DEL.
+    return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")

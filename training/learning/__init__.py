@@ -1,0 +1,1 @@
+"""The networks: factors, combiners, fitting, evaluation, export."""

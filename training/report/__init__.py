@@ -1,0 +1,1 @@
+"""What a run shows people: pictures, plots and the page of a run."""

@@ -1,0 +1,93 @@
+"""Pictures of a run's shapes as elements of its report, and the colours of the whole report."""
+
+from __future__ import annotations
+
+import base64
+import importlib.util
+import io
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from markupsafe import Markup
+from matplotlib.colors import Colormap, LinearSegmentedColormap, to_hex, to_rgb
+from numpy.typing import NDArray
+from PIL import Image
+
+from shapespace.arrays import FloatArray, IntArray
+from shapespace.mesh.rigid_motion import align
+from shapespace.training.report.record import Record
+from shapespace.training.report.rendering import Camera
+
+#: Largest displacement at which a mode is shown, in diagonals.
+MODE_REACH = 0.1
+#: What shapes are made of: as they are, as the networks have them (yellow in the paper too), and without a factor.
+CLAY, COMPOSITE, NEUTRAL = "#d3ccc1", "#e3b23c", "#4b5a6b"
+ERROR = LinearSegmentedColormap.from_list("error", [CLAY, "#f2c14e", "#e4572e", "#8f1440"])
+
+
+@dataclass(frozen=True)
+class Studio:
+    """Draws the shapes of one run, all with one camera.
+
+    Attributes:
+        camera: sees every shape of the run.
+        base: (V, 3) shape that the others are aligned to.
+        faces: (F, 3).
+    """
+
+    camera: Camera
+    base: FloatArray
+    faces: IntArray
+
+    @classmethod
+    def of(cls, record: Record) -> Studio | None:
+        """Set up the camera; None where there is no shape to draw, or nothing to draw with."""
+        if record.base is None or importlib.util.find_spec("embreex") is None:
+            return None
+        base, faces = record.base.astype(np.float64), record.reference["faces"]
+        names = {"test_exact", "test_predicted", "strip_joint", "strip_factors"} & record.gallery.keys()
+        shapes = [align(record.gallery[name].reshape(-1, *base.shape), base) for name in sorted(names)]
+        return cls(Camera.facing(base, faces, np.concatenate([base[None], *shapes])), base, faces)
+
+    def closer(self, reference: FloatArray) -> Studio:
+        """The same view without the room that far-reaching shapes need: for the base, the reference and modes."""
+        points = np.concatenate([self.base, align(reference, self.base)])
+        return replace(self, camera=self.camera.framing(points, 1.2 * MODE_REACH))
+
+    def pixels(
+        self, shape: FloatArray, size: int, colours: Any = CLAY, faces: IntArray | None = None, *, smooth: bool = True
+    ) -> NDArray[np.uint8]:
+        """A picture (h, w, 4) of a shape (V, 3), or several (T, V, 3) side by side; colours are a name or (…, V, 3)."""
+        faces = self.faces if faces is None else faces
+        shapes = shape.reshape(-1, *shape.shape[-2:])
+        tints = np.broadcast_to(to_rgb(colours) if isinstance(colours, str) else colours, shapes.shape)
+        pictures = [self.camera.render(x, faces, c, size, smooth=smooth) for x, c in zip(shapes, tints, strict=True)]
+        return np.concatenate(pictures, axis=1)
+
+    def draw(self, shape: FloatArray, alt: str, size: int, *how: Any, **more: Any) -> Markup:
+        """The same as an image element."""
+        pixels = self.pixels(shape, size, *how, **more)
+        file = io.BytesIO()
+        Image.fromarray(pixels).save(file, format="WEBP", quality=84)
+        height, width = pixels.shape[:2]
+        return Markup('<img src="data:image/webp;base64,{}" width="{}" height="{}" alt="{}">').format(
+            base64.b64encode(file.getvalue()).decode(), width, height, alt
+        )
+
+
+def ramp(hue: str) -> Colormap:
+    """Colours from clay to a hue; in the middle more of it than on a straight line, where it would look muddy."""
+    middle = 0.35 * np.array(to_rgb(CLAY)) + 0.65 * np.array(to_rgb(hue))
+    return LinearSegmentedColormap.from_list(hue, [to_rgb(CLAY), tuple(middle), to_rgb(hue)])
+
+
+def tint(colours: Colormap, values: FloatArray) -> FloatArray:
+    """Colours (…, 3) of values between 0 and 1."""
+    return np.asarray(colours(np.nan_to_num(values).clip(0, 1)))[..., :3]
+
+
+def colour_bar(colours: Colormap, *labels: str) -> dict[str, Any]:
+    """A legend: a CSS gradient, and labels evenly along it."""
+    stops = ", ".join(to_hex(colours(x)) for x in np.linspace(0, 1, 9))
+    return {"gradient": f"linear-gradient(90deg, {stops})", "labels": labels}

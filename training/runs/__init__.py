@@ -1,0 +1,1 @@
+"""A run: configuration, stages, what they leave, and the workers that compute."""

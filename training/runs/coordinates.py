@@ -1,0 +1,33 @@
+"""Latent coordinates: the box they live in and which of them close up."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from shapespace.arrays import FloatArray
+
+
+@dataclass(frozen=True)
+class Coordinates:
+    """Bounds and periods of m latent coordinates.
+
+    Attributes:
+        lower, upper: (m,) bounds of the hypercube.
+        period: (m,) period, NaN for coordinates without one.
+    """
+
+    lower: FloatArray
+    upper: FloatArray
+    period: FloatArray
+
+    def __getitem__(self, index: list[int]) -> Coordinates:
+        return Coordinates(self.lower[index], self.upper[index], self.period[index])
+
+    def __len__(self) -> int:
+        return len(self.lower)
+
+    def uniform(self, count: int, rng: np.random.Generator) -> FloatArray:
+        """Codes (count, m) uniform in the hypercube."""
+        return rng.uniform(self.lower, self.upper, (count, len(self)))

@@ -1,0 +1,177 @@
+"""What each stage of a run gave up, in sentences, from what it left in the run directory."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shapespace.training.runs.sampling import DONE, columns
+
+#: A larger share of logarithms or samples lost stops the run.
+MOST_LOST = 0.25
+#: By so much of the box codes that are lost lie farther out in a factor where it is named.
+CLEARLY = 0.05
+#: Names in a sentence.
+NAMED = 6
+
+COARSER = (
+    "more collection.coarse_vertices or a larger material.eta, as the usual cause are thin or folded parts of the "
+    "coarse mesh"
+)
+
+
+class LostTooMuchError(RuntimeError):
+    """A stage gave up more than is worth going on with; what it did stays, and the message says how to go on."""
+
+
+@dataclass(frozen=True)
+class Loss:
+    """One thing that a stage gave up.
+
+    Attributes:
+        sentence: what, how much, and where.
+        share: of the logarithms or samples that are lost; 0 of what nothing stops for.
+        advice: what may help, where the share is large.
+    """
+
+    sentence: str
+    share: float = 0.0
+    advice: str = ""
+
+    @property
+    def too_much(self) -> bool:
+        """Whether the run should stop."""
+        return self.share > MOST_LOST
+
+
+def losses(folder: Path, stage: str) -> list[Loss]:
+    """What a stage that is done gave up; nothing of a stage that found nothing."""
+    return _STAGES[stage](folder) if stage in _STAGES else []
+
+
+def refuse(stage: str, lost: list[Loss], command: str = "") -> None:
+    """Stop a run that has lost too much.
+
+    Raises:
+        LostTooMuchError: with what was lost, what may help, and the command that goes on all the same.
+    """
+    grave = [loss for loss in lost if loss.too_much]
+    if grave:
+        why = "; ".join(loss.sentence for loss in grave)
+        advice = "; ".join(dict.fromkeys(loss.advice for loss in grave))
+        raise LostTooMuchError(
+            f"stopped after {stage}: {why}, more than a quarter, and what is learned from the rest is worth little.\n"
+            f"What may help: {advice}." + (f"\nTo go on all the same: {command}" if command else "")
+        )
+
+
+def _json(path: Path) -> dict[str, Any]:
+    return dict(json.loads(path.read_text(encoding="utf-8"))) if path.exists() else {}
+
+
+def _some(names: list[str]) -> str:
+    more = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
+    return ", ".join(names[:NAMED]) + more
+
+
+def _ingest(folder: Path) -> list[Loss]:
+    facts = _json(folder / "ingest.json")
+    sentences = [*facts.get("notes", ()), *facts.get("warnings", ())]
+    if facts.get("reason"):
+        sentences.append(f"coarse mesh: {facts['reason']}")
+    return [Loss(sentence) for sentence in sentences]
+
+
+def _modes(folder: Path) -> list[Loss]:
+    facts = _json(folder / "modes.json")
+    if "steps" not in facts:
+        return []
+    with np.load(folder / "shapes.npz") as file:
+        names = file["names"].astype(str)
+    steps, asked, found = np.array(facts["steps"]), facts["asked"], facts["modes"]
+    lost = []
+    linearised = names[steps == 0].tolist()
+    if linearised:
+        sentence = f"linearised {len(linearised)} of {len(steps)} logarithms: {_some(linearised)}"
+        lost.append(Loss(sentence, len(linearised) / len(steps), COARSER))
+    finer = names[steps > facts["log_steps"]].tolist()
+    if finer:
+        lost.append(Loss(f"twice as many steps for {len(finer)} of {len(steps)} logarithms: {_some(finer)}"))
+    if found < asked:
+        why = (
+            f"{len(steps)} shapes differ in {found} directions"
+            if found == len(steps) - 1
+            else "the others would be nought; a smaller modes.sparsity keeps more, where it isn't 0 already"
+        )
+        lost.append(Loss(f"m {found} of {asked}, because {why}"))
+    if not facts.get("converged", True):
+        lost.append(Loss("sparse modes: the iteration ended at modes.max_iterations, before it had converged"))
+    return lost
+
+
+def _samples(folder: Path) -> list[Loss]:
+    grouping = _json(folder / "factors.json")
+    advice = f"{COARSER}; or without the shapes farthest from the others, which make the box of codes large"
+    lost = []
+    kinds = {"joint": folder / "samples"}
+    kinds |= {f"{name!r}": folder / "samples" / f"factor-{j}" for j, name in enumerate(grouping.get("names", ()))}
+    for kind, path in kinds.items():
+        samples = columns(path, "asked", "latents", "status", "reason")
+        if not samples:
+            continue
+        failed = samples["status"] != DONE
+        shortened = (samples["latents"] != samples["asked"]).any(axis=1)
+        if shortened.any():
+            whose = "joint samples" if kind == "joint" else f"samples of factor {kind}"
+            where = _farthest(samples["asked"], shortened, grouping) if kind == "joint" else ""
+            sentence = f"shortened {shortened.sum()} of {len(failed)} codes of {whose} until they had a shape{where}"
+            lost.append(Loss(sentence, float((shortened | failed).mean()), advice))
+        if not failed.any():
+            continue
+        reason, _ = Counter(str(r).partition(":")[0] for r in samples["reason"][failed]).most_common(1)[0]
+        if kind == "joint":
+            where = _farthest(samples["latents"], failed, grouping)
+            sentence = f"failed {failed.sum()} of {len(failed)} joint samples ({reason}){where}"
+        else:
+            sentence = f"failed {failed.sum()} of {len(failed)} samples of factor {kind} ({reason})"
+        lost.append(Loss(sentence, float(failed.mean()), advice))
+    return lost
+
+
+def _farthest(latents: NDArray, failed: NDArray, grouping: dict[str, Any]) -> str:
+    """The factor in which lost codes lie clearly farther out than the others, if there is one."""
+    names, factors = grouping.get("names", []), grouping.get("factors", [])
+    if len(factors) < 2 or failed.all():
+        return ""
+    reach = np.abs(latents) / np.abs(latents).max(axis=0).clip(1e-300)
+    by_factor = np.stack([reach[:, members].max(axis=1) for members in factors], axis=1)
+    excess = by_factor[failed].mean(axis=0) - by_factor[~failed].mean(axis=0)
+    return f", most in factor {names[int(excess.argmax())]!r}" if excess.max() > CLEARLY else ""
+
+
+def _evaluation(folder: Path) -> list[Loss]:
+    figures = _json(folder / "evaluation.json")
+    lost = []
+    statuses = figures.get("vertex_error", {}).get("status", {})
+    stalled, count = sum(n for status, n in statuses.items() if status != "converged"), sum(statuses.values())
+    if stalled:
+        lost.append(Loss(f"{stalled} of {count} test shapes were not quite found from their lengths and angles"))
+    total = figures.get("r2", {}).get("composite", {}).get("total", 1.0)
+    if not total > 1 - MOST_LOST:
+        lost.append(Loss(f"the networks miss much: R² {total:.2f}; a larger samples.count may help"))
+    return lost
+
+
+_STAGES: dict[str, Callable[[Path], list[Loss]]] = {
+    "ingest": _ingest,
+    "modes": _modes,
+    "samples": _samples,
+    "evaluation": _evaluation,
+}

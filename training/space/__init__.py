@@ -1,0 +1,1 @@
+"""The space of a collection: its mean, logarithms, modes and factors."""

@@ -1,0 +1,392 @@
+"""Principal geodesic analysis, plain and sparse: the directions in which the shapes of a collection differ.
+
+The shapes z^i are carried to the tangent space at their mean z̄ by the discrete logarithm, v^i = log_z̄ z^i, and a few
+modes u_j are sought whose combinations come close to them (paper, section 3). Everything is computed in vertex fields d
+(V, 3), of which ``u = J d`` with ``J = Dz(X̄)`` are the changes of lengths and angles: then u is tangent whatever d is,
+and the metric is one sparse matrix, ``g(u, u') = dᵀ M d'`` with ``M = ½ Jᵀ Hess₂W[z̄, z̄] J``.
+
+The logarithms are not centred. The mean is the point that the modes start from, and the logarithms at the Riemannian
+centre of mass sum to nothing; at the elastic mean nearly so.
+
+**Sparse modes.** Minimise over tangent u_j and coefficients w
+
+    ‖V − U W‖_g² + λ Σ_j ‖u_j‖_{1,z̄},   |w_j|_∞ ≤ 1,   ‖u‖_{1,z̄} = Σ_e |u_l| / l̄ + η l̄ a^{-1/2} |u_θ|,
+
+the norm that the paper gives for p = 1. The problem is convex in each mode and in W, not in both, so one block after
+the other is solved and the objective never rises.
+
+- A mode u_j alone asks for the tangent vector that minimises ``|w_j|² ‖u − t‖_g² + λ ‖u‖_1``, with t what the other
+  modes leave. ADMM splits u = J d from z = u: d solves ``(M + Jᵀ G J) d = …``, with G the diagonal of the metric, and
+  z is a soft threshold. The matrix is the same for all modes and all iterations because the penalty G is scaled
+  with |w_j|² like the rest: it is factorised once. A few iterations are enough, as z and its multiplier are kept.
+- W is least squares in a box, a small problem for each shape, by coordinate descent.
+
+The start is the modes of the plain analysis rotated among themselves to be as concentrated as they can (varimax):
+at λ = 0 that is a minimum already, and it ends as low as a start from localised pieces and sooner than one from the
+modes as they are.
+
+What sparsity costs and brings, share explained / mean share of edges that carry 95 % of a mode, measured at η = 1e-4 on
+a hand (57 poses, m = 12), a captured dancer (60, m = 20) and a posed body (44, m = 20):
+
+| sparsity | hand | dancer | body |
+|---|---|---|---|
+| plain | 0.983 / 0.20 | 0.943 / 0.38 | 0.969 / 0.31 |
+| 0.03 | 0.980 / 0.07 | 0.939 / 0.28 | |
+| 0.1 (default) | 0.970 / 0.06 | 0.916 / 0.20 | 0.917 / 0.04 |
+| 0.2 | | 0.878 / 0.14 | |
+| 0.3 | 0.929 / 0.05 | 0.837 / 0.11 | |
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+
+from shapespace.arrays import FloatArray
+from shapespace.coordinates.normal_matrix import NormalMatrix, QuadraticForm
+from shapespace.coordinates.nric import WeightedNorm
+from shapespace.mesh.rigid_motion import without_rigid_motion
+from shapespace.shell.space import Point, ShellSpace
+from shapespace.solve.cholesky import analyse
+
+#: λ as a share of the price at which the strongest mode of the plain analysis is no longer worth having.
+SPARSITY = 0.1
+#: Most rounds through all sparse modes.
+ITERATIONS = 200
+#: ADMM iterations on a mode before the next has its turn, and their over-relaxation.
+INNER_ITERATIONS = 10
+OVERRELAXATION = 1.6
+#: Most rounds of the rotation at the start, and of coordinate descent on the coefficients.
+VARIMAX_ITERATIONS, SWEEPS = 200, 100
+#: The objective is compared with that of so many iterations ago.
+PATIENCE = 10
+#: A mode that carries less than this of all energy is none.
+NEGLIGIBLE = 1e-9
+#: Of a mode's square, the share whose edges say how local it is.
+LOCAL = 0.95
+#: Each side of a coefficient's range reaches at least this share of the other side.
+MARGIN = 0.1
+
+
+class ModeError(ValueError):
+    """Modes that can't be computed as asked, with a sentence that says why."""
+
+
+@dataclass(frozen=True)
+class Modes:
+    """Directions in the tangent space at a mean, strongest first, and where the shapes lie along them.
+
+    Each is scaled so that the largest coefficient of a shape is 1, and positive. There may be fewer than asked for:
+    a mode that carries nothing is left out.
+
+    Attributes:
+        nric: (m, 2E) changes u_j of lengths and angles.
+        vertices: (m, V, 3) vertex fields d_j, without rigid motion, u_j = J d_j.
+        coefficients: (n, m) orthogonal projections, in the metric, of the shapes' logarithms.
+        lower, upper: (m,) the hypercube: ranges of the coefficients, widened where the mean would be at its edge.
+        explained: share of ``Σ ‖v^i‖_g²`` that the projections keep.
+        converged: whether the iteration ended by itself.
+        history: of the sparse analysis, for each iteration ``iteration, objective, misfit, penalty`` (objective =
+            misfit + penalty, as shares of ``Σ ‖v^i‖_g²``) and ``support``, the mean of ``localisation``.
+    """
+
+    nric: FloatArray
+    vertices: FloatArray
+    coefficients: FloatArray
+    lower: FloatArray
+    upper: FloatArray
+    explained: float
+    converged: bool = True
+    history: list[dict[str, float]] = field(default_factory=list, repr=False)
+
+    def __len__(self) -> int:
+        return len(self.vertices)
+
+
+def pga(space: ShellSpace, mean: FloatArray, fields: FloatArray, count: int) -> Modes:
+    """Principal geodesic analysis: the modes whose span comes closest to the logarithms in the metric.
+
+    Args:
+        space: where.
+        mean: X̄ (V, 3).
+        fields: (n, V, 3) logarithms.
+        count: m, at most n.
+
+    Raises:
+        ModeError: a count that is not possible, or fields without anything in them.
+    """
+    problem = _Problem(space, mean, fields, count)
+    return problem.modes(problem.principal(count)[0])
+
+
+def spga(
+    space: ShellSpace,
+    mean: FloatArray,
+    fields: FloatArray,
+    count: int,
+    sparsity: float,
+    *,
+    max_iterations: int = ITERATIONS,
+    tolerance: float = 1e-3,
+) -> Modes:
+    """Sparse principal geodesic analysis: localised modes that still come close to the logarithms.
+
+    ``sparsity`` does not depend on the number of shapes, on their size or on the mesh. Nothing here is random.
+
+    Args:
+        space: where; its η weighs the angles in the 1-norm, too.
+        mean: X̄ (V, 3).
+        fields: (n, V, 3) logarithms.
+        count: m, at most n.
+        sparsity: λ as a share of ``max_j 2 |w_j|² ‖u_j‖_g² / ‖u_j‖_1`` over the modes of the plain analysis, the price
+            at which the last of them, scaled down to nothing, is worth no more. 0 gives the span of the plain analysis.
+        max_iterations: rounds through all modes.
+        tolerance: ends when the objective fell by less than this part of itself in ten rounds.
+
+    Raises:
+        ModeError: a count or sparsity that is not possible, or a sparsity that leaves no mode.
+    """
+    if not 0 <= sparsity < np.inf:
+        raise ModeError(f"sparsity must be a number from 0 up, not {sparsity}")
+    problem = _Problem(space, mean, fields, count)
+    D, W = problem.principal(count)
+    price = sparsity * problem.highest_price(D, W)
+    rotation = _varimax(problem.scaled(D))
+    D, W = _normalised(rotation.T @ D, rotation.T @ W)
+    converged, history = _alternate(problem, D, W, price, max_iterations, tolerance)
+    return problem.modes(D, converged, history)
+
+
+def projected(space: ShellSpace, mean: FloatArray, fields: FloatArray, span: FloatArray) -> tuple[FloatArray, float]:
+    """The parts (n, V, 3) of fields (n, V, 3) in the span of others (k, V, 3), orthogonal in the metric.
+
+    Returns:
+        The parts, and the share of ``Σ ‖v^i‖_g²`` that they keep.
+
+    Raises:
+        ModeError: fields that can't be used.
+    """
+    problem = _Problem(space, mean, fields, 1)
+    D = without_rigid_motion(span, problem.point.vertices).reshape(len(span), -1)
+    W, explained = problem.project(D)
+    return (W.T @ D).reshape(fields.shape), explained
+
+
+def edge_magnitudes(nric: FloatArray, norm: WeightedNorm) -> FloatArray:
+    """How much each edge (…, E) has of a change (…, 2E) of lengths and angles, in a weighted norm."""
+    lengths, angles = np.split(nric**2 * norm.squared, 2, axis=-1)
+    return np.sqrt(lengths + angles)
+
+
+def localisation(nric: FloatArray, norm: WeightedNorm) -> FloatArray:
+    """The smallest part of all edges that carries LOCAL of each mode's square ``‖u_j‖²``.
+
+    Args:
+        nric: (m, 2E) modes.
+        norm: at their mean.
+
+    Returns:
+        (m,) between 1/E and 1.
+    """
+    squares = np.sort(edge_magnitudes(nric, norm) ** 2, axis=1)[:, ::-1].cumsum(axis=1)
+    return ((squares < LOCAL * squares[:, -1:]).sum(axis=1) + 1) / squares.shape[1]
+
+
+class _Problem:
+    """The tangent space at a mean with the logarithms in it, all as matrices on flat vertex fields (3V,).
+
+    Attributes:
+        D: (n, 3V) the logarithms.
+        MD: (3V, n) lowered by the metric.
+        total: ``Σ ‖v^i‖_g²``.
+        weights: (2E,) of the 1-norm.
+        diagonal: (2E,) of the metric.
+    """
+
+    def __init__(self, space: ShellSpace, mean: FloatArray, fields: FloatArray, count: int) -> None:
+        self.point: Point = space.point(mean)
+        fields = np.asarray(fields, dtype=np.float64)
+        if fields.ndim != 3 or fields.shape[1:] != self.point.vertices.shape:
+            raise ModeError(f"fields must be (n, {len(self.point.vertices)}, 3), not {fields.shape}")
+        if not np.isfinite(fields).all():
+            raise ModeError("a field has an entry that is not finite")
+        if not 1 <= count <= len(fields):
+            raise ModeError(f"the number of modes must be from 1 to the number of shapes, {len(fields)}, not {count}")
+        hessian = self.point.hessian
+        self.form = QuadraticForm(hessian.faces / 2, hessian.angles / 2)
+        self.J = space.jacobian.matrix(self.point.gradients)
+        H = _matrix(self.form, space.energy.sides, space.connectivity.edge_count)
+        self.M = sparse.csr_array(self.J.T @ H @ self.J)
+        self.diagonal: FloatArray = H.diagonal()
+        eta = space.material.eta
+        self.norm = WeightedNorm.of(space.reference.with_vertices(self.point.vertices), eta)
+        # Σ w_l |u_l| + η Σ w_θ |u_θ|, from the squares w_l² and η w_θ².
+        self.weights = np.sqrt(self.norm.squared * np.repeat([1, eta], space.connectivity.edge_count))
+        self.D = without_rigid_motion(fields, self.point.vertices).reshape(len(fields), -1)
+        self.MD = self.M @ self.D.T
+        self.total = float(np.vdot(self.D.T, self.MD))
+        if not self.total > 0:
+            raise ModeError("there are no modes: all shapes are the same as the mean")
+
+    def principal(self, count: int) -> tuple[FloatArray, FloatArray]:
+        """The strongest m modes (m, 3V), orthogonal, and coefficients (m, n), orthonormal: ``D ≈ Wᵀ modes``."""
+        values, vectors = np.linalg.eigh(self.D @ self.MD)
+        kept = np.flatnonzero(values > NEGLIGIBLE * self.total)[::-1][:count]
+        W = vectors[:, kept].T
+        return W @ self.D, W
+
+    def scaled(self, D: FloatArray) -> FloatArray:
+        """Fields (m, 3V) as lengths and angles (2E, m), in units of the metric's diagonal."""
+        return np.sqrt(self.diagonal)[:, None] * (self.J @ D.T)
+
+    def one_norms(self, D: FloatArray) -> FloatArray:
+        """``‖J d‖_1`` (m,) of fields (m, 3V)."""
+        return self.weights @ np.abs(self.J @ D.T)
+
+    def highest_price(self, D: FloatArray, W: FloatArray) -> float:
+        """The largest λ at which one of these modes is worth having: where ``(1−s)² E + s λ L`` first falls with s."""
+        D, W = _normalised(D, W)
+        energies = (W**2).sum(axis=1) * np.einsum("jx,xj->j", D, self.M @ D.T)
+        return float((2 * energies / self.one_norms(D)).max())
+
+    def project(self, D: FloatArray) -> tuple[NDArray, float]:
+        """Coefficients (m, n) of the logarithms' projections to the span of fields (m, 3V), and the share explained."""
+        B = D @ self.MD
+        W = np.linalg.lstsq(D @ (self.M @ D.T), B, rcond=NEGLIGIBLE)[0]
+        return W, float(np.vdot(W, B)) / self.total
+
+    def modes(self, D: FloatArray, converged: bool = True, history: list[dict[str, float]] | None = None) -> Modes:
+        """Project the logarithms to the span, drop what carries nothing, scale, orient and sort."""
+        D = D[np.einsum("jx,xj->j", D, self.M @ D.T) > NEGLIGIBLE * self.total / len(self.D)]
+        if not len(D):
+            raise ModeError("the sparsity is too high: no mode is left")
+        W, explained = self.project(D)
+        peaks = W[np.arange(len(W)), np.abs(W).argmax(axis=1)]
+        D, W = D * peaks[:, None], W / peaks[:, None]
+        energies = (W**2).sum(axis=1) * np.einsum("jx,xj->j", D, self.M @ D.T)
+        order = np.argsort(-energies, kind="stable")
+        D, W = D[order], W[order]
+        lower, upper = W.min(axis=1), W.max(axis=1)
+        vertices = without_rigid_motion(D.reshape(len(D), -1, 3), self.point.vertices)
+        return Modes(
+            nric=(self.J @ vertices.reshape(len(D), -1).T).T,
+            vertices=vertices,
+            coefficients=W.T,
+            lower=np.minimum(lower, -MARGIN * upper),
+            upper=np.maximum(upper, -MARGIN * lower),
+            explained=explained,
+            converged=converged,
+            history=history or [],
+        )
+
+
+def _matrix(form: QuadraticForm, sides: NDArray[np.int64], edges: int) -> sparse.csr_array:
+    """A quadratic form as a matrix (2E, 2E)."""
+    rows = np.broadcast_to(sides[:, None], form.faces.shape).ravel()
+    columns = np.broadcast_to(sides[None], form.faces.shape).ravel()
+    lengths = sparse.csr_array((form.faces.ravel(), (rows, columns)), shape=(edges, edges))
+    return sparse.csr_array(sparse.block_diag([lengths, sparse.diags_array(form.angles)], format="csr"))
+
+
+def _normalised(D: FloatArray, W: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """The same product ``Dᵀ W`` with ``|w_j|_∞ = 1``."""
+    largest = np.abs(W).max(axis=1, keepdims=True)
+    return D * largest, W / largest
+
+
+def _varimax(loadings: FloatArray) -> FloatArray:
+    """The rotation (m, m) that makes the squares of loadings (p, m) differ most (Kaiser 1958), by SVD."""
+    rotation, before = np.eye(loadings.shape[1]), 0.0
+    for _ in range(VARIMAX_ITERATIONS):
+        turned = loadings @ rotation
+        left, values, right = np.linalg.svd(loadings.T @ (turned**3 - turned * (turned**2).mean(axis=0)))
+        rotation = left @ right
+        if values.sum() < before * (1 + 1e-7):
+            break
+        before = values.sum()
+    return rotation
+
+
+class _Shrinkage:
+    """ADMM for ``argmin_d ‖d − t‖_M² + p ‖J d‖_1``, with a state for each mode that is kept between calls."""
+
+    def __init__(self, problem: _Problem, space: ShellSpace, D: FloatArray) -> None:
+        form, G = problem.form, problem.diagonal
+        faces = form.faces * (1 + np.eye(3)[:, :, None])
+        matrix = NormalMatrix(space.connectivity)
+        self._cholesky = analyse(matrix.pattern, space.backend)
+        self._cholesky.factorise(matrix.entries(problem.point.gradients, QuadraticForm(faces, 2 * form.angles)))
+        self._J, self._M = problem.J, problem.M
+        self._JtG = sparse.csr_array(problem.J.T @ sparse.diags_array(G))
+        self._threshold = np.divide(problem.weights, 2 * G, out=np.zeros_like(G), where=G > 0)
+        self._z = (self._J @ D.T).T
+        self._y = np.zeros_like(self._z)
+
+    def __call__(self, j: int, target: FloatArray, price: float) -> FloatArray:
+        """Improve mode j (3V,) towards a target."""
+        z, y, threshold = self._z[j], self._y[j], price * self._threshold
+        pull = self._M @ target
+        for _ in range(INNER_ITERATIONS):
+            d = self._cholesky.solve(pull + self._JtG @ (z - y))
+            y += OVERRELAXATION * (self._J @ d) + (1 - OVERRELAXATION) * z
+            z[:] = np.sign(y) * np.maximum(np.abs(y) - threshold, 0)
+            y -= z
+        return d
+
+
+def _alternate(
+    problem: _Problem, D: FloatArray, W: FloatArray, price: float, max_iterations: int, tolerance: float
+) -> tuple[bool, list[dict[str, float]]]:
+    """Minimise in place over modes D (m, 3V) and coefficients W (m, n), block by block; never uphill."""
+    shrink = _Shrinkage(problem, problem.point.space, D)
+    history: list[dict[str, float]] = []
+    for iteration in range(max_iterations + 1):
+        MD = problem.M @ D.T
+        gram, B, norms = D @ MD, D @ problem.MD, problem.one_norms(D)
+        misfit = 1 + float(np.vdot(W @ W.T, gram) - 2 * np.vdot(W, B)) / problem.total
+        penalty = price * float(norms.sum()) / problem.total
+        support = localisation((problem.J @ D[norms > 0].T).T, problem.norm) if norms.any() else np.zeros(1)
+        history.append(
+            {
+                "iteration": iteration,
+                "objective": misfit + penalty,
+                "misfit": misfit,
+                "penalty": penalty,
+                "support": float(support.mean()),
+            }
+        )
+        if iteration >= PATIENCE:
+            then, now = history[-1 - PATIENCE]["objective"], history[-1]["objective"]
+            if then - now <= tolerance * now:
+                return True, history
+        _fit_in_box(gram, B, W)
+        for j, w in enumerate(W):
+            square = float(w @ w)
+            if square == 0:
+                continue
+            others = W @ w
+            others[j] = 0
+            target = (w @ problem.D - others @ D) / square
+            lowered = problem.M @ target
+
+            def worth(d: FloatArray) -> float:
+                """The objective with this as mode j, less what it is with none."""
+                fit = d @ (problem.M @ d) - 2 * d @ lowered  # noqa: B023 - used before the next round
+                return float(square * fit + price * problem.one_norms(d[None])[0])  # noqa: B023
+
+            # ADMM need not go downhill, and near the end of a mode nothing may be better than something.
+            D[j] = min((shrink(j, target, price / square), D[j].copy(), np.zeros_like(target)), key=worth)
+    return False, history
+
+
+def _fit_in_box(gram: FloatArray, B: FloatArray, W: FloatArray) -> None:
+    """Minimise ``wᵀ gram w − 2 wᵀ b`` over |w|_∞ ≤ 1 for each column of B (m, n), in place, by coordinate descent."""
+    for _ in range(SWEEPS):
+        before = W.copy()
+        for j in np.flatnonzero(gram.diagonal()):
+            W[j] = np.clip(W[j] + (B[j] - gram[j] @ W) / gram[j, j], -1, 1)
+        if np.abs(W - before).max() < 1e-9:
+            break

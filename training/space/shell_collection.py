@@ -1,0 +1,82 @@
+"""A collection parametrised by the tangent space at its mean: codes are velocities, shapes their exponentials."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from shapespace.arrays import FloatArray, IntArray
+from shapespace.mesh.triangle_mesh import TriangleMesh
+from shapespace.shell.energy import Material
+from shapespace.shell.many_exponentials import exponentials
+from shapespace.shell.space import ShellSpace
+from shapespace.training.runs.coordinates import Coordinates
+from shapespace.training.runs.sampling import Shapes
+
+
+@dataclass(frozen=True, eq=False)
+class ShellCollection:
+    """The shapes ``exp_z̄(Σ_j w_j u_j)`` of codes w in a hypercube (paper, section 3); see sampling.Collection.
+
+    Pickled without the symbolic analysis of its space: whoever unpickles it repeats that once, at the first shape.
+
+    Attributes:
+        reference: z̄, the mean, of about unit area.
+        modes: (m, V, 3) vertex fields d_j at the mean, ``u_j = Dz d_j``.
+        lower, upper: (m,) bounds of the coefficients.
+        factors: indices of modes of each factor, by name.
+        steps: K of the exponential.
+        material: μ, λ, η.
+        scale: length of one unit of the reference in the user's units.
+    """
+
+    reference: TriangleMesh
+    modes: FloatArray
+    lower: FloatArray
+    upper: FloatArray
+    factors: dict[str, list[int]]
+    steps: int
+    material: Material
+    scale: float
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: value for name, value in self.__dict__.items() if name != "space"}
+
+    @cached_property
+    def space(self) -> ShellSpace:
+        """The Riemannian manifold around the mean."""
+        return ShellSpace(self.reference, self.material)
+
+    @property
+    def latent_names(self) -> tuple[str, ...]:
+        """(m,) names after the factors: "upper left", or "upper left, 1" and so on where a factor has several modes."""
+        names = [""] * len(self.modes)
+        for factor, members in self.factors.items():
+            for k, j in enumerate(members, 1):
+                names[j] = factor if len(members) == 1 else f"{factor}, {k}"
+        return tuple(names)
+
+    @property
+    def coordinates(self) -> Coordinates:
+        """The hypercube, of coordinates without a period."""
+        return Coordinates(self.lower, self.upper, np.full(len(self.modes), np.nan))
+
+    @property
+    def symmetries(self) -> list[IntArray]:
+        """None is known."""
+        return []
+
+    def shapes(self, latents: FloatArray) -> Shapes:
+        """Exponentials of codes (n, m), computed in this process; angles are unwrapped along each geodesic."""
+        # One code at a time: a product with all of them would round differently with their number.
+        velocities = np.stack([np.tensordot(code, self.modes, axes=1) for code in latents])
+        paths = exponentials(self.space, self.reference.vertices, velocities, self.steps, workers=1)
+        found = [
+            (path.vertices[-1], path.nric[-1], "" if path.converged else f"{path.status}: {path.reason}")
+            for path in paths
+        ]
+        vertices, z, reasons = zip(*found, strict=True)
+        return Shapes(np.stack(vertices), np.stack(z), list(reasons))

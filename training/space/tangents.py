@@ -1,0 +1,203 @@
+"""The shapes of a collection as tangent vectors at their mean: the discrete logarithms."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from shapespace.arrays import FloatArray
+from shapespace.coordinates.nric import WeightedNorm, unwrap
+from shapespace.mesh.rigid_motion import without_rigid_motion
+from shapespace.shell.geodesic import geodesic, halved, towards
+from shapespace.shell.space import Path, ShellSpace
+from shapespace.solve.cholesky import NotPositiveDefiniteError
+from shapespace.solve.status import Status
+from shapespace.training.runs.progress import progress
+from shapespace.training.runs.workers import run
+from shapespace.training.space.modes import ModeError
+
+#: Of the geodesics to the shapes, as a length; far below what modes leave unexplained.
+LOGARITHM_TOLERANCE = 1e-6
+#: Logarithms that a process computes at a time.
+CHUNK = 4
+#: Neighbours whose geodesics are tried as a beginning.
+NEIGHBOURS = 4
+
+
+@dataclass(frozen=True)
+class Tangents:
+    """The shapes of a collection seen from their mean.
+
+    Attributes:
+        fields: (n, V, 3) vertex fields, without rigid motion.
+        status: of the last geodesic tried; where it is not CONVERGED, the field is the linearised logarithm.
+        steps: K of the geodesic found, 0 where there is none.
+        via: for each shape the neighbour whose geodesic its own began with, −1 where it needed none.
+        reasons: for each shape why the straight way to it was not found, or an empty string.
+    """
+
+    fields: FloatArray
+    status: tuple[Status, ...]
+    steps: tuple[int, ...]
+    via: tuple[int, ...]
+    reasons: tuple[str, ...]
+
+    @property
+    def fallbacks(self) -> list[int]:
+        """The shapes whose logarithm had to be linearised."""
+        return [i for i, steps in enumerate(self.steps) if steps == 0]
+
+
+def tangents(space: ShellSpace, mean: FloatArray, shapes: ArrayLike, steps: int, workers: int = -1) -> Tangents:
+    """The discrete logarithms of shapes at their mean.
+
+    The geodesic to a near shape is found from the straight line of lengths and angles. To a far one that line may lead
+    through what is no surface; then it is found from the geodesic to a neighbour, and so on outwards: a tree, as a
+    minimum spanning tree is grown. Where none of the nearest neighbours helps, from bisection, and last with twice as
+    many steps, where a face would else collapse within one. Failing all, the difference of lengths and angles, with
+    the angles unwrapped from the mean's, is projected to the tangent space: the logarithm to first order.
+
+    A logarithm is the inverse of the exponential with as many steps, and converges only to first order in 1/K: on real
+    collections those of 4 and of 8 steps differ by 10 to 35 % of their length.
+
+    Args:
+        space: where; each process gets a copy.
+        mean: X̄ (V, 3).
+        shapes: (n, V, 3), in any position.
+        steps: K of the geodesics.
+        workers: processes, by default one a core; 1 computes here. The result does not depend on it.
+
+    Raises:
+        ModeError: a shape with a coordinate that isn't finite.
+        WorkersError: processes that are killed again and again.
+    """
+    x = np.stack([space.shape(shape) for shape in np.asarray(shapes, dtype=np.float64)])
+    bad = np.flatnonzero(~np.isfinite(x).all(axis=(1, 2)))
+    if len(bad):
+        raise ModeError(f"shape {bad[0]} has a coordinate that is not finite")
+    search = _Search(space, mean, x, steps, workers)
+    search.straight()
+    search.by_neighbours()
+    if search.by_bisection():
+        search.by_neighbours()
+    search.in_more_steps()
+    return search.result()
+
+
+#: A shape found by a geodesic: its shapes, or none, how it ended, and why not.
+_Found = tuple[FloatArray | None, Status, str]
+
+
+class _Search:
+    """Geodesics from the mean to shapes, the easy ones first."""
+
+    def __init__(self, space: ShellSpace, mean: FloatArray, shapes: FloatArray, steps: int, workers: int) -> None:
+        self._space, self._mean, self._shapes, self._steps, self._workers = space, mean, shapes, steps, workers
+        self._paths: dict[int, FloatArray] = {}
+        self._via = [-1] * len(shapes)
+        self._status, self._reasons = [Status.STALLED] * len(shapes), [""] * len(shapes)
+        z = unwrap(space.nric(shapes), space.nric(mean))
+        weights = np.sqrt(WeightedNorm.of(space.reference.with_vertices(mean), space.material.eta).squared)
+        scaled = z * weights
+        squares = (scaled**2).sum(axis=1)
+        self._distances: FloatArray = np.add.outer(squares, squares) - 2 * scaled @ scaled.T
+
+    @property
+    def _left(self) -> list[int]:
+        return [i for i in range(len(self._shapes)) if i not in self._paths]
+
+    def _do(self, function: Callable[..., _Found], items: list[tuple[int, tuple]], chunk: int = 1) -> bool:
+        """Try a function on some shapes, each with what else it needs; whether one more is found."""
+        parts = [items[k : k + chunk] for k in range(0, len(items), chunk)]
+        work = [[(self._shapes[i], *more) for i, more in part] for part in parts]
+        news = False
+        results = run(partial(_each, function, self._space, self._mean), work, workers=self._workers)
+        for k, found in progress(results, "logarithms", f"{chunk} shapes" if chunk > 1 else "shape", len(parts)):
+            for (i, _), (path, status, reason) in zip(parts[k], found, strict=True):
+                self._status[i], self._reasons[i] = status, self._reasons[i] or reason
+                if path is not None:
+                    self._paths[i], news = path, True
+        return news
+
+    def straight(self) -> None:
+        """The straight way to each."""
+        self._do(_straight, [(i, (self._steps,)) for i in self._left], CHUNK)
+
+    def by_neighbours(self) -> None:
+        """From each shape's nearest neighbour that is found and hasn't been tried, as long as there are some."""
+        tried: dict[int, set[int]] = {i: set() for i in self._left}
+        while items := [(i, j) for i in self._left if len(tried[i]) < NEIGHBOURS for j in self._nearest(i, tried[i])]:
+            for i, j in items:
+                tried[i].add(j)
+            self._from_neighbours(_towards, items)
+
+    def by_bisection(self) -> bool:
+        """From the middle of mean and shape; whether that finds one."""
+        return self._do(_bisected, [(i, (self._steps,)) for i in self._left])
+
+    def in_more_steps(self) -> None:
+        """From the nearest neighbour, in twice as many steps."""
+        self._from_neighbours(_halved, [(i, j) for i in self._left for j in self._nearest(i)])
+
+    def _nearest(self, i: int, without: Collection[int] = ()) -> list[int]:
+        """The nearest shape that is found, if there is one."""
+        others = [j for j in self._paths if j not in without]
+        return [min(others, key=lambda j: (float(self._distances[i, j]), j))] if others else []
+
+    def _from_neighbours(self, function: Callable[..., _Found], pairs: list[tuple[int, int]]) -> None:
+        self._do(function, [(i, (self._paths[j],)) for i, j in pairs])
+        for i, j in pairs:
+            if i in self._paths:
+                self._via[i] = j
+
+    def result(self) -> Tangents:
+        """What is found, and the rest linearised."""
+        fields, steps = [], []
+        z = self._space.nric(self._mean)
+        for i, shape in enumerate(self._shapes):
+            path = self._paths.get(i)
+            steps.append(0 if path is None else len(path) - 1)
+            if path is None:
+                fields.append(self._space.project(self._mean, unwrap(self._space.nric(shape), z) - z))
+            else:
+                fields.append(without_rigid_motion(steps[-1] * (path[1] - path[0]), self._mean))
+        return Tangents(np.stack(fields), tuple(self._status), tuple(steps), tuple(self._via), tuple(self._reasons))
+
+
+def _each(function: Callable[..., _Found], space: ShellSpace, mean: FloatArray, items: list[tuple]) -> list[_Found]:
+    return [function(space, mean, *item) for item in items]
+
+
+def _found(path: Path) -> _Found:
+    return (path.vertices if path.converged else None), path.status, path.reason
+
+
+def _straight(space: ShellSpace, mean: FloatArray, shape: FloatArray, steps: int) -> _Found:
+    return _found(geodesic(space, mean, shape, steps, tolerance=LOGARITHM_TOLERANCE, bisect=False))
+
+
+def _bisected(space: ShellSpace, mean: FloatArray, shape: FloatArray, steps: int) -> _Found:
+    return _found(geodesic(space, mean, shape, steps, tolerance=LOGARITHM_TOLERANCE))
+
+
+def _towards(space: ShellSpace, mean: FloatArray, shape: FloatArray, path: FloatArray) -> _Found:
+    near = Path(path, Status.CONVERGED, space)
+    return _from(near, space, mean, shape)
+
+
+def _halved(space: ShellSpace, mean: FloatArray, shape: FloatArray, path: FloatArray) -> _Found:
+    return _from(halved(space, Path(path, Status.CONVERGED, space)), space, mean, shape)
+
+
+def _from(near: Path, space: ShellSpace, mean: FloatArray, shape: FloatArray) -> _Found:
+    """The geodesic that begins as that to a neighbour."""
+    try:
+        first = towards(space, near, shape)
+    except NotPositiveDefiniteError as error:
+        return None, Status.DEGENERATE, f"a shape on the way is degenerate: {error}"
+    steps = len(first) - 1
+    return _found(geodesic(space, mean, shape, steps, tolerance=LOGARITHM_TOLERANCE, first=first))
