@@ -230,11 +230,12 @@ def test_a_client_has_so_many_requests_at_once_and_others_go_on(pair: list[Serve
         # One that has counted nothing yet.
         proxy = stack.enter_context(proxying(tmp_path / "it", *(server.url for server in pair)))
         same, other = (stack.enter_context(client(proxy, f"127.0.0.{k}")) for k in (3, 4))
-        holding = [stack.enter_context(connect(proxy, "127.0.0.3")) for _ in range(16)]
-        for connection in holding:
-            connection.sendall(half.encode())
-        eventually(lambda: same.get("/v1/models").status_code == 503)
-        refused = same.get("/v1/models")
+        holding: list[socket.socket] = []
+        while (refused := same.get("/v1/models")).status_code != 503:
+            assert len(holding) < 30
+            holding.append(stack.enter_context(connect(proxy, "127.0.0.3")))
+            holding[-1].sendall(half.encode())
+        assert len(holding) >= 16
         assert refused.headers["Retry-After"]
         assert refused.headers["Content-Type"] == "application/problem+json"
         assert refused.json()["type"] == TYPE_PREFIX + "busy"
