@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 
 from shapespace.arrays import FloatArray, IntArray
-from shapespace.coordinates.nric import NRICGradients, WeightedNorm
+from shapespace.coordinates.nric import NRICGradients, NRICSecondDerivatives, WeightedNorm
 from shapespace.mesh.triangle_mesh import Connectivity
 from shapespace.solve.cholesky import SymmetricPattern
 
@@ -69,6 +69,20 @@ class NormalMatrix:
             entries = self.pattern.scatter(contributions)
         entries[self.pattern.diagonal] += self.REGULARISATION * entries[self.pattern.diagonal].mean()
         return entries
+
+    def second_derivative(self, second: NRICSecondDerivatives, covector: FloatArray) -> FloatArray:
+        """Upper-triangle entries of ``Σ_i p_i D²z_i(X)``: how ``Jᵀp`` changes with X for fixed p (2E,)."""
+        edges = second.lengths.shape[-1]
+        contributions, on_lengths = self._work_space(21 * edges)
+        out = on_lengths.reshape(21, edges)
+        blocks = second.lengths * covector[:edges]
+        a, b = np.triu_indices(3)
+        out[:6] = out[6:12] = blocks[a, b]
+        out[12:] = -blocks.reshape(9, edges)
+        a, b = np.triu_indices(12)
+        angles = second.angles[a // 3, b // 3, a % 3, b % 3]
+        np.multiply(angles, covector.take(edges + self._interior), out=contributions[21 * edges :].reshape(78, -1))
+        return self.pattern.scatter(contributions, self._slots_of_edges)
 
     def _work_space(self, lengths: int) -> tuple[FloatArray, FloatArray]:
         """Contributions, and the part of them that comes from lengths."""

@@ -103,6 +103,42 @@ class Frame:
         tail -= right
         return NRICGradients(self.edges / self.lengths, angles)
 
+    def second_derivatives(self) -> NRICSecondDerivatives:
+        """The second derivatives, of one shape.
+
+        Of an angle by the edge vector e and the vectors a and b to the opposite vertices, whose gradients are
+        ``g_a = −|e| n_a/|n_a|²`` with ``n_a = e × a``, ``g_b = −|e| n_b/|n_b|²`` with ``n_b = b × e`` and
+        ``g_e = −(a·e/|e|²) g_a − (b·e/|e|²) g_b``; by the tail, minus the sum.
+        """
+        direction = self.edges / self.lengths
+        eye = np.eye(3)[:, :, None]
+        lengths = (eye - direction[:, None] * direction[None]) / self.lengths
+        e, size = self.hinge_edges, self.hinge_lengths
+        along = e / size
+        by = np.empty((4, 4, 3, 3, e.shape[-1]))  # by tail, head, left and right
+        head = np.zeros((3, 3, e.shape[-1]))
+        for vertex, arm, normal, sign in (
+            (2, self.to_left, self.left_normal, 1),
+            (3, self.to_right, self.right_normal, -1),
+        ):
+            square = dot(normal, normal)
+            # Reflection at the face's plane: d(n/|n|²) = (I − 2 n nᵀ/|n|²) dn / |n|².
+            reflection = (eye - 2 * normal[:, None] * normal[None] / square) * (size / square)
+            turned = sign * np.einsum("ijh,jkh->ikh", reflection, _cross_matrix(arm))
+            by[vertex, vertex] = -sign * np.einsum("ijh,jkh->ikh", reflection, _cross_matrix(e))
+            by[vertex, 1] = turned - normal[:, None] * along[None] / square
+            by[1, vertex] = by[vertex, 1].swapaxes(0, 1)
+            gradient = -size / square * normal
+            share = dot(arm, e) / size**2
+            slope = (arm - 2 * share * e) / size**2
+            head -= gradient[:, None] * slope[None] + share * by[vertex, 1]
+        by[1, 1] = head
+        by[2, 3] = by[3, 2] = 0
+        by[0, 1:] = -by[1:, 1:].sum(axis=0)
+        by[1:, 0] = by[0, 1:].swapaxes(1, 2)
+        by[0, 0] = -by[1:, 0].sum(axis=0)
+        return NRICSecondDerivatives(lengths, by)
+
 
 def edge_lengths(vertices: FloatArray, connectivity: Connectivity) -> FloatArray:
     """Lengths (…, E) of the edges of shapes (…, V, 3)."""
@@ -178,6 +214,27 @@ class NRICGradients:
 
     lengths: FloatArray
     angles: FloatArray
+
+
+@dataclass(frozen=True)
+class NRICSecondDerivatives:
+    """What ``D²z(X)`` is made of.
+
+    Attributes:
+        lengths: (3, 3, E) second derivative of each length by its head; also by its tail, and minus that by both.
+        angles: (4, 4, 3, 3, H) of each interior angle by tail, head, left and right opposite vertex.
+    """
+
+    lengths: FloatArray
+    angles: FloatArray
+
+
+def _cross_matrix(v: FloatArray) -> FloatArray:
+    """(3, 3, …) matrices of ``x ↦ v × x`` by components (3, …)."""
+    out = np.zeros((3, *v.shape))
+    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        out[k, j], out[j, k] = v[i], -v[i]
+    return out
 
 
 class NRICJacobian:

@@ -88,6 +88,15 @@ class ShellEnergy:
         """Prepare rest shapes z (…, 2E)."""
         return RestShape(self, z)
 
+    def matrix(self, form: QuadraticForm) -> sparse.csr_array:
+        """A quadratic form of one shape as a matrix (2E, 2E)."""
+        e = self.connectivity.edge_count
+        rows, columns = (np.broadcast_to(x, form.faces.shape).ravel() for x in (self.sides[:, None], self.sides[None]))
+        angles = np.arange(e, 2 * e)
+        data = np.concatenate([form.faces.ravel(), form.angles])
+        place = np.concatenate([rows, angles]), np.concatenate([columns, angles])
+        return sparse.csr_array((data, place), shape=(2 * e, 2 * e))
+
     def sum_over_faces(self, sides: FloatArray) -> FloatArray:
         """Add to each edge (…, E) what its one or two faces have for it (…, 3, F)."""
         flat = sides.reshape(*sides.shape[:-2], -1)
@@ -226,3 +235,70 @@ class RestShape:
         ]
         data, i, j = (np.concatenate([np.ravel(x[k]) for x in entries]) for k in range(3))
         return sparse.csr_array((data, (i, j)), shape=(2 * e, 2 * e))
+
+    def hessian_deformed(self, z: FloatArray) -> QuadraticForm:
+        """``∂₂∂₂W[rest, z]``; at z = rest it is ``hessian()``. One rest shape and one deformed shape only.
+
+        By q~_i and q~_m it is ``1/(16a) (4κ/(S (1+s)²) c~_i c~_m + (λ/2 − 2κ/(1+s)) (1 − 2δ_im))``.
+        """
+        m = self._energy
+        gamma, _, s, _ = self._compare(z)
+        c = self._c + gamma
+        stiffness = 2 * m.kappa / (1 + s)
+        blocks = c[:, None] * (c * (2 * stiffness / ((1 + s) * self._S)))[None]
+        blocks += (m.lambda_ / 2 - stiffness) * _OPPOSITE
+        by_q = stiffness * s * self._c + (m.lambda_ / 2 - stiffness) * gamma
+        return QuadraticForm(_by_lengths(blocks, by_q, z[: len(z) // 2][m.sides]) / (16 * self.areas), 2 * self._beta)
+
+    def hessian_rest(self, z: FloatArray) -> sparse.csr_array:
+        """``∂₁∂₁W[rest, z]`` (2E, 2E). One rest shape and one deformed shape only.
+
+        Membrane part by the q of a face, with ``T = t + 2``, ``c~ = c + γ`` and ``Q = μ/2 t + λ/4 s + κ log(1+s)``:
+        ``1/(16a) (−(1 − 2δ_im) (μ + Q) − (μ/S) (c_m γ_i + c_i c~_m) + (c_i c_m/S) (Q + μ T + λ/2 (1+s) + 2κ))``.
+        Bending couples the sides of both faces at an edge, by their area in d_e.
+        """
+        m = self._energy
+        e = m.connectivity.edge_count
+        gamma, t, s, turn = self._compare(z)
+        c, S = self._c, self._S
+        Q = m.mu / 2 * t + m.lambda_ / 4 * s + m.kappa * np.log1p(s)
+        outer = c[:, None] * c[None]
+
+        # Bending, ``b = 3η l² turn² / A`` with A the areas of the two faces: by l, A and the angle.
+        bending = turn**2 * self._beta
+        length, A = self._lengths, self._edge_area
+        by_A = -bending / A
+        around = by_A[m.sides].sum(axis=0)
+
+        blocks = (outer * (Q + m.mu * (t + 2) + m.lambda_ / 2 * (1 + s) + 2 * m.kappa - around)) / S
+        blocks -= m.mu / S * (c[None] * gamma[:, None] + c[:, None] * (c + gamma)[None])
+        blocks += (around - m.mu - Q) * _OPPOSITE
+        by_q = m.mu * gamma + (around - Q) * c
+        blocks = _by_lengths(blocks, by_q, self._sides) / (16 * self.areas)
+
+        edges, (i, j) = np.arange(e), np.broadcast_arrays(m.sides[:, None], m.sides[None])
+        membrane = sparse.csr_array((blocks.ravel(), (i.ravel(), j.ravel())), shape=(e, e))
+        slopes = 2 * self._sides * c / (16 * self.areas)
+        areas = sparse.csr_array((np.broadcast_to(slopes[None], i.shape).ravel(), (i.ravel(), j.ravel())), shape=(e, e))
+
+        def diagonal(entries: FloatArray) -> sparse.csr_array:
+            return sparse.csr_array((entries, (edges, edges)), shape=(e, e))
+
+        mixed = areas.T @ diagonal(2 * by_A / length)
+        lengths = membrane + diagonal(2 * bending / length**2) + mixed + mixed.T
+        lengths = lengths + areas.T @ diagonal(2 * bending / A**2) @ areas
+        by_turn = 2 * turn * self._beta
+        angles = areas.T @ diagonal(by_turn / A) - diagonal(2 * by_turn / length)
+        whole = sparse.block_array([[lengths, angles], [angles.T, diagonal(2 * self._beta)]])
+        return sparse.csr_array(whole)
+
+
+#: ``∂(q_j + q_k − q_i)/∂q_m`` for the three sides of a face, with a dimension for the faces.
+_OPPOSITE = (1.0 - 2.0 * np.eye(3))[:, :, None]
+
+
+def _by_lengths(by_q: FloatArray, slope: FloatArray, sides: FloatArray) -> FloatArray:
+    """Second derivatives by lengths (3, 3, F) from those by squared lengths and the first ones (3, F): ``q = l²``."""
+    blocks = 4 * by_q * sides[:, None] * sides[None]
+    blocks[np.arange(3), np.arange(3)] += 2 * slope
+    return blocks

@@ -18,10 +18,11 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy import sparse
 
 from shapespace.arrays import FloatArray
 from shapespace.coordinates.normal_matrix import NormalMatrix, QuadraticForm
-from shapespace.coordinates.nric import NRICGradients, NRICJacobian, edge_lengths, nric, wrap
+from shapespace.coordinates.nric import Frame, NRICGradients, NRICJacobian, edge_lengths, nric, wrap
 from shapespace.mesh.rigid_motion import rigid_motions, without_rigid_motion
 from shapespace.mesh.triangle_mesh import TriangleMesh, face_areas
 from shapespace.shell.energy import Material, RestShape, ShellEnergy
@@ -223,6 +224,11 @@ class ShellSpace:
         if x.shape != self.reference.vertices.shape:
             raise ValueError(f"vertices must be {self.reference.vertices.shape} like the reference's, not {x.shape}")
         return x
+
+    def curvature(self, point: Point, covector: FloatArray) -> sparse.csc_array:
+        """``Σ_i p_i D²z_i(X)`` (3V, 3V) of a covector p (2E,): how ``Jᵀp`` changes with X."""
+        second = Frame(point.vertices, self.connectivity).second_derivatives()
+        return self._matrix.pattern.matrix(self._matrix.second_derivative(second, covector))
 
     def inner(self, vertices: FloatArray, first: FloatArray, second: FloatArray) -> float:
         """``g(u, v)`` of two vertex fields (V, 3) at a shape."""

@@ -6,7 +6,17 @@ import numpy as np
 import pytest
 import trimesh
 
-from shapespace.coordinates.nric import NRICJacobian, WeightedNorm, dihedral_angles, edge_lengths, nric, unwrap, wrap
+from shapespace.coordinates.normal_matrix import NormalMatrix
+from shapespace.coordinates.nric import (
+    Frame,
+    NRICJacobian,
+    WeightedNorm,
+    dihedral_angles,
+    edge_lengths,
+    nric,
+    unwrap,
+    wrap,
+)
 from shapespace.mesh.triangle_mesh import TriangleMesh, face_normals
 from tests.shapespace.conftest import MESHES
 
@@ -225,6 +235,20 @@ def test_the_jacobian_has_the_slopes_of_a_derivative(mesh, pose, rng, slope):
         central = slope(lambda h, half=half: ((at(h) - at(-h)) / (2 * h) - change)[half], 1e-3)
         assert taylor == pytest.approx(2, abs=0.1)
         assert central == pytest.approx(2, abs=0.1)
+
+
+def test_second_derivatives_have_the_slope_of_a_derivative(mesh, pose, rng, slope):
+    jacobian, matrix = NRICJacobian(mesh.connectivity), NormalMatrix(mesh.connectivity)
+    covector = rng.standard_normal(2 * mesh.connectivity.edge_count)
+    direction = 0.1 * edge_lengths(pose, mesh.connectivity).mean() * rng.standard_normal(pose.shape)
+    second = Frame(pose, mesh.connectivity).second_derivatives()
+    curvature = matrix.pattern.matrix(matrix.second_derivative(second, covector))
+    change = (curvature @ direction.ravel()).reshape(pose.shape)
+
+    def pulled(x):
+        return jacobian.pull_back(jacobian.gradients(x), covector)
+
+    assert slope(lambda h: pulled(pose + h * direction) - pulled(pose) - h * change) > 1.9
 
 
 def test_rigid_motions_lie_in_the_jacobians_kernel(mesh, pose):

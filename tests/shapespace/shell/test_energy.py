@@ -95,6 +95,14 @@ def test_the_mixed_hessian_has_the_slope_of_a_derivative(energy, z, other, direc
     assert slope(lambda h: rest.gradient_rest(other + h * direction) - here - h * change) == pytest.approx(2, abs=0.1)
 
 
+def test_second_derivatives_have_the_slopes_of_derivatives(energy, z, other, direction, slope):
+    rest = energy.rest(z)
+    by_rest, by_deformed = rest.hessian_rest(other) @ direction, energy.matrix(rest.hessian_deformed(other)) @ direction
+    at_rest, deformed = rest.gradient_rest(other), rest.gradient_deformed(other)
+    assert slope(lambda h: energy.rest(z + h * direction).gradient_rest(other) - at_rest - h * by_rest) > 1.9
+    assert slope(lambda h: rest.gradient_deformed(other + h * direction) - deformed - h * by_deformed) > 1.9
+
+
 def test_the_metric_is_half_the_hessian_and_minus_the_mixed_one(energy, space, mesh, z, direction):
     h = 1e-5
     rest = energy.rest(z)
