@@ -63,6 +63,11 @@ class Edited:
     shape: Shape
     distances: FloatArray
 
+    @property
+    def residual(self) -> float:
+        """Root mean square of the distances."""
+        return float(np.sqrt((self.distances**2).mean()))
+
 
 class Editor:
     """Finds codes for targets, for any number of threads.

@@ -1,0 +1,266 @@
+"""A model as a library: codes to vertices, meshes and pulled vertices back to codes, random codes."""
+
+from __future__ import annotations
+
+import os
+import re
+import warnings
+from collections.abc import Mapping
+from functools import cached_property
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from shapespace.arrays import FloatArray, IntArray
+from shapespace.bundle.reader import MANIFEST, BundleError, read_bundle
+from shapespace.bundle.schema import VERSION_PATTERN
+from shapespace.files.formats import read_arrays
+from shapespace.mesh.triangle_mesh import TriangleMesh
+from shapespace.model.correspondence import InvalidMeshError, Matched, match
+from shapespace.model.edit import PRIOR, Edited, Editor, Target
+from shapespace.model.encode import Encoded, Encoder
+from shapespace.model.latent_space import Bounds, Codes, Distribution, WrongLengthError
+from shapespace.model.shape_model import MeshChoice, ShapeModel
+from shapespace.solve.deadline import Deadline
+from shapespace.solve.status import Status
+
+#: The values of the enumerations, so that callers may write plain strings.
+MeshName = MeshChoice | Literal["fine", "coarse"]
+BoundsName = Bounds | Literal["allow", "clamp", "reject"]
+DistributionName = Distribution | Literal["uniform", "gaussian"]
+
+
+def load(folder: str | os.PathLike[str], threads: int = 1) -> Model:
+    """Read a bundle, check every file against its manifest, and make a model of it.
+
+    Args:
+        folder: NAME/VERSION, or NAME for the highest version there.
+        threads: shapes that may be computed at once, see Model.
+
+    Raises:
+        BundleError: no bundle, or one that is not exactly as its manifest says.
+
+    >>> import shapespace
+    >>> shapespace.load("models/figure")
+    <Model figure/1: 20 coordinates, 9 factors, 4601 vertices>
+    """
+    path = Path(os.path.abspath(folder))  # the names of the last two folders count, also of "."
+    if not (path / MANIFEST).exists():
+        try:
+            versions = [int(entry.name) for entry in path.iterdir() if re.fullmatch(VERSION_PATTERN, entry.name)]
+        except OSError as error:
+            raise BundleError(f"{path} can't be read: {error.strerror}") from None
+        if not versions:
+            raise BundleError(f"{path} holds no bundle: give a folder NAME/VERSION, or NAME with versions in it")
+        path /= str(max(versions))
+    return Model(read_bundle(path), threads)
+
+
+class Model(ShapeModel):
+    """A bundle at work, with the calls that the HTTP interface has.
+
+    Codes are (m,) numbers, one for each coordinate; positions are in the units of the training meshes, aligned to the
+    reference. Every method may be called from several threads at once.
+
+    >>> import shapespace
+    >>> model = shapespace.load("models/figure")
+    >>> model.dimension, model.names[0], model.period[0]
+    (20, 'back, 1', None)
+    >>> model.vertices.shape, model.faces.shape
+    ((4601, 3), (9198, 3))
+    >>> model.manifest.factors[0].name
+    'back'
+    """
+
+    def __repr__(self) -> str:
+        facts = self.manifest
+        return (
+            f"<Model {facts.name}/{facts.version}: {self.dimension} coordinates, {len(facts.factors)} factors, "
+            f"{len(self.vertices)} vertices>"
+        )
+
+    @property
+    def dimension(self) -> int:
+        """Number m of coordinates of a code."""
+        return self.latents.dimension
+
+    @property
+    def names(self) -> list[str]:
+        """Name of each coordinate."""
+        return self.latents.names
+
+    @property
+    def lower(self) -> FloatArray:
+        """(m,) lower bound of each coordinate, the smallest that was trained."""
+        return self.latents.lower
+
+    @property
+    def upper(self) -> FloatArray:
+        """(m,) upper bound of each coordinate."""
+        return self.latents.upper
+
+    @property
+    def period(self) -> list[float | None]:
+        """Period of each coordinate; None for those that are no angles."""
+        return self.manifest.period
+
+    @property
+    def faces(self) -> IntArray:
+        """(F, 3) faces of the fine mesh; ``model.mesh(MeshChoice.COARSE)`` has those of the coarse one."""
+        return self.mesh(MeshChoice.FINE).faces
+
+    @property
+    def vertices(self) -> FloatArray:
+        """(V, 3) the reference shape on the fine mesh, in the units of the training meshes."""
+        return self.reference_shape().vertices
+
+    def decode(self, codes: ArrayLike, mesh: MeshName = "fine", bounds: BoundsName = "allow") -> FloatArray:
+        """The shapes of codes.
+
+        Warns with RuntimeWarning where Gauss–Newton did not converge; ``shape`` gives the diagnostics of one code.
+
+        Args:
+            codes: (n, m), or one code (m,).
+            mesh: "fine" or "coarse"; a model without a finer mesh answers both with the one it has.
+            bounds: "allow" extrapolates outside the bounds, "clamp" moves to the nearest bound, "reject" refuses.
+
+        Returns:
+            Positions (n, V, 3), or (V, 3) of one code.
+
+        Raises:
+            LatentError: a code of the wrong length, not finite, or out of bounds where that is refused.
+            ModelFailedError: the networks failed at a code, or took too long.
+
+        >>> import numpy as np, shapespace
+        >>> model = shapespace.load("models/figure")
+        >>> model.decode(np.zeros((2, 20))).shape
+        (2, 4601, 3)
+        >>> model.decode(np.zeros(20), mesh="coarse").shape
+        (1000, 3)
+        """
+        values, choice = np.asarray(codes, dtype=np.float64), MeshChoice(mesh)
+        if values.ndim not in (1, 2):
+            raise WrongLengthError(f"codes must be (n, m) or (m,), not {values.shape}")
+        checked, inside = self.latents.codes(np.atleast_2d(values), Bounds(bounds))
+        positions = np.empty((len(checked), *self.mesh(choice).vertices.shape))
+        ended = []
+        for k, code in enumerate(checked):
+            shape = self.shape(code, bool(inside[k]), choice)
+            positions[k] = shape.vertices
+            ended.append(shape.diagnostics.status)
+        missed = [k for k, status in enumerate(ended) if status is not Status.CONVERGED]
+        if missed:
+            warnings.warn(
+                f"{len(missed)} of {len(ended)} shapes did not converge; the first is that of code {missed[0]}: "
+                f"{ended[missed[0]]}",
+                RuntimeWarning,
+                stacklevel=2,
+            )
+        return positions if values.ndim == 2 else positions[0]
+
+    def encode(
+        self,
+        mesh: ArrayLike | TriangleMesh | Matched | str | os.PathLike[str],
+        bounds: BoundsName = "allow",
+        deadline: Deadline | None = None,
+    ) -> Encoded:
+        """The code whose shape comes closest to a mesh in correspondence, in any rigid pose.
+
+        Args:
+            mesh: the fine or the coarse mesh of the model, as vertices (V, 3) in its order, as a mesh, or as the path
+                of an OBJ, PLY, STL, OFF, glTF or NPZ file; in the units of the training meshes.
+            bounds: "allow" lets the code lie up to half the bounds' width outside, "clamp" searches inside only,
+                "reject" refuses a code outside.
+            deadline: after which the status is Status.DEADLINE.
+
+        Raises:
+            MeshError: a file that can't be read.
+            InvalidMeshError: none of the model's meshes.
+            LatentError: numbers that overflow, or a code out of bounds where that is refused.
+
+        >>> import numpy as np, shapespace
+        >>> model = shapespace.load("models/figure")
+        >>> code = np.linspace(-0.5, 0.5, 20)
+        >>> found = model.encode(model.decode(code))
+        >>> bool(np.abs(found.code - code).max() < 1e-2), found.mesh, found.shape.vertices.shape
+        (True, <MeshChoice.FINE: 'fine'>, (4601, 3))
+        """
+        return self._encoder(mesh if isinstance(mesh, Matched) else self._matched(mesh), Bounds(bounds), deadline)
+
+    def edit(
+        self,
+        code: ArrayLike,
+        targets: Mapping[int, ArrayLike],
+        prior: float = PRIOR,
+        mesh: MeshName = "fine",
+        deadline: Deadline | None = None,
+    ) -> Edited:
+        """The code inside the bounds whose shape comes closest to having some vertices at some places.
+
+        Args:
+            code: (m,) to start from; moved to the nearest bounds first.
+            targets: position (3,) by vertex, at least one, in the frame and units of what ``decode`` answers.
+            prior: weight of the mean square change of the code, in widths of the bounds, against the mean square
+                distance from the targets, in diagonals of the bounding box.
+            mesh: whose vertices are meant, "fine" or "coarse".
+            deadline: after which the status is Status.DEADLINE.
+
+        Raises:
+            LatentError: a code of the wrong length, or numbers that are not finite.
+            ValueError: no targets, or a vertex that the mesh does not have.
+
+        >>> import numpy as np, shapespace
+        >>> model = shapespace.load("models/figure")
+        >>> wanted = model.decode(np.full(20, 0.2))
+        >>> found = model.edit(np.zeros(20), {vertex: wanted[vertex] for vertex in (10, 2000, 4600)})
+        >>> size = np.linalg.norm(np.ptp(wanted, axis=0))
+        >>> found.code.shape, bool(found.residual < 0.01 * size)
+        ((20,), True)
+        """
+        choice = MeshChoice(mesh)
+        count = len(self.mesh(choice).vertices)
+        if not targets:
+            raise ValueError("There are no targets. Give at least one.")
+        for vertex in targets:
+            if not 0 <= vertex < count:
+                raise ValueError(f"There is no vertex {vertex}: the {choice} mesh has vertices 0 to {count - 1}.")
+        start, _ = self.latents.code(np.asarray(code, dtype=np.float64).tolist(), Bounds.CLAMP)
+        pulled = [Target(int(v), np.asarray(place, dtype=np.float64).tolist()) for v, place in targets.items()]
+        return self._editor(start, pulled, prior, choice, deadline)
+
+    def sample(self, count: int, seed: int = 0, distribution: DistributionName = "uniform") -> Codes:
+        """Random codes (count, m) inside the bounds; one seed gives the same on every machine.
+
+        Args:
+            count: how many.
+            seed: of the random numbers.
+            distribution: "uniform" in the bounds, or "gaussian": around their middle with a standard deviation of a
+                quarter of their width, cut off at them.
+
+        >>> import shapespace
+        >>> model = shapespace.load("models/figure")
+        >>> codes = model.sample(3, seed=1)
+        >>> codes.shape, bool((codes >= model.lower.astype("f4")).all() and (codes <= model.upper.astype("f4")).all())
+        ((3, 20), True)
+        """
+        return self.latents.sample(count, seed, Distribution(distribution))
+
+    @cached_property
+    def _encoder(self) -> Encoder:
+        return Encoder(self)
+
+    @cached_property
+    def _editor(self) -> Editor:
+        return Editor(self)
+
+    def _matched(self, mesh: ArrayLike | TriangleMesh | str | os.PathLike[str]) -> Matched:
+        if isinstance(mesh, TriangleMesh):
+            return match(self, mesh.vertices, mesh.faces)
+        if isinstance(mesh, str | os.PathLike):
+            return match(self, *read_arrays(Path(mesh)))
+        vertices = np.asarray(mesh, dtype=np.float64)
+        if vertices.ndim != 2 or vertices.shape[1] != 3:
+            raise InvalidMeshError(f"vertices must be (V, 3), not {vertices.shape}")
+        return match(self, vertices, np.empty((0, 3), np.int64))
