@@ -1,4 +1,4 @@
-"""What ``import shapespace`` gives: every public name, each with an example that runs, and nothing before it is used."""
+"""What ``import shapespace`` gives: public names, each with an example that runs, and nothing before it is used."""
 
 import doctest
 import importlib
