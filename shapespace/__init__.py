@@ -42,7 +42,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from shapespace.mesh.triangle_mesh import TriangleMesh
-    from shapespace.model.model import Model, load
+    from shapespace.model.shape_model import ShapeModel, load
     from shapespace.shell.energy import Material
     from shapespace.shell.exponential import exponential
     from shapespace.shell.geodesic import geodesic, logarithm
@@ -52,7 +52,7 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 __all__ = [
     "Material",
-    "Model",
+    "ShapeModel",
     "ShellSpace",
     "TriangleMesh",
     "elastic_mean",
@@ -64,13 +64,13 @@ __all__ = [
 
 _MODULES = {
     "Material": "shell.energy",
-    "Model": "model.model",
+    "ShapeModel": "model.shape_model",
     "ShellSpace": "shell.space",
     "TriangleMesh": "mesh.triangle_mesh",
     "elastic_mean": "shell.mean",
     "exponential": "shell.exponential",
     "geodesic": "shell.geodesic",
-    "load": "model.model",
+    "load": "model.shape_model",
     "logarithm": "shell.geodesic",
 }
 

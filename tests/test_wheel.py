@@ -17,7 +17,7 @@ import httpx
 import numpy as np
 import pytest
 
-from shapespace.model.model import load
+from shapespace.model.shape_model import load
 from tests.service.conftest import ROOT
 
 SOURCES = ("pyproject.toml", "setup.py", "README.md", "LICENSE", "shapespace", "service", "training", "models")

@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy import sparse
 
 from shapespace.arrays import FloatArray
 from shapespace.coordinates.nric import WeightedNorm, nric
-
-if TYPE_CHECKING:
-    from shapespace.model.shape_model import ShapeModel
+from shapespace.model.decoder import Decoder
 
 #: Step of a difference quotient, as a fraction of the coordinate's range: what an angle moves may be as small as a bump
 #: on its way round, and elsewhere smaller steps drown in the networks' rounding.
@@ -23,7 +20,7 @@ NODES, MOST_NODES = 32, 1024
 SKETCH = 1024
 
 
-def derivatives(model: ShapeModel, x: FloatArray) -> FloatArray:
+def derivatives(model: Decoder, x: FloatArray) -> FloatArray:
     """(2E, m) of the networks at a code (m,), by differences.
 
     One code at a time: the combiner is quicker so than on many at once, which don't fit into the cache.
@@ -33,7 +30,7 @@ def derivatives(model: ShapeModel, x: FloatArray) -> FloatArray:
     return np.stack([(model.nric(x + step) - z) / step.max() for step in steps], axis=1)
 
 
-def factor_derivatives(model: ShapeModel, x: FloatArray) -> FloatArray:
+def factor_derivatives(model: Decoder, x: FloatArray) -> FloatArray:
     """(2E, m) of the sum of the factors at a code (m,), by central differences."""
     columns = []
     for j, factor in enumerate(model.manifest.factors):
@@ -44,13 +41,13 @@ def factor_derivatives(model: ShapeModel, x: FloatArray) -> FloatArray:
     return np.concatenate(columns).T
 
 
-def _steps(model: ShapeModel) -> FloatArray:
+def _steps(model: Decoder) -> FloatArray:
     latents = model.latents
     steps: FloatArray = np.where(latents.periodic, PERIODIC_DIFFERENCE, DIFFERENCE) * latents.width
     return steps
 
 
-def nodes(model: ShapeModel, j: int) -> FloatArray:
+def nodes(model: Decoder, j: int) -> FloatArray:
     """Nodes (n, m_j) over the coordinates of a factor if all of them are periodic, otherwise none.
 
     Where coordinates go round, a shape may have to move far before it comes nearer, and no descent finds the way.
@@ -84,7 +81,7 @@ class FactorGrids:
     _matrix: sparse.csr_array
 
     @classmethod
-    def of(cls, model: ShapeModel) -> FactorGrids:
+    def of(cls, model: Decoder) -> FactorGrids:
         """Run the factors on their grids."""
         reference = model.reference
         centre = nric(reference.vertices, reference.connectivity)

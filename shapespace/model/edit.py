@@ -12,9 +12,9 @@ from shapespace.arrays import FloatArray, IntArray
 from shapespace.coordinates.nric import wrap
 from shapespace.coordinates.reconstruction import Reconstructor
 from shapespace.mesh.rigid_motion import without_rigid_motion
+from shapespace.model.decoder import Decoder, MeshChoice, Shape
 from shapespace.model.derivatives import batches, derivatives, factor_derivatives, nodes
 from shapespace.model.latent_space import Bounds, Codes, NotFiniteError
-from shapespace.model.shape_model import MeshChoice, Shape, ShapeModel
 from shapespace.solve.deadline import Deadline
 from shapespace.solve.least_squares import Fit, least_squares, shrinkable
 from shapespace.solve.status import Status
@@ -80,7 +80,7 @@ class Editor:
     reconstruction solves; by the implicit function theorem ``dX = (JᵀWJ)⁻¹ JᵀW dz``, where its residual is small.
     """
 
-    def __init__(self, model: ShapeModel) -> None:
+    def __init__(self, model: Decoder) -> None:
         self.model = model
 
     def __call__(
@@ -153,7 +153,7 @@ class _Problem:
 
     def __init__(
         self,
-        model: ShapeModel,
+        model: Decoder,
         rough: _Chart,
         chart: _Chart,
         start: FloatArray,
@@ -243,7 +243,7 @@ class _Chart:
 
     def __init__(
         self,
-        model: ShapeModel,
+        model: Decoder,
         reconstruct: Reconstructor,
         vertices: IntArray,
         mesh: MeshChoice,

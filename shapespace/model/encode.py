@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -10,9 +11,9 @@ from shapespace.arrays import FloatArray
 from shapespace.coordinates.nric import WeightedNorm, nric, wrap
 from shapespace.mesh.rigid_motion import align
 from shapespace.model.correspondence import InvalidMeshError, Matched
-from shapespace.model.derivatives import derivatives, factor_derivatives, nodes
+from shapespace.model.decoder import Decoder, MeshChoice, Shape
+from shapespace.model.derivatives import FactorGrids, derivatives, factor_derivatives, nodes
 from shapespace.model.latent_space import Bounds, Codes, NotFiniteError
-from shapespace.model.shape_model import MeshChoice, Shape, ShapeModel
 from shapespace.solve.deadline import Deadline
 from shapespace.solve.least_squares import Fit, least_squares
 from shapespace.solve.status import Status
@@ -57,7 +58,7 @@ class Encoder:
     evaluations beside one Jacobian.
     """
 
-    def __init__(self, model: ShapeModel) -> None:
+    def __init__(self, model: Decoder) -> None:
         self.model = model
         self._norm = WeightedNorm.of(model.reference, model.manifest.eta_reconstruction)
         self._root = np.sqrt(self._norm.squared)
@@ -92,6 +93,11 @@ class Encoder:
         status = Status.DEADLINE if shape.diagnostics.status is Status.DEADLINE else fit.status
         return Encoded(code, inside, status, fit.evaluations, residual, shape, distances, given.mesh)
 
+    @cached_property
+    def grids(self) -> FactorGrids:
+        """What starts are chosen from; made once, at the first mesh."""
+        return FactorGrids.of(self.model)
+
     def _fit(self, target: FloatArray, lower: FloatArray, upper: FloatArray, deadline: Deadline | None) -> Fit:
         latents, root = self.model.latents, self._root
         box = lower, upper, latents.width
@@ -108,7 +114,7 @@ class Encoder:
             )
 
         x = (latents.lower + latents.upper) / 2
-        for _ in range(SWEEPS * len(self.model.grids.images)):
+        for _ in range(SWEEPS * len(self.grids.images)):
             moved = self._elsewhere(x, affine(x))
             if moved is None:
                 break
@@ -134,7 +140,7 @@ class Encoder:
         What counts is the direction of a factor's shape from z̄, not its size, because the factors add up in direction
         only roughly in size: a bump on the inner side of a torus is not as large as on the outer one.
         """
-        grids = self.model.grids
+        grids = self.grids
         missing = -grids.sketch(residual)
         best, found = 0.0, None
         for j, images in grids.images.items():

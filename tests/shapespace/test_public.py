@@ -42,7 +42,7 @@ def test_every_public_name_is_there_and_has_an_example() -> None:
         value = getattr(shapespace, name)
         assert value.__name__ == name
         assert examples(value) or re.search(rf"shapespace\.{name}\b", tour), name
-    for name, method in vars(shapespace.Model).items():
+    for name, method in vars(shapespace.ShapeModel).items():
         if inspect.isfunction(method) and not name.startswith("_"):
             assert f"model.{name}(" in examples(method)
     with pytest.raises(AttributeError, match="has no attribute 'unknown'"):
@@ -63,7 +63,7 @@ import shapespace
 assert [name for name in sys.modules if name.startswith("shapespace")] == ["shapespace"]
 ALLOWED |= {"numpy", "scipy"}
 for name in shapespace.__all__:
-    if name not in {"load", "Model"}:
+    if name not in {"load", "ShapeModel"}:
         getattr(shapespace, name)
 ALLOWED |= {"onnx", "onnxruntime", "pydantic"}
 shapespace.load(sys.argv[1])

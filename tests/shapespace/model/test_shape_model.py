@@ -13,9 +13,9 @@ from shapespace.bundle.reader import BundleError
 from shapespace.files.formats import MESH_FORMATS
 from shapespace.mesh.triangle_mesh import MeshError, TriangleMesh
 from shapespace.model.correspondence import InvalidMeshError
+from shapespace.model.decoder import MeshChoice
 from shapespace.model.latent_space import NotFiniteError, OutOfBoundsError, WrongLengthError
-from shapespace.model.model import Model, load
-from shapespace.model.shape_model import MeshChoice
+from shapespace.model.shape_model import ShapeModel, load
 from tests.service.bundles import SCALE, fine_reference, reference, write_bundle
 from tests.service.conftest import ROOT, starting
 
@@ -33,7 +33,7 @@ def models(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def model(models: Path) -> Model:
+def model(models: Path) -> ShapeModel:
     return load(models / "with-fine")
 
 
@@ -88,7 +88,7 @@ def test_codes_are_those_of_the_server(models: Path, client: httpx.Client, name:
     np.testing.assert_array_equal(changed.distances, edited["distances"])
 
 
-def test_a_mesh_is_encoded_from_vertices_meshes_and_files(model: Model, tmp_path: Path) -> None:
+def test_a_mesh_is_encoded_from_vertices_meshes_and_files(model: ShapeModel, tmp_path: Path) -> None:
     for mesh, its_reference in (("fine", fine_reference()), ("coarse", reference())):
         shape = model.decode(CODES[0], mesh)
         np.savez(tmp_path / "shape.npz", vertices=shape, faces=its_reference.faces)
@@ -115,16 +115,16 @@ def test_a_folder_a_name_or_here(models: Path, monkeypatch: pytest.MonkeyPatch) 
             load(folder)
 
 
-def test_its_facts(model: Model) -> None:
+def test_its_facts(model: ShapeModel) -> None:
     assert (model.dimension, len(model.names)) == (3, 3)
     assert model.period == [None, 2 * np.pi, None]
     np.testing.assert_array_equal([model.lower, model.upper], [[-0.2, -np.pi, 0], [0.2, np.pi, 1]])
     np.testing.assert_array_equal(model.faces, fine_reference().faces)
     np.testing.assert_array_equal(model.vertices, SCALE * fine_reference().vertices)
-    assert repr(model) == f"<Model with-fine/1: 3 coordinates, 2 factors, {len(model.vertices)} vertices>"
+    assert repr(model) == f"<ShapeModel with-fine/1: 3 coordinates, 2 factors, {len(model.vertices)} vertices>"
 
 
-def test_what_is_wrong_is_said(model: Model) -> None:
+def test_what_is_wrong_is_said(model: ShapeModel) -> None:
     with pytest.raises(WrongLengthError, match="takes 3"):
         model.decode([[0.0, 1.0]])
     with pytest.raises(WrongLengthError, match=r"\(n, m\) or \(m,\)"):
@@ -149,9 +149,9 @@ def test_what_is_wrong_is_said(model: Model) -> None:
         model.edit(CODES[0], {0: [np.inf, 0, 0]})
 
 
-def test_shapes_that_were_not_found_are_told(model: Model, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_shapes_that_were_not_found_are_told(model: ShapeModel, monkeypatch: pytest.MonkeyPatch) -> None:
     assert model.decode(np.zeros((0, 3))).shape == (0, *model.vertices.shape)
-    monkeypatch.setattr("shapespace.model.shape_model.TOLERANCE", 1e-300)
+    monkeypatch.setattr("shapespace.model.decoder.TOLERANCE", 1e-300)
     with pytest.warns(RuntimeWarning, match="1 of 1 shapes did not converge; the first is that of code 0: ") as caught:
         model.decode(CODES[:1])
     assert caught[0].filename == __file__
