@@ -56,7 +56,7 @@ class Refuse:
     def find_spec(self, name, path=None, target=None):
         if name.split(".")[0] in {"distributed", "fastapi", "httpx", "joblib", "numpy", "onnx", "onnxruntime",
                                   "pydantic", "scipy", "torch", "trimesh"} - ALLOWED:
-            raise ModuleNotFoundError(f"{name} is refused")
+            raise ModuleNotFoundError(f"{name} is refused", name=name)
 ALLOWED = set()
 sys.meta_path.insert(0, Refuse())
 import shapespace
@@ -65,6 +65,12 @@ ALLOWED |= {"numpy", "scipy"}
 for name in shapespace.__all__:
     if name not in {"load", "ShapeModel"}:
         getattr(shapespace, name)
+try:
+    shapespace.load
+except ModuleNotFoundError as error:
+    assert str(error) == f"shapespace.load needs {error.name}: pip install 'shapespace[model]'", error
+else:
+    raise AssertionError("it has imported what is refused")
 ALLOWED |= {"onnx", "onnxruntime", "pydantic"}
 shapespace.load(sys.argv[1])
 """
