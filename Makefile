@@ -55,7 +55,7 @@ lint: $(VENV)/.all $(BIN)/hadolint ## check style, types, doors between packages
 
 # What the libraries of serving take part in, and training doesn't.
 SERVING = $(filter-out $(foreach name,blocks bundled_files proxy reloading replicas,%/test_$(name).py), \
-	$(wildcard tests/service/test_*.py)) $(foreach name,files/test_formats files/test_reading files/test_gltf_reading \
+	$(wildcard tests/service/test_*.py)) $(foreach name,files/test_formats files/test_polygon_reading files/test_gltf_reading \
 	coordinates/test_reconstruction solve/test_cholesky,tests/shapespace/$(name).py)
 
 lowest: $(VENV)-lowest/.installed ## run the server's tests with the lowest versions that pyproject.toml allows

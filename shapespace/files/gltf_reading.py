@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shapespace.arrays import FloatArray, IntArray
-from shapespace.files.reading import PIECE, Limits, clipped
+from shapespace.files.limits import PIECE, Limits, clipped
 from shapespace.mesh.triangle_mesh import MeshError
 
 #: Most bytes of the JSON, without data; and of its values. A rig with animations has a hundred thousand.

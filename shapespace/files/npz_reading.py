@@ -12,7 +12,7 @@ from typing import IO
 import numpy as np
 from numpy.typing import NDArray
 
-from shapespace.files.reading import PIECE, UNLIMITED, Limits, clipped
+from shapespace.files.limits import PIECE, UNLIMITED, Limits, clipped
 from shapespace.mesh.triangle_mesh import MeshError
 
 _MOST_ARRAYS = 1000

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from shapespace.arrays import FloatArray, IntArray
-from shapespace.files.reading import Limits
+from shapespace.files.limits import Limits
 from shapespace.mesh.triangle_mesh import diagonal
 from shapespace.model.decoder import Decoder, MeshChoice
 
