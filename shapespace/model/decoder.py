@@ -1,4 +1,4 @@
-"""One bundle at work: latent codes to lengths and angles, and those to vertices."""
+"""Decoding: latent codes to lengths and angles by the networks of a bundle, and those to vertices by Gauss–Newton."""
 
 from __future__ import annotations
 
@@ -29,21 +29,21 @@ from shapespace.solve.status import Status
 
 logger = logging.getLogger(__name__)
 #: Gauss–Newton stops once no vertex moves further than this fraction of the diagonal: a fiftieth of a pixel where a
-#: shape fills a screen, and less than the residual that the diagnostics tell changes by.
+#: shape fills a screen.
 TOLERANCE = 2e-5
-#: A model that has taken too long gets half the time from then on, but this at least: whoever asks for such codes again
-#: and again should not keep the workers from the other models.
+#: When networks have taken too long, their limit of time is halved, down to so many seconds, and grows by that factor
+#: with each answer in time. Otherwise repeated requests for such codes would keep the workers from other models.
 LEAST_PATIENCE, RECOVERY = 0.5, 1.1
 #: Random codes at which a model is rehearsed.
 REHEARSED = 2
 
 
 class ModelFailedError(RuntimeError):
-    """A model whose networks fail at a code, with a sentence that says what to do; the cause says which, and how."""
+    """Networks that fail at a code, with a sentence that says what to do; its cause names the network and the fault."""
 
 
 class NetworkTimeError(ModelFailedError):
-    """A model whose networks take too long at a code."""
+    """Networks that take too long at a code."""
 
 
 class MeshChoice(StrEnum):
@@ -58,17 +58,17 @@ class Diagnostics:
     """How well a shape was found.
 
     Attributes:
-        status: how Gauss–Newton ended, see shapespace.coordinates.reconstruction.Status.
+        status: how Gauss–Newton ended, see shapespace.solve.status.Status.
         iterations: its steps.
         residual: distance between the lengths and angles asked for and those of the shape, relative,
             weighted norm.
-        flipped_faces: faces at an edge that is folded more than π/2 away from what was asked for.
+        flipped_faces: faces at an edge whose dihedral angle is more than π/2 from the one asked for.
         integrability: how far the lengths and angles asked for are from those of any surface: root mean square over
             vertices of ``|Q(z)|``, the sine of half the angle by which faces around a vertex fail to close.
         plausibility: distance to the nearest code of a training shape, in multiples of the distance that these
             typically have from each other; None where the model has no such codes.
         inside_bounds: whether the code lies inside the model's bounds.
-        model: digest of the model.
+        model: digest of the model's manifest.
     """
 
     status: Status
@@ -83,11 +83,11 @@ class Diagnostics:
 
 @dataclass(frozen=True)
 class Shape:
-    """A shape as it leaves: aligned to the reference, in the units of the training meshes.
+    """A shape as it is answered: aligned to the reference, in the units of the training meshes.
 
     Attributes:
         vertices: (V, 3), of the mesh that was asked for.
-        diagnostics: how well it was found; of the coarse mesh.
+        diagnostics: how well it was found; they concern the coarse mesh.
         seconds: time spent by stage, ``network`` and ``reconstruct``.
     """
 
@@ -113,13 +113,13 @@ class LengthsAndAngles:
 class Decoder:
     """The networks and the Gauss–Newton solver of a bundle, ready for any number of threads.
 
-    Every code goes through the networks on its own and starts from the same place, so that a shape doesn't
-    depend on what it was asked for together with.
+    Each code is decoded by itself, and Gauss–Newton starts from the same places, so that a shape does not depend on
+    other codes.
 
     Args:
         bundle: verified.
-        threads: shapes that may be reconstructed at once; each gets a solver, the first one here and the others when
-            they are first needed, which takes about as long as a shape.
+        threads: shapes that may be reconstructed at once; each has a solver of its own. The first is made here, the
+            others when they are needed, which takes about as long as a shape.
 
     Raises:
         BundleError: a network that doesn't load, or has other inputs or outputs than the manifest says.
@@ -143,24 +143,25 @@ class Decoder:
         #: Spaces for exact exponentials, one for each thread that computes some; made when none is free.
         self.spaces: queue.SimpleQueue[ShellSpace] = queue.SimpleQueue()
         self._solvers: queue.SimpleQueue[Reconstructor] = queue.SimpleQueue()
-        self._first = Reconstructor(self.reference, manifest.eta_reconstruction)
-        self._first.guess(nric(self.reference.vertices, self.reference.connectivity))  # so that no request waits for it
-        self._solvers.put(self._first)
+        self._first_solver = Reconstructor(self.reference, manifest.eta_reconstruction)
+        # What it prepares at its first shape is done here, so that no request waits for it.
+        self._first_solver.guess(nric(self.reference.vertices, self.reference.connectivity))
+        self._solvers.put(self._first_solver)
         #: Solvers that may still be made: a server of many threads rarely needs them all.
-        self._more, self._counting = threads - 1, threading.Lock()
+        self._solvers_left, self._lock = threads - 1, threading.Lock()
         self._patience = PATIENCE
 
     def mesh(self, choice: MeshChoice) -> TriangleMesh:
-        """The reference, normalised, on the mesh of choice; its faces are those of every shape."""
+        """The reference, normalised, as the fine or the coarse mesh; every shape has its faces."""
         fine = self.finer(choice)
         return fine.reference if fine else self.reference
 
     def finer(self, choice: MeshChoice) -> FineMesh | None:
-        """The finer mesh, where there is one and it is the choice."""
+        """The finer mesh, where the model has one and it is the choice; otherwise None."""
         return self.fine if choice is MeshChoice.FINE else None
 
     def reference_shape(self, mesh: MeshChoice = MeshChoice.FINE) -> Shape:
-        """The reference itself: the answer where there is no code."""
+        """The reference itself: what is answered without a code."""
         diagnostics = Diagnostics(Status.CONVERGED, 0, 0.0, 0, 0.0, None, True, self.digest)
         vertices = self.manifest.scale * self.mesh(mesh).vertices
         return Shape(vertices, diagnostics, {"network": 0.0, "reconstruct": 0.0})
@@ -172,18 +173,17 @@ class Decoder:
         mesh: MeshChoice = MeshChoice.FINE,
         deadline: Deadline | None = None,
     ) -> Shape:
-        """The shape of one code (m,), whatever Gauss–Newton's status.
+        """The shape of one code (m,), also where Gauss–Newton did not converge: the diagnostics say so.
 
         Args:
             code: checked by ``latents.codes``.
-            inside_bounds: goes into the diagnostics.
+            inside_bounds: what the diagnostics say of it.
             mesh: fine or coarse.
             deadline: after which Gauss–Newton gives up with Status.DEADLINE.
 
         Raises:
-            NotFiniteError: the code is so far out that the numbers overflow.
+            NotFiniteError: the code is so far outside the bounds that the numbers overflow.
             ModelFailedError: the networks failed at this code, or took too long.
-            DeadlineError: the deadline passed while they were at work.
         """
         began = time.perf_counter()
         _, target = self._networks(code[None])
@@ -195,7 +195,7 @@ class Decoder:
         with np.errstate(over="ignore", invalid="ignore"):
             try:
                 vertices = self.finish(found.vertices, mesh)
-            except np.linalg.LinAlgError:  # aligned, what isn't finite
+            except np.linalg.LinAlgError:  # of the alignment, where vertices are not finite
                 raise NotFiniteError(self._overflow) from None
             if found.status is Status.NOT_FINITE or not np.isfinite(vertices.astype(np.float32)).all():
                 raise NotFiniteError(self._overflow)
@@ -213,7 +213,7 @@ class Decoder:
         return Shape(vertices, diagnostics, seconds)
 
     def lengths_and_angles(self, code: Codes) -> LengthsAndAngles:
-        """What the networks say to a code (m,), before any reconstruction; raises NotFiniteError."""
+        """What the networks predict for a code (m,), before any reconstruction; raises NotFiniteError."""
         factors, z = (array[0].astype(np.float64) for array in self._networks(code[None]))
         half = self.manifest.edges
         for array in (factors, z):
@@ -224,19 +224,19 @@ class Decoder:
         return LengthsAndAngles(z[:half], z[half:], factors)
 
     def nric(self, code: FloatArray) -> FloatArray:
-        """What the networks say to a code (m,): (2E,), normalised, not finite where they overflow."""
+        """What the networks predict for a code (m,): NRIC (2E,), normalised, not finite where they overflow."""
         return self._networks(code[None].astype(np.float32))[1][0]
 
     def factor(self, j: int, parts: FloatArray) -> FloatArray:
-        """What factor j's network alone says to parts (n, m_j) of codes: (n, 2E), normalised."""
+        """What the network of factor j predicts for its parts (n, m_j) of codes: NRIC (n, 2E), normalised."""
         with self._limited() as until:
             return self._factors[j](parts.astype(np.float32), until).astype(np.float64)
 
     def rehearse(self) -> None:
-        """Do once what serving does: every network, at the ends of its bounds and elsewhere, and one shape.
+        """Run every network once, at the ends of the bounds and between them, and reconstruct one shape.
 
         Raises:
-            BundleError: it must not be served.
+            BundleError: something fails, so that the bundle must not be served.
         """
         for network in (*self._factors, self._combiner, *([self._start] if self._start else [])):
             network.check()
@@ -257,16 +257,16 @@ class Decoder:
         return self.latents.codes([x.tolist() for x in (lower + (upper - lower) / 2, lower, upper)], Bounds.CLAMP)[0]
 
     def finish(self, shape: FloatArray, mesh: MeshChoice) -> FloatArray:
-        """A shape (V, 3) in any pose as it leaves: on the mesh of choice, aligned, in the training meshes' units."""
+        """A shape (V, 3) in any pose as it is answered: on the mesh of choice, aligned, in the user's units."""
         return self.manifest.scale * self.placed(shape, mesh)
 
     def placed(self, shapes: FloatArray, mesh: MeshChoice, carried: FloatArray | None = None) -> FloatArray:
-        """Shapes (…, V, 3) on the mesh of choice, aligned to its reference; instead of them what is carried along."""
+        """Shapes (…, V, 3) on the mesh of choice, aligned to its reference; or what is ``carried`` by that motion."""
         fine = self.finer(mesh)
         return align(fine.prolong(shapes) if fine else shapes, self.mesh(mesh).vertices, carried)
 
     def coarse(self, vertices: FloatArray, mesh: MeshChoice) -> FloatArray:
-        """The vertices (V, 3) of the coarse mesh among those of a mesh of choice."""
+        """The coarse mesh's vertices, given those (V, 3) of the mesh of choice."""
         fine = self.finer(mesh)
         return vertices[fine.prolong.coarse_vertices] if fine else vertices
 
@@ -291,7 +291,7 @@ class Decoder:
 
     @contextmanager
     def _limited(self) -> Iterator[float]:
-        """The moment by which networks must have answered; what they raise becomes what callers know."""
+        """Yields the moment by which networks must have answered; turns their errors into ModelFailedError."""
         patience = self._patience
         try:
             yield time.monotonic() + patience
@@ -308,7 +308,7 @@ class Decoder:
 
     @contextmanager
     def solver(self) -> Iterator[Reconstructor]:
-        """A solver for the time being; waits for one where all are in use."""
+        """Lends a solver; waits while all are in use."""
         solver = self._spare_solver()
         try:
             yield solver
@@ -318,10 +318,10 @@ class Decoder:
     def _spare_solver(self) -> Reconstructor:
         with suppress(queue.Empty):
             return self._solvers.get_nowait()
-        with self._counting:
-            make = self._more > 0
-            self._more -= make
-        return self._first.another() if make else self._solvers.get()
+        with self._lock:
+            make = self._solvers_left > 0
+            self._solvers_left -= make
+        return self._first_solver.another() if make else self._solvers.get()
 
     @property
     def _overflow(self) -> str:

@@ -1,4 +1,4 @@
-"""From a mesh to its latent code: least squares on the networks, in lengths and angles, where poses don't matter."""
+"""Encoding: from a mesh to its latent code, by least squares in lengths and angles, which do not depend on the pose."""
 
 from __future__ import annotations
 
@@ -18,9 +18,10 @@ from shapespace.solve.deadline import Deadline
 from shapespace.solve.least_squares import Fit, least_squares
 from shapespace.solve.status import Status
 
-#: Times that each factor is moved on its grid, given the others, and how much more it must explain then.
+#: Times that each factor may be moved on its grid while the others stay, and the factor by which a move must explain
+#: more of the misfit than the present place does.
 SWEEPS, PROMISING = 4, 1.2
-#: A code may leave the bounds by this fraction of its range where that is allowed.
+#: A code may leave the bounds by this fraction of their width where that is allowed.
 MARGIN = 0.5
 
 
@@ -29,14 +30,14 @@ class Encoded:
     """The code whose lengths and angles come closest to a mesh's.
 
     Attributes:
-        code: (m,), as the networks take it.
+        code: (m,), float32, as the networks take it.
         inside_bounds: whether it lies inside the bounds.
         status: how the iteration ended.
         iterations: evaluations of the networks' misfit.
         residual: relative misfit of lengths and angles, in the weighted norm of the reconstruction.
-        shape: what the service answers to the code, on the mesh that was given.
-        distances: (V,) of the given vertices to that shape, after rigid alignment.
-        mesh: which mesh was given.
+        shape: of the code, on the mesh that was given.
+        distances: (V,) from the given vertices to those of that shape, after rigid alignment.
+        mesh: whether the fine or the coarse mesh was given.
     """
 
     code: Codes
@@ -50,7 +51,7 @@ class Encoded:
 
 
 class Encoder:
-    """Finds codes of meshes, for any number of threads.
+    """Finds codes of meshes; may be used by several threads at once.
 
     Minimises ``‖z(code) − z‖_{2,z̄}``, angles compared modulo 2π, in two rounds. The first takes the factors alone,
     ``z̄ + Σ_j (ψ_j − z̄)``, which come within a few percent and cost little; where a factor has periodic coordinates it
@@ -115,7 +116,7 @@ class Encoder:
 
         x = (latents.lower + latents.upper) / 2
         for _ in range(SWEEPS * len(self.grids.images)):
-            moved = self._elsewhere(x, affine(x))
+            moved = self._another_start(x, affine(x))
             if moved is None:
                 break
             x = moved
@@ -125,7 +126,7 @@ class Encoder:
         )  # fmt: skip
         best = from_composite(rough.x)
         for _ in range(SWEEPS):
-            moved = self._elsewhere(best.x, best.residual)
+            moved = self._another_start(best.x, best.residual)
             if moved is None or best.status is Status.DEADLINE:
                 break
             other = from_composite(moved)
@@ -134,7 +135,7 @@ class Encoder:
             best = other
         return best
 
-    def _elsewhere(self, x: FloatArray, residual: FloatArray) -> FloatArray | None:
+    def _another_start(self, x: FloatArray, residual: FloatArray) -> FloatArray | None:
         """A code with one factor moved to the node that fits best, where that promises to be better than x.
 
         What counts is the direction of a factor's shape from z̄, not its size, because the factors add up in direction

@@ -1,4 +1,4 @@
-"""The exponentials that the networks have learned to imitate, computed as they are defined."""
+"""Exact shapes: the discrete exponentials that the networks approximate, computed."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ class Exact:
     """The discrete exponential of one code.
 
     Attributes:
-        status: of its solver, see shapespace.coordinates.reconstruction.Status.
-        vertices: (V, 3) float32, aligned like every shape, in the units of the training meshes; None where it failed.
+        status: of its solver, see shapespace.solve.status.Status.
+        vertices: (V, 3) float32, aligned to the reference, in the units of the training meshes; None where it failed.
         mean, max: distance of the networks' answer from it, over vertices; None where it failed.
     """
 
