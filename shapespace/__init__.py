@@ -75,18 +75,20 @@ _MODULES = {
 }
 
 
-def __getattr__(name: str) -> object:
-    # Imported when first asked for: the client and the workers of a cluster have few of the libraries installed.
-    if name not in _MODULES:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    try:
-        module = import_module(f"{__name__}.{_MODULES[name]}")
-    except ModuleNotFoundError as error:
-        reason = f"shapespace.{name} needs {error.name}: pip install 'shapespace[model]'"
-        raise ModuleNotFoundError(reason, name=error.name) from error
-    value = getattr(module, name)
-    globals()[name] = value
-    return value
+if not TYPE_CHECKING:  # a type checker would take any name for one of these
+
+    def __getattr__(name: str) -> object:
+        # Imported when first asked for: the client and the workers of a cluster have few of the libraries installed.
+        if name not in _MODULES:
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        try:
+            module = import_module(f"{__name__}.{_MODULES[name]}")
+        except ModuleNotFoundError as error:
+            reason = f"shapespace.{name} needs {error.name}: pip install 'shapespace[model]'"
+            raise ModuleNotFoundError(reason, name=error.name) from error
+        value = getattr(module, name)
+        globals()[name] = value
+        return value
 
 
 def __dir__() -> list[str]:

@@ -119,6 +119,32 @@ def test_a_checkout_without_links_is_refused_in_a_sentence(tmp_path: Path) -> No
         build(sources)
 
 
+def test_type_checkers_know_it(installed: Path, tmp_path: Path) -> None:
+    (tmp_path / "user.py").write_text("""
+import shapespace
+model = shapespace.load("models/figure")
+code: str = model.encode("mesh.obj").code
+shapespace.lode
+""")
+    checker = (
+        sys.executable,
+        "-m",
+        "mypy",
+        "--python-executable",
+        installed / "python",
+        "--no-error-summary",
+        "user.py",
+    )
+    told = subprocess.run(checker, cwd=tmp_path, env=ENVIRONMENT, capture_output=True, text=True, check=False).stdout
+    # The stubs of libraries are their own affair.
+    found = [
+        line.split(": ", 2)[::2] for line in told.splitlines() if line.startswith("user.py:") and ": error: " in line
+    ]
+    assert [place for place, _ in found] == ["user.py:4", "user.py:5"], told
+    assert "ndarray" in found[0][1]
+    assert "lode" in found[1][1]
+
+
 def test_nothing_else_can_be_imported(installed: Path, tmp_path: Path) -> None:
     program = """
 import importlib.util, pathlib, sys
