@@ -56,7 +56,7 @@ def animated_glb(frames: NDArray[np.floating], faces: IntArray) -> AnimatedGLB:
     else:
         weights = _basis_weights(frames, BASIS_TOLERANCE * _diagonal(frames))
         fit = np.asarray(np.linalg.pinv(weights), np.float64)
-        # Blender (5.0 too) cuts weights off below 0: a vector with weights of both signs becomes two targets.
+        # Blender (at least up to 5.0) cuts off weights below 0: a vector with both signs becomes two targets.
         both = (weights < 0).any(axis=0)
         weights = np.hstack([weights.clip(0), -weights[:, both].clip(max=0)])
         fit = np.concatenate([fit, -fit[both]])
