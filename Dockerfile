@@ -13,7 +13,7 @@ COPY requirements/build.txt requirements/serve.txt requirements/
 RUN --mount=type=secret,id=pip,target=/etc/pip.conf \
     pip install --require-hashes --requirement requirements/build.txt && \
     pip --python /opt/shapespace install --require-hashes --requirement requirements/serve.txt
-COPY pyproject.toml README.md LICENSE ./
+COPY pyproject.toml setup.py README.md LICENSE ./
 COPY shapespace shapespace
 COPY service service
 RUN pip wheel --no-deps --no-index --no-build-isolation --wheel-dir wheels . && \

@@ -28,7 +28,7 @@ BUILD_SYSTEM := $(shell sed -n 's/^requires = \["\(.*\)"\]$$/\1/p' pyproject.tom
 COMPILE = $(BIN)/uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-annotate \
 	--no-emit-index-url --no-emit-find-links --custom-compile-command 'make lock' $(ARGS)
 
-.PHONY: help serve install train test lint lowest lock faults folders soak fuzz fuzz-api mutants coverage audit sbom bench results clients openapi image-test clean
+.PHONY: help serve install train test lint lowest lock faults folders soak fuzz fuzz-api mutants coverage audit sbom bench results clients openapi image-test wheel clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-12s%s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -55,7 +55,7 @@ lint: $(VENV)/.all $(BIN)/hadolint ## check style, types, doors between packages
 
 # What the libraries of serving take part in, and training doesn't.
 SERVING = $(filter-out $(foreach name,blocks bundled_files proxy reloading replicas,%/test_$(name).py), \
-	$(wildcard tests/service/test_*.py)) $(foreach name,files/test_formats files/test_reading files/test_gltf_reading \
+	$(wildcard tests/service/test_*.py)) $(foreach name,files/test_formats files/test_polygon_reading files/test_gltf_reading \
 	coordinates/test_reconstruction solve/test_cholesky,tests/shapespace/$(name).py)
 
 lowest: $(VENV)-lowest/.installed ## run the server's tests with the lowest versions that pyproject.toml allows
@@ -116,6 +116,10 @@ results: $(VENV)/.train ## compute what is missing of docs/results.md (DATA=fold
 
 clients: $(VENV)/.all $(MODULES) $(VENV)-blender/.bpy ## have Blender and three.js open what the server answers
 	PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/python -m tests.clients $(VENV)-blender/bin/python
+
+wheel: $(VENV)/.created ## build dist/shapespace-….whl, which holds the figure too
+	rm -rf build/lib # what is there would go into the wheel
+	$(BIN)/python -m pip wheel --no-deps --wheel-dir dist .
 
 openapi: $(VENV)/.serve ## write openapi/openapi.json from the app
 	$(BIN)/python -m shapespace.service.http.openapi

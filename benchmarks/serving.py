@@ -36,7 +36,8 @@ from shapespace.coordinates.nric import NRICJacobian, WeightedNorm
 from shapespace.coordinates.reconstruction import Reconstructor
 from shapespace.files.formats import MESH_FORMATS
 from shapespace.mesh.rigid_motion import align
-from shapespace.model.shape_model import TOLERANCE, MeshChoice, ShapeModel
+from shapespace.model.decoder import TOLERANCE, MeshChoice
+from shapespace.model.shape_model import ShapeModel
 from shapespace.shell.energy import Material
 from shapespace.shell.exponential import exponential
 from shapespace.shell.space import ShellSpace

@@ -28,7 +28,7 @@ def main() -> None:
 def _serve(trials: Trials) -> None:
     from pydantic import ValidationError
 
-    from shapespace.service.settings import PREFIX, Settings, is_loopback, unknown_variables
+    from shapespace.service.settings import BUNDLED, PREFIX, Settings, is_loopback, unknown_variables
 
     try:
         settings = Settings()
@@ -47,6 +47,8 @@ def _serve(trials: Trials) -> None:
     log = logging.getLogger(__name__)
     for name in unknown_variables():
         log.warning("%s is no setting: the README lists those there are", name)
+    if settings.models_dir == BUNDLED:
+        log.info("serving what is installed with the package; a folder models or SHAPESPACE_MODELS_DIR gives others")
     if hasattr(signal, "SIGHUP"):
         signal.signal(signal.SIGHUP, signal.SIG_IGN)  # until the server can reload
     # Uvicorn raises the signal once more when everything is finished: that is a success.

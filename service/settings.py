@@ -12,7 +12,11 @@ from typing import Annotated
 from pydantic import BeforeValidator, Field, NonNegativeFloat, PositiveFloat, PositiveInt, SecretStr, field_validator
 from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict
 
+import shapespace
+
 PREFIX = "SHAPESPACE_"
+#: Models that are installed with the package.
+BUNDLED = Path(shapespace.__file__).parent / "models"
 
 
 class LogFormat(StrEnum):
@@ -37,6 +41,11 @@ def cpu_quota(cgroup: Path = Path("/sys/fs/cgroup")) -> int:
     return max(1, min(count, round(share))) if share > 0 else count
 
 
+def default_models_dir() -> Path:
+    """``models`` in the working directory; where there is none, the models that were installed with the package."""
+    return Path("models") if Path("models").exists() else BUNDLED
+
+
 def _split(value: object) -> object:
     return tuple(filter(None, map(str.strip, value.split(",")))) if isinstance(value, str) else value
 
@@ -50,7 +59,10 @@ class Settings(BaseSettings):
 
     model_config = SettingsConfigDict(env_prefix=PREFIX, env_ignore_empty=True, frozen=True, allow_inf_nan=False)
 
-    models_dir: Path = Field(default=Path("models"), description="folder of bundles, NAME/VERSION/")
+    models_dir: Path = Field(
+        default_factory=default_models_dir,
+        description="folder of bundles, NAME/VERSION/; by default `models` here, or the one installed with the package",
+    )
     host: str = Field(default="127.0.0.1", description="address to listen on")
     port: int = Field(default=8000, ge=0, le=65535, description="port to listen on; 0 takes a free one")
     workers: PositiveInt = Field(

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from shapespace.files.formats import read_arrays
-from shapespace.files.reading import Limits
+from shapespace.files.limits import Limits
 from shapespace.mesh.triangle_mesh import MeshError
 from shapespace.service.http.messages.uploads import UploadError, read_mesh_file
 

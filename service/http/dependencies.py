@@ -9,7 +9,8 @@ from typing import Annotated
 from fastapi import Depends, Path, Query, Request
 from pydantic import WithJsonSchema
 
-from shapespace.model.shape_model import MeshChoice, ShapeModel
+from shapespace.model.decoder import MeshChoice
+from shapespace.model.shape_model import ShapeModel
 from shapespace.service.http.connections import Connections
 from shapespace.service.http.problems import ProblemError
 from shapespace.service.http.recent import RecentAnswers

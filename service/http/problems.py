@@ -15,9 +15,9 @@ from starlette.routing import Match
 from starlette.types import Scope
 
 from shapespace.model.correspondence import InvalidMeshError
+from shapespace.model.decoder import ModelFailedError, NetworkTimeError
 from shapespace.model.exact_shapes import NoTangentSpaceError
 from shapespace.model.latent_space import NotFiniteError, OutOfBoundsError, WrongLengthError
-from shapespace.model.shape_model import ModelFailedError, NetworkTimeError
 from shapespace.service.limits.workers import BusyError, DeadlineError, DisconnectedError, EndingError
 from shapespace.service.repository.repository import UnknownModelError, UnknownVersionError
 from shapespace.service.use_cases.animation import PathTooLongError, UnknownInterpolationError

@@ -20,8 +20,9 @@ from starlette.types import Receive, Scope, Send
 from shapespace import __version__
 from shapespace.files.archives import Buffer
 from shapespace.files.colouring import Colouring
+from shapespace.model.decoder import Diagnostics, MeshChoice, Shape
 from shapespace.model.latent_space import CheckedCode, Codes
-from shapespace.model.shape_model import Diagnostics, MeshChoice, Shape, ShapeModel
+from shapespace.model.shape_model import ShapeModel
 from shapespace.service.http.dependencies import Service
 from shapespace.service.http.messages.color_query import Comparison
 from shapespace.service.http.messages.schemas import MeshAnswer

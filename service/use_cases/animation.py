@@ -14,8 +14,8 @@ import orjson
 from pydantic import ConfigDict, Field, ValidationError, field_validator, model_validator
 
 from shapespace.arrays import FloatArray
+from shapespace.model.decoder import MeshChoice
 from shapespace.model.latent_space import LatentSpace
-from shapespace.model.shape_model import MeshChoice
 from shapespace.service.http.messages.schemas import Body, Number, Whole
 from shapespace.service.use_cases.shape_formats import holds_more_values
 

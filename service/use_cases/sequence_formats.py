@@ -15,8 +15,8 @@ from shapespace.files.archives import Buffer, npz_pieces, zip_pieces
 from shapespace.files.formats import OCTET_STREAM, obj_faces, obj_vertices
 from shapespace.files.point_cache import point_cache
 from shapespace.files.usd import animated_usd, usd_installed
+from shapespace.model.decoder import Diagnostics, Shape
 from shapespace.model.latent_space import Codes
-from shapespace.model.shape_model import Diagnostics, Shape
 from shapespace.service.use_cases.shape_formats import diagnostics_arrays, dump_json, float32
 
 

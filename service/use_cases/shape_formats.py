@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from shapespace.arrays import FloatArray, IntArray
 from shapespace.files.colouring import Colouring
 from shapespace.files.formats import MESH_FORMATS, MeshFormat
+from shapespace.model.decoder import Diagnostics
 from shapespace.model.exact_shapes import Exact
-from shapespace.model.shape_model import Diagnostics
 
 #: Bytes that are counted at once: where there are too many values, few of these pieces are looked at.
 _PIECE = 2**16

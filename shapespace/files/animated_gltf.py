@@ -18,7 +18,7 @@ DENSE_FRAMES = 64
 #: Enough targets are kept to bring every vertex this close, as a fraction of the bounding box's diagonal.
 BASIS_TOLERANCE = 1e-4
 FRAMES_PER_SECOND = 30
-#: Bytes of displacements that are held at once, and frames whose normals are.
+#: Bytes of displacements, and frames of normals, that are held in memory at once.
 BLOCK, _FRAMES_AT_ONCE = 2**21, 16
 
 
@@ -56,7 +56,7 @@ def animated_glb(frames: NDArray[np.floating], faces: IntArray) -> AnimatedGLB:
     else:
         weights = _basis_weights(frames, BASIS_TOLERANCE * _diagonal(frames))
         fit = np.asarray(np.linalg.pinv(weights), np.float64)
-        # Blender cuts weights off below 0 (up to 5.0 at least), so who goes both ways becomes two targets.
+        # Blender (at least up to 5.0) cuts off weights below 0: a vector with both signs becomes two targets.
         both = (weights < 0).any(axis=0)
         weights = np.hstack([weights.clip(0), -weights[:, both].clip(max=0)])
         fit = np.concatenate([fit, -fit[both]])

@@ -1,4 +1,4 @@
-"""ZIP archives made piece by piece, so that what is large is held neither twice nor compressed."""
+"""ZIP and NPZ archives written piece by piece, so that a large archive is never held whole."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ import numpy as np
 Buffer = bytes | bytearray | memoryview
 #: Harder compression takes longer than the shapes themselves, for a tenth of the size.
 TEXT_LEVEL = 1
-#: As NumPy's own.
+#: The level that NumPy uses.
 ARRAY_LEVEL = 6
 
 
 class _Sink(io.RawIOBase):
-    """Takes what is written until somebody takes it away; can't go back."""
+    """A file that keeps what is written until it is taken; not seekable."""
 
     def __init__(self) -> None:
         self._pieces: list[bytes] = []

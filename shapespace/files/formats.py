@@ -12,8 +12,9 @@ import numpy as np
 
 from shapespace.arrays import FloatArray, IntArray
 from shapespace.files.gltf_reading import read_gltf
+from shapespace.files.limits import UNLIMITED, Limits, clipped
 from shapespace.files.npz_reading import load_npz
-from shapespace.files.reading import UNLIMITED, Limits, clipped, read_obj, read_off, read_ply, read_stl
+from shapespace.files.polygon_reading import read_obj, read_off, read_ply, read_stl
 from shapespace.mesh.triangle_mesh import MeshError
 
 if TYPE_CHECKING:
@@ -141,6 +142,13 @@ def read_arrays(
 
     Raises:
         MeshError: unreadable, too large, or not exactly one mesh; with the reason.
+
+    >>> import numpy as np
+    >>> corners, faces = np.eye(4, 3), np.array([[0, 1, 2], [0, 3, 1], [1, 3, 2], [2, 3, 0]])
+    >>> content = MESH_FORMATS["obj"].encode(corners, faces)
+    >>> vertices, triangles = read_arrays(content, "obj")
+    >>> bool((vertices == corners).all() and (triangles == faces).all())
+    True
     """
     beside = source if isinstance(source, Path) else None
     if isinstance(source, Path):
@@ -151,7 +159,7 @@ def read_arrays(
             raise MeshError(f"can't be read: {error.strerror}") from error
     data = memoryview(source)
     try:
-        # What isn't finite is for the caller to judge.
+        # Whether coordinates that are not finite are a fault is for the caller to decide.
         with np.errstate(all="ignore"):
             match format:
                 case "glb" | "gltf":

@@ -1,8 +1,8 @@
-"""glTF 2.0, read: the triangles of a scene at rest, from GLB or from JSON with its data inside or beside it.
+"""Reader of glTF 2.0: the triangles of a scene at rest, from GLB or from JSON with its data inside or beside it.
 
-What a scene comes to is counted before any of its data are unpacked, and a node is visited once. Skins, morph targets,
+The size of a scene is known before any of its data are unpacked, and each node is visited once. Skins, morph targets,
 animations, materials, pictures, cameras and lights are left out; what would change the triangles and isn't known here
-is refused. By the glTF 2.0 specification of the Khronos Group, whose sections are named.
+is refused. Sections named in comments are those of the Khronos Group's glTF 2.0 specification.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shapespace.arrays import FloatArray, IntArray
-from shapespace.files.reading import PIECE, Limits, clipped
+from shapespace.files.limits import PIECE, Limits, clipped
 from shapespace.mesh.triangle_mesh import MeshError
 
 #: Most bytes of the JSON, without data; and of its values. A rig with animations has a hundred thousand.
@@ -41,17 +41,17 @@ _DATA = re.compile(rb'"(data:[^"\\]*+)"')
 def read_gltf(
     data: memoryview, limits: Limits, *, binary: bool, beside: Path | None = None
 ) -> tuple[FloatArray, IntArray]:
-    """Vertices (V, 3) and faces (F, 3) of the default scene, its primitives one behind the other.
+    """Vertices (V, 3) and faces (F, 3) of the default scene, its primitives one after the other.
 
     Args:
         data: the file.
-        limits: to what its scene may come.
+        limits: of the whole scene.
         binary: whether it is GLB.
-        beside: its path, where buffers may lie beside it.
+        beside: path of the file, where buffers in files beside it may be read.
 
     Raises:
         MeshError: too large, too deep, no mesh or more than one, or something that isn't read; with the reason.
-        Exception: damaged, in whichever way it shows.
+        Exception: of any kind, where the file is damaged.
     """
     text, chunk = _chunks(data) if binary else (data, None)
     tree, uris = _parse(text)

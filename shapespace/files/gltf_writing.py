@@ -1,7 +1,6 @@
-"""glTF 2.0: one mesh, still or moving, as GLB or as JSON with its buffer inside.
+"""Writer of glTF 2.0: one mesh, still or animated, as GLB or as JSON with its buffer inside.
 
-trimesh writes still meshes only, and a served mesh goes through here on every request, so the container is
-ours.
+Written here because trimesh writes no animations, and because every served mesh passes through it.
 """
 
 from __future__ import annotations

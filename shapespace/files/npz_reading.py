@@ -1,4 +1,4 @@
-"""NPZ, read: only what is asked for, and never more than the file can hold."""
+"""Reader of NPZ: only the arrays that are asked for, and never more memory than the file can fill."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typing import IO
 import numpy as np
 from numpy.typing import NDArray
 
-from shapespace.files.reading import PIECE, UNLIMITED, Limits, clipped
+from shapespace.files.limits import PIECE, UNLIMITED, Limits, clipped
 from shapespace.mesh.triangle_mesh import MeshError
 
 _MOST_ARRAYS = 1000
@@ -23,7 +23,7 @@ _DEFLATION, _LONGEST_NUMBER = 1032, 32
 
 
 class _File:
-    """Bytes as an open file, not copied; whoever asks for a large piece at once was told to by the file's directory."""
+    """Bytes as an open file, without a copy; refuses large reads, which zipfile makes for long directories only."""
 
     def __init__(self, data: memoryview) -> None:
         self._data, self._place = data, 0
@@ -58,7 +58,7 @@ def load_npz(
 
     Args:
         data: the file.
-        names: the arrays to be read, those that are there.
+        names: the arrays to read, as far as there are any.
         limits: of the vertices and faces.
 
     Raises:
@@ -93,7 +93,8 @@ class _Array:
     """An array in an archive, of which only the head has been read."""
 
     def __init__(self, member: IO[bytes], entry: zipfile.ZipInfo) -> None:
-        if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):  # others take what memory they like
+        # The decompressors of other methods don't limit the memory that they take.
+        if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
             raise zipfile.BadZipFile("compressed in another way")
         self._member, self._size = member, entry.file_size
         start = io.BytesIO(member.read(_HEAD))
@@ -104,7 +105,7 @@ class _Array:
         self._start = start.read()
 
     def check(self, name: str, limits: Limits) -> None:
-        """Refuse vertices or faces that are too many, or that are as long as only text can be."""
+        """Raise MeshError for too many vertices or faces, or for entries so long that they can only be text."""
         if self._dtype.itemsize > _LONGEST_NUMBER:
             raise MeshError(f"{name} must be an array of numbers, not {clipped(self._dtype)}")
         triples = -(-math.prod(self._shape) // 3)

@@ -15,12 +15,12 @@ from shapespace.files.animated_gltf import FRAMES_PER_SECOND
 from shapespace.files.gltf_writing import vertex_normals
 
 _PIECE, _FRAMES_AT_ONCE = 2**20, 32
-#: As glTF's clay.
+#: The colour of the glTF writer's material.
 _COLOUR = (0.72, 0.76, 0.82)
 
 
 def usd_installed() -> bool:
-    """Whether ``usd-core`` is there; doesn't load it, which takes its time."""
+    """Whether ``usd-core`` is installed, found out without importing it, which is slow."""
     return find_spec("pxr") is not None
 
 

@@ -1,1 +1,1 @@
-"""One bundle at work: codes to shapes, and shapes back to codes."""
+"""A bundle in use: codes to shapes, and shapes back to codes."""

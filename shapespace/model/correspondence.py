@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from shapespace.arrays import FloatArray, IntArray
-from shapespace.files.reading import Limits
+from shapespace.files.limits import Limits
 from shapespace.mesh.triangle_mesh import diagonal
-from shapespace.model.shape_model import MeshChoice, ShapeModel
+from shapespace.model.decoder import Decoder, MeshChoice
 
 #: Larger meshes than the model's are read up to these, so that their sizes can be told.
 _VERTICES_READ, _FACES_READ = 2**15, 2**16
@@ -32,14 +32,14 @@ class Matched:
     mesh: MeshChoice
 
 
-def limits(model: ShapeModel) -> Limits:
+def limits(model: Decoder) -> Limits:
     """How large a file has to be read to tell whether it holds one of the model's meshes."""
     layouts = _layouts(model)
     vertices, faces = max(layout.count for layout in layouts), max(len(layout.faces) for layout in layouts)
     return Limits(max(vertices, 3 * faces, _VERTICES_READ), max(faces, _FACES_READ))
 
 
-def match(model: ShapeModel, vertices: FloatArray, faces: IntArray) -> Matched:
+def match(model: Decoder, vertices: FloatArray, faces: IntArray) -> Matched:
     """Find which of the model's meshes a file holds.
 
     Vertices count in their order and faces in any; JSON may leave these out. STL, which shares no vertices, counts by
@@ -121,7 +121,7 @@ def _canonical(faces: IntArray) -> IntArray:
     return turned[np.lexsort(turned.T[::-1])]
 
 
-def _layouts(model: ShapeModel) -> list[_Layout]:
+def _layouts(model: Decoder) -> list[_Layout]:
     layouts = []
     choices = [MeshChoice.FINE, MeshChoice.COARSE] if model.fine else [MeshChoice.FINE]
     if model.fine and (model.fine.prolong.coarse_vertices < 0).any():

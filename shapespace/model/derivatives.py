@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy import sparse
 
 from shapespace.arrays import FloatArray
 from shapespace.coordinates.nric import WeightedNorm, nric
+from shapespace.model.decoder import Decoder
 
-if TYPE_CHECKING:
-    from shapespace.model.shape_model import ShapeModel
-
-#: Step of a difference quotient, as a fraction of the coordinate's range: what an angle moves may be as small as a bump
-#: on its way round, and elsewhere smaller steps drown in the networks' rounding.
+#: Step of a difference quotient, as a fraction of the coordinate's range. An angle may move something as small as a
+#: bump around the shape; for other coordinates smaller steps drown in the rounding of the networks' float32.
 PERIODIC_DIFFERENCE, DIFFERENCE = 1e-3, 1e-2
 #: Nodes for each periodic coordinate of a factor, and all of them at most.
 NODES, MOST_NODES = 32, 1024
@@ -23,17 +20,17 @@ NODES, MOST_NODES = 32, 1024
 SKETCH = 1024
 
 
-def derivatives(model: ShapeModel, x: FloatArray) -> FloatArray:
+def derivatives(model: Decoder, x: FloatArray) -> FloatArray:
     """(2E, m) of the networks at a code (m,), by differences.
 
-    One code at a time: the combiner is quicker so than on many at once, which don't fit into the cache.
+    One code at a time, which is faster than a batch: the combiner's arrays of many codes do not fit into the cache.
     """
     z = model.nric(x)
     steps = np.diag(_steps(model))
     return np.stack([(model.nric(x + step) - z) / step.max() for step in steps], axis=1)
 
 
-def factor_derivatives(model: ShapeModel, x: FloatArray) -> FloatArray:
+def factor_derivatives(model: Decoder, x: FloatArray) -> FloatArray:
     """(2E, m) of the sum of the factors at a code (m,), by central differences."""
     columns = []
     for j, factor in enumerate(model.manifest.factors):
@@ -44,16 +41,16 @@ def factor_derivatives(model: ShapeModel, x: FloatArray) -> FloatArray:
     return np.concatenate(columns).T
 
 
-def _steps(model: ShapeModel) -> FloatArray:
+def _steps(model: Decoder) -> FloatArray:
     latents = model.latents
     steps: FloatArray = np.where(latents.periodic, PERIODIC_DIFFERENCE, DIFFERENCE) * latents.width
     return steps
 
 
-def nodes(model: ShapeModel, j: int) -> FloatArray:
-    """Nodes (n, m_j) over the coordinates of a factor if all of them are periodic, otherwise none.
+def nodes(model: Decoder, j: int) -> FloatArray:
+    """Nodes (n, m_j) of a grid over the coordinates of a factor if all of them are periodic, otherwise none.
 
-    Where coordinates go round, a shape may have to move far before it comes nearer, and no descent finds the way.
+    Along a period the misfit may have to grow before it falls, so that descent alone does not find the minimum.
     """
     factor, latents = model.manifest.factors[j], model.latents
     own, size = slice(factor.start, factor.stop), factor.stop - factor.start
@@ -65,7 +62,7 @@ def nodes(model: ShapeModel, j: int) -> FloatArray:
 
 
 def batches(nodes: FloatArray) -> list[FloatArray]:
-    """Nodes in parts whose shapes fit into the cache."""
+    """Nodes in batches whose shapes fit into the cache."""
     return np.array_split(nodes, -(-len(nodes) // 16)) if len(nodes) else []
 
 
@@ -84,8 +81,8 @@ class FactorGrids:
     _matrix: sparse.csr_array
 
     @classmethod
-    def of(cls, model: ShapeModel) -> FactorGrids:
-        """Run the factors on their grids."""
+    def of(cls, model: Decoder) -> FactorGrids:
+        """Run the factors of a model on their grids."""
         reference = model.reference
         centre = nric(reference.vertices, reference.connectivity)
         root = np.sqrt(WeightedNorm.of(reference, model.manifest.eta_reconstruction).squared)

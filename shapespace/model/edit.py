@@ -1,4 +1,4 @@
-"""From a few vertices that should be elsewhere to the latent code that brings them there."""
+"""Editing: the latent code that brings a few vertices to given positions."""
 
 from __future__ import annotations
 
@@ -12,23 +12,23 @@ from shapespace.arrays import FloatArray, IntArray
 from shapespace.coordinates.nric import wrap
 from shapespace.coordinates.reconstruction import Reconstructor
 from shapespace.mesh.rigid_motion import without_rigid_motion
+from shapespace.model.decoder import Decoder, MeshChoice, Shape
 from shapespace.model.derivatives import batches, derivatives, factor_derivatives, nodes
 from shapespace.model.latent_space import Bounds, Codes, NotFiniteError
-from shapespace.model.shape_model import MeshChoice, Shape, ShapeModel
 from shapespace.solve.deadline import Deadline
 from shapespace.solve.least_squares import Fit, least_squares, shrinkable
 from shapespace.solve.status import Status
 
 #: Weight of the prior where none is given: a code half the bounds away costs as much as half a percent of the diagonal.
 PRIOR = 1e-4
-#: A shape is moved by this fraction of its derivative to see how it would be aligned and prolonged.
+#: Step of the difference quotients through alignment and prolongation, as a fraction of the diagonal.
 DIFFERENCE = 1e-4
-#: Other starts at most, where the misfit is above one of these fractions of the diagonal: with rough shapes, with those
-#: that are answered. And what part of its square, as far as it is that small, must be thought to remain there.
+#: At most so many other starts are tried while the misfit is above these fractions of the diagonal (of rough shapes, of
+#: answered ones). Another start or fit counts only if it leaves at most the fraction PROMISING of what can be reduced.
 STARTS, GOOD_ROUGHLY, GOOD, PROMISING = 4, 2e-2, 2e-3, 0.9
-#: Targets at most that another start is chosen by: each costs three solves, and as many fields.
+#: Most targets by which another start is chosen: each costs three linear solves.
 RANKED = 32
-#: Shapes at most that a fit is refined with. What takes longer follows a valley that hardly falls.
+#: Most shapes of a refinement: what takes longer follows a valley that hardly descends.
 REFINEMENTS = 8
 
 
@@ -38,7 +38,7 @@ class Target:
 
     Attributes:
         vertex: index in the mesh of choice.
-        position: (3,) in the frame and units of what the service answers.
+        position: (3,) in the frame and units of answered shapes.
     """
 
     vertex: int
@@ -52,8 +52,8 @@ class Edited:
     Attributes:
         code: (m,) inside the bounds.
         status: how the iteration ended.
-        iterations: shapes that it looked at.
-        shape: what the service answers to the code, on the mesh of choice.
+        iterations: shapes that were reconstructed.
+        shape: of the code, on the mesh of choice.
         distances: (k,) of that shape's vertices to their targets.
     """
 
@@ -63,9 +63,14 @@ class Edited:
     shape: Shape
     distances: FloatArray
 
+    @property
+    def residual(self) -> float:
+        """Root mean square of the distances."""
+        return float(np.sqrt((self.distances**2).mean()))
+
 
 class Editor:
-    """Finds codes for targets, for any number of threads.
+    """Finds codes for targets; may be used by several threads at once.
 
     Minimises over codes inside the bounds
 
@@ -75,7 +80,7 @@ class Editor:
     reconstruction solves; by the implicit function theorem ``dX = (JᵀWJ)⁻¹ JᵀW dz``, where its residual is small.
     """
 
-    def __init__(self, model: ShapeModel) -> None:
+    def __init__(self, model: Decoder) -> None:
         self.model = model
 
     def __call__(
@@ -96,7 +101,7 @@ class Editor:
             deadline: after which the status is Status.DEADLINE.
 
         Raises:
-            NotFiniteError: a target out of all proportion.
+            NotFiniteError: a target so far away that numbers overflow.
         """
         model = self.model
         positions = np.array([target.position for target in targets]) / model.manifest.scale
@@ -104,27 +109,27 @@ class Editor:
             raise NotFiniteError("A target lies so far away that the numbers overflow. Send finite positions.")
         with model.solver() as reconstruct:
             vertices = np.array([target.vertex for target in targets])
-            rough, chart = (
-                _Chart(model, reconstruct, vertices, mesh, deadline, rough=rough) for rough in (True, False)
+            rough, pulled = (
+                _PulledVertices(model, reconstruct, vertices, mesh, deadline, rough=rough) for rough in (True, False)
             )
-            problem = _Problem(model, rough, chart, start.astype(np.float64), positions, prior, deadline)
+            problem = _Problem(model, rough, pulled, start.astype(np.float64), positions, prior, deadline)
             fit = _best(problem)
         code, _ = model.latents.code(fit.x.tolist(), Bounds.CLAMP)
         shape = model.shape(code, True, mesh, deadline)
         found = shape.vertices[[target.vertex for target in targets]]
         distances = np.linalg.norm(found - model.manifest.scale * positions, axis=1)
         status = Status.DEADLINE if shape.diagnostics.status is Status.DEADLINE else fit.status
-        return Edited(code, status, chart.shapes, shape, distances)
+        return Edited(code, status, pulled.shapes, shape, distances)
 
 
 def _best(problem: _Problem) -> Fit:
-    """The best that a few starts lead to."""
+    """The best fit from a few starts."""
     rough = problem.search(problem.start)
     best = problem.refine(rough.x)
     for _ in range(STARTS):
         if best.status is Status.DEADLINE or problem.misfit(best) < GOOD:
             break
-        other = problem.search(problem.elsewhere(best, problem.chart))
+        other = problem.search(problem.another_start(best, problem.pulled))
         if not other.cost < rough.cost:
             break
         fit = problem.refine(other.x)
@@ -135,28 +140,28 @@ def _best(problem: _Problem) -> Fit:
 
 
 def _worthwhile(cost: float) -> float:
-    """What another fit's cost must be below."""
+    """The cost below which another fit is taken in place of one of this cost."""
     return cost - (1 - PROMISING) * shrinkable(cost, GOOD_ROUGHLY)
 
 
 class _Problem:
     """The least-squares problem of one edit.
 
-    First with rough shapes, which cost a third of those that are answered or less, and lie about half a percent of the
-    diagonal from them; from there a few of the others do.
+    It is solved twice: with rough shapes, which cost at most a third of answered ones and lie about half a percent of
+    the diagonal from them, and from there with answered ones, of which a few suffice.
     """
 
     def __init__(
         self,
-        model: ShapeModel,
-        rough: _Chart,
-        chart: _Chart,
+        model: Decoder,
+        rough: _PulledVertices,
+        pulled: _PulledVertices,
         start: FloatArray,
         positions: FloatArray,
         prior: float,
         deadline: Deadline | None,
     ) -> None:
-        self.rough, self.chart, self.start = rough, chart, start
+        self.rough, self.pulled, self.start = rough, pulled, start
         self._model, self._positions, self._deadline = model, positions, deadline
         self._box = *model.latents.box(), model.latents.width
         self._weight = 1 / (model.reference.diagonal * np.sqrt(len(positions)))
@@ -167,45 +172,45 @@ class _Problem:
         return float(np.linalg.norm(fit.residual[: self._positions.size]))
 
     def search(self, start: FloatArray) -> Fit:
-        """From a start by rough shapes and the factors' derivatives, which are quick, and from others if it fails."""
+        """Fit rough shapes by the factors' derivatives, both cheap; tries other starts where the misfit stays large."""
         best = self._search(start)
         for _ in range(STARTS):
             if best.status is Status.DEADLINE or self.misfit(best) < GOOD_ROUGHLY:
                 break
-            fit = self._search(self.elsewhere(best, self.rough))
+            fit = self._search(self.another_start(best, self.rough))
             if not fit.cost < _worthwhile(best.cost):
                 break
             best = fit
         return best
 
     def _search(self, start: FloatArray) -> Fit:
-        chart = self.rough
+        pulled = self.rough
         return least_squares(
-            lambda x: self._residual(x, chart),
-            lambda x, _: self._jacobian(chart.derivatives(x, factor_derivatives(self._model, x))),
+            lambda x: self._residual(x, pulled),
+            lambda x, _: self._jacobian(pulled.derivatives(x, factor_derivatives(self._model, x))),
             start, *self._box, tolerance=1e-3, gain_tolerance=0.05, large=GOOD_ROUGHLY, secant=False,
             max_evaluations=20, deadline=self._deadline,
         )  # fmt: skip
 
     def refine(self, start: FloatArray) -> Fit:
-        """From nearby by the shapes that are answered and the whole composite's derivatives."""
-        chart = self.chart
+        """Fit answered shapes by the whole composite's derivatives, from a start nearby."""
+        pulled = self.pulled
         return least_squares(
-            lambda x: self._residual(x, chart),
-            lambda x, _: self._jacobian(chart.derivatives(x, derivatives(self._model, x))),
+            lambda x: self._residual(x, pulled),
+            lambda x, _: self._jacobian(pulled.derivatives(x, derivatives(self._model, x))),
             start, *self._box, tolerance=1e-3, gain_tolerance=0.002, large=GOOD_ROUGHLY, max_evaluations=REFINEMENTS,
             deadline=self._deadline,
         )  # fmt: skip
 
-    def elsewhere(self, fit: Fit, chart: _Chart) -> FloatArray:
-        """Another start: the fit with one factor moved to where, to first order, the misfit shrinks most.
+    def another_start(self, fit: Fit, pulled: _PulledVertices) -> FloatArray:
+        """Another start: the fit with one factor moved to the node where, to first order, the misfit is smallest.
 
-        That is the reference where no such move promises enough.
+        The reference where no such move promises enough.
         """
         model = self._model
         count = len(self._positions)
         some = np.linspace(0, count - 1, min(count, RANKED)).astype(np.int64)
-        sensitivity = chart.sensitivity(fit.x, some) * self._weight
+        sensitivity = pulled.sensitivity(fit.x, some) * self._weight
         missing = fit.residual[: self._positions.size].reshape(-1, 3)[some].ravel()
         best, found = _worthwhile(float(missing @ missing)), np.clip(np.zeros_like(fit.x), *model.latents.box())
         half = model.manifest.edges
@@ -221,24 +226,24 @@ class _Problem:
                     found[own] = part[left.argmin()]
         return found
 
-    def _residual(self, x: FloatArray, chart: _Chart) -> FloatArray:
+    def _residual(self, x: FloatArray, pulled: _PulledVertices) -> FloatArray:
         away = self._held * self._model.latents.shorter(x - self.start)
-        return np.concatenate([self._weight * (chart.positions(x) - self._positions).ravel(), away])
+        return np.concatenate([self._weight * (pulled.positions(x) - self._positions).ravel(), away])
 
     def _jacobian(self, moves: FloatArray) -> FloatArray:
         return np.concatenate([self._weight * moves.reshape(len(moves), -1).T, np.diag(self._held)])
 
 
-class _Chart:
-    """Positions of a few vertices as functions of the code, as the service answers them but for the scale.
+class _PulledVertices:
+    """Positions of a few vertices of answered shapes, normalised, as functions of the code.
 
-    Each shape is reconstructed from the last one, or from frames where these are nearer; a rough one is that of the
-    frames (shapespace/coordinates/frame_integration.py), without Gauss–Newton.
+    Each shape is reconstructed from the last one, or from integrated frames where these are nearer; a rough shape is
+    that of the frames (shapespace.coordinates.frame_integration) without Gauss–Newton.
     """
 
     def __init__(
         self,
-        model: ShapeModel,
+        model: Decoder,
         reconstruct: Reconstructor,
         vertices: IntArray,
         mesh: MeshChoice,

@@ -1,8 +1,9 @@
-"""From a mesh to its latent code: least squares on the networks, in lengths and angles, where poses don't matter."""
+"""Encoding: from a mesh to its latent code, by least squares in lengths and angles, which do not depend on the pose."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -10,16 +11,17 @@ from shapespace.arrays import FloatArray
 from shapespace.coordinates.nric import WeightedNorm, nric, wrap
 from shapespace.mesh.rigid_motion import align
 from shapespace.model.correspondence import InvalidMeshError, Matched
-from shapespace.model.derivatives import derivatives, factor_derivatives, nodes
+from shapespace.model.decoder import Decoder, MeshChoice, Shape
+from shapespace.model.derivatives import FactorGrids, derivatives, factor_derivatives, nodes
 from shapespace.model.latent_space import Bounds, Codes, NotFiniteError
-from shapespace.model.shape_model import MeshChoice, Shape, ShapeModel
 from shapespace.solve.deadline import Deadline
 from shapespace.solve.least_squares import Fit, least_squares
 from shapespace.solve.status import Status
 
-#: Times that each factor is moved on its grid, given the others, and how much more it must explain then.
+#: Times that each factor may be moved on its grid while the others stay, and the factor by which a move must explain
+#: more of the misfit than the present place does.
 SWEEPS, PROMISING = 4, 1.2
-#: A code may leave the bounds by this fraction of its range where that is allowed.
+#: A code may leave the bounds by this fraction of their width where that is allowed.
 MARGIN = 0.5
 
 
@@ -28,14 +30,14 @@ class Encoded:
     """The code whose lengths and angles come closest to a mesh's.
 
     Attributes:
-        code: (m,), as the networks take it.
+        code: (m,), float32, as the networks take it.
         inside_bounds: whether it lies inside the bounds.
         status: how the iteration ended.
         iterations: evaluations of the networks' misfit.
         residual: relative misfit of lengths and angles, in the weighted norm of the reconstruction.
-        shape: what the service answers to the code, on the mesh that was given.
-        distances: (V,) of the given vertices to that shape, after rigid alignment.
-        mesh: which mesh was given.
+        shape: of the code, on the mesh that was given.
+        distances: (V,) from the given vertices to those of that shape, after rigid alignment.
+        mesh: whether the fine or the coarse mesh was given.
     """
 
     code: Codes
@@ -49,7 +51,7 @@ class Encoded:
 
 
 class Encoder:
-    """Finds codes of meshes, for any number of threads.
+    """Finds codes of meshes; may be used by several threads at once.
 
     Minimises ``‖z(code) − z‖_{2,z̄}``, angles compared modulo 2π, in two rounds. The first takes the factors alone,
     ``z̄ + Σ_j (ψ_j − z̄)``, which come within a few percent and cost little; where a factor has periodic coordinates it
@@ -57,7 +59,7 @@ class Encoder:
     evaluations beside one Jacobian.
     """
 
-    def __init__(self, model: ShapeModel) -> None:
+    def __init__(self, model: Decoder) -> None:
         self.model = model
         self._norm = WeightedNorm.of(model.reference, model.manifest.eta_reconstruction)
         self._root = np.sqrt(self._norm.squared)
@@ -92,6 +94,11 @@ class Encoder:
         status = Status.DEADLINE if shape.diagnostics.status is Status.DEADLINE else fit.status
         return Encoded(code, inside, status, fit.evaluations, residual, shape, distances, given.mesh)
 
+    @cached_property
+    def grids(self) -> FactorGrids:
+        """What starts are chosen from; made once, at the first mesh."""
+        return FactorGrids.of(self.model)
+
     def _fit(self, target: FloatArray, lower: FloatArray, upper: FloatArray, deadline: Deadline | None) -> Fit:
         latents, root = self.model.latents, self._root
         box = lower, upper, latents.width
@@ -108,8 +115,8 @@ class Encoder:
             )
 
         x = (latents.lower + latents.upper) / 2
-        for _ in range(SWEEPS * len(self.model.grids.images)):
-            moved = self._elsewhere(x, affine(x))
+        for _ in range(SWEEPS * len(self.grids.images)):
+            moved = self._another_start(x, affine(x))
             if moved is None:
                 break
             x = moved
@@ -119,7 +126,7 @@ class Encoder:
         )  # fmt: skip
         best = from_composite(rough.x)
         for _ in range(SWEEPS):
-            moved = self._elsewhere(best.x, best.residual)
+            moved = self._another_start(best.x, best.residual)
             if moved is None or best.status is Status.DEADLINE:
                 break
             other = from_composite(moved)
@@ -128,13 +135,13 @@ class Encoder:
             best = other
         return best
 
-    def _elsewhere(self, x: FloatArray, residual: FloatArray) -> FloatArray | None:
+    def _another_start(self, x: FloatArray, residual: FloatArray) -> FloatArray | None:
         """A code with one factor moved to the node that fits best, where that promises to be better than x.
 
         What counts is the direction of a factor's shape from z̄, not its size, because the factors add up in direction
         only roughly in size: a bump on the inner side of a torus is not as large as on the outer one.
         """
-        grids = self.model.grids
+        grids = self.grids
         missing = -grids.sketch(residual)
         best, found = 0.0, None
         for j, images in grids.images.items():

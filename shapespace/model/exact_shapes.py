@@ -1,4 +1,4 @@
-"""The exponentials that the networks have learned to imitate, computed as they are defined."""
+"""Exact shapes: the discrete exponentials that the networks approximate, computed."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from shapespace.model.decoder import Decoder, MeshChoice
 from shapespace.model.latent_space import Codes
-from shapespace.model.shape_model import MeshChoice, ShapeModel
 from shapespace.shell.energy import Material
 from shapespace.shell.exponential import exponential
 from shapespace.shell.space import ShellSpace
@@ -26,8 +26,8 @@ class Exact:
     """The discrete exponential of one code.
 
     Attributes:
-        status: of its solver, see shapespace.coordinates.reconstruction.Status.
-        vertices: (V, 3) float32, aligned like every shape, in the units of the training meshes; None where it failed.
+        status: of its solver, see shapespace.solve.status.Status.
+        vertices: (V, 3) float32, aligned to the reference, in the units of the training meshes; None where it failed.
         mean, max: distance of the networks' answer from it, over vertices; None where it failed.
     """
 
@@ -37,7 +37,7 @@ class Exact:
     max: float | None
 
 
-def require_tangent_space(model: ShapeModel) -> None:
+def require_tangent_space(model: Decoder) -> None:
     """Raise NoTangentSpaceError for models that have none."""
     if model.modes is None or model.manifest.exponential_steps is None:
         raise NoTangentSpaceError(
@@ -47,7 +47,7 @@ def require_tangent_space(model: ShapeModel) -> None:
 
 
 def exact(
-    model: ShapeModel, code: Codes, answer: NDArray[np.float32], mesh: MeshChoice, deadline: Deadline | None = None
+    model: Decoder, code: Codes, answer: NDArray[np.float32], mesh: MeshChoice, deadline: Deadline | None = None
 ) -> Exact:
     """The exponential ``exp_z̄(Σ_j code_j u_j)`` in K steps, with the material and K of the model's manifest.
 

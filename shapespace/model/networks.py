@@ -1,4 +1,4 @@
-"""ONNX networks at work, each run with a limit of time."""
+"""ONNX networks, each run with a limit of time."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ from numpy.typing import NDArray
 from shapespace.bundle.reader import LONGEST_REASON, Bundle, BundleError
 from shapespace.bundle.schema import Network
 
-#: Seconds for what the networks say to one code: hundreds of times what they need.
+#: Seconds that the networks may take for one code, hundreds of times what they need.
 PATIENCE = 5.0
-#: ONNX Runtime's own log quotes names from the file: nothing of it but what ends the process.
+#: Only what ends the process is logged: ONNX Runtime's messages quote names from the file, which a stranger chose.
 _FATAL = 4
 onnxruntime.set_default_logger_severity(_FATAL)
 
 
 class NetworkError(RuntimeError):
-    """A network that gives no answer at a code, with what it was."""
+    """A network that gives no answer at a code, with the reason."""
 
 
 class TerminatedError(NetworkError):
-    """A network that has been told to end, because its time was over."""
+    """A network that was stopped because its time was over."""
 
 
 class _Watch:
@@ -50,7 +50,7 @@ class _Watch:
             self._wake()
 
     def end(self, options: onnxruntime.RunOptions) -> None:
-        """It is over."""
+        """Stop watching over a run that has ended."""
         del self._runs[id(options)]
 
     def _wake(self) -> None:
@@ -77,7 +77,7 @@ _watch = _Watch()
 
 
 class Session:
-    """One ONNX network, which is what the manifest says of it.
+    """One ONNX network whose input and output are those of the manifest.
 
     Args:
         bundle: holds its bytes.
@@ -90,8 +90,8 @@ class Session:
 
     def __init__(self, bundle: Bundle, network: Network, inputs: list[int], outputs: list[int]) -> None:
         options = onnxruntime.SessionOptions()
-        # The workers run side by side, a network inside one of them: a second layer of threads would only
-        # get in the way. The arena keeps the memory of the largest run for ever.
+        # Callers decode in several threads already, and more threads inside each would compete with them. The arena
+        # would keep the memory of the largest run for ever.
         options.intra_op_num_threads = options.inter_op_num_threads = 1
         options.add_session_config_entry("session.intra_op.allow_spinning", "0")
         options.enable_cpu_mem_arena = False
@@ -116,7 +116,7 @@ class Session:
         self._row, self._shape = tuple(inputs), tuple(outputs)
 
     def check(self) -> None:
-        """Run it once, for two rows of zeros; raises BundleError where it doesn't answer with finite numbers."""
+        """Run the network once, for two rows of zeros; raises BundleError unless it answers finite numbers."""
         try:
             result = self(np.zeros((2, *self._row), np.float32), time.monotonic() + PATIENCE)
         except NetworkError as error:
@@ -125,7 +125,7 @@ class Session:
             raise BundleError(f"{self._file} does not give finite numbers for zeros")
 
     def __call__(self, rows: NDArray[np.float32], until: float) -> NDArray[np.float32]:
-        """What it says to rows (n, …), by that moment of ``time.monotonic``.
+        """Outputs for rows (n, …), by that moment of ``time.monotonic``.
 
         Raises:
             TerminatedError: the moment came first.

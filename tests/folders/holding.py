@@ -15,8 +15,8 @@ from shapespace.bundle.reader import read_bundle
 from shapespace.mesh.triangle_mesh import Connectivity, diagonal, face_normals
 from shapespace.mesh.triangle_quality import FOLD_LIMIT, dots
 from shapespace.model.correspondence import Matched
-from shapespace.model.encode import Encoder
-from shapespace.model.shape_model import MeshChoice, ShapeModel
+from shapespace.model.decoder import MeshChoice
+from shapespace.model.shape_model import ShapeModel
 from shapespace.training import __main__ as training
 from shapespace.training.collection.ingest import read_collection
 from tests.folders.catalogue import Folder
@@ -129,11 +129,11 @@ def sound(folder: Folder, place: Path, data: Path) -> str:
     flipped = sum(shape.diagnostics.flipped_faces for shape in served)
     assert not flipped, f"{flipped} faces of {CODES} served shapes are flipped"
 
-    collection, encode = read_collection(data), Encoder(model)
+    collection = read_collection(data)
     errors = []
     for name, shape in list(zip(collection.names, collection.vertices, strict=True))[:ENCODED]:
         if name not in folder.odd:
-            found = encode(Matched(np.array(shape), MeshChoice.FINE))
+            found = model.encode(Matched(np.array(shape), MeshChoice.FINE))
             errors.append(found.distances.mean() / diagonal(shape))
     assert np.mean(errors) <= folder.back, f"training shapes come back to {np.mean(errors):.3f} of the diagonal"
     centre = collection.vertices[collection.central]

@@ -103,6 +103,7 @@ def try_shell(text: str, server: Server, folder: Path) -> None:
 
 
 def try_python(text: str, server: Server, folder: Path) -> None:
+    (folder / "models").symlink_to(ROOT / "models")
     run([sys.executable, "-c", text], server, folder)
 
 

@@ -14,7 +14,8 @@ import numpy as np
 import pytest
 
 from shapespace.bundle.reader import read_bundle
-from shapespace.model.shape_model import LEAST_PATIENCE, ModelFailedError, NetworkTimeError, ShapeModel
+from shapespace.model.decoder import LEAST_PATIENCE, ModelFailedError, NetworkTimeError
+from shapespace.model.shape_model import ShapeModel
 from tests.service import hostile
 from tests.service.bundles import write_bundle
 from tests.service.conftest import ROOT, Server, Start, starting
@@ -73,7 +74,7 @@ def test_a_network_that_hangs_is_ended_and_the_others_go_on(client: httpx.Client
     assert {answer.json()["type"] for answer in answers} == {TYPE}
     details = {answer.json()["detail"] for answer in answers}
     assert any("did not answer within 5 s at this code" in detail for detail in details), details
-    assert f"ERROR shapespace.model.shape_model: model {model}/1: factor-0.onnx does not answer in time" in server.log
+    assert f"ERROR shapespace.model.decoder: model {model}/1: factor-0.onnx does not answer in time" in server.log
     assert ask(client, model, GOOD).json()["vertices"] == right.json()["vertices"]
 
 

@@ -10,8 +10,9 @@ from onnx import numpy_helper
 from shapespace.bundle.reader import read_bundle
 from shapespace.coordinates.reconstruction import Reconstructor
 from shapespace.mesh.rigid_motion import align
+from shapespace.model.decoder import TOLERANCE, MeshChoice
 from shapespace.model.latent_space import NotFiniteError
-from shapespace.model.shape_model import TOLERANCE, MeshChoice, ShapeModel
+from shapespace.model.shape_model import ShapeModel
 from shapespace.service.http.responses import solve
 from shapespace.service.limits.workers import DeadlineError, Workers
 from shapespace.service.use_cases.shape_formats import worst

@@ -19,8 +19,9 @@ from pydantic import BaseModel, ConfigDict, Field, NonNegativeInt, field_validat
 from pydantic.json_schema import SkipJsonSchema
 
 from shapespace.files.archives import Buffer
+from shapespace.model.decoder import MeshChoice
 from shapespace.model.latent_space import Bounds
-from shapespace.model.shape_model import MeshChoice, ShapeModel
+from shapespace.model.shape_model import ShapeModel
 from shapespace.service.http.messages import bodies
 from shapespace.service.http.messages.schemas import BoundsField, Number
 from shapespace.service.http.problems import ProblemError

@@ -7,9 +7,9 @@ from typing import Annotated, Any
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
 from shapespace.files.colouring import Quantity
+from shapespace.model.decoder import MeshChoice
 from shapespace.model.edit import PRIOR
 from shapespace.model.latent_space import Bounds, Distribution
-from shapespace.model.shape_model import MeshChoice
 
 Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
 #: JSON knows one kind of number only, where 3.0 is as whole as 3.

@@ -8,7 +8,7 @@ from collections import deque
 from starlette.requests import Request
 
 from shapespace.arrays import FloatArray, IntArray
-from shapespace.files.reading import Limits
+from shapespace.files.limits import Limits
 from shapespace.service.http.problems import ProblemError
 from shapespace.service.limits.memory import MMAP_THRESHOLD
 from shapespace.service.limits.sandbox import (

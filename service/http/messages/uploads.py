@@ -18,7 +18,7 @@ from python_multipart.multipart import MultipartParser, parse_options_header
 
 from shapespace.arrays import FloatArray, IntArray
 from shapespace.files.formats import MESH_FORMATS, OCTET_STREAM, read_arrays
-from shapespace.files.reading import Limits, clipped, count
+from shapespace.files.limits import Limits, clipped, count_bytes
 from shapespace.mesh.triangle_mesh import MeshError
 from shapespace.service.limits.sandbox import Arrays, Facts, FailedError
 
@@ -204,7 +204,7 @@ def _read_json(data: memoryview, limits: Limits) -> tuple[FloatArray, IntArray]:
         # Three in a vertex or face, one behind it, and one for its colour.
         (_LISTS_BESIDE + 5 * each, b",", "commas"),
     ):
-        if count(data, characters) > most:
+        if count_bytes(data, characters) > most:
             raise MeshError(f"it has more than {most} {name}")
     if len(data) > _BYTES_BESIDE + _BYTES_OF_EACH * each:
         raise MeshError(f"it has {len(data)} bytes, where {_BYTES_BESIDE + _BYTES_OF_EACH * each} are enough")

@@ -11,7 +11,6 @@ from fastapi import APIRouter, Depends, Query, Request, Response
 
 from shapespace.model.correspondence import limits, match
 from shapespace.model.edit import Editor, Target
-from shapespace.model.encode import Encoder
 from shapespace.model.latent_space import Bounds
 from shapespace.service.http.dependencies import MeshQuery, Model, ServiceDependency, limit_codes, one_of
 from shapespace.service.http.messages.bodies import JSONBody
@@ -79,7 +78,7 @@ async def encode(
         mesh = read_upload(service.sandbox, body, content_type, format, limits(model), deadline)
         given = match(model, *mesh)
         read = time.perf_counter()
-        found = Encoder(model)(given, bounds, deadline)
+        found = model.encode(given, bounds, deadline)
         if found.status is Status.DEADLINE:
             raise service.workers.late()
         answer = {

@@ -13,10 +13,11 @@ from numpy.typing import NDArray
 
 from shapespace.files.archives import Buffer, npz_pieces
 from shapespace.files.formats import OCTET_STREAM
+from shapespace.model.decoder import MeshChoice
 from shapespace.model.exact_shapes import Exact, require_tangent_space
 from shapespace.model.exact_shapes import exact as exponential
 from shapespace.model.latent_space import Bounds, Codes
-from shapespace.model.shape_model import MeshChoice, ShapeModel
+from shapespace.model.shape_model import ShapeModel
 from shapespace.service.http.dependencies import (
     Format,
     MeshQuery,

@@ -1,14 +1,13 @@
-"""OBJ, OFF, PLY and STL, read: the vertices in the order of the file, and its polygons as triangles.
+"""Readers of OBJ, OFF, PLY and STL: the vertices in the order of the file, and its polygons as triangles.
 
-By hand, since other readers split and shuffle vertices along seams of texture, and since files come from outside: every
-reader goes through its file once, knows what a file comes to before it unpacks it, and stops at the limits it is given.
+Written here because other readers split and reorder vertices along seams of texture, and because files come from
+strangers: every reader goes through its file once, and checks sizes against its limits before it allocates anything.
 """
 
 from __future__ import annotations
 
 import re
 import struct
-import sys
 from array import array
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -20,53 +19,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shapespace.arrays import FloatArray, IntArray
+from shapespace.files.limits import Limits, clipped, count_bytes
 from shapespace.mesh.triangle_mesh import MeshError
 
 #: Bytes of the longest line and of the longest head of a PLY file.
 LONGEST_LINE, LONGEST_HEAD = 2**20, 2**16
-#: Bytes looked at in one piece.
-PIECE = 2**20
 #: Most ends of lines for each vertex and face, and beside these: an ASCII STL file has seven lines for a face, an OBJ
 #: file up to seven with texture and normals, and each may end in two characters.
 _LINES_OF_EACH, _LINES_BESIDE = 16, 100_000
 _LINE = re.compile(rb"[^\r\n]++")
-
-
-@dataclass(frozen=True)
-class Limits:
-    """How large a mesh may be for its reader to go on; by default as large as its file makes it.
-
-    Attributes:
-        vertices: the most.
-        faces: the most triangles.
-    """
-
-    vertices: int = sys.maxsize
-    faces: int = sys.maxsize
-
-    def check(self, vertices: int, faces: int) -> None:
-        """Refuse what is larger, with MeshError."""
-        if vertices > self.vertices:
-            raise MeshError(f"it has more than {self.vertices} vertices")
-        if faces > self.faces:
-            raise MeshError(f"it has more than {self.faces} faces")
-
-
-#: For files of one's own.
-UNLIMITED = Limits()
-
-
-def count(data: memoryview, *characters: bytes) -> int:
-    """How many of the bytes are one of some characters."""
-    # In pieces, as each needs a byte for every byte compared.
-    pieces = (np.frombuffer(data[start : start + PIECE], np.uint8) for start in range(0, len(data), PIECE))
-    return sum(int(np.count_nonzero(piece == character[0])) for piece in pieces for character in characters)
-
-
-def clipped(text: object, most: int = 100) -> str:
-    """What a file says, for a message: on one line, and not all of it."""
-    line = " ".join(str(text)[:1000].split())
-    return line if len(line) <= most else f"{line[:most]}…"
 
 
 class _Lines:
@@ -78,7 +39,7 @@ class _Lines:
 
     def __init__(self, data: memoryview, limits: Limits) -> None:
         most = _LINES_BESIDE + _LINES_OF_EACH * (limits.vertices + limits.faces)
-        lines = count(data, b"\n", b"\r")
+        lines = count_bytes(data, b"\n", b"\r")
         if lines > most:
             raise MeshError(f"it has {lines} lines, where {most} are enough")
         self._data, self._place = data, 0
@@ -95,7 +56,7 @@ class _Lines:
 
     @property
     def _number(self) -> int:
-        return 1 + count(self._data[: self._place], b"\n")
+        return 1 + count_bytes(self._data[: self._place], b"\n")
 
     def __iter__(self) -> Iterator[bytes]:
         return self._lines

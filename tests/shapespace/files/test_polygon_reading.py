@@ -10,8 +10,8 @@ import pytest
 import trimesh
 
 from shapespace.files.formats import MESH_FORMATS, read_arrays
+from shapespace.files.limits import Limits
 from shapespace.files.npz_reading import load_npz
-from shapespace.files.reading import Limits
 from shapespace.mesh.triangle_mesh import MeshError
 from tests.hostile import INDICES, XYZ, archive, npy, ply_head
 

@@ -1,0 +1,50 @@
+"""How much of a file is read, and how much of it messages quote."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+
+import numpy as np
+
+from shapespace.mesh.triangle_mesh import MeshError
+
+#: Bytes that are looked at together.
+PIECE = 2**20
+
+
+@dataclass(frozen=True)
+class Limits:
+    """Sizes of a mesh beyond which its reader stops; by default none.
+
+    Attributes:
+        vertices: most vertices.
+        faces: most triangles.
+    """
+
+    vertices: int = sys.maxsize
+    faces: int = sys.maxsize
+
+    def check(self, vertices: int, faces: int) -> None:
+        """Raise MeshError for a mesh that is larger."""
+        if vertices > self.vertices:
+            raise MeshError(f"it has more than {self.vertices} vertices")
+        if faces > self.faces:
+            raise MeshError(f"it has more than {self.faces} faces")
+
+
+#: For files that are trusted.
+UNLIMITED = Limits()
+
+
+def count_bytes(data: memoryview, *characters: bytes) -> int:
+    """How many bytes of the data are any of some characters."""
+    # In pieces: a comparison needs as many bytes as it compares.
+    pieces = (np.frombuffer(data[start : start + PIECE], np.uint8) for start in range(0, len(data), PIECE))
+    return sum(int(np.count_nonzero(piece == character[0])) for piece in pieces for character in characters)
+
+
+def clipped(text: object, most: int = 100) -> str:
+    """Text from a file as messages quote it: on one line, and at most so many characters of it."""
+    line = " ".join(str(text)[:1000].split())
+    return line if len(line) <= most else f"{line[:most]}…"

@@ -1,0 +1,157 @@
+"""The model as a library: it is found by its folder, and answers what the server answers."""
+
+import os
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+import httpx
+import numpy as np
+import pytest
+
+from shapespace.bundle.reader import BundleError
+from shapespace.files.formats import MESH_FORMATS
+from shapespace.mesh.triangle_mesh import MeshError, TriangleMesh
+from shapespace.model.correspondence import InvalidMeshError
+from shapespace.model.decoder import MeshChoice
+from shapespace.model.latent_space import NotFiniteError, OutOfBoundsError, WrongLengthError
+from shapespace.model.shape_model import ShapeModel, load
+from tests.service.bundles import SCALE, fine_reference, reference, write_bundle
+from tests.service.conftest import ROOT, starting
+
+CODES = np.array([[0.1, 0.7, 0.4], [0.0, -1.0, 0.2]])
+
+
+@pytest.fixture(scope="module")
+def models(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("library") / "models"
+    for version in ("1", "2", "10"):
+        write_bundle(folder, "small", version)
+    write_bundle(folder, "with-fine", fine=True)
+    shutil.copytree(ROOT / "models" / "figure", folder / "figure")  # a bundle must not be a link
+    return folder
+
+
+@pytest.fixture(scope="module")
+def model(models: Path) -> ShapeModel:
+    return load(models / "with-fine")
+
+
+@pytest.fixture(scope="module")
+def client(models: Path) -> Iterator[httpx.Client]:
+    with starting() as start, httpx.Client(base_url=start(models).url, timeout=120) as client:
+        yield client
+
+
+def post(client: httpx.Client, name: str, call: str, **body: object) -> dict:
+    return client.post(f"/v1/models/{name}/{call}", json=body).raise_for_status().json()
+
+
+@pytest.mark.parametrize("name", ["with-fine", "figure"])
+@pytest.mark.parametrize("mesh", ["fine", "coarse"])
+def test_shapes_are_those_of_the_server(models: Path, client: httpx.Client, name: str, mesh: str) -> None:
+    model = load(models / name)
+    codes = 1.2 * model.sample(3, seed=5, distribution="gaussian").astype(np.float64)
+    answer = post(client, name, "vertices", latents=codes.tolist(), mesh=mesh)
+    found = model.decode(codes, mesh=mesh)
+    np.testing.assert_array_equal(found.astype(np.float32), np.array(answer["vertices"], np.float32))
+    drawn = client.get(f"/v1/models/{name}/mesh", params={"mesh": mesh, "format": "json"}).json()
+    np.testing.assert_array_equal(model.mesh(MeshChoice(mesh)).faces, drawn["faces"])
+    np.testing.assert_array_equal(model.decode(codes[1], mesh=mesh), found[1])
+    clamped = post(client, name, "vertices", latents=(9 * codes).tolist(), mesh=mesh, bounds="clamp")
+    found = model.decode(9 * codes, mesh, "clamp")
+    np.testing.assert_array_equal(found.astype(np.float32), np.array(clamped["vertices"], np.float32))
+
+
+@pytest.mark.parametrize("name", ["with-fine", "figure"])
+def test_codes_are_those_of_the_server(models: Path, client: httpx.Client, name: str, tmp_path: Path) -> None:
+    model = load(models / name)
+    for distribution in ("uniform", "gaussian"):
+        codes = post(client, name, "sample", count=2, seed=3, distribution=distribution)["latents"]
+        np.testing.assert_array_equal(model.sample(2, 3, distribution), np.array(codes, np.float32))
+    shape = model.decode(codes[0])
+    file = tmp_path / "shape.ply"
+    file.write_bytes(MESH_FORMATS["ply"].encode(shape, model.faces))
+    answer = client.post(f"/v1/models/{name}/encode?format=ply", content=file.read_bytes()).raise_for_status().json()
+    found = model.encode(file)
+    np.testing.assert_array_equal(found.code, np.array(answer["latent"], np.float32))
+    assert (found.residual, found.iterations, found.status) == tuple(
+        answer[key] for key in ("residual", "iterations", "status")
+    )
+    assert answer["vertex_error"] == {"mean": found.distances.mean(), "max": found.distances.max()}
+    targets = {5: shape[5] + 0.05 * SCALE, 40: shape[40]}
+    pairs = [{"vertex": vertex, "position": place.tolist()} for vertex, place in targets.items()]
+    edited = post(client, name, "edit", latent=codes[1], targets=pairs, prior=1e-3)
+    changed = model.edit(codes[1], targets, prior=1e-3)
+    np.testing.assert_array_equal(changed.code, np.array(edited["latent"], np.float32))
+    assert changed.residual == edited["residual"]
+    np.testing.assert_array_equal(changed.distances, edited["distances"])
+
+
+def test_a_mesh_is_encoded_from_vertices_meshes_and_files(model: ShapeModel, tmp_path: Path) -> None:
+    for mesh, its_reference in (("fine", fine_reference()), ("coarse", reference())):
+        shape = model.decode(CODES[0], mesh)
+        np.savez(tmp_path / "shape.npz", vertices=shape, faces=its_reference.faces)
+        plain = model.encode(shape)
+        assert plain.mesh == mesh
+        np.testing.assert_allclose(plain.code, CODES[0], atol=1e-3)
+        for given in (
+            TriangleMesh.from_arrays(shape, its_reference.faces),
+            shape.tolist(),
+            tmp_path / "shape.npz",
+            str(tmp_path / "shape.npz"),
+        ):
+            np.testing.assert_array_equal(model.encode(given).code, plain.code)
+
+
+def test_a_folder_a_name_or_here(models: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert load(str(models / "small" / "2")).manifest.version == "2"
+    assert load(models / "small").manifest.version == "10"  # the highest, not the last in the alphabet
+    for folder in (models / "small", models / "small" / "10"):
+        monkeypatch.chdir(folder)
+        assert load(os.curdir).manifest.version == "10"
+    for folder in (models, models / "small" / "1" / "manifest.json", models / "none"):
+        with pytest.raises(BundleError, match="holds no bundle" if folder == models else "can't be read"):
+            load(folder)
+
+
+def test_its_facts(model: ShapeModel) -> None:
+    assert (model.dimension, len(model.names)) == (3, 3)
+    assert model.period == [None, 2 * np.pi, None]
+    np.testing.assert_array_equal([model.lower, model.upper], [[-0.2, -np.pi, 0], [0.2, np.pi, 1]])
+    np.testing.assert_array_equal(model.faces, fine_reference().faces)
+    np.testing.assert_array_equal(model.vertices, SCALE * fine_reference().vertices)
+    assert repr(model) == f"<ShapeModel with-fine/1: 3 coordinates, 2 factors, {len(model.vertices)} vertices>"
+
+
+def test_what_is_wrong_is_said(model: ShapeModel) -> None:
+    with pytest.raises(WrongLengthError, match="takes 3"):
+        model.decode([[0.0, 1.0]])
+    with pytest.raises(WrongLengthError, match=r"\(n, m\) or \(m,\)"):
+        model.decode(np.zeros((1, 1, 3)))
+    with pytest.raises(OutOfBoundsError):
+        model.decode([0, 0, 2], bounds="reject")
+    with pytest.raises(ValueError, match="'large' is not a valid MeshChoice"):
+        model.decode(CODES, mesh="large")  # type: ignore[arg-type]
+    with pytest.raises(InvalidMeshError, match=r"\(V, 3\)"):
+        model.encode(np.zeros(3))
+    with pytest.raises(InvalidMeshError, match="has 7 vertices"):
+        model.encode(np.zeros((7, 3)))
+    with pytest.raises(MeshError, match="can't be read"):
+        model.encode("nothing.obj")
+    with pytest.raises(ValueError, match="Give at least one"):
+        model.edit(CODES[0], {})
+    count = len(reference().vertices)
+    for vertex in (-1, count):
+        with pytest.raises(ValueError, match=f"There is no vertex {vertex}: the coarse mesh"):
+            model.edit(CODES[0], {vertex: [0, 0, 0]}, mesh="coarse")
+    with pytest.raises(NotFiniteError):
+        model.edit(CODES[0], {0: [np.inf, 0, 0]})
+
+
+def test_shapes_that_were_not_found_are_told(model: ShapeModel, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert model.decode(np.zeros((0, 3))).shape == (0, *model.vertices.shape)
+    monkeypatch.setattr("shapespace.model.decoder.TOLERANCE", 1e-300)
+    with pytest.warns(RuntimeWarning, match="1 of 1 shapes did not converge; the first is that of code 0: ") as caught:
+        model.decode(CODES[:1])
+    assert caught[0].filename == __file__
