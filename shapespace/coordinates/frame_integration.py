@@ -52,8 +52,7 @@ class FrameIntegration:
         anchor = self.ANCHOR * weights.mean()
         entries[pattern.diagonal] += anchor
         self._anchored = anchor * reference.vertices
-        self._cholesky = analyse(pattern, backend)
-        self._cholesky.factorise(entries)
+        self._poisson = analyse(pattern, backend).factorise(entries)
 
     def _plant(self, reference: TriangleMesh) -> None:
         """A tree of short paths from a face in the middle of each part; faces in the order of their depth."""
@@ -122,7 +121,7 @@ class FrameIntegration:
         sides[:, 0] -= sides[:, 2]
         right = self._divergence @ sides.reshape(3, -1).T + self._anchored
         # One by one: Pardiso takes more than twice as long for three at once.
-        return np.stack([self._cholesky.solve(column) for column in right.T], axis=1)
+        return np.stack([self._poisson.solve(column) for column in right.T], axis=1)
 
     def _frames(self, halves: FloatArray, angles: FloatArray) -> FloatArray:
         """Unit quaternions (4, F) of the faces' planes.
