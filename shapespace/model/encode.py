@@ -14,7 +14,7 @@ from shapespace.model.derivatives import derivatives, factor_derivatives, nodes
 from shapespace.model.latent_space import Bounds, Codes, NotFiniteError
 from shapespace.model.shape_model import MeshChoice, Shape, ShapeModel
 from shapespace.solve.deadline import Deadline
-from shapespace.solve.least_squares import Fit, least_squares
+from shapespace.solve.least_squares import Box, Fit, Stopping, least_squares
 from shapespace.solve.status import Status
 
 #: Times that each factor is moved on its grid, given the others, and how much more it must explain then.
@@ -90,11 +90,11 @@ class Encoder:
         distances = np.linalg.norm(align(shape.vertices, given.vertices) - given.vertices, axis=1)
         residual = float(np.sqrt(fit.cost / self._norm.square(target)))
         status = Status.DEADLINE if shape.diagnostics.status is Status.DEADLINE else fit.status
-        return Encoded(code, inside, status, fit.evaluations, residual, shape, distances, given.mesh)
+        return Encoded(code, inside, status, fit.iterations, residual, shape, distances, given.mesh)
 
     def _fit(self, target: FloatArray, lower: FloatArray, upper: FloatArray, deadline: Deadline | None) -> Fit:
         latents, root = self.model.latents, self._root
-        box = lower, upper, latents.width
+        box = Box(lower, upper, latents.width)
 
         def affine(x: FloatArray) -> FloatArray:
             return root * self._difference(self._affine(x), target)
@@ -104,7 +104,11 @@ class Encoder:
 
         def from_composite(start: FloatArray) -> Fit:
             return least_squares(
-                composite, lambda x, _: root[:, None] * derivatives(self.model, x), start, *box, deadline=deadline
+                composite,
+                lambda x, _: root[:, None] * derivatives(self.model, x),
+                start,
+                box,
+                Stopping(deadline=deadline),
             )
 
         x = (latents.lower + latents.upper) / 2
@@ -114,12 +118,16 @@ class Encoder:
                 break
             x = moved
         rough = least_squares(
-            affine, lambda x, _: root[:, None] * factor_derivatives(self.model, x), x, *box, tolerance=1e-3,
-            secant=False, deadline=deadline,
-        )  # fmt: skip
+            affine,
+            lambda x, _: root[:, None] * factor_derivatives(self.model, x),
+            x,
+            box,
+            Stopping(tolerance=1e-3, deadline=deadline),
+            secant=False,
+        )
         best = from_composite(rough.x)
         for _ in range(SWEEPS):
-            moved = self._elsewhere(best.x, best.residual)
+            moved = self._elsewhere(best.x, best.residuals)
             if moved is None or best.status is Status.DEADLINE:
                 break
             other = from_composite(moved)
