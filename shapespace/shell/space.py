@@ -249,8 +249,8 @@ class DiscretePath(Outcome):
     """Shapes at equal times, as far as they could be found; converged if the path is complete.
 
     Of its equations ``iterations`` are all together, and ``residual`` is the largest ``sqrt(F_kᵀ A_k⁻¹ F_k)`` of the
-    discrete Euler–Lagrange equation at an inner shape, with A_k factorised near it; the exponential has taken another
-    step since.
+    discrete Euler–Lagrange equation at an inner shape, with A_k factorised near it, or 0 where no shape has been solved
+    for; the exponential has taken another step since.
 
     Attributes:
         vertices: (n, V, 3), always finite.
