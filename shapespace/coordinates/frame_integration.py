@@ -1,9 +1,13 @@
-"""Vertices straight from lengths and angles: frames along a spanning tree of the faces, then one linear solve.
+"""Vertices straight from lengths and angles: face frames along a spanning tree of the faces, then one linear solve.
 
 Lengths give every triangle its form and an angle the rotation between two neighbours, so that a tree gives a frame to
 each face, and with it the vectors of its sides; the vertices that fit these vectors best solve a Poisson equation with
 a fixed matrix (Lipman, Sorkine, Levin and Cohen-Or 2005). Exact where z is integrable. Where it isn't, each path
 through the tree adds up its errors: good as a start of Gauss–Newton, which sees all edges alike.
+
+**Half angles.** A rotation by φ about a unit axis a is the quaternion (cos φ/2, a sin φ/2), so all that is needed of an
+inner angle γ is half of it: from its cosine, by the law of cosines ``cos γ = (b² + c² − a²) / 2bc``, follow
+``sin γ/2 = √((1 − cos γ)/2)`` and ``cos γ/2 = √((1 + cos γ)/2)``, without a trigonometric function.
 """
 
 from __future__ import annotations
@@ -36,7 +40,34 @@ class FrameIntegration:
     def __init__(self, reference: TriangleMesh, backend: Backend = "auto") -> None:
         c = reference.connectivity
         self._connectivity, self._count = c, len(c.faces)
-        self._plant(reference)
+        parents = _spanning_forest(reference)
+        depths = _depths(parents)
+        # Faces in the order of their depth, the roots first, and where each face is in that order.
+        order: IntArray = np.argsort(depths, kind="stable")
+        self._place = np.argsort(order)
+        self._roots = int((depths == 0).sum())
+        self._root_frames = _face_frames(reference, order[: self._roots])
+        self._hinges_to_parents(order[self._roots :], parents)
+        self._rounds = _rounds(depths[order], self._place[parents[order]])
+        self._poisson_equation(reference, backend)
+
+    def _hinges_to_parents(self, children: IntArray, parents: IntArray) -> None:
+        """The edge between each face that is no root and its parent, and which side of either face that is."""
+        c = self._connectivity
+        edge_of = {(a, b): e for (a, b), e in zip(c.edge_faces[c.hinge_edges].tolist(), c.hinge_edges, strict=True)}
+        edge_of |= {(b, a): e for (a, b), e in edge_of.items()}
+        pairs = zip(parents[children].tolist(), children.tolist(), strict=True)
+        self._tree_edges: IntArray = np.array([edge_of[pair] for pair in pairs], dtype=np.int64)
+        self._left_sides, self._right_sides = (
+            (c.face_edges[faces] == self._tree_edges[:, None]).argmax(axis=1) * self._count + faces
+            for faces in c.edge_faces[self._tree_edges].T
+        )
+        #: 1 where the parent is the left face of the edge, −1 where the rotation is to be reversed.
+        self._direction = np.where(c.edge_faces[self._tree_edges, 0] == parents[children], 1.0, -1.0)
+
+    def _poisson_equation(self, reference: TriangleMesh, backend: Backend) -> None:
+        """The right-hand side's matrix and the factor of the left-hand side's."""
+        c = self._connectivity
         # Side k runs from corner k + 1 to corner k + 2.
         tails, heads = c.faces.T[[1, 2, 0]].ravel(), c.faces.T[[2, 0, 1]].ravel()
         weights = ((reference.vertices[heads] - reference.vertices[tails]) ** 2).sum(axis=1) ** -1.0
@@ -52,51 +83,7 @@ class FrameIntegration:
         anchor = self.ANCHOR * weights.mean()
         entries[pattern.diagonal] += anchor
         self._anchored = anchor * reference.vertices
-        self._cholesky = analyse(pattern, backend)
-        self._cholesky.factorise(entries)
-
-    def _plant(self, reference: TriangleMesh) -> None:
-        """A tree of short paths from a face in the middle of each part; faces in the order of their depth."""
-        centres = reference.vertices[reference.faces].mean(axis=1)
-        c, count = reference.connectivity, self._count
-        left, right = c.edge_faces[c.hinge_edges].T
-        steps = np.linalg.norm(centres[left] - centres[right], axis=1)
-        steps += steps.mean()  # errors come with every hinge, however near
-        graph = sparse.csr_array((steps, (left, right)), shape=(count, count))
-        parts = connected_components(graph, directed=False)[1]
-        roots = np.array([_middle(graph, np.flatnonzero(parts == part)) for part in range(parts.max() + 1)])
-        _, above, _ = dijkstra(graph, directed=False, indices=roots, min_only=True, return_predecessors=True)
-        parent: IntArray = above.astype(np.int64)
-        parent[roots] = roots
-        depth: IntArray = np.zeros(count, dtype=np.int64)
-        ancestor: IntArray = np.arange(count)
-        while (parent[ancestor] != ancestor).any():
-            depth += parent[ancestor] != ancestor
-            ancestor = parent[ancestor]
-        order: IntArray = np.argsort(depth, kind="stable")
-        self._place = np.argsort(order)
-        depth, ancestor = depth[order], self._place[parent[order]]
-
-        # The edge between each face and its parent, and the places of its sides in the two.
-        edge_of = {(a, b): e for a, b, e in zip(left.tolist(), right.tolist(), c.hinge_edges, strict=True)}
-        edge_of |= {(b, a): e for (a, b), e in edge_of.items()}
-        self._roots = int((depth == 0).sum())
-        children = order[self._roots :]
-        pairs = zip(parent[children].tolist(), children.tolist(), strict=True)
-        self._tree_edges: IntArray = np.array([edge_of[pair] for pair in pairs], dtype=np.int64)
-        self._left_sides, self._right_sides = (
-            (c.face_edges[faces] == self._tree_edges[:, None]).argmax(axis=1) * count + faces
-            for faces in c.edge_faces[self._tree_edges].T
-        )
-        self._turn = np.where(c.edge_faces[self._tree_edges, 0] == parent[children], 1.0, -1.0)
-        self._root_frames = _quaternions(reference, order[: self._roots])
-        #: The first face of each round of multiplications, and the ancestors of it and those after it.
-        self._rounds: list[tuple[int, IntArray]] = []
-        reach = 1
-        while reach <= depth[-1]:
-            first = int(np.searchsorted(depth, reach))
-            self._rounds.append((first, ancestor[first:]))
-            ancestor, reach = ancestor[ancestor], 2 * reach
+        self._poisson = analyse(pattern, backend).factorise(entries)
 
     @np.errstate(divide="ignore", over="ignore", invalid="ignore")
     def __call__(self, z: FloatArray) -> FloatArray:
@@ -111,7 +98,7 @@ class FrameIntegration:
         halves = np.empty((2, 3, self._count))
         halves[0] = sin_1, -sin_0, np.ones_like(sin_0)
         halves[1] = cos_1, cos_0, np.zeros_like(sin_0)
-        w, x, y, n = self._frames(halves.reshape(2, -1), z.take(c.edge_count + self._tree_edges) / 2)
+        w, x, y, n = self._face_frames(halves.reshape(2, -1), z.take(c.edge_count + self._tree_edges) / 2)
         first = np.stack([1 - 2 * (y * y + n * n), 2 * (x * y + w * n), 2 * (x * n - w * y)])
         second = np.stack([2 * (x * y - w * n), 1 - 2 * (x * x + n * n), 2 * (y * n + w * x)])
         sides = np.empty((3, 3, self._count))
@@ -122,17 +109,18 @@ class FrameIntegration:
         sides[:, 0] -= sides[:, 2]
         right = self._divergence @ sides.reshape(3, -1).T + self._anchored
         # One by one: Pardiso takes more than twice as long for three at once.
-        return np.stack([self._cholesky.solve(column) for column in right.T], axis=1)
+        return np.stack([self._poisson.solve(column) for column in right.T], axis=1)
 
-    def _frames(self, halves: FloatArray, angles: FloatArray) -> FloatArray:
-        """Unit quaternions (4, F) of the faces' planes.
+    def _face_frames(self, halves: FloatArray, angles: FloatArray) -> FloatArray:
+        """Unit quaternions (4, F) of the face frames.
 
         Args:
             halves: (2, 3F) cosines and sines of half the directions of their sides.
             angles: (F − roots,) halves of the angles between each face and its parent.
         """
-        # Across a hinge: turn its direction in the left face to the first axis, fold, turn to that in the right one,
-        # where it runs the other way.
+        # Across a hinge: rotate its direction α in the left face to the first axis, fold by θ, rotate to its direction
+        # β in the right face, where it runs the other way. As quaternions z(α) x(θ) z(−β), where (a, b) are cosine and
+        # sine of α/2, and (c, d) of β/2.
         a, b = halves.take(self._left_sides, axis=1)
         d, c = halves.take(self._right_sides, axis=1)
         np.negative(c, out=c)
@@ -144,11 +132,57 @@ class FrameIntegration:
         np.multiply(sine, a * c - b * d, out=across[1])
         np.multiply(sine, b * c + a * d, out=across[2])
         np.multiply(cosine, b * c - a * d, out=across[3])
-        across[1:] *= self._turn
+        across[1:] *= self._direction
         # Products along the paths from the roots, twice as long in each round.
         for first, ancestors in self._rounds:
             q[:, first:] = quaternions.product(q.take(ancestors, axis=1), q[:, first:])
         return q.take(self._place, axis=1)
+
+
+def _spanning_forest(mesh: TriangleMesh) -> IntArray:
+    """The parent (F,) of each face in a tree of short paths from a face in the middle of each part; a root is its own.
+
+    Lengths are those between the centres of faces, and a mean one more a hinge: errors come with each, however near.
+    """
+    c, centres = mesh.connectivity, mesh.vertices[mesh.faces].mean(axis=1)
+    left, right = c.edge_faces[c.hinge_edges].T
+    steps = np.linalg.norm(centres[left] - centres[right], axis=1)
+    steps += steps.mean()
+    graph = sparse.csr_array((steps, (left, right)), shape=(len(centres), len(centres)))
+    parts = connected_components(graph, directed=False)[1]
+    roots = np.array([_middle(graph, np.flatnonzero(parts == part)) for part in range(parts.max() + 1)])
+    _, predecessors, _ = dijkstra(graph, directed=False, indices=roots, min_only=True, return_predecessors=True)
+    parents: IntArray = predecessors.astype(np.int64)
+    parents[roots] = roots
+    return parents
+
+
+def _depths(parents: IntArray) -> IntArray:
+    """Steps (F,) from each face to its root."""
+    depths: IntArray = np.zeros(len(parents), dtype=np.int64)
+    ancestors: IntArray = np.arange(len(parents))
+    while (parents[ancestors] != ancestors).any():
+        depths += parents[ancestors] != ancestors
+        ancestors = parents[ancestors]
+    return depths
+
+
+def _rounds(depths: IntArray, parents: IntArray) -> list[tuple[int, IntArray]]:
+    """How to multiply along all paths from the roots at once, in as many rounds as the depth has binary digits.
+
+    In each round every product is multiplied by that of its face's ancestor, which reaches as far up again ("pointer
+    jumping", Wyllie 1979). A round is the first face that takes part and the ancestors of it and all after it.
+
+    Args:
+        depths: (F,) increasing.
+        parents: (F,) of faces in that order, a root's is itself.
+    """
+    rounds, ancestors, reach = [], parents, 1
+    while reach <= depths[-1]:
+        first = int(np.searchsorted(depths, reach))
+        rounds.append((first, ancestors[first:]))
+        ancestors, reach = ancestors[ancestors], 2 * reach
+    return rounds
 
 
 def _half(cosine: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -167,8 +201,8 @@ def _middle(graph: sparse.csr_array, part: IntArray) -> int:
     return int(part[np.maximum(distances[-1], distances[-2]).argmin()])
 
 
-def _quaternions(mesh: TriangleMesh, faces: IntArray) -> FloatArray:
-    """(4, n) rotations that take the axes to the frames of faces: along side 2, across it, and the normal."""
+def _face_frames(mesh: TriangleMesh, faces: IntArray) -> FloatArray:
+    """(4, n) quaternions that take the axes to face frames: along side 2, across it, and the normal."""
     corners = mesh.vertices[mesh.faces[faces]]
     along = corners[:, 1] - corners[:, 0]
     along /= np.linalg.norm(along, axis=1, keepdims=True)

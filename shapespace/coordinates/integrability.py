@@ -1,9 +1,9 @@
 """When lengths and angles are those of a surface: triangle inequalities and the closing conditions Q(z) = 0.
 
-Walk around an interior vertex with a frame: x along the current edge, z along the face's normal. Each corner
-turns it by the inner angle γ about z, each edge by the dihedral angle θ about x. Back at the start the frame
+Walk around an interior vertex with a face frame: x along the current edge, z along the face's normal. Each corner
+rotates it by the inner angle γ about z, each edge by the dihedral angle θ about x. Back at the start the frame
 must be what it was (paper, appendix C, after Wang, Liu and Tong 2012, with quaternions as Sassen et al.
-2019). The turns add up to 2π where the surface is flat, so the product of the unit quaternions is −1 there
+2019). The rotations add up to 2π where the surface is flat, so the product of the unit quaternions is −1 there
 and stays near it at every integrable z; its vector part is the condition: three numbers a vertex.
 
 On a simply connected surface that is all. Every handle, and every boundary loop but the first, leaves loops
@@ -30,7 +30,7 @@ def triangle_slack(z: FloatArray, connectivity: Connectivity) -> FloatArray:
 
 
 class _Move(NamedTuple):
-    """One motion of a frame along a loop: a turn by an inner or dihedral angle, or a slide along an edge."""
+    """One motion of a face frame along a loop: a rotation by an inner or dihedral angle, or a slide along an edge."""
 
     kind: str
     parameter: int
@@ -271,7 +271,7 @@ def _ascent(parent: dict[int, tuple[int, int]], face: int) -> list[int]:
 
 
 def _moves(connectivity: Connectivity, loop: list[int]) -> list[_Move]:
-    """The motions of a frame along a loop of alternating faces and edges.
+    """The motions of a face frame along a loop of alternating faces and edges.
 
     The frame's origin is a vertex, its x axis runs along an edge. In each face it slides to the edge's other
     end if need be, turns to the next edge there, and tips over into the next face.

@@ -26,6 +26,15 @@ class QuadraticForm:
     angles: FloatArray
 
 
+def _upper(size: int) -> int:
+    """Entries of the upper triangle of a symmetric block, its diagonal included."""
+    return size * (size + 1) // 2
+
+
+#: Unknowns of the ends of an edge, of the corners of a face and of the vertices of a hinge: sizes of the blocks.
+EDGE, FACE, HINGE = 2 * 3, 3 * 3, 4 * 3
+
+
 class NormalMatrix:
     """``JᵀHJ + εI`` as entries of a fixed symmetric pattern, by one scatter.
 
@@ -57,15 +66,14 @@ class NormalMatrix:
         """Upper-triangle entries of ``JᵀHJ + εI`` for one shape's Jacobian."""
         if isinstance(form, WeightedNorm):
             edges = gradients.lengths.shape[-1]
-            contributions, on_lengths = self._work_space(21 * edges)
-            self._edges(gradients.lengths, form.squared[:edges], on_lengths.reshape(21, edges))
-            self._angles(gradients.angles, form.squared[edges:], contributions[21 * edges :])
+            contributions, on_lengths, on_angles = self._work_space(_upper(EDGE), edges)
+            self._edges(gradients.lengths, form.squared[:edges], on_lengths)
+            self._angles(gradients.angles, form.squared[edges:], on_angles)
             entries = self.pattern.scatter(contributions, self._slots_of_edges)
         else:
-            faces = form.faces.shape[-1]
-            contributions, on_lengths = self._work_space(45 * faces)
-            self._faces(gradients.lengths, form.faces, on_lengths.reshape(45, faces))
-            self._angles(gradients.angles, form.angles, contributions[45 * faces :])
+            contributions, on_lengths, on_angles = self._work_space(_upper(FACE), form.faces.shape[-1])
+            self._faces(gradients.lengths, form.faces, on_lengths)
+            self._angles(gradients.angles, form.angles, on_angles)
             entries = self.pattern.scatter(contributions)
         entries[self.pattern.diagonal] += self.REGULARISATION * entries[self.pattern.diagonal].mean()
         return entries
@@ -73,29 +81,29 @@ class NormalMatrix:
     def second_derivative(self, second: NRICSecondDerivatives, covector: FloatArray) -> FloatArray:
         """Upper-triangle entries of ``Σ_i p_i D²z_i(X)``: how ``Jᵀp`` changes with X for fixed p (2E,)."""
         edges = second.lengths.shape[-1]
-        contributions, on_lengths = self._work_space(21 * edges)
-        out = on_lengths.reshape(21, edges)
+        contributions, on_lengths, on_angles = self._work_space(_upper(EDGE), edges)
         blocks = second.lengths * covector[:edges]
-        a, b = np.triu_indices(3)
-        out[:6] = out[6:12] = blocks[a, b]
-        out[12:] = -blocks.reshape(9, edges)
-        a, b = np.triu_indices(12)
+        on_lengths[:6] = on_lengths[6:12] = blocks[np.triu_indices(3)]
+        on_lengths[12:] = -blocks.reshape(9, edges)
+        a, b = np.triu_indices(HINGE)
         angles = second.angles[a // 3, b // 3, a % 3, b % 3]
-        np.multiply(angles, covector.take(edges + self._interior), out=contributions[21 * edges :].reshape(78, -1))
+        np.multiply(angles, covector.take(edges + self._interior), out=on_angles)
         return self.pattern.scatter(contributions, self._slots_of_edges)
 
-    def _work_space(self, lengths: int) -> tuple[FloatArray, FloatArray]:
-        """Contributions, and the part of them that comes from lengths."""
-        contributions = np.empty(lengths + 78 * len(self._interior))
-        return contributions, contributions[:lengths]
+    def _work_space(self, entries: int, blocks: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Contributions, and views of those from lengths (entries, blocks) and of those from angles, per hinge."""
+        lengths = entries * blocks
+        contributions = np.empty(lengths + _upper(HINGE) * len(self._interior))
+        on_lengths, on_angles = contributions[:lengths], contributions[lengths:]
+        return contributions, on_lengths.reshape(entries, blocks), on_angles.reshape(_upper(HINGE), -1)
 
     def _angles(self, gradients: FloatArray, weights: FloatArray, out: FloatArray) -> None:
-        g = gradients.reshape(12, -1)
+        g = gradients.reshape(HINGE, -1)
         weighted = g * weights.take(self._interior)
-        pieces, start = out.reshape(78, -1), 0
-        for a in range(12):
-            np.multiply(g[a], weighted[a:], out=pieces[start : start + 12 - a])
-            start += 12 - a
+        start = 0
+        for a in range(HINGE):
+            np.multiply(g[a], weighted[a:], out=out[start : start + HINGE - a])
+            start += HINGE - a
 
     @cached_property
     def _slots_of_edges(self) -> IntArray:
@@ -107,16 +115,18 @@ class NormalMatrix:
         columns = [tails + b[:, None], heads + b[:, None], *(heads + k for _ in range(3) for k in range(3))]
         keys = self.pattern.rows * size + self.pattern.indices
         slots = np.searchsorted(keys, (np.concatenate(rows) * size + np.concatenate(columns)).ravel())
-        return np.concatenate([slots, self.pattern.slots[45 * self._sides.shape[1] :]])
+        return np.concatenate([slots, self.pattern.slots[_upper(FACE) * self._sides.shape[1] :]])
 
     def _edges(self, directions: FloatArray, weights: FloatArray, out: FloatArray) -> None:
+        # The 3×3 blocks of the tail, of the head, which is the same, and of both, which is its negative and whole.
+        tails, heads, both = np.split(out, [_upper(3), 2 * _upper(3)])
         weighted = directions * weights
         start = 0
         for a in range(3):
-            np.multiply(directions[a], weighted[a:], out=out[start : start + 3 - a])
-            np.multiply(-directions[a], weighted, out=out[12 + 3 * a : 15 + 3 * a])
+            np.multiply(directions[a], weighted[a:], out=tails[start : start + 3 - a])
+            np.multiply(-directions[a], weighted, out=both[3 * a : 3 * a + 3])
             start += 3 - a
-        out[6:12] = out[:6]
+        heads[:] = tails
 
     def _faces(self, directions: FloatArray, blocks: FloatArray, out: FloatArray) -> None:
         u = directions.take(self._sides, axis=1) * self._signs
@@ -124,12 +134,12 @@ class NormalMatrix:
         corners = np.zeros((3, 3, 3, u.shape[-1]))
         for k, (tail, head) in enumerate(self._corners):
             corners[k, tail], corners[k, head] = -u[:, k], u[:, k]
-        g = corners.reshape(3, 9, -1)
+        g = corners.reshape(3, FACE, -1)
         weighted = np.einsum("kmf,mbf->kbf", blocks, g)
         start = 0
-        for a in range(9):
+        for a in range(FACE):
             i, j = self._corners[a // 3]
-            piece = out[start : start + 9 - a]
+            piece = out[start : start + FACE - a]
             np.multiply(g[i, a], weighted[i, a:], out=piece)
             piece += g[j, a] * weighted[j, a:]
-            start += 9 - a
+            start += FACE - a

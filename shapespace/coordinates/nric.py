@@ -35,7 +35,7 @@ def cross(a: FloatArray, b: FloatArray) -> FloatArray:
     return out
 
 
-class Frame:
+class HingeGeometry:
     """Edge vectors, and at every hinge the vectors and normals that angles are made of, all (3, …).
 
     What lengths and angles have in common with their derivatives, which is most of the work.
@@ -151,13 +151,13 @@ def edge_lengths(vertices: FloatArray, connectivity: Connectivity) -> FloatArray
 def dihedral_angles(vertices: FloatArray, connectivity: Connectivity) -> FloatArray:
     """Signed dihedral angles (…, E) of shapes (…, V, 3), in (−π, π], zero on boundary edges."""
     angles = np.zeros((*vertices.shape[:-2], connectivity.edge_count))
-    angles[..., connectivity.hinge_edges] = Frame(vertices, connectivity).angles()
+    angles[..., connectivity.hinge_edges] = HingeGeometry(vertices, connectivity).angles()
     return angles
 
 
 def nric(vertices: FloatArray, connectivity: Connectivity) -> FloatArray:
     """Lengths and angles ``z`` (…, 2E) of shapes (…, V, 3)."""
-    return Frame(vertices, connectivity).nric()
+    return HingeGeometry(vertices, connectivity).nric()
 
 
 def wrap(angles: FloatArray) -> FloatArray:
@@ -298,4 +298,4 @@ class NRICJacobian:
 
     def gradients(self, vertices: FloatArray) -> NRICGradients:
         """The derivatives at a shape (V, 3)."""
-        return Frame(vertices, self.connectivity).gradients()
+        return HingeGeometry(vertices, self.connectivity).gradients()

@@ -13,12 +13,15 @@ from scipy import sparse
 from shapespace.arrays import FloatArray
 from shapespace.coordinates.frame_integration import FrameIntegration
 from shapespace.coordinates.normal_matrix import NormalMatrix
-from shapespace.coordinates.nric import Frame, NRICGradients, NRICJacobian, WeightedNorm
+from shapespace.coordinates.nric import HingeGeometry, NRICGradients, NRICJacobian, WeightedNorm
 from shapespace.mesh.rigid_motion import rigid_motions
 from shapespace.mesh.triangle_mesh import TriangleMesh, face_areas
 from shapespace.solve.anderson import Anderson
-from shapespace.solve.cholesky import Backend, Cholesky, NotPositiveDefiniteError, analyse
+from shapespace.solve.cholesky import Backend, Factor, NotPositiveDefiniteError, analyse
 from shapespace.solve.deadline import Deadline
+from shapespace.solve.line_search import backtrack, sufficient_decrease
+from shapespace.solve.outcome import Outcome
+from shapespace.solve.preconditioner import Preconditioner
 from shapespace.solve.status import Status
 
 #: Weight of the angles in the reconstruction's norm. A parameter of its own: the metric's η is far too small here,
@@ -33,27 +36,24 @@ REACH, LIFE = 1e-2, 16
 FIRST_DAMPING, DAMPING_FACTOR, LARGEST_DAMPING, DAMPING_AT_A_MINIMUM = 1e-6, 10, 1e3, 1e-4
 #: Least share of its area that a damped step leaves to a face.
 LEAST_AREA = 0.1
-#: A first guess from frames with a smaller relative misfit is good enough not to look for another.
+#: A first guess from face frames with a smaller relative misfit is good enough not to look for another.
 GOOD_GUESS = 0.05
 
 
-@dataclass(frozen=True)
-class Reconstruction:
+@dataclass(frozen=True, kw_only=True)
+class Reconstruction(Outcome):
     """What Gauss–Newton found.
+
+    An iteration is one evaluation of z(X) and one solve. The residual is ``‖z(X) − z*‖ / ‖z*‖`` in the weighted norm:
+    about the relative misfit of an edge.
 
     Attributes:
         vertices: (V, 3), always finite.
-        status: how the iteration ended.
-        iterations: steps tried, each from one evaluation of z(X) and one solve.
-        residual: ``‖z(X) − z*‖ / ‖z*‖`` in the weighted norm; about the relative misfit of an edge.
         flipped_faces: faces at an edge whose angle is more than π/2 away from the one asked for.
     """
 
     vertices: FloatArray
-    status: Status
-    iterations: int
-    residual: float
-    flipped_faces: int
+    flipped_faces: int = 0
 
 
 class Reconstructor:
@@ -98,16 +98,16 @@ class Reconstructor:
     def guess(self, target: FloatArray, *others: Callable[[], FloatArray]) -> FloatArray:
         """A start (V, 3) near the shape of z* (2E,), which depends on nothing but z*.
 
-        Frames first, which are exact for integrable z*. Where they go astray, for errors of z* add up along them,
-        the start with the smallest misfit among them, the others, called only then, and the reference.
+        Integrated face frames first, which are exact for integrable z*. Where they go astray, for errors of z* add up
+        along them, the start with the smallest misfit among them, the others, called only then, and the reference.
         """
         return self._guess(target, others).vertices
 
     def _guess(self, target: FloatArray, others: Iterable[Callable[[], FloatArray]]) -> _Point:
-        framed = self._point(self.integrate(target), target)
-        if framed.energy <= GOOD_GUESS**2 * self.norm.square(target):
-            return framed
-        return self._nearest(target, framed, [*(other() for other in others), self.reference.vertices])
+        integrated = self._point(self.integrate(target), target)
+        if integrated.energy <= GOOD_GUESS**2 * self.norm.square(target):
+            return integrated
+        return self._nearest(target, integrated, [*(other() for other in others), self.reference.vertices])
 
     def nearest(self, target: FloatArray, *shapes: FloatArray) -> FloatArray:
         """The shape (V, 3) among some whose misfit is the smallest; the last where none has a finite one."""
@@ -154,104 +154,117 @@ class Reconstructor:
 
     @np.errstate(divide="ignore", over="ignore", invalid="ignore")
     def _iterate(
-        self, target: FloatArray, here: _Point, tolerance: float, max_iterations: int, deadline: Deadline | None
+        self, target: FloatArray, start: _Point, tolerance: float, max_iterations: int, deadline: Deadline | None
     ) -> Reconstruction:
-        limit, reach = (share * self._diagonal for share in (tolerance, REACH))
-        if not np.isfinite(here.energy):
-            return Reconstruction(self.reference.vertices, Status.NOT_FINITE, 0, np.inf, 0)
-        status, iterations = Status.ITERATION_LIMIT, 0
-        factor: _Factor | None = None
-        while iterations < max_iterations:
-            if deadline is not None and deadline.passed:
-                status = Status.DEADLINE
-                break
-            if new := factor is None:
-                try:
-                    self._cholesky.factorise(self.normal_matrix.entries(here.gradients, self.norm))
-                except NotPositiveDefiniteError:
-                    status = Status.STALLED
-                    break
-                factor = _Factor(self._cholesky, here.vertices)
-            iterations += 1
-            forces = -self.jacobian.pull_back(here.gradients, self.norm.squared * here.misfit)
-            step, mixed = factor.step(here.vertices, forces)
-            size, t = np.abs(step).max(), 1.0
-            if new and not np.isfinite(size):
-                status = Status.STALLED
-                break
-            trial = self._point(mixed, target)
-            if new:
-                slope = 2 * np.vdot(forces, step)
-                while not (trial.energy <= here.energy - 1e-4 * t * slope or size * t <= limit):
-                    t /= 2
-                    trial = self._point(here.vertices + t * step, target)
-            if not trial.energy <= here.energy:
-                if not (new or size <= limit):
-                    factor = None
-                    continue
-                # The last, tiny step is taken only if it helps: at the minimum rounding decides.
-                status = Status.CONVERGED if t == 1 or size <= limit else Status.STALLED
-                break
-            here = trial
-            if size * t <= limit:
-                status = Status.CONVERGED if t == 1 else Status.STALLED
-                break
-            if t < 1 or factor.steps == LIFE or np.abs(here.vertices - factor.at).max() > reach:
-                factor = None
-        if status is Status.STALLED and iterations:
-            here, status, iterations = self._damped(target, here, limit, iterations, max_iterations, deadline)
-        residual = float(np.sqrt(here.energy / self.norm.square(target)))
-        return Reconstruction(here.vertices, status, iterations, residual, self._flipped(here.misfit))
+        if not np.isfinite(start.energy):
+            reason = "lengths and angles of the start are not finite, or those asked for"
+            return Reconstruction(vertices=self.reference.vertices, status=Status.NOT_FINITE, reason=reason)
+        limits = _Limits(tolerance * self._diagonal, REACH * self._diagonal, max_iterations, deadline)
+        ended = self._gauss_newton(target, start, limits)
+        if ended.status is Status.STALLED and ended.iterations:
+            ended = self._levenberg_marquardt(target, ended, limits)
+        return Reconstruction(
+            vertices=ended.point.vertices,
+            status=ended.status,
+            iterations=ended.iterations,
+            reason=ended.reason,
+            residual=float(np.sqrt(ended.point.energy / self.norm.square(target))),
+            flipped_faces=self._flipped(ended.point.misfit),
+        )
 
-    def _damped(
-        self,
-        target: FloatArray,
-        here: _Point,
-        limit: float,
-        iterations: int,
-        max_iterations: int,
-        deadline: Deadline | None,
-    ) -> tuple[_Point, Status, int]:
+    def _gauss_newton(self, target: FloatArray, here: _Point, limits: _Limits) -> _Found:
+        """Steps with new factors in a line search; with old ones accelerated, and only as long as they help."""
+        iterations = 0
+        factor: _GaussNewtonFactor | None = None
+        while (reached := limits.reached(iterations)) is None:
+            new = factor is None
+            if factor is None:
+                try:
+                    factor = _GaussNewtonFactor(self._factor(here), here.vertices)
+                except NotPositiveDefiniteError as error:
+                    return _stalled(here, iterations, str(error))
+            iterations += 1
+            forces = self._forces(here)
+            step, mixed = factor.step(here.vertices, forces)
+            size = float(np.abs(step).max())
+            if not new:
+                t, trial = 1.0, self._point(mixed, target)
+            elif np.isfinite(size):
+                t, trial = self._line_search(target, here, forces, step, limits.step)
+            else:
+                return _stalled(here, iterations, "a step is not finite")
+            helps, tiny = trial.energy <= here.energy, size * t <= limits.step
+            if not (helps or new or tiny):
+                factor = None
+                continue
+            # The last, tiny step is taken only if it helps: at the minimum rounding decides.
+            here = trial if helps else here
+            if tiny or not helps:
+                if t < 1:
+                    return _stalled(here, iterations, "only steps shorter than the tolerance lower the misfit")
+                return _Found(point=here, status=Status.CONVERGED, iterations=iterations)
+            if t < 1 or factor.is_spent(here.vertices, limits.reach):
+                factor = None
+        return _Found(point=here, status=reached, iterations=iterations)
+
+    def _line_search(
+        self, target: FloatArray, here: _Point, forces: FloatArray, step: FloatArray, shortest: float
+    ) -> tuple[float, _Point]:
+        """The share of a step that lowers the energy enough, or moves no vertex further than ``shortest``."""
+        slope, size = 2 * float(np.vdot(forces, step)), np.abs(step).max()
+        found = backtrack(
+            lambda t: self._point(here.vertices + t * step, target),
+            lambda t, trial: sufficient_decrease(here.energy, trial.energy, t, slope) or size * t <= shortest,
+            smallest=0,
+        )
+        return found or (0.0, here)
+
+    def _levenberg_marquardt(self, target: FloatArray, begun: _Found, limits: _Limits) -> _Found:
         """Levenberg and Marquardt's iteration (Marquardt 1963), from where Gauss–Newton stalled.
 
         A step is taken if it lowers the energy and lets no face collapse. The angles asked for may be those of no
         shape, and then the least energy may belong to a face without height: there the steps end at its edge.
         """
-        damping, diagonal = FIRST_DAMPING, self.normal_matrix.pattern.diagonal
+        here, iterations, damping = begun.point, begun.iterations, FIRST_DAMPING
         areas = face_areas(here.vertices, self.reference.faces)
-        while iterations < max_iterations:
-            if deadline is not None and deadline.passed:
-                return here, Status.DEADLINE, iterations
-            entries = self.normal_matrix.entries(here.gradients, self.norm)
-            entries[diagonal] *= 1 + damping
-            forces = -self.jacobian.pull_back(here.gradients, self.norm.squared * here.misfit)
+        while (reached := limits.reached(iterations)) is None:
             try:
-                self._cholesky.factorise(entries)
-                step = self._cholesky.solve(forces.ravel()).reshape(-1, 3)
-            except NotPositiveDefiniteError:
-                return here, Status.STALLED, iterations
+                step = self._factor(here, damping).solve(self._forces(here).ravel()).reshape(-1, 3)
+            except NotPositiveDefiniteError as error:
+                return _stalled(here, iterations, str(error))
             iterations += 1
             trial = self._point(here.vertices + step, target)
             left = face_areas(trial.vertices, self.reference.faces)
             helps = trial.energy < here.energy and bool((left >= LEAST_AREA * areas).all())
             if helps:
                 here, areas = trial, left
-            if np.abs(step).max() <= limit and damping <= DAMPING_AT_A_MINIMUM:
-                return here, Status.CONVERGED, iterations
+            if np.abs(step).max() <= limits.step and damping <= DAMPING_AT_A_MINIMUM:
+                return _Found(point=here, status=Status.CONVERGED, iterations=iterations)
             damping = damping / DAMPING_FACTOR if helps else max(damping * DAMPING_FACTOR, FIRST_DAMPING)
             if not damping <= LARGEST_DAMPING:
-                return here, Status.STALLED, iterations
-        return here, Status.ITERATION_LIMIT, iterations
+                return _stalled(here, iterations, "no damped step lowers the misfit")
+        return _Found(point=here, status=reached, iterations=iterations)
+
+    def _forces(self, here: _Point) -> FloatArray:
+        """The negative gradient (V, 3) of half the energy."""
+        return -self.jacobian.pull_back(here.gradients, self.norm.squared * here.misfit)
+
+    def _factor(self, here: _Point, damping: float = 0.0) -> Factor:
+        """The normal matrix, its diagonal raised by a share; raises NotPositiveDefiniteError."""
+        entries = self.normal_matrix.entries(here.gradients, self.norm)
+        if damping:
+            entries[self.normal_matrix.pattern.diagonal] *= 1 + damping
+        return self._cholesky.factorise(entries)
 
     @np.errstate(divide="ignore", over="ignore", invalid="ignore")
     def _point(self, vertices: FloatArray, target: FloatArray) -> _Point:
-        frame = Frame(vertices, self.reference.connectivity)
-        misfit = frame.nric()
+        geometry = HingeGeometry(vertices, self.reference.connectivity)
+        misfit = geometry.nric()
         misfit -= target
         half = len(misfit) // 2
         # As `wrap`, in place and ten times faster; half a turn counts the same either way round.
         misfit[half:] -= 2 * np.pi * np.rint(misfit[half:] / (2 * np.pi))
-        return _Point(vertices, misfit, float(self.norm.square(misfit)), frame)
+        return _Point(vertices, misfit, float(self.norm.square(misfit)), geometry)
 
     def differential(self, vertices: FloatArray, changes: FloatArray) -> FloatArray:
         """How a reconstructed shape (V, 3) moves, (n, V, 3), where what it was asked for changes by (n, 2E).
@@ -259,9 +272,9 @@ class Reconstructor:
         ``dX = (JᵀWJ)⁻¹ JᵀW dz``, from the implicit function theorem at a minimum whose residual is small; without rigid
         motion. Raises NotPositiveDefiniteError.
         """
-        jacobian = self._factorised_at(vertices)
+        jacobian, factor = self._linearised_at(vertices)
         forces = jacobian.T @ (changes * self.norm.squared).T
-        return self._cholesky.solve(forces.T).reshape(len(changes), -1, 3)
+        return factor.solve(forces.T).reshape(len(changes), -1, 3)
 
     def sensitivity(self, vertices: FloatArray, fields: FloatArray) -> FloatArray:
         """The transpose of ``differential``.
@@ -269,14 +282,15 @@ class Reconstructor:
         How products of a reconstructed shape (V, 3) with vertex fields (n, V, 3) depend on what it was asked for,
         (n, 2E).
         """
-        jacobian = self._factorised_at(vertices)
-        solved = self._cholesky.solve(fields.reshape(len(fields), -1))
+        jacobian, factor = self._linearised_at(vertices)
+        solved = factor.solve(fields.reshape(len(fields), -1))
         return (jacobian @ solved.T).T * self.norm.squared
 
-    def _factorised_at(self, vertices: FloatArray) -> sparse.csr_array:
+    def _linearised_at(self, vertices: FloatArray) -> tuple[sparse.csr_array, Factor]:
+        """J and the factor of JᵀWJ."""
         gradients = self.jacobian.gradients(vertices)
-        self._cholesky.factorise(self.normal_matrix.entries(gradients, self.norm))
-        return self.jacobian.matrix(gradients)
+        factor = self._cholesky.factorise(self.normal_matrix.entries(gradients, self.norm))
+        return self.jacobian.matrix(gradients), factor
 
     def _flipped(self, misfit: FloatArray) -> int:
         connectivity = self.reference.connectivity
@@ -291,29 +305,61 @@ class _Point:
     vertices: FloatArray
     misfit: FloatArray
     energy: float
-    frame: Frame
+    geometry: HingeGeometry
 
     @cached_property
     def gradients(self) -> NRICGradients:
         """The derivatives, which the last shape doesn't need."""
-        return self.frame.gradients()
+        return self.geometry.gradients()
 
 
-class _Factor:
-    """The normal matrix of one shape, factorised, for steps from there and from its neighbours.
+@dataclass(frozen=True, kw_only=True)
+class _Found(Outcome):
+    """Where one of the two iterations ended."""
 
-    The rigid motions of its own shape, which the matrix doesn't resist, are taken out of the forces: at a neighbour
-    they are other motions, and forces that balance there would turn it without bound here.
+    point: _Point
+
+
+def _stalled(point: _Point, iterations: int, reason: str) -> _Found:
+    return _Found(point=point, status=Status.STALLED, iterations=iterations, reason=reason)
+
+
+@dataclass(frozen=True)
+class _Limits:
+    """When to stop: the lengths are in the mesh's unit.
+
+    Attributes:
+        step: movement of a vertex that counts as none.
+        reach: movement of a vertex after which a factor is made anew.
+        iterations: most of them, both kinds together.
+        deadline: after which none begins.
     """
 
-    def __init__(self, cholesky: Cholesky, at: FloatArray) -> None:
-        self.at, self.steps = at, 0
-        self._cholesky, self._rigid, self._mixing = cholesky, rigid_motions(at), Anderson()
+    step: float
+    reach: float
+    iterations: int
+    deadline: Deadline | None
+
+    def reached(self, iterations: int) -> Status | None:
+        """The limit that is reached after so many iterations, if one is."""
+        if iterations >= self.iterations:
+            return Status.ITERATION_LIMIT
+        return Status.DEADLINE if self.deadline is not None and self.deadline.passed else None
+
+
+class _GaussNewtonFactor:
+    """The normal matrix of one shape, factorised, for steps from there and from its neighbours."""
+
+    def __init__(self, factor: Factor, at: FloatArray) -> None:
+        self._at, self._steps = at, 0
+        self._inverse, self._mixing = Preconditioner(factor, rigid_motions(at)), Anderson()
 
     def step(self, vertices: FloatArray, forces: FloatArray) -> tuple[FloatArray, FloatArray]:
         """The step from a shape, and the next shape, which the steps so far have their part in."""
-        self.steps += 1
-        flat = forces.ravel()
-        balanced = flat - (self._rigid @ flat) @ self._rigid
-        step = self._cholesky.solve(balanced).reshape(-1, 3)
+        self._steps += 1
+        step = self._inverse(forces)
         return step, self._mixing(vertices, forces, step)
+
+    def is_spent(self, vertices: FloatArray, reach: float) -> bool:
+        """Whether it has been used often enough, or the shape has left its neighbourhood."""
+        return self._steps == LIFE or bool(np.abs(vertices - self._at).max() > reach)

@@ -12,7 +12,7 @@ from shapespace.arrays import FloatArray, IntArray
 from shapespace.mesh.quadrics import monomials, quadrics_of
 from shapespace.mesh.thinning import thin
 from shapespace.mesh.triangle_mesh import Connectivity, MeshError, TriangleMesh, face_areas
-from shapespace.mesh.triangle_quality import FOLD_LIMIT, Triangles, dots, folded_pairs
+from shapespace.mesh.triangle_quality import FOLD_LIMIT, Pairs, Triangles, dots, folded_pairs
 
 #: Smallest angle (degrees) that a collapse may leave in any shape: the first limit until no collapse is left,
 #: then the next. Stricter ones cost accuracy: the cheap collapses wait while dear ones are made.
@@ -157,6 +157,27 @@ def _reason(count: int, target: int, specks: int) -> str:
     if specks:
         parts.append(f"{specks} faces have next to no area or height in some shape, and no collapse or flip mends that")
     return "; ".join(parts)
+
+
+@dataclass(frozen=True)
+class _Neighbourhood:
+    """What a collapse changes.
+
+    Attributes:
+        rows: faces as triples of vertices, to which the other lists refer by number.
+        old: faces at the vertex that is collapsed.
+        staying: those of them that don't vanish.
+        new: what these become, in the same order.
+        pairs_before: neighbours among the old faces and those across from them.
+        pairs_after: the same among the new ones.
+    """
+
+    rows: list[_Face]
+    old: list[int]
+    staying: list[int]
+    new: list[int]
+    pairs_before: Pairs
+    pairs_after: Pairs
 
 
 class _Decimation:
@@ -331,43 +352,53 @@ class _Decimation:
 
     def _keeps_shape(self, u: int, v: int, sine: float, *, heal: bool = False) -> bool:
         """Whether u → v leaves nothing bad that was not worse before, in any shape; or, to ``heal``, less that is."""
-        fan = self._fan(self._link(u))
-        k = len(fan)
-        gone = [v in (a, b) for a, b, _ in fan]
-        stays = [i for i in range(k) if not gone[i]]
-        rows = [(u, a, b) for a, b, _ in fan] + [(v, a, b) for a, b, _ in fan]
-        outer: list[int | None] = []
-        for a, b, f in fan:
-            across = self._across(a, b, f)
-            outer.append(len(rows) if across else None)
-            rows += [self.faces[g] for g in across]
-        neighbours = [(i, (i + 1) % k) for i in range(k if fan[-1][1] == fan[0][0] else k - 1)]
-        before = neighbours + [(i, o) for i, o in enumerate(outer) if o is not None]
-        # Faces that vanish leave the ones behind them as neighbours.
-        new = [outer[i] if gone[i] else k + i for i in range(k)]
-        after = [(new[i], new[j]) for i, j in neighbours if not (gone[i] and gone[j])]
-        after += [(new[i], outer[i]) for i in stays]
-
-        # A face of u that vanishes has no image: put another in its place rather than one without area.
-        for i in range(k):
-            if gone[i]:
-                rows[k + i] = rows[i]
-        triangles = self._triangles(np.array(rows))
-        kept = [(i, j) for i, j in after if i is not None and j is not None]
-        was = triangles.quality(list(range(k)), before, sine)
-        becomes = triangles.quality([k + i for i in stays], kept, sine)
+        around = self._around(u, v)
+        triangles = self._triangles(np.array(around.rows))
+        was = triangles.quality(around.old, around.pairs_before, sine)
+        becomes = triangles.quality(around.new, around.pairs_after, sine)
         if becomes.size < min(1, was.size):
             return False
         if heal:
             return becomes.faults < was.faults
         no_more = becomes.slivers <= was.slivers and becomes.folds <= was.folds
-        if was.slivers + was.folds and no_more and triangles.squares[:, :k].max() <= self.small**2:
+        if was.slivers + was.folds and no_more and triangles.squares[:, around.old].max() <= self.small**2:
             return True
-        turns = dots(triangles.normals[stays], triangles.normals[[k + i for i in stays]])
+        turns = dots(triangles.normals[around.staying], triangles.normals[around.new])
         return (
             becomes.sine >= min(sine**2, was.sine)
             and becomes.fold >= min(FOLD_LIMIT, was.fold)
             and bool((turns >= TURN_LIMIT).all())
+        )
+
+    def _around(self, u: int, v: int) -> _Neighbourhood:
+        """The faces that u → v changes, before and after, and those across their outer sides."""
+        fan = self._fan(self._link(u))
+        k = len(fan)
+        gone = [v in (a, b) for a, b, _ in fan]
+        staying = [i for i in range(k) if not gone[i]]
+        rows = [(u, a, b) for a, b, _ in fan] + [(v, a, b) for a, b, _ in fan]
+        # A face of u that vanishes has no image: put another in its place rather than one without area.
+        for i in range(k):
+            if gone[i]:
+                rows[k + i] = rows[i]
+        across: list[int | None] = []
+        for a, b, f in fan:
+            found = self._across(a, b, f)
+            across.append(len(rows) if found else None)
+            rows += [self.faces[g] for g in found]
+        consecutive = [(i, (i + 1) % k) for i in range(k if fan[-1][1] == fan[0][0] else k - 1)]
+        # Faces that vanish leave the ones behind them as neighbours.
+        image = [across[i] if gone[i] else k + i for i in range(k)]
+        before = consecutive + [(i, o) for i, o in enumerate(across) if o is not None]
+        after = [(image[i], image[j]) for i, j in consecutive if not (gone[i] and gone[j])]
+        after += [(image[i], across[i]) for i in staying]
+        return _Neighbourhood(
+            rows=rows,
+            old=list(range(k)),
+            staying=staying,
+            new=[k + i for i in staying],
+            pairs_before=before,
+            pairs_after=[(i, j) for i, j in after if i is not None and j is not None],
         )
 
     # ------------------------------------------------------------ changes

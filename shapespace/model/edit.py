@@ -16,7 +16,7 @@ from shapespace.model.decoder import Decoder, MeshChoice, Shape
 from shapespace.model.derivatives import batches, derivatives, factor_derivatives, nodes
 from shapespace.model.latent_space import Bounds, Codes, NotFiniteError
 from shapespace.solve.deadline import Deadline
-from shapespace.solve.least_squares import Fit, least_squares, shrinkable
+from shapespace.solve.least_squares import Box, Fit, Stopping, least_squares, shrinkable
 from shapespace.solve.status import Status
 
 #: Weight of the prior where none is given: a code half the bounds away costs as much as half a percent of the diagonal.
@@ -163,13 +163,13 @@ class _Problem:
     ) -> None:
         self.rough, self.pulled, self.start = rough, pulled, start
         self._model, self._positions, self._deadline = model, positions, deadline
-        self._box = *model.latents.box(), model.latents.width
+        self._box = Box(*model.latents.box(), model.latents.width)
         self._weight = 1 / (model.reference.diagonal * np.sqrt(len(positions)))
         self._held = np.sqrt(prior / len(start)) / model.latents.width
 
     def misfit(self, fit: Fit) -> float:
         """Root mean square distance from the targets, as a fraction of the diagonal."""
-        return float(np.linalg.norm(fit.residual[: self._positions.size]))
+        return float(np.linalg.norm(fit.residuals[: self._positions.size]))
 
     def search(self, start: FloatArray) -> Fit:
         """Fit rough shapes by the factors' derivatives, both cheap; tries other starts where the misfit stays large."""
@@ -188,9 +188,11 @@ class _Problem:
         return least_squares(
             lambda x: self._residual(x, pulled),
             lambda x, _: self._jacobian(pulled.derivatives(x, factor_derivatives(self._model, x))),
-            start, *self._box, tolerance=1e-3, gain_tolerance=0.05, large=GOOD_ROUGHLY, secant=False,
-            max_evaluations=20, deadline=self._deadline,
-        )  # fmt: skip
+            start,
+            self._box,
+            Stopping(1e-3, 0.05, GOOD_ROUGHLY, max_evaluations=20, deadline=self._deadline),
+            secant=False,
+        )
 
     def refine(self, start: FloatArray) -> Fit:
         """Fit answered shapes by the whole composite's derivatives, from a start nearby."""
@@ -198,9 +200,10 @@ class _Problem:
         return least_squares(
             lambda x: self._residual(x, pulled),
             lambda x, _: self._jacobian(pulled.derivatives(x, derivatives(self._model, x))),
-            start, *self._box, tolerance=1e-3, gain_tolerance=0.002, large=GOOD_ROUGHLY, max_evaluations=REFINEMENTS,
-            deadline=self._deadline,
-        )  # fmt: skip
+            start,
+            self._box,
+            Stopping(1e-3, 0.002, GOOD_ROUGHLY, max_evaluations=REFINEMENTS, deadline=self._deadline),
+        )
 
     def another_start(self, fit: Fit, pulled: _PulledVertices) -> FloatArray:
         """Another start: the fit with one factor moved to the node where, to first order, the misfit is smallest.
@@ -211,7 +214,7 @@ class _Problem:
         count = len(self._positions)
         some = np.linspace(0, count - 1, min(count, RANKED)).astype(np.int64)
         sensitivity = pulled.sensitivity(fit.x, some) * self._weight
-        missing = fit.residual[: self._positions.size].reshape(-1, 3)[some].ravel()
+        missing = fit.residuals[: self._positions.size].reshape(-1, 3)[some].ravel()
         best, found = _worthwhile(float(missing @ missing)), np.clip(np.zeros_like(fit.x), *model.latents.box())
         half = model.manifest.edges
         for j, factor in enumerate(model.manifest.factors):

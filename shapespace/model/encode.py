@@ -15,7 +15,7 @@ from shapespace.model.decoder import Decoder, MeshChoice, Shape
 from shapespace.model.derivatives import FactorGrids, derivatives, factor_derivatives, nodes
 from shapespace.model.latent_space import Bounds, Codes, NotFiniteError
 from shapespace.solve.deadline import Deadline
-from shapespace.solve.least_squares import Fit, least_squares
+from shapespace.solve.least_squares import Box, Fit, Stopping, least_squares
 from shapespace.solve.status import Status
 
 #: Times that each factor may be moved on its grid while the others stay, and the factor by which a move must explain
@@ -92,7 +92,7 @@ class Encoder:
         distances = np.linalg.norm(align(shape.vertices, given.vertices) - given.vertices, axis=1)
         residual = float(np.sqrt(fit.cost / self._norm.square(target)))
         status = Status.DEADLINE if shape.diagnostics.status is Status.DEADLINE else fit.status
-        return Encoded(code, inside, status, fit.evaluations, residual, shape, distances, given.mesh)
+        return Encoded(code, inside, status, fit.iterations, residual, shape, distances, given.mesh)
 
     @cached_property
     def grids(self) -> FactorGrids:
@@ -101,7 +101,7 @@ class Encoder:
 
     def _fit(self, target: FloatArray, lower: FloatArray, upper: FloatArray, deadline: Deadline | None) -> Fit:
         latents, root = self.model.latents, self._root
-        box = lower, upper, latents.width
+        box = Box(lower, upper, latents.width)
 
         def affine(x: FloatArray) -> FloatArray:
             return root * self._difference(self._affine(x), target)
@@ -111,7 +111,11 @@ class Encoder:
 
         def from_composite(start: FloatArray) -> Fit:
             return least_squares(
-                composite, lambda x, _: root[:, None] * derivatives(self.model, x), start, *box, deadline=deadline
+                composite,
+                lambda x, _: root[:, None] * derivatives(self.model, x),
+                start,
+                box,
+                Stopping(deadline=deadline),
             )
 
         x = (latents.lower + latents.upper) / 2
@@ -121,12 +125,16 @@ class Encoder:
                 break
             x = moved
         rough = least_squares(
-            affine, lambda x, _: root[:, None] * factor_derivatives(self.model, x), x, *box, tolerance=1e-3,
-            secant=False, deadline=deadline,
-        )  # fmt: skip
+            affine,
+            lambda x, _: root[:, None] * factor_derivatives(self.model, x),
+            x,
+            box,
+            Stopping(tolerance=1e-3, deadline=deadline),
+            secant=False,
+        )
         best = from_composite(rough.x)
         for _ in range(SWEEPS):
-            moved = self._another_start(best.x, best.residual)
+            moved = self._another_start(best.x, best.residuals)
             if moved is None or best.status is Status.DEADLINE:
                 break
             other = from_composite(moved)
@@ -135,14 +143,14 @@ class Encoder:
             best = other
         return best
 
-    def _another_start(self, x: FloatArray, residual: FloatArray) -> FloatArray | None:
+    def _another_start(self, x: FloatArray, residuals: FloatArray) -> FloatArray | None:
         """A code with one factor moved to the node that fits best, where that promises to be better than x.
 
         What counts is the direction of a factor's shape from z̄, not its size, because the factors add up in direction
         only roughly in size: a bump on the inner side of a torus is not as large as on the outer one.
         """
         grids = self.grids
-        missing = -grids.sketch(residual)
+        missing = -grids.sketch(residuals)
         best, found = 0.0, None
         for j, images in grids.images.items():
             factor = self.model.manifest.factors[j]

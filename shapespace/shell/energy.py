@@ -1,4 +1,4 @@
-"""The elastic energy of a thin shell in lengths and angles, with the derivatives that the calculus uses.
+"""The elastic energy of a thin shell in lengths and angles, with the derivatives that geodesics are made of.
 
 ``W[z, z~] = W_mem + W_bend`` measures the deformation of a rest shape z into z~ (paper, appendix C). On each
 face, with the Cauchy–Green tensor A of the affine map between the two triangles and the rest area a,

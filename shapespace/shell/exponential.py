@@ -12,18 +12,20 @@ from scipy.sparse.linalg import splu
 from shapespace.arrays import FloatArray
 from shapespace.coordinates.normal_matrix import NormalMatrix
 from shapespace.mesh.rigid_motion import without_rigid_motion
-from shapespace.shell.space import TOLERANCE, Path, Point, ShellSpace, fault_between
+from shapespace.shell.space import TOLERANCE, ChordSolver, DiscretePath, Point, ShellSpace, fault_between
 from shapespace.solve.anderson import Anderson
 from shapespace.solve.cholesky import NotPositiveDefiniteError
 from shapespace.solve.deadline import Deadline
+from shapespace.solve.line_search import backtrack
+from shapespace.solve.outcome import Outcome
+from shapespace.solve.preconditioner import step_length
 from shapespace.solve.status import Status
 
 #: Shapes behind a start value: a polynomial through eight of them leaves an error of eighth order in the step.
 EXTRAPOLATED = 8
-#: What a factor costs in iterations. An old one is renewed when it has taken so many more than it did when new, or
-#: looks like taking them within one step.
+#: What making a factor costs, in iterations.
 COST = 8
-#: Old factors are turned along from the step on in which one took so many more.
+#: Factors are rotated along from the step on in which one took so many iterations more than when it was new.
 PATIENCE = 1
 #: Two iterations that leave more than this of the residual aren't worth going on with.
 SLOW = 0.5
@@ -41,7 +43,7 @@ def exponential(
     *,
     tolerance: float = TOLERANCE,
     deadline: Deadline | None = None,
-) -> Path:
+) -> DiscretePath:
     """Shoot the discrete geodesic of K steps: ``X_1 = X_0 + d/K``, then one equation after the other.
 
     The one-sided first step makes it first-order in 1/K. Rigid motions are taken out of the velocity, see
@@ -65,11 +67,12 @@ def exponential(
         raise ValueError("steps must not be 0")
     if not (np.isfinite(start).all() and np.isfinite(velocity).all()):
         start = np.where(np.isfinite(start), start, space.reference.vertices)
-        return Path(start[None], Status.NOT_FINITE, space, "start or velocity has an entry that is not finite")
+        reason = "start or velocity has an entry that is not finite"
+        return DiscretePath(vertices=start[None], space=space, status=Status.NOT_FINITE, reason=reason)
     second = start + without_rigid_motion(velocity, start) / abs(steps)
     if steps < 0:
         path = extrapolate(space, second, start, -steps, forward=False, tolerance=tolerance, deadline=deadline)
-        return Path(path.vertices[1:], path.status, space, path.reason, path.iterations, path.residuals)
+        return replace(path, vertices=path.vertices[1:])
     return extrapolate(space, start, second, steps - 1, tolerance=tolerance, deadline=deadline)
 
 
@@ -83,7 +86,7 @@ def extrapolate(
     forward: bool = True,
     tolerance: float = TOLERANCE,
     deadline: Deadline | None = None,
-) -> Path:
+) -> DiscretePath:
     """Continue two neighbouring shapes of a discrete geodesic by more of its shapes.
 
     Args:
@@ -101,56 +104,86 @@ def extrapolate(
     """
     previous, current = space.point(first), space.point(second)
     shapes: list[FloatArray] = [previous.vertices, current.vertices]
-    solved: list[_Solution] = []
-    status, reason = Status.CONVERGED, ""
     fault = fault_between(previous, current)
     if fault:
-        return Path(shapes[0][None], Status.DEGENERATE, space, f"the given step: {fault}")
-    chord, areas = space.chord, previous.rest.areas
-    # Iterations that the factor took when new, and that it has taken more since then.
-    fresh, more, turning = 0, COST, False
+        reason = f"the given step: {fault}"
+        return DiscretePath(vertices=shapes[0][None], space=space, status=Status.DEGENERATE, reason=reason)
+    renewal, areas = _Renewal(space), previous.rest.areas
+    iterations, residual = 0, 0.0
+
+    def path(status: Status, reason: str = "") -> DiscretePath:
+        told = f"step {len(shapes)}: {reason}" if reason else ""
+        return DiscretePath(
+            vertices=np.stack(shapes),
+            space=space,
+            status=status,
+            iterations=iterations,
+            residual=residual,
+            reason=told,
+        )
+
     for _ in range(steps):
         if deadline is not None and deadline.passed:
-            status, reason = Status.DEADLINE, f"step {len(shapes)}: the time was over"
-            break
+            return path(Status.DEADLINE, "the time was over")
         equation = _Step(previous, current, forward)
-        start = _extrapolated(shapes[-EXTRAPOLATED:])
-        wasted, solution = 0, None
-        if more < COST:
-            if turning:
-                chord.turn_to(current)
-            # The factor's matrix may differ from the step's own by a factor of 2 or so.
-            solution = _chord(equation, start, tolerance / 2, fresh + COST)
-            more += max(solution.iterations - fresh, 0)
-            turning = turning or solution.fault is not None or solution.iterations > fresh + PATIENCE
-            if solution.fault:
-                wasted = solution.iterations
-        if solution is None or solution.fault:
-            try:
-                chord.factorise(current)
-            except NotPositiveDefiniteError as error:
-                status, reason = Status.DEGENERATE, f"step {len(shapes)}: {error}"
-                break
-            solution = _chord(equation, start, tolerance)
-            fresh, more = solution.iterations, 0
-        if solution.fault:
-            solution = _newton(equation, tolerance)
-        if solution.fault:
+        try:
+            solution = renewal.solve(equation, _extrapolated(shapes[-EXTRAPOLATED:]), tolerance)
+        except NotPositiveDefiniteError as error:
+            return path(Status.DEGENERATE, str(error))
+        if not solution.converged:
             smallest = (current.rest.areas / areas).min()
-            status = Status.STALLED
-            reason = f"step {len(shapes)}: {solution.fault}; a face has {smallest:.1e} of its area at the start"
-            break
-        solved.append(replace(solution, iterations=wasted + solution.iterations))
+            return path(Status.STALLED, f"{solution.reason}; a face has {smallest:.1e} of its area at the start")
+        iterations, residual = iterations + solution.iterations, max(residual, solution.residual)
         shapes.append(solution.point.vertices)
         previous, current = current, solution.point
-    return Path(
-        np.stack(shapes),
-        status,
-        space,
-        reason,
-        tuple(s.iterations for s in solved),
-        tuple(s.residual for s in solved),
-    )
+    return path(Status.CONVERGED)
+
+
+class _Renewal:
+    """When a factor made at one shape of a path is given up for a new one, at the next shape.
+
+    A factor is, in turn,
+
+    - **new**, for the step that it is made for. The iterations of that step, ``_when_new``, are what later ones are
+      compared with.
+    - **old**, for the steps after it. What they take more is added up in ``_excess``. Once a step has taken more than
+      PATIENCE iterations more, or has failed, old factors are rotated along to the shape at hand, from the next step
+      to the end of the path: rotating costs little, but for small motions it is of no use.
+    - **spent**, when ``_excess`` reaches COST, for then a new factor would have been cheaper; or when an iteration with
+      it fails or foresees more than COST additional iterations, in which case the step is solved again with a new one.
+    """
+
+    def __init__(self, space: ShellSpace) -> None:
+        self._space = space
+        self._factor: ChordSolver | None = None
+        self._when_new = self._excess = 0
+        self._rotates = False
+
+    def solve(self, equation: _Step, start: FloatArray, tolerance: float) -> _Solution:
+        """Solve one step, with the factor at hand if it will do; raises NotPositiveDefiniteError."""
+        wasted = 0
+        if self._factor is not None:
+            solution = self._with_old_factor(self._factor, equation, start, tolerance)
+            if solution.converged:
+                return solution
+            wasted = solution.iterations
+        chord = self._space.factorise(equation.current)
+        solution = _chord(equation, chord, start, tolerance)
+        self._factor, self._when_new, self._excess = chord, solution.iterations, 0
+        if not solution.converged:
+            solution = _newton(equation, chord, tolerance)
+        return replace(solution, iterations=wasted + solution.iterations)
+
+    def _with_old_factor(self, factor: ChordSolver, equation: _Step, start: FloatArray, tolerance: float) -> _Solution:
+        chord = factor.rotated_to(equation.current) if self._rotates else factor
+        # The factor's matrix may differ from the step's own by a factor of 2 or so.
+        solution = _chord(equation, chord, start, tolerance / 2, self._when_new + COST)
+        more = solution.iterations - self._when_new
+        self._excess += max(more, 0)
+        self._rotates = self._rotates or not solution.converged or more > PATIENCE
+        if self._excess >= COST:
+            self._factor = None
+        return solution
 
 
 def _extrapolated(shapes: list[FloatArray]) -> FloatArray:
@@ -195,76 +228,87 @@ class _Step:
         return sparse.csc_array(derivative + shift * sparse.eye_array(derivative.shape[0]))
 
 
-@dataclass(frozen=True)
-class _Solution:
-    """Where an iteration on one step ended, with its fault if it isn't solved."""
+@dataclass(frozen=True, kw_only=True)
+class _Solution(Outcome):
+    """Where an iteration on one step ended."""
 
     point: Point
-    iterations: int
-    residual: float
-    fault: str | None
 
 
-def _checked(equation: _Step, point: Point, iterations: int, residual: float) -> _Solution:
-    return _Solution(point, iterations, residual, fault_between(equation.current, point))
+def _accepted(equation: _Step, point: Point, iterations: int, residual: float) -> _Solution:
+    """A solution of the equation, which also has to be a deformation."""
+    fault = fault_between(equation.current, point)
+    status = Status.DEGENERATE if fault else Status.CONVERGED
+    return _Solution(status=status, iterations=iterations, residual=residual, reason=fault or "", point=point)
 
 
-def _chord(equation: _Step, start: FloatArray, tolerance: float, limit: float = np.inf) -> _Solution:
+def _stalled(point: Point, iterations: int, residual: float, reason: str) -> _Solution:
+    return _Solution(status=Status.STALLED, iterations=iterations, residual=residual, reason=reason, point=point)
+
+
+def _chord(
+    equation: _Step, chord: ChordSolver, start: FloatArray, tolerance: float, limit: float = np.inf
+) -> _Solution:
     """``X ← X + A⁻¹F(X)`` with the factor at hand, accelerated, until it is solved or isn't worth going on.
 
     Args:
         equation: the step to solve.
+        chord: A⁻¹ of a shape nearby.
         start: first guess.
         tolerance: of ``sqrt(Fᵀ A⁻¹ F)``, with the factor at hand. Where it holds, the step at hand is taken as well:
             that costs little, and what error it leaves grows a hundredfold when shapes are extrapolated.
         limit: iterations, above which it is given up as soon as the rate so far says so.
     """
-    space = equation.current.space
-    mixing = Anderson()
+    space, mixing = equation.current.space, Anderson()
     x, residuals = start, [np.inf, np.inf]
     while True:
         point = space.point(x)
         forces = equation.forces(point)
-        step = space.chord.solve(forces)
-        residuals.append(float(np.sqrt(np.abs(np.vdot(forces, step)))))
+        step = chord.solve(forces)
+        residuals.append(step_length(forces, step))
         iterations = len(residuals) - 3
         if residuals[-1] <= tolerance:
-            return _checked(equation, space.point(x + step), iterations, residuals[-1])
+            return _accepted(equation, space.point(x + step), iterations, residuals[-1])
         rate = (residuals[-1] / residuals[2]) ** (1 / max(iterations, 1))
         needed = iterations + np.log(tolerance / residuals[-1]) / np.log(rate) if rate < 1 else 0
         if not residuals[-1] < SLOW * residuals[-3] or (iterations > 1 and needed > limit):
-            return _Solution(point, iterations, residuals[-1], f"no convergence, residual {residuals[-1]:.1e}")
+            return _stalled(point, iterations, residuals[-1], f"no convergence, residual {residuals[-1]:.1e}")
         x = mixing(x, forces, step)
 
 
-def _newton(equation: _Step, tolerance: float) -> _Solution:
-    """Exact Newton with a line search, from the current shape."""
-    space = equation.current.space
-
-    def residual_of(forces: FloatArray) -> float:
-        return float(np.sqrt(np.abs(np.vdot(forces, space.chord.solve(forces)))))
-
-    point = equation.current
-    forces = equation.forces(point)
-    residual = residual_of(forces)
+def _newton(equation: _Step, chord: ChordSolver, tolerance: float) -> _Solution:
+    """Exact Newton with a line search, from the current shape; residuals are measured with the factor of a chord."""
+    point, forces, residual = equation.current, *_measured(equation, chord, equation.current)
     for iteration in range(NEWTON_ITERATIONS + 1):
         if residual <= tolerance:
-            return _checked(equation, point, iteration, residual)
+            return _accepted(equation, point, iteration, residual)
         if iteration == NEWTON_ITERATIONS:
             break
         try:
             step = -splu(equation.derivative(point)).solve(forces.ravel()).reshape(-1, 3)
         except RuntimeError:
-            return _Solution(point, iteration, residual, "the derivative is singular")
-        t = 1.0
-        while True:
-            trial = space.point(point.vertices + t * step)
-            trial_forces = equation.forces(trial)
-            trial_residual = residual_of(trial_forces)
-            if trial_residual < (1 - t / 4) * residual:
-                break
-            t /= 2
-            if t < SMALLEST_STEP:
-                return _Solution(point, iteration, residual, f"Newton stalls at residual {residual:.1e}")
-        point, forces, residual = trial, trial_forces, trial_residual
-    return _Solution(point, NEWTON_ITERATIONS, residual, f"Newton is slow, residual {residual:.1e}")
+            return _stalled(point, iteration, residual, "the derivative is singular")
+        found = _line_search(equation, chord, point, step, residual)
+        if found is None:
+            return _stalled(point, iteration, residual, f"Newton stalls at residual {residual:.1e}")
+        point, forces, residual = found
+    return _stalled(point, NEWTON_ITERATIONS, residual, f"Newton is slow, residual {residual:.1e}")
+
+
+def _measured(equation: _Step, chord: ChordSolver, point: Point) -> tuple[FloatArray, float]:
+    """F at a shape, and the residual."""
+    forces = equation.forces(point)
+    return forces, step_length(forces, chord.solve(forces))
+
+
+def _line_search(
+    equation: _Step, chord: ChordSolver, point: Point, step: FloatArray, residual: float
+) -> tuple[Point, FloatArray, float] | None:
+    """The shape along a step whose residual is a quarter of the step's share smaller, with F and residual there."""
+
+    def trial(t: float) -> tuple[Point, FloatArray, float]:
+        there = point.space.point(point.vertices + t * step)
+        return there, *_measured(equation, chord, there)
+
+    found = backtrack(trial, lambda t, there: there[2] < (1 - t / 4) * residual, SMALLEST_STEP)
+    return found and found[1]

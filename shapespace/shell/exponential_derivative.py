@@ -11,7 +11,7 @@ from scipy.sparse.linalg import SuperLU, splu
 from shapespace.arrays import FloatArray
 from shapespace.coordinates.normal_matrix import NormalMatrix
 from shapespace.mesh.rigid_motion import without_rigid_motion
-from shapespace.shell.space import Path, Point
+from shapespace.shell.space import DiscretePath, Point
 
 
 class ExponentialDerivative:
@@ -37,7 +37,7 @@ class ExponentialDerivative:
         RuntimeError: a matrix is singular: the end of the path is conjugate to its start.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: DiscretePath) -> None:
         if not path.converged:
             raise ValueError(f"a path that ended early has no derivative: {path.reason}")
         self._steps = len(path.vertices) - 1

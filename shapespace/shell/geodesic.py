@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -14,7 +14,8 @@ from shapespace.mesh.rigid_motion import align
 from shapespace.shell.space import (
     TOLERANCE,
     ChordSolver,
-    Path,
+    DiscretePath,
+    Factorise,
     Point,
     ShellSpace,
     edge_length,
@@ -23,6 +24,7 @@ from shapespace.shell.space import (
 )
 from shapespace.solve.anderson import Anderson
 from shapespace.solve.cholesky import NotPositiveDefiniteError
+from shapespace.solve.line_search import backtrack
 from shapespace.solve.status import Status
 from shapespace.solve.truncated_newton import descend
 
@@ -37,8 +39,10 @@ JUMP = 4.0
 MIDDLE_ITERATIONS, MIDDLE_TOLERANCE = 30, 1e-2
 #: Three iterations that leave more than this of the residual ask for new factors.
 SLOW = 0.1
-#: Gauss–Newton steps towards each shape of the first path; it need not be exact.
-NEAREST_ITERATIONS = 4
+#: Gauss–Newton steps towards each shape of the first path, which need not be exact, and the smallest one tried.
+NEAREST_ITERATIONS, SMALLEST_STEP = 4, 1 / 32
+#: Part of the squared misfit that one of them must take away, or none follows.
+WORTHWHILE = 0.1
 
 
 @np.errstate(divide="ignore", over="ignore", invalid="ignore")
@@ -51,7 +55,7 @@ def geodesic(
     tolerance: float = TOLERANCE,
     first: FloatArray | None = None,
     bisect: bool = True,
-) -> Path:
+) -> DiscretePath:
     """Connect two shapes by K + 1 shapes of least path energy ``K Σ W[z_{k−1}, z_k]``.
 
     Stationary where ``F_k = J_kᵀ (∂₂W[z_{k−1}, z_k] + ∂₁W[z_k, z_{k+1}]) = 0`` for every inner shape, all of
@@ -76,38 +80,44 @@ def geodesic(
     if steps < 1:
         raise ValueError(f"a path needs at least one step, not {steps}")
     if not np.isfinite(start).all():
-        return Path(space.reference.vertices[None], Status.NOT_FINITE, space, "start has an entry that is not finite")
+        nowhere, reason = space.reference.vertices[None], "start has an entry that is not finite"
+        return DiscretePath(vertices=nowhere, space=space, status=Status.NOT_FINITE, reason=reason)
     if not np.isfinite(end).all():
-        return Path(start[None], Status.NOT_FINITE, space, "end has an entry that is not finite")
+        reason = "end has an entry that is not finite"
+        return DiscretePath(vertices=start[None], space=space, status=Status.NOT_FINITE, reason=reason)
     if steps == 1:
-        return Path(np.stack([start, align(end, start)]), Status.CONVERGED, space)
-    chords = space.chords(steps - 1)
-    ways: list[Callable[[], FloatArray]] = [lambda: _straight(space, start, end, chords)]
+        both = np.stack([start, align(end, start)])
+        return DiscretePath(vertices=both, space=space, status=Status.CONVERGED, residual=0)
+    factorise = space.factorisations(steps - 1)
+    ways: list[Callable[[], _Begun]] = [lambda: _straight(space, start, end, factorise)]
     if bisect:
-        ways.append(lambda: _descended(space, _bisected(space, start, end, chords), chords, tolerance))
+        ways.append(lambda: _descended(space, _bisected(space, start, end, factorise), factorise, tolerance))
     if first is not None:
         given = np.concatenate([start[None], first[1:-1], align(end, first[-2])[None]])
-        ways = [lambda: _descended(space, given, chords, tolerance)]
-    attempt = _Relaxed(start[None], 0, (), "")
-    for first_path in ways:
+        ways = [lambda: _descended(space, given, factorise, tolerance)]
+    for begin in ways:
         try:
-            attempt = _relax(space, first_path(), chords, tolerance)
+            found = _relax(space, begin(), factorise, tolerance)
         except NotPositiveDefiniteError as error:
-            attempt = _Relaxed(start[None], 1, (), f"a shape on the way is degenerate: {error}")
-        if not attempt.fault:
+            reason = f"a shape on the way is degenerate: {error}"
+            found = DiscretePath(vertices=start[None], space=space, status=Status.STALLED, iterations=1, reason=reason)
+        if found.converged:
+            shapes = found.vertices
             for k in range(1, steps + 1):
-                attempt.shapes[k] = align(attempt.shapes[k], attempt.shapes[k - 1])
-            iterations = (attempt.iterations,)
-            return Path(attempt.shapes, Status.CONVERGED, space, "", iterations, attempt.residuals)
-    return Path(start[None], Status.STALLED, space, attempt.fault or "", (attempt.iterations,), attempt.residuals)
+                shapes[k] = align(shapes[k], shapes[k - 1])
+            return found
+    return replace(found, vertices=start[None], status=Status.STALLED)
 
 
-def _descended(space: ShellSpace, shapes: FloatArray, chords: list[ChordSolver], tolerance: float) -> FloatArray:
-    """The path (K + 1, V, 3) of least energy downhill from another; leaves each chord factorised near its shape."""
-    energy = _PathEnergy(space, shapes[0], shapes[-1], chords)
+#: A first path (K + 1, V, 3), and a factor near each of its inner shapes.
+_Begun = tuple[FloatArray, list[ChordSolver]]
+
+
+def _descended(space: ShellSpace, shapes: FloatArray, factorise: list[Factorise], tolerance: float) -> _Begun:
+    """The path of least energy downhill from another."""
+    energy = _PathEnergy(space, shapes[0], shapes[-1], factorise)
     shapes = energy.path(descend(energy, shapes[1:-1], tolerance / 2, DESCENTS).x)
-    _renew(space, shapes, chords)
-    return shapes
+    return shapes, _factorised(space, shapes, factorise)
 
 
 @dataclass(frozen=True)
@@ -123,7 +133,7 @@ class Logarithm:
 
     velocity: FloatArray
     nric: FloatArray
-    path: Path
+    path: DiscretePath
 
 
 def logarithm(
@@ -146,100 +156,109 @@ def logarithm(
     return Logarithm(velocity, steps * (path.nric[1] - path.nric[0]), path)
 
 
-def towards(space: ShellSpace, path: Path, end: FloatArray) -> FloatArray:
+def towards(space: ShellSpace, path: DiscretePath, end: FloatArray) -> FloatArray:
     """A first path (K + 1, V, 3) for ``geodesic``, from a geodesic to a shape near its end.
 
     To lengths and angles of its shapes a growing part is added of what the two ends differ by.
     """
-    steps, chord = len(path.vertices) - 1, space.chord
+    steps = len(path.vertices) - 1
     change = unwrap(space.nric(end), path.nric[-1]) - path.nric[-1]
     shapes = [path.vertices[0]]
     for k in range(1, steps):
-        guess = space.point(path.vertices[k])
-        chord.factorise(guess)
-        shapes.append(_nearest(guess, path.nric[k] + k / steps * change, chord))
+        chord = space.factorise(space.point(path.vertices[k]))
+        shapes.append(_nearest(chord, path.nric[k] + k / steps * change))
     return np.stack([*shapes, align(end, shapes[-1])])
 
 
-def halved(space: ShellSpace, path: Path) -> Path:
+def halved(space: ShellSpace, path: DiscretePath) -> DiscretePath:
     """The same path in twice as many steps, with shapes between by half the change of lengths and angles."""
-    chord, shapes = space.chord, [path.vertices[0]]
+    shapes = [path.vertices[0]]
     for k in range(1, len(path.vertices)):
-        guess = space.point(shapes[-1])
-        chord.factorise(guess)
-        middle = _nearest(guess, (path.nric[k - 1] + path.nric[k]) / 2, chord)
+        chord = space.factorise(space.point(shapes[-1]))
+        middle = _nearest(chord, (path.nric[k - 1] + path.nric[k]) / 2)
         shapes += [middle, align(path.vertices[k], middle)]
-    return Path(np.stack(shapes), path.status, space)
+    return DiscretePath(vertices=np.stack(shapes), space=space, status=path.status)
 
 
-def _straight(space: ShellSpace, start: FloatArray, end: FloatArray, chords: list[ChordSolver]) -> FloatArray:
-    """Shapes (K + 1, V, 3) near a straight line of lengths and angles; leaves each chord factorised near its shape.
+def _straight(space: ShellSpace, start: FloatArray, end: FloatArray, factorise: list[Factorise]) -> _Begun:
+    """Shapes near a straight line of lengths and angles.
 
     One after the other, because each is a good start for the next: Gauss–Newton with a factor kept fixed.
     """
     first = space.point(start)
     line = unwrap(space.nric(end), first.z) - first.z
-    steps = len(chords) + 1
-    shapes = [start]
-    for k, chord in enumerate(chords, start=1):
+    steps = len(factorise) + 1
+    shapes, chords = [start], []
+    for k in range(1, steps):
         guess = space.point(start if k == 1 else 2 * shapes[-1] - shapes[-2])
-        chord.factorise(guess)
-        shapes.append(_nearest(guess, first.z + k / steps * line, chord))
-    return np.stack([*shapes, align(end, shapes[-1])])
+        chords.append(factorise[k - 1](guess))
+        shapes.append(_nearest(chords[-1], first.z + k / steps * line))
+    return np.stack([*shapes, align(end, shapes[-1])]), chords
 
 
-def _nearest(guess: Point, target: FloatArray, chord: ChordSolver) -> FloatArray:
-    """A few steps from a guess to the shape whose lengths and angles come closest to a target, in the metric."""
-    point, misfit = guess, unwrap(target, guess.z) - guess.z
-    square = misfit @ guess.lower(misfit)
+def _nearest(chord: ChordSolver, target: FloatArray) -> FloatArray:
+    """A few steps from a factor's shape to that whose lengths and angles come closest to a target, in its metric."""
+    point, misfit, square = _compared(chord.at, chord.at, target)
     for _ in range(NEAREST_ITERATIONS):
-        step = chord.solve(point.pull_back(guess.lower(misfit)))
-        t = 1.0
-        while t > 1 / 64:
-            trial = guess.space.point(point.vertices + t * step)
-            trial_misfit = unwrap(target, trial.z) - trial.z
-            trial_square = trial_misfit @ guess.lower(trial_misfit)
-            if trial_square < square and keeps_faces(guess.space, point.vertices, trial.vertices):
-                break
-            t /= 2
-        else:
+        step = chord.solve(point.pull_back(chord.at.lower(misfit)))
+        found = _line_search(chord.at, target, point, step, square)
+        if found is None:
             break
-        gain = 1 - trial_square / square
-        point, misfit, square = trial, trial_misfit, trial_square
-        if gain < 0.1:
+        before = square
+        point, misfit, square = found
+        if 1 - square / before < WORTHWHILE:
             break
     return point.vertices
 
 
-def _bisected(space: ShellSpace, start: FloatArray, end: FloatArray, chords: list[ChordSolver]) -> FloatArray:
-    """The same, slower, for shapes far apart: the middle of both by least energy, then the middles of the halves.
+#: A shape, by how much its lengths and angles miss a target (2E,), and the square of that in a metric.
+_Compared = tuple[Point, FloatArray, float]
+
+
+def _compared(metric: Point, point: Point, target: FloatArray) -> _Compared:
+    misfit = unwrap(target, point.z) - point.z
+    return point, misfit, float(misfit @ metric.lower(misfit))
+
+
+def _line_search(metric: Point, target: FloatArray, point: Point, step: FloatArray, square: float) -> _Compared | None:
+    """The shape along a step that comes closer to a target without a face that collapses."""
+    found = backtrack(
+        lambda t: _compared(metric, point.space.point(point.vertices + t * step), target),
+        lambda _, there: there[2] < square and keeps_faces(point.space, point.vertices, there[0].vertices),
+        SMALLEST_STEP,
+    )
+    return found and found[1]
+
+
+def _bisected(space: ShellSpace, start: FloatArray, end: FloatArray, factorise: list[Factorise]) -> FloatArray:
+    """A first path (K + 1, V, 3) between shapes far apart: their middle by least energy, then those of the halves.
 
     Each is sought from one of the two that it lies between, and so are all shapes valid on the way. The line of lengths
     and angles may lead through what is no shape.
     """
-    shapes: dict[int, FloatArray] = {0: start, len(chords) + 1: end}
+    shapes: dict[int, FloatArray] = {0: start, len(factorise) + 1: end}
 
     def fill(i: int, j: int) -> None:
         if j - i < 2:
             return
         k = (i + j) // 2
-        between = _Middle(space, shapes[i], shapes[j], (k - i, j - k), chords[0])
+        between = _Middle(space, shapes[i], shapes[j], (k - i, j - k), factorise[0])
         nearer = shapes[i] if k - i <= j - k else shapes[j]
         shapes[k] = descend(between, nearer, MIDDLE_TOLERANCE, MIDDLE_ITERATIONS).x
         fill(i, k)
         fill(k, j)
 
-    fill(0, len(chords) + 1)
+    fill(0, len(factorise) + 1)
     return np.stack([shapes[k] for k in sorted(shapes)])
 
 
 class _Middle:
-    """``W[a, z(X)]/s + W[z(X), b]/t`` by X, for a shape s steps after a and t before b; see newton.Energy."""
+    """``W[a, z(X)]/s + W[z(X), b]/t`` by X, for a shape s steps after a and t before b; see truncated_newton.Energy."""
 
     def __init__(
-        self, space: ShellSpace, a: FloatArray, b: FloatArray, steps: tuple[int, int], chord: ChordSolver
+        self, space: ShellSpace, a: FloatArray, b: FloatArray, steps: tuple[int, int], factorise: Factorise
     ) -> None:
-        self._space, self._chord = space, chord
+        self._space, self._factorise = space, factorise
         self._first, self._second = 1 / steps[0], 1 / steps[1]
         self._a, self._b = space.point(a).rest, space.nric(b)
         self.length = edge_length(space)
@@ -257,8 +276,7 @@ class _Middle:
         return keeps_faces(self._space, x, x + step)
 
     def precondition(self, x: FloatArray) -> Callable[[FloatArray], FloatArray]:
-        self._chord.factorise(self._space.point(x))
-        return self._chord.solve
+        return self._factorise(self._space.point(x)).solve
 
 
 def _inverse_in_time(steps: int) -> FloatArray:
@@ -267,9 +285,9 @@ def _inverse_in_time(steps: int) -> FloatArray:
     return np.minimum.outer(k, k) * (steps - np.maximum.outer(k, k)) / steps
 
 
-def _renew(space: ShellSpace, shapes: FloatArray, chords: list[ChordSolver]) -> None:
-    for chord, x in zip(chords, shapes[1:-1], strict=True):
-        chord.factorise(space.point(x))
+def _factorised(space: ShellSpace, shapes: FloatArray, factorise: list[Factorise]) -> list[ChordSolver]:
+    """A factor at each inner shape of a path (K + 1, V, 3)."""
+    return [f(space.point(x)) for f, x in zip(factorise, shapes[1:-1], strict=True)]
 
 
 def _forces(space: ShellSpace, shapes: FloatArray) -> tuple[list[Point], FloatArray]:
@@ -283,11 +301,11 @@ def _forces(space: ShellSpace, shapes: FloatArray) -> tuple[list[Point], FloatAr
 
 
 class _PathEnergy:
-    """``Σ W[z_{k−1}, z_k]`` by the inner shapes (K − 1, V, 3) of a path; see newton.Energy."""
+    """``Σ W[z_{k−1}, z_k]`` by the inner shapes (K − 1, V, 3) of a path; see truncated_newton.Energy."""
 
-    def __init__(self, space: ShellSpace, start: FloatArray, end: FloatArray, chords: list[ChordSolver]) -> None:
-        self._space, self._start, self._end, self._chords = space, start[None], end[None], chords
-        self._inverse = _inverse_in_time(len(chords) + 1)
+    def __init__(self, space: ShellSpace, start: FloatArray, end: FloatArray, factorise: list[Factorise]) -> None:
+        self._space, self._start, self._end, self._factorise = space, start[None], end[None], factorise
+        self._inverse = _inverse_in_time(len(factorise) + 1)
         self.length = edge_length(space)
 
     def path(self, x: FloatArray) -> FloatArray:
@@ -306,26 +324,16 @@ class _PathEnergy:
 
     def precondition(self, x: FloatArray) -> Callable[[FloatArray], FloatArray]:
         """One H, of the middle shape, for all: only then is the product symmetric and positive definite."""
-        _renew(self._space, self.path(x), self._chords)
-        middle = self._chords[len(self._chords) // 2].at
+        chords = _factorised(self._space, self.path(x), self._factorise)
+        middle = chords[len(chords) // 2].at
 
         def solve(forces: FloatArray) -> FloatArray:
-            moves = [c.solve(f) for c, f in zip(self._chords, forces, strict=True)]
-            tangents = [c.at.push_forward(m) for c, m in zip(self._chords, moves, strict=True)]
+            moves = [c.solve(f) for c, f in zip(chords, forces, strict=True)]
+            tangents = [c.at.push_forward(m) for c, m in zip(chords, moves, strict=True)]
             covectors = [middle.lower(t) for t in self._inverse @ np.stack(tangents)]
-            return np.stack([c.solve(c.at.pull_back(p)) for c, p in zip(self._chords, covectors, strict=True)])
+            return np.stack([c.solve(c.at.pull_back(p)) for c, p in zip(chords, covectors, strict=True)])
 
         return solve
-
-
-@dataclass(frozen=True)
-class _Relaxed:
-    """Where the iteration on a whole path ended, with its fault if it isn't solved."""
-
-    shapes: FloatArray
-    iterations: int
-    residuals: tuple[float, ...]
-    fault: str | None
 
 
 def _jump(space: ShellSpace, shapes: FloatArray) -> str | None:
@@ -338,38 +346,69 @@ def _jump(space: ShellSpace, shapes: FloatArray) -> str | None:
     return None
 
 
-def _relax(space: ShellSpace, shapes: FloatArray, chords: list[ChordSolver], tolerance: float) -> _Relaxed:
-    inverse = _inverse_in_time(len(shapes) - 1)
-    shapes, best, lowest = shapes.copy(), shapes.copy(), np.inf
+def _relax(space: ShellSpace, begun: _Begun, factorise: list[Factorise], tolerance: float) -> DiscretePath:
+    """All equations of a path at once, from a first path: rounds of iterations, each with new factors.
+
+    Given up after two rounds that don't halve the residual.
+    """
+    shapes, chords = begun
+    chords = [c.rotated_to(space.point(x)) for c, x in zip(chords, shapes[1:-1], strict=True)]
+    best, lowest = shapes, np.inf
     iterations = failures = 0
     for renewal in range(RENEWALS):
         if renewal:
-            _renew(space, shapes, chords)
-        else:
-            for chord, x in zip(chords, shapes[1:-1], strict=True):
-                chord.turn_to(space.point(x))
-        before = lowest
-        mixing, residuals = Anderson(), []
-        for _ in range(ITERATIONS):
-            points, forces = _forces(space, shapes)
-            moves = np.stack([c.solve(f) for c, f in zip(chords, forces, strict=True)])
-            squares = np.abs(np.einsum("kvc,kvc->k", forces, moves))
-            residuals.append(float(np.sqrt(squares.max())))
-            if residuals[-1] <= tolerance:
-                faults = (fault_between(a, b) for a, b in pairwise(points))
-                fault = next((f for f in faults if f), None) or _jump(space, shapes)
-                return _Relaxed(shapes, iterations, tuple(np.sqrt(squares).tolist()), fault)
-            if residuals[-1] < lowest:
-                lowest, best = residuals[-1], shapes.copy()
-            if not np.isfinite(residuals[-1]) or (len(residuals) > 3 and residuals[-1] > SLOW * residuals[-4]):
-                break
-            tangents = np.stack([c.push_forward(m) for c, m in zip(chords, moves, strict=True)])
-            moves = np.stack([c.project(t) for c, t in zip(chords, inverse @ tangents, strict=True)])
-            shapes[1:-1] = mixing(shapes[1:-1].copy(), forces, moves)
-            iterations += 1
-        shapes = best.copy()
-        failures += lowest > before / 2
+            chords = _factorised(space, best, factorise)
+        found = _round(space, best, chords, tolerance)
+        iterations += found.iterations
+        if found.status in (Status.CONVERGED, Status.DEGENERATE):
+            return replace(found, iterations=iterations)
+        failures += min(found.residual, lowest) > lowest / 2
+        if found.residual < lowest:
+            best, lowest = found.vertices, found.residual
         if failures == 2:
             break
-    fault = f"residual {lowest:.1e} after {iterations} iterations"
-    return _Relaxed(best, iterations, (lowest,), fault)
+    return _stalled(space, best, iterations, lowest)
+
+
+def _stalled(space: ShellSpace, shapes: FloatArray, iterations: int, residual: float) -> DiscretePath:
+    return DiscretePath(
+        vertices=shapes,
+        space=space,
+        status=Status.STALLED,
+        iterations=iterations,
+        residual=residual,
+        reason=f"residual {residual:.1e} after {iterations} iterations",
+    )
+
+
+def _round(space: ShellSpace, shapes: FloatArray, chords: list[ChordSolver], tolerance: float) -> DiscretePath:
+    """Iterate with the same factors, accelerated, as long as it is worth it; the shapes of the smallest residual.
+
+    Its status is DEGENERATE where the equations are solved by what is no geodesic.
+    """
+    inverse = _inverse_in_time(len(shapes) - 1)
+    shapes, best, lowest = shapes.copy(), shapes, np.inf
+    mixing, residuals = Anderson(), []
+    for _ in range(ITERATIONS):
+        points, forces = _forces(space, shapes)
+        moves = np.stack([c.solve(f) for c, f in zip(chords, forces, strict=True)])
+        residuals.append(float(np.sqrt(np.abs(np.einsum("kvc,kvc->k", forces, moves)).max())))
+        if residuals[-1] <= tolerance:
+            faults = (fault_between(a, b) for a, b in pairwise(points))
+            fault = next((f for f in faults if f), None) or _jump(space, shapes)
+            return DiscretePath(
+                vertices=shapes,
+                space=space,
+                status=Status.DEGENERATE if fault else Status.CONVERGED,
+                iterations=len(residuals) - 1,
+                residual=residuals[-1],
+                reason=fault or "",
+            )
+        if residuals[-1] < lowest:
+            lowest, best = residuals[-1], shapes.copy()
+        if not np.isfinite(residuals[-1]) or (len(residuals) > 3 and residuals[-1] > SLOW * residuals[-4]):
+            return _stalled(space, best, len(residuals) - 1, lowest)
+        tangents = np.stack([c.push_forward(m) for c, m in zip(chords, moves, strict=True)])
+        moves = np.stack([c.project(t) for c, t in zip(chords, inverse @ tangents, strict=True)])
+        shapes[1:-1] = mixing(shapes[1:-1].copy(), forces, moves)
+    return _stalled(space, best, ITERATIONS, lowest)

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import fields
+from typing import Any
 
 import numpy as np
 
 from shapespace.arrays import FloatArray
 from shapespace.shell.exponential import exponential
-from shapespace.shell.space import Path, ShellSpace
+from shapespace.shell.space import DiscretePath, ShellSpace
 
 
 def exponentials(
@@ -19,7 +21,7 @@ def exponentials(
     *,
     workers: int = -1,
     chunk: int = 8,
-) -> Iterator[Path]:
+) -> Iterator[DiscretePath]:
     """Shoot from one shape with many velocities, yielding paths in their order as they are finished.
 
     Processes, not threads: NumPy on small arrays holds the interpreter lock, and a factor belongs to one
@@ -44,14 +46,14 @@ def exponentials(
         parallel = Parallel(n_jobs=workers, return_as="generator", inner_max_num_threads=1, backend="loky")
         finished = parallel(delayed(_shoot)(space, start, part, steps) for part in parts)
     for paths in finished:
-        for vertices, status, *rest in paths:
-            yield Path(vertices, status, space, *rest)
+        for path in paths:
+            yield DiscretePath(**path, space=space)
 
 
-def _shoot(space: ShellSpace, start: FloatArray, velocities: FloatArray, steps: int) -> list[tuple]:
-    """Paths as plain tuples: sent with their space, each would carry the mesh home."""
+def _shoot(space: ShellSpace, start: FloatArray, velocities: FloatArray, steps: int) -> list[dict[str, Any]]:
+    """Paths without their space: sent with it, each would carry the mesh home."""
     from threadpoolctl import threadpool_limits
 
     with threadpool_limits(1):
         paths = [exponential(space, start, v, steps) for v in velocities]
-    return [(p.vertices, p.status, p.reason, p.iterations, p.residuals) for p in paths]
+    return [{f.name: getattr(p, f.name) for f in fields(p) if f.name != "space"} for p in paths]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -13,33 +13,31 @@ from shapespace.shell.geodesic import Logarithm, logarithm
 from shapespace.shell.space import TOLERANCE, Point, ShellSpace, edge_length, fault_between, keeps_faces
 from shapespace.solve.anderson import Anderson
 from shapespace.solve.cholesky import NotPositiveDefiniteError
+from shapespace.solve.line_search import backtrack, sufficient_decrease
+from shapespace.solve.outcome import Outcome
+from shapespace.solve.preconditioner import step_length
 from shapespace.solve.status import Status
 from shapespace.solve.truncated_newton import descend
 
 #: Most iterations of either mean.
 ITERATIONS = 100
+#: Below this residual the elastic mean keeps its factor and trusts full, accelerated steps; above it, the smallest step
+#: that a line search tries.
+RENEW_ABOVE, SMALLEST_STEP = 1e-2, 1e-4
 
 
-@dataclass(frozen=True)
-class Mean:
-    """A mean shape.
+@dataclass(frozen=True, kw_only=True)
+class Mean(Outcome):
+    """A mean shape, with ``sqrt(Fᵀ A⁻¹ F)``, the length of the step still to go, as residual.
 
     Attributes:
         vertices: (V, 3), always finite; the best found.
-        status: how the iteration ended.
-        iterations: shapes tried.
-        residual: ``sqrt(Fᵀ A⁻¹ F)``, the length of the step still to go.
-        reason: what happened if it did not converge, in words.
         worst: of the elastic mean, where it did not converge: number of the shape and of the face whose areas in shape
             and mean are furthest apart.
         logarithms: for the centre of mass, those of the shapes at it, in their order.
     """
 
     vertices: FloatArray
-    status: Status
-    iterations: int
-    residual: float
-    reason: str = ""
     logarithms: tuple[Logarithm, ...] = ()
     worst: tuple[int, int] | None = None
 
@@ -68,32 +66,16 @@ def elastic_mean(
     shapes, w = _checked(space, shapes, weights)
     fault = _not_finite(shapes)
     if fault:
-        return Mean(space.reference.vertices, Status.NOT_FINITE, 0, np.inf, fault)
+        return Mean(vertices=space.reference.vertices, status=Status.NOT_FINITE, reason=fault)
     energy = _MeanEnergy(space, shapes, w)
     if start is None:
         start = shapes[int(np.argmin([energy.value(x) for x in shapes]))]
     found = _quasi_newton(energy, start)
-    if found.status is Status.CONVERGED:
-        return found
-    iterations, residual, reason = found.iterations, found.residual, found.reason
-    vertices, status = found.vertices, found.status
-    if np.isfinite(energy.value(vertices)):
-        try:
-            more = descend(energy, vertices, TOLERANCE, ITERATIONS)
-        except NotPositiveDefiniteError as error:
-            status, reason = Status.DEGENERATE, str(error)
-        else:
-            iterations, residual, vertices = iterations + more.iterations, more.residual, more.x
-            if more.converged:
-                return Mean(vertices, Status.CONVERGED, iterations, residual)
-            status, reason = Status.STALLED, f"residual {residual:.1e} after {iterations} iterations"
-    else:
-        status, reason = Status.DEGENERATE, "a shape has a face without area"
-    return Mean(vertices, status, iterations, residual, reason, worst=energy.worst(vertices))
+    return found if found.converged else _newton(energy, found)
 
 
 class _MeanEnergy:
-    """``Σ w_i W[z_i, z(X)]`` of shapes (n, V, 3) with weights (n,); see newton.Energy."""
+    """``Σ w_i W[z_i, z(X)]`` of shapes (n, V, 3) with weights (n,); see truncated_newton.Energy."""
 
     def __init__(self, space: ShellSpace, shapes: FloatArray, weights: FloatArray) -> None:
         self.space, self._weights = space, weights
@@ -118,8 +100,7 @@ class _MeanEnergy:
         return keeps_faces(self.space, x, x + step)
 
     def precondition(self, x: FloatArray) -> Callable[[FloatArray], FloatArray]:
-        self.space.chord.factorise(self.space.point(x))
-        return self.space.chord.solve
+        return self.space.factorise(self.space.point(x)).solve
 
     def worst(self, x: FloatArray) -> tuple[int, int]:
         """The shape and the face whose area is furthest from that in a mean."""
@@ -129,22 +110,28 @@ class _MeanEnergy:
 
 
 def _quasi_newton(mean: _MeanEnergy, start: FloatArray) -> Mean:
+    """With the metric of the current shape, in a line search; near the mean with that of one shape, accelerated."""
     space = mean.space
     point, energy = space.point(start), mean.value(start)
     best, lowest = start, np.inf
     mixing, residual, iterations = Anderson(), np.inf, 0
-    chord = space.chord
     for iterations in range(ITERATIONS):
         forces = mean.forces_at(point)
         if residual > RENEW_ABOVE:
             try:
-                chord.factorise(point)
+                chord = space.factorise(point)
             except NotPositiveDefiniteError as error:
-                return Mean(best, Status.DEGENERATE, iterations, residual, str(error))
+                return Mean(
+                    vertices=best,
+                    status=Status.DEGENERATE,
+                    iterations=iterations,
+                    residual=residual,
+                    reason=str(error),
+                )
         step = chord.solve(forces)
-        residual = float(np.sqrt(abs(np.vdot(forces, step))))
+        residual = step_length(forces, step)
         if residual <= TOLERANCE:
-            return Mean(point.vertices, Status.CONVERGED, iterations, residual)
+            return Mean(vertices=point.vertices, status=Status.CONVERGED, iterations=iterations, residual=residual)
         if residual < lowest:
             best, lowest = point.vertices, residual
         if residual <= RENEW_ABOVE:
@@ -152,17 +139,48 @@ def _quasi_newton(mean: _MeanEnergy, start: FloatArray) -> Mean:
             if np.isfinite(point.z).all():
                 continue
             break
-        t = 1.0
-        while t > 1e-4:
-            trial = space.point(point.vertices + t * step)
-            trial_energy = mean.value_of(trial.z)
-            if trial_energy <= energy - 1e-4 * t * residual**2:
-                break
-            t /= 2
-        else:
+        found = _line_search(mean, point, energy, step, residual**2)
+        if found is None:
             break
-        point, energy = trial, trial_energy
-    return Mean(best, Status.STALLED, iterations, lowest)
+        point, energy = found
+    return Mean(vertices=best, status=Status.STALLED, iterations=iterations, residual=lowest)
+
+
+def _line_search(
+    mean: _MeanEnergy, point: Point, energy: float, step: FloatArray, slope: float
+) -> tuple[Point, float] | None:
+    """The shape along a step that lowers the energy enough, and its energy."""
+
+    def trial(t: float) -> tuple[Point, float]:
+        there = mean.space.point(point.vertices + t * step)
+        return there, mean.value_of(there.z)
+
+    found = backtrack(trial, lambda t, there: sufficient_decrease(energy, there[1], t, slope), SMALLEST_STEP)
+    return found and found[1]
+
+
+def _newton(mean: _MeanEnergy, begun: Mean) -> Mean:
+    """Go on by truncated Newton from where quasi-Newton ended."""
+    vertices, iterations, residual = begun.vertices, begun.iterations, begun.residual
+    status, reason = Status.DEGENERATE, "a shape has a face without area"
+    if np.isfinite(mean.value(vertices)):
+        try:
+            found = descend(mean, vertices, TOLERANCE, ITERATIONS)
+        except NotPositiveDefiniteError as error:
+            reason = str(error)
+        else:
+            vertices, iterations, residual = found.x, iterations + found.iterations, found.residual
+            if found.converged:
+                return Mean(vertices=vertices, status=Status.CONVERGED, iterations=iterations, residual=residual)
+            status, reason = Status.STALLED, f"residual {residual:.1e} after {iterations} iterations"
+    return Mean(
+        vertices=vertices,
+        status=status,
+        iterations=iterations,
+        residual=residual,
+        reason=reason,
+        worst=mean.worst(vertices),
+    )
 
 
 @np.errstate(divide="ignore", over="ignore", invalid="ignore")
@@ -192,43 +210,38 @@ def centre_of_mass(
     shapes, w = _checked(space, shapes, weights)
     fault = _not_finite(shapes)
     if fault:
-        return Mean(space.reference.vertices, Status.NOT_FINITE, 0, np.inf, fault)
+        return Mean(vertices=space.reference.vertices, status=Status.NOT_FINITE, reason=fault)
     if start is None:
         start = elastic_mean(space, shapes, w).vertices
     mixing, residual = Anderson(), np.inf
     vertices, best = start, start
-    logarithms: tuple[Logarithm, ...] = ()
-    reason = f"{ITERATIONS} iterations were not enough"
+
+    def mean(status: Status, iterations: int, reason: str = "") -> Mean:
+        return Mean(vertices=best, status=status, iterations=iterations, residual=residual, reason=reason)
+
     for iteration in range(ITERATIONS):
         logarithms = tuple(logarithm(space, vertices, shape, steps) for shape in shapes)
         failed = next((i for i, log in enumerate(logarithms) if not log.path.converged), None)
         if failed is not None:
-            reason = f"no geodesic to shape {failed}: {logarithms[failed].path.reason}"
-            return Mean(best, Status.STALLED, iteration, residual, reason)
-        point, chord = space.point(vertices), space.chord
+            return mean(Status.STALLED, iteration, f"no geodesic to shape {failed}: {logarithms[failed].path.reason}")
+        point = space.point(vertices)
         first = np.stack([log.path.nric[1] for log in logarithms])
         forces = -steps * point.pull_back(w @ point.rest.gradient_rest(first))
         try:
-            chord.factorise(point)
+            step = space.factorise(point).solve(forces)
         except NotPositiveDefiniteError as error:
-            return Mean(best, Status.DEGENERATE, iteration, residual, str(error))
-        step = chord.solve(forces)
-        before, residual = residual, float(np.sqrt(abs(np.vdot(forces, step))))
+            return mean(Status.DEGENERATE, iteration, str(error))
+        before, residual = residual, step_length(forces, step)
         if residual <= tolerance:
-            return Mean(vertices, Status.CONVERGED, iteration, residual, "", logarithms)
+            best = vertices
+            return replace(mean(Status.CONVERGED, iteration), logarithms=logarithms)
         if residual > 2 * before:
-            reason = f"residual grows from {before:.1e} to {residual:.1e}"
-            break
+            return mean(Status.STALLED, iteration, f"residual grows from {before:.1e} to {residual:.1e}")
         best, vertices = vertices, mixing(vertices, forces, step)
         fault = fault_between(point, space.point(vertices))
         if fault:
-            reason = fault
-            break
-    return Mean(best, Status.STALLED, iteration, residual, reason)
-
-
-#: Below this the elastic mean keeps its factor and trusts full, accelerated steps.
-RENEW_ABOVE = 1e-2
+            return mean(Status.STALLED, iteration, fault)
+    return mean(Status.STALLED, iteration, f"{ITERATIONS} iterations were not enough")
 
 
 def _checked(

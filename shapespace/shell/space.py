@@ -7,14 +7,15 @@ equations in 3V unknowns with only the six rigid motions left over. Integrabilit
 matter, and the matrices are symmetric positive definite and nine times smaller in work than the indefinite
 ones of the constrained form (which the tests compare with).
 
-The modules that do something with this space: ``exponential`` (shooting), ``geodesic`` (connecting,
-logarithm), ``transport``, ``mean`` and ``sampling`` (many exponentials at once).
+The modules that do something with this space: ``exponential`` (shooting), ``many_exponentials`` (in parallel),
+``geodesic`` (connecting, logarithm), ``transport`` and ``mean``.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from functools import cached_property
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from functools import cached_property, partial
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -22,13 +23,14 @@ from scipy import sparse
 
 from shapespace.arrays import FloatArray
 from shapespace.coordinates.normal_matrix import NormalMatrix, QuadraticForm
-from shapespace.coordinates.nric import Frame, NRICGradients, NRICJacobian, edge_lengths, nric, wrap
+from shapespace.coordinates.nric import HingeGeometry, NRICGradients, NRICJacobian, edge_lengths, nric, wrap
 from shapespace.mesh.rigid_motion import rigid_motions, without_rigid_motion
 from shapespace.mesh.triangle_mesh import TriangleMesh, face_areas
 from shapespace.shell.energy import Material, RestShape, ShellEnergy
-from shapespace.shell.vertex_rotations import Turning
+from shapespace.shell.vertex_rotations import VertexRotations
 from shapespace.solve.cholesky import Backend, Cholesky, analyse
-from shapespace.solve.status import Status
+from shapespace.solve.outcome import Outcome
+from shapespace.solve.preconditioner import Preconditioner
 
 #: Solved to here: ``sqrt(Fᵀ A⁻¹ F)``, the distance that a Newton step would still go, as a length in the metric.
 TOLERANCE = 1e-9
@@ -41,7 +43,7 @@ LARGEST_TURN = 0.75 * np.pi
 
 
 class Point:
-    """A shape with what the calculus needs of it, each computed when first asked for.
+    """A shape with what its tangent space and its energy are made of, each computed when first asked for.
 
     Attributes:
         vertices: (V, 3) X.
@@ -64,9 +66,9 @@ class Point:
         return self.space.jacobian.gradients(self.vertices)
 
     @cached_property
-    def frames(self) -> FloatArray:
-        """(xyz, 3, F) of the faces."""
-        return self.space.turning.frames(self.vertices)
+    def face_frames(self) -> FloatArray:
+        """(xyz, 3, F), see VertexRotations."""
+        return self.space.vertex_rotations.face_frames(self.vertices)
 
     @cached_property
     def hessian(self) -> QuadraticForm:
@@ -119,38 +121,30 @@ def edge_length(space: ShellSpace) -> float:
     return float(edge_lengths(space.reference.vertices, space.connectivity).mean())
 
 
+@dataclass(frozen=True)
 class ChordSolver:
     """``A = Jᵀ Hess₂W[z, z] J``, factorised at one shape and used for all its neighbours.
 
-    A has the infinitesimal rigid motions of *its* shape as null space. At a neighbour they are other
-    motions, so forces that balance there don't balance here, and solving as they stand would turn the shape
-    without bound. Leaving out that part of the forces is a choice of gauge: the equation left still
-    determines the shape, and the spectrum of A relative to the neighbour's matrix is close to 1 (0.95 to
-    1.05 for a bend by 5°, 0.5 to 2.4 for 75°, measured).
+    Rigid motions are left out of the forces, see Preconditioner. The spectrum of A relative to a neighbour's matrix is
+    close to 1: 0.95 to 1.05 for a bend by 5°, 0.5 to 2.4 for 75°, measured.
+
+    Attributes:
+        at: the shape whose matrix is factorised.
+        inverse: A⁻¹, up to the rigid motions of that shape.
+        rotations: (V, 3, 3) of its vertices to the shape that is served, if they are taken into account.
     """
 
-    #: The shape whose matrix is factorised.
     at: Point
+    inverse: Preconditioner
+    rotations: FloatArray | None = None
 
-    def __init__(self, matrix: NormalMatrix, cholesky: Cholesky, number: int) -> None:
-        self._matrix, self._cholesky, self._number = matrix, cholesky, number
-        self._rigid = np.zeros((0, 0))
-        self._turn: FloatArray | None = None
-
-    def factorise(self, point: Point) -> None:
-        """Take the matrix of this shape; raises NotPositiveDefiniteError."""
-        self._cholesky.factorise(self._matrix.entries(point.gradients, point.hessian), self._number)
-        self._rigid = rigid_motions(point.vertices)
-        self._turn = None
-        self.at = point
-
-    def turn_to(self, point: Point) -> None:
-        """Serve another shape from now on: ``R A⁻¹ Rᵀ`` and ``J Rᵀ`` with rotations of the vertices to it."""
-        self._turn = point.space.turning(self.at.frames, point.frames)
+    def rotated_to(self, point: Point) -> ChordSolver:
+        """The same factor, serving another shape: ``R A⁻¹ Rᵀ`` and ``J Rᵀ`` with rotations of the vertices to it."""
+        return replace(self, rotations=point.space.vertex_rotations(self.at.face_frames, point.face_frames))
 
     def solve(self, forces: FloatArray) -> FloatArray:
         """``A⁻¹F`` (…, V, 3), up to the rigid motions of the factor's shape."""
-        return self._there(self._solve(self._back(forces)))
+        return self._there(self.inverse(self._back(forces)))
 
     def push_forward(self, displacement: FloatArray) -> FloatArray:
         """``J d`` (2E,) of a vertex field (V, 3), with the factor's shape's J."""
@@ -158,22 +152,21 @@ class ChordSolver:
 
     def project(self, tangent: FloatArray) -> FloatArray:
         """The vertex field (V, 3) whose J d comes closest to a change (2E,) of lengths and angles."""
-        return self._there(self._solve(self.at.pull_back(self.at.lower(tangent))))
-
-    def _solve(self, forces: FloatArray) -> FloatArray:
-        flat = forces.reshape(-1, forces.shape[-2] * 3)
-        balanced = flat - (flat @ self._rigid.T) @ self._rigid
-        return self._cholesky.solve(balanced, self._number).reshape(forces.shape)
+        return self._there(self.inverse(self.at.pull_back(self.at.lower(tangent))))
 
     def _there(self, field: FloatArray) -> FloatArray:
-        return field if self._turn is None else np.einsum("vij,...vj->...vi", self._turn, field)
+        return field if self.rotations is None else np.einsum("vij,...vj->...vi", self.rotations, field)
 
     def _back(self, field: FloatArray) -> FloatArray:
-        return field if self._turn is None else np.einsum("vji,...vj->...vi", self._turn, field)
+        return field if self.rotations is None else np.einsum("vji,...vj->...vi", self.rotations, field)
+
+
+#: Factorises A at a shape; raises NotPositiveDefiniteError. What it has returned before can't solve any more then.
+Factorise = Callable[[Point], ChordSolver]
 
 
 class ShellSpace:
-    """The Riemannian manifold of all shapes of a collection, with metric ``g_z = ½ Hess₂ W[z, z]``.
+    """The Riemannian manifold of the shapes of one connectivity, with metric ``g_z = ½ Hess₂ W[z, z]``.
 
     The symbolic analysis happens here, once. Holds work space: use one per thread, or pickle it to another
     process, which sends the reference and repeats the analysis there.
@@ -191,31 +184,30 @@ class ShellSpace:
         self.backend: Backend = backend
         self.energy = ShellEnergy(self.connectivity, self.material, reference.area)
         self.jacobian = NRICJacobian(self.connectivity)
-        self.turning = Turning(self.connectivity)
+        self.vertex_rotations = VertexRotations(self.connectivity)
         self._matrix = NormalMatrix(self.connectivity)
-        self._chords: list[ChordSolver] = []
+        self._factorise: list[Factorise] = []
 
     def __reduce__(self) -> tuple:
         return type(self), (self.reference, self.material, self.backend)
 
-    def chords(self, count: int) -> list[ChordSolver]:
-        """That many solvers with a factor each, which keep it until they factorise again."""
-        if len(self._chords) < count:
+    def factorisations(self, count: int) -> list[Factorise]:
+        """That many functions that factorise A at a shape, whose results can be used side by side."""
+        if len(self._factorise) < count:
             cholesky = analyse(self._matrix.pattern, self.backend, count)
-            self._chords = [ChordSolver(self._matrix, cholesky, number) for number in range(count)]
-        return self._chords[:count]
+            self._factorise = [partial(_factorised, self._matrix, cholesky, number) for number in range(count)]
+        return self._factorise[:count]
 
-    @property
-    def chord(self) -> ChordSolver:
-        """A single solver, the first."""
-        return self.chords(1)[0]
+    def factorise(self, point: Point) -> ChordSolver:
+        """A at a shape, by the first of the ``factorisations``."""
+        return self.factorisations(1)[0](point)
 
     def nric(self, vertices: FloatArray) -> FloatArray:
         """Lengths and angles (…, 2E) of shapes (…, V, 3)."""
         return nric(vertices, self.connectivity)
 
     def point(self, vertices: FloatArray) -> Point:
-        """A shape (V, 3) with what the calculus needs of it."""
+        """A shape (V, 3) as a point of the manifold."""
         return Point(self, self.shape(vertices))
 
     def shape(self, vertices: ArrayLike) -> FloatArray:
@@ -227,7 +219,7 @@ class ShellSpace:
 
     def curvature(self, point: Point, covector: FloatArray) -> sparse.csc_array:
         """``Σ_i p_i D²z_i(X)`` (3V, 3V) of a covector p (2E,): how ``Jᵀp`` changes with X."""
-        second = Frame(point.vertices, self.connectivity).second_derivatives()
+        second = HingeGeometry(point.vertices, self.connectivity).second_derivatives()
         return self._matrix.pattern.matrix(self._matrix.second_derivative(second, covector))
 
     def inner(self, vertices: FloatArray, first: FloatArray, second: FloatArray) -> float:
@@ -245,39 +237,34 @@ class ShellSpace:
 
         ``J d`` is the orthogonal projection to the tangent space: d = (Jᵀ H J)⁻¹ Jᵀ H u. It has no rigid part.
         """
-        point, chord = self.point(vertices), self.chord
-        chord.factorise(point)
+        point = self.point(vertices)
+        chord = self.factorise(point)
         d = chord.project(change)
         # Once more with what is left, because A is regularised.
         d += chord.project(change - point.push_forward(d))
         return without_rigid_motion(d, point.vertices)
 
 
-@dataclass(frozen=True)
-class Path:
-    """Shapes at equal times, as far as they could be found; every vertex is finite.
+def _factorised(matrix: NormalMatrix, cholesky: Cholesky, number: int, point: Point) -> ChordSolver:
+    factor = cholesky.factorise(matrix.entries(point.gradients, point.hessian), number)
+    return ChordSolver(point, Preconditioner(factor, rigid_motions(point.vertices)))
+
+
+@dataclass(frozen=True, kw_only=True)
+class DiscretePath(Outcome):
+    """Shapes at equal times, as far as they could be found; converged if the path is complete.
+
+    Of its equations ``iterations`` are all together, and ``residual`` is the largest ``sqrt(F_kᵀ A_k⁻¹ F_k)`` of the
+    discrete Euler–Lagrange equation at an inner shape, with A_k factorised near it, or 0 where no shape has been solved
+    for; the exponential has taken another step since.
 
     Attributes:
-        vertices: (n, V, 3).
-        status: CONVERGED if the path is complete.
-        reason: what happened otherwise, in words.
-        iterations: of each solved step, or the iterations on all steps together.
-        residuals: ``sqrt(Fᵀ A⁻¹ F)`` of the discrete Euler–Lagrange equation at each inner shape, with A
-            factorised near it; the exponential has taken another step since.
+        vertices: (n, V, 3), always finite.
         space: where the path lies.
     """
 
     vertices: FloatArray
-    status: Status
     space: ShellSpace = field(repr=False)
-    reason: str = ""
-    iterations: tuple[int, ...] = ()
-    residuals: tuple[float, ...] = ()
-
-    @property
-    def converged(self) -> bool:
-        """Whether the path is complete."""
-        return self.status is Status.CONVERGED
 
     @cached_property
     def nric(self) -> FloatArray:

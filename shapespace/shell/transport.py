@@ -11,28 +11,27 @@ from shapespace.arrays import FloatArray
 from shapespace.mesh.rigid_motion import align, without_rigid_motion
 from shapespace.shell.exponential import extrapolate
 from shapespace.shell.geodesic import geodesic
-from shapespace.shell.space import TOLERANCE, Path, ShellSpace
+from shapespace.shell.space import TOLERANCE, DiscretePath, ShellSpace
+from shapespace.solve.outcome import Outcome
 from shapespace.solve.status import Status
 
 
-@dataclass(frozen=True)
-class Transport:
-    """A vector carried along a path.
+@dataclass(frozen=True, kw_only=True)
+class Transport(Outcome):
+    """A vector carried along a path; converged if it got to the end.
+
+    Iterations and the largest residual are those of the geodesics and exponentials solved on the way.
 
     Attributes:
         velocities: (n, V, 3) vertex fields without rigid motion, one at each shape reached, the given one
             first.
-        status: CONVERGED if it got to the end.
-        reason: what happened otherwise, in words.
     """
 
     velocities: FloatArray
-    status: Status
-    reason: str = ""
 
 
 def parallel_transport(
-    space: ShellSpace, path: Path, velocity: FloatArray, *, tolerance: float = TOLERANCE
+    space: ShellSpace, path: DiscretePath, velocity: FloatArray, *, tolerance: float = TOLERANCE
 ) -> Transport:
     """Carry a tangent vector along a path, a geodesic parallelogram for each of its K steps.
 
@@ -53,19 +52,28 @@ def parallel_transport(
     first = path.vertices[0]
     carried = [without_rigid_motion(space.shape(velocity), first)]
     if not np.isfinite(carried[0]).all():
-        return Transport(np.zeros((0, *first.shape)), Status.NOT_FINITE, "the vector is not finite")
+        nothing = np.zeros((0, *first.shape))
+        return Transport(velocities=nothing, status=Status.NOT_FINITE, reason="the vector is not finite")
     size = space.norm(first, carried[0])
     if size == 0:
-        return Transport(np.zeros_like(path.vertices), Status.CONVERGED)
+        return Transport(velocities=np.zeros_like(path.vertices), status=Status.CONVERGED, residual=0)
     stride = np.sqrt(path.energy) / steps
     shrink = (stride if stride > 0 else size) / size
+    iterations, residual = 0, 0.0
     for x, y in pairwise(path.vertices):
-        middle = geodesic(space, x + shrink * carried[-1], y, 2, tolerance=tolerance)
-        rung = middle
-        if middle.converged:
-            rung = extrapolate(space, x, align(middle.vertices[1], x), 1, tolerance=tolerance)
+        half = rung = geodesic(space, x + shrink * carried[-1], y, 2, tolerance=tolerance)
+        if half.converged:
+            rung = extrapolate(space, x, align(half.vertices[1], x), 1, tolerance=tolerance)
+            iterations += half.iterations
+        iterations, residual = iterations + rung.iterations, max(residual, half.residual, rung.residual)
         if not rung.converged:
-            return Transport(np.stack(carried), rung.status, f"step {len(carried)}: {rung.reason}")
+            return Transport(
+                velocities=np.stack(carried),
+                status=rung.status,
+                iterations=iterations,
+                residual=residual,
+                reason=f"step {len(carried)}: {rung.reason}",
+            )
         tip = align(rung.vertices[-1], y)
         carried.append((tip - y) / shrink)
-    return Transport(np.stack(carried), Status.CONVERGED)
+    return Transport(velocities=np.stack(carried), status=Status.CONVERGED, iterations=iterations, residual=residual)

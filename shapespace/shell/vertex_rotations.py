@@ -10,15 +10,17 @@ from shapespace.coordinates.nric import components, cross, dot
 from shapespace.mesh.triangle_mesh import Connectivity
 
 
-class Turning:
+class VertexRotations:
     """A rotation for each vertex: the mean of its faces', then of its neighbours' as many times as ROUNDS says.
 
-    Each rotation is a quaternion, and quaternions are summed over neighbourhoods. Between frames a and b it is
-    ``(1 + Σ_k a_k · b_k, Σ_k a_k × b_k)``, which is 4w times the unit quaternion (w, v): a sum doesn't depend on its
-    sign, and turns by nearly 180°, whose axis is uncertain, count little.
+    Means are those of quaternions (Markley, Cheng, Crassidis and Oshman, "Averaging quaternions", 2007), in the cheap
+    form for rotations that are near each other: the normalised weighted sum instead of an eigenvector. Between face
+    frames a and b the quaternion is ``(1 + Σ_k a_k · b_k, Σ_k a_k × b_k)``, which is 4w times the unit quaternion
+    (w, v). So a sum doesn't depend on its sign, which is what the eigenvector is for; and rotations by nearly 180°,
+    whose axis is uncertain, weigh little.
 
-    Neighbours have to turn nearly alike, because differences of rotation stretch a shell, which is much stiffer
-    against that than against bending: without rounds the matrix of a captured body is worse off turned than not.
+    Neighbours have to rotate nearly alike, because differences of rotation stretch a shell, which is much stiffer
+    against that than against bending: without rounds the matrix of a captured body is worse off rotated than not.
     """
 
     ROUNDS = 6
@@ -30,7 +32,7 @@ class Turning:
         self._around = sparse.csr_array((np.ones(3 * faces), corner), shape=(connectivity.vertex_count, faces))
         self._neighbours = sparse.csr_array((self._around @ self._around.T).astype(bool).astype(np.float64))
 
-    def frames(self, vertices: FloatArray) -> FloatArray:
+    def face_frames(self, vertices: FloatArray) -> FloatArray:
         """(xyz, 3, F): unit vectors along a side of each face, across it, and along its normal."""
         a, b, c = (components(vertices).take(k, axis=1) for k in self._corners)
         side = b - a
@@ -40,13 +42,17 @@ class Turning:
         return np.stack([side, cross(normal, side), normal], axis=1)
 
     def __call__(self, old: FloatArray, new: FloatArray) -> FloatArray:
-        """Rotations (V, 3, 3) from frames to frames; not finite where all around turn by 180° or a face has no area."""
+        """Rotations (V, 3, 3) that take face frames to face frames, both (xyz, 3, F).
+
+        Not finite where all around a vertex rotate by 180°, or a face has no area.
+        """
         quaternions = np.empty((4, old.shape[-1]))
         quaternions[0] = 1 + np.einsum("xkf,xkf->f", old, new)
         quaternions[1:] = cross(old, new).sum(axis=1)
         means = np.asarray(self._around @ quaternions.T)
         for _ in range(self.ROUNDS):
             means = np.asarray(self._neighbours @ means)
+        # Of length √2, for then the matrix needs no factors of 2.
         means *= np.sqrt(2) / np.linalg.norm(means, axis=1, keepdims=True)
         w, x, y, z = means.T
         rows = [

@@ -1,4 +1,4 @@
-"""Anderson acceleration of a preconditioned fixed-point iteration."""
+"""Anderson acceleration of a preconditioned fixed-point iteration (Walker and Ni 2011)."""
 
 from __future__ import annotations
 
@@ -8,9 +8,12 @@ from shapespace.arrays import FloatArray
 
 
 class Anderson:
-    """Mixes the last iterates of ``x ← x + M⁻¹F(x)`` so that ``‖F‖`` in the norm of M⁻¹ is smallest.
+    """Mixes the last iterates of ``x ← x + P F(x)`` so that ``FᵀPF``, linearised, is least.
 
-    For an affine F this is GMRES with preconditioner M in that norm; it costs a few dot products and needs no
+    With the differences ΔF, ΔG of the last few F and of the last few images ``G = x + P F``, the next iterate is
+    ``G − ΔG γ``, where γ solves ``(ΔFᵀ P ΔF) γ = ΔFᵀ P F``: the unconstrained form of Walker and Ni, "Anderson
+    acceleration for fixed-point iterations" (SIAM J. Numer. Anal. 49, 2011), with P's norm for the Euclidean one. For
+    an affine F it amounts to GMRES preconditioned by P, as they show; it costs a few dot products and needs no
     derivative. The chord iteration it serves contracts by 0.03 to 0.3, and faster with every mixed iterate.
     """
 
@@ -23,7 +26,7 @@ class Anderson:
         self._history = np.empty(0)
 
     def __call__(self, x: FloatArray, forces: FloatArray, step: FloatArray) -> FloatArray:
-        """The next iterate from x, F(x) and M⁻¹F(x), all of one shape."""
+        """The next iterate from x, F(x) and the step P F(x), all of one shape."""
         now = np.concatenate([x, forces, step], axis=None).reshape(3, -1)
         now[0] += now[2]
         if self._last is None:

@@ -1,4 +1,4 @@
-"""Sparse Cholesky with one pattern for ever: analyse once, factorise many times.
+"""Sparse Cholesky of matrices with one pattern: analyse once, factorise many times, solve with what that returns.
 
 Two backends behind one interface. ``pardiso`` (MKL, a wheel for x86-64) is the faster one where it is installed;
 ``banded`` needs only SciPy: reverse Cuthill–McKee, then LAPACK on the band. On meshes of about 1000 vertices the two
@@ -12,6 +12,7 @@ import importlib.util
 import re
 import sys
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import cache
 from importlib import metadata
 from typing import Literal, Protocol
@@ -77,17 +78,22 @@ class SymmetricPattern:
         return sparse.csc_array(upper + sparse.triu(upper, 1).T)
 
 
+class Factor(Protocol):
+    """A factorised matrix. Not for use by two threads at once."""
+
+    def solve(self, right: ArrayLike) -> FloatArray:
+        """Solve for one right-hand side (N,), or for several (n, N)."""
+
+
 class Cholesky(Protocol):
     """Factorises symmetric positive definite matrices of one pattern. Not for use by two threads at once.
 
-    Keeps several factors side by side, by number; a factor stays until its number is factorised again.
+    It has room for several factors side by side, by number. A new factor takes the place of the one with its number,
+    which must not be asked any more: where the memory is shared it raises RuntimeError.
     """
 
-    def factorise(self, entries: FloatArray, factor: int = 0) -> None:
+    def factorise(self, entries: FloatArray, number: int = 0) -> Factor:
         """Factorise the matrix with these upper-triangle entries; raises NotPositiveDefiniteError."""
-
-    def solve(self, right: ArrayLike, factor: int = 0) -> FloatArray:
-        """Solve with a factor for one right-hand side (N,), or for several (n, N)."""
 
 
 class BandedCholesky:
@@ -96,7 +102,7 @@ class BandedCholesky:
     def __init__(self, pattern: SymmetricPattern) -> None:
         n = pattern.size
         graph = pattern.matrix(np.ones(len(pattern)))
-        self._order = reverse_cuthill_mckee(sparse.csr_matrix(graph), symmetric_mode=True)
+        self._order: IntArray = reverse_cuthill_mckee(sparse.csr_matrix(graph), symmetric_mode=True).astype(np.int64)
         place = np.empty(n, dtype=np.int64)
         place[self._order] = np.arange(n)
         a, b = place[pattern.rows], place[pattern.indices]
@@ -105,27 +111,31 @@ class BandedCholesky:
         # Lower form, Fortran order: entry (high, low) lies at row high - low of column low.
         self._slots = low * (self.bandwidth + 1) + (high - low)
         self._shape = (self.bandwidth + 1, n)
-        self._factors: dict[int, FloatArray] = {}
 
-    def factorise(self, entries: FloatArray, factor: int = 0) -> None:
-        """See Cholesky."""
+    def factorise(self, entries: FloatArray, number: int = 0) -> Factor:
+        """See Cholesky; every factor has memory of its own, and the number doesn't matter."""
         band = np.zeros(self._shape, order="F")
         band.ravel(order="K")[self._slots] = entries
         if not np.isfinite(entries).all():
             raise NotPositiveDefiniteError("the matrix has an entry that is not finite")
         try:
-            self._factors[factor] = linalg.cholesky_banded(band, overwrite_ab=True, lower=True, check_finite=False)
+            factor = linalg.cholesky_banded(band, overwrite_ab=True, lower=True, check_finite=False)
         except linalg.LinAlgError as error:
             raise NotPositiveDefiniteError(str(error)) from error
+        return _BandedFactor(factor, self._order)
 
-    def solve(self, right: ArrayLike, factor: int = 0) -> FloatArray:
-        """See Cholesky."""
-        if factor not in self._factors:
-            raise RuntimeError("factorise first")
+
+@dataclass(frozen=True)
+class _BandedFactor:
+    band: FloatArray
+    order: IntArray
+
+    def solve(self, right: ArrayLike) -> FloatArray:
+        """See Factor."""
         right = np.asarray(right)
         x = np.empty(right.shape)
-        x[..., self._order] = linalg.cho_solve_banded(
-            (self._factors[factor], True), right[..., self._order].T, check_finite=False, overwrite_b=True
+        x[..., self.order] = linalg.cho_solve_banded(
+            (self.band, True), right[..., self.order].T, check_finite=False, overwrite_b=True
         ).T
         return x
 
@@ -163,8 +173,9 @@ class PardisoCholesky:
     def __init__(self, pattern: SymmetricPattern, factors: int = 1) -> None:
         self._size = pattern.size
         self._structure = pattern.indptr + np.int32(1), pattern.indices + np.int32(1)
-        #: Entries behind each factor; Pardiso looks at them again when it solves.
-        self._entries: list[FloatArray | None] = [None] * factors
+        #: How many factors there have been of each number. The factors themselves refer to this object: to hold them
+        #: here would be a cycle, and MKL's memory would wait for the garbage collector.
+        self._versions = [0] * factors
         entries = np.ones(len(pattern))
         entries[pattern.diagonal] = len(pattern)
         # Limbs are better off with minimum degree, balls with nested dissection, by up to a third of the time.
@@ -184,17 +195,17 @@ class PardisoCholesky:
         self._run(11, entries)
         return int(self._options[17])
 
-    def _run(self, phase: int, entries: FloatArray, right: FloatArray | None = None, factor: int = 0) -> FloatArray:
+    def _run(self, phase: int, entries: FloatArray, right: FloatArray | None = None, number: int = 0) -> FloatArray:
         b = np.zeros(self._size) if right is None else right
         x = np.empty_like(b)
         error = ctypes.c_int32(0)
-        numbers = [len(self._entries), factor + 1, self._POSITIVE_DEFINITE, phase, self._size]
-        factors, number, kind, phase_, size, columns, quiet = (
+        numbers = [len(self._versions), number + 1, self._POSITIVE_DEFINITE, phase, self._size]
+        factors, number_, kind, phase_, size, columns, quiet = (
             ctypes.byref(ctypes.c_int32(n)) for n in (*numbers, b.size // self._size, 0)
         )
         indptr, indices = (a.ctypes.data for a in self._structure)
         _mkl().pardiso(
-            *(self._handle.ctypes.data, factors, number, kind, phase_, size),
+            *(self._handle.ctypes.data, factors, number_, kind, phase_, size),
             *(entries.ctypes.data, indptr, indices, None, columns, self._options.ctypes.data, quiet),
             *(b.ctypes.data, x.ctypes.data, ctypes.byref(error)),
         )
@@ -202,24 +213,39 @@ class PardisoCholesky:
             raise NotPositiveDefiniteError(f"Pardiso's phase {phase} failed with error {error.value}")
         return x
 
-    def factorise(self, entries: FloatArray, factor: int = 0) -> None:
+    def factorise(self, entries: FloatArray, number: int = 0) -> Factor:
         """See Cholesky."""
         if not np.isfinite(entries).all():
             raise NotPositiveDefiniteError("the matrix has an entry that is not finite")
-        kept = self._entries[factor] = np.array(entries, dtype=np.float64)
-        self._run(22, kept, factor=factor)
+        kept = np.array(entries, dtype=np.float64)
+        self._versions[number] += 1
+        self._run(22, kept, number=number)
+        return _PardisoFactor(self, kept, number, self._versions[number])
 
-    def solve(self, right: ArrayLike, factor: int = 0) -> FloatArray:
-        """See Cholesky."""
-        entries = self._entries[factor]
-        if entries is None:
-            raise RuntimeError("factorise first")
-        return self._run(33, entries, np.ascontiguousarray(right, dtype=np.float64), factor)
+    def solve(self, factor: _PardisoFactor, right: ArrayLike) -> FloatArray:
+        """Solve with a factor made here; raises RuntimeError where another has taken its place."""
+        if self._versions[factor.number] != factor.version:
+            raise RuntimeError(f"factor {factor.number} has been replaced by a later factorisation")
+        return self._run(33, factor.entries, np.ascontiguousarray(right, dtype=np.float64), factor.number)
 
     def __del__(self, finalizing: Callable[[], bool] = sys.is_finalizing) -> None:
         # MKL keeps the factors outside Python's memory until told otherwise. At the end `sys` itself may be gone.
-        if hasattr(self, "_entries") and not finalizing():
+        if hasattr(self, "_versions") and not finalizing():
             self._run(-1, np.zeros(1))
+
+
+@dataclass(frozen=True, eq=False)
+class _PardisoFactor:
+    """One of MKL's factors, with the entries behind it: Pardiso looks at them again when it solves."""
+
+    cholesky: PardisoCholesky
+    entries: FloatArray
+    number: int
+    version: int
+
+    def solve(self, right: ArrayLike) -> FloatArray:
+        """See Factor."""
+        return self.cholesky.solve(self, right)
 
 
 def analyse(pattern: SymmetricPattern, backend: Backend = "auto", factors: int = 1) -> Cholesky:

@@ -10,53 +10,92 @@ from scipy.linalg import cholesky, solve_triangular
 
 from shapespace.arrays import FloatArray
 from shapespace.solve.deadline import Deadline
+from shapespace.solve.outcome import Outcome
 from shapespace.solve.status import Status
 
 #: A Jacobian is renewed once the point has moved this far, as a fraction of the scale, before it is believed.
 TRUSTED = 0.05
-#: What a step must gain of what the Jacobian promised, or a new one is made if it has been updated.
-POOR = 0.25
-#: Damping relative to the largest diagonal entry of JᵀJ: always, and the first and the last where a step fails.
-SMALLEST_DAMPING, FIRST_DAMPING, LARGEST_DAMPING = 1e-10, 1e-3, 1e3
+#: What a step must gain of what the Jacobian promised: to be taken; or a new Jacobian is made if it has been updated;
+#: or the damping doesn't fall.
+TAKEN, POOR, GOOD = 1e-3, 0.25, 0.5
+#: Damping relative to the largest diagonal entry of JᵀJ: always, and the first and the last where a step fails; and the
+#: factor by which it rises and falls.
+SMALLEST_DAMPING, FIRST_DAMPING, LARGEST_DAMPING, DAMPING_FACTOR = 1e-10, 1e-3, 1e3, 10
 
 
 @dataclass(frozen=True)
-class Fit:
-    """What the iteration found.
+class Box:
+    """Where the unknowns may be, each (m,).
+
+    Attributes:
+        lower: sides of the box, infinite where there is none.
+        upper: the opposite ones.
+        scale: lengths that count as equally long in each coordinate.
+    """
+
+    lower: FloatArray
+    upper: FloatArray
+    scale: FloatArray
+
+
+@dataclass(frozen=True)
+class Stopping:
+    """When the iteration ends.
+
+    Attributes:
+        tolerance: once no coordinate would move further than this fraction of its scale,
+        gain_tolerance: or ``‖r‖²`` would not shrink by more than this fraction of itself,
+        large: where ``‖r‖`` is less; above, of ``‖r‖`` times this: most of such a residual can't vanish.
+        max_evaluations: of the residual.
+        deadline: after which no evaluation begins.
+    """
+
+    tolerance: float = 1e-4
+    gain_tolerance: float = 1e-6
+    large: float = np.inf
+    max_evaluations: int = 40
+    deadline: Deadline | None = None
+
+    def nothing_to_gain(self, step: FloatArray, predicted: float, cost: float) -> bool:
+        """Whether a step, in units of the scale, is not worth an evaluation."""
+        return bool(
+            np.abs(step).max() <= self.tolerance or predicted <= self.gain_tolerance * shrinkable(cost, self.large)
+        )
+
+    def reached(self, evaluations: int) -> Status | None:
+        """The limit that is reached after so many evaluations, if one is."""
+        if evaluations >= self.max_evaluations:
+            return Status.ITERATION_LIMIT
+        return Status.DEADLINE if self.deadline is not None and self.deadline.passed else None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Fit(Outcome):
+    """What the iteration found. Iterations are evaluations of the residuals, those of Jacobians not counted.
 
     Attributes:
         x: (m,) inside the box.
-        residual: (n,) there.
-        status: how the iteration ended.
-        evaluations: of the residual, those of Jacobians not counted.
+        residuals: (n,) r(x), whose norm is the residual.
     """
 
     x: FloatArray
-    residual: FloatArray
-    status: Status
-    evaluations: int
+    residuals: FloatArray
 
     @property
     def cost(self) -> float:
         """``‖r‖²``."""
-        return float(self.residual @ self.residual)
+        return float(self.residuals @ self.residuals)
 
 
 @np.errstate(over="ignore", invalid="ignore")
 def least_squares(
-    residual: Callable[[FloatArray], FloatArray],
+    residuals: Callable[[FloatArray], FloatArray],
     jacobian: Callable[[FloatArray, FloatArray], FloatArray],
     start: FloatArray,
-    lower: FloatArray,
-    upper: FloatArray,
-    scale: FloatArray,
+    box: Box,
+    stopping: Stopping | None = None,
     *,
-    tolerance: float = 1e-4,
-    gain_tolerance: float = 1e-6,
-    large: float = np.inf,
     secant: bool = True,
-    max_evaluations: int = 40,
-    deadline: Deadline | None = None,
 ) -> Fit:
     """Minimise ``‖r(x)‖²`` over a box by Gauss–Newton with damping (Levenberg and Marquardt).
 
@@ -66,62 +105,94 @@ def least_squares(
     right as the Jacobian. ``scipy.optimize.least_squares`` would make one at each step.
 
     Args:
-        residual: (m,) to (n,).
-        jacobian: x and its residual to (n, m).
+        residuals: r, (m,) to (n,).
+        jacobian: x and r(x) to (n, m).
         start: (m,); what lies outside the box is moved to its side.
-        lower: (m,) sides of the box, infinite where there is none.
-        upper: (m,) the opposite ones.
-        scale: (m,) lengths that count as equally long in each coordinate.
-        tolerance: stop once no coordinate would move further than this fraction of its scale,
-        gain_tolerance: or ``‖r‖²`` would not shrink by more than this fraction of itself,
-        large: where ``‖r‖`` is less; above, of ``‖r‖`` times this: most of such a residual can't vanish.
+        box: where to look, and in what units.
+        stopping: when to end.
         secant: whether Jacobians are worth saving; otherwise one is made at each step.
-        max_evaluations: of the residual.
-        deadline: after which no evaluation begins.
     """
-    low, high = lower / scale, upper / scale
+    stopping = stopping or Stopping()
+    scale, low, high = box.scale, box.lower / box.scale, box.upper / box.scale
     u = np.clip(start / scale, low, high)
-    r = residual(u * scale)
-    evaluations, damping, made_at = 1, 0.0, u
-    J = jacobian(u * scale, r) * scale
-    updates = 0
+    r = residuals(u * scale)
+    J = _Jacobian(lambda u, r: jacobian(u * scale, r) * scale, secant, u, r)
+    evaluations, damping = 1, 0.0
 
-    def fit(status: Status) -> Fit:
-        return Fit(u * scale, r, status, evaluations)
+    def fit(status: Status, reason: str = "") -> Fit:
+        norm = float(np.linalg.norm(r))
+        return Fit(x=u * scale, residuals=r, status=status, iterations=evaluations, residual=norm, reason=reason)
 
     if not np.isfinite(r).all():
-        return fit(Status.NOT_FINITE)
-    while evaluations < max_evaluations:
-        if deadline is not None and deadline.passed:
-            return fit(Status.DEADLINE)
-        if not np.isfinite(J).all():
-            return fit(Status.STALLED)
-        step = _step(J, r, low - u, high - u, damping)
-        predicted = r @ r - np.sum((r + J @ step) ** 2)
-        if np.abs(step).max() <= tolerance or predicted <= gain_tolerance * shrinkable(float(r @ r), large):
-            if updates and np.abs(u - made_at).max() > TRUSTED:
-                J, made_at, updates = jacobian(u * scale, r) * scale, u, 0
-                continue
-            return fit(Status.CONVERGED)
+        return fit(Status.NOT_FINITE, "the residuals at the start are not finite")
+    while (reached := stopping.reached(evaluations)) is None:
+        if not np.isfinite(J.matrix).all():
+            return fit(Status.STALLED, "the Jacobian is not finite")
+        step = _step(J.matrix, r, low - u, high - u, damping)
+        predicted = float(r @ r - np.sum((r + J.matrix @ step) ** 2))
+        if stopping.nothing_to_gain(step, predicted, float(r @ r)):
+            if not J.is_outdated(u):
+                return fit(Status.CONVERGED)
+            J.renew(u, r)
+            continue
         trial = np.clip(u + step, low, high)
-        trial_r = residual(trial * scale)
+        trial_r = residuals(trial * scale)
         evaluations += 1
-        gain = (r @ r - trial_r @ trial_r) / predicted
-        taken = bool(gain > 1e-3)  # not where it isn't a number
+        gain = float((r @ r - trial_r @ trial_r) / predicted)
+        taken = bool(gain > TAKEN)  # not where it isn't a number
         if taken:
-            if secant:  # a step that failed may have met a cliff, whose slope is nobody else's
-                J += np.outer(trial_r - r - J @ step, step / (step @ step))
+            J.follow(step, trial_r - r)
             u, r = trial, trial_r
-            damping = damping if gain < 0.5 else damping / 10 if damping > FIRST_DAMPING else 0.0
-        elif not updates:
-            damping = max(10 * damping, FIRST_DAMPING)
+            if gain >= GOOD:
+                damping = damping / DAMPING_FACTOR if damping > FIRST_DAMPING else 0.0
+        elif not J.updates:
+            damping = max(DAMPING_FACTOR * damping, FIRST_DAMPING)
             if damping > LARGEST_DAMPING:
-                return fit(Status.STALLED)
-        if (taken and not secant) or (updates and not gain > POOR) or updates == len(u):
-            J, made_at, updates = jacobian(u * scale, r) * scale, u, 0
+                return fit(Status.STALLED, "no damped step lowers the residual")
+        J.renew_or_keep(u, r, taken, gain)
+    return fit(reached)
+
+
+class _Jacobian:
+    """A Jacobian that is made at some points and follows by Broyden's updates from there.
+
+    Attributes:
+        matrix: (n, m), in units of the scale.
+        updates: steps that it has followed since it was made.
+    """
+
+    matrix: FloatArray
+    updates: int
+
+    def __init__(
+        self, make: Callable[[FloatArray, FloatArray], FloatArray], secant: bool, u: FloatArray, r: FloatArray
+    ) -> None:
+        self._make, self._secant = make, secant
+        self.renew(u, r)
+
+    def renew(self, u: FloatArray, r: FloatArray) -> None:
+        """Make it at a point."""
+        self.matrix, self._made_at, self.updates = self._make(u, r), u, 0
+
+    def is_outdated(self, u: FloatArray) -> bool:
+        """Whether it has been updated only, and over too long a way to tell a minimum."""
+        return self.updates > 0 and bool(np.abs(u - self._made_at).max() > TRUSTED)
+
+    def follow(self, step: FloatArray, change: FloatArray) -> None:
+        """Agree with how the residuals have changed along a step that is taken.
+
+        Not along one that failed: it may have met a cliff, whose slope is nobody else's.
+        """
+        if self._secant:
+            self.matrix += np.outer(change - self.matrix @ step, step / (step @ step))
+
+    def renew_or_keep(self, u: FloatArray, r: FloatArray, taken: bool, gain: float) -> None:
+        """Make it anew after a step that has gained a share of what it promised, if it is time."""
+        disappointing = self.updates > 0 and not gain > POOR
+        if (taken and not self._secant) or disappointing or self.updates == len(u):
+            self.renew(u, r)
         else:
-            updates += taken
-    return fit(Status.ITERATION_LIMIT)
+            self.updates += taken
 
 
 def shrinkable(cost: float, large: float) -> float:

@@ -1,4 +1,4 @@
-"""How an iteration ended: a value, not an exception."""
+"""The ways in which an iteration ends, see outcome.Outcome: values, not exceptions."""
 
 from enum import StrEnum
 

@@ -9,14 +9,18 @@ from typing import Protocol
 import numpy as np
 
 from shapespace.arrays import FloatArray
+from shapespace.solve.line_search import backtrack, sufficient_decrease
+from shapespace.solve.outcome import Outcome
+from shapespace.solve.preconditioner import step_length
+from shapespace.solve.status import Status
 
 #: Most conjugate gradients in a step, and the part of the forces at which they end: at most, and at least.
 GRADIENTS = 60
 LOOSEST, TIGHTEST = 0.3, 1e-3
 #: Displacement by which the Hessian is felt, as a share of the length that the problem gives.
 PROBE = 1e-6
-#: Armijo's share of the expected descent, what rounding adds to an energy, and the smallest step tried.
-ARMIJO, ROUNDING, SMALLEST_STEP = 1e-4, 1e-15, 1e-6
+#: What rounding adds to an energy, as a share of it, and the smallest step tried.
+ROUNDING, SMALLEST_STEP = 1e-15, 1e-6
 
 
 class Energy(Protocol):
@@ -39,21 +43,15 @@ class Energy(Protocol):
         """Forces to a step: symmetric positive definite, near the inverse of the Hessian at x."""
 
 
-@dataclass(frozen=True)
-class Descent:
-    """Where a descent ended.
+@dataclass(frozen=True, kw_only=True)
+class Descent(Outcome):
+    """Where a descent ended, with the length of the preconditioned forces there, ``sqrt(Fᵀ P F)``, as residual.
 
     Attributes:
         x: the unknowns.
-        residual: length of the preconditioned forces there, ``sqrt(Fᵀ P F)``.
-        iterations: steps taken.
-        converged: whether the residual is below the tolerance.
     """
 
     x: FloatArray
-    residual: float
-    iterations: int
-    converged: bool
 
 
 @np.errstate(divide="ignore", over="ignore", invalid="ignore")
@@ -69,25 +67,39 @@ def descend(energy: Energy, x: FloatArray, tolerance: float, max_iterations: int
         tolerance: of the residual.
         max_iterations: most steps.
     """
-    value, residual = energy.value(x), np.inf
+    value, residual, status = energy.value(x), np.inf, Status.ITERATION_LIMIT
     for iteration in range(max_iterations + 1):
         solve, forces = energy.precondition(x), energy.forces(x)
         first = solve(forces)
-        residual = float(np.sqrt(abs(np.vdot(forces, first))))
-        if not np.isfinite(residual) or residual <= tolerance or iteration == max_iterations:
+        residual = step_length(forces, first)
+        if not np.isfinite(residual):
+            status = Status.STALLED
+            break
+        if residual <= tolerance:
+            status = Status.CONVERGED
+            break
+        if iteration == max_iterations:
             break
         step = _newton_step(energy, x, forces, first, solve, residual)
-        slope, t = float(np.vdot(forces, step)), 1.0
-        while t > SMALLEST_STEP:
-            if energy.admits(x, t * step):
-                trial = energy.value(x + t * step)
-                if trial <= value - ARMIJO * t * slope + ROUNDING * abs(value):
-                    break
-            t /= 2
-        else:
+        found = _line_search(energy, x, value, step, float(np.vdot(forces, step)))
+        if found is None:
+            status = Status.STALLED
             break
-        x, value = x + t * step, trial
-    return Descent(x, residual, iteration, residual <= tolerance)
+        t, value = found
+        x = x + t * step
+    return Descent(x=x, status=status, iterations=iteration, residual=residual)
+
+
+def _line_search(
+    energy: Energy, x: FloatArray, value: float, step: FloatArray, slope: float
+) -> tuple[float, float] | None:
+    """The share of a step that is admitted and lowers the energy enough, and the energy there."""
+    rounding = ROUNDING * abs(value)
+    return backtrack(
+        lambda t: energy.value(x + t * step) if energy.admits(x, t * step) else np.nan,
+        lambda t, trial: sufficient_decrease(value, trial, t, slope, rounding),
+        SMALLEST_STEP,
+    )
 
 
 def _newton_step(

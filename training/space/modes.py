@@ -317,8 +317,8 @@ class _Shrinkage:
         form, G = problem.form, problem.diagonal
         faces = form.faces * (1 + np.eye(3)[:, :, None])
         matrix = NormalMatrix(space.connectivity)
-        self._cholesky = analyse(matrix.pattern, space.backend)
-        self._cholesky.factorise(matrix.entries(problem.point.gradients, QuadraticForm(faces, 2 * form.angles)))
+        entries = matrix.entries(problem.point.gradients, QuadraticForm(faces, 2 * form.angles))
+        self._factor = analyse(matrix.pattern, space.backend).factorise(entries)
         self._J, self._M = problem.J, problem.M
         self._JtG = sparse.csr_array(problem.J.T @ sparse.diags_array(G))
         self._threshold = np.divide(problem.weights, 2 * G, out=np.zeros_like(G), where=G > 0)
@@ -330,7 +330,7 @@ class _Shrinkage:
         z, y, threshold = self._z[j], self._y[j], price * self._threshold
         pull = self._M @ target
         for _ in range(INNER_ITERATIONS):
-            d = self._cholesky.solve(pull + self._JtG @ (z - y))
+            d = self._factor.solve(pull + self._JtG @ (z - y))
             y += OVERRELAXATION * (self._J @ d) + (1 - OVERRELAXATION) * z
             z[:] = np.sign(y) * np.maximum(np.abs(y) - threshold, 0)
             y -= z

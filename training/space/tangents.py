@@ -13,7 +13,7 @@ from shapespace.arrays import FloatArray
 from shapespace.coordinates.nric import WeightedNorm, unwrap
 from shapespace.mesh.rigid_motion import without_rigid_motion
 from shapespace.shell.geodesic import geodesic, halved, towards
-from shapespace.shell.space import Path, ShellSpace
+from shapespace.shell.space import DiscretePath, ShellSpace
 from shapespace.solve.cholesky import NotPositiveDefiniteError
 from shapespace.solve.status import Status
 from shapespace.training.runs.progress import progress
@@ -172,7 +172,7 @@ def _each(function: Callable[..., _Found], space: ShellSpace, mean: FloatArray, 
     return [function(space, mean, *item) for item in items]
 
 
-def _found(path: Path) -> _Found:
+def _found(path: DiscretePath) -> _Found:
     return (path.vertices if path.converged else None), path.status, path.reason
 
 
@@ -185,15 +185,15 @@ def _bisected(space: ShellSpace, mean: FloatArray, shape: FloatArray, steps: int
 
 
 def _towards(space: ShellSpace, mean: FloatArray, shape: FloatArray, path: FloatArray) -> _Found:
-    near = Path(path, Status.CONVERGED, space)
+    near = DiscretePath(vertices=path, space=space, status=Status.CONVERGED)
     return _from(near, space, mean, shape)
 
 
 def _halved(space: ShellSpace, mean: FloatArray, shape: FloatArray, path: FloatArray) -> _Found:
-    return _from(halved(space, Path(path, Status.CONVERGED, space)), space, mean, shape)
+    return _from(halved(space, DiscretePath(vertices=path, space=space, status=Status.CONVERGED)), space, mean, shape)
 
 
-def _from(near: Path, space: ShellSpace, mean: FloatArray, shape: FloatArray) -> _Found:
+def _from(near: DiscretePath, space: ShellSpace, mean: FloatArray, shape: FloatArray) -> _Found:
     """The geodesic that begins as that to a neighbour."""
     try:
         first = towards(space, near, shape)

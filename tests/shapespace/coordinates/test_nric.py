@@ -8,7 +8,7 @@ import trimesh
 
 from shapespace.coordinates.normal_matrix import NormalMatrix
 from shapespace.coordinates.nric import (
-    Frame,
+    HingeGeometry,
     NRICJacobian,
     WeightedNorm,
     dihedral_angles,
@@ -241,7 +241,7 @@ def test_second_derivatives_have_the_slope_of_a_derivative(mesh, pose, rng, slop
     jacobian, matrix = NRICJacobian(mesh.connectivity), NormalMatrix(mesh.connectivity)
     covector = rng.standard_normal(2 * mesh.connectivity.edge_count)
     direction = 0.1 * edge_lengths(pose, mesh.connectivity).mean() * rng.standard_normal(pose.shape)
-    second = Frame(pose, mesh.connectivity).second_derivatives()
+    second = HingeGeometry(pose, mesh.connectivity).second_derivatives()
     curvature = matrix.pattern.matrix(matrix.second_derivative(second, covector))
     change = (curvature @ direction.ravel()).reshape(pose.shape)
 

@@ -6,14 +6,14 @@ import pytest
 from shapespace.mesh.rigid_motion import align, without_rigid_motion
 from shapespace.shell.exponential import exponential
 from shapespace.shell.exponential_derivative import ExponentialDerivative
-from shapespace.shell.space import Path
+from shapespace.shell.space import DiscretePath
 from shapespace.solve.status import Status
 
 STEPS = 5
 
 
 @pytest.fixture
-def path(space, mesh, velocity) -> Path:
+def path(space, mesh, velocity) -> DiscretePath:
     path = exponential(space, mesh.vertices, velocity, STEPS, tolerance=1e-12)
     assert path.converged
     return path
@@ -58,6 +58,13 @@ def test_rigid_motions_have_no_part_in_it(path, mesh, rng):
 
 
 def test_a_path_that_ended_early_has_none(space, mesh):
-    broken = Path(mesh.vertices[None], Status.STALLED, space, "a face collapsed")
+    broken = DiscretePath(
+        vertices=mesh.vertices[None],
+        space=space,
+        status=Status.STALLED,
+        iterations=0,
+        residual=np.inf,
+        reason="a face collapsed",
+    )
     with pytest.raises(ValueError, match="a face collapsed"):
         ExponentialDerivative(broken)

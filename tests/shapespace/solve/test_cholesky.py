@@ -1,6 +1,7 @@
 """Both Cholesky backends beside dense algebra, on the normal matrices they are made for."""
 
 import importlib.util
+import weakref
 
 import numpy as np
 import pytest
@@ -86,19 +87,18 @@ def test_solutions_are_those_of_dense_algebra(backend, pattern, positive, rng):
     for _ in range(5):
         entries, right = positive(), rng.standard_normal(40)
         kept = right.copy()
-        cholesky.factorise(entries)
+        factor = cholesky.factorise(entries)
         expected = np.linalg.solve(pattern.matrix(entries).toarray(), right)
-        np.testing.assert_allclose(cholesky.solve(right), expected, rtol=1e-10, atol=1e-13)
+        np.testing.assert_allclose(factor.solve(right), expected, rtol=1e-10, atol=1e-13)
         assert np.array_equal(right, kept)
 
 
 def test_several_right_hand_sides_at_once(backend, pattern, positive, rng):
-    cholesky = analyse(pattern, backend)
     entries, right = positive(), rng.standard_normal((3, 40))
-    cholesky.factorise(entries)
+    factor = analyse(pattern, backend).factorise(entries)
     dense = pattern.matrix(entries).toarray()
     for rows in (right, np.asfortranarray(right), right[:1], rng.integers(-5, 5, (2, 40))):
-        found = cholesky.solve(rows)
+        found = factor.solve(rows)
         assert found.shape == rows.shape
         np.testing.assert_allclose(found, np.linalg.solve(dense, rows.T).T, rtol=1e-10, atol=1e-13)
 
@@ -112,36 +112,34 @@ def test_backends_agree_on_normal_matrices(name, rng):
     entries[normal.pattern.diagonal] *= 1 + 1e-4
     dense = np.linalg.solve(normal.pattern.matrix(entries).toarray(), right)
     for backend in BACKENDS:
-        cholesky = analyse(normal.pattern, backend)
-        cholesky.factorise(entries)
-        assert np.linalg.norm(cholesky.solve(right) - dense) < 1e-8 * np.linalg.norm(dense)
+        factor = analyse(normal.pattern, backend).factorise(entries)
+        assert np.linalg.norm(factor.solve(right) - dense) < 1e-8 * np.linalg.norm(dense)
 
 
 def test_one_analysis_serves_many_factors_side_by_side(backend, pattern, positive, rng):
     cholesky = analyse(pattern, backend, factors=3)
     matrices = [positive() for _ in range(3)]
+    factors = []
     right = rng.standard_normal(40)
 
     def check():
-        for number, entries in enumerate(matrices):
+        for entries, factor in zip(matrices, factors, strict=True):
             expected = np.linalg.solve(pattern.matrix(entries).toarray(), right)
-            np.testing.assert_allclose(cholesky.solve(right, number), expected, rtol=1e-10, atol=1e-13)
+            np.testing.assert_allclose(factor.solve(right), expected, rtol=1e-10, atol=1e-13)
 
     for number, entries in enumerate(matrices):
         given = entries.copy()
-        cholesky.factorise(given, number)
+        factors.append(cholesky.factorise(given, number))
         given[:] = np.nan  # a factor doesn't depend on what becomes of its matrix
     check()
     matrices[1] = positive()
-    cholesky.factorise(matrices[1], 1)
+    factors[1] = cholesky.factorise(matrices[1], 1)
     check()
 
 
 def test_two_analyses_do_not_meet(backend, pattern, positive, rng):
-    first, second = (analyse(pattern, backend) for _ in range(2))
     a, b, right = positive(), positive(), rng.standard_normal(40)
-    first.factorise(a)
-    second.factorise(b)
+    first, second = (analyse(pattern, backend).factorise(entries) for entries in (a, b))
     expected = np.linalg.solve(pattern.matrix(a).toarray(), right)
     del second
     np.testing.assert_allclose(first.solve(right), expected, rtol=1e-10, atol=1e-13)
@@ -151,9 +149,9 @@ def test_at_the_end_of_python_mkl_is_left_alone(pattern, positive):
     """Its library may be gone before the factors are."""
     cholesky = PardisoCholesky(pattern)
     entries = positive()
-    cholesky.factorise(entries)
+    factor = cholesky.factorise(entries)
     cholesky.__del__(finalizing=lambda: True)
-    np.testing.assert_allclose(pattern.matrix(entries) @ cholesky.solve(np.ones(40)), 1, rtol=1e-10)
+    np.testing.assert_allclose(pattern.matrix(entries) @ factor.solve(np.ones(40)), 1, rtol=1e-10)
 
 
 # ---------------------------------------------------------------- refusals
@@ -164,15 +162,14 @@ def test_at_the_end_of_python_mkl_is_left_alone(pattern, positive):
 def test_what_has_no_factor_is_refused_and_harms_no_other(backend, pattern, positive, rng, place, value):
     cholesky = analyse(pattern, backend, factors=2)
     good, right = positive(), rng.standard_normal(40)
-    cholesky.factorise(good, 1)
+    factor = cholesky.factorise(good, 1)
     bad = positive()
     bad[pattern.diagonal[place]] = value
     with pytest.raises(NotPositiveDefiniteError):
         cholesky.factorise(bad, 0)
-    for number in (1, 0):
-        expected = np.linalg.solve(pattern.matrix(good).toarray(), right)
-        np.testing.assert_allclose(cholesky.solve(right, number), expected, rtol=1e-10, atol=1e-13)
-        cholesky.factorise(good, 0)
+    expected = np.linalg.solve(pattern.matrix(good).toarray(), right)
+    for unharmed in (factor, cholesky.factorise(good, 0)):
+        np.testing.assert_allclose(unharmed.solve(right), expected, rtol=1e-10, atol=1e-13)
 
 
 def test_an_indefinite_matrix_of_positive_diagonal_is_refused(backend):
@@ -188,13 +185,36 @@ def test_a_hidden_entry_that_is_not_finite_is_named(backend, pattern, positive):
         analyse(pattern, backend).factorise(entries)
 
 
-def test_solving_comes_after_factorising(backend, pattern, positive):
-    cholesky = analyse(pattern, backend, factors=2)
-    with pytest.raises(RuntimeError, match="factorise first"):
-        cholesky.solve(np.ones(40))
+def test_a_factor_that_has_been_replaced_is_not_taken_for_the_new_one(backend, pattern, positive):
+    cholesky, entries, right = analyse(pattern, backend), positive(), np.ones(40)
+    old = cholesky.factorise(entries)
+    expected = old.solve(right)
     cholesky.factorise(positive())
-    with pytest.raises(RuntimeError, match="factorise first"):
-        cholesky.solve(np.ones(40), 1)
+    if backend == "banded":  # each has memory of its own
+        assert np.array_equal(old.solve(right), expected)
+    else:
+        with pytest.raises(RuntimeError, match="replaced"):
+            old.solve(right)
+
+
+def test_a_factor_that_failed_leaves_none_behind(pattern, positive):
+    cholesky, entries = PardisoCholesky(pattern), positive()
+    old = cholesky.factorise(entries)
+    entries[pattern.diagonal[3]] = -1
+    with pytest.raises(NotPositiveDefiniteError):
+        cholesky.factorise(entries)
+    with pytest.raises(RuntimeError, match="replaced"):
+        old.solve(np.ones(40))
+
+
+def test_the_memory_of_factors_is_not_held_by_a_cycle(pattern, positive):
+    """MKL's memory is freed with the last factor, not when the garbage collector comes by."""
+    cholesky = PardisoCholesky(pattern)
+    factor, gone = cholesky.factorise(positive()), weakref.ref(cholesky)
+    del cholesky
+    assert gone() is not None
+    del factor
+    assert gone() is None
 
 
 def test_pardiso_is_taken_where_it_is_installed(pattern, monkeypatch):
@@ -258,6 +278,6 @@ def test_the_pattern_stays_where_entries_cancel(backend):
     other = flat.vertices + 0.1 * np.random.default_rng(0).standard_normal((4, 3))
     for shape in (flat.vertices, other, flat.vertices):
         entries = normal.entries(jacobian.gradients(shape), form)
-        cholesky.factorise(entries)
+        factor = cholesky.factorise(entries)
         right = normal.pattern.matrix(entries) @ np.arange(12.0)
-        assert np.abs(normal.pattern.matrix(entries) @ cholesky.solve(right) - right).max() < 1e-6
+        assert np.abs(normal.pattern.matrix(entries) @ factor.solve(right) - right).max() < 1e-6

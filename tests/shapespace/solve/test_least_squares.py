@@ -5,7 +5,7 @@ import pytest
 from scipy import optimize
 
 from shapespace.solve.deadline import Deadline
-from shapespace.solve.least_squares import Fit, least_squares
+from shapespace.solve.least_squares import Box, Fit, Stopping, least_squares
 from shapespace.solve.status import Status
 
 RNG = np.random.default_rng(0)
@@ -30,7 +30,7 @@ PROBLEMS = {
 }
 
 
-def solve(residual, start, lower, upper, calls=None, **options) -> Fit:  # type: ignore[no-untyped-def]
+def solve(residual, start, lower, upper, calls=None, secant=True, **options) -> Fit:  # type: ignore[no-untyped-def]
     def jacobian(x: np.ndarray, _: np.ndarray) -> np.ndarray:
         if calls is not None:
             calls.append(x)
@@ -38,7 +38,8 @@ def solve(residual, start, lower, upper, calls=None, **options) -> Fit:  # type:
 
     start, lower, upper = (np.array(value, dtype=float) for value in (start, lower, upper))
     options = {"tolerance": 1e-6, "gain_tolerance": 0, "max_evaluations": 300} | options
-    return least_squares(residual, jacobian, start, lower, upper, np.ones(len(start)), **options)
+    box = Box(lower, upper, np.ones(len(start)))
+    return least_squares(residual, jacobian, start, box, Stopping(**options), secant=secant)
 
 
 @pytest.mark.parametrize("secant", [True, False])
@@ -49,7 +50,8 @@ def test_it_finds_what_scipy_finds(problem: str, secant: bool) -> None:
     found = solve(residual, start, lower, upper, secant=secant)
     assert found.status is Status.CONVERGED
     np.testing.assert_allclose(found.x, expected.x, atol=2e-4)
-    np.testing.assert_allclose(found.residual, residual(found.x))
+    np.testing.assert_allclose(found.residuals, residual(found.x))
+    assert found.residual**2 == pytest.approx(found.cost)
     assert found.cost == pytest.approx(2 * expected.cost, rel=1e-6, abs=1e-10)
     assert (found.x >= lower).all()
     assert (found.x <= upper).all()
@@ -72,11 +74,8 @@ def test_scale_says_what_counts_as_far() -> None:
         residual,
         lambda x, _: np.stack([(residual(x + d) - residual(x)) / d.sum() for d in np.diag(1e-6 * units)], axis=1),
         np.array([0.2, 1.0, 0.0]) * units,
-        np.full(3, -np.inf),
-        np.full(3, np.inf),
-        units,
-        tolerance=1e-7,
-        gain_tolerance=0,
+        Box(np.full(3, -np.inf), np.full(3, np.inf), units),
+        Stopping(tolerance=1e-7, gain_tolerance=0),
     )
     expected = optimize.least_squares(decay, [0.2, 1.0, 0.0]).x
     np.testing.assert_allclose(found.x / units, expected, atol=1e-4)
@@ -86,7 +85,7 @@ def test_a_start_outside_is_moved_to_the_side_of_the_box() -> None:
     found = solve(rosenbrock, [9, 9], [-2, -2], [2, 2], max_evaluations=1)
     np.testing.assert_array_equal(found.x, [2, 2])
     assert found.status is Status.ITERATION_LIMIT
-    assert found.evaluations == 1
+    assert found.iterations == 1
 
 
 def test_failures_are_values() -> None:
@@ -113,9 +112,7 @@ def test_a_cliff_on_the_way_is_no_minimum(height: float, secant: bool) -> None:
         lambda x: np.where(x > 0.5, height, 3 - x),
         lambda x, _: np.array([[-1.0]]),
         np.zeros(1),
-        np.full(1, -np.inf),
-        np.full(1, np.inf),
-        np.ones(1),
+        Box(np.full(1, -np.inf), np.full(1, np.inf), np.ones(1)),
         secant=secant,
     )
     assert stopped.status is not Status.NOT_FINITE

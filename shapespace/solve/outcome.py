@@ -1,0 +1,31 @@
+"""What every iteration returns besides its result."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from shapespace.solve.status import Status
+
+
+@dataclass(frozen=True, kw_only=True)
+class Outcome:
+    """How an iteration ended. Drivers extend it by what they have found, which is finite whatever the status.
+
+    Attributes:
+        status: CONVERGED, or why it ended without.
+        iterations: steps tried.
+        residual: what is left, in the norm that the driver names; infinite where nothing has been computed.
+        reason: in words, why it did not converge; may be empty where the status says all.
+    """
+
+    status: Status
+    iterations: int = 0
+    residual: float = np.inf
+    reason: str = ""
+
+    @property
+    def converged(self) -> bool:
+        """Whether the tolerance is met."""
+        return self.status is Status.CONVERGED

@@ -1,0 +1,130 @@
+"""Shooting: its equations, its ends and what it tells where there is no way on."""
+
+import numpy as np
+import pytest
+
+from shapespace.shell.energy import Material
+from shapespace.shell.exponential import exponential, extrapolate
+from shapespace.shell.geodesic import geodesic
+from shapespace.shell.many_exponentials import exponentials
+from shapespace.shell.space import ShellSpace
+from shapespace.solve.deadline import Deadline
+from shapespace.solve.status import Status
+from tests.shapespace.shell.constrained import constrained_exponential
+from tests.shapespace.shell.measures import distance, true_residuals
+
+K = 4
+
+
+def test_the_exponential_ends_when_its_deadline_passes(space, mesh, velocity):
+    deadline = Deadline(60)
+    assert len(exponential(space, mesh.vertices, velocity, 4, deadline=deadline).vertices) == 5
+    deadline.call_off()
+    path = exponential(space, mesh.vertices, velocity, 4, deadline=deadline)
+    assert path.status is Status.DEADLINE
+    assert len(path.vertices) == 2
+
+
+def test_every_step_of_the_exponential_solves_its_equation(space, mesh, velocity):
+    path = exponential(space, mesh.vertices, velocity, 8)
+    assert path.converged
+    assert len(path.vertices) == 9
+    assert true_residuals(space, path).max() <= 1e-9
+
+
+def test_standing_still_needs_no_iteration(space, mesh):
+    path = exponential(space, mesh.vertices, np.zeros_like(mesh.vertices), K)
+    assert path.iterations == 0
+    np.testing.assert_allclose(path.vertices[-1], mesh.vertices, atol=1e-12 * mesh.diagonal)
+
+
+def test_the_unit_of_length_changes_no_iteration(mesh, velocity):
+    material = Material(eta=1e-3)
+    larger = mesh.with_vertices(10 * mesh.vertices)
+    small = exponential(ShellSpace(mesh, material), mesh.vertices, velocity, K)
+    large = exponential(ShellSpace(larger, material), larger.vertices, 10 * velocity, K)
+    assert small.iterations == large.iterations
+    assert large.residual == pytest.approx(small.residual, rel=0.1, abs=1e-12)
+
+
+def test_a_rigid_part_of_the_velocity_changes_nothing(space, mesh, velocity):
+    turning = np.cross([0.1, 0.4, -0.2], mesh.vertices)
+    plain = exponential(space, mesh.vertices, velocity, K)
+    turned = exponential(space, mesh.vertices, velocity + turning, K)
+    np.testing.assert_allclose(turned.vertices, plain.vertices, atol=1e-9 * mesh.diagonal)
+
+
+def test_a_step_back_and_forth_returns(space, mesh, velocity):
+    first = mesh.vertices
+    second = first + velocity / K
+    back = extrapolate(space, second, first, 2, forward=False)
+    forth = extrapolate(space, back.vertices[-1], back.vertices[-2], 2)
+    assert back.converged
+    assert forth.converged
+    assert distance(space, forth.vertices[-2], first) < 1e-6
+    assert distance(space, forth.vertices[-1], second) < 1e-6
+
+
+def test_shooting_backwards_continues_the_path_before_its_start(space, mesh, velocity):
+    before = exponential(space, mesh.vertices, 0.5 * velocity, -2)
+    after = exponential(space, mesh.vertices, 0.5 * velocity, 2)
+    whole = extrapolate(space, before.vertices[-1], before.vertices[-2], 3)
+    assert distance(space, whole.vertices[-1], after.vertices[-1]) < 1e-6
+
+
+@pytest.mark.parametrize("mesh", ["closed", "sheet"], indirect=True)  # simply connected
+def test_nodal_and_constrained_form_are_the_same(space, mesh, velocity):
+    path = exponential(space, mesh.vertices, velocity, K, tolerance=1e-11)
+    z = constrained_exponential(space, path.nric[0], path.nric[1], K)
+    np.testing.assert_allclose(z, path.nric, atol=1e-8)
+
+
+def test_backends_agree(mesh, velocity):
+    paths = []
+    for backend in ("banded", "auto"):
+        space = ShellSpace(mesh, Material(eta=1e-3), backend)
+        paths.append(exponential(space, mesh.vertices, velocity, K))
+        paths.append(geodesic(space, mesh.vertices, paths[-1].vertices[-1], K))
+    for path in paths[1:]:
+        assert distance(space, path.vertices[-1], paths[0].vertices[-1]) < 1e-6
+
+
+@pytest.mark.parametrize("mesh", ["sheet"], indirect=True)
+@pytest.mark.parametrize("pose", [1.3], indirect=True)
+def test_many_exponentials_do_not_depend_on_how_many_work(mesh, space, velocity):
+    velocities = np.stack([velocity, 0.2 * velocity, np.full_like(velocity, np.nan), -0.3 * velocity])
+    here = list(exponentials(space, mesh.vertices, velocities, K, workers=1))
+    there = list(exponentials(space, mesh.vertices, velocities, K, workers=2, chunk=1))
+    assert [p.status for p in here] == [p.status for p in there]
+    assert here[2].status is Status.NOT_FINITE
+    for a, b in zip(here, there, strict=True):
+        np.testing.assert_array_equal(a.vertices, b.vertices)
+    alone = exponential(space, mesh.vertices, velocities[3], K)
+    np.testing.assert_array_equal(alone.vertices, here[3].vertices)
+
+
+def test_a_velocity_that_tears_the_mesh_is_told(space, mesh, rng):
+    path = exponential(space, mesh.vertices, 20 * mesh.diagonal * rng.standard_normal(mesh.vertices.shape), K)
+    assert not path.converged
+    assert path.reason
+    assert np.isfinite(path.vertices).all()
+
+
+@pytest.mark.parametrize("pose", [1.3], indirect=True)
+def test_a_long_way_ends_in_a_finite_path_whatever_happens(mesh, velocity):
+    """Bending so stiff that faces collapse before the end: the shapes until then are there, and a reason."""
+    space = ShellSpace(mesh, Material(eta=1.0))
+    path = exponential(space, mesh.vertices, 5 * velocity, K)
+    assert np.isfinite(path.vertices).all()
+    assert path.converged == (len(path.vertices) == K + 1)
+    assert path.converged or path.reason
+
+
+def test_exact_newton_takes_over_where_the_chord_fails(space, mesh, velocity, monkeypatch):
+    easy = exponential(space, mesh.vertices, velocity, K)
+    monkeypatch.setattr("shapespace.shell.exponential.SLOW", 1e-9)
+    hard = exponential(space, mesh.vertices, velocity, K)
+    back = exponential(space, mesh.vertices, velocity, -2)
+    assert hard.converged
+    assert back.converged
+    assert distance(space, hard.vertices[-1], easy.vertices[-1]) < 1e-6

@@ -1,0 +1,55 @@
+"""Means: forces that balance, and shapes that have none."""
+
+import numpy as np
+import pytest
+
+from shapespace.shell.mean import centre_of_mass, elastic_mean
+from shapespace.shell.space import ShellSpace
+from shapespace.solve.status import Status
+from tests.shapespace.conftest import MESHES
+
+
+def test_forces_balance_at_the_elastic_mean(space, mesh, pose):
+    shapes, weights = np.stack([mesh.vertices, pose]), np.array([1.0, 2.0])
+    found = elastic_mean(space, shapes, weights)
+    assert found.status is Status.CONVERGED
+    point = space.point(found.vertices)
+    pulls = [point.pull_back(p) for p in space.energy.rest(space.nric(shapes)).gradient_deformed(point.z)]
+    assert np.abs(weights @ np.reshape(pulls, (2, -1))).max() < 1e-6 * np.abs(pulls).max()
+
+
+@pytest.mark.parametrize(("name", "seed", "size"), [("sheet", 1, 0.25), ("closed", 3, 0.35), ("torus", 2, 0.35)])
+def test_faces_that_differ_much_between_shapes_have_a_mean(name, seed, size):
+    """With the metric alone the steps stall: it knows of one shape, and here each face is another in every shape."""
+    mesh = MESHES[name]()
+    edge = np.linalg.norm(mesh.vertices[mesh.edges[:, 0]] - mesh.vertices[mesh.edges[:, 1]], axis=1).mean()
+    noise = np.random.default_rng(seed).standard_normal((5, *mesh.vertices.shape))
+    shapes, space = mesh.vertices + size * edge * noise, ShellSpace(mesh)
+    assert elastic_mean(space, shapes[:2]).status is Status.CONVERGED
+    found = elastic_mean(space, shapes)
+    assert found.status is Status.CONVERGED
+    point = space.point(found.vertices)
+    pulls = [point.pull_back(p) for p in space.energy.rest(space.nric(shapes)).gradient_deformed(point.z)]
+    assert np.abs(np.sum(pulls, axis=0)).max() < 1e-6 * np.abs(pulls).max()
+
+
+def test_without_a_mean_the_worst_face_is_named(space, mesh, pose):
+    i, j, _ = mesh.faces[7]
+    flat = pose.copy()
+    flat[i] = flat[j]
+    found = elastic_mean(space, np.stack([mesh.vertices, pose, flat]))
+    assert found.status is not Status.CONVERGED
+    assert found.reason
+    assert found.worst is not None
+    shape, face = found.worst
+    assert shape == 2
+    assert {i, j} <= set(mesh.faces[face])
+
+
+@pytest.mark.parametrize("weights", [[0, 0], [1, -1], [1], [np.nan, 1], [np.inf, 1]])
+def test_weights_that_make_no_mean_are_refused(space, mesh, pose, weights):
+    for mean in (elastic_mean, centre_of_mass):
+        with pytest.raises(ValueError, match="weights"):
+            mean(space, [mesh.vertices, pose], weights)
+        with pytest.raises(ValueError, match="no shapes"):
+            mean(space, [])
