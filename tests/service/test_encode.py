@@ -14,7 +14,7 @@ from shapespace.files.formats import MESH_FORMATS, npz
 from shapespace.mesh.triangle_mesh import TriangleMesh
 from shapespace.model.correspondence import InvalidMeshError, Matched, limits, match
 from shapespace.model.shape_model import MeshChoice, ShapeModel
-from shapespace.service.http.messages.uploads import read_mesh_file
+from shapespace.service.use_cases.uploads import read_mesh_file
 from tests.hostile import HOSTILE, MIB
 from tests.service.bundles import SCALE, fine_reference, reference, seal, write_bundle
 
