@@ -29,7 +29,7 @@ class UnknownFrameError(LookupError):
     """A frame that the animation doesn't have."""
 
 
-def create_interpolation(model: ShapeModel, animation: Animation, most_frames: int) -> str:
+def interpolation_id(model: ShapeModel, animation: Animation, most_frames: int) -> str:
     """An id that holds an animation; nothing is stored.
 
     Raises:

@@ -27,11 +27,9 @@ from shapespace.service.http.problems import DOMAIN_ERRORS, domain_problem
 from shapespace.service.http.responses import file_headers, shape_response, written_response
 from shapespace.service.use_cases.animation import Animation
 from shapespace.service.use_cases.sequence import (
-    create_interpolation as create,
-)
-from shapespace.service.use_cases.sequence import (
     find_interpolation,
     frame_code,
+    interpolation_id,
     sequence_file,
     sequence_lines,
 )
@@ -57,7 +55,7 @@ async def create_interpolation(
 ) -> InterpolationAnswer:
     """An address for the animation along a path of codes. Nothing is stored: the id holds it all."""
     body = body.model_copy(update={"mesh": mesh or body.mesh})
-    id = create(model, body, service.settings.max_frames)
+    id = interpolation_id(model, body, service.settings.max_frames)
     path = f"/v1/interpolations/{id}"
     response.headers["Location"] = path
     links = {"self": path} | {name: f"{path}?format={name}" for name in sequence_types()}
