@@ -140,6 +140,7 @@ def test_a_large_file_comes_in_pieces_and_holds_its_memory_until_it_is_read(
         assert workers.places.used == 0
         with file:
             pieces = [bytes(piece) async for piece in file]
+        assert workers.memory.used == 0
         assert len(pieces) > 4
         return whole, b"".join(pieces)
 
@@ -157,6 +158,10 @@ def test_lengths_and_angles_come_with_those_of_each_factor(model: ShapeModel) ->
     assert np.allclose(answer["lengths"][1], SCALE * expected[:half], atol=1e-5)
     assert np.allclose(answer["angles"][1], expected[half:], atol=1e-5)
     assert np.shape(answer["factors"]) == (2, 2, 2 * half)
+    # The combiner adds up how far each factor is from the reference.
+    lengths = np.array(answer["factors"][1])[:, :half]
+    reference = SCALE * nric(model.reference.vertices, model.reference.connectivity)[:half]
+    assert np.allclose(lengths.sum(axis=0) - reference, answer["lengths"][1], atol=1e-5)
 
 
 @pytest.mark.parametrize("outputs", [["nric"], ["vertices"], ["vertices", "nric"]])
