@@ -6,8 +6,9 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Annotated
 
-from fastapi import Depends, HTTPException, Path, Query, Request
+from fastapi import Depends, Path, Query, Request
 from pydantic import WithJsonSchema
+from starlette.exceptions import HTTPException
 
 from shapespace.model.shape_model import MeshChoice, ShapeModel
 from shapespace.service.http.caching import AnswerCache
