@@ -7,8 +7,8 @@ import signal
 import sys
 from contextlib import suppress
 
-from shapespace.service.limits import memory
-from shapespace.service.repository.candidates import Trials, bundle_folders
+from shapespace.service.limits.process_memory import tune_malloc
+from shapespace.service.repository.validation import BundleValidator, bundle_folders
 
 #: Characters that a key should have.
 SHORT_KEY = 16
@@ -16,16 +16,16 @@ SHORT_KEY = 16
 
 def main() -> None:
     """Serve until SIGTERM or SIGINT; running requests are finished."""
-    memory.be_frugal()
-    trials = Trials()
+    tune_malloc()
+    validator = BundleValidator()
     try:
-        trials.prepare()  # another process imports and tries while this one imports
-        _serve(trials)
+        validator.prepare()  # another process imports what validation needs while this one imports
+        _serve(validator)
     finally:
-        trials.close()
+        validator.close()
 
 
-def _serve(trials: Trials) -> None:
+def _serve(validator: BundleValidator) -> None:
     from pydantic import ValidationError
 
     from shapespace.service.settings import BUNDLED, PREFIX, Settings, is_loopback, unknown_variables
@@ -37,7 +37,7 @@ def _serve(trials: Trials) -> None:
             print(f"{PREFIX}{str(fault['loc'][0]).upper()}: {fault['msg']}", file=sys.stderr)
         raise SystemExit(2) from None
     with suppress(OSError):  # the first look will say what is the matter
-        trials.begin(bundle_folders(settings.models_dir)[0])
+        validator.begin(bundle_folders(settings.models_dir)[0])
 
     from shapespace.service import logs
     from shapespace.service.http.app import create_app
@@ -58,7 +58,7 @@ def _serve(trials: Trials) -> None:
         log.warning("there is no key (SHAPESPACE_API_KEY): whoever reaches %s may call", settings.host)
     elif settings.api_key is not None and len(settings.api_key.get_secret_value()) < SHORT_KEY:
         log.warning("SHAPESPACE_API_KEY is short: a good one is what `openssl rand -hex 16` prints")
-    Server(create_app(settings, trials), settings).run()
+    Server(create_app(settings, validator), settings).run()
 
 
 if __name__ == "__main__":

@@ -20,7 +20,7 @@ from typing import Any
 from shapespace.files.formats import read_arrays
 from shapespace.files.limits import Limits
 from shapespace.mesh.triangle_mesh import MeshError
-from shapespace.service.http.messages.uploads import UploadError, read_mesh_file
+from shapespace.service.use_cases.uploads import UploadError, read_mesh_file
 
 #: Seconds of a processor after which a child is ended.
 SECONDS = 30

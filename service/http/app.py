@@ -14,19 +14,28 @@ from threadpoolctl import threadpool_limits
 
 from shapespace import __version__
 from shapespace.service.http import problems
+from shapespace.service.http.caching import AnswerCache
 from shapespace.service.http.connections import Connections
 from shapespace.service.http.dependencies import Service, known_query
 from shapespace.service.http.description import describe
 from shapespace.service.http.middleware import AnswerHead, LimitBody, Observe, PaceAnswers, RequireHost, RequireKey
-from shapespace.service.http.recent import RecentAnswers
-from shapespace.service.http.routes import codes, health, inference, interpolations, models, operation, page, shapes
+from shapespace.service.http.routes import (
+    codes,
+    health,
+    interpolations,
+    models,
+    open_inference,
+    operation,
+    page,
+    shapes,
+)
 from shapespace.service.limits.quota import UPLOADS
 from shapespace.service.limits.sandbox import Sandbox
 from shapespace.service.limits.workers import Workers
 from shapespace.service.operation.metrics import Metrics
 from shapespace.service.operation.reloading import Reloader
-from shapespace.service.repository.candidates import Trials
 from shapespace.service.repository.repository import ModelRepository
+from shapespace.service.repository.validation import BundleValidator
 from shapespace.service.settings import Settings, is_loopback
 
 #: What pages of other origins may send, and see in answers.
@@ -38,12 +47,12 @@ CORS_ANSWER += ["Server-Timing", "Shape-Color", "Shape-Diagnostics", "X-Request-
 LOOPBACK = ("localhost", "127.0.0.1", "[::1]")
 
 
-def create_app(settings: Settings | None = None, trials: Trials | None = None) -> FastAPI:
+def create_app(settings: Settings | None = None, validator: BundleValidator | None = None) -> FastAPI:
     """The service as an ASGI application; bundles are loaded when it starts.
 
     Args:
         settings: by default from the environment.
-        trials: of these bundles, where they have begun already.
+        validator: of these bundles, where it has begun already.
     """
     settings = settings or Settings()
 
@@ -53,13 +62,14 @@ def create_app(settings: Settings | None = None, trials: Trials | None = None) -
         with threadpool_limits(1):
             workers = Workers(settings.workers, settings.queue, settings.deadline)
             connections = Connections(settings.max_connections, settings.deadline, settings.trusted_proxies)
-            repository = ModelRepository(settings.models_dir, settings.workers, trials)
-            metrics = Metrics(repository, workers, connections)
+            repository = ModelRepository(settings.models_dir, settings.workers, validator)
+            metrics = Metrics(repository, workers, connections.quota)
+            connections.refused = metrics.refused
             reloader = Reloader(repository, metrics)
-            recent = RecentAnswers(settings.cache)
+            answers = AnswerCache(settings.cache)
             sandbox = Sandbox(min(settings.workers, UPLOADS))
             sandbox.prepare("read")
-            app.state.service = Service(settings, repository, workers, connections, metrics, reloader, recent, sandbox)
+            app.state.service = Service(settings, repository, workers, connections, metrics, reloader, answers, sandbox)
             # For what reads bodies and folders, beside the threads that compute.
             asyncio.get_running_loop().set_default_executor(ThreadPoolExecutor(2, thread_name_prefix="reading"))
             chores = [asyncio.create_task(connections.sweep())]
@@ -86,7 +96,9 @@ def create_app(settings: Settings | None = None, trials: Trials | None = None) -
         openapi_url=None,
     )
     problems.install(app)
-    routers = [module.router for module in (models, shapes, codes, interpolations, inference, health, operation, page)]
+    routers = [
+        module.router for module in (models, shapes, codes, interpolations, open_inference, health, operation, page)
+    ]
     for router in routers:
         app.include_router(router)
     app.router.routes.append(page.assets())

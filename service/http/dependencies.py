@@ -8,14 +8,16 @@ from typing import Annotated
 
 from fastapi import Depends, Path, Query, Request
 from pydantic import WithJsonSchema
+from starlette.exceptions import HTTPException
 
 from shapespace.model.decoder import MeshChoice
 from shapespace.model.shape_model import ShapeModel
+from shapespace.service.http.caching import AnswerCache
 from shapespace.service.http.connections import Connections
 from shapespace.service.http.problems import ProblemError
-from shapespace.service.http.recent import RecentAnswers
+from shapespace.service.limits.quota import client_name
 from shapespace.service.limits.sandbox import Sandbox
-from shapespace.service.limits.workers import Workers
+from shapespace.service.limits.workers import Caller, DisconnectedError, Workers
 from shapespace.service.operation.metrics import Metrics
 from shapespace.service.operation.reloading import Reloader
 from shapespace.service.repository.repository import ModelRepository
@@ -36,7 +38,7 @@ class Service:
     connections: Connections
     metrics: Metrics
     reloader: Reloader
-    recent: RecentAnswers
+    answers: AnswerCache
     sandbox: Sandbox
     draining: bool = False
 
@@ -48,6 +50,21 @@ async def _service(request: Request) -> Service:
 
 
 ServiceDependency = Annotated[Service, Depends(_service)]
+
+
+async def _caller(request: Request) -> Caller:
+    async def gone() -> Exception:
+        try:
+            while (await request.receive())["type"] != "http.disconnect":
+                pass
+        except HTTPException as error:  # what still comes is too much
+            return error
+        return DisconnectedError("The client closed the connection before its answer was ready.")
+
+    return Caller(client_name(request.client.host) if request.client else "", gone)
+
+
+CallerDependency = Annotated[Caller, Depends(_caller)]
 
 ModelName = Annotated[str, Path(description="Name of a model.", examples=["freaky-torus"])]
 MeshQuery = Annotated[
@@ -80,24 +97,3 @@ async def known_query(request: Request) -> None:
     if unknown:
         choice = f"choose among {', '.join(listed)}" if listed else "this call has none"
         raise ProblemError("invalid-request", f"There is no query parameter {unknown[0]!r} here: {choice}.")
-
-
-def limit_codes(service: Service, count: int, field: str = "latents") -> None:
-    """Refuse requests for no shape or too many; raises ProblemError, too-many-codes or invalid-request."""
-    if count > service.settings.max_codes:
-        raise ProblemError(
-            "too-many-codes",
-            f"{field} asks for {count} codes; the limit is {service.settings.max_codes}. Send several requests.",
-        )
-    if count == 0:
-        raise ProblemError("invalid-request", f"{field} asks for no code. Send at least one code.")
-
-
-def limit_frames(service: Service, frames: int) -> None:
-    """Refuse too long animations; raises ProblemError, too-many-frames."""
-    if frames > service.settings.max_frames:
-        raise ProblemError(
-            "too-many-frames",
-            f"frames is {frames}; the limit is {service.settings.max_frames}. Ask for fewer, or for "
-            "parts of the path by start and stop.",
-        )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
 from fastapi import APIRouter, FastAPI
@@ -12,10 +12,11 @@ from pydantic import BaseModel
 from pydantic.json_schema import models_json_schema
 
 from shapespace.service.http.messages.bodies import JSONBody
-from shapespace.service.http.messages.inference_messages import InferenceRequest
-from shapespace.service.http.messages.schemas import Problem
+from shapespace.service.http.messages.open_inference import InferenceRequest
+from shapespace.service.http.messages.schemas import MeshAnswer, Problem
 from shapespace.service.http.middleware import OPEN
-from shapespace.service.http.responses import problems
+from shapespace.service.http.problems import KINDS, MEDIA_TYPE
+from shapespace.service.use_cases.shape_formats import SHAPE_FORMATS
 
 DESCRIPTION = """\
 Learned product shape manifolds of triangle meshes. A latent code goes through small networks to edge lengths
@@ -25,7 +26,17 @@ Coordinates are in the units of the training meshes, indices start at 0, every m
 model's reference. Every error is a problem (RFC 9457) whose `detail` says what to do.
 """
 
-
+_HEADERS = {
+    name: {"description": description, "schema": {"type": "string"}}
+    for name, description in {
+        "ETag": "Strong; the same from every replica. Sent back as `If-None-Match` it saves the work.",
+        "Shape-Diagnostics": (
+            "JSON: `status`, `iterations`, `residual`, `flipped_faces`, `integrability`, `plausibility`, "
+            "`inside_bounds`, `model`."
+        ),
+        "Server-Timing": "Milliseconds by stage: `network`, `reconstruct`, `encode`.",
+    }.items()
+}
 #: Bodies that routes read by themselves or only answer with, beside those of JSONBody.
 _MODELS: tuple[type[BaseModel], ...] = (InferenceRequest, Problem)
 _KEYS = {
@@ -72,6 +83,46 @@ def describe(app: FastAPI, routers: Iterable[APIRouter]) -> None:
         (path, method.upper()): [p["name"] for p in call.get("parameters", ()) if p["in"] == "query"]
         for path, calls in generate()["paths"].items()
         for method, call in calls.items()
+    }
+
+
+def binary(media_types: Mapping[str, str], description: str, *, cached: bool = True) -> dict[int | str, dict[str, Any]]:
+    """OpenAPI's description of an answer in one of several binary formats, with an entity tag where ``cached``."""
+    schema = {"schema": {"type": "string", "format": "binary"}}
+    others = {media_type: schema for media_type in media_types.values() if media_type != "application/json"}
+    headers = {name: header for name, header in _HEADERS.items() if cached or name != "ETag"}
+    answers: dict[int | str, dict[str, Any]] = {
+        200: {"description": description, "content": others, "headers": headers}
+    }
+    if cached:
+        answers[304] = {"description": "The client has this answer already, by `If-None-Match`."}
+    return answers
+
+
+def mesh_answers(description: str) -> dict[int | str, dict[str, Any]]:
+    """OpenAPI's description of a mesh in one of its formats."""
+    answers = binary({name: format.media_type for name, format in SHAPE_FORMATS.items()}, description)
+    answers[200]["model"] = MeshAnswer
+    answers[200]["headers"] |= {
+        "Shape-Color": {
+            "description": "JSON, with `color`: `quantity`, `range` of the legend, `map`.",
+            "schema": {"type": "string"},
+        }
+    }
+    return answers
+
+
+def problems(*statuses: int) -> dict[int | str, dict[str, Any]]:
+    """OpenAPI's description of the problems that a call may answer."""
+    reference = {MEDIA_TYPE: {"schema": {"$ref": "#/components/schemas/Problem"}}}
+    return {
+        status: {
+            "description": "; ".join(
+                f"{kind.title} (`{name}`)" for name, kind in KINDS.items() if kind.status == status
+            ),
+            "content": reference,
+        }
+        for status in statuses
     }
 
 

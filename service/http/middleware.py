@@ -67,16 +67,16 @@ class Observe:
         id = given if REQUEST_ID.fullmatch(given) else uuid4().hex
         context = logs.request_id.set(id)
         service, method = scope["app"].state.service, scope.get("asked", scope["method"])
-        status, timing = 499, ""  # nginx's number for a client that went away
+        status = 499  # nginx's number for a client that went away
         answered = False
         began = time.perf_counter()
 
         async def observed(message: Message) -> None:
-            nonlocal status, timing, answered
+            nonlocal status, answered
             if message["type"] == "http.response.start":
                 answered = True
                 headers = MutableHeaders(scope=message)
-                status, timing = message["status"], headers.get("server-timing", "")
+                status = message["status"]
                 headers["X-Request-ID"] = id
                 headers["X-Content-Type-Options"] = "nosniff"
                 if service.draining:  # the next request is for another server
@@ -93,7 +93,7 @@ class Observe:
         finally:
             seconds = time.perf_counter() - began
             route = _template(scope)
-            service.metrics.answered(route, method, status, seconds, timing)
+            service.metrics.answered(route, method, status, seconds)
             # As it came, percent-encoded: a path can't break a line.
             path = scope.get("raw_path", b"")[:LONGEST_PATH].decode("ascii", "replace")
             facts = {"method": method, "path": path, "route": route, "status": status}

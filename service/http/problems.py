@@ -21,8 +21,12 @@ from shapespace.model.latent_space import NotFiniteError, OutOfBoundsError, Wron
 from shapespace.service.limits.workers import BusyError, DeadlineError, DisconnectedError, EndingError
 from shapespace.service.repository.repository import UnknownModelError, UnknownVersionError
 from shapespace.service.use_cases.animation import PathTooLongError, UnknownInterpolationError
+from shapespace.service.use_cases.batch import NoCodesError, TooManyCodesError
+from shapespace.service.use_cases.codes import InvalidTargetError
+from shapespace.service.use_cases.sequence import TooManyFramesError, UnknownFrameError
 from shapespace.service.use_cases.sequence_formats import NoRoomError
 from shapespace.service.use_cases.shape_formats import dump_json
+from shapespace.service.use_cases.uploads import UnknownFormatError, UnreadableFormError, UnusableMeshError
 
 MEDIA_TYPE = "application/problem+json"
 TYPE_PREFIX = "urn:shapespace:problem:"
@@ -71,15 +75,23 @@ KINDS = {
     "no-room": Kind(507, "No room for a temporary file"),
 }
 
-#: What the domain raises, by kind; the message becomes the detail.
+#: What the model and the use cases raise, and its kind of problem; the message becomes the detail.
 _OF_EXCEPTION: dict[type[Exception], str] = {
     UnknownModelError: "unknown-model",
     UnknownVersionError: "unknown-version",
     UnknownInterpolationError: "unknown-interpolation",
+    UnknownFrameError: "unknown-frame",
     WrongLengthError: "wrong-length",
     NotFiniteError: "not-finite",
     OutOfBoundsError: "out-of-bounds",
+    NoCodesError: "invalid-request",
+    TooManyCodesError: "too-many-codes",
+    TooManyFramesError: "too-many-frames",
     PathTooLongError: "path-too-long",
+    InvalidTargetError: "invalid-request",
+    UnreadableFormError: "malformed-request",
+    UnknownFormatError: "unsupported-media-type",
+    UnusableMeshError: "invalid-mesh",
     InvalidMeshError: "invalid-mesh",
     NoTangentSpaceError: "no-tangent-space",
     BusyError: "busy",

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import ctypes
 import logging
 import os
 import signal
@@ -11,6 +10,7 @@ import socket
 import struct
 import sys
 import threading
+from array import array
 from types import FrameType
 from typing import Any
 
@@ -58,6 +58,7 @@ class Server(uvicorn.Server):
         )
         self._app, self._settings = app, settings
         self._reloads: set[asyncio.Task[None]] = set()
+        self._signals: list[int] = []
         self._terminal = sys.stdin is not None and sys.stdin.isatty()
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
@@ -88,8 +89,9 @@ class Server(uvicorn.Server):
         if not self.started:
             os._exit(0)  # nothing has begun, and what loads models may take its time
         super().handle_exit(sig, frame)
+        self._signals.append(sig)
         self._app.state.service.draining = True
-        drain = self._settings.drain if sig == signal.SIGTERM and len(self._captured_signals) == 1 else 0.0
+        drain = self._settings.drain if sig == signal.SIGTERM and len(self._signals) == 1 else 0.0
         leave = threading.Timer(drain + GONE, os._exit, [0])
         leave.daemon = True
         leave.start()
@@ -98,7 +100,7 @@ class Server(uvicorn.Server):
         """Drain, then finish what runs."""
         loop = asyncio.get_running_loop()
         # A person doesn't want to wait.
-        drained = loop.time() if signal.SIGINT in self._captured_signals else await self._drain()
+        drained = loop.time() if signal.SIGINT in self._signals else await self._drain()
         loop.call_at(drained + FINISH, self._app.state.service.workers.end)
         await super().shutdown(sockets)
 
@@ -110,28 +112,29 @@ class Server(uvicorn.Server):
         logger.info("no longer ready, and still answering for %g s", self._settings.drain)
         time = asyncio.get_running_loop().time
         end = time() + self._settings.drain
-        while time() < end and len(self._captured_signals) < 2:
+        while time() < end and len(self._signals) < 2:
             await asyncio.sleep(0.05)
         drained = time()
         for server in self.servers:
             for listener in server.sockets:
-                _greet_nobody(listener)
+                _drop_new_connections(listener)
         await asyncio.sleep(0.05)  # whoever was half-way through is accepted
         while self.server_state.connections and time() < drained + LINGER:
             await asyncio.sleep(0.05)
         return drained
 
 
-def _greet_nobody(listener: socket.socket) -> None:
+def _drop_new_connections(listener: socket.socket) -> None:
     """Let no further connection begin, and those that have begun be accepted.
 
     Closing the port resets the connections that the system has made and the program not yet accepted: their clients
-    would lose a request. With SYN segments dropped none are made any more, and a client that tries finds the port
-    closed when it tries again after a second. Systems other than Linux do without.
+    would lose a request, also behind a proxy, which must not send a POST twice. With SYN segments dropped none are
+    made any more, and a client that tries finds the port closed when it tries again after a second. A last ``accept``
+    before ``close`` is no substitute: between the two other threads run. Systems other than Linux do without.
     """
-    instructions = b"".join(struct.pack("HBBI", *instruction) for instruction in _DROP_SYN)
-    buffer = ctypes.create_string_buffer(instructions)
-    program = struct.pack("HP", len(_DROP_SYN), ctypes.addressof(buffer))
+    instructions = array("B", b"".join(struct.pack("HBBI", *instruction) for instruction in _DROP_SYN))
+    address, _ = instructions.buffer_info()
+    program = struct.pack("HP", len(_DROP_SYN), address)
     try:
         listener.setsockopt(socket.SOL_SOCKET, _SO_ATTACH_FILTER, program)
     except OSError as error:

@@ -30,19 +30,19 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from shapespace.service.limits.memory import be_frugal, give_back, mapped, resident
+from shapespace.service.limits.process_memory import mapped_size, resident_size, trim_heap, tune_malloc
 from shapespace.solve.deadline import Deadline
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 #: What children can do, by name: functions ``(body: bytearray, **facts) -> (facts, arrays)``. What they find wrong they
-#: say by FailedError. A module is imported by the children that need it, and by nobody else.
+#: say by FailedError. Names and no imports: only the children that need a module import it, and it is of a layer above.
 TASKS = {
     # A bundle that is to be served, loaded and run once.
-    "try": "shapespace.service.repository.trial:try_bundle",
+    "validate": "shapespace.service.repository.validation_task:validate_bundle",
     # A mesh file that somebody has sent.
-    "read": "shapespace.service.http.messages.uploads:read_in_sandbox",
+    "read": "shapespace.service.use_cases.uploads:read_in_sandbox",
 }
 Facts = dict[str, Any]
 Arrays = dict[str, "NDArray[Any]"]
@@ -406,14 +406,14 @@ def main() -> None:
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)
     threading.Thread(target=_end_with, args=[connection], daemon=True).start()
-    be_frugal()
+    tune_malloc()
     with suppress(OSError):  # where memory runs out, this process goes before the server
         Path("/proc/self/oom_score_adj").write_text("1000")
     for limit in (resource.RLIMIT_CORE, resource.RLIMIT_FSIZE):
         resource.setrlimit(limit, (0, 0))
     with suppress(Exception):  # a call will say what is the matter
         _function(sys.argv[2])
-    _send(connection, {"memory": resident()})
+    _send(connection, {"memory": resident_size()})
     with suppress(EOFError, ConnectionError):
         while True:
             _serve(connection, _receive(connection))
@@ -436,9 +436,9 @@ def _serve(connection: socket.socket, request: Mapping[str, Any]) -> None:
             return task(bodies.pop(), **request["facts"])  # and nobody keeps it longer
 
     reply, arrays = _outcome(run)
-    give_back()
+    trim_heap()
     described = [(name, array.dtype.str, array.shape) for name, array in arrays.items()]
-    _send(connection, reply | {"arrays": described, "memory": resident()})
+    _send(connection, reply | {"arrays": described, "memory": resident_size()})
     for array in arrays.values():
         connection.sendall(array.data.cast("B") if array.size else b"")
 
@@ -488,7 +488,7 @@ def _limited(memory: int, seconds: int) -> Iterator[None]:
     """Bound what is mapped beyond what is so now, and the processor's time, where the system knows such limits."""
     usage = resource.getrusage(resource.RUSAGE_SELF)
     limits = {resource.RLIMIT_CPU: math.ceil(usage.ru_utime + usage.ru_stime) + seconds + 1}
-    if now := mapped():
+    if now := mapped_size():
         limits[resource.RLIMIT_AS] = now + memory
     before = {limit: resource.getrlimit(limit) for limit in limits}
     try:

@@ -13,13 +13,11 @@ from collections import deque
 from collections.abc import AsyncGenerator, AsyncIterator, Awaitable, Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack, asynccontextmanager, contextmanager
+from dataclasses import dataclass
 from functools import partial
 from typing import TypeVar
 
-from starlette.exceptions import HTTPException
-from starlette.requests import Request
-
-from shapespace.service.limits.quota import Quota, QuotaError, client_name
+from shapespace.service.limits.quota import Quota, QuotaError
 from shapespace.solve.deadline import Deadline
 
 logger = logging.getLogger(__name__)
@@ -46,6 +44,19 @@ class DisconnectedError(ConnectionError):
 
 class EndingError(RuntimeError):
     """The server ends before the answer is ready."""
+
+
+@dataclass(frozen=True)
+class Caller:
+    """Who waits for an answer.
+
+    Attributes:
+        client: the address that it counts for, see ``client_name``; empty where it is unknown.
+        gone: waits until nobody waits for the answer any more, and gives the error to end the work with.
+    """
+
+    client: str
+    gone: Callable[[], Awaitable[Exception]]
 
 
 class Call(Deadline):
@@ -118,34 +129,34 @@ class Workers:
         return ThreadPoolExecutor(self.threads, thread_name_prefix="shapespace")
 
     @asynccontextmanager
-    async def admit(self, request: Request) -> AsyncIterator[Call]:
+    async def admit(self, caller: Caller) -> AsyncIterator[Call]:
         """Count a request in for the duration; gives its deadline.
 
         Raises:
             BusyError: too many requests are being worked on or waiting, of all clients or of this one.
         """
-        with self._place(self.places, request), self._call() as call:
-            watching = asyncio.create_task(self._watch(request, call))
+        with self._place(self.places, caller), self._call() as call:
+            watching = asyncio.create_task(self._watch(caller, call))
             try:
                 yield call
             finally:
                 watching.cancel()
 
     @contextmanager
-    def stream(self, request: Request) -> Iterator[None]:
+    def stream(self, caller: Caller) -> Iterator[None]:
         """Count in, for the duration, a request whose answer is read while it is computed; raises BusyError."""
-        with self._place(self.streams, request):
+        with self._place(self.streams, caller):
             yield
 
     @contextmanager
-    def holding(self, request: Request, size: int) -> Iterator[ExitStack]:
+    def holding(self, caller: Caller, size: int) -> Iterator[ExitStack]:
         """Count in so many bytes of an answer, for the block or as long as who takes the stack keeps it.
 
         Raises:
             BusyError: all requests together hold too much, or those of one client.
         """
         with ExitStack() as held:
-            held.enter_context(self._place(self.memory, request, size))
+            held.enter_context(self._place(self.memory, caller, size))
             yield held
 
     async def run(self, function: Callable[[Call], T], call: Call) -> T:
@@ -216,10 +227,9 @@ class Workers:
         self._pool.shutdown(wait=False, cancel_futures=True)
 
     @contextmanager
-    def _place(self, quota: Quota, request: Request, amount: int = 1) -> Iterator[None]:
-        client = client_name(request.client.host) if request.client else ""
+    def _place(self, quota: Quota, caller: Caller, amount: int = 1) -> Iterator[None]:
         try:
-            quota.take(client, amount)
+            quota.take(caller.client, amount)
         except QuotaError:
             whose = "" if quota.used + amount > quota.limit else " for this client"
             raise BusyError(
@@ -228,7 +238,7 @@ class Workers:
         try:
             yield
         finally:
-            quota.give_back(client, amount)
+            quota.give_back(caller.client, amount)
 
     @contextmanager
     def _call(self) -> Iterator[Call]:
@@ -242,14 +252,8 @@ class Workers:
             self._calls.discard(call)
             call.close()
 
-    async def _watch(self, request: Request, call: Call) -> None:
-        try:
-            while (await request.receive())["type"] != "http.disconnect":
-                pass
-        except HTTPException as error:  # what still comes is too much
-            call.give_up(error)
-        else:
-            call.give_up(DisconnectedError("The client closed the connection before its answer was ready."))
+    async def _watch(self, caller: Caller, call: Call) -> None:
+        call.give_up(await caller.gone())
 
     def _abandon(self, work: Future[T]) -> None:
         """Wait for a thread whose result nobody wants; if it goes on, another one takes its place."""

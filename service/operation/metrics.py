@@ -2,29 +2,32 @@
 
 from __future__ import annotations
 
-import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, ProcessCollector
 from prometheus_client.core import GaugeMetricFamily, Metric
 from prometheus_client.registry import Collector
 
 from shapespace import __version__
-from shapespace.service.http.connections import Connections
+from shapespace.service.limits.quota import Quota
 from shapespace.service.limits.workers import Workers
 from shapespace.service.repository.repository import Changes, ModelRepository
 
 #: From a cached answer to the default deadline, in seconds.
 BUCKETS = (0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1, 2.5, 5, 10, 30, 60)
 METHODS = frozenset({"GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS"})
-STAGES = ("network", "reconstruct", "encode")
-_STAGE = re.compile(rf"({'|'.join(STAGES)});dur=([0-9.]+)")
 
 
 class Metrics:
-    """What a server counts and measures, with a registry of its own."""
+    """What a server counts and measures, with a registry of its own.
 
-    def __init__(self, repository: ModelRepository, workers: Workers, connections: Connections) -> None:
+    Args:
+        repository: the models that are served.
+        workers: the threads that compute.
+        connections: how many are open, and may be.
+    """
+
+    def __init__(self, repository: ModelRepository, workers: Workers, connections: Quota) -> None:
         self.registry = registry = CollectorRegistry()
         ProcessCollector(registry=registry)
         registry.register(_Models(repository))
@@ -51,10 +54,9 @@ class Metrics:
             ["result"],
             registry=registry,
         )
-        refusals = Counter(
+        self._refusals = Counter(
             "shapespace_refusals", "Connections that were refused without a whole request.", ["kind"], registry=registry
         )
-        connections.refused = lambda kind: refusals.labels(kind).inc()
         for name, text, value in (
             ("bundles_refused", "Bundles that the latest look refused.", lambda: len(repository.refused)),
             ("admitted", "Requests at work or waiting for a worker.", lambda: workers.places.used),
@@ -62,14 +64,14 @@ class Metrics:
             ("streams", "Answers that are read while they are computed.", lambda: workers.streams.used),
             ("streams_limit", "Such answers that may be; more get 503.", lambda: workers.streams.limit),
             ("lost_threads", "Threads still at work long after their deadline.", lambda: workers.lost),
-            ("connections", "Open connections.", lambda: connections.quota.used),
-            ("connections_limit", "Connections that may be open.", lambda: connections.quota.limit),
+            ("connections", "Open connections.", lambda: connections.used),
+            ("connections_limit", "Connections that may be open.", lambda: connections.limit),
             ("workers", "Shapes computed at once.", lambda: workers.threads),
         ):
             Gauge(f"shapespace_{name}", text, registry=registry).set_function(value)
         Gauge("shapespace_build_info", "Always 1.", ["version"], registry=registry).labels(__version__).set(1)
 
-    def answered(self, route: str, method: str, status: int, seconds: float, server_timing: str) -> None:
+    def answered(self, route: str, method: str, status: int, seconds: float) -> None:
         """Count an answer.
 
         Args:
@@ -77,13 +79,19 @@ class Metrics:
             method: of the request; unknown ones share a label.
             status: of the answer.
             seconds: from the request's head to the answer's end.
-            server_timing: the answer's header.
         """
         method = method if method in METHODS else "other"
         self._requests.labels(route, method, str(status)).inc()
         self._seconds.labels(route, method).observe(seconds)
-        for stage, milliseconds in _STAGE.findall(server_timing):
-            self._stages.labels(stage).observe(float(milliseconds) / 1e3)
+
+    def timed(self, seconds: Mapping[str, float]) -> None:
+        """Count the time of an answer by stage."""
+        for stage, duration in seconds.items():
+            self._stages.labels(stage).observe(duration)
+
+    def refused(self, kind: str) -> None:
+        """Count a connection that was refused without a whole request."""
+        self._refusals.labels(kind).inc()
 
     def reloaded(self, changes: Changes) -> None:
         """Count a look at the models folder."""

@@ -1,1 +1,1 @@
-"""The bundles that are served, how they are tried, and how they change."""
+"""The bundles that are served, how they are validated, and how they change."""

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from shapespace.bundle.reader import BundleError, check_place, manifest_digest, read_bundle, read_files
 from shapespace.model.shape_model import ShapeModel
-from shapespace.service.limits.memory import give_back
+from shapespace.service.limits.process_memory import trim_heap
 from shapespace.service.limits.sandbox import (
     ClosedError,
     DiedError,
@@ -22,7 +22,7 @@ from shapespace.service.limits.sandbox import (
     in_a_line,
 )
 from shapespace.service.logs import printable
-from shapespace.service.repository.candidates import Trials, bundle_folders
+from shapespace.service.repository.validation import BundleValidator, bundle_folders
 
 logger = logging.getLogger(__name__)
 
@@ -66,17 +66,17 @@ class ModelRepository:
     Args:
         folder: holds NAME/VERSION/; hidden entries and plain files beside the names are passed over.
         threads: shapes that a model may work on at once.
-        trials: for the first look, where they have begun already.
+        validator: for the first look, where it has begun already.
 
     Attributes:
         refused: bundles that the latest look refused.
         seen: the folder's signature before that look.
     """
 
-    def __init__(self, folder: Path, threads: int = 1, trials: Trials | None = None) -> None:
+    def __init__(self, folder: Path, threads: int = 1, validator: BundleValidator | None = None) -> None:
         self._folder, self._threads = folder, threads
         self._models: Mapping[str, Mapping[int, ShapeModel]] = {}
-        self._trials, self._closed = trials or Trials(), False
+        self._validator, self._closed = validator or BundleValidator(), False
         self.refused: list[str] = []
         self.seen: Signature = ()
         self.reload()
@@ -88,14 +88,14 @@ class ModelRepository:
         the whole folder is out of reach, what was loaded before stays.
         """
         try:
-            return self._reload(self._trials)
+            return self._reload(self._validator)
         finally:
-            self._trials.close()
-            self._trials = Trials()  # which has no process before there is something to try
+            self._validator.close()
+            self._validator = BundleValidator()  # which has no process before there is something to validate
             if self._closed:
-                self._trials.close()
+                self._validator.close()
 
-    def _reload(self, trials: Trials) -> Changes:
+    def _reload(self, validator: BundleValidator) -> Changes:
         self.seen = self.signature()  # first, so that what changes from now on makes a difference
         try:
             folders, unreadable = bundle_folders(self._folder)
@@ -109,12 +109,12 @@ class ModelRepository:
         def serve(model: ShapeModel) -> None:
             models.setdefault(model.manifest.name, {})[int(model.manifest.version)] = model
 
-        trials.begin(folder for folder in folders if _is_new(folder, before.get((folder.parent.name, folder.name))))
+        validator.begin(folder for folder in folders if _is_new(folder, before.get((folder.parent.name, folder.name))))
         for folder in folders:
             place = printable(f"{folder.parent.name}/{folder.name}")
             model = before.pop((folder.parent.name, folder.name), None)
             try:
-                new = self._take_up(folder, model, trials)
+                new = self._take_up(folder, model, validator)
                 if new is not model:
                     changes.loaded.append(place)
                     logger.info("bundle %s is served", place)
@@ -138,21 +138,21 @@ class ModelRepository:
             logger.info("bundle %s/%s is gone and no longer served", name, version)
         self._models, self.refused = models, changes.refused
         if changes.loaded or changes.removed:
-            give_back()
+            trim_heap()
         return changes
 
     def close(self) -> None:
-        """End trials that still run; what they were for stays as it is."""
+        """End validations that still run; the bundles that they were for stay as they are."""
         self._closed = True
-        self._trials.close()
+        self._validator.close()
 
-    def _take_up(self, folder: Path, model: ShapeModel | None, trials: Trials) -> ShapeModel:
+    def _take_up(self, folder: Path, model: ShapeModel | None, validator: BundleValidator) -> ShapeModel:
         """The model of a bundle: the one there is, or a new one where the bundle has changed."""
         check_place(folder)
         if model is not None and manifest_digest(folder) == model.digest:
             read_files(folder, model.manifest)
             return model
-        return ShapeModel(read_bundle(folder, trials.digest(folder)), self._threads)
+        return ShapeModel(read_bundle(folder, validator.digest(folder)), self._threads)
 
     def signature(self) -> Signature:
         """Something that differs once any bundle does, without reading one."""
@@ -207,7 +207,7 @@ class ModelRepository:
 
 
 def _is_new(folder: Path, model: ShapeModel | None) -> bool:
-    """Whether there is a bundle to try, other than the one that is served."""
+    """Whether there is a bundle to validate, other than the one that is served."""
     try:
         check_place(folder)
         return model is None or manifest_digest(folder) != model.digest

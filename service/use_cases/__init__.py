@@ -1,1 +1,1 @@
-"""What the service does, without HTTP: shapes, sequences, codes."""
+"""What the service does, without HTTP: values in; answer, diagnostics and timings out."""

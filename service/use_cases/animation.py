@@ -16,7 +16,7 @@ from pydantic import ConfigDict, Field, ValidationError, field_validator, model_
 from shapespace.arrays import FloatArray
 from shapespace.model.decoder import MeshChoice
 from shapespace.model.latent_space import LatentSpace
-from shapespace.service.http.messages.schemas import Body, Number, Whole
+from shapespace.service.use_cases.fields import Body, Number, Whole
 from shapespace.service.use_cases.shape_formats import holds_more_values
 
 #: Longest id: behind most proxies a whole URL may take 16 KiB at most.

@@ -75,7 +75,7 @@ def json_pieces(members: Mapping[str, Iterable[Any]]) -> Iterator[bytes]:
     yield b"]}"
 
 
-def exact_lists(exponentials: Sequence[Exact]) -> dict[str, list[Any]]:
+def exponential_lists(exponentials: Sequence[Exact]) -> dict[str, list[Any]]:
     """Exponentials of n codes as lists (n,), for JSON."""
     return {
         "exact": [e.vertices for e in exponentials],
@@ -84,7 +84,7 @@ def exact_lists(exponentials: Sequence[Exact]) -> dict[str, list[Any]]:
     }
 
 
-def exact_arrays(exponentials: Sequence[Exact], vertex_count: int) -> dict[str, NDArray]:
+def exponential_arrays(exponentials: Sequence[Exact], vertex_count: int) -> dict[str, NDArray]:
     """Exponentials of n codes as arrays, for NPZ files; NaN where one failed."""
     missing = np.full((vertex_count, 3), np.nan, np.float32)
     return {

@@ -31,10 +31,10 @@ from shapespace.mesh.triangle_mesh import MeshError
 from shapespace.model.correspondence import InvalidMeshError, Matched, limits, match
 from shapespace.model.latent_space import LatentError
 from shapespace.model.shape_model import ShapeModel
-from shapespace.service.http.messages.uploads import FORMATS, UploadError, read_mesh_file
 from shapespace.service.http.negotiation import choose
 from shapespace.service.http.problems import ProblemError
 from shapespace.service.use_cases.animation import Animation, UnknownInterpolationError
+from shapespace.service.use_cases.uploads import FORMATS, UploadError, read_mesh_file
 from shapespace.training.collection.ingest import IngestError, read_collection
 from tests.hostile import BINARY, MATRIX, document, glb
 from tests.service.bundles import reference, seal, write_bundle

@@ -104,6 +104,6 @@ def lie(body: bytearray) -> Answer:
 
 
 def crash_at_c(body: bytearray, folder: str) -> Answer:
-    from shapespace.service.repository.trial import try_bundle
+    from shapespace.service.repository.validation_task import validate_bundle
 
-    return crash(body) if Path(folder).parent.name == "c" else try_bundle(body, folder)
+    return crash(body) if Path(folder).parent.name == "c" else validate_bundle(body, folder)

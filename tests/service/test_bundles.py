@@ -22,9 +22,9 @@ from shapespace.files.formats import npz
 from shapespace.mesh.prolongation import Prolongation
 from shapespace.model.shape_model import ShapeModel
 from shapespace.service.limits import sandbox
-from shapespace.service.repository import candidates
-from shapespace.service.repository.candidates import Trials
+from shapespace.service.repository import validation
 from shapespace.service.repository.repository import Changes, ModelRepository
+from shapespace.service.repository.validation import BundleValidator
 from tests.faults.serving import peak_memory
 from tests.service import hostile
 from tests.service.bundles import SCALE, fine_arrays, network, networks, reference, rescale, seal, write_bundle
@@ -508,18 +508,18 @@ def messages(caplog: pytest.LogCaptureFixture) -> list[str]:
     return found
 
 
-def test_a_trial_that_never_ends_or_dies_is_no_reason_to_try_no_others(
+def test_a_validation_that_never_ends_or_dies_keeps_no_other_bundle_out(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     hostile.hostile(tmp_path, "a", hostile.doubles)
     write_bundle(tmp_path, "b")
-    monkeypatch.setattr(candidates, "SECONDS", 8)
+    monkeypatch.setattr(validation, "SECONDS", 8)
     repository = ModelRepository(tmp_path)
     assert [model.manifest.name for model in repository] == ["b"]
     assert messages(caplog) == ["bundle a/1 is not served: tried in a process of its own, it took longer than 8 s"]
 
     write_bundle(tmp_path, "c")
-    monkeypatch.setitem(sandbox.TASKS, "try", "tests.service.tasks:crash_at_c")
+    monkeypatch.setitem(sandbox.TASKS, "validate", "tests.service.tasks:crash_at_c")
     assert repository.reload() == Changes(refused=["a/1", "c/1"])
     assert messages(caplog)[-1] == "bundle c/1 is not served: tried in a process of its own, it died of SIGSEGV"
 
@@ -528,8 +528,8 @@ def test_a_trial_that_never_ends_or_dies_is_no_reason_to_try_no_others(
     assert repository.reload() == Changes(loaded=["c/1"])
 
 
-class Swapping(Trials):
-    """Changes each bundle in the moment between its trial and its use."""
+class Swapping(BundleValidator):
+    """Changes each bundle in the moment between its validation and its use."""
 
     def digest(self, folder: Path) -> str:
         digest = super().digest(folder)
@@ -539,7 +539,7 @@ class Swapping(Trials):
 
 def test_only_the_bundle_that_was_tried_is_served(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     write_bundle(tmp_path, "small")
-    repository = ModelRepository(tmp_path, trials=Swapping())
+    repository = ModelRepository(tmp_path, validator=Swapping())
     assert list(repository) == []
     assert messages(caplog) == ["bundle small/1 is not served: it changed while it was tried"]
     assert repository.reload() == Changes(loaded=["small/1"])

@@ -52,8 +52,8 @@ class Load:
 
 
 @pytest.mark.parametrize("drain", [0, 1])
-def test_sigterm_under_load_loses_no_accepted_request(models: Path, start: Start, drain: float) -> None:
-    server = start(models, workers=2, drain=drain)
+def test_sigterm_under_load_loses_no_accepted_request(small_models: Path, start: Start, drain: float) -> None:
+    server = start(small_models, workers=2, drain=drain)
     load = Load(server, 6)
     while load.outcomes["answered"] < 30:
         time.sleep(0.05)
@@ -65,8 +65,8 @@ def test_sigterm_under_load_loses_no_accepted_request(models: Path, start: Start
     assert "Traceback" not in server.log
 
 
-def test_readiness_turns_first_and_everything_is_still_answered(models: Path, start: Start) -> None:
-    server = start(models, drain=3)
+def test_readiness_turns_first_and_everything_is_still_answered(small_models: Path, start: Start) -> None:
+    server = start(small_models, drain=3)
     with httpx.Client(base_url=server.url) as kept:
         assert kept.get("/v2/health/ready").json() == {"ready": True}
         server.process.send_signal(signal.SIGTERM)
@@ -83,8 +83,8 @@ def test_readiness_turns_first_and_everything_is_still_answered(models: Path, st
     assert server.process.wait(60) == 0
 
 
-def test_a_connection_opened_before_the_end_is_answered_after_it(models: Path, start: Start) -> None:
-    server = start(models, drain=0)
+def test_a_connection_opened_before_the_end_is_answered_after_it(small_models: Path, start: Start) -> None:
+    server = start(small_models, drain=0)
     host, port = server.url.removeprefix("http://").split(":")
     with socket.create_connection((host, int(port))) as connection:
         assert httpx.get(f"{server.url}/v2/health/live").status_code == 200  # by now it is accepted
@@ -97,12 +97,12 @@ def test_a_connection_opened_before_the_end_is_answered_after_it(models: Path, s
     assert server.process.wait(60) == 0
 
 
-def test_it_ends_with_its_terminal(models: Path) -> None:
+def test_it_ends_with_its_terminal(small_models: Path) -> None:
     terminal, shell = pty.openpty()
     process = subprocess.Popen(
         [sys.executable, "-m", "shapespace.service"],
         cwd=ROOT,
-        env=os.environ | {"SHAPESPACE_MODELS_DIR": str(models), "SHAPESPACE_PORT": "0"},
+        env=os.environ | {"SHAPESPACE_MODELS_DIR": str(small_models), "SHAPESPACE_PORT": "0"},
         stdin=shell,
         stdout=subprocess.PIPE,
         stderr=subprocess.DEVNULL,
@@ -120,8 +120,8 @@ def test_it_ends_with_its_terminal(models: Path) -> None:
         assert process.wait(60) == 0
 
 
-def test_an_interrupt_ends_it_at_once_and_cleanly(models: Path, start: Start) -> None:
-    server = start(models, drain=60)
+def test_an_interrupt_ends_it_at_once_and_cleanly(small_models: Path, start: Start) -> None:
+    server = start(small_models, drain=60)
     with httpx.Client(base_url=server.url) as client:
         assert client.get("/v2/health/live").status_code == 200
         server.process.send_signal(signal.SIGINT)

@@ -15,7 +15,7 @@ from shapespace.mesh.triangle_mesh import TriangleMesh
 from shapespace.model.correspondence import InvalidMeshError, Matched, limits, match
 from shapespace.model.decoder import MeshChoice
 from shapespace.model.shape_model import ShapeModel
-from shapespace.service.http.messages.uploads import read_mesh_file
+from shapespace.service.use_cases.uploads import read_mesh_file
 from tests.hostile import HOSTILE, MIB
 from tests.service.bundles import SCALE, fine_reference, reference, seal, write_bundle
 

@@ -38,7 +38,7 @@ def test_what_reading_costs(name: str, cost: Costs) -> None:
 def test_the_reader_is_light() -> None:
     """A process that does nothing else has no use for a server, for networks or for sparse matrices."""
     heavy = ("fastapi", "starlette", "pydantic", "onnxruntime", "torch", "trimesh", "scipy")
-    module = "shapespace.service.http.messages.uploads"
+    module = "shapespace.service.use_cases.uploads"
     program = f"import sys, {module}; print([name for name in {heavy} if name in sys.modules])"
     told = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert told.stdout.strip() == "[]"

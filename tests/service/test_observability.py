@@ -16,10 +16,13 @@ MESH = "/v1/models/small/mesh"
 CODE = {"latent": [0.1, 0.7, 0.4]}
 
 
-def test_requests_are_counted_by_route_method_and_status(models: Path, start: Start) -> None:
-    with httpx.Client(base_url=start(models).url, timeout=60) as client:
+def test_requests_are_counted_by_route_method_and_status(small_models: Path, start: Start) -> None:
+    with httpx.Client(base_url=start(small_models).url, timeout=60) as client:
         for _ in range(3):
             client.post(MESH, json=CODE).raise_for_status()
+        target = {"vertex": 0, "position": [0, 0, 0]}
+        edited = client.post("/v1/models/small/edit", json=CODE | {"targets": [target]})
+        assert edited.headers["Server-Timing"].startswith("search;dur=")
         client.post(MESH, json={"latent": [1]})
         client.get("/v1/models/large")
         found = samples(client)
@@ -32,14 +35,16 @@ def test_requests_are_counted_by_route_method_and_status(models: Path, start: St
     for stage in ("network", "reconstruct", "encode"):
         assert value(found, "shapespace_stage_seconds_count", stage=stage) == 3
         assert value(found, "shapespace_stage_seconds_sum", stage=stage) > 0
+    assert value(found, "shapespace_stage_seconds_count", stage="search") == 1
+    assert value(found, "shapespace_stage_seconds_count", stage="read") == 0
     assert value(found, "shapespace_model_info", model="small", version="10", digest=digest) == 1
     assert value(found, "shapespace_admitted") == 0
     assert value(found, "shapespace_admitted_limit") > value(found, "shapespace_workers") > 0
     assert value(found, "process_resident_memory_bytes") > 0
 
 
-def test_no_request_can_lengthen_the_list_of_labels(models: Path, start: Start) -> None:
-    with httpx.Client(base_url=start(models).url, timeout=60) as client:
+def test_no_request_can_lengthen_the_list_of_labels(small_models: Path, start: Start) -> None:
+    with httpx.Client(base_url=start(small_models).url, timeout=60) as client:
 
         def ask(i: int) -> None:
             for path in (f"/x{i}", f"/v1/models/m{i}", f"/page/p{i}", f"/v1/interpolations/i{i}", f"/v2/models/m{i}"):
@@ -68,8 +73,8 @@ def test_a_request_has_an_id_of_its_own_or_a_good_one_that_it_brings(client: htt
         assert len({answer.headers["X-Request-ID"] for answer in answers}) == 3
 
 
-def test_a_log_in_json_has_one_object_a_line(models: Path, start: Start) -> None:
-    server = start(models, log_format="json")
+def test_a_log_in_json_has_one_object_a_line(small_models: Path, start: Start) -> None:
+    server = start(small_models, log_format="json")
     with httpx.Client(base_url=server.url) as client:
         client.post(MESH, json=CODE, headers={"X-Request-ID": "mine"})
         client.get("/v1/models/la%0Arge?version=1")
@@ -85,8 +90,8 @@ def test_a_log_in_json_has_one_object_a_line(models: Path, start: Start) -> None
     assert requests[1]["status"] == 404
 
 
-def test_a_log_for_people_names_the_request_too(models: Path, start: Start) -> None:
-    server = start(models, colour="blue")
+def test_a_log_for_people_names_the_request_too(small_models: Path, start: Start) -> None:
+    server = start(small_models, colour="blue")
     with httpx.Client(base_url=server.url) as client:
         client.get("/v1/models", headers={"X-Request-ID": "mine"})
     lines = server.stop().splitlines()
@@ -94,8 +99,8 @@ def test_a_log_for_people_names_the_request_too(models: Path, start: Start) -> N
     assert any("SHAPESPACE_COLOUR is no setting" in line for line in lines)
 
 
-def test_a_key_opens_all_but_what_is_open(models: Path, start: Start) -> None:
-    with httpx.Client(base_url=start(models, api_key="open sesame").url, timeout=60) as client:
+def test_a_key_opens_all_but_what_is_open(small_models: Path, start: Start) -> None:
+    with httpx.Client(base_url=start(small_models, api_key="open sesame").url, timeout=60) as client:
         for path in ("/v2/health/live", "/v2/health/ready", "/", "/page/page.css", "/openapi.json"):
             assert client.get(path).status_code == 200, path
         keys: list[dict[str, str]] = [
@@ -118,8 +123,8 @@ def test_a_key_opens_all_but_what_is_open(models: Path, start: Start) -> None:
                 assert client.get(path, headers=headers).status_code == 200
 
 
-def test_pages_of_named_origins_may_call(models: Path, start: Start) -> None:
-    server = start(models, cors_origins="https://a.example, https://b.example", api_key="sesame")
+def test_pages_of_named_origins_may_call(small_models: Path, start: Start) -> None:
+    server = start(small_models, cors_origins="https://a.example, https://b.example", api_key="sesame")
     ask = {"Access-Control-Request-Method": "POST", "Access-Control-Request-Headers": "content-type, x-api-key"}
     with httpx.Client(base_url=server.url) as client:
         for origin, allowed in (("https://a.example", True), ("https://b.example", True), ("https://c.example", False)):

@@ -18,9 +18,9 @@ CODE = {"latent": [0.1, 0.7, 0.4]}
 MANY = {"latents": [[0.2, k / 100, 1.0] for k in range(200)]}
 
 
-def test_health_answers_while_every_worker_is_busy(models: Path, start: Start) -> None:
+def test_health_answers_while_every_worker_is_busy(small_models: Path, start: Start) -> None:
     with (
-        httpx.Client(base_url=start(models, workers=1).url, timeout=120) as client,
+        httpx.Client(base_url=start(small_models, workers=1).url, timeout=120) as client,
         ThreadPoolExecutor(1) as pool,
     ):
         solving = pool.submit(client.post, "/v1/models/small/vertices", json=MANY)
@@ -32,9 +32,9 @@ def test_health_answers_while_every_worker_is_busy(models: Path, start: Start) -
     assert while_solving >= 3
 
 
-def test_a_long_request_lets_a_short_one_pass(models: Path, start: Start) -> None:
+def test_a_long_request_lets_a_short_one_pass(small_models: Path, start: Start) -> None:
     with (
-        httpx.Client(base_url=start(models, workers=1).url, timeout=120) as client,
+        httpx.Client(base_url=start(small_models, workers=1).url, timeout=120) as client,
         ThreadPoolExecutor(1) as pool,
     ):
         solving = pool.submit(client.post, "/v1/models/small/vertices", json=MANY)
@@ -45,9 +45,9 @@ def test_a_long_request_lets_a_short_one_pass(models: Path, start: Start) -> Non
     assert finished_before >= 3
 
 
-def test_a_full_queue_is_busy_and_says_when_to_come_back(models: Path, start: Start) -> None:
+def test_a_full_queue_is_busy_and_says_when_to_come_back(small_models: Path, start: Start) -> None:
     with (
-        httpx.Client(base_url=start(models, workers=1, queue=1).url, timeout=120) as client,
+        httpx.Client(base_url=start(small_models, workers=1, queue=1).url, timeout=120) as client,
         ThreadPoolExecutor(8) as pool,
     ):
         answers = list(pool.map(lambda _: client.post("/v1/models/small/vertices", json=MANY), range(8)))
@@ -62,8 +62,8 @@ def test_a_full_queue_is_busy_and_says_when_to_come_back(models: Path, start: St
     assert after.status_code == 200, "a place in the queue is given back"
 
 
-def test_a_mesh_file_has_a_limit_of_its_own(models: Path, start: Start) -> None:
-    with httpx.Client(base_url=start(models, max_body=1000, max_upload=2000).url) as client:
+def test_a_mesh_file_has_a_limit_of_its_own(small_models: Path, start: Start) -> None:
+    with httpx.Client(base_url=start(small_models, max_body=1000, max_upload=2000).url) as client:
         for path, most in (("mesh", 1000), ("encode?format=obj", 2000)):
             for size in (most, most + 1):
                 answer = client.post(
@@ -73,8 +73,8 @@ def test_a_mesh_file_has_a_limit_of_its_own(models: Path, start: Start) -> None:
         assert f"limit of {most} bytes" in answer.json()["detail"]
 
 
-def test_a_passed_deadline_ends_the_work(models: Path, start: Start) -> None:
-    with httpx.Client(base_url=start(models, deadline=1e-6).url, timeout=120) as client:
+def test_a_passed_deadline_ends_the_work(small_models: Path, start: Start) -> None:
+    with httpx.Client(base_url=start(small_models, deadline=1e-6).url, timeout=120) as client:
         for path, body in (("mesh", CODE), ("vertices", MANY), ("nric", {"latents": [CODE["latent"]]})):
             answer = client.post(f"/v1/models/small/{path}", json=body)
             assert answer.status_code == 504
@@ -85,9 +85,9 @@ def test_a_passed_deadline_ends_the_work(models: Path, start: Start) -> None:
             assert client.get(id["links"][name]).status_code == 504, name
 
 
-def test_a_deadline_holds_between_codes_before_any_reconstruction_too(models: Path, start: Start) -> None:
+def test_a_deadline_holds_between_codes_before_any_reconstruction_too(small_models: Path, start: Start) -> None:
     many = [CODE["latent"]] * 5000
-    with httpx.Client(base_url=start(models, deadline=0.1, max_codes=len(many)).url, timeout=120) as client:
+    with httpx.Client(base_url=start(small_models, deadline=0.1, max_codes=len(many)).url, timeout=120) as client:
         tensor = {"name": "latent", "shape": [len(many), 3], "datatype": "FP32", "data": many}
         for path, body in (
             ("/v1/models/small/nric", {"latents": many}),
@@ -96,8 +96,8 @@ def test_a_deadline_holds_between_codes_before_any_reconstruction_too(models: Pa
             assert client.post(path, json=body).status_code == 504
 
 
-def test_sigterm_ends_it_cleanly_after_the_running_request(models: Path, start: Start) -> None:
-    server = start(models, workers=1)
+def test_sigterm_ends_it_cleanly_after_the_running_request(small_models: Path, start: Start) -> None:
+    server = start(small_models, workers=1)
     with httpx.Client(base_url=server.url, timeout=120) as client:
         path = {"keyframes": [[0, 0, 0], [0.2, 3.0, 1.0]], "frames": 100}
         links = client.post("/v1/models/small/interpolations", json=path).json()["links"]
@@ -111,7 +111,7 @@ def test_sigterm_ends_it_cleanly_after_the_running_request(models: Path, start: 
     assert "Traceback" not in server.log
 
 
-def test_a_mistake_of_the_server_shows_no_traceback(models: Path, tmp_path: Path) -> None:
+def test_a_mistake_of_the_server_shows_no_traceback(small_models: Path, tmp_path: Path) -> None:
     # A route that fails is not to be had from outside, so one is added to the real application.
     program = """
 import sys, httpx, asyncio
@@ -139,11 +139,11 @@ asyncio.run(main())
     ("name", "value"),
     [("PORT", "http"), ("CORS_ORIGINS", "a.example"), ("CORS_ORIGINS", "https://a.example/page"), ("DEADLINE", "inf")],
 )
-def test_settings_that_make_no_sense_are_named(models: Path, name: str, value: str) -> None:
+def test_settings_that_make_no_sense_are_named(small_models: Path, name: str, value: str) -> None:
     found = subprocess.run(
         [sys.executable, "-m", "shapespace.service"],
         cwd=ROOT,
-        env={f"SHAPESPACE_{name}": value, "SHAPESPACE_MODELS_DIR": str(models)},
+        env={f"SHAPESPACE_{name}": value, "SHAPESPACE_MODELS_DIR": str(small_models)},
         capture_output=True,
         text=True,
         check=False,

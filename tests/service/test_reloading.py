@@ -17,7 +17,7 @@ import httpx
 import numpy as np
 import pytest
 
-from shapespace.service.http.connections import Connections
+from shapespace.service.limits.quota import Quota
 from shapespace.service.limits.workers import Workers
 from shapespace.service.operation.metrics import Metrics
 from shapespace.service.operation.reloading import Reloader
@@ -132,7 +132,7 @@ def test_a_reload_that_fails_whole_is_counted(tmp_path: Path) -> None:
     # No way is known to bring this about from outside.
     write_bundle(tmp_path, "small")
     repository = ModelRepository(tmp_path)
-    metrics = Metrics(repository, Workers(1, 0, 1), Connections(10, 1))
+    metrics = Metrics(repository, Workers(1, 0, 1), Quota(10))
 
     def broken() -> Changes:
         raise RuntimeError

@@ -13,8 +13,8 @@ from shapespace.mesh.rigid_motion import align
 from shapespace.model.decoder import TOLERANCE, MeshChoice
 from shapespace.model.latent_space import NotFiniteError
 from shapespace.model.shape_model import ShapeModel
-from shapespace.service.http.responses import solve
 from shapespace.service.limits.workers import DeadlineError, Workers
+from shapespace.service.use_cases.batch import solve
 from shapespace.service.use_cases.shape_formats import worst
 from shapespace.solve.deadline import Deadline
 from shapespace.solve.status import Status

@@ -35,9 +35,9 @@ CODE = [0.1, 0.7, 0.4]
 
 
 @pytest.fixture
-def quiet(models: Path, start: Start) -> Server:
+def quiet(small_models: Path, start: Start) -> Server:
     """A server of its own, so that its memory is its own."""
-    server = start(models, workers=2)
+    server = start(small_models, workers=2)
     httpx.post(f"{server.url}{MODEL}/mesh", json={"latent": CODE}, timeout=60).raise_for_status()
     return server
 
@@ -128,15 +128,15 @@ def test_a_request_says_once_whom_it_is_for(quiet: Server, hosts: list[str]) -> 
     assert status == (421 if len(hosts) == 1 else 400), problem
 
 
-def test_hosts_can_be_named(models: Path, start: Start) -> None:
-    server = start(models, hosts="shapes.example, localhost")
+def test_hosts_can_be_named(small_models: Path, start: Start) -> None:
+    server = start(small_models, hosts="shapes.example, localhost")
     for host, status in (("shapes.example", 200), ("Shapes.example:8000", 200), ("a.example", 421)):
         assert httpx.get(f"{server.url}/v1/models", headers={"Host": host}).status_code == status
         assert httpx.get(f"{server.url}/v2/health/live", headers={"Host": host}).status_code == 200
 
 
-def test_with_a_key_any_name_will_do(models: Path, start: Start) -> None:
-    server = start(models, api_key="open sesame")
+def test_with_a_key_any_name_will_do(small_models: Path, start: Start) -> None:
+    server = start(small_models, api_key="open sesame")
     headers = {"Host": "a.example", "X-API-Key": "open sesame"}
     assert httpx.get(f"{server.url}/v1/models", headers=headers).status_code == 200
 
@@ -144,8 +144,8 @@ def test_with_a_key_any_name_will_do(models: Path, start: Start) -> None:
 # Connections
 
 
-def test_connections_are_limited_and_one_address_leaves_some(models: Path, start: Start) -> None:
-    server = start(models, max_connections=8)
+def test_connections_are_limited_and_one_address_leaves_some(small_models: Path, start: Start) -> None:
+    server = start(small_models, max_connections=8)
     with contextlib.ExitStack() as stack:
         taken = [stack.enter_context(connect(server)) for _ in range(6)]
         status, problem = status_and_problem(rest(stack.enter_context(connect(server))))
@@ -160,9 +160,13 @@ def test_connections_are_limited_and_one_address_leaves_some(models: Path, start
         assert value(samples(client), "shapespace_connections_limit") == 8
 
 
-def test_the_end_of_file_handles_is_told_once_a_second(models: Path) -> None:
-    environment = os.environ | {"SHAPESPACE_MODELS_DIR": str(models), "SHAPESPACE_PORT": "0", "SHAPESPACE_WATCH": "0"}
-    log = models.parent / "handles.log"
+def test_the_end_of_file_handles_is_told_once_a_second(small_models: Path) -> None:
+    environment = os.environ | {
+        "SHAPESPACE_MODELS_DIR": str(small_models),
+        "SHAPESPACE_PORT": "0",
+        "SHAPESPACE_WATCH": "0",
+    }
+    log = small_models.parent / "handles.log"
     with (
         log.open("w") as lines,
         subprocess.Popen(
@@ -206,13 +210,14 @@ def answers(address: str) -> bool:
     return False
 
 
-def test_who_sends_no_head_is_let_go(quiet: Server) -> None:
+def test_who_sends_no_head_is_let_go(models: Path, start: Start) -> None:
     """But for those whose last request is still being answered."""
-    card = httpx.get(f"{quiet.url}/v1/models/figure").json()
+    server = start(models, workers=2)
+    card = httpx.get(f"{server.url}/v1/models/figure").json()
     path = {"keyframes": [card["lower"], card["upper"]], "frames": 600}
-    link = httpx.post(f"{quiet.url}/v1/models/figure/interpolations", json=path).json()["links"]["jsonl"]
+    link = httpx.post(f"{server.url}/v1/models/figure/interpolations", json=path).json()["links"]["jsonl"]
     began = time.monotonic()
-    with connect(quiet) as silent, connect(quiet) as slow, connect(quiet) as reading:
+    with connect(server) as silent, connect(server) as slow, connect(server) as reading:
         reading.sendall(b"GET %s HTTP/1.1\r\nHost: localhost\r\n\r\n\r\nGET /" % link.encode())
         slow.sendall(b"GET / HTTP/1.1\r\nHo")
         assert rest(silent) == b""
@@ -225,8 +230,8 @@ def test_who_sends_no_head_is_let_go(quiet: Server) -> None:
         assert reading.recv(MIB), "it goes on"
 
 
-def test_who_sends_no_body_is_let_go_by_the_deadline(models: Path, start: Start) -> None:
-    server = start(models, deadline=2)
+def test_who_sends_no_body_is_let_go_by_the_deadline(small_models: Path, start: Start) -> None:
+    server = start(small_models, deadline=2)
     with connect(server) as slow:
         slow.sendall(b"POST %s/mesh HTTP/1.1\r\nHost: localhost\r\n" % MODEL.encode())
         slow.sendall(b"Content-Type: application/json\r\nContent-Length: 100\r\n\r\n{")
@@ -305,8 +310,8 @@ def test_codes_of_another_length_are_refused_as_bytes(quiet: Server) -> None:
         assert (answer.status_code, answer.json()["type"]) == (422, "urn:shapespace:problem:wrong-length")
 
 
-def test_bodies_are_limited_together(models: Path, start: Start) -> None:
-    server = start(models, max_upload=4 * MIB, max_body=1000)
+def test_bodies_are_limited_together(small_models: Path, start: Start) -> None:
+    server = start(small_models, max_upload=4 * MIB, max_body=1000)
     head = b"POST %s/encode?format=obj HTTP/1.1\r\nHost: localhost\r\nContent-Length: %d\r\n\r\n"
     with contextlib.ExitStack() as stack:
         senders = [stack.enter_context(connect(server)) for _ in range(6)]
@@ -449,18 +454,18 @@ def test_an_accept_of_thousands_of_ranges_is_read_in_part(client: httpx.Client) 
     assert client.get(f"{MODEL}/mesh", headers={"Accept": f"{many},model/obj"}).status_code == 406
 
 
-def test_a_head_is_logged_as_one(models: Path, start: Start) -> None:
-    server = start(models)
+def test_a_head_is_logged_as_one(small_models: Path, start: Start) -> None:
+    server = start(small_models)
     assert httpx.head(f"{server.url}/v1/models").status_code == 200
     assert "HEAD /v1/models 200" in server.stop()
 
 
 @pytest.mark.parametrize("key", ["line\nbreak", "schlüssel", " padded"])
-def test_a_key_that_no_header_can_carry_is_refused_at_the_start(models: Path, key: str) -> None:
+def test_a_key_that_no_header_can_carry_is_refused_at_the_start(small_models: Path, key: str) -> None:
     found = subprocess.run(
         [sys.executable, "-m", "shapespace.service"],
         cwd=ROOT,
-        env=os.environ | {"SHAPESPACE_API_KEY": key, "SHAPESPACE_MODELS_DIR": str(models)},
+        env=os.environ | {"SHAPESPACE_API_KEY": key, "SHAPESPACE_MODELS_DIR": str(small_models)},
         capture_output=True,
         text=True,
         check=False,
@@ -471,13 +476,13 @@ def test_a_key_that_no_header_can_carry_is_refused_at_the_start(models: Path, ke
     assert key not in found.stderr
 
 
-def test_a_server_for_all_says_that_it_has_no_key(models: Path, start: Start) -> None:
-    assert "there is no key" in start(models, host="0.0.0.0").stop()  # noqa: S104 - that is what is tried
-    assert "no key" not in start(models).stop()
+def test_a_server_for_all_says_that_it_has_no_key(small_models: Path, start: Start) -> None:
+    assert "there is no key" in start(small_models, host="0.0.0.0").stop()  # noqa: S104 - that is what is tried
+    assert "no key" not in start(small_models).stop()
 
 
-def test_keys_after_a_wrong_one_wait_their_turn(models: Path, start: Start) -> None:
-    server = start(models, api_key="open sesame")
+def test_keys_after_a_wrong_one_wait_their_turn(small_models: Path, start: Start) -> None:
+    server = start(small_models, api_key="open sesame")
 
     def ask(key: str) -> int:
         return httpx.get(f"{server.url}/v1/models", headers={"X-API-Key": key}, timeout=60).status_code

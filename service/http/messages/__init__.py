@@ -1,1 +1,1 @@
-"""Bodies of requests and answers: schemas, JSON, uploads, tensors."""
+"""Bodies of requests and answers: schemas, JSON, tensors; and what stands in queries."""

@@ -1,9 +1,13 @@
-"""JSON bodies: counted before they are parsed, checked away from the event loop, and refused with a few faults."""
+"""Bodies of requests: JSON, counted before it is parsed, checked away from the event loop, refused with a few faults.
+
+Files are gathered in pieces, for whoever reads them.
+"""
 
 from __future__ import annotations
 
 import asyncio
 import json
+from collections import deque
 from typing import Generic, TypeVar
 
 import orjson
@@ -13,6 +17,7 @@ from pydantic import BaseModel, ValidationError
 
 from shapespace.service.http.negotiation import declared_type
 from shapespace.service.http.problems import ProblemError
+from shapespace.service.limits.process_memory import MMAP_THRESHOLD
 from shapespace.service.use_cases.shape_formats import holds_more_values
 
 M = TypeVar("M", bound=BaseModel)
@@ -22,6 +27,9 @@ MOST_VALUES = 2**18
 SMALL = 2**12
 #: Bytes up to which NaN is understood: the parser that knows it keeps all threads waiting, 40 ms for a MiB of escapes.
 LENIENT = 2**20
+#: Bytes in which a body is gathered, and given on: what is longer than this isn't on the heap, so that a piece that
+#: has been given on takes no memory any more.
+_PIECE = MMAP_THRESHOLD
 
 
 class JSONBody(Generic[M]):
@@ -86,3 +94,13 @@ def parse(text: bytes) -> object:
     except ValueError:
         where, why = 0, "a number of thousands of digits"
     raise RequestValidationError([{"type": "json_invalid", "loc": ("body", where), "ctx": {"error": why}}])
+
+
+async def gather(request: Request) -> deque[bytearray]:
+    """A request's body in pieces, however small those were in which it came."""
+    pieces = deque([bytearray()])
+    async for piece in request.stream():
+        if len(pieces[-1]) > _PIECE:
+            pieces.append(bytearray())
+        pieces[-1] += piece
+    return pieces

@@ -4,20 +4,14 @@ from __future__ import annotations
 
 from typing import Annotated, Any
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Field
 
 from shapespace.files.colouring import Quantity
 from shapespace.model.decoder import MeshChoice
 from shapespace.model.edit import PRIOR
 from shapespace.model.latent_space import Bounds, Distribution
+from shapespace.service.use_cases.fields import Body, Number, Whole
 
-Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
-#: JSON knows one kind of number only, where 3.0 is as whole as 3.
-Whole = Annotated[
-    int,
-    Field(strict=True),
-    BeforeValidator(lambda given: int(given) if isinstance(given, float) and given.is_integer() else given),
-]
 #: Each list fails at its first fault: there may be as many as elements.
 Latent = Annotated[
     list[Number],
@@ -41,23 +35,6 @@ MeshField = Annotated[MeshChoice, Field(description="Which mesh to answer, where
 BoundsField = Annotated[
     Bounds, Field(description="Outside the bounds: extrapolate, clamp to the nearest bound, or reject.")
 ]
-
-
-#: Members that an object of a body may have: each unknown one is a fault.
-_MEMBERS = 32
-
-
-class Body(BaseModel):
-    """A body of a request, or an object in it."""
-
-    model_config = ConfigDict(extra="forbid")
-
-    @model_validator(mode="before")
-    @classmethod
-    def _of_few_members(cls, given: object) -> object:
-        if isinstance(given, dict) and len(given) > _MEMBERS:
-            raise ValueError(f"it has {len(given)} members; /openapi.json lists those there are")
-        return given
 
 
 class MeshRequest(Body):

@@ -5,9 +5,9 @@ from __future__ import annotations
 from fastapi import APIRouter
 
 from shapespace.service.http.dependencies import ServiceDependency
+from shapespace.service.http.description import problems
 from shapespace.service.http.messages.schemas import Health, Readiness
 from shapespace.service.http.problems import ProblemError
-from shapespace.service.http.responses import problems
 
 router = APIRouter(prefix="/v2/health", tags=["health"])
 

@@ -8,8 +8,8 @@ from fastapi import APIRouter
 
 from shapespace.model.shape_model import ShapeModel
 from shapespace.service.http.dependencies import Model, ServiceDependency
+from shapespace.service.http.description import problems
 from shapespace.service.http.messages.schemas import ModelCard, ModelList, ModelSummary
-from shapespace.service.http.responses import problems
 
 router = APIRouter(prefix="/v1/models", tags=["models"])
 

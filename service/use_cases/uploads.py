@@ -45,19 +45,23 @@ _PIECE = 2**20
 
 
 class UploadError(ValueError):
-    """An upload that can't be used.
+    """An upload that can't be used: what is wrong, and what to do."""
 
-    Args:
-        kind: of problem.
-        sentence: what is wrong, and what to do.
-    """
 
-    def __init__(self, kind: str, sentence: str) -> None:
-        super().__init__(kind, sentence)  # both, so that it can be sent to another process
-        self.kind, self.sentence = kind, sentence
+class UnusableMeshError(UploadError):
+    """No file, or one that holds no mesh within the limits."""
 
-    def __str__(self) -> str:
-        return self.sentence
+
+class UnreadableFormError(UploadError):
+    """A form that breaks the rules of its format, or holds more than one file."""
+
+
+class UnknownFormatError(UploadError):
+    """A format that nothing tells, or that nobody knows."""
+
+
+#: The same by name, by which they travel from one process to another.
+UPLOAD_ERRORS = {error.__name__: error for error in (UnusableMeshError, UnreadableFormError, UnknownFormatError)}
 
 
 def read_mesh_file(
@@ -82,14 +86,13 @@ def read_mesh_file(
     if declared == b"multipart/form-data":
         data, name, declared = _Form(body, options.get(b"boundary")).file()
     if not data:
-        raise UploadError("invalid-mesh", "The file is empty. Send a mesh file as the body, or as a file of a form.")
+        raise UnusableMeshError("The file is empty. Send a mesh file as the body, or as a file of a form.")
     found = format or _guess(declared.decode("latin-1"), name, bytes(data[:4]))
     if found not in FORMATS:
         listed = ", ".join(f"{name} ({kind.media_type})" for name, kind in MESH_FORMATS.items())
         told = clipped(declared.decode("latin-1")) or "No content type"
         fault = f"There is no format {clipped(format)!r} here" if format else f"{told} tells no format"
-        raise UploadError(
-            "unsupported-media-type",
+        raise UnknownFormatError(
             f"{fault}. Say by ?format= or Content-Type which: {listed}, json (application/json).",
         )
     try:
@@ -97,7 +100,7 @@ def read_mesh_file(
         return *_checked(vertices, faces), found
     except MeshError as error:
         sentence = f"The mesh can't be used: {str(error).rstrip('.')}. Send one {found} file."
-        raise UploadError("invalid-mesh", sentence) from None
+        raise UnusableMeshError(sentence) from None
 
 
 def _guess(declared: str, name: str, start: bytes) -> str | None:
@@ -113,7 +116,7 @@ def read_in_sandbox(
     try:
         found = read_mesh_file(body, content_type, format, Limits(vertices, faces))
     except UploadError as error:
-        raise FailedError(error.kind, error.sentence) from None
+        raise FailedError(type(error).__name__, str(error)) from None
     return {"format": found[2]}, {"vertices": found[0], "faces": found[1]}
 
 
@@ -160,11 +163,11 @@ class _Form:
         except FormParserError:
             raise self._unreadable("Invalid multipart data.") from None
         if self._found is None:
-            raise UploadError("invalid-mesh", "The form holds no file. Send the mesh file as one of its fields.")
+            raise UnusableMeshError("The form holds no file. Send the mesh file as one of its fields.")
         return self._found
 
-    def _unreadable(self, why: str) -> UploadError:
-        return UploadError("malformed-request", f"The form can't be read: {why} Send one file in it.")
+    def _unreadable(self, why: str) -> UnreadableFormError:
+        return UnreadableFormError(f"The form can't be read: {why} Send one file in it.")
 
     def _on_header_field(self, data: bytes, start: int, stop: int) -> None:
         self._header = bytes(data[start : min(stop, start + _LONGEST_HEADER)]).lower()

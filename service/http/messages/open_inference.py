@@ -23,8 +23,9 @@ from shapespace.model.decoder import MeshChoice
 from shapespace.model.latent_space import Bounds
 from shapespace.model.shape_model import ShapeModel
 from shapespace.service.http.messages import bodies
-from shapespace.service.http.messages.schemas import BoundsField, Number
+from shapespace.service.http.messages.schemas import BoundsField
 from shapespace.service.http.problems import ProblemError
+from shapespace.service.use_cases.fields import Number
 from shapespace.service.use_cases.shape_formats import dump_json
 
 #: How long the JSON part of a body is, where bytes follow it.
@@ -130,7 +131,7 @@ class InferenceRequest(_Message):
         """Names of the outputs to give."""
         return [output.name for output in self.outputs] or list(OUTPUTS)
 
-    def binary(self, name: OutputName) -> bool:
+    def binary(self, name: str) -> bool:
         """Whether an output is to follow the JSON as bytes."""
         asked = [output.parameters.binary_data for output in self.outputs if output.name == name]
         return self.parameters.binary_data_output if not asked or asked[0] is None else asked[0]
@@ -257,9 +258,9 @@ def _invalid(detail: str) -> ProblemError:
 
 
 def answer(
-    request: InferenceRequest, model: ShapeModel, outputs: Mapping[OutputName, NDArray[np.float32]]
-) -> tuple[Iterator[Buffer], int | None]:
-    """The body of an answer in pieces, and how long its JSON part is where bytes follow.
+    request: InferenceRequest, model: ShapeModel, outputs: Mapping[str, NDArray[np.float32]]
+) -> tuple[Iterator[Buffer], Mapping[str, int]]:
+    """The body of an answer in pieces, and HEADER, the length of its JSON part, where bytes follow.
 
     Args:
         request: says how each output is to come.
@@ -269,14 +270,12 @@ def answer(
     text = _text(request, model, outputs)
     tail = [array.astype(_FLOAT, copy=False).data for name, array in outputs.items() if request.binary(name)]
     if not tail:
-        return text, None
+        return text, {}
     whole = b"".join(text)  # whose length comes first
-    return chain([whole], (flat.cast("B") for flat in tail)), len(whole)
+    return chain([whole], (flat.cast("B") for flat in tail)), {HEADER: len(whole)}
 
 
-def _text(
-    request: InferenceRequest, model: ShapeModel, outputs: Mapping[OutputName, NDArray[np.float32]]
-) -> Iterator[bytes]:
+def _text(request: InferenceRequest, model: ShapeModel, outputs: Mapping[str, NDArray[np.float32]]) -> Iterator[bytes]:
     facts = {"model_name": model.manifest.name, "model_version": model.manifest.version}
     yield dump_json(facts)[:-1] + b',"outputs":['
     for k, (name, array) in enumerate(outputs.items()):

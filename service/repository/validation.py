@@ -1,4 +1,4 @@
-"""Bundles that may be served, and their trial in a process of its own before the server reads them itself."""
+"""Bundles of a folder, and their validation in a process of its own before the server reads them itself."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pathlib import Path
 from shapespace.service.limits.sandbox import ClosedError, Sandbox
 from shapespace.solve.deadline import Deadline
 
-#: What the trial of one bundle may take: seconds, and bytes beside so many times those of its files. Each byte of a
+#: What validating one bundle may take: seconds, and bytes beside so many times those of its files. Each byte of a
 #: network is there as it was read, parsed, checked, and three times in ONNX Runtime while it loads. The solver's share
 #: comes on top, once the mesh has been read.
 SECONDS, MEMORY, MEMORY_PER_BYTE = 60.0, 512 * 2**20, 6
@@ -36,38 +36,38 @@ def bundle_folders(folder: Path) -> tuple[list[Path], dict[Path, OSError]]:
     return found, unreadable
 
 
-class Trials:
-    """Trials of bundles, one after the other, ahead of whoever asks for what came of them."""
+class BundleValidator:
+    """Validates bundles one after the other, ahead of whoever asks for the outcome."""
 
     def __init__(self) -> None:
         self._sandbox = Sandbox(1)
-        self._thread = ThreadPoolExecutor(1, thread_name_prefix="trials")
+        self._thread = ThreadPoolExecutor(1, thread_name_prefix="validation")
         self._digests: dict[Path, Future[str]] = {}
         self._lock, self._closed = threading.Lock(), False
 
     def prepare(self) -> None:
-        """Have a process import what trials need; doesn't wait for it."""
-        self._sandbox.prepare("try")
+        """Have a process import what validation needs; doesn't wait for it."""
+        self._sandbox.prepare("validate")
 
     def begin(self, folders: Iterable[Path]) -> None:
-        """Try bundles that haven't been, in this order; doesn't wait for them."""
+        """Validate bundles that haven't been, in this order; doesn't wait for them."""
         for folder in folders:
             with self._lock:
                 if folder not in self._digests and not self._closed:
-                    self._digests[folder] = self._thread.submit(self._try, folder)
+                    self._digests[folder] = self._thread.submit(self._validate, folder)
 
     def digest(self, folder: Path) -> str:
-        """The digest of a bundle that has been tried, and found good.
+        """The digest of a bundle that has passed.
 
         Raises:
             SandboxError: what is wrong with it.
-            ClosedError: it has not been tried.
+            ClosedError: it has not been validated.
         """
         self.begin([folder])
         try:
             return self._digests[folder].result()
         except (KeyError, CancelledError):
-            raise ClosedError("there are no more trials") from None
+            raise ClosedError("nothing is validated any more") from None
 
     def close(self) -> None:
         """End what still runs."""
@@ -76,9 +76,9 @@ class Trials:
         self._sandbox.close()
         self._thread.shutdown(cancel_futures=True)
 
-    def _try(self, folder: Path) -> str:
+    def _validate(self, folder: Path) -> str:
         memory = MEMORY + MEMORY_PER_BYTE * min(_bytes(folder), _MOST)
-        facts, _ = self._sandbox.call("try", {"folder": str(folder)}, deadline=Deadline(SECONDS), memory=memory)
+        facts, _ = self._sandbox.call("validate", {"folder": str(folder)}, deadline=Deadline(SECONDS), memory=memory)
         return str(facts["digest"])
 
 
@@ -87,4 +87,4 @@ def _bytes(folder: Path) -> int:
         with os.scandir(folder) as entries:
             return sum(entry.stat(follow_symlinks=False).st_size for entry in entries)
     except OSError:
-        return 0  # the trial will say
+        return 0  # validation will say

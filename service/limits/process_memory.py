@@ -13,7 +13,7 @@ MMAP_THRESHOLD = 4 * 2**20
 _TRIM_THRESHOLD, _MMAP_THRESHOLD, _ARENA_MAX = -1, -3, -8  # malloc.h
 
 
-def be_frugal() -> None:
+def tune_malloc() -> None:
     """One heap for all threads, given back at its end; to be called before there are threads.
 
     By default each thread has a heap of its own that keeps the largest shape it has worked on: 40 MB more with two
@@ -24,18 +24,18 @@ def be_frugal() -> None:
             mallopt(ctypes.c_int(parameter), ctypes.c_int(value))
 
 
-def give_back() -> None:
+def trim_heap() -> None:
     """Return to the system what making models has left over."""
     if trim := _glibc("malloc_trim"):
         trim(ctypes.c_size_t(0))
 
 
-def mapped() -> int:
+def mapped_size() -> int:
     """Bytes of addresses that this process has mapped; 0 where the system doesn't tell."""
     return _pages(0)
 
 
-def resident() -> int:
+def resident_size() -> int:
     """Bytes of this process that are in memory; 0 where the system doesn't tell."""
     return _pages(1)
 

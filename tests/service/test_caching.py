@@ -1,4 +1,4 @@
-"""Recent answers: never more bytes than allowed, never another answer than a fresh one."""
+"""Answers kept for who asks again: never more bytes than allowed, never another answer than a fresh one."""
 
 import re
 from pathlib import Path
@@ -6,46 +6,50 @@ from pathlib import Path
 import httpx
 import numpy as np
 
-from shapespace.service.http.recent import Answer, RecentAnswers
+from shapespace.service.http.caching import AnswerCache, CachedAnswer
 from tests.service.bundles import write_bundle
 from tests.service.conftest import Start
 
 CODE = "0.11,0.72,0.43"
 
 
-def answer(size: int) -> Answer:
-    return Answer(bytes(size), {"Shape-Diagnostics": "{}"})
+def answer(size: int) -> CachedAnswer:
+    return CachedAnswer(bytes(size), {"Shape-Diagnostics": "{}"})
 
 
 def test_what_is_kept_never_grows_over_the_limit_and_the_last_is_always_there() -> None:
-    recent, rng = RecentAnswers(100_000), np.random.default_rng(0)
+    cache, rng = AnswerCache(100_000), np.random.default_rng(0)
     for k in range(500):
         tag = str(rng.integers(40))
-        recent.put(tag, answer(int(rng.integers(1, 30_000))))
-        assert recent.size <= 100_000
-        assert recent.get(tag)
-        recent.get(str(k % 40))
-    assert len(recent) > 3
-    assert recent.size == sum(recent._answers[tag].size for tag in recent._answers)
+        cache.keep(tag, answer(int(rng.integers(1, 30_000))))
+        assert sum(kept.size for kept in cache.values()) <= 100_000
+        assert cache.get(tag)
+        cache.get(str(k % 40))
+    assert len(cache) > 3
+    assert cache.currsize == sum(kept.size for kept in cache.values())
 
 
 def test_what_nobody_asked_for_goes_first() -> None:
-    recent = RecentAnswers(3 * answer(1000).size)
+    cache = AnswerCache(3 * answer(1000).size)
     for tag in "abc":
-        recent.put(tag, answer(1000))
-    assert recent.get("a")
-    recent.put("d", answer(1000))
-    assert [tag for tag in "abcd" if recent.get(tag)] == ["a", "c", "d"]
+        cache.keep(tag, answer(1000))
+    assert cache.get("a")
+    cache.keep("d", answer(1000))
+    assert [tag for tag in "abcd" if cache.get(tag)] == ["a", "c", "d"]
 
 
 def test_an_answer_that_is_too_large_is_not_kept_and_drives_out_no_other() -> None:
-    recent = RecentAnswers(10_000)
-    recent.put("small", answer(100))
-    recent.put("large", answer(10_000))
-    assert recent.get("small")
-    assert not recent.get("large")
-    recent.put("small", answer(10_000))  # the same again, grown
-    assert len(recent) == recent.size == 0
+    cache = AnswerCache(10_000)
+    cache.keep("small", answer(100))
+    cache.keep("large", answer(10_000))
+    assert cache.get("small")
+    assert not cache.get("large")
+
+
+def test_a_cache_without_room_keeps_nothing() -> None:
+    cache = AnswerCache(0)
+    cache.keep("small", answer(1))
+    assert not cache
 
 
 def test_a_second_answer_is_the_first_one_without_its_work(tmp_path: Path, start: Start) -> None:

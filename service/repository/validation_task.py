@@ -1,4 +1,4 @@
-"""Trying a bundle before it is served; runs in a sandbox's child."""
+"""Validating a bundle before it is served; runs in a sandbox's child."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ OF_A_VERTEX, MOST_OF_VERTICES = 64 * 2**10, 4 * 2**30
 analyse(SymmetricPattern(1, np.array([0]), np.array([0])))
 
 
-def try_bundle(body: bytearray, folder: str) -> tuple[Facts, Arrays]:
+def validate_bundle(body: bytearray, folder: str) -> tuple[Facts, Arrays]:
     """Load a bundle, and do once what serving does with it.
 
     Args:

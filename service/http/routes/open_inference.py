@@ -3,30 +3,32 @@
 from __future__ import annotations
 
 import asyncio
+from functools import partial
 from typing import Annotated, Any
 
-import numpy as np
 from fastapi import APIRouter, Depends, Path, Request, Response
 
 from shapespace import __version__
 from shapespace.files.formats import OCTET_STREAM
 from shapespace.model.shape_model import ShapeModel
-from shapespace.service.http.dependencies import ModelName, Service, ServiceDependency, limit_codes
-from shapespace.service.http.messages.inference_messages import (
+from shapespace.service.http.dependencies import CallerDependency, ModelName, Service, ServiceDependency
+from shapespace.service.http.description import problems
+from shapespace.service.http.messages.open_inference import (
     HEADER,
     InferenceAnswer,
     InferenceRequest,
     ModelMetadata,
     ModelReadiness,
-    OutputName,
     ServerMetadata,
     answer,
     model_metadata,
     parse,
 )
-from shapespace.service.http.messages.inference_messages import codes as codes_of
-from shapespace.service.http.responses import in_pieces, nric_size_of, predictions, problems, shapes, size_of
-from shapespace.service.use_cases.shape_formats import dump_json, worst
+from shapespace.service.http.messages.open_inference import codes as codes_of
+from shapespace.service.http.responses import diagnostics_header, written_response
+from shapespace.service.limits.workers import Caller
+from shapespace.service.use_cases.batch import require_count
+from shapespace.service.use_cases.shapes import infer
 
 router = APIRouter(prefix="/v2", tags=["inference"])
 
@@ -110,39 +112,36 @@ async def versioned_ready(model: Versioned) -> ModelReadiness:
 
 
 @router.post(f"{_NEWEST}/infer", name="infer", **_INFER)
-async def newest_infer(service: ServiceDependency, request: Request, model: Newest) -> Response:
+async def newest_infer(
+    service: ServiceDependency, request: Request, caller: CallerDependency, model: Newest
+) -> Response:
     """Lengths and angles, and vertices, of codes, by a model's newest version."""
-    return await _infer(service, request, model)
+    return await _infer(service, request, caller, model)
 
 
 @router.post(f"{_VERSIONED}/infer", name="infer_version", **_INFER)
-async def versioned_infer(service: ServiceDependency, request: Request, model: Versioned) -> Response:
+async def versioned_infer(
+    service: ServiceDependency, request: Request, caller: CallerDependency, model: Versioned
+) -> Response:
     """Lengths and angles, and vertices, of codes, by one version of a model."""
-    return await _infer(service, request, model)
+    return await _infer(service, request, caller, model)
 
 
-async def _infer(service: Service, request: Request, model: ShapeModel) -> Response:
+async def _infer(service: Service, request: Request, caller: Caller, model: ShapeModel) -> Response:
     message, tail = await asyncio.to_thread(parse, await request.body(), request.headers.get(HEADER))
-    limit_codes(service, message.inputs[0].shape[0])
-    values = codes_of(message, tail)
-    codes, inside = model.latents.codes(values, message.parameters.bounds)
-    headers: dict[str, str] = {}
-    seconds: dict[str, float] = {}
-    outputs: dict[OutputName, np.ndarray] = {}
-    mesh = message.parameters.mesh
-    size = size_of(model, len(codes), mesh) + nric_size_of(model, len(codes))
-    with service.workers.holding(request, size) as held:
-        async with service.workers.admit(request) as call:
-            for name in message.wanted:
-                if name == "vertices":
-                    found = await shapes(service, model, codes, inside, mesh, call)
-                    outputs[name] = found.vertices
-                    headers["Shape-Diagnostics"] = dump_json(worst(found.diagnostics)).decode()
-                    seconds |= found.seconds
-                else:
-                    outputs[name] = (await predictions(service, model, codes, call)).nric
-            pieces, length = answer(message, model, outputs)
-            if length is not None:
-                headers[HEADER] = str(length)
-            media_type = "application/json" if length is None else OCTET_STREAM
-            return await in_pieces(service, call, pieces, size, held, headers, seconds, media_type)
+    require_count(message.inputs[0].shape[0], service.settings.max_codes)
+    options, write = message.parameters, partial(answer, message, model)
+    written = await infer(
+        service.workers,
+        caller,
+        model,
+        codes_of(message, tail),
+        options.bounds,
+        options.mesh,
+        message.wanted,
+        write,
+    )
+    headers = diagnostics_header(written.diagnostics) if written.diagnostics else {}
+    if HEADER not in written.facts:
+        return written_response(service, written, headers, "application/json")
+    return written_response(service, written, headers | {HEADER: str(written.facts[HEADER])}, OCTET_STREAM)

@@ -1,0 +1,185 @@
+"""Finding latent codes: of mesh files, of vertices pulled elsewhere, at random."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Generic, TypeVar
+
+from shapespace.arrays import FloatArray, IntArray
+from shapespace.files.limits import Limits
+from shapespace.model.correspondence import limits, match
+from shapespace.model.decoder import MeshChoice
+from shapespace.model.edit import Edited, Editor, Target
+from shapespace.model.encode import Encoded
+from shapespace.model.latent_space import Bounds, Codes, Distribution
+from shapespace.model.shape_model import ShapeModel
+from shapespace.service.limits.sandbox import (
+    ClosedError,
+    FailedError,
+    LateError,
+    NoProcessError,
+    OutOfMemoryError,
+    Pieces,
+    Sandbox,
+    SandboxError,
+)
+from shapespace.service.limits.workers import BusyError, Caller, DeadlineError, EndingError, Workers
+from shapespace.service.use_cases.batch import Timings, require_count
+from shapespace.service.use_cases.uploads import UPLOAD_ERRORS, UnusableMeshError
+from shapespace.solve.deadline import Deadline
+from shapespace.solve.status import Status
+
+logger = logging.getLogger(__name__)
+#: Bytes that reading a file may take beside the file.
+MEMORY = 64 * 2**20
+_LEAST = 2**16
+T = TypeVar("T")
+
+
+class InvalidTargetError(ValueError):
+    """A target for a vertex that the mesh doesn't have, or more targets than vertices."""
+
+
+@dataclass(frozen=True)
+class Timed(Generic[T]):
+    """What a search found, and its time by stage."""
+
+    found: T
+    seconds: Timings
+
+
+@dataclass(frozen=True)
+class Upload:
+    """A mesh file that somebody has sent.
+
+    Attributes:
+        pieces: of the file, or of the form that holds it; emptied while it is read.
+        content_type: as it was declared, or nothing.
+        format: as it was asked for, which wins.
+    """
+
+    pieces: Pieces
+    content_type: str
+    format: str | None
+
+
+async def encode(
+    workers: Workers, sandbox: Sandbox, caller: Caller, model: ShapeModel, upload: Upload, bounds: Bounds
+) -> Timed[Encoded]:
+    """The code whose shape comes closest to a mesh in correspondence, in any rigid pose.
+
+    Raises:
+        UploadError, InvalidMeshError: no mesh that can be used.
+        LatentError: numbers that overflow, or a code outside the bounds where that is refused.
+        BusyError, DeadlineError, DisconnectedError, EndingError: no place, or the call ended before.
+    """
+
+    def make(deadline: Deadline) -> Timed[Encoded]:
+        began = time.perf_counter()
+        given = match(model, *read_mesh(sandbox, upload, limits(model), deadline))
+        read = time.perf_counter()
+        found = model.encode(given, bounds, deadline)
+        if found.status is Status.DEADLINE:
+            raise workers.late()
+        return Timed(found, {"read": read - began, "search": time.perf_counter() - read})
+
+    async with workers.admit(caller) as call:
+        return await workers.run(make, call)
+
+
+async def edit(
+    workers: Workers,
+    caller: Caller,
+    model: ShapeModel,
+    latent: Sequence[float],
+    targets: Sequence[Target],
+    prior: float,
+    mesh: MeshChoice,
+) -> Timed[Edited]:
+    """The code inside the bounds whose shape comes closest to having some vertices at some places.
+
+    Args:
+        workers: that compute.
+        caller: who waits.
+        model: whose code it is.
+        latent: (m,) to start from, clamped to the bounds.
+        targets: vertices of the mesh, and where they should be.
+        prior: weight of the change of the code.
+        mesh: that the targets' vertices belong to.
+
+    Raises:
+        InvalidTargetError: no such vertex, or too many targets.
+        LatentError: a start that can't be used.
+        BusyError, DeadlineError, DisconnectedError, EndingError: no place, or the call ended before.
+    """
+    count = len(model.mesh(mesh).vertices)
+    if len(targets) > count:
+        raise InvalidTargetError(f"targets has {len(targets)} entries. Send {count} at most.")
+    for i, target in enumerate(targets):
+        if not 0 <= target.vertex < count:
+            raise InvalidTargetError(
+                f"targets[{i}].vertex is {target.vertex}, but the {mesh} mesh has vertices 0 to {count - 1}."
+            )
+    start, _ = model.latents.code(latent, Bounds.CLAMP)
+
+    def make(deadline: Deadline) -> Timed[Edited]:
+        began = time.perf_counter()
+        found = Editor(model)(start, targets, prior, mesh, deadline)
+        if found.status is Status.DEADLINE:
+            raise workers.late()
+        return Timed(found, {"search": time.perf_counter() - began})
+
+    async with workers.admit(caller) as call:
+        return await workers.run(make, call)
+
+
+def sample(model: ShapeModel, count: int, seed: int, distribution: Distribution, most: int) -> Codes:
+    """Random codes (count, m) inside the bounds, at most so many; raises NoCodesError or TooManyCodesError."""
+    require_count(count, most, "count")
+    return model.latents.sample(count, seed, distribution)
+
+
+def read_mesh(sandbox: Sandbox, upload: Upload, limits: Limits, deadline: Deadline) -> tuple[FloatArray, IntArray]:
+    """Vertices (V, 3) and faces (F, 3) of an uploaded file, read in a process of its own.
+
+    Args:
+        sandbox: whose children know the task ``read``.
+        upload: which is emptied.
+        limits: of the mesh.
+        deadline: after which the child is ended.
+
+    Raises:
+        UploadError: no mesh that can be used.
+        DeadlineError: the file was not read in time.
+        BusyError: no process can be had.
+        EndingError: the server ends.
+    """
+    facts = {"content_type": upload.content_type, "format": upload.format}
+    bounds = {"vertices": limits.vertices, "faces": limits.faces}
+    most = 24 * (limits.vertices + limits.faces) + _LEAST
+    try:
+        _, arrays = sandbox.call("read", facts | bounds, upload.pieces, deadline=deadline, memory=MEMORY, most=most)
+    except FailedError as error:
+        if error.kind in UPLOAD_ERRORS:
+            raise UPLOAD_ERRORS[error.kind](error.sentence) from None
+        logger.error("an uploaded file breaks its reader: %s", error.sentence)
+        raise _unusable("it breaks its reader") from None
+    except LateError:
+        raise DeadlineError("The file was not read in time. Send a smaller one.") from None
+    except NoProcessError as error:
+        logger.error("uploads can't be read: %s", error)
+        raise BusyError("No process can be had to read the file. Try again after Retry-After.") from None
+    except OutOfMemoryError:
+        raise _unusable("reading it takes more memory than a mesh of this model does") from None
+    except ClosedError as error:
+        raise EndingError("The server is about to end. Send the file to another one.") from error
+    except SandboxError as error:
+        raise _unusable(str(error)) from None
+    return arrays["vertices"], arrays["faces"]
+
+
+def _unusable(why: str) -> UnusableMeshError:
+    return UnusableMeshError(f"The mesh can't be used: {why}. Send a plain file of one mesh.")

@@ -1,0 +1,91 @@
+"""Codes to lengths and angles (NRIC) as the networks predict them, before any reconstruction."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shapespace.files.archives import Buffer
+from shapespace.model.latent_space import Bounds, Codes
+from shapespace.model.shape_model import ShapeModel
+from shapespace.service.limits.workers import Call, Caller, Workers
+from shapespace.service.use_cases.batch import Batch, TooManyCodesError, Written, batch
+from shapespace.service.use_cases.shape_formats import float32, json_pieces
+
+#: Bytes of the predictions of one answer: networks with convolutions need room beside their answers.
+MOST_BYTES = 2**25
+
+
+@dataclass(frozen=True)
+class Predictions:
+    """Lengths and angles of several codes, in the units of the training meshes and in radians.
+
+    Attributes:
+        nric: (n, 2E) float32.
+        factors: (n, J, 2E) float32, where they are wanted.
+    """
+
+    nric: NDArray[np.float32]
+    factors: NDArray[np.float32] | None
+
+
+async def nric_file(
+    workers: Workers,
+    caller: Caller,
+    model: ShapeModel,
+    latents: Sequence[Sequence[float]],
+    bounds: Bounds,
+    *,
+    factors: bool,
+) -> Written:
+    """Lengths and angles of codes as JSON, with those of each factor on request.
+
+    Raises:
+        LatentError: a code that can't be used.
+        TooManyCodesError, BusyError: more than one answer, or all together, may hold.
+        DeadlineError, DisconnectedError, EndingError: the call ended before the file was ready.
+    """
+    codes, _ = model.latents.codes(latents, bounds)
+    async with batch(workers, caller, nric_size(model, len(codes), factors=factors)) as work:
+        began = time.perf_counter()
+        found = await predictions(work, model, codes, factors=factors)
+        seconds = {"network": time.perf_counter() - began}
+
+        def encode() -> tuple[Iterator[Buffer], dict[str, Any]]:
+            lengths, angles = np.split(found.nric, 2, axis=1)
+            lists: dict[str, Iterable[Any]] = {"lengths": map(float32, lengths), "angles": map(float32, angles)}
+            if found.factors is not None:
+                lists["factors"] = found.factors
+            return json_pieces(lists), {}
+
+        return await work.write(encode, seconds)
+
+
+def nric_size(model: ShapeModel, count: int, *, factors: bool = False) -> int:
+    """Bytes of predictions for that many codes; raises TooManyCodesError where one answer may not hold them."""
+    size = 8 * model.manifest.edges * (1 + (len(model.manifest.factors) if factors else 0))
+    if count * size > MOST_BYTES:
+        raise TooManyCodesError(f"{count} codes are too many for one answer. Ask for {MOST_BYTES // size} at most.")
+    return count * size
+
+
+async def predictions(work: Batch, model: ShapeModel, codes: Codes, *, factors: bool = False) -> Predictions:
+    """What the networks say to codes (n, m), side by side; raises as ``Batch.map``."""
+    n, wide = len(codes), 2 * model.manifest.edges
+    found = np.empty((n, wide), np.float32)
+    parts = np.empty((n, len(model.manifest.factors), wide), np.float32) if factors else None
+
+    def predict(item: tuple[int, Codes], _: Call) -> None:
+        k, code = item
+        z = model.lengths_and_angles(code)
+        found[k] = np.concatenate([z.lengths, z.angles])
+        if parts is not None:
+            parts[k] = z.factors
+
+    await work.map(predict, enumerate(codes))
+    return Predictions(found, parts)

@@ -1,0 +1,120 @@
+"""Interpolations: an id for an animation, and its frames as one file, as a stream of lines, or one by one."""
+
+from __future__ import annotations
+
+from collections.abc import AsyncGenerator, Iterator
+from contextlib import aclosing
+from functools import partial
+from itertools import count
+from typing import Any
+
+from shapespace.files.archives import Buffer
+from shapespace.model.latent_space import CheckedCode, Codes
+from shapespace.model.shape_model import ShapeModel
+from shapespace.service.limits.workers import Caller, Workers
+from shapespace.service.repository.repository import ModelRepository
+from shapespace.service.use_cases.animation import Animation, UnknownInterpolationError
+from shapespace.service.use_cases.batch import Written, batch, solve
+from shapespace.service.use_cases.sequence_formats import SEQUENCE_FORMATS, Frames, json_line
+from shapespace.service.use_cases.shape_formats import worst
+from shapespace.service.use_cases.shapes import shapes, shapes_size
+from shapespace.solve.deadline import Deadline
+
+
+class TooManyFramesError(ValueError):
+    """An animation of more frames than the server answers."""
+
+
+class UnknownFrameError(LookupError):
+    """A frame that the animation doesn't have."""
+
+
+def interpolation_id(model: ShapeModel, animation: Animation, most_frames: int) -> str:
+    """An id that holds an animation; nothing is stored.
+
+    Raises:
+        TooManyFramesError: more frames than that.
+        LatentError: a keyframe or a frame that is no code of the model.
+        PathTooLongError: keyframes that don't fit into an id.
+    """
+    _require_frames(animation, most_frames)
+    id = animation.to_id(model.digest, model.latents)
+    model.latents.codes(animation.codes(model.latents))  # every frame must be a code
+    return id
+
+
+def find_interpolation(repository: ModelRepository, id: str, most_frames: int) -> tuple[Animation, ShapeModel]:
+    """The animation of an id, and its model.
+
+    Raises:
+        UnknownInterpolationError: a damaged id, or one whose model is not served.
+        TooManyFramesError: more frames than that.
+    """
+    animation, digest = Animation.from_id(id)
+    _require_frames(animation, most_frames)
+    model = repository.by_digest(digest)
+    if model is None:
+        raise UnknownInterpolationError(
+            "The model of this interpolation is not served here any more. POST the keyframes to the "
+            "interpolations of a model that /v1/models lists."
+        )
+    return animation, model
+
+
+def frame_code(model: ShapeModel, animation: Animation, k: int) -> CheckedCode:
+    """The code of one frame; raises UnknownFrameError."""
+    if not 0 <= k < animation.frame_count:
+        raise UnknownFrameError(f"There is no frame {k}. Choose one from 0 to {animation.frame_count - 1}.")
+    return model.latents.code(animation.codes(model.latents, slice(k, k + 1))[0])
+
+
+async def sequence_file(
+    workers: Workers, caller: Caller, model: ShapeModel, animation: Animation, format: str
+) -> Written:
+    """All frames as one file in one of SEQUENCE_FORMATS.
+
+    Raises:
+        TooManyCodesError, BusyError: more than one answer, or all together, may hold.
+        DeadlineError, DisconnectedError, EndingError: the call ended before the file was ready.
+        NoRoomError: no room for a temporary file.
+    """
+    codes, inside = model.latents.codes(animation.codes(model.latents))
+    async with batch(workers, caller, shapes_size(model, len(codes), animation.mesh)) as work:
+        found = await shapes(work, model, codes, inside, animation.mesh)
+        faces = model.mesh(animation.mesh).faces
+        frames = Frames(found.vertices, found.diagnostics, faces, animation.positions, codes)
+
+        def encode() -> tuple[Iterator[Buffer], dict[str, Any]]:
+            return SEQUENCE_FORMATS[format].encode(frames)
+
+        return await work.write(encode, found.seconds, worst(found.diagnostics))
+
+
+async def sequence_lines(
+    workers: Workers, caller: Caller, model: ShapeModel, animation: Animation
+) -> AsyncGenerator[bytes, None]:
+    """All frames as lines of JSON, each as soon as it is ready; raises BusyError and as ``Workers.run``."""
+    codes, inside = model.latents.codes(animation.codes(model.latents))
+    faces = model.mesh(animation.mesh).faces
+
+    def line(frame: tuple[int, float, Codes, bool], deadline: Deadline) -> bytes:
+        k, t, code, inside = frame
+        shape = solve(workers, model, animation.mesh, (code, inside), deadline)
+        return json_line(k, t, shape, None if k else faces)
+
+    frames = zip(count(), animation.positions.tolist(), codes, map(bool, inside))
+    # Each frame has the deadline to itself: a stream may take as long as its reader likes.
+    with workers.stream(caller):
+        # The first alone: beside the second, with which it would share the interpreter, it takes half as long again.
+        yield await workers.piece(partial(line, next(frames)), None)
+        async with aclosing(workers.map(line, frames, None)) as lines:
+            async for ready in lines:
+                yield ready
+
+
+def _require_frames(animation: Animation, most: int) -> None:
+    if animation.frames > most:
+        raise TooManyFramesError(
+            f"frames is {animation.frames}; the limit is {most}. Ask for fewer, or for "
+            "parts of the path by start and stop."
+        )

@@ -1,0 +1,162 @@
+"""Many codes to the positions of their vertices, with the true discrete exponentials on request."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shapespace.files.archives import Buffer, npz_pieces
+from shapespace.files.formats import OCTET_STREAM
+from shapespace.model.decoder import Diagnostics, MeshChoice
+from shapespace.model.exact_shapes import Exact, exact, require_tangent_space
+from shapespace.model.latent_space import Bounds, CheckedCode, Codes
+from shapespace.model.shape_model import ShapeModel
+from shapespace.service.limits.workers import Call, Caller, Workers
+from shapespace.service.use_cases.batch import Batch, Timings, TooManyCodesError, Written, batch, total_seconds
+from shapespace.service.use_cases.nric import nric_size, predictions
+from shapespace.service.use_cases.shape_formats import (
+    diagnostics_arrays,
+    exponential_arrays,
+    exponential_lists,
+    json_pieces,
+    worst,
+)
+
+#: Vertices of all shapes of one answer together: 48 MiB of positions.
+MOST_VERTICES = 2**22
+#: Media types of the formats of many shapes by name; the first is the default.
+VERTICES_TYPES = {"json": "application/json", "npz": OCTET_STREAM}
+
+
+@dataclass(frozen=True)
+class Shapes:
+    """Several shapes.
+
+    Attributes:
+        vertices: (n, V, 3) float32, in the units of the training meshes.
+        diagnostics: how well each was found.
+        seconds: time of all of them by stage.
+    """
+
+    vertices: NDArray[np.float32]
+    diagnostics: list[Diagnostics]
+    seconds: Timings
+
+
+async def vertices_file(
+    workers: Workers,
+    caller: Caller,
+    model: ShapeModel,
+    latents: Sequence[Sequence[float]],
+    bounds: Bounds,
+    mesh: MeshChoice,
+    format: str,
+    *,
+    exponentials: bool = False,
+) -> Written:
+    """Positions and diagnostics of the shapes of codes, in one of VERTICES_TYPES.
+
+    Args:
+        workers: that compute.
+        caller: who waits.
+        model: whose codes they are.
+        latents: n lists of m numbers.
+        bounds: what to do outside the bounds.
+        mesh: fine or coarse.
+        format: name of the format.
+        exponentials: whether to compute the true discrete exponentials as well.
+
+    Raises:
+        NoTangentSpaceError: exponentials of a model that has none.
+        LatentError: a code that can't be used.
+        TooManyCodesError, BusyError: more than one answer, or all together, may hold.
+        DeadlineError, DisconnectedError, EndingError: the call ended before the file was ready.
+    """
+    if exponentials:
+        require_tangent_space(model)
+    codes, inside = model.latents.codes(latents, bounds)
+    async with batch(workers, caller, shapes_size(model, (2 if exponentials else 1) * len(codes), mesh)) as work:
+        found = await shapes(work, model, codes, inside, mesh)
+        true = await _exponentials(work, model, codes, found, mesh) if exponentials else None
+
+        def encode() -> tuple[Iterator[Buffer], dict[str, Any]]:
+            if format == "json":
+                diagnostics = map(asdict, found.diagnostics)
+                lists: dict[str, Iterable[Any]] = {"vertices": found.vertices, "diagnostics": diagnostics}
+                return json_pieces(lists | (exponential_lists(true) if true else {})), {}
+            arrays = diagnostics_arrays(found.diagnostics)
+            arrays |= exponential_arrays(true, found.vertices.shape[1]) if true else {}
+            return npz_pieces(vertices=found.vertices, faces=model.mesh(mesh).faces, latents=codes, **arrays), {}
+
+        return await work.write(encode, found.seconds, worst(found.diagnostics))
+
+
+#: Writes the outputs of ``infer``, by name, to the pieces of a file and facts about it.
+WriteOutputs = Callable[[Mapping[str, NDArray[np.float32]]], tuple[Iterator[Buffer], Mapping[str, Any]]]
+
+
+async def infer(
+    workers: Workers,
+    caller: Caller,
+    model: ShapeModel,
+    latents: NDArray[np.floating],
+    bounds: Bounds,
+    mesh: MeshChoice,
+    outputs: Sequence[str],
+    write: WriteOutputs,
+) -> Written:
+    """The outputs of codes (n, m) that are wanted: ``nric`` (n, 2E), ``vertices`` (n, V, 3), or both.
+
+    Raises:
+        LatentError, TooManyCodesError, BusyError, DeadlineError, DisconnectedError, EndingError: as ``vertices_file``.
+    """
+    codes, inside = model.latents.codes(latents, bounds)
+    async with batch(workers, caller, shapes_size(model, len(codes), mesh) + nric_size(model, len(codes))) as work:
+        arrays: dict[str, NDArray[np.float32]] = {}
+        found: Shapes | None = None
+        for name in outputs:
+            if name == "vertices":
+                found = await shapes(work, model, codes, inside, mesh)
+                arrays[name] = found.vertices
+            else:
+                arrays[name] = (await predictions(work, model, codes)).nric
+        seconds, diagnostics = (found.seconds, worst(found.diagnostics)) if found else ({}, None)
+        return await work.write(lambda: write(arrays), seconds, diagnostics)
+
+
+def shapes_size(model: ShapeModel, count: int, mesh: MeshChoice) -> int:
+    """Bytes of that many shapes; raises TooManyCodesError where they are more than one answer may hold."""
+    vertices = len(model.mesh(mesh).vertices)
+    if count * vertices > MOST_VERTICES:
+        raise TooManyCodesError(
+            f"{count} shapes of {vertices} vertices are too many for one answer. Ask for {MOST_VERTICES // vertices} "
+            "at most, for the coarse mesh, or for an animation's frames as JSON lines or one by one."
+        )
+    return 12 * count * vertices
+
+
+async def shapes(work: Batch, model: ShapeModel, codes: Codes, inside: NDArray[np.bool_], mesh: MeshChoice) -> Shapes:
+    """Shapes of codes (n, m), side by side; raises as ``Batch.map``."""
+    vertices = np.empty((len(codes), *model.mesh(mesh).vertices.shape), np.float32)
+
+    def find(item: tuple[int, CheckedCode], call: Call) -> tuple[Diagnostics, Timings]:
+        k, code = item
+        shape = work.solve(model, mesh, code, call)
+        vertices[k] = shape.vertices
+        return shape.diagnostics, shape.seconds
+
+    found = await work.map(find, enumerate(zip(codes, map(bool, inside), strict=True)))
+    return Shapes(vertices, [diagnostics for diagnostics, _ in found], total_seconds(seconds for _, seconds in found))
+
+
+async def _exponentials(work: Batch, model: ShapeModel, codes: Codes, found: Shapes, mesh: MeshChoice) -> list[Exact]:
+    """Discrete exponentials of codes (n, m), side by side, and how far the networks' shapes are from them."""
+
+    def one(item: tuple[Codes, NDArray[np.float32]], call: Call) -> Exact:
+        return exact(model, *item, mesh, call)
+
+    return await work.map(one, zip(codes, found.vertices, strict=True))
