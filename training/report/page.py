@@ -28,8 +28,9 @@ from shapespace.training.report.pictures import (
     tint,
 )
 from shapespace.training.report.plots import Line, lines, plot
-from shapespace.training.report.record import HUES, STAGES, Record
-from shapespace.training.runs.files import write_text
+from shapespace.training.report.record import HUES, Record
+from shapespace.training.runs.directory import RunDirectory
+from shapespace.training.runs.stages import STAGES
 
 #: Pixels of a picture's longer side; shown at half of it or less, so that it is sharp on a phone.
 LARGE, SMALL = 480, 300
@@ -270,10 +271,10 @@ def page(record: Record) -> str:
     )
     environment.filters |= {"figure": figure, "r2": r2, "percent": percent, "duration": duration, "bytes": size}
     return environment.get_template("report.jinja").render(
-        title=export.get("title") or record.folder.resolve().name,
+        title=export.get("title") or record.run.folder.resolve().name,
         description=export.get("description", ""),
         record=record,
-        stages=STAGES,
+        stages=list(STAGES),
         pictures=studio is not None,
         shapes=list(shapes(record, close)) if close else [],
         modes=list(mode_cards(record, close)) if close and modes else [],
@@ -298,12 +299,11 @@ def page(record: Record) -> str:
     )
 
 
-def write_report(folder: Path) -> Path:
+def write_report(run: RunDirectory) -> Path:
     """Write ``report.html`` from what a run, finished or not, has left in its directory; returns its path.
 
     Raises:
         ReportError: the folder is no run directory, or a file in it can't be read.
     """
-    path = folder / "report.html"
-    write_text(path, page(Record(folder)))
-    return path
+    run.report.write(page(Record(run)))
+    return run.report.path

@@ -12,7 +12,6 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationErr
 
 from shapespace.coordinates.reconstruction import DEFAULT_ETA
 from shapespace.shell.energy import Material
-from shapespace.training.space.modes import ITERATIONS, SPARSITY
 
 #: Which edges a convolution hears of, see networks.EdgeConvolution.
 Neighbourhood = Literal["star", "flaps"]
@@ -67,11 +66,11 @@ class ModeSettings(_Section):
 
     count: int = Field(20, ge=1)
     """m; at most the number of shapes less one."""
-    sparsity: float = Field(SPARSITY, ge=0, lt=1)
+    sparsity: float = Field(0.1, ge=0, lt=1)
     """λ as a share of the price at which the principal modes stop paying; 0 is principal geodesic analysis."""
     log_steps: int = Field(16, ge=2)
     """K of the logarithms, best that of the exponentials, whose inverse they are."""
-    max_iterations: int = Field(ITERATIONS, ge=1)
+    max_iterations: int = Field(200, ge=1)
 
 
 class FactorSettings(_Section):
@@ -213,7 +212,7 @@ class EvaluationSettings(_Section):
 class ExportSettings(_Section):
     """What the bundle says of itself."""
 
-    name: str = Field(pattern=r"^[a-z0-9][a-z0-9-]*$")
+    name: str = Field(pattern=r"^[a-z0-9][a-z0-9-]*$", max_length=64)
     version: int = Field(1, ge=1)
     title: str
     description: str

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import json
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from shapespace.training.runs.directory import RunDirectory
 from shapespace.training.runs.sampling import DONE, columns
 
 #: A larger share of logarithms or samples lost stops the run.
@@ -51,9 +50,9 @@ class Loss:
         return self.share > MOST_LOST
 
 
-def losses(folder: Path, stage: str) -> list[Loss]:
+def losses(run: RunDirectory, stage: str) -> list[Loss]:
     """What a stage that is done gave up; nothing of a stage that found nothing."""
-    return _STAGES[stage](folder) if stage in _STAGES else []
+    return _STAGES[stage](run) if stage in _STAGES else []
 
 
 def refuse(stage: str, lost: list[Loss], command: str = "") -> None:
@@ -72,29 +71,24 @@ def refuse(stage: str, lost: list[Loss], command: str = "") -> None:
         )
 
 
-def _json(path: Path) -> dict[str, Any]:
-    return dict(json.loads(path.read_text(encoding="utf-8"))) if path.exists() else {}
-
-
 def _some(names: list[str]) -> str:
     more = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
     return ", ".join(names[:NAMED]) + more
 
 
-def _ingest(folder: Path) -> list[Loss]:
-    facts = _json(folder / "ingest.json")
+def _ingest(run: RunDirectory) -> list[Loss]:
+    facts = run.ingest.read_if_written()
     sentences = [*facts.get("notes", ()), *facts.get("warnings", ())]
     if facts.get("reason"):
         sentences.append(f"coarse mesh: {facts['reason']}")
     return [Loss(sentence) for sentence in sentences]
 
 
-def _modes(folder: Path) -> list[Loss]:
-    facts = _json(folder / "modes.json")
+def _modes(run: RunDirectory) -> list[Loss]:
+    facts = run.decomposition.read_if_written()
     if "steps" not in facts:
         return []
-    with np.load(folder / "shapes.npz") as file:
-        names = file["names"].astype(str)
+    names = run.shapes.read()["names"].astype(str)
     steps, asked, found = np.array(facts["steps"]), facts["asked"], facts["modes"]
     lost = []
     linearised = names[steps == 0].tolist()
@@ -116,12 +110,12 @@ def _modes(folder: Path) -> list[Loss]:
     return lost
 
 
-def _samples(folder: Path) -> list[Loss]:
-    grouping = _json(folder / "factors.json")
+def _samples(run: RunDirectory) -> list[Loss]:
+    grouping = run.factors.read_if_written()
     advice = f"{COARSER}; or without the shapes farthest from the others, which make the box of codes large"
     lost = []
-    kinds = {"joint": folder / "samples"}
-    kinds |= {f"{name!r}": folder / "samples" / f"factor-{j}" for j, name in enumerate(grouping.get("names", ()))}
+    kinds = {"joint": run.samples}
+    kinds |= {f"{name!r}": run.factor_samples(j) for j, name in enumerate(grouping.get("names", ()))}
     for kind, path in kinds.items():
         samples = columns(path, "asked", "latents", "status", "reason")
         if not samples:
@@ -156,8 +150,8 @@ def _farthest(latents: NDArray, failed: NDArray, grouping: dict[str, Any]) -> st
     return f", most in factor {names[int(excess.argmax())]!r}" if excess.max() > CLEARLY else ""
 
 
-def _evaluation(folder: Path) -> list[Loss]:
-    figures = _json(folder / "evaluation.json")
+def _evaluation(run: RunDirectory) -> list[Loss]:
+    figures = run.evaluation.read_if_written()
     lost = []
     statuses = figures.get("vertex_error", {}).get("status", {})
     stalled, count = sum(n for status, n in statuses.items() if status != "converged"), sum(statuses.values())
@@ -169,7 +163,7 @@ def _evaluation(folder: Path) -> list[Loss]:
     return lost
 
 
-_STAGES: dict[str, Callable[[Path], list[Loss]]] = {
+_STAGES: dict[str, Callable[[RunDirectory], list[Loss]]] = {
     "ingest": _ingest,
     "modes": _modes,
     "samples": _samples,

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from shapespace.arrays import FloatArray, IntArray
 from shapespace.mesh.triangle_mesh import TriangleMesh
+from shapespace.training.runs.atomic_files import NpzFile
 from shapespace.training.runs.coordinates import Coordinates
-from shapespace.training.runs.files import write_npz
 from shapespace.training.runs.progress import bar
 from shapespace.training.runs.workers import run
 
@@ -148,7 +148,7 @@ def draw(
     with bar(title, "sample", len(latents), initial=done) as drawn:
         for k, part in results:
             index = parts[missing[k]]
-            write_npz(missing[k], index=index, asked=latents[index], **part)
+            NpzFile(missing[k]).write(index=index, asked=latents[index], **part)
             done, failed = done + len(index), failed + int((part["status"] != DONE).sum())
             drawn.update(len(index))
             yield done, len(latents), failed

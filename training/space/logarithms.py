@@ -29,7 +29,7 @@ NEIGHBOURS = 4
 
 
 @dataclass(frozen=True)
-class Tangents:
+class Logarithms:
     """The shapes of a collection seen from their mean.
 
     Attributes:
@@ -52,7 +52,7 @@ class Tangents:
         return [i for i, steps in enumerate(self.steps) if steps == 0]
 
 
-def tangents(space: ShellSpace, mean: FloatArray, shapes: ArrayLike, steps: int, workers: int = -1) -> Tangents:
+def logarithms(space: ShellSpace, mean: FloatArray, shapes: ArrayLike, steps: int, workers: int = -1) -> Logarithms:
     """The discrete logarithms of shapes at their mean.
 
     The geodesic to a near shape is found from the straight line of lengths and angles. To a far one that line may lead
@@ -154,7 +154,7 @@ class _Search:
             if i in self._paths:
                 self._via[i] = j
 
-    def result(self) -> Tangents:
+    def result(self) -> Logarithms:
         """What is found, and the rest linearised."""
         fields, steps = [], []
         z = self._space.nric(self._mean)
@@ -165,7 +165,7 @@ class _Search:
                 fields.append(self._space.project(self._mean, unwrap(self._space.nric(shape), z) - z))
             else:
                 fields.append(without_rigid_motion(steps[-1] * (path[1] - path[0]), self._mean))
-        return Tangents(np.stack(fields), tuple(self._status), tuple(steps), tuple(self._via), tuple(self._reasons))
+        return Logarithms(np.stack(fields), tuple(self._status), tuple(steps), tuple(self._via), tuple(self._reasons))
 
 
 def _each(function: Callable[..., _Found], space: ShellSpace, mean: FloatArray, items: list[tuple]) -> list[_Found]:
