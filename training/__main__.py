@@ -29,7 +29,7 @@ from shapespace.training.space.stages import MeanError
 
 #: Exit codes: a fault of the input or of the machine, one of ours (EX_SOFTWARE), and Ctrl+C as shells have it.
 FAILURE, DEFECT, STOPPED = 1, 70, 130
-#: What is a sentence already.
+#: Errors whose message is a sentence for the user.
 EXPECTED = (
     ConfigError,
     ExportError,
@@ -44,12 +44,12 @@ EXPECTED = (
     WorkersError,
     OSError,
 )
-#: The folder that holds the Makefile, where this is no installed package.
+#: The repository, which holds the Makefile, unless this is an installed package.
 HOME = Path(__file__).parents[2]
 
 
 def _here(path: Path) -> str:
-    """A path for the command line of who stands in the working directory."""
+    """A path as it can be typed in the working directory."""
     near = os.path.relpath(path)
     return shlex.quote(str(path.resolve()) if near.startswith(os.path.join("..", "..")) else near)
 

@@ -103,22 +103,21 @@ def ingest(run: Run) -> None:
         run.directory.log("ingested", **space.ingest(run.directory, run.config, run.accepted))
 
 
-def _found(run: Run, find: Callable[[RunDirectory, Config], dict[str, Any]]) -> None:
-    run.directory.log("found", **find(run.directory, run.config))
-
-
-def _skipped(run: Run) -> None:
-    run.directory.log("skipped", why="the generator gives factors and bounds itself")
+def _discover(run: Run, find: Callable[[RunDirectory, Config], dict[str, Any]]) -> None:
+    if run.by_design:
+        run.directory.log("skipped", why="the generator gives factors and bounds itself")
+    else:
+        run.directory.log("found", **find(run.directory, run.config))
 
 
 def mean(run: Run) -> None:
     """mean.npz."""
-    _skipped(run) if run.by_design else _found(run, space.mean)
+    _discover(run, space.mean)
 
 
 def modes(run: Run) -> None:
     """modes-by-strength.npz and modes.json."""
-    _skipped(run) if run.by_design else _found(run, space.modes)
+    _discover(run, space.modes)
 
 
 def factors(run: Run) -> None:
@@ -127,7 +126,7 @@ def factors(run: Run) -> None:
         given = run.collection.factors
         run.directory.factors.write({"factors": list(given.values()), "names": list(given)})
     else:
-        _found(run, space.factors)
+        _discover(run, space.factors)
 
 
 def _draw(run: Run, folder: Path, latents: FloatArray, title: str, *, shorten: bool) -> None:

@@ -16,15 +16,15 @@ from shapespace.files.reading import PIECE, UNLIMITED, Limits, clipped
 from shapespace.mesh.triangle_mesh import MeshError
 
 _MOST_ARRAYS = 1000
-#: Bytes in which the head of an array ends, of which NumPy takes ten thousand at most.
+#: Bytes that contain the head of an array; NumPy accepts heads of ten thousand bytes at most.
 _HEAD = 12_000
-#: Bytes that deflate can make of one, and those of NumPy's longest number.
+#: Bytes that deflate can make of one byte, at most; and those of NumPy's longest number.
 _DEFLATION, _LONGEST_NUMBER = 1032, 32
 _READ_HEAD = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
 
 
 class _File:
-    """Bytes as an open file, not copied; whoever asks for a large piece at once was told to by the file's directory."""
+    """Bytes as an open file, not copied. A request for a large piece is refused: it follows a forged directory."""
 
     def __init__(self, data: memoryview) -> None:
         self._data, self._place = data, 0

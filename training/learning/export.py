@@ -38,7 +38,7 @@ class ExportError(RuntimeError):
 def _to_onnx(network: nn.Module, example: Tensor, names: Network) -> bytes:
     """An ONNX file of a network, with the names that bundles have for its input and output."""
     network.eval()
-    # Without gradients, so that the network takes its path of plain gathers and sums.
+    # Without gradients networks compute by plain gathers and sums, which ONNX has.
     with torch.no_grad(), warnings.catch_warnings():
         warnings.simplefilter("ignore")
         program: Any = torch.onnx.export(
@@ -63,7 +63,7 @@ def _to_onnx(network: nn.Module, example: Tensor, names: Network) -> bytes:
 
 
 def _narrow(graph: onnx.GraphProto) -> None:
-    """Keep large constants in as few bits as hold them as they are; the runtime widens them when it loads the file."""
+    """Store each constant in the narrowest type that holds it exactly; the runtime widens it when it loads the file."""
     for tensor in graph.initializer:
         values = torch.tensor(onnx.numpy_helper.to_array(tensor))
         kind = narrowest(values)

@@ -1,4 +1,4 @@
-"""A run's page, to look at rather than to read: ``report.html``, one file that asks nothing of the network."""
+"""The report of a run: ``report.html``, one self-contained file of pictures, plots and tables."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ from shapespace.training.runs.stages import STAGES
 
 #: Pixels of a picture's longer side; shown at half of it or less, so that it is sharp on a phone.
 LARGE, SMALL = 480, 300
-#: More modes than these aren't drawn.
+#: Most modes that are drawn.
 MODES_SHOWN = 40
 #: What the keys of R² in evaluation.json stand for.
 MODELS = {
@@ -44,7 +44,7 @@ MODELS = {
     "affine of learned factors": "Affine sum of learned factors",
     "grid": "Affine sum of multilinear grids",
 }
-#: Keys of evaluation.json that have their place on the page; the others come into a table of their own.
+#: Keys of evaluation.json with a section on the page; all others are listed in one table.
 PLACED = {"eta", "test_samples", "r2", "r2_factors", "variants", "vertex_error", "sizes", "times", "fractions"}
 PLACED |= {"prolongation"}
 
@@ -213,7 +213,7 @@ def fraction_plot(record: Record) -> Markup | None:
 
 
 def flatten(value: Any, name: str = "") -> Iterator[tuple[str, Any]]:
-    """Figures that the page knows nothing of, each under its path."""
+    """Figures without a section of their own, each with its path."""
     if isinstance(value, dict | list):
         for key, inner in value.items() if isinstance(value, dict) else enumerate(value):
             yield from flatten(inner, f"{name} · {key}" if name else str(key))

@@ -23,7 +23,7 @@ from shapespace.training.runs.stages import STAGES
 from shapespace.training.space.modes import edge_magnitudes
 
 Value = TypeVar("Value")
-#: Of the factors, in their order; in plots too.
+#: Colours of the factors in their order, in plots too.
 HUES = ("#d1495b", "#2a7fba", "#3a9d5d", "#8e5bb5", "#e08a1e", "#1a9aa0", "#b5651d", "#d45fa0", "#7b9a24", "#5560c9")
 
 
@@ -87,7 +87,7 @@ class Record:
 
     @cached_property
     def given_up(self) -> list[tuple[str, str]]:
-        """Stage and sentence of all that the stages which are done gave up."""
+        """What the finished stages could not do: pairs of a stage and a sentence."""
         found = []
         for stage in (name for name in STAGES if self.seconds.get(name) is not None):
             lost = _readable(self.run.folder, partial(losses, self.run, stage))
@@ -96,7 +96,7 @@ class Record:
 
     @cached_property
     def at_work(self) -> str:
-        """What the log says last of a stage that isn't done."""
+        """Progress of the stage at work, from the last line of the log; empty where it reports none."""
         last = deque(self.run.events(), maxlen=1)
         if last and last[0].get("event") == "progress":
             return "{what}: {done} of {total}".format(**last[0])

@@ -16,7 +16,7 @@ from shapespace.shell.energy import Material
 #: Which edges a convolution hears of, see networks.EdgeConvolution.
 Neighbourhood = Literal["star", "flaps"]
 
-#: Of each factor, where the configuration doesn't say: a factor has few modes.
+#: Default number of samples of each factor alone: few suffice, as a factor has few modes.
 FACTOR_SAMPLES = 1000
 
 
@@ -280,12 +280,12 @@ def parse(text: str, source: str) -> Config:
 
 
 def load(path: Path, data: Path | None = None, fractions: Sequence[float] = ()) -> tuple[Config, str]:
-    """Read a configuration file, with what the command line has to say to it.
+    """Read a configuration file, and apply the options of the command line to it.
 
     Args:
         path: of the file.
-        data: goes before ``collection.data``.
-        fractions: go before ``networks.fractions``.
+        data: replaces ``collection.data``.
+        fractions: replace ``networks.fractions``.
 
     Returns:
         The configuration, and the text that says the same from any folder: ``collection.data`` made absolute, the

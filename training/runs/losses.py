@@ -1,4 +1,4 @@
-"""What each stage of a run gave up, in sentences, from what it left in the run directory."""
+"""What each stage of a run could not do, in sentences, read from the files that it left."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from shapespace.training.runs.sampling import DONE, columns
 
 #: A larger share of logarithms or samples lost stops the run.
 MOST_LOST = 0.25
-#: By so much of the box codes that are lost lie farther out in a factor where it is named.
+#: A factor is named as the cause where lost codes lie farther from 0 in it than others do, by this share of the box.
 CLEARLY = 0.05
-#: Names in a sentence.
+#: Most names in a sentence.
 NAMED = 6
 
 COARSER = (
@@ -27,16 +27,16 @@ COARSER = (
 
 
 class LostTooMuchError(RuntimeError):
-    """A stage gave up more than is worth going on with; what it did stays, and the message says how to go on."""
+    """A stage lost too many logarithms or samples. What it did stays; the message says how to go on."""
 
 
 @dataclass(frozen=True)
 class Loss:
-    """One thing that a stage gave up.
+    """One thing that a stage could not do.
 
     Attributes:
         sentence: what, how much, and where.
-        share: of the logarithms or samples that are lost; 0 of what nothing stops for.
+        share: of the logarithms or samples that are lost; 0 for what never stops a run.
         advice: what may help, where the share is large.
     """
 
@@ -51,7 +51,7 @@ class Loss:
 
 
 def losses(run: RunDirectory, stage: str) -> list[Loss]:
-    """What a stage that is done gave up; nothing of a stage that found nothing."""
+    """What a finished stage could not do."""
     return _STAGES[stage](run) if stage in _STAGES else []
 
 
@@ -140,7 +140,7 @@ def _samples(run: RunDirectory) -> list[Loss]:
 
 
 def _farthest(latents: NDArray, failed: NDArray, grouping: dict[str, Any]) -> str:
-    """The factor in which lost codes lie clearly farther out than the others, if there is one."""
+    """The end of a sentence: in which factor lost codes lie clearly farther from 0 than others do, if in any."""
     names, factors = grouping.get("names", []), grouping.get("factors", [])
     if len(factors) < 2 or failed.all():
         return ""

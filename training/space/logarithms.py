@@ -24,19 +24,19 @@ from shapespace.training.space.modes import ModeError
 LOGARITHM_TOLERANCE = 1e-6
 #: Logarithms that a process computes at a time.
 CHUNK = 4
-#: Neighbours whose geodesics are tried as a beginning.
+#: Neighbours whose geodesics are tried as initial values.
 NEIGHBOURS = 4
 
 
 @dataclass(frozen=True)
 class Logarithms:
-    """The shapes of a collection seen from their mean.
+    """Discrete logarithms of the shapes of a collection at their mean.
 
     Attributes:
         fields: (n, V, 3) vertex fields, without rigid motion.
         status: of the last geodesic tried; where it is not CONVERGED, the field is the linearised logarithm.
         steps: K of the geodesic found, 0 where there is none.
-        via: for each shape the neighbour whose geodesic its own began with, −1 where it needed none.
+        via: for each shape the neighbour whose geodesic was the initial value of its own, −1 where none was needed.
         reasons: for each shape why the straight way to it was not found, or an empty string.
     """
 
@@ -65,7 +65,7 @@ def logarithms(space: ShellSpace, mean: FloatArray, shapes: ArrayLike, steps: in
     collections those of 4 and of 8 steps differ by 10 to 35 % of their length.
 
     Args:
-        space: where; each process gets a copy.
+        space: the shape space; each process gets a copy.
         mean: X̄ (V, 3).
         shapes: (n, V, 3), in any position.
         steps: K of the geodesics.

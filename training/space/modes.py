@@ -109,7 +109,7 @@ def pga(space: ShellSpace, mean: FloatArray, fields: FloatArray, count: int) -> 
     """Principal geodesic analysis: the modes whose span comes closest to the logarithms in the metric.
 
     Args:
-        space: where.
+        space: the shape space.
         mean: X̄ (V, 3).
         fields: (n, V, 3) logarithms.
         count: m, at most n.
@@ -136,7 +136,7 @@ def spga(
     ``sparsity`` does not depend on the number of shapes, on their size or on the mesh. Nothing here is random.
 
     Args:
-        space: where; its η weighs the angles in the 1-norm, too.
+        space: the shape space; its η also weighs the angles in the 1-norm.
         mean: X̄ (V, 3).
         fields: (n, V, 3) logarithms.
         count: m, at most n.
