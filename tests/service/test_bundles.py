@@ -482,7 +482,7 @@ ATTACKS: dict[str, tuple[Callable[[Path], object], str]] = {
     "gives another shape": (of(hostile.changes_shape), "factor-0.onnx gives (2, 384), not (1, 384)"),
     "is not finite": (of(hostile.not_finite), "does not give finite numbers for zeros"),
     "has no training codes": (of(hostile.no_codes), "training_codes is empty"),
-    "unpacks": (of(hostile.unpacks), "its arrays would come to 1700008"),
+    "unpacks": (of(hostile.unpacks), "its arrays would come to 170000"),
     "forges a line": (name_with_a_line_break, r"bad\nINFO shapespace: bundle forged is served/1 is not served"),
 }
 
