@@ -28,7 +28,7 @@ BUILD_SYSTEM := $(shell sed -n 's/^requires = \["\(.*\)"\]$$/\1/p' pyproject.tom
 COMPILE = $(BIN)/uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-annotate \
 	--no-emit-index-url --no-emit-find-links --custom-compile-command 'make lock' $(ARGS)
 
-.PHONY: help serve install train test lint lowest lock faults folders soak fuzz fuzz-api mutants coverage audit sbom bench results clients openapi image-test wheel clean
+.PHONY: help serve install train test lint lowest lock faults folders soak fuzz fuzz-api mutants coverage audit sbom bench results clients openapi configuration image-test wheel clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-12s%s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -123,6 +123,9 @@ wheel: $(VENV)/.created ## build dist/shapespace-….whl, which holds the figure
 
 openapi: $(VENV)/.serve ## write openapi/openapi.json from the app
 	$(BIN)/python -m shapespace.service.http.openapi
+
+configuration: $(VENV)/.train ## write docs/configuration.md from the settings in training/runs/config.py
+	$(BIN)/python -m scripts.configuration
 
 image-test: $(VENV)/.client ## build the container image, try it for real, and attack it
 	PATH="$(CURDIR)/$(BIN):$$PATH" scripts/image-test.sh

@@ -7,7 +7,6 @@ it was. Bundles are written beside the runs: they hold the collections' geometry
 from __future__ import annotations
 
 import argparse
-import json
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -23,8 +22,7 @@ from shapespace.training.pipeline import Run, execute, learner_of
 from shapespace.training.report.pictures import COMPOSITE, Studio
 from shapespace.training.report.record import Record
 from shapespace.training.runs.config import load
-from shapespace.training.runs.files import write_json
-from shapespace.training.runs.sampling import DONE
+from shapespace.training.runs.sampling import DONE, columns
 
 ROOT = Path(__file__).resolve().parents[1]
 #: Collections of real meshes, in the order of the tables; then the hand without what the method rests on.
@@ -42,37 +40,41 @@ class Row:
     """A run with everything that was measured on it."""
 
     def __init__(self, name: str, run: Run) -> None:
-        self.name, self.run, self.config = name, run, run.config
+        self.name, self.directory, self.config = name, run.directory, run.config
 
-    def read(self, name: str) -> Any:
-        """What a stage or a study left as JSON, or None."""
-        path = self.run.folder / f"{name}.json"
-        return json.loads(path.read_text()) if path.exists() else None
+    def study(self, name: str) -> dict[str, Any]:
+        """What a study left, or nothing."""
+        return self.directory.study(name).read_if_written()
+
+    @cached_property
+    def ingest(self) -> dict[str, Any]:
+        """Of the collection; nothing of one that is a product by design."""
+        return self.directory.ingest.read_if_written()
 
     @cached_property
     def evaluation(self) -> dict[str, Any]:
         """Of the networks."""
-        return dict(self.read("evaluation"))
+        return self.directory.evaluation.read()
 
     @cached_property
     def sizes(self) -> list[int]:
         """Modes of each factor."""
-        return [len(members) for members in self.read("factors")["factors"]]
+        return [len(members) for members in self.directory.factors.read()["factors"]]
 
     @cached_property
     def samples(self) -> dict[str, int]:
         """Exponentials drawn: ``joint`` and of the ``factors``, and how many of each ``failed``."""
         found = {"joint": 0, "factors": 0, "joint failed": 0, "factors failed": 0}
-        for path in (self.run.folder / "samples").rglob("part-*.npz"):
-            with np.load(path) as part:
-                kind = "joint" if path.parent.name == "samples" else "factors"
-                found[kind] += len(part["status"])
-                found[f"{kind} failed"] += int((part["status"] != DONE).sum())
+        own = [("factors", self.directory.factor_samples(j)) for j in range(len(self.sizes))]
+        for kind, folder in [("joint", self.directory.samples), *own]:
+            status = columns(folder, "status").get("status", np.array([]))
+            found[kind] += len(status)
+            found[f"{kind} failed"] += int((status != DONE).sum())
         return found
 
     @cached_property
     def _log(self) -> list[dict[str, Any]]:
-        return [json.loads(line) for line in (self.run.folder / "log.jsonl").read_text().splitlines()]
+        return list(self.directory.events())
 
     def seconds(self, stage: str) -> float:
         """That a stage took in all calls that finished it: a later one goes on from what is there."""
@@ -86,13 +88,13 @@ class Row:
     @cached_property
     def localisation(self) -> tuple[float, float]:
         """Share of the edges that carry 95 % of a mode's energy, mean over modes of PGA and of SPGA."""
-        with np.load(self.run.folder / "modes.npz") as modes:
-            return float(modes["pga_localisation"].mean()), float(modes["localisation"].mean())
+        modes = self.directory.modes.read()
+        return float(modes["pga_localisation"].mean()), float(modes["localisation"].mean())
 
     @cached_property
     def overlaps(self) -> tuple[float, float]:
         """Of supports of different factors: mean and largest."""
-        shared = np.array(self.read("factors")["overlap"])
+        shared = np.array(self.directory.factors.read()["overlap"])
         apart = shared[~np.eye(len(shared), dtype=bool)]
         return (float(apart.mean()), float(apart.max())) if len(apart) else (0.0, 0.0)
 
@@ -111,19 +113,20 @@ def study(name: str, run: Run) -> None:
     """Everything of one run that isn't there yet."""
     print(f"\n{name}")
     execute(run, "evaluation" if name in CONTRASTS else None, keep_going=True)
-    if name in COLLECTIONS and not (run.folder / "space.json").exists():
+    spaces, extrapolations = (run.directory.study(study) for study in ("space", "limits"))
+    if name in COLLECTIONS and not spaces.exists():
         print("space …")
-        write_json(run.folder / "space.json", space.measure(run.folder, run.config))
-    if name in EXTRAPOLATED and not (run.folder / "limits.json").exists():
+        spaces.write(space.measure(run.directory, run.config))
+    if name in EXTRAPOLATED and not extrapolations.exists():
         print("limits …")
-        write_json(run.folder / "limits.json", {"extrapolation": limits.extrapolation(learner_of(run))})
+        extrapolations.write({"extrapolation": limits.extrapolation(learner_of(run))})
 
 
 def draw_strips(rows: list[Row], path: Path) -> None:
     """Between two random codes of each, all factors together, reconstructed from what the networks say."""
     strips = []
     for row in rows:
-        record = Record(row.run.folder)
+        record = Record(row.directory)
         if studio := Studio.of(record):
             strips.append(
                 Image.fromarray(studio.pixels(align(record.gallery["strip_joint"], studio.base), 170, COMPOSITE))
@@ -164,7 +167,7 @@ def plot_space(rows: list[Row], path: Path) -> None:
     """Generalisation by the number of modes, beside principal components of vertices."""
     figure, axes = plt.subplots(1, len(rows), figsize=(1.6 + 2.2 * len(rows), 2.9), layout="constrained", squeeze=False)
     for axis, row in zip(axes[0], rows, strict=True):
-        found = row.read("space")
+        found = row.study("space")
         for kind, style in (("modes", "o-"), ("components", "s--")):
             values = [100 * value for value in found["generalisation"][kind]]
             axis.plot(found["modes"], values, style, label={"modes": "sparse geodesic modes"}.get(kind, kind))
@@ -190,13 +193,13 @@ def main() -> None:
     if not arguments.page:
         for name in arguments.only or runs:
             study(name, runs[name])
-    rows = {name: Row(name, run) for name, run in runs.items() if (run.folder / "evaluation.json").exists()}
+    rows = {name: Row(name, run) for name, run in runs.items() if run.directory.evaluation.exists()}
     real, ours = ([rows[name] for name in names if name in rows] for names in (COLLECTIONS, OWN))
     docs = ROOT / "docs"
     draw_strips([rows[name] for name in PICTURED if name in rows], docs / "results-shapes.png")
     if some := [row for row in real if row.evaluation["fractions"]]:
         plot_samples(some, docs / "results-samples.png")
-    if some := [row for row in real if row.read("space")]:
+    if some := [row for row in real if row.study("space")]:
         plot_space(some, docs / "results-space.png")
     environment = jinja2.Environment(  # noqa: S701 - Markdown
         loader=jinja2.FileSystemLoader(Path(__file__).parent),
@@ -204,7 +207,7 @@ def main() -> None:
         lstrip_blocks=True,
         undefined=jinja2.StrictUndefined,
     )
-    spaces, extrapolated = (any(row.read(name) for row in real) for name in ("space", "limits"))
+    spaces, extrapolated = (any(row.study(name) for row in real) for name in ("space", "limits"))
     page = environment.get_template("results.md.jinja").render(
         rows=rows, real=real, ours=ours, spaces=spaces, extrapolated=extrapolated
     )

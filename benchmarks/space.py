@@ -7,7 +7,6 @@ shapes are means over vertices after rigid alignment, as shares of the reference
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,10 +18,11 @@ from shapespace.shell.many_exponentials import exponentials
 from shapespace.shell.mean import elastic_mean
 from shapespace.shell.space import ShellSpace
 from shapespace.training.runs.config import Config
+from shapespace.training.runs.directory import RunDirectory
 from shapespace.training.runs.sampling import read
 from shapespace.training.space import modes
-from shapespace.training.space.discovery import material
-from shapespace.training.space.tangents import tangents
+from shapespace.training.space.logarithms import logarithms
+from shapespace.training.space.stages import material
 
 FOLDS = 5
 #: Random codes whose shapes are compared with the collection.
@@ -65,24 +65,19 @@ class PrincipalComponents:
         return self.mean + (drawn @ self.axes[:count]).reshape(codes, *self.mean.shape)
 
 
-def measure(folder: Path, config: Config) -> dict[str, Any]:
+def measure(run: RunDirectory, config: Config) -> dict[str, Any]:
     """The three of a run whose samples are drawn, by the number of modes where that is a choice."""
-    with np.load(folder / "shapes.npz") as file:
-        shapes = file["vertices"]
-    with np.load(folder / "reference.npz") as file:
-        reference = TriangleMesh.from_mapping(file)
-    with np.load(folder / "modes.npz") as file:
-        sparse, principal = file["vertices"][np.argsort(file["rank"])], file["pga_vertices"]
-    with np.load(folder / "mean.npz") as file:
-        mean = file["vertices"]
+    shapes, reference, mean = run.shapes.read()["vertices"], run.reference_mesh(), run.mean.read()["vertices"]
+    found = run.modes_by_strength.read()
+    sparse, principal = found["vertices"], found["pga_vertices"]
     m = len(sparse)
     counts = sorted({2**k for k in range(m.bit_length()) if 2**k < m} | {m})
-    drawn = read(folder / "samples").vertices[:CODES].astype(np.float64)
+    drawn = read(run.samples).vertices[:CODES].astype(np.float64)
     linear = PrincipalComponents.of(shapes, reference.vertices)
     others = linear.random(min(m, len(shapes) - 1), CODES, np.random.default_rng(0))
     energy = (linear.coefficients**2).sum(axis=0)
     space = ShellSpace(reference.with_vertices(mean), material(config))
-    fields = tangents(space, mean, shapes, config.modes.log_steps).fields
+    fields = logarithms(space, mean, shapes, config.modes.log_steps).fields
 
     def explained(span: FloatArray) -> list[float]:
         return [modes.projected(space, mean, fields, span[:k])[1] for k in counts]
@@ -126,7 +121,7 @@ def generalisation(reference: TriangleMesh, shapes: FloatArray, config: Config, 
         kept = np.setdiff1d(np.arange(len(shapes)), held_out)
         mean = elastic_mean(ShellSpace(reference, material(config)), shapes[kept]).vertices
         space = ShellSpace(reference.with_vertices(mean), material(config))
-        fields = tangents(space, mean, shapes, config.modes.log_steps).fields
+        fields = logarithms(space, mean, shapes, config.modes.log_steps).fields
         most = min(counts[-1], len(kept) - 1)
         sparse = modes.spga(space, mean, fields[kept], most, config.modes.sparsity).vertices
         linear = PrincipalComponents.of(shapes[kept], reference.vertices)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 from pathlib import Path
 
 import numpy as np
@@ -12,9 +10,12 @@ import trimesh
 from onnx import TensorProto, helper, numpy_helper
 
 from shapespace.arrays import FloatArray
+from shapespace.bundle.geometry import Geometry
+from shapespace.bundle.schema import Origin, Tolerance
+from shapespace.bundle.writer import Facts, Networks, write_bundle
 from shapespace.coordinates.nric import nric
-from shapespace.files.formats import npz
 from shapespace.mesh.triangle_mesh import TriangleMesh
+from shapespace.shell.energy import Material
 
 LATENTS_OF_A_FACTOR = 4
 
@@ -56,57 +57,33 @@ def write(models: Path, vertices: int, latents: int) -> Path:
     """A bundle in ``models/``; returns its folder."""
     mesh = capsule(vertices)
     name = f"capsule-{vertices}-{latents}"
-    folder = models / name / "1"
-    folder.mkdir(parents=True)
     rest, changes = nric(mesh.vertices, mesh.connectivity), directions(mesh, latents)
-    starts = range(0, latents, LATENTS_OF_A_FACTOR)
-    factors = []
-    for j, start in enumerate(starts):
-        part = changes[start : start + LATENTS_OF_A_FACTOR]
-        nodes = [helper.make_node("Gemm", ["latent", "D", "z"], ["nric"])]
-        file = f"factor-{j}.onnx"
-        (folder / file).write_bytes(_network(nodes, {"D": part, "z": rest}, [len(part)], len(rest)))
-        facts = {"name": f"factor {j}", "start": start, "stop": start + len(part)}
-        factors.append(facts | {"file": file, "input": "latent", "output": "nric"})
+    groups = [range(latents)[k : k + LATENTS_OF_A_FACTOR] for k in range(0, latents, LATENTS_OF_A_FACTOR)]
+    nodes = [helper.make_node("Gemm", ["latent", "D", "z"], ["nric"])]
     add_up = [
         helper.make_node("Einsum", ["factors"], ["sum"], equation="njz->nz"),
         helper.make_node("Sub", ["sum", "more"], ["nric"]),
     ]
-    more = {"more": (len(factors) - 1) * rest}
-    (folder / "combiner.onnx").write_bytes(_network(add_up, more, [len(factors), len(rest)], len(rest)))
-    (folder / "geometry.npz").write_bytes(npz(vertices=mesh.vertices, faces=mesh.faces, edges=mesh.edges))
-    files = {
-        path.name: {"sha256": hashlib.sha256(path.read_bytes()).hexdigest(), "bytes": path.stat().st_size}
-        for path in sorted(folder.iterdir())
-    }
-    manifest = {
-        "schema_version": 1,
-        "name": name,
-        "version": "1",
-        "licence": "MIT",
-        "title": name,
-        "description": "For benchmarks.",
-        "latent_dimension": latents,
-        "latent_names": [f"latent {k}" for k in range(latents)],
-        "factors": factors,
-        "lower": [-1.0] * latents,
-        "upper": [1.0] * latents,
-        "period": [None] * latents,
-        "edges": len(mesh.edges),
-        "vertices": len(mesh.vertices),
-        "faces": len(mesh.faces),
-        "mu": 1.0,
-        "lambda": 1.0,
-        "eta": 1e-4,
-        "eta_reconstruction": 1e-2,
-        "scale": 1.0,
-        "combiner": {"file": "combiner.onnx", "input": "factors", "output": "nric"},
-        "start": None,
-        "geometry": {"file": "geometry.npz"},
-        "onnx_tolerance": {"required": 1e-4, "measured": 1e-7},
-        "figures": {},
-        "origin": {"config": {}, "data_digest": "0" * 64, "code_version": "benchmark"},
-        "files": files,
-    }
-    (folder / "manifest.json").write_text(json.dumps(manifest))
-    return folder
+    networks = Networks(
+        factors=[_network(nodes, {"D": changes[list(k)], "z": rest}, [len(k)], len(rest)) for k in groups],
+        combiner=_network(add_up, {"more": (len(groups) - 1) * rest}, [len(groups), len(rest)], len(rest)),
+    )
+    facts = Facts(
+        name=name,
+        version="1",
+        licence="MIT",
+        title=name,
+        description="For benchmarks.",
+        latent_names=[f"latent {k}" for k in range(latents)],
+        factors={f"factor {j}": group for j, group in enumerate(groups)},
+        lower=np.full(latents, -1.0),
+        upper=np.full(latents, 1.0),
+        period=np.full(latents, np.nan),
+        material=Material(),
+        eta_reconstruction=1e-2,
+        scale=1.0,
+        tolerance=Tolerance(required=1e-4, measured=1e-7),
+        figures={},
+        origin=Origin(config={}, data_digest="0" * 64, code_version="benchmark"),
+    )
+    return write_bundle(models, facts, networks, Geometry(reference=mesh))

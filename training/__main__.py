@@ -14,20 +14,22 @@ from pathlib import Path
 from shapespace.training.collection import init
 from shapespace.training.collection.ingest import IngestError
 from shapespace.training.learning.export import ExportError
-from shapespace.training.pipeline import STAGES, OldRunError, Run, execute
+from shapespace.training.pipeline import OldRunError, Run, execute
 from shapespace.training.report.page import write_report
 from shapespace.training.report.record import Record, ReportError
 from shapespace.training.runs.config import ConfigError, load
+from shapespace.training.runs.directory import RunDirectory
 from shapespace.training.runs.losses import LostTooMuchError
 from shapespace.training.runs.sampling import SamplesError
+from shapespace.training.runs.stages import STAGES
 from shapespace.training.runs.workers import WorkersError
-from shapespace.training.space.discovery import MeanError
 from shapespace.training.space.factors import FactorError
 from shapespace.training.space.modes import ModeError
+from shapespace.training.space.stages import MeanError
 
 #: Exit codes: a fault of the input or of the machine, one of ours (EX_SOFTWARE), and Ctrl+C as shells have it.
 FAILURE, DEFECT, STOPPED = 1, 70, 130
-#: What is a sentence already.
+#: Errors whose message is a sentence for the user.
 EXPECTED = (
     ConfigError,
     ExportError,
@@ -42,12 +44,12 @@ EXPECTED = (
     WorkersError,
     OSError,
 )
-#: The folder that holds the Makefile, where this is no installed package.
+#: The repository, which holds the Makefile, unless this is an installed package.
 HOME = Path(__file__).parents[2]
 
 
 def _here(path: Path) -> str:
-    """A path for the command line of who stands in the working directory."""
+    """A path as it can be typed in the working directory."""
     near = os.path.relpath(path)
     return shlex.quote(str(path.resolve()) if near.startswith(os.path.join("..", "..")) else near)
 
@@ -70,10 +72,10 @@ def _serving(models: Path) -> str:
 
 
 def _open(folder: Path, models: Path) -> Run:
-    source = folder / "config.toml"
-    if not source.is_file():
+    directory = RunDirectory(folder)
+    if not directory.is_run():
         raise ConfigError(f"{folder} is no run directory: it holds no config.toml")
-    return Run(folder, *load(source), models)
+    return Run(folder, *load(directory.config.path), models)
 
 
 def _init(arguments: argparse.Namespace) -> None:
@@ -109,15 +111,15 @@ def _folder(arguments: argparse.Namespace) -> Path:
 
 def _status(arguments: argparse.Namespace) -> None:
     run = _open(arguments.run, arguments.models)
-    begun = ": ".join(filter(None, ("begun", Record(run.folder).at_work)))
+    begun = ": ".join(filter(None, ("begun", Record(run.directory).at_work)))
     for name in STAGES:
-        stamp = run.stamp(name)
+        stamp = run.directory.stamp(name).read_if_written()
         state = f"done in {stamp['seconds']:.0f} s" if "seconds" in stamp else begun if stamp else "to do"
         print(f"{name:12} {state}")
 
 
 def _report(arguments: argparse.Namespace) -> None:
-    print(write_report(arguments.run))
+    print(write_report(RunDirectory(arguments.run)))
 
 
 def _export(arguments: argparse.Namespace) -> None:
@@ -180,12 +182,14 @@ def parser() -> argparse.ArgumentParser:
 def _keep_traceback(arguments: argparse.Namespace) -> Path:
     """Write the traceback of what is being handled into the run directory, or where there is none elsewhere."""
     text = traceback.format_exc()
-    try:
-        path = (Path(tempfile.mkdtemp()) if "meshes" in arguments else _folder(arguments)) / "traceback.txt"
-        path.write_text(text, encoding="utf-8")
-    except OSError:
-        path = Path(tempfile.mkdtemp()) / "traceback.txt"
-        path.write_text(text, encoding="utf-8")
+    folders = [] if "meshes" in arguments else [_folder(arguments)]
+    for folder in (*folders, Path(tempfile.mkdtemp())):
+        path = RunDirectory(folder).traceback.path
+        try:
+            path.write_text(text, encoding="utf-8")
+        except OSError:
+            continue
+        break
     return path
 
 

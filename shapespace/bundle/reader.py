@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import io
-import math
 import os
 import re
 import stat
@@ -18,21 +17,18 @@ import onnx
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
-from shapespace.arrays import FloatArray, IntArray
-from shapespace.bundle.schema import NAME_PATTERN, VERSION_PATTERN, FileEntry, Manifest
-from shapespace.mesh.prolongation import PREFIX, Prolongation, ProlongationError
-from shapespace.mesh.triangle_mesh import MeshError, TriangleMesh
+from shapespace.bundle.geometry import Geometry, GeometryError
+from shapespace.bundle.schema import MANIFEST, NAME_PATTERN, VERSION_PATTERN, FileEntry, Manifest
+from shapespace.files.npz_reading import PackedArray
 
-MANIFEST = "manifest.json"
+#: Bytes of a manifest.
 MANIFEST_LIMIT = 4 * 2**20
-#: The fine mesh lies this close to what the reference is prolonged to, as a fraction of the diagonal: float32.
-FINE_TOLERANCE = 1e-5
 #: Bytes of a bundle's files together.
 LARGEST = 2**30
-#: What the arrays of an NPZ file may come to: so many times its own length, and so many bytes beside. Packed meshes are
-#: a half to a sixth as long; what packs much better is no mesh.
+#: Limit on the unpacked arrays of an NPZ file: so many times its own length, and so many bytes more. Compression makes
+#: meshes two to six times smaller; data that shrink much more are no mesh.
 UNPACKED, BESIDE = 16, 2**20
-#: Characters of a reason: libraries quote what they can't read, and names in a file are as long as it says.
+#: Characters of a reason. Libraries quote what they can't read, and names inside a file may be of any length.
 LONGEST_REASON = 300
 
 
@@ -43,44 +39,20 @@ class BundleError(ValueError):
         super().__init__(reason if len(reason) <= LONGEST_REASON else f"{reason[:LONGEST_REASON]} …")
 
 
-@dataclass(frozen=True)
-class FineMesh:
-    """A finer mesh that follows the coarse one.
-
-    Attributes:
-        reference: at the coarse reference.
-        prolong: coarse vertices to fine ones.
-    """
-
-    reference: TriangleMesh
-    prolong: Prolongation
-
-
-@dataclass(frozen=True)
-class Bundle:
-    """A bundle whose files are what the manifest says, read into memory.
+@dataclass(frozen=True, kw_only=True)
+class Bundle(Geometry):
+    """A bundle whose files are what the manifest says, read into memory, with the shapes of its geometry.
 
     Attributes:
         manifest: what it says about itself.
         digest: SHA-256 of the manifest in hexadecimal. The manifest holds the digests of all files, so this
             one identifies every byte of the bundle.
-        reference: the reference shape, normalised.
-        fine: the finer mesh, if there is one.
         networks: bytes of each ONNX file by its name.
-        modes: (m, V, 3) vertex fields d_j at the reference, where codes are coefficients of tangent vectors.
-        training_codes: (n, m) codes of the shapes that the model was made from, if there are any.
-        file_vertices: (N,) vertex of the finest mesh that each vertex of the user's files became, −1 for those in no
-            face; None where that is each by itself.
     """
 
     manifest: Manifest
     digest: str
-    reference: TriangleMesh
-    fine: FineMesh | None
     networks: Mapping[str, bytes]
-    modes: FloatArray | None = None
-    training_codes: FloatArray | None = None
-    file_vertices: IntArray | None = None
 
 
 def check_place(folder: Path) -> None:
@@ -118,10 +90,10 @@ def read_bundle(folder: Path, digest: str | None = None) -> Bundle:
     if (manifest.name, manifest.version) != (name, version):
         raise BundleError(f"{MANIFEST} is of {manifest.name}/{manifest.version}, not of {name}/{version}")
     files = read_files(folder, manifest)
-    reference, fine, more = _geometry(files.pop(manifest.geometry.file), manifest)
+    geometry = _geometry(files.pop(manifest.geometry.file), manifest)
     for file, content in files.items():
         _check_network(file, content)
-    return Bundle(manifest, hashlib.sha256(text).hexdigest(), reference, fine, files, **more)
+    return Bundle(manifest=manifest, digest=hashlib.sha256(text).hexdigest(), networks=files, **vars(geometry))
 
 
 def read_files(folder: Path, manifest: Manifest) -> dict[str, bytes]:
@@ -173,123 +145,32 @@ def _verified(path: Path, entry: FileEntry) -> bytes:
     return content
 
 
-def _geometry(content: bytes, manifest: Manifest) -> tuple[TriangleMesh, FineMesh | None, dict[str, NDArray]]:
+def _geometry(content: bytes, manifest: Manifest) -> Geometry:
     file = manifest.geometry.file
     try:
-        geometry = _arrays(content)
-        reference = TriangleMesh.from_mapping(geometry)
-        edges = geometry["edges"]
-    except KeyError as error:
-        raise BundleError(f"{file} has no array {error}") from None
-    except (BundleError, MeshError) as error:
+        arrays = _arrays(content)
+    except BundleError as error:
         raise BundleError(f"{file}: {error}") from None
     except Exception as error:  # zip and array headers fail in many ways
         raise BundleError(f"{file} is not a readable NPZ file: {error}") from None
-    for array_name, array in geometry.items():
-        if np.issubdtype(array.dtype, np.floating) and not np.isfinite(array).all():
-            raise BundleError(f"{file}: {array_name} has an entry that is not finite")
-    counts = (len(reference.vertices), len(reference.faces), len(reference.edges))
-    if counts != (manifest.vertices, manifest.faces, manifest.edges):
-        raise BundleError(
-            f"{file} has (V, F, E) = {counts}, the manifest says {(manifest.vertices, manifest.faces, manifest.edges)}"
-        )
-    if not np.array_equal(edges, reference.edges):
-        raise BundleError(f"{file}: edges are not those of the faces in lexicographic order")
-    m, V = manifest.latent_dimension, manifest.vertices
-    for array_name, wanted, text in (
-        ("modes", (m, V, 3), f"({m}, {V}, 3)"),
-        ("training_codes", (None, m), f"(n, {m})"),
-    ):
-        _check_shape(file, geometry, array_name, wanted, text)
-    fine = _fine(file, geometry, reference)
-    more: dict[str, NDArray] = {
-        name: geometry[name].astype(np.float64) for name in ("modes", "training_codes") if name in geometry
-    }
-    if "file_vertices" in geometry:
-        more["file_vertices"] = _file_vertices(file, geometry["file_vertices"], fine.reference if fine else reference)
-    return reference, fine, more
+    try:
+        return Geometry.from_arrays(arrays, manifest)
+    except GeometryError as error:
+        raise BundleError(str(error)) from None
 
 
 def _arrays(content: bytes) -> dict[str, NDArray]:
-    """The arrays of an NPZ file; none is made before it is known how long it is, and that it is so long."""
+    """The arrays of an NPZ file; memory is taken only after the sizes in its directory have been checked."""
     with zipfile.ZipFile(io.BytesIO(content)) as archive:
         entries = archive.infolist()
         most = UNPACKED * len(content) + BESIDE
         if (total := sum(entry.file_size for entry in entries)) > most:
             raise BundleError(f"its arrays would come to {total} bytes, where {most} are the most")
-        return {entry.filename.removesuffix(".npy"): _array(archive, entry) for entry in entries}
-
-
-def _array(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> NDArray:
-    if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):  # others unpack all at once
-        raise ValueError(f"{entry.filename} is packed in a way that NumPy doesn't")
-    with archive.open(entry) as file:
-        match np.lib.format.read_magic(file):
-            case (1, 0):
-                shape, fortran, dtype = np.lib.format.read_array_header_1_0(file)
-            case (2, 0):
-                shape, fortran, dtype = np.lib.format.read_array_header_2_0(file)
-            case version:
-                raise ValueError(f"{entry.filename} is of version {version}")
-        size = math.prod(shape) * dtype.itemsize
-        if dtype.hasobject or not 0 <= size <= entry.file_size:
-            raise ValueError(f"{entry.filename} can't be {dtype} {shape}")
-        array = np.frombuffer(bytearray(file.read(size)), dtype)
-        return array.reshape(shape, order="F" if fortran else "C")
-
-
-def _file_vertices(file: str, places: NDArray, mesh: TriangleMesh) -> IntArray:
-    """Checked: whole numbers (N,) that name every vertex of the finest mesh."""
-    count = len(mesh.vertices)
-    if places.ndim != 1 or not np.issubdtype(places.dtype, np.integer) or len(places) < count:
-        raise BundleError(
-            f"{file}: file_vertices must be at least {count} whole numbers, not {places.dtype} {places.shape}"
-        )
-    if not np.array_equal(np.unique(places[places != -1]), np.arange(count)):
-        raise BundleError(f"{file}: file_vertices must name each of the vertices 0 to {count - 1}, or -1")
-    return places.astype(np.int64)
-
-
-def _check_shape(
-    file: str, geometry: Mapping[str, NDArray], name: str, wanted: tuple[int | None, ...], text: str
-) -> None:
-    if name not in geometry:
-        return
-    array = geometry[name]
-    if not array.size:
-        raise BundleError(f"{file}: {name} is empty")
-    fits = len(array.shape) == len(wanted) and all(
-        want in (None, size) for size, want in zip(array.shape, wanted, strict=True)
-    )
-    if not fits or not np.issubdtype(array.dtype, np.floating):
-        raise BundleError(f"{file}: {name} must be real numbers {text}, not {array.dtype} {array.shape}")
-
-
-def _fine(file: str, geometry: Mapping[str, NDArray], reference: TriangleMesh) -> FineMesh | None:
-    if not any(name.startswith(("fine_", PREFIX)) for name in geometry):
-        return None
-    try:
-        fine = TriangleMesh.from_arrays(geometry["fine_vertices"], geometry["fine_faces"])
-        prolong = Prolongation.from_arrays(geometry)
-    except KeyError as error:
-        raise BundleError(f"{file} has no array {error}, which goes with the other arrays of a fine mesh") from None
-    except ProlongationError as error:
-        raise BundleError(f"{file}: {error}") from None
-    except MeshError as error:
-        raise BundleError(f"{file}: fine mesh: {error}") from None
-    if not np.array_equal(prolong.faces, reference.faces):
-        raise BundleError(f"{file}: {PREFIX}faces are not the faces of the mesh")
-    if prolong.vertex_count != len(fine.vertices):
-        raise BundleError(
-            f"{file}: the prolongation is to {prolong.vertex_count} vertices, but there are {len(fine.vertices)} "
-            "fine_vertices"
-        )
-    distance = np.linalg.norm(prolong(reference.vertices) - fine.vertices, axis=1).max()
-    if distance > FINE_TOLERANCE * fine.diagonal:
-        raise BundleError(
-            f"{file}: fine_vertices are up to {distance:.1e} away from where the prolongation takes the reference"
-        )
-    return FineMesh(fine, prolong)
+        arrays = {}
+        for entry in entries:
+            with archive.open(entry) as member:
+                arrays[entry.filename.removesuffix(".npy")] = PackedArray(member, entry).read(most)
+        return arrays
 
 
 def _check_network(file: str, content: bytes) -> None:

@@ -1,9 +1,13 @@
-"""The manifest of a bundle: ``models/NAME/VERSION/manifest.json``."""
+"""What a bundle ``models/NAME/VERSION/`` is made of: its files, its manifest, and the arrays of its geometry.
+
+The writer and the reader both go by this module, and nothing else spells these names.
+"""
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, NamedTuple
 
+import numpy as np
 from pydantic import (
     BaseModel,
     ConfigDict,
@@ -14,6 +18,8 @@ from pydantic import (
     model_validator,
 )
 
+SCHEMA_VERSION = 1
+MANIFEST = "manifest.json"
 NAME_PATTERN = r"^[a-z0-9][a-z0-9._-]{0,63}$"
 VERSION_PATTERN = r"^[1-9][0-9]{0,8}$"
 #: A plain file name: no folder, no way out of the bundle, nothing hidden.
@@ -32,16 +38,18 @@ class Network(_Strict):
     output: str
 
 
-class Factor(Network):
-    """The network ψ_j of one factor, fed with latents ``start`` to ``stop``, the last one excluded."""
-
+class _Range(_Strict):
     name: str
     start: int = Field(ge=0)
     stop: PositiveInt
 
 
-class Geometry(_Strict):
-    """The NPZ file with ``vertices``, ``faces`` and ``edges`` of the reference."""
+class Factor(Network, _Range):
+    """The network ψ_j of one factor, fed with latents ``start`` to ``stop``, the last one excluded."""
+
+
+class GeometryFile(_Strict):
+    """The NPZ file that holds the arrays of `ARRAYS`."""
 
     file: FileName
 
@@ -71,7 +79,7 @@ class FileEntry(_Strict):
 class Manifest(_Strict):
     """What a bundle says about itself. Lengths are normalised: one unit is ``scale`` units of the user."""
 
-    schema_version: Literal[1]
+    schema_version: Literal[1]  # SCHEMA_VERSION; a type can't name it
     name: str = Field(pattern=NAME_PATTERN)
     version: str = Field(pattern=VERSION_PATTERN)
     licence: str
@@ -87,7 +95,7 @@ class Manifest(_Strict):
     vertices: PositiveInt
     faces: PositiveInt
     mu: PositiveFloat
-    lambda_: PositiveFloat = Field(alias="lambda")
+    lambda_: NonNegativeFloat = Field(alias="lambda")
     eta: PositiveFloat
     eta_reconstruction: PositiveFloat
     #: K of the exponentials that a code stands for, where the bundle has modes.
@@ -95,7 +103,7 @@ class Manifest(_Strict):
     scale: PositiveFloat
     combiner: Network
     start: Network | None
-    geometry: Geometry
+    geometry: GeometryFile
     onnx_tolerance: Tolerance
     figures: dict[str, Any]
     origin: Origin
@@ -117,3 +125,46 @@ class Manifest(_Strict):
         if sorted(named) != sorted(self.files):
             raise ValueError("files must list exactly the networks and the geometry")
         return self
+
+
+class ArrayType(NamedTuple):
+    """How ``geometry.npz`` holds an array.
+
+    Attributes:
+        shape: a letter is a number: m, V, F and E those of the manifest, another one any number above 0.
+        dtype: as it is written; any other of the same kind, real or whole numbers, can be read.
+    """
+
+    shape: tuple[int | str, ...]
+    dtype: type[np.number]
+
+
+#: The arrays of ``geometry.npz``. The first three are always there; ``fine_*`` and ``prolongation_*`` all or none.
+ARRAYS = {
+    # The reference, normalised, and its edges in lexicographic order.
+    "vertices": ArrayType(("V", 3), np.float64),
+    "faces": ArrayType(("F", 3), np.int32),
+    "edges": ArrayType(("E", 2), np.int32),
+    # Vertex fields d_j at the reference, where codes are coefficients of tangent vectors.
+    "modes": ArrayType(("m", "V", 3), np.float32),
+    # Codes of the shapes that the model was made from.
+    "training_codes": ArrayType(("n", "m"), np.float64),
+    # For each vertex of the user's files the vertex of the finest mesh that it became, or -1.
+    "file_vertices": ArrayType(("N",), np.int32),
+    # A finer mesh at the reference, and what takes vertices of the coarse one to it: see mesh.prolongation.
+    "fine_vertices": ArrayType(("W", 3), np.float64),
+    "fine_faces": ArrayType(("G", 3), np.int32),
+    "prolongation_faces": ArrayType(("F", 3), np.int32),
+    "prolongation_indptr": ArrayType(("W + 1",), np.int32),
+    "prolongation_indices": ArrayType(("weights",), np.int32),
+    "prolongation_weights": ArrayType(("weights",), np.float64),
+}
+#: The files of a bundle as they are written. They are read under the names that the manifest gives them.
+COMBINER = Network(file="combiner.onnx", input="factors", output="nric")
+START = Network(file="start.onnx", input="latent", output="vertices")
+GEOMETRY = GeometryFile(file="geometry.npz")
+
+
+def factor_network(j: int) -> Network:
+    """The file of ψ_j as it is written."""
+    return Network(file=f"factor-{j}.onnx", input="latent", output="nric")

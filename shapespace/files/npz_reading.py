@@ -16,14 +16,15 @@ from shapespace.files.limits import PIECE, UNLIMITED, Limits, clipped
 from shapespace.mesh.triangle_mesh import MeshError
 
 _MOST_ARRAYS = 1000
-#: Bytes in which the head of an array ends, of which NumPy takes ten thousand at most.
+#: Bytes that contain the head of an array; NumPy accepts heads of ten thousand bytes at most.
 _HEAD = 12_000
-#: Bytes that deflate can make of one, and those of NumPy's longest number.
+#: Bytes that deflate can make of one byte, at most; and those of NumPy's longest number.
 _DEFLATION, _LONGEST_NUMBER = 1032, 32
+_READ_HEAD = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
 
 
 class _File:
-    """Bytes as an open file, without a copy; refuses large reads, which zipfile makes for long directories only."""
+    """Bytes as an open file, not copied. A request for a large piece is refused: it follows a forged directory."""
 
     def __init__(self, data: memoryview) -> None:
         self._data, self._place = data, 0
@@ -77,9 +78,11 @@ def load_npz(
             arrays = {}
             for name, entry in entries.items():
                 with archive.open(entry) as member:
-                    array = _Array(member, entry)
+                    array = PackedArray(member, entry)
+                    if array.dtype.hasobject:
+                        raise MeshError("not a readable npz file: it holds pickled objects, save plain arrays instead")
                     if name in ("vertices", "faces"):
-                        array.check(name, limits)
+                        _check(name, array, limits)
                     if name in names:
                         arrays[name] = array.read(_DEFLATION * len(data))
     except MeshError:
@@ -89,37 +92,52 @@ def load_npz(
     return arrays
 
 
-class _Array:
-    """An array in an archive, of which only the head has been read."""
+class PackedArray:
+    """An array in an opened archive, of which only the head has been read.
+
+    Args:
+        member: the opened entry.
+        entry: what the archive's directory says of it.
+
+    Attributes:
+        shape, dtype: as the head says.
+
+    Raises:
+        ValueError: compressed in a way that NumPy does not, or without a head that can be read.
+    """
 
     def __init__(self, member: IO[bytes], entry: zipfile.ZipInfo) -> None:
-        # The decompressors of other methods don't limit the memory that they take.
-        if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-            raise zipfile.BadZipFile("compressed in another way")
-        self._member, self._size = member, entry.file_size
+        if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):  # others take what memory they like
+            raise ValueError(f"{entry.filename} is packed in a way that NumPy doesn't")
+        self._member, self._entry = member, entry
         start = io.BytesIO(member.read(_HEAD))
-        read_head = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
-        self._shape, self._columns_first, self._dtype = read_head[np.lib.format.read_magic(start)](start)
-        if self._dtype.hasobject:
-            raise MeshError("not a readable npz file: it holds pickled objects, save plain arrays instead")
+        version = np.lib.format.read_magic(start)
+        if version not in _READ_HEAD:
+            raise ValueError(f"{entry.filename} is of version {version}")
+        self.shape, self._columns_first, self.dtype = _READ_HEAD[version](start)
         self._start = start.read()
 
-    def check(self, name: str, limits: Limits) -> None:
-        """Raise MeshError for too many vertices or faces, or for entries so long that they can only be text."""
-        if self._dtype.itemsize > _LONGEST_NUMBER:
-            raise MeshError(f"{name} must be an array of numbers, not {clipped(self._dtype)}")
-        triples = -(-math.prod(self._shape) // 3)
-        limits.check(triples if name == "vertices" else 0, triples if name == "faces" else 0)
-
     def read(self, most: int) -> NDArray:
-        """The array; raises ValueError where it has more bytes than its entry says, or than can be there."""
-        length = math.prod(self._shape) * self._dtype.itemsize
-        if not 0 <= length <= min(self._size, most):
-            raise ValueError("it says more than there is")
+        """The array, of at most so many bytes.
+
+        Raises:
+            ValueError: pickled objects, or more bytes than the archive's directory says, or than ``most``.
+        """
+        length = math.prod(self.shape) * self.dtype.itemsize
+        if self.dtype.hasobject or not 0 <= length <= min(self._entry.file_size, most):
+            raise ValueError(f"{self._entry.filename} can't be {self.dtype} {self.shape}")
         content = np.empty(length, np.uint8)
         content[: len(self._start)] = np.frombuffer(self._start[:length], np.uint8)
         for start in range(len(self._start), length, PIECE):
             piece = content[start : start + PIECE]
             piece[:] = np.frombuffer(self._member.read(len(piece)), np.uint8)
         self._member.read(1)  # at the end of an entry its checksum is compared
-        return content.view(self._dtype).reshape(self._shape, order="F" if self._columns_first else "C")
+        return content.view(self.dtype).reshape(self.shape, order="F" if self._columns_first else "C")
+
+
+def _check(name: str, array: PackedArray, limits: Limits) -> None:
+    """Refuse vertices or faces that are too many, or whose entries are as long as only text can be."""
+    if array.dtype.itemsize > _LONGEST_NUMBER:
+        raise MeshError(f"{name} must be an array of numbers, not {clipped(array.dtype)}")
+    triples = -(-math.prod(array.shape) // 3)
+    limits.check(triples if name == "vertices" else 0, triples if name == "faces" else 0)

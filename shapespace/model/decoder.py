@@ -15,7 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shapespace.arrays import FloatArray
-from shapespace.bundle.reader import Bundle, BundleError, FineMesh
+from shapespace.bundle.geometry import FineMesh
+from shapespace.bundle.reader import Bundle, BundleError
 from shapespace.coordinates.integrability import Integrability
 from shapespace.coordinates.nric import nric
 from shapespace.coordinates.reconstruction import Reconstruction, Reconstructor

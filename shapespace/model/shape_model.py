@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from shapespace.arrays import FloatArray, IntArray
-from shapespace.bundle.reader import MANIFEST, BundleError, read_bundle
-from shapespace.bundle.schema import VERSION_PATTERN
+from shapespace.bundle.reader import BundleError, read_bundle
+from shapespace.bundle.schema import MANIFEST, VERSION_PATTERN
 from shapespace.files.formats import read_arrays
 from shapespace.mesh.triangle_mesh import TriangleMesh
 from shapespace.model.correspondence import InvalidMeshError, Matched, match

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import trimesh
 
-from shapespace.training.pipeline import STAGES
+from shapespace.training.runs.stages import STAGES
 from tests.training.conftest import command
 from tests.training.test_collection import results
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 from pathlib import Path
 from typing import Any
@@ -11,10 +10,14 @@ import numpy as np
 import onnx
 from onnx import TensorProto, helper, numpy_helper
 
+from shapespace.bundle import writer
+from shapespace.bundle.geometry import FineMesh, Geometry
+from shapespace.bundle.schema import MANIFEST, Origin, Tolerance
+from shapespace.bundle.writer import Facts, Networks
 from shapespace.coordinates.nric import nric
-from shapespace.files.formats import npz
 from shapespace.mesh.prolongation import Prolongation
 from shapespace.mesh.triangle_mesh import TriangleMesh
+from shapespace.shell.energy import Material
 from shapespace.training.collection import freaky_torus
 
 SCALE = 3.0
@@ -154,100 +157,62 @@ def network_with_shape(nodes: list[Any], weights: dict[str, np.ndarray], mesh: T
     return helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=9)
 
 
-def manifest(name: str, version: str, *, start: bool = False, idle: int = 0) -> dict[str, Any]:
-    """Everything but ``files``."""
+def facts(name: str = "small", version: str = "1", *, idle: int = 0) -> Facts:
+    """What the manifest says beside what follows from the files."""
+    return Facts(
+        name=name,
+        version=version,
+        licence="CC0-1.0",
+        title="Small torus",
+        description="A torus for tests.",
+        latent_names=[*LATENTS, *(f"idle-{k}" for k in range(idle))],
+        factors={"size": [0], "form": list(range(1, 3 + idle))},
+        lower=np.array([-0.2, -np.pi, 0.0, *[-1.0] * idle]),
+        upper=np.array([0.2, np.pi, 1.0, *[1.0] * idle]),
+        period=np.array([np.nan, 2 * np.pi, np.nan, *[np.nan] * idle]),
+        material=Material(),
+        eta_reconstruction=1e-2,
+        scale=SCALE,
+        tolerance=Tolerance(required=1e-4, measured=1e-7),
+        figures={"r2": {"composite": {"total": 1.0}}},
+        origin=Origin(config={}, data_digest="0" * 64, code_version="test"),
+    )
+
+
+def geometry(*, fine: bool = False) -> Geometry:
+    """The reference; where it has a finer mesh, with modes and codes beside it."""
     mesh = reference()
-    return {
-        "schema_version": 1,
-        "name": name,
-        "version": version,
-        "licence": "CC0-1.0",
-        "title": "Small torus",
-        "description": "A torus for tests.",
-        "latent_dimension": 3 + idle,
-        "latent_names": [*LATENTS, *(f"idle-{k}" for k in range(idle))],
-        "factors": [
-            {
-                "name": "size",
-                "start": 0,
-                "stop": 1,
-                "file": "factor-0.onnx",
-                "input": "latent",
-                "output": "nric",
-            },
-            {
-                "name": "form",
-                "start": 1,
-                "stop": 3 + idle,
-                "file": "factor-1.onnx",
-                "input": "latent",
-                "output": "nric",
-            },
-        ],
-        "lower": [-0.2, -np.pi, 0.0, *[-1.0] * idle],
-        "upper": [0.2, np.pi, 1.0, *[1.0] * idle],
-        "period": [None, 2 * np.pi, None, *[None] * idle],
-        "edges": mesh.connectivity.edge_count,
-        "vertices": len(mesh.vertices),
-        "faces": len(mesh.faces),
-        "mu": 1.0,
-        "lambda": 1.0,
-        "eta": 1e-4,
-        "eta_reconstruction": 1e-2,
-        "scale": SCALE,
-        "combiner": {"file": "combiner.onnx", "input": "factors", "output": "nric"},
-        "start": {"file": "start.onnx", "input": "latent", "output": "vertices"} if start else None,
-        "geometry": {"file": "geometry.npz"},
-        "onnx_tolerance": {"required": 1e-4, "measured": 1e-7},
-        "figures": {"r2": {"composite": {"total": 1.0}}},
-        "origin": {"config": {}, "data_digest": "0" * 64, "code_version": "test"},
-    }
-
-
-def fine_arrays() -> dict[str, np.ndarray]:
-    """What geometry.npz holds where there is a finer mesh, with modes and codes beside it."""
-    mesh, fine = reference(), fine_reference()
-    return {
-        "fine_vertices": fine.vertices,
-        "fine_faces": fine.faces.astype(np.int32),
-        "modes": np.zeros((3, len(mesh.vertices), 3), np.float32),
-        "training_codes": np.array([[0, 0, 0], [0, 0, 0.1], [0, 0, 0.2], [0.1, 3, 0.5], [0.1, -3, 0.5]]),
-        **Prolongation.of(mesh, fine).arrays(),
-    }
+    if not fine:
+        return Geometry(reference=mesh)
+    finer = fine_reference()
+    return Geometry(
+        reference=mesh,
+        fine=FineMesh(finer, Prolongation.of(mesh, finer)),
+        modes=np.zeros((3, len(mesh.vertices), 3)),
+        training_codes=np.array([[0, 0, 0], [0, 0, 0.1], [0, 0, 0.2], [0.1, 3, 0.5], [0.1, -3, 0.5]]),
+    )
 
 
 def write_bundle(
     models: Path, name: str = "small", version: str = "1", *, start: bool = False, fine: bool = False, idle: int = 0
 ) -> Path:
     """Write a whole bundle and return its folder; idle coordinates come last and change nothing."""
-    folder = models / name / version
-    folder.mkdir(parents=True)
-    mesh = reference()
-    for file, model in networks(idle).items():
-        (folder / file).write_bytes(model.SerializeToString())
-    if start:
-        (folder / "start.onnx").write_bytes(start_network().SerializeToString())
-    arrays = {"vertices": mesh.vertices, "faces": mesh.faces, "edges": mesh.edges}
-    (folder / "geometry.npz").write_bytes(npz(**arrays, **(fine_arrays() if fine else {})))
-    seal(folder, manifest(name, version, start=start, idle=idle))
-    return folder
+    *factors, combiner = (model.SerializeToString() for model in networks(idle).values())
+    files = Networks(factors=factors, combiner=combiner, start=start_network().SerializeToString() if start else None)
+    return writer.write_bundle(models, facts(name, version, idle=idle), files, geometry(fine=fine))
 
 
-def seal(folder: Path, facts: dict[str, Any] | None = None) -> None:
-    """Write the manifest with the digests of the files as they are; by default the facts stay."""
-    path = folder / "manifest.json"
-    facts = facts or json.loads(path.read_text())
-    files = sorted(file for file in folder.iterdir() if file.is_file() and file.name != path.name)
-    facts["files"] = {
-        file.name: {"sha256": hashlib.sha256(file.read_bytes()).hexdigest(), "bytes": file.stat().st_size}
-        for file in files
-    }
-    path.write_text(json.dumps(facts))
+def seal(folder: Path) -> None:
+    """Give the manifest the digests of the files as they are, after something was done to them."""
+    path = folder / MANIFEST
+    files = sorted(file for file in folder.iterdir() if file.is_file() and file != path)
+    entries = {file.name: writer.entry(file.read_bytes()).model_dump() for file in files}
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"files": entries}))
 
 
 def rescale(folder: Path, scale: float) -> None:
     """Turn a bundle into another one, all of whose lengths are in other units, in one step as `export` does it."""
-    facts = json.loads((folder / "manifest.json").read_text()) | {"scale": scale}
+    facts = json.loads((folder / MANIFEST).read_text()) | {"scale": scale}
     part = folder.parent / ".manifest.json"
     part.write_text(json.dumps(facts))
-    part.replace(folder / "manifest.json")
+    part.replace(folder / MANIFEST)

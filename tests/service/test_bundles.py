@@ -27,7 +27,8 @@ from shapespace.service.repository.repository import Changes, ModelRepository
 from shapespace.service.repository.validation import BundleValidator
 from tests.faults.serving import peak_memory
 from tests.service import hostile
-from tests.service.bundles import SCALE, fine_arrays, network, networks, reference, rescale, seal, write_bundle
+from tests.service.bundles import SCALE, network, networks, reference, rescale, seal, write_bundle
+from tests.service.bundles import geometry as geometry_of
 from tests.service.conftest import Start
 from tests.service.watching import samples, value
 
@@ -208,10 +209,12 @@ def no_network(folder: Path) -> None:
 
 
 def geometry(folder: Path, **changes: np.ndarray) -> None:
-    mesh = reference()
-    arrays = {"vertices": mesh.vertices, "faces": mesh.faces, "edges": mesh.edges} | changes
-    (folder / "geometry.npz").write_bytes(npz(**arrays))
+    (folder / "geometry.npz").write_bytes(npz(**geometry_of().arrays() | changes))
     seal(folder)
+
+
+def fine_arrays() -> dict[str, np.ndarray]:
+    return geometry_of(fine=True).arrays()
 
 
 def nan_vertex(folder: Path) -> None:
@@ -479,7 +482,7 @@ ATTACKS: dict[str, tuple[Callable[[Path], object], str]] = {
     "gives another shape": (of(hostile.changes_shape), "factor-0.onnx gives (2, 384), not (1, 384)"),
     "is not finite": (of(hostile.not_finite), "does not give finite numbers for zeros"),
     "has no training codes": (of(hostile.no_codes), "training_codes is empty"),
-    "unpacks": (of(hostile.unpacks), "its arrays would come to 1700008"),
+    "unpacks": (of(hostile.unpacks), "its arrays would come to 170000"),
     "forges a line": (name_with_a_line_break, r"bad\nINFO shapespace: bundle forged is served/1 is not served"),
 }
 

@@ -1,8 +1,11 @@
 """The list of models, the cards, health."""
 
+import json
+from pathlib import Path
+
 import httpx
 
-from tests.service.bundles import manifest
+from tests.service.bundles import write_bundle
 
 
 def test_the_list_names_the_newest_version_by_number(client: httpx.Client) -> None:
@@ -12,9 +15,9 @@ def test_the_list_names_the_newest_version_by_number(client: httpx.Client) -> No
     assert [factor["name"] for factor in small["factors"]] == ["size", "form"]
 
 
-def test_the_card_holds_the_facts_of_the_manifest(client: httpx.Client) -> None:
+def test_the_card_holds_the_facts_of_the_manifest(client: httpx.Client, tmp_path: Path) -> None:
     card = client.get("/v1/models/small", params={"version": "2"}).json()
-    facts = manifest("small", "2", start=True)
+    facts = json.loads((write_bundle(tmp_path, "small", "2", start=True) / "manifest.json").read_text())
     for key in ("name", "version", "lower", "upper", "period", "edges", "vertices", "faces", "figures", "scale"):
         assert card[key] == facts[key], key
     assert card["versions"] == ["1", "2", "10"]

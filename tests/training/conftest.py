@@ -72,7 +72,7 @@ def command(config: Path, out: Path, *more: str) -> list[str]:
     return [
         sys.executable,
         "-m",
-        "training",
+        "shapespace.training",
         "run",
         str(config),
         "--out",

@@ -19,7 +19,7 @@ from safetensors.numpy import load_file
 
 from shapespace.mesh.rigid_motion import align
 from shapespace.mesh.triangle_mesh import TriangleMesh
-from shapespace.training.pipeline import STAGES
+from shapespace.training.runs.stages import STAGES
 from tests.service.conftest import starting
 from tests.training.conftest import command
 

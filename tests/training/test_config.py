@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import get_args
 
 import pytest
 
-from shapespace.training.runs.config import ConfigError, load, parse
+from shapespace.training.collection.generators import MESHES, PRODUCTS
+from shapespace.training.runs.config import CollectionSettings, ConfigError, load, parse
 from tests.training.conftest import TINY
 
 EXAMPLES = sorted((Path(__file__).parents[2] / "examples").glob("*.toml"))
@@ -65,3 +67,9 @@ def test_the_command_s_arguments_go_before_the_file_and_into_the_text_that_is_ke
 def test_a_file_that_needs_no_changes_is_kept_as_it_stands() -> None:
     path = Path(__file__).parents[2] / "examples" / "freaky-torus.toml"
     assert load(path)[1] == path.read_text()
+
+
+def test_every_generator_that_can_be_named_is_there() -> None:
+    named = set(get_args(get_args(CollectionSettings.model_fields["generator"].annotation)[0]))
+    assert named == PRODUCTS.keys() | MESHES.keys()
+    assert not PRODUCTS.keys() & MESHES.keys()

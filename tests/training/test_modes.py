@@ -17,8 +17,8 @@ from shapespace.shell.exponential import exponential
 from shapespace.shell.geodesic import geodesic
 from shapespace.shell.space import ShellSpace
 from shapespace.solve.status import Status
+from shapespace.training.space.logarithms import logarithms
 from shapespace.training.space.modes import ModeError, Modes, _fit_in_box, localisation, pga, spga
-from shapespace.training.space.tangents import tangents
 from tests.shapespace.conftest import bent
 
 
@@ -257,7 +257,7 @@ def test_what_is_not_possible_is_refused(bumps, change, message):
 def test_logarithms_lead_back_to_the_shapes_wherever_they_are(bumps, rng):
     turn = np.linalg.qr(rng.standard_normal((3, 3)))[0]
     shapes = (bumps.mean + 0.3 * bumps.fields[:2]) @ (turn * np.linalg.det(turn)) + [1, 2, 3]
-    found = tangents(bumps.space, bumps.mean, shapes, 4, workers=1)
+    found = logarithms(bumps.space, bumps.mean, shapes, 4, workers=1)
     assert found.status == (Status.CONVERGED,) * 2
     assert found.steps == (4, 4)
     assert found.fallbacks == []
@@ -269,8 +269,8 @@ def test_logarithms_lead_back_to_the_shapes_wherever_they_are(bumps, rng):
 
 def test_processes_give_what_one_gives(bumps):
     shapes = bumps.mean + 0.1 * bumps.fields[:5]
-    here = tangents(bumps.space, bumps.mean, shapes, 4, workers=1)
-    there = tangents(bumps.space, bumps.mean, shapes, 4, workers=2)
+    here = logarithms(bumps.space, bumps.mean, shapes, 4, workers=1)
+    there = logarithms(bumps.space, bumps.mean, shapes, 4, workers=2)
     assert (here.fields == there.fields).all()
     assert here.reasons == there.reasons == ("",) * 5
 
@@ -283,7 +283,7 @@ def test_far_shapes_are_reached_by_way_of_their_neighbours():
     shapes = np.stack([bent(rod.vertices, angle) for angle in (4, -1, 1)])
     straight = [geodesic(space, start, shape, 8, tolerance=1e-6, bisect=False) for shape in shapes]
     assert [path.converged for path in straight] == [False, True, False]
-    found = tangents(space, start, shapes, 8, workers=1)
+    found = logarithms(space, start, shapes, 8, workers=1)
     assert found.status == (Status.CONVERGED,) * 3
     assert found.steps == (8, 8, 8)
     assert found.via[1] == -1
@@ -302,7 +302,7 @@ def test_where_there_is_no_geodesic_the_logarithm_is_linearised(bumps, rng):
     crumpled = bumps.mean + 0.8 * rng.standard_normal(bumps.mean.shape)
     i, j, k = bumps.space.connectivity.faces[7]
     crumpled[[i, j, k]] = [[0, 0, 0], [1, 0, 0], [3, 0, 0]]  # a face without area
-    found = tangents(bumps.space, bumps.mean, np.stack([crumpled, bumps.mean + 0.1 * bumps.fields[0]]), 4, workers=1)
+    found = logarithms(bumps.space, bumps.mean, np.stack([crumpled, bumps.mean + 0.1 * bumps.fields[0]]), 4, workers=1)
     assert found.fallbacks == [0]
     assert found.steps == (0, 4)
     assert found.status[0] is not Status.CONVERGED
@@ -315,4 +315,4 @@ def test_where_there_is_no_geodesic_the_logarithm_is_linearised(bumps, rng):
 def test_a_shape_that_is_not_finite_has_no_logarithm(bumps):
     shapes = np.stack([bumps.mean, np.where(np.arange(3) == 1, np.nan, bumps.mean)])
     with pytest.raises(ModeError, match="shape 1 has a coordinate that is not finite"):
-        tangents(bumps.space, bumps.mean, shapes, 4, workers=1)
+        logarithms(bumps.space, bumps.mean, shapes, 4, workers=1)

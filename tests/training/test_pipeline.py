@@ -16,13 +16,15 @@ import onnxruntime
 import pytest
 import torch
 
+from shapespace.bundle.geometry import Geometry
 from shapespace.bundle.reader import read_bundle
 from shapespace.coordinates.nric import WeightedNorm, nric
 from shapespace.training.collection.freaky_torus import FreakyTorus, vertices
 from shapespace.training.learning.export import ExportError, export
-from shapespace.training.pipeline import STAGES, Run, learner_of
+from shapespace.training.pipeline import Run, learner_of
 from shapespace.training.runs.config import load, parse
 from shapespace.training.runs.sampling import read
+from shapespace.training.runs.stages import STAGES
 from tests.training.conftest import TINY, command
 
 
@@ -116,7 +118,15 @@ def test_export_refuses_where_onnx_and_torch_disagree(tiny_run: Path, tmp_path: 
     run = Run(tiny_run, *load(tiny_run / "config.toml"), tmp_path)
     strict = parse(TINY + "tolerance = 1e-12\n", "strict")
     with pytest.raises(ExportError, match="differ by"):
-        export(learner_of(run).main(), run.collection, strict, {}, "", tmp_path, {})
+        export(
+            learner_of(run).main(),
+            run.collection,
+            strict,
+            {},
+            "",
+            tmp_path,
+            Geometry(reference=FreakyTorus().reference),
+        )
     assert not (tmp_path / "tiny-torus" / "1").exists()
 
 

@@ -21,10 +21,11 @@ from PIL import Image
 from shapespace.files.gltf_writing import vertex_normals
 from shapespace.mesh.triangle_mesh import TriangleMesh
 from shapespace.training.__main__ import main
-from shapespace.training.pipeline import STAGES as PIPELINE
 from shapespace.training.report.page import duration, write_report
-from shapespace.training.report.record import STAGES, Record, ReportError
+from shapespace.training.report.record import Record, ReportError
 from shapespace.training.report.rendering import Camera
+from shapespace.training.runs.directory import RunDirectory
+from shapespace.training.runs.stages import STAGES
 
 NASTY = "<script>alert('thumb')</script>"
 SECTIONS = {"shapes", "modes", "factors", "strip", "tests", "figures", "losses", "stages", "configuration"}
@@ -193,7 +194,7 @@ def small_pictures() -> Iterator[None]:
 
 @pytest.fixture(scope="module")
 def page(run: Path) -> Page:
-    assert write_report(run) == run / "report.html"
+    assert write_report(RunDirectory(run)) == run / "report.html"
     return Page(run / "report.html")
 
 
@@ -202,7 +203,7 @@ def partial(run: Path, folder: Path, *names: str) -> Page:
     (folder / "stages").mkdir(parents=True)
     for name in ("config.toml", *names):
         shutil.copy(run / name, folder / name)
-    return Page(write_report(folder))
+    return Page(write_report(RunDirectory(folder)))
 
 
 def test_every_section_is_there_with_its_figures(page: Page) -> None:
@@ -282,7 +283,7 @@ def test_errors_go_from_clay_to_red_where_they_are_large(page: Page) -> None:
 
 
 def test_supports_are_where_the_tangent_acts(run: Path) -> None:
-    record = Record(run)
+    record = Record(RunDirectory(run))
     edges = record.reference["edges"]
     tangent = np.zeros((2, 2 * len(edges)))
     tangent[0, 5], tangent[1, len(edges) + 9] = 1, 1
@@ -299,8 +300,13 @@ def test_a_run_on_its_way_makes_a_partial_report(run: Path, tmp_path: Path) -> N
     assert page.sections == {"shapes", "modes", "figures", "configuration"}
 
 
-def test_the_page_knows_the_stages() -> None:
-    assert tuple(PIPELINE) == STAGES
+def test_modes_are_shown_before_they_have_factors(run: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    folder.mkdir()
+    for name in ("config.toml", "reference.npz"):
+        shutil.copy(run / name, folder)
+    shutil.copy(run / "modes.npz", RunDirectory(folder).modes_by_strength.path)
+    assert "modes" in Page(write_report(RunDirectory(folder))).sections
 
 
 def test_stages_say_how_far_the_run_is(run: Path, tmp_path: Path) -> None:
@@ -310,7 +316,7 @@ def test_stages_say_how_far_the_run_is(run: Path, tmp_path: Path) -> None:
     (folder / "stages" / "ingest.json").write_text('{"key": "k", "seconds": 2.5}')
     (folder / "stages" / "mean.json").write_text('{"key": "k"}')
     (folder / "log.jsonl").write_text('{"event": "progress", "what": "logs", "done": 3, "total": 9}\n{"event": "pro')
-    words = Page(write_report(folder)).words
+    words = Page(write_report(RunDirectory(folder))).words
     assert "mean: begun" in words
     assert "modes: to do" in words
     assert "ingest: " not in words
@@ -334,7 +340,7 @@ def test_a_broken_file_is_named_in_one_line(tmp_path: Path, name: str, content: 
     (tmp_path / "config.toml").write_text(CONFIG)
     (tmp_path / name).write_text(content)
     with pytest.raises(ReportError, match=name) as caught:
-        write_report(tmp_path)
+        write_report(RunDirectory(tmp_path))
     assert "\n" not in str(caught.value)
 
 
@@ -358,8 +364,12 @@ def test_the_command_says_where_the_page_is(
 
 def test_the_report_needs_no_torch(tmp_path: Path) -> None:
     (tmp_path / "config.toml").write_text(CONFIG)
-    write = f"from shapespace.training.report.page import write_report; write_report(pathlib.Path({str(tmp_path)!r}))"
-    code = f"import pathlib, sys; sys.modules['torch'] = None; {write}"
+    code = (
+        "import pathlib, sys; sys.modules['torch'] = None\n"
+        "from shapespace.training.report.page import write_report\n"
+        "from shapespace.training.runs.directory import RunDirectory\n"
+        f"write_report(RunDirectory(pathlib.Path({str(tmp_path)!r})))"
+    )
     subprocess.run([sys.executable, "-c", code], check=True)
     assert (tmp_path / "report.html").is_file()
 

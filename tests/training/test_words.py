@@ -9,6 +9,7 @@ import shlex
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +19,9 @@ from shapespace.files.formats import MESH_FORMATS
 from shapespace.training import __main__ as command
 from shapespace.training.report.page import page
 from shapespace.training.report.record import Record
+from shapespace.training.runs.directory import RunDirectory
 from shapespace.training.runs.losses import losses
+from shapespace.training.runs.stages import STAGES
 from tests.faults.training import CONFIG, bars
 
 SHAPES, FACES = bars(6)
@@ -103,6 +106,41 @@ def test_a_run_of_version_0_1_is_not_continued_and_loses_nothing(place: Path, sa
     assert (run / "mean.npz").exists()
 
 
+def test_a_stage_of_another_version_is_done_again_with_all_that_follows(
+    place: Path, said: Said, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    until_factors = "run", "bars.toml", "--until", "factors"
+    said(*until_factors)
+    assert "another version" not in said(*until_factors)
+    monkeypatch.setitem(STAGES, "modes", replace(STAGES["modes"], version=STAGES["modes"].version + 1))
+    words = said(*until_factors)
+    assert words.count("another version") == 1
+    assert "modes: another version of shapespace computed it otherwise; it and all that follows is done again" in words
+    assert [name for name in STAGES if f"{name}: done before" in words] == ["ingest", "mean"]
+    # As releases wrote them before stages had versions.
+    RunDirectory(place / "runs" / "bars").stamp("factors").write({"key": "0", "basis": "0", "seconds": 1.0})
+    words = said(*until_factors)
+    assert "factors: another version" in words
+    assert "factors: done before" not in words
+
+
+def test_factors_know_the_order_of_their_modes_after_a_setting_came_and_went(place: Path, said: Said) -> None:
+    config, run = place / "bars.toml", RunDirectory(place / "runs" / "bars")
+    said("run", "bars.toml", "--until", "factors")
+    before, grouping = run.modes.read(), run.factors.read()
+    text = config.read_text()
+    config.write_text(text.replace("log_steps = 2", "log_steps = 3"))
+    said("run", "bars.toml", "--until", "modes")
+    config.write_text(text)
+    assert "factors: done before" in said("run", "bars.toml", "--until", "factors")
+    after = run.modes.read()
+    assert run.factors.read() == grouping
+    assert before.keys() == after.keys()
+    assert all(np.array_equal(before[name], after[name]) for name in before)
+    strongest = run.modes_by_strength.read()
+    np.testing.assert_array_equal(strongest["nric"][after["rank"]], after["nric"])
+
+
 def test_an_odd_shape_stops_the_run_until_it_is_accepted(place: Path, said: Said) -> None:
     write(place / "meshes" / "bar3.obj", 1000 * SHAPES[3])
     words = said("init", "meshes")
@@ -114,7 +152,7 @@ def test_an_odd_shape_stops_the_run_until_it_is_accepted(place: Path, said: Said
     assert refused.endswith("--accept bar3\n")
     assert not (place / "runs" / "bars" / "reference.npz").exists()
     assert "bar3.obj: is of another size" in said(*run, "--accept", "bar3.obj")
-    assert "bar3.obj: is of another size" in page(Record(place / "runs" / "bars"))
+    assert "bar3.obj: is of another size" in page(Record(RunDirectory(place / "runs" / "bars")))
 
 
 def done_up_to_modes(place: Path, said: Said) -> Path:
@@ -124,7 +162,7 @@ def done_up_to_modes(place: Path, said: Said) -> Path:
 
 def test_lost_logarithms_are_said_and_stop_the_run(place: Path, said: Said) -> None:
     run = done_up_to_modes(place, said)
-    assert [loss.sentence for loss in losses(run, "modes")] == []
+    assert [loss.sentence for loss in losses(RunDirectory(run), "modes")] == []
     modes = json.loads((run / "modes.json").read_text())
     for steps, says, stops in (
         ([4, 4, 4, 8, 4], "twice as many steps for 1 of 5 logarithms: bar3", False),
@@ -135,7 +173,7 @@ def test_lost_logarithms_are_said_and_stop_the_run(place: Path, said: Said) -> N
         words = said("run", "bars.toml", "--until", "factors", code=int(stops))
         assert f"  {says}\n" in words
         assert "  m 2 of 9, because the others would be nought" in words
-        assert (says in page(Record(run))) is True
+        assert (says in page(Record(RunDirectory(run)))) is True
         assert (run / "factors.json").exists() != stops
         (run / "factors.json").unlink(missing_ok=True)
         (run / "stages" / "factors.json").unlink(missing_ok=True)
@@ -157,7 +195,7 @@ def test_failed_samples_are_counted_by_factor(place: Path) -> None:
         used = latents.copy()
         used[:5] *= 0.85
         np.savez(folder / "part-00000.npz", asked=latents, latents=used, status=status, reason=reason)
-    shortened, joint, own_shortened, own = losses(run, "samples")
+    shortened, joint, own_shortened, own = losses(RunDirectory(run), "samples")
     assert shortened.sentence.startswith("shortened 5 of 40 codes of joint samples until they had a shape")
     assert own_shortened.sentence == "shortened 5 of 40 codes of samples of factor 'upper right' until they had a shape"
     lost = status == "failed"

@@ -1,4 +1,4 @@
-"""What is odd about a shape beside the others of its collection: another unit, another order, a mirror image.
+"""Shapes that differ suspiciously from the others of their collection: another unit, another order, a mirror image.
 
 Each such shape is a mesh that can be used, and that leads to a model nobody wants. All checks compare, none knows what
 the shapes are of, so each can be wrong: people are told, and decide.
@@ -19,7 +19,7 @@ from scipy.spatial import KDTree
 from shapespace.arrays import FloatArray, IntArray
 from shapespace.mesh.triangle_mesh import Connectivity, face_areas
 
-#: An area by so much above or below the median's is another unit.
+#: Areas that differ from the median by more than this factor suggest another unit.
 AREA_FACTOR = 3.0
 #: A vertex is out of place where its shortest edge is longer than so many times its longest one elsewhere,
 STRETCH = 2.0
@@ -27,9 +27,10 @@ STRETCH = 2.0
 LONG = 3.0
 #: Where half of all edges are longer than so many times those of the others, no vertex is in its place.
 SCRAMBLED = 2.5
-#: "Elsewhere" is this quantile over the shapes, so that a quarter of them may be right and still be heard.
+#: "Elsewhere" is this quantile over the shapes, so that faults are found even where only a quarter of the shapes are
+#: right.
 QUANTILE = 0.25
-#: A mirror image comes so much closer in square to most others by a reflection; a turned shape so much by a rotation.
+#: Ratios of squared distances below which a reflection, or a rotation, explains why a shape differs from the others.
 MIRRORED, TURNED = 0.5, 0.1
 #: Degrees between a rotation and one that exchanges axes; and between those shapes that stand alike.
 QUARTER_TURN, ALIKE = 25.0, 30.0

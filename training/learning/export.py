@@ -1,14 +1,9 @@
-"""Bundles: ONNX files, geometry and a manifest, written only where ONNX and PyTorch agree."""
+"""Export: trained networks become ONNX files of a bundle, which is written only where ONNX and PyTorch agree."""
 
 from __future__ import annotations
 
-import hashlib
-import json
 import logging
-import os
-import shutil
 import warnings
-from collections.abc import Mapping
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -18,54 +13,57 @@ import onnx
 import onnxruntime
 import torch
 from numpy.typing import NDArray
+from pydantic import ValidationError
 from torch import Tensor, nn
 
+from shapespace.bundle.geometry import Geometry
+from shapespace.bundle.schema import COMBINER, START, Network, Origin, Tolerance, factor_network
+from shapespace.bundle.writer import Facts, Networks, write_bundle
 from shapespace.coordinates.nric import WeightedNorm
-from shapespace.mesh.triangle_mesh import TriangleMesh
+from shapespace.shell.energy import Material
 from shapespace.training.learning.layers import narrowest
 from shapespace.training.learning.learning import Composite
 from shapespace.training.learning.networks import predict
 from shapespace.training.learning.start_network import StartNetwork
 from shapespace.training.runs.config import Config
-from shapespace.training.runs.files import write_npz
 from shapespace.training.runs.sampling import Collection
 
 OPSET = 18
 
 
 class ExportError(RuntimeError):
-    """The bundle would not compute what the networks compute."""
+    """The bundle would not compute what the networks compute, or could not be read."""
 
 
-def _to_onnx(network: nn.Module, example: Tensor, names: tuple[str, str], path: Path) -> None:
+def _to_onnx(network: nn.Module, example: Tensor, names: Network) -> bytes:
+    """An ONNX file of a network, with the names that bundles have for its input and output."""
     network.eval()
-    # Without gradients, so that the network takes its path of plain gathers and sums.
+    # Without gradients networks compute by plain gathers and sums, which ONNX has.
     with torch.no_grad(), warnings.catch_warnings():
         warnings.simplefilter("ignore")
         program: Any = torch.onnx.export(
             network,
             (example,),
-            input_names=[names[0]],
-            output_names=[names[1]],
+            input_names=[names.input],
+            output_names=[names.output],
             dynamic_shapes=({0: torch.export.Dim("n", min=1)},),
             opset_version=OPSET,
             dynamo=True,
             verbose=False,
         )
-    program.save(path, external_data=False)
-    model = onnx.load(path)
-    # Traces of the exporting machine: paths of source files in the metadata of every node.
+    model: onnx.ModelProto = program.model_proto
+    # The metadata of every node tell of the exporting machine: paths of source files.
     for node in model.graph.node:
         node.ClearField("metadata_props")
         node.ClearField("doc_string")
     model.ClearField("metadata_props")
     _narrow(model.graph)
     onnx.checker.check_model(model, full_check=True)
-    onnx.save(model, path)
+    return bytes(model.SerializeToString())
 
 
 def _narrow(graph: onnx.GraphProto) -> None:
-    """Keep large constants in as few bits as hold them as they are; the runtime widens them when it loads the file."""
+    """Store each constant in the narrowest type that holds it exactly; the runtime widens it when it loads the file."""
     for tensor in graph.initializer:
         values = torch.tensor(onnx.numpy_helper.to_array(tensor))
         kind = narrowest(values)
@@ -75,24 +73,35 @@ def _narrow(graph: onnx.GraphProto) -> None:
             graph.node.insert(0, onnx.helper.make_node("Cast", [narrow], [wide], to=onnx.TensorProto.FLOAT))
 
 
-def _session(path: Path) -> onnxruntime.InferenceSession:
-    return onnxruntime.InferenceSession(path, providers=["CPUExecutionProvider"])
+def _answer(file: bytes, names: Network, rows: NDArray) -> NDArray:
+    """What an ONNX file says to some rows, computed as a server does it."""
+    session = onnxruntime.InferenceSession(file, providers=["CPUExecutionProvider"])
+    answer: NDArray = session.run([names.output], {names.input: rows})[0]
+    return answer
 
 
-def parity(composite: Composite, folder: Path, latents: Tensor, norm: WeightedNorm) -> float:
-    """Largest ``‖z_onnx − z_torch‖ / ‖z_torch‖`` over codes (n, m), through the files as a server would run them."""
+def difference(composite: Composite, networks: Networks, latents: Tensor, norm: WeightedNorm) -> float:
+    """Largest ``‖z_onnx − z_torch‖ / ‖z_torch‖`` over codes (n, m)."""
     expected = predict(composite, latents, 8).numpy()
     shapes = [
-        _session(folder / f"factor-{j}.onnx").run(None, {"latent": latents[:, index].numpy()})[0]
-        for j, index in enumerate(composite.factors)
+        _answer(file, factor_network(j), latents[:, index].numpy())
+        for j, (file, index) in enumerate(zip(networks.factors, composite.factors, strict=True))
     ]
-    answer = _session(folder / "combiner.onnx").run(None, {"factors": np.stack(shapes, axis=1)})[0]
+    answer = _answer(networks.combiner, COMBINER, np.stack(shapes, axis=1))
     return float(np.sqrt(norm.square(answer - expected) / norm.square(expected)).max())
 
 
-def _digest(path: Path) -> dict[str, Any]:
-    data = path.read_bytes()
-    return {"sha256": hashlib.sha256(data).hexdigest(), "bytes": len(data)}
+def _networks(composite: Composite, start: StartNetwork | None, latents: Tensor) -> Networks:
+    logging.getLogger("torch.onnx").setLevel(logging.ERROR)
+    some = latents[:2]
+    return Networks(
+        factors=[
+            _to_onnx(network, some[:, index], factor_network(j))
+            for j, (network, index) in enumerate(zip(composite.networks, composite.factors, strict=True))
+        ],
+        combiner=_to_onnx(composite.combiner, predict(composite.factor_shapes, some), COMBINER),
+        start=_to_onnx(start, some, START) if start else None,
+    )
 
 
 def export(
@@ -101,11 +110,11 @@ def export(
     config: Config,
     figures: dict[str, Any],
     data_digest: str,
-    destination: Path,
-    geometry: Mapping[str, NDArray],
+    models: Path,
+    geometry: Geometry,
     start: StartNetwork | None = None,
 ) -> Path:
-    """Write ``destination/NAME/VERSION/``, replacing what is there.
+    """Write ``models/NAME/VERSION/``, replacing what is there.
 
     Args:
         composite: the networks.
@@ -113,62 +122,55 @@ def export(
         config: of the run.
         figures: what was measured of them.
         data_digest: SHA-256 of the samples they learned from.
-        destination: the models directory.
-        geometry: arrays of geometry.npz beside the reference's: a finer mesh with its prolongation, modes,
-            training codes.
+        models: the models directory.
+        geometry: of the bundle.
         start: for start.onnx, where there is one.
 
     Raises:
-        ExportError: ONNX and PyTorch differ by more than the tolerance on 64 random codes.
+        ExportError: ONNX and PyTorch differ by more than the tolerance on 64 random codes, or the bundle contradicts
+            itself.
     """
     settings, reference = config.export, collection.reference
-    folder = destination / settings.name / str(settings.version)
-    part = folder.with_name(f".{folder.name}.part")  # hidden from a server that watches
-    shutil.rmtree(part, ignore_errors=True)
-    part.mkdir(parents=True)
-
-    logging.getLogger("torch.onnx").setLevel(logging.ERROR)
     rng = np.random.default_rng(0)
     latents = torch.as_tensor(collection.coordinates.uniform(64, rng), dtype=torch.float32)
-    for j, (network, index) in enumerate(zip(composite.networks, composite.factors, strict=True)):
-        _to_onnx(network, latents[:2, index], ("latent", "nric"), part / f"factor-{j}.onnx")
-    _to_onnx(
-        composite.combiner, predict(composite.factor_shapes, latents[:2]), ("factors", "nric"), part / "combiner.onnx"
-    )
+    networks = _networks(composite, start, latents)
 
-    if start:
-        _to_onnx(start, latents[:2], ("latent", "vertices"), part / "start.onnx")
-
-    difference = parity(composite, part, latents, WeightedNorm.of(reference, config.evaluation.eta))
-    if not difference <= settings.tolerance:
+    measured = difference(composite, networks, latents, WeightedNorm.of(reference, config.evaluation.eta))
+    if not measured <= settings.tolerance:
         raise ExportError(
-            f"ONNX and PyTorch differ by {difference:.1e} in the weighted norm, over {settings.tolerance:.0e}"
+            f"ONNX and PyTorch differ by {measured:.1e} in the weighted norm, over {settings.tolerance:.0e}"
         )
-    if start:
-        answer = _session(part / "start.onnx").run(None, {"latent": latents.numpy()})[0]
+    if start and networks.start:
+        answer = _answer(networks.start, START, latents.numpy())
         distance = float(np.abs(answer - predict(start, latents, 8).numpy()).max())
         if not distance <= settings.tolerance * reference.diagonal:
             raise ExportError(f"start.onnx and PyTorch differ by {distance:.1e}, over {settings.tolerance:.0e}")
 
-    write_npz(
-        part / "geometry.npz",
-        vertices=reference.vertices,
-        faces=reference.faces.astype(np.int32),
-        edges=reference.edges.astype(np.int32),
-        **geometry,
+    coordinates, material = collection.coordinates, config.material
+    facts = Facts(
+        name=settings.name,
+        version=str(settings.version),
+        licence=settings.licence,
+        title=settings.title,
+        description=settings.description,
+        latent_names=collection.latent_names,
+        factors=collection.factors,
+        lower=coordinates.lower,
+        upper=coordinates.upper,
+        period=coordinates.period,
+        material=Material(material.mu, material.lambda_, material.eta),
+        eta_reconstruction=settings.eta_reconstruction,
+        exponential_steps=None if geometry.modes is None else config.samples.steps,
+        scale=collection.scale,
+        tolerance=Tolerance(required=settings.tolerance, measured=measured),
+        figures=figures,
+        origin=Origin(config=_portable(config), data_digest=data_digest, code_version=metadata.version("shapespace")),
     )
-    manifest = _manifest(composite, collection, config, figures, data_digest, difference, "modes" in geometry)
-    if start:
-        manifest["start"] = {"file": "start.onnx", "input": "latent", "output": "vertices"}
-    manifest["files"] = {path.name: _digest(path) for path in sorted(part.iterdir())}
-    (part / "manifest.json").write_text(json.dumps(manifest, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
-    old = folder.with_name(f".{folder.name}.old")
-    shutil.rmtree(old, ignore_errors=True)
-    if folder.exists():
-        os.replace(folder, old)
-    os.replace(part, folder)
-    shutil.rmtree(old, ignore_errors=True)
-    return folder
+    try:
+        return write_bundle(models, facts, networks, geometry)
+    except ValidationError as error:
+        fault = error.errors(include_url=False, include_input=False)[0]
+        raise ExportError(f"the manifest's {'.'.join(map(str, fault['loc']))}: {fault['msg']}") from None
 
 
 def _portable(config: Config) -> dict[str, Any]:
@@ -177,54 +179,3 @@ def _portable(config: Config) -> dict[str, Any]:
     if config.collection.data is not None:
         values["collection"]["data"] = config.collection.data.name
     return values
-
-
-def _manifest(
-    composite: Composite, collection: Collection, config: Config, figures: dict[str, Any], data_digest: str,
-    difference: float, tangent: bool,
-) -> dict[str, Any]:  # fmt: skip
-    settings, coordinates, material = config.export, collection.coordinates, config.material
-    reference: TriangleMesh = collection.reference
-    return {
-        "schema_version": 1,
-        "name": settings.name,
-        "version": str(settings.version),
-        "licence": settings.licence,
-        "title": settings.title,
-        "description": settings.description,
-        "latent_dimension": len(coordinates),
-        "latent_names": list(collection.latent_names),
-        "factors": [
-            {
-                "name": name,
-                "start": index[0],
-                "stop": index[-1] + 1,
-                "file": f"factor-{j}.onnx",
-                "input": "latent",
-                "output": "nric",
-            }
-            for j, (name, index) in enumerate(collection.factors.items())
-        ],
-        "lower": coordinates.lower.tolist(),
-        "upper": coordinates.upper.tolist(),
-        "period": [None if np.isnan(p) else p for p in coordinates.period.tolist()],
-        "edges": reference.connectivity.edge_count,
-        "vertices": reference.connectivity.vertex_count,
-        "faces": len(reference.faces),
-        "mu": material.mu,
-        "lambda": material.lambda_,
-        "eta": material.eta,
-        "eta_reconstruction": settings.eta_reconstruction,
-        "exponential_steps": config.samples.steps if tangent else None,
-        "scale": collection.scale,
-        "combiner": {"file": "combiner.onnx", "input": "factors", "output": "nric"},
-        "start": None,
-        "geometry": {"file": "geometry.npz"},
-        "onnx_tolerance": {"required": settings.tolerance, "measured": difference},
-        "figures": figures,
-        "origin": {
-            "config": _portable(config),
-            "data_digest": data_digest,
-            "code_version": metadata.version("shapespace"),
-        },
-    }

@@ -13,8 +13,8 @@ from torch import Tensor, nn
 from torch.optim.lr_scheduler import CosineAnnealingLR, ReduceLROnPlateau
 
 from shapespace.training.learning.networks import ShapeNetwork, predict
+from shapespace.training.runs.atomic_files import whole
 from shapespace.training.runs.config import FitSettings
-from shapespace.training.runs.files import whole
 from shapespace.training.runs.progress import bar
 
 CHECKPOINT_EPOCHS = 5

@@ -30,6 +30,7 @@ from shapespace.training.learning.networks import (
     predict,
 )
 from shapespace.training.runs.config import CombinerSettings, Config, FitSettings, LatentNetworkSettings
+from shapespace.training.runs.directory import RunDirectory
 from shapespace.training.runs.sampling import Collection, Samples, read, split
 
 
@@ -67,8 +68,8 @@ class Learner:
     Args:
         collection: what the samples are of.
         config: of the run.
-        folder: of the run.
-        data_key: names the samples.
+        run: holds the samples, and gets the networks.
+        data_key: names the samples and the version of what is learned from them.
         fraction: share of the training codes to learn from. With less the number of epochs grows, so that the number of
             steps stays.
         all_of_factors: whether the factors learn from all of their own samples all the same.
@@ -79,23 +80,22 @@ class Learner:
         self,
         collection: Collection,
         config: Config,
-        folder: Path,
+        run: RunDirectory,
         data_key: str,
         fraction: float = 1.0,
         all_of_factors: bool = False,
         seed: int | None = None,
     ) -> None:
-        self.collection, self.config, self.run = collection, config, folder
+        self.collection, self.config, self.run = collection, config, run
         self.seed = config.networks.seed if seed is None else seed
         self._data_key, self._fraction = data_key, fraction
         self._factor_fraction = 1.0 if all_of_factors else fraction
-        (folder / "networks").mkdir(exist_ok=True)
         self.histories: dict[str, Any] = {}
 
     @cached_property
     def joint(self) -> Samples:
         """The joint samples."""
-        return read(self.run / "samples")
+        return read(self.run.samples)
 
     @cached_property
     def split(self) -> dict[str, IntArray]:
@@ -103,8 +103,7 @@ class Learner:
         if self.seed != self.config.networks.seed:
             settings, rng = self.config.samples, np.random.default_rng(self.seed)
             return split(np.arange(len(self.joint.index)), settings.test_fraction, settings.validation_fraction, rng)
-        with np.load(self.run / "samples" / "split.npz") as file:
-            return {name: np.searchsorted(self.joint.index, index) for name, index in file.items()}
+        return {name: np.searchsorted(self.joint.index, index) for name, index in self.run.split.read().items()}
 
     @cached_property
     def _reference(self) -> FloatArray:
@@ -114,7 +113,7 @@ class Learner:
     def _path(self, kind: str, fractions: Sequence[float], *settings: BaseModel) -> Path:
         decides = [self._data_key, fractions, self.seed]
         text = json.dumps([*decides, [s.model_dump(mode="json") for s in settings]])
-        return self.run / "networks" / f"{kind}-{hashlib.sha256(text.encode()).hexdigest()[:12]}.safetensors"
+        return self.run.network(f"{kind}-{hashlib.sha256(text.encode()).hexdigest()[:12]}")
 
     def _scaling(self, z: NDArray) -> Scaling:
         return Scaling.of(self._reference, WeightedNorm.of(self.collection.reference, eta=1.0).squared, z)
@@ -185,7 +184,7 @@ class Learner:
 
     def factor_samples(self, j: int) -> Samples:
         """The samples of a factor alone."""
-        return read(self.run / "samples" / f"factor-{j}")
+        return read(self.run.factor_samples(j))
 
     def factor(self, j: int, settings: LatentNetworkSettings) -> FactorNetwork:
         """ψ_j, on the factor's own samples; parts of test codes are never among them."""

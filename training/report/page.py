@@ -1,4 +1,4 @@
-"""A run's page, to look at rather than to read: ``report.html``, one file that asks nothing of the network."""
+"""The report of a run: ``report.html``, one self-contained file of pictures, plots and tables."""
 
 from __future__ import annotations
 
@@ -28,12 +28,13 @@ from shapespace.training.report.pictures import (
     tint,
 )
 from shapespace.training.report.plots import Line, lines, plot
-from shapespace.training.report.record import HUES, STAGES, Record
-from shapespace.training.runs.files import write_text
+from shapespace.training.report.record import HUES, Record
+from shapespace.training.runs.directory import RunDirectory
+from shapespace.training.runs.stages import STAGES
 
 #: Pixels of a picture's longer side; shown at half of it or less, so that it is sharp on a phone.
 LARGE, SMALL = 480, 300
-#: More modes than these aren't drawn.
+#: Most modes that are drawn.
 MODES_SHOWN = 40
 #: What the keys of R² in evaluation.json stand for.
 MODELS = {
@@ -43,7 +44,7 @@ MODELS = {
     "affine of learned factors": "Affine sum of learned factors",
     "grid": "Affine sum of multilinear grids",
 }
-#: Keys of evaluation.json that have their place on the page; the others come into a table of their own.
+#: Keys of evaluation.json with a section on the page; all others are listed in one table.
 PLACED = {"eta", "test_samples", "r2", "r2_factors", "variants", "vertex_error", "sizes", "times", "fractions"}
 PLACED |= {"prolongation"}
 
@@ -212,7 +213,7 @@ def fraction_plot(record: Record) -> Markup | None:
 
 
 def flatten(value: Any, name: str = "") -> Iterator[tuple[str, Any]]:
-    """Figures that the page knows nothing of, each under its path."""
+    """Figures without a section of their own, each with its path."""
     if isinstance(value, dict | list):
         for key, inner in value.items() if isinstance(value, dict) else enumerate(value):
             yield from flatten(inner, f"{name} · {key}" if name else str(key))
@@ -270,10 +271,10 @@ def page(record: Record) -> str:
     )
     environment.filters |= {"figure": figure, "r2": r2, "percent": percent, "duration": duration, "bytes": size}
     return environment.get_template("report.jinja").render(
-        title=export.get("title") or record.folder.resolve().name,
+        title=export.get("title") or record.run.folder.resolve().name,
         description=export.get("description", ""),
         record=record,
-        stages=STAGES,
+        stages=list(STAGES),
         pictures=studio is not None,
         shapes=list(shapes(record, close)) if close else [],
         modes=list(mode_cards(record, close)) if close and modes else [],
@@ -298,12 +299,11 @@ def page(record: Record) -> str:
     )
 
 
-def write_report(folder: Path) -> Path:
+def write_report(run: RunDirectory) -> Path:
     """Write ``report.html`` from what a run, finished or not, has left in its directory; returns its path.
 
     Raises:
         ReportError: the folder is no run directory, or a file in it can't be read.
     """
-    path = folder / "report.html"
-    write_text(path, page(Record(folder)))
-    return path
+    run.report.write(page(Record(run)))
+    return run.report.path

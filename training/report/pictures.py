@@ -21,7 +21,7 @@ from shapespace.training.report.rendering import Camera
 
 #: Largest displacement at which a mode is shown, in diagonals.
 MODE_REACH = 0.1
-#: What shapes are made of: as they are, as the networks have them (yellow in the paper too), and without a factor.
+#: Colours of shapes: exact ones, those from networks (yellow in the paper too), and modes without a factor.
 CLAY, COMPOSITE, NEUTRAL = "#d3ccc1", "#e3b23c", "#4b5a6b"
 ERROR = LinearSegmentedColormap.from_list("error", [CLAY, "#f2c14e", "#e4572e", "#8f1440"])
 

@@ -2,27 +2,28 @@
 
 from __future__ import annotations
 
-import json
 import tomllib
 import zipfile
+from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import cycle
 from pathlib import Path
-from typing import Any
+from typing import TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from shapespace.arrays import FloatArray
 from shapespace.coordinates.nric import WeightedNorm
 from shapespace.mesh.triangle_mesh import TriangleMesh
+from shapespace.training.runs.directory import RunDirectory
 from shapespace.training.runs.losses import losses
+from shapespace.training.runs.stages import STAGES
 from shapespace.training.space.modes import edge_magnitudes
 
-#: In the pipeline's order.
-STAGES = ("ingest", "mean", "modes", "factors", "samples", "networks", "evaluation", "export")
-#: Of the factors, in their order; in plots too.
+Value = TypeVar("Value")
+#: Colours of the factors in their order, in plots too.
 HUES = ("#d1495b", "#2a7fba", "#3a9d5d", "#8e5bb5", "#e08a1e", "#1a9aa0", "#b5651d", "#d45fa0", "#7b9a24", "#5560c9")
 
 
@@ -39,6 +40,13 @@ class Factor:
     modes: list[int]
 
 
+def _readable(path: Path, read: Callable[[], Value]) -> Value:
+    try:
+        return read()
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+        raise ReportError(f"{path} can't be read: {str(error).splitlines()[0]}") from error
+
+
 class Record:
     """What a run has left so far; what isn't there is empty or None.
 
@@ -46,66 +54,52 @@ class Record:
         ReportError: the folder is no run directory; or, on reading, a file of it is broken.
     """
 
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
-        if not (folder / "config.toml").is_file():
-            raise ReportError(f"{folder} is no run directory: it holds no config.toml")
-        self.text = self._read("config.toml", "", lambda path: path.read_text(encoding="utf-8"))
-        self.config: dict[str, Any] = self._read("config.toml", {}, lambda path: tomllib.loads(self.text))
-        self.reference, self.modes, self.gallery = (
-            self._arrays(f"{name}.npz") for name in ("reference", "modes", "gallery")
+    def __init__(self, run: RunDirectory) -> None:
+        self.run = run
+        if not run.is_run():
+            raise ReportError(f"{run.folder} is no run directory: it holds no config.toml")
+        self.text = _readable(run.config.path, run.config.read)
+        self.config = _readable(run.config.path, lambda: tomllib.loads(self.text))
+        self.reference, self.gallery, mean = (
+            _readable(file.path, file.read_if_written) for file in (run.reference, run.gallery, run.mean)
         )
-        self.decomposition, self.evaluation, self.histories = (
-            self._json(name) for name in ("modes.json", "evaluation.json", "networks/histories.json")
+        modes = run.modes if run.modes.exists() else run.modes_by_strength
+        self.modes = _readable(modes.path, modes.read_if_written)
+        self.decomposition, self.evaluation, self.histories, grouping = (
+            _readable(file.path, file.read_if_written)
+            for file in (run.decomposition, run.evaluation, run.histories, run.factors)
         )
-        self.mean: FloatArray | None = self._arrays("mean.npz").get("vertices")
+        self.mean: FloatArray | None = mean.get("vertices")
         #: (V, 3) what tangent vectors start from: the mean, or the reference where there is none.
         self.base = self.reference.get("vertices") if self.mean is None else self.mean
-        grouping = self._json("factors.json")
         groups = grouping.get("factors", [])
         self.factors = [
             Factor(name, hue, group)
             for name, hue, group in zip(grouping.get("names", []), cycle(HUES), groups, strict=False)
         ]
         self.overlap = np.array(grouping.get("overlap", []))
-        stamps = {path.stem: self._json(f"stages/{path.name}") for path in (folder / "stages").glob("*.json")}
         #: Seconds of the stages that are done, None for one at work.
-        self.seconds = {name: stamps[name].get("seconds") for name in STAGES if name in stamps}
-
-    def _read(self, name: str, missing: Any, how: Any) -> Any:
-        path = self.folder / name
-        try:
-            return how(path) if path.exists() else missing
-        except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
-            raise ReportError(f"{path} can't be read: {str(error).splitlines()[0]}") from error
-
-    def _json(self, name: str) -> dict[str, Any]:
-        return self._read(name, {}, lambda path: dict(json.loads(path.read_text(encoding="utf-8"))))
-
-    def _arrays(self, name: str) -> dict[str, NDArray]:
-        return self._read(name, {}, lambda path: dict(np.load(path)))
+        self.seconds = {
+            name: _readable(run.stamp(name).path, partial(run.seconds, name))
+            for name in STAGES
+            if run.stamp(name).exists()
+        }
 
     @cached_property
     def given_up(self) -> list[tuple[str, str]]:
-        """Stage and sentence of all that the stages which are done gave up."""
+        """What the finished stages could not do: pairs of a stage and a sentence."""
         found = []
         for stage in (name for name in STAGES if self.seconds.get(name) is not None):
-            lost = self._read("", [], lambda folder, stage=stage: losses(folder, stage))
+            lost = _readable(self.run.folder, partial(losses, self.run, stage))
             found += [(stage, loss.sentence) for loss in lost]
         return found
 
     @cached_property
     def at_work(self) -> str:
-        """What the log says last of a stage that isn't done."""
-        path = self.folder / "log.jsonl"
-        for line in reversed(path.read_text(encoding="utf-8").splitlines() if path.exists() else []):
-            try:
-                event = json.loads(line)
-            except json.JSONDecodeError:
-                continue  # the last line of a run that was killed
-            if event.get("event") == "progress":
-                return f"{event['what']}: {event['done']} of {event['total']}"
-            return ""
+        """Progress of the stage at work, from the last line of the log; empty where it reports none."""
+        last = deque(self.run.events(), maxlen=1)
+        if last and last[0].get("event") == "progress":
+            return "{what}: {done} of {total}".format(**last[0])
         return ""
 
     def supports(self, tangents: FloatArray) -> FloatArray:

@@ -12,12 +12,11 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationErr
 
 from shapespace.coordinates.reconstruction import DEFAULT_ETA
 from shapespace.shell.energy import Material
-from shapespace.training.space.modes import ITERATIONS, SPARSITY
 
 #: Which edges a convolution hears of, see networks.EdgeConvolution.
 Neighbourhood = Literal["star", "flaps"]
 
-#: Of each factor, where the configuration doesn't say: a factor has few modes.
+#: Default number of samples of each factor alone: few suffice, as a factor has few modes.
 FACTOR_SAMPLES = 1000
 
 
@@ -32,20 +31,23 @@ class ConfigError(ValueError):
 
 
 class _Section(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+    # Docstrings under the fields are their descriptions, from which docs/configuration.md is written.
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, use_attribute_docstrings=True)
 
 
 class CollectionSettings(_Section):
     """Where the shapes come from: a generator of ours, or meshes in correspondence."""
 
     generator: Literal["freaky-torus", "figure"] | None = None
+    """A collection of ours, made by a program; see training/collection/generators.py."""
     data: Path | None = None
     """Folder of OBJ, PLY, STL, OFF or glTF files, or one NPZ file with ``vertices`` (n, V, 3) and ``faces``; relative
-    to the configuration's own folder. The command's ``--data`` goes before."""
+    to the configuration's own folder. The command's ``--data`` takes precedence."""
     reference: str | None = None
-    """Name of the mesh whose area becomes 1 and where served shapes stand; None takes the most central one."""
+    """Name of the mesh that is scaled to area 1 and whose position and orientation served shapes have; by default the
+    most central one."""
     coarse_vertices: int = Field(1000, ge=0)
-    """Vertices to compute with, where the meshes have more; 0 computes with all of them."""
+    """Vertices to compute with: meshes with more are simplified to about this number. 0 computes with all vertices."""
 
     @model_validator(mode="after")
     def _one_source(self) -> CollectionSettings:
@@ -55,46 +57,58 @@ class CollectionSettings(_Section):
 
 
 class MaterialSettings(_Section):
-    """Of the shell, at unit area of the reference; see shapespace.shell.energy.Material."""
+    """Elastic parameters of the shell, at unit area of the reference; see shapespace.shell.energy.Material."""
 
     mu: float = Field(Material.mu, gt=0)
+    """Lamé's μ of the membrane."""
     lambda_: float = Field(Material.lambda_, ge=0, alias="lambda")
+    """Lamé's λ of the membrane."""
     eta: float = Field(Material.eta, gt=0)
+    """Weight η of bending against stretching, about the squared thickness. Larger values make stiffer shells, whose
+    triangles may collapse on the way to far shapes."""
 
 
 class ModeSettings(_Section):
     """Sparse principal geodesic analysis of the collection at its mean."""
 
     count: int = Field(20, ge=1)
-    """m; at most the number of shapes less one."""
-    sparsity: float = Field(SPARSITY, ge=0, lt=1)
-    """λ as a share of the price at which the principal modes stop paying; 0 is principal geodesic analysis."""
+    """Number of modes m; at most the number of shapes less one."""
+    sparsity: float = Field(0.1, ge=0, lt=1)
+    """Weight λ of the sparsity term, as a share of the weight at which every principal mode would vanish. Larger
+    values make each mode move a smaller part; 0 is plain principal geodesic analysis."""
     log_steps: int = Field(16, ge=2)
-    """K of the logarithms, best that of the exponentials, whose inverse they are."""
-    max_iterations: int = Field(ITERATIONS, ge=1)
+    """Time steps K of the discrete logarithms. Best equal to ``samples.steps``: only logarithms and exponentials with
+    the same K are inverse to each other."""
+    max_iterations: int = Field(200, ge=1)
+    """Most rounds of the sparse analysis through all modes."""
 
 
 class FactorSettings(_Section):
     """Groups of modes whose supports overlap."""
 
     count: int | None = Field(None, ge=1)
-    """J; None leaves it to the criterion of shapespace.training.space.factors."""
+    """Number of factors J; by default it follows from how much the modes overlap."""
 
 
 class SampleSettings(_Section):
     """Codes drawn uniformly from the hypercube, and how they are split."""
 
     count: int = Field(4000, ge=10)
+    """Joint samples: random codes whose shapes are computed. They take most of a run's time."""
     steps: int = Field(16, ge=2)
-    """K of the exponentials."""
+    """Time steps K of the discrete exponentials."""
     factor_counts: list[int] | int | None = None
-    """Samples of each factor alone, at its part of the first codes; where there are more than ``count``, further codes
-    are drawn for the factor only. The paper takes ``count``; None takes FACTOR_SAMPLES of them, which are enough."""
+    """Samples of each factor alone, one number for all or one for each. They have the factor's part of the joint
+    codes, and of further codes beyond ``count``. By default 1000, or ``count`` where that is less; the paper takes
+    ``count``."""
     part_size: int = Field(50, ge=1)
+    """Samples in a file: what a worker is given at a time, and what is lost with it."""
     test_fraction: float = Field(0.2, gt=0, lt=1)
+    """Share of the joint samples that only the evaluation sees."""
     validation_fraction: float = Field(0.1, gt=0, lt=1)
-    """Part of the training codes that chooses the learning rate and the best epoch."""
+    """Share of the other joint samples that chooses the learning rate and the best epoch."""
     seed: int = 0
+    """Of the codes and of the split."""
 
     def own(self, factors: int) -> list[int]:
         """Samples of each factor alone."""
@@ -199,11 +213,13 @@ class EvaluationSettings(_Section):
     """How the test split is measured."""
 
     eta: float = Field(1e-2, gt=0)
+    """Weight of angles against lengths in the norm of all figures."""
     grid_nodes: Annotated[int, Field(ge=0), AfterValidator(_grid)] = 0
     """Nodes per coordinate, at most, of the multilinear grid of Sassen et al. 2020, a baseline whose nodes may take as
     long as all samples; 0 leaves it out."""
     grid_size: int = Field(1000, ge=1)
-    """Nodes of the grid of one factor, at most; where that leaves fewer than 3 per coordinate there is none."""
+    """Nodes of the grid of one factor, at most; a factor for which that leaves fewer than 3 per coordinate gets no
+    grid."""
     exact_factors: int = Field(200, ge=2)
     """Test codes whose factors' own exponentials are computed, for the affine sum of exact factors."""
     reconstructions: int = Field(100, ge=1)
@@ -213,18 +229,24 @@ class EvaluationSettings(_Section):
 class ExportSettings(_Section):
     """What the bundle says of itself."""
 
-    name: str = Field(pattern=r"^[a-z0-9][a-z0-9-]*$")
-    version: int = Field(1, ge=1)
+    name: str = Field(pattern=r"^[a-z0-9][a-z0-9-]*$", max_length=64)
+    """In addresses and file names."""
+    version: int = Field(1, ge=1, lt=10**9)
+    """The bundle is ``models/NAME/VERSION``; one of the same version is replaced."""
     title: str
+    """Name of the model for people."""
     description: str
+    """A sentence on the model for people."""
     licence: str
+    """Of the meshes, and so of the model."""
     eta_reconstruction: float = Field(DEFAULT_ETA, gt=0)
+    """Weight η of angles against lengths when vertices are found from them (Gauss–Newton)."""
     tolerance: float = Field(1e-4, gt=0)
     """Largest relative difference of ONNX and PyTorch, in the weighted norm."""
 
 
 class Config(_Section):
-    """A whole run."""
+    """What a configuration consists of."""
 
     collection: CollectionSettings
     material: MaterialSettings = MaterialSettings()
@@ -258,12 +280,12 @@ def parse(text: str, source: str) -> Config:
 
 
 def load(path: Path, data: Path | None = None, fractions: Sequence[float] = ()) -> tuple[Config, str]:
-    """Read a configuration file, with what the command line has to say to it.
+    """Read a configuration file, and apply the options of the command line to it.
 
     Args:
         path: of the file.
-        data: goes before ``collection.data``.
-        fractions: go before ``networks.fractions``.
+        data: replaces ``collection.data``.
+        fractions: replace ``networks.fractions``.
 
     Returns:
         The configuration, and the text that says the same from any folder: ``collection.data`` made absolute, the

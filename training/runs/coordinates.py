@@ -1,4 +1,4 @@
-"""Latent coordinates: the box they live in and which of them close up."""
+"""Latent coordinates: their bounds and periods."""
 
 from __future__ import annotations
 

@@ -1,24 +1,23 @@
-"""What each stage of a run gave up, in sentences, from what it left in the run directory."""
+"""What each stage of a run could not do, in sentences, read from the files that it left."""
 
 from __future__ import annotations
 
-import json
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from shapespace.training.runs.directory import RunDirectory
 from shapespace.training.runs.sampling import DONE, columns
 
 #: A larger share of logarithms or samples lost stops the run.
 MOST_LOST = 0.25
-#: By so much of the box codes that are lost lie farther out in a factor where it is named.
+#: A factor is named as the cause where lost codes lie farther from 0 in it than others do, by this share of the box.
 CLEARLY = 0.05
-#: Names in a sentence.
+#: Most names in a sentence.
 NAMED = 6
 
 COARSER = (
@@ -28,16 +27,16 @@ COARSER = (
 
 
 class LostTooMuchError(RuntimeError):
-    """A stage gave up more than is worth going on with; what it did stays, and the message says how to go on."""
+    """A stage lost too many logarithms or samples. What it did stays; the message says how to go on."""
 
 
 @dataclass(frozen=True)
 class Loss:
-    """One thing that a stage gave up.
+    """One thing that a stage could not do.
 
     Attributes:
         sentence: what, how much, and where.
-        share: of the logarithms or samples that are lost; 0 of what nothing stops for.
+        share: of the logarithms or samples that are lost; 0 for what never stops a run.
         advice: what may help, where the share is large.
     """
 
@@ -51,9 +50,9 @@ class Loss:
         return self.share > MOST_LOST
 
 
-def losses(folder: Path, stage: str) -> list[Loss]:
-    """What a stage that is done gave up; nothing of a stage that found nothing."""
-    return _STAGES[stage](folder) if stage in _STAGES else []
+def losses(run: RunDirectory, stage: str) -> list[Loss]:
+    """What a finished stage could not do."""
+    return _STAGES[stage](run) if stage in _STAGES else []
 
 
 def refuse(stage: str, lost: list[Loss], command: str = "") -> None:
@@ -72,29 +71,24 @@ def refuse(stage: str, lost: list[Loss], command: str = "") -> None:
         )
 
 
-def _json(path: Path) -> dict[str, Any]:
-    return dict(json.loads(path.read_text(encoding="utf-8"))) if path.exists() else {}
-
-
 def _some(names: list[str]) -> str:
     more = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
     return ", ".join(names[:NAMED]) + more
 
 
-def _ingest(folder: Path) -> list[Loss]:
-    facts = _json(folder / "ingest.json")
+def _ingest(run: RunDirectory) -> list[Loss]:
+    facts = run.ingest.read_if_written()
     sentences = [*facts.get("notes", ()), *facts.get("warnings", ())]
     if facts.get("reason"):
         sentences.append(f"coarse mesh: {facts['reason']}")
     return [Loss(sentence) for sentence in sentences]
 
 
-def _modes(folder: Path) -> list[Loss]:
-    facts = _json(folder / "modes.json")
+def _modes(run: RunDirectory) -> list[Loss]:
+    facts = run.decomposition.read_if_written()
     if "steps" not in facts:
         return []
-    with np.load(folder / "shapes.npz") as file:
-        names = file["names"].astype(str)
+    names = run.shapes.read()["names"].astype(str)
     steps, asked, found = np.array(facts["steps"]), facts["asked"], facts["modes"]
     lost = []
     linearised = names[steps == 0].tolist()
@@ -116,12 +110,12 @@ def _modes(folder: Path) -> list[Loss]:
     return lost
 
 
-def _samples(folder: Path) -> list[Loss]:
-    grouping = _json(folder / "factors.json")
+def _samples(run: RunDirectory) -> list[Loss]:
+    grouping = run.factors.read_if_written()
     advice = f"{COARSER}; or without the shapes farthest from the others, which make the box of codes large"
     lost = []
-    kinds = {"joint": folder / "samples"}
-    kinds |= {f"{name!r}": folder / "samples" / f"factor-{j}" for j, name in enumerate(grouping.get("names", ()))}
+    kinds = {"joint": run.samples}
+    kinds |= {f"{name!r}": run.factor_samples(j) for j, name in enumerate(grouping.get("names", ()))}
     for kind, path in kinds.items():
         samples = columns(path, "asked", "latents", "status", "reason")
         if not samples:
@@ -146,7 +140,7 @@ def _samples(folder: Path) -> list[Loss]:
 
 
 def _farthest(latents: NDArray, failed: NDArray, grouping: dict[str, Any]) -> str:
-    """The factor in which lost codes lie clearly farther out than the others, if there is one."""
+    """The end of a sentence: in which factor lost codes lie clearly farther from 0 than others do, if in any."""
     names, factors = grouping.get("names", []), grouping.get("factors", [])
     if len(factors) < 2 or failed.all():
         return ""
@@ -156,8 +150,8 @@ def _farthest(latents: NDArray, failed: NDArray, grouping: dict[str, Any]) -> st
     return f", most in factor {names[int(excess.argmax())]!r}" if excess.max() > CLEARLY else ""
 
 
-def _evaluation(folder: Path) -> list[Loss]:
-    figures = _json(folder / "evaluation.json")
+def _evaluation(run: RunDirectory) -> list[Loss]:
+    figures = run.evaluation.read_if_written()
     lost = []
     statuses = figures.get("vertex_error", {}).get("status", {})
     stalled, count = sum(n for status, n in statuses.items() if status != "converged"), sum(statuses.values())
@@ -169,7 +163,7 @@ def _evaluation(folder: Path) -> list[Loss]:
     return lost
 
 
-_STAGES: dict[str, Callable[[Path], list[Loss]]] = {
+_STAGES: dict[str, Callable[[RunDirectory], list[Loss]]] = {
     "ingest": _ingest,
     "modes": _modes,
     "samples": _samples,

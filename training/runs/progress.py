@@ -1,4 +1,4 @@
-"""Bars for whoever waits: nothing in the first seconds, then how far it is and how long it takes."""
+"""Progress bars: silent in the first seconds, then with an estimate of the time left."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from typing import Any, TypeVar
 
 from tqdm import tqdm
 
-#: Seconds of silence; and between two lines where no terminal rewrites them.
+#: Seconds without output at the start; and between two lines where there is no terminal.
 DELAY, PAUSE = 5, 10
 
 Item = TypeVar("Item")
 
 
 class _Lines(tqdm):
-    """A bar for files and pipes: a line now and then."""
+    """A bar for files and pipes, which writes a new line each time."""
 
     def display(self, msg: str | None = None, pos: int | None = None) -> bool:
         if msg is None:
@@ -26,20 +26,20 @@ class _Lines(tqdm):
 
 
 def bar(title: str, unit: str = "it", total: int | None = None, items: Iterable[Any] | None = None, **how: Any) -> tqdm:
-    """A bar of tqdm's on the standard error, that is gone at the end."""
+    """A bar on the standard error, removed at the end."""
     terminal = sys.stderr.isatty()
     kind, pause = (tqdm, 0.1) if terminal else (_Lines, PAUSE)
     return kind(items, desc=title, unit=unit, total=total, delay=DELAY, mininterval=pause, leave=False, **how)
 
 
 def progress(items: Iterable[Item], title: str, unit: str = "it", total: int | None = None) -> Iterator[Item]:
-    """The items, counted by a bar."""
+    """Yield the items while a bar counts them."""
     yield from bar(title, unit, total, items)
 
 
 @contextmanager
 def waiting(title: str) -> Iterator[None]:
-    """A bar that only counts seconds, for work that can't say how far it is."""
+    """Show the elapsed seconds during work whose progress is unknown."""
     over = threading.Event()
 
     def tick() -> None:

@@ -14,16 +14,16 @@ from numpy.typing import NDArray
 
 from shapespace.arrays import FloatArray, IntArray
 from shapespace.mesh.triangle_mesh import TriangleMesh
+from shapespace.training.runs.atomic_files import NpzFile
 from shapespace.training.runs.coordinates import Coordinates
-from shapespace.training.runs.files import write_npz
 from shapespace.training.runs.progress import bar
 from shapespace.training.runs.workers import run
 
 DONE, FAILED = "done", "failed"
-#: A code without a shape is shortened to this share of itself, so many times at most. Shapes end where a face
-#: collapses, mostly near the corners of the box, which is never smaller than the training shapes need.
+#: A code whose shape can't be computed is multiplied by this factor, at most so many times. Faces collapse mostly at
+#: codes near the corners of the box, which lie farther out than the training shapes do.
 SHORTER, SHORTENINGS = 0.85, 3
-#: Samples, for without a few in each part of the split there is nothing to learn from.
+#: Fewest samples to learn from: each part of the split needs some.
 FEWEST = 10
 
 
@@ -148,7 +148,7 @@ def draw(
     with bar(title, "sample", len(latents), initial=done) as drawn:
         for k, part in results:
             index = parts[missing[k]]
-            write_npz(missing[k], index=index, asked=latents[index], **part)
+            NpzFile(missing[k]).write(index=index, asked=latents[index], **part)
             done, failed = done + len(index), failed + int((part["status"] != DONE).sum())
             drawn.update(len(index))
             yield done, len(latents), failed
@@ -157,7 +157,7 @@ def draw(
 
 
 def _part(collection: Collection, shorten: bool, asked: FloatArray) -> dict[str, NDArray]:
-    """What a part holds of the shapes of its codes."""
+    """The arrays of a part, but ``index`` and ``asked``."""
     shapes, latents = collection.shapes(asked), asked.copy()
     vertices, nric, reasons = shapes.vertices.copy(), shapes.nric.copy(), np.array(shapes.reasons, dtype=object)
     for _ in range(SHORTENINGS if shorten else 0):
@@ -193,12 +193,12 @@ def _status(path: Path, index: IntArray, latents: FloatArray) -> NDArray[np.str_
 
 
 def asked_for(part: Mapping[str, NDArray]) -> NDArray:
-    """Codes that the samples of a part were asked for; parts of version 0.1 have no others than those used."""
+    """Codes that the samples of a part were asked for; version 0.1 did not shorten any, and stored only those used."""
     return part["asked"] if "asked" in part else part["latents"]
 
 
 def columns(folder: Path, *names: str) -> dict[str, NDArray]:
-    """Some arrays of all samples of a folder, failed ones too; none of a folder without parts."""
+    """Some arrays of all samples of a folder, failed ones included; an empty mapping where there are no parts."""
     found: dict[str, list[NDArray]] = {name: [] for name in names}
     for path in sorted(folder.glob("part-*.npz")):
         with np.load(path) as part:
@@ -226,7 +226,7 @@ def read(folder: Path) -> Samples:
 
 
 def used(folder: Path, asked: FloatArray) -> FloatArray:
-    """Codes (n, m) as asked for, but those shortened that a folder's samples had to shorten."""
+    """Codes (n, m) as asked for, except those that had to be shortened, which are given as they were used."""
     found, codes = columns(folder, "index", "latents", "status"), asked.copy()
     done = found["status"] == DONE
     codes[found["index"][done]] = found["latents"][done]
@@ -234,7 +234,7 @@ def used(folder: Path, asked: FloatArray) -> FloatArray:
 
 
 def split(index: IntArray, test: float, validation: float, rng: np.random.Generator) -> dict[str, IntArray]:
-    """Disjoint sorted parts of the samples' indices: test of all, validation of the rest, and train, what is left."""
+    """Split indices at random into sorted parts: a share of all is test, one of the rest validation, the rest train."""
     order = rng.permutation(index)
     n_test = max(1, round(test * len(order)))
     n_validation = max(1, round(validation * (len(order) - n_test)))

@@ -16,11 +16,11 @@ from shapespace.coordinates.nric import WeightedNorm
 from shapespace.mesh.triangle_mesh import TriangleMesh
 from shapespace.training.space.modes import edge_magnitudes
 
-#: Groups that overlap more than this, on average over their pairs of modes, are never left apart for their overlap.
+#: Upper bound of the default threshold: groups whose modes overlap more than this on average are always joined.
 THRESHOLD = 0.5
-#: Modes that a factor takes unless told otherwise: its samples have to fill a box of that dimension.
+#: Default limit on the modes of a factor, since its samples have to fill a box of that dimension.
 LARGEST = 9
-#: An axis along which a mesh spreads less than this share of its longest tells nothing.
+#: Axes along which a mesh spreads less than this share of its largest spread give no names.
 THIN = 0.2
 #: A part lies to one side if it is further from the centre than this share of the mesh's standard deviation.
 ASIDE = 0.5

@@ -51,11 +51,10 @@ from shapespace.coordinates.nric import WeightedNorm
 from shapespace.mesh.rigid_motion import without_rigid_motion
 from shapespace.shell.space import Point, ShellSpace
 from shapespace.solve.cholesky import analyse
+from shapespace.training.runs.config import ModeSettings
 
-#: λ as a share of the price at which the strongest mode of the plain analysis is no longer worth having.
-SPARSITY = 0.1
 #: Most rounds through all sparse modes.
-ITERATIONS = 200
+ITERATIONS = ModeSettings().max_iterations
 #: ADMM iterations on a mode before the next has its turn, and their over-relaxation.
 INNER_ITERATIONS = 10
 OVERRELAXATION = 1.6
@@ -63,7 +62,7 @@ OVERRELAXATION = 1.6
 VARIMAX_ITERATIONS, SWEEPS = 200, 100
 #: The objective is compared with that of so many iterations ago.
 PATIENCE = 10
-#: A mode that carries less than this of all energy is none.
+#: Modes with a smaller share of the total energy are dropped: they are round-off.
 NEGLIGIBLE = 1e-9
 #: Of a mode's square, the share whose edges say how local it is.
 LOCAL = 0.95
@@ -110,7 +109,7 @@ def pga(space: ShellSpace, mean: FloatArray, fields: FloatArray, count: int) -> 
     """Principal geodesic analysis: the modes whose span comes closest to the logarithms in the metric.
 
     Args:
-        space: where.
+        space: the shape space.
         mean: X̄ (V, 3).
         fields: (n, V, 3) logarithms.
         count: m, at most n.
@@ -137,7 +136,7 @@ def spga(
     ``sparsity`` does not depend on the number of shapes, on their size or on the mesh. Nothing here is random.
 
     Args:
-        space: where; its η weighs the angles in the 1-norm, too.
+        space: the shape space; its η also weighs the angles in the 1-norm.
         mean: X̄ (V, 3).
         fields: (n, V, 3) logarithms.
         count: m, at most n.

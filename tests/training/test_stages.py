@@ -8,8 +8,8 @@ import trimesh
 
 from shapespace.mesh.triangle_mesh import TriangleMesh
 from shapespace.training.runs.config import parse
-from shapespace.training.runs.files import write_npz
-from shapespace.training.space.discovery import MeanError, mean, write_reference
+from shapespace.training.runs.directory import RunDirectory
+from shapespace.training.space.stages import MeanError, mean, write_reference
 
 CONFIG = """
 [collection]
@@ -32,12 +32,13 @@ def test_a_run_without_a_mean_ends_with_the_place(tmp_path: Path) -> None:
     # Coarse vertex v is the fine one 2 v + 1, and a file has 5 more that are in no face.
     fine_index = 2 * np.arange(len(mesh.vertices)) + 1
     file_vertices = np.concatenate([np.full(5, -1), np.arange(2 * len(mesh.vertices))])
-    write_reference(tmp_path, mesh, 10.0, fine_index=fine_index, file_vertices=file_vertices)
+    run = RunDirectory(tmp_path)
+    write_reference(run, mesh, 10.0, fine_index=fine_index, file_vertices=file_vertices)
     names = np.array(["one", "two", "three"])
     files, first = np.array(["one.obj", "two.obj", "three.ply"]), np.array([1, 1, 0])
-    write_npz(tmp_path / "shapes.npz", names=names, vertices=shapes, files=files, first=first)
+    run.shapes.write(names=names, vertices=shapes, files=files, first=first)
     with pytest.raises(MeanError) as error:
-        mean(tmp_path, parse(CONFIG, "balls.toml"))
+        mean(run, parse(CONFIG, "balls.toml"))
     faces = mesh.faces[[{i, j} <= set(face) for face in mesh.faces]]
     places = [
         f"one of two.obj at its vertex {2 * v + 1 + 5 + 1} (counted from 1), at ({x:.6g}, {y:.6g}, {z:.6g}), "
@@ -45,6 +46,6 @@ def test_a_run_without_a_mean_ends_with_the_place(tmp_path: Path) -> None:
     ]
     assert sum(place in str(error.value) for place in places) >= 1
     assert "coarse_vertices" in str(error.value)
-    assert not (tmp_path / "mean.npz").exists()
-    write_npz(tmp_path / "shapes.npz", names=np.array(["one", "three"]), vertices=shapes[[0, 2]])
-    assert mean(tmp_path, parse(CONFIG, "balls.toml"))["status"] == "converged"
+    assert not run.mean.exists()
+    run.shapes.write(names=np.array(["one", "three"]), vertices=shapes[[0, 2]])
+    assert mean(run, parse(CONFIG, "balls.toml"))["status"] == "converged"

@@ -24,19 +24,19 @@ from shapespace.training.space.modes import ModeError
 LOGARITHM_TOLERANCE = 1e-6
 #: Logarithms that a process computes at a time.
 CHUNK = 4
-#: Neighbours whose geodesics are tried as a beginning.
+#: Neighbours whose geodesics are tried as initial values.
 NEIGHBOURS = 4
 
 
 @dataclass(frozen=True)
-class Tangents:
-    """The shapes of a collection seen from their mean.
+class Logarithms:
+    """Discrete logarithms of the shapes of a collection at their mean.
 
     Attributes:
         fields: (n, V, 3) vertex fields, without rigid motion.
         status: of the last geodesic tried; where it is not CONVERGED, the field is the linearised logarithm.
         steps: K of the geodesic found, 0 where there is none.
-        via: for each shape the neighbour whose geodesic its own began with, −1 where it needed none.
+        via: for each shape the neighbour whose geodesic was the initial value of its own, −1 where none was needed.
         reasons: for each shape why the straight way to it was not found, or an empty string.
     """
 
@@ -52,7 +52,7 @@ class Tangents:
         return [i for i, steps in enumerate(self.steps) if steps == 0]
 
 
-def tangents(space: ShellSpace, mean: FloatArray, shapes: ArrayLike, steps: int, workers: int = -1) -> Tangents:
+def logarithms(space: ShellSpace, mean: FloatArray, shapes: ArrayLike, steps: int, workers: int = -1) -> Logarithms:
     """The discrete logarithms of shapes at their mean.
 
     The geodesic to a near shape is found from the straight line of lengths and angles. To a far one that line may lead
@@ -65,7 +65,7 @@ def tangents(space: ShellSpace, mean: FloatArray, shapes: ArrayLike, steps: int,
     collections those of 4 and of 8 steps differ by 10 to 35 % of their length.
 
     Args:
-        space: where; each process gets a copy.
+        space: the shape space; each process gets a copy.
         mean: X̄ (V, 3).
         shapes: (n, V, 3), in any position.
         steps: K of the geodesics.
@@ -154,7 +154,7 @@ class _Search:
             if i in self._paths:
                 self._via[i] = j
 
-    def result(self) -> Tangents:
+    def result(self) -> Logarithms:
         """What is found, and the rest linearised."""
         fields, steps = [], []
         z = self._space.nric(self._mean)
@@ -165,7 +165,7 @@ class _Search:
                 fields.append(self._space.project(self._mean, unwrap(self._space.nric(shape), z) - z))
             else:
                 fields.append(without_rigid_motion(steps[-1] * (path[1] - path[0]), self._mean))
-        return Tangents(np.stack(fields), tuple(self._status), tuple(steps), tuple(self._via), tuple(self._reasons))
+        return Logarithms(np.stack(fields), tuple(self._status), tuple(steps), tuple(self._via), tuple(self._reasons))
 
 
 def _each(function: Callable[..., _Found], space: ShellSpace, mean: FloatArray, items: list[tuple]) -> list[_Found]:

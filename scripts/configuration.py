@@ -1,0 +1,143 @@
+"""Write ``docs/configuration.md``: every setting of a configuration, from the models that read it."""
+
+from __future__ import annotations
+
+import json
+import types
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Annotated, Any, Literal, Union, get_args, get_origin
+
+import annotated_types
+from pydantic import BaseModel
+from pydantic.fields import FieldInfo
+from pydantic_core import PydanticUndefined
+
+from shapespace.training.runs.config import Config
+
+TARGET = Path(__file__).parents[1] / "docs" / "configuration.md"
+HEAD = """\
+# Configuration
+
+Every setting of a file for `shapespace-train run`, by its TOML table. `make configuration` writes this page from
+`training/runs/config.py`. A setting without a default has to be there; unknown ones are refused.
+"""
+NAMES = {int: "whole number", float: "number", str: "text", bool: "`true` or `false`", Path: "path"}
+
+
+def models_in(annotation: Any) -> list[type[BaseModel]]:
+    """The models somewhere in a type."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return [annotation]
+    return list(dict.fromkeys(model for part in get_args(annotation) for model in models_in(part)))
+
+
+def limits(metadata: list[Any]) -> Iterator[str]:
+    """What a value must be beside its type."""
+    signs = {"gt": ">", "ge": "≥", "lt": "<", "le": "≤"}
+    for constraint in [other for each in metadata for other in getattr(each, "metadata", [each])]:
+        for name, sign in signs.items():
+            if (bound := getattr(constraint, name, None)) is not None:
+                yield f"{sign} {bound:,}"
+        if pattern := getattr(constraint, "pattern", None):
+            yield f"matches `{pattern}`"
+        if isinstance(constraint, annotated_types.MaxLen):
+            yield f"at most {constraint.max_length} long"
+
+
+def words(annotation: Any) -> str:
+    """A type in words."""
+    origin, parts = get_origin(annotation), get_args(annotation)
+    if origin is Literal:
+        return " or ".join(f"`{json.dumps(value)}`" for value in parts)
+    if origin is Annotated:
+        return ", ".join([words(parts[0]), *limits(list(parts[1:]))])
+    if origin in (Union, types.UnionType):
+        return " or ".join(dict.fromkeys(words(part) for part in parts if part is not type(None)))
+    if origin is list:
+        kind, *bounds = words(parts[0]).split(", ")
+        return ", ".join([f"list of {kind}s", *bounds])
+    if origin is dict:
+        return f"{words(parts[1])} for each name"
+    return "table" if models_in(annotation) else NAMES[annotation]
+
+
+def value(default: Any) -> str:
+    """A default as TOML has it."""
+    if default is None:
+        return "left out"
+    return "" if isinstance(default, BaseModel) or default == {} else f"`{json.dumps(default)}`"
+
+
+def shown(default: BaseModel | None, name: str, field: FieldInfo) -> Any:
+    """What a setting is in a table that holds this by default; PydanticUndefined where it has to be given."""
+    return getattr(default, name) if default else field.get_default(call_default_factory=True, validated_data={})
+
+
+class Page:
+    """Collects each model once, with all places at which it stands."""
+
+    def __init__(self) -> None:
+        #: The tables of a model, each with what it holds by default.
+        self.places: dict[type[BaseModel], list[tuple[str, BaseModel | None]]] = {}
+        self._visit(Config, "", None)
+
+    def _visit(self, model: type[BaseModel], path: str, default: BaseModel | None) -> None:
+        self.places.setdefault(model, []).append((path, default))
+        for name, field in model.model_fields.items():
+            inside = shown(default, name, field)
+            place = f"{path}.{field.alias or name}".lstrip(".")
+            if get_origin(field.annotation) is dict:
+                place += ".NAME"
+            for other in models_in(field.annotation):
+                self._visit(other, place, inside if isinstance(inside, other) else None)
+
+    def _anchor(self, model: type[BaseModel]) -> str:
+        place = self.places[model][0][0]
+        several = [other for other, places in self.places.items() if places[0][0] == place]
+        kind = model.model_fields.get("kind")
+        return f"{place} ({', '.join(get_args(kind.annotation))})" if len(several) > 1 and kind else place
+
+    def _row(self, name: str, field: FieldInfo, default: BaseModel | None) -> str:
+        here = shown(default, name, field)
+        text = "required" if here is PydanticUndefined else value(here)
+        kind = ", ".join([words(field.annotation), *limits(field.metadata)])
+        meaning = " ".join((field.description or "").split()).replace("``", "`")
+        links = [
+            f"[{self._anchor(model)}](#{self._anchor(model).translate(str.maketrans(' ', '-', '.(),')).lower()})"
+            for model in models_in(field.annotation)
+        ]
+        meaning = " ".join(filter(None, [meaning, f"See {', '.join(links)}." if links else ""]))
+        cells = (f"`{field.alias or name}`", kind, text, meaning)
+        return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
+
+    def _section(self, model: type[BaseModel]) -> Iterator[str]:
+        (_, default), *others = self.places[model]
+        yield f"## {self._anchor(model)}" if self._anchor(model) else "## The tables"
+        yield ""
+        yield " ".join((model.__doc__ or "").split()).replace("``", "`")
+        yield ""
+        for place, other in others:
+            differing = [
+                f"`{field.alias or name} = {json.dumps(getattr(other, name))}`"
+                for name, field in model.model_fields.items()
+                if other and not models_in(field.annotation) and getattr(other, name) != shown(default, name, field)
+            ]
+            yield f"- also as `{place}`" + (f", where the defaults are {', '.join(differing)}" if differing else "")
+        if others:
+            yield ""
+        yield "| setting | type | default | meaning |"
+        yield "|---|---|---|---|"
+        for name, field in model.model_fields.items():
+            yield self._row(name, field, default)
+        yield ""
+
+    def text(self) -> str:
+        """The whole page."""
+        lines = [line for model in self.places for line in self._section(model)]
+        return "\n".join([HEAD, *lines]).rstrip() + "\n"
+
+
+if __name__ == "__main__":
+    TARGET.write_text(Page().text(), encoding="utf-8")
+    print(TARGET)  # noqa: T201 - commands talk to people

@@ -1,0 +1,165 @@
+"""The shapes of a bundle, and ``geometry.npz``, which holds them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shapespace.arrays import FloatArray, IntArray
+from shapespace.bundle.schema import ARRAYS, ArrayType, Manifest
+from shapespace.mesh.prolongation import PREFIX, Prolongation, ProlongationError
+from shapespace.mesh.triangle_mesh import MeshError, TriangleMesh
+
+#: Largest distance of a vertex of the fine mesh from the prolonged reference, as a fraction of the diagonal: that of
+#: float32.
+FINE_TOLERANCE = 1e-5
+
+
+class GeometryError(ValueError):
+    """Arrays that don't fit each other or the manifest, with a sentence that says why."""
+
+
+@dataclass(frozen=True)
+class FineMesh:
+    """A finer mesh that follows the coarse one.
+
+    Attributes:
+        reference: at the coarse reference.
+        prolong: coarse vertices to fine ones.
+    """
+
+    reference: TriangleMesh
+    prolong: Prolongation
+
+
+@dataclass(frozen=True, kw_only=True)
+class Geometry:
+    """What ``geometry.npz`` holds.
+
+    Attributes:
+        reference: the reference shape, normalised.
+        fine: the finer mesh, if there is one.
+        modes: (m, V, 3) vertex fields d_j at the reference, where codes are coefficients of tangent vectors.
+        training_codes: (n, m) codes of the shapes that the model was made from, if there are any.
+        file_vertices: (N,) vertex of the finest mesh that each vertex of the user's files became, −1 for those in no
+            face; None where that is each by itself.
+    """
+
+    reference: TriangleMesh
+    fine: FineMesh | None = None
+    modes: FloatArray | None = None
+    training_codes: FloatArray | None = None
+    file_vertices: IntArray | None = None
+
+    def arrays(self) -> dict[str, NDArray]:
+        """The arrays of the file, by name, in the types of `ARRAYS`."""
+        mesh = self.reference
+        found = {
+            "vertices": mesh.vertices,
+            "faces": mesh.faces,
+            "edges": mesh.edges,
+            "modes": self.modes,
+            "training_codes": self.training_codes,
+            "file_vertices": self.file_vertices,
+        }
+        if self.fine:
+            fine = self.fine.reference
+            found |= {"fine_vertices": fine.vertices, "fine_faces": fine.faces, **self.fine.prolong.arrays()}
+        return {name: array.astype(ARRAYS[name].dtype) for name, array in found.items() if array is not None}
+
+    @classmethod
+    def from_arrays(cls, arrays: Mapping[str, NDArray], manifest: Manifest) -> Geometry:
+        """Read `arrays` back, checked against each other and the manifest; arrays of other names are left alone.
+
+        Raises:
+            GeometryError: naming the file, the array and the fault.
+        """
+        file = manifest.geometry.file
+        try:
+            reference, edges = TriangleMesh.from_mapping(arrays), arrays["edges"]
+        except KeyError as error:
+            raise GeometryError(f"{file} has no array {error}") from None
+        except MeshError as error:
+            raise GeometryError(f"{file}: {error}") from None
+        for name, array in arrays.items():
+            if np.issubdtype(array.dtype, np.floating) and not np.isfinite(array).all():
+                raise GeometryError(f"{file}: {name} has an entry that is not finite")
+        counts = (len(reference.vertices), len(reference.faces), len(reference.edges))
+        said = (manifest.vertices, manifest.faces, manifest.edges)
+        if counts != said:
+            raise GeometryError(f"{file} has (V, F, E) = {counts}, the manifest says {said}")
+        if not np.array_equal(edges, reference.edges):
+            raise GeometryError(f"{file}: edges are not those of the faces in lexicographic order")
+        fine = _fine(file, arrays, reference)
+        places = arrays.get("file_vertices")
+        if places is not None:
+            _check_file_vertices(file, places, fine.reference if fine else reference)
+        sizes = {"m": manifest.latent_dimension, "V": manifest.vertices, "F": manifest.faces, "E": manifest.edges}
+        for name in ARRAYS.keys() & arrays.keys():
+            _check_type(f"{file}: {name}", arrays[name], ARRAYS[name], sizes)
+
+        def numbers(name: str) -> NDArray | None:
+            return arrays[name].astype(np.float64) if name in arrays else None
+
+        return cls(
+            reference=reference,
+            fine=fine,
+            modes=numbers("modes"),
+            training_codes=numbers("training_codes"),
+            file_vertices=None if places is None else places.astype(np.int64),
+        )
+
+
+def _check_type(name: str, array: NDArray, wanted: ArrayType, sizes: Mapping[str, int]) -> None:
+    if not array.size:
+        raise GeometryError(f"{name} is empty")
+    shape = [sizes.get(size, size) if isinstance(size, str) else size for size in wanted.shape]
+    fits = array.ndim == len(shape) and all(
+        isinstance(want, str) or want == size for want, size in zip(shape, array.shape, strict=True)
+    )
+    real = issubclass(wanted.dtype, np.floating)
+    if not fits or not np.issubdtype(array.dtype, np.floating if real else np.integer):
+        text = f"({', '.join(map(str, shape))}{',' if len(shape) == 1 else ''})"
+        kind = "real" if real else "whole"
+        raise GeometryError(f"{name} must be {kind} numbers {text}, not {array.dtype} {array.shape}")
+
+
+def _check_file_vertices(file: str, places: NDArray, mesh: TriangleMesh) -> None:
+    """Refuse what isn't whole numbers (N,) that name every vertex of the finest mesh."""
+    count = len(mesh.vertices)
+    if places.ndim != 1 or not np.issubdtype(places.dtype, np.integer) or len(places) < count:
+        raise GeometryError(
+            f"{file}: file_vertices must be at least {count} whole numbers, not {places.dtype} {places.shape}"
+        )
+    if not np.array_equal(np.unique(places[places != -1]), np.arange(count)):
+        raise GeometryError(f"{file}: file_vertices must name each of the vertices 0 to {count - 1}, or -1")
+
+
+def _fine(file: str, arrays: Mapping[str, NDArray], reference: TriangleMesh) -> FineMesh | None:
+    if not any(name.startswith(("fine_", PREFIX)) for name in arrays):
+        return None
+    try:
+        fine = TriangleMesh.from_arrays(arrays["fine_vertices"], arrays["fine_faces"])
+        prolong = Prolongation.from_arrays(arrays)
+    except KeyError as error:
+        raise GeometryError(f"{file} has no array {error}, which goes with the other arrays of a fine mesh") from None
+    except ProlongationError as error:
+        raise GeometryError(f"{file}: {error}") from None
+    except MeshError as error:
+        raise GeometryError(f"{file}: fine mesh: {error}") from None
+    if not np.array_equal(prolong.faces, reference.faces):
+        raise GeometryError(f"{file}: {PREFIX}faces are not the faces of the mesh")
+    if prolong.vertex_count != len(fine.vertices):
+        raise GeometryError(
+            f"{file}: the prolongation is to {prolong.vertex_count} vertices, but there are {len(fine.vertices)} "
+            "fine_vertices"
+        )
+    distance = np.linalg.norm(prolong(reference.vertices) - fine.vertices, axis=1).max()
+    if distance > FINE_TOLERANCE * fine.diagonal:
+        raise GeometryError(
+            f"{file}: fine_vertices are up to {distance:.1e} away from where the prolongation takes the reference"
+        )
+    return FineMesh(fine, prolong)

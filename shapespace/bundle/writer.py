@@ -1,0 +1,167 @@
+"""Writing a bundle: whole or not at all."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import os
+import shutil
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shapespace.arrays import FloatArray
+from shapespace.bundle.geometry import Geometry
+from shapespace.bundle.schema import (
+    COMBINER,
+    GEOMETRY,
+    MANIFEST,
+    SCHEMA_VERSION,
+    START,
+    FileEntry,
+    Manifest,
+    Origin,
+    Tolerance,
+    factor_network,
+)
+from shapespace.shell.energy import Material
+
+
+@dataclass(frozen=True, kw_only=True)
+class Networks:
+    """The ONNX files of a bundle; the batch, n, is dynamic in all of them.
+
+    Attributes:
+        factors: for each factor ψ_j, its latents to lengths and angles (n, 2E).
+        combiner: shapes of all factors (n, J, 2E) to lengths and angles (n, 2E).
+        start: latents (n, m) to vertices (n, V, 3), where Gauss–Newton starts; optional.
+    """
+
+    factors: Sequence[bytes]
+    combiner: bytes
+    start: bytes | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Facts:
+    """What a manifest says that does not follow from the bundle's files; see schema.Manifest.
+
+    Attributes:
+        name, version: also the folders of the bundle.
+        latent_names: (m,).
+        factors: indices of each factor's latents, by name; consecutive.
+        lower, upper: (m,) bounds of the latents.
+        period: (m,), NaN for latents without one.
+        material: μ, λ, η of the shell.
+        eta_reconstruction: η of Gauss–Newton.
+        exponential_steps: K of the exponentials that a code stands for, where the bundle has modes.
+        scale: length of one unit of the reference in the user's units.
+        tolerance: of ONNX against PyTorch.
+        figures: of the evaluation, as JSON.
+        origin: where the bundle comes from.
+    """
+
+    name: str
+    version: str
+    licence: str
+    title: str
+    description: str
+    latent_names: Sequence[str]
+    factors: Mapping[str, Sequence[int]]
+    lower: FloatArray
+    upper: FloatArray
+    period: FloatArray
+    material: Material
+    eta_reconstruction: float
+    scale: float
+    tolerance: Tolerance
+    figures: Mapping[str, Any]
+    origin: Origin
+    exponential_steps: int | None = None
+
+
+def write_bundle(models: Path, facts: Facts, networks: Networks, geometry: Geometry) -> Path:
+    """Write ``models/NAME/VERSION/``, replacing what is there, and return it.
+
+    Equal contents give equal bytes.
+
+    Raises:
+        pydantic.ValidationError: the facts contradict each other or the files; nothing is written.
+        OSError: the folder can't be written.
+    """
+    files = {factor_network(j).file: content for j, content in enumerate(networks.factors)}
+    files |= {COMBINER.file: networks.combiner, GEOMETRY.file: _npz(geometry.arrays())}
+    if networks.start is not None:
+        files[START.file] = networks.start
+    manifest = _manifest(facts, geometry, files)
+    text = json.dumps(manifest.model_dump(by_alias=True), indent=2, ensure_ascii=False) + "\n"
+
+    folder = models / facts.name / facts.version
+    part, old = (folder.with_name(f".{folder.name}.{end}") for end in ("part", "old"))  # hidden from a watching server
+    shutil.rmtree(part, ignore_errors=True)
+    part.mkdir(parents=True)
+    for name, content in (files | {MANIFEST: text.encode()}).items():
+        with (part / name).open("wb") as file:
+            file.write(content)
+            # Renamed before it is on the disk, it could be empty after a power cut.
+            file.flush()
+            os.fsync(file.fileno())
+    shutil.rmtree(old, ignore_errors=True)
+    if folder.exists():
+        os.replace(folder, old)
+    os.replace(part, folder)
+    shutil.rmtree(old, ignore_errors=True)
+    return folder
+
+
+def entry(content: bytes) -> FileEntry:
+    """What a manifest says of a file."""
+    return FileEntry(sha256=hashlib.sha256(content).hexdigest(), bytes=len(content))
+
+
+def _npz(arrays: Mapping[str, NDArray]) -> bytes:
+    file = io.BytesIO()
+    np.savez(file, **arrays)  # type: ignore[arg-type]
+    return file.getvalue()
+
+
+def _manifest(facts: Facts, geometry: Geometry, files: Mapping[str, bytes]) -> Manifest:
+    reference = geometry.reference
+    return Manifest.model_validate({
+        "schema_version": SCHEMA_VERSION,
+        "name": facts.name,
+        "version": facts.version,
+        "licence": facts.licence,
+        "title": facts.title,
+        "description": facts.description,
+        "latent_dimension": len(facts.lower),
+        "latent_names": list(facts.latent_names),
+        "factors": [
+            {"name": name, "start": index[0], "stop": index[-1] + 1, **factor_network(j).model_dump()}
+            for j, (name, index) in enumerate(facts.factors.items())
+        ],
+        "lower": facts.lower.tolist(),
+        "upper": facts.upper.tolist(),
+        "period": [None if np.isnan(period) else period for period in facts.period.tolist()],
+        "edges": len(reference.edges),
+        "vertices": len(reference.vertices),
+        "faces": len(reference.faces),
+        "mu": facts.material.mu,
+        "lambda": facts.material.lambda_,
+        "eta": facts.material.eta,
+        "eta_reconstruction": facts.eta_reconstruction,
+        "exponential_steps": facts.exponential_steps,
+        "scale": facts.scale,
+        "combiner": COMBINER,
+        "start": START if START.file in files else None,
+        "geometry": GEOMETRY,
+        "onnx_tolerance": facts.tolerance,
+        "figures": dict(facts.figures),
+        "origin": facts.origin,
+        "files": {name: entry(files[name]) for name in sorted(files)},
+    })  # fmt: skip

@@ -1,0 +1,83 @@
+"""Files that a killed run, or a power cut, leaves whole: each is written beside its place, then renamed into it."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+@contextmanager
+def whole(path: Path) -> Iterator[IO[bytes]]:
+    """A file to write to that takes the path's place at the end, whole, or not at all; its folder is made."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    part = path.with_suffix(".part")
+    with part.open("wb") as file:
+        yield file
+        # Renamed before it is on the disk, it could be empty after a power cut.
+        file.flush()
+        os.fsync(file.fileno())
+    os.replace(part, path)
+
+
+@dataclass(frozen=True)
+class _File:
+    path: Path
+
+    def exists(self) -> bool:
+        """Whether it has been written."""
+        return self.path.exists()
+
+
+class TextFile(_File):
+    """A text in UTF-8."""
+
+    def read(self) -> str:
+        """The text; raises OSError or UnicodeDecodeError."""
+        return self.path.read_text(encoding="utf-8")
+
+    def write(self, text: str) -> None:
+        """Replace the file."""
+        with whole(self.path) as file:
+            file.write(text.encode())
+
+
+class JsonFile(_File):
+    """A JSON object."""
+
+    def read(self) -> dict[str, Any]:
+        """The object; raises OSError or ValueError."""
+        return dict(json.loads(self.path.read_text(encoding="utf-8")))
+
+    def read_if_written(self) -> dict[str, Any]:
+        """The object, an empty one where the file has not been written."""
+        return self.read() if self.exists() else {}
+
+    def write(self, value: dict[str, Any]) -> None:
+        """Replace the file."""
+        TextFile(self.path).write(json.dumps(value, indent=2) + "\n")
+
+
+class NpzFile(_File):
+    """Arrays by name."""
+
+    def read(self) -> dict[str, NDArray]:
+        """All arrays; raises OSError, ValueError, EOFError or zipfile.BadZipFile."""
+        with np.load(self.path) as file:
+            return dict(file)
+
+    def read_if_written(self) -> dict[str, NDArray]:
+        """All arrays, none where the file has not been written."""
+        return self.read() if self.exists() else {}
+
+    def write(self, **arrays: Any) -> None:
+        """Replace the file."""
+        with whole(self.path) as file:
+            np.savez(file, **arrays)

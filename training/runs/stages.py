@@ -1,0 +1,92 @@
+"""The stages of a run, in order: what each reads of the configuration, what it leaves, and when it is done again."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel
+
+from shapespace.training.runs.config import Config
+from shapespace.training.runs.directory import RunDirectory
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One stage.
+
+    Attributes:
+        version: of its numerics. Raise it in the commit after which the same settings and input give other numbers.
+        settings: the part of the configuration that it reads.
+        results: files and folders that are removed where that part, the version, or an earlier stage has changed.
+        amounts: settings that may change without it, since the stage knows what is there and what is missing.
+    """
+
+    version: int
+    settings: Callable[[Config], Sequence[BaseModel]]
+    results: Callable[[RunDirectory], Sequence[Path]] = lambda run: ()
+    amounts: frozenset[str] = frozenset()
+
+    def keys(self, name: str, config: Config, before: str) -> dict[str, str]:
+        """Digests of what the stage depends on: ``key`` of everything, ``basis`` of all but its amounts.
+
+        Args:
+            name: of the stage.
+            config: of the run.
+            before: key of the stage before, or of the data.
+        """
+        settings = [s.model_dump(mode="json") for s in self.settings(config)]
+        rest = [{k: v for k, v in s.items() if k not in self.amounts} for s in settings]
+
+        def digest(read: list[dict[str, Any]]) -> str:
+            return hashlib.sha256(json.dumps([name, self.version, read, before]).encode()).hexdigest()
+
+        return {"key": digest(settings), "basis": digest(rest)}
+
+
+STAGES: dict[str, Stage] = {
+    "ingest": Stage(
+        version=1,
+        settings=lambda config: [config.collection],
+        results=lambda run: [run.reference.path, run.prolongation.path, run.shapes.path, run.ingest.path],
+    ),
+    "mean": Stage(
+        version=1,
+        settings=lambda config: [config.material],
+        results=lambda run: [run.mean.path],
+    ),
+    "modes": Stage(
+        version=1,
+        settings=lambda config: [config.modes],
+        results=lambda run: [run.modes_by_strength.path, run.decomposition.path],
+    ),
+    "factors": Stage(
+        version=1,
+        settings=lambda config: [config.factors],
+        results=lambda run: [run.modes.path, run.factors.path],
+    ),
+    "samples": Stage(
+        version=1,
+        settings=lambda config: [config.samples],
+        results=lambda run: [run.samples],
+        amounts=frozenset({"count", "factor_counts"}),
+    ),
+    # Its files are named by what decides their contents, so that a change leaves alone the networks it doesn't touch.
+    "networks": Stage(
+        version=1,
+        settings=lambda config: [config.networks, config.monolithic, *config.variants.values()],
+    ),
+    "evaluation": Stage(
+        version=1,
+        settings=lambda config: [config.evaluation],
+        results=lambda run: [run.evaluation.path, run.gallery.path, run.report.path, run.exact],
+    ),
+    "export": Stage(
+        version=1,
+        settings=lambda config: [config.export],
+    ),
+}

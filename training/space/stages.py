@@ -1,0 +1,239 @@
+"""The stages `ingest`, `mean`, `modes` and `factors` of a collection of meshes, and what they leave for the later ones.
+
+A collection that is a product by design does not need them.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from shapespace.bundle.geometry import FineMesh, Geometry
+from shapespace.coordinates.nric import WeightedNorm
+from shapespace.mesh.coarsening import coarsen
+from shapespace.mesh.prolongation import Prolongation
+from shapespace.mesh.rigid_motion import align
+from shapespace.mesh.triangle_mesh import TriangleMesh, face_areas
+from shapespace.shell.energy import Material
+from shapespace.shell.mean import Mean, elastic_mean
+from shapespace.shell.space import ShellSpace
+from shapespace.solve.status import Status
+from shapespace.training.collection.generators import MESHES
+from shapespace.training.collection.ingest import MeshCollection, normalised, read_collection
+from shapespace.training.runs.config import Config, ConfigError
+from shapespace.training.runs.directory import RunDirectory
+from shapespace.training.runs.progress import waiting
+from shapespace.training.space.factors import between, group, names, overlap
+from shapespace.training.space.logarithms import logarithms
+from shapespace.training.space.modes import localisation, pga, spga
+from shapespace.training.space.shell_collection import ShellCollection
+
+
+def material(config: Config) -> Material:
+    """Of the shell, as the configuration says."""
+    settings = config.material
+    return Material(settings.mu, settings.lambda_, settings.eta)
+
+
+def _meshes(config: Config) -> MeshCollection:
+    settings = config.collection
+    if settings.generator is not None:
+        return MESHES[settings.generator]()
+    if settings.data is None:
+        raise ConfigError("collection.data: say where the meshes are, here or with --data")
+    return read_collection(settings.data)
+
+
+def ingest(run: RunDirectory, config: Config, accepted: Sequence[str] = ()) -> dict[str, Any]:
+    """``reference.npz``, and in ``shapes.npz`` names and normalised vertices (n, V, 3), coarsened where asked for.
+
+    Args:
+        run: gets the files.
+        config: of the run.
+        accepted: names or files of shapes that are taken though they are in another unit or order.
+
+    Raises:
+        IngestError: the collection can't be used, or shapes of it have to be accepted first.
+    """
+    settings = config.collection
+    meshes = _meshes(config)
+    meshes.require_accepted(accepted)
+    chosen = meshes.index(settings.reference)
+    vertices, scale = normalised(meshes, chosen)
+    fine = TriangleMesh.from_arrays(vertices[chosen], meshes.faces)
+    facts: dict[str, Any] = {"shapes": len(vertices), "vertices": vertices.shape[1], "reference": meshes.names[chosen]}
+    facts["notes"] = list(meshes.notes)
+    facts["warnings"] = [warned.sentence for warned in meshes.warnings]
+    reference, more = fine, {}
+    if 0 < settings.coarse_vertices < vertices.shape[1]:
+        with waiting("coarse mesh"):
+            coarsening = coarsen(fine, settings.coarse_vertices, vertices)
+        exact, vertices = vertices, vertices[:, coarsening.fine_index]
+        reference = TriangleMesh.from_arrays(vertices[chosen], coarsening.faces)
+        more = {"fine_vertices": fine.vertices, "fine_faces": fine.faces, "fine_index": coarsening.fine_index}
+        prolong = Prolongation.of(reference, fine)
+        run.prolongation.write(**prolong.arrays())
+        facts |= {
+            "coarse_vertices": vertices.shape[1],
+            "asked_vertices": settings.coarse_vertices,
+            "smallest_angle": float(np.degrees(coarsening.smallest_angle)),
+            "smallest_area": coarsening.smallest_area,
+            "specks": coarsening.specks,
+            "folds": coarsening.folds,
+            "reason": coarsening.reason,
+            "prolongation": prolong.errors(vertices, exact),
+        }
+    if meshes.file_vertices is not None and len(meshes.file_vertices) > len(fine.vertices):
+        more["file_vertices"] = meshes.file_vertices
+    write_reference(run, reference, scale, **more)
+    places = meshes.places or [(name, 0) for name in meshes.names]
+    files, first = map(np.array, zip(*places, strict=True))
+    run.shapes.write(names=np.array(meshes.names), vertices=vertices, files=files, first=first)
+    run.ingest.write(facts)
+    return facts
+
+
+def write_reference(run: RunDirectory, mesh: TriangleMesh, scale: float, **fine: np.ndarray) -> None:
+    """``reference.npz``, see RunDirectory.reference."""
+    run.reference.write(vertices=mesh.vertices, faces=mesh.faces, edges=mesh.edges, scale=np.array(scale), **fine)
+
+
+class MeanError(ValueError):
+    """A collection without a mean, with a sentence that says where and what to do."""
+
+
+def mean(run: RunDirectory, config: Config) -> dict[str, Any]:
+    """``mean.npz``: the elastic mean of all shapes, where the tangent space is attached.
+
+    Raises:
+        MeanError: it isn't found.
+    """
+    reference, shapes = run.reference_mesh(), run.shapes.read()["vertices"]
+    with waiting("elastic mean"):
+        found = elastic_mean(ShellSpace(reference, material(config)), shapes)
+    if found.status is not Status.CONVERGED:
+        raise MeanError(_where(run, found))
+    facts = {"status": str(found.status), "iterations": found.iterations, "residual": found.residual}
+    # Shapes are served where the mean stands, which has to be where the reference stands in its file.
+    vertices = align(found.vertices, reference.vertices)
+    run.mean.write(vertices=vertices, **{k: np.array(v) for k, v in facts.items()})
+    return facts
+
+
+def _where(run: RunDirectory, found: Mean) -> str:
+    """Which place of which shape keeps a mean from being found, and what to do about it."""
+    if found.worst is None:
+        return f"the shapes have no mean: {found.reason}"
+    shape, face = found.worst
+    reference, shapes = run.reference.read(), run.shapes.read()
+    file, first = shapes["files"][shape], shapes["first"][shape]
+    vertex = int(reference["faces"][face, 0])
+    position = float(reference["scale"]) * shapes["vertices"][shape, vertex]
+    number = int(reference["fine_index"][vertex]) if "fine_index" in reference else vertex
+    if "file_vertices" in reference:
+        number = int(np.flatnonzero(reference["file_vertices"] == number)[0])
+    here, there = (face_areas(x, reference["faces"])[face] for x in (shapes["vertices"][shape], found.vertices))
+    return (
+        f"the shapes have no mean: {found.reason}. Of all faces, one of {file} at its vertex "
+        f"{number + first} (counted from {first}), at ({', '.join(f'{x:.6g}' for x in position)}), is "
+        "furthest from the others' with "
+        f"{here / there if there else np.inf:.1e} of the area in the mean so far. Mend the mesh there, take this shape "
+        "out of the folder, or change coarse_vertices in the configuration so that another vertex is kept"
+    )
+
+
+def modes(run: RunDirectory, config: Config) -> dict[str, Any]:
+    """``modes-by-strength.npz`` and ``modes.json``: the shapes' logarithms, sparse and principal modes."""
+    settings, centre, shapes = config.modes, run.mean_mesh(), run.shapes.read()["vertices"]
+    space = ShellSpace(centre, material(config))
+    norm = WeightedNorm.of(centre, config.material.eta)
+    found = logarithms(space, centre.vertices, shapes, settings.log_steps)
+    count = min(settings.count, len(shapes) - 1)
+    dense = sparse = pga(space, centre.vertices, found.fields, count)
+    if settings.sparsity:
+        sparse = spga(
+            space, centre.vertices, found.fields, count, settings.sparsity, max_iterations=settings.max_iterations
+        )
+    run.modes_by_strength.write(
+        nric=sparse.nric,
+        vertices=sparse.vertices,
+        coefficients=sparse.coefficients,
+        lower=sparse.lower,
+        upper=sparse.upper,
+        localisation=localisation(sparse.nric, norm),
+        pga_nric=dense.nric,
+        pga_vertices=dense.vertices,
+        pga_localisation=localisation(dense.nric, norm),
+    )
+    facts = {
+        "modes": len(sparse),
+        "converged": sparse.converged,
+        "explained": sparse.explained,
+        "pga_explained": dense.explained,
+        "linearised_logarithms": len(found.fallbacks),
+        "asked": settings.count,
+        "log_steps": settings.log_steps,
+        "steps": list(found.steps),
+        "via": list(found.via),
+    }
+    run.decomposition.write(facts | {"reasons": list(found.reasons), "history": sparse.history})
+    return facts
+
+
+def factors(run: RunDirectory, config: Config) -> dict[str, Any]:
+    """``factors.json``, groups of modes with overlapping supports, and ``modes.npz``, the modes in their order.
+
+    In that order each factor's latents are a range, as bundles want them.
+    """
+    found, centre = run.modes_by_strength.read(), run.mean_mesh()
+    norm = WeightedNorm.of(centre, config.material.eta)
+    z = np.ascontiguousarray(found["nric"])  # sums round by the order in memory, and files keep that
+    shared = overlap(z, norm)
+    groups = group(shared, config.factors.count)
+    order = [j for members in groups for j in members]
+    ordered = {name: found[name][order] for name in ("nric", "vertices", "lower", "upper", "localisation")}
+    ordered |= {"coefficients": found["coefficients"][:, order], "rank": np.array(order)}
+    run.modes.write(**found | ordered)
+    starts = np.cumsum([0, *map(len, groups)])
+    run.factors.write(
+        {
+            "factors": [list(range(a, b)) for a, b in itertools.pairwise(starts.tolist())],
+            "names": names(groups, z, norm, centre),
+            "overlap": between(shared, groups).tolist(),
+        }
+    )
+    return {"factors": len(groups), "largest": max(map(len, groups))}
+
+
+def collection(run: RunDirectory, config: Config) -> ShellCollection:
+    """The collection that the stages found."""
+    factors, modes = run.factors.read(), run.modes.read()
+    return ShellCollection(
+        reference=run.mean_mesh(),
+        modes=modes["vertices"],
+        lower=modes["lower"],
+        upper=modes["upper"],
+        factors=dict(zip(factors["names"], factors["factors"], strict=True)),
+        steps=config.samples.steps,
+        material=material(config),
+        scale=float(run.reference.read()["scale"]),
+    )
+
+
+def geometry(run: RunDirectory) -> Geometry:
+    """What the bundle's geometry holds: the mean, the fine mesh there, the modes, and the codes of the shapes."""
+    mean, reference, modes = run.mean_mesh(), run.reference.read(), run.modes.read()
+    fine = None
+    if run.prolongation.exists():
+        prolong = Prolongation.from_arrays(run.prolongation.read())
+        fine = FineMesh(TriangleMesh.from_arrays(prolong(mean.vertices), reference["fine_faces"]), prolong)
+    return Geometry(
+        reference=mean,
+        fine=fine,
+        modes=modes["vertices"],
+        training_codes=modes["coefficients"],
+        file_vertices=reference.get("file_vertices"),
+    )
