@@ -22,8 +22,7 @@ from shapespace.training.collection.freaky_torus import FreakyTorus
 from shapespace.training.collection.ingest import data_files
 from shapespace.training.learning.evaluation import alone, evaluate
 from shapespace.training.learning.export import export
-from shapespace.training.learning.learning import Learner
-from shapespace.training.learning.start_network import fit_start
+from shapespace.training.learning.learner import Learner
 from shapespace.training.report.page import write_report
 from shapespace.training.runs.config import Config
 from shapespace.training.runs.files import write_json, write_npz, write_text
@@ -244,7 +243,7 @@ def export_bundle(run: Run) -> None:
     learner = learner_of(run)
     extras = discovery.extras(run.folder)
     folder = export(
-        learner.main(), run.collection, run.config, figures, digest.hexdigest(), run.models, extras, fit_start(learner)
+        learner.main(), run.collection, run.config, figures, digest.hexdigest(), run.models, extras, learner.start()
     )
     run.log("exported", bundle=f"{folder.parent.name}/{folder.name}")
 

@@ -23,9 +23,7 @@ from torch import Tensor, nn
 from shapespace.coordinates.nric import WeightedNorm
 from shapespace.mesh.triangle_mesh import TriangleMesh
 from shapespace.training.learning.layers import narrowest
-from shapespace.training.learning.learning import Composite
-from shapespace.training.learning.networks import predict
-from shapespace.training.learning.start_network import StartNetwork
+from shapespace.training.learning.networks import Composite, StartNetwork, predict
 from shapespace.training.runs.config import Config
 from shapespace.training.runs.files import write_npz
 from shapespace.training.runs.sampling import Collection

@@ -1,12 +1,11 @@
-"""The networks stage: factor networks, combiner, monolithic baseline and the rows of the ablation, from samples."""
+"""The networks of a run, each fitted to the samples once and then read from its file."""
 
 from __future__ import annotations
 
 import hashlib
 import json
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -18,61 +17,38 @@ from torch import Tensor
 
 from shapespace.arrays import FloatArray, IntArray
 from shapespace.coordinates.nric import WeightedNorm, nric
-from shapespace.training.learning.crops import Crops
-from shapespace.training.learning.fitting import finished, fit, save_network
-from shapespace.training.learning.layers import PatchBasis, flaps
+from shapespace.training.learning.corrections import JointSamples
+from shapespace.training.learning.fitting import fit, read_network, save_network
+from shapespace.training.learning.layers import PatchBasis, Scaling
 from shapespace.training.learning.networks import (
     CombinerNetwork,
+    Composite,
     FactorNetwork,
     MonolithicNetwork,
-    Scaling,
     ShapeNetwork,
+    StartNetwork,
+    factor_shapes,
     predict,
 )
-from shapespace.training.runs.config import CombinerSettings, Config, FitSettings, LatentNetworkSettings
+from shapespace.training.runs.config import Config, FitSettings, LatentNetworkSettings, Recipe
 from shapespace.training.runs.sampling import Collection, Samples, read, split
 
 
-@dataclass(frozen=True)
-class Composite:
-    """``Φ = Ψ ∘ (ψ_1, …, ψ_J)``.
-
-    Attributes:
-        factors: latent indices of each factor.
-        networks: the ψ_j.
-        combiner: Ψ.
-    """
-
-    factors: list[list[int]]
-    networks: list[FactorNetwork]
-    combiner: CombinerNetwork
-
-    def factor_shapes(self, latents: Tensor) -> Tensor:
-        """(n, J, 2E) outputs of the ψ_j."""
-        return torch.stack(
-            [network(latents[:, index]) for network, index in zip(self.networks, self.factors, strict=True)], dim=1
-        )
-
-    def __call__(self, latents: Tensor) -> Tensor:
-        """NRIC (n, 2E) of codes (n, m)."""
-        return self.combiner(self.factor_shapes(latents))
-
-
 class Learner:
-    """Fits networks on the samples of a run, each into a file named by everything that decides it.
+    """Fits networks to the samples of a run; each is saved in a file whose name is a digest of all that it depends on.
 
-    Two rows that share a network share its file; a half-finished file is continued, and a finished one is read without
-    a look at the samples.
+    So recipes that have a network in common share its file. An unfinished file is continued; a finished one is read,
+    and the samples are not.
 
     Args:
         collection: what the samples are of.
         config: of the run.
         folder: of the run.
-        data_key: names the samples.
-        fraction: share of the training codes to learn from. With less the number of epochs grows, so that the number of
-            steps stays.
-        all_of_factors: whether the factors learn from all of their own samples all the same.
-        seed: of the networks, by default the configuration's; another one splits the samples anew too.
+        data_key: identifies the samples.
+        fraction: share of the training codes to learn from. The number of epochs is divided by it, so that the number
+            of steps stays the same.
+        all_of_factors: whether the factor networks learn from all samples of the factors nevertheless.
+        seed: of the networks, by default the configuration's. Another one also means another split of the samples.
     """
 
     def __init__(
@@ -121,7 +97,7 @@ class Learner:
 
     @property
     def rows(self) -> dict[str, IntArray]:
-        """The split, with the share of it to learn from. Codes are independent, so the first are as good as any."""
+        """The split, with only the share of it to learn from: the first rows, since codes are independent."""
         return {
             name: index if name == "test" else index[: max(4, round(self._fraction * len(index)))]
             for name, index in self.split.items()
@@ -144,11 +120,6 @@ class Learner:
             self.seed,
         )
 
-    def _load(self, network: ShapeNetwork, path: Path, state: dict[str, Any], tensors: dict[str, Tensor]) -> None:
-        network.load_state_dict(tensors)
-        network.eval()
-        self._record(path, state)
-
     def _record(self, path: Path, state: dict[str, Any]) -> None:
         self.histories[path.stem] = {k: state[k] for k in ("epoch", "best", "history")}
 
@@ -156,39 +127,44 @@ class Learner:
         self, kind: type[FactorNetwork], settings: LatentNetworkSettings, index: list[int], path: Path, fraction: float,
         data: Callable[[], tuple[Samples, dict[str, IntArray]]],
     ) -> FactorNetwork:  # fmt: skip
+        """A network from the latents ``index`` to shapes, read from ``path`` or fitted to samples and rows of these."""
         coordinates = self.collection.coordinates[index]
-        if saved := finished(path):
-            basis = {k.removeprefix("basis."): v for k, v in saved[1].items() if k.startswith("basis.")}
-            blank = PatchBasis.blank(basis) if basis else None
-            network = kind(settings, coordinates, Scaling.blank(len(self._reference)), blank)
-            self._load(network, path, *saved)
+        saved = read_network(path) if path.exists() else None
+        if saved and saved.done:
+            own = {k.removeprefix("basis."): v for k, v in saved.tensors.items() if k.startswith("basis.")}
+            basis = PatchBasis.blank(own) if settings.energy < 1 else None
+            network = kind(settings, coordinates, Scaling.blank(len(self._reference)), basis)
+            network.load_state_dict(saved.tensors)
+            network.eval()
+            self._record(path, saved.state)
             return network
         torch.manual_seed(self.seed)
         samples, rows = data()
-        train = rows["train"]
-        scaling = self._scaling(samples.nric[train])
-        basis_fitted = None
-        if settings.energy < 1:
-            y = scaling.down(torch.from_numpy(samples.nric[train])).numpy()
-            midpoints = self.collection.reference.edge_midpoints
-            basis_fitted = PatchBasis.fit(y, midpoints, settings.patches, settings.energy, self.seed)
-        network = kind(settings, coordinates, scaling, basis_fitted)
         latents = torch.as_tensor(samples.latents[:, index], dtype=torch.float32)
-        if not path.exists():
-            pairs = [
-                (latents[part], network.target(torch.from_numpy(samples.nric[part])))
-                for part in (train, rows["validation"])
-            ]
-            network.fit_skip(*pairs[0], pairs[1])
-        self._record(path, self._fit(network, latents, samples.nric, rows, settings.fit, path, fraction))
+        train, z = rows["train"], samples.nric
+        scaling = self._scaling(z[train])
+        network = kind(settings, coordinates, scaling, self._basis(settings, scaling, z[train]))
+        if not saved:
+            own_pair, held_out = (
+                (latents[part], network.target(torch.from_numpy(z[part]))) for part in (train, rows["validation"])
+            )
+            network.fit_skip(*own_pair, held_out)
+        self._record(path, self._fit(network, latents, z, rows, settings.fit, path, fraction))
         return network
+
+    def _basis(self, settings: LatentNetworkSettings, scaling: Scaling, z: NDArray) -> PatchBasis | None:
+        """The last layer of a network, from NRIC (n, 2E); None where it is dense."""
+        if settings.energy == 1:
+            return None
+        y, midpoints = scaling.down(torch.from_numpy(z)).numpy(), self.collection.reference.edge_midpoints
+        return PatchBasis.fit(y, midpoints, settings.patches, settings.energy, self.seed)
 
     def factor_samples(self, j: int) -> Samples:
         """The samples of a factor alone."""
         return read(self.run / "samples" / f"factor-{j}")
 
     def factor(self, j: int, settings: LatentNetworkSettings) -> FactorNetwork:
-        """ψ_j, on the factor's own samples; parts of test codes are never among them."""
+        """ψ_j, from samples of the factor alone, none of them at a part of a test code."""
         index = list(self.collection.factors.values())[j]
 
         def data() -> tuple[Samples, dict[str, IntArray]]:
@@ -199,62 +175,58 @@ class Learner:
         return self._latent_network(FactorNetwork, settings, index, path, self._factor_fraction, data)
 
     def factor_rows(self, index: IntArray) -> dict[str, IntArray]:
-        """Which of a factor's samples, at codes of this index, it learns from and is chosen by."""
+        """Rows of a factor's samples, which have these indices of codes: train and validation."""
         rows = self.rows if self._factor_fraction < 1 else self.split
         held_out = np.isin(index, self.joint.index[rows["validation"]])
         if self._factor_fraction < 1:
             train = np.isin(index, self.joint.index[rows["train"]])
         else:
-            # Codes beyond the joint ones, and those that have no joint shape, are the factor's own.
+            # Codes beyond the joint ones, and those whose joint shape failed, are training codes of the factor.
             train = ~np.isin(index, self.joint.index[np.concatenate([rows["test"], rows["validation"]])])
         return {"train": np.flatnonzero(train), "validation": np.flatnonzero(held_out)}
 
     def exponentials(self) -> int:
-        """Samples that the composite is learned from and chosen by, joint ones and those of the factors."""
+        """Number of samples behind the composite: joint ones and those of factors, held-out ones included."""
         own = (self.factor_rows(self.factor_samples(j).index) for j in range(len(self.collection.factors)))
         return sum(len(rows[part]) for rows in (self.rows, *own) for part in ("train", "validation"))
 
-    def composite(
-        self, factors: Sequence[LatentNetworkSettings] | LatentNetworkSettings, combiner: CombinerSettings
-    ) -> Composite:
-        """The ψ_j first, then Ψ on their outputs."""
-        if isinstance(factors, LatentNetworkSettings):
-            factors = [factors] * len(self.collection.factors)
+    def composite(self, recipe: Recipe) -> Composite:
+        """The ψ_j first, then Ψ, which is fitted to their outputs."""
+        indices = list(self.collection.factors.values())
+        factors = recipe.factors if isinstance(recipe.factors, list) else [recipe.factors] * len(indices)
         networks = [self.factor(j, settings) for j, settings in enumerate(factors)]
-        torch.manual_seed(self.seed)
         fractions = [self._fraction, self._factor_fraction]
-        path = self._path("combiner", fractions, combiner, *factors)
-        saved = finished(path)
-        scaling = Scaling.blank(len(self._reference)) if saved else self._scaling(self.joint.nric[self.rows["train"]])
-        reference = self.collection.reference
-        network = CombinerNetwork(combiner, reference.connectivity, scaling, len(networks))
-        composite = Composite(list(self.collection.factors.values()), networks, network)
-        if saved:
-            self._load(network, path, *saved)
-            return composite
-        inputs = predict(composite.factor_shapes, torch.as_tensor(self.joint.latents, dtype=torch.float32))
+        path = self._path("combiner", fractions, recipe.combiner, *factors)
+        saved, reference = read_network(path) if path.exists() else None, self.collection.reference
+        if saved and saved.done:
+            combiner = CombinerNetwork.load(saved.metadata, reference, saved.tensors)
+            combiner.eval()
+            self._record(path, saved.state)
+            return Composite(indices, networks, combiner)
+        inputs = predict(
+            partial(factor_shapes, networks, indices), torch.as_tensor(self.joint.latents, dtype=torch.float32)
+        )
         z, rows = self.joint.nric, self.rows
-        if combiner.symmetries:
+        if recipe.combiner.symmetries:
             inputs, z, rows = self._with_images(inputs, rows)
-        own, other = ((inputs[part], torch.from_numpy(z[part])) for part in (rows["train"], rows["validation"]))
-        corrected = combiner.kernel or combiner.polynomial
-        convolutions = self._path("convolutions", fractions, combiner, *factors) if corrected else path
-        if not convolutions.exists():
-            network.fit_pairwise(*own, other)
-        state: dict[str, Any] = {"done": True, "epoch": 0, "best": None, "history": []}
-        if combiner.layers:
-            if combiner.crop:
-                network.crops = Crops(
-                    reference.edge_midpoints, flaps(reference.connectivity), combiner.crop, combiner.layers
-                )
-            state = self._fit(network, inputs, z, rows, combiner.fit, convolutions, self._fraction)
-        network.eval()
-        if corrected:
-            # Last, because on the samples it has learned from it leaves too little for others to learn.
-            network.fit_correction(combiner, reference.edge_midpoints, own, other, self.seed)
-            save_network(path, network, state)
+        torch.manual_seed(self.seed)
+        if saved:
+            combiner = CombinerNetwork.load(saved.metadata, reference, saved.tensors)
+        else:
+            scaling = self._scaling(self.joint.nric[self.rows["train"]])
+            own, held_out = (
+                JointSamples(inputs[part], torch.from_numpy(z[part]), scaling)
+                for part in (rows["train"], rows["validation"])
+            )
+            combiner = CombinerNetwork.fit(recipe.combiner.correction, reference, own, held_out, self.seed)
+        if descent := combiner.correction.descent:
+            state = self._fit(combiner, inputs, z, rows, descent, path, self._fraction)
+        else:
+            state = {"done": True, "epoch": 0, "best": None, "history": []}
+            combiner.eval()
+            save_network(path, combiner, state)
         self._record(path, state)
-        return composite
+        return Composite(indices, networks, combiner)
 
     def _with_images(self, inputs: Tensor, rows: dict[str, IntArray]) -> tuple[Tensor, NDArray, dict[str, IntArray]]:
         """Factor shapes, joint shapes and rows, with the images of the training samples under each symmetry."""
@@ -267,16 +239,12 @@ class Learner:
         return inputs, z, rows
 
     def main(self) -> Composite:
-        """The recipe that is exported."""
-        return self.composite(self.config.networks.factors, self.config.networks.combiner)
+        """By the main recipe, which is exported."""
+        return self.composite(self.config.networks)
 
     def variants(self) -> dict[str, Composite]:
-        """A composite for each row of the ablation."""
-        networks = self.config.networks
-        return {
-            name: self.composite(variant.factors or networks.factors, variant.combiner or networks.combiner)
-            for name, variant in self.config.variants.items()
-        }
+        """One for each row of the ablation."""
+        return {name: self.composite(recipe) for name, recipe in self.config.recipes.items()}
 
     def monolithic(self) -> FactorNetwork:
         """The fully connected baseline on the joint samples."""
@@ -286,3 +254,12 @@ class Learner:
         return self._latent_network(
             MonolithicNetwork, settings, index, path, self._fraction, lambda: (self.joint, self.rows)
         )
+
+    def start(self) -> StartNetwork:
+        """The start network, from the joint samples: in closed form, in seconds, and not saved."""
+        collection, samples, rows = self.collection, self.joint, self.rows
+        network = StartNetwork(collection.coordinates, collection.reference.vertices)
+        latents = torch.as_tensor(samples.latents, dtype=torch.float32)
+        train, held_out = rows["train"], rows["validation"]
+        network.fit(latents[train], samples.vertices[train], (latents[held_out], samples.vertices[held_out]))
+        return network
