@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
@@ -30,8 +31,28 @@ from shapespace.training.learning.networks import (
     factor_shapes,
     predict,
 )
-from shapespace.training.runs.config import Config, FitSettings, LatentNetworkSettings, Recipe
+from shapespace.training.runs.config import CombinerSettings, Config, FitSettings, LatentNetworkSettings, Recipe
 from shapespace.training.runs.sampling import Collection, Samples, read, split
+
+
+@dataclass(frozen=True)
+class _Data:
+    """What a network is fitted to.
+
+    Attributes:
+        inputs: (n, …) of all samples.
+        z: (n, 2E) their NRIC.
+        rows: indices of samples: train, validation.
+    """
+
+    inputs: Tensor
+    z: NDArray[np.float32]
+    rows: dict[str, IntArray]
+
+    def part(self, name: str) -> tuple[Tensor, Tensor]:
+        """Inputs and NRIC of a part of the samples."""
+        rows = self.rows[name]
+        return self.inputs[rows], torch.from_numpy(self.z[rows])
 
 
 class Learner:
@@ -104,20 +125,18 @@ class Learner:
         }
 
     def _fit(
-        self, network: ShapeNetwork, inputs: Tensor, z: NDArray, rows: dict[str, IntArray], fitting: FitSettings,
-        path: Path, fraction: float,
-    ) -> dict[str, Any]:  # fmt: skip
-        title = path.stem.rpartition("-")[0]
+        self, network: ShapeNetwork, data: _Data, fitting: FitSettings, path: Path, fraction: float
+    ) -> dict[str, Any]:
         return fit(
             network,
-            inputs,
-            torch.from_numpy(z),
-            torch.from_numpy(rows["train"]),
-            torch.from_numpy(rows["validation"]),
+            data.inputs,
+            torch.from_numpy(data.z),
+            torch.from_numpy(data.rows["train"]),
+            torch.from_numpy(data.rows["validation"]),
             fitting.model_copy(update={"max_epochs": round(fitting.max_epochs / fraction)}),
             path,
-            title,
-            self.seed,
+            title=path.stem.rpartition("-")[0],
+            seed=self.seed,
         )
 
     def _record(self, path: Path, state: dict[str, Any]) -> None:
@@ -125,7 +144,7 @@ class Learner:
 
     def _latent_network(
         self, kind: type[FactorNetwork], settings: LatentNetworkSettings, index: list[int], path: Path, fraction: float,
-        data: Callable[[], tuple[Samples, dict[str, IntArray]]],
+        samples: Callable[[], tuple[Samples, dict[str, IntArray]]],
     ) -> FactorNetwork:  # fmt: skip
         """A network from the latents ``index`` to shapes, read from ``path`` or fitted to samples and rows of these."""
         coordinates = self.collection.coordinates[index]
@@ -139,17 +158,17 @@ class Learner:
             self._record(path, saved.state)
             return network
         torch.manual_seed(self.seed)
-        samples, rows = data()
-        latents = torch.as_tensor(samples.latents[:, index], dtype=torch.float32)
-        train, z = rows["train"], samples.nric
-        scaling = self._scaling(z[train])
-        network = kind(settings, coordinates, scaling, self._basis(settings, scaling, z[train]))
+        drawn, rows = samples()
+        data = _Data(torch.as_tensor(drawn.latents[:, index], dtype=torch.float32), drawn.nric, rows)
+        z = drawn.nric[rows["train"]]
+        scaling = self._scaling(z)
+        network = kind(settings, coordinates, scaling, self._basis(settings, scaling, z))
         if not saved:
             own_pair, held_out = (
-                (latents[part], network.target(torch.from_numpy(z[part]))) for part in (train, rows["validation"])
+                (latents, network.target(exact)) for latents, exact in map(data.part, ("train", "validation"))
             )
             network.fit_skip(*own_pair, held_out)
-        self._record(path, self._fit(network, latents, z, rows, settings.fit, path, fraction))
+        self._record(path, self._fit(network, data, settings.fit, path, fraction))
         return network
 
     def _basis(self, settings: LatentNetworkSettings, scaling: Scaling, z: NDArray) -> PatchBasis | None:
@@ -167,12 +186,12 @@ class Learner:
         """ψ_j, from samples of the factor alone, none of them at a part of a test code."""
         index = list(self.collection.factors.values())[j]
 
-        def data() -> tuple[Samples, dict[str, IntArray]]:
-            samples = self.factor_samples(j)
-            return samples, self.factor_rows(samples.index)
+        def samples() -> tuple[Samples, dict[str, IntArray]]:
+            own = self.factor_samples(j)
+            return own, self.factor_rows(own.index)
 
         path = self._path(f"factor-{j}", [self._factor_fraction], settings)
-        return self._latent_network(FactorNetwork, settings, index, path, self._factor_fraction, data)
+        return self._latent_network(FactorNetwork, settings, index, path, self._factor_fraction, samples)
 
     def factor_rows(self, index: IntArray) -> dict[str, IntArray]:
         """Rows of a factor's samples, which have these indices of codes: train and validation."""
@@ -195,48 +214,51 @@ class Learner:
         indices = list(self.collection.factors.values())
         factors = recipe.factors if isinstance(recipe.factors, list) else [recipe.factors] * len(indices)
         networks = [self.factor(j, settings) for j, settings in enumerate(factors)]
-        fractions = [self._fraction, self._factor_fraction]
-        path = self._path("combiner", fractions, recipe.combiner, *factors)
+        path = self._path("combiner", [self._fraction, self._factor_fraction], recipe.combiner, *factors)
+
+        def shapes() -> Tensor:
+            latents = torch.as_tensor(self.joint.latents, dtype=torch.float32)
+            return predict(partial(factor_shapes, networks, indices), latents)
+
+        return Composite(indices, networks, self._combiner(recipe.combiner, path, shapes))
+
+    def _combiner(self, settings: CombinerSettings, path: Path, shapes: Callable[[], Tensor]) -> CombinerNetwork:
+        """Ψ, read from ``path`` or fitted to the factors' shapes (n, J, 2E) of all joint samples."""
         saved, reference = read_network(path) if path.exists() else None, self.collection.reference
         if saved and saved.done:
             combiner = CombinerNetwork.load(saved.metadata, reference, saved.tensors)
             combiner.eval()
             self._record(path, saved.state)
-            return Composite(indices, networks, combiner)
-        inputs = predict(
-            partial(factor_shapes, networks, indices), torch.as_tensor(self.joint.latents, dtype=torch.float32)
-        )
-        z, rows = self.joint.nric, self.rows
-        if recipe.combiner.symmetries:
-            inputs, z, rows = self._with_images(inputs, rows)
+            return combiner
+        data = _Data(shapes(), self.joint.nric, self.rows)
+        if settings.symmetries:
+            data = self._with_images(data)
         torch.manual_seed(self.seed)
         if saved:
             combiner = CombinerNetwork.load(saved.metadata, reference, saved.tensors)
         else:
             scaling = self._scaling(self.joint.nric[self.rows["train"]])
-            own, held_out = (
-                JointSamples(inputs[part], torch.from_numpy(z[part]), scaling)
-                for part in (rows["train"], rows["validation"])
-            )
-            combiner = CombinerNetwork.fit(recipe.combiner.correction, reference, own, held_out, self.seed)
+            own, held_out = (JointSamples(*data.part(name), scaling) for name in ("train", "validation"))
+            combiner = CombinerNetwork.fit(settings.correction, reference, own, held_out, self.seed)
         if descent := combiner.correction.descent:
-            state = self._fit(combiner, inputs, z, rows, descent, path, self._fraction)
+            state = self._fit(combiner, data, descent, path, self._fraction)
         else:
             state = {"done": True, "epoch": 0, "best": None, "history": []}
             combiner.eval()
             save_network(path, combiner, state)
         self._record(path, state)
-        return Composite(indices, networks, combiner)
+        return combiner
 
-    def _with_images(self, inputs: Tensor, rows: dict[str, IntArray]) -> tuple[Tensor, NDArray, dict[str, IntArray]]:
-        """Factor shapes, joint shapes and rows, with the images of the training samples under each symmetry."""
-        z, rows, train = self.joint.nric, dict(rows), rows["train"]
+    def _with_images(self, data: _Data) -> _Data:
+        """The same, with the images of the training samples under each symmetry of the collection."""
+        inputs, z, train = data.inputs, data.z, data.rows["train"]
+        rows = dict(data.rows)
         for edges in self.collection.symmetries:
             both_halves = np.concatenate([edges, len(edges) + edges])
             rows["train"] = np.concatenate([rows["train"], len(z) + np.arange(len(train))])
-            inputs = torch.cat([inputs, inputs[train][:, :, both_halves]])
-            z = np.concatenate([z, self.joint.nric[train][:, both_halves]])
-        return inputs, z, rows
+            inputs = torch.cat([inputs, data.inputs[train][:, :, both_halves]])
+            z = np.concatenate([z, data.z[train][:, both_halves]])
+        return _Data(inputs, z, rows)
 
     def main(self) -> Composite:
         """By the main recipe, which is exported."""
