@@ -9,7 +9,7 @@ import torch
 
 from shapespace.coordinates.nric import WeightedNorm, nric
 from shapespace.training.learning.evaluation import alone, r_squared
-from shapespace.training.learning.learning import Learner
+from shapespace.training.learning.learner import Learner
 from shapespace.training.learning.networks import affine_sum, predict
 from shapespace.training.runs.workers import run
 

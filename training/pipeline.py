@@ -20,8 +20,7 @@ from shapespace.training.collection.generators import PRODUCTS
 from shapespace.training.collection.ingest import data_files
 from shapespace.training.learning.evaluation import alone, evaluate
 from shapespace.training.learning.export import export
-from shapespace.training.learning.learning import Learner
-from shapespace.training.learning.start_network import fit_start
+from shapespace.training.learning.learner import Learner
 from shapespace.training.report.page import write_report
 from shapespace.training.runs.config import Config
 from shapespace.training.runs.directory import RunDirectory
@@ -225,7 +224,7 @@ def export_bundle(run: Run) -> None:
         digest.hexdigest(),
         run.models,
         geometry,
-        fit_start(learner),
+        learner.start(),
     )
     directory.log("exported", bundle=f"{folder.parent.name}/{folder.name}")
 

@@ -38,10 +38,7 @@ skip_degree = 2
 fit = { batch_size = 16, max_epochs = 3 }
 
 [networks.combiner]
-width = 4
-layers = 1
-pairwise = 2
-fit = { batch_size = 16, max_epochs = 3 }
+correction = { kind = "kernel" }
 
 [monolithic]
 hidden = [16]

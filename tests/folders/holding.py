@@ -47,7 +47,7 @@ skip_degree = 3
 fit = {{ batch_size = 16, max_epochs = 10 }}
 
 [networks.combiner]
-kernel = 6
+correction = {{ kind = "kernel", coefficients = 6 }}
 
 [monolithic]
 hidden = [16]

@@ -35,11 +35,12 @@ patches = 8
 energy = 0.95
 fit = { batch_size = 20, max_epochs = 6 }
 
-[networks.combiner]
+[networks.combiner.correction]
+kind = "convolutions"
 neighbourhood = "flaps"
 width = 8
 layers = 2
-pairwise = 2
+products = 2
 fit = { batch_size = 8, max_epochs = 7 }
 
 [monolithic]
@@ -48,13 +49,7 @@ fit = { batch_size = 8, max_epochs = 3 }
 
 [variants.paper]
 title = "the paper's combiner"
-[variants.paper.combiner]
-residual = false
-kernel = 0
-edge_channels = 0
-width = 4
-layers = 2
-fit = { batch_size = 8, max_epochs = 1 }
+combiner.correction = { kind = "paper", width = 4, layers = 2, fit = { batch_size = 8, max_epochs = 1 } }
 
 [evaluation]
 grid_nodes = 4

@@ -50,13 +50,7 @@ skip_degree = 2
 fit = { batch_size = 16, max_epochs = 8 }
 
 [networks.combiner]
-width = 4
-layers = 1
-pairwise = 2
-kernel = 0
-polynomial = 4
-monomials = 60
-fit = { batch_size = 16, max_epochs = 6 }
+correction = { kind = "polynomials", coefficients = 4, monomials = 60 }
 
 [monolithic]
 hidden = [16]

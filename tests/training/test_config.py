@@ -8,10 +8,17 @@ from typing import get_args
 import pytest
 
 from shapespace.training.collection.generators import MESHES, PRODUCTS
-from shapespace.training.runs.config import CollectionSettings, ConfigError, load, parse
+from shapespace.training.runs.config import (
+    CollectionSettings,
+    Config,
+    ConfigError,
+    PolynomialSettings,
+    load,
+    parse,
+)
 from tests.training.conftest import TINY
 
-EXAMPLES = sorted((Path(__file__).parents[2] / "examples").glob("*.toml"))
+EXAMPLES = sorted((Path(__file__).parents[2] / "examples").rglob("*.toml"))
 
 
 @pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
@@ -29,6 +36,12 @@ def test_every_example_is_a_configuration(path: Path) -> None:
         ('name = "tiny-torus"', 'name = "../up"', "export.name"),
         ("[export]", "[export", "not TOML"),
         ('licence = "MIT"', "", "export.licence"),
+        ("products = 2", "cofficients = 2", "networks.combiner.correction.convolutions.cofficients"),
+        ('kind = "convolutions"', 'kind = "kernels"', "networks.combiner.correction"),
+        ("products = 2", "products = 2\nresidual = false", "products need residual"),
+        ('kind = "paper", width', 'kind = "paper", widht', r"variants\.paper\.combiner\.correction\.paper\.widht"),
+        ("[variants.paper]", '[variants.paper]\nbase = "paper"', "no variant 'paper' stands before it"),
+        ("[variants.paper]", "[variants.paper]\nfactors = [{}, {}]", "factors: 2 tables over 3"),
     ],
 )
 def test_a_faulty_setting_is_named(old: str, new: str, says: str) -> None:
@@ -73,3 +86,75 @@ def test_every_generator_that_can_be_named_is_there() -> None:
     named = set(get_args(get_args(CollectionSettings.model_fields["generator"].annotation)[0]))
     assert named == PRODUCTS.keys() | MESHES.keys()
     assert not PRODUCTS.keys() & MESHES.keys()
+
+
+def variant(text: str) -> Config:
+    return parse(TINY.replace("[evaluation]", text + "\n[evaluation]"), "here")
+
+
+def test_a_variant_is_what_differs_from_the_main_recipe() -> None:
+    config = variant('[variants.a]\ntitle = ""\ncombiner.correction = { width = 3, fit = { max_epochs = 2 } }')
+    main, changed = config.networks, config.recipes["a"]
+    fit = main.combiner.correction.fit.model_copy(update={"max_epochs": 2})
+    assert changed.factors == main.factors
+    assert changed.combiner.correction == main.combiner.correction.model_copy(update={"width": 3, "fit": fit})
+
+
+def test_a_variant_is_what_differs_from_its_base() -> None:
+    config = variant(
+        """
+        [variants.a]
+        title = ""
+        combiner = { symmetries = false, correction = { width = 3 } }
+        [variants.b]
+        title = ""
+        base = "a"
+        combiner.correction.layers = 1
+        """
+    )
+    first, second = (config.recipes[name].combiner for name in "ab")
+    assert second.correction == first.correction.model_copy(update={"layers": 1})
+    assert not second.symmetries
+
+
+def test_a_correction_of_another_kind_starts_from_its_defaults() -> None:
+    config = variant('[variants.a]\ntitle = ""\ncombiner.correction = { kind = "polynomials", monomials = 7 }')
+    assert config.recipes["a"].combiner.correction == PolynomialSettings(monomials=7)
+
+
+def test_factors_of_a_variant_differ_all_alike_or_each_for_itself() -> None:
+    config = variant(
+        """
+        [variants.a]
+        title = ""
+        factors = { energy = 1.0 }
+        [variants.b]
+        title = ""
+        factors = [{}, { hidden = [5] }, { skip_orders = [] }]
+        """
+    )
+    main, alike, each = config.networks.factors, config.recipes["a"].factors, config.recipes["b"].factors
+    assert alike == [factor.model_copy(update={"energy": 1.0}) for factor in main]
+    assert each[0] == main[0]
+    assert (each[1].hidden, each[1].energy) == ([5], main[1].energy)
+    assert (each[2].skip_orders, each[2].fourier) == ([], main[2].fourier)
+    one = parse(TINY[: TINY.index("[[networks")] + TINY[TINY.index("[monolithic]") :], "here")
+    assert one.recipes["paper"].factors == one.networks.factors
+
+
+def test_what_is_kept_of_a_configuration_says_the_same() -> None:
+    for path in EXAMPLES:
+        config = load(path)[0]
+        again = Config.model_validate(config.model_dump(mode="json", by_alias=True))
+        assert again == config
+        assert again.recipes == config.recipes
+
+
+def test_a_configuration_of_version_0_1_is_refused_in_a_sentence_that_says_what_to_write() -> None:
+    path = Path(__file__).parents[2] / "runs" / "freaky-torus" / "config.toml"
+    with pytest.raises(ConfigError) as caught:
+        load(path)
+    (line,) = str(caught.value).splitlines()[1:]
+    assert "settings of version 0.1: write kernel as correction = { kind = " in line
+    for name in ("pairwise", "layers", "crop", "fit"):
+        assert name in line

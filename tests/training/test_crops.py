@@ -9,10 +9,11 @@ import trimesh
 
 from shapespace.coordinates.nric import WeightedNorm, nric
 from shapespace.mesh.triangle_mesh import TriangleMesh
-from shapespace.training.learning.crops import UNIFORM, Crops
-from shapespace.training.learning.layers import flaps
-from shapespace.training.learning.networks import CombinerNetwork, Scaling
-from shapespace.training.runs.config import CombinerSettings
+from shapespace.training.learning.convolutions import UNIFORM, Crops, flaps
+from shapespace.training.learning.corrections import JointSamples
+from shapespace.training.learning.layers import Scaling
+from shapespace.training.learning.networks import CombinerNetwork
+from shapespace.training.runs.config import ConvolutionSettings
 
 LAYERS = 3
 
@@ -34,20 +35,22 @@ def combiner(mesh: TriangleMesh) -> tuple[CombinerNetwork, torch.Tensor, torch.T
     torch.manual_seed(0)
     noise = np.random.default_rng(0).normal(size=(12, *mesh.vertices.shape))
     z = nric(mesh.vertices + 0.02 * noise, mesh.connectivity).astype(np.float32)
-    settings = CombinerSettings(width=6, layers=LAYERS, neighbourhood="flaps", kernel=0)
+    settings = ConvolutionSettings(width=6, layers=LAYERS, neighbourhood="flaps")
     scaling = Scaling.of(nric(mesh.vertices, mesh.connectivity), WeightedNorm.of(mesh, 1.0).squared, z)
-    network = CombinerNetwork(settings, mesh.connectivity, scaling, 2).eval()
-    torch.nn.init.normal_(network.readout.weight)
-    return network, torch.from_numpy(z[:8].reshape(4, 2, -1)), network.target(torch.from_numpy(z[8:]))
+    inputs, joint = torch.from_numpy(z[:8].reshape(4, 2, -1)), torch.from_numpy(z[8:])
+    samples = JointSamples(inputs, joint, scaling)
+    network = CombinerNetwork.fit(settings, mesh, samples, samples, 0).eval()
+    torch.nn.init.normal_(network.correction.readout.weight)
+    return network, inputs, network.target(joint)
 
 
 def test_on_inner_edges_a_crop_s_loss_is_the_whole_mesh_s(mesh: TriangleMesh) -> None:
     network, inputs, target = combiner(mesh)
     error = (network.coefficients(inputs) - target).detach().view(4, 2, -1)
-    network.crops = crops(mesh, 90)
-    drawn = network.crops.about(torch.tensor([0, 50, 100, 150]))
+    network.correction.crops = crops(mesh, 90)
+    drawn = network.correction.crops.about(torch.tensor([0, 50, 100, 150]))
     assert 0 < drawn.inner.float().mean() < 1
-    network.crops.draw = lambda missed: drawn
+    network.correction.crops.draw = lambda missed: drawn
     inner = torch.stack(
         [
             error[k][:, edges[inner]].square().mean()
@@ -61,8 +64,8 @@ def test_on_inner_edges_a_crop_s_loss_is_the_whole_mesh_s(mesh: TriangleMesh) ->
 def test_a_crop_of_everything_is_the_whole_mesh(mesh: TriangleMesh) -> None:
     network, inputs, target = combiner(mesh)
     whole = network.loss(inputs, target)
-    network.crops = crops(mesh, 10**6)
-    assert network.crops.about(torch.tensor([7])).inner.all()
+    network.correction.crops = crops(mesh, 10**6)
+    assert network.correction.crops.about(torch.tensor([7])).inner.all()
     torch.testing.assert_close(network.loss(inputs, target), whole, rtol=1e-4, atol=0)  # sums in another order
 
 

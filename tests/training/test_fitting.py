@@ -12,7 +12,8 @@ import trimesh
 from shapespace.coordinates.nric import WeightedNorm, nric
 from shapespace.mesh.triangle_mesh import TriangleMesh
 from shapespace.training.learning import fitting
-from shapespace.training.learning.networks import FactorNetwork, Scaling
+from shapespace.training.learning.layers import Scaling
+from shapespace.training.learning.networks import FactorNetwork
 from shapespace.training.runs.config import FitSettings, LatentNetworkSettings
 from shapespace.training.runs.coordinates import Coordinates
 
@@ -74,7 +75,7 @@ def test_a_finished_fit_is_read_not_repeated(data: tuple, tmp_path: Path, monkey
 
 def test_a_fit_learns_and_keeps_its_best_epoch(data: tuple, tmp_path: Path) -> None:
     network = fit(data, tmp_path / "n.safetensors", FitSettings(max_epochs=60, batch_size=16, learning_rate=1e-2))
-    state, _ = fitting.load_network(tmp_path / "n.safetensors", network)
+    state = fitting.read_network(tmp_path / "n.safetensors").state
     errors = [validation for _, validation in state["history"]]
     assert state["best"] == min(errors)
     assert state["best"] < 0.05 * errors[0]
@@ -88,6 +89,6 @@ def test_a_fit_learns_and_keeps_its_best_epoch(data: tuple, tmp_path: Path) -> N
 
 def test_the_rate_falls_on_a_plateau_and_ends_the_fit(data: tuple, tmp_path: Path) -> None:
     settings = FitSettings(max_epochs=500, batch_size=16, learning_rate=1e-2, final_rate=5e-3, patience=1)
-    network = fit(data, tmp_path / "n.safetensors", settings)
-    state, _ = fitting.load_network(tmp_path / "n.safetensors", network)
+    fit(data, tmp_path / "n.safetensors", settings)
+    state = fitting.read_network(tmp_path / "n.safetensors").state
     assert state["epoch"] < 500

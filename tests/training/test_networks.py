@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,21 +16,28 @@ from torch import nn
 
 from shapespace.coordinates.nric import WeightedNorm, nric
 from shapespace.mesh.triangle_mesh import Connectivity, TriangleMesh
-from shapespace.training.learning.corrections import ridge_regression
+from shapespace.training.learning.convolutions import EdgeConvolution, Flaps, Star, flaps
+from shapespace.training.learning.corrections import JointSamples
+from shapespace.training.learning.fitting import read_network, save_network
 from shapespace.training.learning.layers import (
-    EdgeConvolution,
-    Flaps,
     FourierProducts,
     LatentFeatures,
     PatchBasis,
     Polynomials,
-    Star,
-    flaps,
+    Scaling,
     narrowest,
 )
-from shapespace.training.learning.networks import CombinerNetwork, FactorNetwork, Scaling, affine_sum
-from shapespace.training.learning.polynomials import PatchPolynomials, learned_metric
-from shapespace.training.runs.config import CombinerSettings, LatentNetworkSettings
+from shapespace.training.learning.networks import CORRECTIONS, CombinerNetwork, FactorNetwork, affine_sum, resolved
+from shapespace.training.learning.polynomials import PolynomialCorrection, learned_metric
+from shapespace.training.runs.config import (
+    AutoSettings,
+    ConvolutionSettings,
+    KernelSettings,
+    LatentNetworkSettings,
+    PaperSettings,
+    PolynomialSettings,
+    ProductSettings,
+)
 from shapespace.training.runs.coordinates import Coordinates
 
 AROUND = {"star": Star, "flaps": Flaps}
@@ -105,10 +115,18 @@ def test_the_gradient_of_a_convolution_is_right(sheet: TriangleMesh, neighbourho
     assert torch.autograd.gradcheck(convolution, (x,))
 
 
-def test_a_residual_combiner_begins_as_the_affine_sum(ball: TriangleMesh) -> None:
+def fitted(mesh: TriangleMesh, settings: Any, factors: torch.Tensor, z: torch.Tensor, own: int) -> CombinerNetwork:
+    """All of its closed form, from the first ``own`` samples; the others choose."""
+    scale = scaling(mesh, z.numpy())
+    parts = (JointSamples(factors[part], z[part], scale) for part in (slice(own), slice(own, None)))
+    with torch.no_grad():
+        return CombinerNetwork.fit(settings, mesh, *parts, 0).eval()
+
+
+def test_residual_convolutions_begin_as_the_affine_sum(ball: TriangleMesh) -> None:
     z = noisy(ball, 6).astype(np.float32)
     factors = z.reshape(2, 3, -1)
-    network = CombinerNetwork(CombinerSettings(width=4), ball.connectivity, scaling(ball, z), 3).eval()
+    network = fitted(ball, ConvolutionSettings(width=4), torch.from_numpy(factors), torch.from_numpy(z[:2]), 1)
     with torch.no_grad():
         answer = network(torch.from_numpy(factors)).numpy()
     reference = nric(ball.vertices, ball.connectivity)
@@ -137,58 +155,76 @@ def beyond_cubic(a: NDArray, b: NDArray, f: NDArray, g: NDArray) -> NDArray:
     return np.sin(2 * a * b) * a * f
 
 
-def test_pairwise_products_find_a_bilinear_interplay(ball: TriangleMesh) -> None:
-    """a b f is out of reach of the affine sum and exact with one product."""
-    x, y = interplay(ball, 60, lambda a, b, f, g: a * b * f)
-    network = CombinerNetwork(
-        CombinerSettings(width=4, pairwise=1), ball.connectivity, scaling(ball, y.numpy()), 2
-    ).eval()  # fmt: skip
+def bilinear(a: NDArray, b: NDArray, f: NDArray, g: NDArray) -> NDArray:
+    return a * b * f
+
+
+KINDS = [
+    (ProductSettings(coefficients=1), bilinear, 1e-6),
+    (ConvolutionSettings(width=4, products=1), bilinear, 1e-6),
+    (KernelSettings(coefficients=3), beyond_cubic, 1e-2),
+    (PolynomialSettings(coefficients=3, monomials=20), cubic, 1e-3),
+]
+
+
+@pytest.mark.parametrize(("settings", "missed", "left"), KINDS, ids=lambda value: getattr(value, "kind", None))
+def test_every_correction_finds_an_interplay_from_factors_alone(
+    ball: TriangleMesh, settings: Any, missed: Missed, left: float
+) -> None:
+    """At codes that it has not seen, of a size that no affine sum reaches."""
+    x, z = interplay(ball, 260, missed)
+    network, unseen = fitted(ball, settings, x[:180], z[:180], 150), slice(180, None)
     with torch.no_grad():
-        before = (network(x) - y).abs().max()
-        network.fit_pairwise(x[:40], y[:40], (x[40:], y[40:]))
-        after = (network(x) - y).abs().max()
-    assert before > 0.01
-    assert after < 1e-4
+        sums = torch.from_numpy(affine_sum(network.scaling.mean.numpy(), x[unseen].numpy()))
+        before = (network.scaling.down(sums) - network.scaling.down(z[unseen])).square().mean()
+        after = (network.coefficients(x[unseen]) - network.scaling.down(z[unseen])).square().mean()
+    assert after < left * before
 
 
 @pytest.mark.parametrize(
-    ("settings", "missed", "left"),
-    [
-        (CombinerSettings(kernel=3), beyond_cubic, 1e-2),
-        (CombinerSettings(kernel=0, polynomial=3, monomials=20), cubic, 1e-3),
-    ],
-    ids=["kernel", "polynomials"],
+    "settings", [settings for settings, _, _ in KINDS] + [PaperSettings(width=4), AutoSettings()], ids=lambda s: s.kind
 )
-def test_corrections_find_an_interplay_from_factors_alone(
-    ball: TriangleMesh, settings: CombinerSettings, missed: Missed, left: float
-) -> None:
-    """At codes they have not seen; and they come back from a saved state as they were."""
-    x, y = interplay(ball, 260, missed)
-    scale = scaling(ball, y.numpy())
-    network = CombinerNetwork(settings, ball.connectivity, scale, 2).eval()
-    unseen = slice(180, None)
+def test_every_correction_comes_back_from_its_file(ball: TriangleMesh, settings: Any, tmp_path: Path) -> None:
+    x, z = interplay(ball, 60, cubic)
+    network = fitted(ball, settings, x, z, 40)
     with torch.no_grad():
-        before = (network(x[unseen]) - y[unseen]).square().mean()
-        network.fit_correction(settings, ball.edge_midpoints, (x[:150], y[:150]), (x[150:180], y[150:180]), 0)
-        after = (network(x[unseen]) - y[unseen]).square().mean()
-        assert after < left * before
-        again = CombinerNetwork(settings, ball.connectivity, scale, 2).eval()
-        again.load_state_dict(network.state_dict())
-        torch.testing.assert_close(again(x), network(x))
+        for parameter in network.parameters():
+            parameter += 0.1
+    save_network(tmp_path / "n.safetensors", network, {"done": True})
+    saved = read_network(tmp_path / "n.safetensors")
+    assert json.loads(saved.metadata["correction"])["kind"] == resolved(settings).kind
+    again = CombinerNetwork.load(saved.metadata, ball, saved.tensors).eval()
+    with torch.no_grad():
+        assert torch.equal(again(x), network(x))
+
+
+def test_every_kind_has_a_class() -> None:
+    assert {settings.kind for settings, _, _ in KINDS} == set(CORRECTIONS)
+    assert resolved(AutoSettings()) == KernelSettings()
+    paper = resolved(PaperSettings())
+    assert (paper.neighbourhood, paper.residual, paper.dropout, paper.edge_channels) == ("star", False, 0.1, 0)
+    assert (paper.fit.schedule, paper.fit.learning_rate) == ("plateau", 1e-3)
+
+
+def polynomials(mesh: TriangleMesh, coefficients: int, monomials: int) -> tuple[PolynomialCorrection, torch.Tensor]:
+    """Fitted ones, and shapes of factors."""
+    x, z = interplay(mesh, 60, cubic)
+    network = fitted(mesh, PolynomialSettings(coefficients=coefficients, monomials=monomials), x, z, 40)
+    assert isinstance(network.correction, PolynomialCorrection)
+    return network.correction, network.scaling.down(x)
 
 
 def test_polynomials_look_at_no_other_patch(ball: TriangleMesh) -> None:
-    x, z = interplay(ball, 60, cubic)
-    y = x - x.mean(dim=0)
-    fitted = PatchPolynomials.fit(2, 10, ball.edge_midpoints, (y[:40], z[:40]), (y[40:], z[40:]), 0)
-    here = fitted.entries[0][fitted.entries[0] < z.shape[1]]
-    other = torch.ones(z.shape[1], dtype=torch.bool)
+    correction, y = polynomials(ball, 2, 10)
+    size = y.shape[2]
+    here = correction.entries[0][correction.entries[0] < size]
+    other = torch.ones(size, dtype=torch.bool)
     other[here] = False
-    changed = y[40:].clone()
+    changed = y.clone()
     changed[:, :, here] += 0.1
     with torch.no_grad():
-        moved = (fitted(changed) - fitted(y[40:])).abs().amax(dim=0)
-    assert len(fitted.entries) > 1
+        moved = (correction.difference(changed) - correction.difference(y)).abs().amax(dim=0)
+    assert len(correction.entries) > 1
     assert moved[other].max() == 0 < moved[here].min()
 
 
@@ -205,21 +241,9 @@ def test_a_learned_metric_finds_the_direction_that_matters() -> None:
 
 
 def test_weights_of_polynomials_take_a_byte_each(ball: TriangleMesh) -> None:
-    x, z = interplay(ball, 60, cubic)
-    y = x - x.mean(dim=0)
-    fitted = PatchPolynomials.fit(3, 60, ball.edge_midpoints, (y[:40], z[:40]), (y[40:], z[40:]), 0)
-    assert narrowest(fitted.weights) == torch.int8
-    assert narrowest(fitted.axes) == narrowest(fitted.basis) == torch.int8
-
-
-def test_ridge_regression_takes_a_penalty_that_held_out_pairs_ask_for() -> None:
-    torch.manual_seed(0)
-    x, other = torch.randn(30, 25), torch.randn(200, 25)
-    true = torch.randn(25, 3)
-    h, b = ridge_regression(x, x @ true, (other, other @ true))
-    torch.testing.assert_close(h @ b, true.double(), atol=1e-3, rtol=0)
-    h, b = ridge_regression(x, torch.randn(30, 3), (other, torch.zeros(200, 3)))
-    assert (other.double() @ h @ b).square().mean() < 0.01, "noise is not followed"
+    correction, _ = polynomials(ball, 3, 60)
+    assert narrowest(correction.weights) == torch.int8
+    assert narrowest(correction.axes) == narrowest(correction.basis) == torch.int8
 
 
 def test_scaled_differences_go_both_ways_and_have_unit_size(sheet: TriangleMesh) -> None:

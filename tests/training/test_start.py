@@ -9,7 +9,7 @@ import torch
 
 from shapespace.bundle.reader import read_bundle
 from shapespace.mesh.rigid_motion import align
-from shapespace.training.learning.start_network import StartNetwork, fit_start
+from shapespace.training.learning.networks import StartNetwork
 from shapespace.training.pipeline import Run, learner_of
 from shapespace.training.runs.config import load
 from shapespace.training.runs.coordinates import Coordinates
@@ -53,7 +53,7 @@ def test_a_bundle_has_the_start_of_its_samples(tiny_run: Path) -> None:
         "output": "vertices",
     }
     run = Run(tiny_run, *load(tiny_run / "config.toml"), tiny_run / "models")
-    network = fit_start(learner_of(run))
+    network = learner_of(run).start()
     codes = np.random.default_rng(4).uniform(0, 6, (5, 4)).astype(np.float32)
     with torch.no_grad():
         expected = network(torch.from_numpy(codes)).numpy()

@@ -47,7 +47,7 @@ count = {modes}    # numbers that describe a shape, {most} at most; more keep fi
 # hidden = {factor.hidden}    # layers of each factor's network; wider where the report shows a low R² of factors
 
 [networks.combiner]
-# kernel = {combiner.kernel}    # principal coefficients of each factor that decide how the factors join
+# correction = {{ kind = "{combiner.correction.kind}" }}    # how the factors join; or "kernel", "polynomials", …
 
 [export]
 name = {name}    # in addresses and file names: small letters, digits and hyphens

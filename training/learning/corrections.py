@@ -1,97 +1,97 @@
-"""What is fitted in closed form to what a sum of factors, or the convolutions after it, miss of a joint shape."""
+"""Corrections of the affine sum of the factors' shapes: what they have in common, and two kinds in closed form."""
 
 from __future__ import annotations
 
 import itertools
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Self
 
 import torch
 from torch import Tensor, nn
 
-from shapespace.training.learning.layers import half_precision
-
-#: Weights of the penalty that `ridge_regression` chooses from, as shares of the mean square of a feature.
-RIDGES = tuple(10.0**k for k in range(-6, 3))
-
-
-def ridge_regression(x: Tensor, y: Tensor, held_out: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
-    """The linear map from features x (n, p) to y (n, q) whose penalty suits held-out pairs best.
-
-    Features ought to have a mean square of about one.
-
-    Returns:
-        H (p, p) and B (p, q), whose product is the map; the columns of x H are orthonormal but for the penalty.
-    """
-    x, y = x.double(), y.double()
-    value, vector = torch.linalg.eigh(x.T @ x / len(x))
-    right, other = vector.T @ (x.T @ y / len(x)), held_out[0].double() @ vector
-
-    def error(ridge: float) -> float:
-        return float((other @ (right / (value + ridge)[:, None]) - held_out[1]).square().mean())
-
-    scale = (value.clamp_min(0) + min(RIDGES, key=error)).rsqrt()
-    return vector * scale, right * scale[:, None]
+from shapespace.mesh.triangle_mesh import TriangleMesh
+from shapespace.training.learning.layers import Scaling, half_precision
+from shapespace.training.learning.linear import Ridge, principal_axes, regression, ridge
+from shapespace.training.runs.config import FitSettings, KernelSettings, ProductSettings
 
 
-def low_rank(h: Tensor, b: Tensor, rank: int) -> tuple[Tensor, Tensor]:
-    """The map of low rank, as two factors, whose values are nearest to those of ``h b`` from `ridge_regression`."""
-    strongest = torch.linalg.eigh(b @ b.T)[1][:, -rank:]
-    return h @ strongest, strongest.T @ b
+@dataclass(frozen=True)
+class JointSamples:
+    """What a correction is fitted to, or chosen by.
 
-
-class PairwiseProducts(nn.Module):
-    """A bilinear correction of the affine sum, (n, J, 2E) → (n, 2E), fitted by ridge regression.
-
-    Each factor is brought to a few principal coefficients; a linear map of low rank takes these and their products
-    between every two factors to scaled differences. What two factors do to each other is smooth and global where they
-    overlap widely, and there a few products do what many convolutions would.
+    Attributes:
+        factors: (n, J, 2E) NRIC of the factors' shapes.
+        joint: (n, 2E) NRIC of the joint shapes.
+        scaling: to scaled differences.
     """
 
-    centre: Tensor
-    axes: Tensor
-    weights: Tensor
-    basis: Tensor
-    #: Largest rank of the linear map.
-    RANK = 64
+    factors: Tensor
+    joint: Tensor
+    scaling: Scaling
 
-    def __init__(self, factor_count: int, rank: int, size: int) -> None:
-        super().__init__()
-        self.pairs = list(itertools.combinations(range(factor_count), 2))
-        self.register_buffer("centre", torch.zeros(factor_count, size))
-        self.register_buffer("axes", torch.zeros(factor_count, size, rank))
-        features = 1 + factor_count * rank + len(self.pairs) * rank**2
-        self.register_buffer("weights", torch.zeros(features, min(features, self.RANK)))
-        self.register_buffer("basis", torch.zeros(min(features, self.RANK), size))
+    @property
+    def inputs(self) -> Tensor:
+        """(n, J, 2E) scaled differences of the factors' shapes."""
+        return self.scaling.down(self.factors)
 
-    def _features(self, y: Tensor) -> Tensor:
-        c = torch.einsum("njs,jsr->njr", y - self.centre, self.axes)
-        products = [(c[:, i, :, None] * c[:, j, None, :]).flatten(1) for i, j in self.pairs]
-        return torch.cat([torch.ones_like(c[:, 0, :1]), c.flatten(1), *products], dim=1)
+    @property
+    def missed(self) -> Tensor:
+        """(n, 2E) scaled differences of the joint shapes from the affine sums, in NRIC of single precision."""
+        # In parts, since all inputs together take J times the room of the result.
+        sums = torch.cat([self.scaling.up(self.scaling.down(part).sum(dim=1)) for part in self.factors.split(32)])
+        return (self.joint - sums) * self.scaling.factor
 
-    def fit(self, y: Tensor, residual: Tensor, held_out: tuple[Tensor, Tensor]) -> None:
-        """Fit axes and weights to factor shapes (n, J, 2E) and what the affine sum misses (n, 2E)."""
-        self.centre.copy_(y.mean(dim=0))
-        for j in range(y.shape[1]):
-            _, s, vt = torch.linalg.svd(y[:, j] - self.centre[j], full_matrices=False)
-            rank = min(self.axes.shape[2], len(s))
-            # Coefficients of unit variance, so that one ridge suits all products; those that are hardly there stay
-            # small, or they would be made of rounding errors.
-            self.axes[j, :, :rank] = (vt[:rank] / s[:rank, None].clamp_min(1e-2 * s[0]) * len(y) ** 0.5).T
-        h, b = ridge_regression(self._features(y), residual, (self._features(held_out[0]), held_out[1]))
-        weights, basis = low_rank(h, b, len(self.basis))
-        self.weights.copy_(weights)
-        self.basis.copy_(basis)
+
+class Correction(nn.Module, ABC):
+    """The joint shape from those of the factors, (n, J, 2E) → (n, 2E), all of them as scaled differences.
+
+    Every kind implements `fit`, `difference` (or `forward`) and `load`; its state is its ``state_dict()``.
+    """
+
+    @classmethod
+    @abstractmethod
+    def fit(cls, settings: Any, reference: TriangleMesh, own: JointSamples, held_out: JointSamples, seed: int) -> Self:
+        """Fit all that has a closed form.
+
+        Args:
+            settings: of this kind.
+            reference: the mesh.
+            own: samples to fit to.
+            held_out: samples that choose penalties.
+            seed: of whatever is random.
+        """
+
+    @classmethod
+    @abstractmethod
+    def load(cls, settings: Any, reference: TriangleMesh, tensors: Mapping[str, Tensor]) -> Self:
+        """What a ``state_dict()`` was of."""
+
+    @property
+    def descent(self) -> FitSettings | None:
+        """How to train it by gradient descent after `fit`; None where there is nothing to train."""
+        return None
+
+    def difference(self, y: Tensor) -> Tensor:
+        """(n, 2E) what is added to the affine sum."""
+        raise NotImplementedError
 
     def forward(self, y: Tensor) -> Tensor:
-        return self._features(y) @ self.weights @ self.basis
+        return y.sum(dim=1) + self.difference(y)
+
+    def loss(self, y: Tensor, target: Tensor) -> Tensor:
+        """Mean square error, or an estimate of it, to train with."""
+        return nn.functional.mse_loss(self(y), target)
 
 
-class KernelCorrection(nn.Module):
-    """A smooth correction of the joint shape, (n, J, 2E) → (n, 2E): kernel ridge regression on the factors' shapes.
+class KernelCorrection(Correction):
+    """Kernel ridge regression on the factors' shapes, smooth and global.
 
-    Two samples are as alike as their factors' shapes are near, ``exp(−½ Σ_j ‖x_j − x_j'‖² / (ℓ σ_j)²)`` with σ_j the
-    spread of factor j along its strongest direction. Each shape is brought to a few principal coefficients first. What
-    is predicted are principal coefficients of what is missed without it. Products of coefficients, two or three at a
-    time, are among the functions that such a kernel spans, at the weight that their smoothness deserves.
+    The kernel of two samples is ``exp(−½ Σ_j ‖x_j − x_j'‖² / (ℓ σ_j)²)``, with the difference of the shapes of factor j
+    in a few principal coefficients, and σ_j the standard deviation of the first. Its values are principal coefficients
+    of what the affine sum misses. Products of two or three coefficients, which describe how factors act on each other,
+    are among the functions that such a kernel approximates.
     """
 
     centre: Tensor
@@ -101,15 +101,15 @@ class KernelCorrection(nn.Module):
     weights: Tensor
     mean: Tensor
     basis: Tensor
-    #: Samples that it is fitted to, at most.
+    #: Samples to fit to, at most: the time grows with their cube, the size of the network with their number.
     ANCHORS = 4000
-    #: Lengths ℓ and penalties, as shares of the kernel's value at no distance, of which held-out samples choose one.
-    #: Below 1e-4 weights grow beyond what single precision keeps of them.
+    #: Candidates for the length ℓ and for the penalty, where the kernel's largest value is 1. With penalties below 1e-4
+    #: the weights are too large for single precision.
     LENGTHS = (2.0, 4.0, 8.0, 16.0)
-    RIDGES = tuple(10.0 ** (k / 2) for k in range(-8, -1))
-    #: Samples that the principal axes of factors are taken from, at most.
+    PENALTIES = tuple(10.0 ** (k / 2) for k in range(-8, -1))
+    #: Samples that the principal axes of factors are computed from, at most.
     AXES = 500
-    #: Variance that the basis of the correction keeps, and its largest rank.
+    #: Share of the variance that the basis of the correction keeps, and its largest rank.
     ENERGY, RANK = 0.995, 512
 
     def __init__(self, factor_count: int, coefficients: int, size: int, anchors: int, rank: int) -> None:
@@ -123,66 +123,139 @@ class KernelCorrection(nn.Module):
         self.register_buffer("basis", torch.zeros(rank, size))
 
     @classmethod
-    def blank(cls, tensors: dict[str, Tensor]) -> KernelCorrection:
-        """One of the sizes of a saved one, to load it into; ``tensors`` are the saved one's, by their own names."""
+    def load(cls, settings: KernelSettings, reference: TriangleMesh, tensors: Mapping[str, Tensor]) -> KernelCorrection:
+        """See `Correction`; sizes are those of the tensors."""
         (factors, size, coefficients), anchors = tensors["axes"].shape, len(tensors["anchors"])
-        return cls(factors, coefficients, size, anchors, len(tensors["basis"]))
-
-    @classmethod
-    def fit(cls, coefficients: int, y: Tensor, residual: Tensor, held_out: tuple[Tensor, Tensor]) -> KernelCorrection:
-        """Fit to factor shapes (n, J, 2E) and what is missed so far (n, 2E), both as scaled differences."""
-        y, residual = y[: cls.ANCHORS], residual[: cls.ANCHORS]
-        mean = residual.mean(dim=0)
-        s, vt = _principal((residual - mean)[: 3 * cls.RANK])
-        energy = s.square().cumsum(0)
-        rank = min(int((energy < cls.ENERGY * energy[-1]).sum()) + 1, cls.RANK)
-        result = cls(y.shape[1], coefficients, y.shape[2], len(y), rank)
-        result.mean.copy_(mean)
-        result.basis.copy_(half_precision(vt[:rank]))
-        result.centre.copy_(y.mean(dim=0))
-        for j in range(y.shape[1]):
-            some = y[: cls.AXES, j] - result.centre[j]
-            s, vt = _principal(some)
-            count = min(coefficients, len(s))
-            result.axes[j, :, :count] = half_precision(vt[:count].T * (len(some) ** 0.5 / s[0].clamp_min(1e-12)))
-        result.anchors.copy_(result._inputs(y))
-        result._fit_weights(result._wanted(residual), result._inputs(held_out[0]), result._wanted(held_out[1]))
+        result = cls(factors, coefficients, size, anchors, len(tensors["basis"]))
+        result.load_state_dict(tensors)
         return result
 
-    def _fit_weights(self, target: Tensor, held_out: Tensor, wanted: Tensor) -> None:
-        best = float("inf")
-        for length in self.LENGTHS:
-            gamma = torch.tensor(0.5 / length**2)
-            kernel, other = self._kernel(self.anchors, gamma), self._kernel(held_out, gamma)
-            for ridge in self.RIDGES:
-                weights = torch.cholesky_solve(target, torch.linalg.cholesky(kernel + ridge * torch.eye(len(kernel))))
-                error = float((other @ weights - wanted).square().mean())
-                if error < best:
-                    best = error
-                    self.gamma.copy_(gamma)
-                    self.weights.copy_(weights)
+    @classmethod
+    def fit(
+        cls, settings: KernelSettings, reference: TriangleMesh, own: JointSamples, held_out: JointSamples, seed: int
+    ) -> KernelCorrection:
+        """See `Correction`."""
+        y, residual = own.inputs[: cls.ANCHORS], own.missed[: cls.ANCHORS]
+        mean = residual.mean(dim=0)
+        s, axes = principal_axes((residual - mean)[: 3 * cls.RANK], by="rows")
+        energy = s.square().cumsum(0)
+        rank = min(int((energy < cls.ENERGY * energy[-1]).sum()) + 1, cls.RANK)
+        result = cls(y.shape[1], settings.coefficients, y.shape[2], len(y), rank)
+        result.mean.copy_(mean)
+        result.basis.copy_(half_precision(axes[:rank]))
+        result._fit_inputs(y)
+        result.anchors.copy_(result._inputs(y))
+        result._fit_weights(
+            result._values(residual), (result._inputs(held_out.inputs), result._values(held_out.missed))
+        )
+        return result
 
-    def _wanted(self, residual: Tensor) -> Tensor:
+    def _fit_inputs(self, y: Tensor) -> None:
+        """Principal axes of the shapes of each factor, scaled so that the first coefficient has a variance of one."""
+        self.centre.copy_(y.mean(dim=0))
+        for j in range(y.shape[1]):
+            some = y[: self.AXES, j] - self.centre[j]
+            s, axes = principal_axes(some, by="rows")
+            count = min(self.axes.shape[2], len(s))
+            self.axes[j, :, :count] = half_precision(axes[:count].T * (len(some) ** 0.5 / s[0].clamp_min(1e-12)))
+
+    def _fit_weights(self, target: Tensor, held_out: tuple[Tensor, Tensor]) -> None:
+        """The length and the penalty that suit held-out inputs and values best, and the weights (anchors, rank)."""
+
+        def fitted(length: float) -> tuple[Ridge, Tensor]:
+            gamma = torch.tensor(0.5 / length**2)
+            kernel, other = self._kernel(self.anchors, gamma), self._kernel(held_out[0], gamma)
+            return ridge(kernel, target, (other, held_out[1]), self.PENALTIES), gamma
+
+        best, gamma = min(map(fitted, self.LENGTHS), key=lambda fit: fit[0].error)
+        self.gamma.copy_(gamma)
+        self.weights.copy_(best.weights)
+
+    def _values(self, residual: Tensor) -> Tensor:
+        """(n, rank) coefficients of residuals (n, 2E), in double precision."""
         return ((residual - self.mean) @ self.basis.T).double()
 
     def _inputs(self, y: Tensor) -> Tensor:
-        # Not einsum, which would transpose the axes anew for every code once it is exported.
+        """(n, J d) coefficients of the factors' shapes (n, J, 2E)."""
+        # Not einsum, which, once exported, would transpose the axes in every call.
         return torch.matmul((y - self.centre)[:, :, None], self.axes).flatten(1)
 
     def _kernel(self, inputs: Tensor, gamma: Tensor) -> Tensor:
-        """(n, anchors), in double precision: used to fit."""
+        """(n, anchors), in double precision, to fit with."""
         return torch.exp(-gamma.double() * torch.cdist(inputs.double(), self.anchors.double()).square())
 
-    def forward(self, y: Tensor) -> Tensor:
-        # Large weights of opposite signs: in single precision up to 3 % of the correction would be rounding.
+    def difference(self, y: Tensor) -> Tensor:
+        # Weights are large and of both signs: in single precision up to 3 % of the result would be rounding errors.
         c, anchors = self._inputs(y).double(), self.anchors.double()
         squares = c.square().sum(dim=1, keepdim=True) - 2 * c @ anchors.T + anchors.square().sum(dim=1)
         coefficients = torch.exp(-self.gamma.double() * squares) @ self.weights.double()
         return self.mean + coefficients.to(y.dtype) @ self.basis
 
 
-def _principal(x: Tensor) -> tuple[Tensor, Tensor]:
-    """Singular values, falling, and right singular vectors of x (n, p), by the Gram matrix of its n < p rows."""
-    value, vector = torch.linalg.eigh(x.double() @ x.double().T)
-    s = value.flip(0).clamp_min(1e-30).sqrt()
-    return s.to(x.dtype), (vector.flip(1).T @ x.double() / s[:, None]).to(x.dtype)
+class ProductCorrection(Correction):
+    """A bilinear map of the factors' shapes, fitted by ridge regression.
+
+    Features are a few principal coefficients of each factor and their products between every two factors; the linear
+    map from these has a low rank. Where two factors overlap widely, their interaction is smooth and global, and a few
+    products represent what many convolutions would be needed for.
+    """
+
+    centre: Tensor
+    axes: Tensor
+    weights: Tensor
+    basis: Tensor
+    #: Largest rank of the linear map.
+    RANK = 64
+
+    def __init__(self, factor_count: int, coefficients: int, size: int) -> None:
+        super().__init__()
+        self.pairs = list(itertools.combinations(range(factor_count), 2))
+        self.register_buffer("centre", torch.zeros(factor_count, size))
+        self.register_buffer("axes", torch.zeros(factor_count, size, coefficients))
+        features = 1 + factor_count * coefficients + len(self.pairs) * coefficients**2
+        self.register_buffer("weights", torch.zeros(features, min(features, self.RANK)))
+        self.register_buffer("basis", torch.zeros(min(features, self.RANK), size))
+
+    @classmethod
+    def load(
+        cls, settings: ProductSettings, reference: TriangleMesh, tensors: Mapping[str, Tensor]
+    ) -> ProductCorrection:
+        """See `Correction`; sizes are those of the tensors."""
+        factors, size, coefficients = tensors["axes"].shape
+        result = cls(factors, coefficients, size)
+        result.load_state_dict(tensors)
+        return result
+
+    @classmethod
+    def fit(
+        cls, settings: ProductSettings, reference: TriangleMesh, own: JointSamples, held_out: JointSamples, seed: int
+    ) -> ProductCorrection:
+        """See `Correction`."""
+        y, others = own.inputs, held_out.inputs
+        residual, wanted = (s.scaling.down(s.joint) - x.sum(dim=1) for s, x in ((own, y), (held_out, others)))
+        result = cls(y.shape[1], settings.coefficients, y.shape[2])
+        result._fit_axes(y)
+        fitted = regression(result._features(y), residual, (result._features(others), wanted))
+        weights, basis = fitted.low_rank(len(result.basis))
+        result.weights.copy_(weights)
+        result.basis.copy_(basis)
+        return result
+
+    def _fit_axes(self, y: Tensor) -> None:
+        """Principal axes of the shapes of each factor, scaled so that coefficients have a variance of one."""
+        self.centre.copy_(y.mean(dim=0))
+        for j in range(y.shape[1]):
+            s, axes = principal_axes(y[:, j] - self.centre[j], by="svd")
+            count = min(self.axes.shape[2], len(s))
+            # Equal variances, so that one penalty suits all products; those of almost no variance are rounding errors
+            # and stay small.
+            self.axes[j, :, :count] = (axes[:count] / s[:count, None].clamp_min(1e-2 * s[0]) * len(y) ** 0.5).T
+
+    def _features(self, y: Tensor) -> Tensor:
+        """(n, 1 + J d + ½ J (J − 1) d²) of the factors' shapes (n, J, 2E)."""
+        c = torch.einsum("njs,jsr->njr", y - self.centre, self.axes)
+        products = [(c[:, i, :, None] * c[:, j, None, :]).flatten(1) for i, j in self.pairs]
+        return torch.cat([torch.ones_like(c[:, 0, :1]), c.flatten(1), *products], dim=1)
+
+    def difference(self, y: Tensor) -> Tensor:
+        return self._features(y) @ self.weights @ self.basis

@@ -1,4 +1,4 @@
-"""The figures of the paper's table for one run: R² of every model, vertex error, sizes and times."""
+"""The numbers of the paper's table for one run: R² of every model, vertex error, sizes and times."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from shapespace.mesh.rigid_motion import align
 from shapespace.mesh.triangle_mesh import TriangleMesh
 from shapespace.training.learning.gallery import extremes, strip
 from shapespace.training.learning.layers import narrowest
-from shapespace.training.learning.learning import Learner
+from shapespace.training.learning.learner import Learner
 from shapespace.training.learning.networks import affine_sum, predict
 from shapespace.training.runs.config import Config, EvaluationSettings
 from shapespace.training.runs.coordinates import Coordinates
@@ -47,14 +47,20 @@ def r_squared(predicted: NDArray, exact: NDArray, norm: WeightedNorm) -> dict[st
 
 
 def alone(latents: FloatArray, factor: list[int]) -> FloatArray:
-    """Codes (n, m) of one factor's part alone, the rest at the reference."""
+    """Codes (n, m) with the latents of one factor only, the others zero."""
     result = np.zeros_like(latents)
     result[:, factor] = latents[:, factor]
     return result
 
 
-#: A coarser grid isn't worth its exponentials.
+#: Of each coordinate of a grid: with two it would be linear.
 FEWEST_NODES = 3
+
+#: A map from codes (n, m) to NRIC (n, 2E), or to those of the factors (n, J, 2E).
+Model = Callable[[torch.Tensor], torch.Tensor]
+
+#: Exact NRIC (n, 2E) of codes (n, m), which are saved under a name; NaN for a code whose shape was not found.
+Exact = Callable[[str, FloatArray], NDArray[np.float32]]
 
 
 @dataclass(frozen=True)
@@ -62,12 +68,19 @@ class MultilinearGrid:
     """Multilinear interpolation of exact shapes on a regular grid of one factor (Sassen et al. 2020).
 
     Attributes:
-        interpolate: NRIC (n, 2E) of the factor's latents (n, m_j).
+        factor: indices of the factor's latents.
+        interpolate: NRIC (n, 2E) of these latents (n, m_j).
         size: bytes of the values at the nodes.
     """
 
+    factor: list[int]
     interpolate: RegularGridInterpolator
     size: int
+
+    def __call__(self, latents: FloatArray) -> FloatArray:
+        """NRIC (n, 2E) of the factor's part of codes (n, m)."""
+        result: FloatArray = self.interpolate(latents[:, self.factor])
+        return result
 
     @classmethod
     def of(
@@ -77,9 +90,9 @@ class MultilinearGrid:
 
         Args:
             coordinates: of all latents.
-            factor: indices of its own.
-            nodes: of each of its coordinates; the end of a period, which is its beginning, is none.
-            shapes: exact NRIC of codes (n, m).
+            factor: indices of the factor's.
+            nodes: number along each of them; the end of a period is its beginning and does not count.
+            shapes: exact NRIC (n, 2E) of codes (n, m).
         """
         own = coordinates[factor]
         ends = np.isfinite(own.period).astype(int)
@@ -89,8 +102,8 @@ class MultilinearGrid:
         latents[:, factor] = np.stack(at_nodes, axis=-1).reshape(-1, len(factor))
         values = shapes(latents).reshape(*[nodes] * len(factor), -1)
         closed = np.pad(values, [*((0, end) for end in ends), (0, 0)], mode="wrap")
-        # Rounding may leave a code a little outside.
-        return cls(RegularGridInterpolator(axes, closed, bounds_error=False, fill_value=None), values.nbytes)
+        # Rounding may move a code to just outside of the grid.
+        return cls(factor, RegularGridInterpolator(axes, closed, bounds_error=False, fill_value=None), values.nbytes)
 
 
 @dataclass(frozen=True)
@@ -101,7 +114,7 @@ class Reconstructions:
         vertices: (n, V, 3), aligned to the exact ones.
         errors: (n, V) distances, as fractions of the reference's bounding-box diagonal.
         iterations: (n,) of Gauss–Newton from the reference.
-        statuses: (n,) how it ended.
+        statuses: (n,) of the same.
     """
 
     vertices: FloatArray
@@ -119,7 +132,7 @@ class Reconstructions:
         return cls(vertices, errors, [f.iterations for f in found], [str(f.status) for f in found])
 
     def figures(self) -> dict[str, Any]:
-        """``mean`` and ``max`` error, mean ``iterations``, how often each ``status`` was met."""
+        """``mean`` and ``max`` error, mean ``iterations``, and the number of times of each ``status``."""
         return {
             "mean": float(self.errors.mean()),
             "max": float(self.errors.max()),
@@ -129,134 +142,175 @@ class Reconstructions:
 
 
 def grid_nodes(dimension: int, settings: EvaluationSettings) -> int:
-    """Nodes of each coordinate of a factor's grid; below FEWEST_NODES there is none."""
+    """Nodes along each coordinate of a factor's grid; where these are less than FEWEST_NODES there is none."""
     return min(settings.grid_nodes, int(settings.grid_size ** (1 / dimension) + 1e-9))
 
 
+@dataclass(frozen=True)
+class TestSplit:
+    """The test split of a learner, which is read here and nowhere before.
+
+    Attributes:
+        rows: (n,) of the joint samples.
+        latents: (n, m) codes.
+        z: (n, 2E) exact NRIC.
+        vertices: (n, V, 3) exact ones.
+        norm: of differences of NRIC.
+    """
+
+    rows: IntArray
+    latents: FloatArray
+    z: NDArray[np.float32]
+    vertices: NDArray[np.float32]
+    norm: WeightedNorm
+
+    @classmethod
+    def of(cls, learner: Learner) -> TestSplit:
+        """That of this seed."""
+        rows, joint = learner.split["test"], learner.joint
+        norm = WeightedNorm.of(learner.collection.reference, learner.config.evaluation.eta)
+        return cls(rows, joint.latents[rows], joint.nric[rows], joint.vertices[rows], norm)
+
+    def r2(self, model: Model) -> dict[str, float]:
+        """R² of what a model makes of all codes."""
+        return self.r2_of(self.predicted(model))
+
+    def r2_of(self, predicted: NDArray, rows: IntArray | slice = slice(None)) -> dict[str, float]:
+        """R² of NRIC (k, 2E) that were predicted for these rows of the split."""
+        return r_squared(predicted, self.z[rows], self.norm)
+
+    def predicted(self, model: Model) -> NDArray[np.float32]:
+        """What a model makes of all codes."""
+        result: NDArray[np.float32] = predict(model, torch.as_tensor(self.latents, dtype=torch.float32)).numpy()
+        return result
+
+
 def evaluate(
-    learner: Callable[..., Learner], config: Config, exact: Callable[[str, FloatArray], NDArray[np.float32]]
+    learner: Callable[..., Learner], config: Config, exact: Exact
 ) -> tuple[dict[str, Any], dict[str, NDArray]]:
-    """Every model on the test split, which is read here and nowhere before.
+    """Compare every model with the test split.
 
     Args:
         learner: by the ``fraction`` of the training samples that it learns from, or another ``seed``.
         config: of the run.
-        exact: NRIC (n, 2E) of a named set of codes (n, m), with NaN for a code whose shape couldn't be found.
+        exact: exact shapes.
 
     Returns:
-        What goes into evaluation.json and into gallery.npz.
+        The contents of evaluation.json and of gallery.npz.
     """
-    settings, whole = config.evaluation, learner()
-    collection, reference = whole.collection, whole.collection.reference
-    factors, coordinates = collection.factors, collection.coordinates
-    norm = WeightedNorm.of(reference, settings.eta)
+    settings, main = config.evaluation, learner()
+    collection, reference = main.collection, main.collection.reference
     z_reference = nric(reference.vertices, reference.connectivity)
-    composite, monolithic, test = whole.main(), whole.monolithic(), whole.split["test"]
-
-    some = test[: settings.exact_factors]
-    shapes = np.stack([_exact_factor(whole, some, j, exact) for j in range(len(factors))], axis=1)
-    # A joint shape can be found where a factor's own can't.
-    there = np.flatnonzero(np.isfinite(shapes).all(axis=(1, 2)))
-    shapes = shapes[there]
-    latents, z, vertices = (getattr(whole.joint, name)[test] for name in ("latents", "nric", "vertices"))
-    codes = torch.as_tensor(latents, dtype=torch.float32)
-
-    def score(predicted: NDArray, rows: IntArray | slice = slice(None)) -> dict[str, float]:
-        return r_squared(predicted, z[rows], norm)
-
-    def network_score(network: Callable[[torch.Tensor], torch.Tensor]) -> dict[str, float]:
-        return score(predict(network, codes).numpy())
-
-    learned, answer = predict(composite.factor_shapes, codes).numpy(), predict(composite, codes).numpy()
+    test, composite, monolithic = TestSplit.of(main), main.main(), main.monolithic()
+    shapes, found = exact_factors(main, test.rows[: settings.exact_factors], exact)
+    learned, predicted = test.predicted(composite.factor_shapes), test.predicted(composite)
     r2 = {
-        "composite": score(answer),
-        "monolithic": network_score(monolithic),
-        "affine": score(affine_sum(z_reference, shapes), there),
-        "affine of learned factors": score(affine_sum(z_reference, learned)),
+        "composite": test.r2_of(predicted),
+        "monolithic": test.r2(monolithic),
+        "affine": test.r2_of(affine_sum(z_reference, shapes), found),
+        "affine of learned factors": test.r2_of(affine_sum(z_reference, learned)),
     }
     sizes = {"composite": size_bytes(*composite.networks, composite.combiner), "monolithic": size_bytes(monolithic)}
-    nodes = [grid_nodes(len(index), settings) for index in factors.values()]
-    if min(nodes) >= FEWEST_NODES:
-        grids = [
-            MultilinearGrid.of(coordinates, index, n, partial(exact, f"grid-{j}"))
-            for j, (index, n) in enumerate(zip(factors.values(), nodes, strict=True))
-        ]
-        values = [grid.interpolate(latents[:, index]) for grid, index in zip(grids, factors.values(), strict=True)]
-        if np.isfinite(values).all():
-            r2["grid"] = score(affine_sum(z_reference, np.stack(values, axis=1)))
+    if grids := factor_grids(collection, settings, exact):
+        interpolated = affine_sum(z_reference, np.stack([grid(test.latents) for grid in grids], axis=1))
+        # A node without a shape leaves NaN around it.
+        if np.isfinite(interpolated).all():
+            r2["grid"] = test.r2_of(interpolated)
             sizes["grid"] = sum(grid.size for grid in grids)
-    first = slice(settings.reconstructions)
-    eta = config.export.eta_reconstruction
-    found = Reconstructions.of(reference, eta, answer[first], vertices[first])
+    first, eta = slice(settings.reconstructions), config.export.eta_reconstruction
+    reconstructed = Reconstructions.of(reference, eta, predicted[first], test.vertices[first])
     figures = {
         "eta": settings.eta,
-        "test_samples": len(test),
+        "test_samples": len(test.rows),
         "r2": r2,
-        "affine_samples": len(there),
-        "r2_factors": {name: r_squared(learned[there, j], shapes[:, j], norm) for j, name in enumerate(factors)},
-        "variants": {
-            name: {"title": config.variants[name].title, "r2": network_score(variant)}
-            for name, variant in whole.variants().items()
+        "affine_samples": len(found),
+        "r2_factors": {
+            name: r_squared(learned[found, j], shapes[:, j], test.norm) for j, name in enumerate(collection.factors)
         },
-        "exponentials": whole.exponentials(),
-        "fractions": [
-            {
-                "fraction": fraction,
-                "training_samples": len(some.rows["train"]),
-                "exponentials": {"composite": some.exponentials(), "all of factors": free.exponentials()},
-                "r2": {
-                    "composite": network_score(some.main()),
-                    "all of factors": network_score(free.main()),
-                    "monolithic": network_score(some.monolithic()),
-                },
-            }
-            for fraction, some, free in (
-                (f, learner(fraction=f), learner(fraction=f, all_of_factors=True)) for f in config.networks.fractions
-            )
-        ],
-        "seeds": [_other_seed(learner(seed=seed), norm) for seed in config.networks.seeds],
-        "vertex_error": found.figures(),
+        "variants": {
+            name: {"title": config.variants[name].title, "r2": test.r2(variant)}
+            for name, variant in main.variants().items()
+        },
+        "exponentials": main.exponentials(),
+        "fractions": [_fraction(learner, fraction, test) for fraction in config.networks.fractions],
+        "seeds": [_other_seed(learner(seed=seed)) for seed in config.networks.seeds],
+        "vertex_error": reconstructed.figures(),
         "sizes": sizes,
         "times": model_times(collection, composite, eta),
     }
-    gallery = extremes(found.vertices, vertices[first], found.errors, test[first])
+    gallery = extremes(reconstructed.vertices, test.vertices[first], reconstructed.errors, test.rows[first])
     return figures, gallery | strip(collection, composite, eta) | {"faces": reference.faces}
 
 
-def _other_seed(learner: Learner, norm: WeightedNorm) -> dict[str, Any]:
-    """R² of networks learned with another seed, on that seed's own test split."""
-    test = learner.split["test"]
-    codes, z = torch.as_tensor(learner.joint.latents[test], dtype=torch.float32), learner.joint.nric[test]
-    models: dict[str, Callable[[torch.Tensor], torch.Tensor]]
-    models = {"composite": learner.main(), "monolithic": learner.monolithic()}
-    r2 = {name: r_squared(predict(model, codes).numpy(), z, norm) for name, model in models.items()}
+def _fraction(learner: Callable[..., Learner], fraction: float, test: TestSplit) -> dict[str, Any]:
+    """R² of networks that learn from a fraction of the training codes, and of one with all samples of the factors."""
+    some, free = learner(fraction=fraction), learner(fraction=fraction, all_of_factors=True)
+    return {
+        "fraction": fraction,
+        "training_samples": len(some.rows["train"]),
+        "exponentials": {"composite": some.exponentials(), "all of factors": free.exponentials()},
+        "r2": {
+            "composite": test.r2(some.main()),
+            "all of factors": test.r2(free.main()),
+            "monolithic": test.r2(some.monolithic()),
+        },
+    }
+
+
+def _other_seed(learner: Learner) -> dict[str, Any]:
+    """R² of networks learned with another seed, on the test split of that seed."""
+    test = TestSplit.of(learner)
+    r2 = {"composite": test.r2(learner.main()), "monolithic": test.r2(learner.monolithic())}
     return {"seed": learner.seed, "r2": r2}
 
 
-def _exact_factor(
-    learner: Learner, test: IntArray, j: int, exact: Callable[[str, FloatArray], NDArray]
-) -> NDArray[np.float32]:
-    """Exact shapes (n, 2E) of a factor's part alone of joint samples (n,), NaN where there is none."""
+def exact_factors(learner: Learner, rows: IntArray, exact: Exact) -> tuple[NDArray[np.float32], IntArray]:
+    """Exact shapes of each factor's part alone of joint samples (n,).
+
+    Returns:
+        NRIC (k, J, 2E) of those samples for which all factors have one, and which these are (k,): a joint shape can
+        exist where one of a factor does not.
+    """
+    count = len(learner.collection.factors)
+    shapes = np.stack([_exact_factor(learner, rows, j, exact) for j in range(count)], axis=1)
+    found = np.flatnonzero(np.isfinite(shapes).all(axis=(1, 2)))
+    return shapes[found], found
+
+
+def _exact_factor(learner: Learner, rows: IntArray, j: int, exact: Exact) -> NDArray[np.float32]:
+    """Exact NRIC (n, 2E) of one factor's part alone of joint samples (n,), NaN where there is none."""
     index = list(learner.collection.factors.values())[j]
-    codes, samples = learner.joint.index[test], learner.factor_samples(j)
-    result = np.full((len(test), samples.nric.shape[1]), np.nan, dtype=np.float32)
-    # A part whose own shape is that of a shorter one says nothing of the joint code.
-    there = np.isin(codes, samples.index[~samples.shortened])
-    result[there] = samples.nric[np.searchsorted(samples.index, codes[there])]
+    codes, samples = learner.joint.index[rows], learner.factor_samples(j)
+    result = np.full((len(rows), samples.nric.shape[1]), np.nan, dtype=np.float32)
+    # Where a sample's code was shortened, its shape is not that of the joint code's part.
+    known = np.isin(codes, samples.index[~samples.shortened])
+    result[known] = samples.nric[np.searchsorted(samples.index, codes[known])]
     beyond = codes >= learner.config.samples.own(len(learner.collection.factors))[j]
     if beyond.any():
-        result[beyond] = exact(f"factor-{j}", alone(learner.joint.latents[test[beyond]], index))
+        result[beyond] = exact(f"factor-{j}", alone(learner.joint.latents[rows[beyond]], index))
     return result
 
 
+def factor_grids(collection: Collection, settings: EvaluationSettings, exact: Exact) -> list[MultilinearGrid]:
+    """A grid for each factor; none at all where one of them would be too coarse."""
+    factors = list(collection.factors.values())
+    nodes = [grid_nodes(len(index), settings) for index in factors]
+    if min(nodes) < FEWEST_NODES:
+        return []
+    return [
+        MultilinearGrid.of(collection.coordinates, index, count, partial(exact, f"grid-{j}"))
+        for j, (index, count) in enumerate(zip(factors, nodes, strict=True))
+    ]
+
+
 def size_bytes(*networks: nn.Module) -> int:
-    """Bytes of the floating-point parameters and buffers, as a bundle has them."""
+    """Bytes of the floating-point parameters and buffers, in the types that they have in a bundle."""
     tensors = (t for n in networks for t in n.state_dict().values() if t.is_floating_point())
     return sum(t.numel() * narrowest(t).itemsize for t in tensors)
 
 
 def median_seconds(function: Callable[[], Any], repeat: int = 20) -> float:
-    """Median wall time of a call, after one that warms up."""
+    """Median wall time of a call, after one that does not count."""
     function()
     times = []
     for _ in range(repeat):
@@ -266,9 +320,7 @@ def median_seconds(function: Callable[[], Any], repeat: int = 20) -> float:
     return float(np.median(times))
 
 
-def model_times(
-    collection: Collection, composite: Callable[[torch.Tensor], torch.Tensor], eta: float
-) -> dict[str, float]:
+def model_times(collection: Collection, composite: Model, eta: float) -> dict[str, float]:
     """Median seconds for one code: exact shape, composite network, reconstruction from the reference (one thread)."""
     rng = np.random.default_rng(0)
     latents = collection.coordinates.uniform(1, rng)

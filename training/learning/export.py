@@ -22,9 +22,7 @@ from shapespace.bundle.writer import Facts, Networks, write_bundle
 from shapespace.coordinates.nric import WeightedNorm
 from shapespace.shell.energy import Material
 from shapespace.training.learning.layers import narrowest
-from shapespace.training.learning.learning import Composite
-from shapespace.training.learning.networks import predict
-from shapespace.training.learning.start_network import StartNetwork
+from shapespace.training.learning.networks import Composite, StartNetwork, predict
 from shapespace.training.runs.config import Config
 from shapespace.training.runs.sampling import Collection
 

@@ -1,8 +1,9 @@
-"""The training loop: Adam, a falling rate, and a checkpoint that a killed run continues from."""
+"""Gradient descent: the training loop, and the files of networks, from which a killed run continues."""
 
 from __future__ import annotations
 
 import json
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -17,40 +18,50 @@ from shapespace.training.runs.atomic_files import whole
 from shapespace.training.runs.config import FitSettings
 from shapespace.training.runs.progress import bar
 
+#: Epochs between two checkpoints.
 CHECKPOINT_EPOCHS = 5
 
 
-def save_network(path: Path, network: nn.Module, state: dict[str, Any], extra: dict[str, Tensor] | None = None) -> None:
-    """Write parameters, buffers and a JSON state as one safetensors file, whole or not at all."""
+@dataclass(frozen=True)
+class SavedNetwork:
+    """What a network's file holds.
+
+    Attributes:
+        state: of training: ``done``, ``epoch``, ``best`` validation loss, ``history`` of (train, validation) losses.
+        metadata: of the network, see `ShapeNetwork.metadata`.
+        tensors: its ``state_dict()``.
+        extra: of an unfinished one, the rest that is needed to continue.
+    """
+
+    state: dict[str, Any]
+    metadata: dict[str, str]
+    tensors: dict[str, Tensor]
+    extra: dict[str, Tensor]
+
+    @property
+    def done(self) -> bool:
+        """Whether training has finished."""
+        return bool(self.state["done"])
+
+
+def save_network(
+    path: Path, network: ShapeNetwork, state: dict[str, Any], extra: dict[str, Tensor] | None = None
+) -> None:
+    """Write a network and the state of its training as one safetensors file, whole or not at all."""
     tensors = {f"network.{k}": v for k, v in network.state_dict().items()} | (extra or {})
     tensors = {k: v.contiguous().clone() for k, v in tensors.items()}
     with whole(path) as file:
-        file.write(save(tensors, metadata={"state": json.dumps(state)}))
+        file.write(save(tensors, metadata={"state": json.dumps(state), **network.metadata}))
 
 
-def load_network(path: Path, network: nn.Module) -> tuple[dict[str, Any], dict[str, Tensor]]:
-    """Read what `save_network` wrote into the network; returns state and the extra tensors."""
-    state, tensors, extra = read_network(path)
-    network.load_state_dict(tensors)
-    return state, extra
-
-
-def read_network(path: Path) -> tuple[dict[str, Any], dict[str, Tensor], dict[str, Tensor]]:
-    """What `save_network` wrote: state, the network's tensors by its own names, the extra ones."""
+def read_network(path: Path) -> SavedNetwork:
+    """What `save_network` wrote."""
     with safe_open(path, framework="pt") as file:
-        state = json.loads(file.metadata()["state"])
+        metadata = dict(file.metadata())
         tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 - not a mapping
     prefix = "network."
     own = {k.removeprefix(prefix): tensors.pop(k) for k in list(tensors) if k.startswith(prefix)}
-    return state, own, tensors
-
-
-def finished(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]] | None:
-    """State and tensors, by the network's own names, of a fit that is done; None where it isn't."""
-    if not path.exists():
-        return None
-    state, tensors, _ = read_network(path)
-    return (state, tensors) if state["done"] else None
+    return SavedNetwork(json.loads(metadata.pop("state")), metadata, own, tensors)
 
 
 def fit(
@@ -64,61 +75,49 @@ def fit(
     title: str,
     seed: int,
 ) -> dict[str, Any]:
-    """Fit a network to NRIC samples and leave the best epoch's parameters in ``path``.
+    """Fit a network to NRIC samples, and save it as it was after the epoch with the least validation loss.
 
-    The loss is the mean square of scaled differences (networks.py) between `coefficients` and `target`. Where a last
-    layer of low rank is orthonormal this differs from the loss on z by a constant. An unfinished file at ``path`` is
-    continued: parameters, Adam, schedule, random state and history are all in it.
+    The loss is the mean square difference of `coefficients` and `target`. With a last layer of low rank and orthonormal
+    basis it differs by a constant from the loss on z. An unfinished file at ``path`` is continued: it holds parameters,
+    Adam's moments, schedule, random state and history.
 
     Args:
-        network: what is fitted, from its present parameters.
-        inputs: (n, …) all inputs.
-        z: (n, 2E) all targets.
-        train: (n_train,) indices.
-        validation: (n_validation,) indices, which choose the learning rate and the epoch that is kept.
-        settings: rates, patience, batch size.
+        network: with its initial parameters.
+        inputs: (n, …) of all samples.
+        z: (n, 2E) NRIC of all samples.
+        train: (n_train,) indices of those to fit to.
+        validation: (n_validation,) indices of those that choose the learning rate and the epoch that is kept.
+        settings: learning rate, number of epochs, batch size.
         path: safetensors file of the result.
-        title: what the progress bar says.
+        title: of the progress bar.
         seed: of the order of batches and of dropout.
 
     Returns:
-        The state: epochs, best validation loss, history of (train, validation) losses.
+        The state, see `SavedNetwork`.
     """
     with torch.no_grad():
         target = network.target(z)
     optimiser = torch.optim.Adam(network.parameters(), settings.learning_rate)
-    schedule = (
-        ReduceLROnPlateau(optimiser, factor=0.1, patience=settings.patience, threshold=1e-3)
-        if settings.schedule == "plateau"
-        else CosineAnnealingLR(optimiser, T_max=settings.max_epochs)
-    )
+    schedule = _schedule(optimiser, settings)
     torch.manual_seed(seed)
-    state: dict[str, Any] = {"done": False, "epoch": 0, "best": float("inf"), "history": []}
-    best = {k: v.clone() for k, v in network.state_dict().items()}
     if path.exists():
-        state, extra = load_network(path, network)
-        if state["done"]:
+        saved = read_network(path)
+        network.load_state_dict(saved.tensors)
+        state = saved.state
+        if saved.done:
             network.eval()
             return state
-        best = _restore(network, optimiser, schedule, state, extra)
+        best = _restore(optimiser, schedule, state, saved.extra)
     else:
-        # What was fitted in closed form may be the best there is.
+        # What was fitted in closed form may be better than any epoch.
         network.eval()
-        state["best"] = _error(network, inputs[validation], target[validation], settings.batch_size)
+        error = _error(network, inputs[validation], target[validation], settings.batch_size)
+        state = {"done": False, "epoch": 0, "best": error, "history": []}
+        best = _copied(network)
 
     epochs = bar(title, "epoch", settings.max_epochs, initial=state["epoch"])
     while not state["done"]:
-        network.train()
-        order = train[torch.randperm(len(train))]
-        total = 0.0
-        # The last batch is left out where it is short: batch normalisation of one sample has no variance.
-        batches = [b for b in order.split(settings.batch_size) if len(b) == settings.batch_size] or [order]
-        for batch in batches:
-            loss = network.loss(inputs[batch], target[batch])
-            optimiser.zero_grad()
-            loss.backward()
-            optimiser.step()
-            total += loss.item() / len(batches)
+        total = _epoch(network, optimiser, inputs, target, train, settings.batch_size)
         network.eval()
         error = _error(network, inputs[validation], target[validation], settings.batch_size)
         if isinstance(schedule, ReduceLROnPlateau):
@@ -129,7 +128,7 @@ def fit(
         state["history"].append([total, error])
         if error < state["best"]:
             state["best"] = error
-            best = {k: v.clone() for k, v in network.state_dict().items()}
+            best = _copied(network)
         rate = optimiser.param_groups[0]["lr"]
         epochs.set_postfix(train=f"{total:.2e}", validation=f"{error:.2e}", rate=f"{rate:.0e}")
         epochs.update()
@@ -143,13 +142,46 @@ def fit(
     return state
 
 
+def _schedule(optimiser: torch.optim.Optimizer, settings: FitSettings) -> ReduceLROnPlateau | CosineAnnealingLR:
+    if settings.schedule == "plateau":
+        return ReduceLROnPlateau(optimiser, factor=0.1, patience=settings.patience, threshold=1e-3)
+    return CosineAnnealingLR(optimiser, T_max=settings.max_epochs)
+
+
+def _epoch(
+    network: ShapeNetwork,
+    optimiser: torch.optim.Optimizer,
+    inputs: Tensor,
+    target: Tensor,
+    train: Tensor,
+    batch_size: int,
+) -> float:
+    """One pass over the training samples in random order; returns the mean loss of its batches."""
+    network.train()
+    order = train[torch.randperm(len(train))]
+    total = 0.0
+    # A last batch of fewer samples is left out: batch normalisation of one sample has no variance.
+    batches = [b for b in order.split(batch_size) if len(b) == batch_size] or [order]
+    for batch in batches:
+        loss = network.loss(inputs[batch], target[batch])
+        optimiser.zero_grad()
+        loss.backward()
+        optimiser.step()
+        total += loss.item() / len(batches)
+    return total
+
+
+def _copied(network: ShapeNetwork) -> dict[str, Tensor]:
+    return {k: v.clone() for k, v in network.state_dict().items()}
+
+
 def _error(network: ShapeNetwork, inputs: Tensor, target: Tensor, batch_size: int) -> float:
     return nn.functional.mse_loss(predict(network.coefficients, inputs, batch_size), target).item()
 
 
 def _checkpoint(
     path: Path,
-    network: nn.Module,
+    network: ShapeNetwork,
     optimiser: torch.optim.Optimizer,
     schedule: ReduceLROnPlateau | CosineAnnealingLR,
     state: dict[str, Any],
@@ -166,13 +198,12 @@ def _checkpoint(
 
 
 def _restore(
-    network: nn.Module,
     optimiser: torch.optim.Optimizer,
     schedule: ReduceLROnPlateau | CosineAnnealingLR,
     state: dict[str, Any],
     extra: dict[str, Tensor],
 ) -> dict[str, Tensor]:
-    """Put a checkpoint back; returns the best parameters so far."""
+    """Restore all but the network from a checkpoint; returns the best parameters so far."""
     torch.set_rng_state(extra["rng"])
     schedule.load_state_dict(state.pop("schedule"))
     moments: dict[int, dict[str, Tensor]] = {}

@@ -1,4 +1,4 @@
-"""Shapes worth looking at: the best, the median and the worst of the test split, and an interpolation by factors."""
+"""Shapes for the report: test shapes with the least, the median and the largest error; an interpolation by factors."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from shapespace.arrays import FloatArray
 from shapespace.coordinates.nric import nric
 from shapespace.coordinates.reconstruction import Reconstructor
 from shapespace.mesh.rigid_motion import align
-from shapespace.training.learning.learning import Composite
+from shapespace.training.learning.networks import Composite
 from shapespace.training.runs.sampling import Collection
 
 STRIP_FRAMES = 7
@@ -38,7 +38,7 @@ def extremes(predicted: NDArray, exact: NDArray, errors: NDArray, index: NDArray
 
 
 def strip(collection: Collection, composite: Composite, eta: float) -> dict[str, NDArray]:
-    """An interpolation between two codes and its factor elements, as the paper's figure of SCAPE shows them.
+    """An interpolation between two codes, and those of the factors alone, as the paper's figure of SCAPE shows them.
 
     Each frame's reconstruction starts from the one before.
 
@@ -59,7 +59,7 @@ def strip(collection: Collection, composite: Composite, eta: float) -> dict[str,
 
 def _sequence(reconstruct: Callable, rows: FloatArray, collection: Collection) -> FloatArray:
     reference = collection.reference
-    # The first frame is reached from the reference, whose lengths and angles are known, by way of the halves between.
+    # The first frame is reached from the reference by way of three shapes between.
     rest = nric(reference.vertices, reference.connectivity)
     start = reference.vertices
     for share in (0.25, 0.5, 0.75):

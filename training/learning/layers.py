@@ -1,9 +1,13 @@
-"""What the networks are made of: functions of the latents, a last layer of low rank, convolutions on edges."""
+"""Parts that all networks are made of: scaling, functions of the latents, a last layer of low rank.
+
+Networks put out NRIC ``z`` (n, 2E) and compute in *scaled differences*: ``(z − z̄)`` times the square roots of the
+weights of ``‖·‖_{2,z̄}``, lengths and angles each divided by their own standard deviation, so that a mean square over
+entries is the loss with both halves normalised.
+"""
 
 from __future__ import annotations
 
 import itertools
-from typing import Any
 
 import numpy as np
 import torch
@@ -13,20 +17,20 @@ from scipy.cluster.vq import kmeans2
 from torch import Tensor, nn
 
 from shapespace.arrays import FloatArray, IntArray
-from shapespace.mesh.triangle_mesh import Connectivity
+from shapespace.training.learning.linear import principal_axes
 from shapespace.training.runs.coordinates import Coordinates
 
-#: Entries from which a tensor that 8 or 16 bits hold as it is takes less room in a bundle.
+#: Smallest number of entries of a tensor that is stored in 8 or 16 bits, if these hold its values exactly.
 NARROWED_SIZE = 1024
 
 
 def half_precision(x: Tensor) -> Tensor:
-    """The nearest values of 16 bits, in the same type."""
+    """The nearest 16-bit floating-point values, in the type of x."""
     return x.half().to(x.dtype)
 
 
 def narrowest(x: Tensor) -> torch.dtype:
-    """The type that a tensor goes into a bundle in: of 8 or 16 bits where they hold all of a large one."""
+    """The type that a tensor has in a bundle: 8 or 16 bits where they hold all values of a large one exactly."""
     if x.dtype == torch.float32 and x.numel() >= NARROWED_SIZE:
         for narrow in (torch.int8, torch.float16):
             if torch.equal(x, x.to(narrow).to(x.dtype)):
@@ -34,10 +38,53 @@ def narrowest(x: Tensor) -> torch.dtype:
     return x.dtype
 
 
-class LatentFeatures(nn.Module):
-    """The functions of the latents that a network starts from, (n, m) → (n, size).
+class Scaling(nn.Module):
+    """Affine map between NRIC and scaled differences.
 
-    A bounded coordinate is brought to [−1, 1]. A periodic one gives cos kx, sin kx for k = 1 … order.
+    Args:
+        mean: z̄ of the reference, (2E,).
+        factor: (2E,) scaled differences per unit of z; 0 where an entry has no weight (boundary angles).
+    """
+
+    mean: Tensor
+    factor: Tensor
+    inverse: Tensor
+
+    def __init__(self, mean: FloatArray, factor: FloatArray) -> None:
+        super().__init__()
+        self.register_buffer("mean", torch.as_tensor(mean, dtype=torch.float32))
+        self.register_buffer("factor", torch.as_tensor(factor, dtype=torch.float32))
+        inverse = np.divide(1.0, factor, out=np.zeros_like(factor), where=factor > 0)
+        self.register_buffer("inverse", torch.as_tensor(inverse, dtype=torch.float32))
+
+    @classmethod
+    def blank(cls, size: int) -> Scaling:
+        """Zeros, to load saved tensors into."""
+        return cls(np.zeros(size), np.zeros(size))
+
+    @classmethod
+    def of(cls, reference: FloatArray, weights: FloatArray, samples: NDArray) -> Scaling:
+        """Scale so that samples (n, 2E) have unit mean square about their mean, per half; weights (2E,) at η = 1."""
+        root, half = np.sqrt(weights), len(weights) // 2
+        spread = (samples - samples.mean(axis=0)) * root
+        factor = root.copy()
+        for part in (slice(0, half), slice(half, None)):
+            factor[part] /= max(float(np.sqrt(np.mean(spread[:, part] ** 2))), 1e-12)
+        return cls(reference, factor)
+
+    def down(self, z: Tensor) -> Tensor:
+        """NRIC to scaled differences."""
+        return (z - self.mean) * self.factor
+
+    def up(self, y: Tensor) -> Tensor:
+        """Scaled differences to NRIC."""
+        return self.mean + y * self.inverse
+
+
+class LatentFeatures(nn.Module):
+    """The inputs of a perceptron, (n, m) → (n, size).
+
+    A bounded coordinate is mapped to [−1, 1], a periodic one to cos kx, sin kx for k = 1 … order.
     """
 
     centre: Tensor
@@ -104,9 +151,9 @@ class FourierProducts(nn.Module):
 class Polynomials(nn.Module):
     """Products of Legendre polynomials of bounded coordinates up to a total degree, (n, m) → (n, size).
 
-    Over the box they are orthogonal, with a root mean square of ``DECAY^degree``: a smooth map has less and less of the
-    higher degrees, and a ridge penalty that knows it needs far fewer samples (a hand's factor of 6 coordinates from 72
-    samples: R² 0.999, without it 0.85). The constant is the first.
+    They are orthogonal over the box, with a root mean square of ``DECAY^degree``: the coefficients of a smooth map
+    fall with the degree, and a ridge penalty that grows with it needs far fewer samples (a hand's factor of 6
+    coordinates from 72 samples: R² 0.999, 0.85 with equal sizes). The constant is the first.
     """
 
     DECAY = 0.3
@@ -139,7 +186,7 @@ class Polynomials(nn.Module):
     def forward(self, latent: Tensor) -> Tensor:
         x = (latent - self.centre) / self.radius
         values = (x[:, :, None] ** self.power @ self.legendre).flatten(1)
-        # One gather and one product for all coordinates: in a small network every operation counts.
+        # One gather and one product for all coordinates: the time of a small network is its number of operations.
         return values.index_select(1, self.columns).unflatten(1, self.exponents.shape).prod(dim=1) * self.sizes
 
 
@@ -154,8 +201,9 @@ def patch_entries(midpoints: FloatArray, count: int, seed: int) -> list[IntArray
 class PatchBasis(nn.Module):
     """A linear last layer of low rank: an orthonormal principal basis for each patch of neighbouring edges.
 
-    A shape variation that moves about the surface has no small global basis, but within a patch it does.
-    Being orthonormal up to one common unit, it turns a mean square of scaled differences into one of coefficients.
+    A variation that wanders over the surface has no small basis on all of it, but has one within a patch.
+    The basis is orthonormal up to one common factor, so the mean square of what is missed is the same, up to that
+    factor, in coefficients as in scaled differences.
     """
 
     mean: Tensor
@@ -174,7 +222,7 @@ class PatchBasis(nn.Module):
 
     @classmethod
     def blank(cls, tensors: dict[str, Tensor]) -> PatchBasis:
-        """One of the sizes of a saved one, to load it into; ``tensors`` are the saved one's, by their own names."""
+        """Zeros of the sizes of saved tensors, to load these into."""
         sizes = [tensors[f"basis{i}"].shape for i in range(sum(name.startswith("basis") for name in tensors))]
         stops = np.cumsum([size for _, size in sizes])
         entries = [np.arange(stop - size, stop) for stop, (_, size) in zip(stops, sizes, strict=True)]
@@ -182,24 +230,21 @@ class PatchBasis(nn.Module):
 
     @classmethod
     def fit(cls, y: NDArray, midpoints: FloatArray, patches: int, energy: float, seed: int) -> PatchBasis:
-        """Principal bases of scaled differences y (n, 2E), sharing the kept variance over the patches as it pays."""
+        """Principal bases of scaled differences y (n, 2E).
+
+        Of all axes of all patches those of the largest variance are kept, until they hold the share ``energy`` of it.
+        """
         mean = y.mean(axis=0)
         entries, values, vectors = patch_entries(midpoints, patches, seed), [], []
         for columns in entries:
-            # Right singular vectors by whichever Gram matrix is smaller.
-            d = (y[:, columns] - mean[columns]).astype(np.float64)
-            if len(d) < len(columns):
-                _, s, vt = np.linalg.svd(d, full_matrices=False)
-                value, vector = s**2, vt.T
-            else:
-                value, vector = np.linalg.eigh(d.T @ d)
-                value, vector = value[::-1], vector[:, ::-1]
-            values.append(value)
-            vectors.append(vector)
+            d = torch.as_tensor((y[:, columns] - mean[columns]).astype(np.float64))
+            s, axes = principal_axes(d, by="svd" if len(d) < len(columns) else "columns")
+            values.append(s.numpy() ** 2)
+            vectors.append(axes.numpy().T)
         every = np.sort(np.concatenate(values))[::-1]
         cut = every[min(np.searchsorted(np.cumsum(every), energy * every.sum()), len(every) - 1)]
         ranks = [max(1, int((value >= cut).sum())) for value in values]
-        # The unit that gives the coefficients of y a mean square of one, so that a perceptron starts at their size.
+        # In this unit the coefficients of y have a mean square of one, as the outputs of a new perceptron.
         unit = np.sqrt(every.sum() / len(y) / sum(ranks))
         return cls(entries, [unit * v[:, :r] for v, r in zip(vectors, ranks, strict=True)], mean)
 
@@ -233,140 +278,3 @@ def perceptron(sizes: list[int]) -> nn.Sequential:
     for n_in, n_out in itertools.pairwise(sizes[:-1]):
         layers += [nn.Linear(n_in, n_out), nn.BatchNorm1d(n_out), nn.ELU()]
     return nn.Sequential(*layers, nn.Linear(sizes[-2], sizes[-1]))
-
-
-class EdgeConvolution(nn.Module):
-    """A graph convolution on features (E, n, C) of edges.
-
-    ``star`` is the paper's ``W₁ x_e + W₂ Σ_{N(e)} x + b``, where N(e) are the edges that share a vertex with e. It
-    can't tell directions apart. ``flaps`` gives a matrix of its own to each of the four other edges of the two faces
-    at e, in the order that e's direction and the faces' orientation fix: ``W₁ x_e + Σ_k W_{2,k} x_{e_k} + b``.
-    """
-
-    def __init__(self, around: Star | Flaps, n_in: int, n_out: int) -> None:
-        super().__init__()
-        self.own = nn.Linear(n_in, n_out)
-        self.around = around
-        self.other = nn.Linear(around.count * n_in, n_out, bias=False)
-        if isinstance(around, Star):
-            with torch.no_grad():
-                # About ten neighbours: without this their sum outweighs the edge itself at the start.
-                self.other.weight /= 10
-
-    def forward(self, x: Tensor, neighbours: Tensor | None = None) -> Tensor:
-        """On the whole mesh, or on a part of it with a table of its own, see `crops.Crop`."""
-        around = self.around(x) if neighbours is None else _side_by_side(_gather(x, neighbours))
-        return self.own(x) + self.other(around)
-
-
-class Star(nn.Module):
-    """(E, n, C) → the same: sums over the edges that share a vertex with each, by way of sums at the vertices."""
-
-    edges: Tensor
-    at_vertex: Tensor
-    count = 1
-
-    def __init__(self, connectivity: Connectivity) -> None:
-        super().__init__()
-        self.register_buffer("edges", torch.tensor(connectivity.edges), persistent=False)
-        self.register_buffer("at_vertex", torch.as_tensor(edges_at_vertices(connectivity)), persistent=False)
-
-    def forward(self, x: Tensor) -> Tensor:
-        if torch.compiler.is_exporting():
-            at_vertex = _gather(x, self.at_vertex).sum(dim=1)
-            return at_vertex[self.edges[:, 0]] + at_vertex[self.edges[:, 1]] - 2 * x
-        return _StarSum.apply(x, self.edges, self.at_vertex)
-
-
-class Flaps(nn.Module):
-    """(E, n, C) → (E, n, 4 C): the features of the four other edges of the two faces at each edge, see `flaps`."""
-
-    neighbours: Tensor
-    targets: Tensor
-    offsets: Tensor
-    count = 4
-
-    def __init__(self, connectivity: Connectivity) -> None:
-        super().__init__()
-        table = flaps(connectivity)
-        # For the gradient: at which places of the table each edge stands.
-        flat, count = table.ravel(), connectivity.edge_count
-        order = np.argsort(flat, kind="stable")[: int((flat < count).sum())]
-        for name, index in {
-            "neighbours": table,
-            "targets": order,
-            "offsets": np.searchsorted(flat[order], np.arange(count)),
-        }.items():
-            self.register_buffer(name, torch.as_tensor(index), persistent=False)
-
-    def forward(self, x: Tensor) -> Tensor:
-        if torch.compiler.is_exporting():
-            around = _gather(x, self.neighbours)
-        else:
-            around = _FlapGather.apply(x, self.neighbours, self.targets, self.offsets)
-        return _side_by_side(around)
-
-
-def edges_at_vertices(connectivity: Connectivity) -> IntArray:
-    """(V, k) edges at each vertex, padded with E."""
-    ends, count = connectivity.edges.ravel(), connectivity.edge_count
-    order = np.argsort(ends, kind="stable")
-    valence = np.bincount(ends, minlength=connectivity.vertex_count)
-    table = np.full((len(valence), valence.max()), count)
-    table[np.arange(valence.max()) < valence[:, None]] = order // 2
-    return table
-
-
-def flaps(connectivity: Connectivity) -> IntArray:
-    """(E, 4) other edges of the faces left and right of i → j, in each the one at i first; E where there is none."""
-    table = np.full((connectivity.edge_count, 4), connectivity.edge_count)
-    for side in (0, 1):
-        there = np.flatnonzero(connectivity.edge_faces[:, side] >= 0)
-        face = connectivity.edge_faces[there, side]
-        for column in (0, 1):
-            # Edge k of a face lies opposite to its corner k: the edge at i is the one opposite to j.
-            corner = connectivity.faces[face] == connectivity.edges[there, 1 - column, None]
-            table[there, 2 * side + column] = connectivity.face_edges[face][corner]
-    return table
-
-
-def _gather(x: Tensor, neighbours: Tensor) -> Tensor:
-    """(E, k, n, C) features of the neighbours of each edge, zero where there is none."""
-    padded = torch.cat([x, torch.zeros_like(x[:1])])
-    return padded.index_select(0, neighbours.flatten()).unflatten(0, neighbours.shape)
-
-
-def _side_by_side(around: Tensor) -> Tensor:
-    """(E, k, n, C) → (E, n, k C)."""
-    return around.transpose(1, 2).flatten(2)
-
-
-class _FlapGather(torch.autograd.Function):
-    """The same for training: its gradient is a gather too, several times faster than autograd's scatter."""
-
-    @staticmethod
-    def forward(ctx: Any, x: Tensor, neighbours: Tensor, targets: Tensor, offsets: Tensor) -> Tensor:
-        ctx.save_for_backward(targets, offsets)
-        return _gather(x, neighbours)
-
-    @staticmethod
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None, None, None]:
-        targets, offsets = ctx.saved_tensors
-        flat = gradient.reshape(gradient.shape[0] * gradient.shape[1], -1)
-        total = nn.functional.embedding_bag(targets, flat, offsets, mode="sum")
-        return total.view(len(offsets), *gradient.shape[2:]), None, None, None
-
-
-class _StarSum(torch.autograd.Function):
-    """``Bᵀ(Bx) − 2x`` with the incidence B of vertices and edges; symmetric, so it is its own gradient."""
-
-    @staticmethod
-    def forward(ctx: Any, x: Tensor, edges: Tensor, at_vertex: Tensor) -> Tensor:
-        ctx.save_for_backward(edges, at_vertex)
-        padded = torch.cat([x, torch.zeros_like(x[:1])]).flatten(1)
-        sums = nn.functional.embedding_bag(at_vertex, padded, mode="sum", padding_idx=len(x))
-        return nn.functional.embedding_bag(edges, sums, mode="sum").view_as(x) - 2 * x
-
-    @staticmethod
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None, None]:
-        return _StarSum.apply(gradient.contiguous(), *ctx.saved_tensors), None, None

@@ -1,32 +1,54 @@
-"""A correction of the joint shape by polynomials in the factors' shapes, one for each patch of edges."""
+"""Polynomials of the factors' shapes, one map for each patch of edges, that correct the affine sum."""
 
 from __future__ import annotations
 
 import itertools
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from shapespace.arrays import FloatArray
+from shapespace.mesh.triangle_mesh import TriangleMesh
+from shapespace.training.learning.corrections import Correction, JointSamples
 from shapespace.training.learning.layers import half_precision, patch_entries
+from shapespace.training.learning.linear import SpectralRidge, principal_axes, ridge
+from shapespace.training.runs.config import PolynomialSettings
 from shapespace.training.runs.progress import progress
 
-#: What is fitted to, or chosen by: factor shapes (n, J, 2E) and what is missed of the joint one (n, 2E).
+#: Factor shapes (n, J, 2E), and what their affine sum misses of the joint shape (n, 2E), as scaled differences.
 Pairs = tuple[Tensor, Tensor]
 
 
-class PatchPolynomials(nn.Module):
-    """A correction of the joint shape, (n, J, 2E) → (n, 2E): cubic in the factors' shapes, patch by patch.
+class PolynomialCorrection(Correction):
+    """Cubic polynomials of the factors' shapes, patch by patch.
 
-    What factors do to each other on an edge depends on what each of them does there. So in each patch of neighbouring
-    edges every factor's shape is brought to a few principal coefficients, and the correction is a polynomial in those
-    of all factors. There are more of them than samples tell apart, but few directions among them matter. Which is
-    learned first (`learned_metric`). In the coordinates of that metric the kernel ``1 + s + s²/2 + s³/6`` is a sum over
-    monomials, and those that it gives most weight are kept: a map of fixed size, however many samples there were.
+    How factors act on each other at an edge depends on what each of them does nearby. So in each patch of neighbouring
+    edges the shape of every factor is projected to a few principal coefficients, and the correction is a polynomial of
+    those of all factors. These are more coordinates than the samples can tell apart, but only few directions among them
+    matter: they are found first, as a metric (`learned_metric`). In the coordinates of that metric the kernel
+    ``1 + s + s²/2 + s³/6`` is a sum over monomials; those of the largest weight are kept, so that the size of the map
+    does not depend on the number of samples.
+
+    With P patches of at most S entries of NRIC, rank r of the metric, M monomials, and rank k of the output:
+
+    Attributes:
+        entries: (P, S) indices of the entries in each patch, 2E where there are fewer.
+        place: (2E,) index in the flat ``entries`` of each entry of NRIC.
+        axes: (P, J, d, S) principal axes of the factors' shapes, integers of 8 bits.
+        units: (P, J d) factors of the axes.
+        centre: (P, J d) coefficients of the mean shapes.
+        metric: (P, r, J d) coordinates u of coefficients c, ``u = A c``.
+        pairs: (2, ·) indices of the coordinates in the monomials of degree two.
+        triples: (3, ·) the same of degree three.
+        weights: (P, k, M), integers of 8 bits.
+        gains: (P, k) factors of the weights and of the basis.
+        basis: (P, S, k), integers of 8 bits.
+        mean: (2E,) the constant.
     """
 
     entries: Tensor
@@ -43,93 +65,42 @@ class PatchPolynomials(nn.Module):
     mean: Tensor
     #: Edges of a patch, on average.
     EDGES = 24
-    #: Samples that the principal axes of factors are taken from, at most.
+    #: Samples that the principal axes of factors are computed from, at most.
     AXES = 500
-    #: Share of the error on held-out samples that a lower rank of the last layers may cost.
+    #: How much the low rank of the output may add to the squared error on held-out samples, as a share of it.
     SLACK = 0.125
 
-    def __init__(self, shapes: Mapping[str, torch.Size]) -> None:
+    def __init__(self, tensors: Mapping[str, Tensor]) -> None:
         super().__init__()
-        for name, shape in shapes.items():
-            whole = name in ("entries", "place", "pairs", "triples")
-            self.register_buffer(name, torch.zeros(shape, dtype=torch.int64 if whole else torch.float32))
+        for name, tensor in tensors.items():
+            self.register_buffer(name, tensor)
 
     @classmethod
-    def blank(cls, tensors: Mapping[str, Tensor]) -> PatchPolynomials:
-        """One of the sizes of a saved one, to load it into; ``tensors`` are the saved one's, by their own names."""
-        return cls({name: tensor.shape for name, tensor in tensors.items()})
+    def load(
+        cls, settings: PolynomialSettings, reference: TriangleMesh, tensors: Mapping[str, Tensor]
+    ) -> PolynomialCorrection:
+        """See `Correction`."""
+        return cls(tensors)
 
     @classmethod
     def fit(
-        cls, coefficients: int, monomials: int, midpoints: FloatArray, own: Pairs, held_out: Pairs, seed: int
-    ) -> PatchPolynomials:
-        """Fit to what is missed so far, all of it as scaled differences.
-
-        Args:
-            coefficients: of each factor in a patch.
-            monomials: of second and third degree that are kept, in each patch.
-            midpoints: (E, 3) of the edges.
-            own: what is fitted to.
-            held_out: what chooses penalties and metrics.
-            seed: of the patches.
-        """
+        cls, settings: PolynomialSettings, reference: TriangleMesh, own: JointSamples, held_out: JointSamples, seed: int
+    ) -> PolynomialCorrection:
+        """See `Correction`; the held-out samples choose metrics too, and the seed is that of the patches."""
+        pairs, others = (own.inputs, own.missed), (held_out.inputs, held_out.missed)
+        midpoints = reference.edge_midpoints
         entries = patch_entries(midpoints, math.ceil(len(midpoints) / cls.EDGES), seed)
-        patches = [_Patch(columns, coefficients, own[0][: cls.AXES]) for columns in entries]
+        patches = [_Patch(columns, settings.coefficients, pairs[0][: cls.AXES]) for columns in entries]
         for patch in progress(patches, "metrics", "patch"):
-            patch.learn_metric(own, held_out)
+            patch.learn_metric(pairs, others)
         spread = torch.stack([patch.spread for patch in patches]).clamp_min(1e-30).log().mean(dim=0)
-        pairs, triples = _strongest(spread.numpy(), monomials)
-        rank = 1 + int(np.concatenate([pairs.ravel(), triples.ravel()]).max(initial=0))
-        roots = torch.cat([torch.ones(rank), _roots(pairs), _roots(triples)])
+        monomials = _Monomials.strongest(spread.numpy(), settings.monomials)
         for patch in progress(patches, "polynomials", "patch"):
-            patch.fit(own, held_out, rank, pairs, triples, roots)
-        return cls._of(patches, rank, pairs, triples, own[1].shape[1])
+            patch.fit(pairs, others, monomials)
+        return cls(_assembled(patches, monomials, pairs[1].shape[1], cls.SLACK))
 
-    @classmethod
-    def _of(cls, patches: list[_Patch], rank: int, pairs: NDArray, triples: NDArray, size: int) -> PatchPolynomials:
-        energy = nn.utils.rnn.pad_sequence([patch.energy for patch in patches], batch_first=True).sum(dim=0)
-        lost = energy.sum() - energy.cumsum(0)
-        allowed = cls.SLACK * sum(patch.error for patch in patches)
-        count = min(int((lost > allowed).sum()) + 1, len(energy))
-
-        # Short patches are filled up with an entry that isn't there, which counts for nothing.
-        widest = max(len(patch.columns) for patch in patches)
-        factors, coefficients, _ = patches[0].axes.shape
-        entries = torch.full((len(patches), widest), size)
-        axes = torch.zeros(len(patches), factors, coefficients, widest)
-        weights = torch.zeros(len(patches), count, rank + len(pairs) + len(triples))
-        gains = torch.zeros(len(patches), count)
-        basis = torch.zeros(len(patches), widest, count)
-        mean = torch.zeros(size)
-        for p, patch in enumerate(patches):
-            columns, own = patch.columns, patch.basis[:, :count]
-            found = own.T @ patch.weights
-            entries[p, : len(columns)] = torch.as_tensor(columns)
-            axes[p, :, :, : len(columns)] = patch.axes
-            weights[p, : len(found)], first = in_bytes(found, dim=1)
-            basis[p, : len(columns), : len(found)], second = in_bytes(own, dim=0)
-            gains[p, : len(found)] = first.flatten() * second.flatten()
-            mean[columns] = patch.mean.float()
-        tensors = {
-            "entries": entries,
-            "place": torch.argsort(entries.flatten())[:size],
-            "axes": axes,
-            "units": torch.stack([patch.units for patch in patches]).float(),
-            "centre": torch.stack([patch.centre for patch in patches]).float(),
-            "metric": torch.stack([patch.metric[:rank] for patch in patches]),
-            "pairs": torch.as_tensor(pairs.T.copy()),
-            "triples": torch.as_tensor(triples.T.copy()),
-            "weights": weights,
-            "gains": gains,
-            "basis": basis,
-            "mean": mean,
-        }
-        result = cls.blank(tensors)
-        result.load_state_dict(tensors)
-        return result
-
-    def forward(self, y: Tensor) -> Tensor:
-        # Codes come last: so gathers copy rows, and products of small matrices take few steps in the runtime.
+    def difference(self, y: Tensor) -> Tensor:
+        # The dimension of samples comes last: so gathers copy rows, and products of small matrices are few operations.
         rows = torch.cat([y, torch.zeros_like(y[:, :, :1])], dim=2).permute(2, 1, 0)
         local = rows.index_select(0, self.entries.flatten()).unflatten(0, self.entries.shape).transpose(1, 2)
         c = (self.axes @ local).flatten(1, 2) * self.units[:, :, None] - self.centre[:, :, None]
@@ -140,8 +111,59 @@ class PatchPolynomials(nn.Module):
         return out.index_select(0, self.place).T + self.mean
 
 
+def _assembled(patches: list[_Patch], monomials: _Monomials, size: int, slack: float) -> dict[str, Tensor]:
+    """The tensors of a `PolynomialCorrection` of 2E = ``size`` from its fitted patches."""
+    rank = _output_rank(patches, slack)
+    weights, gains, basis = _output_layers(patches, rank)
+    # Shorter patches are padded with an entry of NRIC that does not exist, where shapes are zero.
+    entries = _padded([torch.as_tensor(patch.columns) for patch in patches], size)
+    mean = torch.zeros(size)
+    for patch in patches:
+        mean[patch.columns] = patch.mean.float()
+    return {
+        "entries": entries,
+        "place": torch.argsort(entries.flatten())[:size],
+        "axes": _padded([patch.axes.permute(2, 0, 1) for patch in patches]).permute(0, 2, 3, 1).contiguous(),
+        "units": torch.stack([patch.units for patch in patches]).float(),
+        "centre": torch.stack([patch.centre for patch in patches]).float(),
+        "metric": torch.stack([patch.metric[: monomials.rank] for patch in patches]),
+        "pairs": torch.as_tensor(monomials.pairs.T.copy()),
+        "triples": torch.as_tensor(monomials.triples.T.copy()),
+        "weights": weights,
+        "gains": gains,
+        "basis": basis,
+        "mean": mean,
+    }
+
+
+def _padded(parts: list[Tensor], value: float = 0) -> Tensor:
+    """(P, longest, …) of P tensors (·, …)."""
+    return nn.utils.rnn.pad_sequence(parts, batch_first=True, padding_value=value)
+
+
+def _output_rank(patches: list[_Patch], slack: float) -> int:
+    """The smallest rank of the output that adds no more than this share to the squared error of all patches."""
+    energy = _padded([patch.energy for patch in patches]).sum(dim=0)
+    lost = energy.sum() - energy.cumsum(0)
+    return min(int((lost > slack * sum(patch.error for patch in patches)).sum()) + 1, len(energy))
+
+
+def _output_layers(patches: list[_Patch], rank: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Weights (P, rank, M), gains (P, rank) and basis (P, S, rank) of the last two layers."""
+    weights, gains, bases = [], [], []
+    for patch in patches:
+        basis = patch.basis[:, :rank]
+        inner, first = in_bytes(basis.T @ patch.weights, dim=1)
+        outer, second = in_bytes(basis, dim=0)
+        missing = rank - basis.shape[1]
+        weights.append(nn.functional.pad(inner, (0, 0, 0, missing)))
+        gains.append(nn.functional.pad(first.flatten() * second.flatten(), (0, missing)))
+        bases.append(nn.functional.pad(outer, (0, missing)))
+    return torch.stack(weights), torch.stack(gains), _padded(bases)
+
+
 def in_bytes(x: Tensor, dim: int) -> tuple[Tensor, Tensor]:
-    """Whole numbers from −127 to 127, and the unit along ``dim`` in which they are x."""
+    """Integers from −127 to 127, as floating-point numbers, and the factors along ``dim`` that make x of them."""
     unit = x.abs().amax(dim=dim, keepdim=True).clamp_min(1e-30) / 127
     return (x / unit).round(), unit
 
@@ -159,44 +181,70 @@ def _factorial(index: Sequence[int] | NDArray) -> int:
     return math.prod(map(math.factorial, np.bincount(index)))
 
 
-def _strongest(spread: NDArray, count: int) -> tuple[NDArray, NDArray]:
-    """The pairs (k, 2) and triples (l, 3) of coordinates whose monomials the kernel gives most weight.
+@dataclass(frozen=True)
+class _Monomials:
+    """Monomials of degree two and three that all patches have.
 
-    In ``s^k / k!`` the monomial ``x^β`` has the weight ``x^β x'^β / β!``. Coordinates have the logarithms ``spread`` of
-    their mean squares, falling.
+    Attributes:
+        pairs: (k, 2) indices of coordinates.
+        triples: (l, 3) the same.
     """
-    found = [
-        (sum(spread[list(index)]) - math.log(_factorial(index)), index)
-        for degree in (2, 3)
-        for index in itertools.combinations_with_replacement(range(len(spread)), degree)
-    ]
-    kept = [index for _, index in sorted(found, reverse=True)[:count]]
-    pairs, triples = ([index for index in kept if len(index) == degree] for degree in (2, 3))
-    return np.array(pairs, dtype=int).reshape(-1, 2), np.array(triples, dtype=int).reshape(-1, 3)
+
+    pairs: NDArray
+    triples: NDArray
+
+    @classmethod
+    def strongest(cls, spread: NDArray, count: int) -> _Monomials:
+        """Those that the kernel gives most weight.
+
+        In ``s^k / k!``, s = u·u', the monomial ``u^β`` has the weight ``1 / β!``.
+
+        Args:
+            spread: logarithms of the mean squares of the coordinates, falling.
+            count: of monomials.
+        """
+        found = [
+            (sum(spread[list(index)]) - math.log(_factorial(index)), index)
+            for degree in (2, 3)
+            for index in itertools.combinations_with_replacement(range(len(spread)), degree)
+        ]
+        kept = [index for _, index in sorted(found, reverse=True)[:count]]
+        pairs, triples = ([index for index in kept if len(index) == degree] for degree in (2, 3))
+        return cls(np.array(pairs, dtype=int).reshape(-1, 2), np.array(triples, dtype=int).reshape(-1, 3))
+
+    @property
+    def rank(self) -> int:
+        """Coordinates that occur, the first ones; at least one."""
+        return 1 + int(np.concatenate([self.pairs.ravel(), self.triples.ravel()]).max(initial=0))
+
+    @cached_property
+    def roots(self) -> Tensor:
+        """(r + k + l,) square roots of their weights in the kernel, those of degree one first."""
+        return torch.cat([torch.ones(self.rank), _roots(self.pairs), _roots(self.triples)])
 
 
 class _Patch:
     """One patch while it is fitted.
 
     Attributes:
-        columns: (S,) its entries, lengths and then angles.
-        axes: (J, d, S) principal axes of the factors' shapes there, numbers of a byte.
-        units: (J d,) of the axes, in which the widest coefficient has a variance of one.
-        centre: (J d,) coefficients of their mean.
-        metric: (J d, J d) a row for each coordinate, the strongest first, that it is of the coefficients.
-        spread: (J d,) mean squares of these.
-        weights: (S, monomials) of the polynomial without its constant.
-        basis: (S, k) principal axes of what it finds.
-        energy: (k,) its mean squares along them.
-        error: mean square of what it misses of held-out samples.
-        mean: (S,) its constant.
+        columns: (S,) its entries of NRIC, lengths and then angles.
+        axes: (J, d, S) principal axes of the factors' shapes there, integers of 8 bits.
+        units: (J d,) factors of the axes, with which the first coefficient of the widest factor has a variance of one.
+        centre: (J d,) coefficients of the mean shapes.
+        metric: (J d, J d) rows A of the coordinates ``u = A c`` of coefficients c, those of the largest variance first.
+        spread: (J d,) mean squares of the coordinates.
+        weights: (S, M) of the monomials.
+        basis: (S, k) principal axes of the polynomial's values.
+        energy: (k,) mean squares of the values along these.
+        error: squared error on held-out samples, their mean summed over the entries.
+        mean: (S,) the constant.
     """
 
     def __init__(self, columns: NDArray, coefficients: int, y: Tensor) -> None:
         self.columns, axes, centre, widest = columns, [], [], 0.0
         for shapes in y[:, :, columns].double().unbind(1):
             middle = shapes.mean(dim=0)
-            _, s, vt = torch.linalg.svd(shapes - middle, full_matrices=False)
+            s, vt = principal_axes(shapes - middle, by="svd")
             vt = nn.functional.pad(vt[:coefficients], (0, 0, 0, max(0, coefficients - len(vt))))
             axes.append(vt)
             centre.append(vt @ middle)
@@ -212,42 +260,39 @@ class _Patch:
         return c.flatten(1) * self.units - self.centre
 
     def learn_metric(self, own: Pairs, held_out: Pairs) -> None:
-        """Find the coordinates in which the correction is a polynomial."""
+        """Find the metric, and its principal coordinates."""
         x, other = self._inputs(own[0]), self._inputs(held_out[0])
         wanted, theirs = (pairs[1][:, self.columns].double() for pairs in (own, held_out))
         self.mean = wanted.mean(dim=0)
         metric, self.penalty = learned_metric(x, wanted - self.mean, (other, theirs - self.mean))
-        # The kernel knows no axes: with those of the samples, few monomials carry most of it.
+        # The kernel is invariant under rotations: in the principal axes of the samples the fewest monomials matter.
         z = x @ metric
-        value, axes = torch.linalg.eigh(z.T @ z / len(z))
-        self.metric, self.spread = half_precision((metric @ axes.flip(1)).T.float()), value.flip(0)
+        s, axes = principal_axes(z, by="columns")
+        self.metric, self.spread = half_precision((metric @ axes.T).T.float()), s.square() / len(z)
 
-    def _features(self, y: Tensor, rank: int, pairs: NDArray, triples: NDArray, roots: Tensor) -> Tensor:
-        """(n, 1 + r + …) monomials, weighted as the kernel does."""
-        u = self.metric[:rank].double() @ self._inputs(y).T
-        products = (_products(u, torch.as_tensor(index.T)) for index in (pairs, triples))
-        return torch.cat([torch.ones_like(u[:1]), torch.cat([u, *products]) * roots[:, None]]).T
+    def _features(self, y: Tensor, monomials: _Monomials) -> Tensor:
+        """(n, 1 + M) monomials, each times the square root of its weight in the kernel."""
+        u = self.metric[: monomials.rank].double() @ self._inputs(y).T
+        products = (_products(u, torch.as_tensor(index.T)) for index in (monomials.pairs, monomials.triples))
+        return torch.cat([torch.ones_like(u[:1]), torch.cat([u, *products]) * monomials.roots[:, None]]).T
 
-    def fit(self, own: Pairs, held_out: Pairs, rank: int, pairs: NDArray, triples: NDArray, roots: Tensor) -> None:
-        """Ridge regression on the monomials, whose weights in the kernel have these square roots."""
-        x, other = (self._features(y, rank, pairs, triples, roots) for y in (own[0], held_out[0]))
+    def fit(self, own: Pairs, held_out: Pairs, monomials: _Monomials) -> None:
+        """Ridge regression on the monomials, with the kernel's penalty or one ten times smaller or larger."""
+        x, other = (self._features(y, monomials) for y in (own[0], held_out[0]))
         wanted, theirs = (residual[:, self.columns].double() - self.mean for _, residual in (own, held_out))
-        dual = len(x) < x.shape[1]
-        square, right = (x @ x.T, wanted) if dual else (x.T @ x, x.T @ wanted)
-        best = math.inf
-        for penalty in (max(self.penalty / 10, PENALTIES[0]), self.penalty, 10 * self.penalty):
-            half = torch.linalg.cholesky(square + penalty * torch.eye(len(square)))
-            found = torch.cholesky_solve(right, half)
-            found = x.T @ found if dual else found
-            error = float((other @ found - theirs).square().sum())
-            if error < best:
-                best, weights = error, found
+        penalties = max(self.penalty / 10, PENALTIES[0]), self.penalty, 10 * self.penalty
+        if len(x) < x.shape[1]:
+            found = ridge(x @ x.T, wanted, (other @ x.T, theirs), penalties)
+            weights = x.T @ found.weights
+        else:
+            found = ridge(x.T @ x, x.T @ wanted, (other, theirs), penalties)
+            weights = found.weights
         self.mean = self.mean + weights[0]
-        told = x[:, 1:] @ weights[1:]
-        self.error = best / len(other)
-        value, vector = torch.linalg.eigh(told.T @ told / len(told))
-        self.energy, self.basis = value.flip(0).clamp_min(0), vector.flip(1).float()
-        self.weights = (weights[1:] * roots[:, None]).T.float()
+        self.error = found.error * theirs.shape[1]
+        values = x[:, 1:] @ weights[1:]
+        s, axes = principal_axes(values, by="columns")
+        self.energy, self.basis = s.square() / len(values), axes.T.float()
+        self.weights = (weights[1:] * monomials.roots[:, None]).T.float()
 
 
 def _roots(index: NDArray) -> Tensor:
@@ -255,56 +300,61 @@ def _roots(index: NDArray) -> Tensor:
     return torch.tensor([_factorial(row) for row in index], dtype=torch.float64).rsqrt()
 
 
-#: Penalties that held-out samples choose from.
+#: Candidates for the penalty, where the kernel is 1 at the centre.
 PENALTIES = tuple(10.0 ** (k / 2) for k in range(-14, 1))
 #: Samples that a metric is learned from, at most, and those of them at which gradients are taken.
 SAMPLES, GRADIENTS = 800, 150
-#: Times that it is learned anew, and the power of the gradients' mean outer product that it becomes: less than the half
-#: that would be consistent, which follows noise.
+#: How often the metric is updated, and the power of the mean outer product of gradients that it is set to. With the
+#: consistent power 1/2 it follows noise.
 STEPS, POWER = 4, 0.25
-#: Principal components of what is fitted whose gradients count.
+#: Principal components of the values whose gradients count.
 OUTPUTS = 16
-#: Root mean square of the strongest coefficient in the kernel's coordinates, to begin with.
+#: Root mean square of the strongest coefficient in the first metric.
 SCALE = 1 / 8
 
 
 def _kernel(s: Tensor) -> Tensor:
-    """``κ(s)``, the exponential's first terms."""
+    """``κ(s)``, the exponential series to degree three."""
     return 1 + s + s**2 / 2 + s**3 / 6
 
 
-def learned_metric(x: Tensor, y: Tensor, held_out: tuple[Tensor, Tensor]) -> tuple[Tensor, float]:
-    """A linear map (k, k) of inputs x (n, k), after which kernel ridge regression with ``κ(z·z')`` suits y (n, q) best.
+def learned_metric(x: Tensor, y: Tensor, held_out: Pairs) -> tuple[Tensor, float]:
+    """A linear map A (k, k) of inputs x (n, k), z = x A, for which kernel ridge regression of y (n, q) is accurate.
 
-    ``κ(s) = 1 + s + s²/2 + s³/6``. The map starts as a multiple of the identity. Then it is made, several times, a root
-    of the mean outer product of the gradients of what was found with it: directions along which nothing changes fade
-    (recursive feature machines: Radhakrishnan et al., Science 383, 2024). Held-out pairs choose the penalty and the
-    step.
+    The kernel is ``κ(z·z') = 1 + s + s²/2 + s³/6``, s = z·z'. A starts as a multiple of the identity and is then set,
+    several times, to a power of the mean outer product of the gradients of the regression, which shrinks the directions
+    in which y does not change (recursive feature machines: Radhakrishnan et al., Science 383, 2024). Held-out pairs
+    choose the penalty and the step.
 
     Returns:
-        The map, and the penalty that suited it.
+        The map and its penalty.
     """
     x, y = x[:SAMPLES], y[:SAMPLES]
-    components = torch.linalg.svd(y, full_matrices=False)[2][:OUTPUTS].T
+    components = principal_axes(y, by="svd")[1][:OUTPUTS].T
     metric = SCALE * torch.eye(x.shape[1], dtype=x.dtype)
-    total = (x @ metric).square().sum()
+    size = (x @ metric).square().sum()
     best, chosen = math.inf, (metric, PENALTIES[-1])
     for step in range(STEPS + 1):
         z = x @ metric
         s = z @ z.T
-        value, vector = torch.linalg.eigh(_kernel(s))
-        right = vector.T @ y
-        other = _kernel(held_out[0] @ metric @ z.T) @ vector
-        found = {p: right / (value.clamp_min(0) + p)[:, None] for p in PENALTIES}
-        errors = {p: float((other @ spectrum - held_out[1]).square().sum()) for p, spectrum in found.items()}
-        penalty = min(errors, key=errors.__getitem__)
-        if errors[penalty] < best:
-            best, chosen = errors[penalty], (metric, penalty)
+        found = SpectralRidge.fit(_kernel(s), y, (_kernel(held_out[0] @ metric @ z.T), held_out[1]), PENALTIES)
+        if found.error < best:
+            best, chosen = found.error, (metric, found.penalty)
         if step < STEPS:
-            s = s[:GRADIENTS]
-            weights = vector @ found[penalty] @ components
-            gradients = torch.einsum("pn,nq,nk->pqk", 1 + s + s**2 / 2, weights, z).flatten(0, 1) @ metric.T
-            value, vector = torch.linalg.eigh(gradients.T @ gradients)
-            metric = vector * (value / value[-1].clamp_min(1e-30)).clamp_min(1e-12) ** POWER
-            metric = metric * (total / (x @ metric).square().sum().clamp_min(1e-30)).sqrt()
+            metric = _updated(metric, z, s[:GRADIENTS], found.weights @ components)
+            metric = metric * (size / (x @ metric).square().sum().clamp_min(1e-30)).sqrt()
     return chosen
+
+
+def _updated(metric: Tensor, z: Tensor, s: Tensor, weights: Tensor) -> Tensor:
+    """A power of the mean outer product of gradients, up to a factor.
+
+    Args:
+        metric: A (k, k).
+        z: (n, k) = x A.
+        s: (m, n) inner products of the samples at which gradients are taken, with all.
+        weights: (n, q) of the kernel regression.
+    """
+    gradients = torch.einsum("pn,nq,nk->pqk", 1 + s + s**2 / 2, weights, z).flatten(0, 1) @ metric.T
+    value, vector = torch.linalg.eigh(gradients.T @ gradients)
+    return vector * (value / value[-1].clamp_min(1e-30)).clamp_min(1e-12) ** POWER

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tomllib
 from collections.abc import Sequence
+from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -13,7 +14,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationErr
 from shapespace.coordinates.reconstruction import DEFAULT_ETA
 from shapespace.shell.energy import Material
 
-#: Which edges a convolution hears of, see networks.EdgeConvolution.
+#: Which edges a convolution takes its input from, see convolutions.EdgeConvolution.
 Neighbourhood = Literal["star", "flaps"]
 
 #: Default number of samples of each factor alone: few suffice, as a factor has few modes.
@@ -117,13 +118,15 @@ class SampleSettings(_Section):
 
 
 class FitSettings(_Section):
-    """Adam. Its rate is divided by ten whenever the validation loss stops falling, as in the paper (section 4), or
-    falls along half a cosine to nothing at the last epoch, which is better where the number of epochs is what counts.
-    """
+    """Gradient descent with Adam."""
 
     schedule: Literal["plateau", "cosine"] = "plateau"
+    """Of the learning rate. ``plateau`` divides it by ten whenever the validation loss has not fallen for ``patience``
+    epochs, as in the paper (section 4). ``cosine`` lets it fall along half a cosine, to zero after ``max_epochs``:
+    fewer epochs are needed."""
     learning_rate: float = Field(1e-3, gt=0)
     final_rate: float = Field(1e-6, gt=0)
+    """Training ends when the learning rate falls below this."""
     patience: int = Field(10, ge=1)
     max_epochs: int = Field(500, ge=1)
     batch_size: int = Field(64, ge=2)
@@ -133,66 +136,156 @@ class LatentNetworkSettings(_Section):
     """A network from latents to NRIC: a factor network or the monolithic baseline."""
 
     hidden: list[int] = [128, 128]
+    """Width of each hidden layer."""
     fourier: int = Field(1, ge=0)
-    """Highest frequency of a periodic coordinate among the inputs; 0 feeds the bare angle, as the paper does."""
-    skip_orders: list[int] | None = None
-    """Largest frequency of each coordinate in a linear layer beside the hidden ones, fitted by ridge regression."""
+    """Highest frequency of a periodic coordinate among the inputs; 0 takes the angle itself, as the paper does."""
+    skip_orders: list[int] = []
+    """Largest frequency of each coordinate in a linear layer of Fourier products beside the hidden ones, fitted by
+    ridge regression; an empty list leaves it out. All coordinates must be periodic."""
     skip_degree: int = Field(3, ge=0)
-    """The same layer of polynomials up to this total degree, where no coordinate has a period; 0 leaves it out."""
+    """Total degree of the polynomials in such a layer, for factors without a periodic coordinate; 0 leaves it out."""
     patches: int = Field(1, ge=1)
-    """Groups of neighbouring edges with a principal basis each, as the last layer."""
+    """Groups of neighbouring edges, each with a principal basis of its own, in the last layer."""
     energy: float = Field(0.9999, gt=0, le=1)
-    """Variance kept by that basis; 1 makes the last layer a dense one, as the paper's are."""
+    """Share of the variance that this basis keeps; 1 makes the last layer dense, as in the paper."""
     fit: FitSettings = FitSettings(schedule="cosine", learning_rate=2e-3, max_epochs=60)
 
 
-class CombinerSettings(_Section):
-    """From J factor shapes to the joint one: graph convolutions on edges, a kernel, polynomials in patches of edges."""
+class KernelSettings(_Section):
+    """Kernel ridge regression on principal coefficients of the factors' shapes."""
 
+    kind: Literal["kernel"] = "kernel"
+    coefficients: int = Field(12, ge=1)
+    """Principal coefficients of each factor."""
+
+
+class PolynomialSettings(_Section):
+    """Cubic polynomials in principal coefficients of the factors' shapes, for each patch of edges its own.
+
+    For many factors, each of which changes the others a little and locally.
+    """
+
+    kind: Literal["polynomials"] = "polynomials"
+    coefficients: int = Field(12, ge=1)
+    """Principal coefficients of each factor in a patch."""
+    monomials: int = Field(1800, ge=1)
+    """Monomials of degree two and three in each patch."""
+
+
+class ProductSettings(_Section):
+    """Ridge regression on products of the principal coefficients of every two factors."""
+
+    kind: Literal["products"] = "products"
+    coefficients: int = Field(8, ge=1)
+    """Principal coefficients of each factor."""
+
+
+class ConvolutionSettings(_Section):
+    """Graph convolutions on the edges, trained by gradient descent."""
+
+    kind: Literal["convolutions"] = "convolutions"
+    layers: int = Field(3, ge=1)
     width: int = Field(24, ge=1)
-    layers: int = Field(0, ge=0)
-    """Graph convolutions; 0 leaves all to the corrections below."""
+    """Features of each edge after each layer."""
     neighbourhood: Neighbourhood = "star"
     crop: int = Field(0, ge=0)
-    """Edges of the part of each shape that the convolutions learn on, drawn anew in each epoch by what is missed there
-    without them: a network that mends details learns faster so. 0 for whole shapes. Needs ``flaps``."""
+    """Edges of the connected part of each shape that the loss of a training step is computed on, chosen at random in
+    proportion to the error of the affine sum there; 0 takes whole shapes. Needs the neighbourhood ``flaps``."""
     residual: bool = True
-    """Learn the difference to the affine sum of the factors instead of the shape itself; pass each layer's input on."""
+    """Whether the network learns the difference from the affine sum of the factors, and each layer the difference from
+    its input. Otherwise it learns the joint shape itself, as in the paper."""
     edge_channels: int = Field(4, ge=0)
-    """Learned constants of each edge, given to the first convolution beside the factors."""
-    kernel: int = Field(12, ge=0)
-    """Principal coefficients of each factor, on which kernel ridge regression corrects what the convolutions
-    leave; 0 leaves it out, as the paper does."""
-    polynomial: int = Field(0, ge=0)
-    """Principal coefficients of each factor in a patch of edges, of which a polynomial corrects it instead: for many
-    factors that do little to each other, each for itself."""
-    monomials: int = Field(1800, ge=1)
-    """Of second and third degree that such a polynomial has."""
-    pairwise: int = Field(0, ge=0)
-    """Principal coefficients of each factor whose products, two factors at a time, correct a residual's affine sum
-    before the convolutions do."""
+    """Learned constants of each edge, inputs of the first layer beside the factors' shapes."""
+    products: int = Field(0, ge=0)
+    """Principal coefficients of each factor whose products correct the affine sum first, as the kind ``products`` does;
+    0 leaves them out. Needs ``residual``."""
     dropout: float = Field(0.0, ge=0, lt=1)
-    symmetries: bool = True
-    """Learn from the training samples' images under the collection's symmetries too, where it has any."""
+    """Share of the features that are set to zero after each layer during training."""
     fit: FitSettings = FitSettings(schedule="cosine", learning_rate=2e-3, batch_size=16, max_epochs=12)
 
     @model_validator(mode="after")
-    def _something(self) -> CombinerSettings:
-        if not self.layers and not (self.residual and (self.kernel or self.polynomial or self.pairwise)):
-            raise ValueError("without convolutions there must be a residual with a kernel, polynomials or products")
-        if self.kernel and self.polynomial:
-            raise ValueError("either a kernel or polynomials, the other 0")
+    def _consistent(self) -> ConvolutionSettings:
         if self.crop and self.neighbourhood != "flaps":
-            raise ValueError("crops need the neighbourhood flaps")
+            raise ValueError("crop needs the neighbourhood flaps")
+        if self.products and not self.residual:
+            raise ValueError("products need residual = true")
         return self
 
 
-class NetworkSettings(_Section):
-    """Everything that decides what is learned from the samples."""
+class PaperSettings(_Section):
+    """The paper's combiner (section 4): convolutions on stars that learn the joint shape itself, dropout 0.1, Adam with
+    a rate of 1e-3 that is divided by ten on a plateau.
+    """
+
+    kind: Literal["paper"] = "paper"
+    layers: int = Field(3, ge=1)
+    width: int = Field(24, ge=1)
+    fit: FitSettings = FitSettings()
+
+    @property
+    def convolutions(self) -> ConvolutionSettings:
+        """The same, with every setting written out."""
+        return ConvolutionSettings(
+            layers=self.layers, width=self.width, residual=False, edge_channels=0, dropout=0.1, fit=self.fit
+        )
+
+
+class AutoSettings(_Section):
+    """The kind that suits the collection; for now always ``kernel`` with its default settings."""
+
+    kind: Literal["auto"] = "auto"
+
+
+#: The kinds that a network can be of; ``auto`` and ``paper`` stand for one of them.
+ResolvedCorrection = Annotated[
+    KernelSettings | PolynomialSettings | ProductSettings | ConvolutionSettings, Field(discriminator="kind")
+]
+CorrectionSettings = Annotated[ResolvedCorrection | PaperSettings | AutoSettings, Field(discriminator="kind")]
+
+#: Settings of a combiner in version 0.1, and how ``correction`` is written in their place.
+_COMBINER_OF_0_1 = {
+    '{ kind = "kernel", coefficients }': ["kernel"],
+    '{ kind = "polynomials", coefficients, monomials }': ["polynomial", "monomials"],
+    '{ kind = "products", coefficients } or { kind = "convolutions", products, … }': ["pairwise"],
+    '{ kind = "convolutions", … } with the same names': [
+        "layers", "width", "neighbourhood", "crop", "residual", "edge_channels", "dropout", "fit",
+    ],
+}  # fmt: skip
+
+
+class CombinerSettings(_Section):
+    """From J factor shapes to the joint one: their affine sum, and a correction of it."""
+
+    correction: CorrectionSettings = AutoSettings()
+    symmetries: bool = True
+    """Whether the images of the training samples under the collection's symmetries, if it has any, are training samples
+    too."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _not_of_0_1(cls, values: Any) -> Any:
+        written = values if isinstance(values, dict) else {}
+        moved = [
+            f"{', '.join(found)} as correction = {new}"
+            for new, old in _COMBINER_OF_0_1.items()
+            if (found := [name for name in old if name in written])
+        ]
+        if moved:
+            raise ValueError(f"settings of version 0.1: write {'; '.join(moved)}; leave out what was 0")
+        return values
+
+
+class Recipe(_Section):
+    """What the composite network is made of."""
 
     factors: list[LatentNetworkSettings] | LatentNetworkSettings = LatentNetworkSettings()
-    """One for each factor, or one for all."""
+    """One table for each factor, or one for all."""
     combiner: CombinerSettings = CombinerSettings()
+
+
+class NetworkSettings(Recipe):
+    """The main recipe, which is exported, and what else is learned from the samples for comparison."""
+
     seed: int = 0
     fractions: list[Annotated[float, Field(gt=0, lt=1)]] = []
     """Shares of the training codes to learn from as well, for the study of their number: each once with the factors'
@@ -202,11 +295,46 @@ class NetworkSettings(_Section):
 
 
 class VariantSettings(_Section):
-    """One row of the ablation: what differs from the main recipe."""
+    """One row of the ablation: what differs from the main recipe, or from another variant."""
 
     title: str
-    factors: list[LatentNetworkSettings] | LatentNetworkSettings | None = None
-    combiner: CombinerSettings | None = None
+    base: str | None = None
+    """Name of the variant that this one differs from; it must stand before this one. None is the main recipe."""
+    factors: list[dict[str, Any]] | dict[str, Any] = {}
+    """Settings of the factor networks that differ: one table for each factor, or one that is applied to all."""
+    combiner: dict[str, Any] = {}
+    """Settings of the combiner that differ. A correction of another kind starts from that kind's defaults."""
+
+    def applied(self, base: Recipe) -> Recipe:
+        """The recipe that results from a base.
+
+        Raises:
+            ValueError: as many tables of factors as there are factors in the base are needed.
+            ValidationError: settings that can't be used.
+        """
+        below = base.model_dump(include=set(Recipe.model_fields))
+        mine, theirs = self.factors, below["factors"]
+        if isinstance(mine, list) or isinstance(theirs, list):
+            count = len(theirs if isinstance(theirs, list) else mine)
+            theirs = theirs if isinstance(theirs, list) else [theirs] * count
+            mine = mine if isinstance(mine, list) else [mine] * count
+            if len(mine) != len(theirs):
+                raise ValueError(f"factors: {len(mine)} tables over {len(theirs)}")
+            factors: Any = [_merged(a, b) for a, b in zip(theirs, mine, strict=True)]
+        else:
+            factors = _merged(theirs, mine)
+        return Recipe.model_validate({"factors": factors, "combiner": _merged(below["combiner"], self.combiner)})
+
+
+def _merged(below: dict[str, Any], above: dict[str, Any]) -> dict[str, Any]:
+    """Nested tables, the values of ``above`` over those of ``below``; a table of another ``kind`` replaces its own."""
+    result = dict(below)
+    for name, value in above.items():
+        old = below.get(name)
+        if isinstance(value, dict) and isinstance(old, dict) and value.get("kind", old.get("kind")) == old.get("kind"):
+            value = _merged(old, value)
+        result[name] = value
+    return result
 
 
 class EvaluationSettings(_Section):
@@ -261,6 +389,35 @@ class Config(_Section):
     evaluation: EvaluationSettings = EvaluationSettings()
     export: ExportSettings
 
+    @cached_property
+    def recipes(self) -> dict[str, Recipe]:
+        """The full recipe of each variant.
+
+        Raises:
+            ValueError: naming the variant and its faults.
+        """
+        found: dict[str, Recipe] = {}
+        for name, variant in self.variants.items():
+            if variant.base is not None and variant.base not in found:
+                raise ValueError(f"variants.{name}.base: no variant {variant.base!r} stands before it")
+            try:
+                found[name] = variant.applied(found[variant.base] if variant.base else self.networks)
+            except ValidationError as error:
+                raise ValueError("; ".join(f"variants.{name}.{fault}" for fault in _faults(error))) from error
+            except ValueError as error:
+                raise ValueError(f"variants.{name}.{error}") from error
+        return found
+
+    @model_validator(mode="after")
+    def _usable_variants(self) -> Config:
+        _ = self.recipes
+        return self
+
+
+def _faults(error: ValidationError) -> list[str]:
+    """One line for each setting that can't be used."""
+    return [": ".join(filter(None, (".".join(map(str, e["loc"])), e["msg"]))) for e in error.errors()]
+
 
 def parse(text: str, source: str) -> Config:
     """Read a configuration from TOML text.
@@ -275,8 +432,8 @@ def parse(text: str, source: str) -> Config:
     try:
         return Config.model_validate(values)
     except ValidationError as error:
-        faults = "\n".join(f"  {'.'.join(map(str, e['loc']))}: {e['msg']}" for e in error.errors())
-        raise ConfigError(f"{source}: these settings can't be used\n{faults}") from error
+        faults = "".join(f"\n  {fault}" for fault in _faults(error))
+        raise ConfigError(f"{source}: these settings can't be used{faults}") from error
 
 
 def load(path: Path, data: Path | None = None, fractions: Sequence[float] = ()) -> tuple[Config, str]:

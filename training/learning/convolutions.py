@@ -1,0 +1,382 @@
+"""Graph convolutions on the edges of the mesh: the paper's combiner, and better ones, trained on crops of the mesh."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import torch
+from scipy import sparse
+from scipy.sparse.csgraph import dijkstra
+from torch import Tensor, nn
+
+from shapespace.arrays import FloatArray, IntArray
+from shapespace.mesh.triangle_mesh import Connectivity, TriangleMesh
+from shapespace.training.learning.corrections import Correction, JointSamples, ProductCorrection
+from shapespace.training.runs.config import ConvolutionSettings, FitSettings, ProductSettings
+
+
+class ConvolutionCorrection(Correction):
+    """Graph convolutions on edges, each followed by batch normalisation, ELU and dropout.
+
+    With ``residual`` they correct the affine sum, or what products make of it, and begin as zero; without, they make
+    the joint shape themselves, as in the paper. Features of an edge are the lengths and angles of the J factors, length
+    and angle in the reference, and learned constants.
+
+    Args:
+        settings: of the network.
+        reference: the mesh.
+        rest: (2E,) NRIC of the reference.
+        factor_count: J.
+        products: of the factors' shapes, added to the affine sum first.
+    """
+
+    rest: Tensor
+
+    def __init__(
+        self,
+        settings: ConvolutionSettings,
+        reference: TriangleMesh,
+        rest: Tensor,
+        factor_count: int,
+        products: ProductCorrection | None,
+    ) -> None:
+        super().__init__()
+        self.settings, self.reference = settings, reference
+        connectivity = reference.connectivity
+        rest = rest.view(2, -1).T
+        self.register_buffer("rest", (rest - rest.mean(dim=0)) / rest.std(dim=0).clamp_min(1e-6))
+        self.edge_constants = nn.Parameter(0.1 * torch.randn(connectivity.edge_count, settings.edge_channels))
+        widths = [2 * factor_count + 2 + settings.edge_channels] + [settings.width] * settings.layers
+        around = Star(connectivity) if settings.neighbourhood == "star" else Flaps(connectivity)
+        self.convolutions = nn.ModuleList(EdgeConvolution(around, a, b) for a, b in itertools.pairwise(widths))
+        self.norms = nn.ModuleList(nn.BatchNorm1d(width) for width in widths[1:])
+        self.dropout = nn.Dropout(settings.dropout)
+        self.readout = nn.Linear(widths[-1], 2)
+        if settings.residual:
+            nn.init.zeros_(self.readout.weight)
+            nn.init.zeros_(self.readout.bias)
+        self.products = products
+
+    @classmethod
+    def fit(
+        cls,
+        settings: ConvolutionSettings,
+        reference: TriangleMesh,
+        own: JointSamples,
+        held_out: JointSamples,
+        seed: int,
+    ) -> ConvolutionCorrection:
+        """The untrained network, with fitted products; see `Correction`."""
+        products = None
+        if settings.products:
+            how = ProductSettings(coefficients=settings.products)
+            products = ProductCorrection.fit(how, reference, own, held_out, seed)
+        return cls(settings, reference, own.scaling.mean, own.factors.shape[1], products)
+
+    @classmethod
+    def load(
+        cls, settings: ConvolutionSettings, reference: TriangleMesh, tensors: Mapping[str, Tensor]
+    ) -> ConvolutionCorrection:
+        """See `Correction`."""
+        prefix, products = "products.", None
+        if settings.products:
+            own = {name.removeprefix(prefix): t for name, t in tensors.items() if name.startswith(prefix)}
+            products = ProductCorrection.load(ProductSettings(coefficients=settings.products), reference, own)
+        inputs = tensors["convolutions.0.own.weight"].shape[1]
+        factor_count = (inputs - 2 - settings.edge_channels) // 2
+        result = cls(settings, reference, torch.zeros(2 * len(tensors["rest"])), factor_count, products)
+        result.load_state_dict(tensors)
+        return result
+
+    @property
+    def descent(self) -> FitSettings:
+        """Adam trains all but the products."""
+        return self.settings.fit
+
+    @cached_property
+    def crops(self) -> Crops | None:
+        """Where the loss is computed; None on whole shapes.
+
+        Raises:
+            ValueError: they are too small.
+        """
+        size, table = self.settings.crop, flaps(self.reference.connectivity)
+        return Crops(self.reference.edge_midpoints, table, size, self.settings.layers) if size else None
+
+    def _start(self, y: Tensor) -> Tensor:
+        """What the convolutions correct, (n, 2E)."""
+        if not self.settings.residual:
+            return torch.zeros_like(y[:, 0])
+        total = y.sum(dim=1)
+        return total if self.products is None else total + self.products.difference(y)
+
+    def _constants(self) -> Tensor:
+        """(E, 2 + edge_channels) features of edges that are the same for all shapes."""
+        return torch.cat([self.rest, self.edge_constants], dim=1)
+
+    def forward(self, y: Tensor) -> Tensor:
+        start, (n, j, double) = self._start(y), y.shape
+        # Edges come first, so that a sum over neighbours adds contiguous rows.
+        channels = y.view(n, 2 * j, double // 2).permute(2, 0, 1)
+        features = torch.cat([channels, self._constants()[:, None, :].expand(-1, n, -1)], dim=2)
+        return start + self._layers(features).permute(1, 2, 0).reshape(n, double)
+
+    def _layers(self, x: Tensor, neighbours: Tensor | None = None) -> Tensor:
+        """(E, n, 2) of features (E, n, C) of edges."""
+        for convolution, norm in zip(self.convolutions, self.norms, strict=True):
+            new = norm(convolution(x, neighbours).flatten(0, 1))
+            new = self.dropout(nn.functional.elu(new)).view(*x.shape[:2], -1)
+            x = x + new if self.settings.residual and x.shape == new.shape else new
+        return self.readout(x)
+
+    def loss(self, y: Tensor, target: Tensor) -> Tensor:
+        """Mean square error, of the inner edges of crops if there are any."""
+        if self.crops is None:
+            return super().loss(y, target)
+        n, j, double = y.shape
+        missed = (target - self._start(y)).view(n, 2, double // 2)
+        crop = self.crops.draw(missed.square().sum(dim=1))
+
+        def at(channels: Tensor) -> Tensor:
+            """(n, c, E) → (nK, c)."""
+            return channels.take_along_dim(crop.edges[:, None], dim=2).transpose(1, 2).flatten(0, 1)
+
+        x = torch.cat([at(y.view(n, 2 * j, double // 2)), self._constants()[crop.edges.flatten()]], dim=1)[:, None]
+        inner = crop.inner.flatten()
+        return nn.functional.mse_loss(self._layers(x, crop.neighbours)[inner, 0], at(missed)[inner])
+
+
+class EdgeConvolution(nn.Module):
+    """A graph convolution on features (E, n, C) of edges.
+
+    `Star`, the paper's: ``W₁ x_e + W₂ Σ_{N(e)} x + b``, where N(e) are the edges that share a vertex with e. It does
+    not distinguish directions. `Flaps` has a matrix for each of the four other edges of the two faces at e, in an order
+    fixed by e's direction and the faces' orientation: ``W₁ x_e + Σ_k W_{2,k} x_{e_k} + b``.
+    """
+
+    def __init__(self, around: Star | Flaps, n_in: int, n_out: int) -> None:
+        super().__init__()
+        self.own = nn.Linear(n_in, n_out)
+        self.around = around
+        self.other = nn.Linear(around.count * n_in, n_out, bias=False)
+        if isinstance(around, Star):
+            with torch.no_grad():
+                # An edge has about ten neighbours; so their sum is at first of the size of the edge itself.
+                self.other.weight /= 10
+
+    def forward(self, x: Tensor, neighbours: Tensor | None = None) -> Tensor:
+        """Features (E, n, n_out) of features (E, n, n_in).
+
+        Args:
+            x: of the whole mesh, or (n K, 1, n_in) of the edges of n crops.
+            neighbours: of a `Crop`; None for the whole mesh.
+        """
+        around = self.around(x) if neighbours is None else _side_by_side(_gather(x, neighbours))
+        return self.own(x) + self.other(around)
+
+
+class Star(nn.Module):
+    """(E, n, C) → the same: sums over the edges that share a vertex with each, by way of sums at the vertices."""
+
+    edges: Tensor
+    at_vertex: Tensor
+    count = 1
+
+    def __init__(self, connectivity: Connectivity) -> None:
+        super().__init__()
+        self.register_buffer("edges", torch.tensor(connectivity.edges), persistent=False)
+        self.register_buffer("at_vertex", torch.as_tensor(edges_at_vertices(connectivity)), persistent=False)
+
+    def forward(self, x: Tensor) -> Tensor:
+        if torch.compiler.is_exporting():
+            at_vertex = _gather(x, self.at_vertex).sum(dim=1)
+            return at_vertex[self.edges[:, 0]] + at_vertex[self.edges[:, 1]] - 2 * x
+        return _StarSum.apply(x, self.edges, self.at_vertex)
+
+
+class Flaps(nn.Module):
+    """(E, n, C) → (E, n, 4 C): the features of the four other edges of the two faces at each edge, see `flaps`."""
+
+    neighbours: Tensor
+    targets: Tensor
+    offsets: Tensor
+    count = 4
+
+    def __init__(self, connectivity: Connectivity) -> None:
+        super().__init__()
+        table = flaps(connectivity)
+        # For the gradient: the places of each edge in the flat table.
+        flat, count = table.ravel(), connectivity.edge_count
+        order = np.argsort(flat, kind="stable")[: int((flat < count).sum())]
+        for name, index in {
+            "neighbours": table,
+            "targets": order,
+            "offsets": np.searchsorted(flat[order], np.arange(count)),
+        }.items():
+            self.register_buffer(name, torch.as_tensor(index), persistent=False)
+
+    def forward(self, x: Tensor) -> Tensor:
+        if torch.compiler.is_exporting():
+            around = _gather(x, self.neighbours)
+        else:
+            around = _FlapGather.apply(x, self.neighbours, self.targets, self.offsets)
+        return _side_by_side(around)
+
+
+def edges_at_vertices(connectivity: Connectivity) -> IntArray:
+    """(V, k) edges at each vertex, padded with E."""
+    ends, count = connectivity.edges.ravel(), connectivity.edge_count
+    order = np.argsort(ends, kind="stable")
+    valence = np.bincount(ends, minlength=connectivity.vertex_count)
+    table = np.full((len(valence), valence.max()), count)
+    table[np.arange(valence.max()) < valence[:, None]] = order // 2
+    return table
+
+
+def flaps(connectivity: Connectivity) -> IntArray:
+    """(E, 4) other edges of the faces left and right of i → j, in each the one at i first; E where there is none."""
+    table = np.full((connectivity.edge_count, 4), connectivity.edge_count)
+    for side in (0, 1):
+        there = np.flatnonzero(connectivity.edge_faces[:, side] >= 0)
+        face = connectivity.edge_faces[there, side]
+        for column in (0, 1):
+            # Edge k of a face lies opposite to its corner k: the edge at i is the one opposite to j.
+            corner = connectivity.faces[face] == connectivity.edges[there, 1 - column, None]
+            table[there, 2 * side + column] = connectivity.face_edges[face][corner]
+    return table
+
+
+def _gather(x: Tensor, neighbours: Tensor) -> Tensor:
+    """(E, k, n, C) features of the neighbours of each edge, zero where there is none."""
+    padded = torch.cat([x, torch.zeros_like(x[:1])])
+    return padded.index_select(0, neighbours.flatten()).unflatten(0, neighbours.shape)
+
+
+def _side_by_side(around: Tensor) -> Tensor:
+    """(E, k, n, C) → (E, n, k C)."""
+    return around.transpose(1, 2).flatten(2)
+
+
+class _FlapGather(torch.autograd.Function):
+    """`_gather` with a gradient that is a gather too, several times faster than autograd's scatter."""
+
+    @staticmethod
+    def forward(ctx: Any, x: Tensor, neighbours: Tensor, targets: Tensor, offsets: Tensor) -> Tensor:
+        ctx.save_for_backward(targets, offsets)
+        return _gather(x, neighbours)
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None, None, None]:
+        targets, offsets = ctx.saved_tensors
+        flat = gradient.reshape(gradient.shape[0] * gradient.shape[1], -1)
+        total = nn.functional.embedding_bag(targets, flat, offsets, mode="sum")
+        return total.view(len(offsets), *gradient.shape[2:]), None, None, None
+
+
+class _StarSum(torch.autograd.Function):
+    """``Bᵀ(Bx) − 2x`` with the incidence B of vertices and edges; symmetric, so it is its own gradient."""
+
+    @staticmethod
+    def forward(ctx: Any, x: Tensor, edges: Tensor, at_vertex: Tensor) -> Tensor:
+        ctx.save_for_backward(edges, at_vertex)
+        padded = torch.cat([x, torch.zeros_like(x[:1])]).flatten(1)
+        sums = nn.functional.embedding_bag(at_vertex, padded, mode="sum", padding_idx=len(x))
+        return nn.functional.embedding_bag(edges, sums, mode="sum").view_as(x) - 2 * x
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None, None]:
+        return _StarSum.apply(gradient.contiguous(), *ctx.saved_tensors), None, None
+
+
+#: Share of the crops whose centres are drawn uniformly from all edges.
+UNIFORM = 0.25
+
+
+@dataclass(frozen=True)
+class Crop:
+    """The K edges nearest to one edge, for each of n shapes another, as one graph of n K edges.
+
+    Attributes:
+        edges: (n, K) their indices in the mesh.
+        neighbours: (n K, k) indices in the graph of the neighbours of each; n K where there is none.
+        inner: (n, K) whether all layers have all their inputs in the crop, so that the output is that on the whole
+            mesh.
+    """
+
+    edges: Tensor
+    neighbours: Tensor
+    inner: Tensor
+
+
+class Crops:
+    """Draws crops of a mesh.
+
+    Args:
+        midpoints: (E, 3) of the edges; their distances are those of neighbours.
+        neighbours: (E, k) neighbours of each edge in a convolution, E where there is none.
+        size: K, at most.
+        layers: number of convolutions, one after the other.
+
+    Raises:
+        ValueError: crops so small that none of their edges is an inner one.
+    """
+
+    def __init__(self, midpoints: FloatArray, neighbours: IntArray, size: int, layers: int) -> None:
+        self._neighbours, self._layers = torch.as_tensor(neighbours), layers
+        self._nearest = torch.as_tensor(_nearest(midpoints, neighbours, min(size, len(midpoints))))
+        if not self.about(torch.zeros(1, dtype=torch.long)).inner.any():
+            raise ValueError(f"a crop of {size} edges is too small for {layers} convolutions")
+
+    def draw(self, missed: Tensor) -> Crop:
+        """A crop of each shape, about an edge drawn in proportion to the squared error (n, E) or uniformly."""
+        count = missed.shape[1]
+        share = missed / missed.sum(dim=1, keepdim=True).clamp_min(1e-30)
+        return self.about(torch.multinomial((1 - UNIFORM) * share + UNIFORM / count, 1)[:, 0])
+
+    def about(self, centres: Tensor) -> Crop:
+        """The crops about edges (n,)."""
+        edges = self._nearest[centres]
+        local, outside = self._local(edges)
+        n, size = edges.shape
+        graph = torch.where(local < 0, n * size, local + size * torch.arange(n)[:, None, None]).flatten(0, 1)
+        return Crop(edges, graph, self._inner(graph, outside))
+
+    def _local(self, edges: Tensor) -> tuple[Tensor, Tensor]:
+        """Places (n, K, k) of neighbours in crops (n, K), −1 outside of them; and whether they are edges outside."""
+        n, size = edges.shape
+        place = torch.full((n, len(self._neighbours) + 1), -1)
+        place.scatter_(1, edges, torch.arange(size).expand(n, -1))
+        neighbours = self._neighbours[edges]
+        local = place.gather(1, neighbours.flatten(1)).view_as(neighbours)
+        return local, (local < 0) & (neighbours < len(self._neighbours))
+
+    def _inner(self, graph: Tensor, outside: Tensor) -> Tensor:
+        """(n, K) whether no path of as many steps as there are layers leads outside.
+
+        Args:
+            graph: (n K, k) neighbours in the graph.
+            outside: (n, K, k) whether a neighbour lies outside of the crop.
+        """
+        inner = ~outside.any(dim=2)
+        for _ in range(self._layers - 1):
+            known = torch.cat([inner.flatten(), torch.ones(1, dtype=torch.bool)])
+            inner = inner & known[graph].all(dim=1).view_as(inner)
+        return inner
+
+
+def _nearest(midpoints: FloatArray, neighbours: IntArray, size: int) -> IntArray:
+    """(E, size) nearest edges of each edge, by the shortest paths over midpoints (E, 3) of neighbours (E, k)."""
+    count = len(midpoints)
+    edge, column = np.nonzero(neighbours < count)
+    other = neighbours[edge, column]
+    lengths = np.linalg.norm(midpoints[edge] - midpoints[other], axis=1)
+    graph = sparse.csr_array((lengths, (edge, other)), shape=(count, count))
+    # In parts, since all distances together would take E² numbers.
+    parts = np.array_split(np.arange(count), count // 256 + 1)
+    distances = (dijkstra(graph, indices=part) for part in parts)
+    return np.concatenate([np.argpartition(d, size - 1, axis=1)[:, :size] for d in distances])

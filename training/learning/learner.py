@@ -1,0 +1,286 @@
+"""The networks of a run, each fitted to the samples once and then read from its file."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property, partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from pydantic import BaseModel
+from torch import Tensor
+
+from shapespace.arrays import FloatArray, IntArray
+from shapespace.coordinates.nric import WeightedNorm, nric
+from shapespace.training.learning.corrections import JointSamples
+from shapespace.training.learning.fitting import fit, read_network, save_network
+from shapespace.training.learning.layers import PatchBasis, Scaling
+from shapespace.training.learning.networks import (
+    CombinerNetwork,
+    Composite,
+    FactorNetwork,
+    MonolithicNetwork,
+    ShapeNetwork,
+    StartNetwork,
+    factor_shapes,
+    predict,
+)
+from shapespace.training.runs.config import CombinerSettings, Config, FitSettings, LatentNetworkSettings, Recipe
+from shapespace.training.runs.directory import RunDirectory
+from shapespace.training.runs.sampling import Collection, Samples, read, split
+
+
+@dataclass(frozen=True)
+class _Data:
+    """What a network is fitted to.
+
+    Attributes:
+        inputs: (n, …) of all samples.
+        z: (n, 2E) their NRIC.
+        rows: indices of samples: train, validation.
+    """
+
+    inputs: Tensor
+    z: NDArray[np.float32]
+    rows: dict[str, IntArray]
+
+    def part(self, name: str) -> tuple[Tensor, Tensor]:
+        """Inputs and NRIC of a part of the samples."""
+        rows = self.rows[name]
+        return self.inputs[rows], torch.from_numpy(self.z[rows])
+
+
+class Learner:
+    """Fits networks to the samples of a run; each is saved in a file whose name is a digest of all that it depends on.
+
+    So recipes that have a network in common share its file. An unfinished file is continued; a finished one is read,
+    and the samples are not.
+
+    Args:
+        collection: what the samples are of.
+        config: of the run.
+        run: holds the samples, and gets the networks.
+        data_key: identifies the samples and the version of what is learned from them.
+        fraction: share of the training codes to learn from. The number of epochs is divided by it, so that the number
+            of steps stays the same.
+        all_of_factors: whether the factor networks learn from all samples of the factors nevertheless.
+        seed: of the networks, by default the configuration's. Another one also means another split of the samples.
+    """
+
+    def __init__(
+        self,
+        collection: Collection,
+        config: Config,
+        run: RunDirectory,
+        data_key: str,
+        fraction: float = 1.0,
+        all_of_factors: bool = False,
+        seed: int | None = None,
+    ) -> None:
+        self.collection, self.config, self.run = collection, config, run
+        self.seed = config.networks.seed if seed is None else seed
+        self._data_key, self._fraction = data_key, fraction
+        self._factor_fraction = 1.0 if all_of_factors else fraction
+        self.histories: dict[str, Any] = {}
+
+    @cached_property
+    def joint(self) -> Samples:
+        """The joint samples."""
+        return read(self.run.samples)
+
+    @cached_property
+    def split(self) -> dict[str, IntArray]:
+        """Rows of the joint samples: train, validation, test."""
+        if self.seed != self.config.networks.seed:
+            settings, rng = self.config.samples, np.random.default_rng(self.seed)
+            return split(np.arange(len(self.joint.index)), settings.test_fraction, settings.validation_fraction, rng)
+        return {name: np.searchsorted(self.joint.index, index) for name, index in self.run.split.read().items()}
+
+    @cached_property
+    def _reference(self) -> FloatArray:
+        reference = self.collection.reference
+        return nric(reference.vertices, reference.connectivity)
+
+    def _path(self, kind: str, fractions: Sequence[float], *settings: BaseModel) -> Path:
+        decides = [self._data_key, fractions, self.seed]
+        text = json.dumps([*decides, [s.model_dump(mode="json") for s in settings]])
+        return self.run.network(f"{kind}-{hashlib.sha256(text.encode()).hexdigest()[:12]}")
+
+    def _scaling(self, z: NDArray) -> Scaling:
+        return Scaling.of(self._reference, WeightedNorm.of(self.collection.reference, eta=1.0).squared, z)
+
+    @property
+    def rows(self) -> dict[str, IntArray]:
+        """The split, with only the share of it to learn from: the first rows, since codes are independent."""
+        return {
+            name: index if name == "test" else index[: max(4, round(self._fraction * len(index)))]
+            for name, index in self.split.items()
+        }
+
+    def _fit(
+        self, network: ShapeNetwork, data: _Data, fitting: FitSettings, path: Path, fraction: float
+    ) -> dict[str, Any]:
+        return fit(
+            network,
+            data.inputs,
+            torch.from_numpy(data.z),
+            torch.from_numpy(data.rows["train"]),
+            torch.from_numpy(data.rows["validation"]),
+            fitting.model_copy(update={"max_epochs": round(fitting.max_epochs / fraction)}),
+            path,
+            title=path.stem.rpartition("-")[0],
+            seed=self.seed,
+        )
+
+    def _record(self, path: Path, state: dict[str, Any]) -> None:
+        self.histories[path.stem] = {k: state[k] for k in ("epoch", "best", "history")}
+
+    def _latent_network(
+        self, kind: type[FactorNetwork], settings: LatentNetworkSettings, index: list[int], path: Path, fraction: float,
+        samples: Callable[[], tuple[Samples, dict[str, IntArray]]],
+    ) -> FactorNetwork:  # fmt: skip
+        """A network from the latents ``index`` to shapes, read from ``path`` or fitted to samples and rows of these."""
+        coordinates = self.collection.coordinates[index]
+        saved = read_network(path) if path.exists() else None
+        if saved and saved.done:
+            own = {k.removeprefix("basis."): v for k, v in saved.tensors.items() if k.startswith("basis.")}
+            basis = PatchBasis.blank(own) if settings.energy < 1 else None
+            network = kind(settings, coordinates, Scaling.blank(len(self._reference)), basis)
+            network.load_state_dict(saved.tensors)
+            network.eval()
+            self._record(path, saved.state)
+            return network
+        torch.manual_seed(self.seed)
+        drawn, rows = samples()
+        data = _Data(torch.as_tensor(drawn.latents[:, index], dtype=torch.float32), drawn.nric, rows)
+        z = drawn.nric[rows["train"]]
+        scaling = self._scaling(z)
+        network = kind(settings, coordinates, scaling, self._basis(settings, scaling, z))
+        if not saved:
+            own_pair, held_out = (
+                (latents, network.target(exact)) for latents, exact in map(data.part, ("train", "validation"))
+            )
+            network.fit_skip(*own_pair, held_out)
+        self._record(path, self._fit(network, data, settings.fit, path, fraction))
+        return network
+
+    def _basis(self, settings: LatentNetworkSettings, scaling: Scaling, z: NDArray) -> PatchBasis | None:
+        """The last layer of a network, from NRIC (n, 2E); None where it is dense."""
+        if settings.energy == 1:
+            return None
+        y, midpoints = scaling.down(torch.from_numpy(z)).numpy(), self.collection.reference.edge_midpoints
+        return PatchBasis.fit(y, midpoints, settings.patches, settings.energy, self.seed)
+
+    def factor_samples(self, j: int) -> Samples:
+        """The samples of a factor alone."""
+        return read(self.run.factor_samples(j))
+
+    def factor(self, j: int, settings: LatentNetworkSettings) -> FactorNetwork:
+        """ψ_j, from samples of the factor alone, none of them at a part of a test code."""
+        index = list(self.collection.factors.values())[j]
+
+        def samples() -> tuple[Samples, dict[str, IntArray]]:
+            own = self.factor_samples(j)
+            return own, self.factor_rows(own.index)
+
+        path = self._path(f"factor-{j}", [self._factor_fraction], settings)
+        return self._latent_network(FactorNetwork, settings, index, path, self._factor_fraction, samples)
+
+    def factor_rows(self, index: IntArray) -> dict[str, IntArray]:
+        """Rows of a factor's samples, which have these indices of codes: train and validation."""
+        rows = self.rows if self._factor_fraction < 1 else self.split
+        held_out = np.isin(index, self.joint.index[rows["validation"]])
+        if self._factor_fraction < 1:
+            train = np.isin(index, self.joint.index[rows["train"]])
+        else:
+            # Codes beyond the joint ones, and those whose joint shape failed, are training codes of the factor.
+            train = ~np.isin(index, self.joint.index[np.concatenate([rows["test"], rows["validation"]])])
+        return {"train": np.flatnonzero(train), "validation": np.flatnonzero(held_out)}
+
+    def exponentials(self) -> int:
+        """Number of samples behind the composite: joint ones and those of factors, held-out ones included."""
+        own = (self.factor_rows(self.factor_samples(j).index) for j in range(len(self.collection.factors)))
+        return sum(len(rows[part]) for rows in (self.rows, *own) for part in ("train", "validation"))
+
+    def composite(self, recipe: Recipe) -> Composite:
+        """The ψ_j first, then Ψ, which is fitted to their outputs."""
+        indices = list(self.collection.factors.values())
+        factors = recipe.factors if isinstance(recipe.factors, list) else [recipe.factors] * len(indices)
+        networks = [self.factor(j, settings) for j, settings in enumerate(factors)]
+        path = self._path("combiner", [self._fraction, self._factor_fraction], recipe.combiner, *factors)
+
+        def shapes() -> Tensor:
+            latents = torch.as_tensor(self.joint.latents, dtype=torch.float32)
+            return predict(partial(factor_shapes, networks, indices), latents)
+
+        return Composite(indices, networks, self._combiner(recipe.combiner, path, shapes))
+
+    def _combiner(self, settings: CombinerSettings, path: Path, shapes: Callable[[], Tensor]) -> CombinerNetwork:
+        """Ψ, read from ``path`` or fitted to the factors' shapes (n, J, 2E) of all joint samples."""
+        saved, reference = read_network(path) if path.exists() else None, self.collection.reference
+        if saved and saved.done:
+            combiner = CombinerNetwork.load(saved.metadata, reference, saved.tensors)
+            combiner.eval()
+            self._record(path, saved.state)
+            return combiner
+        data = _Data(shapes(), self.joint.nric, self.rows)
+        if settings.symmetries:
+            data = self._with_images(data)
+        torch.manual_seed(self.seed)
+        if saved:
+            combiner = CombinerNetwork.load(saved.metadata, reference, saved.tensors)
+        else:
+            scaling = self._scaling(self.joint.nric[self.rows["train"]])
+            own, held_out = (JointSamples(*data.part(name), scaling) for name in ("train", "validation"))
+            combiner = CombinerNetwork.fit(settings.correction, reference, own, held_out, self.seed)
+        if descent := combiner.correction.descent:
+            state = self._fit(combiner, data, descent, path, self._fraction)
+        else:
+            state = {"done": True, "epoch": 0, "best": None, "history": []}
+            combiner.eval()
+            save_network(path, combiner, state)
+        self._record(path, state)
+        return combiner
+
+    def _with_images(self, data: _Data) -> _Data:
+        """The same, with the images of the training samples under each symmetry of the collection."""
+        inputs, z, train = data.inputs, data.z, data.rows["train"]
+        rows = dict(data.rows)
+        for edges in self.collection.symmetries:
+            both_halves = np.concatenate([edges, len(edges) + edges])
+            rows["train"] = np.concatenate([rows["train"], len(z) + np.arange(len(train))])
+            inputs = torch.cat([inputs, data.inputs[train][:, :, both_halves]])
+            z = np.concatenate([z, data.z[train][:, both_halves]])
+        return _Data(inputs, z, rows)
+
+    def main(self) -> Composite:
+        """By the main recipe, which is exported."""
+        return self.composite(self.config.networks)
+
+    def variants(self) -> dict[str, Composite]:
+        """One for each row of the ablation."""
+        return {name: self.composite(recipe) for name, recipe in self.config.recipes.items()}
+
+    def monolithic(self) -> FactorNetwork:
+        """The fully connected baseline on the joint samples."""
+        settings = self.config.monolithic
+        index = list(range(len(self.collection.coordinates)))
+        path = self._path("monolithic", [self._fraction], settings)
+        return self._latent_network(
+            MonolithicNetwork, settings, index, path, self._fraction, lambda: (self.joint, self.rows)
+        )
+
+    def start(self) -> StartNetwork:
+        """The start network, from the joint samples: in closed form, in seconds, and not saved."""
+        collection, samples, rows = self.collection, self.joint, self.rows
+        network = StartNetwork(collection.coordinates, collection.reference.vertices)
+        latents = torch.as_tensor(samples.latents, dtype=torch.float32)
+        train, held_out = rows["train"], rows["validation"]
+        network.fit(latents[train], samples.vertices[train], (latents[held_out], samples.vertices[held_out]))
+        return network

@@ -1,0 +1,128 @@
+"""Linear algebra of everything that is fitted in closed form: ridge regression and principal axes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class Ridge:
+    """A solution of ``(G + λ I) W = R``.
+
+    Attributes:
+        weights: W (p, q).
+        penalty: λ.
+        error: mean square of what the solution misses of held-out pairs.
+    """
+
+    weights: Tensor
+    penalty: float
+    error: float
+
+
+def ridge(gram: Tensor, right: Tensor, held_out: tuple[Tensor, Tensor], penalties: Sequence[float]) -> Ridge:
+    """Ridge regression with the penalty that suits held-out pairs best; a Cholesky factorisation for each.
+
+    With features X (n, p) of samples, and Y (n, q), these are the normal equations where G = XᵀX and R = XᵀY, and their
+    dual form, or kernel ridge regression, where G = XXᵀ and R = Y.
+
+    Args:
+        gram: G (p, p), positive semi-definite.
+        right: R (p, q).
+        held_out: features (m, p) of held-out samples, or kernels (m, n) of these with the samples; and their values
+            (m, q).
+        penalties: candidates for λ > 0.
+    """
+    features, wanted = held_out
+
+    def solved(penalty: float) -> Ridge:
+        half = torch.linalg.cholesky(gram + penalty * torch.eye(len(gram)))
+        weights = torch.cholesky_solve(right, half)
+        return Ridge(weights, penalty, float((features @ weights - wanted).square().mean()))
+
+    return min(map(solved, penalties), key=lambda fit: fit.error)
+
+
+@dataclass(frozen=True)
+class SpectralRidge:
+    """Ridge regression by the eigenvectors of G, which serve all penalties: for many of them, or a map of low rank.
+
+    Attributes:
+        values: eigenvalues of G (p,), none negative.
+        vectors: V (p, p), its eigenvectors.
+        projected: VᵀR (p, q).
+        penalty: λ, which suits held-out pairs best.
+        error: mean square of what the solution misses of them.
+    """
+
+    values: Tensor
+    vectors: Tensor
+    projected: Tensor
+    penalty: float
+    error: float
+
+    @classmethod
+    def fit(
+        cls, gram: Tensor, right: Tensor, held_out: tuple[Tensor, Tensor], penalties: Sequence[float]
+    ) -> SpectralRidge:
+        """See `ridge` for the arguments."""
+        values, vectors = torch.linalg.eigh(gram)
+        values, projected = values.clamp_min(0), vectors.T @ right
+        features, wanted = held_out[0] @ vectors, held_out[1]
+        errors = {
+            penalty: float((features @ (projected / (values + penalty)[:, None]) - wanted).square().mean())
+            for penalty in penalties
+        }
+        penalty = min(errors, key=errors.__getitem__)
+        return cls(values, vectors, projected, penalty, errors[penalty])
+
+    @property
+    def weights(self) -> Tensor:
+        """W (p, q)."""
+        return self.vectors @ (self.projected / (self.values + self.penalty)[:, None])
+
+    def low_rank(self, rank: int) -> tuple[Tensor, Tensor]:
+        """Factors (p, rank) and (rank, q) of the map of that rank whose values X W are nearest to the solution's."""
+        # The columns of X H are orthonormal but for the penalty, so the error of X H B is that of B.
+        scale = (self.values + self.penalty).rsqrt()
+        h, b = self.vectors * scale, self.projected * scale[:, None]
+        strongest = torch.linalg.eigh(b @ b.T)[1][:, -rank:]
+        return h @ strongest, strongest.T @ b
+
+
+#: Penalties of `regression`, as shares of the mean square of a feature.
+PENALTIES = tuple(10.0**k for k in range(-6, 3))
+
+
+def regression(x: Tensor, y: Tensor, held_out: tuple[Tensor, Tensor]) -> SpectralRidge:
+    """Ridge regression from features x (n, p), of a mean square of about one, to y (n, q), in double precision."""
+    x, y = x.double(), y.double()
+    return SpectralRidge.fit(x.T @ x / len(x), x.T @ y / len(x), (held_out[0].double(), held_out[1]), PENALTIES)
+
+
+def principal_axes(x: Tensor, by: Literal["svd", "rows", "columns"]) -> tuple[Tensor, Tensor]:
+    """Singular values (k,) of x (n, p), falling, and its right singular vectors as rows (k, p), in the type of x.
+
+    The caller subtracts the mean.
+
+    Args:
+        x: n samples.
+        by: ``svd``, accurate to rounding, k = min(n, p). ``rows``, by the eigenvectors of x xᵀ, k = n: the fastest for
+            n much less than p. ``columns``, by those of xᵀ x, k = p: the fastest for n much greater than p. The last
+            two, in double precision, resolve no singular value below 1e-8 of the largest.
+    """
+    if by == "svd":
+        _, s, vt = torch.linalg.svd(x, full_matrices=False)
+        return s, vt
+    wide = x.double()
+    if by == "columns":
+        value, vector = torch.linalg.eigh(wide.T @ wide)
+        return value.flip(0).clamp_min(0).sqrt().to(x.dtype), vector.flip(1).T.to(x.dtype)
+    value, vector = torch.linalg.eigh(wide @ wide.T)
+    s = value.flip(0).clamp_min(1e-30).sqrt()
+    return s.to(x.dtype), (vector.flip(1).T @ wide / s[:, None]).to(x.dtype)
