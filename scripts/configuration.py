@@ -58,6 +58,8 @@ def words(annotation: Any) -> str:
         kind, *bounds = words(parts[0]).split(", ")
         return ", ".join([f"list of {kind}s", *bounds])
     if origin is dict:
+        if parts[1] is Any:
+            return "table"
         return f"{words(parts[1])} for each name"
     return "table" if models_in(annotation) else NAMES[annotation]
 

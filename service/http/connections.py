@@ -184,7 +184,7 @@ class Connection(HttpToolsProtocol):
             piece = data[start : start + PIECE]
             self._bytes += len(piece)
             super().data_received(piece)
-            if self._bytes > HEAD_BYTES or self._lines > HEAD_LINES:
+            if not self._refused and (self._bytes > HEAD_BYTES or self._lines > HEAD_LINES):
                 self._refuse(
                     "head-too-large",
                     f"The head of the request, or the trailers after its body, are over the limit of {HEAD_BYTES} "

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -149,8 +149,23 @@ class Reconstructor:
         max_iterations: int = 200,
         deadline: Deadline | None = None,
     ) -> Reconstruction:
-        """Reconstruct one shape from its own ``guess``, whose misfit is then known already; otherwise as a call."""
-        return self._iterate(target, self._guess(target, others), tolerance, max_iterations, deadline)
+        """Reconstruct one shape from its own ``guess``, whose misfit is then known already; otherwise as a call.
+
+        Where that stalls, the other starts and the reference are tried: frames that went astray may lead to the edge of
+        a face without height, with a smaller misfit on the other side of it.
+        """
+        guess = self._guess(target, others)
+        found = self._iterate(target, guess, tolerance, max_iterations, deadline)
+        if found.status is not Status.STALLED:
+            return found
+        iterations = found.iterations
+        for start in (*(other() for other in others), self.reference.vertices):
+            if not np.array_equal(start, guess.vertices):
+                again = self._iterate(target, self._point(start, target), tolerance, max_iterations, deadline)
+                iterations += again.iterations
+                if again.converged:
+                    return replace(again, iterations=iterations)
+        return found
 
     @np.errstate(divide="ignore", over="ignore", invalid="ignore")
     def _iterate(

@@ -68,6 +68,13 @@ def test_a_head_without_end_is_refused(quiet: Server, line: bytes) -> None:
         assert "refused without a whole request: The head" in quiet.log
 
 
+def test_a_head_that_is_too_long_and_malformed_is_refused_once(quiet: Server) -> None:
+    head = b"GET / HTTP/1.1\r\nHost: localhost\r\nX: " + b"a" * HEAD_BYTES
+    with cheap(quiet), connect(quiet) as connection:
+        connection.sendall(head + b"\0" * 8000)
+        assert rest(connection).count(b"HTTP/1.1 400") == 1
+
+
 def keep_sending(connection: socket.socket, block: bytes, most: int) -> bytes:
     """Send without looking, until the server closes; what it said."""
     with contextlib.suppress(ConnectionError):

@@ -125,11 +125,15 @@ class FitSettings(_Section):
     epochs, as in the paper (section 4). ``cosine`` lets it fall along half a cosine, to zero after ``max_epochs``:
     fewer epochs are needed."""
     learning_rate: float = Field(1e-3, gt=0)
+    """At the start."""
     final_rate: float = Field(1e-6, gt=0)
     """Training ends when the learning rate falls below this."""
     patience: int = Field(10, ge=1)
+    """Epochs without a smaller validation loss before ``plateau`` divides the rate."""
     max_epochs: int = Field(500, ge=1)
+    """Passes over the training samples, at most."""
     batch_size: int = Field(64, ge=2)
+    """Samples in a step."""
 
 
 class LatentNetworkSettings(_Section):
@@ -149,6 +153,7 @@ class LatentNetworkSettings(_Section):
     energy: float = Field(0.9999, gt=0, le=1)
     """Share of the variance that this basis keeps; 1 makes the last layer dense, as in the paper."""
     fit: FitSettings = FitSettings(schedule="cosine", learning_rate=2e-3, max_epochs=60)
+    """How it is trained."""
 
 
 class KernelSettings(_Section):
@@ -185,9 +190,12 @@ class ConvolutionSettings(_Section):
 
     kind: Literal["convolutions"] = "convolutions"
     layers: int = Field(3, ge=1)
+    """Convolutions, one after the other."""
     width: int = Field(24, ge=1)
     """Features of each edge after each layer."""
     neighbourhood: Neighbourhood = "star"
+    """What a convolution sees beside an edge itself: the sum over all edges at its ends (``star``, as in the paper), or
+    the edges of its two faces, each with weights of its own (``flaps``)."""
     crop: int = Field(0, ge=0)
     """Edges of the connected part of each shape that the loss of a training step is computed on, chosen at random in
     proportion to the error of the affine sum there; 0 takes whole shapes. Needs the neighbourhood ``flaps``."""
@@ -202,6 +210,7 @@ class ConvolutionSettings(_Section):
     dropout: float = Field(0.0, ge=0, lt=1)
     """Share of the features that are set to zero after each layer during training."""
     fit: FitSettings = FitSettings(schedule="cosine", learning_rate=2e-3, batch_size=16, max_epochs=12)
+    """How it is trained."""
 
     @model_validator(mode="after")
     def _consistent(self) -> ConvolutionSettings:
@@ -219,8 +228,11 @@ class PaperSettings(_Section):
 
     kind: Literal["paper"] = "paper"
     layers: int = Field(3, ge=1)
+    """Convolutions, one after the other."""
     width: int = Field(24, ge=1)
+    """Features of each edge after each layer."""
     fit: FitSettings = FitSettings()
+    """How it is trained."""
 
     @property
     def convolutions(self) -> ConvolutionSettings:
@@ -257,6 +269,7 @@ class CombinerSettings(_Section):
     """From J factor shapes to the joint one: their affine sum, and a correction of it."""
 
     correction: CorrectionSettings = AutoSettings()
+    """What is learned of the difference between the joint shape and the affine sum."""
     symmetries: bool = True
     """Whether the images of the training samples under the collection's symmetries, if it has any, are training samples
     too."""
@@ -281,12 +294,14 @@ class Recipe(_Section):
     factors: list[LatentNetworkSettings] | LatentNetworkSettings = LatentNetworkSettings()
     """One table for each factor, or one for all."""
     combiner: CombinerSettings = CombinerSettings()
+    """The network that joins the factors' shapes."""
 
 
 class NetworkSettings(Recipe):
     """The main recipe, which is exported, and what else is learned from the samples for comparison."""
 
     seed: int = 0
+    """Of the networks' first weights and the order of the samples."""
     fractions: list[Annotated[float, Field(gt=0, lt=1)]] = []
     """Shares of the training codes to learn from as well, for the study of their number: each once with the factors'
     parts of these codes only, as the paper does, and once with all the samples of the factors."""
@@ -298,6 +313,7 @@ class VariantSettings(_Section):
     """One row of the ablation: what differs from the main recipe, or from another variant."""
 
     title: str
+    """What the report and the tables call it."""
     base: str | None = None
     """Name of the variant that this one differs from; it must stand before this one. None is the main recipe."""
     factors: list[dict[str, Any]] | dict[str, Any] = {}

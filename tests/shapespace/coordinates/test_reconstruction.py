@@ -271,6 +271,18 @@ def test_a_collapsed_start_stalls(mesh, reconstruct, target):
     assert np.array_equal(found.vertices, start)
 
 
+def test_where_the_guess_stalls_others_are_tried(mesh, pose, reconstruct, target, monkeypatch):
+    collapsed = pose.copy()
+    collapsed[mesh.edges[0, 0]] = collapsed[mesh.edges[0, 1]]
+    monkeypatch.setattr("shapespace.coordinates.reconstruction.GOOD_GUESS", np.inf)
+    monkeypatch.setitem(vars(reconstruct), "integrate", lambda _: collapsed)
+    assert reconstruct(target, reconstruct.guess(target)).status is Status.STALLED
+    assert_found(reconstruct.from_guess(target), pose, mesh)
+    # Where none leads anywhere, the first guess is the answer.
+    found = reconstruct.from_guess(target, lambda: collapsed, max_iterations=0)
+    assert np.array_equal(found.vertices, collapsed)
+
+
 def test_a_step_that_overflows_stalls(mesh, reconstruct, target, monkeypatch):
     """Halving it would go on for ever."""
     for value in (np.nan, np.inf):
