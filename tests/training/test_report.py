@@ -300,15 +300,6 @@ def test_a_run_on_its_way_makes_a_partial_report(run: Path, tmp_path: Path) -> N
     assert page.sections == {"shapes", "modes", "figures", "configuration"}
 
 
-def test_modes_are_shown_before_they_have_factors(run: Path, tmp_path: Path) -> None:
-    folder = tmp_path / "run"
-    folder.mkdir()
-    for name in ("config.toml", "reference.npz"):
-        shutil.copy(run / name, folder)
-    shutil.copy(run / "modes.npz", RunDirectory(folder).modes_by_strength.path)
-    assert "modes" in Page(write_report(RunDirectory(folder))).sections
-
-
 def test_stages_say_how_far_the_run_is(run: Path, tmp_path: Path) -> None:
     folder = tmp_path / "run"
     (folder / "stages").mkdir(parents=True)

@@ -126,6 +126,8 @@ def test_a_stage_of_another_version_is_done_again_with_all_that_follows(
 
 def test_factors_know_the_order_of_their_modes_after_a_setting_came_and_went(place: Path, said: Said) -> None:
     config, run = place / "bars.toml", RunDirectory(place / "runs" / "bars")
+    said("run", "bars.toml", "--until", "modes")
+    assert run.modes.read().keys() == run.modes_by_strength.read().keys() | {"rank"}
     said("run", "bars.toml", "--until", "factors")
     before, grouping = run.modes.read(), run.factors.read()
     text = config.read_text()

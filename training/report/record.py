@@ -63,8 +63,7 @@ class Record:
         self.reference, self.gallery, mean = (
             _readable(file.path, file.read_if_written) for file in (run.reference, run.gallery, run.mean)
         )
-        modes = run.modes if run.modes.exists() else run.modes_by_strength
-        self.modes = _readable(modes.path, modes.read_if_written)
+        self.modes = _readable(run.modes.path, run.modes.read_if_written)
         self.decomposition, self.evaluation, self.histories, grouping = (
             _readable(file.path, file.read_if_written)
             for file in (run.decomposition, run.evaluation, run.histories, run.factors)

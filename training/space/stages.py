@@ -146,7 +146,10 @@ def _where(run: RunDirectory, found: Mean) -> str:
 
 
 def modes(run: RunDirectory, config: Config) -> dict[str, Any]:
-    """``modes-by-strength.npz`` and ``modes.json``: the shapes' logarithms, sparse and principal modes."""
+    """``modes-by-strength.npz`` and ``modes.json``: the shapes' logarithms, sparse and principal modes.
+
+    ``modes.npz`` holds the same until `factors` puts them in its order.
+    """
     settings, centre, shapes = config.modes, run.mean_mesh(), run.shapes.read()["vertices"]
     space = ShellSpace(centre, material(config))
     norm = WeightedNorm.of(centre, config.material.eta)
@@ -157,17 +160,20 @@ def modes(run: RunDirectory, config: Config) -> dict[str, Any]:
         sparse = spga(
             space, centre.vertices, found.fields, count, settings.sparsity, max_iterations=settings.max_iterations
         )
-    run.modes_by_strength.write(
-        nric=sparse.nric,
-        vertices=sparse.vertices,
-        coefficients=sparse.coefficients,
-        lower=sparse.lower,
-        upper=sparse.upper,
-        localisation=localisation(sparse.nric, norm),
-        pga_nric=dense.nric,
-        pga_vertices=dense.vertices,
-        pga_localisation=localisation(dense.nric, norm),
-    )
+    arrays = {
+        "nric": sparse.nric,
+        "vertices": sparse.vertices,
+        "coefficients": sparse.coefficients,
+        "lower": sparse.lower,
+        "upper": sparse.upper,
+        "localisation": localisation(sparse.nric, norm),
+        "pga_nric": dense.nric,
+        "pga_vertices": dense.vertices,
+        "pga_localisation": localisation(dense.nric, norm),
+    }
+    run.modes_by_strength.write(**arrays)
+    if not run.factors.exists():  # otherwise they are in the order of factors that may still be right
+        run.modes.write(**arrays, rank=np.arange(len(sparse)))
     facts = {
         "modes": len(sparse),
         "converged": sparse.converged,
