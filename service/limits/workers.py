@@ -89,7 +89,7 @@ class Call(Deadline):
         task = asyncio.ensure_future(work)
         try:
             await asyncio.wait((task, self._over), return_when=asyncio.FIRST_COMPLETED)
-            if not task.done():
+            if self._over.done():  # also where both are
                 self._over.result()
             return task.result()
         finally:

@@ -28,6 +28,7 @@ from shapespace.service.use_cases.shape_formats import (
 
 #: Vertices of all shapes of one answer together: 48 MiB of positions.
 MOST_VERTICES = 2**22
+BYTES_OF_A_VERTEX = 12
 #: Media types of the formats of many shapes by name; the first is the default.
 VERTICES_TYPES = {"json": "application/json", "npz": OCTET_STREAM}
 
@@ -115,7 +116,11 @@ async def infer(
         LatentError, TooManyCodesError, BusyError, DeadlineError, DisconnectedError, EndingError: as ``vertices_file``.
     """
     codes, inside = model.latents.codes(latents, bounds)
-    async with batch(workers, caller, shapes_size(model, len(codes), mesh) + nric_size(model, len(codes))) as work:
+    sizes = {"vertices": shapes_size(model, len(codes), mesh), "nric": nric_size(model, len(codes))}
+    size = sum(sizes[name] for name in outputs)
+    if size > BYTES_OF_A_VERTEX * MOST_VERTICES:
+        raise TooManyCodesError(f"{len(codes)} codes are too many for both outputs. Ask for each by itself, or fewer.")
+    async with batch(workers, caller, size) as work:
         arrays: dict[str, NDArray[np.float32]] = {}
         found: Shapes | None = None
         for name in outputs:
@@ -136,7 +141,7 @@ def shapes_size(model: ShapeModel, count: int, mesh: MeshChoice) -> int:
             f"{count} shapes of {vertices} vertices are too many for one answer. Ask for {MOST_VERTICES // vertices} "
             "at most, for the coarse mesh, or for an animation's frames as JSON lines or one by one."
         )
-    return 12 * count * vertices
+    return BYTES_OF_A_VERTEX * count * vertices
 
 
 async def shapes(work: Batch, model: ShapeModel, codes: Codes, inside: NDArray[np.bool_], mesh: MeshChoice) -> Shapes:

@@ -101,10 +101,12 @@ def hold(folder: Folder, place: Path) -> str:
         assert not (place / "models").exists()
     if code:
         return f"code {code}: {words.strip().splitlines()[-1][:100]}"
-    return sound(folder, place, data)
+    # A shape with crossed faces that somebody insists on may fold others, if the run says so.
+    insists = "--accept" in folder.arguments and "where no shape has a crease" in words
+    return sound(folder, place, data, may_fold=insists)
 
 
-def sound(folder: Folder, place: Path, data: Path) -> str:
+def sound(folder: Folder, place: Path, data: Path, *, may_fold: bool) -> str:
     """Whether the bundle serves sound shapes, and training shapes come back."""
     model = ShapeModel(read_bundle(place / "models" / "figure" / "1"))
     faces = Connectivity(model.reference.faces, len(model.reference.vertices))
@@ -125,9 +127,11 @@ def sound(folder: Folder, place: Path, data: Path) -> str:
     stalled = [shape.diagnostics.status for shape in served if shape.diagnostics.status != "converged"]
     assert not stalled, f"{len(stalled)} of {CODES} served codes end otherwise than converged: {set(stalled)}"
     folds = sum(int(((bends(shape.vertices) < FOLD_LIMIT) & ~crease).sum()) for shape in served)
-    assert not folds, f"{folds} edges of {CODES} served shapes are folded where the collection has no crease"
+    assert may_fold or not folds, (
+        f"{folds} edges of {CODES} served shapes are folded where the collection has no crease"
+    )
     flipped = sum(shape.diagnostics.flipped_faces for shape in served)
-    assert not flipped, f"{flipped} faces of {CODES} served shapes are flipped"
+    assert may_fold or not flipped, f"{flipped} faces of {CODES} served shapes are flipped"
 
     collection = read_collection(data)
     errors = []

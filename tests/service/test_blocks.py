@@ -126,11 +126,21 @@ def try_map(text: str, server: Server, folder: Path) -> None:
         assert (ROOT / line.split()[0]).exists(), line
 
 
+def try_drawing(text: str, server: Server, folder: Path) -> None:
+    """The drawing of the rooms: each is there, and none is missing."""
+    tops = [ROOT / name for name in ("shapespace", "service", "training")]
+    drawn = set(re.findall(r"│ ([a-z_]+) {2,}", text))
+    rooms = {init.parent.name for top in tops for init in top.glob("*/__init__.py")} - {"service", "training"}
+    assert rooms <= drawn
+    assert not [name for name in drawn if not any(list(top.glob(f"{name}*")) for top in tops)]
+
+
 TRIALS: dict[str, Callable[[str, Server, Path], None]] = {
     "sh": try_shell,
     "python": try_python,
     "json": try_log_line,
     "": try_map,
+    "text": try_drawing,
 }
 
 

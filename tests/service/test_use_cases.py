@@ -257,6 +257,22 @@ def test_more_than_an_answer_may_hold_is_refused_before_any_work(
         run(lambda workers: vertices_file(workers, *ask, exponentials=True))
 
 
+def test_both_outputs_together_may_be_more_than_an_answer_holds(
+    model: ShapeModel, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(shapes, "MOST_VERTICES", len(CODES) * len(model.reference.vertices))
+
+    def ask(outputs: list[str]) -> Written:
+        latents, write = np.array(CODES), lambda arrays: (iter([b"x"]), {})
+        return run(
+            lambda workers: infer(workers, CALLER, model, latents, Bounds.ALLOW, MeshChoice.FINE, outputs, write)
+        )
+
+    assert content(ask(["vertices"])) == b"x"
+    with pytest.raises(TooManyCodesError, match="too many for both outputs"):
+        ask(["nric", "vertices"])
+
+
 def test_work_ends_by_its_deadline_and_when_its_caller_leaves(model: ShapeModel) -> None:
     code = model.latents.code(CODES[0])
 

@@ -120,8 +120,8 @@ class RunDirectory:
 
     @property
     def modes(self) -> NpzFile:
-        """The arrays of `modes_by_strength`, in the order of the factors once there are any; and ``rank (m)``, the place
-        of each mode there.
+        """The arrays of `modes_by_strength` in the order of the factors, once there are any; and ``rank (m)``, the
+        place of each mode there.
         """
         return self._npz("modes")
 

@@ -10,6 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from shapespace.coordinates.nric import dihedral_angles
+from shapespace.mesh.triangle_mesh import TriangleMesh
+from shapespace.mesh.triangle_quality import FOLD_LIMIT
 from shapespace.training.runs.directory import RunDirectory
 from shapespace.training.runs.sampling import DONE, columns
 
@@ -136,7 +139,22 @@ def _samples(run: RunDirectory) -> list[Loss]:
         else:
             sentence = f"failed {failed.sum()} of {len(failed)} samples of factor {kind} ({reason})"
         lost.append(Loss(sentence, float(failed.mean()), advice))
-    return lost
+    return lost + _folded(run)
+
+
+def _folded(run: RunDirectory) -> list[Loss]:
+    """Joint samples with two faces folded onto one another where no shape of the collection has as much as a crease."""
+    if not run.shapes.exists():
+        return []
+    connectivity = TriangleMesh.from_mapping(run.reference.read()).connectivity
+    angles = dihedral_angles(run.shapes.read()["vertices"], connectivity)
+    smooth = (np.abs(angles) < np.pi / 2).all(axis=0)
+    folded = count = 0
+    for path in sorted(run.samples.glob("part-*.npz")):
+        with np.load(path) as part:
+            sharp = np.cos(part["nric"][:, connectivity.edge_count :]) < FOLD_LIMIT
+        folded, count = folded + int((sharp & smooth).any(axis=1).sum()), count + len(sharp)
+    return [Loss(f"folded {folded} of {count} joint samples where no shape has a crease")] if folded else []
 
 
 def _farthest(latents: NDArray, failed: NDArray, grouping: dict[str, Any]) -> str:
