@@ -28,7 +28,7 @@ BUILD_SYSTEM := $(shell sed -n 's/^requires = \["\(.*\)"\]$$/\1/p' pyproject.tom
 COMPILE = $(BIN)/uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-annotate \
 	--no-emit-index-url --no-emit-find-links --custom-compile-command 'make lock' $(ARGS)
 
-.PHONY: help serve install train test lint lowest lock faults folders soak fuzz fuzz-api mutants coverage audit sbom bench results clients openapi configuration image-test wheel clean
+.PHONY: help serve install train test check lint lowest lock faults folders soak fuzz fuzz-api mutants coverage audit sbom bench results clients openapi configuration image-test wheel clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-12s%s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -46,12 +46,17 @@ train: $(VENV)/.train ## train the bundled models from their generators
 test: $(VENV)/.all $(MODULES) $(VENV)/.browser ## run the whole suite (ARGS="-k glb" for a part of it, JOBS=2 at once)
 	PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/python -m pytest --numprocesses $(JOBS) --dist loadfile $(ARGS)
 
+check: lint ## what is quick: style, types and doors, then the library, use cases and pages; no torch, Node or browser
+	PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/python -m pytest --numprocesses $(JOBS) --dist loadfile $(QUICK) $(ARGS)
+
 lint: $(VENV)/.all $(BIN)/hadolint ## check style, types, doors between packages and the Dockerfile
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 	$(BIN)/hadolint Dockerfile
+
+QUICK = tests/shapespace tests/service/test_use_cases.py tests/training/test_config.py $(wildcard tests/test_[cdm]*.py)
 
 # What the libraries of serving take part in, and training doesn't.
 SERVING = $(filter-out $(foreach name,blocks bundled_files proxy reloading replicas,%/test_$(name).py), \

@@ -110,10 +110,10 @@ def _folder(arguments: argparse.Namespace) -> Path:
 
 
 def _status(arguments: argparse.Namespace) -> None:
-    run = _open(arguments.run, arguments.models)
-    begun = ": ".join(filter(None, ("begun", Record(run.directory).at_work)))
+    directory = RunDirectory(arguments.run)
+    begun = ": ".join(filter(None, ("begun", Record(directory).at_work)))
     for name in STAGES:
-        stamp = run.directory.stamp(name).read_if_written()
+        stamp = directory.stamp(name).read_if_written()
         state = f"done in {stamp['seconds']:.0f} s" if "seconds" in stamp else begun if stamp else "to do"
         print(f"{name:12} {state}")
 
@@ -174,7 +174,7 @@ def parser() -> argparse.ArgumentParser:
     export.set_defaults(do=_export)
     for command in (status, report, export):
         command.add_argument("run", type=Path, metavar="RUN")
-    for command in (run, status, export):
+    for command in (run, export):
         command.add_argument("--models", type=Path, default=Path("models"), help="where bundles go (default: models)")
     return top
 

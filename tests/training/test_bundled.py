@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import shutil
+import sys
 import tomllib
 from pathlib import Path
 from typing import Any
@@ -10,6 +12,7 @@ from typing import Any
 import pytest
 
 from shapespace.bundle.reader import read_bundle
+from shapespace.training.__main__ import main
 from shapespace.training.learning.networks import resolved
 from shapespace.training.runs.config import CombinerSettings, Config, LatentNetworkSettings, load
 
@@ -99,3 +102,14 @@ def test_a_bundle_meets_what_it_promises(name: str) -> None:
     assert r2["composite"] >= 0.99
     assert r2["composite"] > max(r2["monolithic"], r2["affine"], r2["grid"])
     assert figures["vertex_error"]["mean"] <= 0.01
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_a_run_of_version_0_1_can_be_looked_at(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = shutil.copytree(ROOT / "runs" / name, tmp_path / "run")
+    for command, says in (("status", "export       to do"), ("report", "report.html")):
+        monkeypatch.setattr(sys, "argv", ["shapespace-train", command, str(run)])
+        assert main() == 0
+        assert says in capsys.readouterr().out
