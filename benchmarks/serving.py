@@ -33,7 +33,7 @@ from benchmarks.yardstick import superlu
 from shapespace.arrays import FloatArray
 from shapespace.bundle.reader import read_bundle
 from shapespace.coordinates.nric import NRICJacobian, WeightedNorm
-from shapespace.coordinates.reconstruction import Reconstructor
+from shapespace.coordinates.reconstruction import Reconstruction, Reconstructor
 from shapespace.files.formats import MESH_FORMATS
 from shapespace.mesh.rigid_motion import align
 from shapespace.model.decoder import TOLERANCE, MeshChoice
@@ -181,18 +181,20 @@ def _starts(model: ShapeModel, codes: FloatArray) -> list[object]:
         near = (code + radius * rng.uniform(-1, 1, len(code))).astype(np.float32)
         beside = model._networks(near[None])[1][0]
         learned = list(model._learned_start(code))
-        made: dict[str, Callable[[], FloatArray]] = {
-            "ours": lambda target=target, learned=learned: reconstruct.guess(target, *learned),
+        neighbour = reconstruct(beside, reconstruct.guess(beside), tolerance=TOLERANCE).vertices
+        starts: dict[str, Callable[[], FloatArray]] = {
             "frames": lambda target=target: reconstruct.integrate(target),
             "reference": lambda: model.reference.vertices,
+            **dict(zip(["learned"], learned, strict=False)),
+            "neighbour": lambda neighbour=neighbour: neighbour,
         }
-        made |= dict(zip(["learned"], learned, strict=False))
-        neighbour = reconstruct(beside, reconstruct.guess(beside), tolerance=TOLERANCE).vertices
-        made["neighbour"] = lambda neighbour=neighbour: neighbour
-        found = {}
-        for name, start in made.items():
+        found: dict[str, Reconstruction] = {}
+        for name in ("ours", *starts):
             began = time.thread_time()
-            found[name] = reconstruct(target, start(), tolerance=TOLERANCE)
+            if name == "ours":
+                found[name] = reconstruct.from_guess(target, *learned, tolerance=TOLERANCE)
+            else:
+                found[name] = reconstruct(target, starts[name](), tolerance=TOLERANCE)
             spent.setdefault(name, []).append((found[name].iterations, time.thread_time() - began))
         statuses[found["ours"].status] += 1
         ours = found["ours"].vertices

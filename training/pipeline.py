@@ -115,7 +115,7 @@ def mean(run: Run) -> None:
 
 
 def modes(run: Run) -> None:
-    """modes-by-strength.npz and modes.json."""
+    """modes-by-strength.npz, modes.json, and modes.npz until `factors` has its order."""
     _discover(run, space.modes)
 
 
@@ -275,13 +275,13 @@ def execute(
         LostTooMuchError: more than a quarter of the logarithms or samples are lost, and no ``keep_going``.
     """
     directory, source = run.directory, run.config.collection.data
-    directory.config.write(run.source)
     data, known = run.data(), directory.data.read_if_written()
     if data and not known and directory.seconds("ingest") is not None:
         raise OldRunError(
             f"{directory.folder} is a run of version 0.1, which did not record its data files: status and report still "
             "read it, but it can't be continued. Name another directory with --out"
         )
+    directory.config.write(run.source)
     if source and known and not source.exists():
         show(f"data: {source} is not there any more; the run goes on with what ingest left")
         data = known

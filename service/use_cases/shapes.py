@@ -116,8 +116,9 @@ async def infer(
         LatentError, TooManyCodesError, BusyError, DeadlineError, DisconnectedError, EndingError: as ``vertices_file``.
     """
     codes, inside = model.latents.codes(latents, bounds)
-    sizes = {"vertices": shapes_size(model, len(codes), mesh), "nric": nric_size(model, len(codes))}
-    size = sum(sizes[name] for name in outputs)
+    size = sum(
+        shapes_size(model, len(codes), mesh) if name == "vertices" else nric_size(model, len(codes)) for name in outputs
+    )
     if size > BYTES_OF_A_VERTEX * MOST_VERTICES:
         raise TooManyCodesError(f"{len(codes)} codes are too many for both outputs. Ask for each by itself, or fewer.")
     async with batch(workers, caller, size) as work:

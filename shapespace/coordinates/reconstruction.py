@@ -151,21 +151,23 @@ class Reconstructor:
     ) -> Reconstruction:
         """Reconstruct one shape from its own ``guess``, whose misfit is then known already; otherwise as a call.
 
-        Where that stalls, the other starts and the reference are tried: frames that went astray may lead to the edge of
-        a face without height, with a smaller misfit on the other side of it.
+        Where that stalls, the other starts and the reference are tried, each with as many iterations: frames that went
+        astray may lead to the edge of a face without height, with a smaller misfit on the other side of it. Raises what
+        the other starts raise.
         """
         guess = self._guess(target, others)
         found = self._iterate(target, guess, tolerance, max_iterations, deadline)
         if found.status is not Status.STALLED:
             return found
-        iterations = found.iterations
-        for start in (*(other() for other in others), self.reference.vertices):
-            if not np.array_equal(start, guess.vertices):
-                again = self._iterate(target, self._point(start, target), tolerance, max_iterations, deadline)
-                iterations += again.iterations
-                if again.converged:
-                    return replace(again, iterations=iterations)
-        return found
+        iterations, starts = found.iterations, [*others, lambda: self.reference.vertices]
+        for other in starts:
+            if np.array_equal(start := other(), guess.vertices):
+                continue
+            again = self._iterate(target, self._point(start, target), tolerance, max_iterations, deadline)
+            iterations += again.iterations
+            if again.converged or again.status is Status.DEADLINE:
+                return replace(again, iterations=iterations)
+        return replace(found, iterations=iterations)
 
     @np.errstate(divide="ignore", over="ignore", invalid="ignore")
     def _iterate(

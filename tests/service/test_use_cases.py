@@ -271,6 +271,9 @@ def test_both_outputs_together_may_be_more_than_an_answer_holds(
     assert content(ask(["vertices"])) == b"x"
     with pytest.raises(TooManyCodesError, match="too many for both outputs"):
         ask(["nric", "vertices"])
+    monkeypatch.setattr(shapes, "MOST_VERTICES", len(model.reference.vertices))
+    with pytest.raises(TooManyCodesError, match="Ask for 1 at most"):
+        ask(["vertices"])
 
 
 def test_work_ends_by_its_deadline_and_when_its_caller_leaves(model: ShapeModel) -> None:

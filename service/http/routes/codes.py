@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import asdict
 from typing import Annotated
 
-import numpy as np
 from fastapi import APIRouter, Depends, Query, Request, Response
 
 from shapespace.model.edit import Target
@@ -102,7 +101,7 @@ async def edit(
     found = timed.found
     answer = {
         "latent": found.code,
-        "residual": np.sqrt((found.distances**2).mean()),
+        "residual": found.residual,
         "distances": found.distances,
         "status": found.status,
         "iterations": found.iterations,

@@ -1,6 +1,7 @@
 """Vertices from lengths and angles: exact ones, noisy ones, hopeless ones."""
 
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -278,9 +279,13 @@ def test_where_the_guess_stalls_others_are_tried(mesh, pose, reconstruct, target
     monkeypatch.setitem(vars(reconstruct), "integrate", lambda _: collapsed)
     assert reconstruct(target, reconstruct.guess(target)).status is Status.STALLED
     assert_found(reconstruct.from_guess(target), pose, mesh)
-    # Where none leads anywhere, the first guess is the answer.
-    found = reconstruct.from_guess(target, lambda: collapsed, max_iterations=0)
+    assert reconstruct.from_guess(target, deadline=Deadline(-1)).status is Status.DEADLINE
+    # Where none leads anywhere, what the first guess led to is the answer.
+    stalled = reconstruct(target, collapsed)
+    monkeypatch.setattr(reconstruct, "_iterate", lambda *_: replace(stalled, iterations=5))
+    found = reconstruct.from_guess(target, lambda: pose)
     assert np.array_equal(found.vertices, collapsed)
+    assert found.iterations == 15
 
 
 def test_a_step_that_overflows_stalls(mesh, reconstruct, target, monkeypatch):
