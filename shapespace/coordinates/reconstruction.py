@@ -159,7 +159,8 @@ class Reconstructor:
         found = self._iterate(target, guess, tolerance, max_iterations, deadline)
         if found.status is not Status.STALLED:
             return found
-        iterations, starts = found.iterations, [*others, lambda: self.reference.vertices]
+        iterations = found.iterations
+        starts: list[Callable[[], FloatArray]] = [*others, lambda: self.reference.vertices]
         for other in starts:
             if np.array_equal(start := other(), guess.vertices):
                 continue
