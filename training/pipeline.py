@@ -25,6 +25,7 @@ from shapespace.training.report.page import write_report
 from shapespace.training.runs.config import Config
 from shapespace.training.runs.directory import RunDirectory
 from shapespace.training.runs.losses import losses, refuse
+from shapespace.training.runs.progress import waiting
 from shapespace.training.runs.sampling import FEWEST, Collection, SamplesError, draw, indices, read, split, used
 from shapespace.training.runs.stages import STAGES
 from shapespace.training.space import stages as space
@@ -216,16 +217,18 @@ def export_bundle(run: Run) -> None:
         digest.update(path.read_bytes())
     learner = learner_of(run)
     geometry = Geometry(reference=run.collection.reference) if run.by_design else space.geometry(directory)
-    folder = export(
-        learner.main(),
-        run.collection,
-        run.config,
-        directory.evaluation.read(),
-        digest.hexdigest(),
-        run.models,
-        geometry,
-        learner.start(),
-    )
+    composite = learner.main()
+    with waiting("bundle"):
+        folder = export(
+            composite,
+            run.collection,
+            run.config,
+            directory.evaluation.read(),
+            digest.hexdigest(),
+            run.models,
+            geometry,
+            learner.start(),
+        )
     directory.log("exported", bundle=f"{folder.parent.name}/{folder.name}")
 
 

@@ -26,6 +26,7 @@ from shapespace.training.learning.learner import Learner
 from shapespace.training.learning.networks import affine_sum, predict
 from shapespace.training.runs.config import Config, EvaluationSettings
 from shapespace.training.runs.coordinates import Coordinates
+from shapespace.training.runs.progress import progress
 from shapespace.training.runs.sampling import Collection
 
 
@@ -126,7 +127,8 @@ class Reconstructions:
     def of(cls, reference: TriangleMesh, eta: float, predicted: NDArray, exact: NDArray) -> Reconstructions:
         """Reconstruct NRIC (n, 2E) and compare with vertices (n, V, 3) after rigid alignment."""
         reconstruct = Reconstructor(reference, eta)
-        found = [reconstruct(z, tolerance=1e-6) for z in predicted]
+        shapes = progress(predicted, "reconstructed shapes", "shape", len(predicted))
+        found = [reconstruct(z, tolerance=1e-6) for z in shapes]
         vertices = align(np.array([f.vertices for f in found]), exact)
         errors = np.linalg.norm(vertices - exact, axis=2) / reference.diagonal
         return cls(vertices, errors, [f.iterations for f in found], [str(f.status) for f in found])

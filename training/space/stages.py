@@ -157,9 +157,10 @@ def modes(run: RunDirectory, config: Config) -> dict[str, Any]:
     count = min(settings.count, len(shapes) - 1)
     dense = sparse = pga(space, centre.vertices, found.fields, count)
     if settings.sparsity:
-        sparse = spga(
-            space, centre.vertices, found.fields, count, settings.sparsity, max_iterations=settings.max_iterations
-        )
+        with waiting("sparse modes"):
+            sparse = spga(
+                space, centre.vertices, found.fields, count, settings.sparsity, max_iterations=settings.max_iterations
+            )
     arrays = {
         "nric": sparse.nric,
         "vertices": sparse.vertices,
