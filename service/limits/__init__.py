@@ -1,1 +1,3 @@
-"""What work may take: threads, processes of their own for what strangers wrote, memory, places in the queue."""
+"""How work is bounded: threads with a queue and a deadline, processes that can be ended, memory, shares of clients. The
+numbers are in `settings` or beside the check.
+"""

@@ -1,1 +1,1 @@
-"""Running the server: what it counts, and taking up changed bundles."""
+"""For whoever runs the server: its metrics, and loading bundles that changed on disk."""

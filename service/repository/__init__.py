@@ -1,1 +1,1 @@
-"""The bundles that are served, how they are validated, and how they change."""
+"""The bundles being served: found, validated in a process of their own, swapped while requests run."""

@@ -1,1 +1,1 @@
-"""What passes from training to serving: a folder of networks and arrays under a manifest."""
+"""What passes from training to serving: `schema` says what is in a bundle, `geometry` holds its arrays."""

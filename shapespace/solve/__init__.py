@@ -1,1 +1,1 @@
-"""What the nonlinear solvers are made of: factorisations, acceleration, descent, and how an iteration ended."""
+"""Parts of iterations: Cholesky, preconditioner, mixing, line search, least squares, truncated Newton, `Outcome`."""

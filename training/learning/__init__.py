@@ -1,1 +1,1 @@
-"""The networks: factors, combiners, fitting, evaluation, export."""
+"""The networks: factors, the combiner with its kinds of correction, baselines; fitting, evaluation, export."""

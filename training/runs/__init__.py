@@ -1,1 +1,1 @@
-"""A run: configuration, stages, what they leave, and the workers that compute."""
+"""What all stages share: configuration, the list of stages, the run directory, samples, workers."""

@@ -1,1 +1,1 @@
-"""The space of a collection: its mean, logarithms, modes and factors."""
+"""What is computed in the space of shells for one collection: mean, logarithms, modes, factors."""
