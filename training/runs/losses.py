@@ -14,7 +14,7 @@ from shapespace.coordinates.nric import dihedral_angles
 from shapespace.mesh.triangle_mesh import TriangleMesh
 from shapespace.mesh.triangle_quality import FOLD_LIMIT
 from shapespace.training.runs.directory import RunDirectory
-from shapespace.training.runs.sampling import DONE, columns
+from shapespace.training.runs.sampling import DONE, columns, parts
 
 #: A larger share of logarithms or samples lost stops the run.
 MOST_LOST = 0.25
@@ -150,9 +150,8 @@ def _folded(run: RunDirectory) -> list[Loss]:
     angles = dihedral_angles(run.shapes.read()["vertices"], connectivity)
     smooth = (np.abs(angles) < np.pi / 2).all(axis=0)
     folded = count = 0
-    for path in sorted(run.samples.glob("part-*.npz")):
-        with np.load(path) as part:
-            sharp = np.cos(part["nric"][:, connectivity.edge_count :]) < FOLD_LIMIT
+    for part in parts(run.samples):
+        sharp = np.cos(part["nric"][:, connectivity.edge_count :]) < FOLD_LIMIT
         folded, count = folded + int((sharp & smooth).any(axis=1).sum()), count + len(sharp)
     return [Loss(f"folded {folded} of {count} joint samples where no shape has a crease")] if folded else []
 

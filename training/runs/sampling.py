@@ -197,13 +197,19 @@ def asked_for(part: Mapping[str, NDArray]) -> NDArray:
     return part["asked"] if "asked" in part else part["latents"]
 
 
+def parts(folder: Path) -> Iterator[Mapping[str, NDArray]]:
+    """The files of a folder's samples, opened one after the other; arrays are read when they are asked for."""
+    for path in sorted(folder.glob("part-*.npz")):
+        with np.load(path) as part:
+            yield part
+
+
 def columns(folder: Path, *names: str) -> dict[str, NDArray]:
     """Some arrays of all samples of a folder, failed ones included; an empty mapping where there are no parts."""
     found: dict[str, list[NDArray]] = {name: [] for name in names}
-    for path in sorted(folder.glob("part-*.npz")):
-        with np.load(path) as part:
-            for name, arrays in found.items():
-                arrays.append(asked_for(part) if name == "asked" else part[name])
+    for part in parts(folder):
+        for name, arrays in found.items():
+            arrays.append(asked_for(part) if name == "asked" else part[name])
     return {name: np.concatenate(arrays) for name, arrays in found.items() if arrays}
 
 
@@ -217,11 +223,10 @@ def read(folder: Path) -> Samples:
     """Read all parts of a folder."""
     fields = "index", "latents", "asked", "nric", "vertices"
     found: dict[str, list[NDArray]] = {name: [] for name in fields}
-    for path in sorted(folder.glob("part-*.npz")):
-        with np.load(path) as part:
-            done = part["status"] == DONE
-            for name in fields:
-                found[name].append((asked_for(part) if name == "asked" else part[name])[done])
+    for part in parts(folder):
+        done = part["status"] == DONE
+        for name in fields:
+            found[name].append((asked_for(part) if name == "asked" else part[name])[done])
     return Samples(*(np.concatenate(found[name]) for name in fields))
 
 
