@@ -48,7 +48,7 @@ Facts = dict[str, Any]
 Arrays = dict[str, "NDArray[Any]"]
 Task = Callable[..., tuple[Facts, Arrays]]
 #: A body on its way.
-Pieces = deque[bytearray]
+Pieces = deque[memoryview]
 #: Waits until a connection is ready for an event of ``select.poll``.
 Wait = Callable[[int], None]
 

@@ -208,7 +208,7 @@ def test_a_mesh_is_searched_for_its_code(model: ShapeModel, sandbox: Sandbox) ->
     file = MESH_FORMATS["obj"].encode(model.shape(code).vertices, model.reference.faces, None)
 
     def upload(data: bytes, format: str | None = None) -> codes.Upload:
-        return codes.Upload(deque([bytearray(data)]), "model/obj", format)
+        return codes.Upload(deque([memoryview(data)]), "model/obj", format)
 
     def encode(given: codes.Upload) -> codes.Timed[codes.Encoded]:
         return run(lambda workers: codes.encode(workers, sandbox, CALLER, model, given, Bounds.ALLOW))

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import mmap
 from collections import deque
 from typing import Generic, TypeVar
 
@@ -17,7 +18,6 @@ from pydantic import BaseModel, ValidationError
 
 from shapespace.service.http.negotiation import declared_type
 from shapespace.service.http.problems import ProblemError
-from shapespace.service.limits.process_memory import MMAP_THRESHOLD
 from shapespace.service.use_cases.shape_formats import holds_more_values
 
 M = TypeVar("M", bound=BaseModel)
@@ -27,9 +27,8 @@ MOST_VALUES = 2**18
 SMALL = 2**12
 #: Bytes up to which NaN is understood: the parser that knows it keeps all threads waiting, 40 ms for a MiB of escapes.
 LENIENT = 2**20
-#: Bytes in which a body is gathered, and given on: what is longer than this isn't on the heap, so that a piece that
-#: has been given on takes no memory any more.
-_PIECE = MMAP_THRESHOLD
+#: Bytes in which a body is gathered, and given on.
+_PIECE = 4 * 2**20
 
 
 class JSONBody(Generic[M]):
@@ -96,11 +95,17 @@ def parse(text: bytes) -> object:
     raise RequestValidationError([{"type": "json_invalid", "loc": ("body", where), "ctx": {"error": why}}])
 
 
-async def gather(request: Request) -> deque[bytearray]:
-    """A request's body in pieces, however small those were in which it came."""
-    pieces = deque([bytearray()])
-    async for piece in request.stream():
-        if len(pieces[-1]) > _PIECE:
-            pieces.append(bytearray())
-        pieces[-1] += piece
-    return pieces
+async def gather(request: Request) -> deque[memoryview]:
+    """A request's body in pieces, however small those were in which it came.
+
+    Each has pages of its own: a piece that has been given on takes no memory any more, as on the heap it would until
+    everything after it is gone.
+    """
+    pages: list[mmap.mmap] = []
+    async for part in request.stream():
+        rest = memoryview(part)
+        while rest:
+            if not pages or pages[-1].tell() == _PIECE:
+                pages.append(mmap.mmap(-1, _PIECE))
+            rest = rest[pages[-1].write(rest[: _PIECE - pages[-1].tell()]) :]
+    return deque(memoryview(piece)[: piece.tell()] for piece in pages)
