@@ -17,6 +17,7 @@ from shapespace.service.http.caching import CachedAnswer, cache_headers, entity_
 from shapespace.service.http.dependencies import Service
 from shapespace.service.limits.workers import Caller
 from shapespace.service.use_cases.batch import PiecewiseFile, Timings, Written
+from shapespace.service.use_cases.codes import Found
 from shapespace.service.use_cases.shape import ColourBy, shape_file
 from shapespace.service.use_cases.shape_formats import SHAPE_FORMATS, dump_json
 
@@ -40,9 +41,9 @@ def diagnostics_header(diagnostics: Mapping[str, Any]) -> dict[str, str]:
     return {"Shape-Diagnostics": dump_json(diagnostics).decode()}
 
 
-def json_response(service: Service, content: Mapping[str, Any], seconds: Timings) -> Response:
-    """An object as JSON, with the time that it took."""
-    return Response(dump_json(content), headers=timing(service, seconds), media_type="application/json")
+def found_response(service: Service, found: Found) -> Response:
+    """What a search found, with the time that it took."""
+    return Response(found.content, headers=timing(service, found.seconds), media_type="application/json")
 
 
 async def shape_response(

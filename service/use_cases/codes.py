@@ -5,15 +5,13 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Generic, TypeVar
+from dataclasses import asdict, dataclass
 
 from shapespace.arrays import FloatArray, IntArray
 from shapespace.files.limits import Limits
 from shapespace.model.correspondence import limits, match
 from shapespace.model.decoder import MeshChoice
-from shapespace.model.edit import Edited, Editor, Target
-from shapespace.model.encode import Encoded
+from shapespace.model.edit import Editor, Target
 from shapespace.model.latent_space import Bounds, Codes, Distribution
 from shapespace.model.shape_model import ShapeModel
 from shapespace.service.limits.sandbox import (
@@ -28,6 +26,7 @@ from shapespace.service.limits.sandbox import (
 )
 from shapespace.service.limits.workers import BusyError, Caller, DeadlineError, EndingError, Workers
 from shapespace.service.use_cases.batch import Timings, require_count
+from shapespace.service.use_cases.shape_formats import dump_json, float32
 from shapespace.service.use_cases.uploads import UPLOAD_ERRORS, UnusableMeshError
 from shapespace.solve.deadline import Deadline
 from shapespace.solve.status import Status
@@ -36,7 +35,6 @@ logger = logging.getLogger(__name__)
 #: Bytes that reading a file may take beside the file.
 MEMORY = 64 * 2**20
 _LEAST = 2**16
-T = TypeVar("T")
 
 
 class InvalidTargetError(ValueError):
@@ -44,10 +42,15 @@ class InvalidTargetError(ValueError):
 
 
 @dataclass(frozen=True)
-class Timed(Generic[T]):
-    """What a search found, and its time by stage."""
+class Found:
+    """What a search found.
 
-    found: T
+    Attributes:
+        content: as JSON.
+        seconds: time by stage.
+    """
+
+    content: bytes
     seconds: Timings
 
 
@@ -68,7 +71,7 @@ class Upload:
 
 async def encode(
     workers: Workers, sandbox: Sandbox, caller: Caller, model: ShapeModel, upload: Upload, bounds: Bounds
-) -> Timed[Encoded]:
+) -> Found:
     """The code whose shape comes closest to a mesh in correspondence, in any rigid pose.
 
     Raises:
@@ -77,14 +80,26 @@ async def encode(
         BusyError, DeadlineError, DisconnectedError, EndingError: no place, or the call ended before.
     """
 
-    def make(deadline: Deadline) -> Timed[Encoded]:
+    def make(deadline: Deadline) -> Found:
         began = time.perf_counter()
         given = match(model, *read_mesh(sandbox, upload, limits(model), deadline))
         read = time.perf_counter()
         found = model.encode(given, bounds, deadline)
         if found.status is Status.DEADLINE:
             raise workers.late()
-        return Timed(found, {"read": read - began, "search": time.perf_counter() - read})
+        seconds = {"read": read - began, "search": time.perf_counter() - read}
+        content = {
+            "latent": found.code,
+            "residual": found.residual,
+            "vertex_error": {"mean": found.distances.mean(), "max": found.distances.max()},
+            "vertex_errors": float32(found.distances),
+            "inside_bounds": found.inside_bounds,
+            "status": found.status,
+            "iterations": found.iterations,
+            "mesh": found.mesh,
+            "diagnostics": asdict(found.shape.diagnostics),
+        }
+        return Found(dump_json(content), seconds)
 
     async with workers.admit(caller) as call:
         return await workers.run(make, call)
@@ -98,7 +113,7 @@ async def edit(
     targets: Sequence[Target],
     prior: float,
     mesh: MeshChoice,
-) -> Timed[Edited]:
+) -> Found:
     """The code inside the bounds whose shape comes closest to having some vertices at some places.
 
     Args:
@@ -125,12 +140,21 @@ async def edit(
             )
     start, _ = model.latents.code(latent, Bounds.CLAMP)
 
-    def make(deadline: Deadline) -> Timed[Edited]:
+    def make(deadline: Deadline) -> Found:
         began = time.perf_counter()
         found = Editor(model)(start, targets, prior, mesh, deadline)
         if found.status is Status.DEADLINE:
             raise workers.late()
-        return Timed(found, {"search": time.perf_counter() - began})
+        seconds = {"search": time.perf_counter() - began}
+        content = {
+            "latent": found.code,
+            "residual": found.residual,
+            "distances": found.distances,
+            "status": found.status,
+            "iterations": found.iterations,
+            "diagnostics": asdict(found.shape.diagnostics),
+        }
+        return Found(dump_json(content), seconds)
 
     async with workers.admit(caller) as call:
         return await workers.run(make, call)

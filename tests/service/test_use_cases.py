@@ -210,12 +210,12 @@ def test_a_mesh_is_searched_for_its_code(model: ShapeModel, sandbox: Sandbox) ->
     def upload(data: bytes, format: str | None = None) -> codes.Upload:
         return codes.Upload(deque([memoryview(data)]), "model/obj", format)
 
-    def encode(given: codes.Upload) -> codes.Timed[codes.Encoded]:
+    def encode(given: codes.Upload) -> codes.Found:
         return run(lambda workers: codes.encode(workers, sandbox, CALLER, model, given, Bounds.ALLOW))
 
-    timed = encode(upload(file))
-    assert np.allclose(timed.found.code, code, atol=1e-3)
-    assert set(timed.seconds) == {"read", "search"}
+    found = encode(upload(file))
+    assert np.allclose(json.loads(found.content)["latent"], code, atol=1e-3)
+    assert set(found.seconds) == {"read", "search"}
     with pytest.raises(UnusableMeshError):
         encode(upload(b"v 1 2"))
     with pytest.raises(UnknownFormatError, match="no format 'abc'"):
@@ -226,12 +226,12 @@ def test_a_vertex_is_pulled_to_where_another_code_has_it(model: ShapeModel) -> N
     goal = model.shape(model.latents.codes([[0.15, 0.0, 0.0]])[0][0]).vertices
     targets = [Target(k, goal[k].tolist()) for k in (0, 20, 40)]
 
-    def edit(targets: list[Target]) -> codes.Timed[codes.Edited]:
+    def edit(targets: list[Target]) -> codes.Found:
         return run(lambda workers: codes.edit(workers, CALLER, model, [0.0, 0.0, 0.0], targets, 0.0, MeshChoice.FINE))
 
-    timed = edit(targets)
-    assert timed.found.distances.max() < 1e-2
-    assert set(timed.seconds) == {"search"}
+    found = edit(targets)
+    assert max(json.loads(found.content)["distances"]) < 1e-2
+    assert set(found.seconds) == {"search"}
     for bad in ([Target(len(goal), [0, 0, 0])], targets * len(goal)):
         with pytest.raises(codes.InvalidTargetError):
             edit(bad)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
 from typing import Annotated
 
 from fastapi import APIRouter, Depends, Query, Request, Response
@@ -20,9 +19,9 @@ from shapespace.service.http.messages.schemas import (
     SampleAnswer,
     SampleRequest,
 )
-from shapespace.service.http.responses import json_response
+from shapespace.service.http.responses import found_response
 from shapespace.service.use_cases import codes
-from shapespace.service.use_cases.shape_formats import dump_json, float32
+from shapespace.service.use_cases.shape_formats import dump_json
 from shapespace.service.use_cases.uploads import FORMATS, MEDIA_TYPES
 
 router = APIRouter(prefix="/v1/models/{name}", tags=["codes"])
@@ -67,20 +66,8 @@ async def encode(
     units of the training meshes.
     """
     upload = codes.Upload(await gather(request), request.headers.get("content-type", ""), format)
-    timed = await codes.encode(service.workers, service.sandbox, caller, model, upload, bounds)
-    found = timed.found
-    answer = {
-        "latent": found.code,
-        "residual": found.residual,
-        "vertex_error": {"mean": found.distances.mean(), "max": found.distances.max()},
-        "vertex_errors": float32(found.distances),
-        "inside_bounds": found.inside_bounds,
-        "status": found.status,
-        "iterations": found.iterations,
-        "mesh": found.mesh,
-        "diagnostics": asdict(found.shape.diagnostics),
-    }
-    return json_response(service, answer, timed.seconds)
+    found = await codes.encode(service.workers, service.sandbox, caller, model, upload, bounds)
+    return found_response(service, found)
 
 
 @router.post(
@@ -97,17 +84,8 @@ async def edit(
 ) -> Response:
     """The code inside the bounds whose shape comes closest to having some vertices at some places."""
     targets = [Target(target.vertex, target.position) for target in body.targets]
-    timed = await codes.edit(service.workers, caller, model, body.latent, targets, body.prior, mesh or body.mesh)
-    found = timed.found
-    answer = {
-        "latent": found.code,
-        "residual": found.residual,
-        "distances": found.distances,
-        "status": found.status,
-        "iterations": found.iterations,
-        "diagnostics": asdict(found.shape.diagnostics),
-    }
-    return json_response(service, answer, timed.seconds)
+    found = await codes.edit(service.workers, caller, model, body.latent, targets, body.prior, mesh or body.mesh)
+    return found_response(service, found)
 
 
 @router.post(
