@@ -21,7 +21,7 @@ from benchmarks.serving import bundles
 from shapespace.bundle.reader import read_bundle
 from shapespace.model.correspondence import Matched
 from shapespace.model.decoder import MeshChoice
-from shapespace.model.edit import Editor, Target
+from shapespace.model.edit import Target, edited
 from shapespace.model.latent_space import Codes, Distribution
 from shapespace.model.shape_model import ShapeModel
 
@@ -65,7 +65,7 @@ def edit(model: ShapeModel, count: int) -> str:
         vertices = timed(shape_times, lambda goal=goal: model.shape(goal)).vertices
         chosen = rng.choice(len(vertices), (1, 3, 5, 10)[k % 4], replace=False)
         targets = [Target(int(v), vertices[v].tolist()) for v in chosen]
-        found = timed(times, lambda start=start, targets=targets: Editor(model)(start, targets))
+        found = timed(times, lambda start=start, targets=targets: edited(model, start, targets))
         errors.append(found.distances.max() / diagonal)
     return (
         f"median {np.median(errors):.3%}, largest {np.max(errors):.3%}; over 1 % in "

@@ -16,13 +16,13 @@ from starlette.types import Scope
 
 from shapespace.model.correspondence import InvalidMeshError
 from shapespace.model.decoder import ModelFailedError, NetworkTimeError
+from shapespace.model.edit import InvalidTargetError
 from shapespace.model.exact_shapes import NoTangentSpaceError
 from shapespace.model.latent_space import NotFiniteError, OutOfBoundsError, WrongLengthError
 from shapespace.service.limits.workers import BusyError, DeadlineError, DisconnectedError, EndingError
 from shapespace.service.repository.repository import UnknownModelError, UnknownVersionError
 from shapespace.service.use_cases.animation import PathTooLongError, UnknownInterpolationError
 from shapespace.service.use_cases.batch import NoCodesError, TooManyCodesError
-from shapespace.service.use_cases.codes import InvalidTargetError
 from shapespace.service.use_cases.sequence import TooManyFramesError, UnknownFrameError
 from shapespace.service.use_cases.sequence_formats import NoRoomError
 from shapespace.service.use_cases.shape_formats import dump_json

@@ -11,7 +11,7 @@ from shapespace.arrays import FloatArray, IntArray
 from shapespace.files.limits import Limits
 from shapespace.model.correspondence import limits, match
 from shapespace.model.decoder import MeshChoice
-from shapespace.model.edit import Editor, Target
+from shapespace.model.edit import Target, edited, require_targets
 from shapespace.model.latent_space import Bounds, Codes, Distribution
 from shapespace.model.shape_model import ShapeModel
 from shapespace.service.limits.sandbox import (
@@ -35,10 +35,6 @@ logger = logging.getLogger(__name__)
 #: Bytes that reading a file may take beside the file.
 MEMORY = 64 * 2**20
 _LEAST = 2**16
-
-
-class InvalidTargetError(ValueError):
-    """A target for a vertex that the mesh doesn't have, or more targets than vertices."""
 
 
 @dataclass(frozen=True)
@@ -130,19 +126,12 @@ async def edit(
         LatentError: a start that can't be used.
         BusyError, DeadlineError, DisconnectedError, EndingError: no place, or the call ended before.
     """
-    count = len(model.mesh(mesh).vertices)
-    if len(targets) > count:
-        raise InvalidTargetError(f"targets has {len(targets)} entries. Send {count} at most.")
-    for i, target in enumerate(targets):
-        if not 0 <= target.vertex < count:
-            raise InvalidTargetError(
-                f"targets[{i}].vertex is {target.vertex}, but the {mesh} mesh has vertices 0 to {count - 1}."
-            )
+    require_targets(model, targets, mesh)
     start, _ = model.latents.code(latent, Bounds.CLAMP)
 
     def make(deadline: Deadline) -> Found:
         began = time.perf_counter()
-        found = Editor(model)(start, targets, prior, mesh, deadline)
+        found = edited(model, start, targets, prior, mesh, deadline)
         if found.status is Status.DEADLINE:
             raise workers.late()
         seconds = {"search": time.perf_counter() - began}

@@ -32,6 +32,10 @@ RANKED = 32
 REFINEMENTS = 8
 
 
+class InvalidTargetError(ValueError):
+    """Targets that can't be used."""
+
+
 @dataclass(frozen=True)
 class Target:
     """Where a vertex should be.
@@ -69,8 +73,29 @@ class Edited:
         return float(np.sqrt((self.distances**2).mean()))
 
 
-class Editor:
-    """Finds codes for targets; may be used by several threads at once.
+def require_targets(model: Decoder, targets: Sequence[Target], mesh: MeshChoice) -> None:
+    """Raise InvalidTargetError where there are no targets, more than vertices, or one for a vertex that isn't there."""
+    count = len(model.mesh(mesh).vertices)
+    if not targets:
+        raise InvalidTargetError("There are no targets. Give at least one.")
+    if len(targets) > count:
+        raise InvalidTargetError(f"targets has {len(targets)} entries. Send {count} at most.")
+    for i, target in enumerate(targets):
+        if not 0 <= target.vertex < count:
+            raise InvalidTargetError(
+                f"targets[{i}].vertex is {target.vertex}, but the {mesh} mesh has vertices 0 to {count - 1}."
+            )
+
+
+def edited(
+    model: Decoder,
+    start: Codes,
+    targets: Sequence[Target],
+    prior: float = PRIOR,
+    mesh: MeshChoice = MeshChoice.FINE,
+    deadline: Deadline | None = None,
+) -> Edited:
+    """The code inside the bounds whose shape comes closest to the targets.
 
     Minimises over codes inside the bounds
 
@@ -78,48 +103,36 @@ class Editor:
 
     D being the reference's diagonal. A shape depends on its code by way of the least-squares problem that the
     reconstruction solves; by the implicit function theorem ``dX = (JᵀWJ)⁻¹ JᵀW dz``, where its residual is small.
+
+    Args:
+        model: whose code it is.
+        start: (m,), where the search begins and what the prior holds on to.
+        targets: at least one.
+        prior: weight of the distance from the start.
+        mesh: which mesh the targets' vertices belong to.
+        deadline: after which the status is Status.DEADLINE.
+
+    Raises:
+        InvalidTargetError: see ``require_targets``.
+        NotFiniteError: a target so far away that numbers overflow.
     """
-
-    def __init__(self, model: Decoder) -> None:
-        self.model = model
-
-    def __call__(
-        self,
-        start: Codes,
-        targets: Sequence[Target],
-        prior: float = PRIOR,
-        mesh: MeshChoice = MeshChoice.FINE,
-        deadline: Deadline | None = None,
-    ) -> Edited:
-        """The code inside the bounds whose shape comes closest.
-
-        Args:
-            start: (m,), where the search begins and what the prior holds on to.
-            targets: at least one.
-            prior: weight of the distance from the start.
-            mesh: which mesh the targets' vertices belong to.
-            deadline: after which the status is Status.DEADLINE.
-
-        Raises:
-            NotFiniteError: a target so far away that numbers overflow.
-        """
-        model = self.model
-        positions = np.array([target.position for target in targets]) / model.manifest.scale
-        if not (np.abs(positions) < np.finfo(np.float32).max).all():
-            raise NotFiniteError("A target lies so far away that the numbers overflow. Send finite positions.")
-        with model.solver() as reconstruct:
-            vertices = np.array([target.vertex for target in targets])
-            rough, pulled = (
-                _PulledVertices(model, reconstruct, vertices, mesh, deadline, rough=rough) for rough in (True, False)
-            )
-            problem = _Problem(model, rough, pulled, start.astype(np.float64), positions, prior, deadline)
-            fit = _best(problem)
-        code, _ = model.latents.code(fit.x.tolist(), Bounds.CLAMP)
-        shape = model.shape(code, True, mesh, deadline)
-        found = shape.vertices[[target.vertex for target in targets]]
-        distances = np.linalg.norm(found - model.manifest.scale * positions, axis=1)
-        status = Status.DEADLINE if shape.diagnostics.status is Status.DEADLINE else fit.status
-        return Edited(code, status, pulled.shapes, shape, distances)
+    require_targets(model, targets, mesh)
+    positions = np.array([target.position for target in targets]) / model.manifest.scale
+    if not (np.abs(positions) < np.finfo(np.float32).max).all():
+        raise NotFiniteError("A target lies so far away that the numbers overflow. Send finite positions.")
+    with model.solver() as reconstruct:
+        vertices = np.array([target.vertex for target in targets])
+        rough, pulled = (
+            _PulledVertices(model, reconstruct, vertices, mesh, deadline, rough=rough) for rough in (True, False)
+        )
+        problem = _Problem(model, rough, pulled, start.astype(np.float64), positions, prior, deadline)
+        fit = _best(problem)
+    code, _ = model.latents.code(fit.x.tolist(), Bounds.CLAMP)
+    shape = model.shape(code, True, mesh, deadline)
+    found = shape.vertices[[target.vertex for target in targets]]
+    distances = np.linalg.norm(found - model.manifest.scale * positions, axis=1)
+    status = Status.DEADLINE if shape.diagnostics.status is Status.DEADLINE else fit.status
+    return Edited(code, status, pulled.shapes, shape, distances)
 
 
 def _best(problem: _Problem) -> Fit:

@@ -20,7 +20,7 @@ from shapespace.files.formats import read_arrays
 from shapespace.mesh.triangle_mesh import TriangleMesh
 from shapespace.model.correspondence import InvalidMeshError, Matched, match
 from shapespace.model.decoder import Decoder, MeshChoice
-from shapespace.model.edit import PRIOR, Edited, Editor, Target
+from shapespace.model.edit import PRIOR, Edited, Target, edited
 from shapespace.model.encode import Encoded, Encoder
 from shapespace.model.latent_space import Bounds, Codes, Distribution, WrongLengthError
 from shapespace.solve.deadline import Deadline
@@ -209,7 +209,7 @@ class ShapeModel(Decoder):
 
         Raises:
             LatentError: a code of the wrong length, or numbers that are not finite.
-            ValueError: no targets, or a vertex that the mesh does not have.
+            InvalidTargetError: no targets, or a vertex that the mesh does not have.
 
         >>> import numpy as np, shapespace
         >>> model = shapespace.load("models/figure")
@@ -219,16 +219,9 @@ class ShapeModel(Decoder):
         >>> found.code.shape, bool(found.residual < 0.01 * size)
         ((20,), True)
         """
-        choice = MeshChoice(mesh)
-        count = len(self.mesh(choice).vertices)
-        if not targets:
-            raise ValueError("There are no targets. Give at least one.")
-        for vertex in targets:
-            if not 0 <= vertex < count:
-                raise ValueError(f"There is no vertex {vertex}: the {choice} mesh has vertices 0 to {count - 1}.")
         start, _ = self.latents.code(np.asarray(code, dtype=np.float64).tolist(), Bounds.CLAMP)
         pulled = [Target(int(v), np.asarray(place, dtype=np.float64).tolist()) for v, place in targets.items()]
-        return self._editor(start, pulled, prior, choice, deadline)
+        return edited(self, start, pulled, prior, MeshChoice(mesh), deadline)
 
     def sample(self, count: int, seed: int = 0, distribution: DistributionName = "uniform") -> Codes:
         """Random codes (count, m) inside the bounds; one seed gives the same on every machine.
@@ -250,10 +243,6 @@ class ShapeModel(Decoder):
     @cached_property
     def _encoder(self) -> Encoder:
         return Encoder(self)
-
-    @cached_property
-    def _editor(self) -> Editor:
-        return Editor(self)
 
     def _matched(self, mesh: ArrayLike | TriangleMesh | str | os.PathLike[str]) -> Matched:
         if isinstance(mesh, TriangleMesh):

@@ -17,7 +17,7 @@ from shapespace.coordinates.nric import nric
 from shapespace.files.colouring import Quantity
 from shapespace.files.formats import MESH_FORMATS
 from shapespace.model.decoder import MeshChoice
-from shapespace.model.edit import Target
+from shapespace.model.edit import InvalidTargetError, Target
 from shapespace.model.exact_shapes import NoTangentSpaceError
 from shapespace.model.latent_space import Bounds, Distribution
 from shapespace.model.shape_model import ShapeModel
@@ -233,7 +233,7 @@ def test_a_vertex_is_pulled_to_where_another_code_has_it(model: ShapeModel) -> N
     assert max(json.loads(found.content)["distances"]) < 1e-2
     assert set(found.seconds) == {"search"}
     for bad in ([Target(len(goal), [0, 0, 0])], targets * len(goal)):
-        with pytest.raises(codes.InvalidTargetError):
+        with pytest.raises(InvalidTargetError):
             edit(bad)
 
 

@@ -14,6 +14,7 @@ from shapespace.files.formats import MESH_FORMATS
 from shapespace.mesh.triangle_mesh import MeshError, TriangleMesh
 from shapespace.model.correspondence import InvalidMeshError
 from shapespace.model.decoder import MeshChoice
+from shapespace.model.edit import InvalidTargetError
 from shapespace.model.latent_space import NotFiniteError, OutOfBoundsError, WrongLengthError
 from shapespace.model.shape_model import ShapeModel, load
 from tests.service.bundles import SCALE, fine_reference, reference, write_bundle
@@ -139,11 +140,11 @@ def test_what_is_wrong_is_said(model: ShapeModel) -> None:
         model.encode(np.zeros((7, 3)))
     with pytest.raises(MeshError, match="can't be read"):
         model.encode("nothing.obj")
-    with pytest.raises(ValueError, match="Give at least one"):
+    with pytest.raises(InvalidTargetError, match="Give at least one"):
         model.edit(CODES[0], {})
     count = len(reference().vertices)
     for vertex in (-1, count):
-        with pytest.raises(ValueError, match=f"There is no vertex {vertex}: the coarse mesh"):
+        with pytest.raises(InvalidTargetError, match=f"vertex is {vertex}, but the coarse mesh"):
             model.edit(CODES[0], {vertex: [0, 0, 0]}, mesh="coarse")
     with pytest.raises(NotFiniteError):
         model.edit(CODES[0], {0: [np.inf, 0, 0]})
