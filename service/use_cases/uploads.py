@@ -17,12 +17,14 @@ from python_multipart.exceptions import FormParserError
 from python_multipart.multipart import MultipartParser, parse_options_header
 
 from shapespace.arrays import FloatArray, IntArray
-from shapespace.files.formats import MESH_FORMATS, OCTET_STREAM, read_arrays
+from shapespace.files.formats import OCTET_STREAM, READ_FORMATS, read_arrays
 from shapespace.files.limits import Limits, clipped, count_bytes
 from shapespace.mesh.triangle_mesh import MeshError
 from shapespace.service.limits.sandbox import Arrays, Facts, FailedError
 
-#: Formats that can be read, by media type.
+#: Media types of the formats that can be read, by name.
+FORMATS = READ_FORMATS | {"json": "application/json"}
+#: The same the other way round, with other names of media types.
 MEDIA_TYPES = {
     "text/plain": "obj",
     "model/x.stl-ascii": "stl",
@@ -30,10 +32,8 @@ MEDIA_TYPES = {
     "application/sla": "stl",
     "application/ply": "ply",
     "application/x-npz": "npz",
-    "application/json": "json",
-} | {format.media_type: name for name, format in MESH_FORMATS.items() if format.media_type != OCTET_STREAM}
-FORMATS = (*MESH_FORMATS, "json")
-_MAGIC = {b"glTF": "glb", b"ply": "ply", b"PK": "npz"}
+} | {media_type: name for name, media_type in FORMATS.items() if media_type != OCTET_STREAM}
+_MAGIC = {b"glTF": "glb", b"ply": "ply", b"PK": "npz", b"OFF": "off"}
 #: Characters of a header that says what a body or a part is.
 _LONGEST_HEADER = 1000
 _MOST_FIELDS = 16
@@ -89,11 +89,11 @@ def read_mesh_file(
         raise UnusableMeshError("The file is empty. Send a mesh file as the body, or as a file of a form.")
     found = format or _guess(declared.decode("latin-1"), name, bytes(data[:4]))
     if found not in FORMATS:
-        listed = ", ".join(f"{name} ({kind.media_type})" for name, kind in MESH_FORMATS.items())
+        listed = ", ".join(f"{name} ({media_type})" for name, media_type in FORMATS.items())
         told = clipped(declared.decode("latin-1")) or "No content type"
         fault = f"There is no format {clipped(format)!r} here" if format else f"{told} tells no format"
         raise UnknownFormatError(
-            f"{fault}. Say by ?format= or Content-Type which: {listed}, json (application/json).",
+            f"{fault}. Say by ?format= or Content-Type which: {listed}.",
         )
     try:
         vertices, faces = _read_json(data, limits) if found == "json" else read_arrays(data, found, limits)

@@ -118,6 +118,8 @@ MESH_FORMATS: dict[str, MeshFormat] = {
     "stl": MeshFormat("model/stl", _stl, coloured=False),
     "npz": MeshFormat(OCTET_STREAM, _npz),
 }
+#: Media types of the formats that can be read, by name.
+READ_FORMATS = {name: format.media_type for name, format in MESH_FORMATS.items()} | {"off": OCTET_STREAM}
 
 
 def npz(**arrays: np.ndarray) -> bytes:
@@ -136,8 +138,7 @@ def read_arrays(
 
     Args:
         source: the file's bytes, or its path.
-        format: ``glb``, ``gltf``, ``obj``, ``ply``, ``stl``, ``off`` or ``npz``; by default the path's
-            extension.
+        format: one of READ_FORMATS; by default the path's extension.
         limits: where reading ends without a mesh; they bound its time and memory, whatever the bytes are.
 
     Raises:

@@ -1,6 +1,7 @@
 """``encode``: from a mesh, however it lies and whatever file it is in, back to the code that it was made from."""
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -15,13 +16,12 @@ from shapespace.mesh.triangle_mesh import TriangleMesh
 from shapespace.model.correspondence import InvalidMeshError, Matched, limits, match
 from shapespace.model.decoder import MeshChoice
 from shapespace.model.shape_model import ShapeModel
-from shapespace.service.use_cases.uploads import read_mesh_file
+from shapespace.service.use_cases.uploads import FORMATS, read_mesh_file
 from tests.hostile import HOSTILE, MIB
 from tests.service.bundles import SCALE, fine_reference, reference, seal, write_bundle
 
 ENCODE = "/v1/models/with-fine/encode"
 CODE = [0.1, 0.7, 0.4]
-FORMATS = [*MESH_FORMATS, "json"]
 
 
 def mesh_file(client: httpx.Client, format: str = "json", model: str = "with-fine", **body: Any) -> httpx.Response:
@@ -66,7 +66,7 @@ def test_codes_come_back_from_turned_and_moved_shapes(client: httpx.Client, name
 
 
 @pytest.mark.parametrize("mesh", ["fine", "coarse"])
-@pytest.mark.parametrize("format", FORMATS)
+@pytest.mark.parametrize("format", [*MESH_FORMATS, "json"])
 def test_every_format_gives_the_same_code(client: httpx.Client, format: str, mesh: str) -> None:
     expected = encode(client, mesh_file(client, mesh="coarse").content)
     file = mesh_file(client, format, mesh=mesh)
@@ -81,6 +81,25 @@ def test_every_format_gives_the_same_code(client: httpx.Client, format: str, mes
         np.testing.assert_allclose(found["latent"], expected["latent"], atol=2e-5)
         assert found["mesh"] == mesh
         assert len(found["vertex_errors"]) == len(fine_reference().vertices if mesh == "fine" else reference().vertices)
+
+
+def test_off_is_read_though_it_is_never_written(client: httpx.Client) -> None:
+    shape = mesh_file(client).json()
+    expected = encode(client, as_json(np.array(shape["vertices"]), np.array(shape["faces"])))
+    rows = [*shape["vertices"], *([3, *face] for face in shape["faces"])]
+    lines = ["OFF", f"{len(shape['vertices'])} {len(shape['faces'])} 0", *(" ".join(map(repr, row)) for row in rows)]
+    content = "\n".join(lines).encode()
+    assert encode(client, content, "off") == expected
+    for answer in (
+        client.post(ENCODE, content=content, headers={"Content-Type": "application/octet-stream"}),
+        client.post(ENCODE, files={"file": ("shape.OFF", content)}),
+    ):
+        assert answer.raise_for_status().json() == expected
+
+
+def test_the_page_lets_choose_every_format(client: httpx.Client) -> None:
+    (accepted,) = re.findall(r'id="mesh-file" accept="(.*?)"', client.get("/").text)
+    assert accepted.split(",") == [f".{format}" for format in FORMATS]
 
 
 def test_what_the_query_says_wins(client: httpx.Client) -> None:

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 import trimesh
 
-from shapespace.files.formats import MESH_FORMATS
+from shapespace.files.formats import MESH_FORMATS, READ_FORMATS
 from shapespace.mesh.triangle_mesh import TriangleMesh, face_areas
-from shapespace.training.collection.ingest import FORMATS, IngestError, MeshCollection, normalised, read_collection
+from shapespace.training.collection.ingest import IngestError, MeshCollection, normalised, read_collection
 
 NAMES = ("pose1", "pose2", "pose10")
 BALL = trimesh.creation.icosphere(subdivisions=1)
@@ -70,7 +70,7 @@ def same_surfaces(found: MeshCollection, shapes: np.ndarray = SHAPES, faces: np.
     np.testing.assert_allclose(found.vertices[:, found.faces], shapes[:, faces], rtol=0, atol=1e-6)
 
 
-@pytest.mark.parametrize("format", FORMATS)
+@pytest.mark.parametrize("format", READ_FORMATS)
 def test_every_format_gives_the_same_surfaces(format: str, tmp_path: Path) -> None:
     found = read_collection(write(tmp_path, formats=[format] * 3))
     assert found.names == NAMES

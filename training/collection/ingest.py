@@ -20,14 +20,13 @@ from scipy import sparse
 from scipy.spatial import KDTree
 
 from shapespace.arrays import FloatArray, IntArray
-from shapespace.files.formats import read_arrays
+from shapespace.files.formats import READ_FORMATS, read_arrays
 from shapespace.files.npz_reading import load_npz
 from shapespace.mesh.rigid_motion import align
 from shapespace.mesh.triangle_mesh import Connectivity, MeshError, PlaceError, TriangleMesh, diagonal, face_areas
 from shapespace.training.collection.suspicions import Placements, suspicions
 from shapespace.training.runs.progress import progress
 
-FORMATS = ("obj", "ply", "stl", "off", "gltf", "glb", "npz")
 MIN_SHAPES = 3
 #: Between the name of an NPZ and that of a shape in it.
 _SHAPE = ": shape "
@@ -204,7 +203,9 @@ def data_files(path: Path) -> list[Path]:
     if not path.is_dir():
         return [path] if path.exists() else []
     # Buffers lie beside glTF files.
-    return sorted(p for p in path.iterdir() if _extension(p) in (*FORMATS, "bin") and p.is_file() and p.name[0] != ".")
+    return sorted(
+        p for p in path.iterdir() if _extension(p) in (*READ_FORMATS, "bin") and p.is_file() and p.name[0] != "."
+    )
 
 
 def _stacked(count: int, shapes: Iterable[FloatArray]) -> FloatArray:
@@ -255,11 +256,11 @@ def _extension(path: Path) -> str:
 
 def _read_folder(folder: Path) -> _Raw:
     files = [path for path in folder.iterdir() if not path.name.startswith(".") and not path.is_dir()]
-    paths = sorted((path for path in files if _extension(path) in FORMATS), key=_natural)
+    paths = sorted((path for path in files if _extension(path) in READ_FORMATS), key=_natural)
     if not paths:
         others = sorted({path.suffix or path.name for path in files})
         found = f"only {', '.join(others[:8])}" if others else "it has no files"
-        raise IngestError(f"{folder}: holds no meshes ({found}); these can be read: {', '.join(FORMATS)}")
+        raise IngestError(f"{folder}: holds no meshes ({found}); these can be read: {', '.join(READ_FORMATS)}")
     if len(paths) < MIN_SHAPES:
         hint = (
             "; an NPZ with a whole collection is named itself, not its folder" if _extension(paths[0]) == "npz" else ""
