@@ -1,10 +1,14 @@
 """The list of models, the cards, health."""
 
+import asyncio
 import json
+import os
+import re
 from pathlib import Path
 
 import httpx
 
+from shapespace.service.http.routes.page import FOLDER, TaggedFiles
 from tests.service.bundles import write_bundle
 
 
@@ -32,8 +36,6 @@ def test_health(client: httpx.Client) -> None:
 
 
 def test_the_page_and_all_it_needs_come_from_here(client: httpx.Client) -> None:
-    import re
-
     page = client.get("/").raise_for_status()
     assert page.headers["Content-Type"].startswith("text/html")
     needed = re.findall(r'(?:href|src)="([^"]+)"', page.text)
@@ -41,3 +43,22 @@ def test_the_page_and_all_it_needs_come_from_here(client: httpx.Client) -> None:
     for address in needed:
         assert "//" not in address
         assert client.get("/" + address).status_code == 200, address
+        if tag := client.get("/" + address).headers.get("ETag"):
+            assert client.get("/" + address, headers={"If-None-Match": tag}).status_code == 304
+    again = client.get("/", headers={"If-None-Match": page.headers["ETag"]})
+    assert (again.status_code, again.content) == (304, b"")
+
+
+def test_tags_of_the_page_are_those_of_its_content_whenever_its_files_were_written(tmp_path: Path) -> None:
+    async def tag(k: int, content: bytes) -> str:
+        folder = tmp_path / str(k)
+        folder.mkdir()
+        (folder / "index.html").write_bytes(content)
+        os.utime(folder / "index.html", (k, k))
+        transport = httpx.ASGITransport(TaggedFiles(directory=folder))
+        async with httpx.AsyncClient(transport=transport, base_url="http://localhost") as client:
+            return (await client.get("/index.html")).headers["ETag"]
+
+    content = (FOLDER / "index.html").read_bytes()
+    one, other, changed = (asyncio.run(tag(k, c)) for k, c in enumerate((content, content, content[:-1])))
+    assert one == other != changed

@@ -4,34 +4,60 @@ from __future__ import annotations
 
 import base64
 import hashlib
+import os
 import re
-from functools import cache
+from functools import cache, lru_cache
 from pathlib import Path
-from typing import Any
 
-from fastapi import APIRouter
+from fastapi import APIRouter, Request, Response
 from fastapi.responses import FileResponse
+from starlette.datastructures import Headers
 from starlette.middleware.gzip import GZipMiddleware
-from starlette.responses import Response
 from starlette.routing import BaseRoute, Mount
-from starlette.staticfiles import StaticFiles
+from starlette.staticfiles import NotModifiedResponse, StaticFiles
+from starlette.types import Scope
+
+from shapespace.service.http.caching import entity_tag
 
 FOLDER = Path(__file__).parents[2] / "page"
-_CACHING = {"Cache-Control": "no-cache"}  # by entity tag: modules of two versions must not meet
 
 router = APIRouter(include_in_schema=False)
 
 
+class TaggedFiles(StaticFiles):
+    """Files with entity tags of their content, which replicas have in common whenever their files were written."""
+
+    def file_response(
+        self, full_path: str | os.PathLike[str], stat_result: os.stat_result, scope: Scope, status_code: int = 200
+    ) -> Response:
+        """A file, or 304 where the client has it."""
+        # By entity tag: modules of two versions must not meet.
+        headers = {"ETag": _tag(os.fspath(full_path), stat_result.st_mtime_ns), "Cache-Control": "no-cache"}
+        response = FileResponse(full_path, status_code, headers, stat_result=stat_result)
+        if self.is_not_modified(response.headers, Headers(scope=scope)):
+            return NotModifiedResponse(response.headers)
+        return response
+
+
+@lru_cache(256)
+def _tag(path: str, _changed: int) -> str:
+    return entity_tag(Path(path).read_bytes())
+
+
+_FILES = TaggedFiles(directory=FOLDER)
+
+
 @router.api_route("/", methods=["GET", "HEAD"])
-async def page() -> FileResponse:
+async def page(request: Request) -> Response:
     """Shapes to move by hand."""
-    headers = {"Content-Security-Policy": _policy(), **_CACHING}
-    return FileResponse(FOLDER / "index.html", headers=headers, media_type="text/html")
+    response = await _FILES.get_response("index.html", request.scope)
+    response.headers["Content-Security-Policy"] = _policy()
+    return response
 
 
 def assets() -> BaseRoute:
     """Styles and scripts of the page, compressed."""
-    return Mount("/page", GZipMiddleware(_Assets(directory=FOLDER)), name="page")
+    return Mount("/page", GZipMiddleware(_FILES), name="page")
 
 
 @cache
@@ -41,10 +67,3 @@ def _policy() -> str:
     digests = (base64.b64encode(hashlib.sha256(text.encode()).digest()).decode() for text in maps)
     scripts = " ".join(["'self'", *(f"'sha256-{digest}'" for digest in digests)])
     return f"default-src 'self'; script-src {scripts}; object-src 'none'; base-uri 'none'; frame-ancestors 'none'"
-
-
-class _Assets(StaticFiles):
-    def file_response(self, *args: Any, **kwargs: Any) -> Response:
-        response = super().file_response(*args, **kwargs)
-        response.headers.update(_CACHING)
-        return response
