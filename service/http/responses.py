@@ -18,7 +18,7 @@ from shapespace.service.http.dependencies import Service
 from shapespace.service.limits.workers import Caller
 from shapespace.service.use_cases.batch import PiecewiseFile, Timings, Written
 from shapespace.service.use_cases.codes import Found
-from shapespace.service.use_cases.shape import ColourBy, shape_file
+from shapespace.service.use_cases.one_shape import ColourBy, shape_file
 from shapespace.service.use_cases.shape_formats import SHAPE_FORMATS, dump_json
 
 #: Of an answer that was there already.

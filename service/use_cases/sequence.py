@@ -15,9 +15,9 @@ from shapespace.service.limits.workers import Caller, Workers
 from shapespace.service.repository.repository import ModelRepository
 from shapespace.service.use_cases.animation import Animation, UnknownInterpolationError
 from shapespace.service.use_cases.batch import Written, batch, solve
+from shapespace.service.use_cases.many_shapes import shapes, shapes_size
 from shapespace.service.use_cases.sequence_formats import SEQUENCE_FORMATS, Frames, json_line
 from shapespace.service.use_cases.shape_formats import worst
-from shapespace.service.use_cases.shapes import shapes, shapes_size
 from shapespace.solve.deadline import Deadline
 
 

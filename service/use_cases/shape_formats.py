@@ -13,7 +13,7 @@ from shapespace.arrays import FloatArray, IntArray
 from shapespace.files.colouring import Colouring
 from shapespace.files.formats import MESH_FORMATS, MeshFormat
 from shapespace.model.decoder import Diagnostics
-from shapespace.model.exact_shapes import Exact
+from shapespace.model.exact_shapes import ExactShape
 
 #: Bytes that are counted at once: where there are too many values, few of these pieces are looked at.
 _PIECE = 2**16
@@ -75,7 +75,7 @@ def json_pieces(members: Mapping[str, Iterable[Any]]) -> Iterator[bytes]:
     yield b"]}"
 
 
-def exponential_lists(exponentials: Sequence[Exact]) -> dict[str, list[Any]]:
+def exponential_lists(exponentials: Sequence[ExactShape]) -> dict[str, list[Any]]:
     """Exponentials of n codes as lists (n,), for JSON."""
     return {
         "exact": [e.vertices for e in exponentials],
@@ -84,7 +84,7 @@ def exponential_lists(exponentials: Sequence[Exact]) -> dict[str, list[Any]]:
     }
 
 
-def exponential_arrays(exponentials: Sequence[Exact], vertex_count: int) -> dict[str, NDArray]:
+def exponential_arrays(exponentials: Sequence[ExactShape], vertex_count: int) -> dict[str, NDArray]:
     """Exponentials of n codes as arrays, for NPZ files; NaN where one failed."""
     missing = np.full((vertex_count, 3), np.nan, np.float32)
     return {

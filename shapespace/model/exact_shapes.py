@@ -22,7 +22,7 @@ class NoTangentSpaceError(ValueError):
 
 
 @dataclass(frozen=True)
-class Exact:
+class ExactShape:
     """The discrete exponential of one code.
 
     Attributes:
@@ -46,9 +46,9 @@ def require_tangent_space(model: Decoder) -> None:
         )
 
 
-def exact(
+def exact_shape(
     model: Decoder, code: Codes, answer: NDArray[np.float32], mesh: MeshChoice, deadline: Deadline | None = None
-) -> Exact:
+) -> ExactShape:
     """The exponential ``exp_z̄(Σ_j code_j u_j)`` in K steps, with the material and K of the model's manifest.
 
     Args:
@@ -74,7 +74,7 @@ def exact(
     finally:
         model.spaces.put(space)
     if not path.converged:
-        return Exact(path.status, None, None, None)
+        return ExactShape(path.status, None, None, None)
     vertices = model.finish(path.vertices[-1], mesh)
     distances = np.linalg.norm(vertices - answer, axis=1)
-    return Exact(path.status, vertices.astype(np.float32), float(distances.mean()), float(distances.max()))
+    return ExactShape(path.status, vertices.astype(np.float32), float(distances.mean()), float(distances.max()))

@@ -23,7 +23,7 @@ from shapespace.model.latent_space import Bounds, Distribution
 from shapespace.model.shape_model import ShapeModel
 from shapespace.service.limits.sandbox import Sandbox
 from shapespace.service.limits.workers import BusyError, Caller, DeadlineError, DisconnectedError, Workers
-from shapespace.service.use_cases import batch, codes, shapes
+from shapespace.service.use_cases import batch, codes, many_shapes
 from shapespace.service.use_cases.animation import Animation
 from shapespace.service.use_cases.batch import (
     NoCodesError,
@@ -32,7 +32,9 @@ from shapespace.service.use_cases.batch import (
     Written,
     require_count,
 )
+from shapespace.service.use_cases.many_shapes import infer, vertices_file
 from shapespace.service.use_cases.nric import nric_file
+from shapespace.service.use_cases.one_shape import ColourBy, shape_file
 from shapespace.service.use_cases.sequence import (
     TooManyFramesError,
     UnknownFrameError,
@@ -41,8 +43,6 @@ from shapespace.service.use_cases.sequence import (
     sequence_file,
     sequence_lines,
 )
-from shapespace.service.use_cases.shape import ColourBy, shape_file
-from shapespace.service.use_cases.shapes import infer, vertices_file
 from shapespace.service.use_cases.uploads import UnknownFormatError, UnusableMeshError
 from tests.service.bundles import SCALE, expected_nric, write_bundle
 
@@ -249,7 +249,7 @@ def test_one_seed_gives_the_same_codes_and_a_limit_holds(model: ShapeModel) -> N
 def test_more_than_an_answer_may_hold_is_refused_before_any_work(
     model: ShapeModel, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(shapes, "MOST_VERTICES", len(model.reference.vertices))
+    monkeypatch.setattr(many_shapes, "MOST_VERTICES", len(model.reference.vertices))
     ask = (CALLER, model, CODES, Bounds.ALLOW, MeshChoice.FINE, "json")
     with pytest.raises(TooManyCodesError, match="Ask for 1 at most"):
         run(lambda workers: vertices_file(workers, *ask))
@@ -260,7 +260,7 @@ def test_more_than_an_answer_may_hold_is_refused_before_any_work(
 def test_both_outputs_together_may_be_more_than_an_answer_holds(
     model: ShapeModel, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(shapes, "MOST_VERTICES", len(CODES) * len(model.reference.vertices))
+    monkeypatch.setattr(many_shapes, "MOST_VERTICES", len(CODES) * len(model.reference.vertices))
 
     def ask(outputs: list[str]) -> Written:
         latents, write = np.array(CODES), lambda arrays: (iter([b"x"]), {})
@@ -271,7 +271,7 @@ def test_both_outputs_together_may_be_more_than_an_answer_holds(
     assert content(ask(["vertices"])) == b"x"
     with pytest.raises(TooManyCodesError, match="too many for both outputs"):
         ask(["nric", "vertices"])
-    monkeypatch.setattr(shapes, "MOST_VERTICES", len(model.reference.vertices))
+    monkeypatch.setattr(many_shapes, "MOST_VERTICES", len(model.reference.vertices))
     with pytest.raises(TooManyCodesError, match="Ask for 1 at most"):
         ask(["vertices"])
 

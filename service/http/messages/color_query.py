@@ -12,7 +12,7 @@ from shapespace.model.latent_space import Bounds, LatentSpace
 from shapespace.service.http.messages.latent_query import NUMBERS, numbers
 from shapespace.service.http.negotiation import choose
 from shapespace.service.http.problems import ProblemError
-from shapespace.service.use_cases.shape import ColourBy
+from shapespace.service.use_cases.one_shape import ColourBy
 from shapespace.service.use_cases.shape_formats import SHAPE_FORMATS
 
 #: Why a format isn't among those of a coloured mesh.

@@ -28,7 +28,7 @@ from shapespace.service.http.messages.open_inference import codes as codes_of
 from shapespace.service.http.responses import diagnostics_header, written_response
 from shapespace.service.limits.workers import Caller
 from shapespace.service.use_cases.batch import require_count
-from shapespace.service.use_cases.shapes import infer
+from shapespace.service.use_cases.many_shapes import infer
 
 router = APIRouter(prefix="/v2", tags=["inference"])
 

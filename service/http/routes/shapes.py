@@ -30,9 +30,9 @@ from shapespace.service.http.messages.schemas import (
 from shapespace.service.http.negotiation import choose
 from shapespace.service.http.responses import file_headers, shape_response, written_response
 from shapespace.service.use_cases.batch import require_count
+from shapespace.service.use_cases.many_shapes import VERTICES_TYPES, vertices_file
 from shapespace.service.use_cases.nric import nric_file
 from shapespace.service.use_cases.shape_formats import SHAPE_FORMATS
-from shapespace.service.use_cases.shapes import VERTICES_TYPES, vertices_file
 
 router = APIRouter(prefix="/v1/models/{name}", tags=["shapes"])
 

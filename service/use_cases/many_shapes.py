@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from shapespace.files.archives import Buffer, npz_pieces
 from shapespace.files.formats import OCTET_STREAM
 from shapespace.model.decoder import Diagnostics, MeshChoice
-from shapespace.model.exact_shapes import Exact, exact, require_tangent_space
+from shapespace.model.exact_shapes import ExactShape, exact_shape, require_tangent_space
 from shapespace.model.latent_space import Bounds, CheckedCode, Codes
 from shapespace.model.shape_model import ShapeModel
 from shapespace.service.limits.workers import Call, Caller, Workers
@@ -159,10 +159,12 @@ async def shapes(work: Batch, model: ShapeModel, codes: Codes, inside: NDArray[n
     return Shapes(vertices, [diagnostics for diagnostics, _ in found], total_seconds(seconds for _, seconds in found))
 
 
-async def _exponentials(work: Batch, model: ShapeModel, codes: Codes, found: Shapes, mesh: MeshChoice) -> list[Exact]:
+async def _exponentials(
+    work: Batch, model: ShapeModel, codes: Codes, found: Shapes, mesh: MeshChoice
+) -> list[ExactShape]:
     """Discrete exponentials of codes (n, m), side by side, and how far the networks' shapes are from them."""
 
-    def one(item: tuple[Codes, NDArray[np.float32]], call: Call) -> Exact:
-        return exact(model, *item, mesh, call)
+    def one(item: tuple[Codes, NDArray[np.float32]], call: Call) -> ExactShape:
+        return exact_shape(model, *item, mesh, call)
 
     return await work.map(one, zip(codes, found.vertices, strict=True))
