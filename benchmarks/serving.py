@@ -41,7 +41,7 @@ from shapespace.model.shape_model import ShapeModel
 from shapespace.shell.energy import Material
 from shapespace.shell.exponential import exponential
 from shapespace.shell.space import ShellSpace
-from shapespace.solve.status import Status
+from shapespace.solve.outcome import Status
 
 GLB = MESH_FORMATS["glb"].encode
 #: Two results of one code agree up to this fraction of the diagonal.

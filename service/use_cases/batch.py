@@ -16,7 +16,7 @@ from shapespace.model.latent_space import CheckedCode
 from shapespace.model.shape_model import ShapeModel
 from shapespace.service.limits.workers import Call, Caller, Workers
 from shapespace.solve.deadline import Deadline
-from shapespace.solve.status import Status
+from shapespace.solve.outcome import Status
 
 #: Seconds by stage. ``network``: inference; ``reconstruct``: Gauss–Newton; ``encode``: writing the file;
 #: ``read``: reading an uploaded file; ``search``: looking for a code.

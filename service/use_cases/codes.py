@@ -29,7 +29,7 @@ from shapespace.service.use_cases.batch import Timings, require_count
 from shapespace.service.use_cases.shape_formats import dump_json, float32
 from shapespace.service.use_cases.uploads import UPLOAD_ERRORS, UnusableMeshError
 from shapespace.solve.deadline import Deadline
-from shapespace.solve.status import Status
+from shapespace.solve.outcome import Status
 
 logger = logging.getLogger(__name__)
 #: Bytes that reading a file may take beside the file.

@@ -20,9 +20,8 @@ from shapespace.solve.anderson import Anderson
 from shapespace.solve.cholesky import Backend, Factor, NotPositiveDefiniteError, analyse
 from shapespace.solve.deadline import Deadline
 from shapespace.solve.line_search import backtrack, sufficient_decrease
-from shapespace.solve.outcome import Outcome
+from shapespace.solve.outcome import Outcome, Status
 from shapespace.solve.preconditioner import Preconditioner
-from shapespace.solve.status import Status
 
 #: Weight of the angles in the reconstruction's norm. A parameter of its own: the metric's η is far too small here,
 #: because this norm is dimensionless and sums over edges.

@@ -26,7 +26,7 @@ from shapespace.model.latent_space import Bounds, Codes, Distribution, LatentSpa
 from shapespace.model.networks import PATIENCE, NetworkError, Session, TerminatedError
 from shapespace.shell.space import ShellSpace
 from shapespace.solve.deadline import Deadline
-from shapespace.solve.status import Status
+from shapespace.solve.outcome import Status
 
 logger = logging.getLogger(__name__)
 #: Gauss–Newton stops once no vertex moves further than this fraction of the diagonal: a fiftieth of a pixel where a
@@ -59,7 +59,7 @@ class Diagnostics:
     """How well a shape was found.
 
     Attributes:
-        status: how Gauss–Newton ended, see shapespace.solve.status.Status.
+        status: how Gauss–Newton ended, see shapespace.solve.outcome.Status.
         iterations: its steps.
         residual: distance between the lengths and angles asked for and those of the shape, relative,
             weighted norm.

@@ -17,7 +17,7 @@ from shapespace.model.derivatives import batches, derivatives, factor_derivative
 from shapespace.model.latent_space import Bounds, Codes, NotFiniteError
 from shapespace.solve.deadline import Deadline
 from shapespace.solve.least_squares import Box, Fit, Stopping, least_squares, shrinkable
-from shapespace.solve.status import Status
+from shapespace.solve.outcome import Status
 
 #: Weight of the prior where none is given: a code half the bounds away costs as much as half a percent of the diagonal.
 PRIOR = 1e-4

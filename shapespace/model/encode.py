@@ -16,7 +16,7 @@ from shapespace.model.derivatives import FactorGrids, derivatives, factor_deriva
 from shapespace.model.latent_space import Bounds, Codes, NotFiniteError
 from shapespace.solve.deadline import Deadline
 from shapespace.solve.least_squares import Box, Fit, Stopping, least_squares
-from shapespace.solve.status import Status
+from shapespace.solve.outcome import Status
 
 #: Times that each factor may be moved on its grid while the others stay, and the factor by which a move must explain
 #: more of the misfit than the present place does.

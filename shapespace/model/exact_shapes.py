@@ -14,7 +14,7 @@ from shapespace.shell.energy import Material
 from shapespace.shell.exponential import exponential
 from shapespace.shell.space import ShellSpace
 from shapespace.solve.deadline import Deadline
-from shapespace.solve.status import Status
+from shapespace.solve.outcome import Status
 
 
 class NoTangentSpaceError(ValueError):
@@ -26,7 +26,7 @@ class ExactShape:
     """The discrete exponential of one code.
 
     Attributes:
-        status: of its solver, see shapespace.solve.status.Status.
+        status: of its solver, see shapespace.solve.outcome.Status.
         vertices: (V, 3) float32, aligned to the reference, in the units of the training meshes; None where it failed.
         mean, max: distance of the networks' answer from it, over vertices; None where it failed.
     """

@@ -24,7 +24,7 @@ from shapespace.model.edit import PRIOR, Edited, Target, edited
 from shapespace.model.encode import Encoded, Encoder
 from shapespace.model.latent_space import Bounds, Codes, Distribution, WrongLengthError
 from shapespace.solve.deadline import Deadline
-from shapespace.solve.status import Status
+from shapespace.solve.outcome import Status
 
 #: The values of the enumerations, so that callers may write plain strings.
 MeshName = MeshChoice | Literal["fine", "coarse"]

@@ -17,9 +17,8 @@ from shapespace.solve.anderson import Anderson
 from shapespace.solve.cholesky import NotPositiveDefiniteError
 from shapespace.solve.deadline import Deadline
 from shapespace.solve.line_search import backtrack
-from shapespace.solve.outcome import Outcome
+from shapespace.solve.outcome import Outcome, Status
 from shapespace.solve.preconditioner import step_length
-from shapespace.solve.status import Status
 
 #: Shapes behind a start value: a polynomial through eight of them leaves an error of eighth order in the step.
 EXTRAPOLATED = 8

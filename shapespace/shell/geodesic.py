@@ -25,7 +25,7 @@ from shapespace.shell.space import (
 from shapespace.solve.anderson import Anderson
 from shapespace.solve.cholesky import NotPositiveDefiniteError
 from shapespace.solve.line_search import backtrack
-from shapespace.solve.status import Status
+from shapespace.solve.outcome import Status
 from shapespace.solve.truncated_newton import descend
 
 #: Iterations from one set of factors, and how often the factors are renewed before it is given up.

@@ -14,9 +14,8 @@ from shapespace.shell.space import TOLERANCE, Point, ShellSpace, edge_length, fa
 from shapespace.solve.anderson import Anderson
 from shapespace.solve.cholesky import NotPositiveDefiniteError
 from shapespace.solve.line_search import backtrack, sufficient_decrease
-from shapespace.solve.outcome import Outcome
+from shapespace.solve.outcome import Outcome, Status
 from shapespace.solve.preconditioner import step_length
-from shapespace.solve.status import Status
 from shapespace.solve.truncated_newton import descend
 
 #: Most iterations of either mean.

@@ -12,8 +12,7 @@ from shapespace.mesh.rigid_motion import align, without_rigid_motion
 from shapespace.shell.exponential import extrapolate
 from shapespace.shell.geodesic import geodesic
 from shapespace.shell.space import TOLERANCE, DiscretePath, ShellSpace
-from shapespace.solve.outcome import Outcome
-from shapespace.solve.status import Status
+from shapespace.solve.outcome import Outcome, Status
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -10,8 +10,7 @@ from scipy.linalg import cholesky, solve_triangular
 
 from shapespace.arrays import FloatArray
 from shapespace.solve.deadline import Deadline
-from shapespace.solve.outcome import Outcome
-from shapespace.solve.status import Status
+from shapespace.solve.outcome import Outcome, Status
 
 #: A Jacobian is renewed once the point has moved this far, as a fraction of the scale, before it is believed.
 TRUSTED = 0.05

@@ -1,12 +1,22 @@
-"""What every iteration returns besides its result."""
+"""What every iteration returns besides its result: how it ended is a value, not an exception."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from enum import StrEnum
 
 import numpy as np
 
-from shapespace.solve.status import Status
+
+class Status(StrEnum):
+    """How an iteration ended; anything but CONVERGED still comes with finite vertices."""
+
+    CONVERGED = "converged"
+    STALLED = "stalled"
+    ITERATION_LIMIT = "iteration_limit"
+    DEADLINE = "deadline"
+    NOT_FINITE = "not_finite"
+    DEGENERATE = "degenerate"
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -10,9 +10,8 @@ import numpy as np
 
 from shapespace.arrays import FloatArray
 from shapespace.solve.line_search import backtrack, sufficient_decrease
-from shapespace.solve.outcome import Outcome
+from shapespace.solve.outcome import Outcome, Status
 from shapespace.solve.preconditioner import step_length
-from shapespace.solve.status import Status
 
 #: Most conjugate gradients in a step, and the part of the forces at which they end: at most, and at least.
 GRADIENTS = 60

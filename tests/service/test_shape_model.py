@@ -17,7 +17,7 @@ from shapespace.service.limits.workers import DeadlineError, Workers
 from shapespace.service.use_cases.batch import solve
 from shapespace.service.use_cases.shape_formats import worst
 from shapespace.solve.deadline import Deadline
-from shapespace.solve.status import Status
+from shapespace.solve.outcome import Status
 from tests.service.bundles import networks, seal, start_network, write_bundle
 
 

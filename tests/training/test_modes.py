@@ -16,7 +16,7 @@ from shapespace.mesh.triangle_mesh import TriangleMesh
 from shapespace.shell.exponential import exponential
 from shapespace.shell.geodesic import geodesic
 from shapespace.shell.space import ShellSpace
-from shapespace.solve.status import Status
+from shapespace.solve.outcome import Status
 from shapespace.training.space.logarithms import logarithms
 from shapespace.training.space.modes import ModeError, Modes, _fit_in_box, localisation, pga, spga
 from tests.shapespace.conftest import bent

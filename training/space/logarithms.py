@@ -15,7 +15,7 @@ from shapespace.mesh.rigid_motion import without_rigid_motion
 from shapespace.shell.geodesic import geodesic, halved, towards
 from shapespace.shell.space import DiscretePath, ShellSpace
 from shapespace.solve.cholesky import NotPositiveDefiniteError
-from shapespace.solve.status import Status
+from shapespace.solve.outcome import Status
 from shapespace.training.runs.progress import progress
 from shapespace.training.runs.workers import run
 from shapespace.training.space.modes import ModeError

@@ -20,7 +20,7 @@ from shapespace.mesh.triangle_mesh import TriangleMesh, face_areas
 from shapespace.shell.energy import Material
 from shapespace.shell.mean import Mean, elastic_mean
 from shapespace.shell.space import ShellSpace
-from shapespace.solve.status import Status
+from shapespace.solve.outcome import Status
 from shapespace.training.collection.generators import MESHES
 from shapespace.training.collection.ingest import MeshCollection, normalised, read_collection
 from shapespace.training.runs.config import Config, ConfigError

@@ -8,7 +8,7 @@ from shapespace.coordinates.nric import nric
 from shapespace.coordinates.reconstruction import Reconstructor
 from shapespace.mesh.rigid_motion import align
 from shapespace.mesh.triangle_mesh import TriangleMesh
-from shapespace.solve.status import Status
+from shapespace.solve.outcome import Status
 from tests.shapespace.conftest import bent, closed, sheet
 
 

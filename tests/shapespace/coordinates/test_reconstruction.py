@@ -13,7 +13,7 @@ from shapespace.coordinates.reconstruction import DEFAULT_ETA, Reconstructor
 from shapespace.mesh.rigid_motion import align, without_rigid_motion
 from shapespace.mesh.triangle_mesh import TriangleMesh
 from shapespace.solve.deadline import Deadline
-from shapespace.solve.status import Status
+from shapespace.solve.outcome import Status
 from shapespace.training.collection.freaky_torus import FreakyTorus
 from tests.shapespace.conftest import MESHES, bent
 

@@ -14,8 +14,7 @@ from shapespace.shell.geodesic import geodesic, logarithm
 from shapespace.shell.mean import Mean, centre_of_mass, elastic_mean
 from shapespace.shell.space import DiscretePath, ShellSpace
 from shapespace.shell.transport import parallel_transport
-from shapespace.solve.outcome import Outcome
-from shapespace.solve.status import Status
+from shapespace.solve.outcome import Outcome, Status
 from tests.shapespace.shell.measures import distance
 
 Ended = TypeVar("Ended", bound=Outcome)

@@ -9,7 +9,7 @@ from shapespace.shell.geodesic import geodesic
 from shapespace.shell.many_exponentials import exponentials
 from shapespace.shell.space import ShellSpace
 from shapespace.solve.deadline import Deadline
-from shapespace.solve.status import Status
+from shapespace.solve.outcome import Status
 from tests.shapespace.shell.constrained import constrained_exponential
 from tests.shapespace.shell.measures import distance, true_residuals
 

@@ -7,7 +7,7 @@ from shapespace.mesh.rigid_motion import align, without_rigid_motion
 from shapespace.shell.exponential import exponential
 from shapespace.shell.exponential_derivative import ExponentialDerivative
 from shapespace.shell.space import DiscretePath
-from shapespace.solve.status import Status
+from shapespace.solve.outcome import Status
 
 STEPS = 5
 

@@ -6,7 +6,7 @@ import pytest
 from shapespace.shell.exponential import exponential
 from shapespace.shell.geodesic import geodesic, logarithm
 from shapespace.shell.mean import centre_of_mass, elastic_mean
-from shapespace.solve.status import Status
+from shapespace.solve.outcome import Status
 
 K = 4
 

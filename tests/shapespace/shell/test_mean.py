@@ -5,7 +5,7 @@ import pytest
 
 from shapespace.shell.mean import centre_of_mass, elastic_mean
 from shapespace.shell.space import ShellSpace
-from shapespace.solve.status import Status
+from shapespace.solve.outcome import Status
 from tests.shapespace.conftest import MESHES
 
 

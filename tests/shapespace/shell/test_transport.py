@@ -7,7 +7,7 @@ import pytest
 
 from shapespace.shell.exponential import exponential
 from shapespace.shell.transport import parallel_transport
-from shapespace.solve.status import Status
+from shapespace.solve.outcome import Status
 
 
 def test_transport_takes_one_step_and_not_none(space, mesh, velocity):

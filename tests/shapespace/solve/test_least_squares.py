@@ -6,7 +6,7 @@ from scipy import optimize
 
 from shapespace.solve.deadline import Deadline
 from shapespace.solve.least_squares import Box, Fit, Stopping, least_squares
-from shapespace.solve.status import Status
+from shapespace.solve.outcome import Status
 
 RNG = np.random.default_rng(0)
 TIMES = np.linspace(0, 1, 40)
