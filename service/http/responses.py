@@ -10,7 +10,6 @@ from fastapi import Request, Response
 from fastapi.responses import StreamingResponse
 from starlette.types import Receive, Scope, Send
 
-from shapespace.model.decoder import MeshChoice
 from shapespace.model.latent_space import CheckedCode
 from shapespace.model.shape_model import ShapeModel
 from shapespace.service.http.caching import CachedAnswer, cache_headers, entity_tag, not_modified
@@ -18,7 +17,7 @@ from shapespace.service.http.dependencies import Service
 from shapespace.service.limits.workers import Caller
 from shapespace.service.use_cases.batch import PiecewiseFile, Timings, Written
 from shapespace.service.use_cases.codes import Found
-from shapespace.service.use_cases.one_shape import ColourBy, shape_file
+from shapespace.service.use_cases.one_shape import WantedShape, shape_file
 from shapespace.service.use_cases.shape_formats import SHAPE_FORMATS, dump_json
 
 #: Of an answer that was there already.
@@ -47,30 +46,23 @@ def found_response(service: Service, found: Found) -> Response:
 
 
 async def shape_response(
-    service: Service,
-    request: Request,
-    caller: Caller,
-    model: ShapeModel,
-    code: CheckedCode | None,
-    mesh: MeshChoice,
-    format: str,
-    colour_by: ColourBy | None = None,
+    service: Service, request: Request, caller: Caller, model: ShapeModel, wanted: WantedShape
 ) -> Response:
-    """One shape as a file, as it was answered before where it was; without a code the reference."""
-    colours = (colour_by.quantity, _bytes_of(colour_by.against)) if colour_by else ()
-    tag = entity_tag("shape", model.digest, _bytes_of(code), mesh, format, *colours)
+    """One shape as a file, as it was answered before where it was."""
+    colours = (wanted.colour_by.quantity, _bytes_of(wanted.colour_by.against)) if wanted.colour_by else ()
+    tag = entity_tag("shape", model.digest, _bytes_of(wanted.code), wanted.mesh, wanted.format, *colours)
     if unchanged := not_modified(request, tag):
         return unchanged
     answer, seconds = service.answers.get(tag), _NO_TIME
     if answer is None:
-        found = await shape_file(service.workers, caller, model, code, mesh, format, colour_by)
-        headers = file_headers(asdict(found.diagnostics), f"{model.manifest.name}.{format}")
+        found = await shape_file(service.workers, caller, model, wanted)
+        headers = file_headers(asdict(found.diagnostics), f"{model.manifest.name}.{wanted.format}")
         if found.legend:
             headers["Shape-Color"] = dump_json(found.legend).decode()
         answer, seconds = CachedAnswer(found.content, headers), found.seconds
         service.answers.keep(tag, answer)
     headers = {**cache_headers(tag), **answer.headers, **timing(service, seconds)}
-    return Response(answer.content, headers=headers, media_type=SHAPE_FORMATS[format].media_type)
+    return Response(answer.content, headers=headers, media_type=SHAPE_FORMATS[wanted.format].media_type)
 
 
 def _bytes_of(code: CheckedCode | None) -> bytes:

@@ -31,6 +31,23 @@ class ColourBy:
 
 
 @dataclass(frozen=True)
+class WantedShape:
+    """A shape as somebody wants it.
+
+    Attributes:
+        code: of the shape; None is the reference.
+        mesh: fine or coarse.
+        format: one of SHAPE_FORMATS.
+        colour_by: what to colour it by, if anything.
+    """
+
+    code: CheckedCode | None
+    mesh: MeshChoice
+    format: str
+    colour_by: ColourBy | None = None
+
+
+@dataclass(frozen=True)
 class ShapeFile:
     """A shape as a file.
 
@@ -47,35 +64,28 @@ class ShapeFile:
     seconds: Timings
 
 
-async def shape_file(
-    workers: Workers,
-    caller: Caller,
-    model: ShapeModel,
-    code: CheckedCode | None,
-    mesh: MeshChoice,
-    format: str,
-    colour_by: ColourBy | None = None,
-) -> ShapeFile:
-    """The shape of a code as a file in one of SHAPE_FORMATS; without a code the reference.
+async def shape_file(workers: Workers, caller: Caller, model: ShapeModel, wanted: WantedShape) -> ShapeFile:
+    """One shape as a file.
 
     Raises:
         BusyError: no place for the request.
         DeadlineError, DisconnectedError, EndingError: the call ended before the file was ready.
         NotFiniteError, ModelFailedError: the model has no shape for the code.
     """
+    mesh, colour_by = wanted.mesh, wanted.colour_by
 
     def find(code: CheckedCode | None, deadline: Deadline) -> Shape:
         return model.reference_shape(mesh) if code is None else solve(workers, model, mesh, code, deadline)
 
     def make(deadline: Deadline) -> ShapeFile:
-        found, colouring = [find(code, deadline)], None
+        found, colouring = [find(wanted.code, deadline)], None
         if colour_by:
             found.append(find(colour_by.against, deadline))
         began = time.perf_counter()
         if colour_by:
             vertices, against = (shape.vertices for shape in found)
             colouring = Colouring.between(colour_by.quantity, vertices, against, model.mesh(mesh).connectivity)
-        content = SHAPE_FORMATS[format].encode(found[0].vertices, model.mesh(mesh).faces, colouring)
+        content = SHAPE_FORMATS[wanted.format].encode(found[0].vertices, model.mesh(mesh).faces, colouring)
         seconds = {**total_seconds(shape.seconds for shape in found), "encode": time.perf_counter() - began}
         return ShapeFile(content, found[0].diagnostics, colouring.legend if colouring else None, seconds)
 

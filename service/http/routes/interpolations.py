@@ -26,6 +26,7 @@ from shapespace.service.http.negotiation import choose
 from shapespace.service.http.problems import DOMAIN_ERRORS, domain_problem
 from shapespace.service.http.responses import file_headers, shape_response, written_response
 from shapespace.service.use_cases.animation import Animation
+from shapespace.service.use_cases.one_shape import WantedShape
 from shapespace.service.use_cases.sequence import (
     find_interpolation,
     frame_code,
@@ -109,8 +110,8 @@ async def get_frame(
     """One frame of an animation in any mesh format."""
     chosen = choose_mesh(format, request, color)
     animation, model = find_interpolation(service.repository, id, service.settings.max_frames)
-    code, colour_by = frame_code(model, animation, k), color.on(model.latents)
-    return await shape_response(service, request, caller, model, code, animation.mesh, chosen, colour_by)
+    wanted = WantedShape(frame_code(model, animation, k), animation.mesh, chosen, color.on(model.latents))
+    return await shape_response(service, request, caller, model, wanted)
 
 
 async def _resume(request: Request, first: bytes, rest: AsyncGenerator[bytes, None]) -> AsyncGenerator[bytes, None]:

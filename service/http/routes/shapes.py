@@ -32,6 +32,7 @@ from shapespace.service.http.responses import file_headers, shape_response, writ
 from shapespace.service.use_cases.batch import require_count
 from shapespace.service.use_cases.many_shapes import VERTICES_TYPES, vertices_file
 from shapespace.service.use_cases.nric import nric_file
+from shapespace.service.use_cases.one_shape import WantedShape
 from shapespace.service.use_cases.shape_formats import SHAPE_FORMATS
 
 router = APIRouter(prefix="/v1/models/{name}", tags=["shapes"])
@@ -61,8 +62,8 @@ async def get_mesh(
     """The shape of a code as a mesh file, for a link or a browser."""
     chosen = choose_mesh(format, request, color)
     code = None if latent is None else model.latents.code(numbers(latent, "latent"), bounds)
-    colour_by = color.on(model.latents, bounds)
-    return await shape_response(service, request, caller, model, code, mesh, chosen, colour_by)
+    wanted = WantedShape(code, mesh, chosen, color.on(model.latents, bounds))
+    return await shape_response(service, request, caller, model, wanted)
 
 
 @router.post(
@@ -83,8 +84,8 @@ async def post_mesh(
     """The shape of a code as a mesh file."""
     chosen = choose_mesh(format, request, color)
     code = model.latents.code(body.latent, body.bounds)
-    colour_by = color.on(model.latents, body.bounds)
-    return await shape_response(service, request, caller, model, code, mesh or body.mesh, chosen, colour_by)
+    wanted = WantedShape(code, mesh or body.mesh, chosen, color.on(model.latents, body.bounds))
+    return await shape_response(service, request, caller, model, wanted)
 
 
 @router.post(
