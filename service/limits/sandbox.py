@@ -9,32 +9,40 @@ The children see none of the server's settings, write no file, and end with the 
 
 from __future__ import annotations
 
-import importlib
-import json
 import math
 import os
-import re
-import resource
 import select
 import signal
 import socket
-import struct
 import subprocess
 import sys
 import threading
 import time
-import traceback
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from shapespace.service.limits.process_memory import mapped_size, resident_size, trim_heap, tune_malloc
+from shapespace.service.limits.sandbox_errors import (
+    ClosedError,
+    DiedError,
+    FailedError,
+    LateError,
+    NoProcessError,
+    OutOfMemoryError,
+    SandboxError,
+)
+from shapespace.service.limits.sandbox_wire import (
+    LONGEST_SENTENCE,
+    Arrays,
+    Facts,
+    receive,
+    receive_arrays,
+    send,
+    send_all,
+)
 from shapespace.solve.deadline import Deadline
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
 
 #: What children can do, by name: functions ``(body: bytearray, **facts) -> (facts, arrays)``. What they find wrong they
 #: say by FailedError. Names and no imports: only the children that need a module import it, and it is of a layer above.
@@ -44,64 +52,15 @@ TASKS = {
     # A mesh file that somebody has sent.
     "read": "shapespace.service.use_cases.uploads:read_in_sandbox",
 }
-Facts = dict[str, Any]
-Arrays = dict[str, "NDArray[Any]"]
-Task = Callable[..., tuple[Facts, Arrays]]
 #: A body on its way.
 Pieces = deque[memoryview]
-#: Waits until a connection is ready for an event of ``select.poll``.
-Wait = Callable[[int], None]
 
-#: Bytes of JSON in one message, and characters of a sentence in it.
-LONGEST_MESSAGE, LONGEST_SENTENCE = 2**20, 1000
 #: A child that keeps so much more than it began with is replaced.
 GROWTH = 128 * 2**20
-_LENGTH = struct.Struct("!I")
-_PIECE = 2**20
-_DTYPE = re.compile(r"[<|>][fiub][1248]")
 #: Milliseconds between looks at the deadline, which may be called off.
 _LOOK = 200
 #: Seconds for a child to be gone that has closed its connection.
 _END = 5.0
-
-
-class SandboxError(Exception):
-    """A call without an answer."""
-
-
-class LateError(SandboxError):
-    """The deadline passed, and the child was ended."""
-
-
-class OutOfMemoryError(SandboxError):
-    """The task needs more memory than it may have."""
-
-
-class NoProcessError(SandboxError):
-    """The system gives no process."""
-
-
-class DiedError(SandboxError):
-    """The child died of what it was given."""
-
-
-class ClosedError(SandboxError):
-    """Nothing is done here any more."""
-
-
-class FailedError(SandboxError):
-    """What a task itself found wrong; raised by the task, and again where it was called.
-
-    Attributes:
-        kind: of fault, in a word; UNEXPECTED for an exception that the task was not prepared for.
-        sentence: for people.
-    """
-
-    UNEXPECTED = "unexpected"
-
-    def __init__(self, kind: str, sentence: str) -> None:
-        super().__init__(sentence)
-        self.kind, self.sentence = kind, sentence
 
 
 class Sandbox:
@@ -234,7 +193,7 @@ class _Child:
         self._connection.setblocking(False)
         try:
             self._process = subprocess.Popen(  # noqa: S603 - this interpreter, and a number
-                [sys.executable, "-P", "-m", "shapespace.service.limits.sandbox", str(theirs.fileno()), path],
+                [sys.executable, "-P", "-m", "shapespace.service.limits.sandbox_child", str(theirs.fileno()), path],
                 env=environment,
                 pass_fds=[theirs.fileno()],
                 stdin=subprocess.DEVNULL,
@@ -281,17 +240,17 @@ class _Child:
 
         with self._told(deadline):
             if self._begun is None:
-                self._begun = int(_receive(self._connection, wait)["memory"])
+                self._begun = int(receive(self._connection, wait)["memory"])
             length = sum(map(len, body)) if body else 0
             seconds = math.ceil(deadline.time - time.monotonic())
             request = {"task": path, "facts": facts, "body": length, "memory": memory, "seconds": seconds}
-            _send(self._connection, request, wait)
+            send(self._connection, request, wait)
             while body:
-                _send_all(self._connection, body.popleft(), wait)
-            reply = _receive(self._connection, wait)
+                send_all(self._connection, body.popleft(), wait)
+            reply = receive(self._connection, wait)
             self._now = int(reply["memory"])
             _raise(reply)
-            return dict(reply["facts"]), _receive_arrays(self._connection, reply["arrays"], most, wait)
+            return dict(reply["facts"]), receive_arrays(self._connection, reply["arrays"], most, wait)
 
     @contextmanager
     def _told(self, deadline: Deadline) -> Iterator[None]:
@@ -331,46 +290,6 @@ class _Child:
         self._connection.close()
 
 
-def _blocks(_: int) -> None:
-    """What children wait for is the connection itself."""
-
-
-def _send(connection: socket.socket, message: Mapping[str, Any], wait: Wait = _blocks) -> None:
-    data = json.dumps(message).encode()
-    _send_all(connection, _LENGTH.pack(len(data)) + data, wait)
-
-
-def _send_all(connection: socket.socket, data: bytes | bytearray | memoryview, wait: Wait) -> None:
-    rest = memoryview(data)
-    while rest:
-        wait(select.POLLOUT)
-        with suppress(BlockingIOError):
-            rest = rest[connection.send(rest[:_PIECE]) :]
-
-
-def _receive(connection: socket.socket, wait: Wait = _blocks) -> dict[str, Any]:
-    """The next message; raises EOFError, and ValueError for what is none."""
-    (length,) = _LENGTH.unpack(_receive_exactly(connection, _LENGTH.size, wait))
-    if length > LONGEST_MESSAGE:
-        raise ValueError
-    message = json.loads(_receive_exactly(connection, length, wait))
-    if not isinstance(message, dict):
-        raise ValueError
-    return message
-
-
-def _receive_exactly(connection: socket.socket, length: int, wait: Wait = _blocks) -> bytearray:
-    # By pieces: what hasn't come yet takes no memory.
-    data = bytearray()
-    while len(data) < length:
-        wait(select.POLLIN)
-        piece = connection.recv(min(length - len(data), _PIECE))
-        if not piece:
-            raise EOFError
-        data += piece
-    return data
-
-
 def _raise(reply: Mapping[str, Any]) -> None:
     match reply.get("error"):
         case None:
@@ -379,128 +298,3 @@ def _raise(reply: Mapping[str, Any]) -> None:
             raise OutOfMemoryError("it takes more memory than it may have")
         case error:
             raise FailedError(str(error), str(reply["sentence"])[:LONGEST_SENTENCE])
-
-
-def _receive_arrays(connection: socket.socket, described: Any, most: int, wait: Wait) -> Arrays:
-    import numpy as np
-
-    arrays = {}
-    for name, dtype, shape in described:
-        if not _DTYPE.fullmatch(dtype) or not all(type(size) is int and size >= 0 for size in shape):
-            raise ValueError
-        length = math.prod(shape) * np.dtype(dtype).itemsize
-        most -= length
-        if most < 0:
-            raise ValueError
-        arrays[str(name)] = np.frombuffer(_receive_exactly(connection, length, wait), dtype).reshape(shape)
-    return arrays
-
-
-# What follows runs in the children.
-
-
-def main() -> None:
-    """Serve the parent's calls until it is gone."""
-    connection = socket.socket(fileno=int(sys.argv[1]))
-    # A terminal, or whoever ends a whole group, sends signals to the children as well: the parent decides.
-    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        signal.signal(number, signal.SIG_IGN)
-    threading.Thread(target=_end_with, args=[connection], daemon=True).start()
-    tune_malloc()
-    with suppress(OSError):  # where memory runs out, this process goes before the server
-        Path("/proc/self/oom_score_adj").write_text("1000")
-    for limit in (resource.RLIMIT_CORE, resource.RLIMIT_FSIZE):
-        resource.setrlimit(limit, (0, 0))
-    with suppress(Exception):  # a call will say what is the matter
-        _function(sys.argv[2])
-    _send(connection, {"memory": resident_size()})
-    with suppress(EOFError, ConnectionError):
-        while True:
-            _serve(connection, _receive(connection))
-
-
-def _end_with(connection: socket.socket) -> None:
-    """End this process when its parent is gone, whatever it does at that moment."""
-    poll = select.poll()
-    poll.register(connection, 0)  # nothing but the other side's end
-    poll.poll()
-    os._exit(1)
-
-
-def _serve(connection: socket.socket, request: Mapping[str, Any]) -> None:
-    bodies = [_receive_exactly(connection, request["body"])]
-
-    def run() -> tuple[Facts, Arrays]:
-        task = _function(request["task"])
-        with _limited(request["memory"], request["seconds"]):
-            return task(bodies.pop(), **request["facts"])  # and nobody keeps it longer
-
-    reply, arrays = _outcome(run)
-    trim_heap()
-    described = [(name, array.dtype.str, array.shape) for name, array in arrays.items()]
-    _send(connection, reply | {"arrays": described, "memory": resident_size()})
-    for array in arrays.values():
-        connection.sendall(array.data.cast("B") if array.size else b"")
-
-
-def _outcome(run: Callable[[], tuple[Facts, Arrays]]) -> tuple[Facts, Arrays]:
-    """A reply, and the arrays that go with it."""
-    try:
-        facts, arrays = run()
-        return {"facts": facts}, {name: _contiguous(array) for name, array in arrays.items()}
-    except MemoryError:
-        return {"error": "memory"}, {}
-    except FailedError as error:
-        return {"error": error.kind, "sentence": error.sentence[:LONGEST_SENTENCE]}, {}
-    except Exception as error:
-        return {"error": FailedError.UNEXPECTED, "sentence": in_a_line(error)[:LONGEST_SENTENCE]}, {}
-
-
-def in_a_line(error: BaseException) -> str:
-    """An exception that nobody expected, and where it was raised."""
-    where = traceback.extract_tb(error.__traceback__)[-1:]
-    places = "".join(f" ({Path(frame.filename).name}, line {frame.lineno})" for frame in where)
-    return f"{type(error).__name__}: {' '.join(str(error).split())}{places}"
-
-
-def _contiguous(array: NDArray[Any]) -> NDArray[Any]:
-    import numpy as np
-
-    return np.ascontiguousarray(array)
-
-
-def _function(path: str) -> Task:
-    module, name = path.split(":")
-    function: Task = getattr(importlib.import_module(module), name)
-    return function
-
-
-def allow(memory: int) -> None:
-    """For tasks that have learned what they need: so many bytes more than the caller said."""
-    soft, hard = resource.getrlimit(resource.RLIMIT_AS)
-    if soft != hard:
-        more = soft + memory
-        resource.setrlimit(resource.RLIMIT_AS, (more if hard == resource.RLIM_INFINITY else min(more, hard), hard))
-
-
-@contextmanager
-def _limited(memory: int, seconds: int) -> Iterator[None]:
-    """Bound what is mapped beyond what is so now, and the processor's time, where the system knows such limits."""
-    usage = resource.getrusage(resource.RUSAGE_SELF)
-    limits = {resource.RLIMIT_CPU: math.ceil(usage.ru_utime + usage.ru_stime) + seconds + 1}
-    if now := mapped_size():
-        limits[resource.RLIMIT_AS] = now + memory
-    before = {limit: resource.getrlimit(limit) for limit in limits}
-    try:
-        for limit, value in limits.items():
-            lowest = min(n for n in (value, *before[limit]) if n != resource.RLIM_INFINITY)
-            resource.setrlimit(limit, (lowest, before[limit][1]))
-        yield
-    finally:
-        for limit, pair in before.items():
-            resource.setrlimit(limit, pair)
-
-
-if __name__ == "__main__":
-    # Under its own name, by which tasks know its exceptions.
-    importlib.import_module("shapespace.service.limits.sandbox").main()

@@ -12,7 +12,7 @@ from pathlib import Path
 from shapespace.bundle.reader import BundleError, check_place, manifest_digest, read_bundle, read_files
 from shapespace.model.shape_model import ShapeModel
 from shapespace.service.limits.process_memory import trim_heap
-from shapespace.service.limits.sandbox import (
+from shapespace.service.limits.sandbox_errors import (
     ClosedError,
     DiedError,
     FailedError,

@@ -8,7 +8,8 @@ from collections.abc import Iterable
 from concurrent.futures import CancelledError, Future, ThreadPoolExecutor
 from pathlib import Path
 
-from shapespace.service.limits.sandbox import ClosedError, Sandbox
+from shapespace.service.limits.sandbox import Sandbox
+from shapespace.service.limits.sandbox_errors import ClosedError
 from shapespace.solve.deadline import Deadline
 
 #: What validating one bundle may take: seconds, and bytes beside so many times those of its files. Each byte of a

@@ -8,7 +8,9 @@ import numpy as np
 
 from shapespace.bundle.reader import BundleError, read_bundle
 from shapespace.model.shape_model import ShapeModel
-from shapespace.service.limits.sandbox import Arrays, Facts, FailedError, allow
+from shapespace.service.limits.sandbox_child import allow
+from shapespace.service.limits.sandbox_errors import FailedError
+from shapespace.service.limits.sandbox_wire import Arrays, Facts
 from shapespace.solve.cholesky import SymmetricPattern, analyse
 
 #: Bytes that the solver may take for each vertex of the coarse mesh, about twice what it does, and for all of them.

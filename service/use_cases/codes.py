@@ -14,14 +14,13 @@ from shapespace.model.decoder import MeshChoice
 from shapespace.model.edit import Target, edited, require_targets
 from shapespace.model.latent_space import Bounds, Codes, Distribution
 from shapespace.model.shape_model import ShapeModel
-from shapespace.service.limits.sandbox import (
+from shapespace.service.limits.sandbox import Pieces, Sandbox
+from shapespace.service.limits.sandbox_errors import (
     ClosedError,
     FailedError,
     LateError,
     NoProcessError,
     OutOfMemoryError,
-    Pieces,
-    Sandbox,
     SandboxError,
 )
 from shapespace.service.limits.workers import BusyError, Caller, DeadlineError, EndingError, Workers

@@ -20,7 +20,8 @@ from shapespace.arrays import FloatArray, IntArray
 from shapespace.files.formats import OCTET_STREAM, READ_FORMATS, read_arrays
 from shapespace.files.limits import Limits, clipped, count_bytes
 from shapespace.mesh.triangle_mesh import MeshError
-from shapespace.service.limits.sandbox import Arrays, Facts, FailedError
+from shapespace.service.limits.sandbox_errors import FailedError
+from shapespace.service.limits.sandbox_wire import Arrays, Facts
 
 #: Media types of the formats that can be read, by name.
 FORMATS = READ_FORMATS | {"json": "application/json"}

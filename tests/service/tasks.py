@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from shapespace.service.limits.sandbox import FailedError
+from shapespace.service.limits.sandbox_errors import FailedError
 
 Answer = tuple[dict[str, Any], dict[str, np.ndarray]]
 _kept: list[bytes] = []

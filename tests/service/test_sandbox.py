@@ -14,14 +14,14 @@ import numpy as np
 import pytest
 
 from shapespace.service.limits import sandbox
-from shapespace.service.limits.sandbox import (
+from shapespace.service.limits.sandbox import Sandbox
+from shapespace.service.limits.sandbox_errors import (
     ClosedError,
     DiedError,
     FailedError,
     LateError,
     NoProcessError,
     OutOfMemoryError,
-    Sandbox,
     SandboxError,
 )
 from shapespace.solve.deadline import Deadline

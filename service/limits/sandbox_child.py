@@ -1,0 +1,129 @@
+"""A sandbox's child: an interpreter that does one task after the other until its parent is gone.
+
+It imports little but what a task needs: its memory is what tasks are measured against.
+"""
+
+from __future__ import annotations
+
+import importlib
+import math
+import os
+import resource
+import select
+import signal
+import socket
+import sys
+import threading
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from shapespace.service.limits.process_memory import mapped_size, resident_size, trim_heap, tune_malloc
+from shapespace.service.limits.sandbox_errors import FailedError, in_a_line
+from shapespace.service.limits.sandbox_wire import LONGEST_SENTENCE, Arrays, Facts, receive, receive_exactly, send
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+#: ``(body, **facts)`` to facts and arrays.
+Task = Callable[..., tuple[Facts, Arrays]]
+
+
+def main() -> None:
+    """Serve the parent's calls until it is gone."""
+    connection = socket.socket(fileno=int(sys.argv[1]))
+    # A terminal, or whoever ends a whole group, sends signals to the children as well: the parent decides.
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, signal.SIG_IGN)
+    threading.Thread(target=_end_with, args=[connection], daemon=True).start()
+    tune_malloc()
+    with suppress(OSError):  # where memory runs out, this process goes before the server
+        Path("/proc/self/oom_score_adj").write_text("1000")
+    for limit in (resource.RLIMIT_CORE, resource.RLIMIT_FSIZE):
+        resource.setrlimit(limit, (0, 0))
+    with suppress(Exception):  # a call will say what is the matter
+        _function(sys.argv[2])
+    send(connection, {"memory": resident_size()})
+    with suppress(EOFError, ConnectionError):
+        while True:
+            _serve(connection, receive(connection))
+
+
+def _end_with(connection: socket.socket) -> None:
+    """End this process when its parent is gone, whatever it does at that moment."""
+    poll = select.poll()
+    poll.register(connection, 0)  # nothing but the other side's end
+    poll.poll()
+    os._exit(1)
+
+
+def _serve(connection: socket.socket, request: Mapping[str, Any]) -> None:
+    bodies = [receive_exactly(connection, request["body"])]
+
+    def run() -> tuple[Facts, Arrays]:
+        task = _function(request["task"])
+        with _limited(request["memory"], request["seconds"]):
+            return task(bodies.pop(), **request["facts"])  # and nobody keeps it longer
+
+    reply, arrays = _outcome(run)
+    trim_heap()
+    described = [(name, array.dtype.str, array.shape) for name, array in arrays.items()]
+    send(connection, reply | {"arrays": described, "memory": resident_size()})
+    for array in arrays.values():
+        connection.sendall(array.data.cast("B") if array.size else b"")
+
+
+def _outcome(run: Callable[[], tuple[Facts, Arrays]]) -> tuple[Facts, Arrays]:
+    """A reply, and the arrays that go with it."""
+    try:
+        facts, arrays = run()
+        return {"facts": facts}, {name: _contiguous(array) for name, array in arrays.items()}
+    except MemoryError:
+        return {"error": "memory"}, {}
+    except FailedError as error:
+        return {"error": error.kind, "sentence": error.sentence[:LONGEST_SENTENCE]}, {}
+    except Exception as error:
+        return {"error": FailedError.UNEXPECTED, "sentence": in_a_line(error)[:LONGEST_SENTENCE]}, {}
+
+
+def _contiguous(array: NDArray[Any]) -> NDArray[Any]:
+    import numpy as np
+
+    return np.ascontiguousarray(array)
+
+
+def _function(path: str) -> Task:
+    module, name = path.split(":")
+    function: Task = getattr(importlib.import_module(module), name)
+    return function
+
+
+def allow(memory: int) -> None:
+    """For tasks that have learned what they need: so many bytes more than the caller said."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_AS)
+    if soft != hard:
+        more = soft + memory
+        resource.setrlimit(resource.RLIMIT_AS, (more if hard == resource.RLIM_INFINITY else min(more, hard), hard))
+
+
+@contextmanager
+def _limited(memory: int, seconds: int) -> Iterator[None]:
+    """Bound what is mapped beyond what is so now, and the processor's time, where the system knows such limits."""
+    usage = resource.getrusage(resource.RUSAGE_SELF)
+    limits = {resource.RLIMIT_CPU: math.ceil(usage.ru_utime + usage.ru_stime) + seconds + 1}
+    if now := mapped_size():
+        limits[resource.RLIMIT_AS] = now + memory
+    before = {limit: resource.getrlimit(limit) for limit in limits}
+    try:
+        for limit, value in limits.items():
+            lowest = min(n for n in (value, *before[limit]) if n != resource.RLIM_INFINITY)
+            resource.setrlimit(limit, (lowest, before[limit][1]))
+        yield
+    finally:
+        for limit, pair in before.items():
+            resource.setrlimit(limit, pair)
+
+
+if __name__ == "__main__":
+    main()
