@@ -17,9 +17,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from shapespace.files.formats import read_arrays
 from shapespace.files.limits import Limits
-from shapespace.mesh.triangle_mesh import MeshError
 from shapespace.service.use_cases.uploads import UploadError, read_mesh_file
 
 #: Seconds of a processor after which a child is ended.
@@ -38,12 +36,9 @@ def most_memory() -> int:
 def read(body: bytearray, said: str) -> str:
     """What comes of a body: a sentence, or the mesh's size."""
     try:
-        if said == "off":  # which isn't taken from clients
-            vertices, faces = read_arrays(body, said, LIMITS)
-        else:
-            form = "/" in said
-            vertices, faces, _ = read_mesh_file(body, said if form else "", None if form else said, LIMITS)
-    except (UploadError, MeshError) as error:
+        form = "/" in said
+        vertices, faces, _ = read_mesh_file(body, said if form else "", None if form else said, LIMITS)
+    except UploadError as error:
         return str(error)
     return f"{len(vertices)} vertices and {len(faces)} faces"
 
