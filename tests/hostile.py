@@ -37,6 +37,71 @@ def filled(size: int, start: bytes, repeated: bytes, end: bytes = b"") -> bytes:
     return start + repeated * ((size - len(start) - len(end)) // len(repeated)) + end
 
 
+def repeating(format: str, start: bytes, repeated: bytes, end: bytes = b"") -> Make:
+    """One thing again and again."""
+    return lambda size: (format, filled(size, start, repeated, end))
+
+
+def ply_head(kind: str, *lines: str) -> bytes:
+    return "\n".join(["ply", f"format {kind} 1.0", *lines, "end_header", ""]).encode()
+
+
+XYZ = ("property float x", "property float y", "property float z")
+INDICES = "property list uchar int vertex_indices"
+PROPERTIES = [f"property list uchar int l{k}" for k in range(1500)]
+BOASTED = ("element vertex 1000000000000000", *XYZ, "element face 1000000000000000", INDICES)
+A_FILE = b'--b\r\nContent-Disposition: form-data; name="f"; filename="a.obj"\r\n\r\n'
+
+HOSTILE |= {
+    "obj_of_vertices": repeating("obj", b"", b"v 1 2 3\n", b"f 1 2 3\n"),
+    "obj_of_faces": repeating("obj", b"v 1 2 3\n", b"f 1 1 1\n"),
+    "obj_of_one_polygon": repeating("obj", b"v 1 2 3\n" * 3 + b"f", b" 1"),
+    "obj_of_long_polygons": repeating("obj", b"v 1 2 3\n" * 3, filled(MIB, b"f", b" 1", b"\n")),
+    "obj_of_long_texture_lines": repeating("obj", b"v 1 2 3\n" * 3, filled(MIB, b"vt", b" 1", b"\n")),
+    "obj_of_empty_lines": repeating("obj", b"", b"\n"),
+    "obj_of_short_lines": repeating("obj", b"", b"g\r"),
+    "obj_of_remarks": repeating("obj", b"", b"#\n"),
+    "obj_of_spaces": repeating("obj", b"", b" "),
+    "obj_of_nothing_but_digits": repeating("obj", b"v 1 2 ", b"9"),
+    "obj_of_long_numbers": repeating("obj", b"", filled(MIB, b"v 1 2 0.", b"9", b"\n")),
+    "obj_of_long_whole_numbers": repeating("obj", b"v 1 2 3\n", filled(MIB, b"f 1 1 ", b"1", b"\n")),
+    "off_of_remarks": repeating("off", b"OFF\n", b"# \n"),
+    "off_that_boasts": repeating("off", b"OFF 1000000000000 1000000000000 0\n", b"1 2 3\n"),
+    "off_of_long_lines": repeating("off", b"OFF 1000 1 0\n", filled(MIB, b"1 2 3", b" 4", b"\n")),
+    "off_of_polygons": repeating("off", b"OFF 1 60000 0\n1 2 3\n", b"30" + b" 0" * 30 + b"\n"),
+    "ply_that_boasts": repeating("ply", ply_head("binary_little_endian", *BOASTED), b"\0"),
+    "ply_that_boasts_in_text": repeating("ply", ply_head("ascii", *BOASTED), b"1 2 3\n"),
+    "ply_of_other_rows": repeating(
+        "ply", ply_head("ascii", f"element camera {10**15}", "property int x", "element vertex 1", *XYZ), b"1\n"
+    ),
+    "ply_of_many_properties": repeating(
+        "ply",
+        ply_head("ascii", "element vertex 1", *XYZ, "element face 65000", *PROPERTIES, INDICES) + b"0 0 0\n",
+        b"0 " * len(PROPERTIES) + b"3 0 0 0\n",
+    ),
+    "ply_without_end": repeating("ply", b"ply\nformat ascii 1.0\n", b"comment x\n"),
+    "stl_of_text": repeating("stl", b"solid\n", b"vertex 0 0 0\n", b"endsolid\n"),
+    "stl_of_solids": repeating("stl", b"", b"solid\nendsolid\n"),
+    "stl_of_one_line": repeating("stl", b"solid", b" vertex 0 0 0"),
+    "json_of_vertices": repeating("json", b'{"vertices": [', b"[1,2,3],", b"[1,2,3]]}"),
+    "json_of_numbers": repeating("json", b'{"vertices": [', b"1.5,", b"1]}"),
+    "json_of_objects": repeating("json", b'{"vertices": [', b'{"a":1},', b"1]}"),
+    "json_of_names": repeating("json", b'{"vertices": [', b'"a",', b"1]}"),
+    "json_of_spaces": repeating("json", b'{"vertices": [[1, 2, 3]]', b" ", b"}"),
+    "json_of_nesting": repeating("json", b"", b"["),
+    "gltf_of_many_buffers": repeating("gltf", b'{"buffers": [', b'{"uri":"data:,"},', b"{}]}"),
+    "gltf_of_escapes": repeating("gltf", b'{"buffers": [{"uri": "data:;base64,\\/', b"A", b'"}]}'),
+    "gltf_of_spaces": repeating("gltf", b"{", b" ", b"}"),
+    "form_of_parts": repeating(FORM, b"", b'--b\r\nContent-Disposition: form-data; name="a"\r\n\r\n\r\n', b"--b--\r\n"),
+    "form_of_almost_boundaries": repeating(FORM, A_FILE, b"\r\n--bX"),
+    "form_of_line_ends": repeating(FORM, A_FILE, b"\r\n-"),
+    "form_of_headers": repeating(FORM, b"--b\r\n", b"a: b\r\n"),
+    "form_with_a_long_header": repeating(FORM, b"--b\r\nContent-Disposition: ", b";a=b"),
+    "form_of_nothing": repeating(FORM, b"", b"\r\n"),
+    "form_with_an_obj": repeating(FORM, A_FILE, b"v 1 2 3\n", b"\r\n--b--\r\n"),
+}
+
+
 def glb(tree: object, data: bytes = b"") -> bytes:
     text = tree if isinstance(tree, bytes) else json.dumps(tree, separators=(",", ":")).encode()
     text += b" " * (-len(text) % 4)
@@ -100,112 +165,6 @@ def graph(count: int) -> bytes:
 
 
 @hostile
-def obj_of_vertices(size: int) -> tuple[str, bytes]:
-    return "obj", filled(size, b"", b"v 1 2 3\n", b"f 1 2 3\n")
-
-
-@hostile
-def obj_of_faces(size: int) -> tuple[str, bytes]:
-    return "obj", filled(size, b"v 1 2 3\n", b"f 1 1 1\n")
-
-
-@hostile
-def obj_of_one_polygon(size: int) -> tuple[str, bytes]:
-    return "obj", filled(size, b"v 1 2 3\n" * 3 + b"f", b" 1")
-
-
-@hostile
-def obj_of_long_polygons(size: int) -> tuple[str, bytes]:
-    return "obj", filled(size, b"v 1 2 3\n" * 3, filled(MIB, b"f", b" 1", b"\n"))
-
-
-@hostile
-def obj_of_long_texture_lines(size: int) -> tuple[str, bytes]:
-    return "obj", filled(size, b"v 1 2 3\n" * 3, filled(MIB, b"vt", b" 1", b"\n"))
-
-
-@hostile
-def obj_of_empty_lines(size: int) -> tuple[str, bytes]:
-    return "obj", b"\n" * size
-
-
-@hostile
-def obj_of_short_lines(size: int) -> tuple[str, bytes]:
-    return "obj", filled(size, b"", b"g\r")
-
-
-@hostile
-def obj_of_remarks(size: int) -> tuple[str, bytes]:
-    return "obj", filled(size, b"", b"#\n")
-
-
-@hostile
-def obj_of_spaces(size: int) -> tuple[str, bytes]:
-    return "obj", b" " * size
-
-
-@hostile
-def obj_of_nothing_but_digits(size: int) -> tuple[str, bytes]:
-    return "obj", filled(size, b"v 1 2 ", b"9")
-
-
-@hostile
-def obj_of_long_numbers(size: int) -> tuple[str, bytes]:
-    return "obj", filled(size, b"", filled(MIB, b"v 1 2 0.", b"9", b"\n"))
-
-
-@hostile
-def obj_of_long_whole_numbers(size: int) -> tuple[str, bytes]:
-    return "obj", filled(size, b"v 1 2 3\n", filled(MIB, b"f 1 1 ", b"1", b"\n"))
-
-
-@hostile
-def off_of_remarks(size: int) -> tuple[str, bytes]:
-    return "off", filled(size, b"OFF\n", b"# \n")
-
-
-@hostile
-def off_that_boasts(size: int) -> tuple[str, bytes]:
-    return "off", filled(size, b"OFF 1000000000000 1000000000000 0\n", b"1 2 3\n")
-
-
-@hostile
-def off_of_long_lines(size: int) -> tuple[str, bytes]:
-    return "off", filled(size, b"OFF 1000 1 0\n", filled(MIB, b"1 2 3", b" 4", b"\n"))
-
-
-@hostile
-def off_of_polygons(size: int) -> tuple[str, bytes]:
-    return "off", filled(size, b"OFF 1 60000 0\n1 2 3\n", b"30" + b" 0" * 30 + b"\n")
-
-
-def ply_head(kind: str, *lines: str) -> bytes:
-    return "\n".join(["ply", f"format {kind} 1.0", *lines, "end_header", ""]).encode()
-
-
-XYZ = ("property float x", "property float y", "property float z")
-INDICES = "property list uchar int vertex_indices"
-
-
-@hostile
-def ply_that_boasts(size: int) -> tuple[str, bytes]:
-    head = ply_head("binary_little_endian", f"element vertex {10**15}", *XYZ, f"element face {10**15}", INDICES)
-    return "ply", filled(size, head, b"\0")
-
-
-@hostile
-def ply_that_boasts_in_text(size: int) -> tuple[str, bytes]:
-    head = ply_head("ascii", f"element vertex {10**15}", *XYZ, f"element face {10**15}", INDICES)
-    return "ply", filled(size, head, b"1 2 3\n")
-
-
-@hostile
-def ply_of_other_rows(size: int) -> tuple[str, bytes]:
-    head = ply_head("ascii", f"element camera {10**15}", "property int x", "element vertex 1", *XYZ)
-    return "ply", filled(size, head, b"1\n")
-
-
-@hostile
 def ply_of_lists(size: int) -> tuple[str, bytes]:
     """Faces of different lengths, which have to be looked at one by one, with lists of other things."""
     lists = [f"property list uchar uchar l{k}" for k in range(3)]
@@ -224,18 +183,6 @@ def ply_of_one_list(size: int) -> tuple[str, bytes]:
 
 
 @hostile
-def ply_of_many_properties(size: int) -> tuple[str, bytes]:
-    lines = [f"property list uchar int l{k}" for k in range(1500)]
-    head = ply_head("ascii", "element vertex 1", *XYZ, "element face 65000", *lines, INDICES)
-    return "ply", filled(size, head + b"0 0 0\n", b"0 " * 1500 + b"3 0 0 0\n")
-
-
-@hostile
-def ply_without_end(size: int) -> tuple[str, bytes]:
-    return "ply", filled(size, b"ply\nformat ascii 1.0\n", b"comment x\n")
-
-
-@hostile
 def stl_of_triangles(size: int) -> tuple[str, bytes]:
     count = (size - 84) // 50
     return "stl", bytes(80) + struct.pack("<I", count) + bytes(50 * count)
@@ -244,21 +191,6 @@ def stl_of_triangles(size: int) -> tuple[str, bytes]:
 @hostile
 def stl_that_boasts(size: int) -> tuple[str, bytes]:
     return "stl", bytes(80) + struct.pack("<I", 2**32 - 1) + bytes(size - 84)
-
-
-@hostile
-def stl_of_text(size: int) -> tuple[str, bytes]:
-    return "stl", filled(size, b"solid\n", b"vertex 0 0 0\n", b"endsolid\n")
-
-
-@hostile
-def stl_of_solids(size: int) -> tuple[str, bytes]:
-    return "stl", filled(size, b"", b"solid\nendsolid\n")
-
-
-@hostile
-def stl_of_one_line(size: int) -> tuple[str, bytes]:
-    return "stl", filled(size, b"solid", b" vertex 0 0 0")
 
 
 def archive(
@@ -285,36 +217,27 @@ def npy(shape: str, data: bytes = b"", kind: str = "<f8") -> bytes:
 ZEROS = npy("(2796202, 3)", bytes(64 * MIB))
 
 
-@hostile
-def npz_of_zeros(size: int) -> tuple[str, bytes]:
-    """Sixty-four MiB of nothing, which deflate to sixty-four KiB."""
-    return "npz", archive({"vertices.npy": ZEROS, "faces.npy": ZEROS})
+def twice(member: bytes, method: int = zipfile.ZIP_DEFLATED, patch: tuple[int, int, str] | None = None) -> bytes:
+    """An archive with the same for vertices and faces."""
+    return archive({"vertices.npy": member, "faces.npy": member}, method, patch)
 
 
-@hostile
-def npz_whose_directory_lies(size: int) -> tuple[str, bytes]:
-    """The same, said to be of a few bytes."""
-    return "npz", archive({"vertices.npy": ZEROS, "faces.npy": ZEROS}, patch=(24, 1000, "<I"))
-
-
-@hostile
-def npz_whose_array_boasts(size: int) -> tuple[str, bytes]:
-    member = npy(f"({10**17}, 3)", bytes(24))
-    return "npz", archive({"vertices.npy": member, "faces.npy": member})
-
-
-@hostile
-def npz_of_long_text(size: int) -> tuple[str, bytes]:
-    """A few entries of half a MiB each, which deflate well."""
-    member = npy("(64, 3)", bytes(96 * MIB), f"<U{MIB // 8}")
-    return "npz", archive({"vertices.npy": member, "faces.npy": member})
-
-
-@hostile
-def npz_with_a_long_head(size: int) -> tuple[str, bytes]:
-    """A head of 96 MiB, which deflates to half a MiB."""
-    member = b"\x93NUMPY\x02\x00" + struct.pack("<I", 96 * MIB) + bytes(96 * MIB)
-    return "npz", archive({"vertices.npy": member, "faces.npy": member})
+HOSTILE |= {
+    # Sixty-four MiB of nothing, which deflate to sixty-four KiB; said to be of a few bytes; and encrypted.
+    "npz_of_zeros": lambda _: ("npz", twice(ZEROS)),
+    "npz_whose_directory_lies": lambda _: ("npz", twice(ZEROS, patch=(24, 1000, "<I"))),
+    "npz_that_is_encrypted": lambda _: ("npz", twice(ZEROS, patch=(8, 1, "<H"))),
+    "npz_whose_array_boasts": lambda _: ("npz", twice(npy(f"({10**17}, 3)", bytes(24)))),
+    # A few entries of half a MiB each, which deflate well.
+    "npz_of_long_text": lambda _: ("npz", twice(npy("(64, 3)", bytes(96 * MIB), f"<U{MIB // 8}"))),
+    # A head of 96 MiB, which deflates to half a MiB.
+    "npz_with_a_long_head": lambda _: (
+        "npz",
+        twice(b"\x93NUMPY\x02\x00" + struct.pack("<I", 96 * MIB) + bytes(96 * MIB)),
+    ),
+    # LZMA takes as much memory as its head says.
+    "npz_by_another_method": lambda _: ("npz", twice(npy("(10922, 3)", bytes(MIB // 4)), zipfile.ZIP_LZMA)),
+}
 
 
 @hostile
@@ -334,43 +257,6 @@ def npz_of_a_thousand_members(size: int) -> tuple[str, bytes]:
 
 
 @hostile
-def npz_by_another_method(size: int) -> tuple[str, bytes]:
-    """LZMA takes as much memory as its head says."""
-    member = npy("(10922, 3)", bytes(MIB // 4))
-    return "npz", archive({"vertices.npy": member, "faces.npy": member}, zipfile.ZIP_LZMA)
-
-
-@hostile
-def npz_that_is_encrypted(size: int) -> tuple[str, bytes]:
-    return "npz", archive({"vertices.npy": ZEROS, "faces.npy": ZEROS}, patch=(8, 1, "<H"))
-
-
-@hostile
-def json_of_vertices(size: int) -> tuple[str, bytes]:
-    return "json", filled(size, b'{"vertices": [', b"[1,2,3],", b"[1,2,3]]}")
-
-
-@hostile
-def json_of_numbers(size: int) -> tuple[str, bytes]:
-    return "json", filled(size, b'{"vertices": [', b"1.5,", b"1]}")
-
-
-@hostile
-def json_of_objects(size: int) -> tuple[str, bytes]:
-    return "json", filled(size, b'{"vertices": [', b'{"a":1},', b"1]}")
-
-
-@hostile
-def json_of_names(size: int) -> tuple[str, bytes]:
-    return "json", filled(size, b'{"vertices": [', b'"a",', b"1]}")
-
-
-@hostile
-def json_of_spaces(size: int) -> tuple[str, bytes]:
-    return "json", filled(size, b'{"vertices": [[1, 2, 3]]', b" ", b"}")
-
-
-@hostile
 def json_of_one_wide_string(size: int) -> tuple[str, bytes]:
     """One character beyond the first plane, and every other takes four bytes too."""
     return "json", filled(min(size, 13 * MIB), b'{"name": "\xf0\x9f\x98\x80', b"a", b'"}')
@@ -380,11 +266,6 @@ def json_of_one_wide_string(size: int) -> tuple[str, bytes]:
 def json_with_an_escape(size: int) -> tuple[str, bytes]:
     """The same in ASCII, and wrong at its end, where the error holds all of it."""
     return "json", filled(min(size, 13 * MIB), b'{"name": "\\ud83d\\ude00', b"a", b'"}}')
-
-
-@hostile
-def json_of_nesting(size: int) -> tuple[str, bytes]:
-    return "json", b"[" * size
 
 
 @hostile
@@ -478,55 +359,3 @@ def gltf_of_strides(size: int) -> tuple[str, bytes]:
         accessors=[{"bufferView": 0, "componentType": 5126, "type": "VEC3", "count": count // 3 * 3}],
         meshes=[{"primitives": [{"attributes": {"POSITION": 0}}]}],
     )
-
-
-@hostile
-def gltf_of_many_buffers(size: int) -> tuple[str, bytes]:
-    return "gltf", filled(size, b'{"buffers": [', b'{"uri":"data:,"},', b"{}]}")
-
-
-@hostile
-def gltf_of_escapes(size: int) -> tuple[str, bytes]:
-    return "gltf", filled(size, b'{"buffers": [{"uri": "data:;base64,\\/', b"A", b'"}]}')
-
-
-@hostile
-def gltf_of_spaces(size: int) -> tuple[str, bytes]:
-    return "gltf", filled(size, b"{", b" ", b"}")
-
-
-@hostile
-def form_of_parts(size: int) -> tuple[str, bytes]:
-    part = b'--b\r\nContent-Disposition: form-data; name="a"\r\n\r\n\r\n'
-    return FORM, filled(size, b"", part, b"--b--\r\n")
-
-
-@hostile
-def form_of_almost_boundaries(size: int) -> tuple[str, bytes]:
-    return FORM, filled(size, b'--b\r\nContent-Disposition: form-data; name="f"; filename="a.obj"\r\n\r\n', b"\r\n--bX")
-
-
-@hostile
-def form_of_line_ends(size: int) -> tuple[str, bytes]:
-    return FORM, filled(size, b'--b\r\nContent-Disposition: form-data; name="f"; filename="a.obj"\r\n\r\n', b"\r\n-")
-
-
-@hostile
-def form_of_headers(size: int) -> tuple[str, bytes]:
-    return FORM, filled(size, b"--b\r\n", b"a: b\r\n")
-
-
-@hostile
-def form_with_a_long_header(size: int) -> tuple[str, bytes]:
-    return FORM, filled(size, b"--b\r\nContent-Disposition: ", b";a=b")
-
-
-@hostile
-def form_of_nothing(size: int) -> tuple[str, bytes]:
-    return FORM, b"\r\n" * (size // 2)
-
-
-@hostile
-def form_with_an_obj(size: int) -> tuple[str, bytes]:
-    head = b'--b\r\nContent-Disposition: form-data; name="f"; filename="a.obj"\r\n\r\n'
-    return FORM, filled(size, head, b"v 1 2 3\n", b"\r\n--b--\r\n")
