@@ -56,11 +56,11 @@ lint: $(VENV)/.all $(BIN)/hadolint ## check style, types, doors between packages
 	$(BIN)/lint-imports
 	$(BIN)/hadolint Dockerfile
 
-QUICK = tests/shapespace tests/service/test_use_cases.py tests/training/test_config.py $(wildcard tests/test_[cdm]*.py)
+QUICK = tests/shapespace tests/service/use_cases/test_use_cases.py tests/training/test_config.py $(wildcard tests/test_[cdm]*.py)
 
 # What the libraries of serving take part in, and training doesn't.
 SERVING = $(filter-out $(foreach name,blocks bundled_files proxy reloading replicas,%/test_$(name).py), \
-	$(wildcard tests/service/test_*.py)) $(foreach name,files/test_formats files/test_polygon_reading files/test_gltf_reading \
+	$(wildcard tests/service/*/test_*.py)) $(foreach name,files/test_formats files/test_polygon_reading files/test_gltf_reading \
 	coordinates/test_reconstruction solve/test_cholesky,tests/shapespace/$(name).py)
 
 lowest: $(VENV)-lowest/.installed ## run the server's tests with the lowest versions that pyproject.toml allows
@@ -91,7 +91,7 @@ fuzz: $(VENV)/.all ## try every parser with thousands of made-up files (EXAMPLES
 	PATH="$(CURDIR)/$(BIN):$$PATH" FUZZ_EXAMPLES=$(or $(EXAMPLES),2000) $(BIN)/python -m pytest tests/fuzz $(ARGS)
 
 fuzz-api: $(VENV)/.all ## try every call with thousands of requests (EXAMPLES=100 for each call and phase)
-	PATH="$(CURDIR)/$(BIN):$$PATH" FUZZ_EXAMPLES=$(or $(EXAMPLES),100) $(BIN)/python -m pytest tests/service/test_openapi.py -k schemathesis
+	PATH="$(CURDIR)/$(BIN):$$PATH" FUZZ_EXAMPLES=$(or $(EXAMPLES),100) $(BIN)/python -m pytest tests/service/http/test_openapi.py -k schemathesis
 
 mutants: $(VENV)/.all ## make 160 small mistakes in the library and see which its tests miss (COUNT=160)
 	$(BIN)/python -m pip install $(foreach package,$(MUTANTS),'$(package)')

@@ -19,7 +19,7 @@ from tests.faults.clock import YEAR, jumping_clock
 from tests.faults.on_training import read_only
 from tests.faults.serving import eventually
 from tests.service.bundles import SCALE, rescale, write_bundle
-from tests.service.test_draining import Load
+from tests.service.operation.test_draining import Load
 from tests.service.truth import Truth, fingerprint, good_calls
 
 

@@ -26,7 +26,7 @@ from tests.faults.serving import peak_memory
 from tests.service import hostile
 from tests.service.bundles import SCALE, reference, rescale, write_bundle
 from tests.service.conftest import ROOT, Server, Start
-from tests.service.test_bundles import flip_a_bit
+from tests.service.repository.test_bundles import flip_a_bit
 from tests.service.watching import eventually, samples, value
 
 CODES = [[0.1, 0.7, 0.4], [0.0, 0.0, 0.0], [0.05, 1.0, 0.2]]

@@ -83,7 +83,7 @@ def test_the_summary_of_several_shapes_is_their_worst(tmp_path: Path) -> None:
 
 @pytest.fixture(scope="module", params=["figure", "freaky-torus"])
 def bundled(request: pytest.FixtureRequest) -> ShapeModel:
-    return ShapeModel(read_bundle(Path(__file__).parents[2] / "models" / request.param / "1"))
+    return ShapeModel(read_bundle(Path(__file__).parents[3] / "models" / request.param / "1"))
 
 
 def wide_codes(model: ShapeModel, count: int) -> np.ndarray:

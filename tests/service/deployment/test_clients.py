@@ -8,7 +8,7 @@ import httpx
 
 from tests.clients.files import write_files
 
-THREE = Path(__file__).parents[1] / "clients" / "three.mjs"
+THREE = Path(__file__).parents[2] / "clients" / "three.mjs"
 
 
 def test_three_js_sees_every_vertex_where_it_should_be(client: httpx.Client, tmp_path: Path) -> None:
