@@ -171,7 +171,7 @@ class Client:
             name: of the model.
             mesh: arrays, a file or its content.
             format: of the content; by default the file's suffix.
-            options: version, bounds ("allow", "clamp" or "reject").
+            options: version, bounds ("allow", "clamp" or "reject"), objective ("vertices" or "nric").
 
         Returns:
             ``latent``, ``residual``, ``vertex_error`` and more.

@@ -12,6 +12,7 @@ from shapespace.files.limits import Limits
 from shapespace.model.correspondence import limits, match
 from shapespace.model.decoder import MeshChoice
 from shapespace.model.edit import Target, edited, require_targets
+from shapespace.model.encode import Objective
 from shapespace.model.latent_space import Bounds, Codes, Distribution
 from shapespace.model.shape_model import ShapeModel
 from shapespace.service.limits.sandbox import Pieces, Sandbox
@@ -65,9 +66,15 @@ class Upload:
 
 
 async def encode(
-    workers: Workers, sandbox: Sandbox, caller: Caller, model: ShapeModel, upload: Upload, bounds: Bounds
+    workers: Workers,
+    sandbox: Sandbox,
+    caller: Caller,
+    model: ShapeModel,
+    upload: Upload,
+    bounds: Bounds,
+    objective: Objective,
 ) -> Found:
-    """The code whose shape comes closest to a mesh in correspondence, in any rigid pose.
+    """The code whose shape comes closest to a mesh in correspondence, in any rigid pose; see ShapeModel.encode.
 
     Raises:
         UploadError, InvalidMeshError: no mesh that can be used.
@@ -79,7 +86,7 @@ async def encode(
         began = time.perf_counter()
         given = match(model, *read_mesh(sandbox, upload, limits(model), deadline))
         read = time.perf_counter()
-        found = model.encode(given, bounds, deadline)
+        found = model.encode(given, bounds, deadline, objective)
         if found.status is Status.DEADLINE:
             raise workers.late()
         seconds = {"read": read - began, "search": time.perf_counter() - read}

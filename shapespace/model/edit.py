@@ -15,6 +15,7 @@ from shapespace.mesh.rigid_motion import without_rigid_motion
 from shapespace.model.decoder import Decoder, MeshChoice, Shape
 from shapespace.model.derivatives import batches, derivatives, factor_derivatives, nodes
 from shapespace.model.latent_space import Bounds, Codes, NotFiniteError
+from shapespace.model.searched_shapes import SearchedShapes
 from shapespace.solve.deadline import Deadline
 from shapespace.solve.least_squares import Box, Fit, Stopping, least_squares, shrinkable
 from shapespace.solve.outcome import Status
@@ -132,7 +133,7 @@ def edited(
     found = shape.vertices[[target.vertex for target in targets]]
     distances = np.linalg.norm(found - model.manifest.scale * positions, axis=1)
     status = Status.DEADLINE if shape.diagnostics.status is Status.DEADLINE else fit.status
-    return Edited(code, status, pulled.shapes, shape, distances)
+    return Edited(code, status, pulled.shapes.count, shape, distances)
 
 
 def _best(problem: _Problem) -> Fit:
@@ -251,11 +252,7 @@ class _Problem:
 
 
 class _PulledVertices:
-    """Positions of a few vertices of answered shapes, normalised, as functions of the code.
-
-    Each shape is reconstructed from the last one, or from integrated frames where these are nearer; a rough shape is
-    that of the frames (shapespace.coordinates.frame_integration) without Gauss–Newton.
-    """
+    """Positions of a few vertices of answered shapes, normalised, as functions of the code."""
 
     def __init__(
         self,
@@ -267,26 +264,23 @@ class _PulledVertices:
         *,
         rough: bool,
     ) -> None:
-        self._model, self._reconstruct, self._deadline, self._rough = model, reconstruct, deadline, rough
-        self._vertices, self._mesh = vertices, mesh
-        self._code, self._shape = np.full(model.latents.dimension, np.nan), model.reference.vertices
-        self.shapes = 0
+        self._model, self._reconstruct, self._vertices, self._mesh = model, reconstruct, vertices, mesh
+        self.shapes = SearchedShapes(model, reconstruct, deadline, rough=rough)
 
     def positions(self, x: FloatArray) -> FloatArray:
         """(k, 3) at a code (m,); not finite where the networks overflow."""
-        return self._places(self._solved(x))
+        return self._places(self.shapes(x))
 
     def derivatives(self, x: FloatArray, changes: FloatArray) -> FloatArray:
         """(m, k, 3) at a code (m,), given those of lengths and angles (2E, m)."""
-        shape = self._solved(x)
-        fields = self._reconstruct.differential(shape, changes.T)
+        shape, fields = self.shapes(x), self.shapes.derivatives(x, changes)
         h = DIFFERENCE * self._model.reference.diagonal / max(np.abs(fields).max(), np.finfo(float).tiny)
         here, *there = self._places(np.concatenate([shape[None], shape + h * fields]))
         return np.stack([(places - here) / h for places in there])
 
     def sensitivity(self, x: FloatArray, some: IntArray) -> FloatArray:
         """(3k, 2E) derivatives of some positions (k,) by lengths and angles at a code (m,), without normals'."""
-        model, shape = self._model, self._solved(x)
+        model, shape = self._model, self.shapes(x)
         count, fine = len(shape), model.finer(self._mesh)
         weights = fine.prolong.weights if fine else sparse.eye_array(count, format="csr")
         rows = weights[self._vertices[some]][:, :count]
@@ -297,16 +291,3 @@ class _PulledVertices:
     def _places(self, shapes: FloatArray) -> FloatArray:
         """(…, k, 3) of shapes (…, V, 3)."""
         return self._model.placed(shapes, self._mesh)[..., self._vertices, :]
-
-    def _solved(self, x: FloatArray) -> FloatArray:
-        if not np.array_equal(x, self._code):
-            self._code, self._shape = x.copy(), self._solve(self._model.nric(x))
-        return self._shape
-
-    def _solve(self, target: FloatArray) -> FloatArray:
-        framed, reconstruct = self._reconstruct.integrate(target), self._reconstruct
-        if self._rough:
-            return reconstruct.nearest(target, framed, self._model.reference.vertices)
-        self.shapes += 1
-        start = reconstruct.nearest(target, framed, self._shape)
-        return reconstruct(target, start, tolerance=1e-5, deadline=self._deadline).vertices

@@ -1,19 +1,21 @@
-"""Encoding: from a mesh to its latent code, by least squares in lengths and angles, which do not depend on the pose."""
+"""Encoding: from a mesh to the latent code whose shape comes closest, in vertices or in lengths and angles."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from enum import StrEnum
 from functools import cached_property
 
 import numpy as np
 
 from shapespace.arrays import FloatArray
 from shapespace.coordinates.nric import WeightedNorm, nric, wrap
-from shapespace.mesh.rigid_motion import align
+from shapespace.mesh.rigid_motion import align, without_rigid_motion
 from shapespace.model.correspondence import InvalidMeshError, Matched
 from shapespace.model.decoder import Decoder, MeshChoice, Shape
 from shapespace.model.derivatives import FactorGrids, derivatives, factor_derivatives, nodes
 from shapespace.model.latent_space import Bounds, Codes, NotFiniteError
+from shapespace.model.searched_shapes import SearchedShapes
 from shapespace.solve.deadline import Deadline
 from shapespace.solve.least_squares import Box, Fit, Stopping, least_squares
 from shapespace.solve.outcome import Status
@@ -21,19 +23,30 @@ from shapespace.solve.outcome import Status
 #: Times that each factor may be moved on its grid while the others stay, and the factor by which a move must explain
 #: more of the misfit than the present place does.
 SWEEPS, PROMISING = 4, 1.2
+#: Of the search by vertices: it ends once no coordinate would move further than this fraction of the bounds, or the sum
+#: of squares would shrink by less than this, or after so many shapes.
+TOLERANCE, GAIN, SHAPES = 1e-4, 1e-4, 25
 #: A code may leave the bounds by this fraction of their width where that is allowed.
 MARGIN = 0.5
 
 
+class Objective(StrEnum):
+    """What the shape of a code should have in common with a mesh."""
+
+    VERTICES = "vertices"
+    NRIC = "nric"
+
+
 @dataclass(frozen=True)
 class Encoded:
-    """The code whose lengths and angles come closest to a mesh's.
+    """The code whose shape comes closest to a mesh.
 
     Attributes:
         code: (m,), float32, as the networks take it.
         inside_bounds: whether it lies inside the bounds.
         status: how the iteration ended.
-        iterations: evaluations of the networks' misfit.
+        iterations: shapes that the search by vertices looked at, or evaluations of the networks where it was by
+            lengths and angles.
         residual: relative misfit of lengths and angles, in the weighted norm of the reconstruction.
         shape: of the code, on the mesh that was given.
         distances: (V,) from the given vertices to those of that shape, after rigid alignment.
@@ -53,10 +66,14 @@ class Encoded:
 class Encoder:
     """Finds codes of meshes; may be used by several threads at once.
 
-    Minimises ``‖z(code) − z‖_{2,z̄}``, angles compared modulo 2π, in two rounds. The first takes the factors alone,
-    ``z̄ + Σ_j (ψ_j − z̄)``, which come within a few percent and cost little; where a factor has periodic coordinates it
-    begins at the best of a grid. The second takes the whole composite, and rarely needs more than a handful of
-    evaluations beside one Jacobian.
+    By lengths and angles it minimises ``‖z(code) − z‖_{2,z̄}``, angles compared modulo 2π, in two rounds, whatever the
+    pose. The first takes the factors alone, ``z̄ + Σ_j (ψ_j − z̄)``, which come within a few percent and cost little;
+    where a factor has periodic coordinates it begins at the best of a grid. The second takes the whole composite, and
+    rarely needs more than a handful of evaluations beside one Jacobian.
+
+    By vertices it goes on from there to the minimum of ``Σ_i ‖x_i(code) − x_i‖²`` over the vertices of the coarse mesh,
+    after rigid alignment: small angles add up along a limb, and what is smallest in lengths and angles may be twice as
+    far in space. The shapes' derivatives are those of ``shapespace.model.edit``.
     """
 
     def __init__(self, model: Decoder) -> None:
@@ -65,13 +82,20 @@ class Encoder:
         self._root = np.sqrt(self._norm.squared)
         self._centre = nric(model.reference.vertices, model.reference.connectivity)
 
-    def __call__(self, given: Matched, bounds: Bounds = Bounds.ALLOW, deadline: Deadline | None = None) -> Encoded:
+    def __call__(
+        self,
+        given: Matched,
+        bounds: Bounds = Bounds.ALLOW,
+        deadline: Deadline | None = None,
+        objective: Objective = Objective.VERTICES,
+    ) -> Encoded:
         """The code of a mesh.
 
         Args:
             given: in the model's order, in the units of the training meshes and in any rigid pose.
             bounds: REJECT refuses a code outside the bounds, CLAMP looks for one inside only.
             deadline: after which the status is Status.DEADLINE.
+            objective: what is compared.
 
         Raises:
             InvalidMeshError: edges without any length.
@@ -80,17 +104,22 @@ class Encoder:
         """
         model, latents = self.model, self.model.latents
         with np.errstate(over="ignore", invalid="ignore"):
-            target = nric(model.coarse(given.vertices, given.mesh) / model.manifest.scale, model.reference.connectivity)
+            vertices = model.coarse(given.vertices, given.mesh) / model.manifest.scale
+            target = nric(vertices, model.reference.connectivity)
             if not np.isfinite(self._norm.square(target)):
                 raise NotFiniteError("The mesh is so large that the numbers overflow. Send it in the model's units.")
         if not target.any():
             raise InvalidMeshError("The mesh is a single point: no edge has a length. Send a surface.")
         lower, upper = latents.box(MARGIN if bounds is not Bounds.CLAMP else 0.0)
-        fit = self._fit(target, lower, upper, deadline)
+        box = Box(lower, upper, latents.width)
+        fit = self._by_nric(target, box, deadline)
+        if objective is Objective.VERTICES and fit.status is not Status.DEADLINE:
+            fit = self._by_vertices(vertices, fit.x, box, deadline)
         code, inside = latents.code(fit.x.tolist(), bounds)
         shape = model.shape(code, inside, given.mesh, deadline)
         distances = np.linalg.norm(align(shape.vertices, given.vertices) - given.vertices, axis=1)
-        residual = float(np.sqrt(fit.cost / self._norm.square(target)))
+        left = self._difference(model.nric(code.astype(np.float64)), target)
+        residual = float(np.sqrt(self._norm.square(left) / self._norm.square(target)))
         status = Status.DEADLINE if shape.diagnostics.status is Status.DEADLINE else fit.status
         return Encoded(code, inside, status, fit.iterations, residual, shape, distances, given.mesh)
 
@@ -99,9 +128,31 @@ class Encoder:
         """What starts are chosen from; made once, at the first mesh."""
         return FactorGrids.of(self.model)
 
-    def _fit(self, target: FloatArray, lower: FloatArray, upper: FloatArray, deadline: Deadline | None) -> Fit:
+    def _by_vertices(self, target: FloatArray, start: FloatArray, box: Box, deadline: Deadline | None) -> Fit:
+        """The fit to vertices (V, 3), from a start nearby."""
+        model, weight = self.model, 1 / (self.model.reference.diagonal * np.sqrt(len(target)))
+        with model.solver() as reconstruct:
+            shapes = SearchedShapes(model, reconstruct, deadline)
+
+            def residuals(x: FloatArray) -> FloatArray:
+                shape = shapes(x)
+                if not np.isfinite(shape).all():
+                    return np.full(target.size, np.nan)
+                return weight * (align(shape, target) - target).ravel()
+
+            def jacobian(x: FloatArray, _: FloatArray) -> FloatArray:
+                shape, fields = shapes(x), shapes.derivatives(x, derivatives(model, x))
+                there = align(shape, target)
+                turned = align(shape, target, carried=shape + fields) - there
+                return weight * without_rigid_motion(turned, there).reshape(len(fields), -1).T
+
+            return least_squares(
+                residuals, jacobian, start, box, Stopping(TOLERANCE, GAIN, max_evaluations=SHAPES, deadline=deadline)
+            )
+
+    def _by_nric(self, target: FloatArray, box: Box, deadline: Deadline | None) -> Fit:
+        """The fit to lengths and angles (2E,)."""
         latents, root = self.model.latents, self._root
-        box = Box(lower, upper, latents.width)
 
         def affine(x: FloatArray) -> FloatArray:
             return root * self._difference(self._affine(x), target)

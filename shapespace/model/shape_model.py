@@ -21,7 +21,7 @@ from shapespace.mesh.triangle_mesh import TriangleMesh
 from shapespace.model.correspondence import InvalidMeshError, Matched, match
 from shapespace.model.decoder import Decoder, MeshChoice
 from shapespace.model.edit import PRIOR, Edited, Target, edited
-from shapespace.model.encode import Encoded, Encoder
+from shapespace.model.encode import Encoded, Encoder, Objective
 from shapespace.model.latent_space import Bounds, Codes, Distribution, WrongLengthError
 from shapespace.solve.deadline import Deadline
 from shapespace.solve.outcome import Status
@@ -29,6 +29,7 @@ from shapespace.solve.outcome import Status
 #: The values of the enumerations, so that callers may write plain strings.
 MeshName = MeshChoice | Literal["fine", "coarse"]
 BoundsName = Bounds | Literal["allow", "clamp", "reject"]
+ObjectiveName = Objective | Literal["vertices", "nric"]
 DistributionName = Distribution | Literal["uniform", "gaussian"]
 
 
@@ -165,6 +166,7 @@ class ShapeModel(Decoder):
         mesh: ArrayLike | TriangleMesh | Matched | str | os.PathLike[str],
         bounds: BoundsName = "allow",
         deadline: Deadline | None = None,
+        objective: ObjectiveName = "vertices",
     ) -> Encoded:
         """The code whose shape comes closest to a mesh in correspondence, in any rigid pose.
 
@@ -174,6 +176,8 @@ class ShapeModel(Decoder):
             bounds: "allow" lets the code lie up to half the bounds' width outside, "clamp" searches inside only,
                 "reject" refuses a code outside.
             deadline: after which the status is Status.DEADLINE.
+            objective: what comes closest, "vertices" after rigid alignment, or "nric", lengths and angles, in their
+                weighted norm.
 
         Raises:
             MeshError: a file that can't be read.
@@ -187,7 +191,8 @@ class ShapeModel(Decoder):
         >>> bool(np.abs(found.code - code).max() < 1e-2), found.mesh, found.shape.vertices.shape
         (True, <MeshChoice.FINE: 'fine'>, (4601, 3))
         """
-        return self._encoder(mesh if isinstance(mesh, Matched) else self._matched(mesh), Bounds(bounds), deadline)
+        given = mesh if isinstance(mesh, Matched) else self._matched(mesh)
+        return self._encoder(given, Bounds(bounds), deadline, Objective(objective))
 
     def edit(
         self,

@@ -169,7 +169,7 @@ class EncodeAnswer(BaseModel):
     vertex_errors: list[float] = Field(description="The same vertex by vertex.")
     inside_bounds: bool = Field(description="Whether the code lies inside the model's bounds.")
     status: str = Field(description="How the search ended: converged, stalled, iteration_limit.")
-    iterations: int = Field(description="Its evaluations of the networks.")
+    iterations: int = Field(description="Shapes that it looked at; evaluations of the networks if by `nric`.")
     mesh: MeshChoice = Field(description="Which mesh of the model was sent.")
     diagnostics: DiagnosticsAnswer = Field(description="Of the code's shape.")
 

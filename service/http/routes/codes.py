@@ -7,6 +7,7 @@ from typing import Annotated
 from fastapi import APIRouter, Depends, Query, Request, Response
 
 from shapespace.model.edit import Target
+from shapespace.model.encode import Objective
 from shapespace.model.latent_space import Bounds
 from shapespace.service.http.dependencies import CallerDependency, MeshQuery, Model, ServiceDependency, one_of
 from shapespace.service.http.description import problems
@@ -59,6 +60,10 @@ async def encode(
     bounds: Annotated[
         Bounds, Query(description="Whether the code may lie outside the bounds, is looked for inside, or is refused.")
     ] = Bounds.ALLOW,
+    objective: Annotated[
+        Objective,
+        Query(description="What comes closest: vertices after rigid alignment, or lengths and angles (`nric`)."),
+    ] = Objective.VERTICES,
 ) -> Response:
     """The code whose shape comes closest to a mesh in correspondence, in any rigid pose.
 
@@ -66,7 +71,7 @@ async def encode(
     units of the training meshes.
     """
     upload = codes.Upload(await gather(request), request.headers.get("content-type", ""), format)
-    found = await codes.encode(service.workers, service.sandbox, caller, model, upload, bounds)
+    found = await codes.encode(service.workers, service.sandbox, caller, model, upload, bounds, objective)
     return found_response(service, found)
 
 
