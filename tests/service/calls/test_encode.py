@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from shapespace.bundle.reader import read_bundle
 from shapespace.files.formats import MESH_FORMATS, npz
+from shapespace.mesh.rigid_motion import align
 from shapespace.mesh.triangle_mesh import TriangleMesh
 from shapespace.model.correspondence import InvalidMeshError, Matched, limits, match
 from shapespace.model.decoder import MeshChoice
@@ -253,3 +254,37 @@ def test_files_like_those_that_the_model_was_made_of(of_files: ShapeModel) -> No
     faces[0, 0] = 0  # the vertex that belongs to no face
     with pytest.raises(InvalidMeshError, match="No face joins"):
         matched(of_files, MESH_FORMATS["obj"].encode(vertices, faces), "obj")
+
+
+def bent(x: np.ndarray, length: float) -> np.ndarray:
+    """A shape (V, 3) pushed to and fro by waves of such a length, as no code does it."""
+    return x + 0.1 * length * np.sin(x / length)[:, [1, 2, 0]]
+
+
+def test_the_objective_says_what_comes_closest(client: httpx.Client) -> None:
+    shape = np.array(mesh_file(client, model="figure", latent=[0.5] * 20).json()["vertices"])
+    content = as_json(bent(shape, np.ptp(shape[:, 1]) / 6))
+    path = "/v1/models/figure/encode"
+    by_vertices = encode(client, content, path=path)
+    assert encode(client, content, path=path, objective="vertices") == by_vertices
+    by_nric = encode(client, content, path=path, objective="nric")
+    assert by_nric["residual"] < 0.99 * by_vertices["residual"]
+    assert by_vertices["vertex_error"]["mean"] < 0.8 * by_nric["vertex_error"]["mean"]
+    assert by_vertices["iterations"] <= 30
+    wrong = client.post(path, content=content, params={"format": "json", "objective": "pose"})
+    assert wrong.status_code == 422
+
+
+def test_the_code_is_the_minimum_over_vertices(client: httpx.Client) -> None:
+    mesh = reference()
+    target = bent(SCALE * mesh.vertices, SCALE / 3)
+
+    def squares(latent: np.ndarray) -> float:
+        shape = np.array(mesh_file(client, mesh="coarse", latent=latent.tolist()).json()["vertices"])
+        return float(((align(shape, target) - target) ** 2).sum())
+
+    found = encode(client, as_json(target, mesh.faces))
+    code = np.array(found["latent"])
+    assert squares(code) == pytest.approx(float(np.square(found["vertex_errors"]).sum()), rel=1e-3)
+    for step in 0.02 * np.eye(len(code)):
+        assert squares(code) < min(squares(code + step), squares(code - step))
