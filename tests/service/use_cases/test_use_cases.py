@@ -18,8 +18,8 @@ from shapespace.files.colouring import Quantity
 from shapespace.files.formats import MESH_FORMATS
 from shapespace.model.decoder import MeshChoice
 from shapespace.model.edit import InvalidTargetError, Target
-from shapespace.model.exact_shapes import NoTangentSpaceError
 from shapespace.model.encode import Objective
+from shapespace.model.exact_shapes import NoTangentSpaceError
 from shapespace.model.latent_space import Bounds, Distribution
 from shapespace.model.shape_model import ShapeModel
 from shapespace.service.limits.sandbox import Sandbox
@@ -213,7 +213,8 @@ def test_a_mesh_is_searched_for_its_code(model: ShapeModel, sandbox: Sandbox) ->
         return codes.Upload(deque([memoryview(data)]), "model/obj", format)
 
     def encode(given: codes.Upload) -> codes.Found:
-        return run(lambda workers: codes.encode(workers, sandbox, CALLER, model, given, Bounds.ALLOW, Objective.VERTICES))
+        how = (Bounds.ALLOW, Objective.VERTICES)
+        return run(lambda workers: codes.encode(workers, sandbox, CALLER, model, given, *how))
 
     found = encode(upload(file))
     assert np.allclose(json.loads(found.content)["latent"], code, atol=1e-3)
