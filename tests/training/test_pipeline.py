@@ -159,10 +159,24 @@ def test_more_samples_are_drawn_beside_those_that_are_there(tiny_run: Path, tmp_
         subprocess.run(command(config, copy, "--until", "samples"), check=True, capture_output=True)
 
     draw(TINY.replace("\ncount = 60", "\ncount = 80"))
+    assert all(" done " not in line for line in status(copy)[-3:])
+    shown = ("evaluation.json", "gallery.npz", "report.html", "networks/histories.json")
+    assert not any((copy / name).exists() for name in shown), "figures of other samples"
     assert len(read(copy / "samples").index) == 80
     assert {path: path.stat().st_mtime_ns for path in files} == before
     draw(TINY.replace("\ncount = 60", "\ncount = 80\nsteps = 5"))
     assert all(path.stat().st_mtime_ns != before[path] for path in files)
+
+
+def test_networks_that_are_not_needed_any_more_are_removed(tiny_run: Path, tmp_path: Path) -> None:
+    copy, config = tmp_path / "run", tmp_path / "tiny.toml"
+    shutil.copytree(tiny_run, copy)
+    config.write_text(TINY.replace("[monolithic]\nhidden = [16]", "[monolithic]\nhidden = [8]"))
+    subprocess.run(command(config, copy, "--until", "networks"), check=True, capture_output=True)
+    before, after = ({path.stem for path in (run / "networks").glob("*.safetensors")} for run in (tiny_run, copy))
+    assert [name.startswith("monolithic-") for name in before ^ after] == [True, True]
+    assert len(before) == len(after)
+    assert json.loads((copy / "networks" / "histories.json").read_text()).keys() == after
 
 
 def test_a_run_killed_in_samples_and_in_networks_ends_with_the_same_figures(tiny_run: Path, tmp_path: Path) -> None:

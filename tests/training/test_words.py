@@ -98,12 +98,19 @@ def test_changed_data_are_read_again_and_it_is_said(place: Path, said: Said) -> 
 
 def test_a_run_of_version_0_1_is_not_continued_and_loses_nothing(place: Path, said: Said) -> None:
     said("run", "bars.toml", "--until", "mean")
-    run = place / "runs" / "bars"
-    (run / "data.json").unlink()
-    words = said("run", "bars.toml", code=1)
-    assert "is a run of version 0.1" in words
-    assert "--out" in words
-    assert (run / "mean.npz").exists()
+    run = RunDirectory(place / "runs" / "bars")
+    run.data.path.unlink()
+    for stage in ("ingest", "mean"):
+        stamp = run.stamp(stage).read()
+        del stamp["version"]
+        run.stamp(stage).write(stamp)
+    run.config.write(run.config.read().replace('correction = { kind = "kernel" }', "kernel = 12"))
+    before = {path: path.read_bytes() for path in run.folder.rglob("*") if path.is_file()}
+    for arguments in (("run", "bars.toml"), ("export", "runs/bars")):
+        (sentence,) = said(*arguments, code=1).splitlines()
+        assert sentence.startswith("shapespace-train: runs/bars is a run of version 0.1: ")
+        assert "--out" in sentence
+    assert {path: path.read_bytes() for path in run.folder.rglob("*") if path.is_file()} == before
 
 
 def test_a_stage_of_another_version_is_done_again_with_all_that_follows(
@@ -124,17 +131,24 @@ def test_a_stage_of_another_version_is_done_again_with_all_that_follows(
     assert "factors: done before" not in words
 
 
-def test_factors_know_the_order_of_their_modes_after_a_setting_came_and_went(place: Path, said: Said) -> None:
+def test_a_setting_that_came_and_went_leaves_nothing_and_costs_no_samples(place: Path, said: Said) -> None:
     config, run = place / "bars.toml", RunDirectory(place / "runs" / "bars")
     said("run", "bars.toml", "--until", "modes")
     assert run.modes.read().keys() == run.modes_by_strength.read().keys() | {"rank"}
-    said("run", "bars.toml", "--until", "factors")
+    said("run", "bars.toml", "--until", "samples")
     before, grouping = run.modes.read(), run.factors.read()
+    drawn = {path: path.stat().st_mtime_ns for path in run.samples.rglob("part-*.npz")}
     text = config.read_text()
     config.write_text(text.replace("log_steps = 2", "log_steps = 3"))
     said("run", "bars.toml", "--until", "modes")
+    assert not run.factors.exists()
+    np.testing.assert_array_equal(run.modes.read()["nric"], run.modes_by_strength.read()["nric"])
+    done = [line.split()[0] for line in said("status", "runs/bars").splitlines() if "done in" in line]
+    assert done == ["ingest", "mean", "modes"]
+    assert "to do" in page(Record(run))
     config.write_text(text)
-    assert "factors: done before" in said("run", "bars.toml", "--until", "factors")
+    said("run", "bars.toml", "--until", "samples")
+    assert {path: path.stat().st_mtime_ns for path in run.samples.rglob("part-*.npz")} == drawn
     after = run.modes.read()
     assert run.factors.read() == grouping
     assert before.keys() == after.keys()

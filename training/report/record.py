@@ -78,11 +78,8 @@ class Record:
         ]
         self.overlap = np.array(grouping.get("overlap", []))
         #: Seconds of the stages that are done, None for one at work.
-        self.seconds = {
-            name: _readable(run.stamp(name).path, partial(run.seconds, name))
-            for name in STAGES
-            if run.stamp(name).exists()
-        }
+        stamps = {name: _readable(run.stamp(name).path, run.stamp(name).read_if_written) for name in STAGES}
+        self.seconds = {name: stamp.get("seconds") for name, stamp in stamps.items() if "key" in stamp}
 
     @cached_property
     def given_up(self) -> list[tuple[str, str]]:
