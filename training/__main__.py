@@ -19,8 +19,8 @@ from shapespace.training.report.page import write_report
 from shapespace.training.report.record import Record, ReportError
 from shapespace.training.runs.config import ConfigError, load
 from shapespace.training.runs.directory import RunDirectory
-from shapespace.training.runs.losses import LostTooMuchError
 from shapespace.training.runs.sampling import SamplesError
+from shapespace.training.runs.shortfalls import LostTooMuchError
 from shapespace.training.runs.stages import STAGES
 from shapespace.training.runs.workers import WorkersError
 from shapespace.training.space.factors import FactorError

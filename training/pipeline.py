@@ -24,9 +24,9 @@ from shapespace.training.learning.learner import Learner
 from shapespace.training.report.page import write_report
 from shapespace.training.runs.config import Config
 from shapespace.training.runs.directory import RunDirectory
-from shapespace.training.runs.losses import losses, refuse
 from shapespace.training.runs.progress import waiting
 from shapespace.training.runs.sampling import FEWEST, Collection, SamplesError, draw, indices, read, split, used
+from shapespace.training.runs.shortfalls import refuse, shortfalls
 from shapespace.training.runs.stages import STAGES, stage_keys
 from shapespace.training.space import stages as space
 
@@ -345,9 +345,9 @@ def execute(
             news = True
         if name == "ingest" and data != known:
             directory.data.write(data)
-        lost = losses(directory, name)
-        for loss in lost:
-            show(f"  {loss.sentence}")
+        lost = shortfalls(directory, name)
+        for shortfall in lost:
+            show(f"  {shortfall.sentence}")
         if not keep_going:
             refuse(name, lost, f"{command} --keep-going" if command else "")
         if name == until:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from shapespace.arrays import FloatArray, IntArray
 from shapespace.mesh.triangle_mesh import TriangleMesh
 from shapespace.training.runs.atomic_files import NpzFile
-from shapespace.training.runs.coordinates import Coordinates
+from shapespace.training.runs.latent_coordinates import Coordinates
 from shapespace.training.runs.progress import bar
 from shapespace.training.runs.workers import run
 
