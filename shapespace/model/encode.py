@@ -97,7 +97,7 @@ class Encoder:
     @cached_property
     def grids(self) -> FactorGrids:
         """What starts are chosen from; made once, at the first mesh."""
-        return FactorGrids.of(self.model)
+        return FactorGrids.of(self.model, self._centre, self._root)
 
     def _fit(self, target: FloatArray, lower: FloatArray, upper: FloatArray, deadline: Deadline | None) -> Fit:
         latents, root = self.model.latents, self._root
