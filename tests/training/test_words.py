@@ -181,14 +181,14 @@ def test_lost_logarithms_are_said_and_stop_the_run(place: Path, said: Said) -> N
     assert [shortfall.sentence for shortfall in shortfalls(RunDirectory(run), "modes")] == []
     modes = json.loads((run / "modes.json").read_text())
     for steps, says, stops in (
-        ([4, 4, 4, 8, 4], "twice as many steps for 1 of 5 logarithms: bar3", False),
+        ([4, 4, 4, 8, 4], "took twice as many steps for 1 of 5 logarithms: bar3", False),
         ([4, 0, 4, 4, 4], "linearised 1 of 5 logarithms: bar1", False),
         ([4, 0, 4, 0, 4], "linearised 2 of 5 logarithms: bar1, bar3", True),
     ):
         (run / "modes.json").write_text(json.dumps(modes | {"steps": steps, "log_steps": 4, "asked": 9}))
         words = said("run", "bars.toml", "--until", "factors", code=int(stops))
         assert f"  {says}\n" in words
-        assert "  m 2 of 9, because the others would be nought" in words
+        assert "  found 2 of 9 modes, because the others would be zero" in words
         assert (says in page(Record(RunDirectory(run)))) is True
         assert (run / "factors.json").exists() != stops
         (run / "factors.json").unlink(missing_ok=True)

@@ -74,7 +74,7 @@ class RunDirectory:
 
     @property
     def traceback(self) -> TextFile:
-        """Of an error that is ours."""
+        """Of an error that is a fault of this program."""
         return TextFile(self.folder / "traceback.txt")
 
     # ingest

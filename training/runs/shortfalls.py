@@ -18,7 +18,7 @@ from shapespace.training.runs.sampling import DONE, columns, parts
 
 #: A larger share of logarithms or samples lost stops the run.
 MOST_LOST = 0.25
-#: A factor is named as the cause where lost codes lie farther from 0 in it than others do, by this share of the box.
+#: A factor is named as the cause where, in it, lost codes lie farther from 0 than the others by this share of the box.
 CLEARLY = 0.05
 #: Most names in a sentence.
 NAMED = 6
@@ -100,14 +100,14 @@ def _modes(run: RunDirectory) -> list[Shortfall]:
         lost.append(Shortfall(sentence, len(linearised) / len(steps), COARSER))
     finer = names[steps > facts["log_steps"]].tolist()
     if finer:
-        lost.append(Shortfall(f"twice as many steps for {len(finer)} of {len(steps)} logarithms: {_some(finer)}"))
+        lost.append(Shortfall(f"took twice as many steps for {len(finer)} of {len(steps)} logarithms: {_some(finer)}"))
     if found < asked:
         why = (
             f"{len(steps)} shapes differ in {found} directions"
             if found == len(steps) - 1
-            else "the others would be nought; a smaller modes.sparsity keeps more, where it isn't 0 already"
+            else "the others would be zero; a smaller modes.sparsity keeps more, where it isn't 0 already"
         )
-        lost.append(Shortfall(f"m {found} of {asked}, because {why}"))
+        lost.append(Shortfall(f"found {found} of {asked} modes, because {why}"))
     if not facts.get("converged", True):
         lost.append(Shortfall("sparse modes: the iteration ended at modes.max_iterations, before it had converged"))
     return lost
