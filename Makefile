@@ -56,7 +56,8 @@ lint: $(VENV)/.all $(BIN)/hadolint ## check style, types, doors between packages
 	$(BIN)/lint-imports
 	$(BIN)/hadolint Dockerfile
 
-QUICK = tests/shapespace tests/service/use_cases/test_use_cases.py tests/training/test_config.py $(wildcard tests/test_[cdm]*.py)
+QUICK = tests/shapespace tests/service/use_cases/test_use_cases.py tests/training/runs/test_config.py \
+	$(wildcard tests/test_[cdm]*.py)
 
 # What the libraries of serving take part in, and training doesn't.
 SERVING = $(filter-out $(foreach name,blocks bundled_files proxy reloading replicas,%/test_$(name).py), \

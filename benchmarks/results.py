@@ -7,6 +7,7 @@ it was. Bundles are written beside the runs: they hold the collections' geometry
 from __future__ import annotations
 
 import argparse
+from collections.abc import Callable
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -22,6 +23,7 @@ from shapespace.training.pipeline import Run, execute, learner_of
 from shapespace.training.report.pictures import COMPOSITE, Studio
 from shapespace.training.report.record import Record
 from shapespace.training.runs.config import load
+from shapespace.training.runs.directory import RunDirectory
 from shapespace.training.runs.sampling import DONE, columns
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -34,6 +36,21 @@ OWN = ("freaky-torus", "figure")
 PICTURED = ("hand", "faces", "makehuman", "figure", "freaky-torus")
 #: Runs whose extrapolation is measured: one that is easy and one that isn't.
 EXTRAPOLATED = ("hand", "samba")
+#: Studies, each with the last stage whose results it measures.
+STUDIES = {"space": "samples", "limits": "evaluation"}
+
+
+def measured(run: RunDirectory, name: str) -> dict[str, Any]:
+    """What a study found on a run as it is now, or nothing: figures of other settings, data or versions don't count."""
+    found, stamp = run.study(name).read_if_written(), run.stamp(STUDIES[name]).read_if_written()
+    return found if found.get("key", "") == stamp.get("key") else {}
+
+
+def have(run: RunDirectory, name: str, measure: Callable[[], dict[str, Any]]) -> None:
+    """Measure where there is nothing yet."""
+    if not measured(run, name):
+        print(f"{name} …")
+        run.study(name).write({"key": run.stamp(STUDIES[name]).read()["key"], **measure()})
 
 
 class Row:
@@ -43,8 +60,8 @@ class Row:
         self.name, self.directory, self.config = name, run.directory, run.config
 
     def study(self, name: str) -> dict[str, Any]:
-        """What a study left, or nothing."""
-        return self.directory.study(name).read_if_written()
+        """See `measured`."""
+        return measured(self.directory, name)
 
     @cached_property
     def ingest(self) -> dict[str, Any]:
@@ -110,16 +127,13 @@ def open_run(name: str, data: Path, out: Path) -> Run:
 
 
 def study(name: str, run: Run) -> None:
-    """Everything of one run that isn't there yet."""
+    """Everything of one run that isn't there yet, or is of other settings."""
     print(f"\n{name}")
     execute(run, "evaluation" if name in CONTRASTS else None, keep_going=True)
-    spaces, extrapolations = (run.directory.study(study) for study in ("space", "limits"))
-    if name in COLLECTIONS and not spaces.exists():
-        print("space …")
-        spaces.write(space.measure(run.directory, run.config))
-    if name in EXTRAPOLATED and not extrapolations.exists():
-        print("limits …")
-        extrapolations.write({"extrapolation": limits.extrapolation(learner_of(run))})
+    if name in COLLECTIONS:
+        have(run.directory, "space", lambda: space.measure(run.directory, run.config))
+    if name in EXTRAPOLATED:
+        have(run.directory, "limits", lambda: {"extrapolation": limits.extrapolation(learner_of(run))})
 
 
 def draw_strips(rows: list[Row], path: Path) -> None:

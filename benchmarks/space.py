@@ -7,6 +7,7 @@ shapes are means over vertices after rigid alignment, as shares of the reference
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -14,12 +15,13 @@ import numpy as np
 from shapespace.arrays import FloatArray
 from shapespace.mesh.rigid_motion import align
 from shapespace.mesh.triangle_mesh import TriangleMesh
-from shapespace.shell.many_exponentials import exponentials
+from shapespace.shell.exponential import exponential
 from shapespace.shell.mean import elastic_mean
 from shapespace.shell.space import ShellSpace
 from shapespace.training.runs.config import Config
 from shapespace.training.runs.directory import RunDirectory
 from shapespace.training.runs.sampling import read
+from shapespace.training.runs.workers import run as on_each
 from shapespace.training.space import modes
 from shapespace.training.space.logarithms import logarithms
 from shapespace.training.space.stages import material
@@ -108,6 +110,12 @@ def to_nearest(shapes: FloatArray, collection: FloatArray, diagonal: float) -> f
     return float(np.min([distances(shapes, other, diagonal) for other in collection], axis=0).mean())
 
 
+def _shot(space: ShellSpace, start: FloatArray, steps: int, velocity: FloatArray) -> tuple[FloatArray, bool]:
+    """Where an exponential ends, and whether it converged."""
+    path = exponential(space, start, velocity, steps)
+    return path.vertices[-1], path.converged
+
+
 def generalisation(reference: TriangleMesh, shapes: FloatArray, config: Config, counts: list[int]) -> dict[str, Any]:
     """Mean distance of each shape from what the modes of the other folds' shapes make of it.
 
@@ -127,9 +135,10 @@ def generalisation(reference: TriangleMesh, shapes: FloatArray, config: Config, 
         linear = PrincipalComponents.of(shapes[kept], reference.vertices)
         for row, k in enumerate(counts):
             velocities, _ = modes.projected(space, mean, fields[held_out], sparse[:k])
-            paths = list(exponentials(space, mean, velocities, config.samples.steps))
-            failed += sum(not path.converged for path in paths)
-            near = {"modes": np.array([path.vertices[-1] for path in paths])}
+            shot = dict(on_each(partial(_shot, space, mean, config.samples.steps), velocities))
+            ends, converged = map(np.array, zip(*(shot[row] for row in range(len(velocities))), strict=True))
+            failed += int((~converged).sum())
+            near = {"modes": ends}
             near["components"] = linear.nearest(shapes[held_out], min(k, most))
             for name, found in near.items():
                 errors[name][row].append(distances(found, shapes[held_out], reference.diagonal))

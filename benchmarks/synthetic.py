@@ -21,7 +21,7 @@ LATENTS_OF_A_FACTOR = 4
 
 
 def capsule(vertices: int) -> TriangleMesh:
-    """About so many vertices, of unit area."""
+    """A capsule by meridians and circles of latitude, of about so many vertices and unit area."""
     count = round(np.sqrt(vertices))
     made = trimesh.creation.capsule(height=2, radius=1, count=[count, count])
     mesh = TriangleMesh.from_arrays(made.vertices, made.faces)

@@ -80,25 +80,26 @@ class Page:
     """Collects each model once, with all places at which it stands."""
 
     def __init__(self) -> None:
-        #: The tables of a model, each with what it holds by default.
-        self.places: dict[type[BaseModel], list[tuple[str, BaseModel | None]]] = {}
-        self._visit(Config, "", None)
+        #: The tables of a model, each with the kind that it belongs to, if any, and what it holds by default.
+        self.places: dict[type[BaseModel], list[tuple[str, str, BaseModel | None]]] = {}
+        self._visit(Config, "", "", None)
 
-    def _visit(self, model: type[BaseModel], path: str, default: BaseModel | None) -> None:
-        self.places.setdefault(model, []).append((path, default))
+    def _visit(self, model: type[BaseModel], path: str, kind: str, default: BaseModel | None) -> None:
+        self.places.setdefault(model, []).append((path, kind, default))
         for name, field in model.model_fields.items():
             inside = shown(default, name, field)
             place = f"{path}.{field.alias or name}".lstrip(".")
             if get_origin(field.annotation) is dict:
                 place += ".NAME"
-            for other in models_in(field.annotation):
-                self._visit(other, place, inside if isinstance(inside, other) else None)
+            others = models_in(field.annotation)
+            for other in others:
+                own = other.model_fields.get("kind") if len(others) > 1 else None
+                its = ", ".join(get_args(own.annotation)) if own else kind
+                self._visit(other, place, its, inside if isinstance(inside, other) else None)
 
     def _anchor(self, model: type[BaseModel]) -> str:
-        place = self.places[model][0][0]
-        several = [other for other, places in self.places.items() if places[0][0] == place]
-        kind = model.model_fields.get("kind")
-        return f"{place} ({', '.join(get_args(kind.annotation))})" if len(several) > 1 and kind else place
+        place, kind, _ = self.places[model][0]
+        return f"{place} ({kind})" if kind else place
 
     def _row(self, name: str, field: FieldInfo, default: BaseModel | None) -> str:
         here = shown(default, name, field)
@@ -114,18 +115,19 @@ class Page:
         return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
 
     def _section(self, model: type[BaseModel]) -> Iterator[str]:
-        (_, default), *others = self.places[model]
+        (_, _, default), *others = self.places[model]
         yield f"## {self._anchor(model)}" if self._anchor(model) else "## The tables"
         yield ""
         yield " ".join((model.__doc__ or "").split()).replace("``", "`")
         yield ""
-        for place, other in others:
+        for place, kind, other in others:
             differing = [
                 f"`{field.alias or name} = {json.dumps(getattr(other, name))}`"
                 for name, field in model.model_fields.items()
                 if other and not models_in(field.annotation) and getattr(other, name) != shown(default, name, field)
             ]
-            yield f"- also as `{place}`" + (f", where the defaults are {', '.join(differing)}" if differing else "")
+            also = f"- also as `{place}`" + (f" ({kind})" if kind else "")
+            yield also + (f", where the defaults are {', '.join(differing)}" if differing else "")
         if others:
             yield ""
         yield "| setting | type | default | meaning |"

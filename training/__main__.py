@@ -14,13 +14,13 @@ from pathlib import Path
 from shapespace.training.collection import init
 from shapespace.training.collection.ingest import IngestError
 from shapespace.training.learning.export import ExportError
-from shapespace.training.pipeline import OldRunError, Run, execute
+from shapespace.training.pipeline import OldRunError, Run, execute, refuse_old
 from shapespace.training.report.page import write_report
 from shapespace.training.report.record import Record, ReportError
 from shapespace.training.runs.config import ConfigError, load
 from shapespace.training.runs.directory import RunDirectory
-from shapespace.training.runs.losses import LostTooMuchError
 from shapespace.training.runs.sampling import SamplesError
+from shapespace.training.runs.shortfalls import LostTooMuchError
 from shapespace.training.runs.stages import STAGES
 from shapespace.training.runs.workers import WorkersError
 from shapespace.training.space.factors import FactorError
@@ -75,6 +75,7 @@ def _open(folder: Path, models: Path) -> Run:
     directory = RunDirectory(folder)
     if not directory.is_run():
         raise ConfigError(f"{folder} is no run directory: it holds no config.toml")
+    refuse_old(directory)
     return Run(folder, *load(directory.config.path), models)
 
 
@@ -114,7 +115,7 @@ def _status(arguments: argparse.Namespace) -> None:
     begun = ": ".join(filter(None, ("begun", Record(directory).at_work)))
     for name in STAGES:
         stamp = directory.stamp(name).read_if_written()
-        state = f"done in {stamp['seconds']:.0f} s" if "seconds" in stamp else begun if stamp else "to do"
+        state = f"done in {stamp['seconds']:.0f} s" if "seconds" in stamp else begun if "key" in stamp else "to do"
         print(f"{name:12} {state}")
 
 

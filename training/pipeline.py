@@ -24,15 +24,28 @@ from shapespace.training.learning.learner import Learner
 from shapespace.training.report.page import write_report
 from shapespace.training.runs.config import Config
 from shapespace.training.runs.directory import RunDirectory
-from shapespace.training.runs.losses import losses, refuse
 from shapespace.training.runs.progress import waiting
 from shapespace.training.runs.sampling import FEWEST, Collection, SamplesError, draw, indices, read, split, used
-from shapespace.training.runs.stages import STAGES
+from shapespace.training.runs.shortfalls import refuse, shortfalls
+from shapespace.training.runs.stages import STAGES, stage_keys
 from shapespace.training.space import stages as space
 
 
 class OldRunError(ValueError):
-    """A run of another version that can't be continued."""
+    """A run of version 0.1, which can't be continued."""
+
+
+def refuse_old(directory: RunDirectory) -> None:
+    """Leave a run of version 0.1 as it is: what its files and settings mean today is not known.
+
+    Raises:
+        OldRunError: it is one.
+    """
+    if directory.is_of_0_1():
+        raise OldRunError(
+            f"{directory.folder} is a run of version 0.1: status and report still read it, but it can't be continued "
+            "or exported; run its configuration again with another directory as --out"
+        )
 
 
 class Run:
@@ -116,7 +129,7 @@ def mean(run: Run) -> None:
 
 
 def modes(run: Run) -> None:
-    """modes-by-strength.npz, modes.json, and modes.npz until `factors` has its order."""
+    """modes-by-strength.npz, modes.json, and modes.npz, which `factors` puts in its order."""
     _discover(run, space.modes)
 
 
@@ -158,7 +171,7 @@ def learner_of(run: Run, **how: Any) -> Learner:
 
 
 def networks(run: Run) -> None:
-    """networks/: one file for each fitted network, and the histories of all.
+    """networks/: one file for each fitted network, none of networks that are not needed any more, and all histories.
 
     Raises:
         SamplesError: too few to learn from.
@@ -189,6 +202,9 @@ def networks(run: Run) -> None:
         learner.monolithic()
         histories |= learner.histories
     directory.histories.write(histories)
+    for path in directory.networks():
+        if path.stem not in histories:
+            path.unlink()
 
 
 def evaluation(run: Run) -> None:
@@ -257,6 +273,24 @@ def _changes(before: dict[str, dict[str, Any]], now: dict[str, dict[str, Any]]) 
     return ", ".join(filter(None, (some(word, set(names)) for word, names in kinds.items())))
 
 
+def _forget(directory: RunDirectory, keys: dict[str, dict[str, str]], show: Callable[[str], None]) -> None:
+    """Have no stage done, and no file of it there, that is not of these keys: all that a run shows belongs together."""
+    outdated = []
+    for name, stage in STAGES.items():
+        stamp = directory.stamp(name).read_if_written()
+        if stamp.get("key") == keys[name]["key"]:
+            continue
+        if "key" in stamp:
+            if stamp.get("version") != stage.version:
+                outdated.append(name)
+            directory.stamp(name).write({of: stamp[of] for of in ("basis", "version") if of in stamp})
+        for path in stage.results(directory):
+            if not path.is_dir():
+                path.unlink(missing_ok=True)
+    for name in outdated[:1]:
+        show(f"{name}: another version of shapespace computed it otherwise; it and all that follows is done again")
+
+
 def execute(
     run: Run,
     until: str | None = None,
@@ -279,32 +313,26 @@ def execute(
     """
     directory, source = run.directory, run.config.collection.data
     data, known = run.data(), directory.data.read_if_written()
-    if data and not known and directory.seconds("ingest") is not None:
-        raise OldRunError(
-            f"{directory.folder} is a run of version 0.1, which did not record its data files: status and report still "
-            "read it, but it can't be continued. Name another directory with --out"
-        )
-    directory.config.write(run.source)
+    if data:  # else a generator has them, and a run of 0.1 is done again
+        refuse_old(directory)
     if source and known and not source.exists():
         show(f"data: {source} is not there any more; the run goes on with what ingest left")
         data = known
     elif known and (changes := _changes(known, data)):
         show(f"data: {changes}; all that follows from them is done again, from ingest on")
-    key = json.dumps({name: facts["sha256"] for name, facts in data.items()}) if data else ""
-    news = outdated = False
+    keys = stage_keys(run.config, json.dumps({name: facts["sha256"] for name, facts in data.items()}) if data else "")
+    _forget(directory, keys, show)
+    directory.config.write(run.source)
+    news = False
     for name, stage in STAGES.items():
-        keys, stamp = stage.keys(name, run.config, key), directory.stamp(name).read_if_written()
-        key = keys["key"]
-        if stamp and stamp.get("version") != stage.version and not outdated:
-            outdated = True
-            show(f"{name}: another version of shapespace computed it otherwise; it and all that follows is done again")
-        if stamp.get("key") == key and "seconds" in stamp:
+        stamp = directory.stamp(name).read_if_written()
+        if "seconds" in stamp:
             show(f"{name}: done before ({stamp['seconds']:.0f} s)")
         else:
-            if stamp and stamp["key"] != key and stamp.get("basis") != keys["basis"]:
-                for path in stage.results(directory):
-                    shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
-            begun = keys | {"version": stage.version}
+            if stamp.get("basis") != keys[name]["basis"]:
+                for path in filter(Path.is_dir, stage.results(directory)):
+                    shutil.rmtree(path)
+            begun = keys[name] | {"version": stage.version}
             directory.stamp(name).write(begun)
             directory.log("begin", stage=name)
             show(f"{name} …")
@@ -317,9 +345,9 @@ def execute(
             news = True
         if name == "ingest" and data != known:
             directory.data.write(data)
-        lost = losses(directory, name)
-        for loss in lost:
-            show(f"  {loss.sentence}")
+        lost = shortfalls(directory, name)
+        for shortfall in lost:
+            show(f"  {shortfall.sentence}")
         if not keep_going:
             refuse(name, lost, f"{command} --keep-going" if command else "")
         if name == until:

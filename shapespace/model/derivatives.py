@@ -8,7 +8,6 @@ import numpy as np
 from scipy import sparse
 
 from shapespace.arrays import FloatArray
-from shapespace.coordinates.nric import WeightedNorm, nric
 from shapespace.model.decoder import Decoder
 
 #: Step of a difference quotient, as a fraction of the coordinate's range. An angle may move something as small as a
@@ -81,11 +80,14 @@ class FactorGrids:
     _matrix: sparse.csr_array
 
     @classmethod
-    def of(cls, model: Decoder) -> FactorGrids:
-        """Run the factors of a model on their grids."""
-        reference = model.reference
-        centre = nric(reference.vertices, reference.connectivity)
-        root = np.sqrt(WeightedNorm.of(reference, model.manifest.eta_reconstruction).squared)
+    def of(cls, model: Decoder, centre: FloatArray, root: FloatArray) -> FactorGrids:
+        """Run the factors of a model on their grids.
+
+        Args:
+            model: whose factors.
+            centre: z̄ (2E,).
+            root: (2E,) roots of the weights of the norm.
+        """
         rng = np.random.default_rng(0)
         signs, sums = rng.choice([-1.0, 1.0], len(root)), rng.integers(SKETCH, size=len(root))
         matrix = sparse.csr_array((signs, (sums, np.arange(len(root)))), shape=(SKETCH, len(root)))

@@ -126,7 +126,7 @@ class Encoder:
     @cached_property
     def grids(self) -> FactorGrids:
         """What starts are chosen from; made once, at the first mesh."""
-        return FactorGrids.of(self.model)
+        return FactorGrids.of(self.model, self._centre, self._root)
 
     def _by_vertices(self, target: FloatArray, start: FloatArray, box: Box, deadline: Deadline | None) -> Fit:
         """The fit to vertices (V, 3), from a start nearby."""

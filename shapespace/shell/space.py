@@ -7,8 +7,8 @@ equations in 3V unknowns with only the six rigid motions left over. Integrabilit
 matter, and the matrices are symmetric positive definite and nine times smaller in work than the indefinite
 ones of the constrained form (which the tests compare with).
 
-The modules that do something with this space: ``exponential`` (shooting), ``many_exponentials`` (in parallel),
-``geodesic`` (connecting, logarithm), ``transport`` and ``mean``.
+The modules that do something with this space: ``exponential`` (shooting), ``geodesic`` (connecting, logarithm),
+``transport`` and ``mean``.
 """
 
 from __future__ import annotations

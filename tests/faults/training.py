@@ -13,7 +13,7 @@ import trimesh
 
 from shapespace.training.runs.stages import STAGES
 from tests.training.conftest import command
-from tests.training.test_collection import results
+from tests.training.whole_runs.test_collection import results
 
 CONFIG = """
 [collection]
@@ -57,7 +57,7 @@ tolerance = 0.01
 """
 
 
-#: How far runs go. The suite kills one in each later stage elsewhere, in tests/training/test_collection.py.
+#: How far runs go. The suite kills one in each later stage elsewhere, in tests/training/whole_runs/test_collection.py.
 LAST = "export" if int(os.environ.get("FAULT_SEEDS", "1")) > 1 else "samples"
 
 

@@ -288,7 +288,7 @@ FOLDERS = [
     Folder("slivers", of_all(slivers), "is ready"),
     Folder("needles", of_all(needles), "is ready"),
     Folder("an eyelid that folds", of_one(folded_lid), "is ready", odd=NAME),
-    Folder("3 shapes", lambda folder: write(folder, figures(3)), r"m 2 of 4, because 3 shapes", back=0.05),
+    Folder("3 shapes", lambda folder: write(folder, figures(3)), r"found 2 of 4 modes, because 3 shapes", back=0.05),
     Folder("300 shapes", lambda folder: write(folder, figures(300), "npz")),
     Folder("4601 vertices", lambda folder: write(folder, full(10), "npz")),
     Folder("160,000 vertices", lambda folder: write(folder, large(5))),

@@ -64,7 +64,7 @@ class Joint:
         axes: (3,) axis of rotation at each degree of freedom; they add as rotation vectors.
         softness: 0 where points in between turn by part of the angle, which keeps them as far from the centre,
             1 where they go part of the way, which rounds hips and armpits off.
-        carries: joints all of whose points move along, beyond the planes.
+        carries: joints whose points all move along, also those outside the planes.
     """
 
     name: str
@@ -156,7 +156,7 @@ def _shares() -> dict[str, FloatArray]:
 
 
 def _turn(x: FloatArray, omega: FloatArray) -> FloatArray:
-    """How far points (…, 3) go when rotated by rotation vectors (…, 3): Rodrigues' formula less the identity."""
+    """Displacements of points (…, 3) rotated by rotation vectors (…, 3): Rodrigues' formula less the identity."""
     t = np.linalg.norm(omega, axis=-1, keepdims=True)
     across = np.cross(omega, x)
     return np.sinc(t / np.pi) * across + 0.5 * np.sinc(t / (2 * np.pi)) ** 2 * np.cross(omega, across)
@@ -185,7 +185,7 @@ def pose(angles: ArrayLike) -> FloatArray:
     return vertices
 
 
-#: Poses with a name, by what is not zero.
+#: Poses with a name, each by its angles that are not zero.
 NAMED: dict[str, dict[str, float]] = {
     "rest": {},
     "walking": {

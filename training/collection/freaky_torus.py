@@ -7,7 +7,7 @@ import numpy as np
 from shapespace.arrays import FloatArray, IntArray
 from shapespace.coordinates.nric import nric, unwrap
 from shapespace.mesh.triangle_mesh import Connectivity, TriangleMesh
-from shapespace.training.runs.coordinates import Coordinates
+from shapespace.training.runs.latent_coordinates import Coordinates
 from shapespace.training.runs.sampling import Shapes
 
 U_COUNT, V_COUNT = 64, 32

@@ -1,7 +1,7 @@
 """Reading a collection: mesh files in correspondence, or one NPZ; checked, and welded in the same way for all shapes.
 
 Correspondence means the same faces in the same order. Triangles of STL files correspond by their order, and so do their
-corners. Faces keep their winding, even where it is inside out: what leaves the system then fits what the user has.
+corners. Faces keep their winding, even where it is inside out, so that served shapes fit the user's files.
 """
 
 from __future__ import annotations
@@ -32,15 +32,15 @@ MIN_SHAPES = 3
 _SHAPE = ": shape "
 TOO_FEW = f"has {{}} shapes; at least {MIN_SHAPES} are needed"
 
-#: Vertices nearer than this part of the bounding box's diagonal coincide; float32 keeps 6e-8 of a coordinate.
+#: Vertices closer than this share of the bounding box's diagonal coincide; float32 rounds a coordinate to 6e-8 of it.
 WELD_TOLERANCE = 1e-6
-#: Borders nearer than this part of it were meant to be one, in all likelihood.
+#: Vertices of borders that are closer than this share of it were probably meant to be joined.
 SEAM_TOLERANCE = 1e-4
 
-#: Bytes of vertices up to which a collection is kept in memory.
+#: A collection with more bytes of vertices is kept in a temporary file, not in memory.
 IN_MEMORY = 2**28
 
-#: Volumes below this part of area^(3/2) (a ball: 0.094) say nothing about inside and outside.
+#: A volume below this share of area^(3/2) (a ball has 0.094) is too small to tell inside from outside.
 CLEAR_VOLUME = 1e-3
 
 
@@ -69,14 +69,14 @@ class MeshCollection:
 
     Attributes:
         names: of the n shapes: stems of their files in natural order (pose2 before pose10), or the NPZ's own.
-        vertices: (n, V, 3) positions as in the files; may lie on disk, so take them shape by shape.
+        vertices: (n, V, 3) positions as in the files; a large array lies on disk, so read it shape by shape.
         faces: (F, 3) of every shape, in the order of the files.
         file_vertices: (N,) which vertex each of a file's vertices has become, −1 for those in no face. None where there
             are no files.
-        notes: what was met and dealt with, a sentence each.
+        notes: what was found in the files and handled, one sentence each.
         warnings: what is odd about single shapes.
         central: the shape with the least mean square distance from the others, after rigid alignment.
-        places: of each shape, its file and what that calls its first vertex; none where there are no files.
+        places: for each shape its file, and the number that this gives its first vertex; none where there are no files.
     """
 
     names: tuple[str, ...]
@@ -117,7 +117,15 @@ class MeshCollection:
 
 @dataclass(frozen=True)
 class _Raw:
-    """Shapes as they stand in their files, with the same faces; labels name their origin in messages."""
+    """Shapes as they stand in their files, with the same faces.
+
+    Attributes:
+        labels: where each shape comes from, for messages.
+        names: of the shapes.
+        vertices: (n, V, 3).
+        faces: (F, 3).
+        soup: whether all are triangles that share no vertices, as in STL files.
+    """
 
     labels: Sequence[str]
     names: Sequence[str]
@@ -130,8 +138,8 @@ def read_collection(path: Path) -> MeshCollection:
     """Read a folder of OBJ, PLY, STL, OFF, glTF or NPZ files, or one NPZ of ``vertices`` (n, V, 3) and ``faces``.
 
     Vertices that coincide in every shape become one, since exporters split them along seams of texture or shading and
-    STL has no shared ones; those that coincide in some shapes only stay apart. Vertices in no face are dropped. The
-    other files of a folder and its folders are ignored.
+    STL has no shared ones; those that coincide in some shapes only stay apart. Vertices in no face are dropped. Files
+    of other kinds and subfolders are ignored.
 
     Raises:
         IngestError: nothing to read, fewer than 3 shapes, an unreadable file, different connectivity, an edge with more
@@ -152,8 +160,8 @@ def read_collection(path: Path) -> MeshCollection:
     tolerance = WELD_TOLERANCE * diagonal(vertices[0])
     if all(np.abs(align(shape, vertices[0]) - vertices[0]).max() <= tolerance for shape in vertices):
         raise IngestError(
-            f"{path}: all {len(vertices)} shapes are equal but for where they stand; poses and morph targets inside a "
-            "file are not read, export each shape as a mesh of its own"
+            f"{path}: all {len(vertices)} shapes are equal up to where they stand and how they are turned; poses and "
+            "morph targets inside a file are not read, export each shape as a mesh of its own"
         )
 
     weld, kept_pairs, notes = _welding(vertices, raw.labels)
@@ -223,7 +231,7 @@ def _room(shape: tuple[int, ...]) -> FloatArray:
     if size <= IN_MEMORY:
         return np.empty(shape)
     with tempfile.TemporaryFile() as file:
-        # A full disk is an error here, and later the death of the process.
+        # Reserved now: a full disk is an error here, where writing to the map later would kill the process.
         os.posix_fallocate(file.fileno(), 0, size) if hasattr(os, "posix_fallocate") else file.truncate(size)
         return np.memmap(file, np.float64, "r+", shape=shape)
 
@@ -236,7 +244,7 @@ def _some(vertices: FloatArray, chosen: IntArray) -> FloatArray:
 
 
 def normalised(collection: MeshCollection, reference: int) -> tuple[FloatArray, float]:
-    """Scale so that the reference shape has unit area, about the origin; centres stay where they are.
+    """Scale all shapes about the origin, so that the reference has unit area; they are not centred.
 
     Returns:
         Vertices (n, V, 3) and the scale in the user's units: ``collection.vertices == scale * vertices``.
@@ -263,7 +271,9 @@ def _read_folder(folder: Path) -> _Raw:
         raise IngestError(f"{folder}: holds no meshes ({found}); these can be read: {', '.join(READ_FORMATS)}")
     if len(paths) < MIN_SHAPES:
         hint = (
-            "; an NPZ with a whole collection is named itself, not its folder" if _extension(paths[0]) == "npz" else ""
+            "; where an NPZ holds the whole collection, name that file, not its folder"
+            if _extension(paths[0]) == "npz"
+            else ""
         )
         raise IngestError(f"{folder}: {TOO_FEW.format(len(paths))}{hint}")
     by_name: dict[str, Path] = {}
@@ -272,7 +282,7 @@ def _read_folder(folder: Path) -> _Raw:
             raise IngestError(f"{path}: {by_name[path.stem].name} has the same name; remove or rename one of them")
         by_name[path.stem] = path
 
-    # Triangles of an STL file fit on the shared vertices of any other format.
+    # A file of another format knows which vertices triangles share; those of STL files are put onto them.
     soups = [_extension(path) == "stl" for path in paths]
     first = soups.index(False) if False in soups else 0
     vertices, faces = _read(paths[first])
@@ -307,7 +317,7 @@ def _read(path: Path, vertex_count: int = 0, faces: IntArray | None = None) -> t
 
 
 def _unfinished(path: Path) -> str:
-    """The end of a sentence about an OBJ file whose last line isn't finished, as where a copy was cut short."""
+    """The end of a sentence about an OBJ file whose last line isn't finished, as after an interrupted copy."""
     if _extension(path) != "obj" or not path.is_file():
         return ""
     with path.open("rb") as file:
@@ -381,7 +391,9 @@ def _refusing(label: str, numbers: IntArray | None = None) -> Iterator[None]:
 def _checked(vertices: np.ndarray, faces: np.ndarray) -> tuple[FloatArray, IntArray]:
     """The arrays of one mesh, in double precision; MeshError where they can't be those of a mesh."""
     if vertices.ndim == 3:
-        raise MeshError(f"vertices are of shape {vertices.shape}: an NPZ with a whole collection is named itself")
+        raise MeshError(
+            f"vertices are of shape {vertices.shape}; where an NPZ holds the whole collection, name that file"
+        )
     if vertices.ndim != 2 or vertices.shape[1] != 3 or vertices.dtype.kind not in "fiu":
         raise MeshError(f"vertices must be a (V, 3) array of numbers, not {vertices.dtype} of shape {vertices.shape}")
     if not len(faces):
@@ -436,7 +448,7 @@ def _welding(vertices: FloatArray, labels: Sequence[str]) -> tuple[IntArray, Flo
     """Which vertices of shapes (n, V, 3) coincide in every one of them.
 
     Returns:
-        For each vertex the first one that it coincides with, (V,); the part of the first shape's coinciding pairs that
+        For each vertex the first one that it coincides with, (V,); the share of the first shape's coinciding pairs that
         coincide in each shape too, (n,); and a note on those that don't in every shape.
     """
     tolerance = WELD_TOLERANCE * diagonal(vertices)
@@ -472,7 +484,7 @@ def _seams(vertices: FloatArray, connectivity: Connectivity) -> IntArray:
 
 
 def _refuse_components(raw: _Raw, connectivity: Connectivity, kept_pairs: FloatArray, seams: IntArray) -> None:
-    """Faces hang together where they share an edge: a common vertex alone is a hinge, not a surface."""
+    """IngestError for several parts; faces belong to one part where they share an edge, not a vertex alone."""
     left, right = connectivity.edge_faces[connectivity.interior].T
     count = len(connectivity.faces)
     graph = sparse.coo_array((np.ones(len(left)), (left, right)), shape=(count, count))

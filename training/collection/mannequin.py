@@ -1,4 +1,4 @@
-"""The body of the figure: a solid in formulas, meshed once, left like right.
+"""The body of the figure: a solid given by formulas, meshed once, the same on the left and on the right.
 
 Everything is in metres and radians; the figure stands on y = 0, looks along z, and has its left side at x > 0.
 """
@@ -81,7 +81,7 @@ def _join(f: FloatArray, g: FloatArray, blend: float) -> FloatArray:
     return np.minimum(f, g) - np.maximum(blend - np.abs(f - g), 0) ** 3 / (6 * blend**2)
 
 
-#: The left half's solids, each with its blend with those before.
+#: Solids of the left half, each with the width over which it blends into those before it.
 SOLIDS: list[tuple[_Tube, float]] = [
     # Torso, by height.
     (_Tube(0 * Y, Y, Z, (0.05, 0.04),
@@ -163,7 +163,7 @@ SOLIDS: list[tuple[_Tube, float]] = [
 
 
 def _distance(points: FloatArray) -> FloatArray:
-    """Distances (n,) to the surface, to first order, negative inside; even in x."""
+    """Distances (n,) to the surface, to first order, negative inside; symmetric in x."""
     x, y, z = points.T
     # Rounded where |x| has its kink, which joins the halves smoothly.
     left = np.stack([np.hypot(x, 0.008), y, z], axis=1)
@@ -197,7 +197,7 @@ def _edge_length(points: FloatArray) -> FloatArray:
 
 
 def _scatter() -> tuple[FloatArray, int]:
-    """Points (n, 3) of the surface with x ≥ 0, nearly an edge apart, and how many lie in the middle: the first."""
+    """Points (n, 3) of the surface with x ≥ 0, nearly an edge apart; and how many, the first, lie at x = 0."""
     cell = 0.03
     axes = [np.arange(a, b, cell) for a, b in ((0, 0.7), (-0.02, 1.75), (-0.2, 0.25))]
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)

@@ -32,9 +32,10 @@ SCRAMBLED = 2.5
 QUANTILE = 0.25
 #: Ratios of squared distances below which a reflection, or a rotation, explains why a shape differs from the others.
 MIRRORED, TURNED = 0.5, 0.1
-#: Degrees between a rotation and one that exchanges axes; and between those shapes that stand alike.
+#: Largest angle, in degrees, between a rotation and one that exchanges axes for it to count as that; and between
+#: shapes that count as standing alike.
 QUARTER_TURN, ALIKE = 25.0, 30.0
-#: Vertices, spread evenly, that tell how shapes stand to each other.
+#: Number of vertices, spread evenly, that rigid motions between shapes are computed from.
 SAMPLE = 2000
 
 
@@ -66,7 +67,7 @@ class Placements:
         chosen = np.unique(np.linspace(0, vertices.shape[1] - 1, SAMPLE).astype(int))
         points = np.stack([shape[chosen] for shape in vertices])
         points -= points.mean(axis=1, keepdims=True)
-        # Squares of coordinates in units of 1e-200 would be 0.
+        # Scaled, as the squares of very small coordinates (1e-200) would underflow to 0.
         self.points = points / np.abs(points).max()
         self.squares = (self.points**2).sum(axis=(1, 2))
 
@@ -133,7 +134,7 @@ def suspicions(
     """Everything odd about shapes (n, V, 3), by shape; names (n) are for sentences that name another one."""
     edges = _Edges(vertices, connectivity)
     found = edges.suspicions()
-    # In another order nothing else can be told.
+    # Of a shape in another order the other checks say nothing.
     scrambled = {s.shape for s in found if s.grave}
     found += _sizes(vertices, connectivity, edges.out_of_place, scrambled)
     found += _duplicates(vertices, names)
@@ -179,10 +180,10 @@ def _duplicates(vertices: FloatArray, names: Sequence[str]) -> list[Suspicion]:
 
 
 class _Edges:
-    """Lengths of the edges of all shapes, each beside what it is elsewhere.
+    """Lengths of the edges of all shapes, each compared with the same edge of the other shapes.
 
-    A shape may be in another unit, or rolled up: an edge counts as long only where it is so both as it stands and as a
-    share of the shape's extent.
+    A shape may be in another unit, or rolled up: an edge counts as long only if it is so both in the units of the
+    file and as a share of the shape's extent.
     """
 
     def __init__(self, vertices: FloatArray, connectivity: Connectivity) -> None:
@@ -239,6 +240,6 @@ class _Edges:
         return found
 
     def _exchanged(self, k: int, those: IntArray) -> bool:
-        """Whether most vertices out of place lie on the surface elsewhere, and not beyond it."""
+        """Whether most vertices that are out of place lie on the surface: then they are exchanged, not moved away."""
         near = np.asarray(KDTree(self.vertices[k]).query(self.vertices[k][those], 2)[0])[:, 1]
         return len(those) > 1 and bool((near < LONG * self._middle[k]).mean() > 0.5)

@@ -25,7 +25,7 @@ from shapespace.training.learning.layers import narrowest
 from shapespace.training.learning.learner import Learner
 from shapespace.training.learning.networks import affine_sum, predict
 from shapespace.training.runs.config import Config, EvaluationSettings
-from shapespace.training.runs.coordinates import Coordinates
+from shapespace.training.runs.latent_coordinates import Coordinates
 from shapespace.training.runs.progress import progress
 from shapespace.training.runs.sampling import Collection
 

@@ -18,7 +18,7 @@ from torch import Tensor, nn
 
 from shapespace.arrays import FloatArray, IntArray
 from shapespace.training.learning.linear import principal_axes
-from shapespace.training.runs.coordinates import Coordinates
+from shapespace.training.runs.latent_coordinates import Coordinates
 
 #: Smallest number of entries of a tensor that is stored in 8 or 16 bits, if these hold its values exactly.
 NARROWED_SIZE = 1024

@@ -37,7 +37,7 @@ from shapespace.training.runs.config import (
     PaperSettings,
     ResolvedCorrection,
 )
-from shapespace.training.runs.coordinates import Coordinates
+from shapespace.training.runs.latent_coordinates import Coordinates
 
 
 def predict(network: Callable[[Tensor], Tensor], inputs: Tensor, batch_size: int = 32) -> Tensor:

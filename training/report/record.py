@@ -18,7 +18,7 @@ from shapespace.arrays import FloatArray
 from shapespace.coordinates.nric import WeightedNorm
 from shapespace.mesh.triangle_mesh import TriangleMesh
 from shapespace.training.runs.directory import RunDirectory
-from shapespace.training.runs.losses import losses
+from shapespace.training.runs.shortfalls import shortfalls
 from shapespace.training.runs.stages import STAGES
 from shapespace.training.space.modes import edge_magnitudes
 
@@ -78,19 +78,16 @@ class Record:
         ]
         self.overlap = np.array(grouping.get("overlap", []))
         #: Seconds of the stages that are done, None for one at work.
-        self.seconds = {
-            name: _readable(run.stamp(name).path, partial(run.seconds, name))
-            for name in STAGES
-            if run.stamp(name).exists()
-        }
+        stamps = {name: _readable(run.stamp(name).path, run.stamp(name).read_if_written) for name in STAGES}
+        self.seconds = {name: stamp.get("seconds") for name, stamp in stamps.items() if "key" in stamp}
 
     @cached_property
     def given_up(self) -> list[tuple[str, str]]:
         """What the finished stages could not do: pairs of a stage and a sentence."""
         found = []
         for stage in (name for name in STAGES if self.seconds.get(name) is not None):
-            lost = _readable(self.run.folder, partial(losses, self.run, stage))
-            found += [(stage, loss.sentence) for loss in lost]
+            lost = _readable(self.run.folder, partial(shortfalls, self.run, stage))
+            found += [(stage, shortfall.sentence) for shortfall in lost]
         return found
 
     @cached_property

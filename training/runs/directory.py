@@ -43,23 +43,30 @@ class RunDirectory:
         return self.config.path.is_file()
 
     def stamp(self, stage: str) -> JsonFile:
-        """What is known of a stage that has begun: ``key``, ``basis``, ``version``, and at its end ``seconds``."""
+        """What is known of a stage that has begun: ``key``, ``basis``, ``version``, and at its end ``seconds``.
+
+        Where it is to do again only ``basis`` and ``version``: its folders of samples are of that basis.
+        """
         return self._json(f"stages/{stage}")
 
-    def seconds(self, stage: str) -> float | None:
-        """That a stage took; None of one that is not finished."""
-        return self.stamp(stage).read_if_written().get("seconds")
+    def is_of_0_1(self) -> bool:
+        """Whether version 0.1 began it, which logged what it did but gave stages no version."""
+        stamps = (JsonFile(path).read() for path in self.folder.glob("stages/*.json"))
+        return self._log.exists() and not any("version" in stamp for stamp in stamps)
+
+    @property
+    def _log(self) -> Path:
+        return self.folder / "log.jsonl"
 
     def log(self, event: str, **facts: Any) -> None:
         """Append one line to ``log.jsonl``."""
         line = {"time": datetime.now(UTC).isoformat(timespec="milliseconds"), "event": event, **facts}
-        with (self.folder / "log.jsonl").open("a", encoding="utf-8") as file:
+        with self._log.open("a", encoding="utf-8") as file:
             file.write(json.dumps(line) + "\n")
 
     def events(self) -> Iterator[dict[str, Any]]:
         """The lines of ``log.jsonl``; one that a kill cut short is left out."""
-        path = self.folder / "log.jsonl"
-        for line in path.read_text(encoding="utf-8").splitlines() if path.exists() else ():
+        for line in self._log.read_text(encoding="utf-8").splitlines() if self._log.exists() else ():
             try:
                 yield json.loads(line)
             except json.JSONDecodeError:
@@ -67,7 +74,7 @@ class RunDirectory:
 
     @property
     def traceback(self) -> TextFile:
-        """Of an error that is ours."""
+        """Of an error that is a fault of this program."""
         return TextFile(self.folder / "traceback.txt")
 
     # ingest
@@ -120,8 +127,8 @@ class RunDirectory:
 
     @property
     def modes(self) -> NpzFile:
-        """The arrays of `modes_by_strength` in the order of the factors, once there are any; and ``rank (m)``, the
-        place of each mode there.
+        """The arrays of `modes_by_strength`, once there are factors in their order; and ``rank (m)``, the place of each
+        mode there.
         """
         return self._npz("modes")
 
@@ -152,6 +159,10 @@ class RunDirectory:
         """The file of a network."""
         return self.folder / "networks" / f"{name}.safetensors"
 
+    def networks(self) -> list[Path]:
+        """The files of all networks that are there."""
+        return sorted(self.network("*").parent.glob("*.safetensors"))
+
     @property
     def histories(self) -> JsonFile:
         """``epoch``, ``best`` and losses of each network by the name of its file."""
@@ -180,7 +191,7 @@ class RunDirectory:
         return TextFile(self.folder / "report.html")
 
     def study(self, name: str) -> JsonFile:
-        """What a benchmark measured on this run."""
+        """What a benchmark measured on this run, with the ``key`` of the stage that it measured."""
         return self._json(name)
 
     # Shapes read from the files above.

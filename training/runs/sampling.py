@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from shapespace.arrays import FloatArray, IntArray
 from shapespace.mesh.triangle_mesh import TriangleMesh
 from shapespace.training.runs.atomic_files import NpzFile
-from shapespace.training.runs.coordinates import Coordinates
+from shapespace.training.runs.latent_coordinates import Coordinates
 from shapespace.training.runs.progress import bar
 from shapespace.training.runs.workers import run
 
@@ -37,8 +37,8 @@ class Shapes:
 
     Attributes:
         vertices: (n, V, 3); where a shape could not be found, the last finite one on the way to it.
-        nric: (n, 2E) lengths and angles. Only the collection knows which of an angle's representatives is meant:
-            the reference's nearest, or the one that a path from the reference leads to.
+        nric: (n, 2E) lengths and angles. Angles are defined up to 2π, and the collection says which value is meant: the
+            nearest to the reference's, or the one at the end of a path from the reference.
         reasons: for each why it failed, or an empty string.
     """
 
@@ -83,9 +83,9 @@ class Samples:
     """Finished samples, in the order of their index; failed ones are left out.
 
     Attributes:
-        index: (n,) increasing; samples of two folders belong together where theirs agree.
+        index: (n,) increasing; samples of two folders with the same index belong to the same joint code.
         latents: (n, m) codes that the shapes have.
-        asked: (n, m) codes that were asked for, further out where they had no shape.
+        asked: (n, m) codes that were asked for; farther from 0 than ``latents`` where they had no shape.
         nric: (n, 2E).
         vertices: (n, V, 3).
     """
@@ -157,7 +157,7 @@ def draw(
 
 
 def _part(collection: Collection, shorten: bool, asked: FloatArray) -> dict[str, NDArray]:
-    """The arrays of a part, but ``index`` and ``asked``."""
+    """The arrays of a part, except ``index`` and ``asked``."""
     shapes, latents = collection.shapes(asked), asked.copy()
     vertices, nric, reasons = shapes.vertices.copy(), shapes.nric.copy(), np.array(shapes.reasons, dtype=object)
     for _ in range(SHORTENINGS if shorten else 0):

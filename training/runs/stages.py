@@ -22,7 +22,8 @@ class Stage:
     Attributes:
         version: of its numerics. Raise it in the commit after which the same settings and input give other numbers.
         settings: the part of the configuration that it reads.
-        results: files and folders that are removed where that part, the version, or an earlier stage has changed.
+        results: what is removed where that part, the version, or an earlier stage has changed: files at once, as they
+            would be taken for current, folders of samples when the stage begins, as the change may be taken back.
         amounts: settings that may change without it, since the stage knows what is there and what is missing.
     """
 
@@ -32,13 +33,7 @@ class Stage:
     amounts: frozenset[str] = frozenset()
 
     def keys(self, name: str, config: Config, before: str) -> dict[str, str]:
-        """Digests of what the stage depends on: ``key`` of everything, ``basis`` of all but its amounts.
-
-        Args:
-            name: of the stage.
-            config: of the run.
-            before: key of the stage before, or of the data.
-        """
+        """See `stage_keys`; ``before`` is the key of the stage before, or of the data."""
         settings = [s.model_dump(mode="json") for s in self.settings(config)]
         rest = [{k: v for k, v in s.items() if k not in self.amounts} for s in settings]
 
@@ -62,12 +57,12 @@ STAGES: dict[str, Stage] = {
     "modes": Stage(
         version=1,
         settings=lambda config: [config.modes],
-        results=lambda run: [run.modes_by_strength.path, run.decomposition.path],
+        results=lambda run: [run.modes_by_strength.path, run.modes.path, run.decomposition.path],
     ),
     "factors": Stage(
         version=1,
         settings=lambda config: [config.factors],
-        results=lambda run: [run.modes.path, run.factors.path],
+        results=lambda run: [run.factors.path],
     ),
     "samples": Stage(
         version=1,
@@ -75,10 +70,11 @@ STAGES: dict[str, Stage] = {
         results=lambda run: [run.samples],
         amounts=frozenset({"count", "factor_counts"}),
     ),
-    # Its files are named by what decides their contents, so that a change leaves alone the networks it doesn't touch.
+    # Networks are in files named by what decides their contents, so that a change leaves alone those it doesn't touch.
     "networks": Stage(
         version=1,
         settings=lambda config: [config.networks, config.monolithic, *config.variants.values()],
+        results=lambda run: [run.histories.path],
     ),
     "evaluation": Stage(
         version=1,
@@ -90,3 +86,17 @@ STAGES: dict[str, Stage] = {
         settings=lambda config: [config.export],
     ),
 }
+
+
+def stage_keys(config: Config, data: str) -> dict[str, dict[str, str]]:
+    """For each stage digests of what it depends on: ``key`` of everything, ``basis`` of all but its amounts.
+
+    Args:
+        config: of the run.
+        data: identifies the files of the collection.
+    """
+    found: dict[str, dict[str, str]] = {}
+    for name, stage in STAGES.items():
+        found[name] = stage.keys(name, config, data)
+        data = found[name]["key"]
+    return found

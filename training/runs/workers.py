@@ -1,8 +1,8 @@
 """One function on many items: in processes on this machine, or on a Dask cluster.
 
 Either way an item's result is the same bit for bit, because it depends on the item alone and is computed with one BLAS
-thread (only processors with different instructions may round differently). What a worker that dies was busy with is
-done again by another.
+thread (only processors with different instructions may round differently). The item that a worker was busy with when
+it died is done again by another.
 
 The machines of a cluster need this package in the same version, with its ``cluster`` extra, and no common file system.
 """
@@ -33,8 +33,8 @@ CONNECT = 10.0
 ABANDONED = 60.0
 #: Items in flight for each thread of a cluster: one to work on, one on its way.
 AHEAD = 2
-#: How often workers' deaths are put up with before the work itself is taken for the cause. Dask counts three of its own
-#: each time.
+#: Deaths of workers that are tolerated before the work itself is taken for their cause; on a cluster Dask tolerates
+#: three more for each of these.
 RETRIES = 3
 
 
@@ -81,7 +81,7 @@ class _Travelling(Generic[Item, Result]):
         if getattr(_kept, "digest", None) != self._digest:
             _kept.function = pickle.loads(self._pickled.data)  # noqa: S301 - our own, from where the results go
             _kept.digest = self._digest
-        # For good: another thread of this process may still be at work when this one is done.
+        # Not taken back afterwards: another thread of this process may still be computing.
         threadpool_limits(1)
         return _kept.function(item)
 

@@ -7,13 +7,14 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from shapespace.arrays import FloatArray, IntArray
 from shapespace.mesh.triangle_mesh import TriangleMesh
 from shapespace.shell.energy import Material
-from shapespace.shell.many_exponentials import exponentials
+from shapespace.shell.exponential import exponential
 from shapespace.shell.space import ShellSpace
-from shapespace.training.runs.coordinates import Coordinates
+from shapespace.training.runs.latent_coordinates import Coordinates
 from shapespace.training.runs.sampling import Shapes
 
 
@@ -70,10 +71,11 @@ class ShellCollection:
         return []
 
     def shapes(self, latents: FloatArray) -> Shapes:
-        """Exponentials of codes (n, m), computed in this process; angles are unwrapped along each geodesic."""
+        """Exponentials of codes (n, m), with one BLAS thread; angles are unwrapped along each geodesic."""
         # One code at a time: a product with all of them would round differently with their number.
         velocities = np.stack([np.tensordot(code, self.modes, axes=1) for code in latents])
-        paths = exponentials(self.space, self.reference.vertices, velocities, self.steps, workers=1)
+        with threadpool_limits(1):
+            paths = [exponential(self.space, self.reference.vertices, v, self.steps) for v in velocities]
         found = [
             (path.vertices[-1], path.nric[-1], "" if path.converged else f"{path.status}: {path.reason}")
             for path in paths

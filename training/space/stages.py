@@ -173,8 +173,7 @@ def modes(run: RunDirectory, config: Config) -> dict[str, Any]:
         "pga_localisation": localisation(dense.nric, norm),
     }
     run.modes_by_strength.write(**arrays)
-    if not run.factors.exists():  # otherwise they are in the order of factors that may still be right
-        run.modes.write(**arrays, rank=np.arange(len(sparse)))
+    run.modes.write(**arrays, rank=np.arange(len(sparse)))
     facts = {
         "modes": len(sparse),
         "converged": sparse.converged,

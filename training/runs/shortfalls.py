@@ -18,7 +18,7 @@ from shapespace.training.runs.sampling import DONE, columns, parts
 
 #: A larger share of logarithms or samples lost stops the run.
 MOST_LOST = 0.25
-#: A factor is named as the cause where lost codes lie farther from 0 in it than others do, by this share of the box.
+#: A factor is named as the cause where, in it, lost codes lie farther from 0 than the others by this share of the box.
 CLEARLY = 0.05
 #: Most names in a sentence.
 NAMED = 6
@@ -34,7 +34,7 @@ class LostTooMuchError(RuntimeError):
 
 
 @dataclass(frozen=True)
-class Loss:
+class Shortfall:
     """One thing that a stage could not do.
 
     Attributes:
@@ -53,21 +53,21 @@ class Loss:
         return self.share > MOST_LOST
 
 
-def losses(run: RunDirectory, stage: str) -> list[Loss]:
+def shortfalls(run: RunDirectory, stage: str) -> list[Shortfall]:
     """What a finished stage could not do."""
     return _STAGES[stage](run) if stage in _STAGES else []
 
 
-def refuse(stage: str, lost: list[Loss], command: str = "") -> None:
+def refuse(stage: str, lost: list[Shortfall], command: str = "") -> None:
     """Stop a run that has lost too much.
 
     Raises:
         LostTooMuchError: with what was lost, what may help, and the command that goes on all the same.
     """
-    grave = [loss for loss in lost if loss.too_much]
+    grave = [each for each in lost if each.too_much]
     if grave:
-        why = "; ".join(loss.sentence for loss in grave)
-        advice = "; ".join(dict.fromkeys(loss.advice for loss in grave))
+        why = "; ".join(each.sentence for each in grave)
+        advice = "; ".join(dict.fromkeys(each.advice for each in grave))
         raise LostTooMuchError(
             f"stopped after {stage}: {why}, more than a quarter, and what is learned from the rest is worth little.\n"
             f"What may help: {advice}." + (f"\nTo go on all the same: {command}" if command else "")
@@ -79,15 +79,15 @@ def _some(names: list[str]) -> str:
     return ", ".join(names[:NAMED]) + more
 
 
-def _ingest(run: RunDirectory) -> list[Loss]:
+def _ingest(run: RunDirectory) -> list[Shortfall]:
     facts = run.ingest.read_if_written()
     sentences = [*facts.get("notes", ()), *facts.get("warnings", ())]
     if facts.get("reason"):
         sentences.append(f"coarse mesh: {facts['reason']}")
-    return [Loss(sentence) for sentence in sentences]
+    return [Shortfall(sentence) for sentence in sentences]
 
 
-def _modes(run: RunDirectory) -> list[Loss]:
+def _modes(run: RunDirectory) -> list[Shortfall]:
     facts = run.decomposition.read_if_written()
     if "steps" not in facts:
         return []
@@ -97,23 +97,23 @@ def _modes(run: RunDirectory) -> list[Loss]:
     linearised = names[steps == 0].tolist()
     if linearised:
         sentence = f"linearised {len(linearised)} of {len(steps)} logarithms: {_some(linearised)}"
-        lost.append(Loss(sentence, len(linearised) / len(steps), COARSER))
+        lost.append(Shortfall(sentence, len(linearised) / len(steps), COARSER))
     finer = names[steps > facts["log_steps"]].tolist()
     if finer:
-        lost.append(Loss(f"twice as many steps for {len(finer)} of {len(steps)} logarithms: {_some(finer)}"))
+        lost.append(Shortfall(f"took twice as many steps for {len(finer)} of {len(steps)} logarithms: {_some(finer)}"))
     if found < asked:
         why = (
             f"{len(steps)} shapes differ in {found} directions"
             if found == len(steps) - 1
-            else "the others would be nought; a smaller modes.sparsity keeps more, where it isn't 0 already"
+            else "the others would be zero; a smaller modes.sparsity keeps more, where it isn't 0 already"
         )
-        lost.append(Loss(f"m {found} of {asked}, because {why}"))
+        lost.append(Shortfall(f"found {found} of {asked} modes, because {why}"))
     if not facts.get("converged", True):
-        lost.append(Loss("sparse modes: the iteration ended at modes.max_iterations, before it had converged"))
+        lost.append(Shortfall("sparse modes: the iteration ended at modes.max_iterations, before it had converged"))
     return lost
 
 
-def _samples(run: RunDirectory) -> list[Loss]:
+def _samples(run: RunDirectory) -> list[Shortfall]:
     grouping = run.factors.read_if_written()
     advice = f"{COARSER}; or without the shapes farthest from the others, which make the box of codes large"
     lost = []
@@ -129,7 +129,7 @@ def _samples(run: RunDirectory) -> list[Loss]:
             whose = "joint samples" if kind == "joint" else f"samples of factor {kind}"
             where = _farthest(samples["asked"], shortened, grouping) if kind == "joint" else ""
             sentence = f"shortened {shortened.sum()} of {len(failed)} codes of {whose} until they had a shape{where}"
-            lost.append(Loss(sentence, float((shortened | failed).mean()), advice))
+            lost.append(Shortfall(sentence, float((shortened | failed).mean()), advice))
         if not failed.any():
             continue
         reason, _ = Counter(str(r).partition(":")[0] for r in samples["reason"][failed]).most_common(1)[0]
@@ -138,11 +138,11 @@ def _samples(run: RunDirectory) -> list[Loss]:
             sentence = f"failed {failed.sum()} of {len(failed)} joint samples ({reason}){where}"
         else:
             sentence = f"failed {failed.sum()} of {len(failed)} samples of factor {kind} ({reason})"
-        lost.append(Loss(sentence, float(failed.mean()), advice))
+        lost.append(Shortfall(sentence, float(failed.mean()), advice))
     return lost + _folded(run)
 
 
-def _folded(run: RunDirectory) -> list[Loss]:
+def _folded(run: RunDirectory) -> list[Shortfall]:
     """Joint samples with two faces folded onto one another where no shape of the collection has as much as a crease."""
     if not run.shapes.exists():
         return []
@@ -153,7 +153,7 @@ def _folded(run: RunDirectory) -> list[Loss]:
     for part in parts(run.samples):
         sharp = np.cos(part["nric"][:, connectivity.edge_count :]) < FOLD_LIMIT
         folded, count = folded + int((sharp & smooth).any(axis=1).sum()), count + len(sharp)
-    return [Loss(f"folded {folded} of {count} joint samples where no shape has a crease")] if folded else []
+    return [Shortfall(f"folded {folded} of {count} joint samples where no shape has a crease")] if folded else []
 
 
 def _farthest(latents: NDArray, failed: NDArray, grouping: dict[str, Any]) -> str:
@@ -167,20 +167,20 @@ def _farthest(latents: NDArray, failed: NDArray, grouping: dict[str, Any]) -> st
     return f", most in factor {names[int(excess.argmax())]!r}" if excess.max() > CLEARLY else ""
 
 
-def _evaluation(run: RunDirectory) -> list[Loss]:
+def _evaluation(run: RunDirectory) -> list[Shortfall]:
     figures = run.evaluation.read_if_written()
     lost = []
     statuses = figures.get("vertex_error", {}).get("status", {})
     stalled, count = sum(n for status, n in statuses.items() if status != "converged"), sum(statuses.values())
     if stalled:
-        lost.append(Loss(f"{stalled} of {count} test shapes were not quite found from their lengths and angles"))
+        lost.append(Shortfall(f"{stalled} of {count} test shapes were not quite found from their lengths and angles"))
     total = figures.get("r2", {}).get("composite", {}).get("total", 1.0)
     if not total > 1 - MOST_LOST:
-        lost.append(Loss(f"the networks miss much: R² {total:.2f}; a larger samples.count may help"))
+        lost.append(Shortfall(f"the networks miss much: R² {total:.2f}; a larger samples.count may help"))
     return lost
 
 
-_STAGES: dict[str, Callable[[RunDirectory], list[Loss]]] = {
+_STAGES: dict[str, Callable[[RunDirectory], list[Shortfall]]] = {
     "ingest": _ingest,
     "modes": _modes,
     "samples": _samples,

@@ -18,7 +18,7 @@ from shapespace.training.runs.config import (
 )
 from tests.training.conftest import TINY
 
-EXAMPLES = sorted((Path(__file__).parents[2] / "examples").rglob("*.toml"))
+EXAMPLES = sorted((Path(__file__).parents[3] / "examples").rglob("*.toml"))
 
 
 @pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
@@ -78,7 +78,7 @@ def test_the_command_s_arguments_go_before_the_file_and_into_the_text_that_is_ke
 
 
 def test_a_file_that_needs_no_changes_is_kept_as_it_stands() -> None:
-    path = Path(__file__).parents[2] / "examples" / "freaky-torus.toml"
+    path = Path(__file__).parents[3] / "examples" / "freaky-torus.toml"
     assert load(path)[1] == path.read_text()
 
 
@@ -151,7 +151,7 @@ def test_what_is_kept_of_a_configuration_says_the_same() -> None:
 
 
 def test_a_configuration_of_version_0_1_is_refused_in_a_sentence_that_says_what_to_write() -> None:
-    path = Path(__file__).parents[2] / "runs" / "freaky-torus" / "config.toml"
+    path = Path(__file__).parents[3] / "runs" / "freaky-torus" / "config.toml"
     with pytest.raises(ConfigError) as caught:
         load(path)
     (line,) = str(caught.value).splitlines()[1:]

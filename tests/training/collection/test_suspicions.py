@@ -12,7 +12,7 @@ import pytest
 from shapespace.files.formats import MESH_FORMATS
 from shapespace.training.collection import figure, ingest
 from shapespace.training.collection.ingest import IngestError, MeshCollection, read_collection
-from tests.training.test_collection import bars
+from tests.training.whole_runs.test_collection import bars
 
 SHAPES, FACES = bars(12)
 ODD = 4

@@ -97,7 +97,7 @@ def test_the_bundle_is_one_the_server_takes_and_computes_the_same(tiny_run: Path
     assert bundle.manifest.figures == json.loads((tiny_run / "evaluation.json").read_text())
     assert bundle.manifest.onnx_tolerance.measured <= 1e-4
     text = b"".join(path.read_bytes() for path in folder.iterdir())
-    assert str(Path(__file__).parents[2]).encode() not in text, "a bundle tells nothing of the machine it was made on"
+    assert str(Path(__file__).parents[3]).encode() not in text, "a bundle tells nothing of the machine it was made on"
 
     run = Run(tiny_run, *load(tiny_run / "config.toml"), tiny_run / "models")
     composite = learner_of(run).main()
@@ -159,10 +159,24 @@ def test_more_samples_are_drawn_beside_those_that_are_there(tiny_run: Path, tmp_
         subprocess.run(command(config, copy, "--until", "samples"), check=True, capture_output=True)
 
     draw(TINY.replace("\ncount = 60", "\ncount = 80"))
+    assert all(" done " not in line for line in status(copy)[-3:])
+    shown = ("evaluation.json", "gallery.npz", "report.html", "networks/histories.json")
+    assert not any((copy / name).exists() for name in shown), "figures of other samples"
     assert len(read(copy / "samples").index) == 80
     assert {path: path.stat().st_mtime_ns for path in files} == before
     draw(TINY.replace("\ncount = 60", "\ncount = 80\nsteps = 5"))
     assert all(path.stat().st_mtime_ns != before[path] for path in files)
+
+
+def test_networks_that_are_not_needed_any_more_are_removed(tiny_run: Path, tmp_path: Path) -> None:
+    copy, config = tmp_path / "run", tmp_path / "tiny.toml"
+    shutil.copytree(tiny_run, copy)
+    config.write_text(TINY.replace("[monolithic]\nhidden = [16]", "[monolithic]\nhidden = [8]"))
+    subprocess.run(command(config, copy, "--until", "networks"), check=True, capture_output=True)
+    before, after = ({path.stem for path in (run / "networks").glob("*.safetensors")} for run in (tiny_run, copy))
+    assert [name.startswith("monolithic-") for name in before ^ after] == [True, True]
+    assert len(before) == len(after)
+    assert json.loads((copy / "networks" / "histories.json").read_text()).keys() == after
 
 
 def test_a_run_killed_in_samples_and_in_networks_ends_with_the_same_figures(tiny_run: Path, tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Time the Riemannian calculus on capsules of several sizes: ``python -m benchmarks.calculus``, then ``--help``.
+"""Time exponentials, geodesics and reconstructions on capsules of several sizes: ``python -m benchmarks.shell --help``.
 
 Capsules of radius 1 and length 2, closed, of genus 0, in units of their own; bent by 75° in all; η = 4e-4 at unit
 area; one thread. Each time stands beside a multiple of one SuperLU factorisation (symmetric mode) of ``JᵀJ`` of the
@@ -31,8 +31,8 @@ from tests.shapespace.conftest import bent
 MATERIAL = Material(eta=4e-4)
 
 
-def capsule(count: int, radius: float = 1.0, length: float = 2.0) -> TriangleMesh:
-    """A capsule with exactly this many vertices, evenly spread, axis along x.
+def even_capsule(count: int, radius: float = 1.0, length: float = 2.0) -> TriangleMesh:
+    """A capsule with exactly this many vertices, evenly spread, axis along x; that of `synthetic` has slivers.
 
     Points at the golden angle and equal steps along the axis are of equal area (Archimedes). A conformal map takes
     the capsule to the sphere, where the convex hull is the Delaunay triangulation.
@@ -82,7 +82,7 @@ class Case:
     """A capsule, its bend, and the yardstick."""
 
     def __init__(self, count: int) -> None:
-        self.mesh = capsule(count)
+        self.mesh = even_capsule(count)
         self.end = bent(self.mesh.vertices, np.radians(75))
         t = time.perf_counter()
         self.space = ShellSpace(self.mesh, MATERIAL)
@@ -124,7 +124,7 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=7)
     options = parser.parse_args()
     with threadpool_limits(1):
-        ShellSpace(capsule(100)).factorisations(1)  # loads the solver's library
+        ShellSpace(even_capsule(100)).factorisations(1)  # loads the solver's library
         print("| | V | seconds | processor | × SuperLU | iterations | residual |")
         print("|---|---|---|---|---|---|---|")
         cases = [Case(count) for count in options.sizes]

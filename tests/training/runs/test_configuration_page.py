@@ -31,22 +31,31 @@ def test_types_and_bounds_in_words() -> None:
     assert words(fractions.annotation) == "list of numbers, > 0, < 1"
 
 
+class Fit(BaseModel):
+    """How."""
+
+    rate: float = 0.5
+
+
 class Kernel(BaseModel):
     """One way."""
 
     kind: Literal["kernel"] = "kernel"
     size: int = Field(12, ge=1)
+    fit: Fit = Fit(rate=0.25)
 
 
 class Plain(BaseModel):
     """Another way."""
 
     kind: Literal["plain"] = "plain"
+    fit: Fit = Fit()
 
 
 class Whole(BaseModel):
     """Everything."""
 
+    fit: Fit = Fit()
     way: Kernel | Plain = Kernel(size=3)
     other: Kernel = Kernel()
 
@@ -59,3 +68,6 @@ def test_a_setting_of_several_kinds_has_a_table_for_each(monkeypatch: pytest.Mon
     assert "| `size` | whole number, ≥ 1 | `3` |" in kernel
     assert "- also as `other`, where the defaults are `size = 12`" in kernel
     assert "Another way." in plain
+    fit = text.split("## fit")[1].split("##")[0]
+    assert "- also as `way.fit` (kernel), where the defaults are `rate = 0.25`\n- also as `way.fit` (plain)\n" in fit
+    assert "- also as `other.fit`, where" in fit

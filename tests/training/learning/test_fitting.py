@@ -15,7 +15,7 @@ from shapespace.training.learning import fitting
 from shapespace.training.learning.layers import Scaling
 from shapespace.training.learning.networks import FactorNetwork
 from shapespace.training.runs.config import FitSettings, LatentNetworkSettings
-from shapespace.training.runs.coordinates import Coordinates
+from shapespace.training.runs.latent_coordinates import Coordinates
 
 
 class Killed(Exception):  # noqa: N818 - not an error

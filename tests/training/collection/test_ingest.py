@@ -293,7 +293,7 @@ REFUSALS: dict[str, tuple[Callable[[Path], Path], str]] = {
     "empty folder": (lambda folder: folder, r"holds no meshes \(it has no files\).* obj, ply"),
     "unknown extensions only": (unknown_extensions, r"holds no meshes \(only \.fbx, \.md\).* obj, ply"),
     "two shapes": (written(SHAPES[:2]), r"has 2 shapes; at least 3"),
-    "two collections in one folder": (two_collections, r"has 2 shapes; at least 3.*an NPZ .* named itself"),
+    "two collections in one folder": (two_collections, r"has 2 shapes; at least 3.*an NPZ .* name that file"),
     "one file": (single_file, r"pose1\.obj: .*name the folder"),
     "one name twice": (one_name_twice, r"pose1\.ply: pose1\.obj has the same name"),
     "GLB cut short": (bad_file("pose2.glb", GLB[:-40]), r"pose2\.glb: not a readable glb file"),
@@ -389,7 +389,7 @@ REFUSALS: dict[str, tuple[Callable[[Path], Path], str]] = {
     "equal shapes": (written(SHAPES[[0, 0, 0]]), r"all 3 shapes are equal"),
     "one shape at several places": (
         written(SHAPES[[0, 0, 0]] @ [[0, 1, 0], [-1, 0, 0], [0, 0, 1]] + [[[0, 0, 0]], [[3, 0, 0]], [[0, 0.5, 7]]]),
-        r"all 3 shapes are equal but for where they stand",
+        r"all 3 shapes are equal up to where they stand",
     ),
     "a mirror image": (
         written(SHAPES * [[[1, 1, 1]], [[1, -1, 1]], [[1, 1, 1]]]),
@@ -397,7 +397,7 @@ REFUSALS: dict[str, tuple[Callable[[Path], Path], str]] = {
     ),
     "NPZ of a collection among others": (
         lambda folder: bad_npz()(write(folder)).parent,
-        r"poses\.npz: vertices are of shape \(3, 42, 3\): an NPZ .* named itself",
+        r"poses\.npz: vertices are of shape \(3, 42, 3\); where an NPZ .* name that file",
     ),
     "NPZ without faces": (without_faces, r"poses\.npz: holds no array 'faces', only triangles, vertices"),
     "NPZ of one shape": (bad_npz(vertices=SHAPES[0]), r"poses\.npz: vertices must be an \(n, V, 3\) array"),

@@ -38,7 +38,7 @@ from shapespace.training.runs.config import (
     PolynomialSettings,
     ProductSettings,
 )
-from shapespace.training.runs.coordinates import Coordinates
+from shapespace.training.runs.latent_coordinates import Coordinates
 
 AROUND = {"star": Star, "flaps": Flaps}
 TORUS = Coordinates(np.zeros(2), np.full(2, 2 * np.pi), np.full(2, 2 * np.pi))

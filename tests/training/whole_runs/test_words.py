@@ -20,7 +20,7 @@ from shapespace.training import __main__ as command
 from shapespace.training.report.page import page
 from shapespace.training.report.record import Record
 from shapespace.training.runs.directory import RunDirectory
-from shapespace.training.runs.losses import losses
+from shapespace.training.runs.shortfalls import shortfalls
 from shapespace.training.runs.stages import STAGES
 from tests.faults.training import CONFIG, bars
 
@@ -98,12 +98,19 @@ def test_changed_data_are_read_again_and_it_is_said(place: Path, said: Said) -> 
 
 def test_a_run_of_version_0_1_is_not_continued_and_loses_nothing(place: Path, said: Said) -> None:
     said("run", "bars.toml", "--until", "mean")
-    run = place / "runs" / "bars"
-    (run / "data.json").unlink()
-    words = said("run", "bars.toml", code=1)
-    assert "is a run of version 0.1" in words
-    assert "--out" in words
-    assert (run / "mean.npz").exists()
+    run = RunDirectory(place / "runs" / "bars")
+    run.data.path.unlink()
+    for stage in ("ingest", "mean"):
+        stamp = run.stamp(stage).read()
+        del stamp["version"]
+        run.stamp(stage).write(stamp)
+    run.config.write(run.config.read().replace('correction = { kind = "kernel" }', "kernel = 12"))
+    before = {path: path.read_bytes() for path in run.folder.rglob("*") if path.is_file()}
+    for arguments in (("run", "bars.toml"), ("export", "runs/bars")):
+        (sentence,) = said(*arguments, code=1).splitlines()
+        assert sentence.startswith("shapespace-train: runs/bars is a run of version 0.1: ")
+        assert "--out" in sentence
+    assert {path: path.read_bytes() for path in run.folder.rglob("*") if path.is_file()} == before
 
 
 def test_a_stage_of_another_version_is_done_again_with_all_that_follows(
@@ -124,17 +131,24 @@ def test_a_stage_of_another_version_is_done_again_with_all_that_follows(
     assert "factors: done before" not in words
 
 
-def test_factors_know_the_order_of_their_modes_after_a_setting_came_and_went(place: Path, said: Said) -> None:
+def test_a_setting_that_came_and_went_leaves_nothing_and_costs_no_samples(place: Path, said: Said) -> None:
     config, run = place / "bars.toml", RunDirectory(place / "runs" / "bars")
     said("run", "bars.toml", "--until", "modes")
     assert run.modes.read().keys() == run.modes_by_strength.read().keys() | {"rank"}
-    said("run", "bars.toml", "--until", "factors")
+    said("run", "bars.toml", "--until", "samples")
     before, grouping = run.modes.read(), run.factors.read()
+    drawn = {path: path.stat().st_mtime_ns for path in run.samples.rglob("part-*.npz")}
     text = config.read_text()
     config.write_text(text.replace("log_steps = 2", "log_steps = 3"))
     said("run", "bars.toml", "--until", "modes")
+    assert not run.factors.exists()
+    np.testing.assert_array_equal(run.modes.read()["nric"], run.modes_by_strength.read()["nric"])
+    done = [line.split()[0] for line in said("status", "runs/bars").splitlines() if "done in" in line]
+    assert done == ["ingest", "mean", "modes"]
+    assert "to do" in page(Record(run))
     config.write_text(text)
-    assert "factors: done before" in said("run", "bars.toml", "--until", "factors")
+    said("run", "bars.toml", "--until", "samples")
+    assert {path: path.stat().st_mtime_ns for path in run.samples.rglob("part-*.npz")} == drawn
     after = run.modes.read()
     assert run.factors.read() == grouping
     assert before.keys() == after.keys()
@@ -164,17 +178,17 @@ def done_up_to_modes(place: Path, said: Said) -> Path:
 
 def test_lost_logarithms_are_said_and_stop_the_run(place: Path, said: Said) -> None:
     run = done_up_to_modes(place, said)
-    assert [loss.sentence for loss in losses(RunDirectory(run), "modes")] == []
+    assert [shortfall.sentence for shortfall in shortfalls(RunDirectory(run), "modes")] == []
     modes = json.loads((run / "modes.json").read_text())
     for steps, says, stops in (
-        ([4, 4, 4, 8, 4], "twice as many steps for 1 of 5 logarithms: bar3", False),
+        ([4, 4, 4, 8, 4], "took twice as many steps for 1 of 5 logarithms: bar3", False),
         ([4, 0, 4, 4, 4], "linearised 1 of 5 logarithms: bar1", False),
         ([4, 0, 4, 0, 4], "linearised 2 of 5 logarithms: bar1, bar3", True),
     ):
         (run / "modes.json").write_text(json.dumps(modes | {"steps": steps, "log_steps": 4, "asked": 9}))
         words = said("run", "bars.toml", "--until", "factors", code=int(stops))
         assert f"  {says}\n" in words
-        assert "  m 2 of 9, because the others would be nought" in words
+        assert "  found 2 of 9 modes, because the others would be zero" in words
         assert (says in page(Record(RunDirectory(run)))) is True
         assert (run / "factors.json").exists() != stops
         (run / "factors.json").unlink(missing_ok=True)
@@ -197,7 +211,7 @@ def test_failed_samples_are_counted_by_factor(place: Path) -> None:
         used = latents.copy()
         used[:5] *= 0.85
         np.savez(folder / "part-00000.npz", asked=latents, latents=used, status=status, reason=reason)
-    shortened, joint, own_shortened, own = losses(RunDirectory(run), "samples")
+    shortened, joint, own_shortened, own = shortfalls(RunDirectory(run), "samples")
     assert shortened.sentence.startswith("shortened 5 of 40 codes of joint samples until they had a shape")
     assert own_shortened.sentence == "shortened 5 of 40 codes of samples of factor 'upper right' until they had a shape"
     lost = status == "failed"

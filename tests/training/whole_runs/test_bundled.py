@@ -16,7 +16,7 @@ from shapespace.training.__main__ import main
 from shapespace.training.learning.networks import resolved
 from shapespace.training.runs.config import CombinerSettings, Config, LatentNetworkSettings, load
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[3]
 MODELS = ["freaky-torus", "figure"]
 
 
