@@ -153,7 +153,11 @@ class Connectivity:
 
     @property
     def euler_characteristic(self) -> int:
-        """V − E + F."""
+        """V − E + F: 2 − 2g − b of a connected surface with g handles and b boundary loops.
+
+        >>> Connectivity([[0, 1, 2], [2, 1, 3]], 4).euler_characteristic
+        1
+        """
         return self.vertex_count - self.edge_count + len(self.faces)
 
 

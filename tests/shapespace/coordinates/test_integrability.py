@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from shapespace.coordinates.integrability import Integrability, triangle_slack
+from shapespace.coordinates.integrability import Integrability
 from shapespace.coordinates.nric import NRICJacobian, nric
 from shapespace.mesh.triangle_mesh import TriangleMesh
 
@@ -109,12 +109,8 @@ def test_a_cylinder_that_does_not_close_fails_along_its_loop_only():
     assert np.abs(q[-6:]).max() > 0.1
 
 
-def test_impossible_triangles_show_in_the_slack_and_leave_q_finite(mesh):
+def test_q_is_finite_where_a_triangle_is_impossible(mesh):
     connectivity = mesh.connectivity
     z = nric(mesh.vertices, connectivity)
-    assert (triangle_slack(z, connectivity) > 0).all()
     z[connectivity.face_edges[5, 1]] *= 10
-    slack = triangle_slack(z, connectivity)
-    assert slack[5, 1] < 0
-    assert (slack < 0).any(axis=1).sum() <= 2
     assert np.isfinite(Integrability(connectivity)(z)).all()
