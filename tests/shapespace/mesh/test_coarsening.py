@@ -167,8 +167,8 @@ def annulus() -> TriangleMesh:
 
 @pytest.mark.parametrize("mesh", [MESHES["torus"](), MESHES["sheet"](), annulus()], ids=["torus", "sheet", "annulus"])
 def test_topology_ends_it_where_shape_does_not(mesh, monkeypatch):
-    monkeypatch.setattr("shapespace.mesh.coarsening._Decimation._keeps_shape", lambda *_, **__: True)
-    monkeypatch.setattr("shapespace.mesh.coarsening._Decimation.heal", lambda *_: None)
+    monkeypatch.setattr("shapespace.mesh.decimation.Decimation._keeps_shape", lambda *_, **__: True)
+    monkeypatch.setattr("shapespace.mesh.decimation.Decimation.heal", lambda *_: None)
     found = coarsen(mesh, 1, np.empty((0, *mesh.vertices.shape)))
     coarse = Connectivity(found.faces, len(found.fine_index))
     assert coarse.euler_characteristic == mesh.connectivity.euler_characteristic
