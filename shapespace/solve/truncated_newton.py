@@ -14,7 +14,7 @@ from shapespace.solve.outcome import Outcome
 from shapespace.solve.preconditioner import step_length
 from shapespace.solve.status import Status
 
-#: Most conjugate gradients in a step, and the part of the forces at which they end: at most, and at least.
+#: Most iterations of conjugate gradients in a step; and the part of the forces that may be left: at most, at least.
 GRADIENTS = 60
 LOOSEST, TIGHTEST = 0.3, 1e-3
 #: Displacement by which the Hessian is felt, as a share of the length that the problem gives.
@@ -24,7 +24,7 @@ ROUNDING, SMALLEST_STEP = 1e-15, 1e-6
 
 
 class Energy(Protocol):
-    """What is minimised, by unknowns of any shape."""
+    """What is minimised, over an array of unknowns of any shape."""
 
     @property
     def length(self) -> float:
