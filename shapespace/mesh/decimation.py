@@ -162,7 +162,7 @@ class Decimation:
         return sorted({w for f in self._star[v] for w in self.faces[f]} - {v})
 
     def _link(self, v: int) -> dict[int, tuple[int, int]]:
-        """The faces around a vertex, ``(v, a, b)`` as ``a: (b, number of the face)``."""
+        """The faces around a vertex: for each face ``(v, a, b)`` an item ``a: (b, number of the face)``."""
         link = {}
         for f in self._star[v]:
             a, b, c = self.faces[f]
@@ -201,7 +201,7 @@ class Decimation:
         )
 
     def _keeps_shape(self, u: int, v: int, sine: float, *, heal: bool = False) -> bool:
-        """Whether u → v leaves nothing bad that was not worse before, in any shape; or, to ``heal``, less that is."""
+        """Whether u → v leaves no fault in any shape that wasn't as bad before; or, to ``heal``, fewer faults."""
         around = self._around(u, v)
         triangles = self.triangles(np.array(around.rows))
         was = triangles.quality(around.old, around.pairs_before, sine)
