@@ -33,6 +33,21 @@ The geodesic between them, and their elastic mean:
 >>> 2.0 < float(np.ptp(mean.vertices[:, 0])) < 2.2
 True
 
+The Riemannian centre of mass, which costs a geodesic to each shape in every iteration, and those geodesics' logarithms:
+
+>>> centre = shapespace.centre_of_mass(space, [mesh.vertices, wider])
+>>> centre.converged, len(centre.logarithms)
+(True, 2)
+
+A vector carried along a path, and how the last shape of a path changes with the velocity that it was shot with:
+
+>>> carried = shapespace.parallel_transport(space, path, found.velocity)
+>>> carried.converged, carried.velocities.shape
+(True, (5, 24, 3))
+>>> changes = shapespace.ExponentialDerivative(path).push_forward(found.velocity[None])
+>>> changes.shape
+(1, 24, 3)
+
 An iteration that fails is a value: look at ``status`` and ``reason`` of what comes back. ``shapespace.client`` has the
 calls of a model over HTTP.
 """
@@ -45,33 +60,41 @@ if TYPE_CHECKING:
     from shapespace.model.shape_model import ShapeModel, load
     from shapespace.shell.energy import Material
     from shapespace.shell.exponential import exponential
+    from shapespace.shell.exponential_derivative import ExponentialDerivative
     from shapespace.shell.geodesic import geodesic, logarithm
-    from shapespace.shell.mean import elastic_mean
+    from shapespace.shell.mean import centre_of_mass, elastic_mean
     from shapespace.shell.space import ShellSpace
+    from shapespace.shell.transport import parallel_transport
 
 __version__ = "0.1.0"
 __all__ = [
+    "ExponentialDerivative",
     "Material",
     "ShapeModel",
     "ShellSpace",
     "TriangleMesh",
+    "centre_of_mass",
     "elastic_mean",
     "exponential",
     "geodesic",
     "load",
     "logarithm",
+    "parallel_transport",
 ]
 
 _MODULES = {
+    "ExponentialDerivative": "shell.exponential_derivative",
     "Material": "shell.energy",
     "ShapeModel": "model.shape_model",
     "ShellSpace": "shell.space",
     "TriangleMesh": "mesh.triangle_mesh",
+    "centre_of_mass": "shell.mean",
     "elastic_mean": "shell.mean",
     "exponential": "shell.exponential",
     "geodesic": "shell.geodesic",
     "load": "model.shape_model",
     "logarithm": "shell.geodesic",
+    "parallel_transport": "shell.transport",
 }
 
 

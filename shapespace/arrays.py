@@ -1,4 +1,4 @@
-"""Types of arrays."""
+"""Types of the arrays in signatures."""
 
 import numpy as np
 from numpy.typing import NDArray

@@ -65,9 +65,9 @@ class Client:
 
     Args:
         url: of the server.
-        api_key: where the server wants one.
+        api_key: for servers that want one.
         timeout: seconds to wait for each answer.
-        retries: how often to ask again a server that is busy, after the time that it says.
+        retries: how often a busy server is asked again, each time after the wait that it names.
     """
 
     def __init__(self, url: str, *, api_key: str | None = None, timeout: float = 120, retries: int = 3) -> None:
@@ -165,7 +165,7 @@ class Client:
     def encode(
         self, name: str, mesh: Mesh | bytes | Path, format: str | None = None, **options: Options
     ) -> dict[str, Any]:
-        """The code whose shape is closest to a mesh in correspondence, however that one is turned and moved.
+        """The code whose shape is closest to a mesh in correspondence, whatever its rotation and position.
 
         Args:
             name: of the model.
@@ -207,7 +207,7 @@ class Client:
             latent: (m,) to start from.
             targets: position (3,) by vertex.
             version: of the model.
-            options: prior, the weight that holds the code back; mesh, whose vertices are meant.
+            options: prior, the weight that holds the code back; mesh, the one whose vertices are meant.
 
         Returns:
             ``latent``, ``residual`` and more.
@@ -246,9 +246,9 @@ class Interpolation:
     """An animation; iterating over it gives each frame's vertices (V, 3) as soon as it is ready.
 
     Attributes:
-        client: that asked for it.
-        id: holds all of it, so that it can be asked for again, and of other replicas.
-        frames: how many.
+        client: the one that asked for it.
+        id: holds the whole request, so that any replica can answer it, at any time.
+        frames: how many there are.
     """
 
     client: Client

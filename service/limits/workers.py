@@ -39,7 +39,7 @@ class DeadlineError(TimeoutError):
 
 
 class DisconnectedError(ConnectionError):
-    """Nobody is there to be answered any more."""
+    """Nobody waits for the answer any more."""
 
 
 class EndingError(RuntimeError):
@@ -60,36 +60,36 @@ class Caller:
 
 
 class Call(Deadline):
-    """A deadline that a request on the event loop waits for as well.
+    """A deadline that also ends the waiting of a request on the event loop.
 
     Args:
         seconds: from now.
-        late: the error where they have passed.
+        late: the error to end with once they have passed.
     """
 
     def __init__(self, seconds: float, late: Exception) -> None:
         super().__init__(seconds)
         loop = asyncio.get_running_loop()
         self._over: asyncio.Future[None] = loop.create_future()
-        self._over.add_done_callback(lambda end: end.cancelled() or end.exception())  # it may be nobody's to look at
+        self._over.add_done_callback(lambda end: end.cancelled() or end.exception())  # or asyncio complains
         self._timer = loop.call_later(seconds, self.give_up, late)
 
     def give_up(self, error: Exception) -> None:
-        """End it with an error."""
+        """End the call with an error."""
         self.call_off()
         if not self._over.done():
             self._over.set_exception(error)
 
     def close(self) -> None:
-        """It was in time."""
+        """The work is done, and the deadline doesn't matter any more."""
         self._timer.cancel()
 
     async def first(self, work: Awaitable[T]) -> T:
-        """The result of something, or the error that this ends with before."""
+        """The result of some work, or the error with which this call ends before it is there."""
         task = asyncio.ensure_future(work)
         try:
             await asyncio.wait((task, self._over), return_when=asyncio.FIRST_COMPLETED)
-            if self._over.done():  # also where both are
+            if self._over.done():  # even if the work is done too
                 self._over.result()
             return task.result()
         finally:
@@ -111,7 +111,7 @@ class Workers:
     Attributes:
         places: requests at work or waiting.
         streams: answers that are read while they are computed.
-        memory: bytes of answers that many shapes are gathered for.
+        memory: bytes of answers in which many shapes are gathered.
         lost: threads given up, and still running.
     """
 
@@ -130,7 +130,7 @@ class Workers:
 
     @asynccontextmanager
     async def admit(self, caller: Caller) -> AsyncIterator[Call]:
-        """Count a request in for the duration; gives its deadline.
+        """Admit a request for the block's duration; yields its deadline.
 
         Raises:
             BusyError: too many requests are being worked on or waiting, of all clients or of this one.
@@ -144,13 +144,13 @@ class Workers:
 
     @contextmanager
     def stream(self, caller: Caller) -> Iterator[None]:
-        """Count in, for the duration, a request whose answer is read while it is computed; raises BusyError."""
+        """Admit, for the block's duration, a request whose answer is read while it is computed; raises BusyError."""
         with self._place(self.streams, caller):
             yield
 
     @contextmanager
     def holding(self, caller: Caller, size: int) -> Iterator[ExitStack]:
-        """Count in so many bytes of an answer, for the block or as long as who takes the stack keeps it.
+        """Reserve bytes for an answer until the block ends, or until the stack is closed by whoever has taken it over.
 
         Raises:
             BusyError: all requests together hold too much, or those of one client.
@@ -199,11 +199,11 @@ class Workers:
         finally:
             for task in running:
                 task.cancel()
-            # What else went wrong is of no interest any more, but would be logged as never looked at.
+            # What else went wrong doesn't matter any more, but asyncio would log it as never looked at.
             await asyncio.gather(*running, return_exceptions=True)
 
     async def piece(self, function: Callable[[Call], T], call: Call | None) -> T:
-        """``run`` with a deadline, or one of its own; raises as that does."""
+        """``run`` with this deadline, or without one with a deadline of its own; raises as ``run`` does."""
         if call is not None:
             return await self.run(function, call)
         with self._call() as own:

@@ -13,8 +13,8 @@ from shapespace.bundle.schema import ARRAYS, ArrayType, Manifest
 from shapespace.mesh.prolongation import PREFIX, Prolongation, ProlongationError
 from shapespace.mesh.triangle_mesh import MeshError, TriangleMesh
 
-#: Largest distance of a vertex of the fine mesh from the prolonged reference, as a fraction of the diagonal: that of
-#: float32.
+#: Largest distance of a vertex of the fine mesh from the prolonged reference, as a fraction of the diagonal: the
+#: rounding of float32.
 FINE_TOLERANCE = 1e-5
 
 

@@ -21,9 +21,9 @@ from shapespace.bundle.geometry import Geometry, GeometryError
 from shapespace.bundle.schema import MANIFEST, NAME_PATTERN, VERSION_PATTERN, FileEntry, Manifest
 from shapespace.files.npz_reading import PackedArray
 
-#: Bytes of a manifest.
+#: Most bytes of a manifest.
 MANIFEST_LIMIT = 4 * 2**20
-#: Bytes of a bundle's files together.
+#: Most bytes of a bundle's files together.
 LARGEST = 2**30
 #: Limit on the unpacked arrays of an NPZ file: so many times its own length, and so many bytes more. Compression makes
 #: meshes two to six times smaller; data that shrink much more are no mesh.

@@ -45,7 +45,7 @@ class _Range(_Strict):
 
 
 class Factor(Network, _Range):
-    """The network ψ_j of one factor, fed with latents ``start`` to ``stop``, the last one excluded."""
+    """The network ψ_j of one factor, fed with latents from ``start`` to just before ``stop``."""
 
 
 class GeometryFile(_Strict):
@@ -55,7 +55,7 @@ class GeometryFile(_Strict):
 
 
 class Tolerance(_Strict):
-    """How far ONNX may be from PyTorch, and is, relative in the weighted norm."""
+    """The largest allowed difference between ONNX and PyTorch, and the measured one: relative, in the weighted norm."""
 
     required: PositiveFloat
     measured: NonNegativeFloat
@@ -70,7 +70,7 @@ class Origin(_Strict):
 
 
 class FileEntry(_Strict):
-    """What a file must be."""
+    """What a file's content must be."""
 
     sha256: str = Field(pattern=r"^[0-9a-f]{64}$")
     bytes: int = Field(ge=0)

@@ -52,7 +52,7 @@ class FrameIntegration:
         self._poisson_equation(reference, backend)
 
     def _hinges_to_parents(self, children: IntArray, parents: IntArray) -> None:
-        """The edge between each face that is no root and its parent, and which side of either face that is."""
+        """For each face but the roots, the edge to its parent, and which side of either face that edge is."""
         c = self._connectivity
         edge_of = {(a, b): e for (a, b), e in zip(c.edge_faces[c.hinge_edges].tolist(), c.hinge_edges, strict=True)}
         edge_of |= {(b, a): e for (a, b), e in edge_of.items()}
@@ -142,7 +142,8 @@ class FrameIntegration:
 def _spanning_forest(mesh: TriangleMesh) -> IntArray:
     """The parent (F,) of each face in a tree of short paths from a face in the middle of each part; a root is its own.
 
-    Lengths are those between the centres of faces, and a mean one more a hinge: errors come with each, however near.
+    A path is as long as the way between the centres of its faces, plus the mean such distance for each hinge, because
+    each hinge adds an error, however short it is.
     """
     c, centres = mesh.connectivity, mesh.vertices[mesh.faces].mean(axis=1)
     left, right = c.edge_faces[c.hinge_edges].T
@@ -171,7 +172,8 @@ def _rounds(depths: IntArray, parents: IntArray) -> list[tuple[int, IntArray]]:
     """How to multiply along all paths from the roots at once, in as many rounds as the depth has binary digits.
 
     In each round every product is multiplied by that of its face's ancestor, which reaches as far up again ("pointer
-    jumping", Wyllie 1979). A round is the first face that takes part and the ancestors of it and all after it.
+    jumping", Wyllie 1979). A round is given as the first face that takes part, and the ancestors of that and all later
+    faces.
 
     Args:
         depths: (F,) increasing.
@@ -186,13 +188,13 @@ def _rounds(depths: IntArray, parents: IntArray) -> list[tuple[int, IntArray]]:
 
 
 def _half(cosine: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Sine and cosine of half the angle in [0, π] with this cosine, as near as there is one."""
+    """Sine and cosine of half the angle in [0, π] with this cosine, which is moved into [−1, 1] first."""
     cosine = np.clip(cosine, -1, 1)
     return np.sqrt((1 - cosine) / 2), np.sqrt((1 + cosine) / 2)
 
 
 def _middle(graph: sparse.csr_array, part: IntArray) -> int:
-    """A face of a connected part from which no other is far: half way between two that are."""
+    """A face in the middle of a connected part: half way between two that are far from each other."""
     far = part[0]
     distances = []
     for _ in range(3):

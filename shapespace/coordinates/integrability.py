@@ -1,4 +1,4 @@
-"""When lengths and angles are those of a surface: triangle inequalities and the closing conditions Q(z) = 0.
+"""When lengths and angles are those of a surface: the closing conditions Q(z) = 0.
 
 Walk around an interior vertex with a face frame: x along the current edge, z along the face's normal. Each corner
 rotates it by the inner angle γ about z, each edge by the dihedral angle θ about x. Back at the start the frame
@@ -21,12 +21,6 @@ from scipy import sparse
 from shapespace.arrays import FloatArray, IntArray
 from shapespace.coordinates import quaternions
 from shapespace.mesh.triangle_mesh import Connectivity
-
-
-def triangle_slack(z: FloatArray, connectivity: Connectivity) -> FloatArray:
-    """``l_i + l_j − l_k`` (…, F, 3) of the sides of each face; all positive where the triangle inequalities hold."""
-    sides = z[..., : connectivity.edge_count][..., connectivity.face_edges]
-    return sides.sum(axis=-1, keepdims=True) - 2 * sides
 
 
 class _Move(NamedTuple):

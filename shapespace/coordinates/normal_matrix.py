@@ -15,7 +15,7 @@ from shapespace.solve.cholesky import SymmetricPattern
 
 @dataclass(frozen=True)
 class QuadraticForm:
-    """A quadratic form H on NRIC that couples no more than the three lengths of a face.
+    """A quadratic form H on NRIC that couples nothing but the three lengths of each face.
 
     Attributes:
         faces: (…, 3, 3, F) a symmetric block per face, on the lengths of its three sides.
@@ -118,7 +118,8 @@ class NormalMatrix:
         return np.concatenate([slots, self.pattern.slots[_upper(FACE) * self._sides.shape[1] :]])
 
     def _edges(self, directions: FloatArray, weights: FloatArray, out: FloatArray) -> None:
-        # The 3×3 blocks of the tail, of the head, which is the same, and of both, which is its negative and whole.
+        # 3×3 blocks: tail with tail and head with head are the same, and of both only the upper triangle is kept; tail
+        # with head is their negative, with all its entries.
         tails, heads, both = np.split(out, [_upper(3), 2 * _upper(3)])
         weighted = directions * weights
         start = 0

@@ -38,11 +38,11 @@ def cross(a: FloatArray, b: FloatArray) -> FloatArray:
 class HingeGeometry:
     """Edge vectors, and at every hinge the vectors and normals that angles are made of, all (3, …).
 
-    What lengths and angles have in common with their derivatives, which is most of the work.
+    Lengths, angles and their derivatives are all computed from these, and these are most of the work.
 
     Args:
         vertices: shapes (…, V, 3).
-        connectivity: theirs.
+        connectivity: of all these shapes.
     """
 
     def __init__(self, vertices: FloatArray, connectivity: Connectivity) -> None:
@@ -71,7 +71,7 @@ class HingeGeometry:
         """(…, H) by atan2 of (sine, cosine), which stays accurate near 0 and π where arccos does not."""
         sine = dot(self.left_normal, self.to_right)
         sine *= -self.hinge_lengths
-        sine += 0.0  # never −0, which arctan2 takes from π to −π at a hinge folded flat
+        sine += 0.0  # never −0, for which arctan2 gives −π instead of π at a hinge folded flat
         return np.arctan2(sine, dot(self.left_normal, self.right_normal))
 
     def nric(self) -> FloatArray:

@@ -22,7 +22,7 @@ def turn(angle: FloatArray, axis: int) -> FloatArray:
 
 
 def product(p: FloatArray, q: FloatArray) -> FloatArray:
-    """P q (4, …)."""
+    """The product p q (4, …)."""
     w, x, y, z = p
     a, b, c, d = q
     return np.stack(

@@ -30,8 +30,9 @@ DEFAULT_ETA = 1e-2
 #: steps, which is about what a new one costs.
 REACH, LIFE = 1e-2, 16
 #: Where Gauss–Newton stalls, damping as a share of each diagonal entry: the first, the factor by which it rises where a
-#: step fails and falls where one succeeds, and the largest. A step as short as the tolerance is a minimum's up to the
-#: last: that is felt by no motion but the softest (the matrix of a torus of 2048 vertices has entries of 1e-6).
+#: step fails and falls where one succeeds, and the largest. A step within the tolerance means a minimum only while the
+#: damping is not above the last number, which slows but the softest motions (the matrix of a torus of 2048 vertices
+#: has entries of 1e-6).
 FIRST_DAMPING, DAMPING_FACTOR, LARGEST_DAMPING, DAMPING_AT_A_MINIMUM = 1e-6, 10, 1e3, 1e-4
 #: Least share of its area that a damped step leaves to a face.
 LEAST_AREA = 0.1
@@ -97,8 +98,8 @@ class Reconstructor:
     def guess(self, target: FloatArray, *others: Callable[[], FloatArray]) -> FloatArray:
         """A start (V, 3) near the shape of z* (2E,), which depends on nothing but z*.
 
-        Integrated face frames first, which are exact for integrable z*. Where they go astray, for errors of z* add up
-        along them, the start with the smallest misfit among them, the others, called only then, and the reference.
+        Integrated face frames are exact for integrable z*, but errors of z* add up along them. Where they have gone
+        astray, it is the start with the smallest misfit among them, ``others`` (called only then) and the reference.
         """
         return self._guess(target, others).vertices
 
@@ -372,7 +373,7 @@ class _GaussNewtonFactor:
         self._inverse, self._mixing = Preconditioner(factor, rigid_motions(at)), Anderson()
 
     def step(self, vertices: FloatArray, forces: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """The step from a shape, and the next shape, which the steps so far have their part in."""
+        """The step from a shape, and the next shape, into which the steps so far are mixed."""
         self._steps += 1
         step = self._inverse(forces)
         return step, self._mixing(vertices, forces, step)

@@ -9,7 +9,7 @@ from collections.abc import Iterable, Iterator
 import numpy as np
 
 Buffer = bytes | bytearray | memoryview
-#: Harder compression takes longer than the shapes themselves, for a tenth of the size.
+#: Harder compression takes longer than to compute the shapes, and saves a tenth of the size.
 TEXT_LEVEL = 1
 #: The level that NumPy uses.
 ARRAY_LEVEL = 6
@@ -35,10 +35,10 @@ class _Sink(io.RawIOBase):
 
 
 def zip_pieces(members: Iterable[tuple[str, Iterable[Buffer]]], level: int = TEXT_LEVEL) -> Iterator[bytes]:
-    """An archive of members, each a name and its content in parts; a piece for each part that left something.
+    """Yield an archive of members, each a name and its content in parts, a piece at a time.
 
-    Equal members give equal bytes, whatever the day. Sizes stand behind the members and in the directory, not before
-    them: a reader has to go by the directory.
+    Equal members give equal bytes, whatever the date. Sizes stand behind the members and in the directory, not in front
+    of them, so readers have to go by the directory.
     """
     sink = _Sink()
     with zipfile.ZipFile(sink, "w", zipfile.ZIP_DEFLATED, compresslevel=level) as archive:

@@ -63,7 +63,7 @@ def _obj(vertices: FloatArray, faces: IntArray, colouring: Colouring | None = No
 
 
 def obj_vertices(vertices: FloatArray, colouring: Colouring | None = None) -> str:
-    """The positions (V, 3) of an OBJ file, with colours behind them as most readers know them."""
+    """The positions (V, 3) of an OBJ file, with colours behind them in the way that most readers understand."""
     # Nine significant digits hold a float32 whatever the unit; trimesh writes a fixed number of decimals.
     comment, line, rows = "", "v %.9g %.9g %.9g\n", vertices.astype(np.float32)
     if colouring:
@@ -172,7 +172,7 @@ def read_arrays(
                     return _READERS[str(format)](data, limits)
     except MeshError:
         raise
-    except Exception as error:  # foreign bytes fail in every way there is
+    except Exception as error:  # bytes from outside may raise anything
         raise MeshError(f"not a readable {format} file: {clipped(error, 300)}") from error
 
 

@@ -24,11 +24,11 @@ from shapespace.arrays import FloatArray, IntArray
 from shapespace.files.limits import PIECE, Limits, clipped
 from shapespace.mesh.triangle_mesh import MeshError
 
-#: Most bytes of the JSON, without data; and of its values. A rig with animations has a hundred thousand.
+#: Most bytes of the JSON, without data; and most values in it. A rig with animations has a hundred thousand.
 _MOST_TEXT, _MOST_VALUES = 4 * 2**20, 250_000
-#: Most data inside the JSON; most primitives at all their places; and how deep nodes may lie in others.
+#: Most data URIs in the JSON; most primitives, counted at each of their places; and how deep nodes may be nested.
 _MOST_URIS, _MOST_PARTS, _DEEPEST = 1000, 1000, 100
-#: Extensions that a file may require: this one is read, and those that begin so change no triangle.
+#: Extensions that a file may require: the first is read, and those that begin like the others change no triangle.
 _QUANTIZATION = "KHR_mesh_quantization"
 _APPEARANCE = ("KHR_materials_", "KHR_texture_", "EXT_texture_", "KHR_lights_", "EXT_lights_")
 _TYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
@@ -145,7 +145,7 @@ class _Document:
         """The meshes of the scene by their numbers, each with the matrix (4, 4) of its place, none for the identity."""
         if not self.nodes:
             yield from ((k, None) for k in range(len(self.meshes)))
-        # The last one first, as files have been read from the beginning.
+        # The last root first: the order in which this project has always read files.
         waiting: list[tuple[int, FloatArray | None, int]] = [(root, None, 1) for root in self.roots()]
         while waiting:
             number, outer, depth = waiting.pop()

@@ -38,7 +38,7 @@ UNLIMITED = Limits()
 
 
 def count_bytes(data: memoryview, *characters: bytes) -> int:
-    """How many bytes of the data are any of some characters."""
+    """How many bytes of the data are one of these characters."""
     # In pieces: a comparison needs as many bytes as it compares.
     pieces = (np.frombuffer(data[start : start + PIECE], np.uint8) for start in range(0, len(data), PIECE))
     return sum(int(np.count_nonzero(piece == character[0])) for piece in pieces for character in characters)

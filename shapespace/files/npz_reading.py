@@ -18,7 +18,7 @@ from shapespace.mesh.triangle_mesh import MeshError
 _MOST_ARRAYS = 1000
 #: Bytes that contain the head of an array; NumPy accepts heads of ten thousand bytes at most.
 _HEAD = 12_000
-#: Bytes that deflate can make of one byte, at most; and those of NumPy's longest number.
+#: Most bytes that deflate can make of one; and bytes of NumPy's longest number.
 _DEFLATION, _LONGEST_NUMBER = 1032, 32
 _READ_HEAD = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
 

@@ -339,7 +339,7 @@ class _BinaryTable:
         self._data, self._limits, self._place = data, limits, 0
 
     def _alike(self, element: _Element, lengths: Sequence[int] = ()) -> NDArray:
-        """The rows of an element, onto the file, if lists are as long as that in all of them; properties by number."""
+        """The rows of an element where they lie, if all have lists of these lengths; fields by number of property."""
         fields: list[tuple] = []
         left = iter(lengths)
         for k, p in enumerate(element.properties):
@@ -371,7 +371,7 @@ class _BinaryTable:
             rows = self._alike(element, [length for _, length in spans])
             lengths = zip(element.lists, spans, strict=True)
             alike = all((rows[f"length {k}"] == length).all() for k, (_, length) in lengths)
-        except ValueError:  # too long, if all were like the first one
+        except ValueError:  # the file would end before, were all rows like the first
             alike = False
         if alike and spans[which][1] == 3:
             self._place += rows.nbytes

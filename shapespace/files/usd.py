@@ -61,7 +61,7 @@ def animated_usd(frames: NDArray[np.floating], faces: IntArray) -> Iterator[byte
         points, normals, extent = mesh.CreatePointsAttr(), mesh.CreateNormalsAttr(), mesh.CreateExtentAttr()
         frames = frames.astype(np.float32, copy=False)
         for start in range(0, len(frames), _FRAMES_AT_ONCE):
-            # One change at the end, rather than three a frame that all listeners hear of.
+            # One notification at the end, instead of three for each frame.
             with Sdf.ChangeBlock():
                 for k, frame in enumerate(frames[start : start + _FRAMES_AT_ONCE], start):
                     box = np.stack([frame.min(axis=0), frame.max(axis=0)])

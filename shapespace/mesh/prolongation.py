@@ -19,7 +19,7 @@ from shapespace.mesh.triangle_mesh import Connectivity, MeshError, TriangleMesh,
 #: Weight of a vertex normal against that of an edge in the fit of a vertex' local affine map.
 NORMAL_WEIGHT = 0.1
 PREFIX = "prolongation_"
-#: Fine vertices that are bound together: each looks at dozens of faces.
+#: Fine vertices that are bound at a time: each is compared with dozens of faces, which takes memory.
 CHUNK = 10_000
 
 
@@ -99,7 +99,7 @@ class Prolongation:
 
     @cached_property
     def coarse_vertices(self) -> IntArray:
-        """(V,) the fine vertex that goes exactly with each coarse one, −1 where none does."""
+        """(V,) the fine vertex that is always where a coarse one is, −1 where there is none."""
         alone = np.flatnonzero(np.diff(self.weights.indptr) == 1)[::-1]
         column = self.weights.indices[self.weights.indptr[alone]]
         found = np.full(self.weights.shape[1] // 2, -1)

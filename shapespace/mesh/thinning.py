@@ -21,11 +21,11 @@ SINE, TURN = np.sin(np.deg2rad(10)), np.cos(np.deg2rad(45))
 MOTION_WEIGHT = 0.1
 #: Of the vertices that are tried in a round, the share whose collapses are cheapest and are done.
 CHEAPEST = 0.5
-#: How often more are chosen far from those that are.
+#: How often further vertices are chosen, far from those already chosen.
 SWEEPS = 3
 #: Faces looked at together.
 CHUNK = 50_000
-#: A round that removes less than this share of the vertices is one too many, and so many of them are the last.
+#: A round that removes less than this share of the vertices is in vain; after so many of those thinning ends.
 FEWEST, VAIN = 0.001, 5
 
 
@@ -34,11 +34,11 @@ def thin(connectivity: Connectivity, shapes: FloatArray, target: int) -> tuple[I
 
     In each round vertices far enough from each other are drawn at random, so that no collapse changes the faces that
     another looks at; those are collapsed whose quadrics, of all shapes, say that it costs least (Garland and Heckbert
-    1997). Vertices that locally cost least would lie too far apart for that.
+    1997). To take the vertices that cost less than all around them instead would give too few of them.
 
     Args:
         connectivity: F faces on V vertices.
-        shapes: (n, V, 3) a few shapes, that a collapse must neither fold nor flatten; sizes should be alike.
+        shapes: (n, V, 3) a few shapes of similar size, which a collapse must neither fold nor flatten.
         target: number of vertices.
 
     Returns:

@@ -17,11 +17,11 @@ class MeshError(ValueError):
 
 
 class PlaceError(MeshError):
-    """A fault at vertices or faces, for those who number them otherwise.
+    """A fault at some vertices or faces, which a caller may know by other numbers.
 
     Args:
-        sentence: with a field for each of the numbers; faces' fields begin with ``face``.
-        numbers: from 0; several are written as ``(2, 48)``.
+        sentence: with a field ``{name}`` for each entry of ``numbers``; names of faces begin with ``face``.
+        numbers: by name, counted from 0; several are written as ``(2, 48)``.
     """
 
     def __init__(self, sentence: str, numbers: Mapping[str, Sequence[int]]) -> None:
@@ -29,12 +29,12 @@ class PlaceError(MeshError):
         self.sentence, self.numbers = sentence, numbers
 
     def numbered(self, first: int = 0, vertices: IntArray | None = None) -> str:
-        """The sentence with numbers from ``first``, and of the vertices by what they are elsewhere, (V,)."""
+        """The sentence with numbers counted from ``first``, and those of vertices replaced by ``vertices`` (V,)."""
         shown = self.sentence
         for name, numbers in self.numbers.items():
             known = numbers if vertices is None or name.startswith("face") else vertices[list(numbers)].tolist()
             text = ", ".join(str(number + first) for number in known)
-            # Once, as the name of a file may have braces too.
+            # Only once, because the name of a file may contain braces too.
             shown = shown.replace(f"{{{name}}}", f"({text})" if len(known) > 1 else text, 1)
         return shown
 
@@ -153,7 +153,11 @@ class Connectivity:
 
     @property
     def euler_characteristic(self) -> int:
-        """V − E + F."""
+        """V − E + F: 2 − 2g − b of a connected surface with g handles and b boundary loops.
+
+        >>> Connectivity([[0, 1, 2], [2, 1, 3]], 4).euler_characteristic
+        1
+        """
         return self.vertex_count - self.edge_count + len(self.faces)
 
 

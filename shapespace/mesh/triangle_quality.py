@@ -13,8 +13,6 @@ from shapespace.mesh.triangle_mesh import Connectivity, cross
 FOLD_LIMIT = np.cos(np.deg2rad(140))
 #: Numbers of neighbouring faces.
 Pairs = list[tuple[int, int]]
-
-
 #: Least area of a face, as a share of the mean area of the coarse mesh's faces in the same shape.
 SMALLEST_AREA = 0.01
 #: Least area and sine of a face in a shape, as shares of their means over all shapes.

@@ -48,7 +48,7 @@ class NetworkTimeError(ModelFailedError):
 
 
 class MeshChoice(StrEnum):
-    """Which mesh to answer; a model without a finer one answers both with the one it has."""
+    """Which mesh an answer holds; a model without a finer one answers both with the one it has."""
 
     FINE = "fine"
     COARSE = "coarse"

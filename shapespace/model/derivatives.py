@@ -13,7 +13,7 @@ from shapespace.model.decoder import Decoder
 #: Step of a difference quotient, as a fraction of the coordinate's range. An angle may move something as small as a
 #: bump around the shape; for other coordinates smaller steps drown in the rounding of the networks' float32.
 PERIODIC_DIFFERENCE, DIFFERENCE = 1e-3, 1e-2
-#: Nodes for each periodic coordinate of a factor, and all of them at most.
+#: Nodes along each periodic coordinate of a factor, and most nodes of a factor's grid.
 NODES, MOST_NODES = 32, 1024
 #: Random sums of lengths and angles that stand for all of them on the grids.
 SKETCH = 1024

@@ -27,7 +27,7 @@ class WrongLengthError(LatentError):
 
 
 class NotFiniteError(LatentError):
-    """A code with a coordinate that isn't a finite number, or from which none come out."""
+    """A code with a coordinate that isn't a finite number, or for which the networks give numbers that aren't."""
 
 
 class OutOfBoundsError(LatentError):
@@ -52,8 +52,8 @@ class Distribution(StrEnum):
 class LatentSpace:
     """The coordinates of a model's codes.
 
-    A coordinate with a period is an angle: only its remainder counts, and it is out of bounds nowhere but
-    in the gap that bounds narrower than the period leave.
+    A coordinate with a period is an angle: only its remainder counts, and it can be out of bounds only where the bounds
+    are narrower than the period.
     """
 
     def __init__(self, manifest: Manifest) -> None:
@@ -62,7 +62,7 @@ class LatentSpace:
         self.lower, self.upper = np.array(manifest.lower), np.array(manifest.upper)
         self.periodic = np.array([period is not None for period in manifest.period])
         self._period = np.array([period or 1.0 for period in manifest.period])
-        # As codes are compared, so that a bound itself is inside on every way through.
+        # Rounded as codes are when they are compared, so that a bound itself is always inside.
         self._low, self._high = self.lower.astype(np.float32), self.upper.astype(np.float32)
         #: (m,) what counts as equally far in each coordinate.
         self.width = self.upper - self.lower

@@ -44,7 +44,7 @@ class _Watch:
         self._thread: threading.Thread | None = None
 
     def begin(self, options: onnxruntime.RunOptions, until: float) -> None:
-        """Watch over a run, which must be over at that moment of ``time.monotonic``."""
+        """Watch over a run, which must end by this moment of ``time.monotonic``."""
         self._runs[id(options)] = until, options
         if not self._some.is_set():
             self._wake()
@@ -69,7 +69,7 @@ class _Watch:
                     options.terminate = True
             if not self._runs:
                 self._some.clear()
-                if self._runs:  # one that began in between found the flag still set
+                if self._runs:  # a run that has begun since then found the flag still set
                     self._some.set()
 
 
@@ -110,7 +110,7 @@ class Session:
             if [node.name for node in nodes] != [name] or not _fits(nodes[0], row):
                 have = ", ".join(f"{node.name} {node.type} {node.shape}" for node in nodes)
                 raise BundleError(f"{network.file} must have one {role}, {name} float32 [n, {row}], but has {have}")
-        # It keeps the file for a change of providers, which there is none of here: 20 MB with both bundled models.
+        # ONNX Runtime keeps the file in case its providers change, which they don't: 20 MB with both bundled models.
         self._session._model_bytes = None
         self._file, self._input, self._output = network.file, network.input, network.output
         self._row, self._shape = tuple(inputs), tuple(outputs)

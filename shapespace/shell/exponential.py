@@ -20,13 +20,13 @@ from shapespace.solve.line_search import backtrack
 from shapespace.solve.outcome import Outcome, Status
 from shapespace.solve.preconditioner import step_length
 
-#: Shapes behind a start value: a polynomial through eight of them leaves an error of eighth order in the step.
+#: Shapes from which a first guess is extrapolated: with eight its error is of eighth order in the step.
 EXTRAPOLATED = 8
 #: What making a factor costs, in iterations.
 COST = 8
-#: Factors are rotated along from the step on in which one took so many iterations more than when it was new.
+#: Once a step has taken so many more iterations than with a new factor, old factors are rotated along.
 PATIENCE = 1
-#: Two iterations that leave more than this of the residual aren't worth going on with.
+#: If two iterations leave more than this part of the residual, the factor at hand is given up.
 SLOW = 0.5
 #: Iterations of exact Newton, and the smallest step tried. Those that converge need 4 to 8; where it takes more, a face
 #: is collapsing, and a path that is dragged on ends a few steps later (measured on posed bodies).
@@ -303,7 +303,7 @@ def _measured(equation: _Step, chord: ChordSolver, point: Point) -> tuple[FloatA
 def _line_search(
     equation: _Step, chord: ChordSolver, point: Point, step: FloatArray, residual: float
 ) -> tuple[Point, FloatArray, float] | None:
-    """The shape along a step whose residual is a quarter of the step's share smaller, with F and residual there."""
+    """The shape after a share t of a step that takes away t/4 of the residual or more, with F and residual there."""
 
     def trial(t: float) -> tuple[Point, FloatArray, float]:
         there = point.space.point(point.vertices + t * step)

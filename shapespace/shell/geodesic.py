@@ -35,13 +35,13 @@ RENEWALS = 20
 DESCENTS = 30
 #: A step of a path with more than this times the mean energy of all is a jump: a geodesic has constant speed.
 JUMP = 4.0
-#: Of the shapes of a first path, which need not be exact.
+#: For the shapes of a first path, which need not be exact.
 MIDDLE_ITERATIONS, MIDDLE_TOLERANCE = 30, 1e-2
-#: Three iterations that leave more than this of the residual ask for new factors.
+#: New factors are made after three iterations that leave more than this part of the residual.
 SLOW = 0.1
 #: Gauss–Newton steps towards each shape of the first path, which need not be exact, and the smallest one tried.
 NEAREST_ITERATIONS, SMALLEST_STEP = 4, 1 / 32
-#: Part of the squared misfit that one of them must take away, or none follows.
+#: Part of the squared misfit that such a step must take away for another one to follow.
 WORTHWHILE = 0.1
 
 
@@ -159,7 +159,8 @@ def logarithm(
 def towards(space: ShellSpace, path: DiscretePath, end: FloatArray) -> FloatArray:
     """A first path (K + 1, V, 3) for ``geodesic``, from a geodesic to a shape near its end.
 
-    To lengths and angles of its shapes a growing part is added of what the two ends differ by.
+    Of the difference between the two ends, a part that grows along the path is added to the lengths and angles of its
+    shapes.
     """
     steps = len(path.vertices) - 1
     change = unwrap(space.nric(end), path.nric[-1]) - path.nric[-1]
@@ -171,7 +172,7 @@ def towards(space: ShellSpace, path: DiscretePath, end: FloatArray) -> FloatArra
 
 
 def halved(space: ShellSpace, path: DiscretePath) -> DiscretePath:
-    """The same path in twice as many steps, with shapes between by half the change of lengths and angles."""
+    """The same path in twice as many steps: between two shapes, one at half the change of lengths and angles."""
     shapes = [path.vertices[0]]
     for k in range(1, len(path.vertices)):
         chord = space.factorise(space.point(shapes[-1]))
@@ -233,8 +234,8 @@ def _line_search(metric: Point, target: FloatArray, point: Point, step: FloatArr
 def _bisected(space: ShellSpace, start: FloatArray, end: FloatArray, factorise: list[Factorise]) -> FloatArray:
     """A first path (K + 1, V, 3) between shapes far apart: their middle by least energy, then those of the halves.
 
-    Each is sought from one of the two that it lies between, and so are all shapes valid on the way. The line of lengths
-    and angles may lead through what is no shape.
+    The search for each begins at one of the two shapes that it lies between, so that all shapes on the way are valid; a
+    straight line of lengths and angles may lead through what is no shape.
     """
     shapes: dict[int, FloatArray] = {0: start, len(factorise) + 1: end}
 

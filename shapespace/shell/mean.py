@@ -20,8 +20,8 @@ from shapespace.solve.truncated_newton import descend
 
 #: Most iterations of either mean.
 ITERATIONS = 100
-#: Below this residual the elastic mean keeps its factor and trusts full, accelerated steps; above it, the smallest step
-#: that a line search tries.
+#: Residual below which the elastic mean keeps its factor and takes full, accelerated steps; and the smallest step that
+#: the line search tries above it.
 RENEW_ABOVE, SMALLEST_STEP = 1e-2, 1e-4
 
 
@@ -54,7 +54,7 @@ def elastic_mean(
     Quasi-Newton with the metric of the current shape: ``Σ w_i ∂₂∂₂W[z_i, z]`` is close to ``Hess₂W[z, z]``,
     whose J-pull-back is positive definite, so that its steps always lower the energy if short enough;
     Anderson acceleration takes over where full steps do. Where faces differ so much between the shapes that this is
-    no longer close, Newton's steps go on. A first guess of the centre of mass, and cheap.
+    no longer close, Newton's steps go on. Cheap, and a first guess of the centre of mass.
 
     Args:
         space: where.

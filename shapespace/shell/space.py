@@ -92,7 +92,7 @@ class Point:
 
 
 def fault_between(old: Point, new: Point) -> str | None:
-    """What makes the step from one shape to the next no deformation of a surface, if anything does."""
+    """Why the step from one shape to the next is no deformation of a surface; None if it is one."""
     if not np.isfinite(new.z).all():
         return "a vertex is not finite or an edge has no length"
     ratio = new.rest.areas / old.rest.areas
@@ -254,9 +254,9 @@ def _factorised(matrix: NormalMatrix, cholesky: Cholesky, number: int, point: Po
 class DiscretePath(Outcome):
     """Shapes at equal times, as far as they could be found; converged if the path is complete.
 
-    Of its equations ``iterations`` are all together, and ``residual`` is the largest ``sqrt(F_kᵀ A_k⁻¹ F_k)`` of the
-    discrete Euler–Lagrange equation at an inner shape, with A_k factorised near it, or 0 where no shape has been solved
-    for; the exponential has taken another step since.
+    ``iterations`` are those of all its equations together. ``residual`` is the largest ``sqrt(F_kᵀ A_k⁻¹ F_k)`` of the
+    discrete Euler–Lagrange equation at an inner shape, with A_k factorised near it, or 0 where there was nothing to
+    solve; the exponential takes one more step after that was measured.
 
     Attributes:
         vertices: (n, V, 3), always finite.

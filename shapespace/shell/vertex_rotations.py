@@ -11,7 +11,7 @@ from shapespace.mesh.triangle_mesh import Connectivity
 
 
 class VertexRotations:
-    """A rotation for each vertex: the mean of its faces', then of its neighbours' as many times as ROUNDS says.
+    """A rotation for each vertex: the mean of its faces', then ROUNDS times the mean of its neighbours'.
 
     Means are those of quaternions (Markley, Cheng, Crassidis and Oshman, "Averaging quaternions", 2007), in the cheap
     form for rotations that are near each other: the normalised weighted sum instead of an eigenvector. Between face
@@ -20,7 +20,8 @@ class VertexRotations:
     whose axis is uncertain, weigh little.
 
     Neighbours have to rotate nearly alike, because differences of rotation stretch a shell, which is much stiffer
-    against that than against bending: without rounds the matrix of a captured body is worse off rotated than not.
+    against that than against bending: without these rounds the rotated matrix of a captured body is further from the
+    new shape's than the old one is.
     """
 
     ROUNDS = 6

@@ -68,7 +68,7 @@ class SymmetricPattern:
         return np.repeat(np.arange(self.size), np.diff(self.indptr))
 
     def scatter(self, contributions: FloatArray, slots: IntArray | None = None) -> FloatArray:
-        """Sum contributions (C,) into the entries of the pattern; by default in the order of its making."""
+        """Sum contributions (C,) into the entries of the pattern; ``slots`` by default those of its arguments."""
         sums = np.bincount(self.slots if slots is None else slots, weights=contributions, minlength=len(self))
         return np.asarray(sums, dtype=np.float64)
 
@@ -88,8 +88,8 @@ class Factor(Protocol):
 class Cholesky(Protocol):
     """Factorises symmetric positive definite matrices of one pattern. Not for use by two threads at once.
 
-    It has room for several factors side by side, by number. A new factor takes the place of the one with its number,
-    which must not be asked any more: where the memory is shared it raises RuntimeError.
+    It has room for several factors side by side, by number. A new factor replaces the one with the same number, which
+    must not be used afterwards: a backend that has overwritten its memory raises RuntimeError.
     """
 
     def factorise(self, entries: FloatArray, number: int = 0) -> Factor:
@@ -178,7 +178,8 @@ class PardisoCholesky:
         self._versions = [0] * factors
         entries = np.ones(len(pattern))
         entries[pattern.diagonal] = len(pattern)
-        # Limbs are better off with minimum degree, balls with nested dissection, by up to a third of the time.
+        # Minimum degree is faster for shapes like limbs, nested dissection for shapes like balls: up to a third of the
+        # time.
         sizes = {ordering: self._analyse(ordering, entries) for ordering in (_MINIMUM_DEGREE, _NESTED_DISSECTION)}
         if sizes[_MINIMUM_DEGREE] < sizes[_NESTED_DISSECTION]:
             self._analyse(_MINIMUM_DEGREE, entries)

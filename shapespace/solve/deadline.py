@@ -6,7 +6,7 @@ import time
 
 
 class Deadline:
-    """An end that comes with the time, or as soon as somebody calls the work off; safe between threads.
+    """The moment by which work has to end, or any earlier one at which it is called off; safe between threads.
 
     Args:
         seconds: from now.
@@ -21,7 +21,7 @@ class Deadline:
 
     @property
     def passed(self) -> bool:
-        """Whether whoever works should stop."""
+        """Whether the work should stop."""
         return self._called_off or time.monotonic() > self.time
 
     def call_off(self) -> None:

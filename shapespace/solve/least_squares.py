@@ -1,4 +1,4 @@
-"""Nonlinear least squares in a box, for few unknowns whose every residual is dear."""
+"""Nonlinear least squares in a box, with few unknowns and residuals that are expensive to compute."""
 
 from __future__ import annotations
 
@@ -12,13 +12,14 @@ from shapespace.arrays import FloatArray
 from shapespace.solve.deadline import Deadline
 from shapespace.solve.outcome import Outcome, Status
 
-#: A Jacobian is renewed once the point has moved this far, as a fraction of the scale, before it is believed.
+#: An updated Jacobian is believed at a minimum if that is no further than this, as a fraction of the scale, from where
+#: it was made; otherwise a new one is made there.
 TRUSTED = 0.05
-#: What a step must gain of what the Jacobian promised: to be taken; or a new Jacobian is made if it has been updated;
-#: or the damping doesn't fall.
+#: Shares of the gain that the Jacobian promised. A step must reach the first to be taken, the second for an updated
+#: Jacobian to be kept, the third for the damping to fall.
 TAKEN, POOR, GOOD = 1e-3, 0.25, 0.5
-#: Damping relative to the largest diagonal entry of JᵀJ: always, and the first and the last where a step fails; and the
-#: factor by which it rises and falls.
+#: Damping relative to the largest diagonal entry of JᵀJ: what is always added, the first value after a failed step, the
+#: largest; and the factor by which it rises and falls.
 SMALLEST_DAMPING, FIRST_DAMPING, LARGEST_DAMPING, DAMPING_FACTOR = 1e-10, 1e-3, 1e3, 10
 
 
@@ -42,11 +43,11 @@ class Stopping:
     """When the iteration ends.
 
     Attributes:
-        tolerance: once no coordinate would move further than this fraction of its scale,
-        gain_tolerance: or ``‖r‖²`` would not shrink by more than this fraction of itself,
-        large: where ``‖r‖`` is less; above, of ``‖r‖`` times this: most of such a residual can't vanish.
-        max_evaluations: of the residual.
-        deadline: after which no evaluation begins.
+        tolerance: it has converged once no coordinate would move further than this fraction of its scale,
+        gain_tolerance: or once ``‖r‖²`` would shrink by no more than this fraction of itself.
+        large: where ``‖r‖`` is larger, that fraction is of ``large · ‖r‖``: most of such a residual can't vanish.
+        max_evaluations: most evaluations of the residuals.
+        deadline: no evaluation begins after it.
     """
 
     tolerance: float = 1e-4
@@ -174,19 +175,19 @@ class _Jacobian:
         self.matrix, self._made_at, self.updates = self._make(u, r), u, 0
 
     def is_outdated(self, u: FloatArray) -> bool:
-        """Whether it has been updated only, and over too long a way to tell a minimum."""
+        """Whether it has been updated since it was made, too far from this point to tell a minimum."""
         return self.updates > 0 and bool(np.abs(u - self._made_at).max() > TRUSTED)
 
     def follow(self, step: FloatArray, change: FloatArray) -> None:
         """Agree with how the residuals have changed along a step that is taken.
 
-        Not along one that failed: it may have met a cliff, whose slope is nobody else's.
+        Failed steps don't count: one may have met a cliff, whose slope says nothing about other places.
         """
         if self._secant:
             self.matrix += np.outer(change - self.matrix @ step, step / (step @ step))
 
     def renew_or_keep(self, u: FloatArray, r: FloatArray, taken: bool, gain: float) -> None:
-        """Make it anew after a step that has gained a share of what it promised, if it is time."""
+        """Make it anew if it is time, after a step that has gained this share of what was promised."""
         disappointing = self.updates > 0 and not gain > POOR
         if (taken and not self._secant) or disappointing or self.updates == len(u):
             self.renew(u, r)
@@ -209,6 +210,6 @@ def _step(J: FloatArray, r: FloatArray, low: FloatArray, high: FloatArray, dampi
     if ((d < low) | (d > high)).any():
         from scipy.optimize import lsq_linear  # 9 MB and a tenth of a second that most servers never need
 
-        # A side of no length is one that the solver doesn't take.
+        # The solver refuses a box with a side of no length.
         d = lsq_linear(R, b, (low, np.maximum(high, low + np.finfo(float).eps)), method="bvls").x
     return d

@@ -24,7 +24,7 @@ class Outcome:
     """How an iteration ended. Drivers extend it by what they have found, which is finite whatever the status.
 
     Attributes:
-        status: CONVERGED, or why it ended without.
+        status: CONVERGED, or why the iteration ended before that.
         iterations: steps tried.
         residual: what is left, in the norm that the driver names; infinite where nothing has been computed.
         reason: in words, why it did not converge; may be empty where the status says all.

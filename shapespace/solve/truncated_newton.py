@@ -13,7 +13,7 @@ from shapespace.solve.line_search import backtrack, sufficient_decrease
 from shapespace.solve.outcome import Outcome, Status
 from shapespace.solve.preconditioner import step_length
 
-#: Most conjugate gradients in a step, and the part of the forces at which they end: at most, and at least.
+#: Most iterations of conjugate gradients in a step; and the part of the forces that may be left: at most, at least.
 GRADIENTS = 60
 LOOSEST, TIGHTEST = 0.3, 1e-3
 #: Displacement by which the Hessian is felt, as a share of the length that the problem gives.
@@ -23,7 +23,7 @@ ROUNDING, SMALLEST_STEP = 1e-15, 1e-6
 
 
 class Energy(Protocol):
-    """What is minimised, by unknowns of any shape."""
+    """What is minimised, over an array of unknowns of any shape."""
 
     @property
     def length(self) -> float:

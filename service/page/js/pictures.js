@@ -1,4 +1,4 @@
-/** Small renders of shapes, all by one renderer that nobody sees. */
+/** Small pictures of shapes, all drawn by one renderer outside the page. */
 
 import * as THREE from "three";
 import { frame, geometryOf, litCamera, move, paint, sphereOf, surfaceMaterial } from "./scene.js";

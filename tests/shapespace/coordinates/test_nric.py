@@ -18,7 +18,7 @@ from shapespace.coordinates.nric import (
     wrap,
 )
 from shapespace.mesh.triangle_mesh import TriangleMesh, face_normals
-from tests.shapespace.conftest import MESHES
+from tests.shapespace.conftest import MESHES, hinge
 
 
 def mesh_of(shape):
@@ -31,13 +31,6 @@ def halves(mesh):
 
 def flipped(mesh):
     return TriangleMesh.from_arrays(mesh.vertices, mesh.faces[:, ::-1])
-
-
-def hinge(phi):
-    """Two right triangles with normals at the angle phi, convex where it is positive."""
-    return TriangleMesh.from_arrays(
-        [[0, 0, 0], [2, 0, 0], [0, np.cos(phi), -np.sin(phi)], [0, -1, 0]], [[0, 1, 2], [1, 0, 3]]
-    )
 
 
 # ---------------------------------------------------------------- known shapes

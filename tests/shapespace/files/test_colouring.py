@@ -6,17 +6,16 @@ import pytest
 from matplotlib.colors import to_rgb
 
 from shapespace.files.colouring import Colouring, Quantity
-from shapespace.mesh.triangle_mesh import Connectivity, TriangleMesh
+from shapespace.mesh.triangle_mesh import Connectivity
 from shapespace.training.collection import freaky_torus
+from tests.shapespace.conftest import hinge
 
 ROTATION = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))[0]
-HINGE = Connectivity(np.array([[0, 1, 2], [1, 0, 3]]), 4)
+HINGE = hinge().connectivity
 
 
-def hinge(angle: float, length: float = 1.0) -> np.ndarray:
-    """Two triangles at an edge along x, folded by an angle, positive where convex."""
-    other = [length / 2, -np.cos(angle), -np.sin(angle)]
-    return np.array([[0, 0, 0], [length, 0, 0], [length / 2, 1, 0], other])
+def folded(angle: float, length: float = 1.0) -> np.ndarray:
+    return hinge(angle, length).vertices
 
 
 def between(quantity: Quantity, a: np.ndarray, b: np.ndarray, connectivity: Connectivity) -> Colouring:
@@ -43,16 +42,16 @@ def test_a_uniform_scaling_stretches_by_its_logarithm_and_bends_nothing() -> Non
 
 def test_bending_is_the_change_of_the_angle_at_the_hinge() -> None:
     for before, after in ((0.0, 0.7), (0.3, -0.4), (-0.2, -0.9)):
-        values = between(Quantity.BENDING, hinge(after), hinge(before), HINGE).values
+        values = between(Quantity.BENDING, folded(after), folded(before), HINGE).values
         # The tips have no interior edge.
         np.testing.assert_allclose(values, [after - before, after - before, 0, 0], atol=1e-12)
     # Through the fold at π: the short way.
-    values = between(Quantity.BENDING, hinge(-3.0), hinge(3.0), HINGE).values
+    values = between(Quantity.BENDING, folded(-3.0), folded(3.0), HINGE).values
     np.testing.assert_allclose(values[:2], 2 * np.pi - 6, atol=1e-12)
 
 
 def test_long_edges_count_more() -> None:
-    before, after = hinge(0.0), hinge(0.0, 1.2)
+    before, after = folded(0.0), folded(0.0, 1.2)
     values = between(Quantity.STRETCH, after, before, HINGE).values
     side, sides = np.hypot(0.5, 1), np.hypot(0.6, 1)
     expected = (np.log(1.2) + 2 * side * np.log(sides / side)) / (1 + 2 * side)
@@ -63,7 +62,7 @@ def test_long_edges_count_more() -> None:
 def test_faces_that_collapse_have_finite_colours() -> None:
     flat = np.zeros((4, 3))
     for quantity in Quantity:
-        for a, b in ((flat, hinge(0.1)), (hinge(0.1), flat)):
+        for a, b in ((flat, folded(0.1)), (folded(0.1), flat)):
             found = between(quantity, a, b, HINGE)
             assert np.isfinite(found.values).all()
             assert np.isfinite(found.linear).all()
@@ -109,6 +108,6 @@ def test_a_stray_vertex_does_not_take_the_colour_from_the_others() -> None:
 
 
 def test_a_boundary_does_not_bend() -> None:
-    strip = TriangleMesh(hinge(0.2), HINGE)
-    found = between(Quantity.BENDING, strip.vertices * [1, 1, 0], strip.vertices, HINGE)
+    strip = hinge(0.2)
+    found = between(Quantity.BENDING, strip.vertices * [1, 1, 0], strip.vertices, strip.connectivity)
     np.testing.assert_allclose(found.values[2:], 0)

@@ -22,6 +22,7 @@ from shapespace.training.collection import freaky_torus
 from tests.meshes import read_mesh
 from tests.sequences import read_point_cache, read_usd
 from tests.service.glb import GLB
+from tests.shapespace.conftest import MESHES
 
 CUBE = np.array([[x, y, z] for x in (0.0, 1.0) for y in (0.0, 1.0) for z in (0.0, 1.0)])
 SIDES = np.array([[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]])
@@ -265,6 +266,16 @@ def test_weights_of_what_goes_both_ways_lie_between_0_and_1() -> None:
     for k in (0, 1, count // 2, count - 1):
         off = glb.key(k, "NORMAL") - vertex_normals(frames[k], freaky_torus.connectivity().faces)
         assert np.abs(off).max() < 0.02, "normals move along"
+
+
+def test_more_ways_to_move_than_targets_leave_an_error_that_is_told(rng: np.random.Generator) -> None:
+    mesh, count = MESHES["sheet"](), 2 * DENSE_FRAMES
+    frames = mesh.vertices + 0.01 * rng.standard_normal((count, *mesh.vertices.shape))
+    animated = animated_glb(frames, mesh.faces)
+    glb = GLB(animated.data)
+    error = max(np.linalg.norm(glb.key(k) - frames[k], axis=-1).max() for k in range(count))
+    assert error == pytest.approx(animated.max_vertex_error, rel=1e-3)
+    assert 1e-4 * mesh.diagonal < error < 0.05
 
 
 def test_frames_that_stand_still_make_a_file_too() -> None:

@@ -9,7 +9,7 @@ from scipy.sparse.csgraph import connected_components
 from shapespace.mesh import coarsening
 from shapespace.mesh.coarsening import ANGLE_LIMITS, Coarsening, coarsen
 from shapespace.mesh.triangle_mesh import Connectivity, MeshError, TriangleMesh, face_areas, face_normals
-from tests.shapespace.conftest import MESHES, bent, grid_faces
+from tests.shapespace.conftest import MESHES, TETRAHEDRON, bent, grid_faces
 
 
 def fine_mesh(name: str, rng: np.random.Generator) -> TriangleMesh:
@@ -167,8 +167,8 @@ def annulus() -> TriangleMesh:
 
 @pytest.mark.parametrize("mesh", [MESHES["torus"](), MESHES["sheet"](), annulus()], ids=["torus", "sheet", "annulus"])
 def test_topology_ends_it_where_shape_does_not(mesh, monkeypatch):
-    monkeypatch.setattr("shapespace.mesh.coarsening._Decimation._keeps_shape", lambda *_, **__: True)
-    monkeypatch.setattr("shapespace.mesh.coarsening._Decimation.heal", lambda *_: None)
+    monkeypatch.setattr("shapespace.mesh.decimation.Decimation._keeps_shape", lambda *_, **__: True)
+    monkeypatch.setattr("shapespace.mesh.decimation.Decimation.heal", lambda *_: None)
     found = coarsen(mesh, 1, np.empty((0, *mesh.vertices.shape)))
     coarse = Connectivity(found.faces, len(found.fine_index))
     assert coarse.euler_characteristic == mesh.connectivity.euler_characteristic
@@ -179,7 +179,7 @@ def test_topology_ends_it_where_shape_does_not(mesh, monkeypatch):
 
 def test_a_flat_tetrahedron_does_not_become_two_faces_back_to_back():
     corners = np.array([[0, 0, 0], [3, 0, 0], [0, 3, 0], [1.0, 1.2, 0]])
-    mesh = TriangleMesh.from_arrays(corners, [[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]])
+    mesh = TriangleMesh.from_arrays(corners, TETRAHEDRON)
     assert len(coarsen(mesh, 3, corners[None]).fine_index) == 4
 
 

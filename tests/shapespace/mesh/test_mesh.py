@@ -9,9 +9,8 @@ from scipy.spatial.transform import Rotation
 
 from shapespace.mesh.rigid_motion import align
 from shapespace.mesh.triangle_mesh import Connectivity, MeshError, TriangleMesh, diagonal, face_areas, face_normals
-from tests.shapespace.conftest import MESHES
+from tests.shapespace.conftest import MESHES, TETRAHEDRON
 
-TETRAHEDRON = [[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]]
 CORNERS = [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]
 
 

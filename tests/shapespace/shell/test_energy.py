@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 
 from shapespace.coordinates.nric import nric
-from shapespace.mesh.triangle_mesh import TriangleMesh
 from shapespace.shell.energy import Material, ShellEnergy
+from tests.shapespace.conftest import hinge
 
 MATERIAL = Material(mu=1.3, lambda_=0.7, eta=1e-2)
 
@@ -67,12 +67,9 @@ def test_uniform_scaling_has_the_corrected_membrane_energy(energy, mesh, z, s):
 
 
 def test_a_fold_of_two_triangles_has_the_bending_energy_of_its_formula():
-    flat = TriangleMesh.from_arrays([[0, 0, 0], [2, 0, 0], [1, 1, 0], [1, -1, 0]], [[0, 1, 2], [1, 0, 3]])
+    phi, flat = 0.3, hinge()
     energy = ShellEnergy(flat.connectivity, Material(eta=0.1), flat.area)
-    phi = 0.3
-    folded = flat.vertices.copy()
-    folded[2] = [1, np.cos(phi), -np.sin(phi)]
-    z, z_folded = nric(flat.vertices, flat.connectivity), nric(folded, flat.connectivity)
+    z, z_folded = (nric(shape.vertices, flat.connectivity) for shape in (flat, hinge(phi)))
     # l² = 4, both areas 1, d = 2/3.
     assert energy.rest(z).value(z_folded) == pytest.approx(0.1 * phi**2 * 4 / (2 / 3))
 

@@ -8,7 +8,7 @@ import trimesh
 
 from shapespace.mesh.triangle_mesh import TriangleMesh
 from shapespace.shell.exponential import exponential
-from shapespace.shell.geodesic import geodesic, halved, logarithm, towards
+from shapespace.shell.geodesic import _Middle, geodesic, halved, logarithm, towards
 from shapespace.shell.space import ShellSpace
 from tests.shapespace.conftest import bent
 from tests.shapespace.shell.measures import distance, true_residuals
@@ -40,6 +40,14 @@ def test_the_logarithm_is_also_a_change_of_lengths_and_angles(space, mesh, veloc
     found = logarithm(space, mesh.vertices, move(there.vertices[-1]), K)
     z = there.nric
     np.testing.assert_allclose(found.nric, K * (z[1] - z[0]), atol=1e-5)
+
+
+def test_forces_on_a_shape_between_two_are_the_slope_of_its_energy(space, mesh, pose, velocity, rng, slope):
+    between = _Middle(space, mesh.vertices, pose, (1, 3), space.factorise)
+    x = mesh.vertices + velocity / 4
+    direction = 0.1 * mesh.diagonal / np.sqrt(len(x)) * rng.standard_normal(x.shape)
+    pull = np.vdot(between.forces(x), direction)
+    assert slope(lambda h: between.value(x + h * direction) - between.value(x) + h * pull) > 1.9
 
 
 @pytest.mark.parametrize("pose", [1.3], indirect=True)

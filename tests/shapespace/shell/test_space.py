@@ -2,13 +2,13 @@
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
 from shapespace.coordinates.integrability import Integrability
 from shapespace.mesh.rigid_motion import without_rigid_motion
 from shapespace.mesh.triangle_mesh import TriangleMesh
 from shapespace.shell.exponential import exponential
 from shapespace.shell.space import ShellSpace, fault_between
+from tests.shapespace.conftest import TETRAHEDRON, hinge
 
 K = 4
 
@@ -36,9 +36,8 @@ def test_rigid_motions_have_no_length_and_are_taken_out(space, mesh, velocity):
     np.testing.assert_allclose(cleaned, velocity, atol=1e-10 * mesh.diagonal)
 
 
-def test_a_factor_rotated_with_a_rigid_motion_is_that_of_the_moved_shape(space, mesh, rng):
-    rotation = Rotation.from_rotvec([1.2, -0.7, 2.1]).as_matrix()
-    moved = space.point(mesh.vertices @ rotation.T + [1, 2, 3])
+def test_a_factor_rotated_with_a_rigid_motion_is_that_of_the_moved_shape(space, mesh, move, rng):
+    moved = space.point(move(mesh.vertices))
     forces = moved.pull_back(rng.standard_normal(len(moved.z)))
     change = rng.standard_normal(len(moved.z))
     chord = space.factorise(space.point(mesh.vertices)).rotated_to(moved)
@@ -65,11 +64,8 @@ def test_rotating_a_factor_along_brings_it_nearer(space, mesh, pose, velocity):
 
 @pytest.mark.parametrize(("angle", "told"), [(1.7, None), (3.0, "turn")])
 def test_a_fold_within_one_step_is_told(angle, told):
-    flat = TriangleMesh.from_arrays([[0, 0, 0], [2, 0, 0], [1, 1, 0], [1, -1, 0]], [[0, 1, 2], [1, 0, 3]])
-    folded = flat.vertices.copy()
-    folded[2] = [1, np.cos(angle), np.sin(angle)]
-    space = ShellSpace(flat)
-    fault = fault_between(space.point(flat.vertices), space.point(folded))
+    space = ShellSpace(hinge())
+    fault = fault_between(space.point(hinge().vertices), space.point(hinge(angle).vertices))
     assert (fault is None) if told is None else (told in fault)
 
 
@@ -79,6 +75,6 @@ def test_angles_are_unwrapped_along_the_path(space, mesh, velocity):
 
 
 def test_shapes_of_another_mesh_are_refused(space, mesh):
-    ball = TriangleMesh.from_arrays(np.eye(4)[:, :3], [[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]])
+    ball = TriangleMesh.from_arrays(np.eye(4)[:, :3], TETRAHEDRON)
     with pytest.raises(ValueError, match="vertices"):
         exponential(space, ball.vertices, np.zeros((4, 3)), K)
