@@ -207,6 +207,11 @@ def networks(run: Run) -> None:
             path.unlink()
 
 
+def generalisation(run: Run) -> None:
+    """generalisation.json and least-general.npz."""
+    _discover(run, space.generalisation)
+
+
 def evaluation(run: Run) -> None:
     """evaluation.json and gallery.npz."""
 
@@ -221,6 +226,8 @@ def evaluation(run: Run) -> None:
     figures, gallery = evaluate(partial(learner_of, run), run.config, exact)
     if run.directory.ingest.exists():
         figures["prolongation"] = run.directory.ingest.read().get("prolongation")
+    if run.directory.generalisation.exists():
+        figures["generalisation"] = run.directory.generalisation.read()
     run.directory.gallery.write(**gallery)
     run.directory.evaluation.write(figures)
 
@@ -246,6 +253,8 @@ def export_bundle(run: Run) -> None:
             learner.start(),
         )
     directory.log("exported", bundle=f"{folder.parent.name}/{folder.name}")
+    if not run.by_design:
+        directory.log("encoded", **space.encoded(directory, folder))
 
 
 #: What does each stage; it finds and continues what an interrupted call has left.
@@ -256,6 +265,7 @@ _DO: dict[str, Callable[[Run], None]] = {
     "factors": factors,
     "samples": samples,
     "networks": networks,
+    "generalisation": generalisation,
     "evaluation": evaluation,
     "export": export_bundle,
 }

@@ -33,8 +33,8 @@ data = {data}    # folder of meshes, or one NPZ; relative to this file
 # eta = {material.eta:g}    # bending against stretching; larger makes stiffer shells, whose triangles may collapse
 
 [modes]
-count = {modes}    # numbers that describe a shape, {most} at most; more keep finer detail and take longer
-# sparsity = {mode.sparsity:g}    # larger makes each mode move a smaller part; 0 is principal geodesic analysis
+# count = "{mode.count}"    # numbers that describe a shape: as many as pay; or say how many, {most} at most
+# norm = "{mode.norm}"    # in which modes come close to the shapes; "shell" is the paper's, and costs accuracy
 
 [factors]
 # count = 4    # groups of modes with a network each; left out, it follows from how much the modes overlap
@@ -81,7 +81,6 @@ def configuration(collection: MeshCollection, data: str, title: str) -> str:
         other=_string(collection.names[0]),
         coarse=coarse,
         material=MaterialSettings(),
-        modes=min(ModeSettings().count, count - 1),
         most=count - 1,
         mode=ModeSettings(),
         sample=SampleSettings(),

@@ -46,7 +46,7 @@ MODELS = {
 }
 #: Keys of evaluation.json with a section on the page; all others are listed in one table.
 PLACED = {"eta", "test_samples", "r2", "r2_factors", "variants", "vertex_error", "sizes", "times", "fractions"}
-PLACED |= {"prolongation"}
+PLACED |= {"prolongation", "generalisation"}
 
 
 def shapes(record: Record, studio: Studio) -> Iterator[tuple[Markup, str]]:
@@ -183,6 +183,38 @@ def extremes(record: Record, studio: Studio) -> dict[str, Any] | None:
     return {"rows": rows, "bar": colour_bar(ERROR, *(percent(top * x) for x in (0.01, 0.1, 1)))}
 
 
+def nearness(record: Record, studio: Studio | None) -> list[dict[str, Any]]:
+    """How near the space comes to the user's own shapes, unseen and learned from, each with its worst in a picture."""
+    kinds = []
+    if facts := record.generalisation:
+        kinds.append({
+            "title": "Shapes it has not seen",
+            "how": f"{facts['held_out']} shapes, held out of a run of their own, by exponentials",
+            "figures": [
+                (f"{count:.3g} coordinates", of, components)
+                for count, of, components in zip(facts["counts"], facts["modes"], facts["components"], strict=True)
+            ],
+            "worst": facts["worst"],
+            "file": record.run.least_general,
+        })  # fmt: skip
+    if facts := record.encoded:
+        kinds.append({
+            "title": "Shapes it has learned from",
+            "how": f"all {facts['shapes']}, through encode as it is served",
+            "figures": [("all coordinates", facts, facts["components"])],
+            "worst": facts["worst"],
+            "file": record.run.least_near,
+        })  # fmt: skip
+    for kind in kinds:
+        shapes = kind.pop("file").read_if_written()
+        kind["pictures"] = []
+        if studio and {"given", "found"} <= shapes.keys():
+            for name in ("given", "found"):
+                shape = align(shapes[name], studio.base)
+                kind["pictures"].append((studio.draw(shape, f"{kind['worst']}, {name}", LARGE), name))
+    return kinds
+
+
 def strip(record: Record, studio: Studio) -> Iterator[tuple[str, str, Markup]]:
     """An interpolation: the joint shapes, and below them each factor's own element (paper, figure of SCAPE)."""
     gallery = record.gallery
@@ -274,6 +306,7 @@ def page(record: Record) -> str:
         title=export.get("title") or record.run.folder.resolve().name,
         description=export.get("description", ""),
         record=record,
+        nearness=nearness(record, close or None),
         stages=list(STAGES),
         pictures=studio is not None,
         shapes=list(shapes(record, close)) if close else [],

@@ -68,6 +68,9 @@ class Record:
             _readable(file.path, file.read_if_written)
             for file in (run.decomposition, run.evaluation, run.histories, run.factors)
         )
+        self.generalisation, self.encoded = (
+            _readable(file.path, file.read_if_written) for file in (run.generalisation, run.encoded)
+        )
         self.mean: FloatArray | None = mean.get("vertices")
         #: (V, 3) what tangent vectors start from: the mean, or the reference where there is none.
         self.base = self.reference.get("vertices") if self.mean is None else self.mean

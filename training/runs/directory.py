@@ -168,6 +168,18 @@ class RunDirectory:
         """``epoch``, ``best`` and losses of each network by the name of its file."""
         return self._json("networks/histories")
 
+    # generalisation
+
+    @property
+    def generalisation(self) -> JsonFile:
+        """How near spaces come to shapes that they were found without: see space.stages.generalisation."""
+        return self._json("generalisation")
+
+    @property
+    def least_general(self) -> NpzFile:
+        """Of these shapes the farthest, ``given (V, 3)``, and ``found (V, 3)``, the nearest in its space."""
+        return self._npz("least-general")
+
     # evaluation
 
     @property
@@ -184,6 +196,18 @@ class RunDirectory:
     def gallery(self) -> NpzFile:
         """Shapes for the report."""
         return self._npz("gallery")
+
+    # export
+
+    @property
+    def encoded(self) -> JsonFile:
+        """How near the bundle comes to the shapes that it learned from, and which codes lie outside its bounds."""
+        return self._json("encoded")
+
+    @property
+    def least_near(self) -> NpzFile:
+        """Of these shapes the farthest, ``given (V, 3)``, and ``found (V, 3)``, the shape of its code."""
+        return self._npz("least-near")
 
     @property
     def report(self) -> TextFile:

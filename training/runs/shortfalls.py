@@ -180,9 +180,20 @@ def _evaluation(run: RunDirectory) -> list[Shortfall]:
     return lost
 
 
+def _export(run: RunDirectory) -> list[Shortfall]:
+    facts = run.encoded.read_if_written()
+    outside = facts.get("outside", [])
+    if not outside:
+        return []
+    return [
+        Shortfall(f"the codes of {len(outside)} of {facts['shapes']} shapes lie outside the bounds: {_some(outside)}")
+    ]
+
+
 _STAGES: dict[str, Callable[[RunDirectory], list[Shortfall]]] = {
     "ingest": _ingest,
     "modes": _modes,
     "samples": _samples,
     "evaluation": _evaluation,
+    "export": _export,
 }

@@ -55,7 +55,7 @@ STAGES: dict[str, Stage] = {
         results=lambda run: [run.mean.path],
     ),
     "modes": Stage(
-        version=1,
+        version=2,
         settings=lambda config: [config.modes],
         results=lambda run: [run.modes_by_strength.path, run.modes.path, run.decomposition.path],
     ),
@@ -76,6 +76,11 @@ STAGES: dict[str, Stage] = {
         settings=lambda config: [config.networks, config.monolithic, *config.variants.values()],
         results=lambda run: [run.histories.path],
     ),
+    "generalisation": Stage(
+        version=1,
+        settings=lambda config: [],
+        results=lambda run: [run.generalisation.path, run.least_general.path],
+    ),
     "evaluation": Stage(
         version=1,
         settings=lambda config: [config.evaluation],
@@ -84,6 +89,7 @@ STAGES: dict[str, Stage] = {
     "export": Stage(
         version=1,
         settings=lambda config: [config.export],
+        results=lambda run: [run.encoded.path, run.least_near.path],
     ),
 }
 

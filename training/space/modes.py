@@ -3,22 +3,27 @@
 The shapes z^i are carried to the tangent space at their mean z̄ by the discrete logarithm, v^i = log_z̄ z^i, and a few
 modes u_j are sought whose combinations come close to them (paper, section 3). Everything is computed in vertex fields d
 (V, 3), of which ``u = J d`` with ``J = Dz(X̄)`` are the changes of lengths and angles: then u is tangent whatever d is,
-and the metric is one sparse matrix, ``g(u, u') = dᵀ M d'`` with ``M = ½ Jᵀ Hess₂W[z̄, z̄] J``.
+and how close they come is said by one sparse matrix, ``‖u‖² = dᵀ M d``:
+
+- "vertices": M holds the areas of the vertices, and d the least motion with these changes. It sees a leg that points
+  elsewhere as users do.
+- "shell", the paper's: the metric, ``M = ½ Jᵀ Hess₂W[z̄, z̄] J``. It pays for wrinkles, hardly for where a leg points.
 
 The logarithms are not centred. The mean is the point that the modes start from, and the logarithms at the Riemannian
 centre of mass sum to nothing; at the elastic mean nearly so.
 
 **Sparse modes.** Minimise over tangent u_j and coefficients w
 
-    ‖V − U W‖_g² + λ Σ_j ‖u_j‖_{1,z̄},   |w_j|_∞ ≤ 1,   ‖u‖_{1,z̄} = Σ_e |u_l| / l̄ + η l̄ a^{-1/2} |u_θ|,
+    ‖V − U W‖² + λ Σ_j ‖u_j‖_{1,z̄},   |w_j|_∞ ≤ 1,   ‖u‖_{1,z̄} = Σ_e |u_l| / l̄ + η l̄ a^{-1/2} |u_θ|,
 
 the norm that the paper gives for p = 1. The problem is convex in each mode and in W, not in both, so one block after
 the other is solved and the objective never rises.
 
-- A mode u_j alone asks for the tangent vector that minimises ``|w_j|² ‖u − t‖_g² + λ ‖u‖_1``, with t what the other
-  modes leave. ADMM splits u = J d from z = u: d solves ``(M + Jᵀ G J) d = …``, with G the diagonal of the metric, and
-  z is a soft threshold. The matrix is the same for all modes and all iterations because the penalty G is scaled
-  with |w_j|² like the rest: it is factorised once. A few iterations are enough, as z and its multiplier are kept.
+- A mode u_j alone asks for the tangent vector that minimises ``|w_j|² ‖u − t‖² + λ ‖u‖_1``, with t what the other
+  modes leave. ADMM splits u = J d from z = u: d solves ``(M + Jᵀ G J) d = …``, with G the diagonal of the metric,
+  scaled to weigh as much as M on the logarithms, and z is a soft threshold. The matrix is the same for all modes and
+  all iterations because the penalty G is scaled with |w_j|² like the rest: it is factorised once. A few iterations are
+  enough, as z and its multiplier are kept.
 - W is least squares in a box, a small problem for each shape, by coordinate descent.
 
 The start is the modes of the plain analysis rotated among themselves to be as concentrated as they can (varimax):
@@ -40,6 +45,7 @@ a hand (57 poses, m = 12), a captured dancer (60, m = 20) and a posed body (44, 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,11 +54,14 @@ from scipy import sparse
 from shapespace.arrays import FloatArray
 from shapespace.coordinates.normal_matrix import NormalMatrix, QuadraticForm
 from shapespace.coordinates.nric import WeightedNorm
-from shapespace.mesh.rigid_motion import without_rigid_motion
+from shapespace.mesh.rigid_motion import rigid_motions, without_rigid_motion
+from shapespace.mesh.triangle_mesh import vertex_areas
 from shapespace.shell.space import Point, ShellSpace
-from shapespace.solve.cholesky import analyse
+from shapespace.solve.cholesky import SymmetricPattern, analyse
 from shapespace.training.runs.config import ModeSettings
 
+#: In which the misfit of modes to logarithms is measured.
+Norm = Literal["vertices", "shell"]
 #: Most rounds through all sparse modes.
 ITERATIONS = ModeSettings().max_iterations
 #: ADMM iterations on a mode before the next has its turn, and their over-relaxation.
@@ -62,12 +71,16 @@ OVERRELAXATION = 1.6
 VARIMAX_ITERATIONS, SWEEPS = 200, 100
 #: The objective is compared with that of so many iterations ago.
 PATIENCE = 10
+#: See spga. By vertices it ends sooner: the objective is a thousandth of the shell's, and falls on for long by what
+#: changes no mode.
+TOLERANCE: dict[Norm, float] = {"vertices": 5e-3, "shell": 1e-3}
 #: Modes with a smaller share of the total energy are dropped: they are round-off.
 NEGLIGIBLE = 1e-9
 #: Of a mode's square, the share whose edges say how local it is.
 LOCAL = 0.95
-#: Each side of a coefficient's range reaches at least this share of the other side.
-MARGIN = 0.1
+#: How many parts of the shapes are held out in turn to see how many modes pay, and what a mode has to bring: a share of
+#: the mean distance of shapes from the mean.
+INNER_FOLDS, WORTH = 5, 0.005
 
 
 class ModeError(ValueError):
@@ -84,19 +97,16 @@ class Modes:
     Attributes:
         nric: (m, 2E) changes u_j of lengths and angles.
         vertices: (m, V, 3) vertex fields d_j, without rigid motion, u_j = J d_j.
-        coefficients: (n, m) orthogonal projections, in the metric, of the shapes' logarithms.
-        lower, upper: (m,) the hypercube: ranges of the coefficients, widened where the mean would be at its edge.
-        explained: share of ``Σ ‖v^i‖_g²`` that the projections keep.
+        coefficients: (n, m) orthogonal projections, in the norm, of the shapes' logarithms.
+        explained: share of ``Σ ‖v^i‖²`` that the projections keep.
         converged: whether the iteration ended by itself.
         history: of the sparse analysis, for each iteration ``iteration, objective, misfit, penalty`` (objective =
-            misfit + penalty, as shares of ``Σ ‖v^i‖_g²``) and ``support``, the mean of ``localisation``.
+            misfit + penalty, as shares of ``Σ ‖v^i‖²``) and ``support``, the mean of ``localisation``.
     """
 
     nric: FloatArray
     vertices: FloatArray
     coefficients: FloatArray
-    lower: FloatArray
-    upper: FloatArray
     explained: float
     converged: bool = True
     history: list[dict[str, float]] = field(default_factory=list, repr=False)
@@ -105,19 +115,20 @@ class Modes:
         return len(self.vertices)
 
 
-def pga(space: ShellSpace, mean: FloatArray, fields: FloatArray, count: int) -> Modes:
-    """Principal geodesic analysis: the modes whose span comes closest to the logarithms in the metric.
+def pga(space: ShellSpace, mean: FloatArray, fields: FloatArray, count: int, norm: Norm = "vertices") -> Modes:
+    """Principal geodesic analysis: the modes whose span comes closest to the logarithms.
 
     Args:
         space: the shape space.
         mean: X̄ (V, 3).
         fields: (n, V, 3) logarithms.
         count: m, at most n.
+        norm: in which.
 
     Raises:
         ModeError: a count that is not possible, or fields without anything in them.
     """
-    problem = _Problem(space, mean, fields, count)
+    problem = _Problem(space, mean, fields, count, norm)
     return problem.modes(problem.principal(count)[0])
 
 
@@ -127,6 +138,7 @@ def spga(
     fields: FloatArray,
     count: int,
     sparsity: float,
+    norm: Norm = "vertices",
     *,
     max_iterations: int = ITERATIONS,
     tolerance: float = 1e-3,
@@ -140,8 +152,9 @@ def spga(
         mean: X̄ (V, 3).
         fields: (n, V, 3) logarithms.
         count: m, at most n.
-        sparsity: λ as a share of ``max_j 2 |w_j|² ‖u_j‖_g² / ‖u_j‖_1`` over the modes of the plain analysis, the price
+        sparsity: λ as a share of ``max_j 2 |w_j|² ‖u_j‖² / ‖u_j‖_1`` over the modes of the plain analysis, the price
             at which the last of them, scaled down to nothing, is worth no more. 0 gives the span of the plain analysis.
+        norm: of the misfit.
         max_iterations: rounds through all modes.
         tolerance: ends when the objective fell by less than this part of itself in ten rounds.
 
@@ -150,7 +163,7 @@ def spga(
     """
     if not 0 <= sparsity < np.inf:
         raise ModeError(f"sparsity must be a number from 0 up, not {sparsity}")
-    problem = _Problem(space, mean, fields, count)
+    problem = _Problem(space, mean, fields, count, norm)
     D, W = problem.principal(count)
     price = sparsity * problem.highest_price(D, W)
     rotation = _varimax(problem.scaled(D))
@@ -159,17 +172,74 @@ def spga(
     return problem.modes(D, converged, history)
 
 
-def projected(space: ShellSpace, mean: FloatArray, fields: FloatArray, span: FloatArray) -> tuple[FloatArray, float]:
-    """The parts (n, V, 3) of fields (n, V, 3) in the span of others (k, V, 3), orthogonal in the metric.
+def mode_count(settings: ModeSettings, space: ShellSpace, mean: FloatArray, fields: FloatArray) -> int:
+    """How many modes settings give for logarithms (n, V, 3) at a mean (V, 3), less than n."""
+    asked = worthwhile(space, mean, fields, settings.norm) if settings.count == "auto" else settings.count
+    return min(asked, len(fields) - 1)
 
-    Returns:
-        The parts, and the share of ``Σ ‖v^i‖_g²`` that they keep.
+
+def find_modes(settings: ModeSettings, space: ShellSpace, mean: FloatArray, fields: FloatArray, count: int) -> Modes:
+    """So many modes of logarithms (n, V, 3) at a mean (V, 3), as settings say; raises ModeError."""
+    if not settings.price:
+        return pga(space, mean, fields, count, settings.norm)
+    return spga(
+        space,
+        mean,
+        fields,
+        count,
+        settings.price,
+        settings.norm,
+        max_iterations=settings.max_iterations,
+        tolerance=TOLERANCE[settings.norm],
+    )
+
+
+def worthwhile(space: ShellSpace, mean: FloatArray, fields: FloatArray, norm: Norm = "vertices") -> int:
+    """How many modes pay.
+
+    The m that minimises ``error(m) + WORTH · m``, with the error of what m principal modes of the other shapes leave of
+    logarithms that are held out, as a share of their length. Nothing is shot: a run's figures of generalisation are
+    those of shapes that took part in this.
+
+    Args:
+        space: the shape space.
+        mean: X̄ (V, 3).
+        fields: (n, V, 3) logarithms.
+        norm: in which.
 
     Raises:
         ModeError: fields that can't be used.
     """
-    problem = _Problem(space, mean, fields, 1)
-    D = without_rigid_motion(span, problem.point.vertices).reshape(len(span), -1)
+    problem = _Problem(space, mean, fields, 1, norm)
+    gram, n = problem.D @ problem.MD, len(fields)
+    parts = min(INNER_FOLDS, n)
+    left = np.zeros((n, n))
+    for held in (np.arange(part, n, parts) for part in range(parts)):
+        kept = np.delete(np.arange(n), held)
+        values, vectors = np.linalg.eigh(gram[np.ix_(kept, kept)])
+        values, vectors = values[::-1], vectors[:, ::-1]
+        found = gram[np.ix_(held, kept)] @ vectors[:, values > NEGLIGIBLE * problem.total]
+        taken = np.cumsum(found**2 / values[values > NEGLIGIBLE * problem.total], axis=1)
+        taken = np.pad(taken, ((0, 0), (1, n - 1 - taken.shape[1])), mode="edge")
+        taken[:, 0] = 0
+        left[held] = np.sqrt(np.maximum(gram[held, held][:, None] - taken, 0))
+    errors = left.mean(axis=0) / left[:, 0].mean()
+    return max(1, int(np.argmin(errors + WORTH * np.arange(n))))
+
+
+def projected(
+    space: ShellSpace, mean: FloatArray, fields: FloatArray, span: FloatArray, norm: Norm = "vertices"
+) -> tuple[FloatArray, float]:
+    """The parts (n, V, 3) of fields (n, V, 3) in the span of others (k, V, 3), orthogonal in a norm.
+
+    Returns:
+        The parts, and the share of ``Σ ‖v^i‖²`` that they keep.
+
+    Raises:
+        ModeError: fields that can't be used.
+    """
+    problem = _Problem(space, mean, fields, 1, norm)
+    D = problem.balanced(span)
     W, explained = problem.project(D)
     return (W.T @ D).reshape(fields.shape), explained
 
@@ -198,14 +268,17 @@ class _Problem:
     """The tangent space at a mean with the logarithms in it, all as matrices on flat vertex fields (3V,).
 
     Attributes:
+        areas: (3V,) of the vertices, 1 on average.
+        shell: 1 where the norm is the shell's metric, 0 where it is that of vertices.
+        M: (3V, 3V) the norm.
         D: (n, 3V) the logarithms.
-        MD: (3V, n) lowered by the metric.
-        total: ``Σ ‖v^i‖_g²``.
+        MD: (3V, n) lowered by the norm.
+        total: ``Σ ‖v^i‖²``.
         weights: (2E,) of the 1-norm.
-        diagonal: (2E,) of the metric.
+        G: (2E,) the diagonal of the metric, scaled by the penalty to weigh on the logarithms as much as the norm.
     """
 
-    def __init__(self, space: ShellSpace, mean: FloatArray, fields: FloatArray, count: int) -> None:
+    def __init__(self, space: ShellSpace, mean: FloatArray, fields: FloatArray, count: int, norm: Norm) -> None:
         self.point: Point = space.point(mean)
         fields = np.asarray(fields, dtype=np.float64)
         if fields.ndim != 3 or fields.shape[1:] != self.point.vertices.shape:
@@ -218,17 +291,40 @@ class _Problem:
         self.form = QuadraticForm(hessian.faces / 2, hessian.angles / 2)
         self.J = space.jacobian.matrix(self.point.gradients)
         H = _matrix(self.form, space.energy.sides, space.connectivity.edge_count)
-        self.M = sparse.csr_array(self.J.T @ H @ self.J)
-        self.diagonal: FloatArray = H.diagonal()
-        eta = space.material.eta
-        self.norm = WeightedNorm.of(space.reference.with_vertices(self.point.vertices), eta)
-        # Σ w_l |u_l| + η Σ w_θ |u_θ|, from the squares w_l² and η w_θ².
-        self.weights = np.sqrt(self.norm.squared * np.repeat([1, eta], space.connectivity.edge_count))
-        self.D = without_rigid_motion(fields, self.point.vertices).reshape(len(fields), -1)
+        areas = vertex_areas(self.point.vertices, space.connectivity.faces)
+        self.areas = np.repeat(areas / areas.mean(), 3)
+        self.shell = float(norm == "shell")
+        self.M = sparse.csr_array(sparse.diags_array(self.areas))
+        if self.shell:
+            self.M = sparse.csr_array(self.J.T @ H @ self.J)
+        self.D = self.balanced(fields)
         self.MD = self.M @ self.D.T
         self.total = float(np.vdot(self.D.T, self.MD))
         if not self.total > 0:
             raise ModeError("there are no modes: all shapes are the same as the mean")
+        diagonal: FloatArray = H.diagonal()
+        self.penalty = 1.0 if self.shell else self.total / float(diagonal @ ((self.J @ self.D.T) ** 2).sum(axis=1))
+        self.G = self.penalty * diagonal
+        eta = space.material.eta
+        self.norm = WeightedNorm.of(space.reference.with_vertices(self.point.vertices), eta)
+        # Σ w_l |u_l| + η Σ w_θ |u_θ|, from the squares w_l² and η w_θ².
+        self.weights = np.sqrt(self.norm.squared * np.repeat([1, eta], space.connectivity.edge_count))
+
+    def balanced(self, fields: FloatArray) -> FloatArray:
+        """Fields (n, V, 3) as rows (n, 3V), with the rigid motion that makes them smallest in the norm of vertices."""
+        flat, motions = fields.reshape(len(fields), -1), rigid_motions(self.point.vertices)
+        lowered = motions * self.areas
+        rigid: FloatArray = np.linalg.solve(lowered @ motions.T, lowered @ flat.T).T @ motions
+        return flat - rigid
+
+    def shrinkage_matrix(self) -> tuple[SymmetricPattern, FloatArray]:
+        """``M + JᵀGJ``."""
+        form, matrix = self.form, NormalMatrix(self.point.space.connectivity)
+        faces = form.faces * (self.shell + self.penalty * np.eye(3)[:, :, None])
+        scaled = QuadraticForm(faces, form.angles * (self.shell + self.penalty))
+        entries = matrix.entries(self.point.gradients, scaled)
+        entries[matrix.pattern.diagonal] += (1 - self.shell) * self.areas
+        return matrix.pattern, entries
 
     def principal(self, count: int) -> tuple[FloatArray, FloatArray]:
         """The strongest m modes (m, 3V), orthogonal, and coefficients (m, n), orthonormal: ``D ≈ Wᵀ modes``."""
@@ -239,7 +335,7 @@ class _Problem:
 
     def scaled(self, D: FloatArray) -> FloatArray:
         """Fields (m, 3V) as lengths and angles (2E, m), in units of the metric's diagonal."""
-        return np.sqrt(self.diagonal)[:, None] * (self.J @ D.T)
+        return np.sqrt(self.G)[:, None] * (self.J @ D.T)
 
     def one_norms(self, D: FloatArray) -> FloatArray:
         """``‖J d‖_1`` (m,) of fields (m, 3V)."""
@@ -268,14 +364,11 @@ class _Problem:
         energies = (W**2).sum(axis=1) * np.einsum("jx,xj->j", D, self.M @ D.T)
         order = np.argsort(-energies, kind="stable")
         D, W = D[order], W[order]
-        lower, upper = W.min(axis=1), W.max(axis=1)
         vertices = without_rigid_motion(D.reshape(len(D), -1, 3), self.point.vertices)
         return Modes(
             nric=(self.J @ vertices.reshape(len(D), -1).T).T,
             vertices=vertices,
             coefficients=W.T,
-            lower=np.minimum(lower, -MARGIN * upper),
-            upper=np.maximum(upper, -MARGIN * lower),
             explained=explained,
             converged=converged,
             history=history or [],
@@ -313,11 +406,9 @@ class _Shrinkage:
     """ADMM for ``argmin_d ‖d − t‖_M² + p ‖J d‖_1``, with a state for each mode that is kept between calls."""
 
     def __init__(self, problem: _Problem, space: ShellSpace, D: FloatArray) -> None:
-        form, G = problem.form, problem.diagonal
-        faces = form.faces * (1 + np.eye(3)[:, :, None])
-        matrix = NormalMatrix(space.connectivity)
-        entries = matrix.entries(problem.point.gradients, QuadraticForm(faces, 2 * form.angles))
-        self._factor = analyse(matrix.pattern, space.backend).factorise(entries)
+        G = problem.G
+        pattern, entries = problem.shrinkage_matrix()
+        self._factor = analyse(pattern, space.backend).factorise(entries)
         self._J, self._M = problem.J, problem.M
         self._JtG = sparse.csr_array(problem.J.T @ sparse.diags_array(G))
         self._threshold = np.divide(problem.weights, 2 * G, out=np.zeros_like(G), where=G > 0)

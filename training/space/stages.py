@@ -7,10 +7,12 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+import shapespace
 from shapespace.bundle.geometry import FineMesh, Geometry
 from shapespace.coordinates.nric import WeightedNorm
 from shapespace.mesh.coarsening import coarsen
@@ -25,11 +27,16 @@ from shapespace.training.collection.generators import MESHES
 from shapespace.training.collection.ingest import MeshCollection, normalised, read_collection
 from shapespace.training.runs.config import Config, ConfigError
 from shapespace.training.runs.directory import RunDirectory
-from shapespace.training.runs.progress import waiting
+from shapespace.training.runs.progress import progress, waiting
+from shapespace.training.space.codes import box_of, nearest_codes
 from shapespace.training.space.factors import between, group, names, overlap
+from shapespace.training.space.generalisation import PrincipalComponents, folds, held_out, summary, vertex_distances
 from shapespace.training.space.logarithms import logarithms
-from shapespace.training.space.modes import localisation, pga, spga
+from shapespace.training.space.modes import find_modes, localisation, mode_count, pga
 from shapespace.training.space.shell_collection import ShellCollection
+
+#: Steps K of the logarithms and exponentials by which a run measures how its space generalises.
+LIGHT_STEPS = 8
 
 
 def material(config: Config) -> Material:
@@ -154,19 +161,18 @@ def modes(run: RunDirectory, config: Config) -> dict[str, Any]:
     space = ShellSpace(centre, material(config))
     norm = WeightedNorm.of(centre, config.material.eta)
     found = logarithms(space, centre.vertices, shapes, settings.log_steps)
-    count = min(settings.count, len(shapes) - 1)
-    dense = sparse = pga(space, centre.vertices, found.fields, count)
-    if settings.sparsity:
-        with waiting("sparse modes"):
-            sparse = spga(
-                space, centre.vertices, found.fields, count, settings.sparsity, max_iterations=settings.max_iterations
-            )
+    count = mode_count(settings, space, centre.vertices, found.fields)
+    dense = pga(space, centre.vertices, found.fields, count, settings.norm)
+    with waiting("sparse modes"):
+        sparse = find_modes(settings, space, centre.vertices, found.fields, count)
+    codes = nearest_codes(space, centre.vertices, sparse.vertices, shapes, sparse.coefficients, config.samples.steps)
+    lower, upper = box_of(codes.codes)
     arrays = {
         "nric": sparse.nric,
         "vertices": sparse.vertices,
-        "coefficients": sparse.coefficients,
-        "lower": sparse.lower,
-        "upper": sparse.upper,
+        "coefficients": codes.codes,
+        "lower": lower,
+        "upper": upper,
         "localisation": localisation(sparse.nric, norm),
         "pga_nric": dense.nric,
         "pga_vertices": dense.vertices,
@@ -180,12 +186,42 @@ def modes(run: RunDirectory, config: Config) -> dict[str, Any]:
         "explained": sparse.explained,
         "pga_explained": dense.explained,
         "linearised_logarithms": len(found.fallbacks),
-        "asked": settings.count,
+        "asked": count if settings.count == "auto" else settings.count,
         "log_steps": settings.log_steps,
         "steps": list(found.steps),
         "via": list(found.via),
     }
     run.decomposition.write(facts | {"reasons": list(found.reasons), "history": sparse.history})
+    return facts
+
+
+def generalisation(run: RunDirectory, config: Config) -> dict[str, Any]:
+    """``generalisation.json``: how near modes of a part of the shapes come to the others, beside principal components.
+
+    A fifth of the shapes is held out of everything: mean, logarithms, modes and their number; or below ten each in its
+    turn. Exponentials stand for networks, in LIGHT_STEPS steps. With half as many modes too. And
+    ``least-general.npz``, the shape that is farthest.
+    """
+    reference, shapes, settings = run.reference_mesh(), run.shapes.read()["vertices"], config.modes
+    steps = min(LIGHT_STEPS, settings.log_steps)
+    parts = folds(len(shapes))
+    every = [
+        held_out(reference, shapes, index, None, settings, material(config), steps)
+        for index in (parts if len(parts) == len(shapes) else parts[:1])
+    ]
+    index = np.concatenate([each.index for each in every])
+    given = shapes[index]
+    counts = np.mean([each.counts for each in every], axis=0).tolist()
+    facts: dict[str, Any] = {"held_out": len(index), "steps": steps, "counts": counts}
+    for name in ("modes", "components"):
+        near = [np.concatenate(shapes) for shapes in zip(*(getattr(each, f"by_{name}") for each in every), strict=True)]
+        away = [vertex_distances(shape, given, reference.diagonal) for shape in near]
+        facts[name] = [summary(each) for each in away]
+        if name == "modes":
+            worst = int(away[-1].mean(axis=1).argmax())
+            run.least_general.write(given=given[worst], found=near[-1][worst])
+            facts["worst"] = str(run.shapes.read()["names"][index[worst]])
+    run.generalisation.write(facts)
     return facts
 
 
@@ -212,6 +248,31 @@ def factors(run: RunDirectory, config: Config) -> dict[str, Any]:
         }
     )
     return {"factors": len(groups), "largest": max(map(len, groups))}
+
+
+def encoded(run: RunDirectory, bundle: Path) -> dict[str, Any]:
+    """``encoded.json``: how near a bundle's codes come to the shapes of the collection, and which are out of bounds.
+
+    By ``encode`` as it is served. And ``least-near.npz``, the farthest.
+    """
+    model, reference, shapes = shapespace.load(bundle), run.reference.read(), run.shapes.read()
+    scale = float(reference["scale"])
+    given = scale * shapes["vertices"]
+    found = [model.encode(shape) for shape in progress(given, "codes of the shapes", "shape", len(given))]
+    near = np.stack([each.shape.vertices for each in found])
+    away = vertex_distances(near, given, scale * run.reference_mesh().diagonal)
+    outside = [not each.inside_bounds for each in found]
+    worst = int(away.mean(axis=1).argmax())
+    linear = PrincipalComponents.of(given, scale * reference["vertices"]).nearest(given, model.latents.dimension)
+    facts = summary(away) | {
+        "components": summary(vertex_distances(linear, given, scale * run.reference_mesh().diagonal)),
+        "shapes": len(given),
+        "outside": shapes["names"][outside].tolist(),
+        "worst": str(shapes["names"][worst]),
+    }
+    run.least_near.write(given=given[worst] / scale, found=near[worst] / scale)
+    run.encoded.write(facts)
+    return facts
 
 
 def collection(run: RunDirectory, config: Config) -> ShellCollection:

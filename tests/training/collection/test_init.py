@@ -14,7 +14,7 @@ from shapespace.files.formats import MESH_FORMATS
 from shapespace.training import __main__ as command
 from shapespace.training.collection.ingest import IngestError, read_collection
 from shapespace.training.collection.init import slug, write
-from shapespace.training.runs.config import Config, ConfigError, ModeSettings, load, parse
+from shapespace.training.runs.config import Config, ConfigError, load, parse
 
 
 def meshes(folder: Path, count: int = 4, subdivisions: int = 1) -> Path:
@@ -31,15 +31,14 @@ def run(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
     return command.main()
 
 
-@pytest.mark.parametrize(("count", "modes"), [(3, 2), (25, 20)])
-def test_values_come_from_the_meshes(count: int, modes: int, tmp_path: Path) -> None:
-    folder = meshes(tmp_path / "My Meshes_2", count)
+def test_values_come_from_the_meshes(tmp_path: Path) -> None:
+    folder = meshes(tmp_path / "My Meshes_2", 25)
     out, collection = write(folder, tmp_path / "here.toml")
     config, _ = load(out)
     assert config.collection.data == folder.resolve()
     assert config.collection.reference is None
     assert f'the most central one, "{collection.names[collection.central]}"' in out.read_text()
-    assert config.modes.count == modes
+    assert "24 at most" in out.read_text()
     assert (config.export.name, config.export.title) == ("my-meshes-2", "My Meshes_2")
     assert "coarse_vertices" not in config.collection.model_fields_set
 
@@ -60,9 +59,8 @@ def test_what_is_commented_out_is_the_default_and_can_be_taken(tmp_path: Path) -
 
 def test_what_the_meshes_do_not_decide_is_left_alone(tmp_path: Path) -> None:
     config, _ = load(write(meshes(tmp_path / "meshes"), tmp_path / "here.toml")[0])
-    for name in Config.model_fields.keys() - {"collection", "modes", "export"}:
+    for name in Config.model_fields.keys() - {"collection", "export"}:
         assert getattr(config, name) == Config.model_fields[name].default, name
-    assert config.modes == ModeSettings(count=3)
 
 
 def test_every_setting_says_what_it_does(tmp_path: Path) -> None:

@@ -13,6 +13,7 @@ import pytest
 
 from shapespace.bundle.reader import read_bundle
 from shapespace.training.__main__ import main
+from shapespace.training.collection.generators import PRODUCTS
 from shapespace.training.learning.networks import resolved
 from shapespace.training.runs.config import CombinerSettings, Config, LatentNetworkSettings, load
 
@@ -60,6 +61,10 @@ def today(config: dict[str, Any]) -> Config:
     """A configuration of 0.1, where a variant was whole."""
     networks = config.get("networks", {})
     values = config | {"networks": networks | recipe(networks)}
+    if values["collection"]["generator"] in PRODUCTS:
+        values.pop("modes", None)  # which it doesn't read
+    else:
+        values["modes"] = {"norm": "shell", "sparsity": 0.1} | values["modes"]  # where there was no choice
     if "monolithic" in config:
         values["monolithic"] = latent_network(config["monolithic"])
     main = {name: networks.get(name) for name in ("factors", "combiner")}

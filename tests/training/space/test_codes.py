@@ -1,0 +1,92 @@
+"""Codes of shapes and bounds around them, on an ellipsoid with planted modes."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import trimesh
+
+from shapespace.mesh.rigid_motion import align, without_rigid_motion
+from shapespace.mesh.triangle_mesh import TriangleMesh
+from shapespace.shell.exponential import exponential
+from shapespace.shell.space import ShellSpace
+from shapespace.training.runs.config import ModeSettings
+from shapespace.training.space.codes import box_of, nearest_codes
+from shapespace.training.space.modes import mode_count, pga
+
+STEPS = 4
+
+
+@pytest.fixture(scope="module")
+def space() -> ShellSpace:
+    ball = trimesh.creation.icosphere(subdivisions=2)
+    return ShellSpace(TriangleMesh.from_arrays(ball.vertices * [2, 1, 1], ball.faces))
+
+
+@pytest.fixture(scope="module")
+def modes(space: ShellSpace) -> np.ndarray:
+    x = space.reference.vertices
+    bend = np.stack([np.zeros(len(x)), np.zeros(len(x)), 0.1 * x[:, 0] ** 2], axis=1)
+    stretch = 0.2 * x * [1, 0, 0]
+    return without_rigid_motion(np.stack([bend, stretch]), x)
+
+
+def shot(space: ShellSpace, modes: np.ndarray, code: np.ndarray) -> np.ndarray:
+    path = exponential(space, space.reference.vertices, np.tensordot(code, modes, 1), STEPS)
+    assert path.converged
+    return path.vertices[-1]
+
+
+def test_codes_of_exponentials_come_back_in_any_pose(space, modes, rng):
+    codes = np.array([[0.8, -0.5], [-1.0, 0.9], [0.0, 0.0]])
+    turn = np.linalg.qr(rng.standard_normal((3, 3)))[0]
+    turn *= np.linalg.det(turn)
+    shapes = np.stack([shot(space, modes, code) @ turn + [3, 2, 1] for code in codes])
+    start = codes + 0.3 * rng.standard_normal(codes.shape)
+    found = nearest_codes(space, space.reference.vertices, modes, shapes, start, STEPS, workers=1)
+    assert found.codes == pytest.approx(codes, abs=2e-3)
+    assert found.vertices == pytest.approx(shapes, abs=2e-3)
+    assert max(found.exponentials) < 10
+
+
+def test_a_code_is_a_minimum_for_a_shape_that_no_code_has(space, modes, rng):
+    smooth = np.sin(space.reference.vertices @ rng.standard_normal((3, 3)))
+    shape = shot(space, modes, np.array([0.5, 0.5])) + 0.1 * smooth
+
+    def misfit(code: np.ndarray) -> float:
+        return float(((align(shot(space, modes, code), shape) - shape) ** 2).sum())
+
+    start = np.zeros((1, 2)) + 0.1
+    (found,) = nearest_codes(space, space.reference.vertices, modes, shape[None], start, STEPS, workers=1).codes
+    for step in 0.05 * np.eye(2):
+        assert misfit(found) < min(misfit(found + step), misfit(found - step))
+
+
+def test_a_start_that_has_no_exponential_is_shortened(space, modes):
+    shape = shot(space, modes, np.array([0.5, -0.5]))
+    far = np.array([[0.0, -10.0]])
+    path = exponential(space, space.reference.vertices, np.tensordot(far[0], modes, 1), STEPS)
+    assert not path.converged
+    found = nearest_codes(space, space.reference.vertices, modes, shape[None], far, STEPS, workers=1)
+    assert found.codes[0] == pytest.approx([0.5, -0.5], abs=5e-3)
+
+
+def test_bounds_hold_every_code_with_room_and_the_mean():
+    codes = np.array([[1.0, -2.0, 0.5], [3.0, 2.0, 0.6]])
+    lower, upper = box_of(codes)
+    assert upper == pytest.approx([3.1, 2.2, 0.605])
+    assert lower == pytest.approx([-0.31, -2.2, -0.0605])
+
+
+def test_as_many_modes_as_pay(space, rng):
+    """Three strong directions and many weak ones: more than three would hardly come nearer."""
+    x = space.reference.vertices
+    strong = np.stack([np.sin(x @ rng.standard_normal((3, 3))) for _ in range(3)])
+    weak = 0.003 * np.stack([np.sin(x @ (3 * rng.standard_normal((3, 3)))) for _ in range(20)])
+    mixed = [np.tensordot(rng.standard_normal((25, len(some))), some, 1) for some in (strong, weak)]
+    fields = without_rigid_motion(0.05 * sum(mixed), x)
+    assert mode_count(ModeSettings(), space, x, fields) == 3
+    assert mode_count(ModeSettings(count=7), space, x, fields) == 7
+    assert mode_count(ModeSettings(count=70), space, x, fields) == 24
+    assert len(pga(space, x, fields, 24)) > 20
+    assert mode_count(ModeSettings(), space, x, fields[:2]) == 1

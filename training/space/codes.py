@@ -1,0 +1,119 @@
+"""Codes of the shapes of a collection: whose exponentials come closest to them, in vertices."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+
+from shapespace.arrays import FloatArray
+from shapespace.mesh.rigid_motion import align, without_rigid_motion
+from shapespace.shell.exponential import exponential
+from shapespace.shell.exponential_derivative import ExponentialDerivative
+from shapespace.shell.space import DiscretePath, ShellSpace
+from shapespace.solve.least_squares import Box, Stopping, least_squares
+from shapespace.training.runs.progress import progress
+from shapespace.training.runs.workers import run
+
+#: Of the search: it ends once no coefficient would move further than this, or the sum of squares
+#: would shrink by less than this, or after so many exponentials.
+TOLERANCE, GAIN, EXPONENTIALS = 1e-3, 1e-3, 25
+#: Where an exponential isn't found at the start, the search begins from these shares of it.
+SHARES = (1.0, 0.75, 0.5, 0.25, 0.0)
+#: What bounds have to spare on each side of the shapes' codes, as a share of their range; and what a side has at least,
+#: as a share of the other.
+ROOM, MARGIN = 0.05, 0.1
+
+
+@dataclass(frozen=True)
+class Codes:
+    """Codes and where they lead.
+
+    Attributes:
+        codes: (n, m).
+        vertices: (n, V, 3) their exponentials, aligned to the shapes.
+        exponentials: (n,) that each took.
+    """
+
+    codes: FloatArray
+    vertices: FloatArray
+    exponentials: tuple[int, ...]
+
+
+def nearest_codes(
+    space: ShellSpace,
+    mean: FloatArray,
+    modes: FloatArray,
+    shapes: FloatArray,
+    start: FloatArray,
+    steps: int,
+    workers: int = -1,
+) -> Codes:
+    """The codes ``w`` that minimise ``‖exp_z̄(Σ_j w_j u_j) − x‖²`` over vertices, after rigid alignment.
+
+    Projections of logarithms, which they start from, are so only to first order: what a mode leaves out bends with the
+    rest of the way. Gauss–Newton, with the derivative of the discrete exponential.
+
+    Args:
+        space: the shape space.
+        mean: X̄ (V, 3).
+        modes: (m, V, 3) vertex fields, scaled so that codes are about 1.
+        shapes: (n, V, 3), in any position.
+        start: (n, m) codes nearby.
+        steps: K of the exponentials.
+        workers: processes, by default one a core; the result does not depend on it.
+    """
+    everywhere = np.full(len(modes), np.inf)
+    box = Box(-everywhere, everywhere, np.ones(len(modes)))
+    items = [(shape, code) for shape, code in zip(shapes, start, strict=True)]
+    results = run(partial(_nearest, space, mean, modes, box, steps), items, workers=workers)
+    found = dict(progress(results, "codes", "shape", len(items)))
+    codes, vertices, counts = zip(*(found[k] for k in range(len(items))), strict=True)
+    return Codes(np.stack(codes), np.stack(vertices), counts)
+
+
+def box_of(codes: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Lower and upper bounds (m,) that hold codes (n, m), with some room, and the mean's, which is 0."""
+    lower, upper = codes.min(axis=0), codes.max(axis=0)
+    room = ROOM * (upper - lower)
+    lower, upper = lower - room, upper + room
+    return np.minimum(lower, -MARGIN * upper), np.maximum(upper, -MARGIN * lower)
+
+
+def _nearest(
+    space: ShellSpace,
+    mean: FloatArray,
+    modes: FloatArray,
+    box: Box,
+    steps: int,
+    item: tuple[FloatArray, FloatArray],
+) -> tuple[FloatArray, FloatArray, int]:
+    target, start = item
+    paths: dict[bytes, DiscretePath] = {}
+
+    def shoot(x: FloatArray) -> DiscretePath:
+        key = x.tobytes()
+        if key not in paths:
+            paths.clear()
+            paths[key] = exponential(space, mean, np.tensordot(x, modes, axes=1), steps)
+        return paths[key]
+
+    def residuals(x: FloatArray) -> FloatArray:
+        path = shoot(x)
+        if not path.converged:
+            return np.full(target.size, np.nan)
+        return (align(path.vertices[-1], target) - target).ravel()
+
+    def jacobian(x: FloatArray, _: FloatArray) -> FloatArray:
+        path = shoot(x)
+        shape = path.vertices[-1]
+        fields = ExponentialDerivative(path).push_forward(modes)
+        there = align(shape, target)
+        turned = align(shape, target, carried=shape + fields) - there
+        return without_rigid_motion(turned, there).reshape(len(fields), -1).T
+
+    # The mean itself is always there.
+    first = next(share * start for share in SHARES if shoot(share * start).converged)
+    fit = least_squares(residuals, jacobian, first, box, Stopping(TOLERANCE, GAIN, max_evaluations=EXPONENTIALS))
+    return fit.x, align(shoot(fit.x).vertices[-1], target), fit.iterations
