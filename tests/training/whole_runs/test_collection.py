@@ -137,7 +137,17 @@ def test_a_run_leaves_what_the_contract_promises(run: Path) -> None:
     (other,) = figures["seeds"]
     assert other["seed"] == 1
     assert 0 < abs(other["r2"]["composite"]["total"] - figures["r2"]["composite"]["total"]) < 0.02
-    assert "<html" in (run / "report.html").read_text()
+    report = (run / "report.html").read_text()
+    assert "<html" in report
+    unseen, encoded = (json.loads((run / f"{name}.json").read_text()) for name in ("generalisation", "encoded"))
+    assert figures["generalisation"] == unseen
+    assert (unseen["held_out"], unseen["counts"]) == (8, [2, 3])
+    for kind in ("modes", "components"):
+        fewer, more = (each["mean"] for each in unseen[kind])
+        assert 0 < more < fewer < 0.1
+    assert (encoded["shapes"], encoded["outside"]) == (8, [])
+    assert 0 < encoded["mean"] < encoded["p95"] < 0.02
+    assert report.index("Shapes it has not seen") < report.index("Shapes it has learned from") < report.index("R²")
     events = [json.loads(line) for line in (run / "log.jsonl").read_text().splitlines()]
     assert [e["stage"] for e in events if e["event"] == "end"] == list(STAGES)
 

@@ -1,0 +1,87 @@
+"""How near spaces come to shapes that are held out, beside principal components, on an ellipsoid that bends."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import trimesh
+
+from shapespace.mesh.rigid_motion import without_rigid_motion
+from shapespace.mesh.triangle_mesh import TriangleMesh
+from shapespace.shell.energy import Material
+from shapespace.shell.exponential import exponential
+from shapespace.shell.space import ShellSpace
+from shapespace.training.runs.config import ModeSettings
+from shapespace.training.space.generalisation import (
+    PrincipalComponents,
+    folds,
+    held_out,
+    summary,
+    vertex_distances,
+)
+
+STEPS = 4
+
+
+@pytest.fixture(scope="module")
+def reference() -> TriangleMesh:
+    ball = trimesh.creation.icosphere(subdivisions=2)
+    return TriangleMesh.from_arrays(ball.vertices * [3, 1, 1], ball.faces)
+
+
+@pytest.fixture(scope="module")
+def shapes(reference: TriangleMesh) -> np.ndarray:
+    """A curved family of one parameter: far bends to both sides."""
+    space, x = ShellSpace(reference), reference.vertices
+    bend = without_rigid_motion(np.stack([0 * x[:, 0], 0 * x[:, 0], 0.25 * x[:, 0] ** 2], axis=1), x)
+    paths = [exponential(space, x, t * bend, STEPS) for t in np.linspace(-1, 1, 6)]
+    assert all(path.converged for path in paths)
+    return np.stack([path.vertices[-1] for path in paths])
+
+
+def test_two_modes_follow_a_curved_family_where_components_cut_across(reference, shapes):
+    found = held_out(reference, shapes, np.array([1, 4]), [1, 2], ModeSettings(), Material(), STEPS)
+    assert found.counts == [1, 2]
+    modes, components = (
+        [vertex_distances(near, shapes[[1, 4]], reference.diagonal).mean() for near in each]
+        for each in (found.by_modes, found.by_components)
+    )
+    assert modes[0] < components[0]
+    assert modes[1] < 0.2 * components[1]
+
+
+def test_nothing_is_known_of_what_is_held_out(reference, shapes):
+    """Another shape in place of the one that is held out changes neither mean nor modes: what its pair becomes."""
+    others = shapes.copy()
+    others[4] = reference.vertices * [1, 1.3, 1]
+    how = (np.array([1, 4]), None, ModeSettings(count=1), Material(), 2)
+    found, again = (held_out(reference, each, *how) for each in (shapes, others))
+    assert found.counts == again.counts == [1, 1]
+    assert found.by_modes[0][0] == pytest.approx(again.by_modes[0][0], abs=1e-12)
+    assert found.by_components[0][0] == pytest.approx(again.by_components[0][0], abs=1e-12)
+
+
+@pytest.mark.parametrize(("count", "parts"), [(3, 3), (9, 9), (10, 5), (57, 5)])
+def test_folds_hold_every_shape_out_once(count, parts):
+    found = folds(count)
+    assert len(found) == parts
+    assert sorted(np.concatenate(found)) == list(range(count))
+
+
+def test_components_reproduce_what_they_were_found_from_and_come_nearer_with_more(shapes, rng):
+    linear = PrincipalComponents.of(shapes, shapes[0])
+    assert vertex_distances(linear.nearest(shapes, 5), shapes, 1.0).max() < 1e-9
+    errors = [np.square(vertex_distances(linear.nearest(shapes, k), shapes, 1.0)).sum() for k in range(6)]
+    assert (np.diff(errors) < 0).all()
+    drawn = linear.random(1, 50, rng)
+    along = (drawn - linear.mean).reshape(50, -1) @ linear.axes[0]
+    assert linear.coefficients[:, 0].min() <= along.min() <= along.max() <= linear.coefficients[:, 0].max()
+
+
+def test_distances_know_no_pose_and_no_unit(shapes, rng):
+    turn = np.linalg.qr(rng.standard_normal((3, 3)))[0]
+    turn *= np.linalg.det(turn)
+    expected = vertex_distances(shapes, shapes[0], 2.0)
+    assert vertex_distances(7 * shapes @ turn + 5, 7 * shapes[0], 14.0) == pytest.approx(expected, abs=1e-12)
+    assert expected[0] == pytest.approx(0, abs=1e-12)
+    assert summary(np.arange(101.0)) == {"mean": 50, "p95": 95}
