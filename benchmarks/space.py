@@ -21,7 +21,6 @@ from shapespace.training.space.generalisation import PrincipalComponents, folds,
 from shapespace.training.space.logarithms import logarithms
 from shapespace.training.space.stages import material
 
-FOLDS = 5
 #: Random codes whose shapes are compared with the collection.
 CODES = 200
 

@@ -22,7 +22,16 @@ def test_the_models_and_their_cards(studio: Studio) -> None:
     studio["#about"].click()
     studio.eventually(studio["#card"].is_visible)
     card = studio["#card"].inner_text()
-    for fact in ("A torus for tests.", "with-fine · version 1 · CC0-1.0", "composite", "64", "Digest"):
+    for fact in (
+        "A torus for tests.",
+        "with-fine · version 1 · CC0-1.0",
+        "composite",
+        "64",
+        "Digest",
+        "unseen shapes",
+        "3 %",
+        "5 %",
+    ):
         assert fact in card
     studio.page.keyboard.press("Escape")
     small = studio.picture()

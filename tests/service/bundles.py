@@ -174,7 +174,14 @@ def facts(name: str = "small", version: str = "1", *, idle: int = 0) -> Facts:
         eta_reconstruction=1e-2,
         scale=SCALE,
         tolerance=Tolerance(required=1e-4, measured=1e-7),
-        figures={"r2": {"composite": {"total": 1.0}}},
+        figures={
+            "r2": {"composite": {"total": 1.0}},
+            "generalisation": {
+                "counts": [1, 2],
+                "modes": [{"mean": 0.04}, {"mean": 0.03}],
+                "components": [{"mean": 0.08}, {"mean": 0.05}],
+            },
+        },
         origin=Origin(config={}, data_digest="0" * 64, code_version="test"),
     )
 

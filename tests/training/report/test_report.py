@@ -28,7 +28,7 @@ from shapespace.training.runs.directory import RunDirectory
 from shapespace.training.runs.stages import STAGES
 
 NASTY = "<script>alert('thumb')</script>"
-SECTIONS = {"shapes", "modes", "factors", "strip", "tests", "figures", "losses", "stages", "configuration"}
+SECTIONS = {"nearness", "shapes", "modes", "factors", "strip", "tests", "figures", "losses", "stages", "configuration"}
 CONFIG = '[collection]\n[export]\ntitle = "Sphere & Co <b>"\ndescription = "Made up."\n'
 VOID = {"br", "hr", "img", "input", "link", "meta"}
 
@@ -84,6 +84,8 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
         test_error=np.array([0.001, 0.01, 0.1])[:, None] * (x[:, 1] - x[:, 1].min()),
         strip_joint=shapes, strip_factors=np.array([shapes, shapes[::-1]]),
     )  # fmt: skip
+    for name in ("least-general", "least-near"):
+        np.savez(folder / f"{name}.npz", given=shapes[1], found=shapes[2])
     losses = [[0.5**k, 0.7**k + 0.1 * (k == 7)] for k in range(8)]
     documents: dict[str, Any] = {
         "modes.json": {
@@ -104,6 +106,22 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
             for stem in ("factor-0-abc", "factor-1-abc", "combiner-abc", "combiner-def", "monolithic-abc")
         }
         | {"combiner-fed": {"epoch": 0, "best": None, "history": []}},
+        "generalisation.json": {
+            "held_out": 3,
+            "counts": [2, 4],
+            "steps": 8,
+            "worst": NASTY,
+            "modes": [{"mean": 0.023, "p95": 0.031}, {"mean": 0.0047, "p95": 0.0061}],
+            "components": [{"mean": 0.021, "p95": 0.032}, {"mean": 0.0053, "p95": 0.0071}],
+        },
+        "encoded.json": {
+            "shapes": 9,
+            "outside": [],
+            "worst": "pose7",
+            "mean": 0.0019,
+            "p95": 0.0029,
+            "components": {"mean": 0.0018, "p95": 0.0028},
+        },
         "evaluation.json": {
             "eta": 0.01,
             "test_samples": 80,
@@ -220,12 +238,21 @@ def test_every_section_is_there_with_its_figures(page: Page) -> None:
     assert {f"{key} of the SPGA by iteration" for key in ("objective", "support")} <= labels
     assert "Localisation by mode, SPGA and PGA" in labels
     assert {"Overlap of the factors' supports", "R² by the fraction of samples"} <= labels
-    assert len(page.pictures) == 3 + 2 * 4 + 3 + 3 + 2 * 3  # shapes, modes, factors, strip, tests
+    assert len(page.pictures) == 2 * 2 + 3 + 2 * 4 + 3 + 3 + 2 * 3  # nearness, shapes, modes, factors, strip, tests
+
+
+def test_the_page_opens_with_how_near_the_space_comes_to_the_shapes_of_the_user(page: Page) -> None:
+    assert page.source.index('id="nearness"') < page.source.index("R² of the composite network")
+    words = page.words.replace("\N{NO-BREAK SPACE}", " ")
+    for said in ("3 shapes, held out", "all 9, through encode", "2 coordinates", "0.47 %", "0.61 %", "0.53 %", "pose7"):
+        assert said in words
+    best = re.findall(r'<td class="best">(.*?)</td>', page.source)[:3]
+    assert [cell.replace("\N{NO-BREAK SPACE}", " ") for cell in best] == ["2.1 %", "0.47 %", "0.18 %"]
 
 
 def test_the_best_row_of_rivals_stands_out(page: Page) -> None:
     best = re.findall(r'<td class="best">(.*?)</td>', page.source)
-    assert best[:3] == ["0.9876", "0.9886", "0.8876"]
+    assert best[3:6] == ["0.9876", "0.9886", "0.8876"]
 
 
 def test_the_page_asks_nothing_of_the_network_and_runs_nothing(page: Page) -> None:
