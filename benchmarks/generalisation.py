@@ -16,7 +16,7 @@ import numpy as np
 from shapespace.training.runs.config import load
 from shapespace.training.runs.directory import RunDirectory
 from shapespace.training.space import stages
-from shapespace.training.space.generalisation import folds, held_out, vertex_distances
+from shapespace.training.space.generalisation import FOLDS, folds, held_out, vertex_distances
 
 ROOT = Path(__file__).resolve().parents[1]
 #: Quick ones first.
@@ -44,13 +44,14 @@ def measure(name: str, data: Path, out: Path) -> None:
         run.folder.mkdir(parents=True, exist_ok=True)
         stages.ingest(run, config)
     shapes, reference = run.shapes.read()["vertices"], run.reference_mesh()
-    m = min(int(config.modes.count), len(shapes) - -(-len(shapes) // 5) - 1)
+    m = config.modes.count
+    counts = None if m == "auto" else [-(-m // 2), m]
     for k, index in enumerate(folds(len(shapes))):
         file = run.study(f"fold-{k}")
         if file.exists():
             continue
         material = stages.material(config)
-        found = held_out(reference, shapes, index, [-(-m // 2), m], config.modes, material, stages.LIGHT_STEPS)
+        found = held_out(reference, shapes, index, counts, config.modes, material, stages.LIGHT_STEPS)
         away = {
             kind: [vertex_distances(near, shapes[index], reference.diagonal).tolist() for near in by_count]
             for kind, by_count in (("modes", found.by_modes), ("components", found.by_components))
@@ -67,7 +68,7 @@ def measure(name: str, data: Path, out: Path) -> None:
 def rows(name: str, out: Path) -> list[str]:
     """Of the table, once all folds are there."""
     files = sorted((out / name).glob("fold-*.json"))
-    if len(files) < 5:
+    if len(files) < FOLDS:
         return []
     every = [json.loads(file.read_text()) for file in files]
     result = []

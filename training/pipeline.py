@@ -226,8 +226,9 @@ def evaluation(run: Run) -> None:
     figures, gallery = evaluate(partial(learner_of, run), run.config, exact)
     if run.directory.ingest.exists():
         figures["prolongation"] = run.directory.ingest.read().get("prolongation")
-    if run.directory.generalisation.exists():
-        figures["generalisation"] = run.directory.generalisation.read()
+    unseen = run.directory.generalisation.read_if_written()
+    if unseen and "failed" not in unseen:
+        figures["generalisation"] = unseen
     run.directory.gallery.write(**gallery)
     run.directory.evaluation.write(figures)
 

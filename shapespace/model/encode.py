@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from functools import cached_property
 
@@ -16,6 +16,7 @@ from shapespace.model.decoder import Decoder, MeshChoice, Shape
 from shapespace.model.derivatives import FactorGrids, derivatives, factor_derivatives, nodes
 from shapespace.model.latent_space import Bounds, Codes, NotFiniteError
 from shapespace.model.searched_shapes import SearchedShapes
+from shapespace.solve.cholesky import NotPositiveDefiniteError
 from shapespace.solve.deadline import Deadline
 from shapespace.solve.least_squares import Box, Fit, Stopping, least_squares
 from shapespace.solve.outcome import Status
@@ -114,7 +115,7 @@ class Encoder:
         box = Box(lower, upper, latents.width)
         fit = self._by_nric(target, box, deadline)
         if objective is Objective.VERTICES and fit.status is not Status.DEADLINE:
-            fit = self._by_vertices(vertices, fit.x, box, deadline)
+            fit = self._by_vertices(vertices, fit, box, deadline)
         code, inside = latents.code(fit.x.tolist(), bounds)
         shape = model.shape(code, inside, given.mesh, deadline)
         distances = np.linalg.norm(align(shape.vertices, given.vertices) - given.vertices, axis=1)
@@ -128,10 +129,12 @@ class Encoder:
         """What starts are chosen from; made once, at the first mesh."""
         return FactorGrids.of(self.model, self._centre, self._root)
 
-    def _by_vertices(self, target: FloatArray, start: FloatArray, box: Box, deadline: Deadline | None) -> Fit:
-        """The fit to vertices (V, 3), from a start nearby."""
+    def _by_vertices(self, target: FloatArray, near: Fit, box: Box, deadline: Deadline | None) -> Fit:
+        """The fit to vertices (V, 3), from one nearby, which stands where its shape has all but collapsed."""
         model, weight = self.model, 1 / (self.model.reference.diagonal * np.sqrt(len(target)))
         with model.solver() as reconstruct:
+            if deadline is not None and deadline.passed:  # while waiting for the solver
+                return replace(near, status=Status.DEADLINE)
             shapes = SearchedShapes(model, reconstruct, deadline)
 
             def residuals(x: FloatArray) -> FloatArray:
@@ -146,9 +149,12 @@ class Encoder:
                 turned = align(shape, target, carried=shape + fields) - there
                 return weight * without_rigid_motion(turned, there).reshape(len(fields), -1).T
 
-            return least_squares(
-                residuals, jacobian, start, box, Stopping(TOLERANCE, GAIN, max_evaluations=SHAPES, deadline=deadline)
-            )
+            stopping = Stopping(TOLERANCE, GAIN, max_evaluations=SHAPES, deadline=deadline)
+            try:
+                fit = least_squares(residuals, jacobian, near.x, box, stopping)
+            except NotPositiveDefiniteError:
+                return near
+            return near if fit.status is Status.NOT_FINITE else fit
 
     def _by_nric(self, target: FloatArray, box: Box, deadline: Deadline | None) -> Fit:
         """The fit to lengths and angles (2E,)."""

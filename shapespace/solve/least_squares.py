@@ -116,7 +116,6 @@ def least_squares(
     scale, low, high = box.scale, box.lower / box.scale, box.upper / box.scale
     u = np.clip(start / scale, low, high)
     r = residuals(u * scale)
-    J = _Jacobian(lambda u, r: jacobian(u * scale, r) * scale, secant, u, r)
     evaluations, damping = 1, 0.0
 
     def fit(status: Status, reason: str = "") -> Fit:
@@ -125,6 +124,7 @@ def least_squares(
 
     if not np.isfinite(r).all():
         return fit(Status.NOT_FINITE, "the residuals at the start are not finite")
+    J = _Jacobian(lambda u, r: jacobian(u * scale, r) * scale, secant, u, r)
     while (reached := stopping.reached(evaluations)) is None:
         if not np.isfinite(J.matrix).all():
             return fit(Status.STALLED, "the Jacobian is not finite")

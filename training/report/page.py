@@ -186,10 +186,10 @@ def extremes(record: Record, studio: Studio) -> dict[str, Any] | None:
 def nearness(record: Record, studio: Studio | None) -> list[dict[str, Any]]:
     """How near the space comes to the user's own shapes, unseen and learned from, each with its worst in a picture."""
     kinds = []
-    if facts := record.generalisation:
+    if (facts := record.generalisation) and "failed" not in facts:
         kinds.append({
             "title": "Shapes it has not seen",
-            "how": f"{facts['held_out']} shapes, held out of a run of their own, by exponentials",
+            "how": f"{facts['held_out']} shapes, held out while mean and modes were found; exponentials, no networks",
             "figures": [
                 (f"{count:.3g} coordinates", of, components)
                 for count, of, components in zip(facts["counts"], facts["modes"], facts["components"], strict=True)

@@ -108,6 +108,10 @@ def _modes(run: RunDirectory) -> list[Shortfall]:
             else "the others would be zero; a smaller modes.sparsity keeps more, where it isn't 0 already"
         )
         lost.append(Shortfall(f"found {found} of {asked} modes, because {why}"))
+    unfinished = names[np.array(facts.get("codes", ["converged"] * len(names))) != "converged"].tolist()
+    if unfinished:
+        sentence = f"the codes of {len(unfinished)} of {len(names)} shapes may not be the nearest: {_some(unfinished)}"
+        lost.append(Shortfall(sentence))
     if not facts.get("converged", True):
         lost.append(Shortfall("sparse modes: the iteration ended at modes.max_iterations, before it had converged"))
     return lost
@@ -190,10 +194,16 @@ def _export(run: RunDirectory) -> list[Shortfall]:
     ]
 
 
+def _generalisation(run: RunDirectory) -> list[Shortfall]:
+    why = run.generalisation.read_if_written().get("failed")
+    return [Shortfall(f"how near the space comes to unseen shapes was not measured: {why}")] if why else []
+
+
 _STAGES: dict[str, Callable[[RunDirectory], list[Shortfall]]] = {
     "ingest": _ingest,
     "modes": _modes,
     "samples": _samples,
+    "generalisation": _generalisation,
     "evaluation": _evaluation,
     "export": _export,
 }

@@ -13,6 +13,7 @@ from shapespace.shell.exponential import exponential
 from shapespace.shell.exponential_derivative import ExponentialDerivative
 from shapespace.shell.space import DiscretePath, ShellSpace
 from shapespace.solve.least_squares import Box, Stopping, least_squares
+from shapespace.solve.outcome import Status
 from shapespace.training.runs.progress import progress
 from shapespace.training.runs.workers import run
 
@@ -34,11 +35,13 @@ class Codes:
         codes: (n, m).
         vertices: (n, V, 3) their exponentials, aligned to the shapes.
         exponentials: (n,) that each took.
+        status: (n,) of each search.
     """
 
     codes: FloatArray
     vertices: FloatArray
     exponentials: tuple[int, ...]
+    status: tuple[Status, ...]
 
 
 def nearest_codes(
@@ -69,8 +72,8 @@ def nearest_codes(
     items = [(shape, code) for shape, code in zip(shapes, start, strict=True)]
     results = run(partial(_nearest, space, mean, modes, box, steps), items, workers=workers)
     found = dict(progress(results, "codes", "shape", len(items)))
-    codes, vertices, counts = zip(*(found[k] for k in range(len(items))), strict=True)
-    return Codes(np.stack(codes), np.stack(vertices), counts)
+    codes, vertices, counts, status = zip(*(found[k] for k in range(len(items))), strict=True)
+    return Codes(np.stack(codes), np.stack(vertices), counts, status)
 
 
 def box_of(codes: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -88,7 +91,7 @@ def _nearest(
     box: Box,
     steps: int,
     item: tuple[FloatArray, FloatArray],
-) -> tuple[FloatArray, FloatArray, int]:
+) -> tuple[FloatArray, FloatArray, int, Status]:
     target, start = item
     paths: dict[bytes, DiscretePath] = {}
 
@@ -116,4 +119,4 @@ def _nearest(
     # The mean itself is always there.
     first = next(share * start for share in SHARES if shoot(share * start).converged)
     fit = least_squares(residuals, jacobian, first, box, Stopping(TOLERANCE, GAIN, max_evaluations=EXPONENTIALS))
-    return fit.x, align(shoot(fit.x).vertices[-1], target), fit.iterations
+    return fit.x, align(shoot(fit.x).vertices[-1], target), fit.iterations, fit.status

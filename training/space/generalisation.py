@@ -17,10 +17,11 @@ from shapespace.mesh.triangle_mesh import TriangleMesh
 from shapespace.shell.energy import Material
 from shapespace.shell.mean import elastic_mean
 from shapespace.shell.space import ShellSpace
+from shapespace.solve.outcome import Status
 from shapespace.training.runs.config import ModeSettings
 from shapespace.training.space.codes import nearest_codes
 from shapespace.training.space.logarithms import logarithms
-from shapespace.training.space.modes import find_modes, mode_count
+from shapespace.training.space.modes import ModeError, find_modes, mode_count
 
 #: Shapes are held out in so many folds, or one by one where there are fewer than twice as many.
 FOLDS = 5
@@ -117,9 +118,15 @@ def held_out(
         settings: of the modes.
         material: of the shell.
         steps: K of logarithms and exponentials.
+
+    Raises:
+        ModeError: the shapes that are left have no mean, or no modes.
     """
     kept, unseen = np.delete(shapes, index, axis=0), shapes[index]
-    mean = elastic_mean(ShellSpace(reference, material), kept).vertices
+    found = elastic_mean(ShellSpace(reference, material), kept)
+    if found.status is not Status.CONVERGED:
+        raise ModeError(f"without some shapes the others have no mean: {found.reason}")
+    mean = found.vertices
     space = ShellSpace(reference.with_vertices(mean), material)
     fields = logarithms(space, mean, kept, steps).fields
     components = PrincipalComponents.of(kept, reference.vertices)
@@ -127,12 +134,13 @@ def held_out(
         count = mode_count(settings, space, mean, fields)
         counts = [-(-count // 2), count]
     counts = [min(count, len(kept) - 1) for count in counts]
-    by_modes, by_components = [], []
+    reached, by_modes, by_components = [], [], []
     for count in counts:
         modes = find_modes(settings, space, mean, fields, count)
         flat = modes.vertices.reshape(len(modes), -1)
         away = (align(unseen, mean) - mean).reshape(len(unseen), -1)
         start = np.asarray(np.linalg.lstsq(flat.T, away.T)[0].T, dtype=np.float64)
         by_modes.append(nearest_codes(space, mean, modes.vertices, unseen, start, steps).vertices)
-        by_components.append(components.nearest(unseen, count))
-    return HeldOut(index, counts, by_modes, by_components)
+        by_components.append(components.nearest(unseen, len(modes)))
+        reached.append(len(modes))
+    return HeldOut(index, reached, by_modes, by_components)

@@ -183,7 +183,7 @@ def spga(
 def mode_count(settings: ModeSettings, space: ShellSpace, mean: FloatArray, fields: FloatArray) -> int:
     """How many modes settings give for logarithms (n, V, 3) at a mean (V, 3), less than n."""
     asked = worthwhile(space, mean, fields, settings.norm) if settings.count == "auto" else settings.count
-    return min(asked, len(fields) - 1)
+    return max(1, min(asked, len(fields) - 1))
 
 
 def find_modes(settings: ModeSettings, space: ShellSpace, mean: FloatArray, fields: FloatArray, count: int) -> Modes:
@@ -225,11 +225,10 @@ def worthwhile(space: ShellSpace, mean: FloatArray, fields: FloatArray, norm: No
     for held in (np.arange(part, n, parts) for part in range(parts)):
         kept = np.delete(np.arange(n), held)
         values, vectors = np.linalg.eigh(gram[np.ix_(kept, kept)])
-        values, vectors = values[::-1], vectors[:, ::-1]
-        found = gram[np.ix_(held, kept)] @ vectors[:, values > NEGLIGIBLE * problem.total]
-        taken = np.cumsum(found**2 / values[values > NEGLIGIBLE * problem.total], axis=1)
-        taken = np.pad(taken, ((0, 0), (1, n - 1 - taken.shape[1])), mode="edge")
-        taken[:, 0] = 0
+        some = np.flatnonzero(values > NEGLIGIBLE * problem.total)[::-1]
+        along = np.zeros((len(held), n))  # of none, one, two … modes, as many as there are
+        along[:, 1 : 1 + len(some)] = (gram[np.ix_(held, kept)] @ vectors[:, some]) ** 2 / values[some]
+        taken = np.cumsum(along, axis=1)
         left[held] = np.sqrt(np.maximum(gram[held, held][:, None] - taken, 0))
     errors = left.mean(axis=0) / left[:, 0].mean()
     return max(1, int(np.argmin(errors + WORTH * np.arange(n))))

@@ -22,6 +22,7 @@ from shapespace.mesh.triangle_mesh import TriangleMesh, face_areas
 from shapespace.shell.energy import Material
 from shapespace.shell.mean import Mean, elastic_mean
 from shapespace.shell.space import ShellSpace
+from shapespace.solve.cholesky import NotPositiveDefiniteError
 from shapespace.solve.outcome import Status
 from shapespace.training.collection.generators import MESHES
 from shapespace.training.collection.ingest import MeshCollection, normalised, read_collection
@@ -32,7 +33,7 @@ from shapespace.training.space.codes import box_of, nearest_codes
 from shapespace.training.space.factors import between, group, names, overlap
 from shapespace.training.space.generalisation import PrincipalComponents, folds, held_out, summary, vertex_distances
 from shapespace.training.space.logarithms import logarithms
-from shapespace.training.space.modes import find_modes, localisation, mode_count, pga
+from shapespace.training.space.modes import ModeError, find_modes, localisation, mode_count, pga
 from shapespace.training.space.shell_collection import ShellCollection
 
 #: Steps K of the logarithms and exponentials by which a run measures how its space generalises.
@@ -165,7 +166,7 @@ def modes(run: RunDirectory, config: Config) -> dict[str, Any]:
     dense = pga(space, centre.vertices, found.fields, count, settings.norm)
     with waiting("sparse modes"):
         sparse = find_modes(settings, space, centre.vertices, found.fields, count)
-    codes = nearest_codes(space, centre.vertices, sparse.vertices, shapes, sparse.coefficients, config.samples.steps)
+    codes = nearest_codes(space, centre.vertices, sparse.vertices, shapes, sparse.coefficients, settings.log_steps)
     lower, upper = box_of(codes.codes)
     arrays = {
         "nric": sparse.nric,
@@ -190,6 +191,7 @@ def modes(run: RunDirectory, config: Config) -> dict[str, Any]:
         "log_steps": settings.log_steps,
         "steps": list(found.steps),
         "via": list(found.via),
+        "codes": [str(status) for status in codes.status],
     }
     run.decomposition.write(facts | {"reasons": list(found.reasons), "history": sparse.history})
     return facts
@@ -204,19 +206,26 @@ def generalisation(run: RunDirectory, config: Config) -> dict[str, Any]:
     """
     reference, shapes, settings = run.reference_mesh(), run.shapes.read()["vertices"], config.modes
     steps = min(LIGHT_STEPS, settings.log_steps)
+    facts: dict[str, Any]
     parts = folds(len(shapes))
-    every = [
-        held_out(reference, shapes, index, None, settings, material(config), steps)
-        for index in (parts if len(parts) == len(shapes) else parts[:1])
-    ]
+    try:
+        every = [
+            held_out(reference, shapes, index, None, settings, material(config), steps)
+            for index in (parts if len(parts) == len(shapes) else parts[:1])
+        ]
+    except (ModeError, NotPositiveDefiniteError) as error:  # no reason to do without a model
+        facts = {"failed": str(error)}
+        run.generalisation.write(facts)
+        return facts
     index = np.concatenate([each.index for each in every])
     given = shapes[index]
     counts = np.mean([each.counts for each in every], axis=0).tolist()
-    facts: dict[str, Any] = {"held_out": len(index), "steps": steps, "counts": counts}
+    different = slice(0 if counts[0] < counts[1] else 1, None)
+    facts = {"held_out": len(index), "steps": steps, "counts": counts[different]}
     for name in ("modes", "components"):
         near = [np.concatenate(shapes) for shapes in zip(*(getattr(each, f"by_{name}") for each in every), strict=True)]
         away = [vertex_distances(shape, given, reference.diagonal) for shape in near]
-        facts[name] = [summary(each) for each in away]
+        facts[name] = [summary(each) for each in away[different]]
         if name == "modes":
             worst = int(away[-1].mean(axis=1).argmax())
             run.least_general.write(given=given[worst], found=near[-1][worst])

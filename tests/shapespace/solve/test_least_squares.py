@@ -94,6 +94,12 @@ def test_failures_are_values() -> None:
     broken = solve(lambda x: rosenbrock(x) * np.nan, [0, 0], [-2, -2], [2, 2])
     assert broken.status is Status.NOT_FINITE
 
+    def never(x: np.ndarray, r: np.ndarray) -> np.ndarray:
+        raise AssertionError("there is nothing to derive")
+
+    box = Box(np.full(2, -2.0), np.full(2, 2.0), np.ones(2))
+    assert least_squares(lambda x: x * np.nan, never, np.zeros(2), box).status is Status.NOT_FINITE
+
     def cliff(x: np.ndarray) -> np.ndarray:
         """Not finite where the first steps would lead."""
         return np.where(x > 0.5, np.nan, 1.0) * (x - 2)

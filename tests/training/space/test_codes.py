@@ -90,3 +90,5 @@ def test_as_many_modes_as_pay(space, rng):
     assert mode_count(ModeSettings(count=70), space, x, fields) == 24
     assert len(pga(space, x, fields, 24)) > 20
     assert mode_count(ModeSettings(), space, x, fields[:2]) == 1
+    assert mode_count(ModeSettings(), space, x, fields[:1]) == 1
+    assert mode_count(ModeSettings(), space, x, np.repeat(fields[:1], 6, axis=0)) == 1
