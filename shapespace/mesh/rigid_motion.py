@@ -33,6 +33,16 @@ def without_rigid_motion(displacement: FloatArray, vertices: FloatArray) -> Floa
     return (flat - (flat @ motions.T) @ motions).reshape(displacement.shape)
 
 
+def aligned_change(vertices: FloatArray, fields: FloatArray, target: FloatArray) -> FloatArray:
+    """How a shape (V, 3) aligned to a target (V, 3) changes where the shape changes by vertex fields (n, V, 3).
+
+    To first order, and as far as the two are alike: turned as the shape is, and without the rigid motion that alignment
+    takes away.
+    """
+    there = align(vertices, target)
+    return without_rigid_motion(align(vertices, target, carried=vertices + fields) - there, there)
+
+
 def align(vertices: FloatArray, target: FloatArray, carried: FloatArray | None = None) -> FloatArray:
     """Move shapes (…, V, 3) rigidly to come closest to targets (…, V, 3) in least squares over vertices.
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from shapespace.arrays import FloatArray
 from shapespace.coordinates.nric import WeightedNorm, nric, wrap
-from shapespace.mesh.rigid_motion import align, without_rigid_motion
+from shapespace.mesh.rigid_motion import align, aligned_change
 from shapespace.model.correspondence import InvalidMeshError, Matched
 from shapespace.model.decoder import Decoder, MeshChoice, Shape
 from shapespace.model.derivatives import FactorGrids, derivatives, factor_derivatives, nodes
@@ -144,10 +144,8 @@ class Encoder:
                 return weight * (align(shape, target) - target).ravel()
 
             def jacobian(x: FloatArray, _: FloatArray) -> FloatArray:
-                shape, fields = shapes(x), shapes.derivatives(x, derivatives(model, x))
-                there = align(shape, target)
-                turned = align(shape, target, carried=shape + fields) - there
-                return weight * without_rigid_motion(turned, there).reshape(len(fields), -1).T
+                changes = aligned_change(shapes(x), shapes.derivatives(x, derivatives(model, x)), target)
+                return weight * changes.reshape(len(changes), -1).T
 
             stopping = Stopping(TOLERANCE, GAIN, max_evaluations=SHAPES, deadline=deadline)
             try:

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import partial
+from functools import lru_cache, partial
 
 import numpy as np
 
 from shapespace.arrays import FloatArray
-from shapespace.mesh.rigid_motion import align, without_rigid_motion
+from shapespace.mesh.rigid_motion import align, aligned_change
 from shapespace.shell.exponential import exponential
 from shapespace.shell.exponential_derivative import ExponentialDerivative
 from shapespace.shell.space import DiscretePath, ShellSpace
@@ -17,8 +17,8 @@ from shapespace.solve.outcome import Status
 from shapespace.training.runs.progress import progress
 from shapespace.training.runs.workers import run
 
-#: Of the search: it ends once no coefficient would move further than this, or the sum of squares
-#: would shrink by less than this, or after so many exponentials.
+#: Of the search: it ends once no coefficient would move further than this, or the sum of squares would shrink by less
+#: than this, or after so many exponentials.
 TOLERANCE, GAIN, EXPONENTIALS = 1e-3, 1e-3, 25
 #: Where an exponential isn't found at the start, the search begins from these shares of it.
 SHARES = (1.0, 0.75, 0.5, 0.25, 0.0)
@@ -93,30 +93,23 @@ def _nearest(
     item: tuple[FloatArray, FloatArray],
 ) -> tuple[FloatArray, FloatArray, int, Status]:
     target, start = item
-    paths: dict[bytes, DiscretePath] = {}
 
-    def shoot(x: FloatArray) -> DiscretePath:
-        key = x.tobytes()
-        if key not in paths:
-            paths.clear()
-            paths[key] = exponential(space, mean, np.tensordot(x, modes, axes=1), steps)
-        return paths[key]
+    @lru_cache(2)  # the best code's, and that of the step that is tried
+    def shoot(code: tuple[float, ...]) -> DiscretePath:
+        return exponential(space, mean, np.tensordot(np.array(code), modes, axes=1), steps)
 
     def residuals(x: FloatArray) -> FloatArray:
-        path = shoot(x)
+        path = shoot(tuple(x))
         if not path.converged:
             return np.full(target.size, np.nan)
         return (align(path.vertices[-1], target) - target).ravel()
 
     def jacobian(x: FloatArray, _: FloatArray) -> FloatArray:
-        path = shoot(x)
-        shape = path.vertices[-1]
-        fields = ExponentialDerivative(path).push_forward(modes)
-        there = align(shape, target)
-        turned = align(shape, target, carried=shape + fields) - there
-        return without_rigid_motion(turned, there).reshape(len(fields), -1).T
+        path = shoot(tuple(x))
+        changes = aligned_change(path.vertices[-1], ExponentialDerivative(path).push_forward(modes), target)
+        return changes.reshape(len(changes), -1).T
 
     # The mean itself is always there.
-    first = next(share * start for share in SHARES if shoot(share * start).converged)
+    first = next(share * start for share in SHARES if shoot(tuple(share * start)).converged)
     fit = least_squares(residuals, jacobian, first, box, Stopping(TOLERANCE, GAIN, max_evaluations=EXPONENTIALS))
-    return fit.x, align(shoot(fit.x).vertices[-1], target), fit.iterations, fit.status
+    return fit.x, align(shoot(tuple(fit.x)).vertices[-1], target), fit.iterations, fit.status

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from shapespace.mesh.rigid_motion import align
+from shapespace.mesh.rigid_motion import align, aligned_change
 from shapespace.mesh.triangle_mesh import Connectivity, MeshError, TriangleMesh, diagonal, face_areas, face_normals
 from tests.shapespace.conftest import MESHES, TETRAHEDRON
 
@@ -221,6 +221,14 @@ def test_alignment_never_reflects(mesh, move):
 
     assert handedness(found) == pytest.approx(handedness(mirrored))
     assert handedness(found) == pytest.approx(-handedness(mesh.vertices))
+
+
+def test_changes_of_an_aligned_shape_are_those_of_differences(pose, move, rng):
+    target, fields, h = move(pose), rng.standard_normal((3, *pose.shape)), 1e-5
+    found = aligned_change(pose, fields, target)
+    for field, change in zip(fields, found, strict=True):
+        difference = (align(pose + h * field, target) - align(pose - h * field, target)) / (2 * h)
+        assert change == pytest.approx(difference, abs=1e-6)
 
 
 def test_aligning_many_is_aligning_each(mesh, pose, move):
