@@ -8,19 +8,14 @@ from __future__ import annotations
 
 import argparse
 import json
-import tomllib
 from pathlib import Path
 
 import numpy as np
 
-from shapespace.training.runs.config import load
-from shapespace.training.runs.directory import RunDirectory
+from benchmarks.results import COLLECTIONS, ROOT, open_run
 from shapespace.training.space import stages
-from shapespace.training.space.generalisation import FOLDS, folds, held_out, vertex_distances
+from shapespace.training.space.generalisation import FOLDS, folds, held_out
 
-ROOT = Path(__file__).resolve().parents[1]
-#: Quick ones first.
-COLLECTIONS = ("hand", "horse", "hippocampus", "samba", "faces", "makehuman")
 INTRODUCTION = """# Shapes that a space has not seen
 
 Distance of a vertex from its place after rigid alignment, in percent of the bounding box's diagonal: mean and 95th
@@ -37,9 +32,8 @@ measures and writes this page; a collection is in it once all its folds are meas
 
 def measure(name: str, data: Path, out: Path) -> None:
     """Leave a file of figures for each fold of a collection."""
-    example = ROOT / "examples" / "collections" / f"{name}.toml"
-    config, _ = load(example, data / tomllib.loads(example.read_text())["collection"]["data"])
-    run = RunDirectory(out / name)
+    opened = open_run(name, data, out)
+    run, config = opened.directory, opened.config
     if not run.shapes.exists():
         run.folder.mkdir(parents=True, exist_ok=True)
         stages.ingest(run, config)
@@ -53,8 +47,7 @@ def measure(name: str, data: Path, out: Path) -> None:
         material = stages.material(config)
         found = held_out(reference, shapes, index, counts, config.modes, material, stages.LIGHT_STEPS)
         away = {
-            kind: [vertex_distances(near, shapes[index], reference.diagonal).tolist() for near in by_count]
-            for kind, by_count in (("modes", found.by_modes), ("components", found.by_components))
+            name: [each.tolist() for each in rows] for name, rows in found.distances(shapes, reference.diagonal).items()
         }
         file.write({"counts": found.counts, **away})
         print(

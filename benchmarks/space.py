@@ -17,7 +17,7 @@ from shapespace.training.runs.config import Config
 from shapespace.training.runs.directory import RunDirectory
 from shapespace.training.runs.sampling import read
 from shapespace.training.space import modes
-from shapespace.training.space.generalisation import PrincipalComponents, folds, held_out, vertex_distances
+from shapespace.training.space.generalisation import PrincipalComponents, folds, held_out, joined, vertex_distances
 from shapespace.training.space.logarithms import logarithms
 from shapespace.training.space.stages import material
 
@@ -68,13 +68,7 @@ def generalisation(reference: TriangleMesh, shapes: FloatArray, config: Config, 
 
     Everything is found anew without the fold: mean, logarithms, modes.
     """
-    every = [
-        held_out(reference, shapes, index, counts, config.modes, material(config), config.samples.steps)
-        for index in folds(len(shapes))
-    ]
-    found: dict[str, Any] = {}
-    for name in ("modes", "components"):
-        near = zip(*(getattr(each, f"by_{name}") for each in every), strict=True)
-        given = shapes[np.concatenate([each.index for each in every])]
-        found[name] = [float(vertex_distances(np.concatenate(ends), given, reference.diagonal).mean()) for ends in near]
-    return found
+    how = (counts, config.modes, material(config), config.samples.steps)
+    found = joined([held_out(reference, shapes, index, *how) for index in folds(len(shapes))])
+    away = found.distances(shapes, reference.diagonal)
+    return {name: [float(each.mean()) for each in rows] for name, rows in away.items()}

@@ -29,6 +29,7 @@ from shapespace.training.report.pictures import (
 )
 from shapespace.training.report.plots import Line, lines, plot
 from shapespace.training.report.record import HUES, Record
+from shapespace.training.runs.atomic_files import NpzFile
 from shapespace.training.runs.directory import RunDirectory
 from shapespace.training.runs.stages import STAGES
 
@@ -195,7 +196,7 @@ def nearness(record: Record, studio: Studio | None) -> list[dict[str, Any]]:
                 for count, of, components in zip(facts["counts"], facts["modes"], facts["components"], strict=True)
             ],
             "worst": facts["worst"],
-            "file": record.run.least_general,
+            "pictures": _pair(record.run.least_general, facts["worst"], studio),
         })  # fmt: skip
     if facts := record.encoded:
         kinds.append({
@@ -203,16 +204,19 @@ def nearness(record: Record, studio: Studio | None) -> list[dict[str, Any]]:
             "how": f"all {facts['shapes']}, through encode as it is served",
             "figures": [("all coordinates", facts, facts["components"])],
             "worst": facts["worst"],
-            "file": record.run.least_near,
+            "pictures": _pair(record.run.least_near, facts["worst"], studio),
         })  # fmt: skip
-    for kind in kinds:
-        shapes = kind.pop("file").read_if_written()
-        kind["pictures"] = []
-        if studio and {"given", "found"} <= shapes.keys():
-            for name in ("given", "found"):
-                shape = align(shapes[name], studio.base)
-                kind["pictures"].append((studio.draw(shape, f"{kind['worst']}, {name}", LARGE), name))
     return kinds
+
+
+def _pair(file: NpzFile, title: str, studio: Studio | None) -> list[tuple[Markup, str]]:
+    """A shape and what was found for it, where there are any."""
+    shapes = file.read_if_written() if studio else {}
+    return [
+        (studio.draw(align(shapes[name], studio.base), f"{title}, {name}", LARGE), name)
+        for name in ("given", "found")
+        if studio and name in shapes
+    ]
 
 
 def strip(record: Record, studio: Studio) -> Iterator[tuple[str, str, Markup]]:

@@ -94,9 +94,27 @@ class HeldOut:
     """
 
     index: IntArray
-    counts: list[int]
+    counts: Sequence[float]
     by_modes: list[FloatArray]
     by_components: list[FloatArray]
+
+    def distances(self, shapes: FloatArray, diagonal: float) -> dict[str, list[FloatArray]]:
+        """``modes`` and ``components``, for each number (k, V), from shapes (n, V, 3) of the collection; see above."""
+        given = shapes[self.index]
+        near = {"modes": self.by_modes, "components": self.by_components}
+        return {name: [vertex_distances(each, given, diagonal) for each in found] for name, found in near.items()}
+
+
+def joined(parts: Sequence[HeldOut]) -> HeldOut:
+    """The shapes of several folds together; the numbers of modes are means."""
+    return HeldOut(
+        np.concatenate([part.index for part in parts]),
+        np.mean([part.counts for part in parts], axis=0).tolist(),
+        *(
+            [np.concatenate(shapes) for shapes in zip(*by_count, strict=True)]
+            for by_count in ([part.by_modes for part in parts], [part.by_components for part in parts])
+        ),
+    )
 
 
 def held_out(

@@ -31,7 +31,14 @@ from shapespace.training.runs.directory import RunDirectory
 from shapespace.training.runs.progress import progress, waiting
 from shapespace.training.space.codes import box_of, nearest_codes
 from shapespace.training.space.factors import between, group, names, overlap
-from shapespace.training.space.generalisation import PrincipalComponents, folds, held_out, summary, vertex_distances
+from shapespace.training.space.generalisation import (
+    PrincipalComponents,
+    folds,
+    held_out,
+    joined,
+    summary,
+    vertex_distances,
+)
 from shapespace.training.space.logarithms import logarithms
 from shapespace.training.space.modes import ModeError, find_modes, localisation, mode_count, pga
 from shapespace.training.space.shell_collection import ShellCollection
@@ -206,30 +213,29 @@ def generalisation(run: RunDirectory, config: Config) -> dict[str, Any]:
     """
     reference, shapes, settings = run.reference_mesh(), run.shapes.read()["vertices"], config.modes
     steps = min(LIGHT_STEPS, settings.log_steps)
-    facts: dict[str, Any]
     parts = folds(len(shapes))
     try:
-        every = [
-            held_out(reference, shapes, index, None, settings, material(config), steps)
-            for index in (parts if len(parts) == len(shapes) else parts[:1])
-        ]
+        found = joined(
+            [
+                held_out(reference, shapes, index, None, settings, material(config), steps)
+                for index in (parts if len(parts) == len(shapes) else parts[:1])
+            ]
+        )
     except (ModeError, NotPositiveDefiniteError) as error:  # no reason to do without a model
-        facts = {"failed": str(error)}
-        run.generalisation.write(facts)
-        return facts
-    index = np.concatenate([each.index for each in every])
-    given = shapes[index]
-    counts = np.mean([each.counts for each in every], axis=0).tolist()
-    different = slice(0 if counts[0] < counts[1] else 1, None)
-    facts = {"held_out": len(index), "steps": steps, "counts": counts[different]}
-    for name in ("modes", "components"):
-        near = [np.concatenate(shapes) for shapes in zip(*(getattr(each, f"by_{name}") for each in every), strict=True)]
-        away = [vertex_distances(shape, given, reference.diagonal) for shape in near]
-        facts[name] = [summary(each) for each in away[different]]
-        if name == "modes":
-            worst = int(away[-1].mean(axis=1).argmax())
-            run.least_general.write(given=given[worst], found=near[-1][worst])
-            facts["worst"] = str(run.shapes.read()["names"][index[worst]])
+        facts: dict[str, Any] = {"failed": str(error)}
+    else:
+        away = found.distances(shapes, reference.diagonal)
+        worst = int(away["modes"][-1].mean(axis=1).argmax())
+        number = found.index[worst]
+        run.least_general.write(given=shapes[number], found=found.by_modes[-1][worst])
+        different = slice(0 if found.counts[0] < found.counts[1] else 1, None)
+        facts = {
+            "held_out": len(found.index),
+            "steps": steps,
+            "counts": found.counts[different],
+            **{name: [summary(each) for each in rows[different]] for name, rows in away.items()},
+            "worst": str(run.shapes.read()["names"][number]),
+        }
     run.generalisation.write(facts)
     return facts
 
@@ -264,22 +270,20 @@ def encoded(run: RunDirectory, bundle: Path) -> dict[str, Any]:
 
     By ``encode`` as it is served. And ``least-near.npz``, the farthest.
     """
-    model, reference, shapes = shapespace.load(bundle), run.reference.read(), run.shapes.read()
-    scale = float(reference["scale"])
-    given = scale * shapes["vertices"]
-    found = [model.encode(shape) for shape in progress(given, "codes of the shapes", "shape", len(given))]
-    near = np.stack([each.shape.vertices for each in found])
-    away = vertex_distances(near, given, scale * run.reference_mesh().diagonal)
-    outside = [not each.inside_bounds for each in found]
+    model, reference, shapes = shapespace.load(bundle), run.reference_mesh(), run.shapes.read()
+    given, scale = shapes["vertices"], float(run.reference.read()["scale"])
+    found = [model.encode(scale * shape) for shape in progress(given, "codes of the shapes", "shape", len(given))]
+    near = np.stack([each.shape.vertices for each in found]) / scale
+    linear = PrincipalComponents.of(given, reference.vertices).nearest(given, model.latents.dimension)
+    away, other = (vertex_distances(each, given, reference.diagonal) for each in (near, linear))
     worst = int(away.mean(axis=1).argmax())
-    linear = PrincipalComponents.of(given, scale * reference["vertices"]).nearest(given, model.latents.dimension)
     facts = summary(away) | {
-        "components": summary(vertex_distances(linear, given, scale * run.reference_mesh().diagonal)),
+        "components": summary(other),
         "shapes": len(given),
-        "outside": shapes["names"][outside].tolist(),
+        "outside": shapes["names"][[not each.inside_bounds for each in found]].tolist(),
         "worst": str(shapes["names"][worst]),
     }
-    run.least_near.write(given=given[worst] / scale, found=near[worst] / scale)
+    run.least_near.write(given=given[worst], found=near[worst])
     run.encoded.write(facts)
     return facts
 
