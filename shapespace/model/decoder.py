@@ -24,6 +24,7 @@ from shapespace.mesh.rigid_motion import align
 from shapespace.mesh.triangle_mesh import TriangleMesh
 from shapespace.model.latent_space import Bounds, Codes, Distribution, LatentSpace, NotFiniteError, TrainingCodes
 from shapespace.model.networks import PATIENCE, NetworkError, Session, TerminatedError
+from shapespace.model.population import Population
 from shapespace.shell.space import ShellSpace
 from shapespace.solve.deadline import Deadline
 from shapespace.solve.outcome import Status
@@ -134,6 +135,12 @@ class Decoder:
         self.modes, self.file_vertices = bundle.modes, bundle.file_vertices
         codes = bundle.training_codes
         self._training = None if codes is None else TrainingCodes(self.latents, codes)
+        #: What codes are like: those of the training shapes, or where there are none any inside the bounds.
+        self.population = (
+            Population.in_box(self.latents.lower, self.latents.upper)
+            if codes is None
+            else Population.of(codes, self.latents.width)
+        )
         n_nric = 2 * manifest.edges
         self._factors = [Session(bundle, factor, [factor.stop - factor.start], [n_nric]) for factor in manifest.factors]
         self._combiner = Session(bundle, manifest.combiner, [len(manifest.factors), n_nric], [n_nric])
