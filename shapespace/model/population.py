@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import solve_triangular
+from scipy.linalg import cholesky, solve_triangular
 
 from shapespace.arrays import FloatArray
 
@@ -53,7 +53,7 @@ class Population:
 
     @classmethod
     def _of(cls, mean: FloatArray, covariance: FloatArray) -> Population:
-        return cls(mean, covariance, np.linalg.cholesky(covariance))
+        return cls(mean, covariance, cholesky(covariance, lower=True))
 
     def scores(self, codes: FloatArray) -> FloatArray:
         """Codes (…, m) in coordinates in which the Gaussian is standard; their squares sum to Mahalanobis distances."""
