@@ -61,6 +61,6 @@ class Population:
         return result.reshape(codes.shape)
 
     def sample(self, count: int, seed: int, temperature: float = 1.0) -> FloatArray:
-        """Random codes (count, m), the same on every machine; a temperature scales what they differ by from the mean."""
+        """Random codes (count, m), the same on every machine; a temperature scales their differences from the mean."""
         normal = np.random.Generator(np.random.PCG64(seed)).standard_normal((count, len(self.mean)))
         return self.mean + temperature * normal @ self.root.T
