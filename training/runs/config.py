@@ -75,23 +75,18 @@ class ModeSettings(_Section):
     count: Annotated[int, Field(ge=1)] | Literal["auto"] = "auto"
     """Number of modes m; at most the number of shapes less one. ``auto`` takes as many as pay: one more would lower the
     error of shapes that are held out by less than half a percent of how far shapes lie from the mean."""
-    norm: Literal["vertices", "shell"] = "vertices"
-    """In which modes come close to the shapes: ``vertices``, weighted by area, or ``shell``, the metric, as in the
-    paper."""
-    sparsity: float | None = Field(None, ge=0, lt=1)
+    norm: Literal["mixed", "vertices", "shell"] = "mixed"
+    """In which modes come close to the shapes: ``vertices``, weighted by area; ``shell``, the metric, as in the paper,
+    which pays for wrinkles; or ``mixed``, the first and a tenth of the second."""
+    sparsity: Annotated[float, Field(ge=0, lt=1)] | Literal["auto"] = "auto"
     """Weight λ of the sparsity term, as a share of the weight at which every principal mode would vanish. Larger
-    values make each mode move a smaller part; 0 is plain principal geodesic analysis. By default 0.0003 in the norm of
-    vertices, where little of a mode is lost by it, and 0.1 in that of the shell."""
+    values make each mode move a smaller part; 0 is plain principal geodesic analysis. ``auto`` takes the largest
+    that costs shapes which are held out next to nothing: it adds a tenth at most to the square of their error."""
     log_steps: int = Field(16, ge=2)
     """Time steps K of the discrete logarithms. Best equal to ``samples.steps``: only logarithms and exponentials with
     the same K are inverse to each other."""
     max_iterations: int = Field(200, ge=1)
     """Most rounds of the sparse analysis through all modes."""
-
-    @property
-    def price(self) -> float:
-        """``sparsity``, or its default in the norm."""
-        return {"vertices": 3e-4, "shell": 0.1}[self.norm] if self.sparsity is None else self.sparsity
 
 
 class FactorSettings(_Section):

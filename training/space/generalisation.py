@@ -19,7 +19,7 @@ from shapespace.shell.mean import elastic_mean
 from shapespace.shell.space import ShellSpace
 from shapespace.solve.outcome import Status
 from shapespace.training.runs.config import ModeSettings
-from shapespace.training.space.codes import nearest_codes
+from shapespace.training.space.codes import nearest_codes, rough_codes
 from shapespace.training.space.logarithms import logarithms
 from shapespace.training.space.modes import ModeError, find_modes, mode_count
 
@@ -155,9 +155,7 @@ def held_out(
     reached, by_modes, by_components = [], [], []
     for count in counts:
         modes = find_modes(settings, space, mean, fields, count)
-        flat = modes.vertices.reshape(len(modes), -1)
-        away = (align(unseen, mean) - mean).reshape(len(unseen), -1)
-        start = np.asarray(np.linalg.lstsq(flat.T, away.T)[0].T, dtype=np.float64)
+        start = rough_codes(mean, modes.vertices, unseen)
         by_modes.append(nearest_codes(space, mean, modes.vertices, unseen, start, steps).vertices)
         by_components.append(components.nearest(unseen, len(modes)))
         reached.append(len(modes))

@@ -192,6 +192,7 @@ def modes(run: RunDirectory, config: Config) -> dict[str, Any]:
         "modes": len(sparse),
         "converged": sparse.converged,
         "explained": sparse.explained,
+        "sparsity": sparse.sparsity,
         "pga_explained": dense.explained,
         "linearised_logarithms": len(found.fallbacks),
         "asked": count if settings.count == "auto" else settings.count,
