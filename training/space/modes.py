@@ -253,7 +253,7 @@ def worthwhile(space: ShellSpace, mean: FloatArray, fields: FloatArray, norm: No
 
 
 def _judged(norm: Norm) -> Norm:
-    """In which norm shapes that are held out are missed: where it is mixed, the shell's part is there for smoothness."""
+    """In which norm shapes that are held out are missed: in a mixed one the shell is there for smoothness only."""
     return "shell" if norm == "shell" else "vertices"
 
 
