@@ -45,7 +45,7 @@ def load(folder: str | os.PathLike[str], threads: int = 1) -> ShapeModel:
 
     >>> import shapespace
     >>> shapespace.load("models/figure")
-    <ShapeModel figure/1: 20 coordinates, 9 factors, 4601 vertices>
+    <ShapeModel figure/2: 20 coordinates, 10 factors, 4601 vertices>
     """
     path = Path(os.path.abspath(folder))  # the names of the last two folders count, also of "."
     if not (path / MANIFEST).exists():
@@ -68,11 +68,11 @@ class ShapeModel(Decoder):
     >>> import shapespace
     >>> model = shapespace.load("models/figure")
     >>> model.dimension, model.names[0], model.period[0]
-    (20, 'back, 1', None)
+    (20, 'middle, 1', None)
     >>> model.vertices.shape, model.faces.shape
     ((4601, 3), (9198, 3))
     >>> model.manifest.factors[0].name
-    'back'
+    'middle'
     """
 
     def __repr__(self) -> str:

@@ -108,7 +108,7 @@ def hold(folder: Folder, place: Path) -> str:
 
 def sound(folder: Folder, place: Path, data: Path, *, may_fold: bool) -> str:
     """Whether the bundle serves sound shapes, and training shapes come back."""
-    model = ShapeModel(read_bundle(place / "models" / "figure" / "1"))
+    model = ShapeModel(read_bundle(place / "models" / "figure" / "2"))
     faces = Connectivity(model.reference.faces, len(model.reference.vertices))
     left, right = faces.edge_faces[faces.interior].T
 
