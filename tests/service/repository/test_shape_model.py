@@ -81,9 +81,9 @@ def test_the_summary_of_several_shapes_is_their_worst(tmp_path: Path) -> None:
     assert worst([good, good])["status"] == "converged"
 
 
-@pytest.fixture(scope="module", params=["figure", "freaky-torus"])
+@pytest.fixture(scope="module", params=["figure/2", "freaky-torus/1"])
 def bundled(request: pytest.FixtureRequest) -> ShapeModel:
-    return ShapeModel(read_bundle(Path(__file__).parents[3] / "models" / request.param / "1"))
+    return ShapeModel(read_bundle(Path(__file__).parents[3] / "models" / request.param))
 
 
 def wide_codes(model: ShapeModel, count: int) -> np.ndarray:
