@@ -193,10 +193,17 @@ async def edit(
         return await workers.run(make, call)
 
 
-def sample(model: ShapeModel, count: int, seed: int, distribution: Distribution, most: int) -> Codes:
-    """Random codes (count, m) inside the bounds, at most so many; raises NoCodesError or TooManyCodesError."""
+def sample(
+    model: ShapeModel, count: int, seed: int, distribution: Distribution, temperature: float, most: int
+) -> Codes:
+    """Random codes (count, m), at most so many; see ShapeModel.sample.
+
+    Raises:
+        NoCodesError, TooManyCodesError: not between 1 and so many.
+        LatentError: a temperature at which the numbers overflow.
+    """
     require_count(count, most, "count")
-    return model.latents.sample(count, seed, distribution)
+    return model.sample(count, seed, distribution, temperature)
 
 
 def read_mesh(sandbox: Sandbox, upload: Upload, limits: Limits, deadline: Deadline) -> tuple[FloatArray, IntArray]:

@@ -65,10 +65,11 @@ class Bounds(StrEnum):
 
 
 class Distribution(StrEnum):
-    """How random codes are distributed in the bounds."""
+    """How random codes are distributed: in the bounds, or as those of the training shapes are."""
 
     UNIFORM = "uniform"
     GAUSSIAN = "gaussian"
+    POPULATION = "population"
 
 
 class LatentSpace:
@@ -193,8 +194,10 @@ class LatentSpace:
         """Random codes (count, m) inside the bounds, the same on every machine.
 
         Gaussian codes have their mean in the middle of the bounds and a standard deviation of a quarter of the width,
-        before they are cut off at the bounds.
+        before they are cut off at the bounds. Those of the population are not the space's, but the model's.
         """
+        if distribution is Distribution.POPULATION:
+            raise ValueError("the bounds know no population")
         shares = np.random.Generator(np.random.PCG64(seed)).random((count, self.dimension))
         if distribution is Distribution.GAUSSIAN:
             low, high = ndtr(-2.0), ndtr(2.0)

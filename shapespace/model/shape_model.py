@@ -22,7 +22,8 @@ from shapespace.model.correspondence import InvalidMeshError, Matched, match
 from shapespace.model.decoder import Decoder, MeshChoice
 from shapespace.model.edit import PRIOR, Edited, PriorKind, Target, edited
 from shapespace.model.encode import Encoded, Encoder, Objective
-from shapespace.model.latent_space import Bounds, Codes, Distribution, WrongLengthError
+from shapespace.model.latent_space import Bounds, Codes, Distribution, NotFiniteError, WrongLengthError
+from shapespace.model.spread import require_covariance, spread
 from shapespace.solve.deadline import Deadline
 from shapespace.solve.outcome import Status
 
@@ -258,14 +259,21 @@ class ShapeModel(Decoder):
             self, start, pulled, prior, MeshChoice(mesh), deadline, PriorKind(prior_kind), held, samples, seed
         )
 
-    def sample(self, count: int, seed: int = 0, distribution: DistributionName = "uniform") -> Codes:
-        """Random codes (count, m) inside the bounds; one seed gives the same on every machine.
+    def sample(
+        self, count: int, seed: int = 0, distribution: DistributionName = "uniform", temperature: float = 1.0
+    ) -> Codes:
+        """Random codes (count, m); one seed gives the same on every machine.
 
         Args:
             count: how many.
             seed: of the random numbers.
             distribution: "uniform" in the bounds, or "gaussian": around their middle with a standard deviation of a
-                quarter of their width, cut off at them.
+                quarter of their width, cut off at them. Or "population": the Gaussian with shrinkage fitted to the
+                codes of the training shapes (without any: with mean and variances of uniform ones), not cut off.
+            temperature: factor of the differences from the mean of the population; the others have none.
+
+        Raises:
+            LatentError: a temperature that is negative, not finite, or so large that the numbers overflow.
 
         >>> import shapespace
         >>> model = shapespace.load("models/figure")
@@ -273,7 +281,30 @@ class ShapeModel(Decoder):
         >>> codes.shape, bool((codes >= model.lower.astype("f4")).all() and (codes <= model.upper.astype("f4")).all())
         ((3, 20), True)
         """
-        return self.latents.sample(count, seed, Distribution(distribution))
+        if Distribution(distribution) is not Distribution.POPULATION:
+            return self.latents.sample(count, seed, Distribution(distribution))
+        if not 0 <= temperature < np.inf:
+            raise NotFiniteError(f"temperature is {temperature:g}. Give a finite number of at least 0.")
+        return self.latents.codes(self.population.sample(count, seed, temperature))[0]
+
+    def spread(self, code: ArrayLike, covariance: ArrayLike, mesh: MeshName = "fine") -> FloatArray:
+        """Standard deviation (V,) of where the vertices of a code's shape are, as ``decode`` answers them.
+
+        Args:
+            code: (m,).
+            covariance: (m, m) of codes around it, as ``edit`` and ``encode`` find it.
+            mesh: "fine" or "coarse".
+
+        Raises:
+            LatentError: a code of the wrong length, or numbers that are not finite, or no covariance.
+
+        >>> import numpy as np, shapespace
+        >>> model = shapespace.load("models/figure")
+        >>> model.spread(np.zeros(20), model.population.covariance).shape
+        (4601,)
+        """
+        checked, _ = self.latents.code(np.asarray(code, dtype=np.float64).tolist())
+        return spread(self, checked, require_covariance(self, covariance), MeshChoice(mesh))
 
     @cached_property
     def _encoder(self) -> Encoder:

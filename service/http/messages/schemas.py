@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Any
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from shapespace.files.colouring import Quantity
 from shapespace.model.decoder import MeshChoice
@@ -43,6 +43,9 @@ class MeshRequest(Body):
     latent: Latent
     mesh: MeshField = MeshChoice.FINE
     bounds: BoundsField = Bounds.ALLOW
+    covariance: Annotated[list[Annotated[list[Number], Field(fail_fast=True)]] | None, Field(fail_fast=True)] = Field(
+        None, description="With `?color=spread`: m × m, of codes around this one, as `edit` and `encode` answer it."
+    )
 
 
 class VerticesRequest(Body):
@@ -112,8 +115,18 @@ class SampleRequest(Body):
     distribution: Distribution = Field(
         Distribution.UNIFORM,
         description="In the bounds uniform, or gaussian: around their middle, with a standard deviation of a quarter "
-        "of their width, and cut off at them.",
+        "of their width, and cut off at them. Or the population: the Gaussian with shrinkage fitted to the codes of "
+        "the training shapes, not cut off.",
     )
+    temperature: Number = Field(
+        1.0, ge=0, description="With `population`: factor of the differences from its mean. Otherwise it is 1."
+    )
+
+    @model_validator(mode="after")
+    def _of_the_population(self) -> SampleRequest:
+        if self.temperature != 1 and self.distribution is not Distribution.POPULATION:
+            raise ValueError('temperature goes with "distribution": "population"')
+        return self
 
 
 class NRICRequest(Body):

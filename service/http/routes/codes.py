@@ -120,6 +120,7 @@ async def edit(
 async def sample(
     service: ServiceDependency, model: Model, body: Annotated[SampleRequest, Depends(JSONBody(SampleRequest))]
 ) -> Response:
-    """Random codes inside the bounds; one seed gives the same from every replica."""
-    latents = codes.sample(model, body.count, body.seed, body.distribution, service.settings.max_codes)
+    """Random codes, inside the bounds or as those of the training shapes; one seed gives the same everywhere."""
+    most = service.settings.max_codes
+    latents = codes.sample(model, body.count, body.seed, body.distribution, body.temperature, most)
     return Response(dump_json({"latents": latents}), media_type="application/json")

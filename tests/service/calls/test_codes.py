@@ -160,13 +160,31 @@ def test_samples_depend_on_their_seed_alone_and_lie_inside_the_bounds(client: ht
     np.testing.assert_array_equal(sample(), sample(count=1, seed=0, distribution="uniform"))
 
 
+def test_samples_of_the_population_are_like_the_training_codes(client: httpx.Client) -> None:
+    def sample(**body: Any) -> np.ndarray:
+        asked = {"count": 20, "distribution": "population"} | body
+        drawn = [client.post(SAMPLE, json=asked | {"seed": seed}).raise_for_status() for seed in range(25)]
+        return np.concatenate([answer.json()["latents"] for answer in drawn])
+
+    codes = sample()
+    # Of the first and last coordinates that tests.service.bundles writes; the second is an angle, which goes round.
+    training = np.array([[0, 0], [0, 0.1], [0, 0.2], [0.1, 0.5], [0.1, 0.5]])
+    np.testing.assert_allclose(codes[:, [0, 2]].mean(axis=0), training.mean(axis=0), atol=0.15 * 0.1)
+    np.testing.assert_allclose(codes[:, [0, 2]].std(axis=0), training.std(axis=0), rtol=0.1)
+    narrow = sample(temperature=0.5)[:, [0, 2]]
+    np.testing.assert_allclose(narrow, (codes[:, [0, 2]] + training.mean(axis=0)) / 2, atol=1e-6)
+
+
 def test_bad_samples_are_told_what_to_do(client: httpx.Client) -> None:
     for body, says in (
         ({"count": 21}, "the limit is 20"),
         ({"count": 0}, "at least 1"),
         ({"count": 2.5}, "whole number"),
         ({"seed": -1}, "at least 0"),
-        ({"distribution": "cauchy"}, "'uniform' or 'gaussian'"),
+        ({"distribution": "cauchy"}, "'uniform', 'gaussian' or 'population'"),
+        ({"distribution": "population", "temperature": -1}, "at least 0"),
+        ({"distribution": "population", "temperature": 1e300}, "not a finite number"),
+        ({"temperature": 2}, 'goes with "distribution": "population"'),
     ):
         answer = client.post(SAMPLE, json=body)
         assert answer.status_code == 422, answer.text

@@ -6,9 +6,11 @@ import pytest
 from shapespace.arrays import FloatArray
 from shapespace.mesh.triangle_mesh import TriangleMesh
 from shapespace.model.correspondence import InvalidMeshError
+from shapespace.model.latent_space import NotFiniteError
 from shapespace.model.population import Population
 from shapespace.model.posterior import Posterior, independent_share
 from shapespace.model.shape_model import ShapeModel, load
+from shapespace.model.spread import InvalidCovarianceError
 from tests.service.bundles import SCALE, write_bundle
 from tests.service.conftest import ROOT
 
@@ -134,3 +136,32 @@ def test_a_mesh_in_other_units_is_refused_by_how_much(model: ShapeModel) -> None
         with pytest.raises(InvalidMeshError, match=f"{said}.* times as large.*: send it in the training meshes' units"):
             model.encode(times * shape)
     assert SCALE != 1, "the units of the files are not those of the networks"
+
+
+def test_samples_of_the_population_have_its_moments(figure: ShapeModel) -> None:
+    codes = figure.sample(4000, 1, "population").astype(np.float64)
+    population = figure.population
+    spread = np.sqrt(np.diag(population.covariance))
+    np.testing.assert_allclose((codes.mean(axis=0) - population.mean) / spread, 0, atol=0.07)
+    found = np.cov(codes.T) / np.outer(spread, spread)
+    np.testing.assert_allclose(found, population.covariance / np.outer(spread, spread), atol=0.09)
+    assert (codes > figure.upper).any(), "they are not cut off"
+    half = figure.sample(10, 1, "population", 0.5)
+    np.testing.assert_allclose(half - population.mean, (codes[:10] - population.mean) / 2, atol=1e-6)
+    for temperature in (-1, np.inf, np.nan, 1e300):
+        with pytest.raises(NotFiniteError):
+            figure.sample(1, 1, "population", temperature)
+
+
+def test_the_spread_of_a_pulled_vertex_is_its_sigma(figure: ShapeModel) -> None:
+    start = np.zeros(20)
+    shape, vertex, sigma = figure.decode(start), 100, 0.01
+    found = figure.edit(start, {vertex: shape[vertex]}, sigma=sigma)
+    spread = figure.spread(found.code, found.covariance)
+    prior = figure.spread(found.code, figure.population.covariance)
+    assert spread[vertex] <= 1.01 * np.sqrt(3) * sigma
+    assert prior[vertex] > 3 * spread[vertex]
+    far = np.linalg.norm(shape - shape[vertex], axis=1).argmax()
+    assert spread[far] > 0.5 * prior[far]
+    with pytest.raises(InvalidCovarianceError, match="20 rows of 20"):
+        figure.spread(start, np.eye(3))
