@@ -8,14 +8,14 @@ from functools import cached_property
 
 import numpy as np
 
-from shapespace.arrays import FloatArray
+from shapespace.arrays import FloatArray, IntArray
 from shapespace.coordinates.nric import WeightedNorm, nric, wrap
 from shapespace.mesh.rigid_motion import align, aligned_change
 from shapespace.model.correspondence import InvalidMeshError, Matched
 from shapespace.model.decoder import Decoder, MeshChoice, Shape
 from shapespace.model.derivatives import FactorGrids, derivatives, factor_derivatives, nodes
 from shapespace.model.latent_space import Bounds, Codes, Fixed, NotFiniteError
-from shapespace.model.posterior import Posterior, independent_share
+from shapespace.model.posterior import Posterior, independent_share, patches_of
 from shapespace.model.searched_shapes import SearchedShapes
 from shapespace.solve.cholesky import NotPositiveDefiniteError
 from shapespace.solve.deadline import Deadline
@@ -173,7 +173,7 @@ class Encoder:
         """Around a code (m,), given its shape (V, 3) and that of the mesh (V, 3), both coarse and normalised."""
         model, count = self.model, len(target)
         misfit = align(shape, target) - target
-        share = independent_share(misfit, model.reference)
+        share = independent_share(misfit, self._patches)
         # What is fitted takes up some of the observations; and no shape is known better than it is solved for.
         observed = 3 * count * share
         left = max(observed - 6 - int((~fixed.mask).sum()), 1.0)
@@ -187,6 +187,11 @@ class Encoder:
             fields = np.zeros((len(code), *shape.shape))
         changes = aligned_change(shape, fields, target).reshape(len(code), -1)
         return Posterior.of(share / variance * changes @ changes.T, model.population, fixed.mask)
+
+    @cached_property
+    def _patches(self) -> list[IntArray]:
+        """Of the coarse mesh; made once, as they take as long as a shape."""
+        return patches_of(self.model.reference.vertices)
 
     def _by_vertices(self, target: FloatArray, near: Fit, box: Box, fixed: Fixed, deadline: Deadline | None) -> Fit:
         """The fit to vertices (V, 3), from one nearby, which stands where its shape has all but collapsed."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,7 +10,6 @@ from numpy.typing import NDArray
 from scipy.linalg import cholesky, solve_triangular
 
 from shapespace.arrays import FloatArray, IntArray
-from shapespace.mesh.triangle_mesh import TriangleMesh
 from shapespace.model.latent_space import Codes, LatentSpace
 from shapespace.model.population import Population
 
@@ -57,33 +57,36 @@ class Posterior:
         return latents.codes(code + normal @ self.root.T)[0]
 
 
-def independent_share(residuals: FloatArray, mesh: TriangleMesh) -> float:
+def independent_share(residuals: FloatArray, patches: Iterable[IntArray]) -> float:
     """What share of the residuals (V, 3) of a mesh's vertices counts as independent observations, 1 at most.
 
     Neighbours miss their places alike: a sum over a patch of b vertices has a variance of b · τ times that of one
     vertex, where independent ones would have τ = 1. The share is 1/τ, for patches of the size at which τ is largest
     (integrated autocorrelation by batch means; Geyer 1992).
+
+    Args:
+        residuals: of a fit.
+        patches: of the vertices, see ``patches_of``.
     """
     count, square = len(residuals), float((residuals**2).mean())
     if square == 0:
         return 1.0
     inflation = 1.0
-    order = _patches(mesh.vertices, [size for size in PATCHES if SMALLEST * size <= count])
-    for patch in order:
+    for patch in patches:
         sums = np.stack([np.bincount(patch, column) for column in residuals.T], axis=1)
         inflation = max(inflation, float((sums**2).sum() / (3 * count * square)))
     return 1 / inflation
 
 
-def _patches(points: FloatArray, sizes: list[int]) -> list[IntArray]:
-    """(V,) by number of patches, the patch of each point (V, 3): that of the nearest of as many points far apart."""
-    found, away, nearest = [], np.full(len(points), np.inf), np.zeros(len(points), np.int64)
-    next_one = 0
+def patches_of(points: FloatArray) -> list[IntArray]:
+    """(V,) for each number of PATCHES, the patch of each point (V, 3): that of the nearest of as many far apart."""
+    sizes = [size for size in PATCHES if SMALLEST * size <= len(points)]
+    found, away, nearest, following = [], np.full(len(points), np.inf), np.zeros(len(points), np.int64), 0
     for k in range(max(sizes, default=0)):
-        distance = ((points - points[next_one]) ** 2).sum(axis=1)
+        distance = ((points - points[following]) ** 2).sum(axis=1)
         nearest = np.where(distance < away, k, nearest)
         away = np.minimum(away, distance)
-        next_one = int(away.argmax())
+        following = int(away.argmax())
         if k + 1 in sizes:
             found.append(nearest.copy())
     return found

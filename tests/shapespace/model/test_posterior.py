@@ -8,7 +8,7 @@ from shapespace.mesh.triangle_mesh import TriangleMesh
 from shapespace.model.correspondence import InvalidMeshError
 from shapespace.model.latent_space import NotFiniteError
 from shapespace.model.population import Population
-from shapespace.model.posterior import Posterior, independent_share
+from shapespace.model.posterior import Posterior, independent_share, patches_of
 from shapespace.model.shape_model import ShapeModel, load
 from shapespace.model.spread import InvalidCovarianceError
 from tests.service.bundles import SCALE, write_bundle
@@ -63,8 +63,8 @@ def test_data_and_population_add_up_as_in_linear_regression(population: Populati
 def test_residuals_of_neighbours_count_less_the_more_they_are_alike(
     mesh: TriangleMesh, rng: np.random.Generator
 ) -> None:
-    noise = rng.standard_normal((len(mesh.vertices), 3))
-    alone = independent_share(noise, mesh)
+    noise, patches = rng.standard_normal((len(mesh.vertices), 3)), patches_of(mesh.vertices)
+    alone = independent_share(noise, patches)
     assert 0.3 < alone <= 1
     i, j = mesh.edges.T
     smooth, shares = noise, []
@@ -73,11 +73,11 @@ def test_residuals_of_neighbours_count_less_the_more_they_are_alike(
         np.add.at(around, i, smooth[j])
         np.add.at(around, j, smooth[i])
         smooth = around
-        shares.append(independent_share(smooth, mesh))
+        shares.append(independent_share(smooth, patches))
     assert shares == sorted(shares, reverse=True)
     assert shares[-1] < alone / 2
-    assert independent_share(7 * noise, mesh) == pytest.approx(alone)
-    assert independent_share(0 * noise, mesh) == 1
+    assert independent_share(7 * noise, patches) == pytest.approx(alone)
+    assert independent_share(0 * noise, patches) == 1
 
 
 def bumps(figure: ShapeModel, size: float, width: float, rng: np.random.Generator) -> FloatArray:
