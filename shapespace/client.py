@@ -22,6 +22,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 Options = str | int | float | bool | None
+#: ``rotation`` (3, 3), ``translation`` (3,) and ``scale``, each of which may be left out.
+Placement = Mapping[str, Any]
 
 
 class ClientError(Exception):
@@ -95,25 +97,50 @@ class Client:
         card: dict[str, Any] = self._send("GET", f"/v1/models/{name}", params={"version": version}).json()
         return card
 
-    def mesh(self, name: str, latent: ArrayLike | None = None, format: str = "glb", **options: Options) -> bytes:
+    def mesh(
+        self,
+        name: str,
+        latent: ArrayLike | None = None,
+        format: str = "glb",
+        *,
+        place: Placement | None = None,
+        covariance: ArrayLike | None = None,
+        **options: Options,
+    ) -> bytes:
         """The file of one shape, or of the reference.
 
         Args:
             name: of the model.
             latent: (m,).
             format: glb, gltf, obj, ply, stl, npz or json.
+            place: where to answer it, as ``edit`` answers a ``placement``.
+            covariance: (m, m) of codes around ``latent``, to colour the shape by how far its vertices may be.
             options: version, mesh ("fine" or "coarse"), bounds ("allow", "clamp" or "reject"), color.
         """
+        path, params = f"/v1/models/{name}/mesh", {"format": format, "place": _json(place), **options}
+        if covariance is not None:
+            body = {"latent": _numbers([] if latent is None else latent), "covariance": _numbers(covariance)}
+            if "bounds" in params:
+                body["bounds"] = params.pop("bounds")
+            return self._send("POST", path, params={"color": "spread"} | params, json=body).content
         code = None if latent is None else ",".join(map(repr, _numbers(latent)))
-        return self._send("GET", f"/v1/models/{name}/mesh", params={"latent": code, "format": format} | options).content
+        return self._send("GET", path, params={"latent": code} | params).content
 
-    def shape(self, name: str, latent: ArrayLike | None = None, **options: Options) -> Mesh:
+    def shape(
+        self, name: str, latent: ArrayLike | None = None, *, place: Placement | None = None, **options: Options
+    ) -> Mesh:
         """One shape, or the reference, as arrays; options as for ``mesh``."""
-        arrays = _arrays(self.mesh(name, latent, "npz", **options))
+        arrays = _arrays(self.mesh(name, latent, "npz", place=place, **options))
         return Mesh(arrays["vertices"].astype(np.float32), arrays["faces"].astype(np.int64))
 
     def vertices(
-        self, name: str, latents: ArrayLike, *, version: str | None = None, **options: Options
+        self,
+        name: str,
+        latents: ArrayLike,
+        *,
+        version: str | None = None,
+        place: Placement | None = None,
+        **options: Options,
     ) -> NDArray[np.float32]:
         """Positions (n, V, 3) of codes (n, m).
 
@@ -121,12 +148,13 @@ class Client:
             name: of the model.
             latents: (n, m).
             version: of the model.
+            place: where to answer them, see ``mesh``.
             options: mesh ("fine" or "coarse"), bounds ("allow", "clamp" or "reject").
         """
         answer = self._send(
             "POST",
             f"/v1/models/{name}/vertices",
-            params={"version": version, "format": "npz"},
+            params={"version": version, "format": "npz", "place": _json(place)},
             json={"latents": _numbers(latents), **options},
         )
         return _arrays(answer.content)["vertices"].astype(np.float32)
@@ -163,7 +191,13 @@ class Client:
         return Interpolation(self, answer["id"], answer["frames"])
 
     def encode(
-        self, name: str, mesh: Mesh | bytes | Path, format: str | None = None, **options: Options
+        self,
+        name: str,
+        mesh: Mesh | bytes | Path,
+        format: str | None = None,
+        *,
+        fixed: Mapping[int, float] | None = None,
+        **options: Options,
     ) -> dict[str, Any]:
         """The code whose shape is closest to a mesh in correspondence, whatever its rotation and position.
 
@@ -171,10 +205,12 @@ class Client:
             name: of the model.
             mesh: arrays, a file or its content.
             format: of the content; by default the file's suffix.
-            options: version, bounds ("allow", "clamp" or "reject"), objective ("vertices" or "nric").
+            fixed: value by coordinate that the code keeps.
+            options: version, bounds ("allow", "clamp" or "reject"), objective ("vertices" or "nric"); samples, how many
+                codes to draw from the posterior; seed.
 
         Returns:
-            ``latent``, ``residual``, ``vertex_error`` and more.
+            ``latent``, ``residual``, ``vertex_error``, ``covariance``, ``samples`` and more.
         """
         if isinstance(mesh, Mesh):
             buffer = io.BytesIO()
@@ -185,7 +221,7 @@ class Client:
         else:
             content = mesh
         headers = {"Content-Type": "application/octet-stream"}
-        params = {"format": format, **options}
+        params = {"format": format, "fixed": _json(_by_index(fixed)), **options}
         found: dict[str, Any] = self._send(
             "POST", f"/v1/models/{name}/encode", params=params, content=content, headers=headers
         ).json()
@@ -195,9 +231,11 @@ class Client:
         self,
         name: str,
         latent: ArrayLike,
-        targets: Mapping[int, Sequence[float]],
+        targets: Mapping[int, Sequence[float] | Mapping[str, Any]],
         *,
         version: str | None = None,
+        sigma: float | None = None,
+        fixed: Mapping[int, float] | None = None,
         **options: Options,
     ) -> dict[str, Any]:
         """The code inside the hypercube whose shape comes closest to having some vertices at some places.
@@ -205,24 +243,40 @@ class Client:
         Args:
             name: of the model.
             latent: (m,) to start from.
-            targets: position (3,) by vertex.
+            targets: position (3,) by vertex, in the frame in which the shape of ``latent`` is answered, or
+                ``{"position", "sigma"}``.
             version: of the model.
-            options: prior, the weight that holds the code back; mesh, the one whose vertices are meant.
+            sigma: standard deviation of the targets that have none.
+            fixed: value by coordinate that the code keeps.
+            options: prior, the weight that holds the code back; prior_kind, "groups" or "ridge"; mesh, the one whose
+                vertices are meant; samples, how many codes to draw from the posterior; seed.
 
         Returns:
-            ``latent``, ``residual`` and more.
+            ``latent``, ``placement``, ``residual``, ``covariance``, ``samples`` and more.
         """
-        places = [{"vertex": int(vertex), "position": _numbers(position)} for vertex, position in targets.items()]
+        places = []
+        for vertex, target in targets.items():
+            given = target if isinstance(target, Mapping) else {"position": _numbers(target)}
+            places.append({"vertex": int(vertex)} | ({} if sigma is None else {"sigma": sigma}) | dict(given))
+        held = {} if fixed is None else {"fixed": _by_index(fixed)}
         found: dict[str, Any] = self._send(
             "POST",
             f"/v1/models/{name}/edit",
             params={"version": version},
-            json={"latent": _numbers(latent), "targets": places, **options},
+            json={"latent": _numbers(latent), "targets": places, **held, **options},
         ).json()
         return found
 
     def sample(self, name: str, count: int, *, version: str | None = None, **options: Options) -> NDArray[np.float64]:
-        """Random codes (count, m) in the hypercube; options: seed, distribution ("uniform" or "gaussian")."""
+        """Random codes (count, m).
+
+        Args:
+            name: of the model.
+            count: how many.
+            version: of the model.
+            options: seed; distribution, "uniform" or "gaussian" inside the bounds, or "population", as the codes of the
+                training shapes; temperature, the factor of the population's differences from its mean.
+        """
         answer = self._send(
             "POST", f"/v1/models/{name}/sample", params={"version": version}, json={"count": count, **options}
         ).json()
@@ -284,6 +338,16 @@ class Interpolation:
             "GET", f"/v1/interpolations/{self.id}{path}", params={"format": format}
         ).content
         return content
+
+
+def _by_index(fixed: Mapping[int, float] | None) -> dict[str, float] | None:
+    """As JSON has it, whose members have names."""
+    return None if fixed is None else {str(int(index)): float(value) for index, value in fixed.items()}
+
+
+def _json(value: Mapping[Any, Any] | None) -> str | None:
+    """As it stands in an address."""
+    return None if value is None else json.dumps(value, default=lambda array: array.tolist())
 
 
 def _numbers(values: ArrayLike) -> Any:

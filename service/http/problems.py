@@ -18,7 +18,8 @@ from shapespace.model.correspondence import InvalidMeshError
 from shapespace.model.decoder import ModelFailedError, NetworkTimeError
 from shapespace.model.edit import InvalidTargetError
 from shapespace.model.exact_shapes import NoTangentSpaceError
-from shapespace.model.latent_space import NotFiniteError, OutOfBoundsError, WrongLengthError
+from shapespace.model.latent_space import InvalidFixedError, NotFiniteError, OutOfBoundsError, WrongLengthError
+from shapespace.model.spread import InvalidCovarianceError
 from shapespace.service.limits.workers import BusyError, DeadlineError, DisconnectedError, EndingError
 from shapespace.service.repository.repository import UnknownModelError, UnknownVersionError
 from shapespace.service.use_cases.animation import PathTooLongError, UnknownInterpolationError
@@ -84,6 +85,8 @@ _OF_EXCEPTION: dict[type[Exception], str] = {
     WrongLengthError: "wrong-length",
     NotFiniteError: "not-finite",
     OutOfBoundsError: "out-of-bounds",
+    InvalidFixedError: "invalid-request",
+    InvalidCovarianceError: "invalid-request",
     NoCodesError: "invalid-request",
     TooManyCodesError: "too-many-codes",
     TooManyFramesError: "too-many-frames",

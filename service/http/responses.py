@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import asdict
 from typing import Any
 
+import numpy as np
 from fastapi import Request, Response
 from fastapi.responses import StreamingResponse
 from starlette.types import Receive, Scope, Send
@@ -49,8 +50,14 @@ async def shape_response(
     service: Service, request: Request, caller: Caller, model: ShapeModel, wanted: WantedShape
 ) -> Response:
     """One shape as a file, as it was answered before where it was."""
-    colours = (wanted.colour_by.quantity, _bytes_of(wanted.colour_by.against)) if wanted.colour_by else ()
-    tag = entity_tag("shape", model.digest, _bytes_of(wanted.code), wanted.mesh, wanted.format, *colours)
+    options: list[str | bytes] = []
+    if colour_by := wanted.colour_by:
+        covariance = colour_by.covariance
+        told = _bytes_of(colour_by.against) if covariance is None else covariance.tobytes()
+        options += [colour_by.quantity, told]
+    if place := wanted.place:
+        options += ["place", *(np.asarray(part).tobytes() for part in (place.rotation, place.translation, place.scale))]
+    tag = entity_tag("shape", model.digest, _bytes_of(wanted.code), wanted.mesh, wanted.format, *options)
     if unchanged := not_modified(request, tag):
         return unchanged
     answer, seconds = service.answers.get(tag), _NO_TIME

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 
 from shapespace.arrays import FloatArray, IntArray
 from shapespace.files.limits import Limits
 from shapespace.model.correspondence import limits, match
 from shapespace.model.decoder import MeshChoice
-from shapespace.model.edit import Target, edited, require_targets
+from shapespace.model.edit import PriorKind, Target, edited, require_targets
 from shapespace.model.encode import Objective
 from shapespace.model.latent_space import Bounds, Codes, Distribution
 from shapespace.model.shape_model import ShapeModel
@@ -65,6 +65,28 @@ class Upload:
     format: str | None
 
 
+@dataclass(frozen=True)
+class Wishes:
+    """What may be asked of any search for a code.
+
+    Attributes:
+        fixed: value by coordinate that the code keeps.
+        samples: codes to draw from the posterior.
+        seed: of these.
+        most: samples that are answered at once.
+    """
+
+    fixed: Mapping[int, float]
+    samples: int
+    seed: int
+    most: int
+
+    def require_few(self) -> None:
+        """Raise TooManyCodesError where there are to be more samples than that."""
+        if self.samples:
+            require_count(self.samples, self.most, "samples")
+
+
 async def encode(
     workers: Workers,
     sandbox: Sandbox,
@@ -73,20 +95,24 @@ async def encode(
     upload: Upload,
     bounds: Bounds,
     objective: Objective,
+    wishes: Wishes,
 ) -> Found:
     """The code whose shape comes closest to a mesh in correspondence, in any rigid pose; see ShapeModel.encode.
 
     Raises:
         UploadError, InvalidMeshError: no mesh that can be used.
-        LatentError: numbers that overflow, or a code outside the bounds where that is refused.
+        LatentError: numbers that overflow, a code outside the bounds where that is refused, or no such coordinate.
+        TooManyCodesError: more samples than codes are answered at once.
         BusyError, DeadlineError, DisconnectedError, EndingError: no place, or the call ended before.
     """
+    wishes.require_few()
+    model.latents.fixed(wishes.fixed)  # refused before the file is read
 
     def make(deadline: Deadline) -> Found:
         began = time.perf_counter()
         given = match(model, *read_mesh(sandbox, upload, limits(model), deadline))
         read = time.perf_counter()
-        found = model.encode(given, bounds, deadline, objective)
+        found = model.encode(given, bounds, deadline, objective, wishes.fixed, wishes.samples, wishes.seed)
         if found.status is Status.DEADLINE:
             raise workers.late()
         seconds = {"read": read - began, "search": time.perf_counter() - read}
@@ -100,6 +126,8 @@ async def encode(
             "iterations": found.iterations,
             "mesh": found.mesh,
             "diagnostics": asdict(found.shape.diagnostics),
+            "covariance": found.covariance,
+            "samples": found.samples,
         }
         return Found(dump_json(content), seconds)
 
@@ -114,7 +142,9 @@ async def edit(
     latent: Sequence[float],
     targets: Sequence[Target],
     prior: float,
+    prior_kind: PriorKind,
     mesh: MeshChoice,
+    wishes: Wishes,
 ) -> Found:
     """The code inside the bounds whose shape comes closest to having some vertices at some places.
 
@@ -125,19 +155,24 @@ async def edit(
         latent: (m,) to start from, clamped to the bounds.
         targets: vertices of the mesh, and where they should be.
         prior: weight of the change of the code.
+        prior_kind: what of the change costs.
         mesh: that the targets' vertices belong to.
+        wishes: of the code and around it.
 
     Raises:
         InvalidTargetError: no such vertex, or too many targets.
-        LatentError: a start that can't be used.
+        LatentError: a start that can't be used, or no such coordinate.
+        TooManyCodesError: more samples than codes are answered at once.
         BusyError, DeadlineError, DisconnectedError, EndingError: no place, or the call ended before.
     """
     require_targets(model, targets, mesh)
+    wishes.require_few()
     start, _ = model.latents.code(latent, Bounds.CLAMP)
+    fixed = model.latents.fixed(wishes.fixed)
 
     def make(deadline: Deadline) -> Found:
         began = time.perf_counter()
-        found = edited(model, start, targets, prior, mesh, deadline)
+        found = edited(model, start, targets, prior, mesh, deadline, prior_kind, fixed, wishes.samples, wishes.seed)
         if found.status is Status.DEADLINE:
             raise workers.late()
         seconds = {"search": time.perf_counter() - began}
@@ -147,7 +182,10 @@ async def edit(
             "distances": found.distances,
             "status": found.status,
             "iterations": found.iterations,
+            "placement": {"rotation": found.placement.rotation, "translation": found.placement.translation, "scale": 1},
             "diagnostics": asdict(found.shape.diagnostics),
+            "covariance": found.covariance,
+            "samples": found.samples,
         }
         return Found(dump_json(content), seconds)
 
@@ -155,10 +193,17 @@ async def edit(
         return await workers.run(make, call)
 
 
-def sample(model: ShapeModel, count: int, seed: int, distribution: Distribution, most: int) -> Codes:
-    """Random codes (count, m) inside the bounds, at most so many; raises NoCodesError or TooManyCodesError."""
+def sample(
+    model: ShapeModel, count: int, seed: int, distribution: Distribution, temperature: float, most: int
+) -> Codes:
+    """Random codes (count, m), at most so many; see ShapeModel.sample.
+
+    Raises:
+        NoCodesError, TooManyCodesError: not between 1 and so many.
+        LatentError: a temperature at which the numbers overflow.
+    """
     require_count(count, most, "count")
-    return model.latents.sample(count, seed, distribution)
+    return model.sample(count, seed, distribution, temperature)
 
 
 def read_mesh(sandbox: Sandbox, upload: Upload, limits: Limits, deadline: Deadline) -> tuple[FloatArray, IntArray]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import re
 from typing import Annotated
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
@@ -12,6 +14,25 @@ Whole = Annotated[
     int,
     Field(strict=True),
     BeforeValidator(lambda given: int(given) if isinstance(given, float) and given.is_integer() else given),
+]
+
+
+def _by_index(given: object) -> object:
+    # Told at the first fault: there may be as many as members.
+    if isinstance(given, dict):
+        for index, value in given.items():
+            if not re.fullmatch("[0-9]{1,6}", str(index)):
+                raise ValueError(f'{str(index)[:20]!r} is no index; send numbers by index, as in {{"3": 0.5}}')
+            if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+                raise ValueError(f"the value at {index} is not a finite number")
+    return given
+
+
+#: Numbers by index; the members of a JSON object have names only, so that these are digits.
+NumbersByIndex = Annotated[
+    dict[int, float],
+    BeforeValidator(_by_index),
+    Field(json_schema_extra={"propertyNames": {"pattern": "^[0-9]{1,6}$"}}),
 ]
 #: Members that an object may have: each unknown one is a fault.
 _MEMBERS = 32

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from shapespace.files.archives import Buffer, npz_pieces
 from shapespace.files.formats import OCTET_STREAM
+from shapespace.mesh.rigid_motion import Placement
 from shapespace.model.decoder import Diagnostics, MeshChoice
 from shapespace.model.exact_shapes import ExactShape, exact_shape, require_tangent_space
 from shapespace.model.latent_space import Bounds, CheckedCode, Codes
@@ -18,6 +19,7 @@ from shapespace.model.shape_model import ShapeModel
 from shapespace.service.limits.workers import Call, Caller, Workers
 from shapespace.service.use_cases.batch import Batch, Timings, TooManyCodesError, Written, batch, total_seconds
 from shapespace.service.use_cases.nric import nric_size, predictions
+from shapespace.service.use_cases.one_shape import placed
 from shapespace.service.use_cases.shape_formats import (
     diagnostics_arrays,
     exponential_arrays,
@@ -58,6 +60,7 @@ async def vertices_file(
     format: str,
     *,
     exponentials: bool = False,
+    place: Placement | None = None,
 ) -> Written:
     """Positions and diagnostics of the shapes of codes, in one of VERTICES_TYPES.
 
@@ -70,6 +73,7 @@ async def vertices_file(
         mesh: fine or coarse.
         format: name of the format.
         exponentials: whether to compute the true discrete exponentials as well.
+        place: takes positions from where they are aligned to the reference to where they are wanted.
 
     Raises:
         NoTangentSpaceError: exponentials of a model that has none.
@@ -83,6 +87,9 @@ async def vertices_file(
     async with batch(workers, caller, shapes_size(model, (2 if exponentials else 1) * len(codes), mesh)) as work:
         found = await shapes(work, model, codes, inside, mesh)
         true = await _exponentials(work, model, codes, found, mesh) if exponentials else None
+        if place:
+            found = replace(found, vertices=placed(found.vertices, place).astype(np.float32))
+            true = [_placed(shape, place) for shape in true] if true else None
 
         def encode() -> tuple[Iterator[Buffer], dict[str, Any]]:
             if format == "json":
@@ -94,6 +101,13 @@ async def vertices_file(
             return npz_pieces(vertices=found.vertices, faces=model.mesh(mesh).faces, latents=codes, **arrays), {}
 
         return await work.write(encode, found.seconds, worst(found.diagnostics))
+
+
+def _placed(exact: ExactShape, place: Placement) -> ExactShape:
+    if exact.vertices is None or exact.mean is None or exact.max is None:
+        return exact
+    vertices = placed(exact.vertices, place).astype(np.float32)
+    return replace(exact, vertices=vertices, mean=place.scale * exact.mean, max=place.scale * exact.max)
 
 
 #: Writes the outputs of ``infer``, by name, to the pieces of a file and facts about it.

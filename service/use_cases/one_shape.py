@@ -7,10 +7,16 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
+from shapespace.arrays import FloatArray
 from shapespace.files.colouring import Colouring, Quantity
+from shapespace.mesh.rigid_motion import Placement
 from shapespace.model.decoder import Diagnostics, MeshChoice, Shape
-from shapespace.model.latent_space import CheckedCode
+from shapespace.model.latent_space import CheckedCode, NotFiniteError
 from shapespace.model.shape_model import ShapeModel
+from shapespace.model.spread import spread
 from shapespace.service.limits.workers import Caller, Workers
 from shapespace.service.use_cases.batch import Timings, solve, total_seconds
 from shapespace.service.use_cases.shape_formats import SHAPE_FORMATS
@@ -22,12 +28,14 @@ class ColourBy:
     """What to colour a mesh by.
 
     Attributes:
-        quantity: stretch or bending.
+        quantity: stretch, bending or spread.
         against: code of the shape to compare with; None is the reference.
+        covariance: (m, m) of codes around this one, of a spread only.
     """
 
     quantity: Quantity
     against: CheckedCode | None
+    covariance: FloatArray | None = None
 
 
 @dataclass(frozen=True)
@@ -39,12 +47,14 @@ class WantedShape:
         mesh: fine or coarse.
         format: one of SHAPE_FORMATS.
         colour_by: what to colour it by, if anything.
+        place: takes it from where it is aligned to the reference to where it is wanted.
     """
 
     code: CheckedCode | None
     mesh: MeshChoice
     format: str
     colour_by: ColourBy | None = None
+    place: Placement | None = None
 
 
 @dataclass(frozen=True)
@@ -64,6 +74,18 @@ class ShapeFile:
     seconds: Timings
 
 
+def placed(vertices: NDArray[np.floating], place: Placement | None) -> FloatArray:
+    """Positions (…, V, 3) where they are wanted; raises NotFiniteError."""
+    there = vertices.astype(np.float64, copy=False)
+    if place is None:
+        return there
+    with np.errstate(over="ignore", invalid="ignore"):
+        moved = place(there)
+        if not np.isfinite(moved.astype(np.float32)).all():
+            raise NotFiniteError("place takes the shape so far away that the numbers overflow. Send smaller ones.")
+    return moved
+
+
 async def shape_file(workers: Workers, caller: Caller, model: ShapeModel, wanted: WantedShape) -> ShapeFile:
     """One shape as a file.
 
@@ -79,13 +101,16 @@ async def shape_file(workers: Workers, caller: Caller, model: ShapeModel, wanted
 
     def make(deadline: Deadline) -> ShapeFile:
         found, colouring = [find(wanted.code, deadline)], None
-        if colour_by:
+        if colour_by and wanted.code and colour_by.covariance is not None:
+            colouring = Colouring.of_spread(spread(model, wanted.code[0], colour_by.covariance, mesh, deadline))
+        elif colour_by:
             found.append(find(colour_by.against, deadline))
         began = time.perf_counter()
-        if colour_by:
+        if colour_by and colouring is None:
             vertices, against = (shape.vertices for shape in found)
             colouring = Colouring.between(colour_by.quantity, vertices, against, model.mesh(mesh).connectivity)
-        content = SHAPE_FORMATS[wanted.format].encode(found[0].vertices, model.mesh(mesh).faces, colouring)
+        vertices = placed(found[0].vertices, wanted.place)
+        content = SHAPE_FORMATS[wanted.format].encode(vertices, model.mesh(mesh).faces, colouring)
         seconds = {**total_seconds(shape.seconds for shape in found), "encode": time.perf_counter() - began}
         return ShapeFile(content, found[0].diagnostics, colouring.legend if colouring else None, seconds)
 

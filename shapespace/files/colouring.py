@@ -24,17 +24,21 @@ _COOLWARM = (
 _QUANTILE = 0.98
 #: It never ends below this, in either unit: what hasn't changed is grey, whatever the rounding.
 _SMALLEST = 0.01
+#: Of a spread, whose units may be any.
+_SMALLEST_SPREAD = 1e-9
 
 
 class Quantity(StrEnum):
-    """What is coloured; a mean over the edges at a vertex, weighted by their lengths.
+    """What is coloured; of the first two a mean over the edges at a vertex, weighted by their lengths.
 
     ``stretch`` is the logarithm of an edge's length by its length in the other shape, ``bending`` the change of its
-    dihedral angle in radians, positive where it got more convex.
+    dihedral angle in radians, positive where it got more convex. ``spread`` is the standard deviation of where the
+    vertex is, in the units of the training meshes.
     """
 
     STRETCH = "stretch"
     BENDING = "bending"
+    SPREAD = "spread"
 
 
 @dataclass(frozen=True)
@@ -43,9 +47,9 @@ class Colouring:
 
     Attributes:
         quantity: which.
-        values: (V,), positive or negative.
-        limit: the legend goes from −limit to limit, which is 1, 2 or 5 times a power of ten, so that it stays the
-            same from one frame to the next; values beyond have the colours of its ends.
+        values: (V,), positive or negative; a spread is never negative.
+        limit: the legend goes from −limit, of a spread from 0, to limit, which is 1, 2 or 5 times a power of ten, so
+            that it stays the same from one frame to the next; values beyond have the colours of its ends.
     """
 
     quantity: Quantity
@@ -56,7 +60,7 @@ class Colouring:
     def between(
         cls, quantity: Quantity, vertices: FloatArray, against: FloatArray, connectivity: Connectivity
     ) -> Colouring:
-        """How a shape (V, 3) differs from another one (V, 3) of the same connectivity."""
+        """How a shape (V, 3) differs in stretch or bending from another one (V, 3) of the same connectivity."""
         lengths = edge_lengths(against, connectivity)
         weights = lengths
         # Faces that collapse have edges without length: no warning, and no infinite colour.
@@ -74,11 +78,23 @@ class Colouring:
         values = total / np.where(weight > 0, weight, 1.0)
         return cls(quantity, values, _round_up(float(np.quantile(np.abs(values), _QUANTILE))))
 
+    @classmethod
+    def of_spread(cls, values: FloatArray) -> Colouring:
+        """Standard deviations (V,), from blue to red."""
+        limit = _round_up(float(np.quantile(values, _QUANTILE)), _SMALLEST_SPREAD)
+        return cls(Quantity.SPREAD, values, limit)
+
+    @property
+    def ends(self) -> tuple[float, float]:
+        """Values at the ends of the legend."""
+        return (0.0 if self.quantity is Quantity.SPREAD else -self.limit), self.limit
+
     @property
     def srgb(self) -> FloatArray:
         """(V, 3) colours between 0 and 1 as screens take them."""
         table = np.array([list(bytes.fromhex(colour)) for colour in _COOLWARM.split()]) / 255
-        place = (self.values / self.limit + 1) / 2
+        low, high = self.ends
+        place = (self.values - low) / (high - low)
         return np.stack([np.interp(place, np.linspace(0, 1, len(table)), channel) for channel in table.T], axis=1)
 
     @property
@@ -95,10 +111,10 @@ class Colouring:
     @property
     def legend(self) -> dict[str, object]:
         """What one needs to read the colours."""
-        return {"quantity": str(self.quantity), "range": [-self.limit, self.limit], "map": "coolwarm"}
+        return {"quantity": str(self.quantity), "range": [*self.ends], "map": "coolwarm"}
 
 
-def _round_up(size: float) -> float:
-    size = max(size, _SMALLEST)
+def _round_up(size: float, smallest: float = _SMALLEST) -> float:
+    size = max(size, smallest)
     power = 10.0 ** math.floor(math.log10(size) + 1e-9)
     return next(step * power for step in (1, 2, 5, 10) if size <= step * power * (1 + 1e-9))

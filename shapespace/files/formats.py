@@ -103,7 +103,7 @@ def _npz(vertices: FloatArray, faces: IntArray, colouring: Colouring | None = No
     if colouring:
         colours = {
             "color_quantity": np.array(str(colouring.quantity)),
-            "color_range": np.array([-colouring.limit, colouring.limit]),
+            "color_range": np.array(colouring.ends),
             "color_values": colouring.values.astype(np.float32),
         }
     return npz(vertices=vertices.astype(np.float32), faces=faces.astype(np.int32), **colours)

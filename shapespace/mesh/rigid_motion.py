@@ -2,9 +2,43 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from shapespace.arrays import FloatArray
+
+#: Singular values of rigid motions below this share of the largest count as none.
+RANK = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class Placement:
+    """Takes points from one frame to another: ``x ↦ scale · rotation · x + translation``.
+
+    Attributes:
+        rotation: (3, 3), without reflection.
+        translation: (3,) in the units of the frame that points are taken to.
+        scale: a factor.
+    """
+
+    rotation: FloatArray
+    translation: FloatArray
+    scale: float = 1.0
+
+    def __call__(self, points: FloatArray) -> FloatArray:
+        """Points (…, 3) in the other frame."""
+        return self.scale * points @ self.rotation.T + self.translation
+
+    @classmethod
+    def between(cls, points: FloatArray, there: FloatArray, weights: FloatArray) -> Placement:
+        """The rigid motion that brings points (n, 3) closest to others (n, 3) in weighted least squares (Kabsch)."""
+        share = weights / weights.sum()
+        middle, centre = share @ points, share @ there
+        u, _, vt = np.linalg.svd((share[:, None] * (points - middle)).T @ (there - centre))
+        u[:, -1] *= np.sign(np.linalg.det(u @ vt))
+        rotation = vt.T @ u.T
+        return cls(rotation, centre - rotation @ middle)
 
 
 def rigid_motions(vertices: FloatArray) -> FloatArray:
@@ -31,6 +65,24 @@ def without_rigid_motion(displacement: FloatArray, vertices: FloatArray) -> Floa
     motions = rigid_motions(vertices)
     flat = displacement.reshape(*displacement.shape[:-2], -1)
     return (flat - (flat @ motions.T) @ motions).reshape(displacement.shape)
+
+
+def weighted_change(fields: FloatArray, points: FloatArray, weights: FloatArray) -> FloatArray:
+    """How weighted misfits (n, k, 3) of points (k, 3) change where the points move by fields (n, k, 3).
+
+    A misfit is ``√w (x − target)`` after ``Placement.between``, which takes the infinitesimal rigid motion next to each
+    field away, exactly so where there is no misfit.
+    """
+    x = points - weights @ points / weights.sum()
+    motions = np.zeros((6, *x.shape))
+    for k in range(3):
+        motions[k, :, k] = 1
+        motions[3 + k] = np.cross(np.eye(3)[k], x)
+    roots = np.sqrt(weights)[:, None]
+    _, size, rows = np.linalg.svd((roots * motions).reshape(6, -1), full_matrices=False)
+    rows = rows[size > RANK * size[0]]  # no rotation about a line of points is seen
+    weighted = (roots * fields).reshape(len(fields), -1)
+    return (weighted - (weighted @ rows.T) @ rows).reshape(fields.shape)
 
 
 def aligned_change(vertices: FloatArray, fields: FloatArray, target: FloatArray) -> FloatArray:

@@ -8,13 +8,14 @@ from functools import cached_property
 
 import numpy as np
 
-from shapespace.arrays import FloatArray
+from shapespace.arrays import FloatArray, IntArray
 from shapespace.coordinates.nric import WeightedNorm, nric, wrap
 from shapespace.mesh.rigid_motion import align, aligned_change
 from shapespace.model.correspondence import InvalidMeshError, Matched
 from shapespace.model.decoder import Decoder, MeshChoice, Shape
 from shapespace.model.derivatives import FactorGrids, derivatives, factor_derivatives, nodes
-from shapespace.model.latent_space import Bounds, Codes, NotFiniteError
+from shapespace.model.latent_space import Bounds, Codes, Fixed, NotFiniteError
+from shapespace.model.posterior import Posterior, independent_share, patches_of
 from shapespace.model.searched_shapes import SearchedShapes
 from shapespace.solve.cholesky import NotPositiveDefiniteError
 from shapespace.solve.deadline import Deadline
@@ -29,6 +30,10 @@ SWEEPS, PROMISING = 4, 1.2
 TOLERANCE, GAIN, SHAPES = 1e-4, 1e-4, 25
 #: A code may leave the bounds by this fraction of their width where that is allowed.
 MARGIN = 0.5
+#: A mesh so many times as large as the reference, or as small, is in other units.
+UNITS = 3.0
+#: Standard deviation of a vertex that the posterior assumes at least, as a fraction of the diagonal.
+TOLERANCE_OF_SHAPES = 2e-5
 
 
 class Objective(StrEnum):
@@ -52,6 +57,9 @@ class Encoded:
         shape: of the code, on the mesh that was given.
         distances: (V,) from the given vertices to those of that shape, after rigid alignment.
         mesh: whether the fine or the coarse mesh was given.
+        covariance: (m, m) of codes around this one, by the population of codes and the distances as noise, of which
+            neighbouring ones are not independent; zero for fixed coordinates.
+        samples: (n, m) random codes of that covariance around this one, not cut off at the bounds.
     """
 
     code: Codes
@@ -62,6 +70,8 @@ class Encoded:
     shape: Shape
     distances: FloatArray
     mesh: MeshChoice
+    covariance: FloatArray
+    samples: Codes
 
 
 class Encoder:
@@ -89,6 +99,9 @@ class Encoder:
         bounds: Bounds = Bounds.ALLOW,
         deadline: Deadline | None = None,
         objective: Objective = Objective.VERTICES,
+        fixed: Fixed | None = None,
+        samples: int = 0,
+        seed: int = 0,
     ) -> Encoded:
         """The code of a mesh.
 
@@ -97,9 +110,12 @@ class Encoder:
             bounds: REJECT refuses a code outside the bounds, CLAMP looks for one inside only.
             deadline: after which the status is Status.DEADLINE.
             objective: what is compared.
+            fixed: coordinates that keep their value.
+            samples: codes to draw from the posterior, which is by vertices whatever the objective.
+            seed: of these.
 
         Raises:
-            InvalidMeshError: edges without any length.
+            InvalidMeshError: edges without any length, or a mesh of another size than the training shapes, see UNITS.
             NotFiniteError: lengths so large that the numbers overflow.
             OutOfBoundsError: as ``bounds`` asks for.
         """
@@ -111,25 +127,73 @@ class Encoder:
                 raise NotFiniteError("The mesh is so large that the numbers overflow. Send it in the model's units.")
         if not target.any():
             raise InvalidMeshError("The mesh is a single point: no edge has a length. Send a surface.")
-        lower, upper = latents.box(MARGIN if bounds is not Bounds.CLAMP else 0.0)
+        self._require_size(vertices)
+        fixed = latents.fixed() if fixed is None else fixed
+        lower, upper = latents.box_around(fixed, MARGIN if bounds is not Bounds.CLAMP else 0.0)
         box = Box(lower, upper, latents.width)
-        fit = self._by_nric(target, box, deadline)
+        fit = self._by_nric(target, box, fixed, deadline)
         if objective is Objective.VERTICES and fit.status is not Status.DEADLINE:
-            fit = self._by_vertices(vertices, fit, box, deadline)
-        code, inside = latents.code(fit.x.tolist(), bounds)
-        shape = model.shape(code, inside, given.mesh, deadline)
+            fit = self._by_vertices(vertices, fit, box, fixed, deadline)
+        code, inside = latents.found(fit.x, bounds, fixed)
+        coarse = model.shape(code, inside, MeshChoice.COARSE, deadline)
+        posterior = self._posterior(code, coarse.vertices / model.manifest.scale, vertices, fixed)
+        shape = replace(coarse, vertices=model.finish(coarse.vertices / model.manifest.scale, given.mesh))
         distances = np.linalg.norm(align(shape.vertices, given.vertices) - given.vertices, axis=1)
         left = self._difference(model.nric(code.astype(np.float64)), target)
         residual = float(np.sqrt(self._norm.square(left) / self._norm.square(target)))
         status = Status.DEADLINE if shape.diagnostics.status is Status.DEADLINE else fit.status
-        return Encoded(code, inside, status, fit.iterations, residual, shape, distances, given.mesh)
+        return Encoded(
+            code,
+            inside,
+            status,
+            fit.iterations,
+            residual,
+            shape,
+            distances,
+            given.mesh,
+            posterior.covariance,
+            posterior.sample(latents, code, samples, seed),
+        )
 
     @cached_property
     def grids(self) -> FactorGrids:
         """What starts are chosen from; made once, at the first mesh."""
         return FactorGrids.of(self.model, self._centre, self._root)
 
-    def _by_vertices(self, target: FloatArray, near: Fit, box: Box, deadline: Deadline | None) -> Fit:
+    def _require_size(self, vertices: FloatArray) -> None:
+        """Raise InvalidMeshError where a mesh (V, 3) is as large or small as if it were in other units."""
+        times = _extent(vertices) / _extent(self.model.reference.vertices)
+        if not 1 / UNITS <= times <= UNITS:
+            raise InvalidMeshError(
+                f"The mesh is about {times:.3g} times as large as the training shapes: send it in the training meshes' "
+                "units."
+            )
+
+    def _posterior(self, code: Codes, shape: FloatArray, target: FloatArray, fixed: Fixed) -> Posterior:
+        """Around a code (m,), given its shape (V, 3) and that of the mesh (V, 3), both coarse and normalised."""
+        model, count = self.model, len(target)
+        misfit = align(shape, target) - target
+        share = independent_share(misfit, self._patches)
+        # What is fitted takes up some of the observations; and no shape is known better than it is solved for.
+        observed = 3 * count * share
+        left = max(observed - 6 - int((~fixed.mask).sum()), 1.0)
+        variance = max(
+            float((misfit**2).mean()) * observed / left, (TOLERANCE_OF_SHAPES * model.reference.diagonal) ** 2
+        )
+        try:
+            with model.solver() as reconstruct:
+                fields = reconstruct.differential(shape, derivatives(model, code.astype(np.float64)).T)
+        except NotPositiveDefiniteError:  # of a shape that has all but collapsed nothing is known
+            fields = np.zeros((len(code), *shape.shape))
+        changes = aligned_change(shape, fields, target).reshape(len(code), -1)
+        return Posterior.of(share / variance * changes @ changes.T, model.population, fixed.mask)
+
+    @cached_property
+    def _patches(self) -> list[IntArray]:
+        """Of the coarse mesh; made once, as they take as long as a shape."""
+        return patches_of(self.model.reference.vertices)
+
+    def _by_vertices(self, target: FloatArray, near: Fit, box: Box, fixed: Fixed, deadline: Deadline | None) -> Fit:
         """The fit to vertices (V, 3), from one nearby, which stands where its shape has all but collapsed."""
         model, weight = self.model, 1 / (self.model.reference.diagonal * np.sqrt(len(target)))
         with model.solver() as reconstruct:
@@ -145,7 +209,7 @@ class Encoder:
 
             def jacobian(x: FloatArray, _: FloatArray) -> FloatArray:
                 changes = aligned_change(shapes(x), shapes.derivatives(x, derivatives(model, x)), target)
-                return weight * changes.reshape(len(changes), -1).T
+                return np.where(fixed.mask, 0.0, weight * changes.reshape(len(changes), -1).T)
 
             stopping = Stopping(TOLERANCE, GAIN, max_evaluations=SHAPES, deadline=deadline)
             try:
@@ -154,7 +218,7 @@ class Encoder:
                 return near
             return near if fit.status is Status.NOT_FINITE else fit
 
-    def _by_nric(self, target: FloatArray, box: Box, deadline: Deadline | None) -> Fit:
+    def _by_nric(self, target: FloatArray, box: Box, fixed: Fixed, deadline: Deadline | None) -> Fit:
         """The fit to lengths and angles (2E,)."""
         latents, root = self.model.latents, self._root
 
@@ -167,21 +231,21 @@ class Encoder:
         def from_composite(start: FloatArray) -> Fit:
             return least_squares(
                 composite,
-                lambda x, _: root[:, None] * derivatives(self.model, x),
+                lambda x, _: np.where(fixed.mask, 0.0, root[:, None] * derivatives(self.model, x)),
                 start,
                 box,
                 Stopping(deadline=deadline),
             )
 
-        x = (latents.lower + latents.upper) / 2
+        x = fixed.into((latents.lower + latents.upper) / 2)
         for _ in range(SWEEPS * len(self.grids.images)):
-            moved = self._another_start(x, affine(x))
+            moved = self._another_start(x, affine(x), fixed)
             if moved is None:
                 break
             x = moved
         rough = least_squares(
             affine,
-            lambda x, _: root[:, None] * factor_derivatives(self.model, x),
+            lambda x, _: np.where(fixed.mask, 0.0, root[:, None] * factor_derivatives(self.model, x)),
             x,
             box,
             Stopping(tolerance=1e-3, deadline=deadline),
@@ -189,7 +253,7 @@ class Encoder:
         )
         best = from_composite(rough.x)
         for _ in range(SWEEPS):
-            moved = self._another_start(best.x, best.residuals)
+            moved = self._another_start(best.x, best.residuals, fixed)
             if moved is None or best.status is Status.DEADLINE:
                 break
             other = from_composite(moved)
@@ -198,11 +262,12 @@ class Encoder:
             best = other
         return best
 
-    def _another_start(self, x: FloatArray, residuals: FloatArray) -> FloatArray | None:
+    def _another_start(self, x: FloatArray, residuals: FloatArray, fixed: Fixed) -> FloatArray | None:
         """A code with one factor moved to the node that fits best, where that promises to be better than x.
 
         What counts is the direction of a factor's shape from z̄, not its size, because the factors add up in direction
-        only roughly in size: a bump on the inner side of a torus is not as large as on the outer one.
+        only roughly in size: a bump on the inner side of a torus is not as large as on the outer one. Factors with a
+        fixed coordinate stay.
         """
         grids = self.grids
         missing = -grids.sketch(residuals)
@@ -210,6 +275,8 @@ class Encoder:
         for j, images in grids.images.items():
             factor = self.model.manifest.factors[j]
             own = slice(factor.start, factor.stop)
+            if fixed.mask[own].any():
+                continue
             here = grids.sketch(self._root * (self.model.factor(j, x[None, own])[0] - self._centre))
             explained = _explained(missing + here, images)
             gain = explained.max() - PROMISING * _explained(missing + here, here[None])[0]
@@ -229,6 +296,11 @@ class Encoder:
         for j, factor in enumerate(self.model.manifest.factors):
             z += self.model.factor(j, x[None, factor.start : factor.stop])[0] - self._centre
         return z
+
+
+def _extent(vertices: FloatArray) -> float:
+    """Root mean square distance from the centroid, which a pose changes little."""
+    return float(np.sqrt(((vertices - vertices.mean(axis=0)) ** 2).sum(axis=1).mean()))
 
 
 def _explained(missing: FloatArray, images: FloatArray) -> FloatArray:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from enum import StrEnum
 
 import numpy as np
@@ -34,6 +35,27 @@ class OutOfBoundsError(LatentError):
     """A code outside the bounds where the caller asked to refuse those."""
 
 
+class InvalidFixedError(LatentError):
+    """Coordinates that can't be kept: there are none of that index, or the value is not finite."""
+
+
+@dataclass(frozen=True, eq=False)
+class Fixed:
+    """Coordinates of a code that keep their value.
+
+    Attributes:
+        mask: (m,) which.
+        values: (m,) theirs, as the networks take them; 0 where a coordinate is free.
+    """
+
+    mask: NDArray[np.bool_]
+    values: Codes
+
+    def into(self, x: FloatArray) -> FloatArray:
+        """A code (m,) with these values."""
+        return np.where(self.mask, self.values, x)
+
+
 class Bounds(StrEnum):
     """What to do with a code outside the bounds: extrapolate, move it to the nearest bound, or refuse it."""
 
@@ -43,10 +65,11 @@ class Bounds(StrEnum):
 
 
 class Distribution(StrEnum):
-    """How random codes are distributed in the bounds."""
+    """How random codes are distributed: in the bounds, or as those of the training shapes are."""
 
     UNIFORM = "uniform"
     GAUSSIAN = "gaussian"
+    POPULATION = "population"
 
 
 class LatentSpace:
@@ -117,6 +140,37 @@ class LatentSpace:
         codes, inside = self.codes([value], bounds)
         return codes[0], bool(inside[0])
 
+    def fixed(self, values: Mapping[int, float] | None = None) -> Fixed:
+        """Coordinates that keep a value, by index, inside the bounds or not; raises InvalidFixedError."""
+        values = values or {}
+        unknown = [index for index in values if not 0 <= index < self.dimension]
+        if unknown:
+            raise InvalidFixedError(
+                f"fixed names coordinate {unknown[0]}, but {self.model} has coordinates 0 to {self.dimension - 1}."
+            )
+        mask = np.isin(np.arange(self.dimension), list(values))
+        code = np.array([values.get(k, 0.0) for k in range(self.dimension)])
+        with np.errstate(over="ignore"):
+            bad = np.flatnonzero(~np.isfinite(code.astype(np.float32)))
+        if len(bad):
+            raise InvalidFixedError(f"fixed[{bad[0]}] is not a finite number. Send finite numbers.")
+        return Fixed(mask, np.where(mask, self.code(code.tolist())[0], np.float32(0)))
+
+    def found(self, x: FloatArray, bounds: Bounds, fixed: Fixed) -> CheckedCode:
+        """A code (m,) that a search ended at, and whether it is inside the bounds; as ``code``, but for what is fixed.
+
+        Clamping leaves fixed coordinates alone.
+        """
+        if bounds is Bounds.CLAMP:
+            code, _ = self.code(x.tolist(), Bounds.CLAMP)
+            return self.code(fixed.into(code.astype(np.float64)).tolist())
+        return self.code(fixed.into(x).tolist(), bounds)
+
+    def box_around(self, fixed: Fixed, margin: float = 0.0) -> tuple[FloatArray, FloatArray]:
+        """As ``box``, of no width where a coordinate is fixed."""
+        lower, upper = self.box(margin)
+        return fixed.into(lower), fixed.into(upper)
+
     def unroll(self, keyframes: FloatArray) -> FloatArray:
         """Shift angles of successive keyframes (K, m) by whole periods: each step becomes the shorter arc."""
         steps = self.shorter(np.diff(keyframes, axis=0))
@@ -140,8 +194,10 @@ class LatentSpace:
         """Random codes (count, m) inside the bounds, the same on every machine.
 
         Gaussian codes have their mean in the middle of the bounds and a standard deviation of a quarter of the width,
-        before they are cut off at the bounds.
+        before they are cut off at the bounds. Those of the population are not the space's, but the model's.
         """
+        if distribution is Distribution.POPULATION:
+            raise ValueError("the bounds know no population")
         shares = np.random.Generator(np.random.PCG64(seed)).random((count, self.dimension))
         if distribution is Distribution.GAUSSIAN:
             low, high = ndtr(-2.0), ndtr(2.0)

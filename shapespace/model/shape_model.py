@@ -20,9 +20,10 @@ from shapespace.files.formats import read_arrays
 from shapespace.mesh.triangle_mesh import TriangleMesh
 from shapespace.model.correspondence import InvalidMeshError, Matched, match
 from shapespace.model.decoder import Decoder, MeshChoice
-from shapespace.model.edit import PRIOR, Edited, Target, edited
+from shapespace.model.edit import PRIOR, Edited, PriorKind, Target, edited
 from shapespace.model.encode import Encoded, Encoder, Objective
-from shapespace.model.latent_space import Bounds, Codes, Distribution, WrongLengthError
+from shapespace.model.latent_space import Bounds, Codes, Distribution, NotFiniteError, WrongLengthError
+from shapespace.model.spread import require_covariance, spread
 from shapespace.solve.deadline import Deadline
 from shapespace.solve.outcome import Status
 
@@ -30,7 +31,8 @@ from shapespace.solve.outcome import Status
 MeshName = MeshChoice | Literal["fine", "coarse"]
 BoundsName = Bounds | Literal["allow", "clamp", "reject"]
 ObjectiveName = Objective | Literal["vertices", "nric"]
-DistributionName = Distribution | Literal["uniform", "gaussian"]
+DistributionName = Distribution | Literal["uniform", "gaussian", "population"]
+PriorName = PriorKind | Literal["groups", "ridge"]
 
 
 def load(folder: str | os.PathLike[str], threads: int = 1) -> ShapeModel:
@@ -167,6 +169,9 @@ class ShapeModel(Decoder):
         bounds: BoundsName = "allow",
         deadline: Deadline | None = None,
         objective: ObjectiveName = "vertices",
+        fixed: Mapping[int, float] | None = None,
+        samples: int = 0,
+        seed: int = 0,
     ) -> Encoded:
         """The code whose shape comes closest to a mesh in correspondence, in any rigid pose.
 
@@ -178,11 +183,15 @@ class ShapeModel(Decoder):
             deadline: after which the status is Status.DEADLINE.
             objective: what comes closest, "vertices" after rigid alignment, or "nric", lengths and angles, in their
                 weighted norm.
+            fixed: value by coordinate that the code keeps, in the bounds or not.
+            samples: codes to draw from the posterior.
+            seed: of these.
 
         Raises:
             MeshError: a file that can't be read.
-            InvalidMeshError: none of the model's meshes.
-            LatentError: numbers that overflow, or a code out of bounds where that is refused.
+            InvalidMeshError: none of the model's meshes, or not in their units: less than a third or more than three
+                times as large.
+            LatentError: numbers that overflow, a code out of bounds where that is refused, or no such coordinate.
 
         >>> import numpy as np, shapespace
         >>> model = shapespace.load("models/figure")
@@ -192,7 +201,9 @@ class ShapeModel(Decoder):
         (True, <MeshChoice.FINE: 'fine'>, (4601, 3))
         """
         given = mesh if isinstance(mesh, Matched) else self._matched(mesh)
-        return self._encoder(given, Bounds(bounds), deadline, Objective(objective))
+        return self._encoder(
+            given, Bounds(bounds), deadline, Objective(objective), self.latents.fixed(fixed), samples, seed
+        )
 
     def edit(
         self,
@@ -201,20 +212,34 @@ class ShapeModel(Decoder):
         prior: float = PRIOR,
         mesh: MeshName = "fine",
         deadline: Deadline | None = None,
+        prior_kind: PriorName = "groups",
+        sigma: float | Mapping[int, float] | None = None,
+        fixed: Mapping[int, float] | None = None,
+        samples: int = 0,
+        seed: int = 0,
     ) -> Edited:
         """The code inside the bounds whose shape comes closest to having some vertices at some places.
 
+        What is not asked to move stays where it is, as far as it can: ``placement`` takes what ``decode`` answers for
+        the new code into the frame of the start's shape, in which ``distances`` and ``residual`` are measured.
+
         Args:
             code: (m,) to start from; moved to the nearest bounds first.
-            targets: position (3,) by vertex, at least one, in the frame and units of what ``decode`` answers.
+            targets: position (3,) by vertex, at least one, in the frame of what ``decode`` answers for ``code``.
             prior: weight of the mean square change of the code, in widths of the bounds, against the mean square
                 distance from the targets, in diagonals of the bounding box.
             mesh: whose vertices are meant, "fine" or "coarse".
             deadline: after which the status is Status.DEADLINE.
+            prior_kind: "groups" changes few factors, "ridge" all of them a little.
+            sigma: standard deviation of targets, of all or by vertex; half a percent of the diagonal where there is
+                none.
+            fixed: value by coordinate that the code keeps, in the bounds or not.
+            samples: codes to draw from the posterior.
+            seed: of these.
 
         Raises:
-            LatentError: a code of the wrong length, or numbers that are not finite.
-            InvalidTargetError: no targets, or a vertex that the mesh does not have.
+            LatentError: a code of the wrong length, numbers that are not finite, or no such coordinate.
+            InvalidTargetError: no targets, a vertex that the mesh does not have, or a sigma that is not above 0.
 
         >>> import numpy as np, shapespace
         >>> model = shapespace.load("models/figure")
@@ -225,17 +250,30 @@ class ShapeModel(Decoder):
         ((20,), True)
         """
         start, _ = self.latents.code(np.asarray(code, dtype=np.float64).tolist(), Bounds.CLAMP)
-        pulled = [Target(int(v), np.asarray(place, dtype=np.float64).tolist()) for v, place in targets.items()]
-        return edited(self, start, pulled, prior, MeshChoice(mesh), deadline)
+        sigmas = sigma if isinstance(sigma, Mapping) else dict.fromkeys(targets, sigma)
+        pulled = [
+            Target(int(v), np.asarray(place, dtype=np.float64).tolist(), sigmas.get(v)) for v, place in targets.items()
+        ]
+        held = self.latents.fixed(fixed)
+        return edited(
+            self, start, pulled, prior, MeshChoice(mesh), deadline, PriorKind(prior_kind), held, samples, seed
+        )
 
-    def sample(self, count: int, seed: int = 0, distribution: DistributionName = "uniform") -> Codes:
-        """Random codes (count, m) inside the bounds; one seed gives the same on every machine.
+    def sample(
+        self, count: int, seed: int = 0, distribution: DistributionName = "uniform", temperature: float = 1.0
+    ) -> Codes:
+        """Random codes (count, m); one seed gives the same on every machine.
 
         Args:
             count: how many.
             seed: of the random numbers.
             distribution: "uniform" in the bounds, or "gaussian": around their middle with a standard deviation of a
-                quarter of their width, cut off at them.
+                quarter of their width, cut off at them. Or "population": the Gaussian with shrinkage fitted to the
+                codes of the training shapes (without any: with mean and variances of uniform ones), not cut off.
+            temperature: factor of the differences from the mean of the population; the others have none.
+
+        Raises:
+            LatentError: a temperature that is negative, not finite, or so large that the numbers overflow.
 
         >>> import shapespace
         >>> model = shapespace.load("models/figure")
@@ -243,7 +281,30 @@ class ShapeModel(Decoder):
         >>> codes.shape, bool((codes >= model.lower.astype("f4")).all() and (codes <= model.upper.astype("f4")).all())
         ((3, 20), True)
         """
-        return self.latents.sample(count, seed, Distribution(distribution))
+        if Distribution(distribution) is not Distribution.POPULATION:
+            return self.latents.sample(count, seed, Distribution(distribution))
+        if not 0 <= temperature < np.inf:
+            raise NotFiniteError(f"temperature is {temperature:g}. Give a finite number of at least 0.")
+        return self.latents.codes(self.population.sample(count, seed, temperature))[0]
+
+    def spread(self, code: ArrayLike, covariance: ArrayLike, mesh: MeshName = "fine") -> FloatArray:
+        """Standard deviation (V,) of where the vertices of a code's shape are, as ``decode`` answers them.
+
+        Args:
+            code: (m,).
+            covariance: (m, m) of codes around it, as ``edit`` and ``encode`` find it.
+            mesh: "fine" or "coarse".
+
+        Raises:
+            LatentError: a code of the wrong length, or numbers that are not finite, or no covariance.
+
+        >>> import numpy as np, shapespace
+        >>> model = shapespace.load("models/figure")
+        >>> model.spread(np.zeros(20), model.population.covariance).shape
+        (4601,)
+        """
+        checked, _ = self.latents.code(np.asarray(code, dtype=np.float64).tolist())
+        return spread(self, checked, require_covariance(self, covariance), MeshChoice(mesh))
 
     @cached_property
     def _encoder(self) -> Encoder:

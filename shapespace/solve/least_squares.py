@@ -203,7 +203,8 @@ def shrinkable(cost: float, large: float) -> float:
 def _step(J: FloatArray, r: FloatArray, low: FloatArray, high: FloatArray, damping: float) -> FloatArray:
     """The minimiser of ``‖J d + r‖² + μ‖d‖²`` with low ≤ d ≤ high."""
     H, g = J.T @ J, J.T @ r
-    shift = max(damping, SMALLEST_DAMPING) * max(H.diagonal().max(), np.finfo(float).tiny)
+    # A Jacobian may be all zero: nothing is free.
+    shift = max(damping, SMALLEST_DAMPING) * max(H.diagonal().max(), np.sqrt(np.finfo(float).tiny))
     R = cholesky(H + shift * np.eye(len(g)))
     b = -solve_triangular(R, g, trans="T")
     d: FloatArray = solve_triangular(R, b)

@@ -65,6 +65,27 @@ def test_random_shapes_repeat_by_their_seed(studio: Studio) -> None:
     studio.until_code([*first[:2], locked])
 
 
+def test_a_pull_keeps_what_is_locked(studio: Studio) -> None:
+    studio.coordinate(1).locator("[data-do=lock]").click()
+    sent = []
+    studio.page.on("request", lambda request: sent.append(request.post_data_json) if "/edit" in request.url else None)
+    studio["#pull"].click()
+    before = studio.picture()
+    box = studio["#canvas"].bounding_box()
+    assert box
+    inside = np.abs(before - before[0, 0]).max(axis=2) > 40
+    x = int(np.flatnonzero(inside.any(axis=0))[-1]) - 6
+    y = int(np.median(np.flatnonzero(inside[:, x])))
+    studio.page.mouse.move(box["x"] + x, box["y"] + 60 + y)
+    studio.page.mouse.down()
+    studio.page.mouse.move(box["x"] + x + 15, box["y"] + 60 + y, steps=3)
+    studio.page.wait_for_timeout(200)
+    studio.page.mouse.up()
+    studio.eventually(lambda: any(studio.code))
+    assert studio.code[1] == 0
+    assert sent[0]["fixed"] == {"1": 0}
+
+
 def test_pulling_at_a_vertex_takes_the_shape_along(studio: Studio) -> None:
     studio["#pull"].click()
     before = studio.picture()

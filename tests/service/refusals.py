@@ -18,12 +18,14 @@ BEYOND_SCHEMAS = {
 
 
 #: Further ones of calls whose parts depend on each other, or on the model: a header on the body's length, the number of
-#: a vertex on the mesh, a file on its format, one time on another; `{k}` comes from a link that is a template.
+#: a vertex on the mesh, a file on its format, one time on another, a temperature on its distribution; `{k}` comes from
+#: a link that is a template.
 OF_CALLS = {
     "/interpolations": {"invalid-request"},
     "/{k}": {"invalid-request"},
     "/infer": {"invalid-request", "malformed-request"},
     "/edit": {"invalid-request"},
+    "/sample": {"invalid-request"},
     "/encode": {kind for kind in KINDS if KINDS[kind].status in {400, 422}},
 }
 
@@ -34,6 +36,13 @@ def refusals_are_beyond_schemas(ctx: CheckContext, response: Response, case: Cas
     if case.meta and case.meta.generation.mode.is_positive and response.status_code in {400, 422}:
         kind = response.json()["type"].rpartition(":")[2]
         allowed = BEYOND_SCHEMAS | OF_CALLS.get(case.operation.path[case.operation.path.rindex("/") :], set())
-        if "against" in (case.query or {}) and "color" not in case.query:
+        query, body = case.query or {}, case.body if isinstance(case.body, dict) else {}
+        # What compares needs a colour, a spread a covariance and the other way round; a place is JSON in a string.
+        if (
+            "against" in query
+            or "place" in query
+            or query.get("color") == "spread"
+            or body.get("covariance") is not None
+        ):
             allowed = allowed | {"invalid-request"}
         assert kind in allowed, f"{kind} refuses what the schema allows: {response.text}"

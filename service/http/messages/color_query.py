@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated
 
 from fastapi import Depends, Query, Request
 
 from shapespace.files.colouring import Quantity
-from shapespace.model.latent_space import Bounds, LatentSpace
+from shapespace.model.latent_space import Bounds
+from shapespace.model.shape_model import ShapeModel
+from shapespace.model.spread import require_covariance
 from shapespace.service.http.messages.latent_query import NUMBERS, numbers
 from shapespace.service.http.negotiation import choose
 from shapespace.service.http.problems import ProblemError
@@ -28,11 +31,21 @@ class ColourParameters:
     quantity: Quantity | None
     against: list[float] | None
 
-    def on(self, latents: LatentSpace, bounds: Bounds = Bounds.ALLOW) -> ColourBy | None:
-        """What they ask for, with the other code checked as the first one is; raises LatentError."""
+    def on(
+        self, model: ShapeModel, bounds: Bounds = Bounds.ALLOW, covariance: Sequence[Sequence[float]] | None = None
+    ) -> ColourBy | None:
+        """What they ask for, with the other code checked as the first one is; raises LatentError or ProblemError."""
+        if self.quantity is Quantity.SPREAD:
+            if covariance is None:
+                raise ProblemError(
+                    "invalid-request", "color=spread shows how sure a code is. POST it with its covariance in the body."
+                )
+            return ColourBy(self.quantity, None, require_covariance(model, covariance))
+        if covariance is not None:
+            raise ProblemError("invalid-request", "covariance is what color=spread shows. Add ?color=spread.")
         if self.quantity is None:
             return None
-        return ColourBy(self.quantity, None if self.against is None else latents.code(self.against, bounds))
+        return ColourBy(self.quantity, None if self.against is None else model.latents.code(self.against, bounds))
 
 
 async def _query(
@@ -40,8 +53,9 @@ async def _query(
         Quantity | None,
         Query(
             description="Colour the vertices by how their edges differ from the other shape's: `stretch` is the "
-            "logarithm of the lengths' ratio, `bending` the change of the dihedral angles in radians. Every format but "
-            "STL carries colours; NPZ and JSON carry the values."
+            "logarithm of the lengths' ratio, `bending` the change of the dihedral angles in radians. Or by `spread`, "
+            "the standard deviation of each vertex by the `covariance` in the body of a POST. Every format but STL "
+            "carries colours; NPZ and JSON carry the values."
         ),
     ] = None,
     against: Annotated[
@@ -54,7 +68,7 @@ async def _query(
         ),
     ] = None,
 ) -> ColourParameters:
-    if against is not None and color is None:
+    if against is not None and color in (None, Quantity.SPREAD):
         raise ProblemError("invalid-request", "against says what colours compare with. Add color=stretch or bending.")
     return ColourParameters(color, None if against is None else numbers(against, "against"))
 

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from typing import Annotated, Any
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from shapespace.files.colouring import Quantity
 from shapespace.model.decoder import MeshChoice
-from shapespace.model.edit import PRIOR
+from shapespace.model.edit import PRIOR, PriorKind
 from shapespace.model.latent_space import Bounds, Distribution
-from shapespace.service.use_cases.fields import Body, Number, Whole
+from shapespace.service.use_cases.fields import Body, Number, NumbersByIndex, Whole
 
 #: Each list fails at its first fault: there may be as many as elements.
 Latent = Annotated[
@@ -43,6 +43,9 @@ class MeshRequest(Body):
     latent: Latent
     mesh: MeshField = MeshChoice.FINE
     bounds: BoundsField = Bounds.ALLOW
+    covariance: Annotated[list[Annotated[list[Number], Field(fail_fast=True)]] | None, Field(fail_fast=True)] = Field(
+        None, description="With `?color=spread`: m × m, of codes around this one, as `edit` and `encode` answer it."
+    )
 
 
 class VerticesRequest(Body):
@@ -63,8 +66,21 @@ class TargetRequest(Body):
 
     vertex: Whole = Field(description="Index in the mesh that `mesh` names, from 0.")
     position: Annotated[list[Number], Field(fail_fast=True)] = Field(
-        min_length=3, max_length=3, description="In the units and the frame that meshes are answered in."
+        min_length=3,
+        max_length=3,
+        description="In the frame of the mesh that `latent` is answered with, and its units.",
     )
+    sigma: Number | None = Field(
+        None,
+        gt=0,
+        description="Standard deviation of each coordinate, in the same units; by default half a percent of the "
+        "bounding box's diagonal. A target of twice that counts a quarter.",
+    )
+
+
+FIXED = "Coordinates that keep their value, inside the bounds or not: numbers by index, from 0."
+SAMPLES = "Codes to draw from the posterior, the Gaussian around `latent` of the `covariance` that is answered."
+SEED = "Of the random codes: the same for the same seed."
 
 
 class EditRequest(Body):
@@ -80,6 +96,14 @@ class EditRequest(Body):
         description="Weight of the mean square change of the code, as a fraction of the bounds' width, against the "
         "mean square distance from the targets, as a fraction of the bounding box's diagonal.",
     )
+    prior_kind: PriorKind = Field(
+        PriorKind.GROUPS,
+        description="What of the change costs: `groups` the square of the sum of the factors' norms, so that few "
+        "factors change; `ridge` the sum of their squares.",
+    )
+    fixed: NumbersByIndex = Field({}, description=FIXED, examples=[{"0": 0.5}])
+    samples: Whole = Field(0, ge=0, description=SAMPLES)
+    seed: Whole = Field(0, ge=0, lt=2**63, description=SEED)
     mesh: MeshChoice = Field(MeshChoice.FINE, description="Which mesh the targets' vertices belong to.")
 
 
@@ -91,8 +115,18 @@ class SampleRequest(Body):
     distribution: Distribution = Field(
         Distribution.UNIFORM,
         description="In the bounds uniform, or gaussian: around their middle, with a standard deviation of a quarter "
-        "of their width, and cut off at them.",
+        "of their width, and cut off at them. Or the population: the Gaussian with shrinkage fitted to the codes of "
+        "the training shapes, not cut off.",
     )
+    temperature: Number = Field(
+        1.0, ge=0, description="With `population`: factor of the differences from its mean. Otherwise it is 1."
+    )
+
+    @model_validator(mode="after")
+    def _of_the_population(self) -> SampleRequest:
+        if self.temperature != 1 and self.distribution is not Distribution.POPULATION:
+            raise ValueError('temperature goes with "distribution": "population"')
+        return self
 
 
 class NRICRequest(Body):
@@ -160,6 +194,18 @@ class VerticesAnswer(BaseModel):
     exact_status: list[str] | None = Field(None, description="With `exact`: how each exponential's solver ended.")
 
 
+class PlacementAnswer(BaseModel):
+    """Takes positions from one frame to another: `scale` · `rotation` · x + `translation`."""
+
+    rotation: list[list[float]] = Field(description="3 × 3.", min_length=3, max_length=3)
+    translation: list[float] = Field(min_length=3, max_length=3)
+    scale: float
+
+
+_COVARIANCE = "m × m, of codes around `latent`; zero in the rows and columns of what is fixed."
+_SAMPLED = "Random codes around `latent` of that covariance, as many as `samples`; not cut off at the bounds."
+
+
 class EncodeAnswer(BaseModel):
     """The code of a mesh."""
 
@@ -172,6 +218,8 @@ class EncodeAnswer(BaseModel):
     iterations: int = Field(description="Shapes that it looked at; evaluations of the networks if by `nric`.")
     mesh: MeshChoice = Field(description="Which mesh of the model was sent.")
     diagnostics: DiagnosticsAnswer = Field(description="Of the code's shape.")
+    covariance: list[list[float]] = Field(description=_COVARIANCE)
+    samples: list[list[float]] = Field(description=_SAMPLED)
 
 
 class EditAnswer(BaseModel):
@@ -179,9 +227,15 @@ class EditAnswer(BaseModel):
 
     latent: list[float]
     residual: float = Field(
-        description="Root mean square distance from the targets, in the units of the training meshes."
+        description="Root mean square distance from the targets, in the units of the training meshes, once "
+        "`placement` is applied."
     )
-    distances: list[float] = Field(description="Distance from each target.")
+    distances: list[float] = Field(description="Distance from each target, likewise.")
+    placement: PlacementAnswer = Field(
+        description="Takes the mesh of the new code into the frame of that of the old one; `scale` is 1."
+    )
+    covariance: list[list[float]] = Field(description=_COVARIANCE)
+    samples: list[list[float]] = Field(description=_SAMPLED)
     status: str = Field(description="How the search ended: converged, stalled, iteration_limit.")
     iterations: int = Field(description="Shapes that it looked at.")
     diagnostics: DiagnosticsAnswer = Field(description="Of the code's shape.")

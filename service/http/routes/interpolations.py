@@ -110,7 +110,7 @@ async def get_frame(
     """One frame of an animation in any mesh format."""
     chosen = choose_mesh(format, request, color)
     animation, model = find_interpolation(service.repository, id, service.settings.max_frames)
-    wanted = WantedShape(frame_code(model, animation, k), animation.mesh, chosen, color.on(model.latents))
+    wanted = WantedShape(frame_code(model, animation, k), animation.mesh, chosen, color.on(model))
     return await shape_response(service, request, caller, model, wanted)
 
 

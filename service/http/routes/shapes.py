@@ -20,6 +20,7 @@ from shapespace.service.http.description import binary, mesh_answers, problems
 from shapespace.service.http.messages.bodies import JSONBody
 from shapespace.service.http.messages.color_query import NO_COLOR, ColorQuery, choose_mesh
 from shapespace.service.http.messages.latent_query import NUMBERS, numbers
+from shapespace.service.http.messages.place_query import PlaceQuery
 from shapespace.service.http.messages.schemas import (
     MeshRequest,
     NRICAnswer,
@@ -57,12 +58,13 @@ async def get_mesh(
     mesh: Annotated[MeshChoice, Query(description="Which mesh, where the model has a finer one.")] = MeshChoice.FINE,
     bounds: Annotated[Bounds, Query(description="What to do with a code outside the bounds.")] = Bounds.ALLOW,
     color: ColorQuery = NO_COLOR,
+    place: PlaceQuery = None,
     format: Annotated[Format, one_of(SHAPE_FORMATS)] = None,
 ) -> Response:
     """The shape of a code as a mesh file, for a link or a browser."""
     chosen = choose_mesh(format, request, color)
     code = None if latent is None else model.latents.code(numbers(latent, "latent"), bounds)
-    wanted = WantedShape(code, mesh, chosen, color.on(model.latents, bounds))
+    wanted = WantedShape(code, mesh, chosen, color.on(model, bounds), place)
     return await shape_response(service, request, caller, model, wanted)
 
 
@@ -79,12 +81,14 @@ async def post_mesh(
     body: Annotated[MeshRequest, Depends(JSONBody(MeshRequest))],
     mesh: MeshQuery = None,
     color: ColorQuery = NO_COLOR,
+    place: PlaceQuery = None,
     format: Annotated[Format, one_of(SHAPE_FORMATS)] = None,
 ) -> Response:
     """The shape of a code as a mesh file."""
     chosen = choose_mesh(format, request, color)
     code = model.latents.code(body.latent, body.bounds)
-    wanted = WantedShape(code, mesh or body.mesh, chosen, color.on(model.latents, body.bounds))
+    colours = color.on(model, body.bounds, body.covariance)
+    wanted = WantedShape(code, mesh or body.mesh, chosen, colours, place)
     return await shape_response(service, request, caller, model, wanted)
 
 
@@ -102,6 +106,7 @@ async def post_vertices(
     body: Annotated[VerticesRequest, Depends(JSONBody(VerticesRequest))],
     mesh: MeshQuery = None,
     exact: Annotated[bool, Query(description="As in the body: also the true discrete exponentials.")] = False,
+    place: PlaceQuery = None,
     format: Annotated[Format, one_of(VERTICES_TYPES)] = None,
 ) -> Response:
     """The positions of many shapes at once."""
@@ -116,6 +121,7 @@ async def post_vertices(
         mesh or body.mesh,
         chosen,
         exponentials=exact or body.exact,
+        place=place,
     )
     headers = {"Vary": "Accept", **file_headers(written.diagnostics or {}, f"{model.manifest.name}.{chosen}")}
     return written_response(service, written, headers, VERTICES_TYPES[chosen])

@@ -92,9 +92,11 @@ export async function sample(model, seed) {
 /** The code whose shape comes closest to some vertices' targets. */
 export const edit = (model, body, signal) => json(post(`${model.links.self}/edit`, body, signal));
 
-/** The code of a mesh file. */
-export const encode = (model, file, format) =>
-  json(call(`${model.links.self}/encode?format=${format}`, { method: "POST", body: file }));
+/** The code of a mesh file, with values by coordinate that it keeps. */
+export const encode = (model, file, format, fixed) => {
+  const query = new URLSearchParams({ format, fixed: JSON.stringify(fixed) });
+  return json(call(`${model.links.self}/encode?${query}`, { method: "POST", body: file }));
+};
 
 /** A file to keep, as a blob. */
 export const file = async (path, body) => (await (body ? post(path, body) : call(path))).blob();

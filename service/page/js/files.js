@@ -3,6 +3,7 @@
 import * as api from "./api.js";
 import { element, find, readable } from "./dom.js";
 import { report, reporting, say } from "./messages.js";
+import { fixedBy } from "./space.js";
 
 /** What the server offers for one shape. */
 export const SHAPE_FORMATS = ["glb", "gltf", "obj", "ply", "stl", "npz", "json"];
@@ -102,11 +103,11 @@ export class Files {
 
   /** Find the code of a mesh file and show it. */
   async encode(file) {
-    const { model } = this.store;
+    const { model, locked, code } = this.store;
     const format = file.name.split(".").pop().toLowerCase();
     say(`Looking for the code of ${file.name} …`, { key: "encode" });
     try {
-      const answer = await api.encode(model, file, format);
+      const answer = await api.encode(model, file, format, fixedBy(locked, code));
       if (this.store.model !== model) return;
       this.store.set({ code: answer.latent });
       const error = typeof answer.vertex_error === "number" ? answer.vertex_error : answer.vertex_error?.mean;

@@ -1,4 +1,4 @@
-/** Undo and redo of codes: each rest of the hand is a step. */
+/** Undo and redo of codes, and of where pulls have left their shapes: each rest of the hand is a step. */
 
 import { sameCode } from "./space.js";
 
@@ -24,20 +24,20 @@ export class History {
   }
 
   #record() {
-    const { code, moving, playing } = this.store;
+    const { code, placement, moving, playing } = this.store;
     if (!code || moving || playing) return;
-    if (this.#at < 0 || !sameCode(code, this.#steps[this.#at])) {
-      this.#steps = [...this.#steps.slice(0, this.#at + 1), code].slice(-LONGEST);
+    if (this.#at < 0 || !sameCode(code, this.#steps[this.#at].code)) {
+      this.#steps = [...this.#steps.slice(0, this.#at + 1), { code, placement }].slice(-LONGEST);
       this.#at = this.#steps.length - 1;
     }
     this.#show();
   }
 
   #go(by) {
-    const code = this.#steps[this.#at + by];
-    if (!code || this.store.playing) return;
+    const step = this.#steps[this.#at + by];
+    if (!step || this.store.playing) return;
     this.#at += by;
-    this.store.set({ code });
+    this.store.set(step);
     this.#show();
   }
 

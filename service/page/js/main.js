@@ -26,7 +26,7 @@ const PREFERRED = "figure";
 
 const store = new Store({
   model: null, space: null, references: {}, hasFine: false,
-  code: null, locked: [], moving: false, playing: false, shape: null,
+  code: null, locked: [], placement: null, moving: false, playing: false, shape: null,
   keyframes: [], loop: false, beyond: 0,
   colour: "none", against: -1, highlight: null, regions: null, repaint: null,
   wireframe: false, normals: false, fine: true, pull: false,
@@ -51,7 +51,7 @@ tabs(find("[role=tablist]"));
 // The shape and its colours.
 store.on(["shape"], () => {
   if (!store.shape) return;
-  viewer.show(store.shape.mesh, store.shape.positions, colouring.of(store.shape));
+  viewer.show(store.shape.mesh, store.shape.positions, colouring.of(store.shape), store.shape.placement);
 });
 store.on(["colour", "against", "highlight", "regions", "repaint", "moving"], () => {
   if (store.shape) viewer.paint(colouring.of(store.shape));
@@ -112,7 +112,7 @@ async function openModel({ model, code, keyframes = [], locked, view, state = {}
   const coarse = await api.reference(model, "coarse");
   if (opening !== model) return;
   picker.value = model.name;
-  store.set({ shape: null, playing: false });
+  store.set({ shape: null, playing: false, placement: null });
   viewer.open(coarse);
   pictures.open(coarse);
   turned = Boolean(view);

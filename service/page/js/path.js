@@ -156,7 +156,7 @@ export class Path {
     const positions = shapes[k].map((x, i) => x + share * (next[i] - x));
     const code = codes[(share < 0.5 ? k : k + 1) % codes.length];
     const { model } = this.store;
-    this.store.set({ code, shape: { model, mesh: "coarse", code, positions, diagnostics: null, began: performance.now() } });
+    this.store.set({ code, shape: { model, mesh: "coarse", code, placement: this.store.placement, positions, diagnostics: null, began: performance.now() } });
     this.timeline.value = this.#t;
     this.#tell();
   }

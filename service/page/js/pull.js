@@ -4,6 +4,7 @@ import * as THREE from "three";
 import * as api from "./api.js";
 import { readable } from "./dom.js";
 import { report, say } from "./messages.js";
+import { fixedBy } from "./space.js";
 
 export class Pull {
   #held = null; // what is pulled, from where, since when
@@ -31,9 +32,9 @@ export class Pull {
     if (!hit) return;
     event.stopImmediatePropagation();
     this.viewer.canvas.setPointerCapture(event.pointerId);
-    const { mesh, motion } = this.store.shape;
-    const back = motion.clone().invert(); // to where the server has the shape
-    this.#held = { ...hit, mesh, back, pointer: event.pointerId, code: this.store.code };
+    const { mesh, motion, placement } = this.store.shape;
+    const there = (placement ?? new THREE.Matrix4()).clone().multiply(motion); // from where the server has the shape
+    this.#held = { ...hit, mesh, motion, there, pointer: event.pointerId, code: this.store.code };
     this.store.set({ moving: true });
     this.dot.scale.setScalar(0.018 * this.viewer.sphere.radius);
     this.#mark(hit.position);
@@ -57,15 +58,17 @@ export class Pull {
   async #solve() {
     this.#busy = true;
     while (this.#wanted) {
-      const { code, vertex, mesh, back } = this.#held ?? this.last;
-      const target = this.#wanted.clone().applyMatrix4(back);
+      const { code, vertex, mesh, motion, there } = this.#held ?? this.last;
+      const position = this.#wanted.clone().applyMatrix4(there.clone().invert()).toArray();
       this.#wanted = null;
-      const { model } = this.store;
+      const { model, locked } = this.store;
       try {
-        const answer = await api.edit(model, { latent: code, mesh, targets: [{ vertex, position: target.toArray() }] });
+        const targets = [{ vertex, position }];
+        const answer = await api.edit(model, { latent: code, mesh, targets, fixed: fixedBy(locked, code) });
         if (this.store.model !== model) break;
-        const locked = answer.latent.map((value, k) => (this.store.locked[k] ? code[k] : value));
-        this.store.set({ code: locked });
+        // What isn't pulled stays where it is; the coarse shape lies beside the fine one as before.
+        const placement = there.clone().multiply(matrix(answer.placement)).multiply(motion.clone().invert());
+        this.store.set({ code: answer.latent.map((value, k) => (locked[k] ? code[k] : value)), placement });
         this.answer = answer;
       } catch (error) {
         report(error);
@@ -91,4 +94,9 @@ export class Pull {
     this.answer = null;
     if (typeof residual === "number") say(`The shape follows as far as the model can: ${readable(residual)} from where you pulled.`, { key: "pull" });
   }
+}
+
+/** A placement as the server answers it, as a Matrix4. */
+function matrix({ rotation: [a, b, c], translation: [x, y, z], scale }) {
+  return new THREE.Matrix4().set(...a, x, ...b, y, ...c, z, 0, 0, 0, 1).multiply(new THREE.Matrix4().makeScale(scale, scale, scale));
 }

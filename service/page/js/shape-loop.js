@@ -48,7 +48,8 @@ export class ShapeLoop {
   }
 
   #want(mesh) {
-    this.#wanted = { mesh, model: this.store.model, code: this.store.code, began: performance.now() };
+    const { model, code, placement } = this.store;
+    this.#wanted = { mesh, model, code, placement, began: performance.now() };
     if (!this.#current) this.#run();
   }
 

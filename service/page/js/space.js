@@ -49,3 +49,7 @@ export class LatentSpace {
 }
 
 export const sameCode = (a, b) => a.length === b.length && a.every((value, k) => Math.abs(value - b[k]) < 1e-7);
+
+/** The locked coordinates of a code, as the server takes what is fixed. */
+export const fixedBy = (locked, code) =>
+  Object.fromEntries(code.map((value, k) => [k, value]).filter(([k]) => locked[k]));

@@ -58,12 +58,17 @@ export class Viewer {
     this.geometries[name] = geometryOf(faces, vertices.length / 3);
   }
 
-  /** Show positions on one of the model's meshes. */
-  show(name, positions, colours) {
+  /** Show positions on one of the model's meshes, there or where a motion (Matrix4) takes them. */
+  show(name, positions, colours, placement) {
     const geometry = this.geometries[name];
     move(geometry, positions);
     paint(geometry, colours);
     this.mesh.geometry = this.wires.geometry = geometry;
+    for (const mesh of [this.mesh, this.wires]) {
+      mesh.matrixAutoUpdate = false;
+      mesh.matrix.copy(placement ?? new THREE.Matrix4());
+      mesh.updateMatrixWorld(true);
+    }
     this.mesh.visible = true;
     this.draw();
   }
@@ -121,7 +126,9 @@ export class Viewer {
     caster.setFromCamera(point, this.camera);
     const hit = caster.intersectObject(this.mesh)[0];
     if (!hit) return null;
-    const at = (vertex) => new THREE.Vector3().fromBufferAttribute(this.mesh.geometry.attributes.position, vertex);
+    const { geometry, matrixWorld } = this.mesh;
+    const at = (vertex) =>
+      new THREE.Vector3().fromBufferAttribute(geometry.attributes.position, vertex).applyMatrix4(matrixWorld);
     const corners = [hit.face.a, hit.face.b, hit.face.c];
     const vertex = corners.reduce((a, b) => (at(a).distanceTo(hit.point) <= at(b).distanceTo(hit.point) ? a : b));
     return { vertex, position: at(vertex) };

@@ -133,3 +133,66 @@ def test_a_shape_against_itself_is_grey(client: httpx.Client) -> None:
 def test_a_browser_that_takes_anything_gets_a_coloured_format(client: httpx.Client) -> None:
     answer = client.get(MESH, params={"color": "stretch"}, headers={"Accept": "model/stl, model/obj;q=0.2"})
     assert answer.raise_for_status().headers["Content-Type"] == "model/obj"
+
+
+def spread(
+    client: httpx.Client, covariance: Any, format: str = "json", latent: Any = CODE, **query: str
+) -> httpx.Response:
+    body = {"latent": latent, "covariance": np.asarray(covariance).tolist()}
+    return client.post(MESH, params={"color": "spread", "format": format} | query, json=body)
+
+
+@pytest.mark.parametrize("choice", ["fine", "coarse"])
+def test_spread_is_how_far_the_vertices_of_random_codes_are(client: httpx.Client, choice: str) -> None:
+    root = np.array([[0.01, 0, 0], [0.01, 0.03, 0], [-0.005, 0.01, 0.02]])
+    found = spread(client, root @ root.T, mesh=choice).raise_for_status().json()["color"]
+    codes = CODE + np.random.default_rng(0).standard_normal((400, 3)) @ root.T
+    drawn = []
+    for some in np.split(codes, 20):
+        body = {"latents": some.tolist(), "mesh": choice}
+        drawn.append(client.post(f"{MODEL}/vertices", json=body).raise_for_status().json()["vertices"])
+    deviation = np.sqrt(np.concatenate(drawn).var(axis=0).sum(axis=1))
+    np.testing.assert_allclose(found["values"], deviation, rtol=0.2, atol=2e-3)
+    assert np.ptp(deviation) > 0.005, "the same everywhere proves nothing"
+    assert found["quantity"] == "spread"
+    assert found["range"][0] == 0
+    assert found["range"][1] >= np.quantile(found["values"], 0.97)
+    doubled = spread(client, 4 * root @ root.T, mesh=choice).json()["color"]["values"]
+    np.testing.assert_allclose(doubled, 2 * np.array(found["values"]), rtol=1e-3)
+
+
+def test_a_shape_is_red_where_it_is_unsure(client: httpx.Client) -> None:
+    answers = [spread(client, np.diag([s, 0, 0]), "npz").raise_for_status() for s in (1e-4, 1e-4, 2e-4)]
+    assert answers[0].headers["ETag"] == answers[1].headers["ETag"] != answers[2].headers["ETag"]
+    with np.load(io.BytesIO(answers[0].content)) as arrays:
+        assert arrays["color_range"].tolist() == json.loads(answers[0].headers["Shape-Color"])["range"]
+    obj = spread(client, np.diag([1e-4, 0, 1e-3]), "obj").raise_for_status()
+    found = trimesh.load_mesh(io.BytesIO(obj.content), file_type="obj", process=False)
+    colours = found.visual.vertex_colors.astype(float)
+    values = np.array(spread(client, np.diag([1e-4, 0, 1e-3])).json()["color"]["values"])
+    assert colours[values.argmax(), 0] > colours[values.argmin(), 0]
+    assert colours[values.argmax(), 2] < colours[values.argmin(), 2]
+    sure = spread(client, np.zeros((3, 3))).raise_for_status().json()["color"]["values"]
+    assert not np.any(sure)
+
+
+def test_a_spread_needs_a_covariance(client: httpx.Client) -> None:
+    for covariance, says in (
+        (np.eye(2), "3 rows of 3 numbers"),
+        ([[1, 0, 0], [0, 1, 0]], "3 rows of 3 numbers"),
+        (-np.eye(3), "eigenvalues"),
+        (np.triu(np.ones((3, 3))), "symmetric"),
+        (1e300 * np.eye(3), "too large"),
+    ):
+        answer = spread(client, covariance)
+        assert answer.status_code == 422
+        assert says in answer.json()["detail"]
+    for answer, says in (
+        (client.get(MESH, params={"latent": text(CODE), "color": "spread"}), "POST it with its covariance"),
+        (client.post(MESH, params={"color": "spread"}, json={"latent": CODE}), "POST it with its covariance"),
+        (client.post(MESH, json={"latent": CODE, "covariance": np.eye(3).tolist()}), "Add ?color=spread"),
+        (client.get(MESH, params={"color": "spread", "against": text(CODE)}), "Add color=stretch"),
+        (client.post(MESH, json={"latent": CODE, "covariance": [[1], 2]}), "covariance[1]"),
+    ):
+        assert answer.status_code == 422
+        assert says in answer.json()["detail"]

@@ -137,6 +137,43 @@ def test_bounds(client: httpx.Client) -> None:
     assert refused.json()["type"].endswith("out-of-bounds")
 
 
+def test_the_query_says_what_is_fixed_and_how_many_samples(client: httpx.Client) -> None:
+    content = mesh_file(client).content
+    plain = encode(client, content)
+    found = encode(client, content, fixed='{"2": 0.25, "0": 0.3}', samples="3", seed="4")
+    assert (found["latent"][0], found["latent"][2]) == (np.float32(0.3), 0.25)
+    assert found["vertex_error"]["mean"] > plain["vertex_error"]["mean"]
+    assert np.shape(found["covariance"]) == (3, 3)
+    assert not np.any(found["covariance"][2])
+    assert found["covariance"][1][1] > 0
+    assert [row[2] for row in found["samples"]] == [0.25] * 3
+    assert plain["samples"] == []
+    for query, says in (
+        ({"fixed": "{"}, "fixed is not JSON"),
+        ({"fixed": "[1]"}, "fixed"),
+        ({"fixed": '{"3": 1}'}, "coordinates 0 to 2"),
+        ({"fixed": '{"one": 1}'}, "'one' is no index"),
+        ({"fixed": '{"1": "0"}'}, "the value at 1 is not a finite number"),
+        ({"fixed": '{"1": NaN}'}, "the value at 1 is not a finite number"),
+        ({"fixed": '{"1": 1e39}'}, "fixed[1] is not a finite number"),
+        ({"samples": "21"}, "the limit is 20"),
+        ({"samples": "-1"}, "samples"),
+        ({"seed": "x"}, "seed"),
+    ):
+        answer = client.post(ENCODE, content=content, params={"format": "json"} | query)
+        assert answer.status_code == 422, answer.text
+        assert says in answer.json()["detail"]
+
+
+def test_a_mesh_in_centimetres_is_refused(client: httpx.Client) -> None:
+    vertices = 100 * SCALE * MESH.vertices
+    answer = client.post(ENCODE, content=as_json(vertices, MESH.faces), params={"format": "json"})
+    assert answer.status_code == 422
+    assert answer.json()["type"].endswith("invalid-mesh")
+    assert "about 100 times as large" in answer.json()["detail"]
+    assert "send it in the training meshes' units" in answer.json()["detail"]
+
+
 def test_faces_may_be_in_any_order_and_left_out_of_json(client: httpx.Client) -> None:
     shape = mesh_file(client).json()
     vertices, faces = np.array(shape["vertices"]), np.array(shape["faces"])
@@ -218,8 +255,8 @@ def test_requests_without_a_known_format_or_a_file_are_refused(client: httpx.Cli
 
 
 def test_meshes_that_are_hardly_surfaces_are_answered_too(client: httpx.Client) -> None:
-    for vertices in (MESH.vertices * [1, 0, 0], MESH.vertices * [1, 1, 0], MESH.vertices * [-1, 1, 1]):
-        found = encode(client, as_json(vertices, MESH.faces))
+    for stretch in ([1, 0, 0], [1, 1, 0], [-1, 1, 1]):
+        found = encode(client, as_json(SCALE * MESH.vertices * stretch, MESH.faces))
         assert np.isfinite(found["latent"]).all()
         assert found["residual"] > 0.1
 

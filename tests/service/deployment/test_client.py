@@ -1,5 +1,6 @@
 """The Python client, against a server and without the rest of the project."""
 
+import json
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -93,8 +94,23 @@ def test_codes_are_drawn_found_and_changed(shapes: Client, tmp_path: Path) -> No
     before = np.linalg.norm(shape.vertices[vertex] - wanted)
     edited = shapes.edit("small", codes[0], {vertex: wanted}, prior=0.0)
     assert edited["residual"] < 0.2 * before
-    there = shapes.shape("small", edited["latent"]).vertices[vertex]
+    there = shapes.shape("small", edited["latent"], place=edited["placement"]).vertices[vertex]
     np.testing.assert_allclose(np.linalg.norm(there - wanted), edited["residual"], atol=1e-4)
+    held = shapes.edit("small", codes[0], {vertex: wanted}, sigma=0.01, fixed={1: 0.25}, samples=2, prior_kind="ridge")
+    assert held["latent"][1] == 0.25
+    assert [code[1] for code in held["samples"]] == [0.25] * 2
+    either = {vertex: {"position": wanted.tolist(), "sigma": 0.01}}
+    assert shapes.edit("small", codes[0], either)["covariance"] != edited["covariance"]
+    found = shapes.encode("small", shape, fixed={1: 0.25}, samples=2)
+    assert found["latent"][1] == 0.25
+    assert np.shape(found["samples"]) == (2, 3)
+    assert shapes.sample("small", 4, distribution="population", temperature=0.1).shape == (4, 3)
+    plain, unsure = (shapes.mesh("small", codes[0], "json", **o) for o in ({}, {"covariance": edited["covariance"]}))
+    assert json.loads(unsure)["color"]["quantity"] == "spread"
+    assert json.loads(unsure)["vertices"] == json.loads(plain)["vertices"]
+    moved = {"translation": [1, 0, 0]}
+    positions = [shapes.vertices("small", codes[:1], **options)[0] for options in ({}, {"place": moved})]
+    np.testing.assert_allclose(positions[1] - positions[0], [[1, 0, 0]] * len(positions[0]), atol=1e-5)
 
 
 def test_problems_are_exceptions_that_say_what_to_do(shapes: Client) -> None:

@@ -17,7 +17,7 @@ from shapespace.coordinates.nric import nric
 from shapespace.files.colouring import Quantity
 from shapespace.files.formats import MESH_FORMATS
 from shapespace.model.decoder import MeshChoice
-from shapespace.model.edit import InvalidTargetError, Target
+from shapespace.model.edit import InvalidTargetError, PriorKind, Target
 from shapespace.model.encode import Objective
 from shapespace.model.exact_shapes import NoTangentSpaceError
 from shapespace.model.latent_space import Bounds, Distribution
@@ -205,6 +205,9 @@ def test_frames_are_those_of_one_file_and_of_the_lines(model: ShapeModel) -> Non
         interpolation_id(model, animation, 2)
 
 
+NO_WISHES = codes.Wishes({}, 0, 0, 0)
+
+
 def test_a_mesh_is_searched_for_its_code(model: ShapeModel, sandbox: Sandbox) -> None:
     code = model.latents.codes([CODES[0]])[0][0]
     file = MESH_FORMATS["obj"].encode(model.shape(code).vertices, model.reference.faces, None)
@@ -214,7 +217,7 @@ def test_a_mesh_is_searched_for_its_code(model: ShapeModel, sandbox: Sandbox) ->
 
     def encode(given: codes.Upload) -> codes.Found:
         how = (Bounds.ALLOW, Objective.VERTICES)
-        return run(lambda workers: codes.encode(workers, sandbox, CALLER, model, given, *how))
+        return run(lambda workers: codes.encode(workers, sandbox, CALLER, model, given, *how, NO_WISHES))
 
     found = encode(upload(file))
     assert np.allclose(json.loads(found.content)["latent"], code, atol=1e-3)
@@ -230,7 +233,8 @@ def test_a_vertex_is_pulled_to_where_another_code_has_it(model: ShapeModel) -> N
     targets = [Target(k, goal[k].tolist()) for k in (0, 20, 40)]
 
     def edit(targets: list[Target]) -> codes.Found:
-        return run(lambda workers: codes.edit(workers, CALLER, model, [0.0, 0.0, 0.0], targets, 0.0, MeshChoice.FINE))
+        how = (0.0, PriorKind.GROUPS, MeshChoice.FINE, NO_WISHES)
+        return run(lambda workers: codes.edit(workers, CALLER, model, [0.0, 0.0, 0.0], targets, *how))
 
     found = edit(targets)
     assert max(json.loads(found.content)["distances"]) < 1e-2
@@ -241,10 +245,10 @@ def test_a_vertex_is_pulled_to_where_another_code_has_it(model: ShapeModel) -> N
 
 
 def test_one_seed_gives_the_same_codes_and_a_limit_holds(model: ShapeModel) -> None:
-    first, second = (codes.sample(model, 3, 7, Distribution.UNIFORM, 3) for _ in range(2))
+    first, second = (codes.sample(model, 3, 7, Distribution.UNIFORM, 1.0, 3) for _ in range(2))
     assert np.array_equal(first, second)
     with pytest.raises(TooManyCodesError, match="count asks for 4 codes; the limit is 3"):
-        codes.sample(model, 4, 7, Distribution.UNIFORM, 3)
+        codes.sample(model, 4, 7, Distribution.UNIFORM, 1.0, 3)
     with pytest.raises(NoCodesError):
         require_count(0, 3)
 

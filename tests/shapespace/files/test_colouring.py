@@ -22,13 +22,22 @@ def between(quantity: Quantity, a: np.ndarray, b: np.ndarray, connectivity: Conn
     return Colouring.between(quantity, a, b, connectivity)
 
 
-@pytest.mark.parametrize("quantity", list(Quantity))
+@pytest.mark.parametrize("quantity", [Quantity.STRETCH, Quantity.BENDING])
 def test_a_rigid_motion_changes_nothing_and_is_grey(quantity: Quantity) -> None:
     torus = freaky_torus.reference()
     turned = torus.vertices @ (ROTATION * np.sign(np.linalg.det(ROTATION))).T + [1, 2, 3]
     found = between(quantity, turned, torus.vertices, torus.connectivity)
     np.testing.assert_allclose(found.values, 0, atol=1e-12)
     np.testing.assert_allclose(found.srgb, np.broadcast_to(to_rgb("#dddcdc"), (len(turned), 3)), atol=1e-9)
+
+
+def test_a_spread_goes_from_blue_where_it_is_nothing_to_red() -> None:
+    found = Colouring.of_spread(np.array([0, 0.003, 0.004] + 200 * [0.002]))
+    assert found.ends == (0, 0.002)
+    assert found.legend == {"quantity": "spread", "range": [0, 0.002], "map": "coolwarm"}
+    np.testing.assert_allclose(found.srgb[[0, 1]], [to_rgb("#3b4cc0"), to_rgb("#b40426")])
+    nothing = Colouring.of_spread(np.zeros(3))
+    np.testing.assert_allclose(nothing.srgb, np.broadcast_to(to_rgb("#3b4cc0"), (3, 3)))
 
 
 def test_a_uniform_scaling_stretches_by_its_logarithm_and_bends_nothing() -> None:

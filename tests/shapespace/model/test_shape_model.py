@@ -67,7 +67,7 @@ def test_shapes_are_those_of_the_server(models: Path, client: httpx.Client, name
 @pytest.mark.parametrize("name", ["with-fine", "figure"])
 def test_codes_are_those_of_the_server(models: Path, client: httpx.Client, name: str, tmp_path: Path) -> None:
     model = load(models / name)
-    for distribution in ("uniform", "gaussian"):
+    for distribution in ("population", "uniform", "gaussian"):
         codes = post(client, name, "sample", count=2, seed=3, distribution=distribution)["latents"]
         np.testing.assert_array_equal(model.sample(2, 3, distribution), np.array(codes, np.float32))
     shape = model.decode(codes[0])

@@ -1,0 +1,195 @@
+"""docs/editing.md: whether an edit moves what is meant. ``python -m benchmarks.edit``.
+
+Pulls a fingertip, an elbow or a knee of the bundled figure, each to where it is on the shape of a code of which one
+factor alone differs, one that moves hardly anything but that limb, and measures what else moves.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shapespace.arrays import FloatArray
+from shapespace.mesh.rigid_motion import align
+from shapespace.model.edit import PRIOR, Edited, PriorKind, Target, edited
+from shapespace.model.latent_space import Codes, Distribution
+from shapespace.model.shape_model import ShapeModel, load
+from shapespace.training.collection.mannequin import ARM, ELBOW, HIP, KNEE, LEG, SHOULDER, rest
+
+ROOT = Path(__file__).resolve().parents[1]
+#: How far each vertex is pulled, in the figure's units, which are metres; how many are.
+PULL, PULLS = 0.25, 40
+#: A factor is one limb's if it moves that limb so many times as far as any other.
+OWN = 5.0
+#: Codes at which that is looked at, and directions that are tried for one pull.
+LOOKED_AT, TRIED = 4, 20
+
+PAGE = """# What an edit moves
+
+{count} pulls by {pull} m of a fingertip, an elbow or a knee of the figure, from random codes (Gaussian). Each target is
+where the vertex is on the shape of a code that differs in one factor of that limb alone, so that it is within reach.
+Measured in the frame of the start's shape, into which `placement` takes the new one: the mean distance that vertices of
+the other limbs and of the head have moved, the distance from the target as a share of the pull, factors that have
+changed by more than 1 % of the bounds' width, and the shapes that the search has solved, the start's among them.
+`python -m benchmarks.edit` measures and writes this page.
+
+| `prior_kind` | others: mean (m) | 95 % | largest | off target: median | 95 % | largest | factors | shapes | most |
+|---|---|---|---|---|---|---|---|---|---|
+{rows}
+"""
+
+
+@dataclass(frozen=True)
+class Pull:
+    """A vertex that should be elsewhere.
+
+    Attributes:
+        start: (m,) code to start from.
+        before: (V, 3) its shape.
+        limb: name of the limb.
+        target: where its vertex should be, ``PULL`` from where it is.
+    """
+
+    start: Codes
+    before: FloatArray
+    limb: str
+    target: Target
+
+
+def limbs() -> dict[str, NDArray[np.bool_]]:
+    """(V,) which vertices belong to each limb, and to the head."""
+    found = {}
+    for side, sign in (("left", 1), ("right", -1)):
+        y = rest().vertices * [sign, 1, 1]
+        arm = ((y - SHOULDER) @ ARM > 0.08) & (y[:, 0] > SHOULDER[0]) & (y[:, 1] > 0.7)
+        found[f"{side} arm"] = arm
+        found[f"{side} leg"] = ((y - HIP) @ LEG > 0.12) & (y[:, 0] > 0) & ~arm
+    return found | {"head": rest().vertices[:, 1] > 1.47}
+
+
+def handles() -> list[tuple[str, int]]:
+    """Limbs, and vertices of theirs that are pulled: fingertips, elbows and knees."""
+    found = []
+    for side, sign in (("left", 1), ("right", -1)):
+        y = rest().vertices * [sign, 1, 1]
+        arm = limbs()[f"{side} arm"]
+        fingertip = np.flatnonzero(arm)[(y[arm] @ ARM).argmax()]
+        elbow, knee = (np.linalg.norm(y - joint, axis=1).argmin() for joint in (ELBOW, KNEE))
+        found += [(f"{side} arm", int(fingertip)), (f"{side} arm", int(elbow)), (f"{side} leg", int(knee))]
+    return found
+
+
+def still(shape: FloatArray, before: FloatArray, limb: NDArray[np.bool_]) -> FloatArray:
+    """A shape (V, 3) moved to where all but one limb of it stays, as near as can be."""
+    return align(shape[~limb], before[~limb], carried=shape)
+
+
+def own_factors(model: ShapeModel, rng: np.random.Generator) -> dict[str, list[int]]:
+    """By limb, the factors that move hardly anything else."""
+    parts, before = limbs(), model.decode((model.lower + model.upper) / 2)
+    found: dict[str, list[int]] = {name: [] for name in parts}
+    for j, factor in enumerate(model.manifest.factors):
+        own = slice(factor.start, factor.stop)
+        moved: dict[str, float] = dict.fromkeys(parts, 0.0)
+        for _ in range(LOOKED_AT):
+            code = (model.lower + model.upper) / 2
+            code[own] = rng.uniform(model.lower[own], model.upper[own])
+            shape = model.decode(code)
+            # Whichever limb it is, the shape is best aligned without it.
+            fits = [still(shape, before, limb) for limb in parts.values()]
+            away = min((np.linalg.norm(fit - before, axis=1) for fit in fits), key=np.median)
+            for name, limb in parts.items():
+                moved[name] += away[limb].mean()
+        first, second = sorted(moved, key=lambda name: moved[name])[-1:-3:-1]
+        if moved[first] > OWN * moved[second]:
+            found[first].append(j)
+    return found
+
+
+def pulls(model: ShapeModel, count: int, seed: int) -> list[Pull]:
+    """Random pulls, as many of each handle as can be."""
+    rng, found, parts, several = np.random.default_rng(seed), [], limbs(), handles()
+    own = own_factors(model, rng)
+    starts = iter(model.latents.sample(8 * count, seed, Distribution.GAUSSIAN))
+    while len(found) < count:
+        limb, vertex = several[len(found) % len(several)]
+        start = next(starts)
+        before = model.decode(start)
+        for _ in range(TRIED):
+            factor = model.manifest.factors[rng.choice(own[limb])]
+            target = _place(model, start, before, parts[limb], vertex, slice(factor.start, factor.stop), rng)
+            if target is not None:
+                found.append(Pull(start, before, limb, Target(vertex, target.tolist())))
+                break
+    return found
+
+
+def _place(
+    model: ShapeModel,
+    start: Codes,
+    before: FloatArray,
+    limb: NDArray[np.bool_],
+    vertex: int,
+    own: slice,
+    rng: np.random.Generator,
+) -> FloatArray | None:
+    """Where a vertex is once it has moved by PULL towards a random value of a factor; None if it can't."""
+    goal = rng.uniform(model.lower[own], model.upper[own])
+
+    def place(share: float) -> FloatArray:
+        code = start.astype(np.float64)
+        code[own] += share * (goal - code[own])
+        position: FloatArray = still(model.decode(code), before, limb)[vertex]
+        return position
+
+    low, high = 0.0, 1.0
+    if np.linalg.norm(place(high) - before[vertex]) < PULL:
+        return None
+    for _ in range(12):
+        middle = (low + high) / 2
+        if np.linalg.norm(place(middle) - before[vertex]) < PULL:
+            low = middle
+        else:
+            high = middle
+    return place(high)
+
+
+def row(model: ShapeModel, some: list[Pull], kind: PriorKind, edit: Callable[..., Edited] = edited) -> str:
+    """Edit by every pull, and summarise."""
+    others, away, factors, shapes = [], [], [], []
+    parts = limbs()
+    for pull in some:
+        found = edit(model, pull.start, [pull.target], PRIOR, kind=kind)
+        now = found.placement(found.shape.vertices)
+        rest_of_it = np.logical_or.reduce([limb for name, limb in parts.items() if name != pull.limb])
+        others.append(np.linalg.norm(now - pull.before, axis=1)[rest_of_it].mean())
+        away.append(found.distances[0] / PULL)
+        change = np.abs(model.latents.shorter(found.code - pull.start.astype(np.float64))) / model.latents.width
+        factors.append(sum(change[f.start : f.stop].max() > 0.01 for f in model.manifest.factors))
+        shapes.append(found.iterations)
+    return (
+        f"| `{kind}` | {np.mean(others):.4f} | {np.quantile(others, 0.95):.4f} | {np.max(others):.4f} | "
+        f"{np.median(away):.2%} | {np.quantile(away, 0.95):.2%} | {np.max(away):.2%} | {np.mean(factors):.1f} | "
+        f"{np.mean(shapes):.1f} | {np.max(shapes)} |"
+    )
+
+
+def main() -> None:
+    """Measure, and write the page."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--count", type=int, default=PULLS, help="pulls")
+    given = parser.parse_args()
+    model = load(ROOT / "models" / "figure")
+    some = pulls(model, given.count, 0)
+    rows = "\n".join(row(model, some, kind) for kind in PriorKind)
+    page = PAGE.format(count=given.count, pull=PULL, rows=rows)
+    (ROOT / "docs" / "editing.md").write_text(page, encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,24 @@
+"""JSON in the address: ``?fixed=`` and ``?place=``."""
+
+from __future__ import annotations
+
+from typing import TypeVar
+
+from fastapi.exceptions import RequestValidationError
+from pydantic import TypeAdapter, ValidationError
+
+from shapespace.service.http.messages.bodies import parse
+from shapespace.service.http.problems import ProblemError
+
+T = TypeVar("T")
+
+
+def read_query(text: str, name: str, model: TypeAdapter[T]) -> T:
+    """A parameter of that name; raises RequestValidationError, or ProblemError where it is no JSON."""
+    try:
+        return model.validate_python(parse(text.encode()))
+    except ValidationError as error:
+        faults = error.errors(include_url=False, include_input=False)
+        raise RequestValidationError([{**fault, "loc": ("query", name, *fault["loc"])} for fault in faults]) from None
+    except RequestValidationError:
+        raise ProblemError("invalid-request", f"{name} is not JSON. Send one valid JSON object.") from None

@@ -1,0 +1,77 @@
+"""How far the vertices of a shape may be from where they are, by how sure its code is."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from shapespace.arrays import FloatArray
+from shapespace.model.decoder import Decoder, MeshChoice
+from shapespace.model.derivatives import derivatives
+from shapespace.model.latent_space import Codes, LatentError
+from shapespace.solve.cholesky import NotPositiveDefiniteError
+from shapespace.solve.deadline import Deadline
+
+#: Step of the difference quotient through alignment and prolongation, as a fraction of the diagonal.
+DIFFERENCE = 1e-4
+#: Differences between opposite entries, and eigenvalues below zero, that rounding may cause, as shares of the largest.
+ROUNDING = 1e-5
+
+
+class InvalidCovarianceError(LatentError):
+    """A matrix that is no covariance of codes, with a sentence that says what to do."""
+
+
+def require_covariance(model: Decoder, covariance: ArrayLike) -> FloatArray:
+    """(m, m) as numbers; raises InvalidCovarianceError."""
+    m = model.latents.dimension
+    try:
+        matrix = np.asarray(covariance, dtype=np.float64)
+    except ValueError:
+        matrix = np.zeros(0)
+    if matrix.shape != (m, m):
+        raise InvalidCovarianceError(f"covariance must have {m} rows of {m} numbers, as `edit` and `encode` answer it.")
+    largest = np.abs(matrix).max()
+    if not largest < np.finfo(np.float32).max:
+        raise InvalidCovarianceError("covariance has numbers that are not finite or too large. Send finite ones.")
+    lopsided = np.abs(matrix - matrix.T).max() > ROUNDING * largest
+    if lopsided or np.linalg.eigvalsh(matrix).min() < -ROUNDING * largest:
+        raise InvalidCovarianceError("covariance is not symmetric with eigenvalues of at least 0. Send one that is.")
+    return matrix
+
+
+def spread(
+    model: Decoder,
+    code: Codes,
+    covariance: FloatArray,
+    mesh: MeshChoice = MeshChoice.FINE,
+    deadline: Deadline | None = None,
+) -> FloatArray:
+    """Standard deviation (V,) of vertices, ``√tr(J C Jᵀ)`` with J the derivative of a vertex by the code.
+
+    Args:
+        model: whose code it is.
+        code: (m,).
+        covariance: (m, m) C, see ``require_covariance``.
+        mesh: whose vertices, aligned to the reference as they are answered.
+        deadline: after which the shape is taken as it is.
+
+    Raises:
+        NotFiniteError: the numbers overflow at this code.
+        InvalidCovarianceError: the shape has all but collapsed there, so that it has no derivative.
+    """
+    scale, x = model.manifest.scale, code.astype(np.float64)
+    values, vectors = np.linalg.eigh(covariance)
+    directions = np.sqrt(np.maximum(values, 0))[:, None] * vectors.T
+    coarse = model.shape(code, True, MeshChoice.COARSE, deadline).vertices / scale
+    with model.solver() as reconstruct:
+        try:
+            fields = reconstruct.differential(coarse, (derivatives(model, x) @ directions.T).T)
+        except NotPositiveDefiniteError:
+            raise InvalidCovarianceError(
+                "The shape of this code has all but collapsed: how it changes is unknown. Leave color=spread out."
+            ) from None
+    h = DIFFERENCE * model.reference.diagonal / max(np.abs(fields).max(), np.finfo(float).tiny)
+    moves = (model.placed(coarse + h * fields, mesh) - model.placed(coarse, mesh)) / h
+    result: FloatArray = scale * np.sqrt((moves**2).sum(axis=(0, 2)))
+    return result
