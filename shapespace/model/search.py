@@ -189,7 +189,7 @@ class Search:
         self._model, self._options, self._level, self._deadline = model, options, level, deadline
         self._scan, self._some, self._fans, self._vertices = scan, scan.some(level.points), fans, vertices
         self._diagonal = model.reference.diagonal
-        self._whiten = np.linalg.inv(options.prior.root)
+        self._whiten: FloatArray = np.asarray(np.linalg.inv(options.prior.root), np.float64)
         self.shapes = SearchedShapes(model, reconstruct, deadline, rough=level.rough)
         self._changes: Callable[[Decoder, FloatArray], FloatArray] = factor_derivatives if level.rough else derivatives
         self.count = 0

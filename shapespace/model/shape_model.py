@@ -293,7 +293,13 @@ class ShapeModel(Decoder):
             points=points,
             seed=seed,
         )
-        return self._fitter(*_points_and_faces(scan), options, deadline)
+        return self.fit_with(_points_and_faces(scan), options, deadline)
+
+    def fit_with(
+        self, scan: tuple[FloatArray, IntArray], options: FitOptions, deadline: Deadline | None = None
+    ) -> Fitted:
+        """As ``fit``, with points (N, 3) and faces (F, 3), none if there aren't any, and all options in one."""
+        return self._fitter(*scan, options, deadline)
 
     def sample(self, count: int, seed: int = 0, distribution: DistributionName = "uniform") -> Codes:
         """Random codes (count, m) inside the bounds; one seed gives the same on every machine.
@@ -339,7 +345,7 @@ def _points_and_faces(
     if isinstance(scan, TriangleMesh):
         return scan.vertices, scan.faces
     if isinstance(scan, str | os.PathLike):
-        points, faces = read_arrays(Path(scan))
+        points, faces = read_arrays(Path(scan), points=True)
     elif isinstance(scan, tuple):
         points, faces = (np.asarray(part) for part in scan)
     else:
