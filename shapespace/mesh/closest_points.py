@@ -103,9 +103,11 @@ def nearest_shares(points: FloatArray, corners: FloatArray) -> FloatArray:
     d00, d01, d11 = (ab * ab).sum(-1), (ab * ac).sum(-1), (ac * ac).sum(-1)
     d20, d21 = (ap * ab).sum(-1), (ap * ac).sum(-1)
     tiny = np.finfo(float).tiny
-    scale = np.maximum(d00 * d11 - d01**2, tiny)
+    scale = d00 * d11 - d01**2
+    has_area = scale > 1e-12 * d00 * d11
+    scale = np.where(has_area, scale, 1)
     v, w = (d11 * d20 - d01 * d21) / scale, (d00 * d21 - d01 * d20) / scale
-    inside = (v >= 0) & (w >= 0) & (v + w <= 1)
+    inside = has_area & (v >= 0) & (w >= 0) & (v + w <= 1)
     # Along ab, ac, and bc; squares of distances up to |ap|².
     s = np.clip(d20 / np.maximum(d00, tiny), 0, 1)
     t = np.clip(d21 / np.maximum(d11, tiny), 0, 1)
