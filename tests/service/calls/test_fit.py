@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from shapespace.client import Client, ClientError, Mesh
 from shapespace.files.formats import MESH_FORMATS, npz
 from shapespace.model.shape_model import ShapeModel, load
-from tests.service.conftest import ROOT
+from tests.service.conftest import ROOT, starting
 
 FIT = "/v1/models/figure/fit"
 CODE = np.linspace(-0.4, 0.4, 20)
@@ -164,3 +164,24 @@ def test_the_client_fits_points_meshes_and_files(
         assert caller.fit("figure", shape)["status"] == "converged"
         with pytest.raises(ClientError, match="scale=free"):
             caller.fit("figure", 100 * points)
+
+
+def test_a_fit_that_takes_too_long_is_ended(points: np.ndarray) -> None:
+    with starting() as start, httpx.Client(base_url=start(ROOT / "models", deadline=0.2).url, timeout=60) as client:
+        answer = client.post(FIT, content=as_xyz(points), params={"format": "xyz"})
+        assert answer.status_code == 504
+        assert answer.json()["type"] == "urn:shapespace:problem:deadline-passed"
+        assert client.get("/v2/health/ready").json() == {"ready": True}
+
+
+def test_a_million_points_are_sampled_and_a_large_file_is_no_larger_than_others(
+    client: httpx.Client, points: np.ndarray
+) -> None:
+    many = np.repeat(points, 334, axis=0)[:1_000_000]
+    found = client.post(FIT, content=as_ply(many), params={"format": "ply"}).raise_for_status().json()
+    assert found["sampled"]
+    assert "1000000 points" in found["reason"]
+    too_many = np.repeat(points, 700, axis=0)
+    answer = client.post(FIT, content=as_ply(too_many), params={"format": "ply"})
+    assert answer.status_code == 422
+    assert "2097152 vertices" in answer.json()["detail"]
