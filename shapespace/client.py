@@ -212,18 +212,50 @@ class Client:
         Returns:
             ``latent``, ``residual``, ``vertex_error``, ``covariance``, ``samples`` and more.
         """
-        if isinstance(mesh, Mesh):
-            buffer = io.BytesIO()
-            np.savez(buffer, vertices=mesh.vertices, faces=mesh.faces)
-            content, format = buffer.getvalue(), "npz"
-        elif isinstance(mesh, Path):
-            content, format = mesh.read_bytes(), format or mesh.suffix.lstrip(".")
-        else:
-            content = mesh
+        content, format = _file(mesh, format)
         headers = {"Content-Type": "application/octet-stream"}
         params = {"format": format, "fixed": _json(_by_index(fixed)), **options}
         found: dict[str, Any] = self._send(
             "POST", f"/v1/models/{name}/encode", params=params, content=content, headers=headers
+        ).json()
+        return found
+
+    def fit(
+        self,
+        name: str,
+        scan: Mesh | ArrayLike | bytes | Path,
+        format: str | None = None,
+        *,
+        version: str | None = None,
+        **options: Any,
+    ) -> dict[str, Any]:
+        """The code, place and size that explain a scan, without correspondence.
+
+        Args:
+            name: of the model.
+            scan: points (N, 3), a mesh, a file or its content.
+            format: of the content; by default the file's suffix.
+            version: of the model.
+            options: scale ("fixed" or "free"), partial, noise, landmarks, fixed (value by coordinate), distribution
+                ("population" or "box"), samples, points, seed.
+
+        Returns:
+            ``latent``, ``covariance``, ``placement``, ``status``, ``reason`` and more.
+        """
+        if isinstance(scan, bytes | Path | Mesh):
+            content, format = _file(scan, format)
+        else:
+            buffer = io.BytesIO()
+            np.savez(buffer, vertices=np.asarray(scan, dtype=np.float64))
+            content, format = buffer.getvalue(), "npz"
+        if "fixed" in options:
+            options["fixed"] = {str(k): float(value) for k, value in options["fixed"].items()}
+        found: dict[str, Any] = self._send(
+            "POST",
+            f"/v1/models/{name}/fit",
+            params={"version": version, "format": format},
+            files={"file": ("scan", content)},
+            data={"options": json.dumps(options)},
         ).json()
         return found
 
@@ -348,6 +380,17 @@ def _by_index(fixed: Mapping[int, float] | None) -> dict[str, float] | None:
 def _json(value: Mapping[Any, Any] | None) -> str | None:
     """As it stands in an address."""
     return None if value is None else json.dumps(value, default=lambda array: array.tolist())
+
+
+def _file(mesh: Mesh | bytes | Path, format: str | None) -> tuple[bytes, str | None]:
+    """The content of a mesh file, and its format where that is known."""
+    if isinstance(mesh, Mesh):
+        buffer = io.BytesIO()
+        np.savez(buffer, vertices=mesh.vertices, faces=mesh.faces)
+        return buffer.getvalue(), "npz"
+    if isinstance(mesh, Path):
+        return mesh.read_bytes(), format or mesh.suffix.lstrip(".")
+    return mesh, format
 
 
 def _numbers(values: ArrayLike) -> Any:

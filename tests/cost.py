@@ -37,7 +37,7 @@ def read(body: bytearray, said: str) -> str:
     """What comes of a body: a sentence, or the mesh's size."""
     try:
         form = "/" in said
-        vertices, faces, _ = read_mesh_file(body, said if form else "", None if form else said, LIMITS)
+        vertices, faces, *_ = read_mesh_file(body, said if form else "", None if form else said, LIMITS)
     except UploadError as error:
         return str(error)
     return f"{len(vertices)} vertices and {len(faces)} faces"

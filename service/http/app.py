@@ -21,6 +21,7 @@ from shapespace.service.http.description import describe
 from shapespace.service.http.middleware import AnswerHead, LimitBody, Observe, PaceAnswers, RequireHost, RequireKey
 from shapespace.service.http.routes import (
     codes,
+    fits,
     health,
     interpolations,
     models,
@@ -97,7 +98,8 @@ def create_app(settings: Settings | None = None, validator: BundleValidator | No
     )
     problems.install(app)
     routers = [
-        module.router for module in (models, shapes, codes, interpolations, open_inference, health, operation, page)
+        module.router
+        for module in (models, shapes, codes, fits, interpolations, open_inference, health, operation, page)
     ]
     for router in routers:
         app.include_router(router)

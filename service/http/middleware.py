@@ -203,7 +203,7 @@ class LimitBody:
     Args:
         app: what comes next.
         limit: most bytes of a body.
-        upload: the same where a mesh file is sent, which is to ``…/encode``.
+        upload: the same where a mesh file is sent, which is to ``…/encode`` and ``…/fit``.
     """
 
     def __init__(self, app: ASGIApp, limit: int, upload: int) -> None:
@@ -215,7 +215,7 @@ class LimitBody:
         if scope["type"] != "http":
             await self.app(scope, receive, send)
             return
-        limit = self.upload if scope["path"].endswith("/encode") else self.limit
+        limit = self.upload if scope["path"].endswith(("/encode", "/fit")) else self.limit
         headers = Headers(scope=scope)
         announced = headers.get("content-length", "")
         length = int(announced) if announced.isdecimal() else 0

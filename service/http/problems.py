@@ -19,6 +19,7 @@ from shapespace.model.decoder import ModelFailedError, NetworkTimeError
 from shapespace.model.edit import InvalidTargetError
 from shapespace.model.exact_shapes import NoTangentSpaceError
 from shapespace.model.latent_space import InvalidFixedError, NotFiniteError, OutOfBoundsError, WrongLengthError
+from shapespace.model.scan import InvalidScanError
 from shapespace.model.spread import InvalidCovarianceError
 from shapespace.service.limits.workers import BusyError, DeadlineError, DisconnectedError, EndingError
 from shapespace.service.repository.repository import UnknownModelError, UnknownVersionError
@@ -62,6 +63,7 @@ KINDS = {
     "not-finite": Kind(422, "Not a finite number"),
     "out-of-bounds": Kind(422, "Code out of bounds"),
     "invalid-mesh": Kind(422, "Mesh can't be used"),
+    "invalid-scan": Kind(422, "Scan can't be used"),
     "no-tangent-space": Kind(422, "Model without a tangent space"),
     "too-many-codes": Kind(422, "Too many codes"),
     "too-many-frames": Kind(422, "Too many frames"),
@@ -96,6 +98,7 @@ _OF_EXCEPTION: dict[type[Exception], str] = {
     UnknownFormatError: "unsupported-media-type",
     UnusableMeshError: "invalid-mesh",
     InvalidMeshError: "invalid-mesh",
+    InvalidScanError: "invalid-scan",
     NoTangentSpaceError: "no-tangent-space",
     BusyError: "busy",
     DeadlineError: "deadline-passed",

@@ -207,13 +207,29 @@ def sample(
 
 
 def read_mesh(sandbox: Sandbox, upload: Upload, limits: Limits, deadline: Deadline) -> tuple[FloatArray, IntArray]:
-    """Vertices (V, 3) and faces (F, 3) of an uploaded file, read in a process of its own.
+    """Vertices (V, 3) and faces (F, 3) of an uploaded file; raises as ``read_upload``."""
+    vertices, faces, _ = read_upload(sandbox, upload, limits, deadline)
+    return vertices, faces
+
+
+def read_upload(
+    sandbox: Sandbox,
+    upload: Upload,
+    limits: Limits,
+    deadline: Deadline,
+    *,
+    points: bool = False,
+    memory: int = MEMORY,
+) -> tuple[FloatArray, IntArray, str]:
+    """Vertices (V, 3), faces (F, 3) and the form's ``options`` of an uploaded file, read in a process of its own.
 
     Args:
         sandbox: whose children know the task ``read``.
         upload: which is emptied.
         limits: of the mesh.
         deadline: after which the child is ended.
+        points: whether points without faces will do.
+        memory: bytes that reading may take beside the file.
 
     Raises:
         UploadError: no mesh that can be used.
@@ -221,11 +237,11 @@ def read_mesh(sandbox: Sandbox, upload: Upload, limits: Limits, deadline: Deadli
         BusyError: no process can be had.
         EndingError: the server ends.
     """
-    facts = {"content_type": upload.content_type, "format": upload.format}
+    facts = {"content_type": upload.content_type, "format": upload.format, "points": points}
     bounds = {"vertices": limits.vertices, "faces": limits.faces}
     most = 24 * (limits.vertices + limits.faces) + _LEAST
     try:
-        _, arrays = sandbox.call("read", facts | bounds, upload.pieces, deadline=deadline, memory=MEMORY, most=most)
+        said, arrays = sandbox.call("read", facts | bounds, upload.pieces, deadline=deadline, memory=memory, most=most)
     except FailedError as error:
         if error.kind in UPLOAD_ERRORS:
             raise UPLOAD_ERRORS[error.kind](error.sentence) from None
@@ -242,7 +258,7 @@ def read_mesh(sandbox: Sandbox, upload: Upload, limits: Limits, deadline: Deadli
         raise EndingError("The server is about to end. Send the file to another one.") from error
     except SandboxError as error:
         raise _unusable(str(error)) from None
-    return arrays["vertices"], arrays["faces"]
+    return arrays["vertices"], arrays["faces"], str(said["options"])
 
 
 def _unusable(why: str) -> UnusableMeshError:

@@ -7,7 +7,7 @@ takes time in proportion to their number, and memory that the limits bound.
 from __future__ import annotations
 
 from array import array
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from itertools import chain
 from pathlib import PurePath
 
@@ -17,7 +17,7 @@ from python_multipart.exceptions import FormParserError
 from python_multipart.multipart import MultipartParser, parse_options_header
 
 from shapespace.arrays import FloatArray, IntArray
-from shapespace.files.formats import OCTET_STREAM, READ_FORMATS, read_arrays
+from shapespace.files.formats import OCTET_STREAM, READ_FORMATS, SCAN_FORMATS, read_arrays
 from shapespace.files.limits import Limits, clipped, count_bytes
 from shapespace.mesh.triangle_mesh import MeshError
 from shapespace.service.limits.sandbox_errors import FailedError
@@ -25,6 +25,8 @@ from shapespace.service.limits.sandbox_wire import Arrays, Facts
 
 #: Media types of the formats that can be read, by name.
 FORMATS = READ_FORMATS | {"json": "application/json"}
+#: The same of scans, which may be points without faces.
+POINT_FORMATS = SCAN_FORMATS | {"json": "application/json"}
 #: The same the other way round, with other names of media types.
 MEDIA_TYPES = {
     "text/plain": "obj",
@@ -38,6 +40,7 @@ _MAGIC = {b"glTF": "glb", b"ply": "ply", b"PK": "npz", b"OFF": "off"}
 #: Characters of a header that says what a body or a part is.
 _LONGEST_HEADER = 1000
 _MOST_FIELDS = 16
+_LONGEST_OPTIONS = 2**18
 #: Of JSON: bytes for each vertex and face, with digits and spaces to spare; bytes, lists, objects and quotes beside.
 _BYTES_OF_EACH, _BYTES_BESIDE, _LISTS_BESIDE, _OBJECTS, _QUOTES = 128, 2**20, 1000, 1000, 4000
 #: What isn't ASCII stands in names only, which are of no interest, but would make every character take four bytes.
@@ -66,8 +69,8 @@ UPLOAD_ERRORS = {error.__name__: error for error in (UnusableMeshError, Unreadab
 
 
 def read_mesh_file(
-    body: bytes | bytearray, content_type: str, format: str | None, limits: Limits
-) -> tuple[FloatArray, IntArray, str]:
+    body: bytes | bytearray, content_type: str, format: str | None, limits: Limits, *, points: bool = False
+) -> tuple[FloatArray, IntArray, str, str]:
     """The mesh in the body of a request.
 
     Args:
@@ -75,50 +78,57 @@ def read_mesh_file(
         content_type: the header, or nothing.
         format: what ``?format=`` says, which wins; then the content type, the file's name, its first bytes.
         limits: where reading ends without a mesh.
+        points: whether points without faces will do.
 
     Returns:
-        Vertices (V, 3) as they stand in the file, faces (F, 3), none where it doesn't say, and its format.
+        Vertices (V, 3) as they stand in the file, faces (F, 3), none where it doesn't say, its format, and the text of
+        a form's field ``options``.
 
     Raises:
         UploadError: no file, a form or a file that can't be read, or a format that nothing tells or nobody knows.
     """
-    data, name = memoryview(body), ""
+    data, name, said, formats = memoryview(body), "", b"", POINT_FORMATS if points else FORMATS
     declared, options = parse_options_header(content_type[:_LONGEST_HEADER])
     if declared == b"multipart/form-data":
-        data, name, declared = _Form(body, options.get(b"boundary")).file()
+        form = _Form(body, options.get(b"boundary"))
+        data, name, declared = form.file()
+        said = form.options
     if not data:
         raise UnusableMeshError("The file is empty. Send a mesh file as the body, or as a file of a form.")
-    found = format or _guess(declared.decode("latin-1"), name, bytes(data[:4]))
-    if found not in FORMATS:
-        listed = ", ".join(f"{name} ({media_type})" for name, media_type in FORMATS.items())
+    found = format or _guess(declared.decode("latin-1"), name, bytes(data[:4]), formats)
+    if found not in formats:
+        listed = ", ".join(f"{name} ({media_type})" for name, media_type in formats.items())
         told = clipped(declared.decode("latin-1")) or "No content type"
         fault = f"There is no format {clipped(format)!r} here" if format else f"{told} tells no format"
         raise UnknownFormatError(
             f"{fault}. Say by ?format= or Content-Type which: {listed}.",
         )
     try:
-        vertices, faces = _read_json(data, limits) if found == "json" else read_arrays(data, found, limits)
-        return *_checked(vertices, faces), found
+        if found == "json":
+            vertices, faces = _read_json(data, limits)
+        else:
+            vertices, faces = read_arrays(data, found, limits, points=points)
+        return *_checked(vertices, faces), found, said.decode(errors="replace")
     except MeshError as error:
         sentence = f"The mesh can't be used: {str(error).rstrip('.')}. Send one {found} file."
         raise UnusableMeshError(sentence) from None
 
 
-def _guess(declared: str, name: str, start: bytes) -> str | None:
+def _guess(declared: str, name: str, start: bytes, formats: Collection[str]) -> str | None:
     suffix = PurePath(name).suffix.lstrip(".").lower()
     magic = next((format for magic, format in _MAGIC.items() if start.startswith(magic)), "")
-    return next((guess for guess in (MEDIA_TYPES.get(declared), suffix, magic) if guess in FORMATS), None)
+    return next((guess for guess in (MEDIA_TYPES.get(declared), suffix, magic) if guess in formats), None)
 
 
 def read_in_sandbox(
-    body: bytearray, content_type: str, format: str | None, vertices: int, faces: int
+    body: bytearray, content_type: str, format: str | None, vertices: int, faces: int, points: bool = False
 ) -> tuple[Facts, Arrays]:
     """``read_mesh_file`` as a task of a sandbox; raises FailedError."""
     try:
-        found = read_mesh_file(body, content_type, format, Limits(vertices, faces))
+        found = read_mesh_file(body, content_type, format, Limits(vertices, faces), points=points)
     except UploadError as error:
         raise FailedError(type(error).__name__, str(error)) from None
-    return {"format": found[2]}, {"vertices": found[0], "faces": found[1]}
+    return {"format": found[2], "options": found[3]}, {"vertices": found[0], "faces": found[1]}
 
 
 class _Form:
@@ -136,6 +146,9 @@ class _Form:
         self._fields = self._files = 0
         self._is_file, self._start, self._stop = False, 0, 0
         self._found: tuple[memoryview, str, bytes] | None = None
+        self._field = b""
+        #: Content of the field ``options``, which says how the file is to be used.
+        self.options = b""
 
     def file(self) -> tuple[memoryview, str, bytes]:
         """Its content, its name, and its declared type.
@@ -188,6 +201,7 @@ class _Form:
         if self._fields > _MOST_FIELDS:
             raise self._unreadable(f"Too many fields. Maximum number of fields is {_MOST_FIELDS}.")
         self._name = options.get(b"filename", b"").decode(errors="replace")
+        self._field = options[b"name"]
 
     def _on_part_data(self, data: bytes, start: int, stop: int) -> None:
         self._start, self._stop = self._start or start, stop
@@ -196,6 +210,10 @@ class _Form:
         if self._is_file:
             declared, _ = parse_options_header(self._headers.get(b"content-type"))
             self._found = memoryview(self._body)[self._start : self._stop], self._name, declared
+        elif self._field == b"options":
+            if self._stop - self._start > _LONGEST_OPTIONS:
+                raise self._unreadable(f"options has more than {_LONGEST_OPTIONS} bytes.")
+            self.options = bytes(self._body[self._start : self._stop])
 
 
 def _read_json(data: memoryview, limits: Limits) -> tuple[FloatArray, IntArray]:

@@ -14,7 +14,7 @@ from shapespace.arrays import FloatArray, IntArray
 from shapespace.files.gltf_reading import read_gltf
 from shapespace.files.limits import UNLIMITED, Limits, clipped
 from shapespace.files.npz_reading import load_npz
-from shapespace.files.polygon_reading import read_obj, read_off, read_ply, read_stl
+from shapespace.files.polygon_reading import read_obj, read_off, read_ply, read_stl, read_xyz
 from shapespace.mesh.triangle_mesh import MeshError
 
 if TYPE_CHECKING:
@@ -120,6 +120,8 @@ MESH_FORMATS: dict[str, MeshFormat] = {
 }
 #: Media types of the formats that can be read, by name.
 READ_FORMATS = {name: format.media_type for name, format in MESH_FORMATS.items()} | {"off": OCTET_STREAM}
+#: The same for point clouds, which may do without faces.
+SCAN_FORMATS = READ_FORMATS | {"xyz": OCTET_STREAM}
 
 
 def npz(**arrays: np.ndarray) -> bytes:
@@ -130,7 +132,11 @@ def npz(**arrays: np.ndarray) -> bytes:
 
 
 def read_arrays(
-    source: bytes | bytearray | memoryview | Path, format: str | None = None, limits: Limits = UNLIMITED
+    source: bytes | bytearray | memoryview | Path,
+    format: str | None = None,
+    limits: Limits = UNLIMITED,
+    *,
+    points: bool = False,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Read one mesh as it stands in its file: vertices (V, 3) and faces (F, 3), nothing merged and nothing checked.
 
@@ -140,6 +146,7 @@ def read_arrays(
         source: the file's bytes, or its path.
         format: one of READ_FORMATS; by default the path's extension.
         limits: where reading ends without a mesh; they bound its time and memory, whatever the bytes are.
+        points: whether points without faces will do; then one of SCAN_FORMATS.
 
     Raises:
         MeshError: unreadable, too large, or not exactly one mesh; with the reason.
@@ -166,8 +173,10 @@ def read_arrays(
                 case "glb" | "gltf":
                     return read_gltf(data, limits, binary=format == "glb", beside=beside)
                 case "npz":
-                    arrays = load_npz(data, limits=limits)
-                    return arrays["vertices"], arrays["faces"]
+                    arrays = load_npz(data, limits=limits, needed=("vertices",) if points else ("vertices", "faces"))
+                    return arrays["vertices"], arrays.get("faces", np.zeros((0, 3), np.int64))
+                case "xyz" if points:
+                    return read_xyz(data, limits)
                 case _:
                     return _READERS[str(format)](data, limits)
     except MeshError:

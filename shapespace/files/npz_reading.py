@@ -53,25 +53,29 @@ class _File:
 
 
 def load_npz(
-    data: memoryview, names: Collection[str] = ("vertices", "faces"), limits: Limits = UNLIMITED
+    data: memoryview,
+    names: Collection[str] = ("vertices", "faces"),
+    limits: Limits = UNLIMITED,
+    needed: Collection[str] = ("vertices", "faces"),
 ) -> dict[str, NDArray]:
-    """Arrays of an NPZ file that holds at least ``vertices`` and ``faces``.
+    """Arrays of an NPZ file that holds at least those that are needed.
 
     Args:
         data: the file.
         names: the arrays to read, as far as there are any.
         limits: of the vertices and faces.
+        needed: without which the file is refused.
 
     Raises:
-        MeshError: no NPZ file, too large, pickled objects (which could run code) anywhere in it, or without vertices or
-            faces; with the reason.
+        MeshError: no NPZ file, too large, pickled objects (which could run code) anywhere in it, or without what is
+            needed; with the reason.
     """
     try:
         with zipfile.ZipFile(_File(data)) as archive:
             entries = {e.filename.removesuffix(".npy"): e for e in archive.infolist() if e.filename.endswith(".npy")}
             if len(entries) > _MOST_ARRAYS:
                 raise MeshError(f"holds {len(entries)} arrays, where {_MOST_ARRAYS} are the most")
-            missing = {"vertices", "faces"} - entries.keys()
+            missing = set(needed) - entries.keys()
             if missing:
                 there = clipped(", ".join(sorted(entries)))
                 raise MeshError(f"holds no array '{min(missing)}', only {there or 'nothing'}")

@@ -1,4 +1,4 @@
-"""Readers of OBJ, OFF, PLY and STL: the vertices in the order of the file, and its polygons as triangles.
+"""Readers of OBJ, OFF, PLY, STL and XYZ: the vertices in the order of the file, and its polygons as triangles.
 
 Written here because other readers split and reorder vertices along seams of texture, and because files come from
 strangers: every reader goes through its file once, and checks sizes against its limits before it allocates anything.
@@ -137,6 +137,16 @@ def read_off(data: memoryview, limits: Limits) -> tuple[FloatArray, IntArray]:
             corners, *values = lines.next().split()
             triangles.add([int(value) for value in _exactly(int(corners), values)])
     return np.array(coordinates, np.float64).reshape(-1, 3), triangles.all()
+
+
+def read_xyz(data: memoryview, limits: Limits) -> tuple[FloatArray, IntArray]:
+    """Points (N, 3) of a text with a point on each line, and no faces; normals or colours behind them are left out."""
+    coordinates = array("d")
+    with _Lines(data, limits) as lines:
+        for line in lines:
+            coordinates.extend(_point(line.replace(b",", b" ")))
+            limits.check(len(coordinates) // 3, 0)
+    return np.array(coordinates, np.float64).reshape(-1, 3), np.zeros((0, 3), np.int64)
 
 
 def _exactly(count: int, values: Sequence[bytes]) -> Sequence[bytes]:

@@ -30,15 +30,39 @@ class Placement:
         """Points (…, 3) in the other frame."""
         return self.scale * points @ self.rotation.T + self.translation
 
+    def back(self, points: FloatArray) -> FloatArray:
+        """Points (…, 3) of the other frame in the first one."""
+        return (points - self.translation) @ self.rotation / self.scale
+
+    def after(self, first: Placement) -> Placement:
+        """This one applied to what ``first`` has placed."""
+        return Placement(self.rotation @ first.rotation, self(first.translation), self.scale * first.scale)
+
     @classmethod
-    def between(cls, points: FloatArray, there: FloatArray, weights: FloatArray) -> Placement:
-        """The rigid motion that brings points (n, 3) closest to others (n, 3) in weighted least squares (Kabsch)."""
-        share = weights / weights.sum()
+    def between(
+        cls, points: FloatArray, there: FloatArray, weights: FloatArray | None = None, *, scaled: bool = False
+    ) -> Placement:
+        """What brings points (n, 3) closest to others (n, 3) in weighted least squares (Umeyama 1991).
+
+        Args:
+            points: (n, 3).
+            there: (n, 3).
+            weights: (n,), by default equal ones.
+            scaled: whether the scale is found too, which is 1 otherwise.
+        """
+        share = np.full(len(points), 1 / len(points)) if weights is None else weights / weights.sum()
         middle, centre = share @ points, share @ there
-        u, _, vt = np.linalg.svd((share[:, None] * (points - middle)).T @ (there - centre))
-        u[:, -1] *= np.sign(np.linalg.det(u @ vt))
-        rotation = vt.T @ u.T
-        return cls(rotation, centre - rotation @ middle)
+        x, y = points - middle, there - centre
+        u, s, vt = np.linalg.svd((share[:, None] * x).T @ y)
+        sign = np.array([1, 1, np.sign(np.linalg.det(u @ vt))])
+        rotation = ((u * sign) @ vt).T
+        spread = float((share[:, None] * x * x).sum())
+        scale = float((s * sign).sum() / max(spread, np.finfo(float).tiny)) if scaled else 1.0
+        return cls(rotation, centre - scale * rotation @ middle, scale)
+
+    def angle_to(self, other: Placement) -> float:
+        """Angle between the rotations, in radians."""
+        return float(np.arccos(np.clip((np.trace(self.rotation @ other.rotation.T) - 1) / 2, -1, 1)))
 
 
 def rigid_motions(vertices: FloatArray) -> FloatArray:

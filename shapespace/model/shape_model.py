@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import re
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import Literal
@@ -22,6 +22,7 @@ from shapespace.model.correspondence import InvalidMeshError, Matched, match
 from shapespace.model.decoder import Decoder, MeshChoice
 from shapespace.model.edit import PRIOR, Edited, PriorKind, Target, edited
 from shapespace.model.encode import Encoded, Encoder, Objective
+from shapespace.model.fit import FitOptions, Fitted, Fitter, Landmark, Prior, ScaleChoice
 from shapespace.model.latent_space import Bounds, Codes, Distribution, NotFiniteError, WrongLengthError
 from shapespace.model.spread import require_covariance, spread
 from shapespace.solve.deadline import Deadline
@@ -33,6 +34,8 @@ BoundsName = Bounds | Literal["allow", "clamp", "reject"]
 ObjectiveName = Objective | Literal["vertices", "nric"]
 DistributionName = Distribution | Literal["uniform", "gaussian", "population"]
 PriorName = PriorKind | Literal["groups", "ridge"]
+ScaleName = ScaleChoice | Literal["fixed", "free"]
+ExpectedName = Prior | Literal["population", "box"]
 
 
 def load(folder: str | os.PathLike[str], threads: int = 1) -> ShapeModel:
@@ -259,6 +262,76 @@ class ShapeModel(Decoder):
             self, start, pulled, prior, MeshChoice(mesh), deadline, PriorKind(prior_kind), held, samples, seed
         )
 
+    def fit(
+        self,
+        scan: ArrayLike | TriangleMesh | tuple[ArrayLike, ArrayLike] | str | os.PathLike[str],
+        *,
+        scale: ScaleName = "fixed",
+        partial: bool = False,
+        noise: float | None = None,
+        landmarks: Sequence[Landmark] = (),
+        fixed: Mapping[int, float] | None = None,
+        distribution: ExpectedName = "population",
+        samples: int = 0,
+        points: bool = False,
+        seed: int = 0,
+        deadline: Deadline | None = None,
+    ) -> Fitted:
+        """The code of a scan: points or a mesh of any connectivity, whole or in part, in any pose, with noise.
+
+        Args:
+            scan: points (N, 3); or these and faces (F, 3); or a mesh; or the path of an OBJ, PLY, STL, OFF, glTF, NPZ
+                or XYZ file. In the units of the training meshes unless the scale is free.
+            scale: "fixed", or "free": the scan's size is found too.
+            partial: whether the scan shows a part of the shape only, as from one camera.
+            noise: standard deviation of the scan's points, in its units; by default it is estimated.
+            landmarks: vertices of the fine mesh whose places are known; three or more decide where the search begins.
+            fixed: values of coordinates that keep them, by index.
+            distribution: what codes are held to be like: "population", the Gaussian of the training codes, or "box",
+                any inside the bounds.
+            samples: codes to draw from the posterior.
+            points: whether the distance of each point and of each vertex is wanted.
+            seed: of all random numbers; one seed gives the same answer.
+            deadline: after which the status is "deadline".
+
+        Returns:
+            Code, covariance, placement, distances and how the fit ended: look at ``status`` and ``reason``.
+
+        Raises:
+            MeshError: a file that can't be read.
+            InvalidScanError: a scan or an option that can't be used.
+            ModelFailedError: the networks failed, or took too long.
+
+        >>> import numpy as np, shapespace
+        >>> model = shapespace.load("models/figure")
+        >>> code = np.linspace(-0.5, 0.5, 20)
+        >>> points = np.random.default_rng(0).permutation(model.decode(code))[:3000] + [3, 0, 1]
+        >>> found = model.fit(points)
+        >>> found.status, found.covariance.shape
+        (<FitStatus.CONVERGED: 'converged'>, (20, 20))
+        >>> there = found.placement(found.shape.vertices)
+        >>> bool(np.abs(there - model.decode(code) - [3, 0, 1]).max() < 0.01)
+        True
+        """
+        options = FitOptions(
+            scale=ScaleChoice(scale),
+            partial=partial,
+            noise=noise,
+            landmarks=landmarks,
+            fixed=fixed,
+            prior=Prior(distribution),
+            samples=samples,
+            points=points,
+            seed=seed,
+        )
+        return self.fit_with(_points_and_faces(scan), options, deadline)
+
+    def fit_with(
+        self, scan: tuple[FloatArray, IntArray], options: FitOptions, deadline: Deadline | None = None
+    ) -> Fitted:
+        """As ``fit``, with points (N, 3) and faces (F, 3), none if there aren't any, and all options in one."""
+        return self._fitter(*scan, options, deadline)
+
     def sample(
         self, count: int, seed: int = 0, distribution: DistributionName = "uniform", temperature: float = 1.0
     ) -> Codes:
@@ -310,6 +383,11 @@ class ShapeModel(Decoder):
     def _encoder(self) -> Encoder:
         return Encoder(self)
 
+    @cached_property
+    def _fitter(self) -> Fitter:
+        """What fits scans."""
+        return Fitter(self)
+
     def _matched(self, mesh: ArrayLike | TriangleMesh | str | os.PathLike[str]) -> Matched:
         if isinstance(mesh, TriangleMesh):
             return match(self, mesh.vertices, mesh.faces)
@@ -319,3 +397,18 @@ class ShapeModel(Decoder):
         if vertices.ndim != 2 or vertices.shape[1] != 3:
             raise InvalidMeshError(f"vertices must be (V, 3), not {vertices.shape}")
         return match(self, vertices, np.empty((0, 3), np.int64))
+
+
+def _points_and_faces(
+    scan: ArrayLike | TriangleMesh | tuple[ArrayLike, ArrayLike] | str | os.PathLike[str],
+) -> tuple[FloatArray, IntArray]:
+    """Of what ``fit`` takes; no faces where there are none."""
+    if isinstance(scan, TriangleMesh):
+        return scan.vertices, scan.faces
+    if isinstance(scan, str | os.PathLike):
+        points, faces = read_arrays(Path(scan), points=True)
+    elif isinstance(scan, tuple):
+        points, faces = (np.asarray(part) for part in scan)
+    else:
+        points, faces = np.asarray(scan), np.empty((0, 3))
+    return points.astype(np.float64), faces.reshape(-1, 3).astype(np.int64)

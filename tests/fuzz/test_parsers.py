@@ -235,7 +235,7 @@ def test_uploads(format: str) -> None:
 
 
 def matched(data: bytes, format: str | None, content_type: str = "") -> Matched:
-    vertices, faces, _ = read_mesh_file(data, content_type, format, limits(model()))
+    vertices, faces, *_ = read_mesh_file(data, content_type, format, limits(model()))
     return match(model(), vertices, faces)
 
 

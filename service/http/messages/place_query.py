@@ -43,7 +43,7 @@ async def _query(
     place: Annotated[
         str | None,
         Query(
-            description="Answer the mesh elsewhere: a placement as JSON, as `edit` answers it, which takes x to "
+            description="Answer the mesh elsewhere: a placement as JSON, as `edit` and `fit` answer it: it takes x to "
             "`scale` · `rotation` · x + `translation`. Members left out change nothing.",
             openapi_examples={"a quarter turn": {"value": _EXAMPLE}},
         ),

@@ -31,7 +31,8 @@ def _facts(model: ShapeModel) -> dict[str, Any]:
     path = f"/v1/models/{model.manifest.name}"
     links = {"self": path}
     links |= {
-        call: f"{path}/{call}" for call in ("mesh", "vertices", "nric", "interpolations", "encode", "edit", "sample")
+        call: f"{path}/{call}"
+        for call in ("mesh", "vertices", "nric", "interpolations", "encode", "fit", "edit", "sample")
     }
     wanted = ModelCard.model_fields
     names = [field.alias or name for name, field in wanted.items()]

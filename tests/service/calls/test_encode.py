@@ -274,7 +274,7 @@ def of_files(tmp_path: Path) -> ShapeModel:
 
 
 def matched(model: ShapeModel, data: bytes, format: str) -> Matched:
-    vertices, faces, _ = read_mesh_file(data, "", format, limits(model))
+    vertices, faces, *_ = read_mesh_file(data, "", format, limits(model))
     return match(model, vertices, faces)
 
 

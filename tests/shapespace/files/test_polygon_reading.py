@@ -220,3 +220,38 @@ def test_what_is_refused_and_why(fault: str) -> None:
     assert says in str(refusal.value)
     assert "\n" not in str(refusal.value)
     assert len(str(refusal.value)) < 300
+
+
+def test_points_come_without_faces_where_they_will_do() -> None:
+    rows = "".join(f"  {x} {y}\t{z} 0 0 1\r\n" for x, y, z in CORNERS)
+    files = {
+        "xyz": f"# made by hand\n\n{rows}",
+        "obj": "".join(f"v {x} {y} {z}\n" for x, y, z in CORNERS),
+        "off": f"OFF 5 0 0\n{POINT_LINES}",
+    }
+    buffer = io.BytesIO()
+    np.savez(buffer, vertices=np.array(CORNERS))
+    contents = {name: text.encode() for name, text in files.items()} | {"npz": buffer.getvalue()}
+    for format, content in contents.items():
+        points, faces = read_arrays(content, format, points=True)
+        np.testing.assert_array_equal(points, CORNERS)
+        assert faces.shape == (0, 3)
+    commas, _ = read_arrays(rows.replace("\t", ",").encode(), "xyz", points=True)
+    np.testing.assert_array_equal(commas, CORNERS)
+
+
+def test_points_alone_are_no_mesh() -> None:
+    buffer = io.BytesIO()
+    np.savez(buffer, vertices=np.array(CORNERS))
+    for content, format in ((buffer.getvalue(), "npz"), (POINT_LINES.encode(), "xyz")):
+        with pytest.raises(MeshError):
+            read_arrays(content, format)
+
+
+def test_a_point_that_is_none_is_named_by_its_line_and_too_many_end_the_reading() -> None:
+    with pytest.raises(MeshError, match=r"line 3 is '1 two 3'"):
+        read_arrays(b"0 0 0\n# next\n1 two 3\n", "xyz", points=True)
+    with pytest.raises(MeshError, match=r"line 1"):
+        read_arrays(b"0 0\n", "xyz", points=True)
+    with pytest.raises(MeshError, match="more than 4 vertices"):
+        read_arrays(POINT_LINES.encode(), "xyz", Limits(4, 4), points=True)

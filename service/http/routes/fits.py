@@ -1,0 +1,66 @@
+"""Finding the code of a scan."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Annotated
+
+from fastapi import APIRouter, Depends, Query, Request, Response
+
+from shapespace.model.fit import FitOptions
+from shapespace.service.http.dependencies import CallerDependency, Model, ServiceDependency, one_of
+from shapespace.service.http.description import problems
+from shapespace.service.http.messages.bodies import gather
+from shapespace.service.http.messages.fit import FitAnswer, fit_options
+from shapespace.service.http.messages.schemas import MeshAnswer
+from shapespace.service.http.responses import found_response
+from shapespace.service.use_cases import fit as fits
+from shapespace.service.use_cases.codes import Upload
+from shapespace.service.use_cases.uploads import MEDIA_TYPES, POINT_FORMATS
+
+router = APIRouter(prefix="/v1/models/{name}", tags=["codes"])
+
+_FILE = {"type": "string", "format": "binary", "description": "A mesh or a point cloud."}
+_OPTIONS = {
+    "type": "string",
+    "contentMediaType": "application/json",
+    "description": "The parameters of the query as one JSON object, over which it wins.",
+}
+_FORM = {"type": "object", "properties": {"file": _FILE, "options": _OPTIONS}, "required": ["file"]}
+_UPLOAD = {
+    "requestBody": {
+        "required": True,
+        "content": {
+            **{media_type: {"schema": _FILE} for media_type in (*MEDIA_TYPES, "application/octet-stream")},
+            "application/json": {"schema": {"$ref": f"#/components/schemas/{MeshAnswer.__name__}"}},
+            "multipart/form-data": {"schema": _FORM},
+        },
+    }
+}
+
+
+@router.post(
+    "/fit",
+    responses=problems(400, 404, 413, 415, 422, 503, 504),
+    response_model=FitAnswer,
+    openapi_extra=_UPLOAD,
+)
+async def fit(
+    service: ServiceDependency,
+    request: Request,
+    caller: CallerDependency,
+    model: Model,
+    options: Annotated[Callable[[str], FitOptions], Depends(fit_options)],
+    format: Annotated[
+        str | None,
+        one_of(POINT_FORMATS),
+        Query(description="Format of the file, which wins over `Content-Type`."),
+    ] = None,
+) -> Response:
+    """The code, the place and the size that explain a scan, without correspondence, and how sure that is.
+
+    The file holds a mesh of any connectivity or points without faces, in any rigid pose, whole or in part.
+    """
+    upload = Upload(await gather(request), request.headers.get("content-type", ""), format)
+    found = await fits.fit(service.workers, service.sandbox, caller, model, upload, options)
+    return found_response(service, found)

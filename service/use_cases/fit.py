@@ -1,0 +1,85 @@
+"""Fitting a model to a scan that somebody has sent."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+
+from shapespace.files.limits import Limits
+from shapespace.model.fit import Distances, FitOptions, FitStatus
+from shapespace.model.shape_model import ShapeModel
+from shapespace.service.limits.sandbox import Sandbox
+from shapespace.service.limits.workers import Caller, Workers
+from shapespace.service.use_cases.codes import Found, Upload, read_upload
+from shapespace.service.use_cases.shape_formats import dump_json, float32
+from shapespace.solve.deadline import Deadline
+
+#: How large scans may be, and bytes that reading one may take beside its file.
+LIMITS, MEMORY = Limits(2**21, 2**21), 256 * 2**20
+
+
+async def fit(
+    workers: Workers,
+    sandbox: Sandbox,
+    caller: Caller,
+    model: ShapeModel,
+    upload: Upload,
+    options: Callable[[str], FitOptions],
+) -> Found:
+    """The code, place and size that explain a scan; see ShapeModel.fit.
+
+    Args:
+        workers: that compute.
+        sandbox: that reads the file.
+        caller: who waits.
+        model: that is fitted.
+        upload: the scan.
+        options: what is asked for, given the form's field ``options``, which may be empty.
+
+    Raises:
+        UploadError, InvalidScanError: no scan that can be used.
+        BusyError, DeadlineError, DisconnectedError, EndingError: no place, or the call ended before.
+    """
+
+    def make(deadline: Deadline) -> Found:
+        began = time.perf_counter()
+        points, faces, said = read_upload(sandbox, upload, LIMITS, deadline, points=True, memory=MEMORY)
+        asked = options(said)
+        read = time.perf_counter()
+        found = model.fit_with((points, faces), asked, deadline)
+        if found.status is FitStatus.DEADLINE:
+            raise workers.late()
+        content = {
+            "latent": found.code,
+            "covariance": found.covariance,
+            "placement": {
+                "rotation": np.ascontiguousarray(found.placement.rotation),
+                "translation": found.placement.translation,
+                "scale": found.placement.scale,
+            },
+            "distances": {"scan": _distances(found.scan), "model": _distances(found.model)},
+            "explained": found.explained,
+            "seen": found.seen,
+            "noise": found.noise,
+            "mirrored": found.mirrored,
+            "status": found.status,
+            "reason": found.reason,
+            "sampled": found.sampled,
+            "shapes": {"solved": found.solved, "rough": found.rough},
+            "diagnostics": asdict(found.shape.diagnostics),
+        }
+        if asked.samples:
+            content["samples"] = found.samples
+        return Found(dump_json(content), {"read": read - began, "search": time.perf_counter() - read})
+
+    async with workers.admit(caller) as call:
+        return await workers.run(make, call)
+
+
+def _distances(found: Distances) -> dict[str, Any]:
+    figures: dict[str, Any] = {"mean": found.mean, "p95": found.p95, "max": found.max}
+    return figures if found.points is None else figures | {"points": float32(found.points)}

@@ -1,0 +1,494 @@
+"""Fitting: the code, the place and the size of a model's shape that explain a scan, without correspondence."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from enum import StrEnum
+from functools import cached_property
+
+import numpy as np
+
+from shapespace.arrays import FloatArray, IntArray
+from shapespace.coordinates.reconstruction import Reconstructor
+from shapespace.mesh.closest_points import Fans, Surface
+from shapespace.mesh.rigid_motion import Placement
+from shapespace.model.decoder import Decoder, MeshChoice, Shape
+from shapespace.model.latent_space import Bounds, Codes
+from shapespace.model.placement import Start, coarse, evenly
+from shapespace.model.population import Population
+from shapespace.model.scan import InvalidScanError, Scan, scan_of
+from shapespace.model.search import FULL, ROUGH, Level, Options, Search, State
+from shapespace.model.searched_shapes import SearchedShapes
+from shapespace.solve.cholesky import NotPositiveDefiniteError
+from shapespace.solve.deadline import Deadline
+from shapespace.solve.outcome import Status
+
+#: Shapes on which a scan is first placed, the farthest from each other of so many random ones; and points of each.
+STARTS, DRAWN, SHOWN = 16, 200, 150
+#: Vertices of the model that look for points of the scan: of the coarse and of the fine mesh.
+LOOKING_ROUGHLY, LOOKING = 500, 1000
+#: Placed starts that are followed, and steps of each; steps of the two best from there, and of the best at last.
+FOLLOWED, FIRST_STEPS, MORE_STEPS, LAST_STEPS = 5, 4, 6, 10
+#: Where a limb stays unexplained: attempts to bring it over, their steps, and those in which it is drawn.
+ATTEMPTS, ATTEMPT_STEPS, DRAWING = 4, 9, 4
+#: A scan so many times as large or as small as the model's shapes is in other units, unless its size is free.
+UNITS, UNITS_OF_PART = 3.0, 20.0
+#: A fit is poor where more of the scan than the first has no place on the model while more of the model than the second
+#: has none on the scan: outliers are more of the one and holes of the other, but a limb astray is of both. Of a scan
+#: that shows a part, the most that may have no place.
+MISSED, UNSEEN, MISSED_OF_PART = 0.015, 0.008, 0.03
+#: A fit whose last step was longer, as a fraction of the diagonal, has not come to rest.
+RESTLESS = 5e-3
+#: Another fit counts if it is so far away on average, as a fraction of the diagonal, and its cost no larger than by
+#: this factor and this share.
+ELSEWHERE, NEARLY, BESIDE = 0.05, 1.1, 3e-3
+#: A scan counts as mirrored where its mirror image costs less than this share.
+MIRRORED = 0.6
+#: Other fits that are followed to the end where they are nearly as good.
+RIVALS = 2
+#: Points whose distances are computed at once.
+CHUNK = 50_000
+#: Most landmarks.
+LANDMARKS = 1000
+
+
+class ScaleChoice(StrEnum):
+    """Whether a scan has the size of the model's shapes, or a size that is to be found."""
+
+    FIXED = "fixed"
+    FREE = "free"
+
+
+class Prior(StrEnum):
+    """What codes are held to be like: those of the training shapes, or any in the bounds."""
+
+    POPULATION = "population"
+    BOX = "box"
+
+
+class FitStatus(StrEnum):
+    """How a fit ended: well, with another nearly as good, of no such shape, before it came to rest, too late."""
+
+    CONVERGED = "converged"
+    AMBIGUOUS = "ambiguous"
+    POOR = "poor"
+    STALLED = "stalled"
+    DEADLINE = "deadline"
+
+
+@dataclass(frozen=True)
+class Landmark:
+    """A vertex whose place on the scan is known.
+
+    Attributes:
+        vertex: index in the fine mesh.
+        position: (3,) in the scan's units.
+        sigma: standard deviation of the position there; by default a hundredth of the model's diagonal.
+    """
+
+    vertex: int
+    position: Sequence[float]
+    sigma: float | None = None
+
+
+@dataclass(frozen=True)
+class FitOptions:
+    """What is asked for.
+
+    Attributes:
+        scale: whether the scan's size is that of the model's shapes.
+        partial: whether the scan shows a part of the shape only, as from one camera.
+        noise: standard deviation of the scan's points in its units; by default it is estimated.
+        landmarks: vertices whose places are known; three or more decide where the search begins.
+        fixed: values of coordinates that keep them, by index.
+        prior: what codes are like.
+        samples: codes to draw from the posterior.
+        points: whether the distance of each point and of each vertex is wanted.
+        seed: of all random numbers.
+    """
+
+    scale: ScaleChoice = ScaleChoice.FIXED
+    partial: bool = False
+    noise: float | None = None
+    landmarks: Sequence[Landmark] = ()
+    fixed: Mapping[int, float] | None = None
+    prior: Prior = Prior.POPULATION
+    samples: int = 0
+    points: bool = False
+    seed: int = 0
+
+
+@dataclass(frozen=True, eq=False)
+class Distances:
+    """Distances in the scan's units.
+
+    Attributes:
+        mean, p95, max: over the points that count.
+        points: (n,) each of them, where they were asked for.
+    """
+
+    mean: float
+    p95: float
+    max: float
+    points: FloatArray | None = None
+
+    @classmethod
+    def of(cls, distances: FloatArray, points: FloatArray | None) -> Distances:
+        """Of distances (n,)."""
+        return cls(float(distances.mean()), float(np.quantile(distances, 0.95)), float(distances.max()), points)
+
+
+@dataclass(frozen=True, eq=False)
+class Fitted:
+    """What explains a scan.
+
+    Attributes:
+        code: (m,), float32, as the networks take it.
+        covariance: (m, m) of its coordinates given the scan (Laplace); zero in those that were fixed.
+        placement: takes positions of ``shape`` to the scan's frame.
+        shape: of the code, on the fine mesh, as ``mesh`` answers it.
+        scan: distances of the scan's points from the shape.
+        model: distances of the shape's vertices from the scan.
+        explained: share of the scan that lies at the shape.
+        seen: share of the shape's area that lies at the scan.
+        noise: standard deviation of the scan about the shape, normal to it, in the scan's units.
+        mirrored: cost of the best fit of the scan's mirror image as a share of its own, where it was looked for: a
+            small one says that the scan is mirrored.
+        status: how the fit ended.
+        reason: the same in words.
+        samples: (n, m) codes drawn from the posterior.
+        sampled: whether the scan was brought to fewer points, or points were spread over its faces.
+        solved, rough: shapes that were solved, and roughly computed ones, of which three cost as much as one.
+    """
+
+    code: Codes
+    covariance: FloatArray
+    placement: Placement
+    shape: Shape
+    scan: Distances
+    model: Distances
+    explained: float
+    seen: float
+    noise: float
+    mirrored: float | None
+    status: FitStatus
+    reason: str
+    samples: Codes
+    sampled: bool
+    solved: int
+    rough: int
+
+
+class Fitter:
+    """Fits a model to scans; may be used by several threads at once.
+
+    A scan is brought to a few thousand points. It is placed on a few random shapes, in many rotations. From the best of
+    these, closest points of both sides and Gauss–Newton steps of code, rotation, translation and scale together follow
+    each other, with weights of distances (Geman and McClure) that narrow as the fit improves, first with shapes of
+    frames and the factors' derivatives, then with answered shapes. Where parts of both sides remain without a
+    counterpart, they are drawn to each other for a few steps.
+    """
+
+    def __init__(self, model: Decoder) -> None:
+        self.model = model
+
+    def __call__(
+        self, points: FloatArray, faces: IntArray, options: FitOptions, deadline: Deadline | None = None
+    ) -> Fitted:
+        """The fit to a scan.
+
+        Args:
+            points: (N, 3) in any frame.
+            faces: (F, 3), or none.
+            options: what is asked for.
+            deadline: after which the status is FitStatus.DEADLINE.
+
+        Raises:
+            InvalidScanError: a scan or options that can't be used.
+            ModelFailedError: the networks failed.
+        """
+        return _Fit(self, points, faces, options, deadline)()
+
+    @cached_property
+    def reach(self) -> dict[MeshChoice, tuple[Fans, IntArray]]:
+        """Fans and vertices that look for points, of each mesh."""
+        return {
+            choice: (Fans(mesh.faces, len(mesh.vertices)), evenly(mesh.vertices, count))
+            for choice, count in ((MeshChoice.COARSE, LOOKING_ROUGHLY), (MeshChoice.FINE, LOOKING))
+            for mesh in (self.model.mesh(choice),)
+        }
+
+    @cached_property
+    def shown(self) -> IntArray:
+        """Coarse vertices that show where a shape is."""
+        return evenly(self.model.reference.vertices, SHOWN)
+
+    @cached_property
+    def starts(self) -> tuple[FloatArray, FloatArray]:
+        """Codes (k, m) and their shapes (k, V, 3), coarse and aligned, made at the first scan."""
+        return self.shapes_of(self.codes({}))
+
+    def codes(self, fixed: Mapping[int, float]) -> FloatArray:
+        """(k, m) the mean, and codes far from each other, with some coordinates fixed."""
+        population = self.model.population
+        lower, upper = self.model.latents.box()
+        drawn = np.concatenate([population.mean[None], np.clip(population.sample(DRAWN, 0), lower, upper)])
+        for k, value in fixed.items():
+            drawn[:, k] = value
+        return drawn[evenly(population.scores(drawn), STARTS)]
+
+    def shapes_of(self, codes: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """The codes (k, m) whose shapes are finite, and these (k, V, 3)."""
+        with self.model.solver() as reconstruct:
+            rough = SearchedShapes(self.model, reconstruct, None, rough=True)
+            raw = np.stack([rough(code) for code in codes])
+        finite = np.isfinite(raw).all(axis=(1, 2))
+        if not finite.any():
+            raise InvalidScanError("No shape has the fixed coordinates. Send values nearer to the bounds.")
+        return codes[finite], self.model.placed(raw[finite], MeshChoice.COARSE)
+
+
+class _Fit:
+    """One fit."""
+
+    def __init__(
+        self, fitter: Fitter, points: FloatArray, faces: IntArray, options: FitOptions, deadline: Deadline | None
+    ) -> None:
+        self.model, self.fitter, self.asked, self.deadline = fitter.model, fitter, options, deadline
+        self.points, self.unit = points, fitter.model.manifest.scale
+        self.scan = scan_of(np.asarray(points, np.float64) / self.unit, faces, np.random.default_rng(options.seed))
+        self.options = self._checked()
+        self.free = options.scale is ScaleChoice.FREE
+
+    def __call__(self) -> Fitted:
+        fixed = self.asked.fixed or {}
+        self.codes, self.shapes = self.fitter.shapes_of(self.fitter.codes(fixed)) if fixed else self.fitter.starts
+        if not self.free:
+            self._require_units()
+        with self.model.solver() as reconstruct:
+            rough = self._search(reconstruct, self.scan, ROUGH)
+            best, others = self._roughly(rough, self.scan)
+            full = self._search(reconstruct, self.scan, FULL)
+            final, rival = self._fully(full, best, others)
+            ratio = None
+            covariance = self._covariance(full, final)
+            explained, seen = full.shares(final)
+            if self._is_poor(explained, seen) and not self._late:
+                flip = np.array([-1, 1, 1])
+                mirror = replace(self.scan, points=self.scan.points * flip, normals=self.scan.normals * flip)
+                twin, _ = self._roughly(self._search(reconstruct, mirror, ROUGH), mirror)
+                ratio = twin.cost / best.cost
+        # The model lends its solver again for the shape that is answered.
+        return self._answer(full, final, covariance, explained, seen, ratio, rival, rough.count)
+
+    @property
+    def _late(self) -> bool:
+        return self.deadline is not None and self.deadline.passed
+
+    def _checked(self) -> Options:
+        """The options as a search takes them."""
+        asked, latents, model = self.asked, self.model.latents, self.model
+        count = len(model.mesh(MeshChoice.FINE).vertices)
+        movable = np.ones(latents.dimension, bool)
+        for k, value in (asked.fixed or {}).items():
+            if not 0 <= k < latents.dimension:
+                raise InvalidScanError(f"fixed names coordinate {k}, but there are 0 to {latents.dimension - 1}.")
+            if not abs(value) < np.finfo(np.float32).max:
+                raise InvalidScanError(f"fixed gives coordinate {k} a value that is not a finite number. Send one.")
+            movable[k] = False
+        if not movable.any():
+            raise InvalidScanError("fixed names all coordinates. Leave at least one to be found.")
+        if asked.noise is not None and not 0 < asked.noise < np.inf:
+            raise InvalidScanError("noise must be a positive number, the standard deviation in the scan's units.")
+        if len(asked.landmarks) > LANDMARKS:
+            raise InvalidScanError(f"There are {len(asked.landmarks)} landmarks. Send {LANDMARKS} at most.")
+        for i, landmark in enumerate(asked.landmarks):
+            if not 0 <= landmark.vertex < count:
+                raise InvalidScanError(
+                    f"landmarks[{i}].vertex is {landmark.vertex}, but the fine mesh has vertices 0 to {count - 1}."
+                )
+            if not (len(landmark.position) == 3 and np.abs(landmark.position).max() < np.finfo(np.float32).max):
+                raise InvalidScanError(f"landmarks[{i}].position must be three finite numbers.")
+            if landmark.sigma is not None and not 0 < landmark.sigma < np.inf:
+                raise InvalidScanError(f"landmarks[{i}].sigma must be a positive number.")
+        boxed = asked.prior is Prior.BOX
+        lower, upper = latents.box(0.0 if boxed else 0.5)
+        return Options(
+            partial=asked.partial,
+            free=asked.scale is ScaleChoice.FREE,
+            noise=None if asked.noise is None else asked.noise / self.unit,
+            landmarks=np.array([landmark.vertex for landmark in asked.landmarks], np.int64),
+            places=np.array([landmark.position for landmark in asked.landmarks]).reshape(-1, 3) / self.unit,
+            sigmas=np.array([(landmark.sigma or np.inf) / self.unit for landmark in asked.landmarks]),
+            movable=movable,
+            prior=Population.in_box(latents.lower, latents.upper) if boxed else model.population,
+            lower=lower,
+            upper=upper,
+        )
+
+    def _require_units(self) -> None:
+        sizes = np.sqrt(self.shapes.var(axis=1).sum(axis=1))
+        ratio = self.scan.size / float(np.median(sizes))
+        if not 1 / (UNITS_OF_PART if self.asked.partial else UNITS) <= ratio <= UNITS:
+            raise InvalidScanError(
+                f"The scan is about {ratio:.3g} times as large as the shapes of {self.model.manifest.name}. "
+                f"Send scale=free, or multiply its coordinates by about {1 / ratio:.3g}."
+            )
+
+    def _search(self, reconstruct: Reconstructor, scan: Scan, level: Level) -> Search:
+        fans, looking = self.fitter.reach[level.mesh]
+        return Search(self.model, reconstruct, scan, self.options, level, fans, looking, self.deadline)
+
+    def _placed(self, search: Search, scan: Scan) -> list[Start]:
+        """Where the search begins."""
+        options = self.options
+        if len(options.landmarks) < 3:
+            shown = self.shapes[:, self.fitter.shown]
+            return coarse(scan, shown, partial=options.partial, free=self.free, count=FOLLOWED)
+        rows, starts = search.landmark_rows(), list[Start]()
+        for k, shape in enumerate(self.shapes):
+            own = rows @ shape
+            placement = Placement.between(own, options.places, scaled=self.free)
+            starts.append(Start(k, placement, float(np.linalg.norm(placement(own) - options.places))))
+        return sorted(starts, key=lambda start: start.score)[:FOLLOWED]
+
+    def _roughly(self, search: Search, scan: Scan) -> tuple[State, list[State]]:
+        """The best fit of rough shapes, and others."""
+        begun = [
+            search.start(self.codes[start.shape], start.placement, self.shapes[start.shape])
+            for start in self._placed(search, scan)
+        ]
+        states = [search.run(state, FIRST_STEPS, first=True) for state in begun if state is not None]
+        states.sort(key=lambda state: state.cost)
+        states[:2] = [search.run(state, MORE_STEPS, first=True) for state in states[:2]]
+        states.sort(key=lambda state: state.cost)
+        others = states[1:]
+        best = states[0]
+        for k in range(ATTEMPTS):
+            if self._late or not self._is_poor(*search.shares(best)):
+                break
+            # The best once more, what came of that, and then the others.
+            base = best if k < 2 or k - 2 >= len(others) else others[k - 2]
+            again = search.run(base, ATTEMPT_STEPS, first=False, drawn=DRAWING)
+            if again.cost < best.cost:
+                best = again
+        return best, others
+
+    def _fully(self, search: Search, best: State, others: list[State]) -> tuple[State, State | None]:
+        """The best fit of answered shapes, and another that is nearly as good, if there is one."""
+        begun = search.start(best.code, best.placement, best.shape)
+        if begun is None:
+            return best, None
+        final = search.run(begun, LAST_STEPS, first=False)
+        if not self._late and self._is_poor(*search.shares(final)):
+            again = search.run(final, LAST_STEPS, first=False, drawn=DRAWING)
+            final = again if again.cost < final.cost else final
+        for other in others[:RIVALS]:
+            if self._late or self._apart(other, best) < ELSEWHERE or other.cost > 1.5 * best.cost + BESIDE:
+                continue
+            begun = search.start(other.code, other.placement, other.shape)
+            if begun is None:
+                continue
+            rival = search.run(begun, LAST_STEPS // 2, first=False)
+            if self._apart(rival, final) > ELSEWHERE and rival.cost <= NEARLY * final.cost + BESIDE:
+                return (rival, final) if rival.cost < final.cost else (final, rival)
+        return final, None
+
+    def _apart(self, one: State, other: State) -> float:
+        """Mean distance of vertices, as a fraction of the diagonal."""
+        away = one.placement(one.shape) - other.placement(other.shape)
+        return float(np.linalg.norm(away, axis=1).mean() / one.placement.scale / self.model.reference.diagonal)
+
+    def _covariance(self, search: Search, state: State) -> FloatArray:
+        movable = self.options.movable
+        covariance = np.zeros((len(movable), len(movable)))
+        try:
+            inverse = np.linalg.inv(search.precision(state))
+        except (NotPositiveDefiniteError, np.linalg.LinAlgError):
+            # Without derivatives nothing but the prior is known.
+            whiten = np.linalg.inv(self.options.prior.root)[:, movable]
+            inverse = np.linalg.inv(whiten.T @ whiten)
+        covariance[np.ix_(movable, movable)] = (inverse + inverse.T) / 2
+        return covariance
+
+    def _is_poor(self, explained: float, seen: float) -> bool:
+        if self.options.partial:
+            return 1 - explained > MISSED_OF_PART
+        return 1 - explained > MISSED and 1 - seen > UNSEEN
+
+    def _answer(
+        self,
+        search: Search,
+        state: State,
+        covariance: FloatArray,
+        explained: float,
+        seen: float,
+        mirrored: float | None,
+        rival: State | None,
+        rough: int,
+    ) -> Fitted:
+        model, asked = self.model, self.asked
+        code, inside = model.latents.code(state.code.tolist(), Bounds.ALLOW)
+        shape = model.shape(code, inside, MeshChoice.FINE, self.deadline)
+        there = state.placement(search.surface(state.shape).vertices)
+        # The size is the search's own; between two shapes of one size only the motion is to be found.
+        scale = state.placement.scale
+        placed = Placement.between(scale * shape.vertices, self.unit * there)
+        placement = Placement(placed.rotation, placed.translation, scale)
+        surface = Surface(placement(shape.vertices), search.surface(state.shape).fans)
+        to_model = surface.closest(self.unit * self.scan.points).distances
+        to_scan = self.unit * self.scan.distances(surface.vertices / self.unit)
+        every = None
+        if asked.points:
+            parts = np.array_split(self.points, -(-len(self.points) // CHUNK))
+            every = np.concatenate([surface.closest(part).distances for part in parts])
+        rng = np.random.default_rng(asked.seed)
+        values, vectors = np.linalg.eigh(covariance)
+        root = vectors * np.sqrt(np.maximum(values, 0))
+        drawn = code + rng.standard_normal((asked.samples, len(code))) @ root.T
+        status, reason = self._status(state, explained, seen, mirrored, rival, shape)
+        return Fitted(
+            code=code,
+            covariance=covariance,
+            placement=placement,
+            shape=shape,
+            scan=Distances.of(to_model, every),
+            model=Distances.of(to_scan, to_scan if asked.points else None),
+            explained=explained,
+            seen=seen,
+            noise=self.unit * scale * state.sigma,
+            mirrored=mirrored,
+            status=status,
+            reason=reason,
+            samples=model.latents.codes(drawn)[0],
+            sampled=self.scan.sampled,
+            solved=search.count + 1,
+            rough=rough,
+        )
+
+    def _status(
+        self, state: State, explained: float, seen: float, mirrored: float | None, rival: State | None, shape: Shape
+    ) -> tuple[FitStatus, str]:
+        """How the fit ended, and the same in words."""
+        shares = f"{explained:.0%} of the scan lie at the model, {seen:.0%} of the model at the scan"
+        if self._late or shape.diagnostics.status is Status.DEADLINE:
+            status, reason = FitStatus.DEADLINE, f"The time was over before the fit was done: {shares} so far."
+        elif self._is_poor(explained, seen):
+            status, reason = FitStatus.POOR, f"Only {shares}: the scan is no such shape, or the search went astray."
+            if mirrored is not None and mirrored < MIRRORED:
+                reason += " Its mirror image fits much better: change the sign of one coordinate."
+            elif not self.options.partial:
+                reason += " Send partial=true if it shows a part only, or three landmarks."
+        elif rival is not None:
+            status = FitStatus.AMBIGUOUS
+            apart = self._apart(rival, state)
+            reason = f"{shares}, but another fit, {apart:.0%} of the diagonal away on average, is nearly as good."
+        elif state.moved > RESTLESS:
+            status = FitStatus.STALLED
+            reason = f"{shares}, but the last step still moved the model by {state.moved:.1%} of the diagonal."
+        else:
+            status, reason = FitStatus.CONVERGED, f"{shares}."
+        if self.scan.sampled:
+            reason += f" Of {self.scan.given} points, {len(self.scan.points)} spread evenly over the scan were used."
+        return status, reason

@@ -1,0 +1,162 @@
+"""Scans: points or triangles from anywhere, brought to a few thousand points with normals."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from shapespace.arrays import FloatArray, IntArray
+from shapespace.mesh.triangle_mesh import face_normals
+
+#: Points that a scan is brought to, and the most of which local planes are looked for.
+MOST, PLANES = 3000, 10_000
+#: Fewest points of a scan, and neighbours of a point that tell its local plane.
+FEWEST, NEIGHBOURS = 10, 16
+#: Neighbours whose thickness is half their width, a ratio of moments of the inverse of this, have no plane.
+CLOUDY = 4
+#: A scan whose thickness is less than this share of its extent lies in a plane.
+FLAT = 1e-6
+
+
+class InvalidScanError(ValueError):
+    """A scan, or options for it, that can't be used: with a sentence that says what to do."""
+
+
+@dataclass(frozen=True, eq=False)
+class Scan:
+    """What a model is fitted to.
+
+    Attributes:
+        points: (n, 3) in the scan's units, spread evenly, at most MOST.
+        normals: (n, 3) of unit length.
+        trust: (n,) from 0 to 1, whether the normals say anything: points strewn like a cloud have none.
+        oriented: whether normals tell inside from outside; those of local planes don't.
+        given: number of points or vertices that the scan came with.
+        sampled: whether ``points`` are not just those.
+    """
+
+    points: FloatArray
+    normals: FloatArray
+    trust: FloatArray
+    oriented: bool
+    given: int
+    sampled: bool
+
+    @property
+    def size(self) -> float:
+        """Root mean square distance of the points from their median, which a few strays hardly move."""
+        away = np.linalg.norm(self.points - np.median(self.points, axis=0), axis=1)
+        return float(np.sqrt((np.sort(away)[: max(1, int(0.9 * len(away)))] ** 2).mean()))
+
+    def some(self, count: int) -> Scan:
+        """At most so many of the points; their order is random already."""
+        return replace(self, points=self.points[:count], normals=self.normals[:count], trust=self.trust[:count])
+
+    @cached_property
+    def tree(self) -> cKDTree:
+        """Of the points."""
+        return cKDTree(self.points)
+
+    @cached_property
+    def gaps(self) -> FloatArray:
+        """(n,) how far apart points are around each: as far as its sixth neighbour."""
+        away, _ = near(self.tree, self.points, min(7, len(self.points)))
+        return away[:, -1]
+
+    def distances(self, places: FloatArray) -> FloatArray:
+        """(n,) of places (n, 3) from the surface that the points stand for.
+
+        Over a point it is the distance from the plane there; where no point is near, that from the point.
+        """
+        away, nearest = near(self.tree, places)
+        above = np.abs(((places - self.points[nearest]) * self.normals[nearest]).sum(axis=1))
+        beside = np.sqrt(np.maximum(away**2 - above**2, 0))
+        return np.where(beside <= self.gaps[nearest], above, away)
+
+
+def near(tree: cKDTree, places: FloatArray, count: int = 1) -> tuple[FloatArray, IntArray]:
+    """Distances and indices, (…) of the nearest point of a tree to places (…, 3), or (…, count) of several."""
+    away, index = tree.query(places, k=count)
+    return np.asarray(away), np.asarray(index)
+
+
+def scan_of(points: FloatArray, faces: IntArray, rng: np.random.Generator) -> Scan:
+    """Check a scan and sample it.
+
+    Args:
+        points: (N, 3).
+        faces: (F, 3) indices of them, or none. Faces without area are left out.
+        rng: of the samples.
+
+    Raises:
+        InvalidScanError: fewer than ten points, one that is not finite, all in a plane or at one place, or faces that
+            name points that aren't there.
+    """
+    if points.ndim != 2 or points.shape[1] != 3:
+        raise InvalidScanError(f"A scan must be points (N, 3), not {points.shape}. Send x, y and z of each.")
+    if len(points) < FEWEST:
+        raise InvalidScanError(f"The scan has {len(points)} points. Send at least {FEWEST}, better a few thousand.")
+    bad = np.flatnonzero(~(np.abs(points) < np.finfo(np.float32).max).all(axis=1))
+    if len(bad):
+        raise InvalidScanError(f"Point {bad[0]} has a coordinate that is not a finite number. Send finite positions.")
+    if len(faces) and (faces.min() < 0 or faces.max() >= len(points)):
+        raise InvalidScanError(
+            f"The faces name points {faces.min()} to {faces.max()}, but there are {len(points)}, counted from 0."
+        )
+    spread = np.linalg.svd(_thinned(points - points.mean(axis=0), rng), compute_uv=False)
+    if not spread[2] > FLAT * spread[0]:
+        raise InvalidScanError(
+            "All points of the scan lie in a plane, which shows nothing of a shape. Send points from all over it."
+        )
+    twice_areas = np.linalg.norm(face_normals(points, faces, normalised=False), axis=1)
+    if twice_areas.sum() > 0:
+        return _of_surface(points, faces, twice_areas, rng)
+    return _of_points(points, rng)
+
+
+def _of_surface(points: FloatArray, faces: IntArray, weights: FloatArray, rng: np.random.Generator) -> Scan:
+    """Points at random all over the faces, each with the normal of its own."""
+    # More than are wanted, of which thinning leaves evenly spread ones.
+    chosen = rng.choice(len(faces), 3 * MOST, p=weights / weights.sum())
+    shares = rng.dirichlet(np.ones(3), len(chosen))
+    there = np.einsum("nk,nkx->nx", shares, points[faces[chosen]])
+    kept = rng.permutation(_evenly(there, MOST))
+    normals = face_normals(points, faces[chosen[kept]])
+    return Scan(there[kept], normals, np.ones(len(kept)), True, len(points), True)
+
+
+def _of_points(points: FloatArray, rng: np.random.Generator) -> Scan:
+    """The points themselves, or some of them, with normals of the planes through their neighbours."""
+    some = _thinned(points, rng)
+    kept = rng.permutation(_evenly(some, MOST))
+    _, beside = near(cKDTree(some), some[kept], min(NEIGHBOURS, len(some)))
+    around = some[beside] - some[beside].mean(axis=1, keepdims=True)
+    moments, axes = np.linalg.eigh(np.swapaxes(around, 1, 2) @ around)
+    trust = np.clip(1 - CLOUDY * moments[:, 0] / np.maximum(moments[:, 1], np.finfo(float).tiny), 0, 1)
+    return Scan(some[kept], axes[:, :, 0], trust, False, len(points), len(kept) < len(points))
+
+
+def _thinned(points: FloatArray, rng: np.random.Generator) -> FloatArray:
+    return points if len(points) <= PLANES else points[rng.choice(len(points), PLANES, replace=False)]
+
+
+def _evenly(points: FloatArray, most: int) -> IntArray:
+    """Indices of at most so many of points (n, 3): one from each cell of a grid that is as fine as that allows."""
+    if len(points) <= most:
+        return np.arange(len(points))
+    low, extent = points.min(axis=0), float(np.ptp(points, axis=0).max())
+    coarse, fine, found = 1.0, 4096.0, np.arange(1)
+    # Halving the interval of cells along an edge.
+    while fine - coarse > 0.02 * coarse:
+        cells = np.sqrt(coarse * fine)
+        index = ((points - low) * (cells / extent)).astype(np.int64)
+        key = (index[:, 0] * 8192 + index[:, 1]) * 8192 + index[:, 2]
+        first = np.unique(key, return_index=True)[1]
+        if len(first) <= most:
+            coarse, found = cells, first
+        else:
+            fine = cells
+    return found

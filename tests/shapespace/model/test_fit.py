@@ -1,0 +1,305 @@
+"""Fits: a scan's code, place and size come back, whatever is done to it; what is no such shape is told so."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+import trimesh
+from scipy.spatial.transform import Rotation
+
+from shapespace.arrays import FloatArray, IntArray
+from shapespace.mesh.triangle_mesh import diagonal
+from shapespace.model.fit import FitStatus, Fitted, Landmark
+from shapespace.model.scan import InvalidScanError
+from shapespace.model.shape_model import ShapeModel, load
+from shapespace.solve.deadline import Deadline
+from tests.service.conftest import ROOT
+
+
+@pytest.fixture(scope="module")
+def figure() -> ShapeModel:
+    return load(ROOT / "models" / "figure")
+
+
+@pytest.fixture(scope="module")
+def ring() -> ShapeModel:
+    return load(ROOT / "models" / "freaky-torus")
+
+
+@dataclass(frozen=True)
+class Moved:
+    """A shape of a known code, elsewhere."""
+
+    code: FloatArray
+    shape: FloatArray
+    faces: IntArray
+    size: float
+
+    @classmethod
+    def of(cls, model: ShapeModel, seed: int, scale: float = 1.0, code: FloatArray | None = None) -> "Moved":
+        drawn = np.clip(model.population.sample(1, seed)[0], model.lower, model.upper) if code is None else code
+        shape = model.decode(drawn)
+        turn = Rotation.random(random_state=seed).as_matrix()
+        there = scale * (shape @ turn.T + [3.0, -1.0, 2.0])
+        return cls(drawn, there, model.faces, float(diagonal(there)))
+
+    def points(self, count: int = 4000, seed: int = 0) -> FloatArray:
+        """At random all over the surface."""
+        rng = np.random.default_rng(seed)
+        a, b, c = (self.shape[self.faces[:, k]] for k in range(3))
+        areas = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+        chosen = rng.choice(len(areas), count, p=areas / areas.sum())
+        shares = rng.dirichlet(np.ones(3), count)
+        return np.einsum("nk,nkx->nx", shares, self.shape[self.faces[chosen]])
+
+    def seen_from(self, axis: int) -> FloatArray:
+        """Points that no others hide from a camera far away on an axis."""
+        points = self.points(30_000)
+        cells = np.floor(np.delete(points, axis, 1) / (self.size / 120)).astype(np.int64)
+        _, cell = np.unique(cells, axis=0, return_inverse=True)
+        front = np.full(cell.max() + 1, -np.inf)
+        np.maximum.at(front, cell, points[:, axis])
+        return points[points[:, axis] > front[cell] - 0.02 * self.size][::4]
+
+    def error(self, found: Fitted) -> float:
+        """Mean distance of vertices from where they are, as a fraction of the diagonal."""
+        away = found.placement(found.shape.vertices) - self.shape
+        return float(np.linalg.norm(away, axis=1).mean() / self.size)
+
+
+def test_a_code_comes_back_from_points_anywhere(figure: ShapeModel) -> None:
+    for seed in (1, 2):
+        given = Moved.of(figure, seed)
+        found = figure.fit(given.points())
+        assert found.status is FitStatus.CONVERGED, found.reason
+        assert given.error(found) < 1e-3
+        assert found.explained > 0.99
+        assert found.seen > 0.99
+        assert found.placement.scale == 1
+        assert found.scan.p95 < 2e-3 * given.size
+        assert found.model.max < 0.05 * given.size
+        np.testing.assert_allclose(found.placement.rotation @ found.placement.rotation.T, np.eye(3), atol=1e-9)
+        assert np.linalg.det(found.placement.rotation) == pytest.approx(1)
+        # It costs what is promised: a rough shape a third of a solved one.
+        assert found.solved + found.rough / 3 < 60
+
+
+def test_landmarks_tell_a_ring_how_it_is_turned(ring: ShapeModel) -> None:
+    # Turned about its axis a ring is nearly the one of another code; so only landmarks tell which vertex is where.
+    given = Moved.of(ring, 2)
+    points = given.points()
+    landmarks = [Landmark(k, given.shape[k].tolist()) for k in (0, 300, 700, 1000, 1400, 1900)]
+    found = ring.fit(points, landmarks=landmarks)
+    assert given.error(found) < 5e-3
+    # A bump of two percent of its surface may stay where it isn't, which then is told.
+    for fit in (found, ring.fit(points)):
+        assert fit.scan.mean < 3e-3 * given.size
+        assert fit.status is FitStatus.POOR or fit.scan.p95 < 5e-3 * given.size
+
+
+def test_another_mesh_is_fit_whichever_way_its_faces_are_turned(figure: ShapeModel) -> None:
+    given = Moved.of(figure, 3)
+    other = trimesh.Trimesh(given.shape, given.faces).subdivide()
+    rng = np.random.default_rng(0)
+    order = rng.permutation(len(other.vertices))
+    vertices, faces = np.empty_like(other.vertices), order[other.faces]
+    vertices[order] = other.vertices
+    found = figure.fit((vertices, faces))
+    turned = figure.fit((vertices, faces[:, ::-1]))
+    assert given.error(found) < 1e-3
+    assert given.error(turned) < 1e-3
+    assert found.sampled
+    assert f"Of {len(vertices)} points" in found.reason
+
+
+def test_a_size_is_found_where_it_is_free(figure: ShapeModel) -> None:
+    given = Moved.of(figure, 2, scale=40.0)
+    with pytest.raises(InvalidScanError, match="scale=free"):
+        figure.fit(given.points())
+    found = figure.fit(given.points(), scale="free")
+    assert found.placement.scale == pytest.approx(40, rel=1e-3)
+    assert given.error(found) < 1e-3
+
+
+def test_noise_and_outliers_are_told_from_the_shape(figure: ShapeModel) -> None:
+    given = Moved.of(figure, 2)
+    rng = np.random.default_rng(1)
+    points = given.points() + 0.005 * given.size * rng.standard_normal((4000, 3))
+    low, high = points.min(axis=0), points.max(axis=0)
+    points[:80] = low + (high - low) * rng.random((80, 3))
+    found = figure.fit(points)
+    assert found.status is FitStatus.CONVERGED, found.reason
+    assert given.error(found) < 4e-3
+    assert found.noise == pytest.approx(0.005 * given.size, rel=0.2)
+    assert 0.96 < found.explained < 0.99
+    told = figure.fit(points, noise=0.005 * given.size)
+    assert given.error(told) < 4e-3
+    assert told.noise == pytest.approx(0.005 * given.size)
+
+
+def test_what_one_camera_sees_is_enough_and_the_rest_is_less_certain(figure: ShapeModel) -> None:
+    given = Moved.of(figure, 3)
+    points = given.seen_from(2)
+    found = figure.fit(points, partial=True)
+    assert found.status is FitStatus.CONVERGED, found.reason
+    assert given.error(found) < 0.01
+    assert found.seen < 0.9 < found.explained
+    whole = figure.fit(given.points())
+    assert np.trace(found.covariance) > np.trace(whole.covariance)
+
+
+def test_a_piece_that_does_not_belong_is_left_out(figure: ShapeModel) -> None:
+    given = Moved.of(figure, 2)
+    rng = np.random.default_rng(0)
+    wall = given.shape.mean(axis=0) + given.size * (rng.random((800, 3)) - 0.5) * [1, 0, 1] + [0, given.size, 0]
+    found = figure.fit(np.concatenate([given.points(3200), wall]))
+    assert found.status is FitStatus.CONVERGED, found.reason
+    assert given.error(found) < 5e-3
+    assert found.seen > 0.99
+    assert found.explained < 0.9
+
+
+def test_landmarks_decide_where_a_fit_begins_and_what_it_holds_on_to(figure: ShapeModel) -> None:
+    given = Moved.of(figure, 5)
+    chosen = [0, 700, 1500, 2600, 4000]
+    landmarks = [Landmark(k, given.shape[k].tolist(), 0.01) for k in chosen]
+    found = figure.fit(given.points(), landmarks=landmarks)
+    assert given.error(found) < 1e-3
+    # One that is elsewhere, and certain, moves the shape there.
+    away = given.shape[chosen[0]] + 0.03 * given.size
+    moved = figure.fit(given.points(), landmarks=[Landmark(chosen[0], away.tolist(), 1e-4)])
+    there = [f.placement(f.shape.vertices)[chosen[0]] for f in (found, moved)]
+    assert np.linalg.norm(there[1] - away) < 0.5 * np.linalg.norm(there[0] - away)
+
+
+def test_fixed_coordinates_keep_their_values(figure: ShapeModel) -> None:
+    given = Moved.of(figure, 1)
+    fixed = {0: float(given.code[0]) + 0.2, 7: float(given.code[7])}
+    found = figure.fit(given.points(), fixed=fixed, samples=3)
+    for k, value in fixed.items():
+        assert found.code[k] == np.float32(value)
+        assert (found.samples[:, k] == np.float32(value)).all()
+        assert not found.covariance[k].any()
+        assert not found.covariance[:, k].any()
+    assert (found.covariance.diagonal() > 0).sum() == figure.dimension - 2
+    assert given.error(found) > 10 * given.error(figure.fit(given.points()))
+
+
+def test_the_covariance_is_that_of_the_samples_and_holds_the_truth(figure: ShapeModel) -> None:
+    given = Moved.of(figure, 2)
+    points = given.points() + 0.005 * given.size * np.random.default_rng(2).standard_normal((4000, 3))
+    found = figure.fit(points, samples=4000)
+    assert (np.linalg.eigvalsh(found.covariance) > 0).all()
+    np.testing.assert_array_equal(found.covariance, found.covariance.T)
+    deviations = np.sqrt(found.covariance.diagonal())
+    spread = np.cov(found.samples.T)
+    np.testing.assert_allclose(
+        spread / np.outer(deviations, deviations), found.covariance / np.outer(deviations, deviations), atol=0.1
+    )
+    off = np.abs(found.code - given.code) / deviations
+    assert (off < 1.645).mean() >= 0.7
+    assert off.max() < 6
+    # Much narrower than what is known without a scan.
+    assert (deviations < 0.5 * np.sqrt(figure.population.covariance.diagonal())).all()
+
+
+def test_one_seed_gives_one_answer(figure: ShapeModel) -> None:
+    points = Moved.of(figure, 1).points()
+    one, again, other = (figure.fit(points, samples=2, seed=seed) for seed in (5, 5, 6))
+    np.testing.assert_array_equal(one.code, again.code)
+    np.testing.assert_array_equal(one.samples, again.samples)
+    np.testing.assert_array_equal(one.covariance, again.covariance)
+    assert one.reason == again.reason
+    assert (one.samples != other.samples).any()
+
+
+@pytest.mark.parametrize("name", ["ball", "box"])
+def test_what_is_no_such_shape_is_told_so(figure: ShapeModel, name: str) -> None:
+    solids = {"ball": trimesh.creation.icosphere(4, 0.6), "box": trimesh.creation.box((1, 0.5, 1.5)).subdivide_loop(5)}
+    found = figure.fit((solids[name].vertices, solids[name].faces))
+    assert found.status is FitStatus.POOR
+    assert found.explained < 0.9
+    assert "no such shape" in found.reason
+
+
+def test_a_mirrored_scan_is_told_so(figure: ShapeModel) -> None:
+    # Coordinates of arms and legs that are fixed tell left from right.
+    given = Moved.of(figure, 2)
+    fixed = {k: float(value) for k, value in enumerate(given.code) if k < 18}
+    found = figure.fit(given.points() * [-1, 1, 1], fixed=fixed)
+    assert found.status is FitStatus.POOR
+    assert found.mirrored < 0.6
+    assert "mirror image" in found.reason
+    assert figure.fit(given.points(), fixed=fixed).mirrored is None
+
+
+def test_distances_of_each_point_come_in_its_order(figure: ShapeModel) -> None:
+    given = Moved.of(figure, 1)
+    points = given.points(3500)
+    points[17] += given.size
+    found = figure.fit(points, points=True)
+    assert found.scan.points.shape == (3500,)
+    assert found.model.points.shape == (len(figure.vertices),)
+    assert found.scan.points.argmax() == 17
+    assert figure.fit(points).scan.points is None
+
+
+def test_the_box_keeps_codes_inside_the_bounds(figure: ShapeModel) -> None:
+    code = figure.population.mean.copy()
+    code[0] = figure.upper[0] + 0.2 * (figure.upper[0] - figure.lower[0])
+    given = Moved.of(figure, 1, code=code)
+    free, boxed = (figure.fit(given.points(), distribution=name) for name in ("population", "box"))
+    assert free.code[0] > figure.upper[0] + 0.1
+    assert (boxed.code <= figure.upper.astype(np.float32)).all()
+    assert (boxed.code >= figure.lower.astype(np.float32)).all()
+
+
+def test_a_million_points_are_sampled_and_it_is_said(figure: ShapeModel) -> None:
+    given = Moved.of(figure, 1)
+    found = figure.fit(given.points(1_000_000))
+    assert given.error(found) < 2e-3
+    assert found.sampled
+    assert "1000000 points" in found.reason
+
+
+def test_a_deadline_ends_a_fit_with_what_there_is(figure: ShapeModel) -> None:
+    late = Deadline(60)
+    late.call_off()
+    found = figure.fit(Moved.of(figure, 1).points(), deadline=late)
+    assert found.status is FitStatus.DEADLINE
+    assert found.rough < 12
+    assert np.isfinite(found.covariance).all()
+    assert np.isfinite(found.code).all()
+
+
+CLOUD = np.random.default_rng(0).standard_normal((50, 3))
+
+
+@pytest.mark.parametrize(
+    ("points", "options", "says"),
+    [
+        (CLOUD[:9], {}, "9 points"),
+        (np.zeros((0, 3)), {}, "0 points"),
+        (CLOUD[:, :2], {}, "(N, 3)"),
+        (np.where(np.arange(50)[:, None] == 3, np.nan, CLOUD), {}, "Point 3"),
+        (CLOUD * [1, 0, 1], {}, "in a plane"),
+        (np.ones((50, 3)), {}, "in a plane"),
+        ((CLOUD, [[0, 1, 50]]), {}, "0 to 50"),
+        (CLOUD, {"noise": 0.0}, "noise"),
+        (CLOUD, {"noise": np.nan}, "noise"),
+        (CLOUD, {"fixed": {20: 0.0}}, "coordinate 20"),
+        (CLOUD, {"fixed": {-1: 0.0}}, "coordinate -1"),
+        (CLOUD, {"fixed": {1: np.inf}}, "coordinate 1"),
+        (CLOUD, {"fixed": dict.fromkeys(range(20), 0.0)}, "all coordinates"),
+        (CLOUD, {"landmarks": [Landmark(4601, [0, 0, 0])]}, "0 to 4600"),
+        (CLOUD, {"landmarks": [Landmark(0, [0, np.nan, 0])]}, r"landmarks[0].position"),
+        (CLOUD, {"landmarks": [Landmark(0, [0, 0, 0], 0.0)]}, r"landmarks[0].sigma"),
+        (1000 * CLOUD, {}, "scale=free"),
+        (1e-3 * CLOUD, {}, "scale=free"),
+        (1e-3 * CLOUD, {"partial": True}, "scale=free"),
+    ],
+)
+def test_bad_input_is_refused_with_what_to_do(figure: ShapeModel, points: object, options: dict, says: str) -> None:
+    with pytest.raises(InvalidScanError) as caught:
+        figure.fit(points, **options)
+    assert says in str(caught.value)
