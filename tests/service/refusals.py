@@ -24,6 +24,7 @@ OF_CALLS = {
     "/{k}": {"invalid-request"},
     "/infer": {"invalid-request", "malformed-request"},
     "/edit": {"invalid-request"},
+    "/fit": {kind for kind in KINDS if KINDS[kind].status in {400, 422}},
     "/encode": {kind for kind in KINDS if KINDS[kind].status in {400, 422}},
 }
 
