@@ -47,12 +47,12 @@ outliers. **camera**: at most so many points, those that one camera sees, with t
 it, **drawn** ones shapes of the population's codes. `python -m benchmarks.fit` measures and writes this page.
 
 **error**: median over tries of the mean distance of vertices from the truth, in percent of the diagonal; of the torus
-the distance of its surface, as it may turn about its axis with its code, and then other vertices lie in the same
-places. **encode**: the same of `encode`, which is given the vertices in their order. **failed**: tries further off than
-{failed:g} times the median of their row. **told**: those of them whose status is not `converged`. **false alarms**:
-others whose status is not. **shapes**: solved ones at the median, three rough ones counted as one; **time**: in
-solved shapes. **components**: what one would do otherwise, closest points with as many principal components, of 60
-drawn shapes; they begin with the mean in the place that `fit` has found, which helps them.
+the distance of its surface, which four codes share in as many places, each with other vertices. **encode**: the same
+of `encode`, which is given the vertices in their order. **failed**: tries further off than {failed:g} times the median
+of their row. **told**: those of them whose status is not `converged`. **false alarms**: others whose status is not.
+**shapes**: solved ones at the median, three rough ones counted as one; **time**: in solved shapes. **components**:
+what one would do otherwise, closest points with as many principal components, of 60 drawn shapes; they begin with the
+mean in the place that `fit` has found, which helps them.
 
 | model | shapes | scan | tries | error | encode | ratio | failed | told | false alarms | shapes | time | components |
 |---|---|---|---|---|---|---|---|---|---|---|---|---|
@@ -62,8 +62,9 @@ drawn shapes; they begin with the mean in the place that `fit` has found, which 
 
 How often the code's 90 % intervals hold the truth's coordinates, over all coordinates of all fits that converged, and
 the intervals' median width as a share of the population's. Of shapes drawn from the model the truth is their code; of
-training shapes it is `encode`'s code. Several codes of the torus, turned about its axis, have nearly the same surface:
-the fit finds one of them, and its covariance does not know of the others.
+training shapes it is `encode`'s code. Four codes of the torus have the same surface up to the networks' errors: after
+half a turn about its axis gamma is another by π, and upside down all signs are. A fit finds one of them or another
+nearby, and its covariance does not know of the others: there the intervals do not hold.
 
 | model | shapes | scan | fits | held | width |
 |---|---|---|---|---|---|
