@@ -26,6 +26,7 @@ OF_CALLS = {
     "/infer": {"invalid-request", "malformed-request"},
     "/edit": {"invalid-request"},
     "/sample": {"invalid-request"},
+    "/fit": {kind for kind in KINDS if KINDS[kind].status in {400, 422}},
     "/encode": {kind for kind in KINDS if KINDS[kind].status in {400, 422}},
 }
 

@@ -85,7 +85,7 @@ def test_a_code_comes_back_from_points_anywhere(figure: ShapeModel) -> None:
 
 
 def test_landmarks_tell_a_ring_how_it_is_turned(ring: ShapeModel) -> None:
-    # Turned about its axis a ring is nearly the one of another code; so only landmarks tell which vertex is where.
+    # After half a turn, or upside down, a ring is that of another code; so only landmarks tell which vertex is where.
     given = Moved.of(ring, 2)
     points = given.points()
     landmarks = [Landmark(k, given.shape[k].tolist()) for k in (0, 300, 700, 1000, 1400, 1900)]

@@ -1,0 +1,329 @@
+"""docs/fit.md: how near fits of scans come to the truth, how sure they rightly are, and what they cost.
+
+``python -m benchmarks.fit`` measures the bundled models. With ``--data FOLDER`` also each bundle FOLDER/NAME that has
+shapes it has not seen beside it, FOLDER/NAME.npz with ``vertices`` (n, V, 3) in its order.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import trimesh
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+from threadpoolctl import threadpool_limits
+
+from benchmarks.results import ROOT
+from shapespace.arrays import FloatArray, IntArray
+from shapespace.mesh.closest_points import Fans, Surface
+from shapespace.mesh.rigid_motion import align
+from shapespace.mesh.triangle_mesh import diagonal
+from shapespace.model.fit import FitStatus, Fitted
+from shapespace.model.placement import Placement
+from shapespace.model.shape_model import ShapeModel, load
+from shapespace.training.collection import figure
+
+#: Points of a scan; its noise as a share of the diagonal, and the share of outliers.
+POINTS, NOISE, OUTLIERS = 4000, 0.005, 0.02
+#: How far a try may be off, in medians, and the half width of a 90 % interval in standard deviations.
+FAILED, NINETY = 2.0, 1.645
+VARIANTS = ("whole", "noisy", "camera")
+#: Steps of the closest-point fit with principal components, and how strongly it holds on to the mean.
+COMPONENT_STEPS, HOLD = 40, 1e-3
+
+PAGE = """# Fits of scans
+
+How near `fit` comes to a shape whose vertices are known, from a scan without correspondence: each shape is sampled
+anew, turned at random and moved. **whole**: in turn {points} points all over, and a decimated mesh of jittered
+vertices. **noisy**: {points} points with noise of {noise:.1%} of the bounding box's diagonal and {outliers:.0%}
+outliers. **camera**: at most so many points, those that one camera sees, with the same noise, and `partial=true`.
+**unseen** shapes of the figure are poses from its generator that no training knows, **training** ones those that made
+it, **drawn** ones shapes of the population's codes. `python -m benchmarks.fit` measures and writes this page.
+
+**error**: median over tries of the mean distance of vertices from the truth, in percent of the diagonal; of the torus
+the distance of its surface, which four codes share in as many places, each with other vertices. **encode**: the same
+of `encode`, which is given the vertices in their order. **failed**: tries further off than {failed:g} times the median
+of their row. **told**: those of them whose status is not `converged`. **false alarms**: others whose status is not.
+**shapes**: solved ones at the median, three rough ones counted as one; **time**: in solved shapes. **components**:
+what one would do otherwise, closest points with as many principal components, of 60 drawn shapes; they begin with the
+mean in the place that `fit` has found, which helps them.
+
+| model | shapes | scan | tries | error | encode | ratio | failed | told | false alarms | shapes | time | components |
+|---|---|---|---|---|---|---|---|---|---|---|---|---|
+{rows}
+
+## Intervals
+
+How often the code's 90 % intervals hold the truth's coordinates, over all coordinates of all fits that converged, and
+the intervals' median width as a share of the population's. Of shapes drawn from the model the truth is their code; of
+training shapes it is `encode`'s code. Four codes of the torus have the same surface up to the networks' errors: after
+half a turn about its axis gamma is another by π, and upside down all signs are. A fit finds one of them or another
+nearby, and its covariance does not know of the others: there the intervals do not hold.
+
+| model | shapes | scan | fits | held | width |
+|---|---|---|---|---|---|
+{intervals}
+"""
+
+
+@dataclass
+class Row:
+    """Tries of one kind."""
+
+    errors: list[float] = field(default_factory=list)
+    encoded: list[float] = field(default_factory=list)
+    components: list[float] = field(default_factory=list)
+    converged: list[bool] = field(default_factory=list)
+    shapes: list[float] = field(default_factory=list)
+    seconds: list[float] = field(default_factory=list)
+    held: list[float] = field(default_factory=list)
+    widths: list[float] = field(default_factory=list)
+
+
+def sampled(vertices: FloatArray, faces: IntArray, count: int, rng: np.random.Generator) -> FloatArray:
+    """Points (count, 3) at random all over a surface."""
+    points, _ = trimesh.sample.sample_surface(trimesh.Trimesh(vertices, faces, process=False), count, seed=rng)
+    return np.asarray(points)
+
+
+def remeshed(vertices: FloatArray, faces: IntArray, rng: np.random.Generator) -> tuple[FloatArray, IntArray]:
+    """Another mesh of a surface: a vertex of it chosen at random in each cell of a grid."""
+    fine = trimesh.Trimesh(vertices, faces, process=False).subdivide()
+    order = rng.permutation(len(fine.vertices))
+    cells = np.floor(fine.vertices[order] / (0.015 * diagonal(vertices))).astype(np.int64)
+    _, first, cell = np.unique(cells, axis=0, return_index=True, return_inverse=True)
+    of_vertex = np.empty(len(order), np.int64)
+    of_vertex[order] = cell.ravel()
+    corners = of_vertex[fine.faces]
+    a, b, c = corners.T
+    return fine.vertices[order[first]], corners[(a != b) & (b != c) & (c != a)]
+
+
+def seen(vertices: FloatArray, faces: IntArray, rng: np.random.Generator) -> FloatArray:
+    """Points (n, 3) that one camera sees, far away in a random direction."""
+    size = float(diagonal(vertices))
+    points = sampled(vertices, faces, 10 * POINTS, rng)
+    turned = points @ Rotation.random(random_state=rng).as_matrix().T
+    cells = np.floor(turned[:, :2] / (size / 120)).astype(np.int64)
+    _, cell = np.unique(cells, axis=0, return_inverse=True)
+    front = np.full(cell.max() + 1, -np.inf)
+    np.maximum.at(front, cell.ravel(), turned[:, 2])
+    points = points[turned[:, 2] > front[cell.ravel()] - 0.02 * size]
+    return points[rng.choice(len(points), min(POINTS, len(points)), replace=False)]
+
+
+def scan(
+    vertices: FloatArray, faces: IntArray, variant: str, number: int, rng: np.random.Generator
+) -> tuple[FloatArray, IntArray]:
+    """A scan of a shape (V, 3), in the same place: points, and faces or none."""
+    none, size = np.zeros((0, 3), np.int64), float(diagonal(vertices))
+    if variant == "whole":
+        if number % 2:
+            return remeshed(vertices, faces, rng)
+        return sampled(vertices, faces, POINTS, rng), none
+    points = seen(vertices, faces, rng) if variant == "camera" else sampled(vertices, faces, POINTS, rng)
+    points = points + NOISE * size * rng.standard_normal(points.shape)
+    if variant == "noisy":
+        strays = rng.choice(len(points), int(OUTLIERS * len(points)), replace=False)
+        low, high = points.min(axis=0), points.max(axis=0)
+        points[strays] = low + (high - low) * rng.random((len(strays), 3))
+    return points, none
+
+
+def by_components(
+    training: FloatArray, count: int, points: FloatArray, start: Placement, *, partial: bool
+) -> FloatArray:
+    """Vertices (V, 3) of the closest-point fit with principal components of training shapes (n, V, 3).
+
+    The iterated fit of Scalismo's tutorial on fitting without correspondence, of a Gaussian of aligned vertices.
+    """
+    mean = training.mean(axis=0)
+    _, spread, axes = np.linalg.svd((training - mean).reshape(len(training), -1), full_matrices=False)
+    modes = (spread[:count, None] / np.sqrt(len(training)) * axes[:count]).reshape(-1, *mean.shape)
+    place, shape, tree, weights = start, mean, cKDTree(points), np.zeros(len(modes))
+    for _ in range(COMPONENT_STEPS):
+        there = place.back(points)
+        away, own = cKDTree(shape).query(there)
+        pairs = [(own, there, away)]
+        if not partial:
+            away, other = tree.query(place(shape))
+            pairs.append((np.arange(len(shape)), there[other], away))
+        index, goal, far = (np.concatenate([pair[k] for pair in pairs]) for k in range(3))
+        near = far <= np.quantile(far, 0.95)
+        index, goal = index[near], goal[near]
+        A = modes[:, index].reshape(len(modes), -1)
+        hold = HOLD * np.trace(A @ A.T) / len(modes) * np.eye(len(modes))
+        weights = np.linalg.solve(A @ A.T + hold, A @ (goal - mean[index]).ravel())
+        shape = mean + np.tensordot(weights, modes, 1)
+        place = Placement.between(shape[index], place(goal))
+    return place(shape)
+
+
+class Bench:
+    """One model, and what is measured on it.
+
+    Args:
+        model: with a name.
+        by_surface: whether the distance of the surface counts in place of that of vertices.
+    """
+
+    def __init__(self, model: ShapeModel, *, by_surface: bool) -> None:
+        self.model, self.by_surface = model, by_surface
+        self.fans = Fans(model.faces, len(model.vertices))
+        model.fit(sampled(model.vertices, model.faces, POINTS, np.random.default_rng(0)))  # makes what is made once
+        times = []
+        for code in model.population.sample(12, 1).astype(np.float32):
+            began = time.process_time()
+            model.shape(code)
+            times.append(time.process_time() - began)
+        self.solved = float(np.median(times))
+        # The components are of the same shapes as the codes.
+        codes = model.population.sample(60, 3)
+        self.training = np.stack([model.shape(code).vertices for code in codes.astype(np.float32)])
+
+    def distance(self, found: FloatArray, truth: FloatArray) -> float:
+        """Mean distance of shapes (V, 3) in the same place, as a fraction of the diagonal."""
+        if self.by_surface:
+            away = Surface(found, self.fans).closest(truth).distances
+        else:
+            away = np.linalg.norm(found - truth, axis=1)
+        return float(away.mean() / diagonal(truth))
+
+    def tries(self, shapes: FloatArray, truths: FloatArray | None) -> Iterator[tuple[str, Row]]:
+        """A row for each variant of scans of shapes (n, V, 3), given their codes (n, m) or not."""
+        for variant in VARIANTS:
+            row = Row()
+            for number, shape in enumerate(shapes):
+                self.one(row, variant, number, shape, None if truths is None else truths[number])
+            yield variant, row
+
+    def one(self, row: Row, variant: str, number: int, shape: FloatArray, truth: FloatArray | None) -> None:
+        """One scan of a shape (V, 3) of a code (m,), if that is known."""
+        rng, model = np.random.default_rng(number), self.model
+        points, faces = scan(shape, model.faces, variant, number, rng)
+        turn, shift = Rotation.random(random_state=rng).as_matrix(), diagonal(shape) * rng.standard_normal(3)
+        points, there = points @ turn.T + shift, shape @ turn.T + shift
+        began = time.process_time()
+        found = model.fit((points, faces), partial=variant == "camera")
+        row.seconds.append((time.process_time() - began) / self.solved)
+        row.errors.append(self.distance(found.placement(found.shape.vertices), there))
+        row.converged.append(found.status is FitStatus.CONVERGED)
+        row.shapes.append(found.solved + found.rough / 3)
+        if truth is None:
+            encoded = model.encode(shape)
+            row.encoded.append(self.distance(align(encoded.shape.vertices, shape), shape))
+            begun = Placement.between(self.training.mean(axis=0), found.placement(found.shape.vertices))
+            fitted = by_components(self.training, model.dimension, points, begun, partial=variant == "camera")
+            row.components.append(self.distance(fitted, there))
+        elif row.converged[-1]:
+            self.interval(row, found, truth)
+
+    def interval(self, row: Row, found: Fitted, truth: FloatArray) -> None:
+        """Whether intervals hold a code (m,), and how wide they are."""
+        deviations = np.sqrt(found.covariance.diagonal())
+        off = np.abs(self.model.latents.shorter(found.code - truth))
+        row.held.append(float((off <= NINETY * deviations).mean()))
+        row.widths.append(float(np.median(deviations / np.sqrt(self.model.population.covariance.diagonal()))))
+
+
+def line(name: str, kind: str, variant: str, row: Row) -> str:
+    """Of the table of errors."""
+    errors, converged = np.array(row.errors), np.array(row.converged)
+    failed = errors > FAILED * np.median(errors)
+    encoded = 100 * float(np.median(row.encoded)) if row.encoded else None
+    middle = 100 * float(np.median(errors))
+    cells = [
+        name,
+        kind,
+        variant,
+        str(len(errors)),
+        f"{middle:.3f}",
+        "–" if encoded is None else f"{encoded:.3f}",
+        "–" if encoded is None else f"{middle / encoded:.2f}",
+        str(int(failed.sum())),
+        str(int((failed & ~converged).sum())),
+        str(int((~failed & ~converged).sum())),
+        f"{np.median(row.shapes):.0f}",
+        f"{np.median(row.seconds):.0f}",
+        f"{100 * float(np.median(row.components)):.3f}" if row.components else "–",
+    ]
+    return f"| {' | '.join(cells)} |"
+
+
+def held(name: str, kind: str, variant: str, row: Row) -> str:
+    """Of the table of intervals."""
+    figures = [f"{np.mean(row.held):.0%}", f"{np.median(row.widths):.3f}"] if row.held else ["–", "–"]
+    return f"| {' | '.join([name, kind, variant, str(len(row.held)), *figures])} |"
+
+
+def kinds(
+    model: ShapeModel, unseen: FloatArray | None, count: int
+) -> Iterator[tuple[str, FloatArray, FloatArray | None]]:
+    """Kinds of shapes (n, V, 3), and their codes (n, m) or None where only the shapes are known."""
+    if unseen is not None:
+        yield "unseen", unseen[: 2 * count], None
+    codes = np.clip(model.population.sample(count, 123), model.lower, model.upper)
+    yield "drawn", np.stack([model.decode(code) for code in codes]), codes
+
+
+def measure(name: str, model: ShapeModel, unseen: FloatArray | None, count: int) -> dict[str, list[str]]:
+    """Rows of both tables for one model."""
+    found: dict[str, list[str]] = {"rows": [], "intervals": []}
+    bench = Bench(model, by_surface=name == "freaky-torus")
+    every = list(kinds(model, unseen, count))
+    if name == "figure":
+        shapes = figure.poses(len(figure.NAMED) + count)[1][len(figure.NAMED) :]
+        every.append(("training", shapes, np.stack([model.encode(shape).code for shape in shapes])))
+    for kind, shapes, codes in every:
+        for variant, row in bench.tries(shapes, codes):
+            found["rows"].append(line(name, kind, variant, row))
+            if codes is not None:
+                found["intervals"].append(held(name, kind, variant, row))
+            print(found["rows"][-1], *found["intervals"][-1:], sep="\n", flush=True)
+    return found
+
+
+def main() -> None:
+    """Measure and write."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--data", type=Path, help="folder of other bundles and of shapes that they have not seen")
+    parser.add_argument("--count", type=int, default=10, help="shapes of each kind, twice as many unseen ones")
+    parser.add_argument("--out", type=Path, default=ROOT / "build" / "fit", help="folder of what is measured")
+    parser.add_argument("--page", action="store_true", help="measure nothing, and write the page of what is in --out")
+    parser.add_argument("names", nargs="*", help="models to measure; by default all. The page has every one in --out")
+    given = parser.parse_args()
+    bundles = {name: ROOT / "models" / name for name in ("figure", "freaky-torus")}
+    bundles |= {file.stem: given.data / file.stem for file in sorted(given.data.glob("*.npz"))} if given.data else {}
+    given.out.mkdir(parents=True, exist_ok=True)
+    with threadpool_limits(1):
+        for name in [] if given.page else given.names or bundles:
+            unseen = None
+            if name == "figure":
+                # Its generator makes poses that no training knows; those with a name come first, and are known.
+                known = len(figure.NAMED)
+                unseen = figure.poses(known + 2 * given.count, seed=77)[1][known:]
+            elif name != "freaky-torus":
+                with np.load(given.data / f"{name}.npz", allow_pickle=False) as arrays:
+                    unseen = arrays["vertices"]
+            found = measure(name, load(bundles[name]), unseen, given.count)
+            (given.out / f"{name}.json").write_text(json.dumps(found), encoding="utf-8")
+    every = [json.loads(file.read_text(encoding="utf-8")) for file in sorted(given.out.glob("*.json"))]
+    page = PAGE.format(
+        points=POINTS,
+        noise=NOISE,
+        outliers=OUTLIERS,
+        failed=FAILED,
+        rows="\n".join(row for each in every for row in each["rows"]),
+        intervals="\n".join(row for each in every for row in each["intervals"]),
+    )
+    (ROOT / "docs" / "fit.md").write_text(page, encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
