@@ -55,7 +55,7 @@ class Placement:
         x, y = points - middle, there - centre
         u, s, vt = np.linalg.svd((share[:, None] * x).T @ y)
         sign = np.array([1, 1, np.sign(np.linalg.det(u @ vt))])
-        rotation = ((u * sign) @ vt).T
+        rotation = vt.T @ (u * sign).T
         spread = float((share[:, None] * x * x).sum())
         scale = float((s * sign).sum() / max(spread, np.finfo(float).tiny)) if scaled else 1.0
         return cls(rotation, centre - scale * rotation @ middle, scale)

@@ -92,9 +92,9 @@ def bumps(figure: ShapeModel, size: float, width: float, rng: np.random.Generato
 @pytest.mark.parametrize("width", [None, 0.05], ids=["independent", "alike"])
 def test_the_truth_lies_in_the_intervals_of_a_noisy_mesh(figure: ShapeModel, width: float | None) -> None:
     rng = np.random.default_rng(0)
-    code = 0.3 * figure.sample(1, 2)[0].astype(np.float64)
-    shape, scores = figure.decode(code), []
-    for _ in range(6):
+    scores = []
+    for code in 0.3 * figure.sample(12, 2).astype(np.float64):
+        shape = figure.decode(code)
         noise = 0.005 * rng.standard_normal(shape.shape) if width is None else bumps(figure, 0.005, width, rng)
         found = figure.encode(shape + noise)
         scores.append((found.code - code) / np.sqrt(np.diag(found.covariance)))
