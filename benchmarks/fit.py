@@ -22,10 +22,9 @@ from threadpoolctl import threadpool_limits
 from benchmarks.results import ROOT
 from shapespace.arrays import FloatArray, IntArray
 from shapespace.mesh.closest_points import Fans, Surface
-from shapespace.mesh.rigid_motion import align
+from shapespace.mesh.rigid_motion import Placement, align
 from shapespace.mesh.triangle_mesh import diagonal
 from shapespace.model.fit import FitStatus, Fitted
-from shapespace.model.placement import Placement
 from shapespace.model.shape_model import ShapeModel, load
 from shapespace.training.collection import figure
 

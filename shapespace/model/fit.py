@@ -17,6 +17,7 @@ from shapespace.model.decoder import Decoder, MeshChoice, Shape
 from shapespace.model.latent_space import Bounds, Codes
 from shapespace.model.placement import Start, coarse, evenly
 from shapespace.model.population import Population
+from shapespace.model.posterior import Posterior
 from shapespace.model.scan import InvalidScanError, Scan, scan_of
 from shapespace.model.search import FULL, ROUGH, Level, Options, Search, State
 from shapespace.model.searched_shapes import SearchedShapes
@@ -272,7 +273,7 @@ class _Fit:
             full = self._search(reconstruct, self.scan, FULL)
             final, rival = self._fully(full, best, others)
             ratio = None
-            covariance = self._covariance(full, final)
+            posterior = self._posterior(full, final)
             explained, seen = full.shares(final)
             if self._is_poor(explained, seen) and not self._late:
                 flip = np.array([-1, 1, 1])
@@ -280,7 +281,7 @@ class _Fit:
                 twin, _ = self._roughly(self._search(reconstruct, mirror, ROUGH), mirror)
                 ratio = twin.cost / best.cost
         # The model lends its solver again for the shape that is answered.
-        return self._answer(full, final, covariance, explained, seen, ratio, rival, rough.count)
+        return self._answer(full, final, posterior, explained, seen, ratio, rival, rough.count)
 
     @property
     def _late(self) -> bool:
@@ -290,13 +291,7 @@ class _Fit:
         """The options as a search takes them."""
         asked, latents, model = self.asked, self.model.latents, self.model
         count = len(model.mesh(MeshChoice.FINE).vertices)
-        movable = np.ones(latents.dimension, bool)
-        for k, value in (asked.fixed or {}).items():
-            if not 0 <= k < latents.dimension:
-                raise InvalidScanError(f"fixed names coordinate {k}, but there are 0 to {latents.dimension - 1}.")
-            if not abs(value) < np.finfo(np.float32).max:
-                raise InvalidScanError(f"fixed gives coordinate {k} a value that is not a finite number. Send one.")
-            movable[k] = False
+        movable = ~latents.fixed(asked.fixed).mask
         if not movable.any():
             raise InvalidScanError("fixed names all coordinates. Leave at least one to be found.")
         if asked.noise is not None and not 0 < asked.noise < np.inf:
@@ -400,17 +395,13 @@ class _Fit:
         away = one.placement(one.shape) - other.placement(other.shape)
         return float(np.linalg.norm(away, axis=1).mean() / one.placement.scale / self.model.reference.diagonal)
 
-    def _covariance(self, search: Search, state: State) -> FloatArray:
-        movable = self.options.movable
-        covariance = np.zeros((len(movable), len(movable)))
+    def _posterior(self, search: Search, state: State) -> Posterior:
+        prior, fixed = self.options.prior, ~self.options.movable
         try:
-            inverse = np.linalg.inv(search.precision(state))
+            return Posterior.of(search.normal(state), prior, fixed)
         except (NotPositiveDefiniteError, np.linalg.LinAlgError):
             # Without derivatives nothing but the prior is known.
-            whiten = np.linalg.inv(self.options.prior.root)[:, movable]
-            inverse = np.linalg.inv(whiten.T @ whiten)
-        covariance[np.ix_(movable, movable)] = (inverse + inverse.T) / 2
-        return covariance
+            return Posterior.of(np.zeros_like(prior.covariance), prior, fixed)
 
     def _is_poor(self, explained: float, seen: float) -> bool:
         if self.options.partial:
@@ -421,7 +412,7 @@ class _Fit:
         self,
         search: Search,
         state: State,
-        covariance: FloatArray,
+        posterior: Posterior,
         explained: float,
         seen: float,
         mirrored: float | None,
@@ -443,14 +434,10 @@ class _Fit:
         if asked.points:
             parts = np.array_split(self.points, -(-len(self.points) // CHUNK))
             every = np.concatenate([surface.closest(part).distances for part in parts])
-        rng = np.random.default_rng(asked.seed)
-        values, vectors = np.linalg.eigh(covariance)
-        root = vectors * np.sqrt(np.maximum(values, 0))
-        drawn = code + rng.standard_normal((asked.samples, len(code))) @ root.T
         status, reason = self._status(state, explained, seen, mirrored, rival, shape)
         return Fitted(
             code=code,
-            covariance=covariance,
+            covariance=posterior.covariance,
             placement=placement,
             shape=shape,
             scan=Distances.of(to_model, every),
@@ -461,7 +448,7 @@ class _Fit:
             mirrored=mirrored,
             status=status,
             reason=reason,
-            samples=model.latents.codes(drawn)[0],
+            samples=posterior.sample(model.latents, code, asked.samples, asked.seed),
             sampled=self.scan.sampled,
             solved=search.count + 1,
             rough=rough,

@@ -228,8 +228,8 @@ class Search:
         pairs = self._pairs(state)
         return replace(state, sigma=self._sigma(pairs, state), cost=self._cost(state, pairs))
 
-    def precision(self, state: State) -> FloatArray:
-        """(f, f) inverse covariance of the coordinates that may change, by what the scan says at a fit (Laplace).
+    def normal(self, state: State) -> FloatArray:
+        """(m, m) what the scan and landmarks say of the code at a fit, zero where it may not change: half a Hessian.
 
         Residuals of neighbouring points are alike, so each counts only as far as it is independent.
         """
@@ -242,11 +242,14 @@ class Search:
         H = share / sigma**2 * normal.T @ (weights[:, None] * normal)
         H += self._landmarks(state, self._derivatives(state))[0]
         count = int(self._options.movable.sum())
-        H[:count, :count] += self._prior().T @ self._prior()
         # What is left once motion and size are chosen best for each code.
         rest = H[count:, count:] + 1e-9 * np.eye(len(H) - count) * H.diagonal().max()
-        reduced: FloatArray = H[:count, :count] - H[:count, count:] @ np.linalg.solve(rest, H[count:, :count])
-        return reduced
+        movable = self._options.movable
+        found = np.zeros((len(movable), len(movable)))
+        found[np.ix_(movable, movable)] = H[:count, :count] - H[:count, count:] @ np.linalg.solve(
+            rest, H[count:, :count]
+        )
+        return found
 
     def surface(self, shape: FloatArray) -> Surface:
         """Of a coarse shape (V, 3), on the mesh of this level."""

@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 from shapespace.arrays import FloatArray, IntArray
 from shapespace.mesh.triangle_mesh import diagonal
 from shapespace.model.fit import FitStatus, Fitted, Landmark
+from shapespace.model.latent_space import InvalidFixedError
 from shapespace.model.scan import InvalidScanError
 from shapespace.model.shape_model import ShapeModel, load
 from shapespace.solve.deadline import Deadline
@@ -289,7 +290,7 @@ CLOUD = np.random.default_rng(0).standard_normal((50, 3))
         (CLOUD, {"noise": np.nan}, "noise"),
         (CLOUD, {"fixed": {20: 0.0}}, "coordinate 20"),
         (CLOUD, {"fixed": {-1: 0.0}}, "coordinate -1"),
-        (CLOUD, {"fixed": {1: np.inf}}, "coordinate 1"),
+        (CLOUD, {"fixed": {1: np.inf}}, "fixed[1]"),
         (CLOUD, {"fixed": dict.fromkeys(range(20), 0.0)}, "all coordinates"),
         (CLOUD, {"landmarks": [Landmark(4601, [0, 0, 0])]}, "0 to 4600"),
         (CLOUD, {"landmarks": [Landmark(0, [0, np.nan, 0])]}, r"landmarks[0].position"),
@@ -300,6 +301,6 @@ CLOUD = np.random.default_rng(0).standard_normal((50, 3))
     ],
 )
 def test_bad_input_is_refused_with_what_to_do(figure: ShapeModel, points: object, options: dict, says: str) -> None:
-    with pytest.raises(InvalidScanError) as caught:
+    with pytest.raises((InvalidScanError, InvalidFixedError)) as caught:
         figure.fit(points, **options)
     assert says in str(caught.value)
