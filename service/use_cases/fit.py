@@ -50,7 +50,7 @@ async def fit(
         points, faces, said = read_upload(sandbox, upload, LIMITS, deadline, points=True, memory=MEMORY)
         asked = options(said)
         read = time.perf_counter()
-        found = model.fit_with((points, faces), asked, deadline)
+        found = model.fitter(points, faces, asked, deadline)
         if found.status is FitStatus.DEADLINE:
             raise workers.late()
         content = {

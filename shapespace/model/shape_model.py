@@ -324,13 +324,7 @@ class ShapeModel(Decoder):
             points=points,
             seed=seed,
         )
-        return self.fit_with(_points_and_faces(scan), options, deadline)
-
-    def fit_with(
-        self, scan: tuple[FloatArray, IntArray], options: FitOptions, deadline: Deadline | None = None
-    ) -> Fitted:
-        """As ``fit``, with points (N, 3) and faces (F, 3), none if there aren't any, and all options in one."""
-        return self._fitter(*scan, options, deadline)
+        return self.fitter(*_points_and_faces(scan), options, deadline)
 
     def sample(
         self, count: int, seed: int = 0, distribution: DistributionName = "uniform", temperature: float = 1.0
@@ -384,8 +378,8 @@ class ShapeModel(Decoder):
         return Encoder(self)
 
     @cached_property
-    def _fitter(self) -> Fitter:
-        """What fits scans."""
+    def fitter(self) -> Fitter:
+        """What fits scans, with all options in one; made at the first scan."""
         return Fitter(self)
 
     def _matched(self, mesh: ArrayLike | TriangleMesh | str | os.PathLike[str]) -> Matched:
