@@ -399,7 +399,7 @@ class _Fit:
         prior, fixed = self.options.prior, ~self.options.movable
         try:
             return Posterior.of(search.normal(state), prior, fixed)
-        except (NotPositiveDefiniteError, np.linalg.LinAlgError):
+        except (NotPositiveDefiniteError, ValueError):  # LinAlgError too
             # Without derivatives nothing but the prior is known.
             return Posterior.of(np.zeros_like(prior.covariance), prior, fixed)
 

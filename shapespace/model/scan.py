@@ -106,6 +106,8 @@ def scan_of(points: FloatArray, faces: IntArray, rng: np.random.Generator) -> Sc
         raise InvalidScanError(
             f"The faces name points {faces.min()} to {faces.max()}, but there are {len(points)}, counted from 0."
         )
+    if not np.ptp(points, axis=0).max() > np.finfo(np.float32).tiny:
+        raise InvalidScanError("The scan is so small that the numbers vanish. Send it in units of its own size.")
     spread = np.linalg.svd(_thinned(points - points.mean(axis=0), rng), compute_uv=False)
     if not spread[2] > FLAT * spread[0]:
         raise InvalidScanError(

@@ -452,7 +452,12 @@ class Search:
         prior, count = self._prior(), fields.shape[-1]
         H[:count, :count] += prior.T @ prior
         g[:count] -= prior.T @ self._away(state.code)
-        step = self._inside(H, g, state.code)
+        if not (np.isfinite(H).all() and np.isfinite(g).all()):  # far outside the bounds networks overflow
+            return None
+        try:
+            step = self._inside(H, g, state.code)
+        except np.linalg.LinAlgError:
+            return None
         if not np.isfinite(step).all():
             return None
         change = np.zeros(len(state.code))

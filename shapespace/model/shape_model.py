@@ -300,6 +300,7 @@ class ShapeModel(Decoder):
         Raises:
             MeshError: a file that can't be read.
             InvalidScanError: a scan or an option that can't be used.
+            LatentError: fixed coordinates that the model doesn't have, or with which its numbers overflow.
             ModelFailedError: the networks failed, or took too long.
 
         >>> import numpy as np, shapespace

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from shapespace.arrays import FloatArray, IntArray
 from shapespace.mesh.triangle_mesh import diagonal
 from shapespace.model.fit import FitStatus, Fitted, Landmark
-from shapespace.model.latent_space import InvalidFixedError
+from shapespace.model.latent_space import InvalidFixedError, NotFiniteError
 from shapespace.model.scan import InvalidScanError
 from shapespace.model.shape_model import ShapeModel, load
 from shapespace.solve.deadline import Deadline
@@ -276,6 +276,11 @@ def test_a_deadline_ends_a_fit_with_what_there_is(figure: ShapeModel) -> None:
 CLOUD = np.random.default_rng(0).standard_normal((50, 3))
 
 
+def test_fixed_values_for_which_numbers_overflow_are_refused(figure: ShapeModel) -> None:
+    with pytest.raises(NotFiniteError, match="outside the bounds"):
+        figure.fit(CLOUD, fixed={0: 1e30}, scale="free")
+
+
 @pytest.mark.parametrize(
     ("points", "options", "says"),
     [
@@ -284,7 +289,8 @@ CLOUD = np.random.default_rng(0).standard_normal((50, 3))
         (CLOUD[:, :2], {}, "(N, 3)"),
         (np.where(np.arange(50)[:, None] == 3, np.nan, CLOUD), {}, "Point 3"),
         (CLOUD * [1, 0, 1], {}, "in a plane"),
-        (np.ones((50, 3)), {}, "in a plane"),
+        (np.ones((50, 3)), {}, "so small"),
+        (1e-200 * CLOUD, {"scale": "free"}, "so small"),
         ((CLOUD, [[0, 1, 50]]), {}, "0 to 50"),
         (CLOUD, {"noise": 0.0}, "noise"),
         (CLOUD, {"noise": np.nan}, "noise"),
