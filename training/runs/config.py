@@ -81,7 +81,7 @@ class ModeSettings(_Section):
     sparsity: Annotated[float, Field(ge=0, lt=1)] | Literal["auto"] = "auto"
     """Weight λ of the sparsity term, as a share of the weight at which every principal mode would vanish. Larger
     values make each mode move a smaller part; 0 is plain principal geodesic analysis. ``auto`` takes the largest
-    that costs shapes which are held out next to nothing: it adds a tenth at most to the square of their error."""
+    that costs shapes which are held out next to nothing: it adds 3 % at most to the square of their error."""
     log_steps: int = Field(16, ge=2)
     """Time steps K of the discrete logarithms. Best equal to ``samples.steps``: only logarithms and exponentials with
     the same K are inverse to each other."""

@@ -156,7 +156,7 @@ def test_the_objective_never_rises_and_is_that_of_the_problem(bumps, sparsity):
 
 
 def test_modes_are_as_sparse_as_shapes_that_are_held_out_allow(bumps, rng):
-    """They cost a tenth of the square of what is lost on these, and next to nothing where nothing is lost."""
+    """They cost 3 % of the square of what is lost on these, and next to nothing where nothing is lost."""
     fields = without_rigid_motion(bumps.fields + 0.02 * rng.standard_normal(bumps.fields.shape), bumps.mean)
     exact, noisy = bumps.spga(bumps.fields, 3, None), bumps.spga(fields, 3, None)
     assert exact.sparsity < noisy.sparsity < 0.2
@@ -174,9 +174,9 @@ def test_modes_are_as_sparse_as_shapes_that_are_held_out_allow(bumps, rng):
         return gram.trace() * (1 - projected(bumps.space, bumps.mean, fields, modes.vertices, judged)[1])
 
     plain = bumps.pga(fields, 3)
-    assert left(plain) < left(noisy) <= left(plain) + 0.1 * lost
+    assert left(plain) < left(noisy) <= left(plain) + 0.03 * lost
     sparser = bumps.spga(fields, 3, 2 * noisy.sparsity)
-    assert left(sparser) > left(plain) + 0.1 * lost
+    assert left(sparser) > left(plain) + 0.03 * lost
 
 
 def test_an_iteration_cut_short_says_so(bumps):
