@@ -249,13 +249,13 @@ class Client:
             np.savez(buffer, vertices=np.asarray(scan, dtype=np.float64))
             content, format = buffer.getvalue(), "npz"
         if "fixed" in options:
-            options["fixed"] = {str(k): float(value) for k, value in options["fixed"].items()}
+            options["fixed"] = _by_index(options["fixed"]) or {}
         found: dict[str, Any] = self._send(
             "POST",
             f"/v1/models/{name}/fit",
             params={"version": version, "format": format},
             files={"file": ("scan", content)},
-            data={"options": json.dumps(options)},
+            data={"options": _json(options)},
         ).json()
         return found
 

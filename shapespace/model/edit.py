@@ -161,7 +161,7 @@ def edited(
 
     Raises:
         InvalidTargetError: see ``require_targets``.
-        NotFiniteError: a target so far away that numbers overflow.
+        NotFiniteError: a target or a fixed value so far away that numbers overflow.
     """
     require_targets(model, targets, mesh)
     scale, size = model.manifest.scale, model.reference.diagonal
@@ -181,9 +181,14 @@ def edited(
         )
         here = pulled.placed(before.vertices / scale)
         problem = _Problem(model, rough, pulled, begin, here, wanted, fixed, deadline)
-        best = _best(problem)
-        code, inside = model.latents.found(best.x, Bounds.CLAMP, fixed)
-        changes = pulled.derivatives(best.x)[:, : len(targets)]
+        try:
+            best = _best(problem)
+            code, inside = model.latents.found(best.x, Bounds.CLAMP, fixed)
+            changes = pulled.derivatives(best.x)[:, : len(targets)]
+        except np.linalg.LinAlgError:  # of an alignment, where vertices are not finite
+            raise NotFiniteError(
+                "Fixed values lie so far outside the bounds that the model's numbers overflow. Send nearer ones."
+            ) from None
     found = model.shape(code, inside, MeshChoice.COARSE, deadline)
     points = pulled.placed(found.vertices / scale)
     placement = problem.placement(points, best.weights)

@@ -278,7 +278,9 @@ class _Fit:
             if self._is_poor(explained, seen) and not self._late:
                 flip = np.array([-1, 1, 1])
                 mirror = replace(self.scan, points=self.scan.points * flip, normals=self.scan.normals * flip)
+                asked, self.options = self.options, replace(self.options, places=self.options.places * flip)
                 twin, _ = self._roughly(self._search(reconstruct, mirror, ROUGH), mirror)
+                self.options = asked
                 ratio = twin.cost / best.cost
         # The model lends its solver again for the shape that is answered.
         return self._answer(full, final, posterior, explained, seen, ratio, rival, rough.count)
@@ -294,7 +296,7 @@ class _Fit:
         movable = ~latents.fixed(asked.fixed).mask
         if not movable.any():
             raise InvalidScanError("fixed names all coordinates. Leave at least one to be found.")
-        if asked.noise is not None and not 0 < asked.noise < np.inf:
+        if asked.noise is not None and not 0 < asked.noise < float(np.finfo(np.float32).max):
             raise InvalidScanError("noise must be a positive number, the standard deviation in the scan's units.")
         if len(asked.landmarks) > LANDMARKS:
             raise InvalidScanError(f"There are {len(asked.landmarks)} landmarks. Send {LANDMARKS} at most.")
@@ -345,7 +347,10 @@ class _Fit:
         for k, shape in enumerate(self.shapes):
             own = rows @ shape
             placement = Placement.between(own, options.places, scaled=self.free)
-            starts.append(Start(k, placement, float(np.linalg.norm(placement(own) - options.places))))
+            if placement.scale > 0:
+                starts.append(Start(k, placement, float(np.linalg.norm(placement(own) - options.places))))
+        if not starts:
+            raise InvalidScanError("All landmarks lie at one place, which tells no size. Send others, or scale=fixed.")
         return sorted(starts, key=lambda start: start.score)[:FOLLOWED]
 
     def _roughly(self, search: Search, scan: Scan) -> tuple[State, list[State]]:
@@ -430,10 +435,9 @@ class _Fit:
         surface = Surface(placement(shape.vertices), search.surface(state.shape).fans)
         to_model = surface.closest(self.unit * self.scan.points).distances
         to_scan = self.unit * self.scan.distances(surface.vertices / self.unit)
-        every = None
-        if asked.points:
-            parts = np.array_split(self.points, -(-len(self.points) // CHUNK))
-            every = np.concatenate([surface.closest(part).distances for part in parts])
+        parts = np.array_split(self.points, -(-len(self.points) // CHUNK)) if asked.points else []
+        found = [surface.closest(part).distances for part in parts if not self._late]
+        every = np.concatenate(found) if found and len(found) == len(parts) else None
         status, reason = self._status(state, explained, seen, mirrored, rival, shape)
         return Fitted(
             code=code,

@@ -11,6 +11,8 @@ from shapespace.arrays import FloatArray
 
 #: A coordinate whose codes differ by less than this share of the bounds' width is taken to differ by that much.
 NARROWEST = 1e-3
+#: Correlations shrink by this share at least, so that two codes have a Gaussian too.
+LEAST = 1e-6
 
 
 @dataclass(frozen=True)
@@ -43,7 +45,7 @@ class Population:
         # Variance of the entries of the correlation, which is what chance adds to their squares.
         chance = ((scores**2).T @ scores**2 / count - correlation**2) / count
         np.fill_diagonal(chance, 0)
-        share = min(1.0, chance.sum() / max(float((off**2).sum()), np.finfo(float).tiny))
+        share = float(np.clip(chance.sum() / max(float((off**2).sum()), np.finfo(float).tiny), LEAST, 1))
         return cls._of(mean, np.outer(spread, spread) * ((1 - share) * off + np.eye(len(mean))))
 
     @classmethod

@@ -19,6 +19,8 @@ FEWEST, NEIGHBOURS = 10, 16
 CLOUDY = 4
 #: A scan whose thickness is less than this share of its extent lies in a plane.
 FLAT = 1e-6
+#: Points further from the median than so many times the median distance are strays.
+FAR = 50
 
 
 class InvalidScanError(ValueError):
@@ -108,15 +110,22 @@ def scan_of(points: FloatArray, faces: IntArray, rng: np.random.Generator) -> Sc
         )
     if not np.ptp(points, axis=0).max() > np.finfo(np.float32).tiny:
         raise InvalidScanError("The scan is so small that the numbers vanish. Send it in units of its own size.")
-    spread = np.linalg.svd(_thinned(points - points.mean(axis=0), rng), compute_uv=False)
+    # Strays may lie anywhere: neither flatness nor the spacing of samples may depend on them.
+    away = np.linalg.norm(points - np.median(points, axis=0), axis=1)
+    if not np.median(away) > 0:
+        raise InvalidScanError("More than half of the points lie at one place. Send each point once.")
+    kept = away <= FAR * np.median(away)
+    faces = faces[kept[faces].all(axis=1)]
+    spread = np.linalg.svd(_thinned(points[kept] - points[kept].mean(axis=0), rng), compute_uv=False)
     if not spread[2] > FLAT * spread[0]:
         raise InvalidScanError(
             "All points of the scan lie in a plane, which shows nothing of a shape. Send points from all over it."
         )
     twice_areas = np.linalg.norm(face_normals(points, faces, normalised=False), axis=1)
-    if twice_areas.sum() > 0:
+    # Points with a few faces among them are points.
+    if twice_areas.sum() > 0 and 2 * len(np.unique(faces)) >= kept.sum():
         return _of_surface(points, faces, twice_areas, rng)
-    return _of_points(points, rng)
+    return _of_points(points[kept], rng)
 
 
 def _of_surface(points: FloatArray, faces: IntArray, weights: FloatArray, rng: np.random.Generator) -> Scan:

@@ -6,15 +6,15 @@ from collections.abc import Callable
 from typing import Annotated, Any
 
 from fastapi import Query
-from fastapi.exceptions import RequestValidationError
-from pydantic import BaseModel, Field
+from pydantic import BaseModel, Field, TypeAdapter
 
 from shapespace.model.fit import FitOptions, Landmark, Prior, ScaleChoice
 from shapespace.service.http.messages.bodies import read
+from shapespace.service.http.messages.json_query import read_query
 from shapespace.service.http.messages.schemas import DiagnosticsAnswer, PlacementAnswer
-from shapespace.service.use_cases.fields import Body, Number, Whole
+from shapespace.service.use_cases.fields import Body, Number, NumbersByIndex, Whole
 
-#: Most codes that are drawn from one posterior, and most coordinates and landmarks that options name.
+#: Most codes that are drawn from one posterior, and most landmarks that options name.
 MOST_SAMPLES, MOST_NAMED = 1000, 1000
 
 
@@ -30,6 +30,11 @@ class LandmarkRequest(Body):
     )
 
 
+_Landmarks = Annotated[list[LandmarkRequest], Field(fail_fast=True, max_length=MOST_NAMED)]
+_FIXED: TypeAdapter[dict[int, float]] = TypeAdapter(NumbersByIndex)
+_LANDMARKS: TypeAdapter[list[LandmarkRequest]] = TypeAdapter(_Landmarks)
+
+
 class FitRequest(Body):
     """What is asked for."""
 
@@ -38,34 +43,24 @@ class FitRequest(Body):
     noise: Number | None = Field(None, gt=0)
     distribution: Prior = Prior.POPULATION
     seed: Whole = Field(0, ge=0, lt=2**63)
-    fixed: dict[str, Number] = Field(default_factory=dict, max_length=MOST_NAMED)
-    landmarks: Annotated[list[LandmarkRequest], Field(fail_fast=True)] = Field(
-        default_factory=list, max_length=MOST_NAMED
-    )
+    fixed: NumbersByIndex = Field({})
+    landmarks: _Landmarks = Field(default_factory=list)
     samples: Whole = Field(0, ge=0, le=MOST_SAMPLES)
     points: bool = False
 
     def options(self) -> FitOptions:
         """As a fit takes them."""
-        try:
-            fixed = {int(k): value for k, value in self.fixed.items()}
-        except ValueError:
-            raise _fault("fixed", 'Its names must be indices of coordinates, such as in {"3": 0.2}.') from None
         return FitOptions(
             scale=self.scale,
             partial=self.partial,
             noise=self.noise,
             landmarks=[Landmark(each.vertex, each.position, each.sigma) for each in self.landmarks],
-            fixed=fixed,
+            fixed=self.fixed,
             prior=self.distribution,
             samples=self.samples,
             points=self.points,
             seed=self.seed,
         )
-
-
-def _fault(name: str, why: str) -> RequestValidationError:
-    return RequestValidationError([{"type": "value_error", "loc": ("body", name), "msg": why, "ctx": {"error": why}}])
 
 
 async def fit_options(
@@ -114,9 +109,10 @@ async def fit_options(
         "samples": samples,
         "points": points,
     }
-    for name, text in (("fixed", fixed), ("landmarks", landmarks)):
-        if text is not None:
-            given[name] = getattr(read(f'{{"{name}": {text}}}'.encode(), FitRequest), name)
+    if fixed is not None:
+        given["fixed"] = read_query(fixed, "fixed", _FIXED)
+    if landmarks is not None:
+        given["landmarks"] = read_query(landmarks, "landmarks", _LANDMARKS)
 
     def options(said: str) -> FitOptions:
         asked = read(said.encode(), FitRequest) if said.strip() else None

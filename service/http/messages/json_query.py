@@ -21,4 +21,4 @@ def read_query(text: str, name: str, model: TypeAdapter[T]) -> T:
         faults = error.errors(include_url=False, include_input=False)
         raise RequestValidationError([{**fault, "loc": ("query", name, *fault["loc"])} for fault in faults]) from None
     except RequestValidationError:
-        raise ProblemError("invalid-request", f"{name} is not JSON. Send one valid JSON object.") from None
+        raise ProblemError("invalid-request", f"{name} is not JSON. Send one valid JSON value.") from None

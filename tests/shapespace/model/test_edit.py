@@ -11,7 +11,7 @@ from benchmarks.edit import PULL, limbs, pulls
 from shapespace.arrays import FloatArray
 from shapespace.model.decoder import MeshChoice
 from shapespace.model.edit import PRIOR, SIGMA, SMALL, STILL, UNMOVED, InvalidTargetError, PriorKind, Target, edited
-from shapespace.model.latent_space import InvalidFixedError
+from shapespace.model.latent_space import InvalidFixedError, NotFiniteError
 from shapespace.model.shape_model import ShapeModel, load
 from tests.service.bundles import write_bundle
 from tests.service.conftest import ROOT
@@ -125,6 +125,11 @@ def test_what_is_fixed_is_kept_to_the_last_bit(model: ShapeModel) -> None:
             model.edit(CODE, targets, fixed=fixed)
     with pytest.raises(InvalidFixedError, match="not a finite number"):
         model.edit(CODE, targets, fixed={0: np.nan})
+
+
+def test_fixed_values_for_which_numbers_overflow_are_refused(figure: ShapeModel) -> None:
+    with pytest.raises(NotFiniteError, match="outside the bounds"):
+        figure.edit(np.zeros(20), {0: figure.vertices[0]}, fixed={0: 1e15})
 
 
 def test_targets_count_by_their_sigma(model: ShapeModel) -> None:

@@ -276,6 +276,19 @@ def test_a_deadline_ends_a_fit_with_what_there_is(figure: ShapeModel) -> None:
 CLOUD = np.random.default_rng(0).standard_normal((50, 3))
 
 
+def test_one_stray_however_far_changes_nothing(figure: ShapeModel) -> None:
+    points = figure.decode(np.full(20, 0.1))[::2]
+    plain = figure.fit(points)
+    strayed = figure.fit(np.concatenate([points, [[1e8, 0, 0]]]))
+    assert plain.status is strayed.status is FitStatus.CONVERGED
+    away = strayed.placement(strayed.shape.vertices) - plain.placement(plain.shape.vertices)
+    assert np.linalg.norm(away, axis=1).mean() < 1e-3
+
+
+def test_points_with_a_few_faces_among_them_are_points(figure: ShapeModel) -> None:
+    assert figure.fit((figure.decode(np.full(20, 0.1)), [[0, 1, 2]])).status is FitStatus.CONVERGED
+
+
 def test_fixed_values_for_which_numbers_overflow_are_refused(figure: ShapeModel) -> None:
     with pytest.raises(NotFiniteError, match="outside the bounds"):
         figure.fit(CLOUD, fixed={0: 1e30}, scale="free")
@@ -290,6 +303,9 @@ def test_fixed_values_for_which_numbers_overflow_are_refused(figure: ShapeModel)
         (np.where(np.arange(50)[:, None] == 3, np.nan, CLOUD), {}, "Point 3"),
         (CLOUD * [1, 0, 1], {}, "in a plane"),
         (np.ones((50, 3)), {}, "so small"),
+        (np.concatenate([np.zeros((990, 3)), CLOUD[:10]]), {}, "at one place"),
+        (CLOUD, {"noise": 1e200}, "noise"),
+        (CLOUD, {"scale": "free", "landmarks": [Landmark(5, [0, 0, 0])] * 3}, "at one place"),
         (1e-200 * CLOUD, {"scale": "free"}, "so small"),
         ((CLOUD, [[0, 1, 50]]), {}, "0 to 50"),
         (CLOUD, {"noise": 0.0}, "noise"),

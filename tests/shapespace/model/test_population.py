@@ -35,6 +35,11 @@ def test_one_code_and_coordinates_that_never_differ_have_some_room() -> None:
     assert np.allclose(np.sqrt(found.covariance.diagonal()), 1e-3 * WIDTH)
 
 
+def test_two_codes_have_a_gaussian_too() -> None:
+    found = Population.of(_codes(2), WIDTH)
+    assert (np.linalg.eigvalsh(found.covariance) > 0).all()
+
+
 def test_scores_are_standard() -> None:
     found = Population.of(_codes(500), WIDTH)
     drawn = found.sample(50_000, seed=1)
