@@ -234,6 +234,15 @@ def test_a_mirrored_scan_is_told_so(figure: ShapeModel) -> None:
     assert figure.fit(given.points(), fixed=fixed).mirrored is None
 
 
+def test_a_mirrored_scan_with_landmarks_is_told_so(figure: ShapeModel) -> None:
+    given = Moved.of(figure, 2)
+    some = np.linspace(0, len(given.shape) - 1, 6).astype(int)
+    landmarks = [Landmark(int(vertex), (given.shape[vertex] * [-1, 1, 1]).tolist()) for vertex in some]
+    found = figure.fit(given.points() * [-1, 1, 1], landmarks=landmarks)
+    assert found.status is FitStatus.POOR
+    assert found.mirrored < 0.6
+
+
 def test_distances_of_each_point_come_in_its_order(figure: ShapeModel) -> None:
     given = Moved.of(figure, 1)
     points = given.points(3500)
