@@ -17,6 +17,7 @@ from shapespace.service.http.messages.schemas import MeshAnswer, Problem
 from shapespace.service.http.middleware import OPEN
 from shapespace.service.http.problems import KINDS, MEDIA_TYPE
 from shapespace.service.use_cases.shape_formats import SHAPE_FORMATS
+from shapespace.service.use_cases.uploads import MEDIA_TYPES
 
 DESCRIPTION = """\
 Learned product shape manifolds of triangle meshes. A latent code goes through small networks to edge lengths
@@ -110,6 +111,18 @@ def mesh_answers(description: str) -> dict[int | str, dict[str, Any]]:
         }
     }
     return answers
+
+
+def upload(description: str, fields: Mapping[str, Any] | None = None) -> dict[str, Any]:
+    """OpenAPI's description of a body that is a file, JSON of a mesh, or a form with a file and further fields."""
+    file = {"type": "string", "format": "binary", "description": description}
+    form = {"type": "object", "properties": {"file": file, **(fields or {})}, "required": ["file"]}
+    content = {
+        **{media_type: {"schema": file} for media_type in (*MEDIA_TYPES, "application/octet-stream")},
+        "application/json": {"schema": {"$ref": f"#/components/schemas/{MeshAnswer.__name__}"}},
+        "multipart/form-data": {"schema": form},
+    }
+    return {"requestBody": {"required": True, "content": content}}
 
 
 def problems(*statuses: int) -> dict[int | str, dict[str, Any]]:

@@ -6,9 +6,13 @@ import logging
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
 
 from shapespace.arrays import FloatArray, IntArray
 from shapespace.files.limits import Limits
+from shapespace.mesh.rigid_motion import Placement
 from shapespace.model.correspondence import limits, match
 from shapespace.model.decoder import MeshChoice
 from shapespace.model.edit import PriorKind, Target, edited, require_targets
@@ -182,7 +186,7 @@ async def edit(
             "distances": found.distances,
             "status": found.status,
             "iterations": found.iterations,
-            "placement": {"rotation": found.placement.rotation, "translation": found.placement.translation, "scale": 1},
+            "placement": placement(found.placement),
             "diagnostics": asdict(found.shape.diagnostics),
             "covariance": found.covariance,
             "samples": found.samples,
@@ -204,6 +208,12 @@ def sample(
     """
     require_count(count, most, "count")
     return model.sample(count, seed, distribution, temperature)
+
+
+def placement(found: Placement) -> dict[str, Any]:
+    """A placement as it is answered."""
+    rotation = np.ascontiguousarray(found.rotation)  # as JSON takes it
+    return {"rotation": rotation, "translation": found.translation, "scale": found.scale}
 
 
 def read_mesh(sandbox: Sandbox, upload: Upload, limits: Limits, deadline: Deadline) -> tuple[FloatArray, IntArray]:

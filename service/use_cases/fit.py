@@ -7,14 +7,12 @@ from collections.abc import Callable
 from dataclasses import asdict
 from typing import Any
 
-import numpy as np
-
 from shapespace.files.limits import Limits
 from shapespace.model.fit import Distances, FitOptions, FitStatus
 from shapespace.model.shape_model import ShapeModel
 from shapespace.service.limits.sandbox import Sandbox
 from shapespace.service.limits.workers import Caller, Workers
-from shapespace.service.use_cases.codes import Found, Upload, read_upload
+from shapespace.service.use_cases.codes import Found, Upload, placement, read_upload
 from shapespace.service.use_cases.shape_formats import dump_json, float32
 from shapespace.solve.deadline import Deadline
 
@@ -56,11 +54,7 @@ async def fit(
         content = {
             "latent": found.code,
             "covariance": found.covariance,
-            "placement": {
-                "rotation": np.ascontiguousarray(found.placement.rotation),
-                "translation": found.placement.translation,
-                "scale": found.placement.scale,
-            },
+            "placement": placement(found.placement),
             "distances": {"scan": _distances(found.scan), "model": _distances(found.model)},
             "explained": found.explained,
             "seen": found.seen,

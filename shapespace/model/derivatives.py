@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,6 +14,8 @@ from shapespace.model.decoder import Decoder
 #: Step of a difference quotient, as a fraction of the coordinate's range. An angle may move something as small as a
 #: bump around the shape; for other coordinates smaller steps drown in the rounding of the networks' float32.
 PERIODIC_DIFFERENCE, DIFFERENCE = 1e-3, 1e-2
+#: Step of a difference quotient through alignment and prolongation, as a fraction of the diagonal.
+SMALL_MOVE = 1e-4
 #: Nodes along each periodic coordinate of a factor, and most nodes of a factor's grid.
 NODES, MOST_NODES = 32, 1024
 #: Random sums of lengths and angles that stand for all of them on the grids.
@@ -38,6 +41,25 @@ def factor_derivatives(model: Decoder, x: FloatArray) -> FloatArray:
         ahead, behind = np.split(model.factor(j, np.concatenate([own + steps, own - steps])), 2)
         columns.append((ahead - behind) / (2 * steps.diagonal()[:, None]))
     return np.concatenate(columns).T
+
+
+def carried(
+    model: Decoder, place: Callable[[FloatArray], FloatArray], shape: FloatArray, fields: FloatArray
+) -> FloatArray:
+    """How what is made of a shape, as by alignment and prolongation, changes with it; by differences.
+
+    Args:
+        model: of the shape.
+        place: takes shapes (…, V, 3) to what is made of them, (…, k, 3).
+        shape: (V, 3), normalised.
+        fields: (m, V, 3) changes of the shape.
+
+    Returns:
+        (m, k, 3) derivatives along the fields.
+    """
+    h = SMALL_MOVE * model.reference.diagonal / max(np.abs(fields).max(), np.finfo(float).tiny)
+    result: FloatArray = (place(shape + h * fields) - place(shape)) / h
+    return result
 
 
 def _steps(model: Decoder) -> FloatArray:

@@ -14,7 +14,7 @@ from shapespace.coordinates.nric import wrap
 from shapespace.coordinates.reconstruction import Reconstructor
 from shapespace.mesh.rigid_motion import Placement, align, weighted_change, without_rigid_motion
 from shapespace.model.decoder import Decoder, MeshChoice, Shape
-from shapespace.model.derivatives import batches, derivatives, factor_derivatives, nodes
+from shapespace.model.derivatives import batches, carried, derivatives, factor_derivatives, nodes
 from shapespace.model.latent_space import Bounds, Codes, Fixed, NotFiniteError
 from shapespace.model.posterior import Posterior
 from shapespace.model.searched_shapes import SearchedShapes
@@ -34,8 +34,6 @@ UNMOVED = 3e-3
 #: At most so many times the weights that stand for the prior and for what stays are chosen anew, from rough shapes and
 #: from answered ones, and until no coordinate moves by more than this fraction of the bounds.
 ROUNDS, REFINED, SETTLED = 8, 2, 2e-3
-#: Step of the difference quotients through alignment and prolongation, as a fraction of the diagonal.
-DIFFERENCE = 1e-4
 #: At most so many other starts are tried while the misfit is above these fractions of the diagonal (of rough shapes, of
 #: answered ones). Another start or fit counts only if it leaves at most the fraction PROMISING of what can be reduced.
 STARTS, GOOD_ROUGHLY, GOOD, PROMISING = 4, 2e-2, 2e-3, 0.9
@@ -482,9 +480,7 @@ class _PulledVertices:
         if not np.array_equal(x, self._moved[0]):
             slopes = factor_derivatives if self._rough else derivatives
             shape, fields = self.shapes(x), self.shapes.derivatives(x, slopes(self._model, x))
-            h = DIFFERENCE * self._model.reference.diagonal / max(np.abs(fields).max(), np.finfo(float).tiny)
-            there = self.placed(shape + h * fields)
-            self._moved = x.copy(), (there - self.positions(x)) / h
+            self._moved = x.copy(), carried(self._model, self.placed, shape, fields)
         return self._moved[1]
 
     def sensitivity(self, x: FloatArray, some: IntArray) -> FloatArray:

@@ -268,19 +268,18 @@ class _Fit:
         if not self.free:
             self._require_units()
         with self.model.solver() as reconstruct:
-            rough = self._search(reconstruct, self.scan, ROUGH)
-            best, others = self._roughly(rough, self.scan)
-            full = self._search(reconstruct, self.scan, FULL)
+            rough = self._search(reconstruct, self.scan, self.options, ROUGH)
+            best, others = self._roughly(rough)
+            full = self._search(reconstruct, self.scan, self.options, FULL)
             final, rival = self._fully(full, best, others)
             ratio = None
             posterior = self._posterior(full, final)
             explained, seen = full.shares(final)
             if self._is_poor(explained, seen) and not self._late:
                 flip = np.array([-1, 1, 1])
-                mirror = replace(self.scan, points=self.scan.points * flip, normals=self.scan.normals * flip)
-                asked, self.options = self.options, replace(self.options, places=self.options.places * flip)
-                twin, _ = self._roughly(self._search(reconstruct, mirror, ROUGH), mirror)
-                self.options = asked
+                scan = replace(self.scan, points=self.scan.points * flip, normals=self.scan.normals * flip)
+                options = replace(self.options, places=self.options.places * flip)
+                twin, _ = self._roughly(self._search(reconstruct, scan, options, ROUGH))
                 ratio = twin.cost / best.cost
         # The model lends its solver again for the shape that is answered.
         return self._answer(full, final, posterior, explained, seen, ratio, rival, rough.count)
@@ -333,16 +332,16 @@ class _Fit:
                 f"Send scale=free, or multiply its coordinates by about {1 / ratio:.3g}."
             )
 
-    def _search(self, reconstruct: Reconstructor, scan: Scan, level: Level) -> Search:
+    def _search(self, reconstruct: Reconstructor, scan: Scan, options: Options, level: Level) -> Search:
         fans, looking = self.fitter.reach[level.mesh]
-        return Search(self.model, reconstruct, scan, self.options, level, fans, looking, self.deadline)
+        return Search(self.model, reconstruct, scan, options, level, fans, looking, self.deadline)
 
-    def _placed(self, search: Search, scan: Scan) -> list[Start]:
-        """Where the search begins."""
-        options = self.options
+    def _placed(self, search: Search) -> list[Start]:
+        """Where a search begins."""
+        options = search.options
         if len(options.landmarks) < 3:
             shown = self.shapes[:, self.fitter.shown]
-            return coarse(scan, shown, partial=options.partial, free=self.free, count=FOLLOWED)
+            return coarse(search.scan, shown, partial=options.partial, free=self.free, count=FOLLOWED)
         rows, starts = search.landmark_rows(), list[Start]()
         for k, shape in enumerate(self.shapes):
             own = rows @ shape
@@ -353,11 +352,11 @@ class _Fit:
             raise InvalidScanError("All landmarks lie at one place, which tells no size. Send others, or scale=fixed.")
         return sorted(starts, key=lambda start: start.score)[:FOLLOWED]
 
-    def _roughly(self, search: Search, scan: Scan) -> tuple[State, list[State]]:
+    def _roughly(self, search: Search) -> tuple[State, list[State]]:
         """The best fit of rough shapes, and others."""
         begun = [
             search.start(self.codes[start.shape], start.placement, self.shapes[start.shape])
-            for start in self._placed(search, scan)
+            for start in self._placed(search)
         ]
         states = [search.run(state, FIRST_STEPS, first=True) for state in begun if state is not None]
         states.sort(key=lambda state: state.cost)

@@ -18,15 +18,13 @@ from shapespace.mesh.closest_points import Fans, Surface
 from shapespace.mesh.rigid_motion import Placement, align
 from shapespace.mesh.triangle_mesh import vertex_areas
 from shapespace.model.decoder import Decoder, MeshChoice
-from shapespace.model.derivatives import derivatives, factor_derivatives
+from shapespace.model.derivatives import carried, derivatives, factor_derivatives
 from shapespace.model.population import Population
 from shapespace.model.scan import Scan, near
 from shapespace.model.searched_shapes import SearchedShapes
 from shapespace.solve.cholesky import NotPositiveDefiniteError
 from shapespace.solve.deadline import Deadline
 
-#: Step of the difference quotients through the prolongation, as a fraction of the diagonal.
-DIFFERENCE = 1e-4
 #: Distances at which a pair counts half as much as one without distance, in standard deviations of what is left; they
 #: begin at the share FARTHEST of all distances and shrink by a factor a step.
 WIDTH, FARTHEST, SHRINKING = 3.0, 0.95, 0.7
@@ -185,8 +183,8 @@ class Search:
         vertices: IntArray,
         deadline: Deadline | None,
     ) -> None:
-        self._model, self._options, self._level, self._deadline = model, options, level, deadline
-        self._scan, self._some, self._fans, self._vertices = scan, scan.some(level.points), fans, vertices
+        self._model, self.options, self._level, self._deadline = model, options, level, deadline
+        self.scan, self._some, self._fans, self._vertices = scan, scan.some(level.points), fans, vertices
         self._diagonal = model.reference.diagonal
         self._whiten: FloatArray = np.asarray(np.linalg.inv(options.prior.root), np.float64)
         self.shapes = SearchedShapes(model, reconstruct, deadline, rough=level.rough)
@@ -241,10 +239,10 @@ class Search:
         normal = np.einsum("nxp,nx->np", A[:n], pairs.normals[:n])
         H = share / sigma**2 * normal.T @ (weights[:, None] * normal)
         H += self._landmarks(state, self._derivatives(state))[0]
-        count = int(self._options.movable.sum())
+        count = int(self.options.movable.sum())
         # What is left once motion and size are chosen best for each code.
         rest = H[count:, count:] + 1e-9 * np.eye(len(H) - count) * H.diagonal().max()
-        movable = self._options.movable
+        movable = self.options.movable
         found = np.zeros((len(movable), len(movable)))
         found[np.ix_(movable, movable)] = H[:count, :count] - H[:count, count:] @ np.linalg.solve(
             rest, H[count:, :count]
@@ -283,14 +281,14 @@ class Search:
                 np.full(n, 1 / n),
             )
         ]
-        if not self._options.partial:
+        if not self.options.partial:
             places, across = surface.vertices[self._vertices], surface.vertex_normals[self._vertices]
-            _, nearest = near(self._scan.tree, place(places))
-            gaps = place.back(self._scan.points[nearest]) - places
+            _, nearest = near(self.scan.tree, place(places))
+            gaps = place.back(self.scan.points[nearest]) - places
             # Points of a scan are some way apart, which says nothing of how far the surface is.
-            distances = self._scan.distances(place(places)) / place.scale
+            distances = self.scan.distances(place(places)) / place.scale
             k = len(places)
-            agree = self._alike(self._scan.normals[nearest] @ place.rotation, across, self._scan.trust[nearest])
+            agree = self._alike(self.scan.normals[nearest] @ place.rotation, across, self.scan.trust[nearest])
             rows.append((np.ones(k), n + np.arange(k), self._vertices))
             parts.append((gaps, across, distances, places, agree, np.full(k, 1 / k)))
         gaps, across, distances, places, agree, mass = (np.concatenate([part[i] for part in parts]) for i in range(6))
@@ -301,13 +299,13 @@ class Search:
     def tolerance(self, sigma: float) -> float:
         """How far a point may be from the surface and still count as explained, given what is left of the others."""
         least = NEAR * self._diagonal
-        return least + (min(3 * sigma, least) if self._options.noise is None else 3 * sigma)
+        return least + (min(3 * sigma, least) if self.options.noise is None else 3 * sigma)
 
     def shares(self, state: State) -> tuple[float, float]:
         """How much of the scan is explained, and how much of the model's area is seen."""
         most, surface = self.tolerance(state.sigma), self.surface(state.shape)
-        explained = surface.closest(state.placement.back(self._scan.points)).distances <= most
-        away = self._scan.distances(state.placement(surface.vertices)) / state.placement.scale
+        explained = surface.closest(state.placement.back(self.scan.points)).distances <= most
+        away = self.scan.distances(state.placement(surface.vertices)) / state.placement.scale
         areas = vertex_areas(surface.vertices, surface.fans.faces)
         return float(explained.mean()), float(areas @ (away <= most) / areas.sum())
 
@@ -319,12 +317,12 @@ class Search:
         surface, place, most = self.surface(state.shape), state.placement, self.tolerance(state.sigma)
         points, vertices = place.back(self._some.points), surface.vertices[self._vertices]
         far = np.flatnonzero(pairs.distances[: pairs.of_scan] > most)
-        unseen = np.flatnonzero(self._scan.distances(place(vertices)) / place.scale > most)
+        unseen = np.flatnonzero(self.scan.distances(place(vertices)) / place.scale > most)
         if not len(far) or not len(unseen):
             return pairs
         _, there = near(cKDTree(vertices[unseen]), points[far])
         replaced = [(far, self._vertices[unseen[there]], points[far])]
-        if not self._options.partial:
+        if not self.options.partial:
             _, back = near(cKDTree(points[far]), vertices[unseen])
             replaced.append((pairs.of_scan + unseen, self._vertices[unseen], points[far[back]]))
         index, own, goal = (np.concatenate([each[i] for each in replaced]) for i in range(3))
@@ -344,7 +342,7 @@ class Search:
 
     def _alike(self, normals: FloatArray, others: FloatArray, trust: FloatArray) -> FloatArray:
         cosines = (normals * others).sum(axis=1)
-        if not self._scan.oriented:
+        if not self.scan.oriented:
             cosines = np.abs(cosines)
         elif cosines.sum() < 0:  # the scan's faces are turned inside out
             cosines = -cosines
@@ -354,8 +352,8 @@ class Search:
     def _sigma(self, pairs: _Pairs, state: State) -> float:
         """Standard deviation of the heights, from their median: what doesn't belong has no say."""
         floor = self._level.floor * self._diagonal
-        if self._options.noise is not None:
-            return max(floor, self._options.noise / state.placement.scale)
+        if self.options.noise is not None:
+            return max(floor, self.options.noise / state.placement.scale)
         heights = np.abs(pairs.heights[: pairs.of_scan])
         alike = pairs.agree[: pairs.of_scan] > 0.5
         return max(floor, 1.4826 * float(np.median(heights[alike] if alike.any() else pairs.distances)))
@@ -368,27 +366,22 @@ class Search:
 
     def _away(self, code: FloatArray) -> FloatArray:
         """(m,) scores of a code, an angle's the shorter way."""
-        scores: FloatArray = self._whiten @ self._model.latents.shorter(code - self._options.prior.mean)
+        scores: FloatArray = self._whiten @ self._model.latents.shorter(code - self.options.prior.mean)
         return scores
 
     def _prior(self) -> FloatArray:
         """(m, f) derivative of the scores by the coordinates that may change."""
-        return self._whiten[:, self._options.movable]
+        return self._whiten[:, self.options.movable]
 
     def _derivatives(self, state: State) -> FloatArray:
         """(V, 3, f) of the mesh's vertices by the coordinates that may change; kept as long as the code hardly does."""
         if self._fields is not None and np.abs(self._whiten @ (state.code - self._fields[0])).max() <= KEPT:
             return self._fields[1]
-        changes = self._changes(self._model, state.code)[:, self._options.movable]
+        changes = self._changes(self._model, state.code)[:, self.options.movable]
         raw = self.shapes(state.code)
         fields = self.shapes.derivatives(state.code, changes)
-        carried = align(raw, state.shape, carried=raw + fields)
-        if self._model.finer(self._level.mesh):
-            h = DIFFERENCE * self._diagonal / max(np.abs(fields).max(), np.finfo(float).tiny)
-            here = self._fine(state.shape)
-            moves = np.stack([(self._fine(state.shape + h * (there - state.shape)) - here) / h for there in carried])
-        else:
-            moves = carried - state.shape
+        turned = align(raw, state.shape, carried=raw + fields) - state.shape
+        moves = carried(self._model, self._fine, state.shape, turned)
         found = np.ascontiguousarray(np.moveaxis(moves, 0, -1))
         self._fields = state.code, found
         return found
@@ -405,11 +398,11 @@ class Search:
         o = np.zeros_like(x)
         turns = np.array([[o, z, -y], [-z, o, x], [y, -x, o]]).transpose(2, 0, 1)
         shifts = np.broadcast_to(np.eye(3), (len(places), 3, 3))
-        return np.concatenate([turns, shifts, *([places[:, :, None]] if self._options.free else [])], axis=2)
+        return np.concatenate([turns, shifts, *([places[:, :, None]] if self.options.free else [])], axis=2)
 
     def _landmarks(self, state: State, fields: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Normal matrix and right-hand side of the landmarks."""
-        options = self._options
+        options = self.options
         size = fields.shape[-1] + (7 if options.free else 6)
         if not len(options.landmarks):
             return np.zeros((size, size)), np.zeros(size)
@@ -425,7 +418,7 @@ class Search:
 
     def landmark_rows(self) -> sparse.csr_array:
         """(l, V) landmarks as means of the mesh's vertices."""
-        fine, vertices = self._model.finer(MeshChoice.FINE), self._options.landmarks
+        fine, vertices = self._model.finer(MeshChoice.FINE), self.options.landmarks
         count = len(self._fans.around)
         if fine and self._level.rough:
             return sparse.csr_array(fine.prolong.weights[vertices][:, :count])
@@ -461,7 +454,7 @@ class Search:
         if not np.isfinite(step).all():
             return None
         change = np.zeros(len(state.code))
-        change[self._options.movable] = step[:count]
+        change[self.options.movable] = step[:count]
         score = self._whiten @ change
         longest = max(np.abs(score).max() / LONGEST, np.linalg.norm(step[count : count + 3]) / TURN, 1.0)
         step, change = step / longest, change / longest
@@ -472,13 +465,13 @@ class Search:
         # The new shape lies where the derivatives have led, whatever frame it was solved in.
         led = align(shape, state.shape + self._coarse_move(state, change))
         turn, shift = Rotation.from_rotvec(step[count : count + 3]).as_matrix(), step[count + 3 : count + 6]
-        motion = Placement(turn, shift, float(np.exp(step[count + 6])) if self._options.free else 1.0)
+        motion = Placement(turn, shift, float(np.exp(step[count + 6])) if self.options.free else 1.0)
         moved = float(np.abs(np.einsum("nxp,p->nx", A, step)).max()) / self._diagonal
         settled = bool(np.abs(score).max() <= SHORTEST or moved <= STILL)
         return State(code, led, state.placement.after(motion), settled=settled, moved=moved)
 
     def _coarse_move(self, state: State, change: FloatArray) -> FloatArray:
-        moves = self._derivatives(state) @ change[self._options.movable]
+        moves = self._derivatives(state) @ change[self.options.movable]
         fine = self._model.finer(self._level.mesh)
         if fine is None:
             return moves
@@ -487,7 +480,7 @@ class Search:
 
     def _inside(self, H: FloatArray, g: FloatArray, code: FloatArray) -> FloatArray:
         """The step ``H⁻¹ g``, coordinates that would leave the box held at its sides."""
-        options = self._options
+        options = self.options
         low, high = (side[options.movable] - code[options.movable] for side in (options.lower, options.upper))
         free, step = np.ones(len(g), bool), np.zeros(len(g))
         for _ in range(3):

@@ -7,13 +7,11 @@ from numpy.typing import ArrayLike
 
 from shapespace.arrays import FloatArray
 from shapespace.model.decoder import Decoder, MeshChoice
-from shapespace.model.derivatives import derivatives
+from shapespace.model.derivatives import carried, derivatives
 from shapespace.model.latent_space import Codes, LatentError
 from shapespace.solve.cholesky import NotPositiveDefiniteError
 from shapespace.solve.deadline import Deadline
 
-#: Step of the difference quotient through alignment and prolongation, as a fraction of the diagonal.
-DIFFERENCE = 1e-4
 #: Differences between opposite entries, and eigenvalues below zero, that rounding may cause, as shares of the largest.
 ROUNDING = 1e-5
 
@@ -71,7 +69,6 @@ def spread(
             raise InvalidCovarianceError(
                 "The shape of this code has all but collapsed: how it changes is unknown. Leave color=spread out."
             ) from None
-    h = DIFFERENCE * model.reference.diagonal / max(np.abs(fields).max(), np.finfo(float).tiny)
-    moves = (model.placed(coarse + h * fields, mesh) - model.placed(coarse, mesh)) / h
+    moves = carried(model, lambda shapes: model.placed(shapes, mesh), coarse, fields)
     result: FloatArray = scale * np.sqrt((moves**2).sum(axis=(0, 2)))
     return result

@@ -197,14 +197,12 @@ def spga(
     problem = _Problem(space, mean, fields, count, norm)
     D, W = problem.principal(count)
     highest = problem.highest_price(D, W)
-    seen = _Problem(space, mean, fields, 1, _judged(norm))
-    left = float(seen.left_of_held_out()[:, min(count, len(fields) - 1)].sum()) / seen.total
-    enough = seen.project(D)[1] - SPENT * left
+    enough = _Enough(space, mean, fields, D, norm) if sparsity is None else None
     rotation = _varimax(problem.scaled(D))
     D, W = _normalised(rotation.T @ D, rotation.T @ W)
     for share in SPARSITIES if sparsity is None else [sparsity]:
         converged, history = _alternate(problem, D, W, share * highest, max_iterations, tolerance)
-        if seen.project(D)[1] >= enough:
+        if enough and enough(D):
             break
     return replace(problem.modes(D, converged, history), sparsity=share)
 
@@ -446,6 +444,19 @@ def _varimax(loadings: FloatArray) -> FloatArray:
             break
         before = values.sum()
     return rotation
+
+
+class _Enough:
+    """Whether modes keep enough of the logarithms, beside as many principal modes (m, 3V): see SPENT."""
+
+    def __init__(self, space: ShellSpace, mean: FloatArray, fields: FloatArray, D: FloatArray, norm: Norm) -> None:
+        self._seen = _Problem(space, mean, fields, 1, _judged(norm))
+        left = self._seen.left_of_held_out()[:, min(len(D), len(fields) - 1)].sum()
+        self._least = self._seen.project(D)[1] - SPENT * float(left) / self._seen.total
+
+    def __call__(self, D: FloatArray) -> bool:
+        """Of modes (m, 3V)."""
+        return self._seen.project(D)[1] >= self._least
 
 
 class _Shrinkage:

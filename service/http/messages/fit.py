@@ -8,14 +8,14 @@ from typing import Annotated, Any
 from fastapi import Query
 from pydantic import BaseModel, Field, TypeAdapter
 
-from shapespace.model.fit import FitOptions, Landmark, Prior, ScaleChoice
+from shapespace.model.fit import LANDMARKS, FitOptions, Landmark, Prior, ScaleChoice
 from shapespace.service.http.messages.bodies import read
 from shapespace.service.http.messages.json_query import read_query
 from shapespace.service.http.messages.schemas import DiagnosticsAnswer, PlacementAnswer
 from shapespace.service.use_cases.fields import Body, Number, NumbersByIndex, Whole
 
-#: Most codes that are drawn from one posterior, and most landmarks that options name.
-MOST_SAMPLES, MOST_NAMED = 1000, 1000
+#: Most codes that are drawn from one posterior.
+MOST_SAMPLES = 1000
 
 
 class LandmarkRequest(Body):
@@ -30,7 +30,7 @@ class LandmarkRequest(Body):
     )
 
 
-_Landmarks = Annotated[list[LandmarkRequest], Field(fail_fast=True, max_length=MOST_NAMED)]
+_Landmarks = Annotated[list[LandmarkRequest], Field(fail_fast=True, max_length=LANDMARKS)]
 _FIXED: TypeAdapter[dict[int, float]] = TypeAdapter(NumbersByIndex)
 _LANDMARKS: TypeAdapter[list[LandmarkRequest]] = TypeAdapter(_Landmarks)
 

@@ -11,7 +11,7 @@ from shapespace.model.edit import Target
 from shapespace.model.encode import Objective
 from shapespace.model.latent_space import Bounds
 from shapespace.service.http.dependencies import CallerDependency, MeshQuery, Model, ServiceDependency, one_of
-from shapespace.service.http.description import problems
+from shapespace.service.http.description import problems, upload
 from shapespace.service.http.messages.bodies import JSONBody, gather
 from shapespace.service.http.messages.json_query import read_query
 from shapespace.service.http.messages.schemas import (
@@ -21,7 +21,6 @@ from shapespace.service.http.messages.schemas import (
     EditAnswer,
     EditRequest,
     EncodeAnswer,
-    MeshAnswer,
     SampleAnswer,
     SampleRequest,
 )
@@ -29,30 +28,18 @@ from shapespace.service.http.responses import found_response
 from shapespace.service.use_cases import codes
 from shapespace.service.use_cases.fields import NumbersByIndex
 from shapespace.service.use_cases.shape_formats import dump_json
-from shapespace.service.use_cases.uploads import FORMATS, MEDIA_TYPES
+from shapespace.service.use_cases.uploads import FORMATS
 
 router = APIRouter(prefix="/v1/models/{name}", tags=["codes"])
 
 _FIXED: TypeAdapter[dict[int, float]] = TypeAdapter(NumbersByIndex)
-_FILE = {"type": "string", "format": "binary", "description": "A mesh file."}
-_FORM = {"type": "object", "properties": {"file": _FILE}, "required": ["file"]}
-_UPLOAD = {
-    "requestBody": {
-        "required": True,
-        "content": {
-            **{media_type: {"schema": _FILE} for media_type in (*MEDIA_TYPES, "application/octet-stream")},
-            "application/json": {"schema": {"$ref": f"#/components/schemas/{MeshAnswer.__name__}"}},
-            "multipart/form-data": {"schema": _FORM},
-        },
-    }
-}
 
 
 @router.post(
     "/encode",
     responses=problems(400, 404, 413, 415, 422, 503, 504),
     response_model=EncodeAnswer,
-    openapi_extra=_UPLOAD,
+    openapi_extra=upload("A mesh file."),
 )
 async def encode(
     service: ServiceDependency,
@@ -80,10 +67,10 @@ async def encode(
     The file holds the fine or the coarse mesh of the model in its vertex order (STL: in its order of faces), in the
     units of the training meshes: one of less than a third or more than three times their size is refused.
     """
-    upload = codes.Upload(await gather(request), request.headers.get("content-type", ""), format)
+    file = codes.Upload(await gather(request), request.headers.get("content-type", ""), format)
     held = {} if fixed is None else read_query(fixed, "fixed", _FIXED)
     wishes = codes.Wishes(held, samples, seed, service.settings.max_codes)
-    found = await codes.encode(service.workers, service.sandbox, caller, model, upload, bounds, objective, wishes)
+    found = await codes.encode(service.workers, service.sandbox, caller, model, file, bounds, objective, wishes)
     return found_response(service, found)
 
 

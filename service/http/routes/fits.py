@@ -9,33 +9,20 @@ from fastapi import APIRouter, Depends, Query, Request, Response
 
 from shapespace.model.fit import FitOptions
 from shapespace.service.http.dependencies import CallerDependency, Model, ServiceDependency, one_of
-from shapespace.service.http.description import problems
+from shapespace.service.http.description import problems, upload
 from shapespace.service.http.messages.bodies import gather
 from shapespace.service.http.messages.fit import FitAnswer, fit_options
-from shapespace.service.http.messages.schemas import MeshAnswer
 from shapespace.service.http.responses import found_response
 from shapespace.service.use_cases import fit as fits
 from shapespace.service.use_cases.codes import Upload
-from shapespace.service.use_cases.uploads import MEDIA_TYPES, POINT_FORMATS
+from shapespace.service.use_cases.uploads import POINT_FORMATS
 
 router = APIRouter(prefix="/v1/models/{name}", tags=["codes"])
 
-_FILE = {"type": "string", "format": "binary", "description": "A mesh or a point cloud."}
 _OPTIONS = {
     "type": "string",
     "contentMediaType": "application/json",
     "description": "The parameters of the query as one JSON object, over which it wins.",
-}
-_FORM = {"type": "object", "properties": {"file": _FILE, "options": _OPTIONS}, "required": ["file"]}
-_UPLOAD = {
-    "requestBody": {
-        "required": True,
-        "content": {
-            **{media_type: {"schema": _FILE} for media_type in (*MEDIA_TYPES, "application/octet-stream")},
-            "application/json": {"schema": {"$ref": f"#/components/schemas/{MeshAnswer.__name__}"}},
-            "multipart/form-data": {"schema": _FORM},
-        },
-    }
 }
 
 
@@ -43,7 +30,7 @@ _UPLOAD = {
     "/fit",
     responses=problems(400, 404, 413, 415, 422, 503, 504),
     response_model=FitAnswer,
-    openapi_extra=_UPLOAD,
+    openapi_extra=upload("A mesh or a point cloud.", {"options": _OPTIONS}),
 )
 async def fit(
     service: ServiceDependency,
@@ -61,6 +48,6 @@ async def fit(
 
     The file holds a mesh of any connectivity or points without faces, in any rigid pose, whole or in part.
     """
-    upload = Upload(await gather(request), request.headers.get("content-type", ""), format)
-    found = await fits.fit(service.workers, service.sandbox, caller, model, upload, options)
+    file = Upload(await gather(request), request.headers.get("content-type", ""), format)
+    found = await fits.fit(service.workers, service.sandbox, caller, model, file, options)
     return found_response(service, found)

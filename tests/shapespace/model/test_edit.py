@@ -1,7 +1,5 @@
 """Edits: what is pulled follows, what is not stays, what is fixed is kept, and how sure the code is then."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from scipy.optimize import minimize
@@ -12,23 +10,9 @@ from shapespace.arrays import FloatArray
 from shapespace.model.decoder import MeshChoice
 from shapespace.model.edit import PRIOR, SIGMA, SMALL, STILL, UNMOVED, InvalidTargetError, PriorKind, Target, edited
 from shapespace.model.latent_space import InvalidFixedError, NotFiniteError
-from shapespace.model.shape_model import ShapeModel, load
-from tests.service.bundles import write_bundle
-from tests.service.conftest import ROOT
+from shapespace.model.shape_model import ShapeModel
 
 CODE = np.array([0.1, 0.7, 0.4])
-
-
-@pytest.fixture(scope="module")
-def model(tmp_path_factory: pytest.TempPathFactory) -> ShapeModel:
-    folder = tmp_path_factory.mktemp("edit")
-    write_bundle(folder, "with-fine", fine=True)
-    return load(folder / "with-fine")
-
-
-@pytest.fixture(scope="module")
-def figure() -> ShapeModel:
-    return load(Path(ROOT) / "models" / "figure")
 
 
 @pytest.mark.parametrize("kind", list(PriorKind))

@@ -18,11 +18,6 @@ from tests.service.conftest import ROOT
 
 
 @pytest.fixture(scope="module")
-def figure() -> ShapeModel:
-    return load(ROOT / "models" / "figure")
-
-
-@pytest.fixture(scope="module")
 def ring() -> ShapeModel:
     return load(ROOT / "models" / "freaky-torus")
 

@@ -9,24 +9,11 @@ from shapespace.model.correspondence import InvalidMeshError
 from shapespace.model.latent_space import NotFiniteError
 from shapespace.model.population import Population
 from shapespace.model.posterior import Posterior, independent_share, patches_of
-from shapespace.model.shape_model import ShapeModel, load
+from shapespace.model.shape_model import ShapeModel
 from shapespace.model.spread import InvalidCovarianceError
-from tests.service.bundles import SCALE, write_bundle
-from tests.service.conftest import ROOT
+from tests.service.bundles import SCALE
 
 CODE = np.array([0.1, 0.7, 0.4])
-
-
-@pytest.fixture(scope="module")
-def model(tmp_path_factory: pytest.TempPathFactory) -> ShapeModel:
-    folder = tmp_path_factory.mktemp("posterior")
-    write_bundle(folder, "with-fine", fine=True)
-    return load(folder / "with-fine")
-
-
-@pytest.fixture(scope="module")
-def figure() -> ShapeModel:
-    return load(ROOT / "models" / "figure")
 
 
 @pytest.fixture
