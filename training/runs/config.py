@@ -142,8 +142,10 @@ class FitSettings(_Section):
 
 
 class LatentNetworkSettings(_Section):
-    """A network from latents to NRIC: a factor network, or a baseline on all latents, as ``monolithic``, our recipe with
-    one factor, and ``monolithic_paper``, the paper's."""
+    """A network from latents to NRIC: a factor network, or a baseline on all latents.
+
+    The baselines are ``monolithic``, our recipe with one factor, and ``monolithic_paper``, the paper's.
+    """
 
     hidden: list[int] = [128, 128]
     """Width of each hidden layer."""
