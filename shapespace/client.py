@@ -115,7 +115,8 @@ class Client:
             format: glb, gltf, obj, ply, stl, npz or json.
             place: where to answer it, as ``edit`` answers a ``placement``.
             covariance: (m, m) of codes around ``latent``, to colour the shape by how far its vertices may be.
-            options: version, mesh ("fine" or "coarse"), bounds ("allow", "clamp" or "reject"), color.
+            options: version, mesh ("fine" or "coarse"), bounds ("allow", "clamp" or "reject"), quality ("full" or
+                "draft"), color.
         """
         path, params = f"/v1/models/{name}/mesh", {"format": format, "place": _json(place), **options}
         if covariance is not None:
@@ -149,13 +150,13 @@ class Client:
             latents: (n, m).
             version: of the model.
             place: where to answer them, see ``mesh``.
-            options: mesh ("fine" or "coarse"), bounds ("allow", "clamp" or "reject").
+            options: mesh ("fine" or "coarse"), bounds ("allow", "clamp" or "reject"), quality ("full" or "draft").
         """
         answer = self._send(
             "POST",
             f"/v1/models/{name}/vertices",
             params={"version": version, "format": "npz", "place": _json(place)},
-            json={"latents": _numbers(latents), **options},
+            json={"latents": _numbers(latents), "faces": False, **options},
         )
         return _arrays(answer.content)["vertices"].astype(np.float32)
 
@@ -172,7 +173,7 @@ class Client:
         return np.array(answer["lengths"]), np.array(answer["angles"])
 
     def interpolate(
-        self, name: str, keyframes: ArrayLike, *, version: str | None = None, **options: Any
+        self, name: str, keyframes: ArrayLike, *, version: str | None = None, quality: str = "full", **options: Any
     ) -> Interpolation:
         """An animation along a path of codes.
 
@@ -180,6 +181,7 @@ class Client:
             name: of the model.
             keyframes: (k, m), at least two.
             version: of the model.
+            quality: of the frames, "full" or "draft".
             options: frames, times, start, stop, loop, mesh.
         """
         answer = self._send(
@@ -188,7 +190,7 @@ class Client:
             params={"version": version},
             json={"keyframes": _numbers(keyframes), **options},
         ).json()
-        return Interpolation(self, answer["id"], answer["frames"])
+        return Interpolation(self, answer["id"], answer["frames"], quality)
 
     def encode(
         self,
@@ -335,15 +337,17 @@ class Interpolation:
         client: the one that asked for it.
         id: holds the whole request, so that any replica can answer it, at any time.
         frames: how many there are.
+        quality: "full", or "draft": quicker, and nearly the same.
     """
 
     client: Client
     id: str
     frames: int
+    quality: str = "full"
 
     def __iter__(self) -> Iterator[NDArray[np.float32]]:
         path, http = f"/v1/interpolations/{self.id}", self.client._http
-        with http.stream("GET", path, params={"format": "jsonl"}) as answer:
+        with http.stream("GET", path, params={"format": "jsonl", "quality": self.quality}) as answer:
             if answer.is_error:
                 answer.read()
                 raise ClientError(answer)
@@ -367,7 +371,7 @@ class Interpolation:
 
     def _get(self, path: str, format: str) -> bytes:
         content: bytes = self.client._send(
-            "GET", f"/v1/interpolations/{self.id}{path}", params={"format": format}
+            "GET", f"/v1/interpolations/{self.id}{path}", params={"format": format, "quality": self.quality}
         ).content
         return content
 

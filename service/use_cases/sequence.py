@@ -9,6 +9,7 @@ from itertools import count
 from typing import Any
 
 from shapespace.files.archives import Buffer
+from shapespace.model.decoder import Quality
 from shapespace.model.latent_space import CheckedCode, Codes
 from shapespace.model.shape_model import ShapeModel
 from shapespace.service.limits.workers import Caller, Workers
@@ -69,7 +70,7 @@ def frame_code(model: ShapeModel, animation: Animation, k: int) -> CheckedCode:
 
 
 async def sequence_file(
-    workers: Workers, caller: Caller, model: ShapeModel, animation: Animation, format: str
+    workers: Workers, caller: Caller, model: ShapeModel, animation: Animation, quality: Quality, format: str
 ) -> Written:
     """All frames as one file in one of SEQUENCE_FORMATS.
 
@@ -80,7 +81,7 @@ async def sequence_file(
     """
     codes, inside = model.latents.codes(animation.codes(model.latents))
     async with batch(workers, caller, shapes_size(model, len(codes), animation.mesh)) as work:
-        found = await shapes(work, model, codes, inside, animation.mesh)
+        found = await shapes(work, model, codes, inside, animation.mesh, quality)
         faces = model.mesh(animation.mesh).faces
         frames = Frames(found.vertices, found.diagnostics, faces, animation.positions, codes)
 
@@ -91,7 +92,7 @@ async def sequence_file(
 
 
 async def sequence_lines(
-    workers: Workers, caller: Caller, model: ShapeModel, animation: Animation
+    workers: Workers, caller: Caller, model: ShapeModel, animation: Animation, quality: Quality
 ) -> AsyncGenerator[bytes, None]:
     """All frames as lines of JSON, each as soon as it is ready; raises BusyError and as ``Workers.run``."""
     codes, inside = model.latents.codes(animation.codes(model.latents))
@@ -99,7 +100,7 @@ async def sequence_lines(
 
     def line(frame: tuple[int, float, Codes, bool], deadline: Deadline) -> bytes:
         k, t, code, inside = frame
-        shape = solve(workers, model, animation.mesh, (code, inside), deadline)
+        shape = solve(workers, model, animation.mesh, quality, (code, inside), deadline)
         return json_line(k, t, shape, None if k else faces)
 
     frames = zip(count(), animation.positions.tolist(), codes, map(bool, inside))

@@ -9,12 +9,14 @@ from typing import Annotated
 from fastapi import APIRouter, Depends, Path, Request, Response
 from fastapi.responses import StreamingResponse
 
+from shapespace.model.decoder import Quality
 from shapespace.service.http.caching import cache_headers, entity_tag, not_modified
 from shapespace.service.http.dependencies import (
     CallerDependency,
     Format,
     MeshQuery,
     Model,
+    QualityQuery,
     ServiceDependency,
     one_of,
 )
@@ -24,7 +26,7 @@ from shapespace.service.http.messages.color_query import NO_COLOR, ColorQuery, c
 from shapespace.service.http.messages.schemas import InterpolationAnswer
 from shapespace.service.http.negotiation import choose
 from shapespace.service.http.problems import DOMAIN_ERRORS, domain_problem
-from shapespace.service.http.responses import file_headers, shape_response, written_response
+from shapespace.service.http.responses import draft_option, file_headers, shape_response, written_response
 from shapespace.service.use_cases.animation import Animation
 from shapespace.service.use_cases.one_shape import WantedShape
 from shapespace.service.use_cases.sequence import (
@@ -73,6 +75,7 @@ async def get_interpolation(
     request: Request,
     caller: CallerDependency,
     id: Id,
+    quality: QualityQuery = Quality.FULL,
     format: Annotated[Format, one_of([*MEDIA_TYPES, "obj"])] = None,
 ) -> Response:
     """The animation: GLB, arrays, a zip of OBJ files, a point cache, USD, or JSON lines as they get ready."""
@@ -80,14 +83,14 @@ async def get_interpolation(
     accept = request.headers.get("accept")
     chosen = choose(sequence_types(), "zip" if format == "obj" else format, accept, UNAVAILABLE)
     animation, model = find_interpolation(service.repository, id, service.settings.max_frames)
-    tag = entity_tag("animation", id, chosen)
+    tag = entity_tag("animation", id, chosen, *draft_option(quality))
     if answer := not_modified(request, tag):
         return answer
     if chosen == "jsonl":
-        lines = sequence_lines(service.workers, caller, model, animation)
+        lines = sequence_lines(service.workers, caller, model, animation, quality)
         first = await anext(lines)  # what goes wrong up to here still has a status of its own
         return StreamingResponse(_resume(request, first, lines), headers=cache_headers(tag), media_type=JSON_LINES)
-    written = await sequence_file(service.workers, caller, model, animation, chosen)
+    written = await sequence_file(service.workers, caller, model, animation, quality, chosen)
     diagnostics = {**(written.diagnostics or {}), **written.facts}
     headers = cache_headers(tag) | file_headers(diagnostics, f"{model.manifest.name}-animation.{chosen}")
     return written_response(service, written, headers, MEDIA_TYPES[chosen])
@@ -104,13 +107,14 @@ async def get_frame(
     caller: CallerDependency,
     id: Id,
     k: Annotated[int, Path(description="Number of the frame, from 0.", json_schema_extra={"minimum": 0})],
+    quality: QualityQuery = Quality.FULL,
     color: ColorQuery = NO_COLOR,
     format: Annotated[Format, one_of(SHAPE_FORMATS)] = None,
 ) -> Response:
     """One frame of an animation in any mesh format."""
     chosen = choose_mesh(format, request, color)
     animation, model = find_interpolation(service.repository, id, service.settings.max_frames)
-    wanted = WantedShape(frame_code(model, animation, k), animation.mesh, chosen, color.on(model))
+    wanted = WantedShape(frame_code(model, animation, k), animation.mesh, chosen, quality, color.on(model))
     return await shape_response(service, request, caller, model, wanted)
 
 

@@ -9,7 +9,13 @@ from fastapi import APIRouter
 from shapespace.model.shape_model import ShapeModel
 from shapespace.service.http.dependencies import Model, ServiceDependency
 from shapespace.service.http.description import problems
-from shapespace.service.http.messages.schemas import ModelCard, ModelList, ModelSummary
+from shapespace.service.http.messages.schemas import (
+    DistanceAnswer,
+    GeneralisationAnswer,
+    ModelCard,
+    ModelList,
+    ModelSummary,
+)
 
 router = APIRouter(prefix="/v1/models", tags=["models"])
 
@@ -23,7 +29,21 @@ async def list_models(service: ServiceDependency) -> ModelList:
 @router.get("/{name}", responses=problems(404, 422))
 async def model_card(service: ServiceDependency, model: Model) -> ModelCard:
     """What a model is, its bounds and figures, and where it comes from."""
-    return ModelCard(**_facts(model), digest=model.digest, versions=service.repository.versions(model.manifest.name))
+    return ModelCard(
+        **_facts(model),
+        digest=model.digest,
+        versions=service.repository.versions(model.manifest.name),
+        generalisation=_generalisation(model.manifest.figures.get("generalisation")),
+    )
+
+
+def _generalisation(found: dict[str, Any] | None) -> GeneralisationAnswer | None:
+    """Of the largest number of modes that was measured."""
+    if not found:
+        return None
+    components = DistanceAnswer(**found["components"][-1])
+    shapes, modes = found["held_out"], found["counts"][-1]
+    return GeneralisationAnswer(**found["modes"][-1], components=components, shapes=shapes, modes=modes)
 
 
 def _facts(model: ShapeModel) -> dict[str, Any]:

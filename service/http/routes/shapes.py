@@ -6,13 +6,15 @@ from typing import Annotated
 
 from fastapi import APIRouter, Depends, Query, Request, Response
 
-from shapespace.model.decoder import MeshChoice
+from shapespace.model.decoder import MeshChoice, Quality
 from shapespace.model.latent_space import Bounds
 from shapespace.service.http.dependencies import (
     CallerDependency,
     Format,
     MeshQuery,
     Model,
+    QualityOfBody,
+    QualityQuery,
     ServiceDependency,
     one_of,
 )
@@ -57,6 +59,7 @@ async def get_mesh(
     ] = None,
     mesh: Annotated[MeshChoice, Query(description="Which mesh, where the model has a finer one.")] = MeshChoice.FINE,
     bounds: Annotated[Bounds, Query(description="What to do with a code outside the bounds.")] = Bounds.ALLOW,
+    quality: QualityQuery = Quality.FULL,
     color: ColorQuery = NO_COLOR,
     place: PlaceQuery = None,
     format: Annotated[Format, one_of(SHAPE_FORMATS)] = None,
@@ -64,7 +67,7 @@ async def get_mesh(
     """The shape of a code as a mesh file, for a link or a browser."""
     chosen = choose_mesh(format, request, color)
     code = None if latent is None else model.latents.code(numbers(latent, "latent"), bounds)
-    wanted = WantedShape(code, mesh, chosen, color.on(model, bounds), place)
+    wanted = WantedShape(code, mesh, chosen, quality, color.on(model, bounds), place)
     return await shape_response(service, request, caller, model, wanted)
 
 
@@ -80,6 +83,7 @@ async def post_mesh(
     model: Model,
     body: Annotated[MeshRequest, Depends(JSONBody(MeshRequest))],
     mesh: MeshQuery = None,
+    quality: QualityOfBody = None,
     color: ColorQuery = NO_COLOR,
     place: PlaceQuery = None,
     format: Annotated[Format, one_of(SHAPE_FORMATS)] = None,
@@ -88,7 +92,7 @@ async def post_mesh(
     chosen = choose_mesh(format, request, color)
     code = model.latents.code(body.latent, body.bounds)
     colours = color.on(model, body.bounds, body.covariance)
-    wanted = WantedShape(code, mesh or body.mesh, chosen, colours, place)
+    wanted = WantedShape(code, mesh or body.mesh, chosen, quality or body.quality, colours, place)
     return await shape_response(service, request, caller, model, wanted)
 
 
@@ -105,6 +109,7 @@ async def post_vertices(
     model: Model,
     body: Annotated[VerticesRequest, Depends(JSONBody(VerticesRequest))],
     mesh: MeshQuery = None,
+    quality: QualityOfBody = None,
     exact: Annotated[bool, Query(description="As in the body: also the true discrete exponentials.")] = False,
     place: PlaceQuery = None,
     format: Annotated[Format, one_of(VERTICES_TYPES)] = None,
@@ -120,8 +125,10 @@ async def post_vertices(
         body.bounds,
         mesh or body.mesh,
         chosen,
+        quality=quality or body.quality,
         exponentials=exact or body.exact,
         place=place,
+        faces=body.faces,
     )
     headers = {"Vary": "Accept", **file_headers(written.diagnostics or {}, f"{model.manifest.name}.{chosen}")}
     return written_response(service, written, headers, VERTICES_TYPES[chosen])
