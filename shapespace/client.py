@@ -112,11 +112,11 @@ class Client:
         Args:
             name: of the model.
             latent: (m,).
-            format: glb, gltf, obj, ply, stl, npz or json.
+            format: glb, gltf, obj, ply, stl, npz, zip (OBJ with materials and textures) or json.
             place: where to answer it, as ``edit`` answers a ``placement``.
             covariance: (m, m) of codes around ``latent``, to colour the shape by how far its vertices may be.
             options: version, mesh ("fine" or "coarse"), bounds ("allow", "clamp" or "reject"), quality ("full" or
-                "draft"), color.
+                "draft"), color, topology ("original" or "triangles").
         """
         path, params = f"/v1/models/{name}/mesh", {"format": format, "place": _json(place), **options}
         if covariance is not None:

@@ -11,6 +11,7 @@ from fastapi import Request, Response
 from fastapi.responses import StreamingResponse
 from starlette.types import Receive, Scope, Send
 
+from shapespace.mesh.surface import Topology
 from shapespace.model.decoder import Quality
 from shapespace.model.latent_space import CheckedCode
 from shapespace.model.shape_model import ShapeModel
@@ -63,6 +64,8 @@ async def shape_response(
         options += [colour_by.quantity, told]
     if place := wanted.place:
         options += ["place", *(np.asarray(part).tobytes() for part in (place.rotation, place.translation, place.scale))]
+    if wanted.topology is Topology.TRIANGLES:
+        options.append(wanted.topology)
     tag = entity_tag("shape", model.digest, _bytes_of(wanted.code), wanted.mesh, wanted.format, *options)
     if unchanged := not_modified(request, tag):
         return unchanged

@@ -13,13 +13,14 @@ from numpy.typing import NDArray
 from shapespace.arrays import FloatArray
 from shapespace.files.colouring import Colouring, Quantity
 from shapespace.mesh.rigid_motion import Placement
+from shapespace.mesh.surface import Topology
 from shapespace.model.decoder import Diagnostics, MeshChoice, Quality, Shape
 from shapespace.model.latent_space import CheckedCode, NotFiniteError
 from shapespace.model.shape_model import ShapeModel
 from shapespace.model.spread import spread
 from shapespace.service.limits.workers import Caller, Workers
 from shapespace.service.use_cases.batch import Timings, solve, total_seconds
-from shapespace.service.use_cases.shape_formats import SHAPE_FORMATS
+from shapespace.service.use_cases.shape_formats import SHAPE_FORMATS, shown
 from shapespace.solve.deadline import Deadline
 
 
@@ -49,6 +50,7 @@ class WantedShape:
         quality: of this shape, and of the one that colours compare with.
         colour_by: what to colour it by, if anything.
         place: takes it from where it is aligned to the reference to where it is wanted.
+        topology: of formats that can hold polygons.
     """
 
     code: CheckedCode | None
@@ -57,6 +59,7 @@ class WantedShape:
     quality: Quality = Quality.FULL
     colour_by: ColourBy | None = None
     place: Placement | None = None
+    topology: Topology = Topology.ORIGINAL
 
 
 @dataclass(frozen=True)
@@ -114,7 +117,8 @@ async def shape_file(workers: Workers, caller: Caller, model: ShapeModel, wanted
             vertices, against = (shape.vertices for shape in found)
             colouring = Colouring.between(colour_by.quantity, vertices, against, model.mesh(mesh).connectivity)
         vertices = placed(found[0].vertices, wanted.place)
-        content = SHAPE_FORMATS[wanted.format].encode(vertices, model.mesh(mesh).faces, colouring)
+        surface = shown(model.surface(mesh), wanted.topology)
+        content = SHAPE_FORMATS[wanted.format].encode(vertices, model.mesh(mesh).faces, colouring, surface)
         seconds = {**total_seconds(shape.seconds for shape in found), "encode": time.perf_counter() - began}
         return ShapeFile(content, found[0].diagnostics, colouring.legend if colouring else None, seconds)
 

@@ -9,6 +9,7 @@ from itertools import count
 from typing import Any
 
 from shapespace.files.archives import Buffer
+from shapespace.mesh.surface import Topology
 from shapespace.model.decoder import Quality
 from shapespace.model.latent_space import CheckedCode, Codes
 from shapespace.model.shape_model import ShapeModel
@@ -18,7 +19,7 @@ from shapespace.service.use_cases.animation import Animation, UnknownInterpolati
 from shapespace.service.use_cases.batch import Written, batch, solve
 from shapespace.service.use_cases.many_shapes import shapes, shapes_size
 from shapespace.service.use_cases.sequence_formats import SEQUENCE_FORMATS, Frames, json_line
-from shapespace.service.use_cases.shape_formats import worst
+from shapespace.service.use_cases.shape_formats import shown, worst
 from shapespace.solve.deadline import Deadline
 
 
@@ -70,9 +71,15 @@ def frame_code(model: ShapeModel, animation: Animation, k: int) -> CheckedCode:
 
 
 async def sequence_file(
-    workers: Workers, caller: Caller, model: ShapeModel, animation: Animation, quality: Quality, format: str
+    workers: Workers,
+    caller: Caller,
+    model: ShapeModel,
+    animation: Animation,
+    quality: Quality,
+    format: str,
+    topology: Topology = Topology.ORIGINAL,
 ) -> Written:
-    """All frames as one file in one of SEQUENCE_FORMATS.
+    """All frames as one file in one of SEQUENCE_FORMATS, with polygons or triangles.
 
     Raises:
         TooManyCodesError, BusyError: more than one answer, or all together, may hold.
@@ -83,7 +90,8 @@ async def sequence_file(
     async with batch(workers, caller, shapes_size(model, len(codes), animation.mesh)) as work:
         found = await shapes(work, model, codes, inside, animation.mesh, quality)
         faces = model.mesh(animation.mesh).faces
-        frames = Frames(found.vertices, found.diagnostics, faces, animation.positions, codes)
+        surface = shown(model.surface(animation.mesh), topology)
+        frames = Frames(found.vertices, found.diagnostics, faces, animation.positions, codes, surface)
 
         def encode() -> tuple[Iterator[Buffer], dict[str, Any]]:
             return SEQUENCE_FORMATS[format].encode(frames)

@@ -12,9 +12,11 @@ from numpy.typing import NDArray
 from shapespace.arrays import FloatArray, IntArray
 from shapespace.files.animated_gltf import animated_glb
 from shapespace.files.archives import Buffer, npz_pieces, zip_pieces
-from shapespace.files.formats import OCTET_STREAM, obj_faces, obj_vertices
+from shapespace.files.formats import OCTET_STREAM
 from shapespace.files.point_cache import point_cache
+from shapespace.files.surfaces.obj import obj_faces, obj_files, obj_vertices
 from shapespace.files.usd import animated_usd, usd_installed
+from shapespace.mesh.surface import Surface
 from shapespace.model.decoder import Diagnostics, Shape
 from shapespace.model.latent_space import Codes
 from shapespace.service.use_cases.shape_formats import diagnostics_arrays, dump_json, float32
@@ -34,6 +36,7 @@ class Frames:
         faces: (F, 3).
         positions: (n,) where on the path each frame lies.
         codes: (n, m).
+        surface: of the mesh, where its file had more than triangles.
     """
 
     vertices: NDArray[np.float32]
@@ -41,6 +44,7 @@ class Frames:
     faces: IntArray
     positions: FloatArray
     codes: Codes
+    surface: Surface | None = None
 
 
 @dataclass(frozen=True)
@@ -50,10 +54,12 @@ class SequenceFormat:
     Attributes:
         media_type: as IANA has it.
         encode: a sequence to the pieces of the file, and facts for the diagnostics.
+        polygons: whether faces are those of the surface, where there is one; otherwise they are triangles.
     """
 
     media_type: str
     encode: Callable[[Frames], tuple[Iterator[Buffer], dict[str, Any]]]
+    polygons: bool = False
 
 
 def json_line(k: int, t: float, shape: Shape, faces: IntArray | None) -> bytes:
@@ -66,7 +72,7 @@ def json_line(k: int, t: float, shape: Shape, faces: IntArray | None) -> bytes:
 
 
 def _glb(frames: Frames) -> tuple[Iterator[Buffer], dict[str, Any]]:
-    animated = animated_glb(frames.vertices, frames.faces)
+    animated = animated_glb(frames.vertices, frames.faces, frames.surface)
     return iter([animated.data]), {"targets": animated.targets, "max_vertex_error": animated.max_vertex_error}
 
 
@@ -88,7 +94,7 @@ def _point_cache(frames: Frames) -> tuple[Iterator[Buffer], dict[str, Any]]:
 def _usd(frames: Frames) -> tuple[Iterator[Buffer], dict[str, Any]]:
     def pieces() -> Iterator[Buffer]:
         try:
-            yield from animated_usd(frames.vertices, frames.faces)
+            yield from animated_usd(frames.vertices, frames.faces, frames.surface)
         except OSError:
             raise NoRoomError(
                 "The server has no room for the temporary file that USD takes. Ask for another format, or give it a "
@@ -99,9 +105,18 @@ def _usd(frames: Frames) -> tuple[Iterator[Buffer], dict[str, Any]]:
 
 
 def _zip(frames: Frames) -> tuple[Iterator[Buffer], dict[str, Any]]:
-    faces = obj_faces(frames.faces)
-    objs = ([(obj_vertices(vertices) + faces).encode()] for vertices in frames.vertices)
-    return zip_pieces((f"frame-{k:04d}.obj", obj) for k, obj in enumerate(objs)), {}
+    surface = frames.surface or Surface.of_triangles(frames.faces)
+    beside = obj_files(surface, "frames")
+    head, faces = "mtllib frames.mtl\n" if beside else "", obj_faces(surface)
+
+    def members() -> Iterator[tuple[str, list[bytes]]]:
+        for k, vertices in enumerate(frames.vertices):
+            text = head + obj_vertices(vertices.astype(np.float64), surface=surface) + faces
+            yield f"frame-{k:04d}.obj", [text.encode()]
+        for name, content in beside.items():
+            yield name, [content]
+
+    return zip_pieces(members()), {}
 
 
 JSON_LINES = "application/jsonl"
@@ -109,9 +124,9 @@ JSON_LINES = "application/jsonl"
 SEQUENCE_FORMATS = {
     "glb": SequenceFormat("model/gltf-binary", _glb),
     "npz": SequenceFormat(OCTET_STREAM, _npz),
-    "zip": SequenceFormat("application/zip", _zip),
+    "zip": SequenceFormat("application/zip", _zip, polygons=True),
     "pc2": SequenceFormat(OCTET_STREAM, _point_cache),
-    "usd": SequenceFormat(OCTET_STREAM, _usd),
+    "usd": SequenceFormat(OCTET_STREAM, _usd, polygons=True),
 }
 #: Media types of all formats of a whole animation by name.
 MEDIA_TYPES = {name: format.media_type for name, format in SEQUENCE_FORMATS.items()} | {"jsonl": JSON_LINES}

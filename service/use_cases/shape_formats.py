@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from shapespace.arrays import FloatArray, IntArray
 from shapespace.files.colouring import Colouring
-from shapespace.files.formats import MESH_FORMATS, MeshFormat
+from shapespace.files.formats import MESH_FORMATS, OBJ_ZIP, MeshFormat
+from shapespace.mesh.surface import Surface, Topology
 from shapespace.model.decoder import Diagnostics, Quality
 from shapespace.model.exact_shapes import ExactShape
 
@@ -40,7 +41,9 @@ def float32(array: NDArray) -> NDArray[np.float32]:
     return np.ascontiguousarray(array, dtype=np.float32)
 
 
-def _mesh_json(vertices: FloatArray, faces: IntArray, colouring: Colouring | None = None) -> bytes:
+def _mesh_json(
+    vertices: FloatArray, faces: IntArray, colouring: Colouring | None = None, surface: Surface | None = None
+) -> bytes:
     content: dict[str, Any] = {"vertices": float32(vertices), "faces": np.ascontiguousarray(faces)}
     if colouring:
         content["color"] = {**colouring.legend, "values": float32(colouring.values)}
@@ -48,7 +51,12 @@ def _mesh_json(vertices: FloatArray, faces: IntArray, colouring: Colouring | Non
 
 
 #: Formats of one shape; the first is the default.
-SHAPE_FORMATS = {**MESH_FORMATS, "json": MeshFormat("application/json", _mesh_json)}
+SHAPE_FORMATS = {**MESH_FORMATS, "zip": OBJ_ZIP, "json": MeshFormat("application/json", _mesh_json)}
+
+
+def shown(surface: Surface | None, topology: Topology) -> Surface | None:
+    """A surface with the polygons that are wanted."""
+    return surface.triangulated if surface and topology is Topology.TRIANGLES else surface
 
 
 def diagnostics_arrays(diagnostics: Sequence[Diagnostics]) -> dict[str, NDArray]:

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
 
 from shapespace.arrays import FloatArray, IntArray
 from shapespace.bundle.schema import ARRAYS, ArrayType, Manifest
+from shapespace.bundle.surface import from_entry, surface_arrays
 from shapespace.mesh.prolongation import PREFIX, Prolongation, ProlongationError
+from shapespace.mesh.surface import Surface
 from shapespace.mesh.triangle_mesh import MeshError, TriangleMesh
 
 #: Largest distance of a vertex of the fine mesh from the prolonged reference, as a fraction of the diagonal: the
@@ -44,6 +47,7 @@ class Geometry:
         fine: the finer mesh, if there is one.
         modes: (m, V, 3) vertex fields d_j at the reference, where codes are coefficients of tangent vectors.
         training_codes: (n, m) codes of the shapes that the model was made from, if there are any.
+        surface: what the user's file had on the finest mesh beside triangles, if anything.
         file_vertices: (N,) vertex of the finest mesh that each vertex of the user's files became, −1 for those in no
             face; None where that is each by itself.
     """
@@ -53,6 +57,7 @@ class Geometry:
     modes: FloatArray | None = None
     training_codes: FloatArray | None = None
     file_vertices: IntArray | None = None
+    surface: Surface | None = None
 
     def arrays(self) -> dict[str, NDArray]:
         """The arrays of the file, by name, in the types of `ARRAYS`."""
@@ -68,11 +73,20 @@ class Geometry:
         if self.fine:
             fine = self.fine.reference
             found |= {"fine_vertices": fine.vertices, "fine_faces": fine.faces, **self.fine.prolong.arrays()}
+        if self.surface:
+            found |= surface_arrays(self.surface)
         return {name: array.astype(ARRAYS[name].dtype) for name, array in found.items() if array is not None}
 
     @classmethod
-    def from_arrays(cls, arrays: Mapping[str, NDArray], manifest: Manifest) -> Geometry:
+    def from_arrays(
+        cls, arrays: Mapping[str, NDArray], manifest: Manifest, textures: Mapping[str, bytes] = MappingProxyType({})
+    ) -> Geometry:
         """Read `arrays` back, checked against each other and the manifest; arrays of other names are left alone.
+
+        Args:
+            arrays: of the file.
+            manifest: of the bundle.
+            textures: contents of the files that the manifest names so.
 
         Raises:
             GeometryError: naming the file, the array and the fault.
@@ -100,6 +114,14 @@ class Geometry:
         sizes = {"m": manifest.latent_dimension, "V": manifest.vertices, "F": manifest.faces, "E": manifest.edges}
         for name in ARRAYS.keys() & arrays.keys():
             _check_type(f"{file}: {name}", arrays[name], ARRAYS[name], sizes)
+        surface = None
+        if manifest.surface:
+            finest = fine.reference if fine else reference
+            try:
+                surface = from_entry(manifest.surface, arrays, textures)
+                surface.check(len(finest.vertices), finest.faces)
+            except MeshError as error:
+                raise GeometryError(f"surface: {error}") from None
 
         def numbers(name: str) -> NDArray | None:
             return arrays[name].astype(np.float64) if name in arrays else None
@@ -110,6 +132,7 @@ class Geometry:
             modes=numbers("modes"),
             training_codes=numbers("training_codes"),
             file_vertices=None if places is None else places.astype(np.int64),
+            surface=surface,
         )
 
 

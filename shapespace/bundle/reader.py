@@ -90,7 +90,8 @@ def read_bundle(folder: Path, digest: str | None = None) -> Bundle:
     if (manifest.name, manifest.version) != (name, version):
         raise BundleError(f"{MANIFEST} is of {manifest.name}/{manifest.version}, not of {name}/{version}")
     files = read_files(folder, manifest)
-    geometry = _geometry(files.pop(manifest.geometry.file), manifest)
+    textures = {file: files.pop(file) for file in (manifest.surface.textures if manifest.surface else ())}
+    geometry = _geometry(files.pop(manifest.geometry.file), manifest, textures)
     for file, content in files.items():
         _check_network(file, content)
     return Bundle(manifest=manifest, digest=hashlib.sha256(text).hexdigest(), networks=files, **vars(geometry))
@@ -145,7 +146,7 @@ def _verified(path: Path, entry: FileEntry) -> bytes:
     return content
 
 
-def _geometry(content: bytes, manifest: Manifest) -> Geometry:
+def _geometry(content: bytes, manifest: Manifest, textures: Mapping[str, bytes]) -> Geometry:
     file = manifest.geometry.file
     try:
         arrays = _arrays(content)
@@ -154,7 +155,7 @@ def _geometry(content: bytes, manifest: Manifest) -> Geometry:
     except Exception as error:  # zip and array headers fail in many ways
         raise BundleError(f"{file} is not a readable NPZ file: {error}") from None
     try:
-        return Geometry.from_arrays(arrays, manifest)
+        return Geometry.from_arrays(arrays, manifest, textures)
     except GeometryError as error:
         raise BundleError(str(error)) from None
 

@@ -54,6 +54,37 @@ class GeometryFile(_Strict):
     file: FileName
 
 
+#: A name of a part or a material, on one line.
+Label = Annotated[str, Field(min_length=1, max_length=110, pattern=r"^[^\x00-\x1f\x7f]+$")]
+Labels = Annotated[list[Label], Field(max_length=10_000)]
+Share = Annotated[float, Field(ge=0, le=1)]
+
+
+class MaterialEntry(_Strict):
+    """A material; see mesh.surface."""
+
+    name: Label
+    color: tuple[Share, Share, Share, Share]
+    metallic: Share
+    roughness: Share
+    texture: FileName | None
+
+
+class SurfaceEntry(_Strict):
+    """Names of parts and materials of the finest mesh, whose arrays begin with `SURFACE`; see mesh.surface."""
+
+    objects: Labels
+    groups: Labels
+    materials: list[MaterialEntry] = Field(max_length=10_000)
+    #: Whether the file had normals.
+    normals: bool
+
+    @property
+    def textures(self) -> list[str]:
+        """Files of textures, each once."""
+        return sorted({material.texture for material in self.materials if material.texture is not None})
+
+
 class Tolerance(_Strict):
     """The largest allowed difference between ONNX and PyTorch, and the measured one: relative, in the weighted norm."""
 
@@ -111,6 +142,7 @@ class Manifest(_Strict):
     combiner: Network
     start: Network | None
     geometry: GeometryFile
+    surface: SurfaceEntry | None = None
     onnx_tolerance: Tolerance
     figures: dict[str, Any]
     draft_error: DraftError | None = None
@@ -130,8 +162,9 @@ class Manifest(_Strict):
             raise ValueError(f"the factors must split the {m} latents into consecutive, non-empty ranges")
         named = [network.file for network in (*self.factors, self.combiner)] + [self.geometry.file]
         named += [self.start.file] if self.start else []
+        named += self.surface.textures if self.surface else []
         if sorted(named) != sorted(self.files):
-            raise ValueError("files must list exactly the networks and the geometry")
+            raise ValueError("files must list exactly the networks, the geometry and the textures")
         return self
 
 
@@ -147,6 +180,7 @@ class ArrayType(NamedTuple):
     dtype: type[np.number]
 
 
+SURFACE = "surface_"
 #: The arrays of ``geometry.npz``. The first three are always there; ``fine_*`` and ``prolongation_*`` all or none.
 ARRAYS = {
     # The reference, normalised, and its edges in lexicographic order.
@@ -166,6 +200,16 @@ ARRAYS = {
     "prolongation_indptr": ArrayType(("W + 1",), np.int32),
     "prolongation_indices": ArrayType(("weights",), np.int32),
     "prolongation_weights": ArrayType(("weights",), np.float64),
+    # What the user's file had on the finest mesh beside triangles: P polygons with C corners. See mesh.surface.
+    "surface_starts": ArrayType(("P + 1",), np.int32),
+    "surface_corners": ArrayType(("C",), np.int32),
+    "surface_uv": ArrayType(("U", 2), np.float32),
+    "surface_uv_corners": ArrayType(("C",), np.int32),
+    "surface_shading": ArrayType(("C",), np.int32),
+    "surface_colors": ArrayType(("W or V", 3), np.float32),
+    "surface_object_of": ArrayType(("P",), np.int32),
+    "surface_group_of": ArrayType(("P",), np.int32),
+    "surface_material_of": ArrayType(("P",), np.int32),
 }
 #: The files of a bundle as they are written. They are read under the names that the manifest gives them.
 COMBINER = Network(file="combiner.onnx", input="factors", output="nric")

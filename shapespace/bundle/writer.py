@@ -29,6 +29,7 @@ from shapespace.bundle.schema import (
     Tolerance,
     factor_network,
 )
+from shapespace.bundle.surface import surface_entry
 from shapespace.shell.energy import Material
 
 
@@ -100,6 +101,8 @@ def write_bundle(models: Path, facts: Facts, networks: Networks, geometry: Geome
     files |= {COMBINER.file: networks.combiner, GEOMETRY.file: _npz(geometry.arrays())}
     if networks.start is not None:
         files[START.file] = networks.start
+    if geometry.surface:
+        files |= geometry.surface.textures
     manifest = _manifest(facts, geometry, files)
     text = json.dumps(manifest.model_dump(by_alias=True), indent=2, ensure_ascii=False) + "\n"
 
@@ -162,6 +165,7 @@ def _manifest(facts: Facts, geometry: Geometry, files: Mapping[str, bytes]) -> M
         "combiner": COMBINER,
         "start": START if START.file in files else None,
         "geometry": GEOMETRY,
+        "surface": surface_entry(geometry.surface) if geometry.surface else None,
         "onnx_tolerance": facts.tolerance,
         "figures": dict(facts.figures),
         "draft_error": facts.draft_error,

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from shapespace.arrays import FloatArray, IntArray
-from shapespace.files.gltf_writing import ARRAY_BUFFER, Document, vertex_normals
+from shapespace.files.gltf_writing import ARRAY_BUFFER, Document
+from shapespace.mesh.surface import Surface
 from shapespace.mesh.triangle_mesh import diagonal
 
 #: Up to this many frames each frame has a target of its own; beyond it, a basis of this many vectors at most. Keying
@@ -38,9 +39,10 @@ class AnimatedGLB:
     max_vertex_error: float
 
 
-def animated_glb(frames: NDArray[np.floating], faces: IntArray) -> AnimatedGLB:
-    """Encode shapes (n, V, 3) so that key k, at ``k / FRAMES_PER_SECOND`` seconds, shows frame k.
+def animated_glb(frames: NDArray[np.floating], faces: IntArray, surface: Surface | None = None) -> AnimatedGLB:
+    """Encode shapes (n, V, 3), with their surface where there is one.
 
+    Key k, at ``k / FRAMES_PER_SECOND`` seconds, shows frame k.
     The mesh at rest is frame 0. Up to DENSE_FRAMES each later frame is a target of its own, so that keys are
     exact to float32; longer sequences are spanned by the leading singular vectors of the displacements from
     frame 0. Weights lie between 0 and 1. The error is measured on what is written and stored in ``asset.extras`` too.
@@ -68,13 +70,12 @@ def animated_glb(frames: NDArray[np.floating], faces: IntArray) -> AnimatedGLB:
         targets[:, block] = np.tensordot(fit, displacements, 1)
         shown = np.tensordot(keys[1:].astype(np.float64), targets[:, block], 1)
         error = max(error, float(np.linalg.norm(shown - displacements, axis=-1).max(initial=0)))
-    normal_targets = _normal_targets(frames, faces, fit)
-
-    document = Document(rest, faces, "animation")
+    document = Document(rest, faces, "animation", surface=surface)
+    normal_targets = _normal_targets(frames, document.normals, fit)
     if len(targets):
         document.primitive["targets"] = [
             {
-                "POSITION": document.add(target, bounds=True, target=ARRAY_BUFFER),
+                "POSITION": document.add(target[document.rows], bounds=True, target=ARRAY_BUFFER),
                 "NORMAL": document.add(normal_target, target=ARRAY_BUFFER),
             }
             for target, normal_target in zip(targets, normal_targets, strict=True)
@@ -109,13 +110,15 @@ def _blocks(frames: NDArray[np.floating]) -> Iterator[slice]:
     return (slice(start, start + size) for start in range(0, frames.shape[1], size))
 
 
-def _normal_targets(frames: NDArray[np.floating], faces: IntArray, fit: FloatArray) -> NDArray[np.float32]:
-    """(K, V, 3): what each target adds to the normals, given how targets come from frames (K, n − 1)."""
-    rest = vertex_normals(frames[0].astype(np.float64), faces)
+def _normal_targets(
+    frames: NDArray[np.floating], normals_of: Callable[[FloatArray], FloatArray], fit: FloatArray
+) -> NDArray[np.float32]:
+    """(K, V', 3): what each target adds to the normals, given how targets come from frames (K, n − 1)."""
+    rest = normals_of(frames[0].astype(np.float64))
     targets = np.zeros((len(fit), *rest.shape), np.float32)
     for start in range(1, len(frames), _FRAMES_AT_ONCE):
         some = slice(start, min(start + _FRAMES_AT_ONCE, len(frames)))
-        normals = np.stack([vertex_normals(frame.astype(np.float64), faces) - rest for frame in frames[some]])
+        normals = np.stack([normals_of(frame.astype(np.float64)) - rest for frame in frames[some]])
         part = fit[:, some.start - 1 : some.stop - 1]
         for k in np.flatnonzero(part.any(axis=1)):
             targets[k] += np.tensordot(part[k], normals, 1).astype(np.float32)

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from shapespace.arrays import FloatArray
 from shapespace.coordinates.nric import dihedral_angles, edge_lengths, wrap
+from shapespace.mesh.surface import linear
 from shapespace.mesh.triangle_mesh import Connectivity
 
 #: Moreland's "coolwarm", perceptually even away from its grey middle, at 33 equal steps in sRGB: "Diverging Color Maps
@@ -99,9 +100,8 @@ class Colouring:
 
     @property
     def linear(self) -> FloatArray:
-        """(V, 3) the same colours as linear light, which glTF wants (IEC 61966-2-1)."""
-        c = self.srgb
-        return np.where(c <= 0.04045, c / 12.92, ((c + 0.055) / 1.055) ** 2.4)
+        """(V, 3) the same colours as linear light, which glTF wants."""
+        return linear(self.srgb)
 
     @property
     def srgb_bytes(self) -> NDArray[np.uint8]:

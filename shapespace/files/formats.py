@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
@@ -15,6 +14,7 @@ from shapespace.files.gltf_reading import read_gltf
 from shapespace.files.limits import UNLIMITED, Limits, clipped
 from shapespace.files.npz_reading import load_npz
 from shapespace.files.polygon_reading import read_obj, read_off, read_ply, read_stl, read_xyz
+from shapespace.mesh.surface import Surface
 from shapespace.mesh.triangle_mesh import MeshError
 
 if TYPE_CHECKING:
@@ -27,8 +27,15 @@ OCTET_STREAM = "application/octet-stream"
 class Encode(Protocol):
     """Writes a file."""
 
-    def __call__(self, vertices: FloatArray, faces: IntArray, colouring: Colouring | None = None, /) -> bytes:
-        """Encode vertices (V, 3) in any unit and faces (F, 3); positions are float32."""
+    def __call__(
+        self,
+        vertices: FloatArray,
+        faces: IntArray,
+        colouring: Colouring | None = None,
+        surface: Surface | None = None,
+        /,
+    ) -> bytes:
+        """Encode vertices (V, 3) in any unit and faces (F, 3), with what the surface has; positions are float32."""
 
 
 @dataclass(frozen=True)
@@ -39,66 +46,72 @@ class MeshFormat:
         media_type: as IANA has it; OCTET_STREAM without a registration.
         encode: a mesh, with the colours of its vertices or without, to the file's bytes.
         coloured: whether files can carry colours; where not, ``encode`` leaves them out.
+        polygons: whether faces are those of the surface, where there is one; otherwise they are triangles.
     """
 
     media_type: str
     encode: Encode
     coloured: bool = True
+    polygons: bool = False
 
 
-def _glb(vertices: FloatArray, faces: IntArray, colouring: Colouring | None = None) -> bytes:
+def _glb(
+    vertices: FloatArray, faces: IntArray, colouring: Colouring | None = None, surface: Surface | None = None
+) -> bytes:
     from shapespace.files.gltf_writing import Document
 
-    return Document(vertices, faces, colouring=colouring).glb()
+    return Document(vertices, faces, colouring=colouring, surface=surface).glb()
 
 
-def _gltf(vertices: FloatArray, faces: IntArray, colouring: Colouring | None = None) -> bytes:
+def _gltf(
+    vertices: FloatArray, faces: IntArray, colouring: Colouring | None = None, surface: Surface | None = None
+) -> bytes:
     from shapespace.files.gltf_writing import Document
 
-    return Document(vertices, faces, colouring=colouring).gltf()
+    return Document(vertices, faces, colouring=colouring, surface=surface).gltf()
 
 
-def _obj(vertices: FloatArray, faces: IntArray, colouring: Colouring | None = None) -> bytes:
-    return (obj_vertices(vertices, colouring) + obj_faces(faces)).encode()
+def _obj(
+    vertices: FloatArray, faces: IntArray, colouring: Colouring | None = None, surface: Surface | None = None
+) -> bytes:
+    from shapespace.files.surfaces.obj import write_obj
+
+    return write_obj(vertices, surface or Surface.of_triangles(faces), colouring).encode()
 
 
-def obj_vertices(vertices: FloatArray, colouring: Colouring | None = None) -> str:
-    """The positions (V, 3) of an OBJ file, with colours behind them in the way that most readers understand."""
-    # Nine significant digits hold a float32 whatever the unit; trimesh writes a fixed number of decimals.
-    comment, line, rows = "", "v %.9g %.9g %.9g\n", vertices.astype(np.float32)
-    if colouring:
-        comment = f"# color {json.dumps(colouring.legend)}\n"
-        line, rows = "v %.9g %.9g %.9g %.4g %.4g %.4g\n", np.hstack([rows, colouring.srgb])
-    # All at once is twice as fast as line by line.
-    return comment + line * len(rows) % tuple(rows.ravel().tolist())
+def _obj_zip(
+    vertices: FloatArray, faces: IntArray, colouring: Colouring | None = None, surface: Surface | None = None
+) -> bytes:
+    from shapespace.files.archives import zip_pieces
+    from shapespace.files.surfaces.obj import obj_files, write_obj
+
+    shown = surface or Surface.of_triangles(faces)
+    files = obj_files(shown, "shape")
+    text = write_obj(vertices, shown, colouring, "shape.mtl" if files else None)
+    members = {"shape.obj": text.encode(), **files}
+    return b"".join(zip_pieces((name, [content]) for name, content in members.items()))
 
 
-def obj_faces(faces: IntArray) -> str:
-    """The faces (F, 3) of an OBJ file."""
-    return "f %d %d %d\n" * len(faces) % tuple((faces + 1).ravel().tolist())
+def _ply(
+    vertices: FloatArray, faces: IntArray, colouring: Colouring | None = None, surface: Surface | None = None
+) -> bytes:
+    from shapespace.files.surfaces.ply import write_ply
+
+    return write_ply(vertices, surface or Surface.of_triangles(faces), colouring)
 
 
-def _ply(vertices: FloatArray, faces: IntArray, colouring: Colouring | None = None) -> bytes:
-    return _exported("ply", vertices, faces, colouring)
-
-
-def _stl(vertices: FloatArray, faces: IntArray, colouring: Colouring | None = None) -> bytes:
-    return _exported("stl", vertices, faces, None)
-
-
-def _exported(extension: str, vertices: FloatArray, faces: IntArray, colouring: Colouring | None) -> bytes:
+def _stl(
+    vertices: FloatArray, faces: IntArray, colouring: Colouring | None = None, surface: Surface | None = None
+) -> bytes:
     import trimesh
 
-    colours = {}
-    if colouring:
-        values = {str(colouring.quantity): colouring.values.astype(np.float32)}
-        colours = {"vertex_colors": colouring.srgb_bytes, "vertex_attributes": values}
-    mesh = trimesh.Trimesh(vertices.astype(np.float32), faces, process=False, **colours)  # type: ignore[arg-type]
-    content = mesh.export(file_type=extension)
+    content = trimesh.Trimesh(vertices.astype(np.float32), faces, process=False).export(file_type="stl")
     return content if isinstance(content, bytes) else str(content).encode()
 
 
-def _npz(vertices: FloatArray, faces: IntArray, colouring: Colouring | None = None) -> bytes:
+def _npz(
+    vertices: FloatArray, faces: IntArray, colouring: Colouring | None = None, surface: Surface | None = None
+) -> bytes:
     colours = {}
     if colouring:
         colours = {
@@ -113,11 +126,13 @@ def _npz(vertices: FloatArray, faces: IntArray, colouring: Colouring | None = No
 MESH_FORMATS: dict[str, MeshFormat] = {
     "glb": MeshFormat("model/gltf-binary", _glb),
     "gltf": MeshFormat("model/gltf+json", _gltf),
-    "obj": MeshFormat("model/obj", _obj),
-    "ply": MeshFormat(OCTET_STREAM, _ply),
+    "obj": MeshFormat("model/obj", _obj, polygons=True),
+    "ply": MeshFormat(OCTET_STREAM, _ply, polygons=True),
     "stl": MeshFormat("model/stl", _stl, coloured=False),
     "npz": MeshFormat(OCTET_STREAM, _npz),
 }
+#: An archive of an OBJ file with its materials and textures beside it, which is not read.
+OBJ_ZIP = MeshFormat("application/zip", _obj_zip, polygons=True)
 #: Media types of the formats that can be read, by name.
 READ_FORMATS = {name: format.media_type for name, format in MESH_FORMATS.items()} | {"off": OCTET_STREAM}
 #: The same for point clouds, which may do without faces.

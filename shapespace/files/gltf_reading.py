@@ -1,8 +1,8 @@
 """Reader of glTF 2.0: the triangles of a scene at rest, from GLB or from JSON with its data inside or beside it.
 
 The size of a scene is known before any of its data are unpacked, and each node is visited once. Skins, morph targets,
-animations, materials, pictures, cameras and lights are left out; what would change the triangles and isn't known here
-is refused. Sections named in comments are those of the Khronos Group's glTF 2.0 specification.
+animations, cameras and lights are left out, and so is how it looks; what would change the triangles and isn't known
+here is refused. Sections named in comments are those of the Khronos Group's glTF 2.0 specification.
 """
 
 from __future__ import annotations
@@ -33,6 +33,9 @@ _QUANTIZATION = "KHR_mesh_quantization"
 _APPEARANCE = ("KHR_materials_", "KHR_texture_", "EXT_texture_", "KHR_lights_", "EXT_lights_")
 _TYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _POSITIONS, _INDICES = (5120, 5121, 5122, 5123, 5126), (5121, 5123, 5125)
+#: Of an attribute whose elements are whole numbers; glTF has no longer integers there (3.7.2.1).
+_NUMBERS = (5121, 5123, 5126)
+_WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 _TRIANGLES, _STRIP, _FAN = 4, 5, 6
 _LONGEST_STRIDE = 252
 _DATA = re.compile(rb'"(data:[^"\\]*+)"')
@@ -42,6 +45,16 @@ def read_gltf(
     data: memoryview, limits: Limits, *, binary: bool, beside: Path | None = None
 ) -> tuple[FloatArray, IntArray]:
     """Vertices (V, 3) and faces (F, 3) of the default scene, its primitives one after the other.
+
+    Vertices that the attribute _VERTEX numbers are in that order, those of one number once. Arguments and errors are
+    those of `open_scene`.
+    """
+    scene = open_scene(data, limits, binary=binary, beside=beside)
+    return scene.vertices, scene.faces
+
+
+def open_scene(data: memoryview, limits: Limits, *, binary: bool, beside: Path | None = None) -> Scene:
+    """The default scene of a file.
 
     Args:
         data: the file.
@@ -55,16 +68,9 @@ def read_gltf(
     """
     text, chunk = _chunks(data) if binary else (data, None)
     tree, uris = _parse(text)
-    document = _Document(tree)
-    buffers = _Buffers(document.buffers, chunk, uris, beside)
-    parts = _parts(document)
-    limits.check(sum(part.positions.count for part in parts), sum(part.most_faces for part in parts))
-    vertices, faces, before = [], [], 0
-    for part in parts:
-        vertices.append(part.vertices(buffers))
-        faces.append(before + part.faces(buffers))
-        before += part.positions.count
-    return np.concatenate(vertices), np.concatenate(faces)
+    document = Document(tree)
+    buffers = Buffers(document.buffers, chunk, uris, beside)
+    return Scene(document, buffers, limits)
 
 
 def _chunks(data: memoryview) -> tuple[memoryview, memoryview | None]:
@@ -109,10 +115,11 @@ def _parse(text: memoryview) -> tuple[dict[str, Any], list[memoryview]]:
     return tree, uris
 
 
-class _Document:
+class Document:
     """The parts of the JSON that describe triangles, once they are known to be what they should be."""
 
     def __init__(self, tree: dict[str, Any]) -> None:
+        self.tree = tree
         version = clipped(tree.get("asset", {}).get("version", "2.0"))
         if version.partition(".")[0] != "2":
             raise MeshError(f"it is glTF {version}, and 2 is read")
@@ -213,7 +220,7 @@ def _numbers(value: object, length: int) -> FloatArray:
 
 
 @dataclass(frozen=True)
-class _Accessor:
+class Accessor:
     """Elements of one type, and where they lie (3.6.2).
 
     Attributes:
@@ -235,7 +242,7 @@ class _Accessor:
     normalized: bool
 
     @classmethod
-    def of(cls, document: _Document, index: object, kind: str, components: tuple[int, ...]) -> _Accessor:
+    def of(cls, document: Document, index: object, kind: str, components: tuple[int, ...]) -> Accessor:
         """One of the accessors, which must be of that kind and have such components."""
         accessor = _entry(document.accessors, index)
         if "sparse" in accessor:
@@ -244,7 +251,7 @@ class _Accessor:
             raise MeshError(f"its accessor {index} has no data")
         if accessor["type"] != kind or accessor["componentType"] not in components:
             raise ValueError(f"its accessor {index} is of another type than it has to be")
-        dtype, width = np.dtype(_TYPES[accessor["componentType"]]), 3 if kind == "VEC3" else 1
+        dtype, width = np.dtype(_TYPES[accessor["componentType"]]), _WIDTHS[kind]
         number, size = _whole(accessor["count"]), width * dtype.itemsize
         view = _entry(document.views, accessor["bufferView"])
         stride, inside = _whole(view.get("byteStride", size)), _whole(accessor.get("byteOffset", 0))
@@ -259,14 +266,23 @@ class _Accessor:
             raise ValueError(f"its accessor {index} has {number} elements, which is more than there are data")
         return cls(buffer, start + inside, stride, number, dtype, width, accessor.get("normalized", False) is True)
 
-    def read(self, buffers: _Buffers) -> NDArray:
+    def real(self, buffers: Buffers) -> FloatArray:
+        """(count, width), as the numbers that they stand for."""
+        given = self.read(buffers)
+        values = given.astype(np.float64)
+        if self.normalized and given.dtype.kind != "f":
+            values /= np.iinfo(given.dtype).max
+            np.maximum(values, -1, out=values)
+        return values
+
+    def read(self, buffers: Buffers) -> NDArray:
         """(count, width), as they are."""
         size = self.width * self.dtype.itemsize
         content = buffers.read(self.buffer, self.start, self.start + (self.count - 1) * self.stride + size)
         return np.ndarray((self.count, self.width), self.dtype, content, 0, (self.stride, self.dtype.itemsize))
 
 
-class _Buffers:
+class Buffers:
     """Where the bytes of a document are: in the file's own data, in its JSON, or in files beside it (3.6.1).
 
     Nothing is opened or decoded before it is read, and then only as much as is read.
@@ -276,13 +292,13 @@ class _Buffers:
         self, entries: list[dict[str, Any]], chunk: memoryview | None, uris: list[memoryview], beside: Path | None
     ) -> None:
         self._sources: list[memoryview | Path | None] = []
-        self._encoded = set[int]()
+        self._encoded, self._uris = set[int](), uris
         for k, entry in enumerate(entries):
             uri = entry.get("uri")
             if uri is None:
                 self._sources.append(chunk if k == 0 else None)
             elif uri.startswith("data:"):
-                whole = uris[int(uri[5:])] if uri[5:].isdecimal() else memoryview(uri.encode())
+                whole = self.text(uri)
                 header, comma, _ = bytes(whole[:1000]).partition(b",")
                 if not comma or not header.endswith(b";base64"):
                     raise ValueError("it has data that aren't base64")
@@ -290,6 +306,10 @@ class _Buffers:
                 self._sources.append(whole[len(header) + 1 :])
             else:
                 self._sources.append(_beside(unquote(uri), beside))
+
+    def text(self, uri: str) -> memoryview:
+        """The data URI that one in the JSON stands for."""
+        return self._uris[int(uri[5:])] if uri[5:].isdecimal() else memoryview(uri.encode())
 
     def read(self, index: int, start: int, stop: int) -> bytes | memoryview:
         """Bytes of a buffer; raises ValueError where it ends before."""
@@ -323,14 +343,77 @@ def _beside(name: str, path: Path | None) -> Path:
     return path.parent / inside
 
 
-@dataclass(frozen=True)
-class _Part:
-    """A primitive at one of its places (3.7.2)."""
+class Scene:
+    """The triangles of a scene.
 
-    positions: _Accessor
-    indices: _Accessor | None
+    Args:
+        document: of the file.
+        buffers: its data.
+        limits: of the whole scene.
+
+    Attributes:
+        parts: its primitives, each at its place.
+        read: those whose vertices are listed, one after the other; the others are on the vertices of one of them.
+        vertices: (V, 3).
+        faces: (F, 3), of the parts one after the other.
+        corners: (F, 3) the vertices as they are listed.
+        first: (V,) the first of these that each vertex is.
+    """
+
+    def __init__(self, document: Document, buffers: Buffers, limits: Limits) -> None:
+        self.document, self.buffers, self.parts = document, buffers, _parts(document)
+        numbered = all(part.numbers for part in self.parts)
+        # Our own files have a part for each material, on the same vertices.
+        sources = [(part.positions, part.numbers) if numbered and part.place is None else k
+                   for k, part in enumerate(self.parts)]  # fmt: skip
+        self.read = [self.parts[sources.index(source)] for source in dict.fromkeys(sources)]
+        limits.check(sum(part.positions.count for part in self.read), sum(part.most_faces for part in self.parts))
+        begins = np.cumsum([0, *(part.positions.count for part in self.read)])
+        place = dict(zip(dict.fromkeys(sources), begins.tolist(), strict=False))
+        listed = np.concatenate([part.vertices(buffers) for part in self.read])
+        parts = zip(sources, self.parts, strict=True)
+        self.corners = np.concatenate([place[source] + part.faces(buffers) for source, part in parts])
+        numbers = self._numbers(len(listed)) if numbered else None
+        self.first = np.arange(len(listed)) if numbers is None else np.unique(numbers, return_index=True)[1]
+        self.vertices = listed[self.first]
+        self.faces = self.corners if numbers is None else numbers[self.corners]
+        if numbers is not None and not np.array_equal(listed, self.vertices[numbers], equal_nan=True):
+            raise MeshError("its _VERTEX has one number for vertices at different places")
+
+    def _numbers(self, count: int) -> IntArray:
+        """(count,) the attribute _VERTEX."""
+        values = np.concatenate([part.numbers.read(self.buffers).ravel() for part in self.read if part.numbers])
+        if not ((values >= 0) & (values < count) & (values == np.floor(values))).all():
+            raise MeshError("its _VERTEX has entries that number no vertex")
+        numbers = values.astype(np.int64)
+        there = np.zeros(numbers.max() + 1, bool)
+        there[numbers] = True
+        if not there.all():
+            raise MeshError(f"its _VERTEX leaves out the number {int(there.argmin())}")
+        return numbers
+
+
+@dataclass(frozen=True)
+class Part:
+    """A primitive at one of its places (3.7.2).
+
+    Attributes:
+        positions: of its vertices.
+        indices: of its corners, one after the other where there are none.
+        numbers: the attribute _VERTEX, if it has one.
+        mode: what the corners make.
+        place: matrix (4, 4), none for the identity.
+        primitive: what the file says of it.
+        mesh: what the file says of the mesh that it belongs to.
+    """
+
+    positions: Accessor
+    indices: Accessor | None
+    numbers: Accessor | None
     mode: int
     place: FloatArray | None
+    primitive: dict[str, Any]
+    mesh: dict[str, Any]
 
     @property
     def corners(self) -> int:
@@ -342,20 +425,16 @@ class _Part:
         """How many faces there are at most: some of a strip may have no area."""
         return self.corners // 3 if self.mode == _TRIANGLES else max(0, self.corners - 2)
 
-    def vertices(self, buffers: _Buffers) -> FloatArray:
+    def vertices(self, buffers: Buffers) -> FloatArray:
         """(count, 3) where they stand."""
-        given = self.positions.read(buffers)
-        vertices = given.astype(np.float64)
-        if self.positions.normalized and given.dtype.kind != "f":
-            vertices /= np.iinfo(given.dtype).max
-            np.maximum(vertices, -1, out=vertices)
+        vertices = self.positions.real(buffers)
         if self.place is not None:
             # Coordinates that aren't finite are for the caller to judge.
             with np.errstate(all="ignore"):
                 vertices = vertices @ self.place[:3, :3].T + self.place[:3, 3]
         return vertices
 
-    def faces(self, buffers: _Buffers) -> IntArray:
+    def faces(self, buffers: Buffers) -> IntArray:
         """(F, 3), numbered from the first of these vertices."""
         count = self.positions.count
         if self.indices is None:
@@ -379,9 +458,9 @@ class _Part:
         return faces[:, ::-1] if mirrored else faces
 
 
-def _parts(document: _Document) -> list[_Part]:
+def _parts(document: Document) -> list[Part]:
     """Every primitive of the scene at each of its places."""
-    parts: list[_Part] = []
+    parts: list[Part] = []
     several: dict[int, bool] = {}
     for number, place in document.places():
         primitives = _objects(_entry(document.meshes, number), "primitives")
@@ -389,7 +468,7 @@ def _parts(document: _Document) -> list[_Part]:
         for primitive in primitives:
             if len(parts) == _MOST_PARTS:
                 raise MeshError(f"its scene comes to more than {_MOST_PARTS} parts")
-            parts.append(_part(document, primitive, place))
+            parts.append(_part(document, primitive, place, document.meshes[number]))
     if not parts:
         raise MeshError("holds no mesh")
     # A mesh has a primitive for each of its materials.
@@ -398,15 +477,20 @@ def _parts(document: _Document) -> list[_Part]:
     return parts
 
 
-def _part(document: _Document, primitive: dict[str, Any], place: FloatArray | None) -> _Part:
+def _part(document: Document, primitive: dict[str, Any], place: FloatArray | None, mesh: dict[str, Any]) -> Part:
     mode = primitive.get("mode", _TRIANGLES)
     if mode not in (_TRIANGLES, _STRIP, _FAN):
         raise MeshError("has points or lines: export triangles only")
-    positions = _Accessor.of(document, primitive["attributes"]["POSITION"], "VEC3", _POSITIONS)
+    positions = Accessor.of(document, primitive["attributes"]["POSITION"], "VEC3", _POSITIONS)
     indices = None
     if "indices" in primitive:
-        indices = _Accessor.of(document, primitive["indices"], "SCALAR", _INDICES)
-    part = _Part(positions, indices, mode, place)
+        indices = Accessor.of(document, primitive["indices"], "SCALAR", _INDICES)
+    numbers = None
+    if "_VERTEX" in primitive["attributes"]:
+        numbers = Accessor.of(document, primitive["attributes"]["_VERTEX"], "SCALAR", _NUMBERS)
+        if numbers.count != positions.count:
+            raise ValueError(f"_VERTEX numbers {numbers.count} of {positions.count} vertices")
+    part = Part(positions, indices, numbers, mode, place, primitive, mesh)
     if part.corners < 3 or (mode == _TRIANGLES and part.corners % 3):
         raise ValueError(f"{part.corners} corners make no triangles")
     return part

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from shapespace.arrays import FloatArray, IntArray
 from shapespace.coordinates.nric import components, cross, dot
 from shapespace.files.colouring import Colouring
+from shapespace.mesh.surface import NONE, Material, Surface, linear
 
 FLOAT, UNSIGNED_INT = 5126, 5125
 ARRAY_BUFFER, ELEMENT_ARRAY_BUFFER = 34962, 34963
@@ -38,17 +39,45 @@ WHITE = MATERIAL | {
 
 def vertex_normals(vertices: FloatArray, faces: IntArray) -> FloatArray:
     """Unit normals (V, 3) at the vertices of a shape (V, 3): means of the face normals, weighted by area."""
+    return _normals(vertices, faces, faces, len(vertices))
+
+
+def surface_normals(vertices: FloatArray, surface: Surface) -> FloatArray:
+    """Unit normals (N, 3) of a shape (V, 3) by the numbers of `Surface.normal_corners`."""
+    count = int(max(surface.normal_corners.max() + 1, len(vertices) if surface.shading is None else 0))
+    return _normals(vertices, surface.triangles, surface.normal_faces, count)
+
+
+def _normals(vertices: FloatArray, faces: IntArray, normal_faces: IntArray, count: int) -> FloatArray:
+    """Means (count, 3) of the normals of faces (F, 3), of those whose corners have one number there, (F, 3)."""
     x, corners = components(vertices), np.ascontiguousarray(faces.T)
     a, b, c = (x.take(corner, axis=1) for corner in corners)
-    by_face = cross(b - a, c - a)
-    normals = np.empty((len(vertices), 3))
+    by_face, into = cross(b - a, c - a), normal_faces.T.ravel()
+    normals = np.empty((count, 3))
     for axis, normal in enumerate(by_face):
-        normals[:, axis] = np.bincount(corners.ravel(), np.tile(normal, 3), minlength=len(vertices))
+        normals[:, axis] = np.bincount(into, np.tile(normal, 3), minlength=count)
     length = np.sqrt(dot(normals.T, normals.T))
     # A vertex whose faces cancel out has no normal, but the format insists on a unit vector.
     normals[length == 0] = 0.0, 0.0, 1.0
     normals /= np.where(length > 0, length, 1)[:, None]
     return normals
+
+
+def picture_type(data: bytes) -> str:
+    """The media type of a picture, which is PNG or JPEG."""
+    return "image/png" if data.startswith(b"\x89PNG") else "image/jpeg"
+
+
+def _material(material: Material, pictures: dict[str | None, int]) -> dict[str, Any]:
+    look: dict[str, Any] = {
+        "baseColorFactor": [*material.color],
+        "metallicFactor": material.metallic,
+        "roughnessFactor": material.roughness,
+    }
+    if material.texture is not None:
+        look["baseColorTexture"] = {"index": pictures[material.texture]}
+    found: dict[str, Any] = {"name": material.name, "doubleSided": True, "pbrMetallicRoughness": look}
+    return found | ({"alphaMode": "BLEND"} if material.color[3] < 1 else {})
 
 
 class Document:
@@ -57,67 +86,128 @@ class Document:
     Args:
         vertices: (V, 3) positions at rest, in any unit.
         faces: (F, 3).
-        name: of the mesh and its node.
-        colouring: of the vertices; its legend goes into the mesh's extras.
+        name: of the mesh and its node, where the surface has none.
+        colouring: of the vertices, instead of materials; its legend goes into the mesh's extras.
+        surface: of the mesh. Vertices that have several texture coordinates or normals are there for each of them; the
+            attribute _VERTEX numbers them then.
+
+    Attributes:
+        rows: (V',) the vertex that each vertex of the document is.
     """
 
     def __init__(
-        self, vertices: FloatArray, faces: IntArray, name: str = "shape", colouring: Colouring | None = None
+        self,
+        vertices: FloatArray,
+        faces: IntArray,
+        name: str = "shape",
+        colouring: Colouring | None = None,
+        surface: Surface | None = None,
     ) -> None:
         self._chunks: list[bytes] = []
+        self._size = 0
         self.accessors: list[dict[str, Any]] = []
         self.views: list[dict[str, Any]] = []
-        self.primitive: dict[str, Any] = {
-            "attributes": {
-                "POSITION": self.add(vertices, bounds=True, target=ARRAY_BUFFER),
-                "NORMAL": self.add(vertex_normals(vertices, faces), target=ARRAY_BUFFER),
-            },
-            "indices": self.add(faces.ravel(), target=ELEMENT_ARRAY_BUFFER),
-            "material": 0,
+        self._faces, self._surface = faces, surface
+        self.rows = np.arange(len(vertices)) if surface is None else surface.split.vertex
+        attributes = {
+            "POSITION": self.add(vertices[self.rows], bounds=True, target=ARRAY_BUFFER),
+            "NORMAL": self.add(self.normals(vertices), target=ARRAY_BUFFER),
         }
-        self.mesh: dict[str, Any] = {"name": name, "primitives": [self.primitive]}
+        #: What all primitives have; there is one for each material.
+        self.primitive: dict[str, Any] = {"attributes": attributes}
+        self.mesh: dict[str, Any] = {"name": name}
+        colors = colouring.linear if colouring else None
         if colouring:
-            self.primitive["attributes"]["COLOR_0"] = self.add(colouring.linear, target=ARRAY_BUFFER)
             self.mesh["extras"] = {"color": colouring.legend}
+        elif surface and surface.colors is not None:
+            colors = linear(surface.colors)
+        if surface:
+            if surface.split.uv is not None:
+                # From the upper left.
+                uv = surface.split.uv * [1, -1] + [0, 1]
+                attributes["TEXCOORD_0"] = self.add(uv, target=ARRAY_BUFFER)
+            if len(self.rows) > len(vertices):
+                # As real numbers: integers of that size are not allowed here (3.7.2.1).
+                attributes["_VERTEX"] = self.add(self.rows.astype(np.float32), target=ARRAY_BUFFER)
+            if surface.objects:
+                self.mesh["name"] = surface.objects.names[0]
+        if colors is not None:
+            attributes["COLOR_0"] = self.add(colors[self.rows], target=ARRAY_BUFFER)
         self.tree: dict[str, Any] = {
             "asset": {"version": "2.0", "generator": "shapespace"},
             "scene": 0,
             "scenes": [{"nodes": [0]}],
-            "nodes": [{"name": name, "mesh": 0}],
-            "meshes": [self.mesh],
-            "materials": [WHITE if colouring else MATERIAL],
+            "nodes": [{"name": self.mesh["name"], "mesh": 0}],
         }
+        plain = MATERIAL if colors is None else WHITE
+        triangles = faces if surface is None else surface.split.faces
+        if surface is None or colouring or surface.material_of is None:
+            self._parts = [{"indices": self._indices(triangles), "material": 0}]
+            self.tree["materials"] = [plain]
+        else:
+            of = surface.material_of[surface.triangle_polygons]
+            used = np.unique(of).tolist()
+            self._parts = [{"indices": self._indices(triangles[of == k]), "material": n} for n, k in enumerate(used)]
+            pictures = self._pictures(surface, {surface.materials[k].texture for k in used if k != NONE})
+            self.tree["materials"] = [plain if k == NONE else _material(surface.materials[k], pictures) for k in used]
+
+    def normals(self, vertices: FloatArray) -> FloatArray:
+        """(V', 3) normals of a shape (V, 3) at the document's vertices."""
+        if self._surface is None:
+            return vertex_normals(vertices, self._faces)
+        return surface_normals(vertices, self._surface)[self._surface.split.normal]
+
+    def _indices(self, faces: IntArray) -> int:
+        return self.add(faces.ravel(), target=ELEMENT_ARRAY_BUFFER)
+
+    def _pictures(self, surface: Surface, names: set[str | None]) -> dict[str | None, int]:
+        """Numbers of the textures by name."""
+        found = sorted(name for name in names if name is not None)
+        if found:
+            self.tree["images"] = [
+                {"name": name, "mimeType": picture_type(surface.textures[name]), "bufferView": self._view(data)}
+                for name in found
+                for data in [surface.textures[name]]
+            ]
+            self.tree["textures"] = [{"source": k} for k in range(len(found))]
+        return {name: k for k, name in enumerate(found)}
+
+    def _view(self, data: bytes, target: int | None = None) -> int:
+        """Append bytes and return the number of their view."""
+        view = {"buffer": 0, "byteOffset": self._size, "byteLength": len(data)}
+        if target is not None:
+            view["target"] = target
+        self.views.append(view)
+        # Pictures are of any length, and arrays have components of four bytes.
+        self._chunks += [data, bytes(-len(data) % 4)]
+        self._size += len(data) + -len(data) % 4
+        return len(self.views) - 1
 
     def add(self, array: NDArray, *, bounds: bool = False, target: int | None = None) -> int:
-        """Append an array, scalars or 3-vectors, and return the index of its accessor."""
+        """Append an array, scalars or vectors, and return the index of its accessor."""
         indices = np.issubdtype(array.dtype, np.integer)
         data = np.ascontiguousarray(array, dtype="<u4" if indices else "<f4")
         accessor: dict[str, Any] = {
-            "bufferView": len(self.views),
+            "bufferView": self._view(data.tobytes(), target),
             "componentType": UNSIGNED_INT if indices else FLOAT,
             "count": len(data),
-            "type": "SCALAR" if data.ndim == 1 else "VEC3",
+            "type": "SCALAR" if data.ndim == 1 else f"VEC{data.shape[1]}",
         }
         if bounds:
             # As float32, or rounding could leave a position outside its own bounds.
             accessor["min"], accessor["max"] = (
                 np.atleast_1d(extreme(data, axis=0)).astype(float).tolist() for extreme in (np.min, np.max)
             )
-        view = {"buffer": 0, "byteOffset": sum(map(len, self._chunks)), "byteLength": data.nbytes}
-        if target is not None:
-            view["target"] = target
-        self.views.append(view)
         self.accessors.append(accessor)
-        self._chunks.append(data.tobytes())
         return len(self.accessors) - 1
 
     def _json(self, buffer: dict[str, Any]) -> bytes:
-        tree = {**self.tree, "accessors": self.accessors, "bufferViews": self.views, "buffers": [buffer]}
-        return json.dumps(tree, separators=(",", ":")).encode()
+        mesh = {**self.mesh, "primitives": [{**self.primitive, **part} for part in self._parts]}
+        lists = {"meshes": [mesh], "accessors": self.accessors, "bufferViews": self.views, "buffers": [buffer]}
+        return json.dumps({**self.tree, **lists}, separators=(",", ":")).encode()
 
     def glb(self) -> bytes:
         """The document as one binary file."""
-        # Every array has components of four bytes, so the buffer needs no padding.
         binary = b"".join(self._chunks)
         text = self._json({"byteLength": len(binary)})
         text += b" " * (-len(text) % 4)

@@ -44,6 +44,11 @@ def count_bytes(data: memoryview, *characters: bytes) -> int:
     return sum(int(np.count_nonzero(piece == character[0])) for piece in pieces for character in characters)
 
 
+def label(text: object) -> str | None:
+    """A name from a file, on one line and not too long; None where nothing of it can be shown."""
+    return clipped("".join(c if c.isprintable() else " " for c in str(text)[:1000])) or None
+
+
 def clipped(text: object, most: int = 100) -> str:
     """Text from a file as messages quote it: on one line, and at most so many characters of it."""
     line = " ".join(str(text)[:1000].split())

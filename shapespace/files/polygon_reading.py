@@ -30,7 +30,7 @@ _LINES_OF_EACH, _LINES_BESIDE = 16, 100_000
 _LINE = re.compile(rb"[^\r\n]++")
 
 
-class _Lines:
+class Lines:
     """The lines of a text that are neither empty nor a remark; where one can't be understood, the error names it.
 
     Raises:
@@ -100,7 +100,7 @@ class _Triangles:
 def read_obj(data: memoryview, limits: Limits) -> tuple[FloatArray, IntArray]:
     """Vertices (V, 3) and faces (F, 3) of an OBJ file; everything else in it is left out."""
     coordinates, triangles = array("d"), _Triangles(limits)
-    with _Lines(data, limits) as lines:
+    with Lines(data, limits) as lines:
         for line in lines:
             keyword, *values = line.split(None, 1)
             if keyword == b"v":
@@ -122,7 +122,7 @@ def _point(values: bytes) -> tuple[float, float, float]:
 def read_off(data: memoryview, limits: Limits) -> tuple[FloatArray, IntArray]:
     """Vertices (V, 3) and faces (F, 3) of an OFF file, colours and normals left out."""
     coordinates, triangles = array("d"), _Triangles(limits)
-    with _Lines(data, limits) as lines:
+    with Lines(data, limits) as lines:
         keyword, *counts = lines.next().split()
         if not re.fullmatch(rb"(ST)?C?N?OFF", keyword):
             raise ValueError("another kind of file")
@@ -142,7 +142,7 @@ def read_off(data: memoryview, limits: Limits) -> tuple[FloatArray, IntArray]:
 def read_xyz(data: memoryview, limits: Limits) -> tuple[FloatArray, IntArray]:
     """Points (N, 3) of a text with a point on each line, and no faces; normals or colours behind them are left out."""
     coordinates = array("d")
-    with _Lines(data, limits) as lines:
+    with Lines(data, limits) as lines:
         for line in lines:
             coordinates.extend(_point(line.replace(b",", b" ")))
             limits.check(len(coordinates) // 3, 0)
@@ -176,7 +176,7 @@ def read_stl(data: memoryview, limits: Limits) -> tuple[FloatArray, IntArray]:
 
 def _ascii_stl(data: memoryview, limits: Limits) -> FloatArray:
     coordinates, solids = array("d"), 0
-    with _Lines(data, limits) as lines:
+    with Lines(data, limits) as lines:
         for line in lines:
             keyword = line[:8].lower()
             if keyword.startswith(b"vertex"):
@@ -211,7 +211,7 @@ class _Property:
 
 
 @dataclass(frozen=True)
-class _Element:
+class Element:
     """A kind of rows in a PLY file, and how many there are."""
 
     name: str
@@ -259,8 +259,8 @@ class _Element:
 
 def read_ply(data: memoryview, limits: Limits) -> tuple[FloatArray, IntArray]:
     """Vertices (V, 3) and faces (F, 3) of a PLY file, ASCII or binary; its other elements are left out."""
-    text, elements, body = _ply_head(data)
-    table = _TextTable(body, limits) if text else _BinaryTable(body, limits)
+    text, elements, body = ply_head(data)
+    table = TextTable(body, limits) if text else BinaryTable(body, limits)
     vertices, faces = np.zeros((0, 3)), np.zeros((0, 3), np.int64)
     # Nothing behind these two has to be understood.
     wanted = {element.name for element in elements if element.rows} & {"vertex", "face"}
@@ -269,7 +269,7 @@ def read_ply(data: memoryview, limits: Limits) -> tuple[FloatArray, IntArray]:
             break
         if element.name == "vertex":
             limits.check(element.rows, 0)
-            vertices = table.points(element)
+            vertices = table.columns(element, element.coordinates)
         elif element.name == "face" and element.rows:
             limits.check(0, element.rows)
             faces = table.polygons(element)
@@ -279,19 +279,19 @@ def read_ply(data: memoryview, limits: Limits) -> tuple[FloatArray, IntArray]:
     return vertices, faces
 
 
-def _ply_head(data: memoryview) -> tuple[bool, list[_Element], memoryview]:
+def ply_head(data: memoryview) -> tuple[bool, list[Element], memoryview]:
     """Whether a PLY file is text, its elements, and what comes behind its head."""
     head = bytes(data[:LONGEST_HEAD])
     end = re.search(rb"^end_header[ \t]*\r?\n", head, re.MULTILINE)
     if not head.startswith(b"ply") or not end:
         raise ValueError("damaged, or another kind of file")
-    order, elements = None, list[_Element]()
+    order, elements = None, list[Element]()
     for line in head[: end.start()].splitlines():
         match line.split():
             case [b"format", kind, _]:
                 order = _PLY_ORDERS[kind]
             case [b"element", name, rows]:
-                elements.append(_Element(name.decode("latin-1"), int(rows), []))
+                elements.append(Element(name.decode("latin-1"), int(rows), []))
             case [b"property", b"list", length, kind, name]:
                 elements[-1].properties.append(_property(name, kind, length, order))
             case [b"property", kind, name]:
@@ -311,44 +311,56 @@ def _property(name: bytes, kind: bytes, length: bytes | None, order: str | None)
     return _Property(name.decode("latin-1"), types[0], types[1] if length is not None else None)
 
 
-class _TextTable:
+class TextTable:
     """The rows of an ASCII PLY file, one on a line."""
 
     def __init__(self, data: memoryview, limits: Limits) -> None:
-        self._limits, self._lines = limits, _Lines(data, limits)
+        self._limits, self._lines = limits, Lines(data, limits)
 
-    def skip(self, element: _Element) -> None:
+    def skip(self, element: Element) -> None:
+        """Go behind the rows of an element."""
         with self._lines:
             for _ in range(element.rows):
                 self._lines.next()
 
-    def points(self, element: _Element) -> FloatArray:
-        x, y, z = element.coordinates
-        coordinates = array("d")
+    def columns(self, element: Element, which: Sequence[int]) -> FloatArray:
+        """(rows, k) some properties of an element without lists."""
+        values = array("d")
         with self._lines:
             for _ in range(element.rows):
                 row = self._lines.next().split()
-                coordinates.extend((float(row[x]), float(row[y]), float(row[z])))
-        return np.array(coordinates, np.float64).reshape(-1, 3)
+                values.extend(float(row[k]) for k in which)
+        return np.array(values, np.float64).reshape(-1, len(which))
 
-    def polygons(self, element: _Element) -> IntArray:
-        before, triangles = element.properties[: element.corners], _Triangles(self._limits)
+    def polygons(self, element: Element) -> IntArray:
+        """(F, 3) the polygons that the rows of an element list, as triangles."""
+        triangles = _Triangles(self._limits)
         with self._lines:
-            for _ in range(element.rows):
-                row, start = self._lines.next().split(), 0
-                for p in before:
-                    start += 1 if p.length is None else 1 + int(row[start])
-                triangles.add([int(value) for value in _exactly(int(row[start]), row[start + 1 :])])
+            for (corners,) in self.lists(element, [element.corners]):
+                triangles.add([int(value) for value in corners])
         return triangles.all()
 
+    def lists(self, element: Element, which: Sequence[int]) -> Iterator[list[Sequence[bytes]]]:
+        """Some lists of each row."""
+        for _ in range(element.rows):
+            row, start, found = self._lines.next().split(), 0, dict[int, Sequence[bytes]]()
+            for k, p in enumerate(element.properties[: max(which) + 1]):
+                if p.length is None:
+                    start += 1
+                    continue
+                if k in which:
+                    found[k] = _exactly(int(row[start]), row[start + 1 :])
+                start += 1 + int(row[start])
+            yield [found[k] for k in which]
 
-class _BinaryTable:
+
+class BinaryTable:
     """The rows of a binary PLY file, one behind the other."""
 
     def __init__(self, data: memoryview, limits: Limits) -> None:
         self._data, self._limits, self._place = data, limits, 0
 
-    def _alike(self, element: _Element, lengths: Sequence[int] = ()) -> NDArray:
+    def _alike(self, element: Element, lengths: Sequence[int] = ()) -> NDArray:
         """The rows of an element where they lie, if all have lists of these lengths; fields by number of property."""
         fields: list[tuple] = []
         left = iter(lengths)
@@ -362,18 +374,20 @@ class _BinaryTable:
             raise ValueError(f"it says {element.rows} rows of {clipped(element.name)}, and ends before")
         return np.ndarray((element.rows,), row, self._data, self._place)
 
-    def skip(self, element: _Element) -> None:
+    def skip(self, element: Element) -> None:
+        """Go behind the rows of an element."""
         if element.lists:
             raise ValueError(f"its {clipped(element.name)} rows, before the faces, have lists")
         self._place += self._alike(element).nbytes
 
-    def points(self, element: _Element) -> FloatArray:
-        axes = element.coordinates
+    def columns(self, element: Element, which: Sequence[int]) -> FloatArray:
+        """(rows, k) some properties of an element without lists."""
         rows = self._alike(element)
         self._place += rows.nbytes
-        return np.hstack([rows[f"{k}"] for k in axes]).astype(np.float64)
+        return np.hstack([rows[f"{k}"] for k in which]).astype(np.float64)
 
-    def polygons(self, element: _Element) -> IntArray:
+    def polygons(self, element: Element) -> IntArray:
+        """(F, 3) the polygons that the rows of an element list, as triangles."""
         corners = element.corners
         which = element.lists.index(corners)
         spans, _ = self._row(element)
@@ -386,15 +400,20 @@ class _BinaryTable:
         if alike and spans[which][1] == 3:
             self._place += rows.nbytes
             return rows[f"{corners}"].astype(np.int64)
-        kind, triangles = element.properties[corners].type, _Triangles(self._limits)
-        for _ in range(element.rows):
-            spans, self._place = self._row(element)
-            start, length = spans[which]
-            self._limits.check(0, length - 2)
-            triangles.add(np.ndarray((length,), kind, self._data, start).tolist())
+        triangles = _Triangles(self._limits)
+        for (polygon,) in self.lists(element, [corners]):
+            self._limits.check(0, len(polygon) - 2)
+            triangles.add(polygon.tolist())
         return triangles.all()
 
-    def _row(self, element: _Element) -> tuple[list[tuple[int, int]], int]:
+    def lists(self, element: Element, which: Sequence[int]) -> Iterator[list[NDArray]]:
+        """Some lists of each row."""
+        places = [(element.lists.index(k), element.properties[k].type) for k in which]
+        for _ in range(element.rows):
+            spans, self._place = self._row(element)
+            yield [np.ndarray((spans[place][1],), kind, self._data, spans[place][0]) for place, kind in places]
+
+    def _row(self, element: Element) -> tuple[list[tuple[int, int]], int]:
         """Where the lists of the next row begin and how many entries each has, and where the row ends."""
         spans, place = [], self._place
         for gap, kind, size in element.steps:

@@ -12,7 +12,9 @@ from numpy.typing import NDArray
 
 from shapespace.arrays import IntArray
 from shapespace.files.animated_gltf import FRAMES_PER_SECOND
-from shapespace.files.gltf_writing import vertex_normals
+from shapespace.files.gltf_writing import surface_normals
+from shapespace.files.surfaces.usd import add_surface
+from shapespace.mesh.surface import Surface
 
 _PIECE, _FRAMES_AT_ONCE = 2**20, 32
 #: The colour of the glTF writer's material.
@@ -24,8 +26,8 @@ def usd_installed() -> bool:
     return find_spec("pxr") is not None
 
 
-def animated_usd(frames: NDArray[np.floating], faces: IntArray) -> Iterator[bytes]:
-    """Encode shapes (n, V, 3) as a binary USD layer, in pieces.
+def animated_usd(frames: NDArray[np.floating], faces: IntArray, surface: Surface | None = None) -> Iterator[bytes]:
+    """Encode shapes (n, V, 3), with the polygons of their surface where there is one, as a binary USD layer, in pieces.
 
     Time code k shows frame k, y up and in metres as glTF is. Points are float32. Normals
     at the vertices and extents are sampled with them.
@@ -51,13 +53,16 @@ def animated_usd(frames: NDArray[np.floating], faces: IntArray) -> Iterator[byte
         stage.SetEndTimeCode(len(frames) - 1)
         mesh = UsdGeom.Mesh.Define(stage, "/animation")
         stage.SetDefaultPrim(mesh.GetPrim())
-        mesh.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(len(faces), 3, np.int32)))
-        mesh.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(faces.astype(np.int32).ravel()))
+        shown = surface or Surface.of_triangles(faces)
+        mesh.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(shown.sizes.astype(np.int32)))
+        mesh.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(shown.corners.astype(np.int32)))
         mesh.CreateOrientationAttr(UsdGeom.Tokens.rightHanded)
         mesh.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
         mesh.CreateDoubleSidedAttr(True)
         mesh.CreateDisplayColorAttr([Gf.Vec3f(*_COLOUR)])
-        mesh.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
+        apart = shown.shading is not None
+        mesh.SetNormalsInterpolation(UsdGeom.Tokens.faceVarying if apart else UsdGeom.Tokens.vertex)
+        add_surface(stage, mesh, shown)
         points, normals, extent = mesh.CreatePointsAttr(), mesh.CreateNormalsAttr(), mesh.CreateExtentAttr()
         frames = frames.astype(np.float32, copy=False)
         for start in range(0, len(frames), _FRAMES_AT_ONCE):
@@ -65,7 +70,8 @@ def animated_usd(frames: NDArray[np.floating], faces: IntArray) -> Iterator[byte
             with Sdf.ChangeBlock():
                 for k, frame in enumerate(frames[start : start + _FRAMES_AT_ONCE], start):
                     box = np.stack([frame.min(axis=0), frame.max(axis=0)])
-                    around = vertex_normals(frame.astype(np.float64), faces).astype(np.float32)
+                    around = surface_normals(frame.astype(np.float64), shown).astype(np.float32)
+                    around = around[shown.normal_corners] if apart else around
                     for attribute, rows in ((points, frame), (normals, around), (extent, box)):
                         attribute.Set(Vt.Vec3fArray.FromNumpy(rows), k)
             try:

@@ -21,6 +21,7 @@ from shapespace.coordinates.integrability import Integrability
 from shapespace.coordinates.nric import nric
 from shapespace.coordinates.reconstruction import Reconstructor
 from shapespace.mesh.rigid_motion import align
+from shapespace.mesh.surface import Surface
 from shapespace.mesh.triangle_mesh import TriangleMesh
 from shapespace.model.latent_space import Bounds, Codes, Distribution, LatentSpace, NotFiniteError, TrainingCodes
 from shapespace.model.networks import PATIENCE, NetworkError, Session, TerminatedError
@@ -144,6 +145,7 @@ class Decoder:
         self.latents = LatentSpace(manifest)
         self.reference, self.fine = bundle.reference, bundle.fine
         self.modes, self.file_vertices = bundle.modes, bundle.file_vertices
+        self._surface = bundle.surface
         codes = bundle.training_codes
         self._training = None if codes is None else TrainingCodes(self.latents, codes)
         #: What codes are like: those of the training shapes, or where there are none any inside the bounds.
@@ -174,6 +176,10 @@ class Decoder:
         """The reference, normalised, as the fine or the coarse mesh; every shape has its faces."""
         fine = self.finer(choice)
         return fine.reference if fine else self.reference
+
+    def surface(self, choice: MeshChoice) -> Surface | None:
+        """What the user's file had on that mesh beside triangles; None for the coarse one of two."""
+        return self._surface if self.fine is None or self.finer(choice) else None
 
     def finer(self, choice: MeshChoice) -> FineMesh | None:
         """The finer mesh, where the model has one and it is the choice; otherwise None."""

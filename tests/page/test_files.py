@@ -7,6 +7,7 @@ import json
 import shlex
 import zipfile
 from pathlib import Path
+from zipfile import ZipFile
 
 import httpx
 import numpy as np
@@ -27,7 +28,7 @@ def test_a_download_in_every_format(studio: Studio, expected: np.ndarray, tmp_pa
     move(studio)
     studio.tab("Files")
     formats = studio["#format option"].all_inner_texts()
-    assert formats == [*MESH_FORMATS, "json"]
+    assert formats == [*MESH_FORMATS, "zip", "json"]
     for format in formats:
         studio["#format"].select_option(format)
         with studio.page.expect_download() as download:
@@ -35,6 +36,8 @@ def test_a_download_in_every_format(studio: Studio, expected: np.ndarray, tmp_pa
         assert download.value.suggested_filename == f"with-fine.{format}"
         path = tmp_path / download.value.suggested_filename
         download.value.save_as(path)
+        if format == "zip":
+            path = Path(ZipFile(path).extract("shape.obj", tmp_path))
         if format == "json":
             vertices = np.array(json.loads(path.read_text())["vertices"])
         else:

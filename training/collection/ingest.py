@@ -37,6 +37,8 @@ WELD_TOLERANCE = 1e-6
 #: Vertices of borders that are closer than this share of it were probably meant to be joined.
 SEAM_TOLERANCE = 1e-4
 
+#: Files that lie beside meshes: buffers of glTF, materials of OBJ, and textures.
+_BESIDE = ("bin", "mtl", "png", "jpg", "jpeg")
 #: A collection with more bytes of vertices is kept in a temporary file, not in memory.
 IN_MEMORY = 2**28
 
@@ -210,9 +212,8 @@ def data_files(path: Path) -> list[Path]:
     """The files that a collection is read from, sorted; of a path that isn't there none."""
     if not path.is_dir():
         return [path] if path.exists() else []
-    # Buffers lie beside glTF files.
     return sorted(
-        p for p in path.iterdir() if _extension(p) in (*READ_FORMATS, "bin") and p.is_file() and p.name[0] != "."
+        p for p in path.iterdir() if _extension(p) in (*READ_FORMATS, *_BESIDE) and p.is_file() and p.name[0] != "."
     )
 
 

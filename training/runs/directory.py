@@ -106,6 +106,16 @@ class RunDirectory:
         """Notes and warnings on the collection, and what the coarse mesh is like."""
         return self._json("ingest")
 
+    @property
+    def surface(self) -> NpzFile:
+        """What the reference's file had beside triangles: bundle.surface.surface_arrays, and ``textures`` as bytes."""
+        return self._npz("surface")
+
+    @property
+    def surface_names(self) -> JsonFile:
+        """The names that belong to it: bundle.schema.SurfaceEntry."""
+        return self._json("surface")
+
     # mean, modes, factors
 
     @property

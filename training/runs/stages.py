@@ -47,7 +47,14 @@ STAGES: dict[str, Stage] = {
     "ingest": Stage(
         version=1,
         settings=lambda config: [config.collection],
-        results=lambda run: [run.reference.path, run.prolongation.path, run.shapes.path, run.ingest.path],
+        results=lambda run: [
+            run.reference.path,
+            run.prolongation.path,
+            run.shapes.path,
+            run.ingest.path,
+            run.surface.path,
+            run.surface_names.path,
+        ],
     ),
     "mean": Stage(
         version=1,

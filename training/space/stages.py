@@ -14,16 +14,20 @@ import numpy as np
 
 import shapespace
 from shapespace.bundle.geometry import FineMesh, Geometry
+from shapespace.bundle.schema import SurfaceEntry
+from shapespace.bundle.surface import from_entry, surface_arrays, surface_entry
 from shapespace.coordinates.nric import WeightedNorm
 from shapespace.mesh.coarsening import coarsen
 from shapespace.mesh.prolongation import Prolongation
 from shapespace.mesh.rigid_motion import align
+from shapespace.mesh.surface import Surface
 from shapespace.mesh.triangle_mesh import TriangleMesh, face_areas
 from shapespace.shell.energy import Material
 from shapespace.shell.mean import Mean, elastic_mean
 from shapespace.shell.space import ShellSpace
 from shapespace.solve.cholesky import NotPositiveDefiniteError
 from shapespace.solve.outcome import Status
+from shapespace.training.collection.appearance import kept, reference_surface, texture_bytes
 from shapespace.training.collection.generators import MESHES
 from shapespace.training.collection.ingest import MeshCollection, normalised, read_collection
 from shapespace.training.runs.config import Config, ConfigError
@@ -107,6 +111,12 @@ def ingest(run: RunDirectory, config: Config, accepted: Sequence[str] = ()) -> d
     places = meshes.places or [(name, 0) for name in meshes.names]
     files, first = map(np.array, zip(*places, strict=True))
     run.shapes.write(names=np.array(meshes.names), vertices=vertices, files=files, first=first)
+    surface, left_out = reference_surface(settings.data, meshes, chosen)
+    facts["warnings"] += left_out
+    if surface:
+        facts["notes"].append(kept(surface))
+        run.surface.write(**surface_arrays(surface), **texture_bytes(surface))
+        run.surface_names.write(surface_entry(surface).model_dump())
     run.ingest.write(facts)
     return facts
 
@@ -317,4 +327,12 @@ def geometry(run: RunDirectory) -> Geometry:
         modes=modes["vertices"],
         training_codes=modes["coefficients"],
         file_vertices=reference.get("file_vertices"),
+        surface=_surface(run),
     )
+
+
+def _surface(run: RunDirectory) -> Surface | None:
+    if not run.surface_names.exists():
+        return None
+    entry, arrays = SurfaceEntry.model_validate(run.surface_names.read()), run.surface.read()
+    return from_entry(entry, arrays, {name: arrays[name].tobytes() for name in entry.textures})

@@ -9,6 +9,7 @@ from typing import Annotated
 from fastapi import APIRouter, Depends, Path, Request, Response
 from fastapi.responses import StreamingResponse
 
+from shapespace.mesh.surface import Topology
 from shapespace.model.decoder import Quality
 from shapespace.service.http.caching import cache_headers, entity_tag, not_modified
 from shapespace.service.http.dependencies import (
@@ -24,6 +25,7 @@ from shapespace.service.http.description import binary, mesh_answers, problems
 from shapespace.service.http.messages.bodies import JSONBody
 from shapespace.service.http.messages.color_query import NO_COLOR, ColorQuery, choose_mesh
 from shapespace.service.http.messages.schemas import InterpolationAnswer
+from shapespace.service.http.messages.topology_query import TopologyQuery, choose_topology
 from shapespace.service.http.negotiation import choose
 from shapespace.service.http.problems import DOMAIN_ERRORS, domain_problem
 from shapespace.service.http.responses import draft_option, file_headers, shape_response, written_response
@@ -36,7 +38,13 @@ from shapespace.service.use_cases.sequence import (
     sequence_file,
     sequence_lines,
 )
-from shapespace.service.use_cases.sequence_formats import JSON_LINES, MEDIA_TYPES, UNAVAILABLE, sequence_types
+from shapespace.service.use_cases.sequence_formats import (
+    JSON_LINES,
+    MEDIA_TYPES,
+    SEQUENCE_FORMATS,
+    UNAVAILABLE,
+    sequence_types,
+)
 from shapespace.service.use_cases.shape_formats import SHAPE_FORMATS
 
 router = APIRouter(prefix="/v1", tags=["interpolations"])
@@ -76,6 +84,7 @@ async def get_interpolation(
     caller: CallerDependency,
     id: Id,
     quality: QualityQuery = Quality.FULL,
+    topology: TopologyQuery = None,
     format: Annotated[Format, one_of([*MEDIA_TYPES, "obj"])] = None,
 ) -> Response:
     """The animation: GLB, arrays, a zip of OBJ files, a point cache, USD, or JSON lines as they get ready."""
@@ -83,14 +92,16 @@ async def get_interpolation(
     accept = request.headers.get("accept")
     chosen = choose(sequence_types(), "zip" if format == "obj" else format, accept, UNAVAILABLE)
     animation, model = find_interpolation(service.repository, id, service.settings.max_frames)
-    tag = entity_tag("animation", id, chosen, *draft_option(quality))
+    polygons = chosen in SEQUENCE_FORMATS and SEQUENCE_FORMATS[chosen].polygons
+    faces = choose_topology(topology, chosen, model, animation.mesh, polygons=polygons)
+    tag = entity_tag("animation", id, chosen, *draft_option(quality), *([faces] if faces is Topology.TRIANGLES else []))
     if answer := not_modified(request, tag):
         return answer
     if chosen == "jsonl":
         lines = sequence_lines(service.workers, caller, model, animation, quality)
         first = await anext(lines)  # what goes wrong up to here still has a status of its own
         return StreamingResponse(_resume(request, first, lines), headers=cache_headers(tag), media_type=JSON_LINES)
-    written = await sequence_file(service.workers, caller, model, animation, quality, chosen)
+    written = await sequence_file(service.workers, caller, model, animation, quality, chosen, faces)
     diagnostics = {**(written.diagnostics or {}), **written.facts}
     headers = cache_headers(tag) | file_headers(diagnostics, f"{model.manifest.name}-animation.{chosen}")
     return written_response(service, written, headers, MEDIA_TYPES[chosen])
@@ -109,12 +120,16 @@ async def get_frame(
     k: Annotated[int, Path(description="Number of the frame, from 0.", json_schema_extra={"minimum": 0})],
     quality: QualityQuery = Quality.FULL,
     color: ColorQuery = NO_COLOR,
+    topology: TopologyQuery = None,
     format: Annotated[Format, one_of(SHAPE_FORMATS)] = None,
 ) -> Response:
     """One frame of an animation in any mesh format."""
     chosen = choose_mesh(format, request, color)
     animation, model = find_interpolation(service.repository, id, service.settings.max_frames)
-    wanted = WantedShape(frame_code(model, animation, k), animation.mesh, chosen, quality, color.on(model))
+    faces = choose_topology(topology, chosen, model, animation.mesh, polygons=SHAPE_FORMATS[chosen].polygons)
+    wanted = WantedShape(
+        frame_code(model, animation, k), animation.mesh, chosen, quality, color.on(model), topology=faces
+    )
     return await shape_response(service, request, caller, model, wanted)
 
 

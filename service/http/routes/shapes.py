@@ -30,6 +30,7 @@ from shapespace.service.http.messages.schemas import (
     VerticesAnswer,
     VerticesRequest,
 )
+from shapespace.service.http.messages.topology_query import TopologyQuery, choose_topology
 from shapespace.service.http.negotiation import choose
 from shapespace.service.http.responses import file_headers, shape_response, written_response
 from shapespace.service.use_cases.batch import require_count
@@ -62,12 +63,14 @@ async def get_mesh(
     quality: QualityQuery = Quality.FULL,
     color: ColorQuery = NO_COLOR,
     place: PlaceQuery = None,
+    topology: TopologyQuery = None,
     format: Annotated[Format, one_of(SHAPE_FORMATS)] = None,
 ) -> Response:
     """The shape of a code as a mesh file, for a link or a browser."""
     chosen = choose_mesh(format, request, color)
     code = None if latent is None else model.latents.code(numbers(latent, "latent"), bounds)
-    wanted = WantedShape(code, mesh, chosen, quality, color.on(model, bounds), place)
+    faces = choose_topology(topology, chosen, model, mesh, polygons=SHAPE_FORMATS[chosen].polygons)
+    wanted = WantedShape(code, mesh, chosen, quality, color.on(model, bounds), place, faces)
     return await shape_response(service, request, caller, model, wanted)
 
 
@@ -86,13 +89,16 @@ async def post_mesh(
     quality: QualityOfBody = None,
     color: ColorQuery = NO_COLOR,
     place: PlaceQuery = None,
+    topology: TopologyQuery = None,
     format: Annotated[Format, one_of(SHAPE_FORMATS)] = None,
 ) -> Response:
     """The shape of a code as a mesh file."""
     chosen = choose_mesh(format, request, color)
     code = model.latents.code(body.latent, body.bounds)
     colours = color.on(model, body.bounds, body.covariance)
-    wanted = WantedShape(code, mesh or body.mesh, chosen, quality or body.quality, colours, place)
+    which = mesh or body.mesh
+    faces = choose_topology(topology, chosen, model, which, polygons=SHAPE_FORMATS[chosen].polygons)
+    wanted = WantedShape(code, which, chosen, quality or body.quality, colours, place, faces)
     return await shape_response(service, request, caller, model, wanted)
 
 

@@ -6,7 +6,7 @@ import { report, reporting, say } from "./messages.js";
 import { fixedBy } from "./space.js";
 
 /** What the server offers for one shape. */
-export const SHAPE_FORMATS = ["glb", "gltf", "obj", "ply", "stl", "npz", "json"];
+export const SHAPE_FORMATS = ["glb", "gltf", "obj", "ply", "stl", "npz", "zip", "json"];
 
 const rounded = (code) => code.map((value) => Number(value.toFixed(6)));
 

@@ -14,13 +14,13 @@ from pathlib import Path
 import httpx
 import numpy as np
 import pytest
-import trimesh
 from safetensors.numpy import load_file
 
 from shapespace.mesh.rigid_motion import align
 from shapespace.mesh.triangle_mesh import TriangleMesh
 from shapespace.training.runs.stages import STAGES
 from tests.service.conftest import starting
+from tests.surfaces import ball, write_files
 from tests.training.conftest import command
 
 CONFIG = """
@@ -74,9 +74,12 @@ licence = "MIT"
 
 
 def bars(count: int = 8) -> tuple[np.ndarray, np.ndarray]:
-    """A thick bar in some poses, far from the origin and in large units: each end bends by itself."""
-    ball = trimesh.creation.icosphere(3, 1.0)
-    rest = ball.vertices * [300.0, 80.0, 60.0]
+    """A thick bar in some poses, far from the origin and in large units: each end bends by itself.
+
+    Its files have textured quads; the faces here are these as triangles.
+    """
+    sphere, surface = ball()
+    rest = sphere * [300.0, 80.0, 60.0]
     rng = np.random.default_rng(1)
     shapes = []
     for left, right, twist in np.vstack([np.zeros(3), rng.uniform(-0.8, 0.8, (count - 1, 3))]):
@@ -86,17 +89,17 @@ def bars(count: int = 8) -> tuple[np.ndarray, np.ndarray]:
         y, z = np.cos(turn) * y - np.sin(turn) * z, np.sin(turn) * y + np.cos(turn) * z
         x, z = x * np.cos(bend) - z * np.sin(bend), np.abs(x) * np.sin(bend) + z * np.cos(bend)
         shapes.append(np.stack([1000 + x, y, z], axis=1))
-    return np.array(shapes), ball.faces
+    return np.array(shapes), surface.triangles
 
 
 @pytest.fixture(scope="session")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("collection")
     (folder / "meshes").mkdir()
-    vertices, faces = bars()
+    vertices, _ = bars()
     for k, shape in enumerate(vertices):
         path = folder / "meshes" / f"bar{k}.obj"
-        trimesh.Trimesh(shape, faces, process=False).export(path, digits=12)
+        write_files(path, shape, ball()[1])
         path.write_text(path.read_text() + "\nv 1 2 3\n")  # a vertex in no face, as exporters leave them
     (folder / "bars.toml").write_text(CONFIG)
     return folder

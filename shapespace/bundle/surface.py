@@ -1,0 +1,87 @@
+"""A surface as a bundle holds it, and a run: arrays by name, an entry of names, and textures as files."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shapespace.bundle.schema import SURFACE, MaterialEntry, SurfaceEntry
+from shapespace.files.surfaces.textures import ALL, BEGINNINGS, LARGEST
+from shapespace.mesh.surface import Labels, Material, Surface
+from shapespace.mesh.triangle_mesh import MeshError
+
+
+def surface_arrays(surface: Surface) -> dict[str, NDArray]:
+    """The arrays of a surface by the names that `from_entry` reads."""
+    found = {
+        "starts": surface.starts,
+        "corners": surface.corners,
+        "uv": surface.uv,
+        "uv_corners": surface.uv_corners,
+        "shading": surface.shading,
+        "colors": surface.colors,
+        "object_of": surface.objects.of if surface.objects else None,
+        "group_of": surface.groups.of if surface.groups else None,
+        "material_of": surface.material_of,
+    }
+    return {SURFACE + name: array for name, array in found.items() if array is not None}
+
+
+def surface_entry(surface: Surface) -> SurfaceEntry:
+    """What a manifest says of a surface."""
+    return SurfaceEntry(
+        objects=list(surface.objects.names) if surface.objects else [],
+        groups=list(surface.groups.names) if surface.groups else [],
+        materials=[MaterialEntry(**vars(material)) for material in surface.materials],
+        normals=surface.normals,
+    )
+
+
+def from_entry(entry: SurfaceEntry, arrays: Mapping[str, NDArray], textures: Mapping[str, bytes]) -> Surface:
+    """The surface of an entry.
+
+    Raises:
+        MeshError: an array that is missing, or a texture that is none or too large. Whether arrays fit each other and
+            the mesh says `Surface.check`.
+    """
+
+    def whole(name: str) -> NDArray | None:
+        array = arrays.get(SURFACE + name)
+        return None if array is None else array.astype(np.int64)
+
+    def real(name: str) -> NDArray | None:
+        array = arrays.get(SURFACE + name)
+        return None if array is None else array.astype(np.float64)
+
+    def labels(names: list[str], of: NDArray | None, kind: str) -> Labels | None:
+        if bool(names) != (of is not None):
+            raise MeshError(f"names of {kind} and the polygons that have them go together")
+        return None if of is None else Labels(tuple(names), of)
+
+    starts, corners = whole("starts"), whole("corners")
+    if starts is None or corners is None:
+        raise MeshError(f"there is no array {SURFACE}{'starts' if starts is None else 'corners'}")
+    for name in entry.textures:
+        data = textures.get(name, b"")
+        if not data.startswith(BEGINNINGS):
+            raise MeshError(f"{name} is neither PNG nor JPEG")
+        if len(data) > LARGEST:
+            raise MeshError(f"{name} has more than {LARGEST >> 20} MiB")
+    if sum(len(textures[name]) for name in entry.textures) > ALL:
+        raise MeshError(f"textures have more than {ALL >> 20} MiB together")
+    return Surface(
+        starts=starts,
+        corners=corners,
+        uv=real("uv"),
+        uv_corners=whole("uv_corners"),
+        shading=whole("shading"),
+        normals=entry.normals,
+        colors=real("colors"),
+        objects=labels(entry.objects, whole("object_of"), "objects"),
+        groups=labels(entry.groups, whole("group_of"), "groups"),
+        material_of=whole("material_of"),
+        materials=tuple(Material(**vars(material)) for material in entry.materials),
+        textures={name: textures[name] for name in entry.textures},
+    )

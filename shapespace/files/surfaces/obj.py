@@ -1,0 +1,301 @@
+"""OBJ with what stands in it beside positions, and MTL: both ways."""
+
+from __future__ import annotations
+
+import json
+from array import array
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+
+import numpy as np
+
+from shapespace.arrays import FloatArray
+from shapespace.files.colouring import Colouring
+from shapespace.files.gltf_writing import surface_normals
+from shapespace.files.limits import UNLIMITED, clipped, label
+from shapespace.files.polygon_reading import Lines
+from shapespace.files.surfaces.textures import Textures
+from shapespace.mesh.surface import NONE, Labels, Material, Surface, labelled
+from shapespace.mesh.triangle_mesh import MeshError
+
+#: Decimals to which normals of one vertex have to agree.
+_NORMAL_DECIMALS = 3
+#: Options of a map in MTL, by how many values they take at most.
+_MAP_OPTIONS = {b"-blendu": 1, b"-blendv": 1, b"-boost": 1, b"-mm": 2, b"-o": 3, b"-s": 3, b"-t": 3, b"-texres": 1}
+_MAP_OPTIONS |= {b"-clamp": 1, b"-bm": 1, b"-imfchan": 1, b"-type": 1, b"-cc": 1, b"-colorspace": 1}
+
+
+def read(path: Path, faults: list[str]) -> Surface:
+    """The surface of an OBJ file; sentences on what is left out are appended to ``faults``."""
+    uv, normals, colors, starts, corners = array("d"), array("d"), array("d"), [0], array("q")
+    uv_corners, shading, smoothing = array("q"), array("q"), array("q")
+    objects, groups, materials = list[str | None](), list[str | None](), list[str | None]()
+    current: dict[bytes, str | None] = {b"o": None, b"g": None, b"usemtl": None}
+    libraries, smooth, told, points = list[str](), 0, False, 0
+    with Lines(memoryview(path.read_bytes()), UNLIMITED) as lines:
+        for line in lines:
+            keyword, *values = line.split(None, 1)
+            rest = values[0].partition(b"#")[0].strip() if values else b""
+            if keyword == b"v":
+                row = rest.split()
+                points += 1
+                if len(row) >= 6:
+                    colors.extend(float(value) for value in row[-3:])
+            elif keyword == b"vt":
+                row = rest.split()
+                uv.extend((float(row[0]), float(row[1]) if len(row) > 1 else 0.0))
+            elif keyword == b"vn":
+                normals.extend(float(value) for value in rest.split()[:3])
+            elif keyword == b"f":
+                counts = points, len(uv) // 2, len(normals) // 3
+                for corner in rest.split():
+                    numbers = [_number(text, count) for text, count in zip(corner.split(b"/"), counts, strict=False)]
+                    v, t, n = numbers + [NONE] * (3 - len(numbers))
+                    corners.append(v)
+                    uv_corners.append(t)
+                    shading.append(n)
+                starts.append(len(corners))
+                smoothing.append(smooth)
+                objects.append(current[b"o"])
+                groups.append(current[b"g"])
+                materials.append(current[b"usemtl"])
+            elif keyword == b"s":
+                smooth, told = int(rest) if rest.isdigit() else 0, True
+            elif keyword in current:
+                current[keyword] = label(values[0].decode(errors="replace")) if values else None
+            elif keyword == b"mtllib" and values:
+                libraries.append(values[0].decode(errors="replace").strip())
+    if not len(starts) > 1:
+        raise MeshError("it has no faces")
+    coordinates = np.array(uv).reshape(-1, 2)
+    of_uv = np.array(uv_corners)
+    if not (of_uv >= 0).any():
+        if len(coordinates):
+            faults.append(f"its {len(coordinates)} texture coordinates are left out: no face refers to them")
+        coordinates, of_uv = None, None  # type: ignore[assignment]
+    textures = Textures(faults)
+    labels = labelled(materials)
+    of_file = _read_libraries(path, libraries, textures, labels, faults) if labels else {}
+    return Surface(
+        starts=np.array(starts),
+        corners=np.array(corners),
+        uv=coordinates,
+        uv_corners=of_uv,
+        shading=_shading(np.diff(starts), np.array(shading), normals, np.array(smoothing), told=told),
+        normals=told or len(normals) > 0,
+        colors=_colors(colors, points, faults),
+        objects=labelled(objects),
+        groups=labelled(groups),
+        material_of=labels.of if labels else None,
+        materials=tuple(of_file.get(name, Material(name)) for name in labels.names) if labels else (),
+        textures=textures.files,
+    )
+
+
+def _number(text: bytes, count: int) -> int:
+    """An index from 0; negative ones count back from the last of so many, and nothing is NONE."""
+    if not text:
+        return NONE
+    number = int(text) - 1 if int(text) > 0 else count + int(text)
+    if not 0 <= number < count:
+        raise ValueError
+    return number
+
+
+def _shading(
+    sizes: np.ndarray, of_normal: np.ndarray, normals: array[float], smoothing: np.ndarray, *, told: bool
+) -> np.ndarray | None:
+    """Labels of corners, see Surface.shading: by normals where there are some, otherwise by smoothing groups."""
+    if (of_normal >= 0).all():
+        values = np.array(normals).reshape(-1, 3).round(_NORMAL_DECIMALS)
+        return np.unique(values, axis=0, return_inverse=True)[1].reshape(-1)[of_normal]
+    if not told:
+        return None
+    # Group 0 shades each polygon flat.
+    flat = smoothing.max() + 1 + np.arange(len(sizes))
+    labels: np.ndarray = np.unique(np.where(smoothing == 0, flat, smoothing), return_inverse=True)[1]
+    return np.repeat(labels, sizes)
+
+
+def _colors(values: array[float], points: int, faults: list[str]) -> FloatArray | None:
+    if not values:
+        return None
+    colors = np.array(values).reshape(-1, 3)
+    if len(colors) != points:
+        faults.append(f"its vertex colours are left out: {len(colors)} of {points} vertices have one")
+        return None
+    # Some programs write them from 0 to 255.
+    return np.clip(colors / 255 if colors.max() > 1 else colors, 0, 1)
+
+
+def _read_libraries(
+    path: Path, names: list[str], textures: Textures, wanted: Labels, faults: list[str]
+) -> dict[str, Material]:
+    """Materials of MTL files by name, as far as the surface uses them."""
+    found: dict[str, Material] = {}
+    for name in names:
+        whole = [path.parent / name]
+        for library in whole if whole[0].is_file() else [path.parent / part for part in name.split()]:
+            try:
+                found |= _read_library(library, textures, set(wanted.names))
+            except OSError as error:
+                faults.append(f"the materials of {clipped(library.name)} are left out: {error.strerror}")
+            except (ValueError, IndexError) as error:
+                faults.append(f"the materials of {clipped(library.name)} are left out: {clipped(error)}")
+    return found
+
+
+def _read_library(path: Path, textures: Textures, wanted: set[str]) -> dict[str, Material]:
+    found: dict[str, Material] = {}
+    name, look = "", dict[str, float | tuple[float, ...] | str]()
+
+    def end() -> None:
+        if name in wanted and name not in found:
+            texture = look.pop("texture", None)
+            kept = None if texture is None else textures.add_file(path.parent / str(texture), name)
+            color = look.pop("color", (1.0, 1.0, 1.0))
+            opacity = look.pop("opacity", 1.0)
+            found[name] = Material(name, (*color, opacity), texture=kept, **look)  # type: ignore[arg-type, misc]
+
+    with Lines(memoryview(path.read_bytes()), UNLIMITED) as lines:
+        for line in lines:
+            keyword, *values = line.split(None, 1)
+            if keyword == b"newmtl":
+                end()
+                name, look = label(values[0].decode(errors="replace")) or "", {}
+            elif keyword == b"Kd":
+                r, g, b = (_share(value) for value in values[0].split()[:3])
+                look["color"] = (r, g, b)
+            elif keyword in (b"d", b"Tr"):
+                share = _share(values[0].split()[-1])
+                look["opacity"] = share if keyword == b"d" else 1 - share
+            elif keyword in (b"Pm", b"Pr"):
+                look["metallic" if keyword == b"Pm" else "roughness"] = _share(values[0])
+            elif keyword == b"map_Kd":
+                look["texture"] = _map(values[0])
+    end()
+    return found
+
+
+def _share(text: bytes) -> float:
+    return min(1.0, max(0.0, float(text)))
+
+
+def _map(text: bytes) -> str:
+    """The file of a map, behind its options; names may have spaces in them."""
+    words = text.split()
+    while len(words) > 1 and words[0] in _MAP_OPTIONS:
+        most, words = _MAP_OPTIONS[words[0]], words[1:]
+        while most and len(words) > 1 and (most == 1 or _is_number(words[0])):
+            most, words = most - 1, words[1:]
+    return b" ".join(words).decode(errors="replace").replace("\\", "/")
+
+
+def _is_number(text: bytes) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
+def obj_vertices(vertices: FloatArray, colouring: Colouring | None = None, surface: Surface | None = None) -> str:
+    """The positions (V, 3) of an OBJ file, with colours behind them in the way that most readers understand.
+
+    What of a surface changes with the shape, its normals, follows.
+    """
+    # Nine significant digits hold a float32 whatever the unit; trimesh writes a fixed number of decimals.
+    comment, rows, colors = "", vertices.astype(np.float32), None
+    if colouring:
+        comment, colors = f"# color {json.dumps(colouring.legend)}\n", colouring.srgb
+    elif surface:
+        colors = surface.colors
+    line = "v %.9g %.9g %.9g\n" if colors is None else "v %.9g %.9g %.9g %.4g %.4g %.4g\n"
+    # All at once is twice as fast as line by line.
+    text = comment + _lines(line, rows if colors is None else np.hstack([rows, colors]))
+    if surface and surface.normals:
+        text += _lines("vn %.4f %.4f %.4f\n", surface_normals(vertices, surface))
+    return text
+
+
+def _lines(line: str, rows: np.ndarray) -> str:
+    return line * len(rows) % tuple(rows.ravel().tolist())
+
+
+def obj_faces(surface: Surface) -> str:
+    """The faces of an OBJ file, with texture coordinates, and the names of what they belong to."""
+    uv = "" if surface.uv is None else _lines("vt %.9g %.9g\n", surface.uv.astype(np.float32))
+    return uv + "".join(_faces(surface))
+
+
+def _faces(surface: Surface) -> Iterator[str]:
+    """Faces in runs that have the same names and as many corners, and what stands between these."""
+    corners = [surface.corners + 1]
+    form = "%d"
+    if surface.uv_corners is not None:
+        corners.append(surface.uv_corners + 1)
+        form = "%d/%d"
+    if surface.normals:
+        corners.append(surface.normal_corners + 1)
+        form += "/%d" if surface.uv_corners is not None else "//%d"
+    numbers = np.stack(corners, axis=1)
+    count = len(surface.sizes)
+    named = {
+        "o": surface.objects,
+        "g": surface.groups,
+        "usemtl": None
+        if surface.material_of is None
+        else Labels(tuple(material.name for material in surface.materials), surface.material_of),
+    }
+    lacking = np.zeros(count, bool)
+    if surface.uv_corners is not None:
+        lacking = np.minimum.reduceat(surface.uv_corners, surface.starts[:-1]) < 0
+    keys = [surface.sizes, lacking, *(labels.of for labels in named.values() if labels)]
+    changes = np.flatnonzero(np.any([np.diff(key, prepend=~key[:1]) != 0 for key in keys], axis=0)).tolist()
+    before: dict[str, int] = dict.fromkeys(named, NONE)
+    for start, stop in zip(changes, [*changes[1:], count], strict=True):
+        for keyword, labels in named.items():
+            if labels and before[keyword] != (now := int(labels.of[start])):
+                before[keyword] = now
+                yield f"{keyword} {'' if now == NONE else labels.names[now]}".rstrip() + "\n"
+        some = numbers[surface.starts[start] : surface.starts[stop]]
+        if lacking[start]:
+            yield "".join(_lacking(some, int(surface.sizes[start]), normals=surface.normals))
+        else:
+            yield _lines("f " + " ".join([form] * int(surface.sizes[start])) + "\n", some.reshape(stop - start, -1))
+
+
+def _lacking(numbers: np.ndarray, size: int, *, normals: bool) -> Iterator[str]:
+    """Faces of which some corners have no texture coordinate."""
+    for polygon in numbers.reshape(-1, size, numbers.shape[1]).tolist():
+        words = [f"{v}/{t or ''}{f'/{rest[0]}' if normals else ''}".rstrip("/") for v, t, *rest in polygon]
+        yield f"f {' '.join(words)}\n"
+
+
+def write_obj(
+    vertices: FloatArray, surface: Surface, colouring: Colouring | None = None, library: str | None = None
+) -> str:
+    """An OBJ file; it refers to a library of materials if that is named."""
+    begin = f"mtllib {library}\n" if library else ""
+    return begin + obj_vertices(vertices, colouring, surface) + obj_faces(surface)
+
+
+def write_mtl(surface: Surface) -> str:
+    """The library of a surface's materials, which names its textures."""
+    return "\n".join("".join(_material(material)) for material in surface.materials)
+
+
+def _material(material: Material) -> Iterator[str]:
+    *color, opacity = material.color
+    yield f"newmtl {material.name}\n"
+    yield "Kd {:.6g} {:.6g} {:.6g}\n".format(*color)
+    yield f"d {opacity:.6g}\nPm {material.metallic:.6g}\nPr {material.roughness:.6g}\n"
+    if material.texture is not None:
+        yield f"map_Kd {material.texture}\n"
+
+
+def obj_files(surface: Surface, stem: str) -> Mapping[str, bytes]:
+    """What belongs beside OBJ files: the library of materials, and textures, by name; nothing without materials."""
+    if not surface.materials:
+        return {}
+    return {f"{stem}.mtl": write_mtl(surface).encode(), **surface.textures}

@@ -1,0 +1,157 @@
+"""PLY with what stands in it beside positions: both ways."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shapespace.arrays import FloatArray
+from shapespace.files.colouring import Colouring
+from shapespace.files.limits import UNLIMITED
+from shapespace.files.polygon_reading import BinaryTable, TextTable, ply_head
+from shapespace.mesh.surface import NONE, Surface
+from shapespace.mesh.triangle_mesh import MeshError
+
+#: Names of texture coordinates, and of colours.
+_UV = (("s", "t"), ("u", "v"), ("texture_u", "texture_v"), ("texture_s", "texture_t"))
+_RGB = ("red", "green", "blue")
+
+
+def read(path: Path, faults: list[str]) -> Surface:
+    """The surface of a PLY file; sentences on what is left out are appended to ``faults``."""
+    text, elements, body = ply_head(memoryview(path.read_bytes()))
+    table = TextTable(body, UNLIMITED) if text else BinaryTable(body, UNLIMITED)
+    at_vertices: FloatArray | None = None
+    colors: FloatArray | None = None
+    normals = False
+    for element in elements:
+        names = [p.name for p in element.properties]
+        if element.name == "vertex":
+            uv = next((pair for pair in _UV if set(pair) <= set(names)), ())
+            rgb = _RGB if set(_RGB) <= set(names) else ()
+            normals = "nx" in names
+            values = table.columns(element, [names.index(name) for name in ("x", *uv, *rgb)])
+            at_vertices = values[:, 1:3] if uv else None
+            if rgb:
+                bytes_ = element.properties[names.index("red")].type.kind in "ui"
+                colors = np.clip(values[:, -3:] / (255 if bytes_ else 1), 0, 1)
+        elif element.name == "face":
+            wanted = [element.corners]
+            if "texcoord" in names and element.properties[names.index("texcoord")].length is not None:
+                wanted.append(names.index("texcoord"))
+            starts, corners, at_corners = [0], list[NDArray](), list[NDArray]()
+            for polygon, *coordinates in table.lists(element, wanted):
+                corners.append(np.array(polygon).astype(np.int64))
+                starts.append(starts[-1] + len(polygon))
+                if coordinates:
+                    at_corners.append(_at_corners(np.array(coordinates[0]).astype(np.float64), len(polygon)))
+            if at_vertices is not None and len(at_corners):
+                at_vertices = None  # what is said of each corner says more
+            return _surface(np.array(starts), np.concatenate(corners), at_vertices, at_corners, colors, normals=normals)
+        else:
+            table.skip(element)
+    raise MeshError("it has no faces")
+
+
+def _at_corners(values: FloatArray, count: int) -> FloatArray:
+    """(count, 2), NaN where a face has none."""
+    return values.reshape(count, 2) if len(values) else np.full((count, 2), np.nan)
+
+
+def _surface(
+    starts: NDArray,
+    corners: NDArray,
+    at_vertices: FloatArray | None,
+    at_corners: list[FloatArray],
+    colors: FloatArray | None,
+    *,
+    normals: bool,
+) -> Surface:
+    uv, of_uv = at_vertices, None if at_vertices is None else corners
+    if at_corners:
+        values = np.concatenate(at_corners)
+        there = ~np.isnan(values).any(axis=1)
+        uv, found = np.unique(values[there], axis=0, return_inverse=True)
+        of_uv = np.full(len(corners), NONE)
+        of_uv[there] = found.reshape(-1)
+        if not there.any():
+            uv, of_uv = None, None
+    return Surface(starts=starts, corners=corners, uv=uv, uv_corners=of_uv, colors=colors, normals=normals)
+
+
+def write_ply(vertices: FloatArray, surface: Surface, colouring: Colouring | None = None) -> bytes:
+    """A PLY file, as text where faces have different numbers of corners.
+
+    Texture coordinates are at the vertices, or at corners where a vertex has several; not where corners of faces
+    differ in number too.
+    """
+    fields: list[tuple[str, str, str, NDArray]] = [
+        (name, "float", "<f4", column) for name, column in zip("xyz", vertices.T, strict=True)
+    ]
+    uv = _of_vertices(surface)
+    if uv is not None:
+        fields += [(name, "float", "<f4", column) for name, column in zip("st", uv.T, strict=True)]
+    colors = surface.colors
+    if colouring:
+        fields.append((str(colouring.quantity), "float", "<f4", colouring.values))
+        colors = colouring.srgb
+    if colors is not None:
+        rgba = np.hstack([np.rint(255 * colors), np.full((len(vertices), 1), 255)])
+        fields += [(name, "uchar", "u1", column) for name, column in zip((*_RGB, "alpha"), rgba.T, strict=True)]
+    rows = np.empty(len(vertices), [(name, kind) for name, _, kind, _ in fields])
+    for name, _, _, column in fields:
+        rows[name] = column
+    # Many readers take binary faces only where all have as many corners, and other lists of a face only then.
+    mixed = surface.sizes.min() < surface.sizes.max()
+    lists: list[tuple[str, str, NDArray]] = [("vertex_indices", "int", surface.corners[:, None].astype("<i4"))]
+    if surface.uv is not None and surface.uv_corners is not None and uv is None and not mixed:
+        values = np.where(surface.uv_corners[:, None] >= 0, surface.uv[surface.uv_corners], 0)
+        lists.append(("texcoord", "float", values.astype("<f4")))
+    longest = int(surface.sizes.max()) * max(array.shape[1] for _, _, array in lists)
+    length = ("uchar", "u1") if longest < 256 else ("int", "<i4")
+    head = ["ply", f"format {'ascii' if mixed else 'binary_little_endian'} 1.0", f"element vertex {len(vertices)}"]
+    head += [f"property {kind} {name}" for name, kind, _, _ in fields]
+    head += [f"element face {len(surface.sizes)}"]
+    head += [f"property list {length[0]} {kind} {name}" for name, kind, _ in lists]
+    if mixed:
+        line = " ".join("%d" if kind == "u1" else "%.9g" for _, _, kind, _ in fields) + "\n"
+        text = line * len(rows) % tuple(value for row in rows.tolist() for value in row)
+        body = (text + _face_lines(surface)).encode()
+    else:
+        body = rows.tobytes() + _face_rows(surface, lists, length[1])
+    return "\n".join([*head, "end_header\n"]).encode() + body
+
+
+def _of_vertices(surface: Surface) -> FloatArray | None:
+    """(V, 2) texture coordinates, where each vertex has exactly one."""
+    if surface.uv is None or surface.uv_corners is None or (surface.uv_corners < 0).any():
+        return None
+    one = np.empty(surface.corners.max() + 1, np.int64)
+    one[surface.corners] = surface.uv_corners
+    found: FloatArray = surface.uv[one]
+    return found if np.array_equal(found[surface.corners], surface.uv[surface.uv_corners]) else None
+
+
+def _face_rows(surface: Surface, lists: list[tuple[str, str, NDArray]], length: str) -> bytes:
+    """Faces of as many corners each."""
+    count = len(surface.sizes)
+    pieces: list[NDArray] = []
+    for _, _, array in lists:
+        values = array.reshape(count, -1)
+        pieces += [np.full((count, 1), values.shape[1], length).view(np.uint8), values.view(np.uint8)]
+    return np.hstack(pieces).tobytes()
+
+
+def _face_lines(surface: Surface) -> str:
+    """Faces as text, those of as many corners at once."""
+    lines = np.empty(len(surface.sizes), object)
+    for size in np.unique(surface.sizes).tolist():
+        chosen = np.flatnonzero(surface.sizes == size)
+        line, corners = (
+            " ".join(["%d"] * (size + 1)),
+            surface.corners[surface.starts[chosen][:, None] + np.arange(size)],
+        )
+        lines[chosen] = [line % (size, *polygon) for polygon in corners.tolist()]
+    return "\n".join(lines.tolist()) + "\n"

@@ -1,0 +1,40 @@
+"""Reading the surface of a file that is trusted; what of it can't be kept is left out, with a sentence."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from shapespace.files.limits import clipped
+from shapespace.files.surfaces import gltf, obj, ply
+from shapespace.mesh.surface import Surface
+from shapespace.mesh.triangle_mesh import MeshError
+
+_READERS = {"glb": gltf.read, "gltf": gltf.read, "obj": obj.read, "ply": ply.read}
+#: Formats whose files may have more than triangles.
+FORMATS = tuple(_READERS)
+
+
+def read_surface(path: Path) -> tuple[Surface | None, list[str]]:
+    """The surface of a mesh file, on the vertices that ``read_arrays`` gives; None where it has triangles only.
+
+    Returns:
+        The surface, and a sentence on each thing that is left out.
+
+    Raises:
+        OSError: the file can't be read.
+    """
+    faults: list[str] = []
+    try:
+        with np.errstate(all="ignore"):
+            surface = _READERS[path.suffix.lstrip(".").lower()](path, faults)
+        surface.check(
+            int(surface.corners.max()) + 1 if surface.colors is None else len(surface.colors), surface.triangles
+        )
+    except OSError:
+        raise
+    except Exception as error:  # of what nobody has looked at until now, any
+        reason = str(error) if isinstance(error, MeshError) else f"it can't be understood: {clipped(error, 200)}"
+        return None, [f"its polygons, texture coordinates and materials are left out: {reason}"]
+    return (None if surface.is_plain else surface), faults

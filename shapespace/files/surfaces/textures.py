@@ -1,0 +1,75 @@
+"""Pictures that materials name: copied as they are, if they are there, PNG or JPEG, and not too large."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+from shapespace.files.limits import clipped
+
+#: Most bytes of one picture, and of all pictures of a surface together: every answer holds them.
+LARGEST, ALL = 16 * 2**20, 32 * 2**20
+#: Of PNG and JPEG.
+BEGINNINGS = (b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff")
+
+
+class Textures:
+    """The pictures of a surface.
+
+    Args:
+        faults: gets a sentence for each that can't be kept.
+
+    Attributes:
+        files: their contents by name.
+    """
+
+    def __init__(self, faults: list[str]) -> None:
+        self.files: dict[str, bytes] = {}
+        self._faults, self._known = faults, dict[object, str | None]()
+
+    def add_file(self, path: Path, material: str) -> str | None:
+        """The name by which a file is kept; None where it can't be."""
+
+        def content() -> bytes:
+            if path.stat().st_size > LARGEST:
+                raise ValueError(_too_large(path.stat().st_size))
+            return path.read_bytes()
+
+        return self.add(path.resolve(), path.name, content, material)
+
+    def add(self, key: object, name: str, content: Callable[[], bytes], material: str) -> str | None:
+        """The same for a picture that is the same for the same key."""
+        if key not in self._known:
+            try:
+                self._known[key] = self._kept(name, content())
+            except OSError as error:
+                self._leave_out(key, name, material, error.strerror or "it can't be read")
+            except ValueError as error:
+                self._leave_out(key, name, material, str(error))
+        return self._known[key]
+
+    def _leave_out(self, key: object, name: str, material: str, reason: str) -> None:
+        self._known[key] = None
+        self._faults.append(f"the texture {clipped(name)} of material {material} is left out: {reason}")
+
+    def _kept(self, name: str, data: bytes) -> str:
+        if not data.startswith(BEGINNINGS):
+            raise ValueError("it is neither PNG nor JPEG; save it as one of them")
+        if len(data) > LARGEST or sum(map(len, self.files.values())) + len(data) > ALL:
+            raise ValueError(_too_large(len(data)))
+        # A plain name of a bundle's file, with the ending that it should have.
+        stem = re.sub(r"[^A-Za-z0-9_-]+", "-", Path(name).stem).strip("-_")[:60] or "texture"
+        ending = "png" if data.startswith(BEGINNINGS[0]) else "jpg"
+        taken = {known.casefold() for known in self.files}
+        numbered = (f"{stem}-{k}.{ending}" for k in range(2, len(taken) + 3))
+        kept = next(new for new in (f"{stem}.{ending}", *numbered) if new.casefold() not in taken)
+        self.files[kept] = data
+        return kept
+
+
+def _too_large(size: int) -> str:
+    return (
+        f"it has {size / 2**20:.1f} MiB, where {LARGEST >> 20} are the most, and {ALL >> 20} of all together; make it "
+        "smaller"
+    )

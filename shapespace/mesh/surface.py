@@ -1,0 +1,265 @@
+"""What a file says of a mesh beside positions and triangles: polygons, texture coordinates, names, materials."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from enum import StrEnum
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shapespace.arrays import FloatArray, IntArray
+from shapespace.mesh.triangle_mesh import MeshError
+
+#: Of a number that a corner or a polygon doesn't have.
+NONE = -1
+
+
+class Topology(StrEnum):
+    """Which faces an answer has: the file's polygons, or these cut into triangles."""
+
+    ORIGINAL = "original"
+    TRIANGLES = "triangles"
+
+
+@dataclass(frozen=True)
+class Material:
+    """How a part of a surface looks.
+
+    Attributes:
+        name: of the material.
+        color: red, green and blue as linear light, and opacity, each from 0 to 1; times the texture.
+        metallic, roughness: from 0 to 1.
+        texture: name of the picture of its base colour, if it has one.
+    """
+
+    name: str
+    color: tuple[float, float, float, float] = (1.0, 1.0, 1.0, 1.0)
+    metallic: float = 0.0
+    roughness: float = 0.75
+    texture: str | None = None
+
+
+class Labels(NamedTuple):
+    """A name for each polygon, or none.
+
+    Attributes:
+        names: the different ones.
+        of: (P,) which of them each polygon has, NONE for none.
+    """
+
+    names: tuple[str, ...]
+    of: IntArray
+
+
+class SplitVertices(NamedTuple):
+    """Vertices for formats where each has one texture coordinate and one normal.
+
+    Attributes:
+        vertex: (V',) which vertex each is of, increasing.
+        uv: (V', 2), zeros for those without.
+        normal: (V',) which of the normals of `Surface.normal_faces` each has.
+        faces: (F, 3) triangles.
+    """
+
+    vertex: IntArray
+    uv: FloatArray | None
+    normal: IntArray
+    faces: IntArray
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Surface:
+    """Polygons on the vertices of a mesh, whose triangles are these cut at the first corner of each.
+
+    P polygons have C corners together; corners of one polygon follow each other.
+
+    Attributes:
+        starts: (P + 1,) first corner of each polygon, and C.
+        corners: (C,) vertex of each corner.
+        uv: (U, 2) texture coordinates, from the lower left.
+        uv_corners: (C,) which of them each corner has, NONE for none.
+        shading: (C,) labels: corners of one vertex with the same label are shaded as one, others apart. None where
+            all are smooth.
+        normals: whether the file had normals or said how it is shaded.
+        colors: (V, 3) sRGB from 0 to 1 of each vertex.
+        objects, groups: names of parts.
+        material_of: (P,) which of the materials each polygon has, NONE for none.
+        materials: of the surface.
+        textures: the files of the pictures, by name.
+
+    >>> import numpy as np
+    >>> square = Surface(starts=np.array([0, 4]), corners=np.array([0, 1, 3, 2]))
+    >>> square.triangles.tolist()
+    [[0, 1, 3], [0, 3, 2]]
+    """
+
+    starts: IntArray
+    corners: IntArray
+    uv: FloatArray | None = None
+    uv_corners: IntArray | None = None
+    shading: IntArray | None = None
+    normals: bool = False
+    colors: FloatArray | None = None
+    objects: Labels | None = None
+    groups: Labels | None = None
+    material_of: IntArray | None = None
+    materials: tuple[Material, ...] = ()
+    textures: Mapping[str, bytes] = field(default_factory=dict)
+
+    @classmethod
+    def of_triangles(cls, faces: IntArray) -> Surface:
+        """Triangles (F, 3) and nothing else."""
+        return cls(starts=np.arange(0, faces.size + 1, 3), corners=faces.ravel())
+
+    @property
+    def sizes(self) -> IntArray:
+        """(P,) corners of each polygon."""
+        return np.diff(self.starts)
+
+    @cached_property
+    def triangle_polygons(self) -> IntArray:
+        """(F,) polygon of each triangle."""
+        return np.repeat(np.arange(len(self.sizes)), self.sizes - 2)
+
+    @cached_property
+    def triangle_corners(self) -> IntArray:
+        """(F, 3) corners of each triangle."""
+        cut = self.sizes - 2
+        first = self.starts[:-1][self.triangle_polygons]
+        behind = np.arange(len(first)) - np.repeat(np.cumsum(cut) - cut, cut)
+        return np.stack([first, first + behind + 1, first + behind + 2], axis=1)
+
+    @property
+    def triangles(self) -> IntArray:
+        """(F, 3) vertices of each triangle."""
+        return self.corners[self.triangle_corners]
+
+    @property
+    def is_plain(self) -> bool:
+        """Whether it says nothing that the triangles don't."""
+        parts = (self.uv, self.shading, self.colors, self.objects, self.groups, self.material_of)
+        return bool((self.sizes == 3).all()) and not self.normals and all(part is None for part in parts)
+
+    @cached_property
+    def triangulated(self) -> Surface:
+        """The same with its triangles as polygons."""
+        corners, polygons = self.triangle_corners.ravel(), self.triangle_polygons
+
+        def taken(array: IntArray | None, chosen: IntArray) -> IntArray | None:
+            return None if array is None else array[chosen]
+
+        def labelled(labels: Labels | None) -> Labels | None:
+            return labels and Labels(labels.names, labels.of[polygons])
+
+        return replace(
+            self,
+            starts=np.arange(0, len(corners) + 1, 3),
+            corners=self.corners[corners],
+            uv_corners=taken(self.uv_corners, corners),
+            shading=taken(self.shading, corners),
+            objects=labelled(self.objects),
+            groups=labelled(self.groups),
+            material_of=taken(self.material_of, polygons),
+        )
+
+    def welded(self, vertices: IntArray) -> Surface:
+        """On other vertices: ``vertices`` (N,) is what each has become, NONE for those in no polygon."""
+        colors = None
+        if self.colors is not None:
+            # Backwards, so that the first of welded vertices stays.
+            there = np.flatnonzero(vertices >= 0)[::-1]
+            colors = np.empty((vertices.max() + 1, 3))
+            colors[vertices[there]] = self.colors[there]
+        found = replace(self, corners=vertices[self.corners], colors=colors)
+        # Kept only where some vertex has several.
+        smooth = found.shading is not None and len(np.unique(found.normal_corners)) == len(np.unique(found.corners))
+        return replace(found, shading=None) if smooth else found
+
+    @cached_property
+    def normal_corners(self) -> IntArray:
+        """(C,) which normal each corner has: its vertex, unless the file shades some apart."""
+        if self.shading is None:
+            return self.corners
+        keys = self.corners * (self.shading.max() + 1) + self.shading
+        return np.unique(keys, return_inverse=True)[1]
+
+    @property
+    def normal_faces(self) -> IntArray:
+        """(F, 3) the same for the corners of triangles."""
+        return self.normal_corners[self.triangle_corners]
+
+    @cached_property
+    def split(self) -> SplitVertices:
+        """Its triangles on vertices with one texture coordinate and one normal each."""
+        uv_corners = np.zeros_like(self.corners) if self.uv_corners is None else self.uv_corners
+        keys = np.stack([self.corners, uv_corners, self.normal_corners], axis=1)
+        found, inverse = np.unique(keys, axis=0, return_inverse=True)
+        uv = None
+        if self.uv is not None:
+            uv = np.where(found[:, 1:2] >= 0, self.uv[found[:, 1]], 0.0)
+        return SplitVertices(found[:, 0], uv, found[:, 2], inverse.reshape(-1)[self.triangle_corners])
+
+    def check(self, vertex_count: int, faces: IntArray) -> None:
+        """Raise MeshError unless it is one of the mesh with so many vertices and these triangles (F, 3)."""
+        starts, corners = self.starts, self.corners
+        if starts.ndim != 1 or len(starts) < 2 or starts[0] != 0 or starts[-1] != len(corners):
+            raise MeshError("polygons do not begin at the first corner and end at the last")
+        if (self.sizes < 3).any():
+            raise MeshError(f"polygon {int((self.sizes < 3).argmax())} has fewer than three corners")
+        if not np.array_equal(self.triangles, faces):
+            raise MeshError("polygons are not those of the triangles")
+        for name, of, count in (
+            ("texture coordinate", self.uv_corners, 0 if self.uv is None else len(self.uv)),
+            ("shading label", self.shading, len(corners)),
+            ("object", *_bounds(self.objects)),
+            ("group", *_bounds(self.groups)),
+            ("material", self.material_of, len(self.materials)),
+        ):
+            per_corner = name in ("texture coordinate", "shading label")
+            if of is None:
+                continue
+            if len(of) != (len(corners) if per_corner else len(self.sizes)):
+                raise MeshError(f"there are {len(of)} numbers of a {name}, which is not one for each")
+            if of.min() < NONE or of.max() >= count:
+                raise MeshError(f"a {name} is numbered {of.min()} to {of.max()}, but there are {count}")
+        if self.shading is not None and self.shading.min() < 0:
+            raise MeshError("a corner has no shading label")
+        if (self.uv is None) != (self.uv_corners is None):
+            raise MeshError("texture coordinates and corners that have them go together")
+        if self.uv is not None and not np.isfinite(self.uv).all():
+            raise MeshError("a texture coordinate is not finite")
+        if self.colors is not None and not (
+            self.colors.shape == (vertex_count, 3) and (self.colors >= 0).all() and (self.colors <= 1).all()
+        ):
+            raise MeshError(f"colours must be ({vertex_count}, 3) numbers from 0 to 1")
+        for material in self.materials:
+            if material.texture is not None and material.texture not in self.textures:
+                raise MeshError(f"material {material.name} has no file {material.texture}")
+
+
+def _bounds(labels: Labels | None) -> tuple[IntArray | None, int]:
+    return (None, 0) if labels is None else (labels.of, len(labels.names))
+
+
+def labelled(names: Sequence[str | None]) -> Labels | None:
+    """Labels of polygons, given each one's name; None where none has one."""
+    known = list(dict.fromkeys(name for name in names if name is not None))
+    if not known:
+        return None
+    numbers: dict[str | None, int] = {name: k for k, name in enumerate(known)} | {None: NONE}
+    return Labels(tuple(known), np.array([numbers[name] for name in names]))
+
+
+def linear(srgb: FloatArray) -> FloatArray:
+    """Colours as screens take them, from 0 to 1, as linear light (IEC 61966-2-1)."""
+    return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
+
+
+def srgb(linear: NDArray[np.floating]) -> FloatArray:
+    """The reverse of `linear`."""
+    light = np.clip(linear.astype(np.float64), 0, 1)
+    return np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)

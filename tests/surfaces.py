@@ -1,0 +1,104 @@
+"""A ball of triangles and quads with texture, materials and names; OBJ files of it, not by the project's writers."""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from pathlib import Path
+
+import numpy as np
+import trimesh
+
+from shapespace.mesh.surface import Labels, Material, Surface
+
+
+def png(seed: int = 0, size: int = 4) -> bytes:
+    """A picture of a few pixels."""
+
+    def chunk(kind: bytes, data: bytes) -> bytes:
+        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+    pixels = np.random.default_rng(seed).integers(0, 256, (size, size, 3), np.uint8)
+    rows = b"".join(b"\0" + row.tobytes() for row in pixels)
+    head = struct.pack(">IIBBBBB", size, size, 8, 2, 0, 0, 0)
+    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + chunk(b"IDAT", zlib.compress(rows)) + chunk(b"IEND", b"")
+
+
+def ball(subdivisions: int = 3) -> tuple[np.ndarray, Surface]:
+    """An icosphere of as many quads as half its triangles, each of 20 charts by itself in the texture.
+
+    Returns:
+        Vertices (V, 3), and the surface; five charts are of a material without texture.
+    """
+    sphere = trimesh.creation.icosphere(subdivisions, 1.0)
+    # Each triangle was cut in four; the last two of them make a quad.
+    first, second, third, middle = sphere.faces.reshape(-1, 4, 3).transpose(1, 0, 2)
+    quads = np.hstack([middle[:, [2, 0, 1]], third[:, 2:]])
+    corners = np.hstack([first, second, quads]).ravel()
+    polygons = 3 * len(first)
+    charts = np.arange(polygons) // (polygons // 20)
+    sizes = np.tile([3, 3, 4], len(first))
+    keys = np.repeat(charts, sizes) * len(sphere.vertices) + corners
+    used, uv_corners = np.unique(keys, return_inverse=True)
+    chart, vertex = divmod(used, len(sphere.vertices))
+    places = sphere.vertices[vertex]
+    uv = np.stack([chart % 5 + 0.5 + places[:, 0] / 3, chart // 5 + 0.5 + places[:, 1] / 3], axis=1) / [5, 4]
+    starts = np.concatenate([[0], np.cumsum(sizes)])
+    left = np.minimum.reduceat(sphere.vertices[corners, 0], starts[:-1]) < 0
+    return sphere.vertices, Surface(
+        starts=starts,
+        corners=corners,
+        uv=uv,
+        uv_corners=uv_corners,
+        objects=Labels(("Bar",), np.zeros(polygons, int)),
+        groups=Labels(("left", "right"), np.where(left, 0, 1)),
+        material_of=np.where(charts >= 15, 1, 0),
+        materials=(Material("skin", (0.9, 0.8, 0.7, 1.0), texture="skin.png"), Material("cap", (0.1, 0.2, 0.3, 1.0))),
+        textures={"skin.png": png()},
+    )
+
+
+def write_files(path: Path, vertices: np.ndarray, surface: Surface) -> None:
+    """An OBJ file, and beside it materials and textures."""
+    lines = [f"mtllib {path.parent.name}.mtl", "o Bar"]
+    lines += ["v {!r} {!r} {!r}".format(*row) for row in vertices.tolist()]
+    lines += ["vt {!r} {!r}".format(*row) for row in surface.uv.tolist()]
+    before = None
+    for k, (start, stop) in enumerate(zip(surface.starts[:-1], surface.starts[1:], strict=True)):
+        names = surface.groups.names[surface.groups.of[k]], surface.materials[surface.material_of[k]].name
+        if names != before:
+            lines += [f"g {names[0]}", f"usemtl {names[1]}"]
+            before = names
+        pairs = zip(surface.corners[start:stop] + 1, surface.uv_corners[start:stop] + 1, strict=True)
+        lines.append("f " + " ".join(f"{v}/{t}" for v, t in pairs))
+    path.write_text("\n".join(lines) + "\n")
+    library = [
+        "newmtl skin",
+        "Ns 10",
+        "Kd 0.9 0.8 0.7",
+        "map_Kd -s 1 1 1 maps/skin.png",
+        "newmtl cap",
+        "Kd 0.1 0.2 0.3",
+    ]
+    path.with_name(f"{path.parent.name}.mtl").write_text("\n".join(library) + "\n")
+    path.with_name("maps").mkdir(exist_ok=True)
+    (path.parent / "maps" / "skin.png").write_bytes(surface.textures["skin.png"])
+
+
+def parse_obj(text: str) -> dict:
+    """What an OBJ file holds, word by word: polygons as (vertices, texture coordinates, normals, names by keyword)."""
+    found: dict = {"v": [], "vt": [], "vn": [], "polygons": [], "mtllib": []}
+    names: dict[str, str] = {}
+    for line in text.splitlines():
+        keyword, *words = line.split()
+        if keyword in ("v", "vt", "vn"):
+            found[keyword].append([float(word) for word in words])
+        elif keyword == "f":
+            corners = [[*word.split("/"), "", ""][:3] for word in words]
+            columns = [[int(word) - 1 if word else None for word in column] for column in zip(*corners, strict=True)]
+            found["polygons"].append((*columns, dict(names)))
+        elif keyword == "mtllib":
+            found["mtllib"] += words
+        elif keyword != "#":
+            names[keyword] = " ".join(words)
+    return found

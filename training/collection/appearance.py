@@ -1,0 +1,66 @@
+"""What the reference's file has beside positions and triangles, on the vertices of the collection."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from shapespace.files.surfaces.reading import FORMATS, read_surface
+from shapespace.mesh.surface import Surface
+from shapespace.mesh.triangle_mesh import MeshError
+from shapespace.training.collection.ingest import MeshCollection
+
+
+def reference_surface(data: Path | None, meshes: MeshCollection, chosen: int) -> tuple[Surface | None, list[str]]:
+    """The surface of the reference's file; where its format has triangles only, of the first file that may have more.
+
+    Args:
+        data: the folder; None, or a file, where there are no mesh files.
+        meshes: read from it.
+        chosen: which of them is the reference.
+
+    Returns:
+        The surface, if any, and sentences on what of it is left out.
+    """
+    if data is None or not data.is_dir() or meshes.file_vertices is None:
+        return None, []
+    names = [name for name, _ in (meshes.places[chosen], *meshes.places)]
+    path = next((data / name for name in names if name.rpartition(".")[2].lower() in FORMATS), None)
+    if path is None:
+        return None, []
+    try:
+        found, faults = read_surface(path)
+        if found:
+            found = found.welded(meshes.file_vertices)
+            found.check(meshes.vertices.shape[1], meshes.faces)
+    except (OSError, MeshError) as error:
+        found, faults = None, [f"its polygons, texture coordinates and materials are left out: {error}"]
+    return found, [f"{path}: {fault}" for fault in faults]
+
+
+def kept(surface: Surface) -> str:
+    """One sentence on what is kept of a file."""
+    sizes = surface.sizes
+    counts = {"triangles": (sizes == 3).sum(), "quads": (sizes == 4).sum(), "larger polygons": (sizes > 4).sum()}
+    parts = [f"{count} {name}" for name, count in counts.items() if count]
+    parts += [] if surface.uv is None else [f"{len(surface.uv)} texture coordinates"]
+    parts += [] if surface.colors is None else ["vertex colours"]
+    for labels, one in ((surface.objects, "object"), (surface.groups, "group")):
+        if labels:
+            parts.append(f"{one if len(labels.names) == 1 else one + 's'} {', '.join(labels.names[:4])}")
+    if surface.materials:
+        parts.append(f"materials {', '.join(material.name for material in surface.materials[:4])}")
+    sentence = f"kept for answers: {', '.join(parts)}"
+    if surface.textures:
+        size = sum(map(len, surface.textures.values())) / 2**20
+        sentence += (
+            f"; the textures {', '.join(surface.textures)} ({size:.1f} MiB) go into the bundle as they are: their "
+            "licence has to allow that, and export.licence to fit it"
+        )
+    return sentence
+
+
+def texture_bytes(surface: Surface) -> dict[str, np.ndarray]:
+    """Textures as arrays of bytes, by name."""
+    return {name: np.frombuffer(data, np.uint8) for name, data in surface.textures.items()}
