@@ -134,6 +134,16 @@ class Client:
         arrays = _arrays(self.mesh(name, latent, "npz", place=place, **options))
         return Mesh(arrays["vertices"].astype(np.float32), arrays["faces"].astype(np.int64))
 
+    def blend_shapes(self, name: str, **options: Options) -> bytes:
+        """A GLB with a morph target for each end of each coordinate.
+
+        Args:
+            name: of a model without angles among its coordinates.
+            options: version, mesh ("fine" or "coarse").
+        """
+        content: bytes = self._send("GET", f"/v1/models/{name}/blendshapes", params=options).content
+        return content
+
     def vertices(
         self,
         name: str,
@@ -357,9 +367,9 @@ class Interpolation:
                     raise ClientError(answer, problem)
                 yield np.array(frame["vertices"], dtype=np.float32)
 
-    def file(self, format: str = "glb") -> bytes:
-        """The whole animation."""
-        return self._get("", format)
+    def file(self, format: str = "glb", fps: float | None = None) -> bytes:
+        """The whole animation; GLB, USD and USDZ with so many frames in a second."""
+        return self._get("", format, fps=fps)
 
     def frame(self, k: int, format: str = "glb") -> bytes:
         """One frame, from 0."""
@@ -369,10 +379,9 @@ class Interpolation:
         """Positions (frames, V, 3)."""
         return _arrays(self.file("npz"))["vertices"].astype(np.float32)
 
-    def _get(self, path: str, format: str) -> bytes:
-        content: bytes = self.client._send(
-            "GET", f"/v1/interpolations/{self.id}{path}", params={"format": format, "quality": self.quality}
-        ).content
+    def _get(self, path: str, format: str, **more: Options) -> bytes:
+        params = {"format": format, "quality": self.quality, **more}
+        content: bytes = self.client._send("GET", f"/v1/interpolations/{self.id}{path}", params=params).content
         return content
 
 

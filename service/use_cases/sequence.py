@@ -8,6 +8,7 @@ from functools import partial
 from itertools import count
 from typing import Any
 
+from shapespace.files.animated_gltf import FRAMES_PER_SECOND
 from shapespace.files.archives import Buffer
 from shapespace.mesh.surface import Topology
 from shapespace.model.decoder import Quality
@@ -78,6 +79,7 @@ async def sequence_file(
     quality: Quality,
     format: str,
     topology: Topology = Topology.ORIGINAL,
+    fps: float = FRAMES_PER_SECOND,
 ) -> Written:
     """All frames as one file in one of SEQUENCE_FORMATS, with polygons or triangles.
 
@@ -91,7 +93,7 @@ async def sequence_file(
         found = await shapes(work, model, codes, inside, animation.mesh, quality)
         faces = model.mesh(animation.mesh).faces
         surface = shown(model.surface(animation.mesh), topology)
-        frames = Frames(found.vertices, found.diagnostics, faces, animation.positions, codes, surface)
+        frames = Frames(found.vertices, found.diagnostics, faces, animation.positions, codes, surface, fps)
 
         def encode() -> tuple[Iterator[Buffer], dict[str, Any]]:
             return SEQUENCE_FORMATS[format].encode(frames)

@@ -18,6 +18,7 @@ from shapespace.bundle.reader import BundleError, read_bundle
 from shapespace.bundle.schema import MANIFEST, VERSION_PATTERN
 from shapespace.files.formats import read_arrays
 from shapespace.mesh.triangle_mesh import TriangleMesh
+from shapespace.model.blend_shapes import BlendShapes, blend_shapes
 from shapespace.model.correspondence import InvalidMeshError, Matched, match
 from shapespace.model.decoder import Decoder, MeshChoice, Quality
 from shapespace.model.edit import PRIOR, Edited, PriorKind, Target, edited
@@ -169,6 +170,26 @@ class ShapeModel(Decoder):
                 stacklevel=2,
             )
         return positions if values.ndim == 2 else positions[0]
+
+    def blend_shapes(self, mesh: MeshName = "fine") -> BlendShapes:
+        """The model as linear blend shapes: code 0, and both ends of each coordinate; with how far that is from it.
+
+        Args:
+            mesh: "fine" or "coarse".
+
+        Raises:
+            PeriodicError: there are angles among the coordinates, which have no ends.
+            ModelFailedError: the networks failed, or took too long.
+
+        >>> import shapespace
+        >>> blend = shapespace.load("models/figure").blend_shapes("coarse")
+        >>> blend.names[:2], blend.ends.shape, 0.001 < blend.error["mean"] < 0.05
+        (['middle, 1 +', 'middle, 1 -'], (40, 1000, 3), True)
+        >>> blend.glb()[:4]
+        b'glTF'
+        """
+        choice = MeshChoice(mesh)
+        return blend_shapes(self, choice, lambda code: self.shape(code, mesh=choice))
 
     def encode(
         self,

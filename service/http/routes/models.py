@@ -50,6 +50,8 @@ def _facts(model: ShapeModel) -> dict[str, Any]:
     facts = model.manifest.model_dump(by_alias=True)
     path = f"/v1/models/{model.manifest.name}"
     links = {"self": path}
+    if not any(model.manifest.period):
+        links["blendshapes"] = f"{path}/blendshapes"
     links |= {
         call: f"{path}/{call}"
         for call in ("mesh", "vertices", "nric", "interpolations", "encode", "fit", "edit", "sample")
