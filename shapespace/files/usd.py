@@ -101,7 +101,7 @@ def animated_usd(
         del stage, mesh, points, normals, extent
         if packed:
             package = Path(folder, "animation.usdz")
-            with Usd.ZipFileWriter.CreateNew(str(package)) as archive:
+            with Sdf.ZipFileWriter.CreateNew(str(package)) as archive:
                 for name in (path.name, *textures.values()):  # the layer comes first
                     archive.AddFile(str(path.with_name(name)), name)
             path = package

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 from fastapi import APIRouter
+from pydantic import ValidationError
 
 from shapespace.model.shape_model import ShapeModel
 from shapespace.service.http.dependencies import Model, ServiceDependency
 from shapespace.service.http.description import problems
 from shapespace.service.http.messages.schemas import (
-    DistanceAnswer,
     GeneralisationAnswer,
     ModelCard,
     ModelList,
@@ -33,17 +34,19 @@ async def model_card(service: ServiceDependency, model: Model) -> ModelCard:
         **_facts(model),
         digest=model.digest,
         versions=service.repository.versions(model.manifest.name),
-        generalisation=_generalisation(model.manifest.figures.get("generalisation")),
+        generalisation=_generalisation(model.manifest.figures),
     )
 
 
-def _generalisation(found: dict[str, Any] | None) -> GeneralisationAnswer | None:
-    """Of the largest number of modes that was measured."""
-    if not found:
+def _generalisation(figures: Mapping[str, Any]) -> GeneralisationAnswer | None:
+    """Of the largest number of modes that a run has measured; what other tools write there is left alone."""
+    try:
+        found = figures["generalisation"]
+        content = {**found["modes"][-1], "components": found["components"][-1]}
+        content |= {"shapes": found["held_out"], "modes": found["counts"][-1]}
+        return GeneralisationAnswer.model_validate(content)
+    except (KeyError, IndexError, TypeError, ValidationError):
         return None
-    components = DistanceAnswer(**found["components"][-1])
-    shapes, modes = found["held_out"], found["counts"][-1]
-    return GeneralisationAnswer(**found["modes"][-1], components=components, shapes=shapes, modes=modes)
 
 
 def _facts(model: ShapeModel) -> dict[str, Any]:

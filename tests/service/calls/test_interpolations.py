@@ -199,7 +199,7 @@ def test_an_id_of_a_model_that_is_gone_is_not_found(client: httpx.Client, models
 
 def test_an_animation_has_an_entity_tag(client: httpx.Client) -> None:
     links = create(client, keyframes=[A, B], frames=3)["links"]
-    formats = ("glb", "npz", "zip", "pc2", "usd", "jsonl")
+    formats = ("glb", "npz", "zip", "pc2", "usd", "usdz", "jsonl")
     assert set(links) == {"self", "frames", *formats}
     tags = {name: client.get(links[name]).headers["ETag"] for name in formats}
     assert len(set(tags.values())) == len(formats)
