@@ -14,7 +14,7 @@ from shapespace.files.colouring import Colouring
 from shapespace.files.gltf_writing import surface_normals
 from shapespace.files.limits import UNLIMITED, clipped, label
 from shapespace.files.polygon_reading import Lines
-from shapespace.files.surfaces.textures import Textures
+from shapespace.files.surfaces.textures import Textures, beside
 from shapespace.mesh.surface import NONE, Labels, Material, Surface, labelled
 from shapespace.mesh.triangle_mesh import MeshError
 
@@ -134,8 +134,8 @@ def _read_libraries(
     """Materials of MTL files by name, as far as the surface uses them."""
     found: dict[str, Material] = {}
     for name in names:
-        whole = [path.parent / name]
-        for library in whole if whole[0].is_file() else [path.parent / part for part in name.split()]:
+        whole = [beside(path.parent, name)]
+        for library in whole if whole[0].is_file() else [beside(path.parent, part) for part in name.split()]:
             try:
                 found |= _read_library(library, textures, set(wanted.names))
             except OSError as error:
@@ -152,7 +152,7 @@ def _read_library(path: Path, textures: Textures, wanted: set[str]) -> dict[str,
     def end() -> None:
         if name in wanted and name not in found:
             texture = look.pop("texture", None)
-            kept = None if texture is None else textures.add_file(path.parent / str(texture), name)
+            kept = None if texture is None else textures.add_file(path.parent, str(texture), name)
             color = look.pop("color", (1.0, 1.0, 1.0))
             opacity = look.pop("opacity", 1.0)
             found[name] = Material(name, (*color, opacity), texture=kept, **look)  # type: ignore[arg-type, misc]
@@ -188,7 +188,7 @@ def _map(text: bytes) -> str:
         most, words = _MAP_OPTIONS[words[0]], words[1:]
         while most and len(words) > 1 and (most == 1 or _is_number(words[0])):
             most, words = most - 1, words[1:]
-    return b" ".join(words).decode(errors="replace").replace("\\", "/")
+    return b" ".join(words).decode(errors="replace")
 
 
 def _is_number(text: bytes) -> bool:
