@@ -12,6 +12,7 @@ import pytest
 
 from shapespace.bundle import writer
 from shapespace.bundle.reader import BundleError, read_bundle
+from shapespace.bundle.schema import ARRAYS, SURFACE
 from shapespace.bundle.writer import Networks
 from shapespace.files.surfaces.textures import ALL, LARGEST
 from shapespace.mesh.surface import Labels, Material, Surface
@@ -52,6 +53,8 @@ def folder(tmp_path: Path) -> Path:
 
 
 def test_a_surface_is_read_as_it_was_written(folder: Path) -> None:
+    with np.load(folder / "geometry.npz") as file:
+        assert {name for name in file if name.startswith(SURFACE)} == {n for n in ARRAYS if n.startswith(SURFACE)}
     found, wanted = read_bundle(folder).surface, surface()
     assert found
     for name in ("starts", "corners", "uv_corners", "shading", "material_of"):
