@@ -317,10 +317,10 @@ def test_what_can_t_be_kept_is_left_out_with_a_sentence(
     assert found is None or not found.textures
 
 
-@pytest.mark.parametrize("name", [r"C:\art\skin.png", "/elsewhere/skin.png", "../skin.png", "-s 2 2 maps/skin.png"])
+@pytest.mark.parametrize("name", [r"C:\art\skin.png", "{outside}/skin.png", "../skin.png", "-s 2 2 maps/skin.png"])
 def test_pictures_are_taken_from_the_folder_only(name: str, file: Path) -> None:
     library = file.with_name("balls.mtl")
-    library.write_text(f"newmtl skin\nmap_Kd {name}\n")
+    library.write_text(f"newmtl skin\nmap_Kd {name.format(outside=file.parents[1])}\n")
     (file.parents[1] / "skin.png").write_bytes(png(1))
     if "maps" not in name:
         found, (fault,) = read_surface(file)
