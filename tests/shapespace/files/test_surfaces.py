@@ -285,6 +285,21 @@ def test_faces_of_which_some_have_no_texture_coordinates_keep_those_of_the_other
     assert read_arrays(MESH_FORMATS["glb"].encode(CUBE, found.triangles, None, found), "glb")[0].shape == (8, 3)
 
 
+def test_corners_with_and_without_texture_coordinates_and_normals_go_round(tmp_path: Path) -> None:
+    normals = ["vn -1 0 0", "vn 1 0 0", "vn 0 -1 0", "vn 0 1 0", "vn 0 0 -1", "vn 0 0 1"]
+    faces = [f"f {' '.join(f'{v + 1}/{v % 4 + 1 if k else str()}/{k + 1}' for v in s)}" for k, s in enumerate(SIDES)]
+    found, _ = cube(["vt 0 0", "vt 1 0", "vt 1 1", "vt 0 1", *normals], faces, tmp_path)
+    assert found
+    path = tmp_path / "again.obj"
+    path.write_bytes(MESH_FORMATS["obj"].encode(CUBE, found.triangles, None, found))
+    again, faults = read_surface(path)
+    assert again
+    assert not faults
+    np.testing.assert_array_equal(again.uv_corners, found.uv_corners)
+    np.testing.assert_array_equal(again.normal_corners, found.normal_corners)
+    assert (again.uv_corners[:4] == -1).all()
+
+
 @pytest.mark.parametrize(
     ("lines", "faces", "says"),
     [
