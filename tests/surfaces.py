@@ -89,7 +89,7 @@ def parse_obj(text: str) -> dict:
     """What an OBJ file holds, word by word: polygons as (vertices, texture coordinates, normals, names by keyword)."""
     found: dict = {"v": [], "vt": [], "vn": [], "polygons": [], "mtllib": []}
     names: dict[str, str] = {}
-    for line in text.splitlines():
+    for line in filter(None, text.splitlines()):
         keyword, *words = line.split()
         if keyword in ("v", "vt", "vn"):
             found[keyword].append([float(word) for word in words])
@@ -102,3 +102,19 @@ def parse_obj(text: str) -> dict:
         elif keyword != "#":
             names[keyword] = " ".join(words)
     return found
+
+
+def corner_uv(surface: Surface) -> dict[tuple[int, ...], tuple[str, np.ndarray]]:
+    """By the vertices of each triangle the name of its material, and texture coordinates (3, 2)."""
+    uv = surface.uv[surface.uv_corners[surface.triangle_corners]]
+    named = surface.material_of is not None
+    names = [surface.materials[surface.material_of[k]].name if named else "" for k in surface.triangle_polygons]
+    return {tuple(t): (name, at) for t, name, at in zip(surface.triangles.tolist(), names, uv, strict=True)}
+
+
+def same_corners(found: dict, wanted: dict) -> None:
+    """Hold what `corner_uv` gives of two surfaces against each other."""
+    assert found.keys() == wanted.keys()
+    for triangle, (name, uv) in wanted.items():
+        assert found[triangle][0] == name
+        np.testing.assert_allclose(found[triangle][1], uv, atol=1e-6)

@@ -133,7 +133,7 @@ class Surface:
         behind = np.arange(len(first)) - np.repeat(np.cumsum(cut) - cut, cut)
         return np.stack([first, first + behind + 1, first + behind + 2], axis=1)
 
-    @property
+    @cached_property
     def triangles(self) -> IntArray:
         """(F, 3) vertices of each triangle."""
         return self.corners[self.triangle_corners]
@@ -187,7 +187,7 @@ class Surface:
         keys = self.corners * (self.shading.max() + 1) + self.shading
         return np.unique(keys, return_inverse=True)[1]
 
-    @property
+    @cached_property
     def normal_faces(self) -> IntArray:
         """(F, 3) the same for the corners of triangles."""
         return self.normal_corners[self.triangle_corners]
@@ -195,13 +195,17 @@ class Surface:
     @cached_property
     def split(self) -> SplitVertices:
         """Its triangles on vertices with one texture coordinate and one normal each."""
-        uv_corners = np.zeros_like(self.corners) if self.uv_corners is None else self.uv_corners
-        keys = np.stack([self.corners, uv_corners, self.normal_corners], axis=1)
-        found, inverse = np.unique(keys, axis=0, return_inverse=True)
+        # By vertex, then texture coordinate, then normal; sorting pairs of numbers as one is much faster.
+        number = self.corners
+        for further in (self.uv_corners, self.normal_corners):
+            if further is not None:
+                number = np.unique(number * (further.max() + 2) + further + 1, return_inverse=True)[1]
+        first = np.unique(number, return_index=True)[1]
         uv = None
-        if self.uv is not None:
-            uv = np.where(found[:, 1:2] >= 0, self.uv[found[:, 1]], 0.0)
-        return SplitVertices(found[:, 0], uv, found[:, 2], inverse.reshape(-1)[self.triangle_corners])
+        if self.uv is not None and self.uv_corners is not None:
+            of_uv = self.uv_corners[first]
+            uv = np.where(of_uv[:, None] >= 0, self.uv[of_uv], 0.0)
+        return SplitVertices(self.corners[first], uv, self.normal_corners[first], number[self.triangle_corners])
 
     def check(self, vertex_count: int, faces: IntArray) -> None:
         """Raise MeshError unless it is one of the mesh with so many vertices and these triangles (F, 3)."""

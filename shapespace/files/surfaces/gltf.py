@@ -101,7 +101,7 @@ def _picture(
     uri = image.get("uri")
     content: Callable[[], bytes]
     if uri is not None and not uri.startswith("data:"):
-        return textures.add_file(path.parent / unquote(uri), material)
+        return textures.add_file(path.parent, unquote(uri), material)
     if uri is not None:
 
         def content() -> bytes:

@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import json
 from array import array
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from shapespace.arrays import FloatArray
 from shapespace.files.colouring import Colouring
 from shapespace.files.gltf_writing import surface_normals
 from shapespace.files.limits import UNLIMITED, clipped, label
 from shapespace.files.polygon_reading import Lines
-from shapespace.files.surfaces.textures import Textures
+from shapespace.files.surfaces.textures import Textures, beside
 from shapespace.mesh.surface import NONE, Labels, Material, Surface, labelled
 from shapespace.mesh.triangle_mesh import MeshError
 
@@ -134,8 +135,8 @@ def _read_libraries(
     """Materials of MTL files by name, as far as the surface uses them."""
     found: dict[str, Material] = {}
     for name in names:
-        whole = [path.parent / name]
-        for library in whole if whole[0].is_file() else [path.parent / part for part in name.split()]:
+        whole = [beside(path.parent, name)]
+        for library in whole if whole[0].is_file() else [beside(path.parent, part) for part in name.split()]:
             try:
                 found |= _read_library(library, textures, set(wanted.names))
             except OSError as error:
@@ -152,7 +153,7 @@ def _read_library(path: Path, textures: Textures, wanted: set[str]) -> dict[str,
     def end() -> None:
         if name in wanted and name not in found:
             texture = look.pop("texture", None)
-            kept = None if texture is None else textures.add_file(path.parent / str(texture), name)
+            kept = None if texture is None else textures.add_file(path.parent, str(texture), name)
             color = look.pop("color", (1.0, 1.0, 1.0))
             opacity = look.pop("opacity", 1.0)
             found[name] = Material(name, (*color, opacity), texture=kept, **look)  # type: ignore[arg-type, misc]
@@ -188,7 +189,7 @@ def _map(text: bytes) -> str:
         most, words = _MAP_OPTIONS[words[0]], words[1:]
         while most and len(words) > 1 and (most == 1 or _is_number(words[0])):
             most, words = most - 1, words[1:]
-    return b" ".join(words).decode(errors="replace").replace("\\", "/")
+    return b" ".join(words).decode(errors="replace")
 
 
 def _is_number(text: bytes) -> bool:
@@ -225,21 +226,7 @@ def _lines(line: str, rows: np.ndarray) -> str:
 def obj_faces(surface: Surface) -> str:
     """The faces of an OBJ file, with texture coordinates, and the names of what they belong to."""
     uv = "" if surface.uv is None else _lines("vt %.9g %.9g\n", surface.uv.astype(np.float32))
-    return uv + "".join(_faces(surface))
-
-
-def _faces(surface: Surface) -> Iterator[str]:
-    """Faces in runs that have the same names and as many corners, and what stands between these."""
-    corners = [surface.corners + 1]
-    form = "%d"
-    if surface.uv_corners is not None:
-        corners.append(surface.uv_corners + 1)
-        form = "%d/%d"
-    if surface.normals:
-        corners.append(surface.normal_corners + 1)
-        form += "/%d" if surface.uv_corners is not None else "//%d"
-    numbers = np.stack(corners, axis=1)
-    count = len(surface.sizes)
+    lines = _face_lines(surface)
     named = {
         "o": surface.objects,
         "g": surface.groups,
@@ -247,29 +234,47 @@ def _faces(surface: Surface) -> Iterator[str]:
         if surface.material_of is None
         else Labels(tuple(material.name for material in surface.materials), surface.material_of),
     }
-    lacking = np.zeros(count, bool)
+    # Backwards, as each stands in front of what is there.
+    for keyword, labels in reversed(named.items()):
+        if labels:
+            for k in np.flatnonzero(np.diff(labels.of, prepend=NONE)).tolist():
+                name = "" if labels.of[k] == NONE else f" {labels.names[labels.of[k]]}"
+                lines[k] = f"{keyword}{name}\n{lines[k]}"
+    return uv + "".join(lines.tolist())
+
+
+def _face_lines(surface: Surface) -> NDArray:
+    """(P,) a line for each polygon."""
+    corners, form = [surface.corners + 1], "%d"
     if surface.uv_corners is not None:
-        lacking = np.minimum.reduceat(surface.uv_corners, surface.starts[:-1]) < 0
-    keys = [surface.sizes, lacking, *(labels.of for labels in named.values() if labels)]
-    changes = np.flatnonzero(np.any([np.diff(key, prepend=~key[:1]) != 0 for key in keys], axis=0)).tolist()
-    before: dict[str, int] = dict.fromkeys(named, NONE)
-    for start, stop in zip(changes, [*changes[1:], count], strict=True):
-        for keyword, labels in named.items():
-            if labels and before[keyword] != (now := int(labels.of[start])):
-                before[keyword] = now
-                yield f"{keyword} {'' if now == NONE else labels.names[now]}".rstrip() + "\n"
-        some = numbers[surface.starts[start] : surface.starts[stop]]
-        if lacking[start]:
-            yield "".join(_lacking(some, int(surface.sizes[start]), normals=surface.normals))
-        else:
-            yield _lines("f " + " ".join([form] * int(surface.sizes[start])) + "\n", some.reshape(stop - start, -1))
+        corners, form = [*corners, surface.uv_corners + 1], "%d/%d"
+    if surface.normals:
+        corners, form = [*corners, surface.normal_corners + 1], f"{form}{'//' if form == '%d' else '/'}%d"
+    numbers = np.stack(corners, axis=1)
+    lines = polygon_lines(surface, numbers, lambda size: "f " + " ".join([form] * size) + "\n")
+    if surface.uv_corners is not None:
+        lacking = np.flatnonzero(np.minimum.reduceat(surface.uv_corners, surface.starts[:-1]) < 0)
+        for k in lacking.tolist():
+            some = numbers[surface.starts[k] : surface.starts[k + 1]].tolist()
+            words = ("/".join([str(v), str(t or ""), *map(str, rest)]).rstrip("/") for v, t, *rest in some)
+            lines[k] = f"f {' '.join(words)}\n"
+    return lines
 
 
-def _lacking(numbers: np.ndarray, size: int, *, normals: bool) -> Iterator[str]:
-    """Faces of which some corners have no texture coordinate."""
-    for polygon in numbers.reshape(-1, size, numbers.shape[1]).tolist():
-        words = [f"{v}/{t or ''}{f'/{rest[0]}' if normals else ''}".rstrip("/") for v, t, *rest in polygon]
-        yield f"f {' '.join(words)}\n"
+def polygon_lines(surface: Surface, numbers: NDArray, line: Callable[[int], str]) -> NDArray:
+    """(P,) a line for each polygon, filled with the numbers (C, k) of its corners.
+
+    Args:
+        surface: whose polygons they are.
+        numbers: of each corner.
+        line: by how many corners a polygon has the line, to be filled by ``%``.
+    """
+    lines = np.empty(len(surface.sizes), object)
+    for size in np.unique(surface.sizes).tolist():
+        chosen = np.flatnonzero(surface.sizes == size)
+        rows = numbers[surface.starts[chosen][:, None] + np.arange(size)]
+        lines[chosen] = _lines(line(size), rows.reshape(len(chosen), -1)).splitlines(keepends=True)
+    return lines
 
 
 def write_obj(

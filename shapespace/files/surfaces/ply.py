@@ -11,6 +11,7 @@ from shapespace.arrays import FloatArray
 from shapespace.files.colouring import Colouring
 from shapespace.files.limits import UNLIMITED
 from shapespace.files.polygon_reading import BinaryTable, TextTable, ply_head
+from shapespace.files.surfaces.obj import polygon_lines
 from shapespace.mesh.surface import NONE, Surface
 from shapespace.mesh.triangle_mesh import MeshError
 
@@ -118,7 +119,8 @@ def write_ply(vertices: FloatArray, surface: Surface, colouring: Colouring | Non
     if mixed:
         line = " ".join("%d" if kind == "u1" else "%.9g" for _, _, kind, _ in fields) + "\n"
         text = line * len(rows) % tuple(value for row in rows.tolist() for value in row)
-        body = (text + _face_lines(surface)).encode()
+        faces = polygon_lines(surface, surface.corners[:, None], lambda size: f"{size}{' %d' * size}\n")
+        body = (text + "".join(faces.tolist())).encode()
     else:
         body = rows.tobytes() + _face_rows(surface, lists, length[1])
     return "\n".join([*head, "end_header\n"]).encode() + body
@@ -142,16 +144,3 @@ def _face_rows(surface: Surface, lists: list[tuple[str, str, NDArray]], length: 
         values = array.reshape(count, -1)
         pieces += [np.full((count, 1), values.shape[1], length).view(np.uint8), values.view(np.uint8)]
     return np.hstack(pieces).tobytes()
-
-
-def _face_lines(surface: Surface) -> str:
-    """Faces as text, those of as many corners at once."""
-    lines = np.empty(len(surface.sizes), object)
-    for size in np.unique(surface.sizes).tolist():
-        chosen = np.flatnonzero(surface.sizes == size)
-        line, corners = (
-            " ".join(["%d"] * (size + 1)),
-            surface.corners[surface.starts[chosen][:, None] + np.arange(size)],
-        )
-        lines[chosen] = [line % (size, *polygon) for polygon in corners.tolist()]
-    return "\n".join(lines.tolist()) + "\n"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 from shapespace.files.limits import clipped
 
@@ -12,6 +12,16 @@ from shapespace.files.limits import clipped
 LARGEST, ALL = 16 * 2**20, 32 * 2**20
 #: Of PNG and JPEG.
 BEGINNINGS = (b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff")
+
+
+def beside(folder: Path, name: str) -> Path:
+    """Where a file lies that is named in one of the folder: there or below, whatever other place it names.
+
+    Names from other machines are looked for by their last part, and nothing from elsewhere gets into a bundle.
+    """
+    inside = PurePosixPath(name.replace("\\", "/"))
+    away = inside.is_absolute() or ".." in inside.parts or not (folder / inside).is_file()
+    return folder / (inside.name if away else inside)
 
 
 class Textures:
@@ -28,8 +38,9 @@ class Textures:
         self.files: dict[str, bytes] = {}
         self._faults, self._known = faults, dict[object, str | None]()
 
-    def add_file(self, path: Path, material: str) -> str | None:
+    def add_file(self, folder: Path, name: str, material: str) -> str | None:
         """The name by which a file is kept; None where it can't be."""
+        path = beside(folder, name)
 
         def content() -> bytes:
             if path.stat().st_size > LARGEST:

@@ -48,6 +48,49 @@ def primitive(mode: int | None, indices: list[int] | None, count: int = 6) -> tu
     return read(tree, data + bytes(-len(data) % 4))
 
 
+def numbered(numbers: list[float], kind: int = 5126) -> tuple[np.ndarray, np.ndarray]:
+    """Two triangles on six vertices in a row, the last three at the places of the first, with numbers of their own."""
+    places = np.tile(np.arange(9, dtype="<f4").reshape(3, 3), (2, 1)).tobytes()
+    given = np.array(numbers, {5126: "<f4", 5121: "u1"}[kind]).tobytes()
+    tree = document(
+        buffers=[{"byteLength": len(places + given)}],
+        bufferViews=[
+            {"buffer": 0, "byteLength": len(places)},
+            {"buffer": 0, "byteOffset": len(places), "byteLength": len(given)},
+        ],
+        accessors=[
+            {"bufferView": 0, "componentType": 5126, "type": "VEC3", "count": 6},
+            {"bufferView": 1, "componentType": kind, "type": "SCALAR", "count": len(numbers)},
+        ],
+        meshes=[{"primitives": [{"attributes": {"POSITION": 0, "_VERTEX": 1}}]}],
+    )
+    return read(tree, places + given + bytes(-len(given) % 4))
+
+
+@pytest.mark.parametrize("kind", [5126, 5121])
+def test_vertices_of_one_number_are_one(kind: int) -> None:
+    vertices, faces = numbered([2, 0, 1, 2, 0, 1], kind)
+    np.testing.assert_array_equal(vertices, [[3, 4, 5], [6, 7, 8], [0, 1, 2]])
+    np.testing.assert_array_equal(faces, [[2, 0, 1], [2, 0, 1]])
+
+
+@pytest.mark.parametrize(
+    ("numbers", "says"),
+    [
+        ([0, 1, 2, 0, 1, 6], "number no vertex"),
+        ([0, 1, 2, 0, 1, -1], "number no vertex"),
+        ([0, 1, 2, 0, 1, 1.5], "number no vertex"),
+        ([0, 1, 2, 0, 1, np.nan], "number no vertex"),
+        ([0, 1, 3, 0, 1, 3], "leaves out the number 2"),
+        ([0, 1, 2, 0, 1, 1], "one number for vertices at different places"),
+        ([0, 1, 2], "numbers 3 of 6 vertices"),
+    ],
+)
+def test_numbers_of_vertices_that_can_t_be_are_refused(numbers: list[float], says: str) -> None:
+    with pytest.raises(MeshError, match=says):
+        numbered(numbers)
+
+
 @pytest.mark.parametrize("format", ["glb", "gltf"])
 def test_what_we_write_comes_back_bit_for_bit(format: str) -> None:
     mesh = freaky_torus.reference()

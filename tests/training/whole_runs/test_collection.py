@@ -2,25 +2,31 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import signal
 import subprocess
 import sys
 import time
+import zipfile
 from collections.abc import Iterator
 from pathlib import Path
 
 import httpx
 import numpy as np
 import pytest
+import trimesh
+from pxr import Usd, UsdGeom
 from safetensors.numpy import load_file
 
+from shapespace.files.surfaces.reading import read_surface
 from shapespace.mesh.rigid_motion import align
 from shapespace.mesh.triangle_mesh import TriangleMesh
 from shapespace.training.runs.stages import STAGES
 from tests.service.conftest import starting
-from tests.surfaces import ball, write_files
+from tests.service.glb import GLB
+from tests.surfaces import ball, corner_uv, parse_obj, same_corners, write_files
 from tests.training.conftest import command
 
 CONFIG = """
@@ -205,6 +211,96 @@ def test_the_server_encodes_the_user_s_own_files(url: str, run: Path, folder: Pa
         assert found["vertex_error"]["mean"] < 0.03 * diagonal
         assert len(found["vertex_errors"]) == vertices.shape[1]
         assert (np.array(found["latent"]) > lower - 0.5 * (upper - lower)).all()
+
+
+def test_what_the_files_had_comes_back(url: str, run: Path, folder: Path, tmp_path: Path) -> None:
+    _, given = ball()
+    shapes, _ = bars()
+    mesh = f"{url}/v1/models/bars/mesh"
+    with np.load(run / "modes.npz") as modes:
+        code = ",".join(map(str, modes["coefficients"][3]))
+
+    def ask(**query: str) -> httpx.Response:
+        return httpx.get(mesh, params={"latent": code} | query, timeout=60)
+
+    # Each file of the collection is what the model keeps, but for its positions.
+    answer = parse_obj(ask(format="obj").raise_for_status().text)
+    for k in range(len(shapes)):
+        file = parse_obj((folder / "meshes" / f"bar{k}.obj").read_text())
+        assert answer["polygons"] == file["polygons"]
+        np.testing.assert_allclose(answer["vt"], file["vt"], atol=1e-7)
+    assert not answer["mtllib"], "it refers to no files that are not there"
+    positions = np.array(ask(format="json").json()["vertices"])
+    np.testing.assert_allclose(answer["v"], positions, rtol=1e-6)
+    archive = zipfile.ZipFile(io.BytesIO(ask(format="zip").content))
+    archive.extractall(tmp_path)
+    assert (tmp_path / "skin.png").read_bytes() == given.textures["skin.png"]
+    assert parse_obj(archive.read("shape.obj").decode())["polygons"] == answer["polygons"]
+    (tmp_path / "shape.ply").write_bytes(ask(format="ply").content)
+    kept, _ = read_surface(tmp_path / "shape.ply")
+    assert kept
+    assert np.array_equal(kept.corners, given.corners)
+    assert np.array_equal(kept.starts, given.starts)
+
+    # Triangles where they are asked for, or where a format has no others.
+    triangles = ask(format="obj", topology="triangles")
+    assert [polygon[0] for polygon in parse_obj(triangles.text)["polygons"]] == given.triangles.tolist()
+    tags = [ask(format="obj", **more).headers["ETag"] for more in ({}, {"topology": "original"})]
+    assert tags[0] == tags[1] != triangles.headers["ETag"]
+    for query in ({"format": "glb"}, {"format": "json"}, {"format": "obj", "mesh": "coarse"}):
+        refused = ask(topology="original", **query)
+        assert refused.status_code == 422
+        assert "triangles only" in refused.json()["detail"]
+    coarse = parse_obj(ask(format="obj", mesh="coarse").text)
+    assert {len(polygon[0]) for polygon in coarse["polygons"]} == {3}
+    assert not coarse["vt"]
+
+    # GLB: others see the texture in its place, and our own one encodes.
+    glb = ask(format="glb").content
+    scene = trimesh.load_scene(io.BytesIO(glb), file_type="glb", process=False)
+    assert {part.visual.material.name for part in scene.geometry.values()} == {"skin", "cap"}
+    (tmp_path / "shape.glb").write_bytes(glb)
+    kept, _ = read_surface(tmp_path / "shape.glb")
+    assert kept
+    same_corners(corner_uv(kept), corner_uv(given))
+    headers = {"Content-Type": "model/gltf-binary"}
+    found = httpx.post(f"{url}/v1/models/bars/encode", content=glb, headers=headers, timeout=60).raise_for_status()
+    assert found.json()["vertex_error"]["max"] < 0.01 * np.ptp(positions)
+    # What is coloured shows its colours, not the texture.
+    tree = GLB(ask(format="glb", color="stretch").content).tree
+    assert "images" not in tree
+    assert len(tree["materials"]) == 1
+
+
+def test_animations_have_what_the_files_had(url: str, run: Path, tmp_path: Path) -> None:
+    _, given = ball()
+    with np.load(run / "modes.npz") as modes:
+        body = {"keyframes": modes["coefficients"][:2].tolist(), "frames": 3}
+    made = httpx.post(f"{url}/v1/models/bars/interpolations", json=body).json()
+    address = f"{url}/v1/interpolations/{made['id']}"
+
+    def ask(**query: str) -> httpx.Response:
+        return httpx.get(address, params=query, timeout=60)
+
+    glb = GLB(ask(format="glb").content)
+    rows = glb.array(glb.primitive["attributes"]["_VERTEX"]).astype(int)
+    frame = httpx.get(f"{address}/frames/2", params={"format": "json"}, timeout=60).json()
+    np.testing.assert_allclose(glb.key(2), np.array(frame["vertices"])[rows], atol=1e-3)
+    assert len(glb.tree["images"]) == 1
+    with zipfile.ZipFile(io.BytesIO(ask(format="zip").content)) as archive:
+        assert sorted(archive.namelist()) == [*(f"frame-{k:04d}.obj" for k in range(3)), "frames.mtl", "skin.png"]
+        last = parse_obj(archive.read("frame-0002.obj").decode())
+    assert last["mtllib"] == ["frames.mtl"]
+    assert [len(polygon[0]) for polygon in last["polygons"]] == given.sizes.tolist()
+    for topology, sizes in (("original", given.sizes), ("triangles", np.full(len(given.triangles), 3))):
+        path = tmp_path / f"{topology}.usdc"
+        path.write_bytes(ask(format="usd", topology=topology).content)
+        stage = Usd.Stage.Open(str(path))
+        mesh = UsdGeom.Mesh(stage.GetDefaultPrim())
+        np.testing.assert_array_equal(mesh.GetFaceVertexCountsAttr().Get(), sizes)
+    assert ask(format="npz", topology="original").status_code == 422
+    one = httpx.get(f"{address}/frames/1", params={"format": "obj", "topology": "triangles"}, timeout=60)
+    assert {len(polygon[0]) for polygon in parse_obj(one.text)["polygons"]} == {3}
 
 
 def test_the_server_has_the_exponentials_that_the_networks_learned_from(url: str, run: Path) -> None:
