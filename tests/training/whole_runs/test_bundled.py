@@ -9,12 +9,20 @@ import tomllib
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
+import shapespace
 from shapespace.bundle.reader import read_bundle
+from shapespace.coordinates.nric import WeightedNorm, nric
+from shapespace.mesh.rigid_motion import align
+from shapespace.model.decoder import MeshChoice
+from shapespace.model.exact_shapes import exact_shape
 from shapespace.training.__main__ import main
+from shapespace.training.collection import freaky_torus
 from shapespace.training.collection.generators import PRODUCTS
-from shapespace.training.learning.networks import candidates
+from shapespace.training.learning.evaluation import r_squared
+from shapespace.training.learning.networks import affine_sum, candidates
 from shapespace.training.runs.config import CombinerSettings, Config, LatentNetworkSettings, load
 
 ROOT = Path(__file__).parents[3]
@@ -118,3 +126,50 @@ def test_a_run_of_version_0_1_can_be_looked_at(
         monkeypatch.setattr(sys, "argv", ["shapespace-train", command, str(run)])
         assert main() == 0
         assert says in capsys.readouterr().out
+
+
+def test_the_figures_networks_follow_exponentials_that_nobody_drew_before() -> None:
+    """From the committed ONNX files; the affine sum of the factors, which is no model of the figure, does not."""
+    model = shapespace.load(ROOT / "models" / "figure")
+    codes, reference = model.sample(16, seed=20261123), model.reference
+    answers = model.decode(codes, mesh="coarse").astype(np.float32)
+    found = [exact_shape(model, code, answer, MeshChoice.COARSE) for code, answer in zip(codes, answers, strict=True)]
+    exact = np.stack([nric(e.vertices.astype(float) / model.manifest.scale, reference.connectivity) for e in found])
+    factors = np.stack([model._networks(code[None])[0][0] for code in codes])
+    predicted, affine = (
+        np.stack([model.nric(code) for code in codes]),
+        affine_sum(nric(reference.vertices, reference.connectivity), factors),
+    )
+    norm = WeightedNorm.of(reference, 1e-2)
+    scores = {name: r_squared(z, exact, norm) for name, z in {"networks": predicted, "affine": affine}.items()}
+    assert min(scores["networks"].values()) > 0.999
+    assert scores["affine"]["total"] < 0.995
+
+
+def test_the_torus_networks_know_shape_and_bump_at_fresh_codes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """From the committed ONNX files; a torus without its bump, and one whose ellipse is off by 0.1, do not pass."""
+    model, torus = shapespace.load(ROOT / "models" / "freaky-torus"), freaky_torus.FreakyTorus()
+    codes = torus.coordinates.uniform(40, np.random.default_rng(20261123))
+    exact, norm = torus.shapes(codes), WeightedNorm.of(torus.reference, 1e-2)
+    few, size = exact.vertices[:8], torus.reference.diagonal
+    with monkeypatch.context() as changed:
+        changed.setattr(freaky_torus, "BUMP_HEIGHT", 0.0)
+        smooth = torus.shapes(codes)
+    near = np.linalg.norm(few - smooth.vertices[:8], axis=2) > 0.1 * freaky_torus.BUMP_HEIGHT / torus.scale
+
+    def fails(nric: np.ndarray, vertices: np.ndarray) -> list[str]:
+        r2 = r_squared(nric, exact.nric, norm)
+        away = np.linalg.norm(align(vertices, few) - few, axis=2) / size
+        limits = {
+            "total": r2["total"] < 0.99,
+            "angles": r2["angles"] < 0.85,
+            "mean": away.mean() > 0.004,
+            "near the bump": away[near].mean() > 0.015,
+        }
+        return [name for name, over in limits.items() if over]
+
+    decoded = model.decode(codes[:8], mesh="coarse") / model.manifest.scale
+    assert fails(np.stack([model.nric(code) for code in codes]), decoded) == []
+    assert {"total", "angles", "near the bump"} <= set(fails(smooth.nric, smooth.vertices[:8]))
+    turned = torus.shapes(codes + np.array([0.1, 0, 0, 0]))
+    assert "mean" in fails(turned.nric, turned.vertices[:8])
