@@ -5,12 +5,12 @@ from __future__ import annotations
 from typing import Any
 
 from fastapi import APIRouter
+from pydantic import ValidationError
 
 from shapespace.model.shape_model import ShapeModel
 from shapespace.service.http.dependencies import Model, ServiceDependency
 from shapespace.service.http.description import problems
 from shapespace.service.http.messages.schemas import (
-    DistanceAnswer,
     GeneralisationAnswer,
     ModelCard,
     ModelList,
@@ -37,13 +37,13 @@ async def model_card(service: ServiceDependency, model: Model) -> ModelCard:
     )
 
 
-def _generalisation(found: dict[str, Any] | None) -> GeneralisationAnswer | None:
-    """Of the largest number of modes that was measured."""
-    if not found:
+def _generalisation(found: Any) -> GeneralisationAnswer | None:
+    """Of the largest number of modes that was measured; None of figures in another form, which is not laid down."""
+    try:
+        shapes, modes, components = found["held_out"], found["counts"][-1], found["components"][-1]
+        return GeneralisationAnswer(**found["modes"][-1], components=components, shapes=shapes, modes=modes)
+    except (LookupError, TypeError, ValidationError):
         return None
-    components = DistanceAnswer(**found["components"][-1])
-    shapes, modes = found["held_out"], found["counts"][-1]
-    return GeneralisationAnswer(**found["modes"][-1], components=components, shapes=shapes, modes=modes)
 
 
 def _facts(model: ShapeModel) -> dict[str, Any]:
