@@ -42,6 +42,8 @@ def test_play_pause_and_the_sliders_follow(studio: Studio) -> None:
     studio["#play"].evaluate(PLAY_A_WHILE)
     studio.until_different(before)
     assert "Play" in studio["#play"].inner_text()
+    assert any("quality=draft" in address for address in studio.addresses)
+    assert studio.shown == "fine"
     studio.eventually(lambda: studio.code[2] not in {0, 1})
     size, angle, twist = studio.code
     assert angle == 0

@@ -118,6 +118,35 @@ def test_shapes_that_take_their_time_are_asked_for_once(studio: Studio) -> None:
     assert {asked["mesh"] for asked in studio.asked} == {"fine"}
 
 
+def test_a_draft_that_was_solved_after_all_is_not_asked_for_again(window: Open) -> None:
+    # So far outside the bounds, face frames go astray.
+    studio = window().open(f"#model=figure&z={','.join(['3,-3'] * 10)}")
+    studio.page.wait_for_timeout(1000)
+    fine = [asked for asked in studio.asked if len(asked["latents"]) == 1 and asked["mesh"] == "fine"]
+    assert {asked["quality"] for asked in fine} == {"draft"}
+    assert "folded over" in studio["#diagnostics"].inner_text()
+
+
+def test_nothing_jumps_as_a_draft_comes_to_rest(window: Open) -> None:
+    studio = window().open("#model=figure")
+    held: list[Route] = []
+    studio.page.route(
+        "**/vertices*",
+        lambda route: held.append(route) if '"full"' in (route.request.post_data or "") else route.continue_(),
+    )
+    start = studio.picture()
+    studio.type(3, 0.6)
+    studio["#canvas"].hover()  # away from the factor, which colours what it moves
+    studio.eventually(lambda: bool(held))
+    assert (studio.shown, studio.quality) == ("fine", "draft")
+    draft = studio.picture()
+    for route in held:
+        route.continue_()
+    studio.rest()
+    assert difference(start, draft) > 0.01
+    assert difference(draft, studio.picture()) < 0.25 * difference(start, draft)
+
+
 def test_a_slider_is_dragged(studio: Studio) -> None:
     before = studio.picture()
     box = studio.coordinate(0).locator("input[type=range]").bounding_box()

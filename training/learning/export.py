@@ -7,6 +7,7 @@ import warnings
 from dataclasses import replace
 from importlib import metadata
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -18,9 +19,12 @@ from pydantic import ValidationError
 from torch import Tensor, nn
 
 from shapespace.bundle.geometry import Geometry
+from shapespace.bundle.reader import BundleError
 from shapespace.bundle.schema import COMBINER, START, Network, Origin, Tolerance, factor_network
 from shapespace.bundle.writer import Facts, Networks, write_bundle
 from shapespace.coordinates.nric import WeightedNorm
+from shapespace.model.decoder import ModelFailedError
+from shapespace.model.latent_space import NotFiniteError
 from shapespace.model.shape_model import load
 from shapespace.shell.energy import Material
 from shapespace.training.learning.layers import narrowest
@@ -128,7 +132,7 @@ def export(
 
     Raises:
         ExportError: ONNX and PyTorch differ by more than the tolerance on 64 random codes, or the bundle contradicts
-            itself.
+            itself, or has no shape at a code inside its bounds.
     """
     settings, reference = config.export, collection.reference
     rng = np.random.default_rng(0)
@@ -167,13 +171,17 @@ def export(
         origin=Origin(config=_portable(config), data_digest=data_digest, code_version=metadata.version("shapespace")),
     )
     try:
-        folder = write_bundle(models, facts, networks, geometry)
-        # Drafts are measured as they are served, so that a bundle comes first.
-        facts = replace(facts, draft_error=load(folder).draft_error())
+        # Drafts are measured as they are served, so that a bundle comes first, where no server watches.
+        with TemporaryDirectory() as folder:
+            facts = replace(
+                facts, draft_error=load(write_bundle(Path(folder), facts, networks, geometry)).draft_error()
+            )
         return write_bundle(models, facts, networks, geometry)
     except ValidationError as error:
         fault = error.errors(include_url=False, include_input=False)[0]
         raise ExportError(f"the manifest's {'.'.join(map(str, fault['loc']))}: {fault['msg']}") from None
+    except (BundleError, ModelFailedError, NotFiniteError) as error:
+        raise ExportError(f"the bundle can't be served: {error}") from None
 
 
 def _portable(config: Config) -> dict[str, Any]:

@@ -16,7 +16,8 @@ function flatten(value, path = []) {
 
 export async function openCard(dialog, model) {
   const card = await api.modelCard(model);
-  const { r2, vertex_error: error, generalisation: unseen } = card.figures;
+  const { r2, vertex_error: error } = card.figures;
+  const { generalisation: unseen, draft_error: draft } = card;
   find("h2", dialog).textContent = card.title;
   find(".kind", dialog).textContent = `${card.name} · version ${card.version} · ${card.licence}`;
   find(".description", dialog).textContent = card.description;
@@ -26,8 +27,9 @@ export async function openCard(dialog, model) {
     ["vertices", card.vertices],
     ["faces", card.faces],
     ...(r2?.composite ? [["variance explained (R²)", readable(r2.composite.total, 4)]] : []),
-    ...(unseen ? [["unseen shapes, mean distance", percent(unseen.modes.at(-1).mean)],
-      ["as many principal components", percent(unseen.components.at(-1).mean)]] : []),
+    ...(unseen ? [["unseen shapes, mean distance", percent(unseen.mean)],
+      ["as many principal components", percent(unseen.components.mean)]] : []),
+    ...(draft ? [["drafts, mean distance", percent(draft.mean)]] : []),
     ...(error?.mean ? [["mean vertex error, of the diagonal", percent(error.mean)]] : []),
   ]));
   const cells = (...texts) => texts.map((textContent) => element("td", { textContent }));

@@ -8,6 +8,7 @@ import { meshOf, motionOf } from "./shape-loop.js";
 const PICTURE = 64;
 const SEGMENT = 24; // frames
 const LONGEST = 120; // frames
+const MOST_VERTICES = 2 ** 21; // of all frames: where they would be more, the coarse mesh plays
 const PACE = 1.8; // seconds for a segment
 
 export class Path {
@@ -98,7 +99,10 @@ export class Path {
     this.#loading = loading;
     this.status.textContent = `Computing ${request.frames} frames …`;
     try {
-      const frames = await api.frames(this.store.model, { ...request, mesh: meshOf(this.store) }, loading.signal);
+      const { model, references } = this.store;
+      let mesh = meshOf(this.store);
+      if (request.frames * references[mesh].vertices.length > 3 * MOST_VERTICES) mesh = "coarse";
+      const frames = await api.frames(model, { ...request, mesh }, loading.signal);
       loading.signal.throwIfAborted();
       this.#frames = frames;
     } finally {

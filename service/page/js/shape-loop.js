@@ -3,7 +3,8 @@
  *
  * One request is under way at a time; what is asked for meanwhile supersedes what waited, so nothing queues. A full
  * shape on its way is dropped as soon as the code moves on, and so is a draft that takes too long. A draft that is
- * quick is let finish: dropping it for each pixel of a drag would show nothing until the hand rests.
+ * quick is let finish: dropping it for each pixel of a drag would show nothing until the hand rests. Where the server
+ * has answered a draft by the full shape, nothing more is asked for.
  */
 
 import { Matrix4 } from "three";
@@ -43,11 +44,11 @@ export class ShapeLoop {
     if (this.store.playing || !this.store.model) return;
     const current = this.#current;
     if (current && (current.quality === "full" || performance.now() - current.began > TOO_LONG)) current.abort.abort();
+    clearTimeout(this.#timer);
     this.#want("draft");
-    this.#rest();
   }
 
-  /** Ask for the full shape once nothing has moved for a while. */
+  /** Ask for the full shape once a draft has been there for a while. */
   #rest() {
     clearTimeout(this.#timer);
     if (this.store.playing || !this.store.model) return;
@@ -68,12 +69,14 @@ export class ShapeLoop {
       this.#wanted = null;
       this.#current = { ...asked, abort: new AbortController() };
       try {
-        const { model, code, mesh, quality } = asked;
-        const { shapes, diagnostics } = await api.shapes(model, [code], mesh, { quality, signal: this.#current.abort.signal });
+        const { model, code, mesh, quality: wanted } = asked;
+        const { signal } = this.#current.abort;
+        const { shapes, diagnostics } = await api.shapes(model, [code], mesh, { quality: wanted, signal });
+        const { quality } = diagnostics;
         if (model === this.store.model && !this.store.playing) {
           const motion = motionOf(this.store, mesh, code, shapes[0]);
           const told = quality === "full" ? diagnostics : null;
-          this.store.set({ shape: { ...asked, positions: shapes[0], motion, diagnostics: told } });
+          this.store.set({ shape: { ...asked, quality, positions: shapes[0], motion, diagnostics: told } });
         }
         if (quality === "draft") this.#rest();
       } catch (error) {

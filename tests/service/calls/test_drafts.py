@@ -2,16 +2,19 @@
 
 import io
 import json
+from pathlib import Path
 from typing import Any
 
 import httpx
 import numpy as np
 import pytest
 
+from shapespace.bundle.schema import MANIFEST
 from shapespace.client import Client
 from shapespace.mesh.triangle_mesh import diagonal
 from shapespace.model.shape_model import load
-from tests.service.conftest import ROOT, Server
+from tests.service.bundles import write_bundle
+from tests.service.conftest import ROOT, Server, Start
 
 MODEL = "/v1/models/figure"
 CODE = [0.3, -0.2] * 10
@@ -152,3 +155,22 @@ def test_the_card_tells_how_near_it_comes_to_shapes_that_it_has_not_seen(client:
     assert (unseen["shapes"], unseen["modes"]) == (measured["held_out"], measured["counts"][-1])
     torus = client.get("/v1/models/freaky-torus").json()
     assert torus["generalisation"] is None, "a product by design has no shapes to hold out"
+
+
+def test_cards_of_bundles_that_do_not_tell_how_near_they_come(tmp_path: Path, start: Start) -> None:
+    figures = [
+        None,
+        {},
+        {"failed": "no mean"},
+        {"held_out": 1, "counts": [1], "modes": [{}], "components": [{}]},
+        "1 %",
+    ]
+    for k, unseen in enumerate(figures):
+        manifest = write_bundle(tmp_path, f"older-{k}") / MANIFEST
+        facts = json.loads(manifest.read_text()) | {"figures": {"generalisation": unseen}}
+        facts.pop("draft_error")
+        manifest.write_text(json.dumps(facts))
+    server = start(tmp_path)
+    for k in range(len(figures)):
+        card = httpx.get(f"{server.url}/v1/models/older-{k}").raise_for_status().json()
+        assert (card["draft_error"], card["generalisation"]) == (None, None)

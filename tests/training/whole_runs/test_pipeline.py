@@ -19,6 +19,7 @@ import torch
 from shapespace.bundle.geometry import Geometry
 from shapespace.bundle.reader import read_bundle
 from shapespace.coordinates.nric import WeightedNorm, nric
+from shapespace.model.shape_model import ShapeModel
 from shapespace.training.collection.freaky_torus import FreakyTorus, vertices
 from shapespace.training.learning.export import ExportError, export
 from shapespace.training.pipeline import Run, learner_of
@@ -96,6 +97,8 @@ def test_the_bundle_is_one_the_server_takes_and_computes_the_same(tiny_run: Path
     bundle = read_bundle(folder)
     assert bundle.manifest.figures == json.loads((tiny_run / "evaluation.json").read_text())
     assert bundle.manifest.onnx_tolerance.measured <= 1e-4
+    assert bundle.manifest.draft_error
+    assert bundle.manifest.draft_error.model_dump() == pytest.approx(ShapeModel(bundle).draft_error(), rel=1e-6)
     text = b"".join(path.read_bytes() for path in folder.iterdir())
     assert str(Path(__file__).parents[3]).encode() not in text, "a bundle tells nothing of the machine it was made on"
 
