@@ -24,7 +24,7 @@ def extrapolation(learner: Learner) -> list[dict[str, Any]]:
 
     Returns:
         For each of ``REACHES`` how many of ``CODES`` exponentials failed, and R² on the others of the composite, the
-        monolithic network and the affine sum of exact factors.
+        one-factor network and the affine sum of exact factors.
     """
     collection = learner.collection
     coordinates, factors = collection.coordinates, list(collection.factors.values())

@@ -166,7 +166,7 @@ def plot_samples(rows: list[Row], path: Path) -> None:
         every = sorted([whole, *row.evaluation["fractions"]], key=lambda each: each["fraction"])
         at = [100 * each["fraction"] for each in every]
         for model, style in (("composite", "o-"), ("all of factors", "s--"), ("monolithic", "^:")):
-            label = {"all of factors": "composite, all factor samples"}.get(model, model)
+            label = {"all of factors": "composite, all factor samples", "monolithic": "one factor"}.get(model, model)
             axis.plot(at, [1 - each["r2"][model]["total"] for each in every], style, label=label)
         axis.set(title=row.name, xscale="log", yscale="log", xlabel="joint samples (%)")
         axis.set_xticks(at, [f"{a:g}" for a in at], minor=False)

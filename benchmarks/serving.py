@@ -36,7 +36,7 @@ from shapespace.coordinates.nric import NRICJacobian, WeightedNorm
 from shapespace.coordinates.reconstruction import Reconstruction, Reconstructor
 from shapespace.files.formats import MESH_FORMATS
 from shapespace.mesh.rigid_motion import align
-from shapespace.model.decoder import TOLERANCE, MeshChoice
+from shapespace.model.decoder import TOLERANCE, MeshChoice, Quality
 from shapespace.model.shape_model import ShapeModel
 from shapespace.shell.energy import Material
 from shapespace.shell.exponential import exponential
@@ -105,12 +105,14 @@ def measure(model: ShapeModel, codes: FloatArray) -> dict[str, list[float]]:
         began = time.thread_time()
         shape = model.shape(code)
         solved = time.thread_time() - began
+        draft = seconds(lambda code=code: model.shape(code, quality=Quality.DRAFT))
         encode = seconds(lambda shape=shape: GLB(shape.vertices, fine.faces, None))
         found = {
             "network": network,
             "reconstruct": solved - network,
             "encode": encode,
             "sum": solved + encode,
+            "draft": draft + encode,
             "iterations": shape.diagnostics.iterations,
             "blend shapes": seconds(blend),
         }
@@ -124,7 +126,19 @@ def measure(model: ShapeModel, codes: FloatArray) -> dict[str, list[float]]:
 def stages(models: Path, count: int) -> None:
     """Stage by stage, for every bundle of a folder."""
     print("\nCode → GLB of the fine mesh in process, medians, ms; in brackets steps of Gauss–Newton.\n")
-    columns = "network", "reconstruct", "encode", "sum", "p95", "p99", "SuperLU", "sum / SuperLU", "blend shapes"
+    columns = (
+        "network",
+        "reconstruct",
+        "encode",
+        "sum",
+        "p95",
+        "p99",
+        "draft",
+        "SuperLU",
+        "sum / SuperLU",
+        "draft / SuperLU",
+        "blend shapes",
+    )
     table("model", *columns, "exponential, K = 16")
     for path in bundles(models):
         model = ShapeModel(read_bundle(path))
@@ -138,8 +152,9 @@ def stages(models: Path, count: int) -> None:
             median["encode"],
             median["sum"],
             *(float(np.quantile(times["sum"][3:], q)) for q in (0.95, 0.99)),
+            median["draft"],
             median["SuperLU"],
-            f"{median['sum'] / median['SuperLU']:.2f}",
+            *(f"{median[name] / median['SuperLU']:.2f}" for name in ("sum", "draft")),
             median["blend shapes"],
             ceiling(model, codes[:5]),
         )

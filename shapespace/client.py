@@ -115,8 +115,8 @@ class Client:
             format: glb, gltf, obj, ply, stl, npz, zip (OBJ with materials and textures) or json.
             place: where to answer it, as ``edit`` answers a ``placement``.
             covariance: (m, m) of codes around ``latent``, to colour the shape by how far its vertices may be.
-            options: version, mesh ("fine" or "coarse"), bounds ("allow", "clamp" or "reject"), color, topology
-                ("original" or "triangles").
+            options: version, mesh ("fine" or "coarse"), bounds ("allow", "clamp" or "reject"), quality ("full" or
+                "draft"), color, topology ("original" or "triangles").
         """
         path, params = f"/v1/models/{name}/mesh", {"format": format, "place": _json(place), **options}
         if covariance is not None:
@@ -134,6 +134,16 @@ class Client:
         arrays = _arrays(self.mesh(name, latent, "npz", place=place, **options))
         return Mesh(arrays["vertices"].astype(np.float32), arrays["faces"].astype(np.int64))
 
+    def blend_shapes(self, name: str, **options: Options) -> bytes:
+        """A GLB with a morph target for each end of each coordinate.
+
+        Args:
+            name: of a model without angles among its coordinates.
+            options: version, mesh ("fine" or "coarse").
+        """
+        content: bytes = self._send("GET", f"/v1/models/{name}/blendshapes", params=options).content
+        return content
+
     def vertices(
         self,
         name: str,
@@ -150,13 +160,13 @@ class Client:
             latents: (n, m).
             version: of the model.
             place: where to answer them, see ``mesh``.
-            options: mesh ("fine" or "coarse"), bounds ("allow", "clamp" or "reject").
+            options: mesh ("fine" or "coarse"), bounds ("allow", "clamp" or "reject"), quality ("full" or "draft").
         """
         answer = self._send(
             "POST",
             f"/v1/models/{name}/vertices",
             params={"version": version, "format": "npz", "place": _json(place)},
-            json={"latents": _numbers(latents), **options},
+            json={"latents": _numbers(latents), "faces": False, **options},
         )
         return _arrays(answer.content)["vertices"].astype(np.float32)
 
@@ -173,7 +183,7 @@ class Client:
         return np.array(answer["lengths"]), np.array(answer["angles"])
 
     def interpolate(
-        self, name: str, keyframes: ArrayLike, *, version: str | None = None, **options: Any
+        self, name: str, keyframes: ArrayLike, *, version: str | None = None, quality: str = "full", **options: Any
     ) -> Interpolation:
         """An animation along a path of codes.
 
@@ -181,6 +191,7 @@ class Client:
             name: of the model.
             keyframes: (k, m), at least two.
             version: of the model.
+            quality: of the frames, "full" or "draft".
             options: frames, times, start, stop, loop, mesh.
         """
         answer = self._send(
@@ -189,7 +200,7 @@ class Client:
             params={"version": version},
             json={"keyframes": _numbers(keyframes), **options},
         ).json()
-        return Interpolation(self, answer["id"], answer["frames"])
+        return Interpolation(self, answer["id"], answer["frames"], quality)
 
     def encode(
         self,
@@ -336,15 +347,17 @@ class Interpolation:
         client: the one that asked for it.
         id: holds the whole request, so that any replica can answer it, at any time.
         frames: how many there are.
+        quality: "full", or "draft": quicker, and nearly the same.
     """
 
     client: Client
     id: str
     frames: int
+    quality: str = "full"
 
     def __iter__(self) -> Iterator[NDArray[np.float32]]:
         path, http = f"/v1/interpolations/{self.id}", self.client._http
-        with http.stream("GET", path, params={"format": "jsonl"}) as answer:
+        with http.stream("GET", path, params={"format": "jsonl", "quality": self.quality}) as answer:
             if answer.is_error:
                 answer.read()
                 raise ClientError(answer)
@@ -354,9 +367,9 @@ class Interpolation:
                     raise ClientError(answer, problem)
                 yield np.array(frame["vertices"], dtype=np.float32)
 
-    def file(self, format: str = "glb") -> bytes:
-        """The whole animation."""
-        return self._get("", format)
+    def file(self, format: str = "glb", fps: float | None = None) -> bytes:
+        """The whole animation; GLB, USD and USDZ with so many frames in a second."""
+        return self._get("", format, fps=fps)
 
     def frame(self, k: int, format: str = "glb") -> bytes:
         """One frame, from 0."""
@@ -366,10 +379,9 @@ class Interpolation:
         """Positions (frames, V, 3)."""
         return _arrays(self.file("npz"))["vertices"].astype(np.float32)
 
-    def _get(self, path: str, format: str) -> bytes:
-        content: bytes = self.client._send(
-            "GET", f"/v1/interpolations/{self.id}{path}", params={"format": format}
-        ).content
+    def _get(self, path: str, format: str, **more: Options) -> bytes:
+        params = {"format": format, "quality": self.quality, **more}
+        content: bytes = self.client._send("GET", f"/v1/interpolations/{self.id}{path}", params=params).content
         return content
 
 

@@ -187,7 +187,10 @@ def networks(run: Run) -> None:
     learner = learner_of(run)
     learner.main()
     learner.monolithic()
+    learner.monolithic_paper()
     learner.variants()
+    if run.config.networks.paper:
+        learner.paper()
     histories = learner.histories
     for fraction in run.config.networks.fractions:
         learner = learner_of(run, fraction=fraction)

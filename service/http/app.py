@@ -20,6 +20,7 @@ from shapespace.service.http.dependencies import Service, known_query
 from shapespace.service.http.description import describe
 from shapespace.service.http.middleware import AnswerHead, LimitBody, Observe, PaceAnswers, RequireHost, RequireKey
 from shapespace.service.http.routes import (
+    blend_shapes,
     codes,
     fits,
     health,
@@ -97,10 +98,8 @@ def create_app(settings: Settings | None = None, validator: BundleValidator | No
         openapi_url=None,
     )
     problems.install(app)
-    routers = [
-        module.router
-        for module in (models, shapes, codes, fits, interpolations, open_inference, health, operation, page)
-    ]
+    calls = (models, shapes, blend_shapes, codes, fits, interpolations, open_inference, health, operation, page)
+    routers = [module.router for module in calls]
     for router in routers:
         app.include_router(router)
     app.router.routes.append(page.assets())

@@ -10,7 +10,7 @@ from fastapi import Depends, Path, Query, Request
 from pydantic import WithJsonSchema
 from starlette.exceptions import HTTPException
 
-from shapespace.model.decoder import MeshChoice
+from shapespace.model.decoder import MeshChoice, Quality
 from shapespace.model.shape_model import ShapeModel
 from shapespace.service.http.caching import AnswerCache
 from shapespace.service.http.connections import Connections
@@ -69,6 +69,12 @@ CallerDependency = Annotated[Caller, Depends(_caller)]
 ModelName = Annotated[str, Path(description="Name of a model.", examples=["freaky-torus"])]
 MeshQuery = Annotated[
     MeshChoice | None, Query(alias="mesh", description="As in the body, over which it wins: `fine` or `coarse`.")
+]
+QualityQuery = Annotated[
+    Quality, Query(alias="quality", description="`draft` leaves Gauss–Newton out where the first guess is near enough.")
+]
+QualityOfBody = Annotated[
+    Quality | None, Query(alias="quality", description="As in the body, over which it wins: `full` or `draft`.")
 ]
 Version = Annotated[str | None, Query(description="Version of the model; by default the newest.")]
 Format = Annotated[

@@ -33,7 +33,7 @@ _HEADERS = {
         "ETag": "Strong; the same from every replica. Sent back as `If-None-Match` it saves the work.",
         "Shape-Diagnostics": (
             "JSON: `status`, `iterations`, `residual`, `flipped_faces`, `integrability`, `plausibility`, "
-            "`inside_bounds`, `model`."
+            "`inside_bounds`, `model`, `quality`."
         ),
         "Server-Timing": "Milliseconds by stage: `network`, `reconstruct`, `encode`.",
     }.items()

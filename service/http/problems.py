@@ -14,6 +14,7 @@ from starlette.requests import ClientDisconnect
 from starlette.routing import Match
 from starlette.types import Scope
 
+from shapespace.model.blend_shapes import PeriodicError
 from shapespace.model.correspondence import InvalidMeshError
 from shapespace.model.decoder import ModelFailedError, NetworkTimeError
 from shapespace.model.edit import InvalidTargetError
@@ -65,6 +66,7 @@ KINDS = {
     "invalid-mesh": Kind(422, "Mesh can't be used"),
     "invalid-scan": Kind(422, "Scan can't be used"),
     "no-tangent-space": Kind(422, "Model without a tangent space"),
+    "periodic": Kind(422, "Coordinates without ends"),
     "too-many-codes": Kind(422, "Too many codes"),
     "too-many-frames": Kind(422, "Too many frames"),
     "path-too-long": Kind(422, "Too many keyframes"),
@@ -100,6 +102,7 @@ _OF_EXCEPTION: dict[type[Exception], str] = {
     InvalidMeshError: "invalid-mesh",
     InvalidScanError: "invalid-scan",
     NoTangentSpaceError: "no-tangent-space",
+    PeriodicError: "periodic",
     BusyError: "busy",
     DeadlineError: "deadline-passed",
     NoRoomError: "no-room",

@@ -12,6 +12,7 @@ from fastapi.responses import StreamingResponse
 from starlette.types import Receive, Scope, Send
 
 from shapespace.mesh.surface import Topology
+from shapespace.model.decoder import Quality
 from shapespace.model.latent_space import CheckedCode
 from shapespace.model.shape_model import ShapeModel
 from shapespace.service.http.caching import CachedAnswer, cache_headers, entity_tag, not_modified
@@ -30,6 +31,11 @@ def timing(service: Service, seconds: Timings) -> dict[str, str]:
     """The header ``Server-Timing``, in milliseconds; the metrics count the same."""
     service.metrics.timed(seconds)
     return {"Server-Timing": ", ".join(f"{stage};dur={1e3 * duration:.3f}" for stage, duration in seconds.items())}
+
+
+def draft_option(quality: Quality) -> list[str]:
+    """What tells a draft's entity tag from that of the shape."""
+    return [quality] if quality is Quality.DRAFT else []
 
 
 def file_headers(diagnostics: Mapping[str, Any], filename: str) -> dict[str, str]:
@@ -51,7 +57,7 @@ async def shape_response(
     service: Service, request: Request, caller: Caller, model: ShapeModel, wanted: WantedShape
 ) -> Response:
     """One shape as a file, as it was answered before where it was."""
-    options: list[str | bytes] = []
+    options: list[str | bytes] = [*draft_option(wanted.quality)]
     if colour_by := wanted.colour_by:
         covariance = colour_by.covariance
         told = _bytes_of(colour_by.against) if covariance is None else covariance.tobytes()

@@ -11,7 +11,7 @@ from types import TracebackType
 from typing import Any, TypeVar
 
 from shapespace.files.archives import Buffer
-from shapespace.model.decoder import MeshChoice, Shape
+from shapespace.model.decoder import MeshChoice, Quality, Shape
 from shapespace.model.latent_space import CheckedCode
 from shapespace.model.shape_model import ShapeModel
 from shapespace.service.limits.workers import Call, Caller, Workers
@@ -97,9 +97,11 @@ class Batch:
         async with aclosing(self._workers.map(work, items, self._call)) as results:
             return [result async for result in results]
 
-    def solve(self, model: ShapeModel, mesh: MeshChoice, code: CheckedCode, deadline: Deadline) -> Shape:
+    def solve(
+        self, model: ShapeModel, mesh: MeshChoice, quality: Quality, code: CheckedCode, deadline: Deadline
+    ) -> Shape:
         """A code to its shape, in a worker's thread; raises DeadlineError."""
-        return solve(self._workers, model, mesh, code, deadline)
+        return solve(self._workers, model, mesh, quality, code, deadline)
 
     async def write(
         self,
@@ -137,9 +139,11 @@ async def batch(workers: Workers, caller: Caller, size: int) -> AsyncIterator[Ba
             yield Batch(workers, call, size, held)
 
 
-def solve(workers: Workers, model: ShapeModel, mesh: MeshChoice, code: CheckedCode, deadline: Deadline) -> Shape:
+def solve(
+    workers: Workers, model: ShapeModel, mesh: MeshChoice, quality: Quality, code: CheckedCode, deadline: Deadline
+) -> Shape:
     """A code to its shape; raises DeadlineError."""
-    shape = model.shape(*code, mesh, deadline)
+    shape = model.shape(*code, mesh, deadline, quality)
     if shape.diagnostics.status is Status.DEADLINE:
         raise workers.late()
     return shape

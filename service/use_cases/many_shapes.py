@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from shapespace.files.archives import Buffer, npz_pieces
 from shapespace.files.formats import OCTET_STREAM
 from shapespace.mesh.rigid_motion import Placement
-from shapespace.model.decoder import Diagnostics, MeshChoice
+from shapespace.model.decoder import Diagnostics, MeshChoice, Quality
 from shapespace.model.exact_shapes import ExactShape, exact_shape, require_tangent_space
 from shapespace.model.latent_space import Bounds, CheckedCode, Codes
 from shapespace.model.shape_model import ShapeModel
@@ -59,8 +59,10 @@ async def vertices_file(
     mesh: MeshChoice,
     format: str,
     *,
+    quality: Quality = Quality.FULL,
     exponentials: bool = False,
     place: Placement | None = None,
+    faces: bool = True,
 ) -> Written:
     """Positions and diagnostics of the shapes of codes, in one of VERTICES_TYPES.
 
@@ -72,8 +74,10 @@ async def vertices_file(
         bounds: what to do outside the bounds.
         mesh: fine or coarse.
         format: name of the format.
+        quality: of the shapes.
         exponentials: whether to compute the true discrete exponentials as well.
         place: takes positions from where they are aligned to the reference to where they are wanted.
+        faces: whether NPZ has the mesh's faces, too.
 
     Raises:
         NoTangentSpaceError: exponentials of a model that has none.
@@ -85,7 +89,7 @@ async def vertices_file(
         require_tangent_space(model)
     codes, inside = model.latents.codes(latents, bounds)
     async with batch(workers, caller, shapes_size(model, (2 if exponentials else 1) * len(codes), mesh)) as work:
-        found = await shapes(work, model, codes, inside, mesh)
+        found = await shapes(work, model, codes, inside, mesh, quality)
         true = await _exponentials(work, model, codes, found, mesh) if exponentials else None
         if place:
             found = replace(found, vertices=placed(found.vertices, place).astype(np.float32))
@@ -98,7 +102,8 @@ async def vertices_file(
                 return json_pieces(lists | (exponential_lists(true) if true else {})), {}
             arrays = diagnostics_arrays(found.diagnostics)
             arrays |= exponential_arrays(true, found.vertices.shape[1]) if true else {}
-            return npz_pieces(vertices=found.vertices, faces=model.mesh(mesh).faces, latents=codes, **arrays), {}
+            arrays |= {"faces": model.mesh(mesh).faces} if faces else {}
+            return npz_pieces(vertices=found.vertices, latents=codes, **arrays), {}
 
         return await work.write(encode, found.seconds, worst(found.diagnostics))
 
@@ -121,6 +126,7 @@ async def infer(
     latents: NDArray[np.floating],
     bounds: Bounds,
     mesh: MeshChoice,
+    quality: Quality,
     outputs: Sequence[str],
     write: WriteOutputs,
 ) -> Written:
@@ -140,7 +146,7 @@ async def infer(
         found: Shapes | None = None
         for name in outputs:
             if name == "vertices":
-                found = await shapes(work, model, codes, inside, mesh)
+                found = await shapes(work, model, codes, inside, mesh, quality)
                 arrays[name] = found.vertices
             else:
                 arrays[name] = (await predictions(work, model, codes)).nric
@@ -159,13 +165,15 @@ def shapes_size(model: ShapeModel, count: int, mesh: MeshChoice) -> int:
     return BYTES_OF_A_VERTEX * count * vertices
 
 
-async def shapes(work: Batch, model: ShapeModel, codes: Codes, inside: NDArray[np.bool_], mesh: MeshChoice) -> Shapes:
+async def shapes(
+    work: Batch, model: ShapeModel, codes: Codes, inside: NDArray[np.bool_], mesh: MeshChoice, quality: Quality
+) -> Shapes:
     """Shapes of codes (n, m), side by side; raises as ``Batch.map``."""
     vertices = np.empty((len(codes), *model.mesh(mesh).vertices.shape), np.float32)
 
     def find(item: tuple[int, CheckedCode], call: Call) -> tuple[Diagnostics, Timings]:
         k, code = item
-        shape = work.solve(model, mesh, code, call)
+        shape = work.solve(model, mesh, quality, code, call)
         vertices[k] = shape.vertices
         return shape.diagnostics, shape.seconds
 

@@ -14,7 +14,7 @@ from shapespace.arrays import FloatArray
 from shapespace.files.colouring import Colouring, Quantity
 from shapespace.mesh.rigid_motion import Placement
 from shapespace.mesh.surface import Topology
-from shapespace.model.decoder import Diagnostics, MeshChoice, Shape
+from shapespace.model.decoder import Diagnostics, MeshChoice, Quality, Shape
 from shapespace.model.latent_space import CheckedCode, NotFiniteError
 from shapespace.model.shape_model import ShapeModel
 from shapespace.model.spread import spread
@@ -47,6 +47,7 @@ class WantedShape:
         code: of the shape; None is the reference.
         mesh: fine or coarse.
         format: one of SHAPE_FORMATS.
+        quality: of this shape, and of the one that colours compare with.
         colour_by: what to colour it by, if anything.
         place: takes it from where it is aligned to the reference to where it is wanted.
         topology: of formats that can hold polygons.
@@ -55,6 +56,7 @@ class WantedShape:
     code: CheckedCode | None
     mesh: MeshChoice
     format: str
+    quality: Quality = Quality.FULL
     colour_by: ColourBy | None = None
     place: Placement | None = None
     topology: Topology = Topology.ORIGINAL
@@ -100,7 +102,9 @@ async def shape_file(workers: Workers, caller: Caller, model: ShapeModel, wanted
     mesh, colour_by = wanted.mesh, wanted.colour_by
 
     def find(code: CheckedCode | None, deadline: Deadline) -> Shape:
-        return model.reference_shape(mesh) if code is None else solve(workers, model, mesh, code, deadline)
+        return (
+            model.reference_shape(mesh) if code is None else solve(workers, model, mesh, wanted.quality, code, deadline)
+        )
 
     def make(deadline: Deadline) -> ShapeFile:
         found, colouring = [find(wanted.code, deadline)], None

@@ -8,8 +8,10 @@ from functools import partial
 from itertools import count
 from typing import Any
 
+from shapespace.files.animated_gltf import FRAMES_PER_SECOND
 from shapespace.files.archives import Buffer
 from shapespace.mesh.surface import Topology
+from shapespace.model.decoder import Quality
 from shapespace.model.latent_space import CheckedCode, Codes
 from shapespace.model.shape_model import ShapeModel
 from shapespace.service.limits.workers import Caller, Workers
@@ -74,8 +76,10 @@ async def sequence_file(
     caller: Caller,
     model: ShapeModel,
     animation: Animation,
+    quality: Quality,
     format: str,
     topology: Topology = Topology.ORIGINAL,
+    fps: float = FRAMES_PER_SECOND,
 ) -> Written:
     """All frames as one file in one of SEQUENCE_FORMATS, with polygons or triangles.
 
@@ -86,10 +90,10 @@ async def sequence_file(
     """
     codes, inside = model.latents.codes(animation.codes(model.latents))
     async with batch(workers, caller, shapes_size(model, len(codes), animation.mesh)) as work:
-        found = await shapes(work, model, codes, inside, animation.mesh)
+        found = await shapes(work, model, codes, inside, animation.mesh, quality)
         faces = model.mesh(animation.mesh).faces
         surface = shown(model.surface(animation.mesh), topology)
-        frames = Frames(found.vertices, found.diagnostics, faces, animation.positions, codes, surface)
+        frames = Frames(found.vertices, found.diagnostics, faces, animation.positions, codes, surface, fps)
 
         def encode() -> tuple[Iterator[Buffer], dict[str, Any]]:
             return SEQUENCE_FORMATS[format].encode(frames)
@@ -98,7 +102,7 @@ async def sequence_file(
 
 
 async def sequence_lines(
-    workers: Workers, caller: Caller, model: ShapeModel, animation: Animation
+    workers: Workers, caller: Caller, model: ShapeModel, animation: Animation, quality: Quality
 ) -> AsyncGenerator[bytes, None]:
     """All frames as lines of JSON, each as soon as it is ready; raises BusyError and as ``Workers.run``."""
     codes, inside = model.latents.codes(animation.codes(model.latents))
@@ -106,7 +110,7 @@ async def sequence_lines(
 
     def line(frame: tuple[int, float, Codes, bool], deadline: Deadline) -> bytes:
         k, t, code, inside = frame
-        shape = solve(workers, model, animation.mesh, (code, inside), deadline)
+        shape = solve(workers, model, animation.mesh, quality, (code, inside), deadline)
         return json_line(k, t, shape, None if k else faces)
 
     frames = zip(count(), animation.positions.tolist(), codes, map(bool, inside))

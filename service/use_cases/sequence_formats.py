@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from shapespace.arrays import FloatArray, IntArray
-from shapespace.files.animated_gltf import animated_glb
+from shapespace.files.animated_gltf import FRAMES_PER_SECOND, animated_glb
 from shapespace.files.archives import Buffer, npz_pieces, zip_pieces
 from shapespace.files.formats import OCTET_STREAM
 from shapespace.files.point_cache import point_cache
@@ -37,6 +38,7 @@ class Frames:
         positions: (n,) where on the path each frame lies.
         codes: (n, m).
         surface: of the mesh, where its file had more than triangles.
+        fps: frames in a second.
     """
 
     vertices: NDArray[np.float32]
@@ -45,6 +47,7 @@ class Frames:
     positions: FloatArray
     codes: Codes
     surface: Surface | None = None
+    fps: float = FRAMES_PER_SECOND
 
 
 @dataclass(frozen=True)
@@ -55,11 +58,13 @@ class SequenceFormat:
         media_type: as IANA has it.
         encode: a sequence to the pieces of the file, and facts for the diagnostics.
         polygons: whether faces are those of the surface, where there is one; otherwise they are triangles.
+        timed: whether files say how long a frame is shown.
     """
 
     media_type: str
     encode: Callable[[Frames], tuple[Iterator[Buffer], dict[str, Any]]]
     polygons: bool = False
+    timed: bool = False
 
 
 def json_line(k: int, t: float, shape: Shape, faces: IntArray | None) -> bytes:
@@ -72,7 +77,7 @@ def json_line(k: int, t: float, shape: Shape, faces: IntArray | None) -> bytes:
 
 
 def _glb(frames: Frames) -> tuple[Iterator[Buffer], dict[str, Any]]:
-    animated = animated_glb(frames.vertices, frames.faces, frames.surface)
+    animated = animated_glb(frames.vertices, frames.faces, frames.surface, frames.fps)
     return iter([animated.data]), {"targets": animated.targets, "max_vertex_error": animated.max_vertex_error}
 
 
@@ -91,10 +96,10 @@ def _point_cache(frames: Frames) -> tuple[Iterator[Buffer], dict[str, Any]]:
     return point_cache(frames.vertices), {}
 
 
-def _usd(frames: Frames) -> tuple[Iterator[Buffer], dict[str, Any]]:
+def _usd(frames: Frames, *, packed: bool = False) -> tuple[Iterator[Buffer], dict[str, Any]]:
     def pieces() -> Iterator[Buffer]:
         try:
-            yield from animated_usd(frames.vertices, frames.faces, frames.surface)
+            yield from animated_usd(frames.vertices, frames.faces, frames.surface, frames.fps, packed=packed)
         except OSError:
             raise NoRoomError(
                 "The server has no room for the temporary file that USD takes. Ask for another format, or give it a "
@@ -122,18 +127,21 @@ def _zip(frames: Frames) -> tuple[Iterator[Buffer], dict[str, Any]]:
 JSON_LINES = "application/jsonl"
 #: Formats of a whole animation but for JSON lines, which are streamed; the first is the default.
 SEQUENCE_FORMATS = {
-    "glb": SequenceFormat("model/gltf-binary", _glb),
+    "glb": SequenceFormat("model/gltf-binary", _glb, timed=True),
     "npz": SequenceFormat(OCTET_STREAM, _npz),
     "zip": SequenceFormat("application/zip", _zip, polygons=True),
     "pc2": SequenceFormat(OCTET_STREAM, _point_cache),
-    "usd": SequenceFormat(OCTET_STREAM, _usd, polygons=True),
+    "usd": SequenceFormat(OCTET_STREAM, _usd, polygons=True, timed=True),
+    "usdz": SequenceFormat("model/vnd.usdz+zip", partial(_usd, packed=True), polygons=True, timed=True),
 }
 #: Media types of all formats of a whole animation by name.
 MEDIA_TYPES = {name: format.media_type for name, format in SEQUENCE_FORMATS.items()} | {"jsonl": JSON_LINES}
 #: Why a format may be missing.
-UNAVAILABLE = {"usd": "This server can't write USD, for which it needs the package usd-core: pip install usd-core"}
+UNAVAILABLE = dict.fromkeys(
+    ("usd", "usdz"), "This server can't write USD, for which it needs the package usd-core: pip install usd-core"
+)
 
 
 def sequence_types() -> dict[str, str]:
     """Media types of the formats of a whole animation that this server can write, by name."""
-    return {name: media_type for name, media_type in MEDIA_TYPES.items() if name != "usd" or usd_installed()}
+    return {name: media_type for name, media_type in MEDIA_TYPES.items() if name not in UNAVAILABLE or usd_installed()}

@@ -13,7 +13,7 @@ from shapespace.arrays import FloatArray, IntArray
 from shapespace.files.colouring import Colouring
 from shapespace.files.formats import MESH_FORMATS, OBJ_ZIP, MeshFormat
 from shapespace.mesh.surface import Surface, Topology
-from shapespace.model.decoder import Diagnostics
+from shapespace.model.decoder import Diagnostics, Quality
 from shapespace.model.exact_shapes import ExactShape
 
 #: Bytes that are counted at once: where there are too many values, few of these pieces are looked at.
@@ -69,6 +69,7 @@ def diagnostics_arrays(diagnostics: Sequence[Diagnostics]) -> dict[str, NDArray]
         "integrability": np.array([d.integrability for d in diagnostics]),
         "plausibility": np.array([d.plausibility for d in diagnostics], dtype=np.float64),
         "inside_bounds": np.array([d.inside_bounds for d in diagnostics]),
+        "quality": np.array([str(d.quality) for d in diagnostics]),
     }
 
 
@@ -104,7 +105,7 @@ def exponential_arrays(exponentials: Sequence[ExactShape], vertex_count: int) ->
 
 
 def worst(diagnostics: Sequence[Diagnostics]) -> dict[str, Any]:
-    """One summary of several diagnostics: the largest numbers, and the first status that isn't good."""
+    """One summary of several diagnostics: the largest numbers, the first status that isn't good, a draft if any is."""
     bad = [d.status for d in diagnostics if d.status != "converged"]
     return {
         "status": bad[0] if bad else diagnostics[0].status,
@@ -115,4 +116,5 @@ def worst(diagnostics: Sequence[Diagnostics]) -> dict[str, Any]:
         "plausibility": max((d.plausibility for d in diagnostics if d.plausibility is not None), default=None),
         "inside_bounds": all(d.inside_bounds for d in diagnostics),
         "model": diagnostics[0].model,
+        "quality": Quality.DRAFT if any(d.quality is Quality.DRAFT for d in diagnostics) else Quality.FULL,
     }

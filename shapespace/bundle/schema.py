@@ -92,6 +92,13 @@ class Tolerance(_Strict):
     measured: NonNegativeFloat
 
 
+class DraftError(_Strict):
+    """How far drafts are from solved shapes, over vertices and codes inside the bounds, as shares of the diagonal."""
+
+    mean: NonNegativeFloat
+    p95: NonNegativeFloat
+
+
 class Origin(_Strict):
     """Where a bundle comes from."""
 
@@ -138,6 +145,7 @@ class Manifest(_Strict):
     surface: SurfaceEntry | None = None
     onnx_tolerance: Tolerance
     figures: dict[str, Any]
+    draft_error: DraftError | None = None
     origin: Origin
     files: dict[FileName, FileEntry]
 

@@ -60,6 +60,7 @@ class Facts:
         period: (m,), NaN for latents without one.
         material: μ, λ, η of the shell.
         eta_reconstruction: η of Gauss–Newton.
+        draft_error: ``mean`` and ``p95`` of drafts, where that was measured.
         exponential_steps: K of the exponentials that a code stands for, where the bundle has modes.
         scale: length of one unit of the reference in the user's units.
         tolerance: of ONNX against PyTorch.
@@ -84,6 +85,7 @@ class Facts:
     figures: Mapping[str, Any]
     origin: Origin
     exponential_steps: int | None = None
+    draft_error: Mapping[str, float] | None = None
 
 
 def write_bundle(models: Path, facts: Facts, networks: Networks, geometry: Geometry) -> Path:
@@ -166,6 +168,7 @@ def _manifest(facts: Facts, geometry: Geometry, files: Mapping[str, bytes]) -> M
         "surface": surface_entry(geometry.surface) if geometry.surface else None,
         "onnx_tolerance": facts.tolerance,
         "figures": dict(facts.figures),
+        "draft_error": facts.draft_error,
         "origin": facts.origin,
         "files": {name: entry(files[name]) for name in sorted(files)},
     })  # fmt: skip

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shapespace.arrays import FloatArray, IntArray
-from shapespace.files.gltf_writing import ARRAY_BUFFER, Document
+from shapespace.files.gltf_writing import Document
 from shapespace.mesh.surface import Surface
 from shapespace.mesh.triangle_mesh import diagonal
 
@@ -18,7 +18,8 @@ from shapespace.mesh.triangle_mesh import diagonal
 DENSE_FRAMES = 64
 #: Enough targets are kept to bring every vertex this close, as a fraction of the bounding box's diagonal.
 BASIS_TOLERANCE = 1e-4
-FRAMES_PER_SECOND = 30
+#: Where nobody says otherwise.
+FRAMES_PER_SECOND = 30.0
 #: Bytes of displacements, and frames of normals, that are held in memory at once.
 BLOCK, _FRAMES_AT_ONCE = 2**21, 16
 
@@ -39,10 +40,12 @@ class AnimatedGLB:
     max_vertex_error: float
 
 
-def animated_glb(frames: NDArray[np.floating], faces: IntArray, surface: Surface | None = None) -> AnimatedGLB:
+def animated_glb(
+    frames: NDArray[np.floating], faces: IntArray, surface: Surface | None = None, fps: float = FRAMES_PER_SECOND
+) -> AnimatedGLB:
     """Encode shapes (n, V, 3), with their surface where there is one.
 
-    Key k, at ``k / FRAMES_PER_SECOND`` seconds, shows frame k.
+    Key k, at ``k / fps`` seconds, shows frame k.
     The mesh at rest is frame 0. Up to DENSE_FRAMES each later frame is a target of its own, so that keys are
     exact to float32; longer sequences are spanned by the leading singular vectors of the displacements from
     frame 0. Weights lie between 0 and 1. The error is measured on what is written and stored in ``asset.extras`` too.
@@ -73,15 +76,8 @@ def animated_glb(frames: NDArray[np.floating], faces: IntArray, surface: Surface
     document = Document(rest, faces, "animation", surface=surface)
     normal_targets = _normal_targets(frames, document.normals, fit)
     if len(targets):
-        document.primitive["targets"] = [
-            {
-                "POSITION": document.add(target[document.rows], bounds=True, target=ARRAY_BUFFER),
-                "NORMAL": document.add(normal_target, target=ARRAY_BUFFER),
-            }
-            for target, normal_target in zip(targets, normal_targets, strict=True)
-        ]
-        document.mesh["weights"] = [0.0] * len(targets)
-        times = np.arange(len(frames)) / FRAMES_PER_SECOND
+        document.add_targets(targets, normal_targets)
+        times = np.arange(len(frames)) / fps
         document.tree["animations"] = [
             {
                 "name": "animation",
@@ -98,7 +94,7 @@ def animated_glb(frames: NDArray[np.floating], faces: IntArray, surface: Surface
     document.tree["asset"]["extras"] = {
         "frames": len(frames),
         "targets": len(targets),
-        "frames_per_second": FRAMES_PER_SECOND,
+        "frames_per_second": fps,
         "max_vertex_error": error,
     }
     return AnimatedGLB(document.glb(), len(targets), error)

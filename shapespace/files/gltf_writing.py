@@ -8,6 +8,7 @@ from __future__ import annotations
 import base64
 import json
 import struct
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -200,6 +201,25 @@ class Document:
             )
         self.accessors.append(accessor)
         return len(self.accessors) - 1
+
+    def add_targets(self, moves: Iterable[NDArray], normals: Iterable[NDArray], names: Sequence[str] = ()) -> None:
+        """Add morph targets, at rest with weights 0.
+
+        Args:
+            moves: of each (V, 3) what it adds to the positions.
+            normals: of each (V', 3) what it adds to the normals of the document's vertices.
+            names: of each, where they have some.
+        """
+        self.primitive["targets"] = [
+            {
+                "POSITION": self.add(move[self.rows], bounds=True, target=ARRAY_BUFFER),
+                "NORMAL": self.add(normal, target=ARRAY_BUFFER),
+            }
+            for move, normal in zip(moves, normals, strict=True)
+        ]
+        self.mesh["weights"] = [0.0] * len(self.primitive["targets"])
+        if names:
+            self.mesh.setdefault("extras", {})["targetNames"] = [*names]
 
     def _json(self, buffer: dict[str, Any]) -> bytes:
         mesh = {**self.mesh, "primitives": [{**self.primitive, **part} for part in self._parts]}

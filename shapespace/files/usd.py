@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from shapespace.arrays import IntArray
 from shapespace.files.animated_gltf import FRAMES_PER_SECOND
-from shapespace.files.gltf_writing import surface_normals
+from shapespace.files.gltf_writing import picture_type, surface_normals
 from shapespace.files.surfaces.usd import add_surface
 from shapespace.mesh.surface import Surface
 
@@ -26,11 +26,25 @@ def usd_installed() -> bool:
     return find_spec("pxr") is not None
 
 
-def animated_usd(frames: NDArray[np.floating], faces: IntArray, surface: Surface | None = None) -> Iterator[bytes]:
+def animated_usd(
+    frames: NDArray[np.floating],
+    faces: IntArray,
+    surface: Surface | None = None,
+    fps: float = FRAMES_PER_SECOND,
+    *,
+    packed: bool = False,
+) -> Iterator[bytes]:
     """Encode shapes (n, V, 3), with the polygons of their surface where there is one, as a binary USD layer, in pieces.
 
     Time code k shows frame k, y up and in metres as glTF is. Points are float32. Normals
     at the vertices and extents are sampled with them.
+
+    Args:
+        frames: (n, V, 3).
+        faces: (F, 3).
+        surface: with polygons, materials and textures.
+        fps: time codes in a second.
+        packed: whether the layer comes in a USDZ package, as phones want it, with the textures beside it.
 
     Raises:
         ImportError: ``usd-core`` is not installed.
@@ -47,8 +61,8 @@ def animated_usd(frames: NDArray[np.floating], faces: IntArray, surface: Surface
             raise OSError(f"can't write {path}") from error
         UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
         UsdGeom.SetStageMetersPerUnit(stage, 1.0)
-        stage.SetTimeCodesPerSecond(FRAMES_PER_SECOND)
-        stage.SetFramesPerSecond(FRAMES_PER_SECOND)
+        stage.SetTimeCodesPerSecond(fps)
+        stage.SetFramesPerSecond(fps)
         stage.SetStartTimeCode(0)
         stage.SetEndTimeCode(len(frames) - 1)
         mesh = UsdGeom.Mesh.Define(stage, "/animation")
@@ -62,7 +76,13 @@ def animated_usd(frames: NDArray[np.floating], faces: IntArray, surface: Surface
         mesh.CreateDisplayColorAttr([Gf.Vec3f(*_COLOUR)])
         apart = shown.shading is not None
         mesh.SetNormalsInterpolation(UsdGeom.Tokens.faceVarying if apart else UsdGeom.Tokens.vertex)
-        add_surface(stage, mesh, shown)
+        textures = {}
+        if packed:
+            for number, (name, data) in enumerate(shown.textures.items()):
+                # As short as they can be: what the file called them may be no name for a file here.
+                textures[name] = f"{number}.{picture_type(data).partition('/')[2]}"
+                Path(folder, textures[name]).write_bytes(data)
+        add_surface(stage, mesh, shown, textures)
         points, normals, extent = mesh.CreatePointsAttr(), mesh.CreateNormalsAttr(), mesh.CreateExtentAttr()
         frames = frames.astype(np.float32, copy=False)
         for start in range(0, len(frames), _FRAMES_AT_ONCE):
@@ -79,5 +99,11 @@ def animated_usd(frames: NDArray[np.floating], faces: IntArray, surface: Surface
             except Tf.ErrorException as error:
                 raise OSError(f"can't write {path}") from error
         del stage, mesh, points, normals, extent
+        if packed:
+            package = Path(folder, "animation.usdz")
+            with Sdf.ZipFileWriter.CreateNew(str(package)) as archive:
+                for name in (path.name, *textures.values()):  # the layer comes first
+                    archive.AddFile(str(path.with_name(name)), name)
+            path = package
         with path.open("rb") as file:
             yield from iter(lambda: file.read(_PIECE), b"")

@@ -19,7 +19,7 @@ from shapespace.bundle.geometry import FineMesh
 from shapespace.bundle.reader import Bundle, BundleError
 from shapespace.coordinates.integrability import Integrability
 from shapespace.coordinates.nric import nric
-from shapespace.coordinates.reconstruction import Reconstruction, Reconstructor
+from shapespace.coordinates.reconstruction import Reconstructor
 from shapespace.mesh.rigid_motion import align
 from shapespace.mesh.surface import Surface
 from shapespace.mesh.triangle_mesh import TriangleMesh
@@ -39,6 +39,8 @@ TOLERANCE = 2e-5
 LEAST_PATIENCE, RECOVERY = 0.5, 1.1
 #: Random codes at which a model is rehearsed.
 REHEARSED = 2
+#: Random codes by which drafts are measured.
+DRAFTED = 50
 
 
 class ModelFailedError(RuntimeError):
@@ -56,12 +58,19 @@ class MeshChoice(StrEnum):
     COARSE = "coarse"
 
 
+class Quality(StrEnum):
+    """How exactly a shape is found: by Gauss–Newton, or from face frames alone, in a fraction of the time."""
+
+    FULL = "full"
+    DRAFT = "draft"
+
+
 @dataclass(frozen=True)
 class Diagnostics:
     """How well a shape was found.
 
     Attributes:
-        status: how Gauss–Newton ended, see shapespace.solve.outcome.Status.
+        status: how Gauss–Newton ended, see shapespace.solve.outcome.Status; of a draft, which needs none, converged.
         iterations: its steps.
         residual: distance between the lengths and angles asked for and those of the shape, relative,
             weighted norm.
@@ -72,6 +81,7 @@ class Diagnostics:
             typically have from each other; None where the model has no such codes.
         inside_bounds: whether the code lies inside the model's bounds.
         model: digest of the model's manifest.
+        quality: whether it is a draft.
     """
 
     status: Status
@@ -82,6 +92,7 @@ class Diagnostics:
     plausibility: float | None
     inside_bounds: bool
     model: str
+    quality: Quality = Quality.FULL
 
 
 @dataclass(frozen=True)
@@ -186,6 +197,7 @@ class Decoder:
         inside_bounds: bool = True,
         mesh: MeshChoice = MeshChoice.FINE,
         deadline: Deadline | None = None,
+        quality: Quality = Quality.FULL,
     ) -> Shape:
         """The shape of one code (m,), also where Gauss–Newton did not converge: the diagnostics say so.
 
@@ -194,6 +206,7 @@ class Decoder:
             inside_bounds: what the diagnostics say of it.
             mesh: fine or coarse.
             deadline: after which Gauss–Newton gives up with Status.DEADLINE.
+            quality: a draft is from face frames; where they go astray the shape is solved after all.
 
         Raises:
             NotFiniteError: the code is so far outside the bounds that the numbers overflow.
@@ -203,7 +216,8 @@ class Decoder:
         _, target = self._networks(code[None])
         predicted = time.perf_counter()
         with self.solver() as reconstruct:
-            found: Reconstruction = reconstruct.from_guess(
+            draft = reconstruct.draft(target[0]) if quality is Quality.DRAFT else None
+            found = draft or reconstruct.from_guess(
                 target[0], *self._learned_start(code), tolerance=TOLERANCE, deadline=deadline
             )
         with np.errstate(over="ignore", invalid="ignore"):
@@ -222,9 +236,22 @@ class Decoder:
             self._training.plausibility(code) if self._training else None,
             inside_bounds,
             self.digest,
+            Quality.DRAFT if draft else Quality.FULL,
         )
         seconds = {"network": predicted - began, "reconstruct": time.perf_counter() - predicted}
         return Shape(vertices, diagnostics, seconds)
+
+    def draft_error(self) -> dict[str, float]:
+        """How far drafts are from full shapes: ``mean`` and ``p95`` over vertices of random codes' fine shapes.
+
+        Shares of the diagonal of the reference; codes are uniform inside the bounds. Where frames go astray, a draft is
+        the shape itself. Raises NotFiniteError or ModelFailedError.
+        """
+        size, away = self.manifest.scale * self.mesh(MeshChoice.FINE).diagonal, []
+        for code in self.latents.sample(DRAFTED, 0, Distribution.UNIFORM):
+            draft, full = (self.shape(code, quality=quality).vertices for quality in (Quality.DRAFT, Quality.FULL))
+            away.append(np.linalg.norm(draft - full, axis=1) / size)
+        return {"mean": float(np.mean(away)), "p95": float(np.percentile(away, 95))}
 
     def lengths_and_angles(self, code: Codes) -> LengthsAndAngles:
         """What the networks predict for a code (m,), before any reconstruction; raises NotFiniteError."""

@@ -18,8 +18,9 @@ from shapespace.bundle.reader import BundleError, read_bundle
 from shapespace.bundle.schema import MANIFEST, VERSION_PATTERN
 from shapespace.files.formats import read_arrays
 from shapespace.mesh.triangle_mesh import TriangleMesh
+from shapespace.model.blend_shapes import BlendShapes, blend_shapes
 from shapespace.model.correspondence import InvalidMeshError, Matched, match
-from shapespace.model.decoder import Decoder, MeshChoice
+from shapespace.model.decoder import Decoder, MeshChoice, Quality
 from shapespace.model.edit import PRIOR, Edited, PriorKind, Target, edited
 from shapespace.model.encode import Encoded, Encoder, Objective
 from shapespace.model.fit import FitOptions, Fitted, Fitter, Landmark, Prior, ScaleChoice
@@ -31,6 +32,7 @@ from shapespace.solve.outcome import Status
 #: The values of the enumerations, so that callers may write plain strings.
 MeshName = MeshChoice | Literal["fine", "coarse"]
 BoundsName = Bounds | Literal["allow", "clamp", "reject"]
+QualityName = Quality | Literal["full", "draft"]
 ObjectiveName = Objective | Literal["vertices", "nric"]
 DistributionName = Distribution | Literal["uniform", "gaussian", "population"]
 PriorName = PriorKind | Literal["groups", "ridge"]
@@ -122,7 +124,9 @@ class ShapeModel(Decoder):
         """(V, 3) the reference shape on the fine mesh, in the units of the training meshes."""
         return self.reference_shape().vertices
 
-    def decode(self, codes: ArrayLike, mesh: MeshName = "fine", bounds: BoundsName = "allow") -> FloatArray:
+    def decode(
+        self, codes: ArrayLike, mesh: MeshName = "fine", bounds: BoundsName = "allow", quality: QualityName = "full"
+    ) -> FloatArray:
         """The shapes of codes.
 
         Warns with RuntimeWarning where Gauss–Newton did not converge; ``shape`` gives the diagnostics of one code.
@@ -131,6 +135,7 @@ class ShapeModel(Decoder):
             codes: (n, m), or one code (m,).
             mesh: "fine" or "coarse"; a model without a finer mesh answers both with the one it has.
             bounds: "allow" extrapolates outside the bounds, "clamp" moves to the nearest bound, "reject" refuses.
+            quality: "full", or "draft", which leaves Gauss–Newton out where the first guess is near enough.
 
         Returns:
             Positions (n, V, 3), or (V, 3) of one code.
@@ -153,7 +158,7 @@ class ShapeModel(Decoder):
         positions = np.empty((len(checked), *self.mesh(choice).vertices.shape))
         ended = []
         for k, code in enumerate(checked):
-            shape = self.shape(code, bool(inside[k]), choice)
+            shape = self.shape(code, bool(inside[k]), choice, quality=Quality(quality))
             positions[k] = shape.vertices
             ended.append(shape.diagnostics.status)
         missed = [k for k, status in enumerate(ended) if status is not Status.CONVERGED]
@@ -165,6 +170,26 @@ class ShapeModel(Decoder):
                 stacklevel=2,
             )
         return positions if values.ndim == 2 else positions[0]
+
+    def blend_shapes(self, mesh: MeshName = "fine") -> BlendShapes:
+        """The model as linear blend shapes: code 0, and both ends of each coordinate; with how far that is from it.
+
+        Args:
+            mesh: "fine" or "coarse".
+
+        Raises:
+            PeriodicError: there are angles among the coordinates, which have no ends.
+            ModelFailedError: the networks failed, or took too long.
+
+        >>> import shapespace
+        >>> blend = shapespace.load("models/figure").blend_shapes("coarse")
+        >>> blend.names[:2], blend.ends.shape, 0.001 < blend.error["mean"] < 0.05
+        (['middle, 1 +', 'middle, 1 -'], (40, 1000, 3), True)
+        >>> blend.glb()[:4]
+        b'glTF'
+        """
+        choice = MeshChoice(mesh)
+        return blend_shapes(self, choice, lambda code: self.shape(code, mesh=choice))
 
     def encode(
         self,

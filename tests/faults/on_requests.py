@@ -29,14 +29,14 @@ MOST = 160 * MIB
 SAMPLE = 20
 
 
-@fault("`encode` is sent files made to need gigabytes or minutes")
+@fault("`encode` and `fit` are sent files made to need gigabytes or minutes")
 def bomb(arena: Arena, rng: np.random.Generator) -> str:
     before = peak_memory(arena.steady.server)
     for name in rng.choice(sorted(HOSTILE), SAMPLE, replace=False):
         said, body = HOSTILE[name](int(rng.integers(1, 65)) * MIB)
         form = "/" in said
         answer = arena.steady.client.post(
-            f"{MODEL}/encode",
+            f"{MODEL}/{rng.choice(['encode', 'fit'])}",
             params={} if form else {"format": said},
             headers={"Content-Type": said} if form else {},
             content=body,
@@ -106,6 +106,8 @@ def bodies(number: str) -> list[Call]:
             f'{{"inputs": [{{"name": "latent", "shape": [1, 3], "datatype": "FP32", "data": {code}}}]}}'.encode(),
         ),
         Call("POST", f"{MODEL}/encode", f"v {number} 0 0\n".encode() * 64 + b"f 1 2 3\n", "model/obj"),
+        Call("POST", f"{MODEL}/fit?format=xyz", f"{number} 0 0\n0 1 0\n0 0 1\n".encode() * 64, "text/plain"),
+        Call("POST", f"{MODEL}/fit?noise={number}&format=xyz", b"0 0 0\n0 1 0\n0 0 1\n1 0 0\n" * 64, "text/plain"),
     ]
 
 

@@ -42,7 +42,10 @@ correction = { kind = "kernel" }
 
 [monolithic]
 hidden = [16]
-energy = 1.0
+fit = { batch_size = 16, max_epochs = 3 }
+
+[monolithic_paper]
+hidden = [16]
 fit = { batch_size = 16, max_epochs = 3 }
 
 [evaluation]

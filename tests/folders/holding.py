@@ -51,7 +51,10 @@ correction = {{ kind = "kernel", coefficients = 6 }}
 
 [monolithic]
 hidden = [16]
-energy = 1.0
+fit = {{ batch_size = 16, max_epochs = 2 }}
+
+[monolithic_paper]
+hidden = [16]
 fit = {{ batch_size = 16, max_epochs = 2 }}
 
 [evaluation]

@@ -740,8 +740,8 @@ def long_latent(rng: Rng, world: World) -> Request:
 
 
 def upload(world: World, rng: Rng, format: str, data: bytes) -> Request:
-    """A file to be encoded, in one of the ways to send it."""
-    target = f"/v1/models/{world.any(rng).name}/encode"
+    """A file to be encoded or fitted, in one of the ways to send it."""
+    target = searching(world, rng, format)
     data = data[:UPLOAD]
     way = rng.random()
     if way < 0.6:
@@ -755,6 +755,13 @@ def upload(world: World, rng: Rng, format: str, data: bytes) -> Request:
     )
 
 
+def searching(world: World, rng: Rng, format: str = "") -> str:
+    """The address of a call that takes files; of a quick model where many shapes may be solved."""
+    if format not in POINTS and rng.random() < 0.5:
+        return f"/v1/models/{world.any(rng).name}/encode"
+    return f"/v1/models/{world.quick(rng).name}/fit"
+
+
 def chunks(data: bytes, each: int) -> Iterator[bytes]:
     """A body in chunks."""
     view = memoryview(data)
@@ -764,9 +771,10 @@ def chunks(data: bytes, each: int) -> Iterator[bytes]:
     yield b"0\r\n\r\n"
 
 
-def form(boundary: str, name: str, data: bytes) -> bytes:
-    before = f'--{boundary}\r\nContent-Disposition: form-data; name="file"; filename="{name}"\r\n\r\n'
-    return before.encode() + data + f"\r\n--{boundary}--\r\n".encode()
+def form(boundary: str, name: str, data: bytes, options: bytes = b"") -> bytes:
+    part = f"--{boundary}\r\nContent-Disposition: form-data; name="
+    said = f'{part}"options"\r\n\r\n'.encode() + options + b"\r\n" if options else b""
+    return said + f'{part}"file"; filename="{name}"\r\n\r\n'.encode() + data + f"\r\n--{boundary}--\r\n".encode()
 
 
 TEXTS = {
@@ -779,11 +787,16 @@ TEXTS = {
     "gltf": (b"{},", b"[", b'{"mesh":0},', b'{"children":[0]},', b'"",', b'{"count":9,"type":"VEC3"},', b"0,"),
     "npz": (b"PK\x03\x04", b"\0", b"PK\x01\x02", b"PK\x05\x06", b"\x93NUMPY"),
     "glb": (b"\0", b" ", b"BIN\0", b"JSON", b"{}"),
+    "xyz": (b"1 2 3\n", b"1 2 3 0 0 1\n", b"# x\n", b"\n", b"1e999 nan -\n", b"1 2 ", b"4000000\n"),
+    "off": (b"0 0 0\n", b"3 0 1 2\n", b"\n", b"# x\n", b"1 ", b"8000000 1 0\n"),
 }  # fmt: skip
+#: Formats that `encode` does not take.
+POINTS = ("xyz", "off")
 STARTS = {
     "obj": b"", "npz": b"", "json": b'{"vertices": [',
     "ply": b"ply\nformat ascii 1.0\nelement vertex 8000000\nproperty float x\nproperty float y\nproperty float z\n"
            b"element face 1\nproperty list uchar int vertex_indices\nend_header\n",
+    "xyz": b"", "off": b"OFF\n8000000 8000000 0\n",
     "stl": b"solid x\n", "gltf": b'{"asset":{"version":"2.0"},"scene":0,"nodes":[', "glb": b"glTF\2\0\0\0\0\0\0\4",
 }  # fmt: skip
 
@@ -794,7 +807,7 @@ def long_upload(rng: Rng, world: World) -> Request:
     units = rng.choice(np.array(TEXTS[format], dtype=object), int(rng.integers(1, 4)))
     unit = b"".join(units)
     most = size(rng, UPLOAD)
-    sound = world.any(rng).files[format] if rng.random() < 0.2 else STARTS[format]
+    sound = world.any(rng).files[format] if rng.random() < 0.2 and format not in POINTS else STARTS[format]
     return upload(world, rng, format, sound + unit * (most // len(unit)))
 
 
@@ -828,6 +841,33 @@ def sound_upload(rng: Rng, world: World) -> Request:
     model = world.any(rng)
     format = pick(rng, "obj", "ply", "stl", "npz", "glb", "gltf", "json")
     return post(f"/v1/models/{model.name}/encode?format={format}", model.files[format], {"Content-Type": "x/y"})
+
+
+@kind("fit of points that lie anywhere", long=True)
+def any_points(rng: Rng, world: World) -> Request:
+    """Some of a model's size, with options that may be as large or as many as they can."""
+    model = world.any(rng)
+    vertices = np.array(json.loads(model.files["json"])["vertices"])
+    size = float(vertices.std()) * 10.0 ** pick(rng, 0, 0, 0, rng.uniform(-300, 300))
+    points = size * rng.normal(size=(int(10 ** rng.uniform(1, 6)), 3))
+    if rng.random() < 0.1:
+        points[:, int(rng.integers(3))] = 0
+    text = b"".join(b"%g %g %g\n" % (x, y, z) for x, y, z in points.tolist())
+    places = size * rng.normal(size=(pick(rng, 0, 3, 999), 3))
+    rare = {
+        "noise": float(10.0 ** rng.uniform(-300, 300)),
+        "landmarks": [{"vertex": k, "position": place} for k, place in enumerate(places.tolist())],
+        "fixed": {"0": float(10.0 ** rng.uniform(-3, 38))},
+        "partial": True,
+        "points": True,
+        "samples": 1000,
+    }
+    options = {"scale": pick(rng, "fixed", "free", "free")}
+    options |= {name: value for name, value in rare.items() if rng.random() < 0.3}
+    boundary = "b" * 30
+    body = form(boundary, "x.xyz", text[:UPLOAD], json.dumps(options).encode())
+    type = {"Content-Type": f"multipart/form-data; boundary={boundary}"}
+    return post(f"/v1/models/{model.name}/fit", body, type)
 
 
 def archive(members: dict[str, bytes], old: bytes = b"") -> bytes:
@@ -1000,14 +1040,14 @@ def odd_form(rng: Rng, world: World) -> Request:
     body = variants[int(rng.integers(len(variants)))]()[:UPLOAD]
     if rng.random() < 0.5:
         body = body[: UPLOAD - len(boundary) - 8] + f"\r\n--{boundary}--\r\n".encode()
-    target = f"/v1/models/{world.quick(rng).name}/encode"
+    target = searching(world, rng)
     return post(target, body, {"Content-Type": f"multipart/form-data; boundary={boundary}"})
 
 
 @kind("a form whose type is hard to take apart")
 def odd_form_type(rng: Rng, world: World) -> Request:
     unit = pick(rng, ";", "; boundary=b", ";a=b", '; boundary="', "\\", '"', ";boundary*0=", " ", "; charset=utf-7")
-    target = f"/v1/models/{world.quick(rng).name}/encode"
+    target = searching(world, rng)
     type = "multipart/form-data" + unit * (30_000 // len(unit))
     return post(target, form("b", "x.obj", b"v 0 0 0\n"), {"Content-Type": type})
 

@@ -67,15 +67,20 @@ class Studio:
         return self
 
     def rest(self) -> None:
-        """Wait until the fine mesh is shown, or that of a model with one only."""
+        """Wait until the full shape is shown, on the fine mesh or that of a model with one only."""
         fine = "document.querySelector('#fine')"
         script = f"{fine}.disabled || {fine}.getAttribute('aria-pressed') === 'false' ? 'coarse' : 'fine'"
-        self.eventually(lambda: self.shown == self.page.evaluate(script))
+        self.eventually(lambda: (self.shown, self.quality) == (self.page.evaluate(script), "full"))
 
     @property
     def shown(self) -> str | None:
         """The mesh in the picture."""
         return self.page.locator(".stage").get_attribute("data-shown")
+
+    @property
+    def quality(self) -> str | None:
+        """Whether the shape in the picture is a draft."""
+        return self.page.locator(".stage").get_attribute("data-quality")
 
     def __getitem__(self, selector: str) -> Locator:
         return self.page.locator(selector)

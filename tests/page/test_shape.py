@@ -86,7 +86,7 @@ def test_an_angle_goes_round(studio: Studio) -> None:
     studio.until_code([0, 3.14, 0], 1e-3)
 
 
-def test_coarse_as_it_moves_fine_as_it_rests_and_nothing_queues(studio: Studio) -> None:
+def test_drafts_as_it_moves_the_full_shape_as_it_rests_and_nothing_queues(studio: Studio) -> None:
     studio.asked.clear()
     values = np.linspace(0.01, 0.15, 40).tolist()
     studio.coordinate(0).locator("input[type=range]").evaluate(
@@ -95,9 +95,10 @@ def test_coarse_as_it_moves_fine_as_it_rests_and_nothing_queues(studio: Studio) 
         }""",
         values,
     )
-    studio.eventually(lambda: studio.asked[-1]["mesh"] == "fine" and studio.shown == "fine")
+    studio.eventually(lambda: studio.asked[-1]["quality"] == "full" and studio.quality == "full")
     # All that came while the first was under way is superseded by the last.
-    assert [asked["mesh"] for asked in studio.asked] == ["coarse", "coarse", "fine"]
+    assert [asked["quality"] for asked in studio.asked] == ["draft", "draft", "full"]
+    assert {asked["mesh"] for asked in studio.asked} == {"fine"}
     assert [asked["latents"][0][0] for asked in studio.asked] == pytest.approx([0.01, 0.15, 0.15])
 
 
@@ -110,10 +111,11 @@ def test_shapes_that_take_their_time_are_asked_for_once(studio: Studio) -> None:
     studio.asked.clear()
     studio.type(0, 0.11)
     studio.type(0, 0.12)
-    studio.eventually(lambda: bool(studio.asked) and studio.asked[-1]["mesh"] == "fine")
+    studio.eventually(lambda: bool(studio.asked) and studio.asked[-1]["quality"] == "full")
     studio.rest()
     studio.page.wait_for_timeout(1000)
-    assert [asked["mesh"] for asked in studio.asked] == ["coarse", "coarse", "fine"]
+    assert [asked["quality"] for asked in studio.asked] == ["draft", "draft", "full"]
+    assert {asked["mesh"] for asked in studio.asked} == {"fine"}
 
 
 def test_a_slider_is_dragged(studio: Studio) -> None:
@@ -138,11 +140,13 @@ def test_a_slider_is_dragged(studio: Studio) -> None:
 def test_a_shape_that_is_already_old_is_dropped(studio: Studio) -> None:
     dropped: list[str] = []
     studio.page.on("requestfailed", lambda request: dropped.append(request.post_data or ""))
-    studio.page.route("**/vertices*", lambda route: '"fine"' in (route.request.post_data or "") or route.continue_())
+    studio.page.route("**/vertices*", lambda route: '"full"' in (route.request.post_data or "") or route.continue_())
     studio.type(0, 0.1)
-    studio.eventually(lambda: any(asked["mesh"] == "fine" and asked["latents"][0][0] == 0.1 for asked in studio.asked))
+    studio.eventually(
+        lambda: any(asked["quality"] == "full" and asked["latents"][0][0] == 0.1 for asked in studio.asked)
+    )
     studio.type(0, 0.12)
-    studio.eventually(lambda: any('"fine"' in text and "0.1," in text for text in dropped))
+    studio.eventually(lambda: any('"full"' in text and "0.1," in text for text in dropped))
     studio.page.unroute("**/vertices*")
     studio.type(0, 0.13)
     studio.rest()

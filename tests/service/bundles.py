@@ -177,9 +177,12 @@ def facts(name: str = "small", version: str = "1", *, idle: int = 0) -> Facts:
         figures={
             "r2": {"composite": {"total": 1.0}},
             "generalisation": {
+                "held_out": 3,
+                "steps": 8,
                 "counts": [1, 2],
-                "modes": [{"mean": 0.04}, {"mean": 0.03}],
-                "components": [{"mean": 0.08}, {"mean": 0.05}],
+                "modes": [{"mean": 0.04, "p95": 0.06}, {"mean": 0.03, "p95": 0.05}],
+                "components": [{"mean": 0.08, "p95": 0.12}, {"mean": 0.05, "p95": 0.07}],
+                "worst": "a",
             },
         },
         origin=Origin(config={}, data_digest="0" * 64, code_version="test"),

@@ -11,6 +11,7 @@ BEYOND_SCHEMAS = {
     "not-finite",  # beyond single precision
     "out-of-bounds",
     "path-too-long",
+    "periodic",
     "too-many-codes",
     "too-many-frames",
     "wrong-length",
@@ -39,12 +40,13 @@ def refusals_are_beyond_schemas(ctx: CheckContext, response: Response, case: Cas
         allowed = BEYOND_SCHEMAS | OF_CALLS.get(case.operation.path[case.operation.path.rindex("/") :], set())
         query, body = case.query or {}, case.body if isinstance(case.body, dict) else {}
         # What compares needs a colour, a spread a covariance and the other way round; a place is JSON in a string.
-        # Not every format has polygons.
+        # Not every format has polygons, or tells how long a frame is shown.
         if (
             "against" in query
             or "place" in query
             or query.get("color") == "spread"
             or query.get("topology") == "original"
+            or "fps" in query
             or body.get("covariance") is not None
         ):
             allowed = allowed | {"invalid-request"}

@@ -47,6 +47,10 @@ fit = { batch_size = 8, max_epochs = 7 }
 hidden = [16]
 fit = { batch_size = 8, max_epochs = 3 }
 
+[monolithic_paper]
+hidden = [16]
+fit = { batch_size = 8, max_epochs = 3 }
+
 [variants.paper]
 title = "the paper's combiner"
 combiner.correction = { kind = "paper", width = 4, layers = 2, fit = { batch_size = 8, max_epochs = 1 } }

@@ -23,7 +23,7 @@ from shapespace.mesh.triangle_mesh import TriangleMesh
 from shapespace.training.learning.gallery import extremes, strip
 from shapespace.training.learning.layers import narrowest
 from shapespace.training.learning.learner import Learner
-from shapespace.training.learning.networks import affine_sum, predict
+from shapespace.training.learning.networks import Composite, affine_sum, predict
 from shapespace.training.runs.config import Config, EvaluationSettings
 from shapespace.training.runs.latent_coordinates import Coordinates
 from shapespace.training.runs.progress import progress
@@ -203,16 +203,23 @@ def evaluate(
     settings, main = config.evaluation, learner()
     collection, reference = main.collection, main.collection.reference
     z_reference = nric(reference.vertices, reference.connectivity)
-    test, composite, monolithic = TestSplit.of(main), main.main(), main.monolithic()
+    test, composite = TestSplit.of(main), main.main()
+    baselines: dict[str, Composite | nn.Module] = {
+        "monolithic": main.monolithic(),
+        "monolithic_paper": main.monolithic_paper(),
+        "kernel": main.kernel(),
+    }
+    if config.networks.paper:
+        baselines["paper"] = main.paper()
     shapes, found = exact_factors(main, test.rows[: settings.exact_factors], exact)
     learned, predicted = test.predicted(composite.factor_shapes), test.predicted(composite)
     r2 = {
         "composite": test.r2_of(predicted),
-        "monolithic": test.r2(monolithic),
+        **{name: test.r2(model) for name, model in baselines.items()},
         "affine": test.r2_of(affine_sum(z_reference, shapes), found),
         "affine of learned factors": test.r2_of(affine_sum(z_reference, learned)),
     }
-    sizes = {"composite": size_bytes(*composite.networks, composite.combiner), "monolithic": size_bytes(monolithic)}
+    sizes = {name: size_bytes(model) for name, model in {"composite": composite, **baselines}.items()}
     if grids := factor_grids(collection, settings, exact):
         interpolated = affine_sum(z_reference, np.stack([grid(test.latents) for grid in grids], axis=1))
         # A node without a shape leaves NaN around it.
@@ -234,6 +241,7 @@ def evaluate(
             for name, variant in main.variants().items()
         },
         "exponentials": main.exponentials(),
+        "correction": {"kind": composite.combiner.settings.kind, "tried": composite.combiner.tried},
         "fractions": [_fraction(learner, fraction, test) for fraction in config.networks.fractions],
         "seeds": [_other_seed(learner(seed=seed)) for seed in config.networks.seeds],
         "vertex_error": reconstructed.figures(),
@@ -255,6 +263,7 @@ def _fraction(learner: Callable[..., Learner], fraction: float, test: TestSplit)
             "composite": test.r2(some.main()),
             "all of factors": test.r2(free.main()),
             "monolithic": test.r2(some.monolithic()),
+            "kernel": test.r2(some.kernel()),
         },
     }
 
@@ -263,6 +272,7 @@ def _other_seed(learner: Learner) -> dict[str, Any]:
     """R² of networks learned with another seed, on the test split of that seed."""
     test = TestSplit.of(learner)
     r2 = {"composite": test.r2(learner.main()), "monolithic": test.r2(learner.monolithic())}
+    r2["kernel"] = test.r2(learner.kernel())
     return {"seed": learner.seed, "r2": r2}
 
 
@@ -305,8 +315,9 @@ def factor_grids(collection: Collection, settings: EvaluationSettings, exact: Ex
     ]
 
 
-def size_bytes(*networks: nn.Module) -> int:
+def size_bytes(model: Composite | nn.Module) -> int:
     """Bytes of the floating-point parameters and buffers, in the types that they have in a bundle."""
+    networks = model.parts if isinstance(model, Composite) else [model]
     tensors = (t for n in networks for t in n.state_dict().values() if t.is_floating_point())
     return sum(t.numel() * narrowest(t).itemsize for t in tensors)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import warnings
+from dataclasses import replace
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,7 @@ from shapespace.bundle.geometry import Geometry
 from shapespace.bundle.schema import COMBINER, START, Network, Origin, Tolerance, factor_network
 from shapespace.bundle.writer import Facts, Networks, write_bundle
 from shapespace.coordinates.nric import WeightedNorm
+from shapespace.model.shape_model import load
 from shapespace.shell.energy import Material
 from shapespace.training.learning.layers import narrowest
 from shapespace.training.learning.networks import Composite, StartNetwork, predict
@@ -165,6 +167,9 @@ def export(
         origin=Origin(config=_portable(config), data_digest=data_digest, code_version=metadata.version("shapespace")),
     )
     try:
+        folder = write_bundle(models, facts, networks, geometry)
+        # Drafts are measured as they are served, so that a bundle comes first.
+        facts = replace(facts, draft_error=load(folder).draft_error())
         return write_bundle(models, facts, networks, geometry)
     except ValidationError as error:
         fault = error.errors(include_url=False, include_input=False)[0]

@@ -20,20 +20,31 @@ from shapespace.arrays import FloatArray, IntArray
 from shapespace.coordinates.nric import WeightedNorm, nric
 from shapespace.training.learning.corrections import JointSamples
 from shapespace.training.learning.fitting import fit, read_network, save_network
+from shapespace.training.learning.latent_kernel import LatentKernel
 from shapespace.training.learning.layers import PatchBasis, Scaling
 from shapespace.training.learning.networks import (
     CombinerNetwork,
     Composite,
     FactorNetwork,
-    MonolithicNetwork,
     ShapeNetwork,
     StartNetwork,
+    choices,
     factor_shapes,
     predict,
 )
-from shapespace.training.runs.config import CombinerSettings, Config, FitSettings, LatentNetworkSettings, Recipe
+from shapespace.training.runs.config import (
+    CombinerSettings,
+    Config,
+    FitSettings,
+    LatentNetworkSettings,
+    PaperSettings,
+    Recipe,
+)
 from shapespace.training.runs.directory import RunDirectory
 from shapespace.training.runs.sampling import Collection, Samples, read, split
+
+#: The paper's factor networks.
+PAPER_FACTORS = LatentNetworkSettings(fourier=0, skip_degree=0, energy=1, fit=FitSettings())
 
 
 @dataclass(frozen=True)
@@ -142,16 +153,20 @@ class Learner:
         self.histories[path.stem] = {k: state[k] for k in ("epoch", "best", "history")}
 
     def _latent_network(
-        self, kind: type[FactorNetwork], settings: LatentNetworkSettings, index: list[int], path: Path, fraction: float,
+        self,
+        settings: LatentNetworkSettings,
+        index: list[int],
+        path: Path,
+        fraction: float,
         samples: Callable[[], tuple[Samples, dict[str, IntArray]]],
-    ) -> FactorNetwork:  # fmt: skip
+    ) -> FactorNetwork:
         """A network from the latents ``index`` to shapes, read from ``path`` or fitted to samples and rows of these."""
         coordinates = self.collection.coordinates[index]
         saved = read_network(path) if path.exists() else None
         if saved and saved.done:
             own = {k.removeprefix("basis."): v for k, v in saved.tensors.items() if k.startswith("basis.")}
             basis = PatchBasis.blank(own) if settings.energy < 1 else None
-            network = kind(settings, coordinates, Scaling.blank(len(self._reference)), basis)
+            network = FactorNetwork(settings, coordinates, Scaling.blank(len(self._reference)), basis)
             network.load_state_dict(saved.tensors)
             network.eval()
             self._record(path, saved.state)
@@ -161,7 +176,7 @@ class Learner:
         data = _Data(torch.as_tensor(drawn.latents[:, index], dtype=torch.float32), drawn.nric, rows)
         z = drawn.nric[rows["train"]]
         scaling = self._scaling(z)
-        network = kind(settings, coordinates, scaling, self._basis(settings, scaling, z))
+        network = FactorNetwork(settings, coordinates, scaling, self._basis(settings, scaling, z))
         if not saved:
             own_pair, held_out = (
                 (latents, network.target(exact)) for latents, exact in map(data.part, ("train", "validation"))
@@ -190,7 +205,7 @@ class Learner:
             return own, self.factor_rows(own.index)
 
         path = self._path(f"factor-{j}", [self._factor_fraction], settings)
-        return self._latent_network(FactorNetwork, settings, index, path, self._factor_fraction, samples)
+        return self._latent_network(settings, index, path, self._factor_fraction, samples)
 
     def factor_rows(self, index: IntArray) -> dict[str, IntArray]:
         """Rows of a factor's samples, which have these indices of codes: train and validation."""
@@ -213,7 +228,8 @@ class Learner:
         indices = list(self.collection.factors.values())
         factors = recipe.factors if isinstance(recipe.factors, list) else [recipe.factors] * len(indices)
         networks = [self.factor(j, settings) for j, settings in enumerate(factors)]
-        path = self._path("combiner", [self._fraction, self._factor_fraction], recipe.combiner, *factors)
+        decides = [*factors, *choices(recipe.combiner.correction)]
+        path = self._path("combiner", [self._fraction, self._factor_fraction], recipe.combiner, *decides)
 
         def shapes() -> Tensor:
             latents = torch.as_tensor(self.joint.latents, dtype=torch.float32)
@@ -267,14 +283,39 @@ class Learner:
         """One for each row of the ablation."""
         return {name: self.composite(recipe) for name, recipe in self.config.recipes.items()}
 
-    def monolithic(self) -> FactorNetwork:
-        """The fully connected baseline on the joint samples."""
-        settings = self.config.monolithic
+    def paper(self) -> Composite:
+        """The paper's own system (section 4): perceptrons of bare angles with dense last layers, and its combiner."""
+        return self.composite(Recipe(factors=PAPER_FACTORS, combiner=CombinerSettings(correction=PaperSettings())))
+
+    def monolithic(self) -> Composite:
+        """Our recipe with one factor: what it makes of the joint samples without a product."""
+        network = self._whole("monolithic", self.config.monolithic)
+        index, combiner = list(range(len(self.collection.coordinates))), self.config.networks.combiner
+        decides = [self.config.monolithic, *choices(combiner.correction)]
+        path = self._path("monolithic-combiner", [self._fraction], combiner, *decides)
+
+        def shapes() -> Tensor:
+            latents = torch.as_tensor(self.joint.latents, dtype=torch.float32)
+            return predict(partial(factor_shapes, [network], [index]), latents)
+
+        return Composite([index], [network], self._combiner(combiner, path, shapes))
+
+    def monolithic_paper(self) -> FactorNetwork:
+        """Φ̃, the paper's fully connected baseline."""
+        return self._whole("monolithic-paper", self.config.monolithic_paper)
+
+    def _whole(self, kind: str, settings: LatentNetworkSettings) -> FactorNetwork:
+        """A network from all latents, on the joint samples."""
         index = list(range(len(self.collection.coordinates)))
-        path = self._path("monolithic", [self._fraction], settings)
-        return self._latent_network(
-            MonolithicNetwork, settings, index, path, self._fraction, lambda: (self.joint, self.rows)
-        )
+        path = self._path(kind, [self._fraction], settings)
+        return self._latent_network(settings, index, path, self._fraction, lambda: (self.joint, self.rows))
+
+    def kernel(self) -> LatentKernel:
+        """Kernel ridge regression on the joint samples' latents: in closed form, in seconds, and not saved."""
+        latents = torch.as_tensor(self.joint.latents, dtype=torch.float32)
+        z, rows = torch.from_numpy(self.joint.nric), self.rows
+        own, held_out = ((latents[rows[part]], z[rows[part]]) for part in ("train", "validation"))
+        return LatentKernel(self.collection.coordinates, self._scaling(own[1].numpy()), own, held_out)
 
     def start(self) -> StartNetwork:
         """The start network, from the joint samples: in closed form, in seconds, and not saved."""

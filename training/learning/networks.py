@@ -5,6 +5,7 @@ Paper, sections 3 and 4. All but the start network put out NRIC ``z`` (n, 2E).
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
@@ -35,6 +36,7 @@ from shapespace.training.runs.config import (
     KernelSettings,
     LatentNetworkSettings,
     PaperSettings,
+    PolynomialSettings,
     ResolvedCorrection,
 )
 from shapespace.training.runs.latent_coordinates import Coordinates
@@ -119,10 +121,6 @@ class FactorNetwork(ShapeNetwork):
         return self.scaling.up(y if self.basis is None else self.basis(y))
 
 
-class MonolithicNetwork(FactorNetwork):
-    """Φ̃: all latents (n, m) → NRIC (n, 2E), the paper's fully connected baseline."""
-
-
 #: The classes of corrections, by the kinds of their settings.
 CORRECTIONS: dict[str, type[Correction]] = {
     "kernel": KernelCorrection,
@@ -132,15 +130,24 @@ CORRECTIONS: dict[str, type[Correction]] = {
 }
 
 
-def resolved(settings: CorrectionSettings) -> ResolvedCorrection:
-    """The settings that ``auto`` and ``paper`` stand for; the others themselves."""
+#: Share of the kernel's squared error on held-out codes below which polynomials, which take longer, are chosen.
+BETTER = 0.9
+
+
+def choices(settings: CorrectionSettings) -> list[ResolvedCorrection]:
+    """What ``auto`` chooses from, the first unless another is better; nothing for all other settings."""
+    return [KernelSettings(), PolynomialSettings()] if isinstance(settings, AutoSettings) else []
+
+
+def candidates(settings: CorrectionSettings) -> list[ResolvedCorrection]:
+    """What is fitted for some settings, with all that ``paper`` stands for written out."""
     match settings:
         case AutoSettings():
-            return KernelSettings()
+            return choices(settings)
         case PaperSettings():
-            return settings.convolutions
+            return [settings.convolutions]
         case _:
-            return settings
+            return [settings]
 
 
 class CombinerNetwork(ShapeNetwork):
@@ -150,11 +157,14 @@ class CombinerNetwork(ShapeNetwork):
         scaling: to scaled differences.
         settings: of the correction.
         correction: what maps scaled differences to scaled differences.
+        tried: where it was chosen, by kind the mean square error of scaled differences on held-out codes.
     """
 
-    def __init__(self, scaling: Scaling, settings: ResolvedCorrection, correction: Correction) -> None:
+    def __init__(
+        self, scaling: Scaling, settings: ResolvedCorrection, correction: Correction, tried: Mapping[str, float]
+    ) -> None:
         super().__init__()
-        self.scaling, self.settings, self.correction = scaling, settings, correction
+        self.scaling, self.settings, self.correction, self.tried = scaling, settings, correction, tried
 
     @classmethod
     def fit(
@@ -165,10 +175,21 @@ class CombinerNetwork(ShapeNetwork):
         held_out: JointSamples,
         seed: int,
     ) -> CombinerNetwork:
-        """Fit all that has a closed form; see `Correction.fit`."""
-        chosen = resolved(settings)
-        correction = CORRECTIONS[chosen.kind].fit(chosen, reference, own, held_out, seed)
-        return cls(own.scaling, chosen, correction)
+        """Fit all that has a closed form, see `Correction.fit`; held-out samples choose where there is a choice."""
+        found = [
+            cls(own.scaling, each, CORRECTIONS[each.kind].fit(each, reference, own, held_out, seed), {})
+            for each in candidates(settings)
+        ]
+        if len(found) == 1:
+            return found[0]
+        wanted = own.scaling.down(held_out.joint)
+        tried: dict[str, float] = {
+            each.settings.kind: float((predict(each.coefficients, held_out.factors) - wanted).square().mean())
+            for each in found
+        }
+        first, other = found
+        chosen = other if tried[other.settings.kind] < BETTER * tried[first.settings.kind] else first
+        return cls(own.scaling, chosen.settings, chosen.correction, tried)
 
     @classmethod
     def load(
@@ -182,12 +203,13 @@ class CombinerNetwork(ShapeNetwork):
             parts[part][own] = tensor
         scaling = Scaling.blank(len(parts["scaling"]["mean"]))
         scaling.load_state_dict(parts["scaling"])
-        return cls(scaling, settings, CORRECTIONS[settings.kind].load(settings, reference, parts["correction"]))
+        correction = CORRECTIONS[settings.kind].load(settings, reference, parts["correction"])
+        return cls(scaling, settings, correction, json.loads(metadata.get("tried", "{}")))
 
     @property
     def metadata(self) -> dict[str, str]:
-        """``correction``: its settings, with its kind, as JSON."""
-        return {"correction": self.settings.model_dump_json()}
+        """``correction``: its settings, with its kind, and ``tried``, as JSON."""
+        return {"correction": self.settings.model_dump_json(), "tried": json.dumps(self.tried)}
 
     def target(self, z: Tensor) -> Tensor:
         """Scaled differences (n, 2E) of NRIC (n, 2E)."""
@@ -219,6 +241,11 @@ class Composite:
     factors: list[list[int]]
     networks: list[FactorNetwork]
     combiner: CombinerNetwork
+
+    @property
+    def parts(self) -> list[ShapeNetwork]:
+        """All its networks."""
+        return [*self.networks, self.combiner]
 
     def __call__(self, latents: Tensor) -> Tensor:
         """NRIC (n, 2E) of codes (n, m)."""

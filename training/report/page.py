@@ -40,7 +40,10 @@ MODES_SHOWN = 40
 #: What the keys of R² in evaluation.json stand for.
 MODELS = {
     "composite": "Composite network",
-    "monolithic": "Monolithic network",
+    "monolithic": "The same recipe with one factor",
+    "kernel": "Kernel ridge regression on the codes",
+    "monolithic_paper": "The paper's monolithic network",
+    "paper": "The paper's composite network",
     "affine": "Affine sum of exact factors",
     "affine of learned factors": "Affine sum of learned factors",
     "grid": "Affine sum of multilinear grids",

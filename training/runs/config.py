@@ -142,7 +142,10 @@ class FitSettings(_Section):
 
 
 class LatentNetworkSettings(_Section):
-    """A network from latents to NRIC: a factor network or the monolithic baseline."""
+    """A network from latents to NRIC: a factor network, or a baseline on all latents.
+
+    The baselines are ``monolithic``, our recipe with one factor, and ``monolithic_paper``, the paper's.
+    """
 
     hidden: list[int] = [128, 128]
     """Width of each hidden layer."""
@@ -248,7 +251,7 @@ class PaperSettings(_Section):
 
 
 class AutoSettings(_Section):
-    """The kind that suits the collection; for now always ``kernel`` with its default settings."""
+    """The kind that suits the collection: ``kernel``, or ``polynomials`` where these are better on held-out codes."""
 
     kind: Literal["auto"] = "auto"
 
@@ -312,6 +315,9 @@ class NetworkSettings(Recipe):
     parts of these codes only, as the paper does, and once with all the samples of the factors."""
     seeds: list[int] = []
     """Further seeds, of split and networks, to learn with as well, for the spread of the figures."""
+    paper: bool = False
+    """Whether the paper's own system is trained too, for comparison: its factor networks, convolutions on stars and
+    schedules. Takes hours on a processor."""
 
 
 class VariantSettings(_Section):
@@ -403,8 +409,9 @@ class Config(_Section):
     factors: FactorSettings = FactorSettings()
     samples: SampleSettings = SampleSettings()
     networks: NetworkSettings = NetworkSettings()
-    monolithic: LatentNetworkSettings = LatentNetworkSettings(
-        hidden=[256, 256], skip_degree=0, energy=1, fit=FitSettings(max_epochs=150)
+    monolithic: LatentNetworkSettings = LatentNetworkSettings(hidden=[256, 256])
+    monolithic_paper: LatentNetworkSettings = LatentNetworkSettings(
+        hidden=[256, 256], fourier=0, skip_degree=0, energy=1, fit=FitSettings()
     )
     variants: dict[str, VariantSettings] = {}
     evaluation: EvaluationSettings = EvaluationSettings()

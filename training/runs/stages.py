@@ -80,7 +80,12 @@ STAGES: dict[str, Stage] = {
     # Networks are in files named by what decides their contents, so that a change leaves alone those it doesn't touch.
     "networks": Stage(
         version=1,
-        settings=lambda config: [config.networks, config.monolithic, *config.variants.values()],
+        settings=lambda config: [
+            config.networks,
+            config.monolithic,
+            config.monolithic_paper,
+            *config.variants.values(),
+        ],
         results=lambda run: [run.histories.path],
     ),
     "generalisation": Stage(

@@ -19,11 +19,11 @@ from pydantic import BaseModel, ConfigDict, Field, NonNegativeInt, field_validat
 from pydantic.json_schema import SkipJsonSchema
 
 from shapespace.files.archives import Buffer
-from shapespace.model.decoder import MeshChoice
+from shapespace.model.decoder import MeshChoice, Quality
 from shapespace.model.latent_space import Bounds
 from shapespace.model.shape_model import ShapeModel
 from shapespace.service.http.messages import bodies
-from shapespace.service.http.messages.schemas import BoundsField
+from shapespace.service.http.messages.schemas import BoundsField, QualityField
 from shapespace.service.http.problems import ProblemError
 from shapespace.service.use_cases.fields import Number
 from shapespace.service.use_cases.shape_formats import dump_json
@@ -92,6 +92,7 @@ class InferenceParameters(_Message):
     binary_data_output: bool = Field(False, strict=True, description="All outputs as bytes, unless one says otherwise.")
     mesh: MeshChoice = Field(MeshChoice.FINE, description="Which mesh's vertices, where the model has a finer one.")
     bounds: BoundsField = Bounds.ALLOW
+    quality: QualityField = Quality.FULL
 
 
 class InferenceRequest(_Message):

@@ -8,7 +8,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from shapespace.bundle.schema import SurfaceEntry
 from shapespace.files.colouring import Quantity
-from shapespace.model.decoder import MeshChoice
+from shapespace.model.decoder import MeshChoice, Quality
 from shapespace.model.edit import PRIOR, PriorKind
 from shapespace.model.latent_space import Bounds, Distribution
 from shapespace.service.use_cases.fields import Body, Number, NumbersByIndex, Whole
@@ -33,6 +33,13 @@ Latents = Annotated[
     ),
 ]
 MeshField = Annotated[MeshChoice, Field(description="Which mesh to answer, where the model has a finer one.")]
+QualityField = Annotated[
+    Quality,
+    Field(
+        description="`draft` leaves Gauss–Newton out where the first guess is near enough, in a fraction of the time; "
+        "the card's `draft_error` says how near. `Shape-Diagnostics.quality` says what was answered."
+    ),
+]
 BoundsField = Annotated[
     Bounds, Field(description="Outside the bounds: extrapolate, clamp to the nearest bound, or reject.")
 ]
@@ -44,6 +51,7 @@ class MeshRequest(Body):
     latent: Latent
     mesh: MeshField = MeshChoice.FINE
     bounds: BoundsField = Bounds.ALLOW
+    quality: QualityField = Quality.FULL
     covariance: Annotated[list[Annotated[list[Number], Field(fail_fast=True)]] | None, Field(fail_fast=True)] = Field(
         None, description="With `?color=spread`: m × m, of codes around this one, as `edit` and `encode` answer it."
     )
@@ -60,6 +68,8 @@ class VerticesRequest(Body):
     )
     mesh: MeshField = MeshChoice.FINE
     bounds: BoundsField = Bounds.ALLOW
+    quality: QualityField = Quality.FULL
+    faces: bool = Field(True, strict=True, description="Whether NPZ has the mesh's faces too; JSON never has.")
 
 
 class TargetRequest(Body):
@@ -172,6 +182,7 @@ class DiagnosticsAnswer(BaseModel):
     )
     inside_bounds: bool = Field(description="Whether the code lies inside the model's bounds.")
     model: str = Field(description="SHA-256 of the model's manifest.")
+    quality: Quality = Field(description="`draft` where Gauss–Newton was left out, otherwise `full`.")
 
 
 class VertexError(BaseModel):
@@ -296,6 +307,21 @@ class ModelList(BaseModel):
     models: list[ModelSummary]
 
 
+class DistanceAnswer(BaseModel):
+    """Distance of vertices, as shares of the bounding box's diagonal."""
+
+    mean: float
+    p95: float = Field(description="95th percentile.")
+
+
+class GeneralisationAnswer(DistanceAnswer):
+    """Distance of vertices of shapes that were held out, beside as many principal components of aligned vertices."""
+
+    components: DistanceAnswer
+    shapes: int = Field(description="How many were held out.")
+    modes: float = Field(description="How many modes; a mean where several folds differ.")
+
+
 class ModelCard(ModelSummary):
     """What a model is, how good it is, and where it comes from."""
 
@@ -310,6 +336,12 @@ class ModelCard(ModelSummary):
     eta_reconstruction: float = Field(description="Weight of the angles in Gauss–Newton.")
     onnx_tolerance: dict[str, float]
     figures: dict[str, Any] = Field(description="Evaluation figures on the test split.")
+    generalisation: GeneralisationAnswer | None = Field(
+        description="How near the modes come to shapes that they were found without; null where that is not known."
+    )
+    draft_error: DistanceAnswer | None = Field(
+        description="How far drafts are from full shapes over codes inside the bounds; null where that is not known."
+    )
     origin: dict[str, Any]
 
 

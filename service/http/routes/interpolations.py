@@ -6,16 +6,19 @@ from collections.abc import AsyncGenerator
 from contextlib import aclosing
 from typing import Annotated
 
-from fastapi import APIRouter, Depends, Path, Request, Response
+from fastapi import APIRouter, Depends, Path, Query, Request, Response
 from fastapi.responses import StreamingResponse
 
+from shapespace.files.animated_gltf import FRAMES_PER_SECOND
 from shapespace.mesh.surface import Topology
+from shapespace.model.decoder import Quality
 from shapespace.service.http.caching import cache_headers, entity_tag, not_modified
 from shapespace.service.http.dependencies import (
     CallerDependency,
     Format,
     MeshQuery,
     Model,
+    QualityQuery,
     ServiceDependency,
     one_of,
 )
@@ -25,8 +28,8 @@ from shapespace.service.http.messages.color_query import NO_COLOR, ColorQuery, c
 from shapespace.service.http.messages.schemas import InterpolationAnswer
 from shapespace.service.http.messages.topology_query import TopologyQuery, choose_topology
 from shapespace.service.http.negotiation import choose
-from shapespace.service.http.problems import DOMAIN_ERRORS, domain_problem
-from shapespace.service.http.responses import file_headers, shape_response, written_response
+from shapespace.service.http.problems import DOMAIN_ERRORS, ProblemError, domain_problem
+from shapespace.service.http.responses import draft_option, file_headers, shape_response, written_response
 from shapespace.service.use_cases.animation import Animation
 from shapespace.service.use_cases.one_shape import WantedShape
 from shapespace.service.use_cases.sequence import (
@@ -47,6 +50,8 @@ from shapespace.service.use_cases.shape_formats import SHAPE_FORMATS
 
 router = APIRouter(prefix="/v1", tags=["interpolations"])
 
+#: Most frames in a second: more than any screen shows.
+MOST_FPS = 240
 Id = Annotated[str, Path(description="An interpolation's id.")]
 
 
@@ -81,7 +86,12 @@ async def get_interpolation(
     request: Request,
     caller: CallerDependency,
     id: Id,
+    quality: QualityQuery = Quality.FULL,
     topology: TopologyQuery = None,
+    fps: Annotated[
+        float | None,
+        Query(ge=1, le=MOST_FPS, description="Frames in a second, of GLB, USD and USDZ; by default 30."),
+    ] = None,
     format: Annotated[Format, one_of([*MEDIA_TYPES, "obj"])] = None,
 ) -> Response:
     """The animation: GLB, arrays, a zip of OBJ files, a point cache, USD, or JSON lines as they get ready."""
@@ -89,16 +99,25 @@ async def get_interpolation(
     accept = request.headers.get("accept")
     chosen = choose(sequence_types(), "zip" if format == "obj" else format, accept, UNAVAILABLE)
     animation, model = find_interpolation(service.repository, id, service.settings.max_frames)
-    polygons = chosen in SEQUENCE_FORMATS and SEQUENCE_FORMATS[chosen].polygons
+    written_as = SEQUENCE_FORMATS.get(chosen)
+    if fps is not None and not (written_as and written_as.timed):
+        timed = ", ".join(name for name, each in SEQUENCE_FORMATS.items() if each.timed)
+        said = f"{chosen.upper()} files don't say when a frame is shown."
+        raise ProblemError("invalid-request", f"{said} For fps ask for one of {timed}.")
+    polygons = bool(written_as and written_as.polygons)
     faces = choose_topology(topology, chosen, model, animation.mesh, polygons=polygons)
-    tag = entity_tag("animation", id, chosen, *([faces] if faces is Topology.TRIANGLES else []))
+    options = [*draft_option(quality), *([faces] if faces is Topology.TRIANGLES else [])]
+    options += [] if fps is None else [f"{fps} frames a second"]
+    tag = entity_tag("animation", id, chosen, *options)
     if answer := not_modified(request, tag):
         return answer
     if chosen == "jsonl":
-        lines = sequence_lines(service.workers, caller, model, animation)
+        lines = sequence_lines(service.workers, caller, model, animation, quality)
         first = await anext(lines)  # what goes wrong up to here still has a status of its own
         return StreamingResponse(_resume(request, first, lines), headers=cache_headers(tag), media_type=JSON_LINES)
-    written = await sequence_file(service.workers, caller, model, animation, chosen, faces)
+    written = await sequence_file(
+        service.workers, caller, model, animation, quality, chosen, faces, fps or FRAMES_PER_SECOND
+    )
     diagnostics = {**(written.diagnostics or {}), **written.facts}
     headers = cache_headers(tag) | file_headers(diagnostics, f"{model.manifest.name}-animation.{chosen}")
     return written_response(service, written, headers, MEDIA_TYPES[chosen])
@@ -115,6 +134,7 @@ async def get_frame(
     caller: CallerDependency,
     id: Id,
     k: Annotated[int, Path(description="Number of the frame, from 0.", json_schema_extra={"minimum": 0})],
+    quality: QualityQuery = Quality.FULL,
     color: ColorQuery = NO_COLOR,
     topology: TopologyQuery = None,
     format: Annotated[Format, one_of(SHAPE_FORMATS)] = None,
@@ -123,7 +143,9 @@ async def get_frame(
     chosen = choose_mesh(format, request, color)
     animation, model = find_interpolation(service.repository, id, service.settings.max_frames)
     faces = choose_topology(topology, chosen, model, animation.mesh, polygons=SHAPE_FORMATS[chosen].polygons)
-    wanted = WantedShape(frame_code(model, animation, k), animation.mesh, chosen, color.on(model), topology=faces)
+    wanted = WantedShape(
+        frame_code(model, animation, k), animation.mesh, chosen, quality, color.on(model), topology=faces
+    )
     return await shape_response(service, request, caller, model, wanted)
 
 

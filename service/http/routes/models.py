@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 from fastapi import APIRouter
+from pydantic import ValidationError
 
 from shapespace.model.shape_model import ShapeModel
 from shapespace.service.http.dependencies import Model, ServiceDependency
 from shapespace.service.http.description import problems
-from shapespace.service.http.messages.schemas import ModelCard, ModelList, ModelSummary
+from shapespace.service.http.messages.schemas import (
+    GeneralisationAnswer,
+    ModelCard,
+    ModelList,
+    ModelSummary,
+)
 
 router = APIRouter(prefix="/v1/models", tags=["models"])
 
@@ -23,13 +30,31 @@ async def list_models(service: ServiceDependency) -> ModelList:
 @router.get("/{name}", responses=problems(404, 422))
 async def model_card(service: ServiceDependency, model: Model) -> ModelCard:
     """What a model is, its bounds and figures, and where it comes from."""
-    return ModelCard(**_facts(model), digest=model.digest, versions=service.repository.versions(model.manifest.name))
+    return ModelCard(
+        **_facts(model),
+        digest=model.digest,
+        versions=service.repository.versions(model.manifest.name),
+        generalisation=_generalisation(model.manifest.figures),
+    )
+
+
+def _generalisation(figures: Mapping[str, Any]) -> GeneralisationAnswer | None:
+    """Of the largest number of modes that a run has measured; what other tools write there is left alone."""
+    try:
+        found = figures["generalisation"]
+        content = {**found["modes"][-1], "components": found["components"][-1]}
+        content |= {"shapes": found["held_out"], "modes": found["counts"][-1]}
+        return GeneralisationAnswer.model_validate(content)
+    except (KeyError, IndexError, TypeError, ValidationError):
+        return None
 
 
 def _facts(model: ShapeModel) -> dict[str, Any]:
     facts = model.manifest.model_dump(by_alias=True)
     path = f"/v1/models/{model.manifest.name}"
     links = {"self": path}
+    if not any(model.manifest.period):
+        links["blendshapes"] = f"{path}/blendshapes"
     links |= {
         call: f"{path}/{call}"
         for call in ("mesh", "vertices", "nric", "interpolations", "encode", "fit", "edit", "sample")

@@ -138,6 +138,7 @@ async def _infer(service: Service, request: Request, caller: Caller, model: Shap
         codes_of(message, tail),
         options.bounds,
         options.mesh,
+        options.quality,
         message.wanted,
         write,
     )

@@ -6,13 +6,15 @@ from typing import Annotated
 
 from fastapi import APIRouter, Depends, Query, Request, Response
 
-from shapespace.model.decoder import MeshChoice
+from shapespace.model.decoder import MeshChoice, Quality
 from shapespace.model.latent_space import Bounds
 from shapespace.service.http.dependencies import (
     CallerDependency,
     Format,
     MeshQuery,
     Model,
+    QualityOfBody,
+    QualityQuery,
     ServiceDependency,
     one_of,
 )
@@ -58,6 +60,7 @@ async def get_mesh(
     ] = None,
     mesh: Annotated[MeshChoice, Query(description="Which mesh, where the model has a finer one.")] = MeshChoice.FINE,
     bounds: Annotated[Bounds, Query(description="What to do with a code outside the bounds.")] = Bounds.ALLOW,
+    quality: QualityQuery = Quality.FULL,
     color: ColorQuery = NO_COLOR,
     place: PlaceQuery = None,
     topology: TopologyQuery = None,
@@ -67,7 +70,7 @@ async def get_mesh(
     chosen = choose_mesh(format, request, color)
     code = None if latent is None else model.latents.code(numbers(latent, "latent"), bounds)
     faces = choose_topology(topology, chosen, model, mesh, polygons=SHAPE_FORMATS[chosen].polygons)
-    wanted = WantedShape(code, mesh, chosen, color.on(model, bounds), place, faces)
+    wanted = WantedShape(code, mesh, chosen, quality, color.on(model, bounds), place, faces)
     return await shape_response(service, request, caller, model, wanted)
 
 
@@ -83,6 +86,7 @@ async def post_mesh(
     model: Model,
     body: Annotated[MeshRequest, Depends(JSONBody(MeshRequest))],
     mesh: MeshQuery = None,
+    quality: QualityOfBody = None,
     color: ColorQuery = NO_COLOR,
     place: PlaceQuery = None,
     topology: TopologyQuery = None,
@@ -94,7 +98,7 @@ async def post_mesh(
     colours = color.on(model, body.bounds, body.covariance)
     which = mesh or body.mesh
     faces = choose_topology(topology, chosen, model, which, polygons=SHAPE_FORMATS[chosen].polygons)
-    wanted = WantedShape(code, which, chosen, colours, place, faces)
+    wanted = WantedShape(code, which, chosen, quality or body.quality, colours, place, faces)
     return await shape_response(service, request, caller, model, wanted)
 
 
@@ -111,6 +115,7 @@ async def post_vertices(
     model: Model,
     body: Annotated[VerticesRequest, Depends(JSONBody(VerticesRequest))],
     mesh: MeshQuery = None,
+    quality: QualityOfBody = None,
     exact: Annotated[bool, Query(description="As in the body: also the true discrete exponentials.")] = False,
     place: PlaceQuery = None,
     format: Annotated[Format, one_of(VERTICES_TYPES)] = None,
@@ -126,8 +131,10 @@ async def post_vertices(
         body.bounds,
         mesh or body.mesh,
         chosen,
+        quality=quality or body.quality,
         exponentials=exact or body.exact,
         place=place,
+        faces=body.faces,
     )
     headers = {"Vary": "Accept", **file_headers(written.diagnostics or {}, f"{model.manifest.name}.{chosen}")}
     return written_response(service, written, headers, VERTICES_TYPES[chosen])

@@ -70,18 +70,19 @@ export async function reference(model, mesh) {
 export const textured = async (model) => (await call(`${model.links.mesh}?format=glb`)).arrayBuffer();
 
 /** Positions (3V numbers each) of some codes, and the worst of their diagnostics. */
-export async function shapes(model, latents, mesh, signal) {
-  const response = await post(`${model.links.vertices}?format=npz`, { latents, mesh }, signal);
+export async function shapes(model, latents, mesh, { quality = "full", signal } = {}) {
+  const body = { latents, mesh, quality, faces: false };
+  const response = await post(`${model.links.vertices}?format=npz`, body, signal);
   const { vertices } = await readNpz(await response.arrayBuffer(), ["vertices"]);
   return { shapes: split(vertices), diagnostics: diagnosticsOf(response) };
 }
 
-/** Positions and codes of the frames of a path. */
+/** Positions and codes of the frames of a path, as drafts. */
 export async function frames(model, path, signal) {
   const { id, links } = await interpolation(model, path, signal);
-  const response = await call(`${links.self}?format=npz`, { signal });
+  const response = await call(`${links.self}?format=npz&quality=draft`, { signal });
   const { vertices, latents, t } = await readNpz(await response.arrayBuffer(), ["vertices", "latents", "t"]);
-  return { id, shapes: split(vertices), codes: split(latents).map((code) => Array.from(code)), t: Array.from(t.data) };
+  return { id, mesh: path.mesh, shapes: split(vertices), codes: split(latents).map((code) => Array.from(code)), t: Array.from(t.data) };
 }
 
 export const interpolation = (model, path, signal) => json(post(model.links.interpolations, path, signal));

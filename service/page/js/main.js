@@ -52,7 +52,8 @@ tabs(find("[role=tablist]"));
 // The shape and its colours.
 store.on(["shape"], () => {
   if (!store.shape) return;
-  viewer.show(store.shape.mesh, store.shape.positions, colouring.of(store.shape), store.shape.placement);
+  const { mesh, positions, placement, motion } = store.shape;
+  viewer.show(mesh, positions, colouring.of(store.shape), placement ? placement.clone().multiply(motion) : motion);
 });
 store.on(["colour", "against", "highlight", "regions", "repaint", "moving"], () => {
   if (store.shape) viewer.paint(colouring.of(store.shape));
@@ -68,7 +69,7 @@ viewer.canvas.addEventListener("drawn", () => {
   const took = performance.now() - shape.began;
   const frame = store.playing ? "playing" : `${took.toFixed(0)} ms to the picture`;
   find("#frame-time").textContent = `${shape.positions.length / 3} vertices · ${frame}`;
-  find(".stage").dataset.shown = shape.mesh;
+  Object.assign(find(".stage").dataset, { shown: shape.mesh, quality: shape.quality ?? "draft" });
 });
 store.on(["shape"], () => {
   if (!store.shape?.diagnostics) return;

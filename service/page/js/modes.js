@@ -19,14 +19,14 @@ export class Modes {
     this.#abort = new AbortController();
     const { signal } = this.#abort;
     try {
-      const { shapes: [home] } = await api.shapes(model, [space.home], "coarse", signal);
+      const { shapes: [home] } = await api.shapes(model, [space.home], "coarse", { signal });
       for (const [j, factor] of model.factors.entries()) {
         const changes = [];
         for (let k = factor.start; k < factor.stop; k += 1) {
           const [down, , up] = space.stations(k);
           changes.push({ [k]: down }, { [k]: up });
         }
-        const { shapes } = await api.shapes(model, changes.map((change) => space.homeBut(change)), "coarse", signal);
+        const { shapes } = await api.shapes(model, changes.map((change) => space.homeBut(change)), "coarse", { signal });
         for (let k = factor.start; k < factor.stop; k += 1) {
           const [down, up] = shapes.splice(0, 2);
           this.#draw(k, [down, home, up]);

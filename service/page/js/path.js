@@ -3,6 +3,7 @@
 import * as api from "./api.js";
 import { clone, find, sharp } from "./dom.js";
 import { report, reporting } from "./messages.js";
+import { meshOf, motionOf } from "./shape-loop.js";
 
 const PICTURE = 64;
 const SEGMENT = 24; // frames
@@ -17,7 +18,7 @@ export class Path {
 
   constructor(store, pictures, { list, add, play, loop, beyond, timeline, time, status }) {
     Object.assign(this, { store, pictures, list, play, beyond, timeline, time, status });
-    store.on(["keyframes", "loop", "beyond", "model"], () => this.#changed());
+    store.on(["keyframes", "loop", "beyond", "model", "fine", "hasFine"], () => this.#changed());
     store.on(["keyframes", "model"], () => this.#list());
     store.on(["playing"], () => this.#showPlaying());
     add.addEventListener("click", () => store.set({ keyframes: [...store.keyframes, store.code] }));
@@ -97,7 +98,7 @@ export class Path {
     this.#loading = loading;
     this.status.textContent = `Computing ${request.frames} frames …`;
     try {
-      const frames = await api.frames(this.store.model, { ...request, mesh: "coarse" }, loading.signal);
+      const frames = await api.frames(this.store.model, { ...request, mesh: meshOf(this.store) }, loading.signal);
       loading.signal.throwIfAborted();
       this.#frames = frames;
     } finally {
@@ -146,7 +147,7 @@ export class Path {
 
   /** The shape at the time it is, between two frames a mixture of both. */
   #show() {
-    const { shapes, codes } = this.#frames;
+    const { mesh, shapes, codes } = this.#frames;
     const [start, stop] = this.#ends;
     const steps = this.store.loop ? shapes.length : shapes.length - 1;
     const at = ((this.#t - start) / (stop - start)) * steps;
@@ -155,8 +156,10 @@ export class Path {
     const next = shapes[(k + 1) % shapes.length];
     const positions = shapes[k].map((x, i) => x + share * (next[i] - x));
     const code = codes[(share < 0.5 ? k : k + 1) % codes.length];
-    const { model } = this.store;
-    this.store.set({ code, shape: { model, mesh: "coarse", code, placement: this.store.placement, positions, diagnostics: null, began: performance.now() } });
+    const { model, placement } = this.store;
+    const motion = motionOf(this.store, mesh, code, positions);
+    const shape = { model, mesh, code, placement, motion, positions, diagnostics: null, began: performance.now() };
+    this.store.set({ code, shape });
     this.timeline.value = this.#t;
     this.#tell();
   }

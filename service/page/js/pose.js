@@ -1,6 +1,6 @@
-/** How a fine shape is moved to lie where the coarse one of the same code does. */
+/** How a fine shape lies to the coarse one of the same code. */
 
-import { BufferAttribute, Matrix4, Vector3 } from "three";
+import { Matrix4, Vector3 } from "three";
 import { nearest } from "./modes.js";
 
 const at = (positions, vertex) => new Vector3().fromArray(positions, 3 * vertex);
@@ -34,9 +34,6 @@ export class Pose {
     return frame(coarse, this.#coarse).multiply(frame(fine, this.#fine).invert());
   }
 }
-
-/** Positions after a motion, in place. */
-export const moved = (positions, motion) => new BufferAttribute(positions, 3).applyMatrix4(motion).array;
 
 function frame(positions, corners) {
   const [a, b, c] = Array.from(corners, (v) => at(positions, v));

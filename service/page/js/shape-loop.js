@@ -1,18 +1,32 @@
 /**
- * Keeps the shape shown abreast of the code: coarse as it moves, fine when it rests.
+ * Keeps the shape shown abreast of the code: a draft as it moves, the full shape when it rests, both on one mesh.
  *
- * One request is under way at a time; what is asked for meanwhile supersedes what waited, so nothing queues. A fine
- * shape on its way is dropped as soon as the code moves on, and so is a coarse one that takes too long. A coarse one
- * that is quick is let finish: dropping it for each pixel of a drag would show nothing until the hand rests.
+ * One request is under way at a time; what is asked for meanwhile supersedes what waited, so nothing queues. A full
+ * shape on its way is dropped as soon as the code moves on, and so is a draft that takes too long. A draft that is
+ * quick is let finish: dropping it for each pixel of a drag would show nothing until the hand rests.
  */
 
 import { Matrix4 } from "three";
 import * as api from "./api.js";
 import { report, say, takeBack } from "./messages.js";
-import { moved } from "./pose.js";
 
-const REST = 160; // ms without movement until the fine mesh is asked for
-const TOO_LONG = 400; // ms after which a coarse shape is given up for a newer one
+const REST = 160; // ms without movement until the full shape is asked for
+const TOO_LONG = 400; // ms after which a draft is given up for a newer one
+
+/** The mesh that the switch and the model give. */
+export const meshOf = ({ fine, hasFine }) => (fine && hasFine ? "fine" : "coarse");
+
+/**
+ * The motion (Matrix4) that keeps a shape where the one shown is: each mesh is aligned over its own vertices, so that
+ * the fine and the coarse shape of one code lie a few degrees apart.
+ */
+export function motionOf({ shape, pose }, mesh, code, positions) {
+  if (!shape?.motion) return new Matrix4();
+  if (shape.mesh === mesh) return shape.motion;
+  if (shape.code !== code || !pose) return new Matrix4();
+  const between = mesh === "fine" ? pose.motion(positions, shape.positions) : pose.motion(shape.positions, positions).invert();
+  return shape.motion.clone().multiply(between);
+}
 
 export class ShapeLoop {
   #wanted = null;
@@ -22,34 +36,29 @@ export class ShapeLoop {
   constructor(store) {
     this.store = store;
     store.on(["code", "model"], () => this.#moved());
-    store.on(["fine", "hasFine"], () => this.#rest());
+    store.on(["fine", "hasFine"], () => { if (this.store.shape?.mesh !== meshOf(this.store)) this.#moved(); });
   }
 
   #moved() {
-    if (this.store.playing) return;
+    if (this.store.playing || !this.store.model) return;
     const current = this.#current;
-    if (current && (current.mesh === "fine" || performance.now() - current.began > TOO_LONG)) current.abort.abort();
-    this.#want("coarse");
+    if (current && (current.quality === "full" || performance.now() - current.began > TOO_LONG)) current.abort.abort();
+    this.#want("draft");
     this.#rest();
   }
 
-  /** Ask for the fine mesh once nothing has moved for a while. */
+  /** Ask for the full shape once nothing has moved for a while. */
   #rest() {
     clearTimeout(this.#timer);
     if (this.store.playing || !this.store.model) return;
-    if (!this.store.fine) {
-      if (this.store.shape?.mesh === "fine") this.#want("coarse");
-      return;
-    }
     this.#timer = setTimeout(() => {
-      const onItsWay = this.#current?.mesh === "fine"; // of this code: another would have dropped it
-      if (this.store.hasFine && this.store.shape?.mesh !== "fine" && !onItsWay) this.#want("fine");
+      if (!this.#wanted && !this.#current) this.#want("full");
     }, REST);
   }
 
-  #want(mesh) {
+  #want(quality) {
     const { model, code, placement } = this.store;
-    this.#wanted = { mesh, model, code, placement, began: performance.now() };
+    this.#wanted = { mesh: meshOf(this.store), quality, model, code, placement, began: performance.now() };
     if (!this.#current) this.#run();
   }
 
@@ -59,25 +68,20 @@ export class ShapeLoop {
       this.#wanted = null;
       this.#current = { ...asked, abort: new AbortController() };
       try {
-        const { shapes, diagnostics } = await api.shapes(asked.model, [asked.code], asked.mesh, this.#current.abort.signal);
-        if (asked.model === this.store.model && !this.store.playing) {
-          this.store.set({ shape: { ...asked, ...this.#placed(shapes[0], asked), diagnostics } });
+        const { model, code, mesh, quality } = asked;
+        const { shapes, diagnostics } = await api.shapes(model, [code], mesh, { quality, signal: this.#current.abort.signal });
+        if (model === this.store.model && !this.store.playing) {
+          const motion = motionOf(this.store, mesh, code, shapes[0]);
+          const told = quality === "full" ? diagnostics : null;
+          this.store.set({ shape: { ...asked, positions: shapes[0], motion, diagnostics: told } });
         }
-        if (asked.mesh === "coarse") this.#rest();
+        if (quality === "draft") this.#rest();
       } catch (error) {
         if (error.offline) await this.#untilReady(asked);
         else report(error);
       }
       this.#current = null;
     }
-  }
-
-  /** Positions, and the motion that brought them to where the coarse shape of the same code is. */
-  #placed(positions, { mesh, code }) {
-    const { shape, pose } = this.store;
-    if (mesh === "coarse" || shape?.mesh !== "coarse" || shape.code !== code) return { positions, motion: new Matrix4() };
-    const motion = pose.motion(positions, shape.positions);
-    return { positions: moved(positions, motion), motion };
   }
 
   async #untilReady(asked) {

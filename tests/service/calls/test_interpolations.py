@@ -7,6 +7,7 @@ import json
 import os
 import select
 import socket
+import struct
 import zipfile
 import zlib
 from pathlib import Path
@@ -198,7 +199,7 @@ def test_an_id_of_a_model_that_is_gone_is_not_found(client: httpx.Client, models
 
 def test_an_animation_has_an_entity_tag(client: httpx.Client) -> None:
     links = create(client, keyframes=[A, B], frames=3)["links"]
-    formats = ("glb", "npz", "zip", "pc2", "usd", "jsonl")
+    formats = ("glb", "npz", "zip", "pc2", "usd", "usdz", "jsonl")
     assert set(links) == {"self", "frames", *formats}
     tags = {name: client.get(links[name]).headers["ETag"] for name in formats}
     assert len(set(tags.values())) == len(formats)
@@ -260,6 +261,42 @@ def test_work_ends_when_nobody_waits_for_it(models: Path, start: Start) -> None:
             while_waiting += 1
             assert while_waiting < 200, "all of the frames would take that long"
     assert "Traceback" not in server.stop()
+
+
+def test_frames_a_second_are_those_that_are_asked_for(client: httpx.Client, tmp_path: Path) -> None:
+    from pxr import Usd
+
+    links = create(client, keyframes=[A, B], frames=5)["links"]
+    plain = client.get(links["glb"]).raise_for_status()
+    for fps, rate in ((None, 30), (12.5, 12.5), (240, 240)):
+        query = {} if fps is None else {"fps": fps}
+        answer = client.get(links["self"], params={"format": "glb", **query}).raise_for_status()
+        glb = GLB(answer.content)
+        times = glb.array(glb.tree["animations"][0]["samplers"][0]["input"])
+        np.testing.assert_allclose(times, np.arange(5) / rate, rtol=1e-6)
+        assert (answer.headers["ETag"] == plain.headers["ETag"]) == (fps is None)
+        path = tmp_path / "animation.usdc"
+        path.write_bytes(client.get(links["self"], params={"format": "usd", **query}).raise_for_status().content)
+        assert Usd.Stage.Open(str(path)).GetTimeCodesPerSecond() == rate
+    for query in ({"format": "npz", "fps": 10}, {"fps": 0}, {"fps": 1e9}, {"fps": "fast"}):
+        answer = client.get(links["self"], params=query)
+        assert answer.status_code == 422, query
+        assert "fps" in answer.json()["detail"]
+
+
+def test_usdz_holds_the_layer_as_phones_want_it(client: httpx.Client, tmp_path: Path) -> None:
+    links = create(client, keyframes=[A, B], frames=4)["links"]
+    answer = client.get(links["usdz"]).raise_for_status()
+    assert answer.headers["Content-Type"] == "model/vnd.usdz+zip"
+    with zipfile.ZipFile(io.BytesIO(answer.content)) as archive:
+        (layer,) = archive.infolist()
+        assert layer.compress_type == zipfile.ZIP_STORED
+        named, more = struct.unpack_from("<HH", answer.content, layer.header_offset + 26)
+        assert (layer.header_offset + 30 + named + more) % 64 == 0, "contents begin at multiples of 64 bytes"
+    path = tmp_path / "animation.usdz"
+    path.write_bytes(answer.content)
+    with np.load(io.BytesIO(client.get(links["npz"]).content)) as arrays:
+        assert np.array_equal(read_usd(path)[0], arrays["vertices"])
 
 
 def test_a_server_without_usd_says_how_to_get_it(

@@ -43,7 +43,8 @@ def test_a_uniform_scaling_comes_out_exactly_in_the_users_units(client: httpx.Cl
     assert diagnostics["inside_bounds"] is True
     assert diagnostics["model"] == client.get("/v1/models/small").json()["digest"]
     assert set(diagnostics) == {
-        "status", "iterations", "residual", "flipped_faces", "integrability", "plausibility", "inside_bounds", "model"
+        "status", "iterations", "residual", "flipped_faces", "integrability", "plausibility", "inside_bounds", "model",
+        "quality",
     }  # fmt: skip
 
 

@@ -349,3 +349,15 @@ def test_the_sensitivity_is_the_transposed_differential(mesh, pose, reconstruct,
     products = np.einsum("nvx,kvx->kn", reconstruct.differential(pose, changes), fields)
     transposed = reconstruct.sensitivity(pose, fields) @ changes.T
     np.testing.assert_allclose(transposed, products, rtol=1e-5, atol=1e-6 * np.abs(products).max())
+
+
+def test_a_draft_of_a_shapes_own_lengths_and_angles_is_the_shape(mesh, pose, reconstruct, target):
+    draft = reconstruct.draft(target)
+    assert draft is not None
+    assert draft.residual < 1e-6
+    assert np.abs(align(draft.vertices, pose) - pose).max() < 1e-6 * mesh.diagonal
+
+
+def test_a_draft_of_what_is_no_shape_is_none(mesh, reconstruct, target, rng):
+    noise = target + 0.5 * rng.standard_normal(len(target)) * np.abs(target).mean()
+    assert reconstruct.draft(noise) is None

@@ -19,6 +19,7 @@ from shapespace.mesh.triangle_mesh import Connectivity, TriangleMesh
 from shapespace.training.learning.convolutions import EdgeConvolution, Flaps, Star, flaps
 from shapespace.training.learning.corrections import JointSamples
 from shapespace.training.learning.fitting import read_network, save_network
+from shapespace.training.learning.latent_kernel import LatentKernel
 from shapespace.training.learning.layers import (
     FourierProducts,
     LatentFeatures,
@@ -27,7 +28,7 @@ from shapespace.training.learning.layers import (
     Scaling,
     narrowest,
 )
-from shapespace.training.learning.networks import CORRECTIONS, CombinerNetwork, FactorNetwork, affine_sum, resolved
+from shapespace.training.learning.networks import CORRECTIONS, CombinerNetwork, FactorNetwork, affine_sum, candidates
 from shapespace.training.learning.polynomials import PolynomialCorrection, learned_metric
 from shapespace.training.runs.config import (
     AutoSettings,
@@ -192,7 +193,7 @@ def test_every_correction_comes_back_from_its_file(ball: TriangleMesh, settings:
             parameter += 0.1
     save_network(tmp_path / "n.safetensors", network, {"done": True})
     saved = read_network(tmp_path / "n.safetensors")
-    assert json.loads(saved.metadata["correction"])["kind"] == resolved(settings).kind
+    assert json.loads(saved.metadata["correction"])["kind"] == network.settings.kind
     again = CombinerNetwork.load(saved.metadata, ball, saved.tensors).eval()
     with torch.no_grad():
         assert torch.equal(again(x), network(x))
@@ -200,10 +201,44 @@ def test_every_correction_comes_back_from_its_file(ball: TriangleMesh, settings:
 
 def test_every_kind_has_a_class() -> None:
     assert {settings.kind for settings, _, _ in KINDS} == set(CORRECTIONS)
-    assert resolved(AutoSettings()) == KernelSettings()
-    paper = resolved(PaperSettings())
+    paper = candidates(PaperSettings())[0]
+    assert isinstance(paper, ConvolutionSettings)
     assert (paper.neighbourhood, paper.residual, paper.dropout, paper.edge_channels) == ("star", False, 0.1, 0)
     assert (paper.fit.schedule, paper.fit.learning_rate) == ("plateau", 1e-3)
+
+
+@pytest.mark.parametrize(("missed", "kind"), [(cubic, "polynomials"), (beyond_cubic, "kernel")])
+def test_auto_takes_what_is_better_on_codes_that_it_has_not_seen(ball: TriangleMesh, missed: Missed, kind: str) -> None:
+    x, z = interplay(ball, 260, missed)
+    network = fitted(ball, AutoSettings(), x[:60], z[:60], 40)
+    assert network.settings.kind == kind
+    assert set(network.tried) == {"kernel", "polynomials"}
+    assert min(network.tried, key=lambda name: network.tried[name]) == kind
+    wanted = network.scaling.down(z[40:60])
+    with torch.no_grad():
+        error = float((network.coefficients(x[40:60]) - wanted).square().mean())
+    assert network.tried[kind] == pytest.approx(error, rel=1e-3)
+    assert CombinerNetwork.load(network.metadata, ball, network.state_dict()).tried == network.tried
+
+
+def test_kernel_regression_on_codes_finds_a_smooth_map(ball: TriangleMesh) -> None:
+    """Of an angle and a bounded coordinate; the same map with noise only as far as the noise leaves it."""
+    coordinates = Coordinates(np.array([0.0, -3.0]), np.array([2 * np.pi, 5.0]), np.array([2 * np.pi, np.nan]))
+    codes = torch.as_tensor(coordinates.uniform(300, np.random.default_rng(0)), dtype=torch.float32)
+    rng = np.random.default_rng(1)
+    maps = torch.as_tensor(rng.standard_normal((3, 2 * len(ball.connectivity.edges))), dtype=torch.float32)
+    a, b = codes.T
+    z = torch.stack([torch.cos(2 * a), torch.sin(a) * b, torch.exp(b / 5)], dim=1) @ maps
+    own, held_out, unseen = ((codes[part], z[part]) for part in (slice(150), slice(150, 200), slice(200, None)))
+    scaling = Scaling.of(np.zeros(z.shape[1]), np.ones(z.shape[1]), own[1].numpy())
+    network = LatentKernel(coordinates, scaling, own, held_out)
+    spread = (unseen[1] - unseen[1].mean(dim=0)).square().mean()
+    assert (network(unseen[0]) - unseen[1]).square().mean() < 1e-3 * spread
+    turned = unseen[0] + torch.tensor([2 * np.pi, 0.0])
+    assert torch.allclose(network(turned), network(unseen[0]), atol=1e-3)
+    noise = 0.3 * torch.randn(own[1].shape, generator=torch.Generator().manual_seed(0)) * spread.sqrt()
+    rough = LatentKernel(coordinates, scaling, (own[0], own[1] + noise), held_out)
+    assert (rough(unseen[0]) - unseen[1]).square().mean() < 0.5 * noise.square().mean()
 
 
 def polynomials(mesh: TriangleMesh, coefficients: int, monomials: int) -> tuple[PolynomialCorrection, torch.Tensor]:

@@ -14,7 +14,7 @@ import pytest
 from shapespace.bundle.reader import read_bundle
 from shapespace.training.__main__ import main
 from shapespace.training.collection.generators import PRODUCTS
-from shapespace.training.learning.networks import resolved
+from shapespace.training.learning.networks import candidates
 from shapespace.training.runs.config import CombinerSettings, Config, LatentNetworkSettings, load
 
 ROOT = Path(__file__).parents[3]
@@ -94,7 +94,7 @@ def test_an_example_is_the_recipe_of_the_committed_run(name: str) -> None:
     ]
     assert example.recipes == run.recipes
     assert example.networks.factors == run.networks.factors
-    assert resolved(example.networks.combiner.correction) == resolved(run.networks.combiner.correction)
+    assert candidates(example.networks.combiner.correction) == candidates(run.networks.combiner.correction)
     assert example.networks.combiner.symmetries == run.networks.combiner.symmetries
 
 

@@ -53,7 +53,7 @@ def test_a_run_leaves_what_the_contract_promises(tiny_run: Path) -> None:
         assert sorted(every) == list(range(60))
         assert len(split["test"]) == 12
     figures = json.loads((tiny_run / "evaluation.json").read_text())
-    for model in ("composite", "monolithic", "affine", "grid"):
+    for model in ("composite", "monolithic", "monolithic_paper", "kernel", "affine", "grid"):
         assert set(figures["r2"][model]) == {"total", "lengths", "angles"}
     assert 0.9 < figures["r2"]["affine"]["total"] < 0.99
     assert figures["r2"]["composite"]["total"] > 0.5
@@ -174,7 +174,8 @@ def test_networks_that_are_not_needed_any_more_are_removed(tiny_run: Path, tmp_p
     config.write_text(TINY.replace("[monolithic]\nhidden = [16]", "[monolithic]\nhidden = [8]"))
     subprocess.run(command(config, copy, "--until", "networks"), check=True, capture_output=True)
     before, after = ({path.stem for path in (run / "networks").glob("*.safetensors")} for run in (tiny_run, copy))
-    assert [name.startswith("monolithic-") for name in before ^ after] == [True, True]
+    changed = sorted(name.rpartition("-")[0] for name in before ^ after)
+    assert changed == ["monolithic"] * 2 + ["monolithic-combiner"] * 2
     assert len(before) == len(after)
     assert json.loads((copy / "networks" / "histories.json").read_text()).keys() == after
 

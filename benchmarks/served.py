@@ -1,0 +1,130 @@
+"""docs/served.md: how near served models come to shapes that they have not seen, beside principal components.
+
+``python -m benchmarks.served --data FOLDER`` trains a model on four fifths of each collection, exports it, and has its
+``encode`` find the codes of the other fifth and of the shapes that it was trained on. What is done is kept under
+``--out``: a killed call goes on. ``python -m benchmarks.fit --data OUT/models`` fits scans of the unseen shapes.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tomlkit
+
+from benchmarks.results import COLLECTIONS, ROOT, open_run
+from benchmarks.space import CODES, to_nearest
+from shapespace.arrays import FloatArray
+from shapespace.mesh.triangle_mesh import diagonal
+from shapespace.model.shape_model import ShapeModel, load
+from shapespace.training.pipeline import Run, execute
+from shapespace.training.runs.config import parse
+from shapespace.training.space.generalisation import PrincipalComponents, folds, summary, vertex_distances
+
+#: Most exponentials to learn from: joint, and of each factor.
+JOINT, OF_FACTORS = 1000, 300
+COLUMNS = ("unseen", "trained on")
+
+PAGE = """# Served models and shapes that they have not seen
+
+For each collection a model was trained on four fifths of the shapes, with the settings of `examples/collections` but
+at most {joint} joint exponentials and {factors} of each factor, and exported. Its `encode`, as it is served, was
+given each shape's fine mesh. **unseen**: mean and 95th percentile over all vertices of the other fifth of the shapes,
+of the distance to the shape of the code, in percent of the bounding box's diagonal; **components**: of as many
+principal components of the same four fifths' fine meshes. **trained on**: the same of the shapes that made the model.
+**specificity**: mean distance of {codes} random shapes, uniform in the bounds of the codes or of the components'
+coefficients, to the nearest of the shapes that made the model: lower is better. R² is of the networks, on test
+exponentials. `python -m benchmarks.served --data FOLDER` trains, measures and writes this page.
+
+| | m | unseen | 95 % | components | 95 % | ratio | trained on | components | ratio | specificity | components | R² |
+|---|---|---|---|---|---|---|---|---|---|---|---|---|
+"""
+
+
+def four_fifths(name: str, data: Path, out: Path) -> tuple[Run, FloatArray, FloatArray]:
+    """The run of a collection without its first fold, the fine meshes (n, V, 3) that it knows, and the others."""
+    example = open_run(name, data, out)
+    with np.load(str(example.config.collection.data), allow_pickle=False) as arrays:
+        whole = {key: arrays[key] for key in arrays.files}
+    held = folds(len(whole["vertices"]))[0]
+    known = {key: array if key == "faces" else np.delete(array, held, axis=0) for key, array in whole.items()}
+    file = out / "data" / f"{name}.npz"
+    if not file.exists():
+        file.parent.mkdir(parents=True, exist_ok=True)
+        np.savez(file, **known)
+    document: Any = tomlkit.parse(example.source)
+    document["collection"]["data"] = str(file.resolve())
+    joint, factors = example.config.samples.count, example.config.samples.factor_counts
+    document["samples"]["count"] = min(joint, JOINT)
+    document["samples"]["factor_counts"] = min(factors, OF_FACTORS) if isinstance(factors, int) else OF_FACTORS
+    for section in ("variants", "evaluation"):
+        document.pop(section, None)
+    for studied in ("seeds", "fractions"):
+        document.get("networks", {}).pop(studied, None)
+    document["export"]["name"] = name
+    text = tomlkit.dumps(document)
+    run = Run(out / name, parse(text, name), text, out / "models")
+    return run, known["vertices"].astype(np.float64), whole["vertices"][held].astype(np.float64)
+
+
+def encoded(model: ShapeModel, shapes: FloatArray) -> FloatArray:
+    """(n, V) distances of vertices from shapes (n, V, 3) in correspondence, as shares of the diagonal."""
+    size = float(diagonal(model.vertices))
+    return np.stack([model.encode(shape).distances for shape in shapes]) / size
+
+
+def measure(name: str, data: Path, out: Path) -> dict[str, Any]:
+    """Train, and measure what is trained."""
+    run, known, unseen = four_fifths(name, data, out)
+    execute(run, keep_going=True)
+    unseen_file = out / "models" / f"{name}.npz"
+    if not unseen_file.exists():
+        np.savez(unseen_file, vertices=unseen)
+    model = load(out / "models" / name)
+    m, size = model.dimension, float(diagonal(model.vertices))
+    linear = PrincipalComponents.of(known, model.vertices)
+    found: dict[str, Any] = {"modes": m, "r2": run.directory.evaluation.read()["r2"]["composite"]["total"]}
+    for kind, shapes in zip(COLUMNS, (unseen, known), strict=True):
+        others = vertex_distances(linear.nearest(shapes, m), shapes, size)
+        found[kind] = summary(encoded(model, shapes)) | {"components": summary(others)}
+    drawn = np.stack([model.decode(code) for code in model.sample(CODES, 0)])
+    others = linear.random(m, CODES, np.random.default_rng(0))
+    found["specificity"] = [to_nearest(each, known, size) for each in (drawn, others)]
+    return found
+
+
+def row(name: str, found: dict[str, Any]) -> str:
+    """Of the table."""
+    cells = [name, str(found["modes"])]
+    for kind in COLUMNS:
+        own, other = found[kind], found[kind]["components"]
+        both = [(own["mean"], own["p95"]), (other["mean"], other["p95"])]
+        cells += [f"{100 * figure:.3f}" for pair in both for figure in (pair if kind == "unseen" else pair[:1])]
+        cells.append(f"{own['mean'] / other['mean']:.2f}")
+    cells += [*(f"{100 * figure:.2f}" for figure in found["specificity"]), f"{found['r2']:.4f}"]
+    return f"| {' | '.join(cells)} |"
+
+
+def main() -> None:
+    """Measure and write."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--data", type=Path, required=True, help="folder of the collections")
+    parser.add_argument("--out", type=Path, default=ROOT / "build" / "served")
+    parser.add_argument("names", nargs="*", default=COLLECTIONS)
+    given = parser.parse_args()
+    for name in given.names:
+        file = given.out / f"{name}.json"
+        if not file.exists():
+            found = measure(name, given.data, given.out)
+            file.write_text(json.dumps(found, indent=1), encoding="utf-8")
+        done = {each: given.out / f"{each}.json" for each in COLLECTIONS}
+        rows = [row(each, json.loads(path.read_text())) for each, path in done.items() if path.exists()]
+        page = PAGE.format(joint=JOINT, factors=OF_FACTORS, codes=CODES) + "\n".join(rows) + "\n"
+        (ROOT / "docs" / "served.md").write_text(page, encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,47 @@
+"""A model as linear blend shapes."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from fastapi import APIRouter, Query, Request, Response
+
+from shapespace.model.decoder import MeshChoice
+from shapespace.service.http.caching import CachedAnswer, cache_headers, entity_tag, not_modified
+from shapespace.service.http.dependencies import CallerDependency, Model, ServiceDependency
+from shapespace.service.http.description import binary, problems
+from shapespace.service.http.responses import timing
+from shapespace.service.use_cases.blend_shapes import blend_shapes_file
+from shapespace.service.use_cases.shape_formats import SHAPE_FORMATS
+
+router = APIRouter(prefix="/v1/models/{name}", tags=["shapes"])
+_GLB = {"glb": SHAPE_FORMATS["glb"].media_type}
+
+
+@router.get(
+    "/blendshapes",
+    responses=binary(_GLB, "A GLB with morph targets.") | problems(404, 422, 503, 504),
+    response_class=Response,
+)
+async def get_blend_shapes(
+    service: ServiceDependency,
+    request: Request,
+    caller: CallerDependency,
+    model: Model,
+    mesh: Annotated[MeshChoice, Query(description="Which mesh, where the model has a finer one.")] = MeshChoice.FINE,
+) -> Response:
+    """Code 0, and a morph target for each end of each coordinate: sliders for programs without this server.
+
+    `asset.extras.error` of the file says how far the linear blend is from the model's shapes.
+    """
+    tag = entity_tag("blend shapes", model.digest, mesh)
+    if unchanged := not_modified(request, tag):
+        return unchanged
+    answer, headers = service.answers.get(tag), cache_headers(tag)
+    if answer is None:
+        content, seconds = await blend_shapes_file(service.workers, caller, model, mesh)
+        name = f"{model.manifest.name}-blendshapes.glb"
+        answer = CachedAnswer(content, {"Content-Disposition": f'inline; filename="{name}"'})
+        service.answers.keep(tag, answer)
+        headers |= timing(service, seconds)
+    return Response(answer.content, headers={**headers, **answer.headers}, media_type=_GLB["glb"])

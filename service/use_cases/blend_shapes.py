@@ -1,0 +1,40 @@
+"""A model as a GLB with a slider for each end of each coordinate."""
+
+from __future__ import annotations
+
+import time
+from functools import partial
+
+from shapespace.model.blend_shapes import blend_shapes, require_ends
+from shapespace.model.decoder import MeshChoice, Quality, Shape
+from shapespace.model.latent_space import Codes
+from shapespace.model.shape_model import ShapeModel
+from shapespace.service.limits.workers import Caller, Workers
+from shapespace.service.use_cases.batch import Timings, solve
+from shapespace.solve.deadline import Deadline
+
+
+async def blend_shapes_file(
+    workers: Workers, caller: Caller, model: ShapeModel, mesh: MeshChoice
+) -> tuple[bytes, Timings]:
+    """The file, and the time that it took by stage.
+
+    Raises:
+        PeriodicError: there are angles among the coordinates.
+        NotFiniteError, ModelFailedError: the model has no shape for one of its ends.
+        BusyError, DeadlineError, DisconnectedError, EndingError: no place, or the call ended before.
+    """
+    require_ends(model)
+
+    def shape(deadline: Deadline, code: Codes) -> Shape:
+        return solve(workers, model, mesh, Quality.FULL, (code, True), deadline)
+
+    def make(deadline: Deadline) -> tuple[bytes, Timings]:
+        began = time.perf_counter()
+        found = blend_shapes(model, mesh, partial(shape, deadline))
+        solved = time.perf_counter()
+        content = found.glb()
+        return content, {"reconstruct": solved - began, "encode": time.perf_counter() - solved}
+
+    async with workers.admit(caller) as call:
+        return await workers.run(make, call)
