@@ -12,13 +12,15 @@ import trimesh
 from shapespace.mesh.surface import Labels, Material, Surface
 
 
-def png(seed: int = 0, size: int = 4) -> bytes:
-    """A picture of a few pixels."""
+def png(seed: int = 0, size: int = 4, color: tuple[int, int, int] | None = None) -> bytes:
+    """A picture of a few pixels, of one colour or of any."""
 
     def chunk(kind: bytes, data: bytes) -> bytes:
         return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
 
     pixels = np.random.default_rng(seed).integers(0, 256, (size, size, 3), np.uint8)
+    if color:
+        pixels[:] = color
     rows = b"".join(b"\0" + row.tobytes() for row in pixels)
     head = struct.pack(">IIBBBBB", size, size, 8, 2, 0, 0, 0)
     return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + chunk(b"IDAT", zlib.compress(rows)) + chunk(b"IEND", b"")

@@ -6,6 +6,7 @@ from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from shapespace.bundle.schema import SurfaceEntry
 from shapespace.files.colouring import Quantity
 from shapespace.model.decoder import MeshChoice, Quality
 from shapespace.model.edit import PRIOR, PriorKind
@@ -293,6 +294,10 @@ class ModelSummary(BaseModel):
     vertices: int
     edges: int
     faces: int
+    surface: SurfaceEntry | None = Field(
+        description="What answers of the fine mesh have from the training files beside triangles: names of parts, "
+        "materials, textures, and whether these had normals; null where nothing."
+    )
     links: dict[str, str] = Field(description="Addresses of the model's calls.")
 
 

@@ -66,6 +66,9 @@ export async function reference(model, mesh) {
   return { vertices: vertices.data, faces: faces.data };
 }
 
+/** The reference as GLB, with the materials and textures of the model's files. */
+export const textured = async (model) => (await call(`${model.links.mesh}?format=glb`)).arrayBuffer();
+
 /** Positions (3V numbers each) of some codes, and the worst of their diagnostics. */
 export async function shapes(model, latents, mesh, { quality = "full", signal } = {}) {
   const body = { latents, mesh, quality, faces: false };

@@ -15,6 +15,7 @@ import { Pictures } from "./pictures.js";
 import { Pose } from "./pose.js";
 import { Pull } from "./pull.js";
 import { ShapeLoop } from "./shape-loop.js";
+import { Skin } from "./skin.js";
 import { Sliders } from "./sliders.js";
 import { LatentSpace } from "./space.js";
 import { Store } from "./store.js";
@@ -132,6 +133,16 @@ async function openModel({ model, code, keyframes = [], locked, view, state = {}
     store.set({ references: { coarse, fine }, pose: new Pose(coarse.vertices, fine.vertices), hasFine: true });
   }
   find("#fine").disabled = !store.hasFine;
+  if (model.surface?.materials.some(({ texture }) => texture)) {
+    try {
+      const skin = await Skin.of(await api.textured(model));
+      if (store.model !== model) skin.dispose();
+      else viewer.dress(store.hasFine ? "fine" : "coarse", skin);
+    } catch (error) { // all but the look is there without it
+      report(error);
+    }
+    if (store.model !== model) return;
+  }
   await modes.draw();
 }
 

@@ -36,7 +36,10 @@ export class Viewer {
     this.mesh.frustumCulled = this.wires.frustumCulled = false;
     // Not drawn while empty: three.js would take the lack of normals for flat shading, and keep to it.
     this.mesh.visible = this.wires.visible = false;
-    this.scene.add(this.mesh, this.wires);
+    // Instead of the mesh where there are textures and no colours; what the mesh is, is still what one points at.
+    this.skinned = new THREE.Mesh();
+    this.skinned.frustumCulled = this.skinned.visible = false;
+    this.scene.add(this.mesh, this.wires, this.skinned);
     this.geometries = {};
 
     new ResizeObserver(() => this.#resize()).observe(canvas.parentElement);
@@ -49,6 +52,9 @@ export class Viewer {
   open(reference) {
     for (const geometry of Object.values(this.geometries)) geometry.dispose();
     this.geometries = {};
+    this.skin?.dispose();
+    this.skin = null;
+    this.skinned.visible = false;
     this.addMesh("coarse", reference);
     this.sphere = sphereOf(reference.vertices);
     this.resetView();
@@ -58,23 +64,44 @@ export class Viewer {
     this.geometries[name] = geometryOf(faces, vertices.length / 3);
   }
 
+  /** Materials and textures for one of the model's meshes. */
+  dress(name, skin) {
+    this.skin = skin;
+    this.skinOf = name;
+    Object.assign(this.skinned, { geometry: skin.geometry, material: skin.materials });
+    this.#wear();
+    this.draw();
+  }
+
+  #wear() {
+    const { skin, mesh } = this;
+    if (!mesh.geometry.index) return; // nothing has been shown yet
+    const wears = Boolean(skin) && mesh.geometry === this.geometries[this.skinOf];
+    this.skinned.visible = wears && !this.coloured && mesh.material === this.materials.surface;
+    mesh.visible = !this.skinned.visible;
+    if (wears) skin.follow(mesh.geometry);
+  }
+
   /** Show positions on one of the model's meshes, there or where a motion (Matrix4) takes them. */
   show(name, positions, colours, placement) {
     const geometry = this.geometries[name];
     move(geometry, positions);
     paint(geometry, colours);
     this.mesh.geometry = this.wires.geometry = geometry;
-    for (const mesh of [this.mesh, this.wires]) {
+    for (const mesh of [this.mesh, this.wires, this.skinned]) {
       mesh.matrixAutoUpdate = false;
       mesh.matrix.copy(placement ?? new THREE.Matrix4());
       mesh.updateMatrixWorld(true);
     }
-    this.mesh.visible = true;
+    this.coloured = Boolean(colours);
+    this.#wear();
     this.draw();
   }
 
   paint(colours) {
     paint(this.mesh.geometry, colours);
+    this.coloured = Boolean(colours);
+    this.#wear();
     this.draw();
   }
 
@@ -82,6 +109,7 @@ export class Viewer {
   style({ wireframe, normals }) {
     this.wires.visible = wireframe;
     this.mesh.material = normals ? this.materials.normals : this.materials.surface;
+    this.#wear();
     this.draw();
   }
 

@@ -16,6 +16,7 @@ from scipy.spatial import KDTree
 
 from shapespace.files.animated_gltf import animated_glb
 from shapespace.files.formats import MESH_FORMATS, OBJ_ZIP, read_arrays
+from shapespace.files.limits import Limits
 from shapespace.files.surfaces.reading import read_surface
 from shapespace.files.surfaces.textures import LARGEST
 from shapespace.files.usd import animated_usd
@@ -100,7 +101,9 @@ def test_obj_by_itself_names_no_files() -> None:
             "usemtl": SURFACE.materials[SURFACE.material_of[k]].name,
         }
     triangles = MESH_FORMATS["obj"].encode(VERTICES, SURFACE.triangles, None, SURFACE.triangulated).decode()
-    assert [polygon[0] for polygon in parse_obj(triangles)["polygons"]] == SURFACE.triangles.tolist()
+    cut = parse_obj(triangles)["polygons"]
+    assert [polygon[0] for polygon in cut] == SURFACE.triangles.tolist()
+    assert [polygon[3] for polygon in cut] == [found["polygons"][k][3] for k in SURFACE.triangle_polygons]
 
 
 @pytest.mark.parametrize("format", ["glb", "gltf"])
@@ -116,7 +119,8 @@ def test_others_see_texture_and_materials_in_gltf(format: str) -> None:
     assert looks["cap"].baseColorTexture is None
     np.testing.assert_allclose(looks["cap"].baseColorFactor[:3], np.array([0.1, 0.2, 0.3]) * 255, atol=1)
     # Ours sees the vertices that were split as the ones that they are.
-    vertices, faces = read_arrays(data, format)
+    limits = Limits(len(SURFACE.split.vertex), len(SURFACE.triangles))  # those of both materials are the same
+    vertices, faces = read_arrays(data, format, limits)
     np.testing.assert_allclose(vertices, VERTICES, atol=1e-6)
     assert {tuple(face) for face in faces.tolist()} == {tuple(face) for face in SURFACE.triangles.tolist()}
 

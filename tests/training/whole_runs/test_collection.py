@@ -223,6 +223,13 @@ def test_what_the_files_had_comes_back(url: str, run: Path, folder: Path, tmp_pa
     def ask(**query: str) -> httpx.Response:
         return httpx.get(mesh, params={"latent": code} | query, timeout=60)
 
+    said = httpx.get(f"{url}/v1/models/bars").json()["surface"]
+    assert (said["objects"], said["groups"]) == (["Bar"], ["left", "right"])
+    assert [(material["name"], material["texture"]) for material in said["materials"]] == [
+        ("skin", "skin.png"),
+        ("cap", None),
+    ]
+
     # Each file of the collection is what the model keeps, but for its positions.
     answer = parse_obj(ask(format="obj").raise_for_status().text)
     for k in range(len(shapes)):

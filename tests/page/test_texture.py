@@ -1,0 +1,69 @@
+"""Textures of the model's files."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from shapespace.bundle import writer
+from shapespace.bundle.writer import Networks
+from shapespace.mesh.surface import Material, Surface
+from tests.page.conftest import Open
+from tests.service.bundles import facts, fine_reference, geometry, networks
+from tests.service.conftest import Start
+from tests.surfaces import png
+
+
+def dressed(folder: Path, picture: bytes) -> Path:
+    """A torus whose finer mesh has a red picture on one half and a green material on the other, with a seam."""
+    mesh = fine_reference()
+    faces = mesh.faces
+    half = mesh.vertices[faces].mean(axis=1)[:, 0] > 0
+    surface = Surface(
+        starts=np.arange(0, faces.size + 1, 3),
+        corners=faces.ravel(),
+        uv=np.array([[0.2, 0.2], [0.8, 0.8]]),
+        uv_corners=np.repeat(half, 3).astype(int),
+        material_of=np.where(half, 0, 1),
+        materials=(Material("red", texture="red.png"), Material("green", (0.0, 0.5, 0.0, 1.0))),
+        textures={"red.png": picture},
+    )
+    *factors, combiner = (model.SerializeToString() for model in networks().values())
+    files = Networks(factors=factors, combiner=combiner)
+    writer.write_bundle(folder, facts("dressed"), files, replace(geometry(fine=True), surface=surface))
+    return folder
+
+
+def share(picture: np.ndarray, channel: int) -> float:
+    """Of the pixels in which one colour is much stronger than the others."""
+    others = np.delete(picture, channel, axis=2).max(axis=2)
+    return float((picture[:, :, channel] > others + 60).mean())
+
+
+def test_the_fine_mesh_wears_its_texture(tmp_path: Path, start: Start, window: Open) -> None:
+    studio = window(start(dressed(tmp_path, png(color=(220, 0, 0)))).url).open("#model=dressed")
+    studio.eventually(lambda: share(studio.picture(), 0) > 0.02)
+    first = studio.picture()
+    assert share(first, 1) > 0.02, "the other material"
+    studio.type(2, 0.8)
+    studio.rest()
+    moved = studio.until_different(first)
+    studio.eventually(lambda: share(studio.picture(), 0) > 0.02)
+    assert share(moved, 2) < 0.001
+    # Colours and the coarse mesh are without.
+    studio["#normals"].click()
+    studio.eventually(lambda: share(studio.picture(), 2) > 0.01)
+    studio["#normals"].click()
+    studio.eventually(lambda: share(studio.picture(), 0) > 0.02)
+    studio["#fine"].click()
+    studio.eventually(lambda: share(studio.picture(), 0) < 0.001)
+
+
+def test_a_picture_that_no_browser_reads_leaves_the_rest_as_it_is(tmp_path: Path, start: Start, window: Open) -> None:
+    studio = window(start(dressed(tmp_path, png()[:20])).url, complains=True).open("#model=dressed")
+    studio.eventually(lambda: "could not be decoded" in studio.messages)
+    before = studio.picture()
+    studio.type(2, 0.8)
+    studio.until_different(before)
