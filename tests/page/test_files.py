@@ -75,7 +75,8 @@ def test_a_download_of_the_path(studio: Studio, expected: np.ndarray) -> None:
         elif format == "jsonl":
             assert np.allclose(json.loads(content.splitlines()[-1])["vertices"], expected, atol=1e-5)
         else:
-            assert content.startswith({"glb": b"glTF", "pc2": b"POINTCACHE2", "usd": b"PXR"}[format])
+            begins = {"glb": b"glTF", "pc2": b"POINTCACHE2", "usd": b"PXR", "usdz": b"PK"}
+            assert content.startswith(begins[format])
 
 
 def test_the_copied_call_answers_the_shape(studio: Studio, expected: np.ndarray) -> None:

@@ -24,7 +24,7 @@ export function toHash(store, view) {
 export function fromHash(hash, models) {
   const parts = new URLSearchParams(hash.replace(/^#/, ""));
   const model = models.find(({ name }) => name === parts.get("model"));
-  if (!model) return {};
+  if (!model) return { missing: parts.get("model") };
   const m = model.latent_dimension;
   const isCode = (code) => code.length === m && code.every(Number.isFinite);
   const code = unlist(parts.get("z") ?? "");

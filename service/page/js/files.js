@@ -8,6 +8,9 @@ import { fixedBy } from "./space.js";
 /** What the server offers for one shape. */
 export const SHAPE_FORMATS = ["glb", "gltf", "obj", "ply", "stl", "npz", "zip", "json"];
 
+/** Animations that say how long a frame is shown; the server takes one frame a second or more. */
+const TIMED = ["glb", "usd", "usdz"];
+
 const rounded = (code) => code.map((value) => Number(value.toFixed(6)));
 
 export async function copy(text, what) {
@@ -90,11 +93,13 @@ export class Files {
 
   async #animation() {
     const { model, fine } = this.store;
-    const format = this.animation.value;
     say("The server makes the animation …", { key: "animation" });
     try {
+      await this.#animationFormats(); // they are not there yet where the server was away
+      const format = this.animation.value;
       const { links } = await api.interpolation(model, { ...this.path.request, mesh: fine ? "fine" : "coarse" });
-      keep(await api.file(links[format]), `${model.name}-animation.${format}`);
+      const speed = TIMED.includes(format) ? `&fps=${Math.max(this.path.fps, 1)}` : "";
+      keep(await api.file(links[format] + speed), `${model.name}-animation.${format}`);
       say("The animation is saved.", { key: "animation" });
     } catch (error) {
       say(error.message, { kind: "error", key: "animation" });
@@ -104,6 +109,10 @@ export class Files {
   /** Find the code of a mesh file and show it. */
   async encode(file) {
     const { model, locked, code } = this.store;
+    if (!model) {
+      say("No model is there yet. Drop the file again when its shape is shown.", { kind: "error", key: "encode" });
+      return;
+    }
     const format = file.name.split(".").pop().toLowerCase();
     say(`Looking for the code of ${file.name} …`, { key: "encode" });
     try {

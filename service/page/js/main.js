@@ -8,7 +8,7 @@ import { inWords } from "./diagnostics.js";
 import { element, find, toggle } from "./dom.js";
 import { copy, Files } from "./files.js";
 import { History } from "./history.js";
-import { report, reporting } from "./messages.js";
+import { report, reporting, say } from "./messages.js";
 import { Modes } from "./modes.js";
 import { Path } from "./path.js";
 import { Pictures } from "./pictures.js";
@@ -84,16 +84,22 @@ for (const radio of document.querySelectorAll("[name=colour]")) {
   radio.addEventListener("change", () => store.set({ colour: radio.value }));
   store.on(["colour"], () => { radio.checked = radio.value === store.colour; });
 }
+const root = document.documentElement;
+const { theme } = localStorage;
+if (theme) root.dataset.theme = theme;
 find("#theme").addEventListener("click", () => {
-  const root = document.documentElement;
   const dark = root.dataset.theme ? root.dataset.theme === "dark" : matchMedia("(prefers-color-scheme: dark)").matches;
-  root.dataset.theme = dark ? "light" : "dark";
+  root.dataset.theme = localStorage.theme = dark ? "light" : "dark";
 });
 
 // Codes from elsewhere than the sliders.
 const take = (code) => store.set({ code: store.space.wrapAll(code).map((value, k) => (store.locked[k] ? store.code[k] : value)) });
 const seed = find("#seed");
-const draw = reporting(async () => take(await api.sample(store.model, Number(seed.value))));
+seed.value = sessionStorage.seed ?? 0;
+const draw = reporting(async () => {
+  sessionStorage.seed = seed.value;
+  take(await api.sample(store.model, Number(seed.value)));
+});
 find("#random").addEventListener("click", () => { seed.value = Number(seed.value) + 1; draw(); });
 seed.addEventListener("change", () => { if (seed.validity.valid && seed.value !== "") draw(); });
 find("#reset-all").addEventListener("click", () => take(store.space.home));
@@ -106,7 +112,14 @@ const picker = find("#model");
 let models = [];
 let opening;
 let turned = false;
-picker.addEventListener("change", reporting(() => openModel({ model: models.find(({ name }) => name === picker.value) })));
+picker.addEventListener("change", reporting(async () => {
+  try {
+    await openModel({ model: models.find(({ name }) => name === picker.value) });
+  } catch (error) {
+    picker.value = store.model.name; // which is still shown
+    throw error;
+  }
+}));
 
 async function openModel({ model, code, keyframes = [], locked, view, state = {} }) {
   const space = new LatentSpace(model);
@@ -124,6 +137,7 @@ async function openModel({ model, code, keyframes = [], locked, view, state = {}
     code: space.wrapAll(code ?? space.home), locked: locked ?? space.home.map(() => false),
     keyframes, against: -1, ...state,
   });
+  for (const part of document.querySelectorAll("[inert]")) part.inert = false;
   find("#canvas").setAttribute("aria-label", `${model.title}, the shape of the code that the sliders give`);
   document.title = `${model.title} · shapespace`;
   const fine = await api.reference(model, "fine");
@@ -159,7 +173,13 @@ addEventListener("hashchange", reporting(restore));
 
 async function restore() {
   const asked = fromHash(location.hash, models);
-  await openModel(asked.model ? asked : { model: models.find(({ name }) => name === PREFERRED) ?? models[0] });
+  if (asked.model) return openModel(asked);
+  const model = models.find(({ name }) => name === PREFERRED) ?? models[0];
+  if (asked.missing) {
+    const instead = `The address asks for the model ${asked.missing}, which is not served here. This is ${model.title}.`;
+    say(instead, { kind: "error", key: "missing" });
+  }
+  return openModel({ model });
 }
 
 find("#key form").addEventListener("submit", () => {

@@ -13,6 +13,7 @@ const PACE = 1.8; // seconds for a segment
 
 export class Path {
   #frames = null; // of the path as it is now
+  #coming = null; // the promise of these frames
   #loading = null;
   #t = 0;
   #clock = 0;
@@ -35,9 +36,18 @@ export class Path {
   get request() {
     const { keyframes, loop } = this.store;
     const [start, stop] = this.#ends;
-    const segments = keyframes.length - (loop ? 0 : 1);
-    const frames = Math.min(Math.ceil(SEGMENT * segments * (stop - start)) + 1, LONGEST);
+    const frames = Math.min(Math.ceil(SEGMENT * this.#segments * (stop - start)) + 1, LONGEST);
     return { keyframes, frames, start, stop, loop };
+  }
+
+  /** How many of its frames the player shows in a second. */
+  get fps() {
+    const { frames, start, stop } = this.request;
+    return (frames - 1) / (PACE * this.#segments * (stop - start));
+  }
+
+  get #segments() {
+    return this.store.keyframes.length - (this.store.loop ? 0 : 1);
   }
 
   get #ends() {
@@ -49,7 +59,7 @@ export class Path {
     if (this.store.playing) this.pause();
     this.#frames = null;
     this.#loading?.abort();
-    this.#loading = null;
+    this.#loading = this.#coming = null;
     const { keyframes, loop } = this.store;
     const ready = keyframes.length > 1;
     const [start, stop] = this.#ends;
@@ -91,11 +101,14 @@ export class Path {
     }).catch(report);
   }
 
-  async #load() {
-    if (this.#frames) return this.#frames;
+  #load() {
+    this.#coming ??= this.#fetch();
+    return this.#coming;
+  }
+
+  async #fetch() {
     const { request } = this;
     const loading = new AbortController();
-    this.#loading?.abort();
     this.#loading = loading;
     this.status.textContent = `Computing ${request.frames} frames …`;
     try {
@@ -105,18 +118,21 @@ export class Path {
       const frames = await api.frames(model, { ...request, mesh }, loading.signal);
       loading.signal.throwIfAborted();
       this.#frames = frames;
+    } catch (error) {
+      if (this.#loading === loading) this.#coming = null;
+      throw error;
     } finally {
       if (this.#loading === loading) this.status.textContent = "";
     }
-    return this.#frames;
   }
 
   async #play() {
     await this.#load();
+    if (this.store.playing) return; // another click waited for the same frames
     const [start, stop] = this.#ends;
     if (this.#t >= stop - 1e-6) this.#t = start;
     this.store.set({ playing: true });
-    const segments = this.request.keyframes.length - (this.store.loop ? 0 : 1);
+    const segments = this.#segments;
     let before = performance.now();
     const step = (now) => {
       if (!this.store.playing) return;
@@ -142,7 +158,7 @@ export class Path {
     cancelAnimationFrame(this.#clock);
     this.#t = t;
     this.#tell();
-    if (!this.#frames && this.#loading) return;
+    if (!this.#frames && this.#coming) return;
     await this.#load();
     this.store.set({ playing: true });
     this.#show();

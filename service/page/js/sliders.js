@@ -3,10 +3,12 @@
 import { clone, find, readable, sharp } from "./dom.js";
 
 const PICTURE = 44;
+const REST = 700; // ms without a key until a movement by keys has ended
 
 export class Sliders {
   #rows = [];
-  #held = false; // whether a slider is being dragged
+  #held = false; // whether a slider is being dragged, or moved by keys
+  #timer = 0;
 
   constructor(store, list) {
     Object.assign(this, { store, list });
@@ -75,7 +77,8 @@ export class Sliders {
       this.store.set({ moving: true });
     });
     slider.addEventListener("input", () => this.#set(k, Number(slider.value)));
-    slider.addEventListener("keydown", (event) => this.#wrapAtTheEnd(event, k, slider));
+    slider.addEventListener("keydown", (event) => { this.#typed(event); this.#wrapAtTheEnd(event, k, slider); });
+    slider.addEventListener("blur", () => this.#let());
     box.addEventListener("input", () => { if (box.value !== "") this.#set(k, Number(box.value)); });
     box.addEventListener("change", () => this.#show());
     reset.addEventListener("click", () => this.#set(k, space.home[k]));
@@ -94,7 +97,19 @@ export class Sliders {
     return root;
   }
 
+  /** Keys one after the other are one movement; a shortcut such as undo ends it. */
+  #typed({ key, ctrlKey, metaKey }) {
+    if (ctrlKey || metaKey) this.#let();
+    else if (/^(Arrow|Page|Home|End)/.test(key)) {
+      this.#held = true;
+      this.store.set({ moving: true });
+      clearTimeout(this.#timer);
+      this.#timer = setTimeout(() => this.#let(), REST);
+    }
+  }
+
   #let() {
+    clearTimeout(this.#timer);
     if (!this.#held) return;
     this.#held = false;
     this.store.set({ moving: false });

@@ -1,0 +1,198 @@
+"""What the page makes of browsers, servers and hands that aren't as it would like them."""
+
+from __future__ import annotations
+
+import json
+import socket
+from pathlib import Path
+
+import httpx
+import pytest
+from playwright.sync_api import Browser, Route
+
+from shapespace.files.formats import read_arrays
+from tests.page.conftest import CHROMIUM, Open
+from tests.page.studio import Studio
+from tests.page.test_path import keyframes
+from tests.service.conftest import Server, Start
+
+
+def without(studio: Studio) -> None:
+    studio.eventually(studio["#without"].is_visible)
+    assert "WebGL" in studio["#without"].inner_text()
+    assert "v1/models/NAME/mesh" in studio["#without"].inner_text()
+    assert studio["#without a"].first.is_visible()
+    assert studio["button:visible"].count() == 0
+    assert studio["main"].is_hidden()
+
+
+def test_without_scripts_the_calls_are_told(window: Open) -> None:
+    studio = window(java_script_enabled=False)
+    studio.page.goto(studio.url)
+    without(studio)
+
+
+def test_without_webgl_the_calls_are_told(browser: Browser, server: Server) -> None:
+    alone = browser.browser_type.launch(executable_path=CHROMIUM, args=["--disable-gpu", "--disable-3d-apis"])
+    try:
+        studio = Studio(alone.new_page(), server.url)
+        studio.page.goto(studio.url)
+        without(studio)
+        assert studio.complaints == []
+    finally:
+        alone.close()
+
+
+def test_nothing_can_be_pressed_before_the_model_is_there(window: Open) -> None:
+    studio = window()
+    held: list[Route] = []
+    studio.page.route("**/v1/models", lambda route: held.append(route) or None)
+    studio.page.goto(studio.url)
+    studio.eventually(lambda: bool(held))
+    for selector in ("#random", "#about", "#undo", "#add-keyframe", "#reset-view", "#fine", "#canvas"):
+        assert studio[selector].evaluate("e => e.closest('[inert]') !== null"), selector
+        studio[selector].evaluate("e => e.focus()")
+        assert studio[selector].evaluate("e => document.activeElement !== e"), selector
+    studio["#mesh-file"].set_input_files({"name": "a.obj", "mimeType": "model/obj", "buffer": b"v 0 0 0"})
+    studio.eventually(lambda: "No model is there yet" in studio.messages)
+    assert "null" not in studio.messages
+    held[0].continue_()
+    studio.rest()
+    assert studio["[inert]"].count() == 0
+    studio["#random"].click()
+    studio.eventually(lambda: any(studio.code))
+
+
+def test_the_picker_and_download_while_the_server_is_away_and_after(window: Open, start: Start, models: Path) -> None:
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    server = start(models, port=port)
+    studio = window(server.url, complains=True).open()
+    server.stop()
+    studio["#model"].select_option("Figure")
+    studio.eventually(lambda: "does not answer" in studio.messages)
+    studio.eventually(lambda: studio["#model"].input_value() == "with-fine")
+    studio.tab("Path")
+    studio["#add-keyframe"].click()
+    studio["#add-keyframe"].click()
+    start(models, port=port)
+    with studio.page.expect_download() as download:
+        studio["#download-animation"].click()
+    assert download.value.suggested_filename == "with-fine-animation.glb"
+    assert not any("undefined" in address for address in studio.addresses)
+    studio["#model"].select_option("Figure")
+    studio.eventually(lambda: studio.hash.get("model") == "figure")
+
+
+def test_a_model_that_is_not_served_is_told(window: Open) -> None:
+    studio = window().open("#model=dragon&z=0.1")
+    studio.eventually(lambda: "asks for the model dragon, which is not served here. This is Figure" in studio.messages)
+
+
+def test_a_second_click_on_play_waits_for_the_same_frames(studio: Studio) -> None:
+    keyframes(studio, (-0.2, 0, 0), (0.2, 0, 1))
+    held: list[Route] = []
+    studio.page.route("**/v1/interpolations/**", lambda route: held.append(route) or None)
+    studio["#play"].click()
+    studio.eventually(lambda: bool(held))
+    studio["#play"].click()
+    studio.page.wait_for_timeout(200)
+    held[0].continue_()
+    studio.until_code([0.2, 0, 1])
+    assert len(held) == 1
+    assert studio.messages == ""
+
+
+@pytest.mark.parametrize("width", [1000, 390])
+def test_numbers_are_not_cut(window: Open, width: int) -> None:
+    studio = window(viewport={"width": width, "height": 760}).open()
+    box = studio.coordinate(1).locator("input[type=number]")
+    box.fill("-3.1234")
+    assert box.evaluate("b => b.scrollWidth <= b.clientWidth")
+    script = "b => { b.value = '-300000.1234'; return b.scrollWidth <= b.clientWidth; }"
+    assert not box.evaluate(script), "the measure sees what is cut"
+
+
+def test_every_kind_of_file_that_is_offered_is_read(studio: Studio, server: Server) -> None:
+    studio.tab("Files")
+    offered = (studio["#mesh-file"].get_attribute("accept") or "").replace(".", "").split(",")
+    call = f"{server.url}/v1/models/with-fine"
+    for name in offered:
+        path = "mesh?latent=0.1,0,0.5&mesh=coarse"
+        if name == "off":
+            vertices, faces = read_arrays(httpx.get(f"{call}/{path}&format=npz", timeout=60).content, "npz")
+            lines = [f"OFF\n{len(vertices)} {len(faces)} 0", *(" ".join(map(str, x)) for x in vertices.tolist())]
+            content = "\n".join([*lines, *(f"3 {a} {b} {c}" for a, b, c in faces.tolist()), ""]).encode()
+        else:
+            content = httpx.get(f"{call}/{path}&format={name}", timeout=60).content
+        found = httpx.post(f"{call}/encode?format={name}", content=content, timeout=60)
+        assert found.status_code == 200, (name, found.text)
+
+
+def test_theme_tab_and_seed_survive_a_reload(studio: Studio) -> None:
+    before = studio["html"].evaluate("e => getComputedStyle(e).colorScheme")
+    studio["#theme"].click()
+    studio["#seed"].fill("41")
+    studio["#random"].click()
+    studio.eventually(lambda: any(studio.code))
+    studio.tab("Colour")
+    studio.page.reload()
+    studio.rest()
+    assert studio["html"].evaluate("e => getComputedStyle(e).colorScheme") != before
+    assert studio["#seed"].input_value() == "42"
+    assert studio["#to-colour"].get_attribute("aria-selected") == "true"
+    assert studio["#tab-colour"].is_visible()
+    assert studio["#tab-shape"].is_hidden()
+
+
+def test_ten_arrow_keys_are_one_step(studio: Studio) -> None:
+    slider = studio.coordinate(0).locator("input[type=range]")
+    slider.focus()
+    for _ in range(10):
+        studio.page.keyboard.press("ArrowRight")
+    moved = float(slider.input_value())
+    assert moved > 0
+    studio.page.keyboard.press("Control+z")
+    studio.until_code([0, 0, 0])
+    assert studio["#undo"].is_disabled()
+    studio["#redo"].click()
+    studio.until_code([moved, 0, 0])
+    slider.press("ArrowLeft")
+    studio.coordinate(2).locator("input[type=range]").press("ArrowRight")
+    studio.eventually(lambda: "3 steps" in (studio["#undo"].get_attribute("title") or ""))
+
+
+@pytest.mark.parametrize(("width", "height"), [(390, 760), (500, 320), (320, 640), (1000, 640)])
+def test_legend_and_diagnostics_lie_apart(window: Open, width: int, height: int) -> None:
+    studio = window(viewport={"width": width, "height": height}).open("#model=with-fine&z=0.4,0,2&colour=stretch")
+    studio.eventually(lambda: studio["#legend"].is_visible() and studio["#diagnostics li"].count() > 1)
+    boxes = [studio[name].bounding_box() for name in (".tools", "#legend", "#diagnostics")]
+    for i, a in enumerate(boxes):
+        for b in boxes[:i]:
+            assert a
+            assert b
+            apart = (
+                a["x"] + a["width"] <= b["x"] + 1,
+                b["x"] + b["width"] <= a["x"] + 1,
+                a["y"] + a["height"] <= b["y"] + 1,
+                b["y"] + b["height"] <= a["y"] + 1,
+            )
+            assert any(apart), boxes
+    studio["#reset-all"].scroll_into_view_if_needed()
+    assert studio.page.evaluate("document.documentElement.scrollWidth <= innerWidth")
+
+
+@pytest.mark.parametrize("loop", [False, True])
+def test_the_file_lasts_as_long_as_the_player(studio: Studio, loop: bool) -> None:
+    keyframes(studio, (-0.2, 0, 0), (0.2, 0, 1), (0.1, 0, 0))
+    if loop:
+        studio["#loop"].check()
+    studio.eventually(lambda: studio["#animation-format option"].count() > 0)
+    with studio.page.expect_download() as download:
+        studio["#download-animation"].click()
+    content = Path(download.value.path()).read_bytes()
+    facts = json.loads(content[20 : 20 + int.from_bytes(content[12:16], "little")])["asset"]["extras"]
+    # The player takes 1.8 s from one keyframe to the next; a loop comes back to its first.
+    steps, segments = (facts["frames"], 3) if loop else (facts["frames"] - 1, 2)
+    assert steps / facts["frames_per_second"] == pytest.approx(1.8 * segments)
