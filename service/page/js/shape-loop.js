@@ -18,15 +18,14 @@ const TOO_LONG = 400; // ms after which a draft is given up for a newer one
 export const meshOf = ({ fine, hasFine }) => (fine && hasFine ? "fine" : "coarse");
 
 /**
- * The motion (Matrix4) that keeps a shape where the one shown is: each mesh is aligned over its own vertices, so that
- * the fine and the coarse shape of one code lie a few degrees apart.
+ * The motion (Matrix4) from where the server has a shape to where it is shown. Each mesh is aligned over its own
+ * vertices, so that the fine and the coarse shape of one code lie a few degrees apart: fine ones are shown where they
+ * are, and coarse ones in their place, as far as that was known when the mesh was changed.
  */
 export function motionOf({ shape, pose }, mesh, code, positions) {
-  if (!shape?.motion) return new Matrix4();
+  if (mesh === "fine" || !shape?.motion || !pose) return new Matrix4();
   if (shape.mesh === mesh) return shape.motion;
-  if (shape.code !== code || !pose) return new Matrix4();
-  const between = mesh === "fine" ? pose.motion(positions, shape.positions) : pose.motion(shape.positions, positions).invert();
-  return shape.motion.clone().multiply(between);
+  return shape.code === code ? pose.motion(shape.positions, positions).invert() : new Matrix4();
 }
 
 export class ShapeLoop {
