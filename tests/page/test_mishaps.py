@@ -196,3 +196,18 @@ def test_the_file_lasts_as_long_as_the_player(studio: Studio, loop: bool) -> Non
     # The player takes 1.8 s from one keyframe to the next; a loop comes back to its first.
     steps, segments = (facts["frames"], 3) if loop else (facts["frames"] - 1, 2)
     assert steps / facts["frames_per_second"] == pytest.approx(1.8 * segments)
+
+
+def test_a_browser_that_keeps_nothing_shows_the_page_all_the_same(window: Open) -> None:
+    studio = window()
+    studio.page.add_init_script(
+        """for (const name of ["localStorage", "sessionStorage"]) {
+            Object.defineProperty(window, name, { get() { throw new DOMException("blocked", "SecurityError"); } });
+        }"""
+    )
+    studio.open()
+    studio["#theme"].click()
+    studio.tab("Path")
+    studio["#random"].click()
+    studio.rest()
+    assert studio.messages == ""

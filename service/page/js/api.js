@@ -1,5 +1,6 @@
 /** The calls of the server that the page makes. Every failure becomes a Problem with a sentence for people. */
 
+import { here } from "./memory.js";
 import { readNpz } from "./npz.js";
 
 export const origin = new URL(".", document.baseURI).href.replace(/\/$/, "");
@@ -21,13 +22,13 @@ export class Problem extends Error {
 const wait = (seconds) => new Promise((resolve) => { setTimeout(resolve, 1000 * seconds); });
 
 /** Send a key with every call from now on, as long as the tab is open. */
-export const useKey = (key) => sessionStorage.setItem(KEY, key);
+export const useKey = (key) => here.keep(KEY, key);
 
 async function call(path, options = {}) {
   for (let tries = 1; ; tries += 1) {
     let response;
     try {
-      const key = sessionStorage.getItem(KEY);
+      const key = here.kept(KEY);
       const headers = { ...options.headers, ...(key && { "X-API-Key": key }) };
       response = await fetch(origin + path, { ...options, headers });
     } catch (error) {

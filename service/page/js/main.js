@@ -8,6 +8,7 @@ import { inWords } from "./diagnostics.js";
 import { element, find, toggle } from "./dom.js";
 import { copy, Files } from "./files.js";
 import { History } from "./history.js";
+import { always, here } from "./memory.js";
 import { report, reporting, say } from "./messages.js";
 import { Modes } from "./modes.js";
 import { Path } from "./path.js";
@@ -85,19 +86,20 @@ for (const radio of document.querySelectorAll("[name=colour]")) {
   store.on(["colour"], () => { radio.checked = radio.value === store.colour; });
 }
 const root = document.documentElement;
-const { theme } = localStorage;
+const theme = always.kept("theme");
 if (theme) root.dataset.theme = theme;
 find("#theme").addEventListener("click", () => {
   const dark = root.dataset.theme ? root.dataset.theme === "dark" : matchMedia("(prefers-color-scheme: dark)").matches;
-  root.dataset.theme = localStorage.theme = dark ? "light" : "dark";
+  root.dataset.theme = dark ? "light" : "dark";
+  always.keep("theme", root.dataset.theme);
 });
 
 // Codes from elsewhere than the sliders.
 const take = (code) => store.set({ code: store.space.wrapAll(code).map((value, k) => (store.locked[k] ? store.code[k] : value)) });
 const seed = find("#seed");
-seed.value = sessionStorage.seed ?? 0;
+seed.value = here.kept("seed") ?? 0;
 const draw = reporting(async () => {
-  sessionStorage.seed = seed.value;
+  here.keep("seed", seed.value);
   take(await api.sample(store.model, Number(seed.value)));
 });
 find("#random").addEventListener("click", () => { seed.value = Number(seed.value) + 1; draw(); });

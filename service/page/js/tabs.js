@@ -1,8 +1,10 @@
+import { here } from "./memory.js";
+
 /** Tabs by the pattern of the WAI-ARIA practices: one stop, arrows go between them. A reload keeps the one chosen. */
 export function tabs(list) {
   const all = [...list.querySelectorAll("[role=tab]")];
   const select = (chosen) => {
-    sessionStorage.tab = chosen.id;
+    here.keep("tab", chosen.id);
     for (const tab of all) {
       const is = tab === chosen;
       tab.setAttribute("aria-selected", String(is));
@@ -11,7 +13,7 @@ export function tabs(list) {
     }
   };
   for (const tab of all) tab.addEventListener("click", () => select(tab));
-  select(all.find(({ id }) => id === sessionStorage.tab) ?? all[0]);
+  select(all.find(({ id }) => id === here.kept("tab")) ?? all[0]);
   list.addEventListener("keydown", ({ key }) => {
     const at = all.indexOf(document.activeElement);
     const to = { ArrowRight: at + 1, ArrowLeft: at - 1, Home: 0, End: -1 }[key];
