@@ -6,6 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from shapespace.files import archives
 from shapespace.files.archives import npz_pieces, zip_pieces
 
 
@@ -48,3 +49,14 @@ def test_arrays_of_every_form_are_read_back(rng: np.random.Generator) -> None:
         for name, array in arrays.items():
             assert found[name].dtype == array.dtype
             np.testing.assert_array_equal(found[name], array)
+
+
+def test_rows_are_written_many_at_a_time_and_large_ones_alone(rng: np.random.Generator) -> None:
+    faces = rng.integers(5000, size=(10_000, 3))
+    parts = list(archives._npy(faces))[1:]
+    assert b"".join(parts) == faces.tobytes()
+    assert {len(part) > 0.9 * archives.PIECE for part in parts[:-1]} == {True}
+    assert max(map(len, parts)) <= archives.PIECE
+    shapes = rng.standard_normal((4, 20_000, 3))
+    assert [len(part) for part in archives._npy(shapes)][1:] == [shapes[0].nbytes] * 4
+    assert [*archives._npy(np.empty((0, 3)))][1:] == []
