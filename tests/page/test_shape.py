@@ -102,6 +102,22 @@ def test_drafts_as_it_moves_the_full_shape_as_it_rests_and_nothing_queues(studio
     assert [asked["latents"][0][0] for asked in studio.asked] == pytest.approx([0.01, 0.15, 0.15])
 
 
+def test_a_draft_turns_into_the_full_shape_pixel_by_pixel(studio: Studio) -> None:
+    script = """async ([draft, full]) => {
+        const { between } = await import('/page/js/shape-loop.js');
+        return Array.from(between(Float64Array.from(draft), Float64Array.from(full)), (x) => Array.from(x));
+    }"""
+    full = np.random.default_rng(0).uniform(-1, 1, 300)
+    full[:2] = -1, 1
+    for away, steps in ((0.0, 0), (0.001, 0), (0.01, 5), (1.0, 23)):
+        draft = full + away * np.linspace(-1, 1, 300)
+        way = np.reshape(studio.page.evaluate(script, [draft.tolist(), full.tolist()]), (-1, 300))
+        assert len(way) == steps
+        moves = np.abs(np.diff(np.concatenate([[draft], way, [full]]), axis=0)).max(axis=1)
+        assert moves == pytest.approx(moves.mean(), rel=1e-6)
+        assert away == 1 or moves.max() <= 2 / 1080
+
+
 def test_shapes_that_take_their_time_are_asked_for_once(studio: Studio) -> None:
     def late(route: Route) -> None:
         time.sleep(0.5)

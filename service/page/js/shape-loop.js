@@ -4,7 +4,8 @@
  * One request is under way at a time; what is asked for meanwhile supersedes what waited, so nothing queues. A full
  * shape on its way is dropped as soon as the code moves on, and so is a draft that takes too long. A draft that is
  * quick is let finish: dropping it for each pixel of a drag would show nothing until the hand rests. Where the server
- * has answered a draft by the full shape, nothing more is asked for.
+ * has answered a draft by the full shape, nothing more is asked for. From a draft to its full shape vertices move in steps
+ * of a pixel, so that nothing jumps.
  */
 
 import { Matrix4 } from "three";
@@ -13,6 +14,9 @@ import { report, say, takeBack } from "./messages.js";
 
 const REST = 160; // ms without movement until the full shape is asked for
 const TOO_LONG = 400; // ms after which a draft is given up for a newer one
+
+const LINES = 1080; // of a screen that a shape fills: a step is as large as one
+const MOST = 24; // steps
 
 /** The mesh that the switch and the model give. */
 export const meshOf = ({ fine, hasFine }) => (fine && hasFine ? "fine" : "coarse");
@@ -27,6 +31,20 @@ export function motionOf({ shape, pose }, mesh, code, positions) {
   if (shape.mesh === mesh) return shape.motion;
   return shape.code === code ? pose.motion(shape.positions, positions).invert() : new Matrix4();
 }
+
+/** Positions on the way from a draft to the full shape, both ends left out. */
+export function* between(draft, full) {
+  let [farthest, low, high] = [0, Infinity, -Infinity];
+  full.forEach((x, i) => {
+    farthest = Math.max(farthest, Math.abs(x - draft[i]));
+    low = Math.min(low, x);
+    high = Math.max(high, x);
+  });
+  const steps = Math.min(Math.ceil((farthest / (high - low)) * LINES), MOST);
+  for (let k = 1; k < steps; k += 1) yield draft.map((x, i) => x + (k / steps) * (full[i] - x));
+}
+
+const nextPicture = () => new Promise((resolve) => { requestAnimationFrame(resolve); });
 
 export class ShapeLoop {
   #wanted = null;
@@ -75,15 +93,33 @@ export class ShapeLoop {
         if (model === this.store.model && !this.store.playing) {
           const motion = motionOf(this.store, mesh, code, shapes[0]);
           const told = quality === "full" ? diagnostics : null;
-          this.store.set({ shape: { ...asked, quality, positions: shapes[0], motion, diagnostics: told } });
+          await this.#show({ ...asked, quality, positions: shapes[0], motion, diagnostics: told });
         }
         if (quality === "draft") this.#rest();
       } catch (error) {
         if (error.offline) await this.#untilReady(asked);
-        else report(error);
+        else {
+          if (error.name !== "AbortError") clearTimeout(this.#timer); // the full shape would fail too
+          report(error);
+        }
       }
       this.#current = null;
     }
+  }
+
+  async #show(shape) {
+    const { shape: before } = this.store;
+    const arrived = performance.now();
+    const sameCode = before?.code === shape.code && before.mesh === shape.mesh;
+    if (shape.quality === "full" && before?.quality === "draft" && sameCode) {
+      for (const positions of between(before.positions, shape.positions)) {
+        this.store.set({ shape: { ...before, positions } });
+        await nextPicture();
+        if (this.store.code !== shape.code || this.store.playing || this.store.shape?.mesh !== shape.mesh) return;
+      }
+    }
+    // How long it takes to settle is no part of how long it took to come.
+    this.store.set({ shape: { ...shape, began: shape.began + performance.now() - arrived } });
   }
 
   async #untilReady(asked) {
