@@ -182,7 +182,8 @@ class ShapeModel(Decoder):
             ModelFailedError: the networks failed, or took too long.
 
         >>> import shapespace
-        >>> blend = shapespace.load("models/figure").blend_shapes("coarse")
+        >>> model = shapespace.load("models/figure")
+        >>> blend = model.blend_shapes("coarse")
         >>> blend.names[:2], blend.ends.shape, 0.001 < blend.error["mean"] < 0.05
         (['middle, 1 +', 'middle, 1 -'], (40, 1000, 3), True)
         >>> blend.glb()[:4]

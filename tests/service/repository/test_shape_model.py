@@ -10,7 +10,7 @@ from onnx import numpy_helper
 from shapespace.bundle.reader import read_bundle
 from shapespace.coordinates.reconstruction import Reconstructor
 from shapespace.mesh.rigid_motion import align
-from shapespace.model.decoder import TOLERANCE, MeshChoice
+from shapespace.model.decoder import TOLERANCE, MeshChoice, Quality
 from shapespace.model.latent_space import NotFiniteError
 from shapespace.model.shape_model import ShapeModel
 from shapespace.service.limits.workers import DeadlineError, Workers
@@ -59,7 +59,7 @@ def test_a_deadline_ends_gauss_newton(tmp_path: Path) -> None:
     assert model.shape(codes[0], deadline=past).diagnostics.status is Status.DEADLINE
     workers = Workers(1, 0, deadline=1)
     with pytest.raises(DeadlineError, match="within 1 s"):
-        solve(workers, model, MeshChoice.FINE, (codes[0], True), past)
+        solve(workers, model, MeshChoice.FINE, Quality.FULL, (codes[0], True), past)
     workers.close()
 
 
@@ -77,7 +77,10 @@ def test_the_summary_of_several_shapes_is_their_worst(tmp_path: Path) -> None:
         "plausibility": 1.5,
         "inside_bounds": False,
         "model": model.digest,
+        "quality": "full",
     }
+    draft = dataclasses.replace(good, quality=Quality.DRAFT)
+    assert worst([good, draft])["quality"] == "draft"
     assert worst([good, good])["status"] == "converged"
 
 

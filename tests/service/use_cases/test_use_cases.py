@@ -16,7 +16,7 @@ from shapespace.bundle.reader import read_bundle
 from shapespace.coordinates.nric import nric
 from shapespace.files.colouring import Quantity
 from shapespace.files.formats import MESH_FORMATS
-from shapespace.model.decoder import MeshChoice
+from shapespace.model.decoder import MeshChoice, Quality
 from shapespace.model.edit import InvalidTargetError, PriorKind, Target
 from shapespace.model.encode import Objective
 from shapespace.model.exact_shapes import NoTangentSpaceError
@@ -108,7 +108,7 @@ def test_a_shape_is_a_file_with_diagnostics_and_timings(model: ShapeModel) -> No
 
 def test_without_a_code_it_is_the_reference_and_colours_come_with_a_legend(model: ShapeModel) -> None:
     colour_by = ColourBy(Quantity.STRETCH, model.latents.code(CODES[1]))
-    wanted = WantedShape(None, MeshChoice.FINE, "json", colour_by)
+    wanted = WantedShape(None, MeshChoice.FINE, "json", colour_by=colour_by)
     found = run(lambda workers: shape_file(workers, CALLER, model, wanted))
     answer = json.loads(found.content)
     assert np.allclose(answer["vertices"], SCALE * model.reference.vertices, atol=1e-5)
@@ -176,7 +176,8 @@ def test_inference_computes_the_outputs_that_are_wanted(model: ShapeModel, outpu
         return iter([b"x"]), {"length": 1}
 
     latents = np.array(CODES)
-    written = run(lambda workers: infer(workers, CALLER, model, latents, Bounds.ALLOW, MeshChoice.FINE, outputs, write))
+    how = (Bounds.ALLOW, MeshChoice.FINE, Quality.FULL)
+    written = run(lambda workers: infer(workers, CALLER, model, latents, *how, outputs, write))
     assert list(seen) == outputs
     assert content(written) == b"x"
     assert written.facts == {"length": 1}
@@ -187,8 +188,8 @@ def test_frames_are_those_of_one_file_and_of_the_lines(model: ShapeModel) -> Non
     animation = Animation(keyframes=CODES, frames=3)
 
     async def both(workers: Workers) -> tuple[Written, list[bytes]]:
-        written = await sequence_file(workers, CALLER, model, animation, "npz")
-        return written, [line async for line in sequence_lines(workers, CALLER, model, animation)]
+        written = await sequence_file(workers, CALLER, model, animation, Quality.FULL, "npz")
+        return written, [line async for line in sequence_lines(workers, CALLER, model, animation, Quality.FULL)]
 
     written, lines = run(both)
     with np.load(io.BytesIO(content(written))) as arrays:
@@ -272,7 +273,9 @@ def test_both_outputs_together_may_be_more_than_an_answer_holds(
     def ask(outputs: list[str]) -> Written:
         latents, write = np.array(CODES), lambda arrays: (iter([b"x"]), {})
         return run(
-            lambda workers: infer(workers, CALLER, model, latents, Bounds.ALLOW, MeshChoice.FINE, outputs, write)
+            lambda workers: infer(
+                workers, CALLER, model, latents, Bounds.ALLOW, MeshChoice.FINE, Quality.FULL, outputs, write
+            )
         )
 
     assert content(ask(["vertices"])) == b"x"
