@@ -11,6 +11,7 @@ from shapespace.model.latent_space import Codes
 from shapespace.model.shape_model import ShapeModel
 from shapespace.service.limits.workers import Caller, Workers
 from shapespace.service.use_cases.batch import Timings, solve
+from shapespace.service.use_cases.many_shapes import shapes_size
 from shapespace.solve.deadline import Deadline
 
 
@@ -21,10 +22,12 @@ async def blend_shapes_file(
 
     Raises:
         PeriodicError: there are angles among the coordinates.
+        TooManyCodesError: more vertices, of all ends together, than one answer may hold.
         NotFiniteError, ModelFailedError: the model has no shape for one of its ends.
         BusyError, DeadlineError, DisconnectedError, EndingError: no place, or the call ended before.
     """
     require_ends(model)
+    size = shapes_size(model, 2 * model.latents.dimension + 1, mesh)
 
     def shape(deadline: Deadline, code: Codes) -> Shape:
         return solve(workers, model, mesh, Quality.FULL, (code, True), deadline)
@@ -36,5 +39,6 @@ async def blend_shapes_file(
         content = found.glb()
         return content, {"reconstruct": solved - began, "encode": time.perf_counter() - solved}
 
-    async with workers.admit(caller) as call:
-        return await workers.run(make, call)
+    with workers.holding(caller, size):
+        async with workers.admit(caller) as call:
+            return await workers.run(make, call)

@@ -1,5 +1,6 @@
 """``blendshapes``: sliders for programs that know no networks, read by the letter of glTF."""
 
+import asyncio
 import json
 from pathlib import Path
 
@@ -10,7 +11,12 @@ import pytest
 from shapespace.client import Client
 from shapespace.mesh.rigid_motion import align
 from shapespace.mesh.triangle_mesh import diagonal
+from shapespace.model.decoder import MeshChoice
 from shapespace.model.shape_model import ShapeModel, load
+from shapespace.service.limits.workers import Caller, Workers
+from shapespace.service.use_cases import many_shapes
+from shapespace.service.use_cases.batch import TooManyCodesError
+from shapespace.service.use_cases.blend_shapes import blend_shapes_file
 from tests.service.conftest import ROOT, Server
 from tests.service.glb import GLB, khronos_report
 
@@ -85,6 +91,16 @@ def test_angles_have_no_ends(client: httpx.Client) -> None:
     assert "angles" in answer.json()["detail"]
     assert "blendshapes" not in client.get("/v1/models/freaky-torus").json()["links"]
     assert client.get("/v1/models/figure").json()["links"]["blendshapes"] == PATH
+
+
+def test_more_than_an_answer_holds_is_refused_before_it_is_made(
+    model: ShapeModel, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(many_shapes, "MOST_VERTICES", 41 * 1000 - 1)
+    workers = Workers(1, 0, deadline=1)
+    with pytest.raises(TooManyCodesError, match="41 shapes of 1000 vertices are too many"):
+        asyncio.run(blend_shapes_file(workers, Caller("somebody", asyncio.Event().wait), model, MeshChoice.COARSE))
+    workers.close()
 
 
 def test_library_and_client_give_the_same(server: Server, model: ShapeModel, file: bytes) -> None:
