@@ -50,7 +50,7 @@ def animated_usd(
         ImportError: ``usd-core`` is not installed.
         OSError: there is no room for a temporary file.
     """
-    from pxr import Gf, Sdf, Tf, Usd, UsdGeom, Vt
+    from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdUtils, Vt
 
     # The writer of binary layers takes nothing but a path.
     with TemporaryDirectory(prefix="shapespace-") as folder:
@@ -101,9 +101,9 @@ def animated_usd(
         del stage, mesh, points, normals, extent
         if packed:
             package = Path(folder, "animation.usdz")
-            with Sdf.ZipFileWriter.CreateNew(str(package)) as archive:
-                for name in (path.name, *textures.values()):  # the layer comes first
-                    archive.AddFile(str(path.with_name(name)), name)
+            # With what it refers to.
+            if not UsdUtils.CreateNewUsdzPackage(str(path), str(package)):
+                raise OSError(f"can't write {package}")
             path = package
         with path.open("rb") as file:
             yield from iter(lambda: file.read(_PIECE), b"")

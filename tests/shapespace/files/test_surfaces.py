@@ -385,3 +385,20 @@ def test_arrays_that_do_not_fit_are_refused(change: dict, says: str) -> None:
     square.check(4, triangles)
     with pytest.raises(MeshError, match=says):
         replace(square, **change).check(4, triangles)
+
+
+def test_usdz_packs_the_textures_that_its_materials_read(tmp_path: Path) -> None:
+    vertices, surface = ball()
+    assert surface.textures
+    content = b"".join(animated_usd(np.stack([vertices, vertices]), surface.triangles, surface, packed=True))
+    path = tmp_path / "ball.usdz"
+    path.write_bytes(content)
+    with zipfile.ZipFile(path) as archive:
+        layer, *pictures = archive.namelist()
+        assert layer.endswith(".usdc")
+        assert {archive.read(name) for name in pictures} == set(surface.textures.values())
+    stage = Usd.Stage.Open(str(path))
+    readers = [UsdShade.Shader(prim) for prim in stage.Traverse() if prim.GetTypeName() == "Shader"]
+    files = [reader.GetInput("file").Get() for reader in readers if reader.GetInput("file")]
+    assert files
+    assert all(file.resolvedPath for file in files)
