@@ -207,6 +207,8 @@ def test_it_knows_no_settings_writes_no_file_and_shares_no_stream(
 def test_a_process_that_died_meanwhile_is_replaced(box: Sandbox) -> None:
     pid = call(box, "echo")[0]["pid"]
     os.kill(pid, signal.SIGKILL)
+    # All of it: a thread may outlive the first one by a moment, and until then nobody can wait for the process.
+    eventually(lambda: len(os.listdir(f"/proc/{pid}/task")) == 1)
     eventually(lambda: Path(f"/proc/{pid}/stat").read_text().split()[2] == "Z")
     assert call(box, "echo")[0]["pid"] != pid
     assert not alive(pid)
