@@ -145,6 +145,8 @@ def test_a_draft_that_was_solved_after_all_is_not_asked_for_again(window: Open) 
 
 def test_nothing_jumps_as_a_draft_comes_to_rest(window: Open) -> None:
     studio = window().open("#model=figure")
+    every = studio[".pictures canvas"].count()
+    studio.eventually(lambda: studio[".pictures canvas.drawn"].count() == every)
     held: list[Route] = []
     studio.page.route(
         "**/vertices*",
@@ -152,9 +154,10 @@ def test_nothing_jumps_as_a_draft_comes_to_rest(window: Open) -> None:
     )
     start = studio.picture()
     studio.type(3, 0.6)
-    studio["#canvas"].hover()  # away from the factor, which colours what it moves
-    studio.eventually(lambda: bool(held))
-    assert (studio.shown, studio.quality) == ("fine", "draft")
+    # Away from the factor, which colours what it moves while it is pointed at or written in.
+    studio.coordinate(3).locator("input[type=number]").blur()
+    studio["#canvas"].hover()
+    studio.eventually(lambda: bool(held) and (studio.shown, studio.quality) == ("fine", "draft"))
     draft = studio.picture()
     for route in held:
         route.continue_()
