@@ -56,7 +56,7 @@ def words(annotation: Any) -> str:
         return " or ".join(dict.fromkeys(words(part) for part in parts if part is not type(None)))
     if origin is list:
         kind, *bounds = words(parts[0]).split(", ")
-        return ", ".join([f"list of {kind}s", *bounds])
+        return ", ".join([f"list of {kind}" + ("s" if kind != "text" else ""), *bounds])
     if origin is dict:
         if parts[1] is Any:
             return "table"

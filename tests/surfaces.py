@@ -60,17 +60,60 @@ def ball(subdivisions: int = 3) -> tuple[np.ndarray, Surface]:
     )
 
 
+def with_parts(body: tuple[np.ndarray, Surface]) -> tuple[np.ndarray, Surface]:
+    """A ball with an eye before and a nail behind it in the order of the file: parts of their own on it.
+
+    Returns:
+        Vertices (V, 3) of the eye, a small ball half inside on the left; the body; and the nail, a square of quads that
+        hovers above the body on the right. And the surface.
+    """
+    eye, eye_surface = ball(1)
+    x, y = np.meshgrid(np.linspace(0.5, 0.7, 4), np.linspace(-0.1, 0.1, 3), indexing="ij")
+    nail = np.stack([x, y, 1.03 * np.sqrt(1 - x**2 - y**2)], axis=-1).reshape(-1, 3)
+    numbers = np.arange(12).reshape(4, 3)
+    quads = np.stack([numbers[:-1, :-1], numbers[1:, :-1], numbers[1:, 1:], numbers[:-1, 1:]], axis=-1).reshape(-1)
+    pieces = [(0.1 * eye + [-0.97, 0, 0], eye_surface, "Eye"), (*body, "Bar"), (nail, None, "Nail")]
+    starts, corners, uv, uv_corners, of, groups, materials = [np.zeros(1, int)], [], [], [], [], [], []
+    vertices = uvs = ends = 0
+    for k, (places, surface, _) in enumerate(pieces):
+        sizes = np.full(len(quads) // 4, 4) if surface is None else surface.sizes
+        own_uv = (nail[:, :2] + 1) / 2 if surface is None else surface.uv
+        starts.append(ends + np.cumsum(sizes))
+        corners.append(vertices + (quads if surface is None else surface.corners))
+        uv_corners.append(uvs + (quads if surface is None else surface.uv_corners))
+        uv.append(own_uv)
+        of.append(np.full(len(sizes), k))
+        groups.append(surface.groups.of if surface else np.ones(len(sizes), int))
+        materials.append(surface.material_of if k == 1 else np.full(len(sizes), k // 2))
+        vertices, uvs, ends = vertices + len(places), uvs + len(own_uv), ends + int(sizes.sum())
+    whole = Surface(
+        starts=np.concatenate(starts),
+        corners=np.concatenate(corners),
+        uv=np.concatenate(uv),
+        uv_corners=np.concatenate(uv_corners),
+        objects=Labels(tuple(name for *_, name in pieces), np.concatenate(of)),
+        groups=body[1].groups and Labels(body[1].groups.names, np.concatenate(groups)),
+        material_of=np.concatenate(materials),
+        materials=body[1].materials,
+        textures=body[1].textures,
+    )
+    return np.concatenate([places for places, *_ in pieces]), whole
+
+
 def write_files(path: Path, vertices: np.ndarray, surface: Surface) -> None:
     """An OBJ file, and beside it materials and textures."""
-    lines = [f"mtllib {path.parent.name}.mtl", "o Bar"]
+    lines = [f"mtllib {path.parent.name}.mtl"]
     lines += ["v {!r} {!r} {!r}".format(*row) for row in vertices.tolist()]
     lines += ["vt {!r} {!r}".format(*row) for row in surface.uv.tolist()]
     before = None
     for k, (start, stop) in enumerate(zip(surface.starts[:-1], surface.starts[1:], strict=True)):
-        names = surface.groups.names[surface.groups.of[k]], surface.materials[surface.material_of[k]].name
-        if names != before:
-            lines += [f"g {names[0]}", f"usemtl {names[1]}"]
-            before = names
+        names = (
+            f"o {surface.objects.names[surface.objects.of[k]]}",
+            f"g {surface.groups.names[surface.groups.of[k]]}",
+            f"usemtl {surface.materials[surface.material_of[k]].name}",
+        )
+        lines += [name for name in names if name not in (before or ())]
+        before = names
         pairs = zip(surface.corners[start:stop] + 1, surface.uv_corners[start:stop] + 1, strict=True)
         lines.append("f " + " ".join(f"{v}/{t}" for v, t in pairs))
     path.write_text("\n".join(lines) + "\n")

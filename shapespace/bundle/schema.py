@@ -200,6 +200,9 @@ ARRAYS = {
     "prolongation_indptr": ArrayType(("W + 1",), np.int32),
     "prolongation_indices": ArrayType(("weights",), np.int32),
     "prolongation_weights": ArrayType(("weights",), np.float64),
+    # Where parts move rigidly: of each fine vertex the number of its part or -1, and places at rest of those with one.
+    "prolongation_rigid": ArrayType(("W",), np.int32),
+    "prolongation_rest": ArrayType(("R", 3), np.float64),
     # What the user's file had on the finest mesh beside triangles: P polygons with C corners. See mesh.surface.
     "surface_starts": ArrayType(("P + 1",), np.int32),
     "surface_corners": ArrayType(("C",), np.int32),

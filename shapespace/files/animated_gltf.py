@@ -88,7 +88,7 @@ def animated_glb(
                         "interpolation": "LINEAR",
                     }
                 ],
-                "channels": [{"sampler": 0, "target": {"node": 0, "path": "weights"}}],
+                "channels": [{"sampler": 0, "target": {"node": k, "path": "weights"}} for k in range(document.nodes)],
             }
         ]
     document.tree["asset"]["extras"] = {

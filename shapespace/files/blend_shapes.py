@@ -28,7 +28,7 @@ def blend_shapes_glb(
         surface: of the mesh, where its file had more than triangles.
         extras: of the ``asset``.
     """
-    document = Document(rest, faces, "shape", surface=surface)
+    document = Document(rest, faces, "shape", surface=surface, joined=True)
     normals = document.normals(rest)
     document.add_targets((end - rest for end in ends), (document.normals(end) - normals for end in ends), names)
     if extras:

@@ -461,19 +461,14 @@ class Part:
 def _parts(document: Document) -> list[Part]:
     """Every primitive of the scene at each of its places."""
     parts: list[Part] = []
-    several: dict[int, bool] = {}
     for number, place in document.places():
         primitives = _objects(_entry(document.meshes, number), "primitives")
-        several[number] = len(primitives) > 1
         for primitive in primitives:
             if len(parts) == _MOST_PARTS:
                 raise MeshError(f"its scene comes to more than {_MOST_PARTS} parts")
             parts.append(_part(document, primitive, place, document.meshes[number]))
     if not parts:
         raise MeshError("holds no mesh")
-    # A mesh has a primitive for each of its materials.
-    if len(several) > 1 and not all(several.values()):
-        raise MeshError(f"holds {len(several)} meshes; a file needs exactly one")
     return parts
 
 

@@ -1,4 +1,4 @@
-"""Writer of glTF 2.0: one mesh, still or animated, as GLB or as JSON with its buffer inside.
+"""Writer of glTF 2.0: a shape, still or animated, as GLB or as JSON with its buffer inside.
 
 Written here because trimesh writes no animations, and because every served mesh passes through it.
 """
@@ -9,7 +9,7 @@ import base64
 import json
 import struct
 from collections.abc import Iterable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -81,8 +81,34 @@ def _material(material: Material, pictures: dict[str | None, int]) -> dict[str, 
     return found | ({"alphaMode": "BLEND"} if material.color[3] < 1 else {})
 
 
+class _Piece(NamedTuple):
+    """The triangles of one object and one material, NONE for none."""
+
+    object: int
+    material: int
+    triangles: IntArray
+
+
+def _pieces(surface: Surface, *, objects: bool, materials: bool) -> list[_Piece]:
+    """Of a surface, told apart by these or not."""
+    count = len(surface.triangle_polygons)
+    of_objects = surface.objects.of if objects and surface.objects else None
+    of_materials = surface.material_of if materials else None
+    columns = [
+        np.full(count, NONE) if of is None else of[surface.triangle_polygons] for of in (of_objects, of_materials)
+    ]
+    # One number for each pair: sorting these is much faster than sorting pairs.
+    width = int(columns[1].max()) + 2
+    pairs, of = np.unique(columns[0] * width + columns[1], return_inverse=True)
+    found = []
+    for k, pair in enumerate(pairs.tolist()):
+        object, material = divmod(pair + 1, width)
+        found.append(_Piece(object, material - 1, np.flatnonzero(of == k)))
+    return found
+
+
 class Document:
-    """A glTF document with one mesh on one node, filled from arrays.
+    """A glTF document with a mesh on a node for each object of the surface, filled from arrays that all share.
 
     Args:
         vertices: (V, 3) positions at rest, in any unit.
@@ -91,8 +117,10 @@ class Document:
         colouring: of the vertices, instead of materials; its legend goes into the mesh's extras.
         surface: of the mesh. Vertices that have several texture coordinates or normals are there for each of them; the
             attribute _VERTEX numbers them then.
+        joined: whether all objects are one mesh, with one set of sliders.
 
     Attributes:
+        nodes: number of these.
         rows: (V',) the vertex that each vertex of the document is.
     """
 
@@ -103,6 +131,8 @@ class Document:
         name: str = "shape",
         colouring: Colouring | None = None,
         surface: Surface | None = None,
+        *,
+        joined: bool = False,
     ) -> None:
         self._chunks: list[bytes] = []
         self._size = 0
@@ -116,7 +146,8 @@ class Document:
         }
         #: What all primitives have; there is one for each material.
         self.primitive: dict[str, Any] = {"attributes": attributes}
-        self.mesh: dict[str, Any] = {"name": name}
+        #: What all meshes have.
+        self.mesh: dict[str, Any] = {}
         colors = colouring.linear if colouring else None
         if colouring:
             self.mesh["extras"] = {"color": colouring.legend}
@@ -127,30 +158,39 @@ class Document:
                 # From the upper left.
                 uv = surface.split.uv * [1, -1] + [0, 1]
                 attributes["TEXCOORD_0"] = self.add(uv, target=ARRAY_BUFFER)
-            if len(self.rows) > len(vertices):
+            labels = None if joined else surface.objects
+            several = labels is not None and len(np.unique(labels.of)) > 1
+            if several or len(self.rows) > len(vertices):
                 # As real numbers: integers of that size are not allowed here (3.7.2.1).
                 attributes["_VERTEX"] = self.add(self.rows.astype(np.float32), target=ARRAY_BUFFER)
-            if surface.objects:
-                self.mesh["name"] = surface.objects.names[0]
         if colors is not None:
             attributes["COLOR_0"] = self.add(colors[self.rows], target=ARRAY_BUFFER)
-        self.tree: dict[str, Any] = {
-            "asset": {"version": "2.0", "generator": "shapespace"},
-            "scene": 0,
-            "scenes": [{"nodes": [0]}],
-            "nodes": [{"name": self.mesh["name"], "mesh": 0}],
-        }
+        self.tree: dict[str, Any] = {"asset": {"version": "2.0", "generator": "shapespace"}, "scene": 0}
         plain = MATERIAL if colors is None else WHITE
+        self.tree["materials"] = [plain]
         triangles = faces if surface is None else surface.split.faces
-        if surface is None or colouring or surface.material_of is None:
-            self._parts = [{"indices": self._indices(triangles), "material": 0}]
-            self.tree["materials"] = [plain]
+        pieces = [_Piece(NONE, NONE, np.arange(0))]
+        if surface:
+            pieces = _pieces(surface, objects=not joined, materials=not colouring)
+            used = sorted({piece.material for piece in pieces})
+            if used != [NONE]:
+                pictures = self._pictures(surface, {surface.materials[k].texture for k in used if k != NONE})
+                looks = [plain if k == NONE else _material(surface.materials[k], pictures) for k in used]
+                self.tree["materials"] = looks
         else:
-            of = surface.material_of[surface.triangle_polygons]
-            used = np.unique(of).tolist()
-            self._parts = [{"indices": self._indices(triangles[of == k]), "material": n} for n, k in enumerate(used)]
-            pictures = self._pictures(surface, {surface.materials[k].texture for k in used if k != NONE})
-            self.tree["materials"] = [plain if k == NONE else _material(surface.materials[k], pictures) for k in used]
+            used = [NONE]
+        #: By the number of the object.
+        self._primitives: dict[int, list[dict[str, int]]] = {}
+        for piece in pieces:
+            some = triangles if len(pieces) == 1 else triangles[piece.triangles]
+            primitive = {"indices": self._indices(some), "material": used.index(piece.material)}
+            self._primitives.setdefault(piece.object, []).append(primitive)
+        given = surface and surface.objects
+        first = given.names[0] if given else name
+        self._names = [given.names[k] if given and k != NONE else first for k in self._primitives]
+        self.nodes = len(self._names)
+        self.tree["scenes"] = [{"nodes": [*range(self.nodes)]}]
+        self.tree["nodes"] = [{"name": own, "mesh": k} for k, own in enumerate(self._names)]
 
     def normals(self, vertices: FloatArray) -> FloatArray:
         """(V', 3) normals of a shape (V, 3) at the document's vertices."""
@@ -224,8 +264,11 @@ class Document:
             self.mesh.setdefault("extras", {})["targetNames"] = [*names]
 
     def _json(self, buffer: dict[str, Any]) -> bytes:
-        mesh = {**self.mesh, "primitives": [{**self.primitive, **part} for part in self._parts]}
-        lists = {"meshes": [mesh], "accessors": self.accessors, "bufferViews": self.views, "buffers": [buffer]}
+        entries = [
+            {"name": name, **self.mesh, "primitives": [{**self.primitive, **one} for one in primitives]}
+            for name, primitives in zip(self._names, self._primitives.values(), strict=True)
+        ]
+        lists = {"meshes": entries, "accessors": self.accessors, "bufferViews": self.views, "buffers": [buffer]}
         return json.dumps({**self.tree, **lists}, separators=(",", ":")).encode()
 
     def glb(self) -> bytes:

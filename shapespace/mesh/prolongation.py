@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 import scipy.sparse as sp
@@ -27,6 +28,29 @@ class ProlongationError(ValueError):
     """Arrays that are no prolongation, with a sentence that says why."""
 
 
+class Rider(NamedTuple):
+    """A part of the fine mesh that no coarse face lies under, and what carries it as a whole.
+
+    Attributes:
+        vertices: (k,) of the fine mesh.
+        anchors: (K,) coarse vertices.
+        weights: (K,) of these, with sum 1.
+        rigid: whether it keeps its form.
+    """
+
+    vertices: IntArray
+    anchors: IntArray
+    weights: FloatArray
+    rigid: bool
+
+
+class RigidPart(NamedTuple):
+    """Vertices (k,) of the fine mesh that move rigidly, and where they are at rest, (k, 3)."""
+
+    vertices: IntArray
+    rest: FloatArray
+
+
 @dataclass(frozen=True, eq=False)
 class Prolongation:
     """Carries the fine surface along with a coarse one, around bends too.
@@ -41,52 +65,45 @@ class Prolongation:
     Rotations alone, by polar decomposition of A_j (Sumner, Schmid and Pauly 2007), cost ten times as much and
     are less accurate, because skin stretches where it bends.
 
+    A part that rides along hangs as a whole on its anchors, so that its map is affine; one that is rigid is then
+    replaced by its rest shape in the place that comes closest.
+
     Args:
         faces: (F, 3) of the coarse mesh.
         weights: (Vf, 2V) B beside C.
+        rigid: parts that move rigidly.
     """
 
     faces: IntArray
     weights: sp.csr_array
+    rigid: tuple[RigidPart, ...] = ()
 
     @classmethod
-    def of(cls, coarse: TriangleMesh, fine: TriangleMesh) -> Prolongation:
-        """Bind a fine mesh to a coarse one at rest; both lie on the same surface."""
-        corners, barycentric = _bind(coarse, fine)
-        count, tail, head = len(coarse.vertices), *np.concatenate([coarse.edges, coarse.edges[:, ::-1]]).T
-        around = _around(coarse.faces, count)
-        normals = _scaled_normals(coarse.vertices, coarse.faces, around)
-
-        # A_j = Σ_k (y_k − y_j) g_jkᵀ + n_j h_jᵀ, the normal equations being the same for all three coordinates.
-        edges = coarse.vertices[head] - coarse.vertices[tail]
-        weight = 1 / (edges**2).sum(axis=1)
-        normal_weight = NORMAL_WEIGHT * np.bincount(tail) / (normals**2).sum(axis=1)
-        moments = normal_weight[:, None, None] * normals[:, :, None] * normals[:, None, :]
-        np.add.at(moments, tail, weight[:, None, None] * edges[:, :, None] * edges[:, None, :])
-        inverse = np.linalg.inv(moments)
-        g = weight[:, None] * np.einsum("eij,ej->ei", inverse[tail], edges)
-        h = normal_weight[:, None] * np.einsum("vij,vj->vi", inverse, normals)
-
-        rows = np.repeat(np.arange(len(fine.vertices)), 3)
-        columns, b = corners.ravel(), barycentric.ravel()
-        offsets = b[:, None] * (fine.vertices[rows] - coarse.vertices[columns])
-        on_vertices = sp.csr_array((b, (rows, columns)), shape=(len(fine.vertices), count))
-        on_normals = sp.csr_array(on_vertices.shape)
-        for axis in range(3):
-            difference = sp.csr_array((g[:, axis], (tail, head)), shape=(count, count))
-            difference = difference - sp.diags_array(difference.sum(axis=1))
-            offset = sp.csr_array((offsets[:, axis], (rows, columns)), shape=on_vertices.shape)
-            on_vertices = on_vertices + offset @ difference
-            on_normals = on_normals + offset @ sp.diags_array(h[:, axis])
-        weights = sp.csr_array(sp.hstack([on_vertices, on_normals]))
-        weights.eliminate_zeros()
-        weights.sort_indices()
-        return cls(coarse.faces, weights)
+    def of(cls, coarse: TriangleMesh, fine: TriangleMesh, riders: Sequence[Rider] = ()) -> Prolongation:
+        """Bind a fine mesh to a coarse one at rest; both lie on the same surface, but for parts that ride along."""
+        whole = np.arange(len(fine.vertices))
+        bound = np.setdiff1d(whole, np.concatenate([rider.vertices for rider in riders])) if riders else whole
+        corners, barycentric = _bind(coarse, submesh(fine, bound) if riders else fine)
+        rows, columns, b = [np.repeat(bound, 3)], [corners.ravel()], [barycentric.ravel()]
+        for rider in riders:
+            rows.append(np.repeat(rider.vertices, len(rider.anchors)))
+            columns.append(np.tile(rider.anchors, len(rider.vertices)))
+            b.append(np.tile(rider.weights, len(rider.vertices)))
+        weights = hung(coarse, fine.vertices, *map(np.concatenate, (rows, columns, b)))
+        rigid = (RigidPart(rider.vertices, fine.vertices[rider.vertices]) for rider in riders if rider.rigid)
+        return cls(coarse.faces, weights, tuple(rigid))
 
     def __call__(self, vertices: FloatArray) -> FloatArray:
         """Fine vertices (…, Vf, 3) of coarse ones (…, V, 3)."""
         if vertices.ndim > 2:
             return np.stack([self(shape) for shape in vertices]).reshape(*vertices.shape[:-2], -1, 3)
+        fine = self.affine(vertices)
+        for part in self.rigid:
+            fine[part.vertices] = align(part.rest, fine[part.vertices])
+        return fine
+
+    def affine(self, vertices: FloatArray) -> FloatArray:
+        """Fine vertices (Vf, 3) of coarse ones (V, 3), rigid parts affinely too."""
         fine: FloatArray = self.weights @ np.concatenate(
             [vertices, _scaled_normals(vertices, self.faces, self._around)]
         )
@@ -121,12 +138,14 @@ class Prolongation:
         Returns:
             Distances as fractions of the diagonal of each shape's bounding box, over all vertices and shapes.
         """
-        means, largest = [], []
-        for y, x in zip(coarse, fine, strict=True):
-            distances = np.linalg.norm(align(self(y), x) - x, axis=1) / diagonal(x)
-            means.append(distances.mean())
-            largest.append(distances.max())
+        found = [(away.mean(), away.max()) for away in self.distances(coarse, fine)]
+        means, largest = zip(*found, strict=True)
         return {"mean": float(np.mean(means)), "max": float(np.max(largest))}
+
+    def distances(self, coarse: FloatArray, fine: FloatArray) -> Iterator[FloatArray]:
+        """For each shape how far its fine vertices are (Vf,), as `errors` counts."""
+        for y, x in zip(coarse, fine, strict=True):
+            yield np.linalg.norm(align(self(y), x) - x, axis=1) / diagonal(x)
 
     def arrays(self) -> dict[str, NDArray]:
         """What a file holds; names begin with ``prolongation_``."""
@@ -135,7 +154,16 @@ class Prolongation:
             PREFIX + "indptr": self.weights.indptr.astype(np.int32),
             PREFIX + "indices": self.weights.indices.astype(np.int32),
             PREFIX + "weights": self.weights.data,
-        }
+        } | self._rigid_arrays()
+
+    def _rigid_arrays(self) -> dict[str, NDArray]:
+        if not self.rigid:
+            return {}
+        part = np.full(self.vertex_count, -1, np.int32)
+        rest = np.zeros((self.vertex_count, 3))
+        for k, (vertices, places) in enumerate(self.rigid):
+            part[vertices], rest[vertices] = k, places
+        return {PREFIX + "rigid": part, PREFIX + "rest": rest[part >= 0]}
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, NDArray]) -> Prolongation:
@@ -177,7 +205,67 @@ class Prolongation:
                 f"the weights of fine vertex {astray[0]} sum up to {sums[astray[0]]:.6g}, not 1; it would not "
                 "move with the shape"
             )
-        return cls(connectivity.faces, matrix)
+        return cls(connectivity.faces, matrix, _rigid_parts(arrays, len(indptr) - 1))
+
+
+def submesh(mesh: TriangleMesh, vertices: IntArray) -> TriangleMesh:
+    """The faces of a mesh that join some of its vertices (k,), increasing, as a mesh of these alone."""
+    inside = np.isin(mesh.faces, vertices).all(axis=1)
+    return TriangleMesh.from_arrays(mesh.vertices[vertices], np.searchsorted(vertices, mesh.faces[inside]))
+
+
+def hung(coarse: TriangleMesh, points: FloatArray, rows: IntArray, columns: IntArray, b: FloatArray) -> sp.csr_array:
+    """Weights (k, 2V) that carry points (k, 3) with the vertices they hang on: B beside C of `Prolongation`.
+
+    Args:
+        coarse: at rest.
+        points: at rest.
+        rows: (n,) numbers of points.
+        columns: (n,) coarse vertices that these hang on.
+        b: (n,) with which weight; those of a point have the sum 1.
+    """
+    count, tail, head = len(coarse.vertices), *np.concatenate([coarse.edges, coarse.edges[:, ::-1]]).T
+    around = _around(coarse.faces, count)
+    normals = _scaled_normals(coarse.vertices, coarse.faces, around)
+
+    # A_j = Σ_k (y_k − y_j) g_jkᵀ + n_j h_jᵀ, the normal equations being the same for all three coordinates.
+    edges = coarse.vertices[head] - coarse.vertices[tail]
+    weight = 1 / (edges**2).sum(axis=1)
+    normal_weight = NORMAL_WEIGHT * np.bincount(tail) / (normals**2).sum(axis=1)
+    moments = normal_weight[:, None, None] * normals[:, :, None] * normals[:, None, :]
+    np.add.at(moments, tail, weight[:, None, None] * edges[:, :, None] * edges[:, None, :])
+    inverse = np.linalg.inv(moments)
+    g = weight[:, None] * np.einsum("eij,ej->ei", inverse[tail], edges)
+    h = normal_weight[:, None] * np.einsum("vij,vj->vi", inverse, normals)
+
+    offsets = b[:, None] * (points[rows] - coarse.vertices[columns])
+    on_vertices = sp.csr_array((b, (rows, columns)), shape=(len(points), count))
+    on_normals = sp.csr_array(on_vertices.shape)
+    for axis in range(3):
+        difference = sp.csr_array((g[:, axis], (tail, head)), shape=(count, count))
+        difference = difference - sp.diags_array(difference.sum(axis=1))
+        offset = sp.csr_array((offsets[:, axis], (rows, columns)), shape=on_vertices.shape)
+        on_vertices = on_vertices + offset @ difference
+        on_normals = on_normals + offset @ sp.diags_array(h[:, axis])
+    weights = sp.csr_array(sp.hstack([on_vertices, on_normals]))
+    weights.eliminate_zeros()
+    weights.sort_indices()
+    return weights
+
+
+def _rigid_parts(arrays: Mapping[str, NDArray], count: int) -> tuple[RigidPart, ...]:
+    """Of a mesh with so many fine vertices."""
+    if PREFIX + "rigid" not in arrays and PREFIX + "rest" not in arrays:
+        return ()
+    of, rest = _flat(arrays, "rigid", "i", 1), _flat(arrays, "rest", "f", 2)
+    there = np.flatnonzero(of >= 0)
+    if len(of) != count or rest.shape != (len(there), 3) or not np.isfinite(rest).all():
+        raise ProlongationError(
+            f"{PREFIX}rigid must have {count} entries, and {PREFIX}rest a place for each that is not negative"
+        )
+    order = np.argsort(of[there], kind="stable")
+    parts = np.split(order, np.flatnonzero(np.diff(of[there][order])) + 1) if len(order) else []
+    return tuple(RigidPart(there[part], rest[part]) for part in parts)
 
 
 def _flat(arrays: Mapping[str, NDArray], name: str, kind: str, dimensions: int) -> NDArray:

@@ -166,14 +166,43 @@ class Surface:
             material_of=taken(self.material_of, polygons),
         )
 
+    def only(self, polygons: NDArray[np.bool_]) -> Surface:
+        """Some of its polygons (P,)."""
+        corners = np.repeat(polygons, self.sizes)
+
+        def taken(array: IntArray | None, chosen: NDArray[np.bool_]) -> IntArray | None:
+            return None if array is None else array[chosen]
+
+        def labelled(labels: Labels | None) -> Labels | None:
+            if labels is None:
+                return None
+            there = np.unique(labels.of[polygons])
+            there = there[there >= 0]
+            of = np.where(labels.of[polygons] < 0, NONE, np.searchsorted(there, labels.of[polygons]))
+            return Labels(tuple(labels.names[k] for k in there), of) if len(there) else None
+
+        return replace(
+            self,
+            starts=np.concatenate([[0], np.cumsum(self.sizes[polygons])]),
+            corners=self.corners[corners],
+            uv_corners=taken(self.uv_corners, corners),
+            shading=taken(self.shading, corners),
+            objects=labelled(self.objects),
+            groups=labelled(self.groups),
+            material_of=taken(self.material_of, polygons),
+        )
+
     def welded(self, vertices: IntArray) -> Surface:
-        """On other vertices: ``vertices`` (N,) is what each has become, NONE for those in no polygon."""
+        """On other vertices: ``vertices`` (N,) is what each has become, NONE for those whose polygons are left out."""
+        there = np.logical_and.reduceat(vertices[self.corners] >= 0, self.starts[:-1])
+        if not there.all():
+            return self.only(there).welded(vertices)
         colors = None
         if self.colors is not None:
             # Backwards, so that the first of welded vertices stays.
-            there = np.flatnonzero(vertices >= 0)[::-1]
+            first = np.flatnonzero(vertices >= 0)[::-1]
             colors = np.empty((vertices.max() + 1, 3))
-            colors[vertices[there]] = self.colors[there]
+            colors[vertices[first]] = self.colors[first]
         found = replace(self, corners=vertices[self.corners], colors=colors)
         # Kept only where some vertex has several.
         smooth = found.shading is not None and len(np.unique(found.normal_corners)) == len(np.unique(found.corners))

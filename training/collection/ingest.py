@@ -22,8 +22,11 @@ from scipy.spatial import KDTree
 from shapespace.arrays import FloatArray, IntArray
 from shapespace.files.formats import READ_FORMATS, read_arrays
 from shapespace.files.npz_reading import load_npz
+from shapespace.files.surfaces.reading import FORMATS
 from shapespace.mesh.rigid_motion import align
 from shapespace.mesh.triangle_mesh import Connectivity, MeshError, PlaceError, TriangleMesh, diagonal, face_areas
+from shapespace.training.collection import parts as separate_parts
+from shapespace.training.collection.parts import Part
 from shapespace.training.collection.suspicions import Placements, suspicions
 from shapespace.training.runs.progress import progress
 
@@ -67,7 +70,7 @@ class Warned:
 
 @dataclass(frozen=True, eq=False)
 class MeshCollection:
-    """Shapes in correspondence, each a valid TriangleMesh of one component, in the user's units.
+    """Shapes in correspondence, each a valid TriangleMesh, in the user's units.
 
     Attributes:
         names: of the n shapes: stems of their files in natural order (pose2 before pose10), or the NPZ's own.
@@ -79,6 +82,7 @@ class MeshCollection:
         warnings: what is odd about single shapes.
         central: the shape with the least mean square distance from the others, after rigid alignment.
         places: for each shape its file, and the number that this gives its first vertex; none where there are no files.
+        parts: where there are several, the shell and those that ride along with it; faces of one part share edges.
     """
 
     names: tuple[str, ...]
@@ -89,6 +93,12 @@ class MeshCollection:
     warnings: tuple[Warned, ...] = ()
     central: int = 0
     places: tuple[tuple[str, int], ...] = ()
+    parts: tuple[Part, ...] = ()
+
+    @property
+    def shell_faces(self) -> IntArray:
+        """(G, 3) faces that the model computes with, in the numbers of all vertices."""
+        return self.faces[self.parts[0].faces] if self.parts else self.faces
 
     def index(self, name: str | None) -> int:
         """Index of the shape of that name, or of the most central one for None; IngestError if there is none."""
@@ -136,24 +146,28 @@ class _Raw:
     soup: bool = False
 
 
-def read_collection(path: Path) -> MeshCollection:
+def read_collection(path: Path, wanted: Sequence[str] = ()) -> MeshCollection:
     """Read a folder of OBJ, PLY, STL, OFF, glTF or NPZ files, or one NPZ of ``vertices`` (n, V, 3) and ``faces``.
 
     Vertices that coincide in every shape become one, since exporters split them along seams of texture or shading and
     STL has no shared ones; those that coincide in some shapes only stay apart. Vertices in no face are dropped. Files
     of other kinds and subfolders are ignored.
 
+    Args:
+        path: of the folder or file.
+        wanted: names of the parts to keep, see parts.choose.
+
     Raises:
         IngestError: nothing to read, fewer than 3 shapes, an unreadable file, different connectivity, an edge with more
             than two faces or with oppositely oriented ones, a face without area, a coordinate that isn't finite,
-            several components, or shapes that are all equal or partly mirrored. Vertices and faces are numbered as the
-            file does, OBJ from 1.
+            several parts that none rides along with another, or shapes that are all equal or partly mirrored. Vertices
+            and faces are numbered as the file does, OBJ from 1.
     """
     if not path.exists():
         raise IngestError(f"{path}: no such file or folder")
     raw = _read_folder(path) if path.is_dir() else _read_npz(path)
     used = np.unique(raw.faces)
-    vertices, faces = _some(raw.vertices, used), np.searchsorted(used, raw.faces)
+    vertices, faces = some_vertices(raw.vertices, used), np.searchsorted(used, raw.faces)
     with _refusing(raw.labels[0], used):
         connectivity = Connectivity(faces, len(used))
     for label, shape in zip(raw.labels, vertices, strict=True):
@@ -177,11 +191,19 @@ def read_collection(path: Path) -> MeshCollection:
                 {"face": [int(thin[0])]},
             )
     kept = np.unique(faces)
-    vertices, faces = _some(vertices, kept), np.searchsorted(kept, faces)
+    vertices, faces = some_vertices(vertices, kept), np.searchsorted(kept, faces)
     with _refusing(raw.labels[0], used[kept]):
         connectivity = Connectivity(faces, len(kept))
     seams = _seams(vertices, connectivity)
-    _refuse_components(raw, connectivity, kept_pairs, seams)
+    parts, left_out = _parts(raw, path, wanted, vertices, connectivity, kept_pairs, seams)
+    if parts:
+        notes.append(separate_parts.kept(parts, left_out))
+    if left_out:
+        chosen = np.sort(np.concatenate([part.faces for part in parts]))
+        remaining = np.unique(faces[chosen])
+        vertices, faces = some_vertices(vertices, remaining), np.searchsorted(remaining, faces[chosen])
+        connectivity, kept = Connectivity(faces, len(remaining)), kept[remaining]
+        parts = [Part(part.name, np.searchsorted(chosen, part.faces)) for part in parts]
     if raw.vertices.shape[1] > len(used):
         notes.append(f"dropped {raw.vertices.shape[1] - len(used)} vertices that belong to no face")
     if len(kept) < len(used):
@@ -191,10 +213,14 @@ def read_collection(path: Path) -> MeshCollection:
             f"{len(seams)} pairs of border vertices almost coincide in every shape, to {SEAM_TOLERANCE:g} of the size, "
             "and the surface stays open there: merge them in all meshes if it is meant to be closed"
         )
-    if connectivity.is_closed:
-        notes += _orientation(vertices, faces, raw.labels)
+    shell = faces[parts[0].faces] if parts else faces
+    used_by_shell, local = np.unique(shell, return_inverse=True)
+    if Connectivity(local.reshape(-1, 3), len(used_by_shell)).is_closed:
+        notes += _orientation(vertices, shell, raw.labels)
+    number = np.full(len(used), -1)
+    number[kept] = np.arange(len(kept))
     file_vertices = np.full(raw.vertices.shape[1], -1)
-    file_vertices[used] = np.searchsorted(kept, weld)
+    file_vertices[used] = number[weld]
     placements = Placements(vertices)
     warnings = []
     for found in suspicions(vertices, connectivity, [Path(label).name for label in raw.labels], placements):
@@ -204,7 +230,15 @@ def read_collection(path: Path) -> MeshCollection:
         warnings.append(Warned(raw.names[found.shape], sentence, found.grave))
     places = tuple((Path(label).name, _first_number(label)) for label in raw.labels)
     return MeshCollection(
-        tuple(raw.names), vertices, faces, file_vertices, tuple(notes), tuple(warnings), placements.central, places
+        tuple(raw.names),
+        vertices,
+        faces,
+        file_vertices,
+        tuple(notes),
+        tuple(warnings),
+        placements.central,
+        places,
+        tuple(parts) if len(parts) > 1 else (),
     )
 
 
@@ -237,7 +271,7 @@ def _room(shape: tuple[int, ...]) -> FloatArray:
         return np.memmap(file, np.float64, "r+", shape=shape)
 
 
-def _some(vertices: FloatArray, chosen: IntArray) -> FloatArray:
+def some_vertices(vertices: FloatArray, chosen: IntArray) -> FloatArray:
     """Some vertices of all shapes (n, V, 3)."""
     if len(chosen) == vertices.shape[1]:
         return vertices
@@ -245,12 +279,12 @@ def _some(vertices: FloatArray, chosen: IntArray) -> FloatArray:
 
 
 def normalised(collection: MeshCollection, reference: int) -> tuple[FloatArray, float]:
-    """Scale all shapes about the origin, so that the reference has unit area; they are not centred.
+    """Scale all shapes about the origin, so that the reference's shell has unit area; they are not centred.
 
     Returns:
         Vertices (n, V, 3) and the scale in the user's units: ``collection.vertices == scale * vertices``.
     """
-    scale = float(np.sqrt(face_areas(collection.vertices[reference], collection.faces).sum()))
+    scale = float(np.sqrt(face_areas(collection.vertices[reference], collection.shell_faces).sum()))
     return _stacked(len(collection.vertices), (shape / scale for shape in collection.vertices)), scale
 
 
@@ -293,14 +327,19 @@ def _read_folder(folder: Path) -> _Raw:
             if k == first:
                 yield vertices
                 continue
-            v, f = _read(path, len(vertices), faces)
-            with _refusing(str(path)):
-                if soups[k] and not soups[first]:
-                    yield _on_shared_vertices(v[f], faces, len(vertices), paths[first].name)
-                else:
-                    _refuse_cut_short(paths[first], len(vertices), faces, len(v), f)
-                    _compare(v, f, vertices, faces, paths[first].name)
-                    yield v
+            try:
+                v, f = _read(path, len(vertices), faces)
+                with _refusing(str(path)):
+                    if soups[k] and not soups[first]:
+                        v = _on_shared_vertices(v[f], faces, len(vertices), paths[first].name)
+                    else:
+                        _refuse_cut_short(paths[first], len(vertices), faces, len(v), f)
+                        _compare(v, f, vertices, faces, paths[first].name)
+            except IngestError as error:
+                if why := separate_parts.difference(path, paths[first]):
+                    raise IngestError(f"{path}: has other faces than {paths[first].name}: {why}") from error
+                raise
+            yield v
 
     return _Raw([str(path) for path in paths], list(by_name), _stacked(len(paths), shapes()), faces, all(soups))
 
@@ -484,34 +523,46 @@ def _seams(vertices: FloatArray, connectivity: Connectivity) -> IntArray:
     return seams
 
 
-def _refuse_components(raw: _Raw, connectivity: Connectivity, kept_pairs: FloatArray, seams: IntArray) -> None:
-    """IngestError for several parts; faces belong to one part where they share an edge, not a vertex alone."""
-    left, right = connectivity.edge_faces[connectivity.interior].T
-    count = len(connectivity.faces)
-    graph = sparse.coo_array((np.ones(len(left)), (left, right)), shape=(count, count))
-    parts, part = sparse.csgraph.connected_components(graph, directed=False)
-    if parts == 1:
-        return
+def _parts(
+    raw: _Raw,
+    path: Path,
+    wanted: Sequence[str],
+    vertices: FloatArray,
+    connectivity: Connectivity,
+    kept_pairs: FloatArray,
+    seams: IntArray,
+) -> tuple[list[Part], list[Part]]:
+    """The shell and what rides along, and what is left out; nothing where there is one part."""
+    apart = separate_parts.separate(connectivity)
+    if len(apart) == 1 and not wanted:
+        return [], []
     odd, label = int(kept_pairs.argmin()), raw.labels[0]
     if raw.soup and kept_pairs[odd] < 0.5:
         raise IngestError(
             f"{raw.labels[odd]}: its triangles don't meet where those of {label} do; STL files must list the "
             "faces in the same order"
         )
-    of_vertex = np.zeros(connectivity.vertex_count, int)
-    of_vertex[connectivity.faces] = part[:, None]
-    across = of_vertex[seams[:, 0]] != of_vertex[seams[:, 1]]
-    if across.any():
-        raise IngestError(
-            f"{label}: has {parts} parts that almost meet, where one is required: {across.sum()} pairs of vertices on "
-            f"their borders are less than {SEAM_TOLERANCE:g} of the mesh's size apart; merge them in all meshes"
-        )
+    files = [path / Path(each).name for each in raw.labels] if path.is_dir() else []
+    source = next((file for file in files if _extension(file) in FORMATS), None)
+    for file in files:
+        if source and file != source and (fault := separate_parts.reordered(file, source)):
+            raise IngestError(f"{file}: {fault}, unlike those of {source.name}; export it like the others")
+    named = separate_parts.named(apart, source)
     with _refusing(label):
-        raise PlaceError(
-            f"has {parts} separate parts, where one is required: faces {{faces}} are in different ones, and "
-            f"{np.bincount(part).max()} of {count} faces in the largest; join or delete the others",
-            {"faces": [0, int(part.argmax())]},
-        )
+        try:
+            chosen = separate_parts.choose(named, wanted, vertices, connectivity.faces)
+        except MeshError as error:
+            of_vertex = np.zeros(connectivity.vertex_count, int)
+            for k, faces in enumerate(apart):
+                of_vertex[connectivity.faces[faces]] = k
+            across = of_vertex[seams[:, 0]] != of_vertex[seams[:, 1]]
+            if not across.any() or wanted:
+                raise
+            raise MeshError(
+                f"has {len(apart)} parts that almost meet: {across.sum()} pairs of vertices on their borders are less "
+                f"than {SEAM_TOLERANCE:g} of the mesh's size apart; merge them in all meshes, or take them apart"
+            ) from error
+    return chosen, [part for part in named if not any(part is each for each in chosen)]
 
 
 def _orientation(vertices: FloatArray, faces: IntArray, labels: Sequence[str]) -> list[str]:

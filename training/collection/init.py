@@ -27,7 +27,7 @@ TEMPLATE = """\
 data = {data}    # folder of meshes, or one NPZ; relative to this file
 # The shape whose area becomes 1 inside, and where served shapes stand: the most central one, {reference},
 # unless another is named here, as in: reference = {other}
-{coarse}
+{coarse}{parts}
 
 [material]
 # eta = {material.eta:g}    # bending against stretching; larger makes stiffer shells, whose triangles may collapse
@@ -80,6 +80,7 @@ def configuration(collection: MeshCollection, data: str, title: str) -> str:
         reference=_string(collection.names[collection.central]),
         other=_string(collection.names[0]),
         coarse=coarse,
+        parts=_parts(collection),
         material=MaterialSettings(),
         most=count - 1,
         mode=ModeSettings(),
@@ -90,6 +91,13 @@ def configuration(collection: MeshCollection, data: str, title: str) -> str:
         title=_string(title),
         description=_string(f"Learned from {count} shapes."),
     )
+
+
+def _parts(collection: MeshCollection) -> str:
+    if not collection.parts:
+        return ""
+    names = ", ".join(_string(name) for name in dict.fromkeys(part.name for part in collection.parts))
+    return f"\n# parts = [{names}]    # the first is what the model computes with, the others ride along"
 
 
 def write(meshes: Path, out: Path | None = None, *, force: bool = False) -> tuple[Path, MeshCollection]:

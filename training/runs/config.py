@@ -47,6 +47,10 @@ class CollectionSettings(_Section):
     reference: str | None = None
     """Name of the mesh that is scaled to area 1 and whose position and orientation served shapes have; by default the
     most central one."""
+    parts: list[str] = []
+    """Of meshes of several parts, the names of those to keep: the first is the shell that the model computes with, the
+    others ride along. By default all are kept, and the largest is the shell. Names are those of the file's objects,
+    groups or materials, or ``part 1``, ``part 2`` and so on; ``run --until ingest`` prints them."""
     coarse_vertices: int = Field(1000, ge=0)
     """Vertices to compute with: meshes with more are simplified to about this number. 0 computes with all vertices."""
 

@@ -13,12 +13,14 @@ from typing import Any
 import numpy as np
 
 import shapespace
+from shapespace.arrays import FloatArray
 from shapespace.bundle.geometry import FineMesh, Geometry
 from shapespace.bundle.schema import SurfaceEntry
 from shapespace.bundle.surface import from_entry, surface_arrays, surface_entry
 from shapespace.coordinates.nric import WeightedNorm
 from shapespace.mesh.coarsening import coarsen
-from shapespace.mesh.prolongation import Prolongation
+from shapespace.mesh.prolongation import Prolongation, submesh
+from shapespace.mesh.riders import find_rider
 from shapespace.mesh.rigid_motion import align
 from shapespace.mesh.surface import Surface
 from shapespace.mesh.triangle_mesh import TriangleMesh, face_areas
@@ -29,7 +31,7 @@ from shapespace.solve.cholesky import NotPositiveDefiniteError
 from shapespace.solve.outcome import Status
 from shapespace.training.collection.appearance import kept, reference_surface, texture_bytes
 from shapespace.training.collection.generators import MESHES
-from shapespace.training.collection.ingest import MeshCollection, normalised, read_collection
+from shapespace.training.collection.ingest import MeshCollection, normalised, read_collection, some_vertices
 from shapespace.training.runs.config import Config, ConfigError
 from shapespace.training.runs.directory import RunDirectory
 from shapespace.training.runs.progress import progress, waiting
@@ -63,7 +65,7 @@ def _meshes(config: Config) -> MeshCollection:
         return MESHES[settings.generator]()
     if settings.data is None:
         raise ConfigError("collection.data: say where the meshes are, here or with --data")
-    return read_collection(settings.data)
+    return read_collection(settings.data, settings.parts)
 
 
 def ingest(run: RunDirectory, config: Config, accepted: Sequence[str] = ()) -> dict[str, Any]:
@@ -83,28 +85,35 @@ def ingest(run: RunDirectory, config: Config, accepted: Sequence[str] = ()) -> d
     chosen = meshes.index(settings.reference)
     vertices, scale = normalised(meshes, chosen)
     fine = TriangleMesh.from_arrays(vertices[chosen], meshes.faces)
+    own = np.unique(meshes.shell_faces)
+    shell = submesh(fine, own) if meshes.parts else fine
     facts: dict[str, Any] = {"shapes": len(vertices), "vertices": vertices.shape[1], "reference": meshes.names[chosen]}
     facts["notes"] = list(meshes.notes)
     facts["warnings"] = [warned.sentence for warned in meshes.warnings]
-    reference, more = fine, {}
-    if 0 < settings.coarse_vertices < vertices.shape[1]:
+    reference, more, index = shell, {}, own
+    if 0 < settings.coarse_vertices < len(own):
         with waiting("coarse mesh"):
-            coarsening = coarsen(fine, settings.coarse_vertices, vertices)
-        exact, vertices = vertices, vertices[:, coarsening.fine_index]
-        reference = TriangleMesh.from_arrays(vertices[chosen], coarsening.faces)
-        more = {"fine_vertices": fine.vertices, "fine_faces": fine.faces, "fine_index": coarsening.fine_index}
-        prolong = Prolongation.of(reference, fine)
-        run.prolongation.write(**prolong.arrays())
+            coarsening = coarsen(shell, settings.coarse_vertices, some_vertices(vertices, own))
+        index = own[coarsening.fine_index]
+        reference = TriangleMesh.from_arrays(fine.vertices[index], coarsening.faces)
         facts |= {
-            "coarse_vertices": vertices.shape[1],
+            "coarse_vertices": len(index),
             "asked_vertices": settings.coarse_vertices,
             "smallest_angle": float(np.degrees(coarsening.smallest_angle)),
             "smallest_area": coarsening.smallest_area,
             "specks": coarsening.specks,
             "folds": coarsening.folds,
             "reason": coarsening.reason,
-            "prolongation": prolong.errors(vertices, exact),
         }
+    if reference is not fine:
+        more = {"fine_vertices": fine.vertices, "fine_faces": fine.faces, "fine_index": index}
+        exact, vertices = vertices, vertices[:, index]
+        facts |= (carried := _prolong(run, meshes, reference, fine, vertices, exact))
+        facts["notes"] += [
+            f"{part['name']} is carried {part['carried']}: {part['mean']:.2%} of the diagonal away on average, "
+            f"{part['max']:.2%} at most"
+            for part in carried["prolongation"].get("parts", ())[1:]
+        ]
     if meshes.file_vertices is not None and len(meshes.file_vertices) > len(fine.vertices):
         more["file_vertices"] = meshes.file_vertices
     write_reference(run, reference, scale, **more)
@@ -118,6 +127,42 @@ def ingest(run: RunDirectory, config: Config, accepted: Sequence[str] = ()) -> d
         run.surface.write(**surface_arrays(surface), **texture_bytes(surface))
         run.surface_names.write(surface_entry(surface).model_dump())
     run.ingest.write(facts)
+    return facts
+
+
+def _prolong(
+    run: RunDirectory,
+    meshes: MeshCollection,
+    reference: TriangleMesh,
+    fine: TriangleMesh,
+    coarse: FloatArray,
+    exact: FloatArray,
+) -> dict[str, Any]:
+    """``prolongation.npz``, and how far it is from the fine shapes (n, Vf, 3) given the coarse ones (n, V, 3)."""
+    own = np.unique(meshes.shell_faces)
+    riders = []
+    for part in meshes.parts[1:]:
+        index = np.setdiff1d(meshes.faces[part.faces], own)
+        riders.append(find_rider(reference, fine.vertices[index], index, coarse, some_vertices(exact, index)))
+    prolong = Prolongation.of(reference, fine, riders)
+    run.prolongation.write(**prolong.arrays())
+    facts: dict[str, Any] = {"prolongation": prolong.errors(coarse, exact)}
+    if riders:
+        away = np.stack(list(prolong.distances(coarse, exact)))
+        facts["prolongation"]["parts"] = [
+            {
+                "name": part.name,
+                "carried": how,
+                "mean": float(away[:, index].mean()),
+                "max": float(away[:, index].max()),
+            }
+            for part, how, index in zip(
+                meshes.parts,
+                ("shell", *("rigidly" if rider.rigid else "affinely" for rider in riders)),
+                (own, *(rider.vertices for rider in riders)),
+                strict=True,
+            )
+        ]
     return facts
 
 

@@ -12,6 +12,7 @@ from shapespace.bundle import writer
 from shapespace.bundle.reader import BundleError, read_bundle
 from shapespace.bundle.schema import ARRAYS, MANIFEST, SURFACE, Manifest
 from shapespace.bundle.writer import Networks
+from shapespace.mesh.prolongation import Prolongation, RigidPart
 from tests.service.bundles import facts, fine_reference, geometry, reference, seal, write_bundle
 
 
@@ -21,6 +22,9 @@ def contents(folder: Path) -> dict[str, bytes]:
 
 def test_what_is_written_is_read(tmp_path: Path) -> None:
     written = replace(geometry(fine=True), file_vertices=np.array([-1, *range(512)]))
+    part = np.array([3, 5, 8, 300])
+    prolong = replace(written.fine.prolong, rigid=(RigidPart(part, written.fine.reference.vertices[part]),))
+    written = replace(written, fine=replace(written.fine, prolong=prolong))
     networks = Networks(factors=[b"0", b"1"], combiner=b"2", start=b"3")
     folder = writer.write_bundle(tmp_path, facts(), networks, written)
     assert folder == tmp_path / "small" / "1"
@@ -31,11 +35,15 @@ def test_what_is_written_is_read(tmp_path: Path) -> None:
     np.testing.assert_array_equal(found.modes, written.modes)
     np.testing.assert_array_equal(found.training_codes, written.training_codes)
     assert found.file_vertices is None
+    assert not found.fine.prolong.rigid
     assert found.networks.keys() == {"factor-0.onnx", "factor-1.onnx", "combiner.onnx", "start.onnx"}
     assert (folder / "start.onnx").read_bytes() == b"3"
     with np.load(folder / "geometry.npz") as arrays:
         kinds = {name: kind for name, kind in ARRAYS.items() if not name.startswith(SURFACE)}
         assert list(arrays) == list(kinds)
+        (rigid,) = Prolongation.from_arrays(arrays).rigid
+        np.testing.assert_array_equal(rigid.vertices, part)
+        np.testing.assert_array_equal(rigid.rest, written.fine.reference.vertices[part])
         assert {name: arrays[name].dtype for name in arrays} == {name: kind.dtype for name, kind in kinds.items()}
     assert [path.name for path in folder.parent.iterdir()] == ["1"]
 

@@ -160,8 +160,10 @@ def test_only_the_default_scene_counts() -> None:
     meshes = document()["meshes"]
     tree = document(nodes=nodes, meshes=[*meshes, *meshes], scenes=[{"nodes": [1, 2]}, {"nodes": [0]}], scene=1)  # type: ignore[misc]
     np.testing.assert_array_equal(read(tree)[0], POINTS)
-    with pytest.raises(MeshError, match="holds 2 meshes; a file needs exactly one"):
-        read(tree | {"scene": 0})
+    # All meshes of a scene are one mesh of several parts, the last first.
+    vertices, faces = read(tree | {"scene": 0})
+    np.testing.assert_array_equal(vertices, np.concatenate([POINTS, POINTS + 9]))
+    assert len(faces) == 2 * len(read(tree)[1])
 
 
 def test_without_scenes_every_node_counts_and_without_nodes_the_mesh() -> None:

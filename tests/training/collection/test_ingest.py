@@ -381,11 +381,6 @@ REFUSALS: dict[str, tuple[Callable[[Path], Path], str]] = {
     ),
     "face that names a vertex twice": (ball_and([], [[A, B, B]]), r"pose1\.obj: face 81 names the same vertex twice"),
     "edge of no length in every shape": (nearly_one_place, r"shape 0: face \d+ is degenerate: in every shape"),
-    "two components": (
-        ball_and([[9, 0, 0], [9, 1, 0], [9, 0, 1]], [[42, 43, 44]]),
-        r"pose1\.obj: has 2 separate parts, where one is required: faces \(1, 81\) .*80 of 81 .*counted from 1",
-    ),
-    "parts that share one vertex": (ball_and([[9, 0, 0], [9, 1, 0]], [[A, 42, 43]]), r"has 2 separate parts"),
     "equal shapes": (written(SHAPES[[0, 0, 0]]), r"all 3 shapes are equal"),
     "one shape at several places": (
         written(SHAPES[[0, 0, 0]] @ [[0, 1, 0], [-1, 0, 0], [0, 0, 1]] + [[[0, 0, 0]], [[3, 0, 0]], [[0, 0.5, 7]]]),

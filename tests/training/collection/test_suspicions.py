@@ -137,7 +137,7 @@ def test_parts_that_almost_meet_are_told_from_separate_ones(tmp_path: Path) -> N
     twin[seam] = SHAPES.shape[1] + np.arange(len(seam))
     faces = np.where(left[:, None], FACES, twin[FACES])
     size = np.linalg.norm(np.ptp(SHAPES[0], axis=0))
-    for distance, says in ((2e-5, "2 parts that almost meet"), (0.1, "2 separate parts")):
+    for distance, says in ((2e-5, "4 parts that almost meet"), (0.1, "4 separate parts")):
         shapes = np.concatenate([SHAPES, SHAPES[:, seam] + [0, 0, distance * size]], axis=1)
         with pytest.raises(IngestError, match=says) as refusal:
             write(tmp_path / "meshes", shapes, faces)

@@ -26,7 +26,7 @@ from shapespace.mesh.triangle_mesh import TriangleMesh
 from shapespace.training.runs.stages import STAGES
 from tests.service.conftest import starting
 from tests.service.glb import GLB
-from tests.surfaces import ball, corner_uv, parse_obj, same_corners, write_files
+from tests.surfaces import ball, corner_uv, parse_obj, same_corners, with_parts, write_files
 from tests.training.conftest import command
 
 CONFIG = """
@@ -79,23 +79,35 @@ licence = "MIT"
 """
 
 
+SPHERE, SURFACE = with_parts(ball())
+EYE, BAR, NAIL = (np.unique(SURFACE.corners[np.repeat(SURFACE.objects.of == k, SURFACE.sizes)]) for k in range(3))
+
+
 def bars(count: int = 8) -> tuple[np.ndarray, np.ndarray]:
     """A thick bar in some poses, far from the origin and in large units: each end bends by itself.
 
-    Its files have textured quads; the faces here are these as triangles.
+    Its files have textured quads, and an eye and a nail as parts of their own; the faces here are these as triangles.
     """
-    sphere, surface = ball()
-    rest = sphere * [300.0, 80.0, 60.0]
+    rest = SPHERE * [300.0, 80.0, 60.0]
+    centre = rest[EYE].mean(axis=0)
+    rest[EYE] = centre + 20 * (SPHERE[EYE] - SPHERE[EYE].mean(axis=0))
     rng = np.random.default_rng(1)
     shapes = []
-    for left, right, twist in np.vstack([np.zeros(3), rng.uniform(-0.8, 0.8, (count - 1, 3))]):
-        x, y, z = rest.T
+
+    def bent(points: np.ndarray, left: float, right: float, twist: float) -> np.ndarray:
+        x, y, z = points.T
         bend = left * np.clip(-x / 300, 0, 1) ** 2 + right * np.clip(x / 300, 0, 1) ** 2
         turn = 0.5 * twist * np.clip(x / 300, 0, 1)
         y, z = np.cos(turn) * y - np.sin(turn) * z, np.sin(turn) * y + np.cos(turn) * z
         x, z = x * np.cos(bend) - z * np.sin(bend), np.abs(x) * np.sin(bend) + z * np.cos(bend)
-        shapes.append(np.stack([1000 + x, y, z], axis=1))
-    return np.array(shapes), surface.triangles
+        return np.stack([1000 + x, y, z], axis=1)
+
+    for pose in np.vstack([np.zeros(3), rng.uniform(-0.8, 0.8, (count - 1, 3))]):
+        shape = bent(rest, *pose)
+        # An eye is hard: it goes where the skin around it goes.
+        shape[EYE] = align(rest[EYE], shape[EYE])
+        shapes.append(shape)
+    return np.array(shapes), SURFACE.triangles
 
 
 @pytest.fixture(scope="session")
@@ -105,7 +117,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     vertices, _ = bars()
     for k, shape in enumerate(vertices):
         path = folder / "meshes" / f"bar{k}.obj"
-        write_files(path, shape, ball()[1])
+        write_files(path, shape, SURFACE)
         path.write_text(path.read_text() + "\nv 1 2 3\n")  # a vertex in no face, as exporters leave them
     (folder / "bars.toml").write_text(CONFIG)
     return folder
@@ -115,6 +127,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def run(folder: Path) -> Path:
     done = subprocess.run(command(folder / "bars.toml", folder / "run"), capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
+    assert "3 separate parts: the model computes with 'Bar'" in done.stdout
+    assert "Eye is carried rigidly: " in done.stdout
     return folder / "run"
 
 
@@ -125,7 +139,8 @@ def test_a_run_leaves_what_the_contract_promises(run: Path) -> None:
         assert 100 <= len(mesh.vertices) <= 130
         fine = TriangleMesh.from_arrays(reference["fine_vertices"], reference["fine_faces"])
         assert np.array_equal(fine.faces, faces)
-        assert fine.area == pytest.approx(1)
+        shell = np.isin(faces, BAR).all(axis=1)
+        assert fine.face_areas[shell].sum() == pytest.approx(1)
         np.testing.assert_allclose(reference["scale"] * fine.vertices, vertices[0], atol=1e-4)
     with np.load(run / "mean.npz") as mean:
         # Shapes are served where the mean stands.
@@ -145,12 +160,20 @@ def test_a_run_leaves_what_the_contract_promises(run: Path) -> None:
     assert figures["r2"]["affine"]["total"] > 0.5
     assert figures["r2"]["composite"]["total"] > 0.99
     assert figures["prolongation"]["mean"] < 0.02
+    parts = {part["name"]: part for part in figures["prolongation"]["parts"]}
+    assert {name: part["carried"] for name, part in parts.items()} == {
+        "Bar": "shell",
+        "Eye": "rigidly",
+        "Nail": "affinely",
+    }
+    assert all(0 < part["mean"] < part["max"] < 0.02 for part in parts.values())
     assert [row["fraction"] for row in figures["fractions"]] == [0.5]
     (other,) = figures["seeds"]
     assert other["seed"] == 1
     assert 0 < abs(other["r2"]["composite"]["total"] - figures["r2"]["composite"]["total"]) < 0.02
     report = (run / "report.html").read_text()
     assert "<html" in report
+    assert "Eye, carried rigidly" in report
     unseen, encoded = (json.loads((run / f"{name}.json").read_text()) for name in ("generalisation", "encoded"))
     assert figures["generalisation"] == unseen
     assert (unseen["held_out"], unseen["counts"]) == (8, [2, 3])
@@ -192,7 +215,9 @@ def test_the_server_picks_the_model_up_and_answers_in_the_units_of_the_meshes(ur
     assert fine.shape == (3, *vertices.shape[1:])
     diagonal = np.linalg.norm(np.ptp(vertices[0], axis=0))
     for found, exact in zip(fine, vertices, strict=False):
-        assert np.linalg.norm(align(found, exact) - exact, axis=1).mean() < 0.05 * diagonal
+        off = np.linalg.norm(align(found, exact) - exact, axis=1)
+        assert max(off[part].mean() for part in (EYE, BAR, NAIL)) < 0.05 * diagonal
+        np.testing.assert_allclose(align(found[EYE], exact[EYE]), exact[EYE], atol=1e-5 * diagonal)
     mesh = httpx.get(f"{url}/v1/models/bars/mesh", params={"format": "json", "mesh": "coarse"}).json()
     assert len(mesh["vertices"]) < 140
     assert len(httpx.get(f"{url}/v1/models/bars/mesh", params={"format": "json"}).json()["faces"]) == len(faces)
@@ -214,7 +239,7 @@ def test_the_server_encodes_the_user_s_own_files(url: str, run: Path, folder: Pa
 
 
 def test_what_the_files_had_comes_back(url: str, run: Path, folder: Path, tmp_path: Path) -> None:
-    _, given = ball()
+    given = SURFACE
     shapes, _ = bars()
     mesh = f"{url}/v1/models/bars/mesh"
     with np.load(run / "modes.npz") as modes:
@@ -224,7 +249,7 @@ def test_what_the_files_had_comes_back(url: str, run: Path, folder: Path, tmp_pa
         return httpx.get(mesh, params={"latent": code} | query, timeout=60)
 
     said = httpx.get(f"{url}/v1/models/bars").json()["surface"]
-    assert (said["objects"], said["groups"]) == (["Bar"], ["left", "right"])
+    assert (said["objects"], said["groups"]) == (["Eye", "Bar", "Nail"], ["left", "right"])
     assert [(material["name"], material["texture"]) for material in said["materials"]] == [
         ("skin", "skin.png"),
         ("cap", None),
@@ -266,6 +291,11 @@ def test_what_the_files_had_comes_back(url: str, run: Path, folder: Path, tmp_pa
     glb = ask(format="glb").content
     scene = trimesh.load_scene(io.BytesIO(glb), file_type="glb", process=False)
     assert {part.visual.material.name for part in scene.geometry.values()} == {"skin", "cap"}
+    assert [node["name"] for node in GLB(glb).tree["nodes"]] == ["Eye", "Bar", "Nail"]
+    used = {name: np.unique(scene.geometry[name].faces) for name in ("Eye", "Nail")}
+    for name, vertices in (("Eye", EYE), ("Nail", NAIL)):
+        rows = scene.geometry[name].vertices[used[name]]
+        np.testing.assert_allclose(np.unique(rows, axis=0), np.unique(positions[vertices].astype("f4"), axis=0))
     (tmp_path / "shape.glb").write_bytes(glb)
     kept, _ = read_surface(tmp_path / "shape.glb")
     assert kept
@@ -280,7 +310,7 @@ def test_what_the_files_had_comes_back(url: str, run: Path, folder: Path, tmp_pa
 
 
 def test_animations_have_what_the_files_had(url: str, run: Path, tmp_path: Path) -> None:
-    _, given = ball()
+    given = SURFACE
     with np.load(run / "modes.npz") as modes:
         body = {"keyframes": modes["coefficients"][:2].tolist(), "frames": 3}
     made = httpx.post(f"{url}/v1/models/bars/interpolations", json=body).json()
@@ -293,6 +323,7 @@ def test_animations_have_what_the_files_had(url: str, run: Path, tmp_path: Path)
     rows = glb.array(glb.primitive["attributes"]["_VERTEX"]).astype(int)
     frame = httpx.get(f"{address}/frames/2", params={"format": "json"}, timeout=60).json()
     np.testing.assert_allclose(glb.key(2), np.array(frame["vertices"])[rows], atol=1e-3)
+    assert [channel["target"]["node"] for channel in glb.tree["animations"][0]["channels"]] == [0, 1, 2]
     assert len(glb.tree["images"]) == 1
     with zipfile.ZipFile(io.BytesIO(ask(format="zip").content)) as archive:
         assert sorted(archive.namelist()) == [*(f"frame-{k:04d}.obj" for k in range(3)), "frames.mtl", "skin.png"]
@@ -305,6 +336,8 @@ def test_animations_have_what_the_files_had(url: str, run: Path, tmp_path: Path)
         stage = Usd.Stage.Open(str(path))
         mesh = UsdGeom.Mesh(stage.GetDefaultPrim())
         np.testing.assert_array_equal(mesh.GetFaceVertexCountsAttr().Get(), sizes)
+        subsets = {each.GetDisplayName() for each in stage.GetDefaultPrim().GetChildren()}
+        assert subsets >= {"Eye", "Bar", "Nail"}
     assert ask(format="npz", topology="original").status_code == 422
     one = httpx.get(f"{address}/frames/1", params={"format": "obj", "topology": "triangles"}, timeout=60)
     assert {len(polygon[0]) for polygon in parse_obj(one.text)["polygons"]} == {3}

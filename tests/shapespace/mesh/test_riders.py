@@ -1,0 +1,119 @@
+"""Parts beside a surface: what carries them, and that they go where it goes."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import trimesh
+
+from shapespace.mesh.prolongation import Prolongation, ProlongationError, Rider
+from shapespace.mesh.riders import find_rider
+from shapespace.mesh.rigid_motion import align
+from shapespace.mesh.triangle_mesh import TriangleMesh
+
+SPHERE = trimesh.creation.icosphere(2)
+BODY = TriangleMesh.from_arrays(SPHERE.vertices * [3, 1, 1], SPHERE.faces)
+BALL = trimesh.creation.icosphere(1, 0.2)
+
+
+def bent(points: np.ndarray, angle: float) -> np.ndarray:
+    """Beyond x = 1 all turns about an axis there, the more the farther it is."""
+    x, y, z = points.T
+    turn = angle * np.clip(x - 1, 0, None)
+    return np.stack([np.where(x > 1, 1 + (x - 1) * np.cos(turn) - z * np.sin(turn), x), y,
+                     np.where(x > 1, (x - 1) * np.sin(turn) + z * np.cos(turn), z)], axis=1)  # fmt: skip
+
+
+ANGLES = (0.0, 0.2, 0.4, -0.3, -0.5)
+SHAPES = np.stack([bent(BODY.vertices, angle) for angle in ANGLES])
+
+
+def both(part: np.ndarray, faces: np.ndarray) -> tuple[TriangleMesh, np.ndarray]:
+    """The body and a part behind it as one mesh, and the part's vertices there."""
+    count = len(BODY.vertices)
+    fine = TriangleMesh.from_arrays(np.concatenate([BODY.vertices, part]), np.concatenate([BODY.faces, faces + count]))
+    return fine, count + np.arange(len(part))
+
+
+def ridden(part: np.ndarray, moved: np.ndarray, faces: np.ndarray = BALL.faces) -> tuple[Rider, Prolongation]:
+    fine, index = both(part, faces)
+    rider = find_rider(BODY, part, index, SHAPES, moved)
+    return rider, Prolongation.of(BODY, fine, [rider])
+
+
+def hard(part: np.ndarray) -> np.ndarray:
+    """Where a part is that goes along as a rigid body."""
+    return np.stack([align(part, bent(part, angle)) for angle in ANGLES])
+
+
+EYE = BALL.vertices + np.array([2.4, 0, 0.7])
+
+
+def test_a_hard_part_keeps_its_form_and_comes_near() -> None:
+    moved = hard(EYE)
+    rider, prolong = ridden(EYE, moved)
+    assert rider.rigid
+    assert rider.weights.sum() == pytest.approx(1)
+    index = rider.vertices
+    for shape, truth in zip(SHAPES, moved, strict=True):
+        there = prolong(shape)[index]
+        np.testing.assert_allclose(align(EYE, there), there, atol=1e-12)
+        assert np.linalg.norm(there - truth, axis=1).mean() < 0.02
+    # And the rest is where it would be without it.
+    np.testing.assert_array_equal(prolong(SHAPES[1])[: len(BODY.vertices)], Prolongation.of(BODY, BODY)(SHAPES[1]))
+
+
+def test_a_part_that_changes_its_form_is_carried_affinely() -> None:
+    stretches = (1.0, 1.3, 1.6, 0.8, 0.6)
+    shapes = np.stack([BODY.vertices * [1, 1, k] for k in stretches])
+    moved = np.stack([EYE * [1, 1, k] for k in stretches])
+    fine, index = both(EYE, BALL.faces)
+    rider = find_rider(BODY, EYE, index, shapes, moved)
+    assert not rider.rigid
+    prolong = Prolongation.of(BODY, fine, [rider])
+    np.testing.assert_allclose(prolong(shapes[2])[index], moved[2], atol=0.08)
+
+
+def test_a_part_is_carried_by_what_moves_with_it_not_by_what_is_nearest() -> None:
+    # The ball hovers above the part that bends, and stays with the part that does not.
+    part = BALL.vertices + np.array([2.0, 0, 1.1])
+    moved = np.repeat(part[None], len(ANGLES), axis=0)
+    rider, prolong = ridden(part, moved)
+    assert BODY.vertices[rider.anchors, 0].max() < 1.5
+    assert max(np.abs(prolong(shape)[rider.vertices] - part).max() for shape in SHAPES) < 0.1
+
+
+@pytest.mark.parametrize("rigid", [True, False])
+def test_parts_move_with_the_shape(rigid: bool, rng: np.random.Generator) -> None:
+    fine, index = both(EYE, BALL.faces)
+    prolong = Prolongation.of(BODY, fine, [Rider(index, np.array([3, 9]), np.array([0.25, 0.75]), rigid)])
+    np.testing.assert_allclose(prolong(BODY.vertices), fine.vertices, atol=1e-12)
+    turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    turn *= np.sign(np.linalg.det(turn))
+    np.testing.assert_allclose(prolong(SHAPES[1] @ turn + [1, 2, 3]), prolong(SHAPES[1]) @ turn + [1, 2, 3], atol=1e-12)
+    assert (np.abs(prolong(2 * BODY.vertices) - 2 * fine.vertices).max() < 1e-12) == (not rigid)
+
+
+def test_what_a_file_holds_is_read_back() -> None:
+    _, prolong = ridden(EYE, hard(EYE))
+    again = Prolongation.from_arrays(prolong.arrays())
+    np.testing.assert_array_equal(again(SHAPES[2]), prolong(SHAPES[2]))
+    assert not Prolongation.from_arrays(Prolongation.of(BODY, BODY).arrays()).rigid
+
+
+@pytest.mark.parametrize(
+    ("name", "change"),
+    [
+        ("rigid", lambda array: array[:-1]),
+        ("rest", lambda array: array[:-1]),
+        ("rest", lambda array: array * np.nan),
+        ("rigid", lambda array: array.astype(float)),
+        ("rest", None),
+    ],
+)
+def test_arrays_of_rigid_parts_that_do_not_fit_are_refused(name: str, change) -> None:  # type: ignore[no-untyped-def]
+    arrays = ridden(EYE, hard(EYE))[1].arrays()
+    key = f"prolongation_{name}"
+    arrays = arrays | {key: change(arrays[key])} if change else {k: v for k, v in arrays.items() if k != key}
+    with pytest.raises(ProlongationError, match="prolongation_"):
+        Prolongation.from_arrays(arrays)
