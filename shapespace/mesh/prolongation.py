@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
 
@@ -20,6 +20,8 @@ from shapespace.mesh.triangle_mesh import Connectivity, MeshError, TriangleMesh,
 #: Weight of a vertex normal against that of an edge in the fit of a vertex' local affine map.
 NORMAL_WEIGHT = 0.1
 PREFIX = "prolongation_"
+#: Ridge of `fitted`, as a share of the mean square of what it regresses on, and numbers in memory at a time, thirds.
+RIDGE, FITTED = 1e-3, 2**20
 #: Fine vertices that are bound at a time: each is compared with dozens of faces, which takes memory.
 CHUNK = 10_000
 
@@ -65,6 +67,9 @@ class Prolongation:
     Rotations alone, by polar decomposition of A_j (Sumner, Schmid and Pauly 2007), cost ten times as much and
     are less accurate, because skin stretches where it bends.
 
+    Weights of a few dozen numbers for each fine vertex leave much to be learned: `fitted` takes those, on the same
+    vertices and normals, that come closest to shapes whose fine vertices are known.
+
     A part that rides along hangs as a whole on its anchors, so that its map is affine; one that is rigid is then
     replaced by its rest shape in the place that comes closest.
 
@@ -108,6 +113,40 @@ class Prolongation:
             [vertices, _scaled_normals(vertices, self.faces, self._around)]
         )
         return fine
+
+    def fitted(self, coarse: FloatArray, fine: FloatArray, rows: IntArray, shapes: IntArray) -> Prolongation:
+        """The same with weights that bring fine vertices closest to where they are in some shapes.
+
+        Ridge regression of each vertex on the vertices and normals that it hangs on already, towards the weights that
+        it has. Lengths of the changes count in all directions alike, and they sum up to 0, so that fine vertices still
+        move as the shape does. Vertices that are coarse ones stay so.
+
+        Args:
+            coarse: (n, V, 3) shapes.
+            fine: (n, Vf, 3) what they should become, each in the place of the coarse one.
+            rows: (k,) fine vertices whose weights may change.
+            shapes: (l,) which of the shapes to learn from.
+        """
+        count, weights = coarse.shape[1], self.weights
+        given = np.stack([np.concatenate([y, _scaled_normals(y, self.faces, self._around)]) for y in coarse[shapes]])
+        data, sizes = weights.data.copy(), np.diff(weights.indptr)
+        for size in np.unique(sizes[rows])[1 if sizes[rows].min() == 1 else 0 :]:
+            those = rows[sizes[rows] == size]
+            for some in np.array_split(those, -(-len(those) * size * len(shapes) // FITTED)):
+                places = weights.indptr[some][:, None] + np.arange(size)
+                columns = weights.indices[places]
+                x = given[:, columns]
+                misfit = fine[np.ix_(shapes, some)] - np.einsum("rk,nrki->nri", data[places], x)
+                # Changes that sum up to 0 are made of differences from the middle of the vertices.
+                on_vertices = (columns < count).astype(float)
+                share = on_vertices / on_vertices.sum(axis=1, keepdims=True)
+                x -= on_vertices[..., None] * np.einsum("rk,nrki->nri", share, x)[:, :, None]
+                moments = np.einsum("nrki,nrli->rkl", x, x)
+                ridge = RIDGE * np.trace(moments, axis1=1, axis2=2) / size
+                moments += ridge[:, None, None] * np.eye(size)
+                change = np.linalg.solve(moments, np.einsum("nrki,nri->rk", x, misfit)[..., None])[..., 0]
+                data[places] += change - on_vertices * (share * change).sum(axis=1, keepdims=True)
+        return replace(self, weights=sp.csr_array((data, weights.indices, weights.indptr), shape=weights.shape))
 
     @property
     def vertex_count(self) -> int:

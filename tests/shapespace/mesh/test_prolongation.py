@@ -54,6 +54,36 @@ def test_moves_rigidly_and_grows_with_the_shape(pair, shape, move):
     np.testing.assert_allclose(pair.prolong(2.5 * coarse), 2.5 * pair.prolong(coarse), atol=1e-11)
 
 
+@pytest.fixture
+def fitted(pair: Pair) -> Prolongation:
+    """Of bends by other angles than the shape's."""
+    fine = np.stack([bent(pair.fine.vertices, angle) for angle in (0.4, 0.8, 1.1, 1.6, 9.0)])
+    some = np.arange(0, len(pair.fine.vertices), 2)
+    return pair.prolong.fitted(fine[:, pair.index], fine, some, np.arange(4))
+
+
+def test_fitted_weights_come_nearer_to_shapes_that_they_were_not_fitted_to(pair, shape, fitted):
+    coarse = shape[pair.index]
+    before, after = (np.linalg.norm(each(coarse) - shape, axis=1)[::2].mean() for each in (pair.prolong, fitted))
+    assert after < 0.5 * before
+    # The others are where they were.
+    np.testing.assert_array_equal(fitted(coarse)[1::2], pair.prolong(coarse)[1::2])
+
+
+def test_fitted_weights_move_with_the_shape_and_keep_coarse_vertices(pair, shape, fitted, move):
+    coarse = shape[pair.index]
+    both = move(np.concatenate([coarse, fitted(coarse)]))
+    np.testing.assert_allclose(fitted(both[: len(coarse)]), both[len(coarse) :], atol=1e-11)
+    np.testing.assert_allclose(fitted(2.5 * coarse), 2.5 * fitted(coarse), atol=1e-11)
+    np.testing.assert_array_equal(fitted.coarse_vertices, pair.index)
+
+
+def test_fitting_to_what_a_prolongation_does_changes_nothing(pair, shape):
+    shapes = np.stack([shape, bent(pair.fine.vertices, 0.7)])[:, pair.index]
+    again = pair.prolong.fitted(shapes, pair.prolong(shapes), np.arange(pair.prolong.vertex_count), np.arange(2))
+    np.testing.assert_allclose(again.weights.data, pair.prolong.weights.data, atol=1e-12)
+
+
 def test_follows_affine_maps_of_flat_places_exactly():
     """In a plane the local maps are the map itself, stretch and shear included."""
     mesh = MESHES["sheet"]()
