@@ -1,0 +1,140 @@
+"""docs/detail.md: how much of the files' fine detail answers have, and what carrying it costs.
+
+``python -m benchmarks.detail`` measures the models that ``python -m benchmarks.served`` has left in its ``--out``, on
+the shapes that these were trained on and those that they have not seen.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Callable, Iterator
+from functools import partial
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import trimesh
+from threadpoolctl import threadpool_limits
+
+from benchmarks.results import COLLECTIONS, ROOT
+from shapespace.arrays import FloatArray
+from shapespace.mesh.prolongation import Prolongation
+from shapespace.mesh.rigid_motion import align
+from shapespace.mesh.triangle_mesh import Connectivity, TriangleMesh, diagonal, face_normals
+from shapespace.model.shape_model import ShapeModel, load
+from shapespace.training.runs.directory import RunDirectory
+
+PAGE = """# Fine detail
+
+The models of [served.md](served.md): how near fine answers come to the files' fine meshes, and how rough they are.
+**fine**, **coarse**: vertices. **carried**: the shape's own coarse vertices, taken from the file, with the weights that carry the fine mesh along;
+**answered**: the fine mesh of the code that `encode` finds for the file. **unseen** shapes had no part in mean, modes,
+networks and weights. **distance**: mean of all vertices after rigid alignment, in percent of the bounding box's
+diagonal. **normals**: median angle between a face's normal and that in the file, in degrees. **roughness**: median
+angle between the normals of neighbouring faces, as a multiple of the file's. All are means over the shapes.
+
+| | shapes | fine | coarse | carried: distance | normals | roughness | answered: distance | normals | roughness |
+|---|---|---|---|---|---|---|---|---|---|
+{rows}
+
+## What it costs
+
+Median time to carry one shape from {coarse} coarse vertices, a ball, beside one full shape of the figure without its
+fine mesh, in one call on one thread. `python -m benchmarks.detail` measures and writes this page.
+
+| fine vertices | ms | of a shape of the figure |
+|---|---|---|
+{costs}
+"""
+#: Subdivisions of an icosahedron: of the coarse ball and of the fine ones.
+COARSE, FINE = 3, (4, 5, 6, 7)
+REPEATS = 21
+
+
+class Detail(NamedTuple):
+    """Distance as a share of the diagonal, angle of normals in degrees, and roughness beside the file's."""
+
+    distance: float
+    normals: float
+    roughness: float
+
+    @classmethod
+    def of(cls, found: FloatArray, file: FloatArray, mesh: Connectivity) -> Detail:
+        """Of an answer (V, 3) beside a file (V, 3)."""
+        found = align(found, file)
+        own, others = (face_normals(shape, mesh.faces) for shape in (found, file))
+        away = np.linalg.norm(found - file, axis=1).mean() / diagonal(file)
+        roughness = [float(np.median(_angles(*normals[mesh.edge_faces[mesh.interior]].swapaxes(0, 1))))
+                     for normals in (own, others)]  # fmt: skip
+        return cls(float(away), float(np.median(_angles(own, others))), roughness[0] / roughness[1])
+
+
+def _angles(a: FloatArray, b: FloatArray) -> FloatArray:
+    degrees: FloatArray = np.rad2deg(np.arccos(np.clip((a * b).sum(axis=-1), -1, 1)))
+    return degrees
+
+
+def rows(name: str, out: Path) -> Iterator[str]:
+    """Of a collection, trained on and unseen."""
+    run, model = RunDirectory(out / name), load(out / "models" / name)
+    reference, weights = run.reference.read(), Prolongation.from_arrays(run.prolongation.read())
+    mesh = Connectivity(reference["fine_faces"], len(reference["fine_vertices"]))
+    files = {"trained on": out / "data" / f"{name}.npz", "unseen": out / "models" / f"{name}.npz"}
+    for kind, file in files.items():
+        with np.load(file) as arrays:
+            shapes = arrays["vertices"].astype(np.float64)
+        coarse = shapes[:, reference["fine_index"]]
+        carried = [Detail.of(weights(y), x, mesh) for y, x in zip(coarse, shapes, strict=True)]
+        answered = [Detail.of(model.decode(model.encode(x).code), x, mesh) for x in shapes]
+        cells = [f"{name}, {kind}", str(len(shapes)), f"{mesh.vertex_count:,}", f"{coarse.shape[1]:,}"]
+        for each in (carried, answered):
+            distance, normals, roughness = np.mean(each, axis=0)
+            cells += [f"{100 * distance:.3f}", f"{normals:.2f}", f"{roughness:.3f}"]
+        yield f"| {' | '.join(cells)} |"
+
+
+def costs(model: ShapeModel) -> Iterator[str]:
+    """Of carrying balls, beside a shape of a model."""
+    code = model.sample(1, 0)[0]
+    coarse = _ball(COARSE)
+
+    def full() -> object:
+        return model.decode(code, mesh="coarse")
+
+    with threadpool_limits(1):
+        shape = _median(full)
+        for subdivisions in FINE:
+            fine = _ball(subdivisions)
+            weights = Prolongation.of(coarse, fine)
+            seconds = _median(partial(weights, coarse.vertices))
+            yield f"| {len(fine.vertices):,} | {1e3 * seconds:.2f} | {seconds / shape:.2f} |"
+
+
+def _ball(subdivisions: int) -> TriangleMesh:
+    ball = trimesh.creation.icosphere(subdivisions)
+    return TriangleMesh.from_arrays(ball.vertices, ball.faces)
+
+
+def _median(call: Callable[[], object]) -> float:
+    times = []
+    for _ in range(REPEATS):
+        start = time.perf_counter()
+        call()
+        times.append(time.perf_counter() - start)
+    return float(np.median(times))
+
+
+def main() -> None:
+    """Measure and write."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--out", type=Path, default=ROOT / "build" / "served", help="what benchmarks.served has left")
+    given = parser.parse_args()
+    found = [row for name in COLLECTIONS if (given.out / f"{name}.json").exists() for row in rows(name, given.out)]
+    cost = "\n".join(costs(load(ROOT / "models" / "figure")))
+    page = PAGE.format(rows="\n".join(found), coarse=len(_ball(COARSE).vertices), costs=cost)
+    (ROOT / "docs" / "detail.md").write_text(page, encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
