@@ -15,8 +15,11 @@ from shapespace.mesh.quadrics import monomials, quadrics_of
 from shapespace.mesh.triangle_mesh import Connectivity
 from shapespace.mesh.triangle_quality import FOLD_LIMIT, dots, normals_and_sides, squared_sines, unit
 
-#: Smallest angle that a collapse may leave, unless there was a smaller one around; largest turn of a face's normal.
-SINE, TURN = np.sin(np.deg2rad(10)), np.cos(np.deg2rad(45))
+#: Smallest angles (degrees) that a collapse may leave, unless there was a smaller one around: the first limit holds
+#: until a round removes less than this share of the vertices, then the next.
+ANGLE_LIMITS, SLOW = (10.0, 5.0, 2.5), 0.01
+#: Largest turn of a face's normal.
+TURN = np.cos(np.deg2rad(45))
 #: Weight of the motion of a vertex against the planes of its faces: even triangles are a good start.
 MOTION_WEIGHT = 0.1
 #: Of the vertices that are tried in a round, the share whose collapses are cheapest and are done.
@@ -47,10 +50,12 @@ def thin(connectivity: Connectivity, shapes: FloatArray, target: int) -> tuple[I
     points = np.ascontiguousarray(np.moveaxis(shapes - shapes.mean(axis=1, keepdims=True), 0, 1))
     quadrics, areas = quadrics_of(connectivity, np.moveaxis(points, 1, 0))
     faces, kept, vain = connectivity.faces, np.arange(connectivity.vertex_count), 0
-    rng = np.random.default_rng(0)
+    rng, sines = np.random.default_rng(0), np.sin(np.deg2rad(ANGLE_LIMITS)).tolist()
     while len(kept) > target and vain < VAIN:
-        collapses = _collapses(_Round(faces, points), quadrics, areas, len(kept) - target, rng)
+        collapses = _collapses(_Round(faces, points), quadrics, areas, len(kept) - target, sines[0], rng)
         vain += len(collapses) < FEWEST * len(kept)
+        if len(collapses) < SLOW * len(kept) and len(sines) > 1:
+            sines, vain = sines[1:], 0
         u, v = collapses.T
         goes = np.arange(len(kept))
         goes[u] = v
@@ -135,7 +140,9 @@ def _proper(faces: IntArray) -> NDArray[np.bool_]:
     return proper
 
 
-def _collapses(mesh: _Round, quadrics: FloatArray, areas: FloatArray, most: int, rng: np.random.Generator) -> IntArray:
+def _collapses(
+    mesh: _Round, quadrics: FloatArray, areas: FloatArray, most: int, sine: float, rng: np.random.Generator
+) -> IntArray:
     """Half-edges (k, 2), u → v, that can be collapsed all at once, ``most`` at most."""
     pairs = mesh.half_edges(mesh.apart(rng))
     if not len(pairs):
@@ -148,12 +155,12 @@ def _collapses(mesh: _Round, quadrics: FloatArray, areas: FloatArray, most: int,
     first = order[np.flatnonzero(np.diff(u[order], prepend=-1))]
     first = first[np.argsort(costs[first], kind="stable")][: max(1, int(CHEAPEST * len(first)))]
     pairs = np.stack([u[first], v[first]], axis=1)
-    pairs = pairs[_keep_shape(mesh, pairs)][:most]
+    pairs = pairs[_keep_shape(mesh, pairs, sine)][:most]
     return _without_folds(mesh, pairs)
 
 
-def _keep_shape(mesh: _Round, pairs: IntArray) -> NDArray[np.bool_]:
-    """Which collapses (k, 2) leave no sliver and turn no face much, in any shape."""
+def _keep_shape(mesh: _Round, pairs: IntArray, sine: float) -> NDArray[np.bool_]:
+    """Which collapses (k, 2) leave no angle below ``sine`` and turn no face much, in any shape."""
     u, v = pairs.T
     star, which = mesh.stars(u)
     old = mesh.faces[star]
@@ -166,7 +173,7 @@ def _keep_shape(mesh: _Round, pairs: IntArray) -> NDArray[np.bool_]:
         part = slice(start, start + CHUNK)
         before, was = normals_and_sides(mesh.points[old[part].T])
         after, becomes = normals_and_sides(mesh.points[new[part].T])
-        floor = np.minimum(SINE**2, squared_sines(before, was))
+        floor = np.minimum(sine**2, squared_sines(before, was))
         bad = (squared_sines(after, becomes) < floor) | (dots(unit(before), unit(after)) < TURN)
         good[which[part][bad.any(axis=1)]] = False
     return good

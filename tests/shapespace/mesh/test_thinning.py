@@ -43,6 +43,15 @@ def test_thinning_keeps_the_topology_and_the_shapes(opened: bool) -> None:
         assert away.max() < 0.05 * mesh.diagonal
 
 
+def test_stretched_triangles_are_no_reason_to_stop() -> None:
+    ball = trimesh.creation.icosphere(subdivisions=5)
+    shapes = np.stack([ball.vertices * [a, 1, 1] for a in (3.0, 4.0)])
+    kept, faces = thin(Connectivity(ball.faces, len(ball.vertices)), shapes, 600)
+    assert len(kept) == 600
+    normals, squares = normals_and_sides(shapes[:, kept].swapaxes(0, 1)[faces.T])
+    assert np.rad2deg(np.arcsin(np.sqrt(squared_sines(normals, squares).min()))) > 2.4
+
+
 def test_sharp_edges_are_not_folded_over() -> None:
     ball = trimesh.creation.icosphere(subdivisions=4)
     shapes = np.stack([ball.vertices * [2, 1, flat] for flat in (0.2, 0.12)])
