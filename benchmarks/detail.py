@@ -28,11 +28,12 @@ from shapespace.training.runs.directory import RunDirectory
 PAGE = """# Fine detail
 
 The models of [served.md](served.md): how near fine answers come to the files' fine meshes, and how rough they are.
-**fine**, **coarse**: vertices. **carried**: the shape's own coarse vertices, taken from the file, with the weights that
-carry the fine mesh along; **answered**: the fine mesh of the code that `encode` finds for the file. **unseen** shapes had no part in mean, modes,
-networks and weights. **distance**: mean of all vertices after rigid alignment, in percent of the bounding box's
-diagonal. **normals**: median angle between a face's normal and that in the file, in degrees. **roughness**: median
-angle between the normals of neighbouring faces, as a multiple of the file's. All are means over the shapes.
+**fine**, **coarse**: vertices. **carried**: the shape's own coarse vertices, taken from the file, with the weights
+that carry the fine mesh along; **answered**: the fine mesh of the code that `encode` finds for the file. **unseen**
+shapes had no part in mean, modes, networks and weights. **distance**: mean of all vertices after rigid alignment, in
+percent of the bounding box's diagonal. **normals**: median angle between a face's normal and that in the file, in
+degrees. **roughness**: median angle between the normals of neighbouring faces, as a multiple of the file's. All are
+means over the shapes.
 
 | | shapes | fine | coarse | carried: distance | normals | roughness | answered: distance | normals | roughness |
 |---|---|---|---|---|---|---|---|---|---|
