@@ -27,8 +27,7 @@ from shapespace.service.repository.repository import UnknownModelError, UnknownV
 from shapespace.service.use_cases.animation import PathTooLongError, UnknownInterpolationError
 from shapespace.service.use_cases.batch import NoCodesError, TooManyCodesError
 from shapespace.service.use_cases.sequence import TooManyFramesError, UnknownFrameError
-from shapespace.service.use_cases.sequence_formats import NoRoomError
-from shapespace.service.use_cases.shape_formats import dump_json
+from shapespace.service.use_cases.shape_formats import NoRoomError, dump_json
 from shapespace.service.use_cases.uploads import UnknownFormatError, UnreadableFormError, UnusableMeshError
 
 MEDIA_TYPE = "application/problem+json"

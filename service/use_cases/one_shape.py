@@ -20,7 +20,7 @@ from shapespace.model.shape_model import ShapeModel
 from shapespace.model.spread import spread
 from shapespace.service.limits.workers import Caller, Workers
 from shapespace.service.use_cases.batch import Timings, solve, total_seconds
-from shapespace.service.use_cases.shape_formats import SHAPE_FORMATS, shown
+from shapespace.service.use_cases.shape_formats import SHAPE_FORMATS, shown, writing
 from shapespace.solve.deadline import Deadline
 
 
@@ -118,7 +118,8 @@ async def shape_file(workers: Workers, caller: Caller, model: ShapeModel, wanted
             colouring = Colouring.between(colour_by.quantity, vertices, against, model.mesh(mesh).connectivity)
         vertices = placed(found[0].vertices, wanted.place)
         surface = shown(model.surface(mesh), wanted.topology)
-        content = SHAPE_FORMATS[wanted.format].encode(vertices, model.mesh(mesh).faces, colouring, surface)
+        with writing():
+            content = SHAPE_FORMATS[wanted.format].encode(vertices, model.mesh(mesh).faces, colouring, surface)
         seconds = {**total_seconds(shape.seconds for shape in found), "encode": time.perf_counter() - began}
         return ShapeFile(content, found[0].diagnostics, colouring.legend if colouring else None, seconds)
 

@@ -16,15 +16,11 @@ from shapespace.files.archives import Buffer, npz_pieces, zip_pieces
 from shapespace.files.formats import OCTET_STREAM
 from shapespace.files.point_cache import point_cache
 from shapespace.files.surfaces.obj import obj_faces, obj_files, obj_vertices
-from shapespace.files.usd import animated_usd, usd_installed
+from shapespace.files.usd import animated_usd
 from shapespace.mesh.surface import Surface
 from shapespace.model.decoder import Diagnostics, Shape
 from shapespace.model.latent_space import Codes
-from shapespace.service.use_cases.shape_formats import diagnostics_arrays, dump_json, float32
-
-
-class NoRoomError(OSError):
-    """No room for a temporary file."""
+from shapespace.service.use_cases.shape_formats import diagnostics_arrays, dump_json, float32, writing
 
 
 @dataclass(frozen=True)
@@ -98,13 +94,8 @@ def _point_cache(frames: Frames) -> tuple[Iterator[Buffer], dict[str, Any]]:
 
 def _usd(frames: Frames, *, packed: bool = False) -> tuple[Iterator[Buffer], dict[str, Any]]:
     def pieces() -> Iterator[Buffer]:
-        try:
+        with writing():
             yield from animated_usd(frames.vertices, frames.faces, frames.surface, frames.fps, packed=packed)
-        except OSError:
-            raise NoRoomError(
-                "The server has no room for the temporary file that USD takes. Ask for another format, or give it a "
-                "folder for such files that can be written to (TMPDIR)."
-            ) from None
 
     return pieces(), {}
 
@@ -136,12 +127,3 @@ SEQUENCE_FORMATS = {
 }
 #: Media types of all formats of a whole animation by name.
 MEDIA_TYPES = {name: format.media_type for name, format in SEQUENCE_FORMATS.items()} | {"jsonl": JSON_LINES}
-#: Why a format may be missing.
-UNAVAILABLE = dict.fromkeys(
-    ("usd", "usdz"), "This server can't write USD, for which it needs the package usd-core: pip install usd-core"
-)
-
-
-def sequence_types() -> dict[str, str]:
-    """Media types of the formats of a whole animation that this server can write, by name."""
-    return {name: media_type for name, media_type in MEDIA_TYPES.items() if name not in UNAVAILABLE or usd_installed()}

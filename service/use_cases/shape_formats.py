@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,8 @@ from numpy.typing import NDArray
 
 from shapespace.arrays import FloatArray, IntArray
 from shapespace.files.colouring import Colouring
-from shapespace.files.formats import MESH_FORMATS, OBJ_ZIP, MeshFormat
+from shapespace.files.formats import MESH_FORMATS, OBJ_ZIP, USD_FORMATS, MeshFormat
+from shapespace.files.usd import usd_installed
 from shapespace.mesh.surface import Surface, Topology
 from shapespace.model.decoder import Diagnostics, Quality
 from shapespace.model.exact_shapes import ExactShape
@@ -51,7 +53,32 @@ def _mesh_json(
 
 
 #: Formats of one shape; the first is the default.
-SHAPE_FORMATS = {**MESH_FORMATS, "zip": OBJ_ZIP, "json": MeshFormat("application/json", _mesh_json)}
+SHAPE_FORMATS = {**MESH_FORMATS, "zip": OBJ_ZIP, "json": MeshFormat("application/json", _mesh_json), **USD_FORMATS}
+#: Why a format may be missing.
+UNAVAILABLE = dict.fromkeys(
+    USD_FORMATS, "This server can't write USD, for which it needs the package usd-core: pip install usd-core"
+)
+
+
+class NoRoomError(OSError):
+    """No room for a temporary file."""
+
+
+@contextmanager
+def writing() -> Iterator[None]:
+    """Turn what the writer of USD says where its temporary file can't be written into NoRoomError."""
+    try:
+        yield
+    except OSError:
+        raise NoRoomError(
+            "The server has no room for the temporary file that USD takes. Ask for another format, or give it a "
+            "folder for such files that can be written to (TMPDIR)."
+        ) from None
+
+
+def writable(media_types: Mapping[str, str]) -> dict[str, str]:
+    """Those of the formats, with their media types, that this server can write."""
+    return {name: kind for name, kind in media_types.items() if name not in UNAVAILABLE or usd_installed()}
 
 
 def shown(surface: Surface | None, topology: Topology) -> Surface | None:

@@ -122,6 +122,22 @@ def _npz(
     return npz(vertices=vertices.astype(np.float32), faces=faces.astype(np.int32), **colours)
 
 
+def _usd(
+    vertices: FloatArray, faces: IntArray, colouring: Colouring | None = None, surface: Surface | None = None
+) -> bytes:
+    from shapespace.files.usd import still_usd
+
+    return still_usd(vertices, faces, colouring, surface)
+
+
+def _usdz(
+    vertices: FloatArray, faces: IntArray, colouring: Colouring | None = None, surface: Surface | None = None
+) -> bytes:
+    from shapespace.files.usd import still_usd
+
+    return still_usd(vertices, faces, colouring, surface, packed=True)
+
+
 #: Every mesh format by its name, which is also the extension of its files. The first is the default.
 MESH_FORMATS: dict[str, MeshFormat] = {
     "glb": MeshFormat("model/gltf-binary", _glb),
@@ -133,6 +149,11 @@ MESH_FORMATS: dict[str, MeshFormat] = {
 }
 #: An archive of an OBJ file with its materials and textures beside it, which is not read.
 OBJ_ZIP = MeshFormat("application/zip", _obj_zip, polygons=True)
+#: What the package ``usd-core`` writes, where it is installed; files are binary layers, which are not read.
+USD_FORMATS = {
+    "usd": MeshFormat(OCTET_STREAM, _usd, polygons=True),
+    "usdz": MeshFormat("model/vnd.usdz+zip", _usdz, polygons=True),
+}
 #: Media types of the formats that can be read, by name.
 READ_FORMATS = {name: format.media_type for name, format in MESH_FORMATS.items()} | {"off": OCTET_STREAM}
 #: The same for point clouds, which may do without faces.

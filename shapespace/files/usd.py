@@ -1,8 +1,10 @@
-"""A sequence of shapes as one USD file with time samples; needs the package ``usd-core``."""
+"""A shape as a USD file, or a sequence of shapes with time samples; needs the package ``usd-core``."""
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
+from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -10,13 +12,16 @@ from tempfile import TemporaryDirectory
 import numpy as np
 from numpy.typing import NDArray
 
-from shapespace.arrays import IntArray
+from shapespace.arrays import FloatArray, IntArray
 from shapespace.files.animated_gltf import FRAMES_PER_SECOND
+from shapespace.files.colouring import Colouring
 from shapespace.files.gltf_writing import picture_type, surface_normals
 from shapespace.files.surfaces.usd import add_surface
-from shapespace.mesh.surface import Surface
+from shapespace.mesh.surface import Surface, srgb
 
 _PIECE, _FRAMES_AT_ONCE = 2**20, 32
+#: Of the files in a package: noon in Greenwich on the second day that ZIP can name, so that it can in every zone.
+_TIME = 315_662_400
 #: The colour of the glTF writer's material.
 _COLOUR = (0.72, 0.76, 0.82)
 
@@ -24,6 +29,26 @@ _COLOUR = (0.72, 0.76, 0.82)
 def usd_installed() -> bool:
     """Whether ``usd-core`` is installed, found out without importing it, which is slow."""
     return find_spec("pxr") is not None
+
+
+def still_usd(
+    vertices: FloatArray,
+    faces: IntArray,
+    colouring: Colouring | None = None,
+    surface: Surface | None = None,
+    *,
+    packed: bool = False,
+) -> bytes:
+    """Encode a shape (V, 3) with faces (F, 3); arguments and errors as `animated_usd` has them.
+
+    Args:
+        vertices: (V, 3).
+        faces: (F, 3).
+        colouring: of the vertices, instead of materials.
+        surface: with polygons, materials and textures.
+        packed: see `animated_usd`.
+    """
+    return b"".join(_pieces(vertices[None], faces, surface, None, colouring, packed=packed))
 
 
 def animated_usd(
@@ -50,24 +75,41 @@ def animated_usd(
         ImportError: ``usd-core`` is not installed.
         OSError: there is no room for a temporary file.
     """
-    from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdUtils, Vt
+    return _pieces(frames, faces, surface, fps, None, packed=packed)
 
+
+def _pieces(
+    frames: NDArray[np.floating],
+    faces: IntArray,
+    surface: Surface | None,
+    fps: float | None,
+    colouring: Colouring | None,
+    *,
+    packed: bool,
+) -> Iterator[bytes]:
+    """Of a file with time samples; of one frame without any where it has no frames in a second."""
+    from pxr import Gf, Sdf, Tf, Usd, UsdGeom, Vt
+
+    name = "shape" if fps is None else "animation"
     # The writer of binary layers takes nothing but a path.
     with TemporaryDirectory(prefix="shapespace-") as folder:
-        path = Path(folder, "animation.usdc")
+        path = Path(folder, f"{name}.usdc")
         try:
             stage = Usd.Stage.CreateNew(str(path))
         except Tf.ErrorException as error:
             raise OSError(f"can't write {path}") from error
         UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
         UsdGeom.SetStageMetersPerUnit(stage, 1.0)
-        stage.SetTimeCodesPerSecond(fps)
-        stage.SetFramesPerSecond(fps)
-        stage.SetStartTimeCode(0)
-        stage.SetEndTimeCode(len(frames) - 1)
-        mesh = UsdGeom.Mesh.Define(stage, "/animation")
+        if fps is not None:
+            stage.SetTimeCodesPerSecond(fps)
+            stage.SetFramesPerSecond(fps)
+            stage.SetStartTimeCode(0)
+            stage.SetEndTimeCode(len(frames) - 1)
+        mesh = UsdGeom.Mesh.Define(stage, f"/{name}")
         stage.SetDefaultPrim(mesh.GetPrim())
         shown = surface or Surface.of_triangles(faces)
+        if colouring:
+            shown = replace(shown, colors=srgb(colouring.linear), material_of=None, materials=(), textures={})
         mesh.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(shown.sizes.astype(np.int32)))
         mesh.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(shown.corners.astype(np.int32)))
         mesh.CreateOrientationAttr(UsdGeom.Tokens.rightHanded)
@@ -93,16 +135,24 @@ def animated_usd(
                     around = surface_normals(frame.astype(np.float64), shown).astype(np.float32)
                     around = around[shown.normal_corners] if apart else around
                     for attribute, rows in ((points, frame), (normals, around), (extent, box)):
-                        attribute.Set(Vt.Vec3fArray.FromNumpy(rows), k)
+                        time = Usd.TimeCode.Default() if fps is None else Usd.TimeCode(k)
+                        attribute.Set(Vt.Vec3fArray.FromNumpy(rows), time)
             try:
                 stage.GetRootLayer().Save()  # what is saved is in the file and no longer in memory
             except Tf.ErrorException as error:
                 raise OSError(f"can't write {path}") from error
         del stage, mesh, points, normals, extent
         if packed:
-            package = Path(folder, "animation.usdz")
-            # With what it refers to.
-            if not UsdUtils.CreateNewUsdzPackage(str(path), str(package)):
+            package = Path(folder, f"{name}.usdz")
+            # The layer first. Versions of USD differ in where they have the writer.
+            writer = getattr(Sdf, "ZipFileWriter", None) or Usd.ZipFileWriter
+            archive = writer.CreateNew(str(package))
+            for file in (path, *(Path(folder, picture) for picture in textures.values())):
+                # Equal shapes give equal bytes, but for this: a package has the times of its files.
+                os.utime(file, (_TIME, _TIME))
+                if not archive.AddFile(str(file), file.name):
+                    raise OSError(f"can't write {package}")
+            if not archive.Save():
                 raise OSError(f"can't write {package}")
             path = package
         with path.open("rb") as file:

@@ -16,7 +16,7 @@ from shapespace.service.http.messages.latent_query import NUMBERS, numbers
 from shapespace.service.http.negotiation import choose
 from shapespace.service.http.problems import ProblemError
 from shapespace.service.use_cases.one_shape import ColourBy
-from shapespace.service.use_cases.shape_formats import SHAPE_FORMATS
+from shapespace.service.use_cases.shape_formats import SHAPE_FORMATS, UNAVAILABLE, writable
 
 #: Why a format isn't among those of a coloured mesh.
 _UNCOLOURED = {
@@ -80,4 +80,4 @@ NO_COLOR = ColourParameters(None, None)
 def choose_mesh(format: str | None, request: Request, color: ColourParameters) -> str:
     """The format of a mesh answer, which carries colours where some are asked for; raises ProblemError."""
     formats = {name: f.media_type for name, f in SHAPE_FORMATS.items() if f.coloured or color.quantity is None}
-    return choose(formats, format, request.headers.get("accept"), _UNCOLOURED)
+    return choose(writable(formats), format, request.headers.get("accept"), _UNCOLOURED | UNAVAILABLE)

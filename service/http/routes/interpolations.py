@@ -43,10 +43,8 @@ from shapespace.service.use_cases.sequence_formats import (
     JSON_LINES,
     MEDIA_TYPES,
     SEQUENCE_FORMATS,
-    UNAVAILABLE,
-    sequence_types,
 )
-from shapespace.service.use_cases.shape_formats import SHAPE_FORMATS
+from shapespace.service.use_cases.shape_formats import SHAPE_FORMATS, UNAVAILABLE, writable
 
 router = APIRouter(prefix="/v1", tags=["interpolations"])
 
@@ -72,7 +70,7 @@ async def create_interpolation(
     id = interpolation_id(model, body, service.settings.max_frames)
     path = f"/v1/interpolations/{id}"
     response.headers["Location"] = path
-    links = {"self": path} | {name: f"{path}?format={name}" for name in sequence_types()}
+    links = {"self": path} | {name: f"{path}?format={name}" for name in writable(MEDIA_TYPES)}
     return InterpolationAnswer(id=id, frames=body.frame_count, links=links | {"frames": f"{path}/frames/{{k}}"})
 
 
@@ -97,7 +95,7 @@ async def get_interpolation(
     """The animation: GLB, arrays, a zip of OBJ files, a point cache, USD, or JSON lines as they get ready."""
     # Who asks for OBJ gets one a frame, in a zip.
     accept = request.headers.get("accept")
-    chosen = choose(sequence_types(), "zip" if format == "obj" else format, accept, UNAVAILABLE)
+    chosen = choose(writable(MEDIA_TYPES), "zip" if format == "obj" else format, accept, UNAVAILABLE)
     animation, model = find_interpolation(service.repository, id, service.settings.max_frames)
     written_as = SEQUENCE_FORMATS.get(chosen)
     if fps is not None and not (written_as and written_as.timed):

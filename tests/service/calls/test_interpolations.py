@@ -312,6 +312,10 @@ def test_a_server_without_usd_says_how_to_get_it(
         assert "pip install usd-core" in answer.json()["detail"]
         choices = [choice["format"] for choice in answer.json()["choices"]]
         assert choices == ["glb", "npz", "zip", "pc2", "jsonl"]
+        still = client.get("/v1/models/small/mesh", params={"format": "usdz"})
+        assert still.status_code == 406
+        assert "pip install usd-core" in still.json()["detail"]
+        assert not {"usd", "usdz"} & {choice["format"] for choice in still.json()["choices"]}
 
 
 @pytest.mark.parametrize(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import time
 import zipfile
 from dataclasses import replace
 from pathlib import Path
@@ -15,7 +16,8 @@ from pxr import Usd, UsdGeom, UsdShade
 from scipy.spatial import KDTree
 
 from shapespace.files.animated_gltf import animated_glb
-from shapespace.files.formats import MESH_FORMATS, OBJ_ZIP, read_arrays
+from shapespace.files.colouring import Colouring, Quantity
+from shapespace.files.formats import MESH_FORMATS, OBJ_ZIP, USD_FORMATS, read_arrays
 from shapespace.files.limits import Limits
 from shapespace.files.surfaces.reading import read_surface
 from shapespace.files.surfaces.textures import LARGEST
@@ -402,3 +404,19 @@ def test_usdz_packs_the_textures_that_its_materials_read(tmp_path: Path) -> None
     files = [reader.GetInput("file").Get() for reader in readers if reader.GetInput("file")]
     assert files
     assert all(file.resolvedPath for file in files)
+
+
+@pytest.mark.parametrize("colored", [False, True])
+def test_usd_of_a_shape_is_the_same_at_any_time(colored: bool, tmp_path: Path) -> None:
+    colouring = Colouring(Quantity.STRETCH, np.linspace(-1, 1, len(VERTICES)), 1.0) if colored else None
+    first = {name: kind.encode(VERTICES, SURFACE.triangles, colouring, SURFACE) for name, kind in USD_FORMATS.items()}
+    time.sleep(2.1)  # ZIP counts in steps of two seconds
+    for name, kind in USD_FORMATS.items():
+        assert kind.encode(VERTICES.copy(), SURFACE.triangles, colouring, SURFACE) == first[name]
+    path = tmp_path / "shape.usdz"
+    path.write_bytes(first["usdz"])
+    with zipfile.ZipFile(path) as package:
+        assert len(package.namelist()) == (1 if colored else 2), "colours stand in place of textures"
+    mesh = UsdGeom.Mesh(Usd.Stage.Open(str(path)).GetDefaultPrim())
+    shown = np.array(mesh.GetDisplayColorPrimvar().Get())
+    np.testing.assert_allclose(shown, colouring.linear if colouring else [(0.72, 0.76, 0.82)], atol=1e-6)

@@ -274,6 +274,27 @@ def test_what_the_files_had_comes_back(url: str, run: Path, folder: Path, tmp_pa
     assert np.array_equal(kept.corners, given.corners)
     assert np.array_equal(kept.starts, given.starts)
 
+    for format, topology, sizes in (
+        ("usd", "original", given.sizes),
+        ("usdz", "original", given.sizes),
+        ("usd", "triangles", np.full(len(given.triangles), 3)),
+    ):
+        path = tmp_path / f"{topology}.{'usdc' if format == 'usd' else format}"
+        path.write_bytes(ask(format=format, topology=topology).raise_for_status().content)
+        stage = Usd.Stage.Open(str(path))
+        prim = UsdGeom.Mesh(stage.GetDefaultPrim())
+        assert not prim.GetPointsAttr().GetTimeSamples(), "it does not move"
+        np.testing.assert_array_equal(prim.GetPointsAttr().Get(), positions.astype("f4"))
+        np.testing.assert_array_equal(prim.GetFaceVertexCountsAttr().Get(), sizes)
+        assert {each.GetDisplayName() for each in stage.GetDefaultPrim().GetChildren()} >= {
+            "Eye",
+            "Bar",
+            "Nail",
+            "skin",
+        }
+    with zipfile.ZipFile(tmp_path / "original.usdz") as package:
+        assert given.textures["skin.png"] in [package.read(name) for name in package.namelist()]
+
     # Triangles where they are asked for, or where a format has no others.
     triangles = ask(format="obj", topology="triangles")
     assert [polygon[0] for polygon in parse_obj(triangles.text)["polygons"]] == given.triangles.tolist()
