@@ -104,7 +104,7 @@ class _Layout:
         if faces.min() < 0 or faces.max() >= self.count:
             return f"The faces name vertices {faces.min()} to {faces.max()}, but there are {self.count}."
         # Faces of parts that the model was told to leave out.
-        faces = faces[(self.of_file[faces] >= 0).all(axis=1)]
+        faces = faces[(self.of_file[faces] >= 0).any(axis=1)]
         if len(faces) != len(self.faces):
             return f"The mesh has {len(faces)} faces, but the model's has {len(self.faces)}."
         given, own = (_canonical(f) for f in (self.of_file[faces], self.faces))

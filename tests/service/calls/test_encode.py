@@ -288,6 +288,10 @@ def test_files_like_those_that_the_model_was_made_of(of_files: ShapeModel) -> No
     np.testing.assert_allclose(found.vertices, MESH.vertices, atol=1e-7)
     welded = matched(of_files, written("obj"), "obj")
     np.testing.assert_array_equal(welded.vertices, found.vertices)
+    # A part that the model was told to leave out is no fault.
+    with_part = np.concatenate([faces, [[0, 0, 0]]])
+    again = matched(of_files, MESH_FORMATS["obj"].encode(vertices, with_part), "obj")
+    np.testing.assert_array_equal(again.vertices, found.vertices)
     faces[0, 0] = 0  # the vertex that belongs to no face
     with pytest.raises(InvalidMeshError, match="No face joins"):
         matched(of_files, MESH_FORMATS["obj"].encode(vertices, faces), "obj")

@@ -417,6 +417,7 @@ def test_usd_of_a_shape_is_the_same_at_any_time(colored: bool, tmp_path: Path) -
     path.write_bytes(first["usdz"])
     with zipfile.ZipFile(path) as package:
         assert len(package.namelist()) == (1 if colored else 2), "colours stand in place of textures"
-    mesh = UsdGeom.Mesh(Usd.Stage.Open(str(path)).GetDefaultPrim())
+    stage = Usd.Stage.Open(str(path))
+    mesh = UsdGeom.Mesh(stage.GetDefaultPrim())
     shown = np.array(mesh.GetDisplayColorPrimvar().Get())
     np.testing.assert_allclose(shown, colouring.linear if colouring else [(0.72, 0.76, 0.82)], atol=1e-6)
