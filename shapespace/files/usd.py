@@ -147,10 +147,10 @@ def _pieces(
             # The layer first. Versions of USD differ in where they have the writer.
             writer = getattr(Sdf, "ZipFileWriter", None) or Usd.ZipFileWriter
             archive = writer.CreateNew(str(package))
-            for file in (path, *(Path(folder, picture) for picture in textures.values())):
+            for member in (path, *(Path(folder, picture) for picture in textures.values())):
                 # Equal shapes give equal bytes, but for this: a package has the times of its files.
-                os.utime(file, (_TIME, _TIME))
-                if not archive.AddFile(str(file), file.name):
+                os.utime(member, (_TIME, _TIME))
+                if not archive.AddFile(str(member), member.name):
                     raise OSError(f"can't write {package}")
             if not archive.Save():
                 raise OSError(f"can't write {package}")

@@ -28,8 +28,10 @@ SWEEPS, PROMISING = 4, 1.2
 #: Of the search by vertices: it ends once no coordinate would move further than this fraction of the bounds, or the sum
 #: of squares would shrink by less than this, or after so many shapes.
 TOLERANCE, GAIN, SHAPES = 1e-4, 1e-4, 25
-#: A code may leave the bounds by this fraction of their width where that is allowed.
+#: A code may leave the bounds by this fraction of their width where that is allowed,
 MARGIN = 0.5
+#: and if after so many shapes none inside is found whose mean distance is less than so many times as large.
+INSIDE, AS_NEAR = 5, 1.02
 #: A mesh so many times as large as the reference, or as small, is in other units.
 UNITS = 3.0
 #: Standard deviation of a vertex that the posterior assumes at least, as a fraction of the diagonal.
@@ -134,6 +136,8 @@ class Encoder:
         fit = self._by_nric(target, box, fixed, deadline)
         if objective is Objective.VERTICES and fit.status is not Status.DEADLINE:
             fit = self._by_vertices(vertices, fit, box, fixed, deadline)
+            if bounds is not Bounds.CLAMP:
+                fit = self._inside_if_as_near(vertices, fit, fixed, deadline)
         code, inside = latents.found(fit.x, bounds, fixed)
         coarse = model.shape(code, inside, MeshChoice.COARSE, deadline)
         posterior = self._posterior(code, coarse.vertices / model.manifest.scale, vertices, fixed)
@@ -193,7 +197,9 @@ class Encoder:
         """Of the coarse mesh; made once, as they take as long as a shape."""
         return patches_of(self.model.reference.vertices)
 
-    def _by_vertices(self, target: FloatArray, near: Fit, box: Box, fixed: Fixed, deadline: Deadline | None) -> Fit:
+    def _by_vertices(
+        self, target: FloatArray, near: Fit, box: Box, fixed: Fixed, deadline: Deadline | None, most: int = SHAPES
+    ) -> Fit:
         """The fit to vertices (V, 3), from one nearby, which stands where its shape has all but collapsed."""
         model, weight = self.model, 1 / (self.model.reference.diagonal * np.sqrt(len(target)))
         with model.solver() as reconstruct:
@@ -211,12 +217,23 @@ class Encoder:
                 changes = aligned_change(shapes(x), shapes.derivatives(x, derivatives(model, x)), target)
                 return np.where(fixed.mask, 0.0, weight * changes.reshape(len(changes), -1).T)
 
-            stopping = Stopping(TOLERANCE, GAIN, max_evaluations=SHAPES, deadline=deadline)
+            stopping = Stopping(TOLERANCE, GAIN, max_evaluations=most, deadline=deadline)
             try:
                 fit = least_squares(residuals, jacobian, near.x, box, stopping)
             except NotPositiveDefiniteError:
                 return near
             return near if fit.status is Status.NOT_FINITE else fit
+
+    def _inside_if_as_near(self, target: FloatArray, fit: Fit, fixed: Fixed, deadline: Deadline | None) -> Fit:
+        """The fit to vertices (V, 3), or one inside the bounds that is as near: networks know shapes best there."""
+        lower, upper = self.model.latents.box_around(fixed, 0.0)
+        moved = replace(fit, x=np.clip(fit.x, lower, upper))
+        if np.array_equal(moved.x, fit.x) or fit.status is Status.DEADLINE:
+            return fit
+        box = Box(lower, upper, self.model.latents.width)
+        other = self._by_vertices(target, moved, box, fixed, deadline, most=INSIDE)
+        near = other is not moved and other.status is not Status.DEADLINE and other.cost <= AS_NEAR**2 * fit.cost
+        return replace(other if near else fit, iterations=fit.iterations + other.iterations)
 
     def _by_nric(self, target: FloatArray, box: Box, fixed: Fixed, deadline: Deadline | None) -> Fit:
         """The fit to lengths and angles (2E,)."""

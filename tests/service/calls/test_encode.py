@@ -327,5 +327,8 @@ def test_the_code_is_the_minimum_over_vertices(client: httpx.Client) -> None:
     found = encode(client, as_json(target, mesh.faces))
     code = np.array(found["latent"])
     assert squares(code) == pytest.approx(float(np.square(found["vertex_errors"]).sum()), rel=1e-3)
-    for step in 0.02 * np.eye(len(code)):
-        assert squares(code) < min(squares(code + step), squares(code - step))
+    # Outside the bounds there may be nearer ones, by 2 % at most.
+    lower, upper = np.array([-0.2, -np.pi, 0]), np.array([0.2, np.pi, 1])
+    for step in [*0.02 * np.eye(len(code)), *-0.02 * np.eye(len(code))]:
+        inside = ((lower <= code + step) & (code + step <= upper)).all()
+        assert squares(code) < squares(code + step) * (1 if inside else 1.02**2)

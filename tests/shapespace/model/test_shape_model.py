@@ -156,3 +156,21 @@ def test_shapes_that_were_not_found_are_told(model: ShapeModel, monkeypatch: pyt
     with pytest.warns(RuntimeWarning, match="1 of 1 shapes did not converge; the first is that of code 0: ") as caught:
         model.decode(CODES[:1])
     assert caught[0].filename == __file__
+
+
+def test_a_code_outside_is_answered_only_where_none_inside_is_as_near(figure: ShapeModel) -> None:
+    """Rough shapes of codes on the bounds: what is nearest to them lies on either side."""
+    rng = np.random.default_rng(2)
+    latents = figure.latents
+    away = 0.004 * np.linalg.norm(np.ptp(figure.vertices, axis=0))
+    for k in range(3):
+        code = np.where(rng.random(latents.dimension) < 0.5, latents.lower, latents.upper)
+        shape = figure.decode(code)
+        found = figure.encode(shape + away * rng.normal(size=shape.shape))
+        assert found.inside_bounds, k
+        assert found.distances.mean() < 2.5 * away
+    # What is clearly outside is found there.
+    beyond = latents.lower + 1.1 * latents.width * (np.arange(latents.dimension) == 3)
+    outside = figure.encode(figure.decode(beyond))
+    assert not outside.inside_bounds
+    assert outside.distances.mean() < 0.1 * away
