@@ -249,7 +249,7 @@ class Client:
             format: of the content; by default the file's suffix.
             version: of the model.
             options: scale ("fixed" or "free"), partial, noise, landmarks, fixed (value by coordinate), distribution
-                ("population" or "box"), samples, points, seed.
+                ("population" or "box"), samples, points, used, seed.
 
         Returns:
             ``latent``, ``covariance``, ``placement``, ``status``, ``reason`` and more.

@@ -300,6 +300,7 @@ class ShapeModel(Decoder):
         distribution: ExpectedName = "population",
         samples: int = 0,
         points: bool = False,
+        used: bool = False,
         seed: int = 0,
         deadline: Deadline | None = None,
     ) -> Fitted:
@@ -317,6 +318,7 @@ class ShapeModel(Decoder):
                 any inside the bounds.
             samples: codes to draw from the posterior.
             points: whether the distance of each point and of each vertex is wanted.
+            used: whether the points that stood for the scan are wanted.
             seed: of all random numbers; one seed gives the same answer.
             deadline: after which the status is "deadline".
 
@@ -349,6 +351,7 @@ class ShapeModel(Decoder):
             prior=Prior(distribution),
             samples=samples,
             points=points,
+            used=used,
             seed=seed,
         )
         return self.fitter(*_points_and_faces(scan), options, deadline)

@@ -15,6 +15,8 @@ import { Path } from "./path.js";
 import { Pictures } from "./pictures.js";
 import { Pose } from "./pose.js";
 import { Pull } from "./pull.js";
+import { Ghost } from "./scan/ghost.js";
+import { Reader } from "./scan/reader.js";
 import { ShapeLoop } from "./shape-loop.js";
 import { Skin } from "./skin.js";
 import { Sliders } from "./sliders.js";
@@ -31,7 +33,7 @@ const store = new Store({
   code: null, locked: [], placement: null, moving: false, playing: false, shape: null,
   keyframes: [], loop: false, beyond: 0,
   colour: "none", against: -1, highlight: null, regions: null, repaint: null,
-  wireframe: false, normals: false, fine: true, pull: false,
+  wireframe: false, normals: false, fine: true, pull: false, scan: null, ghost: true,
 });
 
 const viewer = new Viewer(find("#canvas"));
@@ -45,7 +47,12 @@ const path = new Path(store, pictures, {
 });
 const strip = new Strip(store, pictures, { button: find("#draw-strip"), table: find("#strip") });
 new History(store, { undo: find("#undo"), redo: find("#redo") });
-new Files(store, path, find("#tab-files"), find(".stage"));
+new Files(store, path, find("#tab-files"));
+new Ghost(store, viewer);
+new Reader(store, {
+  box: find("#verdict"), input: find("#mesh-file"), readAs: find("#read-as"), ownScale: find("#own-scale"),
+  stage: find(".stage"),
+});
 new Pull(store, viewer);
 new ShapeLoop(store);
 tabs(find("[role=tablist]"));

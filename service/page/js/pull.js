@@ -4,6 +4,7 @@ import * as THREE from "three";
 import * as api from "./api.js";
 import { readable } from "./dom.js";
 import { report, say } from "./messages.js";
+import { matrixOf } from "./pose.js";
 import { fixedBy } from "./space.js";
 
 export class Pull {
@@ -67,7 +68,7 @@ export class Pull {
         const answer = await api.edit(model, { latent: code, mesh, targets, fixed: fixedBy(locked, code) });
         if (this.store.model !== model) break;
         // What isn't pulled stays where it is; the coarse shape lies beside the fine one as before.
-        const placement = there.clone().multiply(matrix(answer.placement)).multiply(motion.clone().invert());
+        const placement = there.clone().multiply(matrixOf(answer.placement)).multiply(motion.clone().invert());
         this.store.set({ code: answer.latent.map((value, k) => (locked[k] ? code[k] : value)), placement });
         this.answer = answer;
       } catch (error) {
@@ -94,9 +95,4 @@ export class Pull {
     this.answer = null;
     if (typeof residual === "number") say(`The shape follows as far as the model can: ${readable(residual)} from where you pulled.`, { key: "pull" });
   }
-}
-
-/** A placement as the server answers it, as a Matrix4. */
-function matrix({ rotation: [a, b, c], translation: [x, y, z], scale }) {
-  return new THREE.Matrix4().set(...a, x, ...b, y, ...c, z, 0, 0, 0, 1).multiply(new THREE.Matrix4().makeScale(scale, scale, scale));
 }
