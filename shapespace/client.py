@@ -292,8 +292,9 @@ class Client:
             version: of the model.
             sigma: standard deviation of the targets that have none.
             fixed: value by coordinate that the code keeps.
-            options: prior, the weight that holds the code back; prior_kind, "groups" or "ridge"; mesh, the one whose
-                vertices are meant; samples, how many codes to draw from the posterior; seed.
+            options: prior, the weight that holds the code back; prior_kind, "groups" or "ridge"; anchored, whether the
+                whole stays in its place; mesh, the one whose vertices are meant; samples, how many codes to draw from
+                the posterior; seed.
 
         Returns:
             ``latent``, ``placement``, ``residual``, ``covariance``, ``samples`` and more.

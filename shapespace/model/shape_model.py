@@ -246,6 +246,7 @@ class ShapeModel(Decoder):
         fixed: Mapping[int, float] | None = None,
         samples: int = 0,
         seed: int = 0,
+        anchored: bool = False,
     ) -> Edited:
         """The code inside the bounds whose shape comes closest to having some vertices at some places.
 
@@ -265,6 +266,8 @@ class ShapeModel(Decoder):
             fixed: value by coordinate that the code keeps, in the bounds or not.
             samples: codes to draw from the posterior.
             seed: of these.
+            anchored: whether the place of the whole is by what is not pulled alone, so that targets out of reach do not
+                carry it along.
 
         Raises:
             LatentError: a code of the wrong length, numbers that are not finite, or no such coordinate.
@@ -285,7 +288,7 @@ class ShapeModel(Decoder):
         ]
         held = self.latents.fixed(fixed)
         return edited(
-            self, start, pulled, prior, MeshChoice(mesh), deadline, PriorKind(prior_kind), held, samples, seed
+            self, start, pulled, prior, MeshChoice(mesh), deadline, PriorKind(prior_kind), held, samples, seed, anchored
         )
 
     def fit(

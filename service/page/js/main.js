@@ -13,6 +13,7 @@ import { report, reporting, say } from "./messages.js";
 import { Modes } from "./modes.js";
 import { Path } from "./path.js";
 import { Pictures } from "./pictures.js";
+import { Pins } from "./pins.js";
 import { Pose } from "./pose.js";
 import { Pull } from "./pull.js";
 import { Ghost } from "./scan/ghost.js";
@@ -33,7 +34,7 @@ const store = new Store({
   code: null, locked: [], placement: null, moving: false, playing: false, shape: null,
   keyframes: [], loop: false, beyond: 0,
   colour: "none", against: -1, highlight: null, regions: null, repaint: null,
-  wireframe: false, normals: false, fine: true, pull: false, scan: null, ghost: true,
+  wireframe: false, normals: false, fine: true, pull: false, pins: [], scan: null, ghost: true,
 });
 
 const viewer = new Viewer(find("#canvas"));
@@ -53,7 +54,7 @@ new Reader(store, {
   box: find("#verdict"), input: find("#mesh-file"), readAs: find("#read-as"), ownScale: find("#own-scale"),
   stage: find(".stage"),
 });
-new Pull(store, viewer);
+new Pins(store, viewer, new Pull(store, viewer), { layer: find("#pins"), clear: find("#clear-pins") });
 new ShapeLoop(store);
 tabs(find("[role=tablist]"));
 
@@ -136,7 +137,7 @@ async function openModel({ model, code, keyframes = [], locked, view, state = {}
   const coarse = await api.reference(model, "coarse");
   if (opening !== model) return;
   picker.value = model.name;
-  store.set({ shape: null, playing: false, placement: null });
+  store.set({ shape: null, playing: false, placement: null, pins: [] });
   viewer.open(coarse);
   pictures.open(coarse);
   turned = Boolean(view);

@@ -44,6 +44,9 @@ export function sphereOf(positions) {
   return new THREE.Sphere(center, Math.sqrt(squared));
 }
 
+/** Of the box around positions (3V numbers). */
+export const diagonalOf = (positions) => new THREE.Box3().setFromArray(positions).getSize(new THREE.Vector3()).length();
+
 /** A geometry for shapes with these faces; positions and colours come later. */
 export function geometryOf(faces, vertexCount) {
   const geometry = new THREE.BufferGeometry();

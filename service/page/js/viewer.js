@@ -162,6 +162,12 @@ export class Viewer {
     return { vertex, position: at(vertex) };
   }
 
+  /** Where a point is in the picture, in pixels from its upper left. */
+  project(position) {
+    const { x, y } = position.clone().project(this.camera);
+    return { x: ((x + 1) / 2) * this.canvas.clientWidth, y: ((1 - y) / 2) * this.canvas.clientHeight };
+  }
+
   /** The point at a place of the window, as far away as `depth` is. */
   unproject({ clientX, clientY }, depth) {
     const box = this.canvas.getBoundingClientRect();

@@ -6,6 +6,7 @@
 import * as api from "../api.js";
 import { find, readable } from "../dom.js";
 import { report, say } from "../messages.js";
+import { diagonalOf } from "../scene.js";
 import { fixedBy, sameCode } from "../space.js";
 import { encodeInWords, fitInWords } from "./words.js";
 import { Verdict } from "./verdict.js";
@@ -56,7 +57,7 @@ export class Reader {
 
   get #about() {
     const { model, references: { fine, coarse } } = this.store;
-    return { model: model.title, diagonal: diagonal((fine ?? coarse).vertices) };
+    return { model: model.title, diagonal: diagonalOf((fine ?? coarse).vertices) };
   }
 
   async #encode(file) {
@@ -167,13 +168,3 @@ export class Reader {
 }
 
 const formatOf = (file) => file.name.split(".").pop().toLowerCase();
-
-/** Of the box around positions (3V numbers). */
-function diagonal(positions) {
-  const [low, high] = [[Infinity, Infinity, Infinity], [-Infinity, -Infinity, -Infinity]];
-  positions.forEach((x, i) => {
-    low[i % 3] = Math.min(low[i % 3], x);
-    high[i % 3] = Math.max(high[i % 3], x);
-  });
-  return Math.hypot(...high.map((top, i) => top - low[i]));
-}
