@@ -11,6 +11,7 @@ import { History } from "./history.js";
 import { always, here } from "./memory.js";
 import { report, reporting, say } from "./messages.js";
 import { Modes } from "./modes.js";
+import { Names, namesOf } from "./names.js";
 import { Path } from "./path.js";
 import { Pictures } from "./pictures.js";
 import { Pins } from "./pins.js";
@@ -30,7 +31,7 @@ import { Viewer } from "./viewer.js";
 const PREFERRED = "figure";
 
 const store = new Store({
-  model: null, space: null, references: {}, hasFine: false,
+  model: null, space: null, names: null, references: {}, hasFine: false,
   code: null, locked: [], placement: null, moving: false, playing: false, shape: null,
   keyframes: [], loop: false, beyond: 0,
   colour: "none", against: -1, highlight: null, regions: null, repaint: null,
@@ -47,6 +48,7 @@ const path = new Path(store, pictures, {
   beyond: find("#beyond"), timeline: find("#timeline"), time: find("#time"), status: find("#path-status"),
 });
 const strip = new Strip(store, pictures, { button: find("#draw-strip"), table: find("#strip") });
+new Names(store, { dialog: find("#names"), button: find("#name") });
 new History(store, { undo: find("#undo"), redo: find("#redo") });
 new Files(store, path, find("#tab-files"));
 new Ghost(store, viewer);
@@ -143,7 +145,7 @@ async function openModel({ model, code, keyframes = [], locked, view, state = {}
   turned = Boolean(view);
   if (view) viewer.view = view;
   store.set({
-    model, space, references: { coarse }, hasFine: false, regions: null, highlight: null,
+    model, space, names: namesOf(model), references: { coarse }, hasFine: false, regions: null, highlight: null,
     code: space.wrapAll(code ?? space.home), locked: locked ?? space.home.map(() => false),
     keyframes, against: -1, ...state,
   });
