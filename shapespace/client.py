@@ -249,7 +249,7 @@ class Client:
             format: of the content; by default the file's suffix.
             version: of the model.
             options: scale ("fixed" or "free"), partial, noise, landmarks, fixed (value by coordinate), distribution
-                ("population" or "box"), samples, points, seed.
+                ("population" or "box"), samples, points, used, seed.
 
         Returns:
             ``latent``, ``covariance``, ``placement``, ``status``, ``reason`` and more.
@@ -292,8 +292,9 @@ class Client:
             version: of the model.
             sigma: standard deviation of the targets that have none.
             fixed: value by coordinate that the code keeps.
-            options: prior, the weight that holds the code back; prior_kind, "groups" or "ridge"; mesh, the one whose
-                vertices are meant; samples, how many codes to draw from the posterior; seed.
+            options: prior, the weight that holds the code back; prior_kind, "groups" or "ridge"; anchored, whether the
+                whole stays in its place; mesh, the one whose vertices are meant; samples, how many codes to draw from
+                the posterior; seed.
 
         Returns:
             ``latent``, ``placement``, ``residual``, ``covariance``, ``samples`` and more.

@@ -149,6 +149,7 @@ async def edit(
     prior_kind: PriorKind,
     mesh: MeshChoice,
     wishes: Wishes,
+    anchored: bool = False,
 ) -> Found:
     """The code inside the bounds whose shape comes closest to having some vertices at some places.
 
@@ -162,6 +163,7 @@ async def edit(
         prior_kind: what of the change costs.
         mesh: that the targets' vertices belong to.
         wishes: of the code and around it.
+        anchored: whether the whole stays where it is.
 
     Raises:
         InvalidTargetError: no such vertex, or too many targets.
@@ -176,7 +178,9 @@ async def edit(
 
     def make(deadline: Deadline) -> Found:
         began = time.perf_counter()
-        found = edited(model, start, targets, prior, mesh, deadline, prior_kind, fixed, wishes.samples, wishes.seed)
+        found = edited(
+            model, start, targets, prior, mesh, deadline, prior_kind, fixed, wishes.samples, wishes.seed, anchored
+        )
         if found.status is Status.DEADLINE:
             raise workers.late()
         seconds = {"search": time.perf_counter() - began}

@@ -66,6 +66,8 @@ async def fit(
             "shapes": {"solved": found.solved, "rough": found.rough},
             "diagnostics": asdict(found.shape.diagnostics),
         }
+        if found.used is not None:
+            content["used"] = {"positions": float32(found.used[:, :3]), "distances": float32(found.used[:, 3])}
         if asked.samples:
             content["samples"] = found.samples
         return Found(dump_json(content), {"read": read - began, "search": time.perf_counter() - read})

@@ -91,22 +91,26 @@ def without_rigid_motion(displacement: FloatArray, vertices: FloatArray) -> Floa
     return (flat - (flat @ motions.T) @ motions).reshape(displacement.shape)
 
 
-def weighted_change(fields: FloatArray, points: FloatArray, weights: FloatArray) -> FloatArray:
+def weighted_change(
+    fields: FloatArray, points: FloatArray, weights: FloatArray, aligned: FloatArray | None = None
+) -> FloatArray:
     """How weighted misfits (n, k, 3) of points (k, 3) change where the points move by fields (n, k, 3).
 
     A misfit is ``√w (x − target)`` after ``Placement.between``, which takes the infinitesimal rigid motion next to each
-    field away, exactly so where there is no misfit.
+    field away, exactly so where there is no misfit. The placement is by the weights ``aligned`` (k,), where these are
+    others.
     """
-    x = points - weights @ points / weights.sum()
+    aligned = weights if aligned is None else aligned
+    x = points - aligned @ points / aligned.sum()
     motions = np.zeros((6, *x.shape))
     for k in range(3):
         motions[k, :, k] = 1
         motions[3 + k] = np.cross(np.eye(3)[k], x)
-    roots = np.sqrt(weights)[:, None]
-    _, size, rows = np.linalg.svd((roots * motions).reshape(6, -1), full_matrices=False)
-    rows = rows[size > RANK * size[0]]  # no rotation about a line of points is seen
-    weighted = (roots * fields).reshape(len(fields), -1)
-    return (weighted - (weighted @ rows.T) @ rows).reshape(fields.shape)
+    roots = np.sqrt(aligned)[:, None]
+    # No rotation about a line of points is seen.
+    inverse = np.linalg.pinv((roots * motions).reshape(6, -1), rcond=RANK)
+    motion = (roots * fields).reshape(len(fields), -1) @ inverse
+    return np.sqrt(weights)[:, None] * (fields - np.tensordot(motion, motions, 1))
 
 
 def aligned_change(vertices: FloatArray, fields: FloatArray, target: FloatArray) -> FloatArray:

@@ -127,6 +127,7 @@ def edited(
     fixed: Fixed | None = None,
     samples: int = 0,
     seed: int = 0,
+    anchored: bool = False,
 ) -> Edited:
     """The code inside the bounds whose shape comes closest to the targets, and what is not asked to move stays.
 
@@ -140,7 +141,8 @@ def edited(
     changes have (groups: the group lasso of Yuan and Lin 2006, squared, so that one factor alone costs what it costs
     with ridge). This P and ρ are replaced by quadratic functions that touch them from above, again and again (Hunter
     and Lange 2004); the best motion of each code is known (Kabsch), so that the search is over codes alone (variable
-    projection: Kaufman 1975).
+    projection: Kaufman 1975). Anchored, the motion is that by which the x_v alone come closest, so that targets out of
+    reach don't carry the whole shape along.
 
     A shape depends on its code by way of the least-squares problem that the reconstruction solves; by the implicit
     function theorem ``dX = (JᵀWJ)⁻¹ JᵀW dz``, where its residual is small.
@@ -156,6 +158,7 @@ def edited(
         fixed: coordinates that keep their value; they count as unchanged.
         samples: codes to draw.
         seed: of these.
+        anchored: whether targets have no say in where the shape lies as a whole.
 
     Raises:
         InvalidTargetError: see ``require_targets``.
@@ -167,7 +170,7 @@ def edited(
     if not (np.abs(positions) < np.finfo(np.float32).max).all():
         raise NotFiniteError("A target lies so far away that the numbers overflow. Send finite positions.")
     sigmas = np.array([SIGMA * size if target.sigma is None else target.sigma / scale for target in targets])
-    wanted = _Wanted(positions, np.maximum(sigmas, LEAST_SIGMA * size) / size, prior, kind)
+    wanted = _Wanted(positions, np.maximum(sigmas, LEAST_SIGMA * size) / size, prior, kind, anchored)
     fixed = model.latents.fixed() if fixed is None else fixed
     begin = fixed.into(start.astype(np.float64))
     # Before a solver is lent: this shape needs one too.
@@ -209,12 +212,13 @@ def edited(
 
 @dataclass(frozen=True, eq=False)
 class _Wanted:
-    """What is asked of the shape: positions (k, 3), normalised, sigmas (k,) in diagonals; and of the code."""
+    """What is asked of the shape: positions (k, 3), normalised, sigmas (k,) in diagonals; of its code and its place."""
 
     positions: FloatArray
     sigmas: FloatArray
     prior: float
     kind: PriorKind
+    anchored: bool
 
 
 @dataclass(frozen=True, eq=False)
@@ -312,7 +316,13 @@ class _Problem:
 
     def placement(self, points: FloatArray, weights: _Weights) -> Placement:
         """Of points (k + V, 3) of a shape where they are wanted."""
-        return Placement.between(points, self._goals, weights.points)
+        return Placement.between(points, self._goals, self._aligned(weights))
+
+    def _aligned(self, weights: _Weights) -> FloatArray:
+        """Weights (k + V,) by which a shape is placed."""
+        if not self._wanted.anchored:
+            return weights.points
+        return np.concatenate([np.zeros(self._count), weights.points[self._count :]])
 
     def search(self, start: FloatArray) -> _Candidate:
         """Fit rough shapes by the factors' derivatives, both cheap; tries other starts where the misfit stays large."""
@@ -373,7 +383,8 @@ class _Problem:
         def jacobian(x: FloatArray, _: FloatArray) -> FloatArray:
             placement, _away = self._misfits(pulled.positions(x), pulled, weights)
             moves = pulled.derivatives(x) @ placement.rotation.T
-            changes = weighted_change(moves, placement(pulled.positions(x)), weights.points)
+            placed = placement(pulled.positions(x))
+            changes = weighted_change(moves, placed, weights.points, self._aligned(weights))
             found = np.concatenate([changes.reshape(len(changes), -1).T, np.diag(held)])
             found[:, self._fixed.mask] = 0
             return found
@@ -421,7 +432,7 @@ class _Problem:
         goals = self._rough_goals if pulled is self.rough else self._goals
         if not np.isfinite(points).all():
             return Placement(np.eye(3), np.zeros(3)), np.full_like(points, np.nan)
-        placement = Placement.between(points, goals, weights.points)
+        placement = Placement.between(points, goals, self._aligned(weights))
         return placement, placement(points) - goals
 
     def another_start(self, near: _Candidate, pulled: _PulledVertices) -> FloatArray:

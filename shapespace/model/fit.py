@@ -106,6 +106,7 @@ class FitOptions:
         prior: what codes are like.
         samples: codes to draw from the posterior.
         points: whether the distance of each point and of each vertex is wanted.
+        used: whether the points that stood for the scan are wanted, to be shown beside the shape.
         seed: of all random numbers.
     """
 
@@ -117,6 +118,7 @@ class FitOptions:
     prior: Prior = Prior.POPULATION
     samples: int = 0
     points: bool = False
+    used: bool = False
     seed: int = 0
 
 
@@ -160,6 +162,8 @@ class Fitted:
         reason: the same in words.
         samples: (n, m) codes drawn from the posterior.
         sampled: whether the scan was brought to fewer points, or points were spread over its faces.
+        used: (n, 4) the points that stood for the scan, in its units, and their distances from the shape, where they
+            were asked for.
         solved, rough: shapes that were solved, and roughly computed ones, of which three cost as much as one.
     """
 
@@ -177,6 +181,7 @@ class Fitted:
     reason: str
     samples: Codes
     sampled: bool
+    used: FloatArray | None
     solved: int
     rough: int
 
@@ -453,6 +458,7 @@ class _Fit:
             reason=reason,
             samples=posterior.sample(model.latents, code, asked.samples, asked.seed),
             sampled=self.scan.sampled,
+            used=np.column_stack([self.unit * self.scan.points, to_model]) if asked.used else None,
             solved=search.count + 1,
             rough=rough,
         )

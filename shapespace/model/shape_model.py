@@ -246,6 +246,7 @@ class ShapeModel(Decoder):
         fixed: Mapping[int, float] | None = None,
         samples: int = 0,
         seed: int = 0,
+        anchored: bool = False,
     ) -> Edited:
         """The code inside the bounds whose shape comes closest to having some vertices at some places.
 
@@ -265,6 +266,8 @@ class ShapeModel(Decoder):
             fixed: value by coordinate that the code keeps, in the bounds or not.
             samples: codes to draw from the posterior.
             seed: of these.
+            anchored: whether the place of the whole is by what is not pulled alone, so that targets out of reach do not
+                carry it along.
 
         Raises:
             LatentError: a code of the wrong length, numbers that are not finite, or no such coordinate.
@@ -285,7 +288,7 @@ class ShapeModel(Decoder):
         ]
         held = self.latents.fixed(fixed)
         return edited(
-            self, start, pulled, prior, MeshChoice(mesh), deadline, PriorKind(prior_kind), held, samples, seed
+            self, start, pulled, prior, MeshChoice(mesh), deadline, PriorKind(prior_kind), held, samples, seed, anchored
         )
 
     def fit(
@@ -300,6 +303,7 @@ class ShapeModel(Decoder):
         distribution: ExpectedName = "population",
         samples: int = 0,
         points: bool = False,
+        used: bool = False,
         seed: int = 0,
         deadline: Deadline | None = None,
     ) -> Fitted:
@@ -317,6 +321,7 @@ class ShapeModel(Decoder):
                 any inside the bounds.
             samples: codes to draw from the posterior.
             points: whether the distance of each point and of each vertex is wanted.
+            used: whether the points that stood for the scan are wanted.
             seed: of all random numbers; one seed gives the same answer.
             deadline: after which the status is "deadline".
 
@@ -349,6 +354,7 @@ class ShapeModel(Decoder):
             prior=Prior(distribution),
             samples=samples,
             points=points,
+            used=used,
             seed=seed,
         )
         return self.fitter(*_points_and_faces(scan), options, deadline)

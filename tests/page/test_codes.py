@@ -21,8 +21,12 @@ def test_a_file_is_encoded(studio: Studio, expected: np.ndarray, server: Server,
     studio.tab("Files")
     studio["#mesh-file"].set_input_files(path)
     studio.until_code(CODE, 0.02)
-    studio.eventually(lambda: "the code of pose.obj" in studio.messages)
-    assert "fit to" in studio.messages
+    words = studio.eventually(lambda: t if "the code of pose.obj" in (t := studio["#verdict"].inner_text()) else None)
+    assert "vertices are off by" in words
+    studio.page.get_by_role("button", name="Back to my shape").click()
+    studio.until_code([0, 0, 0])
+    studio.page.get_by_role("button", name="Show what was found").click()
+    studio.until_code(CODE, 0.02)
 
     # The same by dropping it, after the shape has moved on.
     studio.tab("Shape")

@@ -120,13 +120,17 @@ def test_every_kind_of_file_that_is_offered_is_read(studio: Studio, server: Serv
     call = f"{server.url}/v1/models/with-fine"
     for name in offered:
         path = "mesh?latent=0.1,0,0.5&mesh=coarse"
-        if name == "off":
+        if name in {"off", "xyz"}:
             vertices, faces = read_arrays(httpx.get(f"{call}/{path}&format=npz", timeout=60).content, "npz")
+        if name == "xyz":
+            content = "\n".join(" ".join(map(str, x)) for x in vertices.tolist()).encode()
+        elif name == "off":
             lines = [f"OFF\n{len(vertices)} {len(faces)} 0", *(" ".join(map(str, x)) for x in vertices.tolist())]
             content = "\n".join([*lines, *(f"3 {a} {b} {c}" for a, b, c in faces.tolist()), ""]).encode()
         else:
             content = httpx.get(f"{call}/{path}&format={name}", timeout=60).content
-        found = httpx.post(f"{call}/encode?format={name}", content=content, timeout=60)
+        call_of = "fit" if name == "xyz" else "encode"
+        found = httpx.post(f"{call}/{call_of}?format={name}", content=content, timeout=60)
         assert found.status_code == 200, (name, found.text)
 
 

@@ -276,7 +276,7 @@ def test_the_fine_shape_lies_where_the_coarse_one_does(window: Open) -> None:
     assert (fine & coarse).sum() > 0.96 * (fine | coarse).sum()
 
 
-def test_pointing_at_a_factor_colours_what_it_moves(window: Open) -> None:
+def test_pointing_at_a_factor_colours_where_it_changes_lengths_and_angles(window: Open) -> None:
     studio = window().open("#model=figure")
     every = studio[".pictures canvas"].count()
     studio.eventually(lambda: studio[".pictures canvas.drawn"].count() == every)
@@ -294,6 +294,12 @@ def test_pointing_at_a_factor_colours_what_it_moves(window: Open) -> None:
     assert less < 0.05 * more
     studio["#canvas"].hover()
     studio.eventually(lambda: not orange(studio.picture()).any())
+    # A hip: alignment moves head, hands and feet with it, but there nothing is longer or bent.
+    studio[".factor h2"].first.hover()
+    coloured = orange(studio.eventually(lambda: p if orange(p := studio.picture()).any() else None))
+    height = len(coloured)
+    assert not coloured[: int(0.4 * height)].any()
+    assert not coloured[int(0.75 * height) :].any()
 
 
 def test_pictures_of_each_coordinate(studio: Studio) -> None:

@@ -28,6 +28,7 @@ from shapespace.model.latent_space import NotFiniteError
 from shapespace.model.shape_model import load
 from shapespace.shell.energy import Material
 from shapespace.training.learning.layers import narrowest
+from shapespace.training.learning.naming import NamingError, called
 from shapespace.training.learning.networks import Composite, StartNetwork, predict
 from shapespace.training.runs.config import Config
 from shapespace.training.runs.sampling import Collection
@@ -151,14 +152,18 @@ def export(
             raise ExportError(f"start.onnx and PyTorch differ by {distance:.1e}, over {settings.tolerance:.0e}")
 
     coordinates, material = collection.coordinates, config.material
+    try:
+        factors, names = called(collection.factors, collection.latent_names, settings)
+    except NamingError as error:
+        raise ExportError(str(error)) from None
     facts = Facts(
         name=settings.name,
         version=str(settings.version),
         licence=settings.licence,
         title=settings.title,
         description=settings.description,
-        latent_names=collection.latent_names,
-        factors=collection.factors,
+        latent_names=names,
+        factors=factors,
         lower=coordinates.lower,
         upper=coordinates.upper,
         period=coordinates.period,

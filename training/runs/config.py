@@ -385,6 +385,10 @@ class EvaluationSettings(_Section):
     """Test shapes whose vertices are reconstructed."""
 
 
+#: An axis of the collection's coordinates, with its direction.
+Axis = Literal["+x", "-x", "+y", "-y", "+z", "-z"]
+
+
 class ExportSettings(_Section):
     """What the bundle says of itself."""
 
@@ -402,6 +406,22 @@ class ExportSettings(_Section):
     """Weight η of angles against lengths when vertices are found from them (Gauss–Newton)."""
     tolerance: float = Field(1e-4, gt=0)
     """Largest relative difference of ONNX and PyTorch, in the weighted norm."""
+    faces: Axis | None = None
+    """The axis along which the body looks. Left and right in names are the body's own then; by default they are those
+    of a viewer who has x to the right, y up and z towards the eye."""
+    up: Axis = "+y"
+    """The axis that points to the body's head, where ``faces`` is given."""
+    names: dict[str, str] = {}
+    """What factors and coordinates are called, by the name that the run gives them in its report:
+    ``{"upper right" = "left arm"}``. Coordinates follow their factor unless they are named themselves."""
+
+    @model_validator(mode="after")
+    def _upright(self) -> ExportSettings:
+        if self.faces is not None and self.faces[1] == self.up[1]:
+            raise ValueError(f"a body that looks along {self.faces} cannot have its head along {self.up}")
+        if blank := [old for old, new in self.names.items() if not new.strip()]:
+            raise ValueError(f"names has nothing for {blank[0]!r}")
+        return self
 
 
 class Config(_Section):

@@ -47,6 +47,7 @@ class FitRequest(Body):
     landmarks: _Landmarks = Field(default_factory=list)
     samples: Whole = Field(0, ge=0, le=MOST_SAMPLES)
     points: bool = False
+    used: bool = False
 
     def options(self) -> FitOptions:
         """As a fit takes them."""
@@ -59,6 +60,7 @@ class FitRequest(Body):
             prior=self.distribution,
             samples=self.samples,
             points=self.points,
+            used=self.used,
             seed=self.seed,
         )
 
@@ -98,6 +100,9 @@ async def fit_options(
     ] = None,
     samples: Annotated[int, Query(ge=0, le=MOST_SAMPLES, description="Codes to draw from the posterior.")] = 0,
     points: Annotated[bool, Query(description="Also answer the distance of each point and each vertex.")] = False,
+    used: Annotated[
+        bool, Query(description="Also answer the points that stood for the scan, to be shown beside the shape.")
+    ] = False,
 ) -> Callable[[str], FitOptions]:
     """The options, once a form's field ``options`` is known: what it says wins over the query."""
     given: dict[str, Any] = {
@@ -108,6 +113,7 @@ async def fit_options(
         "seed": seed,
         "samples": samples,
         "points": points,
+        "used": used,
     }
     if fixed is not None:
         given["fixed"] = read_query(fixed, "fixed", _FIXED)
@@ -129,6 +135,13 @@ class DistancesAnswer(BaseModel):
     p95: float
     max: float
     points: list[float] | None = Field(None, description="With `points`: each of them.")
+
+
+class UsedAnswer(BaseModel):
+    """Points that stood for the scan, at most a few thousand."""
+
+    positions: list[list[float]] = Field(description="In the scan's units and frame.")
+    distances: list[float] = Field(description="Of each from the model's surface, in the scan's units.")
 
 
 class BothDistances(BaseModel):
@@ -167,3 +180,4 @@ class FitAnswer(BaseModel):
     shapes: ShapesAnswer
     diagnostics: DiagnosticsAnswer = Field(description="Of the code's shape.")
     samples: list[list[float]] | None = Field(None, description="With `samples`: codes drawn from the posterior.")
+    used: UsedAnswer | None = Field(None, description="With `used`: the points that stood for the scan.")

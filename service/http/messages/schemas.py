@@ -112,6 +112,11 @@ class EditRequest(Body):
         description="What of the change costs: `groups` the square of the sum of the factors' norms, so that few "
         "factors change; `ridge` the sum of their squares.",
     )
+    anchored: bool = Field(
+        False,
+        description="Whether the place of the whole is by what is not pulled alone, so that targets out of reach do "
+        "not carry it along.",
+    )
     fixed: NumbersByIndex = Field({}, description=FIXED, examples=[{"0": 0.5}])
     samples: Whole = Field(0, ge=0, description=SAMPLES)
     seed: Whole = Field(0, ge=0, lt=2**63, description=SEED)

@@ -94,7 +94,16 @@ async def edit(
     targets = [Target(target.vertex, target.position, target.sigma) for target in body.targets]
     wishes = codes.Wishes(body.fixed, body.samples, body.seed, service.settings.max_codes)
     found = await codes.edit(
-        service.workers, caller, model, body.latent, targets, body.prior, body.prior_kind, mesh or body.mesh, wishes
+        service.workers,
+        caller,
+        model,
+        body.latent,
+        targets,
+        body.prior,
+        body.prior_kind,
+        mesh or body.mesh,
+        wishes,
+        body.anchored,
     )
     return found_response(service, found)
 

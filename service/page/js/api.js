@@ -98,9 +98,15 @@ export async function sample(model, seed) {
 export const edit = (model, body, signal) => json(post(`${model.links.self}/edit`, body, signal));
 
 /** The code of a mesh file, with values by coordinate that it keeps. */
-export const encode = (model, file, format, fixed) => {
+export const encode = (model, file, format, fixed, signal) => {
   const query = new URLSearchParams({ format, fixed: JSON.stringify(fixed) });
-  return json(call(`${model.links.self}/encode?${query}`, { method: "POST", body: file }));
+  return json(call(`${model.links.self}/encode?${query}`, { method: "POST", body: file, signal }));
+};
+
+/** The code, the place and the size that explain a scan. */
+export const fit = (model, file, format, options, signal) => {
+  const query = new URLSearchParams({ format, ...options });
+  return json(call(`${model.links.self}/fit?${query}`, { method: "POST", body: file, signal }));
 };
 
 /** A file to keep, as a blob. */

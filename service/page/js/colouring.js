@@ -2,7 +2,7 @@
 
 import * as api from "./api.js";
 import { diverging, gradient, tint } from "./colours.js";
-import { element, find, readable } from "./dom.js";
+import { element, find, percentile, readable } from "./dom.js";
 import { report } from "./messages.js";
 import { nearest } from "./modes.js";
 import { Surface } from "./surface.js";
@@ -115,10 +115,6 @@ export class Colouring {
     if (against >= keyframes.length) this.store.set({ against: -1 });
     this.against.value = this.store.against;
   }
-}
-
-function percentile(values, share) {
-  return values.sort()[Math.floor(share * (values.length - 1))];
 }
 
 /** The next of 1, 2, 5, 10, … times a power of ten. */

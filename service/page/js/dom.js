@@ -11,6 +11,9 @@ export const element = (name, properties = {}, ...children) => {
 /** A number for people: as many digits as say something. */
 export const readable = (value, digits = 3) => Number(value.toPrecision(digits)).toString();
 
+/** The value (of an array of numbers) below which a share of them lies. */
+export const percentile = (values, share) => values.toSorted()[Math.floor(share * (values.length - 1))];
+
 /** A button that is on or off, tied to a value of the store. */
 export function toggle(button, store, key) {
   const show = () => button.setAttribute("aria-pressed", String(store[key]));

@@ -1,9 +1,8 @@
-/** Files in and out: meshes to keep, calls to copy, meshes to encode. */
+/** Files to keep, and calls to copy. */
 
 import * as api from "./api.js";
-import { element, find, readable } from "./dom.js";
-import { report, reporting, say } from "./messages.js";
-import { fixedBy } from "./space.js";
+import { element, find } from "./dom.js";
+import { reporting, say } from "./messages.js";
 
 /** What the server offers for one shape. */
 export const SHAPE_FORMATS = ["glb", "gltf", "obj", "ply", "stl", "npz", "zip", "json"];
@@ -29,7 +28,7 @@ function keep(blob, name) {
 }
 
 export class Files {
-  constructor(store, path, root, stage) {
+  constructor(store, path, root) {
     Object.assign(this, { store, path });
     this.format = find("#format", root);
     this.format.append(...SHAPE_FORMATS.map((name) => element("option", { textContent: name })));
@@ -41,20 +40,6 @@ export class Files {
     find("#download-animation").addEventListener("click", reporting(() => this.#animation()));
     store.on(["keyframes"], reporting(() => this.#animationFormats()));
     find("#copy-curl", root).addEventListener("click", () => copy(this.curl.textContent, "the call"));
-
-    const input = find("#mesh-file", root);
-    input.addEventListener("change", () => { if (input.files[0]) this.encode(input.files[0]); input.value = ""; });
-    addEventListener("dragover", (event) => {
-      if (!event.dataTransfer.types.includes("Files")) return;
-      event.preventDefault();
-      stage.classList.add("dropping");
-    });
-    addEventListener("dragleave", (event) => { if (!event.relatedTarget) stage.classList.remove("dropping"); });
-    addEventListener("drop", (event) => {
-      event.preventDefault();
-      stage.classList.remove("dropping");
-      if (event.dataTransfer.files[0]) this.encode(event.dataTransfer.files[0]);
-    });
   }
 
   /** Path and body of the call that answers the shape as a file. */
@@ -103,28 +88,6 @@ export class Files {
       say("The animation is saved.", { key: "animation" });
     } catch (error) {
       say(error.message, { kind: "error", key: "animation" });
-    }
-  }
-
-  /** Find the code of a mesh file and show it. */
-  async encode(file) {
-    const { model, locked, code } = this.store;
-    if (!model) {
-      say("No model is there yet. Drop the file again when its shape is shown.", { kind: "error", key: "encode" });
-      return;
-    }
-    const format = file.name.split(".").pop().toLowerCase();
-    say(`Looking for the code of ${file.name} …`, { key: "encode" });
-    try {
-      const answer = await api.encode(model, file, format, fixedBy(locked, code));
-      if (this.store.model !== model) return;
-      this.store.set({ code: answer.latent });
-      const error = typeof answer.vertex_error === "number" ? answer.vertex_error : answer.vertex_error?.mean;
-      say(`This is the code of ${file.name}: lengths and angles fit to ${readable(100 * answer.residual, 2)} %`
-        + (error === undefined ? "." : `, its vertices lie ${readable(error)} away on average.`), { key: "encode" });
-    } catch (error) {
-      if (error.offline) report(error);
-      else say(`${file.name}: ${error.message}`, { kind: "error", key: "encode" });
     }
   }
 }

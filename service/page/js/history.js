@@ -1,4 +1,4 @@
-/** Undo and redo of codes, and of where pulls have left their shapes: each rest of the hand is a step. */
+/** Undo and redo of codes, of where pulls have left their shapes, and of their pins: each rest of the hand is a step. */
 
 import { sameCode } from "./space.js";
 
@@ -11,7 +11,7 @@ export class History {
   constructor(store, { undo, redo }) {
     Object.assign(this, { store, undo, redo });
     store.on(["space"], () => { this.#steps = []; this.#at = -1; });
-    store.on(["space", "code", "moving", "playing"], () => this.#record());
+    store.on(["space", "code", "moving", "playing", "pins"], () => this.#record());
     undo.addEventListener("click", () => this.#go(-1));
     redo.addEventListener("click", () => this.#go(1));
     addEventListener("keydown", (event) => {
@@ -24,12 +24,12 @@ export class History {
   }
 
   #record() {
-    const { code, placement, moving, playing } = this.store;
+    const { code, placement, pins, moving, playing } = this.store;
     if (!code || moving || playing) return;
     if (this.#at < 0 || !sameCode(code, this.#steps[this.#at].code)) {
-      this.#steps = [...this.#steps.slice(0, this.#at + 1), { code, placement }].slice(-LONGEST);
+      this.#steps = [...this.#steps.slice(0, this.#at + 1), { code, placement, pins }].slice(-LONGEST);
       this.#at = this.#steps.length - 1;
-    }
+    } else this.#steps[this.#at].pins = pins; // which came or went without a change of shape
     this.#show();
   }
 

@@ -11,10 +11,14 @@ import { History } from "./history.js";
 import { always, here } from "./memory.js";
 import { report, reporting, say } from "./messages.js";
 import { Modes } from "./modes.js";
+import { Names, namesOf } from "./names.js";
 import { Path } from "./path.js";
 import { Pictures } from "./pictures.js";
+import { Pins } from "./pins.js";
 import { Pose } from "./pose.js";
 import { Pull } from "./pull.js";
+import { Ghost } from "./scan/ghost.js";
+import { Reader } from "./scan/reader.js";
 import { ShapeLoop } from "./shape-loop.js";
 import { Skin } from "./skin.js";
 import { Sliders } from "./sliders.js";
@@ -27,11 +31,11 @@ import { Viewer } from "./viewer.js";
 const PREFERRED = "figure";
 
 const store = new Store({
-  model: null, space: null, references: {}, hasFine: false,
+  model: null, space: null, names: null, references: {}, hasFine: false,
   code: null, locked: [], placement: null, moving: false, playing: false, shape: null,
   keyframes: [], loop: false, beyond: 0,
   colour: "none", against: -1, highlight: null, regions: null, repaint: null,
-  wireframe: false, normals: false, fine: true, pull: false,
+  wireframe: false, normals: false, fine: true, pull: false, pins: [], scan: null, ghost: true,
 });
 
 const viewer = new Viewer(find("#canvas"));
@@ -44,9 +48,15 @@ const path = new Path(store, pictures, {
   beyond: find("#beyond"), timeline: find("#timeline"), time: find("#time"), status: find("#path-status"),
 });
 const strip = new Strip(store, pictures, { button: find("#draw-strip"), table: find("#strip") });
+new Names(store, { dialog: find("#names"), button: find("#name") });
 new History(store, { undo: find("#undo"), redo: find("#redo") });
-new Files(store, path, find("#tab-files"), find(".stage"));
-new Pull(store, viewer);
+new Files(store, path, find("#tab-files"));
+new Ghost(store, viewer);
+new Reader(store, {
+  box: find("#verdict"), input: find("#mesh-file"), readAs: find("#read-as"), ownScale: find("#own-scale"),
+  stage: find(".stage"),
+});
+new Pins(store, viewer, new Pull(store, viewer), { layer: find("#pins"), clear: find("#clear-pins") });
 new ShapeLoop(store);
 tabs(find("[role=tablist]"));
 
@@ -129,13 +139,13 @@ async function openModel({ model, code, keyframes = [], locked, view, state = {}
   const coarse = await api.reference(model, "coarse");
   if (opening !== model) return;
   picker.value = model.name;
-  store.set({ shape: null, playing: false, placement: null });
+  store.set({ shape: null, playing: false, placement: null, pins: [] });
   viewer.open(coarse);
   pictures.open(coarse);
   turned = Boolean(view);
   if (view) viewer.view = view;
   store.set({
-    model, space, references: { coarse }, hasFine: false, regions: null, highlight: null,
+    model, space, names: namesOf(model), references: { coarse }, hasFine: false, regions: null, highlight: null,
     code: space.wrapAll(code ?? space.home), locked: locked ?? space.home.map(() => false),
     keyframes, against: -1, ...state,
   });

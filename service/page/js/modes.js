@@ -1,7 +1,9 @@
-/** Pictures of each coordinate, and the region that each factor moves: both from the same few shapes. */
+/** Pictures of each coordinate, and the region where each factor changes lengths and angles: from the same few shapes. */
 
 import * as api from "./api.js";
+import { percentile } from "./dom.js";
 import { report } from "./messages.js";
+import { Surface } from "./surface.js";
 
 /** Fetches the shapes of a model factor by factor, while nothing else is wanted of the server. */
 export class Modes {
@@ -15,11 +17,13 @@ export class Modes {
 
   /** Draw every coordinate's pictures; the home shape is in all of them. */
   async draw() {
-    const { model, space } = this.store;
+    const { model, space, references: { coarse } } = this.store;
+    const surface = new Surface(coarse.faces, coarse.vertices.length / 3);
     this.#abort = new AbortController();
     const { signal } = this.#abort;
     try {
       const { shapes: [home] } = await api.shapes(model, [space.home], "coarse", { signal });
+      const rest = surface.measure(home);
       for (const [j, factor] of model.factors.entries()) {
         const changes = [];
         for (let k = factor.start; k < factor.stop; k += 1) {
@@ -30,7 +34,7 @@ export class Modes {
         for (let k = factor.start; k < factor.stop; k += 1) {
           const [down, up] = shapes.splice(0, 2);
           this.#draw(k, [down, home, up]);
-          this.#grow(j, home, [down, up]);
+          this.#grow(j, surface, rest, [down, up]);
         }
       }
       this.store.set({ regions: this.#regions.map(smooth) });
@@ -43,24 +47,23 @@ export class Modes {
     this.sliders.pictures(k).forEach((canvas, i) => this.pictures.draw(canvas, shapes[i]));
   }
 
-  /** Take how far each vertex moves into a factor's region. */
-  #grow(j, home, shapes) {
-    const region = (this.#regions[j] ??= new Float32Array(home.length / 3));
+  /** Take how much lengths and angles change at each vertex into a factor's region. */
+  #grow(j, surface, rest, shapes) {
+    const region = (this.#regions[j] ??= new Float32Array(surface.vertexCount));
     for (const shape of shapes) {
-      for (let v = 0; v < region.length; v += 1) {
-        const i = 3 * v;
-        const moved = Math.hypot(shape[i] - home[i], shape[i + 1] - home[i + 1], shape[i + 2] - home[i + 2]);
-        region[v] = Math.max(region[v], moved);
-      }
+      const now = surface.measure(shape);
+      const [stretch, bending] = [surface.stretch(rest, now), surface.bending(rest, now)];
+      const change = stretch.map((value, edge) => Math.hypot(value, bending[edge]));
+      surface.atVertices(change, rest, false).forEach((value, v) => { region[v] = Math.max(region[v], value); });
     }
   }
 }
 
-/** Movement to weights between 0 and 1. Alignment moves everything a little: that doesn't count. */
+/** Changes to weights between 0 and 1. Everything changes a little: that doesn't count. */
 function smooth(region) {
-  const most = region.reduce((a, b) => Math.max(a, b), 1e-9);
-  return region.map((moved) => {
-    const share = Math.min(Math.max((moved / most - 0.12) / 0.38, 0), 1);
+  const most = Math.max(percentile(region, 0.99), 1e-9); // an edge that all but vanishes would dim all others
+  return region.map((change) => {
+    const share = Math.min(Math.max((change / most - 0.15) / 0.35, 0), 1);
     return share * share * (3 - 2 * share);
   });
 }

@@ -41,3 +41,9 @@ function frame(positions, corners) {
   const z = x.clone().cross(c.sub(a)).normalize();
   return new Matrix4().makeBasis(x, z.clone().cross(x), z).setPosition(a);
 }
+
+/** A placement as the server answers it, as a Matrix4. */
+export function matrixOf({ rotation: [a, b, c], translation: [x, y, z], scale }) {
+  const motion = new Matrix4().set(...a, x, ...b, y, ...c, z, 0, 0, 0, 1);
+  return motion.multiply(new Matrix4().makeScale(scale, scale, scale));
+}

@@ -1,75 +1,95 @@
-/** Edits the shape by pulling at a vertex: the server finds the code that follows best. */
+/** Edits the shape by pulling at vertices: each stays pinned, and the server finds the code that follows best. */
 
-import * as THREE from "three";
+import { Matrix4, Vector3 } from "three";
 import * as api from "./api.js";
 import { readable } from "./dom.js";
-import { report, say } from "./messages.js";
+import { report, say, takeBack } from "./messages.js";
+import { nearest } from "./modes.js";
+import { matrixOf } from "./pose.js";
+import { diagonalOf } from "./scene.js";
 import { fixedBy } from "./space.js";
 
+const MET = 0.01; // distance from a pin, as a share of the diagonal, at which it is met
+const NEARER = 0.9; // a code that leaves more of the distance than this isn't worth a change of shape
+
+/**
+ * @typedef {object} Pin
+ * @property {string} mesh whose vertex it holds
+ * @property {number} vertex
+ * @property {Vector3} position where that should be, in the scene
+ */
+
 export class Pull {
-  #held = null; // what is pulled, from where, since when
-  #wanted = null;
+  #held = null; // the pull under way: its pin, and the shape where it began
+  #last = null; // the same, also once it is over
+  #wanted = false;
   #busy = false;
+  #answer = null;
 
   constructor(store, viewer) {
     Object.assign(this, { store, viewer });
-    const dot = new THREE.MeshBasicMaterial({ color: 0xe08a2c, depthTest: false });
-    this.dot = new THREE.Mesh(new THREE.SphereGeometry(1, 16, 12), dot);
-    this.dot.renderOrder = 1;
-    this.dot.visible = false;
-    viewer.scene.add(this.dot);
     const { canvas } = viewer;
     store.on(["pull"], () => canvas.classList.toggle("pulling", store.pull));
     // Before the controls see it, which would turn the view.
-    canvas.addEventListener("pointerdown", (event) => this.#take(event), { capture: true });
-    canvas.addEventListener("pointermove", (event) => this.#drag(event));
-    for (const end of ["pointerup", "pointercancel"]) canvas.addEventListener(end, () => this.#let());
+    canvas.addEventListener("pointerdown", (event) => this.#pick(event), { capture: true });
+    addEventListener("pointermove", (event) => this.#drag(event));
+    for (const end of ["pointerup", "pointercancel"]) addEventListener(end, (event) => this.#let(event));
   }
 
-  #take(event) {
+  #pick(event) {
     if (!this.store.pull || event.button !== 0 || this.store.playing || !this.store.shape) return;
     const hit = this.viewer.pick(event);
     if (!hit) return;
     event.stopImmediatePropagation();
     this.viewer.canvas.setPointerCapture(event.pointerId);
-    const { mesh, motion, placement } = this.store.shape;
-    const there = (placement ?? new THREE.Matrix4()).clone().multiply(motion); // from where the server has the shape
-    this.#held = { ...hit, mesh, motion, there, pointer: event.pointerId, code: this.store.code };
-    this.store.set({ moving: true });
-    this.dot.scale.setScalar(0.018 * this.viewer.sphere.radius);
-    this.#mark(hit.position);
+    const pin = { mesh: this.store.shape.mesh, ...hit };
+    this.take(pin, event); // first, as what comes while something moves is part of its step in the history
+    this.store.set({ pins: [...this.store.pins, pin] });
   }
 
-  #mark(position) {
-    this.dot.visible = Boolean(position);
-    if (position) this.dot.position.copy(position);
-    this.viewer.draw();
+  /** Take a pin into the hand that this event is of. */
+  take(pin, event) {
+    const { shape, code, playing } = this.store;
+    if (playing || !shape) return;
+    const { mesh, motion, placement, positions } = shape;
+    const there = (placement ?? new Matrix4()).clone().multiply(motion); // from where the server has the shape
+    const before = { code, placement: this.store.placement };
+    this.#held = { pin, mesh, motion, there, positions, pointer: event.pointerId, before };
+    this.#last = this.#held;
+    this.store.set({ moving: true });
   }
 
   #drag(event) {
     if (!this.#held || event.pointerId !== this.#held.pointer) return;
-    const target = this.viewer.unproject(event, this.#held.position);
-    this.#mark(target);
-    this.#wanted = target;
+    const { pin } = this.#held;
+    const moved = { ...pin, position: this.viewer.unproject(event, pin.position) };
+    this.#held.pin = moved;
+    this.store.set({ pins: this.store.pins.map((each) => (each === pin ? moved : each)) });
+    this.#wanted = true;
     if (!this.#busy) this.#solve();
   }
 
-  /** Only the newest target counts; it waits until the one before is answered. */
+  /** Only the newest targets count; they wait until those before are answered. */
   async #solve() {
     this.#busy = true;
     while (this.#wanted) {
-      const { code, vertex, mesh, motion, there } = this.#held ?? this.last;
-      const position = this.#wanted.clone().applyMatrix4(there.clone().invert()).toArray();
-      this.#wanted = null;
-      const { model, locked } = this.store;
+      this.#wanted = false;
+      const { before, mesh, motion, there, positions } = this.#last;
+      const { code } = before;
+      const { model, locked, pins } = this.store;
+      const targets = this.#targets(pins, mesh, there);
+      const began = awayFrom(targets, positions);
       try {
-        const targets = [{ vertex, position }];
-        const answer = await api.edit(model, { latent: code, mesh, targets, fixed: fixedBy(locked, code) });
+        const body = { latent: code, mesh, targets, anchored: true, fixed: fixedBy(locked, code) };
+        const { latent, placement: place, residual, distances } = await api.edit(model, body);
         if (this.store.model !== model) break;
+        const follows = residual < NEARER * rootMeanSquare(began);
         // What isn't pulled stays where it is; the coarse shape lies beside the fine one as before.
-        const placement = there.clone().multiply(matrix(answer.placement)).multiply(motion.clone().invert());
-        this.store.set({ code: answer.latent.map((value, k) => (locked[k] ? code[k] : value)), placement });
-        this.answer = answer;
+        const placement = there.clone().multiply(matrixOf(place)).multiply(motion.clone().invert());
+        const kept = latent.map((value, k) => (locked[k] ? code[k] : value));
+        if (follows) this.store.set({ code: kept, placement });
+        else this.store.set(before);
+        this.#answer = { distances: follows ? distances : began, follows };
       } catch (error) {
         report(error);
         break;
@@ -79,24 +99,48 @@ export class Pull {
     if (!this.#held) this.#done();
   }
 
-  #let() {
-    if (!this.#held) return;
-    this.last = this.#held;
+  /** The pins as the server takes them, in the frame of the shape where the pull began. */
+  #targets(pins, mesh, there) {
+    const back = there.clone().invert();
+    const { references } = this.store;
+    const found = new Map(pins.map((pin) => {
+      const on = (name) => references[name].vertices;
+      const vertex = pin.mesh === mesh || !references.fine
+        ? pin.vertex
+        : nearest(on(pin.mesh).subarray(3 * pin.vertex, 3 * pin.vertex + 3), on(mesh))[0];
+      return [vertex, pin.position.clone().applyMatrix4(back).toArray()];
+    }));
+    return [...found].map(([vertex, position]) => ({ vertex, position }));
+  }
+
+  #let(event) {
+    if (event.pointerId !== this.#held?.pointer) return;
     this.#held = null;
-    this.#mark(null);
     if (!this.#busy) this.#done();
   }
 
   #done() {
     this.store.set({ moving: false });
-    if (!this.answer) return;
-    const { residual } = this.answer;
-    this.answer = null;
-    if (typeof residual === "number") say(`The shape follows as far as the model can: ${readable(residual)} from where you pulled.`, { key: "pull" });
+    if (!this.#answer) return;
+    const { distances, follows } = this.#answer;
+    const { references: { coarse }, locked } = this.store;
+    this.#answer = null;
+    const shares = distances.map((distance) => distance / diagonalOf(coarse.vertices));
+    const missed = shares.filter((share) => share > MET);
+    const far = `${readable(100 * Math.max(...shares), 2)} % of the diagonal`;
+    takeBack("pull");
+    if (missed.length === 0) {
+      say(`The shape has followed: it is ${far} from where you pulled it.`, { key: "pull" });
+      return;
+    }
+    const which = shares.length === 1 ? "The pin was not met" : `${missed.length} of ${shares.length} pins were not met`;
+    const why = locked.some(Boolean) ? "Unlock coordinates that move this place, or pull less." : "Pull less, or remove a pin.";
+    say(`${which}: the shape stays ${far} away${follows ? "" : ", and was left as it was"}. ${why}`, { key: "pull" });
   }
 }
 
-/** A placement as the server answers it, as a Matrix4. */
-function matrix({ rotation: [a, b, c], translation: [x, y, z], scale }) {
-  return new THREE.Matrix4().set(...a, x, ...b, y, ...c, z, 0, 0, 0, 1).multiply(new THREE.Matrix4().makeScale(scale, scale, scale));
-}
+/** How far each target is from its vertex among positions (3V numbers). */
+const awayFrom = (targets, positions) => targets.map(({ vertex, position }) =>
+  new Vector3().fromArray(positions, 3 * vertex).distanceTo(new Vector3(...position)));
+
+const rootMeanSquare = (values) => Math.hypot(...values) / Math.sqrt(values.length);

@@ -22,11 +22,29 @@ export function litCamera() {
   return camera;
 }
 
-/** Put a camera where a sphere fills the width of its view, or a share of its height. */
-export function frame(camera, { center, radius }, share = 1) {
-  const field = (camera.fov * Math.PI) / 360;
-  const narrow = Math.atan(Math.tan(field) * Math.min(camera.aspect, share));
-  const distance = radius / Math.sin(narrow);
+/** Tangent of half the angle of a camera's height. */
+const slope = (camera) => Math.tan((camera.fov * Math.PI) / 360);
+
+/** How far a camera must be from a sphere to have it in view. */
+const distanceOf = (camera, { radius }) => radius / Math.sin(Math.atan(slope(camera) * Math.min(camera.aspect, 1)));
+
+/** How far it must be to have positions (3V numbers) in the width of its view and in a share of its height. */
+export function distanceTo(camera, positions, center, share) {
+  const back = new THREE.Quaternion().setFromRotationMatrix(
+    new THREE.Matrix4().lookAt(VIEW, new THREE.Vector3(), camera.up)).invert();
+  const high = slope(camera) * share;
+  const wide = slope(camera) * camera.aspect;
+  const point = new THREE.Vector3();
+  let distance = 0;
+  for (let i = 0; i < positions.length; i += 3) {
+    point.fromArray(positions, i).sub(center).applyQuaternion(back);
+    distance = Math.max(distance, point.z + Math.abs(point.x) / wide, point.z + Math.abs(point.y) / high);
+  }
+  return distance;
+}
+
+/** Put a camera so far from the middle of a sphere; where nothing is said, so that this fills its view. */
+export function frame(camera, { center, radius }, distance = distanceOf(camera, { radius })) {
   camera.near = distance / 100;
   camera.far = distance * 20;
   camera.position.copy(center).addScaledVector(VIEW, distance);
@@ -43,6 +61,9 @@ export function sphereOf(positions) {
   }
   return new THREE.Sphere(center, Math.sqrt(squared));
 }
+
+/** Of the box around positions (3V numbers). */
+export const diagonalOf = (positions) => new THREE.Box3().setFromArray(positions).getSize(new THREE.Vector3()).length();
 
 /** A geometry for shapes with these faces; positions and colours come later. */
 export function geometryOf(faces, vertexCount) {

@@ -13,6 +13,7 @@ export class Sliders {
   constructor(store, list) {
     Object.assign(this, { store, list });
     store.on(["space"], () => this.#build());
+    store.on(["names"], () => this.#label());
     store.on(["code", "locked"], () => this.#show());
     // The end of a drag, wherever it ends.
     for (const end of ["pointerup", "pointercancel", "blur"]) addEventListener(end, () => this.#let());
@@ -28,11 +29,9 @@ export class Sliders {
     this.#rows = [];
     this.list.replaceChildren(...model.factors.map((factor, j) => {
       const group = clone("factor");
-      find("h2", group).textContent = factor.name;
       const rows = [];
-      for (let k = factor.start; k < factor.stop; k += 1) rows.push(this.#row(k, factor));
+      for (let k = factor.start; k < factor.stop; k += 1) rows.push(this.#row(k));
       find(".rows", group).append(...rows);
-      find("[data-do=reset]", group).setAttribute("aria-label", `Reset all of ${factor.name}`);
       find("[data-do=reset]", group).addEventListener("click", () => {
         this.#change(this.store.code.map((value, k) => (k >= factor.start && k < factor.stop ? space.home[k] : value)));
       });
@@ -46,12 +45,30 @@ export class Sliders {
     this.#show();
   }
 
-  #row(k, factor) {
-    const { model, space } = this.store;
+  /** Say what everything is called. */
+  #label() {
+    const { names: { factors, labels, coordinates }, space } = this.store;
+    this.list.querySelectorAll(".factor").forEach((group, j) => {
+      find("h2", group).textContent = factors[j];
+      find("[data-do=reset]", group).setAttribute("aria-label", `Reset all of ${factors[j]}`);
+    });
+    this.#rows.forEach(({ root, slider, box, lock, reset, signs }, k) => {
+      const name = coordinates[k];
+      find(".name", root).textContent = labels[k];
+      find(".name", root).title = name;
+      slider.setAttribute("aria-label", name);
+      box.setAttribute("aria-label", `${name}, number`);
+      lock.setAttribute("aria-label", `Lock ${name}`);
+      reset.setAttribute("aria-label", `Reset ${name}`);
+      root.querySelectorAll(".pictures button").forEach((button, i) => {
+        button.setAttribute("aria-label", `${name} to ${readable(space.stations(k)[i])} (${signs[i]})`);
+      });
+    });
+  }
+
+  #row(k) {
+    const { space } = this.store;
     const root = clone("coordinate");
-    const name = model.latent_names[k];
-    // The factor's name stands above already.
-    const label = name.startsWith(factor.name) ? name.slice(factor.name.length).replace(/^[\s,]+/, "") : name;
     const slider = find("input[type=range]", root);
     const box = find("input[type=number]", root);
     const lock = find("[data-do=lock]", root);
@@ -59,18 +76,12 @@ export class Sliders {
     const [low, high] = space.range(k);
     const percent = (value) => `${(100 * (value - low)) / (high - low)}%`;
 
-    find(".name", root).textContent = label;
-    find(".name", root).title = name;
     Object.assign(slider, { min: low, max: high, id: `z${k}` });
-    slider.setAttribute("aria-label", name);
     slider.style.setProperty("--low", percent(space.lower[k]));
     slider.style.setProperty("--high", percent(space.upper[k]));
     slider.style.setProperty("--home", percent(space.home[k]));
     slider.title = `Training data from ${readable(space.lower[k])} to ${readable(space.upper[k])}`
       + (space.period[k] ? `, period ${readable(space.period[k])}` : "");
-    box.setAttribute("aria-label", `${name}, number`);
-    lock.setAttribute("aria-label", `Lock ${name}`);
-    reset.setAttribute("aria-label", `Reset ${name}`);
 
     slider.addEventListener("pointerdown", () => {
       this.#held = true;
@@ -89,11 +100,10 @@ export class Sliders {
     root.querySelectorAll(".pictures button").forEach((button, i) => {
       const value = space.stations(k)[i];
       button.title = `${signs[i]}: ${readable(value)}`;
-      button.setAttribute("aria-label", `${name} to ${readable(value)} (${signs[i]})`);
       sharp(find("canvas", button), PICTURE);
       button.addEventListener("click", () => this.#set(k, value));
     });
-    this.#rows[k] = { root, slider, box, lock, controls: [slider, box, reset, ...root.querySelectorAll(".pictures button")] };
+    this.#rows[k] = { root, slider, box, lock, reset, signs, controls: [slider, box, reset, ...root.querySelectorAll(".pictures button")] };
     return root;
   }
 

@@ -9,16 +9,16 @@ const PICTURE = 56;
 export class Strip {
   constructor(store, pictures, { button, table }) {
     Object.assign(this, { store, pictures, table, button });
-    store.on(["keyframes", "model"], () => {
+    store.on(["keyframes", "model", "names"], () => {
       table.hidden = true;
       button.disabled = store.keyframes.length < 2;
     });
   }
 
   async draw() {
-    const { keyframes, model, space } = this.store;
+    const { keyframes, model, names, space } = this.store;
     const { codes, shapes, t } = await api.frames(model, { keyframes, frames: COLUMNS, mesh: "coarse" });
-    const rows = [["all factors", null], ...model.factors.map((factor) => [factor.name, factor])];
+    const rows = [["all factors", null], ...model.factors.map((factor, j) => [names.factors[j], factor])];
     find("thead tr", this.table).replaceChildren(
       element("td"), ...t.map((time) => element("th", { scope: "col", textContent: time.toFixed(2) })));
     const made = rows.map(([name]) => element("tr", {},

@@ -6,10 +6,11 @@
 
 import * as THREE from "three";
 import { OrbitControls } from "three/addons/OrbitControls.js";
-import { frame, geometryOf, litCamera, move, paint, sphereOf, surfaceMaterial } from "./scene.js";
+import { distanceTo, frame, geometryOf, litCamera, move, paint, sphereOf, surfaceMaterial } from "./scene.js";
 
 const TURN = Math.PI / 24;
-const MARGIN = 110; // pixels of the height that buttons and words take
+const MARGIN = 100; // pixels of the height that buttons and words take
+const ROOM = 1.08; // for shapes that are larger than the reference
 
 export class Viewer {
   #scheduled = false;
@@ -57,6 +58,7 @@ export class Viewer {
     this.skinned.visible = false;
     this.addMesh("coarse", reference);
     this.sphere = sphereOf(reference.vertices);
+    this.reference = reference.vertices;
     this.resetView();
   }
 
@@ -114,12 +116,17 @@ export class Viewer {
   }
 
   resetView() {
-    frame(this.camera, this.sphere, this.#share);
+    frame(this.camera, this.sphere, this.#distance);
     this.controls.target.copy(this.sphere.center);
     this.controls.minDistance = 0.2 * this.sphere.radius;
     this.controls.maxDistance = 20 * this.sphere.radius;
     this.controls.update();
     this.draw();
+  }
+
+  /** From which the reference fills what is free of the picture. */
+  get #distance() {
+    return ROOM * distanceTo(this.camera, this.reference, this.sphere.center, this.#share);
   }
 
   /** Where the camera is and looks, as six numbers. */
@@ -162,6 +169,12 @@ export class Viewer {
     return { vertex, position: at(vertex) };
   }
 
+  /** Where a point is in the picture, in pixels from its upper left. */
+  project(position) {
+    const { x, y } = position.clone().project(this.camera);
+    return { x: ((x + 1) / 2) * this.canvas.clientWidth, y: ((1 - y) / 2) * this.canvas.clientHeight };
+  }
+
   /** The point at a place of the window, as far away as `depth` is. */
   unproject({ clientX, clientY }, depth) {
     const box = this.canvas.getBoundingClientRect();
@@ -174,14 +187,13 @@ export class Viewer {
   #resize() {
     const { clientWidth: width, clientHeight: height } = this.canvas.parentElement;
     if (!width || !height) return;
-    const before = Math.min(this.camera.aspect, this.#share);
+    const before = this.reference && this.#distance;
     this.camera.aspect = width / height;
     this.#share = Math.max(1 - MARGIN / height, 0.4);
     this.renderer.setSize(width, height, false);
     // A smaller window must show as much: the distance follows.
-    const after = Math.min(this.camera.aspect, this.#share);
     const { target } = this.controls;
-    this.camera.position.sub(target).multiplyScalar(before / after).add(target);
+    if (before) this.camera.position.sub(target).multiplyScalar(this.#distance / before).add(target);
     this.camera.updateProjectionMatrix();
     this.draw();
   }

@@ -185,3 +185,14 @@ def test_a_million_points_are_sampled_and_a_large_file_is_no_larger_than_others(
     answer = client.post(FIT, content=as_ply(too_many), params={"format": "ply"})
     assert answer.status_code == 422
     assert "2097152 vertices" in answer.json()["detail"]
+
+
+def test_the_points_that_stood_for_the_scan_are_answered_where_asked_for(
+    client: httpx.Client, figure: ShapeModel, points: np.ndarray
+) -> None:
+    found = client.post(FIT, content=as_xyz(points), params={"format": "xyz", "used": True}).raise_for_status().json()
+    used, distances = (np.array(found["used"][name]) for name in ("positions", "distances"))
+    assert len(used) == len(distances) == len(points)
+    assert np.abs(used[:, None] - points[None]).max(axis=2).min(axis=1).max() < 1e-5
+    assert distances.mean() == pytest.approx(found["distances"]["scan"]["mean"], rel=1e-4)
+    assert "used" not in client.post(FIT, content=as_xyz(points), params={"format": "xyz"}).json()

@@ -7,6 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.edit import PULL, limbs, pulls
 from shapespace.arrays import FloatArray
+from shapespace.mesh.rigid_motion import Placement, weighted_change
 from shapespace.model.decoder import MeshChoice
 from shapespace.model.edit import PRIOR, SIGMA, SMALL, STILL, UNMOVED, InvalidTargetError, PriorKind, Target, edited
 from shapespace.model.latent_space import InvalidFixedError, NotFiniteError
@@ -181,3 +182,35 @@ def test_the_prior_holds_a_code_back_as_much_as_it_weighs(model: ShapeModel) -> 
         held = model.edit(CODE, targets, 1e6, prior_kind=kind)
         np.testing.assert_allclose(held.code, CODE, atol=UNMOVED)
     assert PRIOR < 1e-2
+
+
+def test_anchored_the_whole_stays_though_a_target_is_out_of_reach(figure: ShapeModel) -> None:
+    before = figure.decode(np.zeros(20))
+    hand, size = int(before[:, 0].argmax()), np.linalg.norm(np.ptp(before, axis=0))
+    leg = next(factor for factor in figure.manifest.factors if factor.name == "lower left front")
+    locked = {k: 0.0 for k in range(20) if not leg.start <= k < leg.stop}
+    target = {hand: before[hand] + [0, 0.25, 0]}
+    away = {
+        anchored: np.linalg.norm(found.placement(figure.decode(found.code)) - before, axis=1)
+        for anchored in (False, True)
+        for found in [figure.edit(np.zeros(20), target, fixed=locked, anchored=anchored)]
+    }
+    assert np.median(away[False]) > 0.03 * size
+    assert np.median(away[True]) < 0.005 * size
+    assert away[True][hand] < 0.01 * size
+    # What is in reach is met all the same.
+    assert figure.edit(np.zeros(20), target, anchored=True).residual < 1e-3 * size
+
+
+def test_misfits_change_as_differences_say_whichever_weights_align() -> None:
+    rng = np.random.default_rng(0)
+    points, field = rng.standard_normal((2, 30, 3))
+    weights, aligned = rng.uniform(0.1, 1, (2, 30))
+    step = 1e-6
+
+    def misfits(way: float) -> FloatArray:
+        there = points + way * step * field
+        return np.sqrt(weights)[:, None] * (Placement.between(there, points, aligned)(there) - points)
+
+    found = weighted_change(field[None], points, weights, aligned)[0]
+    np.testing.assert_allclose(found, (misfits(1) - misfits(-1)) / (2 * step), atol=1e-8)

@@ -133,6 +133,22 @@ def test_export_refuses_where_onnx_and_torch_disagree(tiny_run: Path, tmp_path: 
     assert not (tmp_path / "tiny-torus" / "1").exists()
 
 
+def test_a_bundle_calls_things_as_the_configuration_does(tiny_run: Path, tmp_path: Path) -> None:
+    run = Run(tiny_run, *load(tiny_run / "config.toml"), tmp_path)
+    figures = read_bundle(tiny_run / "models" / "tiny-torus" / "1").manifest.figures
+    composite, geometry = learner_of(run).main(), Geometry(reference=FreakyTorus().reference)
+
+    def write(names: str) -> Path:
+        return export(composite, run.collection, parse(TINY + names, "named"), figures, "", tmp_path, geometry)
+
+    manifest = read_bundle(write('names = { bump = "hill", gamma = "along" }\n')).manifest
+    own = list(run.collection.factors)
+    assert [factor.name for factor in manifest.factors] == ["hill" if name == "bump" else name for name in own]
+    assert manifest.latent_names == ["alpha", "beta", "along", "zeta"]
+    with pytest.raises(ExportError, match="'nose', which is neither"):
+        write('names = { nose = "a" }\n')
+
+
 def test_the_same_command_again_does_nothing_and_a_changed_setting_only_its_stages(
     tiny_run: Path, tmp_path: Path
 ) -> None:

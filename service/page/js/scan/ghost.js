@@ -1,0 +1,52 @@
+/** A scan as points over the shape, at the place where the fit has found it. */
+
+import * as THREE from "three";
+import { diverging } from "../colours.js";
+import { matrixOf } from "../pose.js";
+import { sameCode } from "../space.js";
+
+const SIZE = 0.04; // of a point, as three.js has it, in the model's radius: about a hundredth of it in the picture
+
+/** Shows `store.scan` while `store.ghost` is on; its colours are distances as long as its own shape is shown. */
+export class Ghost {
+  #scan = null;
+
+  constructor(store, viewer) {
+    Object.assign(this, { store, viewer });
+    const material = new THREE.PointsMaterial({ vertexColors: true, transparent: true, opacity: 0.85 });
+    this.points = new THREE.Points(new THREE.BufferGeometry(), material);
+    this.points.frustumCulled = this.points.visible = this.points.matrixAutoUpdate = false;
+    viewer.scene.add(this.points);
+    store.on(["scan", "ghost", "code"], () => this.#show());
+  }
+
+  #show() {
+    const { scan, ghost, code } = this.store;
+    const visible = Boolean(scan) && ghost;
+    if (!visible && !this.points.visible) return;
+    if (scan && scan !== this.#scan) this.#take(scan);
+    this.points.visible = visible;
+    if (visible) this.#paint(scan, sameCode(code, scan.latent));
+    this.viewer.draw();
+  }
+
+  #take(scan) {
+    this.#scan = scan;
+    this.points.geometry.dispose();
+    this.points.geometry = new THREE.BufferGeometry();
+    const attribute = new THREE.Float32BufferAttribute(scan.used.positions.flat(), 3);
+    this.points.geometry.setAttribute("position", attribute);
+    this.points.geometry.setAttribute("color", new THREE.BufferAttribute(new Float32Array(attribute.array.length), 3));
+    const there = matrixOf(scan.placement);
+    this.points.matrix.copy(there).invert();
+    this.points.updateMatrixWorld(true);
+    this.points.material.size = SIZE * this.viewer.sphere.radius;
+  }
+
+  #paint({ used, limit }, own) {
+    const { color } = this.points.geometry.attributes;
+    if (own) color.array.set(diverging(used.distances.map((distance) => 2 * distance - limit), limit));
+    else color.array.fill(0.25);
+    color.needsUpdate = true;
+  }
+}

@@ -1,0 +1,170 @@
+/**
+ * Files that become shapes. One with the model's vertices in their order has its code at once; any other is a scan,
+ * which is fitted. A shape that doesn't fit never replaces that of the user, and to that there is a way back.
+ */
+
+import * as api from "../api.js";
+import { find, readable } from "../dom.js";
+import { report, say } from "../messages.js";
+import { diagonalOf } from "../scene.js";
+import { fixedBy, sameCode } from "../space.js";
+import { encodeInWords, fitInWords } from "./words.js";
+import { Verdict } from "./verdict.js";
+
+const POINTS_ONLY = ["xyz"];
+const UNITS = "scale=free"; // what the server says to send where a scan is in other units
+
+export class Reader {
+  #abort = new AbortController();
+  #found = null; // what the file was found to be, and the shape before
+
+  constructor(store, { box, input, readAs, ownScale, stage }) {
+    Object.assign(this, { store, readAs, ownScale, verdict: new Verdict(box, () => this.#leave()) });
+    this.shown = find("#ghost", box);
+    this.shown.addEventListener("change", () => store.set({ ghost: this.shown.checked }));
+    store.on(["ghost"], () => { this.shown.checked = store.ghost; });
+    store.on(["model"], () => { this.verdict.close(); this.#leave(); });
+    store.on(["code"], () => this.#offer());
+    input.addEventListener("change", () => { if (input.files[0]) this.read(input.files[0]); input.value = ""; });
+    addEventListener("dragover", (event) => {
+      if (!event.dataTransfer.types.includes("Files")) return;
+      event.preventDefault();
+      stage.classList.add("dropping");
+    });
+    addEventListener("dragleave", (event) => { if (!event.relatedTarget) stage.classList.remove("dropping"); });
+    addEventListener("drop", (event) => {
+      event.preventDefault();
+      stage.classList.remove("dropping");
+      if (event.dataTransfer.files[0]) this.read(event.dataTransfer.files[0]);
+    });
+  }
+
+  /** Find out what a file is, and show it. */
+  async read(file) {
+    const { model, locked } = this.store;
+    if (!model) {
+      say("No model is there yet. Drop the file again when its shape is shown.", { kind: "error", key: "scan" });
+    } else if (locked.every(Boolean)) {
+      say("All coordinates are locked. Unlock those that may change, then choose the file again.", { kind: "error", key: "scan" });
+    } else if (this.readAs.value === "auto" && !this.ownScale.checked && !POINTS_ONLY.includes(formatOf(file))) {
+      await this.#encode(file);
+    } else await this.#fit(file, this.#asked);
+  }
+
+  get #asked() {
+    return { scale: this.ownScale.checked ? "free" : "fixed", partial: this.readAs.value === "part" };
+  }
+
+  get #about() {
+    const { model, references: { fine, coarse } } = this.store;
+    return { model: model.title, diagonal: diagonalOf((fine ?? coarse).vertices) };
+  }
+
+  async #encode(file) {
+    const { model, locked, code } = this.store;
+    const signal = this.#begin(`Looking for the code of ${file.name} …`);
+    try {
+      const answer = await api.encode(model, file, formatOf(file), fixedBy(locked, code), signal);
+      this.#tell(file, answer, encodeInWords(answer, { file: file.name, ...this.#about }), {});
+    } catch (error) {
+      // Other vertices than the model's, or in other units: then it is a scan, if it is anything.
+      if (error.type?.endsWith("invalid-mesh")) await this.#fit(file, this.#asked);
+      else this.#fail(file, error);
+    }
+  }
+
+  async #fit(file, asked) {
+    const { model, locked, code } = this.store;
+    const signal = this.#begin(`Fitting ${model.title} to ${file.name} …`);
+    try {
+      const options = { ...asked, used: true, fixed: JSON.stringify(fixedBy(locked, code)) };
+      const answer = await api.fit(model, file, formatOf(file), options, signal);
+      const { distances: { scan: { p95 } }, placement } = answer;
+      const { diagonal: size } = this.#about;
+      answer.limit = Math.max(p95, 1e-3 * size * placement.scale);
+      this.#tell(file, answer, fitInWords(answer, { file: file.name, ...this.#about }), asked);
+    } catch (error) {
+      if (error.message.includes(UNITS)) this.#otherUnits(file, error, asked);
+      else this.#fail(file, error);
+    }
+  }
+
+  #begin(what) {
+    this.#leave();
+    this.verdict.await(what, () => { this.verdict.close(); this.#leave(); });
+    return this.#abort.signal;
+  }
+
+  /** Give up what is under way, and take the scan away. */
+  #leave() {
+    this.#abort.abort();
+    this.#abort = new AbortController();
+    this.#found = null;
+    this.store.set({ scan: null });
+  }
+
+  #fail(file, error) {
+    if (error.name === "AbortError") return;
+    this.verdict.close();
+    if (error.offline) report(error);
+    else say(`${file.name}: ${error.message}`, { kind: "error", key: "scan" });
+  }
+
+  #otherUnits(file, error, asked) {
+    const [, ratio] = error.message.match(/about ([\d.e+-]+) times/) ?? [];
+    const words = ratio
+      ? `It is about ${readable(Number(ratio))} times as large as the shapes of ${this.#about.model}.`
+      : "Its size is another than that of the model's shapes.";
+    this.verdict.say({
+      how: "fair",
+      title: `${file.name} seems to be in other units`,
+      words: [words, "Nothing was changed. Its shape can be found all the same, with its size."],
+      more: [],
+    }, [["Fit it with its own scale", () => this.#fit(file, { ...asked, scale: "free" })]]);
+  }
+
+  #tell(file, answer, words, asked) {
+    const { code, placement, locked, space } = this.store;
+    answer.latent = space.wrapAll(answer.latent).map((value, k) => (locked[k] ? code[k] : value));
+    const scan = answer.used ? answer : null;
+    const tries = [];
+    const again = (label, change) => tries.push([label, () => this.#fit(file, { ...this.#asked, ...asked, ...change })]);
+    if (!scan) again("Fit it as a scan", {});
+    if (scan && words.how === "poor" && !asked.partial) again("Fit it as a part of a shape", { partial: true });
+    if (scan && words.how === "poor" && asked.scale !== "free") again("Fit it with its own scale", { scale: "free" });
+    const before = { code, placement };
+    this.#found = { code: answer.latent, before, scan, tries };
+    this.verdict.say(words, []);
+    if (words.how === "poor") this.#offer();
+    else this.#show();
+  }
+
+  #show() {
+    const { code, scan } = this.#found;
+    const { hasFine, fine } = this.store;
+    // The scan is placed by the fine mesh's frame.
+    this.store.set({ playing: false, code, placement: null, scan, ghost: true, fine: fine || (hasFine && Boolean(scan)) });
+    this.#offer();
+  }
+
+  #back() {
+    this.store.set({ ...this.#found.before, ghost: false });
+  }
+
+  /** What can be done from the shape that is shown now. */
+  #offer() {
+    if (!this.#found || !this.store.code) return;
+    const { code, before, scan, tries } = this.#found;
+    const [own, mine] = [sameCode(this.store.code, code), sameCode(this.store.code, before.code)];
+    this.verdict.offer([
+      ...(mine ? [] : [["Back to my shape", () => this.#back()]]),
+      ...(own ? [] : [["Show what was found", () => this.#show()]]),
+      ...tries,
+    ]);
+    this.shown.parentElement.hidden = !this.store.scan;
+    const far = scan && scan.limit / (this.#about.diagonal * scan.placement.scale);
+    this.verdict.scale(this.store.scan && own ? `${readable(100 * far, 2)} % of the diagonal or more` : null);
+  }
+}
+
+const formatOf = (file) => file.name.split(".").pop().toLowerCase();

@@ -1,0 +1,56 @@
+/** The box that says what came of a file, with what can be done about it; also while the answer is awaited. */
+
+import { gradient } from "../colours.js";
+import { element, find } from "../dom.js";
+
+export class Verdict {
+  #timer = 0;
+
+  /** `leave` is called when the box is closed by hand. */
+  constructor(box, leave) {
+    this.box = box;
+    find(".scale", box).style.backgroundImage = gradient;
+    find("[data-do=close]", box).addEventListener("click", () => { this.close(); leave(); });
+  }
+
+  close() {
+    clearInterval(this.#timer);
+    this.box.hidden = true;
+  }
+
+  /** Say what is going on; it can be given up. */
+  await(title, cancel) {
+    this.say({ how: "busy", title, words: [], more: [] }, [["Cancel", cancel]]);
+    const began = performance.now();
+    const tell = () => {
+      find("output", this.box).textContent = `${Math.round((performance.now() - began) / 1000)} s`;
+    };
+    tell();
+    this.#timer = setInterval(tell, 1000);
+  }
+
+  /** Say a verdict, with actions as pairs of a label and what to do. */
+  say({ how, title, words, more }, actions) {
+    clearInterval(this.#timer);
+    this.box.hidden = false;
+    this.box.className = how;
+    find(".waiting", this.box).hidden = how !== "busy";
+    find("h2", this.box).textContent = title;
+    find(".words", this.box).replaceChildren(...words.map((textContent) => element("p", { textContent })));
+    find("details", this.box).hidden = more.length === 0;
+    find("details div", this.box).replaceChildren(...more.map((textContent) => element("p", { textContent })));
+    this.offer(actions);
+    this.scale(null);
+  }
+
+  offer(actions) {
+    const buttons = actions.map(([textContent, onclick]) => element("button", { type: "button", textContent, onclick }));
+    find(".actions", this.box).replaceChildren(...buttons);
+  }
+
+  /** What the colours of the scan mean; null where there is none. */
+  scale(end) {
+    find(".distances", this.box).hidden = end === null;
+    find(".distances .high", this.box).textContent = end ?? "";
+  }
+}

@@ -1,0 +1,55 @@
+"""What factors and coordinates are called by those who use them."""
+
+from __future__ import annotations
+
+from tests.page.conftest import Open
+from tests.page.studio import Studio
+from tests.page.test_operation import AXE, check
+
+
+def headings(studio: Studio) -> list[str]:
+    return studio[".factor h2"].all_inner_texts()
+
+
+def test_people_name_things_for_themselves(window: Open) -> None:
+    studio = window().open()
+    own = headings(studio)
+    slider = studio.coordinate(1).locator("input[type=range]")
+    before = slider.get_attribute("aria-label")
+    studio["#name"].click()
+    studio.page.evaluate(AXE.read_text())
+    check(studio, "names")
+    studio.page.get_by_label("Name for the factor form").fill("  Figure and twist ")
+    studio.page.get_by_label("Name for turn").fill("<b>Turn</b>")
+    studio.page.get_by_role("button", name="Keep").click()
+    assert headings(studio) == [own[0], "Figure and twist"]
+    assert studio.coordinate(1).locator(".name").inner_text() == "<b>Turn</b>"
+    assert slider.get_attribute("aria-label") == "Figure and twist, <b>Turn</b>"
+    assert studio.page.get_by_role("button", name="Reset all of Figure and twist").count() == 1
+
+    studio.page.reload()
+    studio.rest()
+    assert headings(studio) == [own[0], "Figure and twist"]
+    assert studio["#model"].select_option("Figure")
+    studio.eventually(lambda: "Figure and twist" not in headings(studio))
+    studio["#model"].select_option("with-fine")
+    studio.eventually(lambda: headings(studio) == [own[0], "Figure and twist"])
+    studio.tab("Path")
+    studio["#add-keyframe"].click()
+    studio["#add-keyframe"].click()
+    studio["#draw-strip"].click()
+    studio.eventually(lambda: "Figure and twist" in studio["#strip"].inner_text())
+
+    studio.tab("Shape")
+    studio["#name"].click()
+    studio.page.get_by_role("button", name="The model's own names").click()
+    assert headings(studio) == own
+    assert slider.get_attribute("aria-label") == before
+    assert "Figure and twist" not in studio.page.evaluate("JSON.stringify({ ...localStorage })")
+
+
+def test_broken_memory_of_names_does_no_harm(window: Open) -> None:
+    studio = window()
+    studio.page.add_init_script("localStorage.setItem('names:with-fine', '[{\"a\"')")
+    studio.open()
+    assert len(headings(studio)) == 2

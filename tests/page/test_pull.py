@@ -1,0 +1,117 @@
+"""Pulls at the surface, which stay pinned: what follows, what stays, and what is said of it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from tests.page.conftest import Open
+from tests.page.studio import Studio, difference
+from tests.page.test_operation import AXE, check
+
+
+def hand(studio: Studio, right: bool = True) -> tuple[float, float]:
+    """Where the hand on one side of the picture is in the window."""
+    picture, box = studio.picture(), studio["#canvas"].bounding_box()
+    assert box
+    ink = np.abs(picture - picture[0, 0]).max(axis=2) > 40
+    ink = ink[: len(ink) // 2]  # words stand below
+    columns = np.flatnonzero(ink.any(axis=0))
+    x = int(columns[-1] - 6 if right else columns[0] + 6)
+    return box["x"] + x, box["y"] + 60 + int(np.median(np.flatnonzero(ink[:, x])))
+
+
+def pull(studio: Studio, place: tuple[float, float], by: tuple[float, float]) -> None:
+    mouse = studio.page.mouse
+    mouse.move(*place)
+    mouse.down()
+    for share in (0.5, 1):
+        mouse.move(place[0] + share * by[0], place[1] + share * by[1])
+    mouse.up()
+
+
+def edits(studio: Studio) -> list[dict[str, Any]]:
+    """Bodies of all pulls that are asked for from now on."""
+    sent: list[dict[str, Any]] = []
+    studio.page.on("request", lambda request: "/edit" in request.url and sent.append(request.post_data_json))
+    return sent
+
+
+def test_pins_stay_are_pulled_together_and_removed_by_mouse_and_key(window: Open) -> None:
+    studio = window().open("#model=figure")
+    sent = edits(studio)
+    studio["#pull"].click()
+    first, second = hand(studio), hand(studio, right=False)
+    pull(studio, first, (20, -25))
+    studio.eventually(lambda: "The shape has followed" in studio.messages)
+    pins = studio[".pin"]
+    assert pins.count() == 1
+    at = pins.first.bounding_box()
+    assert at
+    assert abs(at["x"] + at["width"] / 2 - first[0] - 20) < 5
+    assert abs(at["y"] + at["height"] / 2 - first[1] + 25) < 5
+    assert len(sent[-1]["targets"]) == 1
+    assert sent[-1]["anchored"] is True
+    one = studio.code
+    pull(studio, second, (-15, -20))
+    studio.eventually(lambda: len(sent[-1]["targets"]) == 2 and studio.code != one)
+    studio.rest()
+    assert pins.count() == 2
+    studio.page.evaluate(AXE.read_text())
+    check(studio, "pins")
+
+    # A pin is pulled on by itself.
+    box = pins.nth(1).bounding_box()
+    assert box
+    pull(studio, (box["x"] + 12, box["y"] + 12), (0, 25))
+    studio.eventually(lambda: len(sent[-1]["targets"]) == 2)
+    assert pins.count() == 2
+    studio.rest()
+
+    pins.first.click()
+    assert pins.count() == 1
+    pins.first.focus()
+    studio.page.keyboard.press("Delete")
+    assert pins.count() == 0
+    assert studio["#clear-pins"].is_hidden()
+    assert studio["#canvas"].evaluate("c => document.activeElement === c")
+
+
+def test_a_press_pins_a_place_and_undo_takes_pins_along(window: Open) -> None:
+    studio = window().open("#model=figure")
+    studio["#pull"].click()
+    studio.page.mouse.click(*hand(studio, right=False))
+    studio.page.wait_for_timeout(100)
+    assert studio[".pin"].count() == 1
+    assert not any(studio.code)
+    pull(studio, hand(studio), (20, -25))
+    studio.eventually(lambda: any(studio.code))
+    studio.rest()
+    assert studio[".pin"].count() == 2
+    studio["#undo"].click()
+    studio.until_code([0] * 20)
+    assert studio[".pin"].count() == 1
+    studio["#redo"].click()
+    studio.eventually(lambda: studio[".pin"].count() == 2)
+    studio["#clear-pins"].click()
+    assert studio[".pin"].count() == 0
+
+
+def test_what_is_locked_stays_though_something_else_is_pulled(window: Open) -> None:
+    locked = [k for k in range(20) if k != 7]  # all but a leg
+    studio = window().open(f"#model=figure&locked={','.join(map(str, locked))}")
+    before = studio.picture()
+    sent = edits(studio)
+    studio["#pull"].click()
+    pull(studio, hand(studio), (20, -40))
+    studio.eventually(lambda: "The pin was not met" in studio.messages and "was left as it was" in studio.messages)
+    assert "Unlock" in studio.messages
+    assert set(map(int, sent[-1]["fixed"])) == set(locked)
+    assert studio.code == [] or not any(studio.code)
+    studio["#clear-pins"].click()
+    studio["[aria-label='Close this message']"].first.click()
+    studio["#theme"].hover()
+    studio["#theme"].focus()
+    studio.rest()
+    studio.eventually(lambda: difference(before, studio.picture()) < 0.001)

@@ -1,0 +1,169 @@
+"""Files that are no meshes in correspondence: scans over the shape, verdicts, and the way back."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import httpx
+import numpy as np
+import pytest
+from playwright.sync_api import Route
+from scipy.spatial.transform import Rotation
+
+from shapespace.arrays import FloatArray
+from shapespace.files.formats import MESH_FORMATS, read_arrays
+from tests.page.conftest import Open
+from tests.page.studio import Studio, difference
+from tests.page.test_operation import AXE, check
+from tests.service.conftest import Server
+
+CODE = [0.5 if k % 3 == 0 else -0.3 for k in range(20)]
+FIGURE = "#model=figure"
+
+
+@dataclass(frozen=True)
+class Given:
+    """A shape of the figure as a scan would come: turned, moved, its faces and vertices thrown together anew."""
+
+    vertices: FloatArray
+    faces: np.ndarray
+
+    def file(self, name: str, scale: float = 1.0) -> dict[str, object]:
+        rng = np.random.default_rng(0)
+        order = rng.permutation(len(self.vertices))
+        turned = scale * (self.vertices @ Rotation.from_rotvec([0.2, 1.1, 0.3]).as_matrix().T + [3, -1, 2])
+        rank = np.argsort(order)
+        format = name.rsplit(".", maxsplit=1)[-1]
+        if format == "xyz":
+            rows = turned[order]
+            content = "\n".join(" ".join(map(repr, row)) for row in rows.tolist()).encode()
+        else:
+            content = MESH_FORMATS[format].encode(turned[order], rng.permutation(rank[self.faces]))
+        return {"name": name, "mimeType": "application/octet-stream", "buffer": content}
+
+
+@pytest.fixture(scope="module")
+def given(server: Server) -> Given:
+    call = f"{server.url}/v1/models/figure/mesh?latent={','.join(map(str, CODE))}&format=npz"
+    return Given(*read_arrays(httpx.get(call, timeout=60).raise_for_status().content, "npz"))
+
+
+def choose(studio: Studio, file: object) -> None:
+    studio.tab("Files")
+    studio["#mesh-file"].set_input_files(file)  # type: ignore[arg-type]
+
+
+def verdict(studio: Studio) -> str:
+    return studio["#verdict"].inner_text()
+
+
+def until_said(studio: Studio, text: str) -> str:
+    return studio.eventually(lambda: words if text in (words := verdict(studio)) else None)
+
+
+def ghost(studio: Studio) -> float:
+    """How much of the picture the scan changes."""
+    box = studio["#ghost"]
+    with_it = studio.picture()
+    box.uncheck()
+    without = studio.until_different(with_it)
+    box.check()
+    return float((np.abs(with_it - without).max(axis=2) > 12).mean())
+
+
+@pytest.mark.parametrize("name", ["scan.ply", "points.xyz"])
+def test_a_scan_is_fitted_and_lies_over_its_shape(window: Open, given: Given, name: str) -> None:
+    studio = window(complains=name.endswith("ply")).open(FIGURE)  # the console names what `encode` refuses
+    start = studio.picture()
+    choose(studio, given.file(name))
+    words = until_said(studio, f"Figure explains {name}")
+    studio.until_code(CODE, 0.12)
+    assert "of the diagonal" in words
+    assert "100 % of the scan lie at the shape" in words
+    studio["#verdict summary"].click()
+    assert "in the model's units" in verdict(studio)
+    studio.rest()
+    studio.page.evaluate(AXE.read_text())
+    check(studio, "scan")
+    assert ghost(studio) > 0.01
+    # Where it was put the points lie at the shape: none beside its outline.
+    shown = studio.picture()
+    studio["#ghost"].uncheck()
+    alone = studio.until_different(shown)
+    paper = np.abs(alone - alone[0, 0]).max(axis=2) < 8
+    beside = (np.abs(shown - alone).max(axis=2) > 40) & paper
+    assert beside.mean() < 0.004
+
+    studio.page.get_by_role("button", name="Back to my shape").click()
+    studio.until_code([0] * 20)
+    studio["#to-files"].focus()
+    studio.eventually(lambda: difference(start, studio.picture()) < 0.001)
+    studio.page.get_by_role("button", name="Show what was found").click()
+    studio.until_code(CODE, 0.12)
+    studio["#undo"].click()
+    studio.until_code([0] * 20)
+    studio["[data-do=close]"].click()
+    assert studio["#verdict"].is_hidden()
+
+
+def test_other_units_are_told_and_the_size_is_found(window: Open, given: Given) -> None:
+    studio = window(complains=True).open(FIGURE)
+    choose(studio, given.file("millimetres.stl", scale=1000))
+    words = until_said(studio, "other units")
+    assert "times as large as the shapes of Figure" in words
+    assert "scale=" not in words
+    assert not any(studio.code)
+    studio.page.get_by_role("button", name="Fit it with its own scale").click()
+    until_said(studio, "Figure explains millimetres.stl")
+    studio.until_code(CODE, 0.12)
+    studio["#verdict summary"].click()
+    times = verdict(studio).split(" times the model's size")[0].split(" ")[-1]
+    assert float(times) == pytest.approx(1000, rel=0.01)
+
+
+def test_what_is_no_such_shape_leaves_the_user_their_own(window: Open) -> None:
+    studio = window().open(FIGURE)
+    studio.type(4, 0.3)
+    mine = [0.3 if k == 4 else 0 for k in range(20)]
+    studio.until_code(mine)
+    cube = np.random.default_rng(0).uniform(-0.4, 0.4, (3000, 3))
+    cube[np.arange(3000), np.arange(3000) % 3] = np.where(np.arange(3000) % 2, -0.4, 0.4)
+    content = "\n".join(" ".join(map(repr, row)) for row in cube.tolist()).encode()
+    choose(studio, {"name": "cube.xyz", "mimeType": "text/plain", "buffer": content})
+    until_said(studio, "cube.xyz is no such shape, or the search went astray")
+    assert "Your shape was left as it was" in verdict(studio)
+    assert studio.code == pytest.approx(mine)
+    studio.page.get_by_role("button", name="Show what was found").click()
+    studio.eventually(lambda: studio.code != pytest.approx(mine))
+    studio.page.get_by_role("button", name="Back to my shape").click()
+    studio.until_code(mine)
+
+
+def test_a_fit_keeps_what_is_locked_and_can_be_given_up(window: Open, given: Given) -> None:
+    studio = window().open(f"{FIGURE}&locked=0,1,2&z={','.join(['0.1'] * 3 + ['0'] * 17)}")
+    held: list[Route] = []
+    studio.page.route("**/fit?*", lambda route: held.append(route) or None)
+    choose(studio, given.file("points.xyz"))
+    studio.eventually(lambda: bool(held))
+    assert studio["#verdict progress"].is_visible()
+    studio.page.get_by_role("button", name="Cancel").click()
+    assert studio["#verdict"].is_hidden()
+    studio.page.unroute("**/fit?*")
+    choose(studio, given.file("points.xyz"))
+    studio.eventually(lambda: studio["#verdict"].is_visible() and studio["#verdict progress"].is_hidden())
+    studio.page.get_by_role("button", name="Show what was found").or_(
+        studio.page.get_by_role("button", name="Back to my shape")
+    ).first.click()
+    assert studio.code[:3] == [0.1] * 3
+
+
+def test_a_part_is_fitted_as_a_part(window: Open, given: Given) -> None:
+    studio = window().open(FIGURE)
+    front = given.vertices[given.vertices[:, 2] > np.quantile(given.vertices[:, 2], 0.4)]
+    studio.tab("Files")
+    studio["#read-as"].select_option("a scan of a part, as from one camera")
+    asked: list[str] = []
+    studio.page.on("request", lambda request: "/fit" in request.url and asked.append(request.url))
+    choose(studio, Given(front, given.faces[:0]).file("front.xyz"))
+    studio.eventually(lambda: studio["#verdict"].is_visible() and studio["#verdict progress"].is_hidden())
+    assert "partial=true" in asked[0]
