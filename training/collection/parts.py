@@ -144,7 +144,7 @@ def kept(parts: Sequence[Part], left_out: Sequence[Part]) -> str:
     shell, *riders = parts
     sentence = f"{len(parts) + len(left_out)} separate parts: the model computes with {_one(shell)}"
     if riders:
-        sentence += f"; {_some([part.name for part in riders])} ride along"
+        sentence += f"; {_some([part.name for part in riders])} {'rides' if len(riders) == 1 else 'ride'} along"
     if left_out:
         sentence += f"; {_some([part.name for part in left_out])} left out"
     return sentence

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 import shapespace
-from shapespace.arrays import FloatArray
+from shapespace.arrays import FloatArray, IntArray
 from shapespace.bundle.geometry import FineMesh, Geometry
 from shapespace.bundle.schema import SurfaceEntry
 from shapespace.bundle.surface import from_entry, surface_arrays, surface_entry
@@ -38,6 +38,7 @@ from shapespace.training.runs.progress import progress, waiting
 from shapespace.training.space.codes import box_of, nearest_codes
 from shapespace.training.space.factors import between, group, names, overlap
 from shapespace.training.space.generalisation import (
+    FOLDS,
     PrincipalComponents,
     folds,
     held_out,
@@ -108,7 +109,9 @@ def ingest(run: RunDirectory, config: Config, accepted: Sequence[str] = ()) -> d
     if reference is not fine:
         more = {"fine_vertices": fine.vertices, "fine_faces": fine.faces, "fine_index": index}
         exact, vertices = vertices, vertices[:, index]
-        facts |= (carried := _prolong(run, meshes, reference, fine, vertices, exact))
+        others = np.delete(np.arange(len(exact)), chosen)
+        held = others[:: min(FOLDS, len(others))]
+        facts |= (carried := _prolong(run, meshes, reference, fine, vertices, exact, held))
         facts["notes"] += [
             f"{part['name']} is carried {part['carried']}: {part['mean']:.2%} of the diagonal away on average, "
             f"{part['max']:.2%} at most"
@@ -137,11 +140,12 @@ def _prolong(
     fine: TriangleMesh,
     coarse: FloatArray,
     exact: FloatArray,
+    held: IntArray,
 ) -> dict[str, Any]:
     """``prolongation.npz``, and how far it is from the fine shapes (n, Vf, 3) given the coarse ones (n, V, 3).
 
-    Its weights are fitted to the shapes, if those fitted to four fifths come closer to the other fifth; the figures are
-    of that fifth.
+    Its weights are fitted to the shapes, if those fitted to the others come closer to the shapes ``held``; the figures
+    are of these. The reference is not among them: there it is exact.
     """
     own = np.unique(meshes.shell_faces)
     riders = []
@@ -149,7 +153,7 @@ def _prolong(
         index = np.setdiff1d(meshes.faces[part.faces], own)
         riders.append(find_rider(reference, fine.vertices[index], index, coarse, some_vertices(exact, index)))
     prolong = trial = Prolongation.of(reference, fine, riders)
-    every, held = np.arange(len(exact)), folds(len(exact))[0]
+    every = np.arange(len(exact))
     fitted = prolong.fitted(coarse, exact, own, np.setdiff1d(every, held))
     found, plain = (each.errors(coarse[held], exact[held]) for each in (fitted, prolong))
     if found["mean"] < plain["mean"]:
