@@ -102,7 +102,7 @@ def test_a_scan_is_fitted_and_lies_over_its_shape(window: Open, given: Given, na
     studio.until_code(CODE, 0.12)
     studio["#undo"].click()
     studio.until_code([0] * 20)
-    studio["[data-do=close]"].click()
+    studio["#verdict [data-do=close]"].click()
     assert studio["#verdict"].is_hidden()
 
 

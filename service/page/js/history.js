@@ -1,4 +1,4 @@
-/** Undo and redo of codes, of where pulls have left their shapes, and of their pins: each rest of the hand is a step. */
+/** Undo and redo of codes, of where pulls left their shapes, and of pins: each rest of the hand is a step. */
 
 import { sameCode } from "./space.js";
 

@@ -71,7 +71,8 @@ export class Names {
   #keep(typed) {
     const { model } = this.store;
     const inputs = typed ? [...this.dialog.querySelectorAll("input")] : [];
-    const said = Object.fromEntries(inputs.map(({ dataset, value }) => [dataset.key, value.trim()]).filter(([, name]) => name));
+    const typedIn = inputs.map(({ dataset, value }) => [dataset.key, value.trim()]);
+    const said = Object.fromEntries(typedIn.filter(([, name]) => name));
     always.keep(place(model), JSON.stringify(said));
     this.store.set({ names: namesOf(model, said) });
   }

@@ -134,7 +134,9 @@ export class Pull {
       return;
     }
     const which = shares.length === 1 ? "The pin was not met" : `${missed.length} of ${shares.length} pins were not met`;
-    const why = locked.some(Boolean) ? "Unlock coordinates that move this place, or pull less." : "Pull less, or remove a pin.";
+    const why = locked.some(Boolean)
+      ? "Unlock coordinates that move this place, or pull less."
+      : "Pull less, or remove a pin.";
     say(`${which}: the shape stays ${far} away${follows ? "" : ", and was left as it was"}. ${why}`, { key: "pull" });
   }
 }

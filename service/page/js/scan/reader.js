@@ -42,10 +42,11 @@ export class Reader {
   /** Find out what a file is, and show it. */
   async read(file) {
     const { model, locked } = this.store;
+    const refuse = (why) => say(why, { kind: "error", key: "scan" });
     if (!model) {
-      say("No model is there yet. Drop the file again when its shape is shown.", { kind: "error", key: "scan" });
+      refuse("No model is there yet. Drop the file again when its shape is shown.");
     } else if (locked.every(Boolean)) {
-      say("All coordinates are locked. Unlock those that may change, then choose the file again.", { kind: "error", key: "scan" });
+      refuse("All coordinates are locked. Unlock those that may change, then choose the file again.");
     } else if (this.readAs.value === "auto" && !this.ownScale.checked && !POINTS_ONLY.includes(formatOf(file))) {
       await this.#encode(file);
     } else await this.#fit(file, this.#asked);
@@ -143,7 +144,8 @@ export class Reader {
     const { code, scan } = this.#found;
     const { hasFine, fine } = this.store;
     // The scan is placed by the fine mesh's frame.
-    this.store.set({ playing: false, code, placement: null, scan, ghost: true, fine: fine || (hasFine && Boolean(scan)) });
+    const finer = fine || (hasFine && Boolean(scan));
+    this.store.set({ playing: false, code, placement: null, scan, ghost: true, fine: finer });
     this.#offer();
   }
 
