@@ -8,8 +8,11 @@ from functools import partial
 from itertools import count
 from typing import Any
 
+import numpy as np
+
 from shapespace.files.animated_gltf import FRAMES_PER_SECOND
 from shapespace.files.archives import Buffer
+from shapespace.files.colouring import Colouring
 from shapespace.mesh.surface import Topology
 from shapespace.model.decoder import Quality
 from shapespace.model.latent_space import CheckedCode, Codes
@@ -19,6 +22,7 @@ from shapespace.service.repository.repository import ModelRepository
 from shapespace.service.use_cases.animation import Animation, UnknownInterpolationError
 from shapespace.service.use_cases.batch import Written, batch, solve
 from shapespace.service.use_cases.many_shapes import shapes, shapes_size
+from shapespace.service.use_cases.one_shape import ColourBy
 from shapespace.service.use_cases.sequence_formats import SEQUENCE_FORMATS, Frames, json_line
 from shapespace.service.use_cases.shape_formats import shown, worst
 from shapespace.solve.deadline import Deadline
@@ -80,8 +84,9 @@ async def sequence_file(
     format: str,
     topology: Topology = Topology.ORIGINAL,
     fps: float = FRAMES_PER_SECOND,
+    colour_by: ColourBy | None = None,
 ) -> Written:
-    """All frames as one file in one of SEQUENCE_FORMATS, with polygons or triangles.
+    """All frames as one file in one of SEQUENCE_FORMATS, with polygons or triangles, coloured or not.
 
     Raises:
         TooManyCodesError, BusyError: more than one answer, or all together, may hold.
@@ -89,16 +94,37 @@ async def sequence_file(
         NoRoomError: no room for a temporary file.
     """
     codes, inside = model.latents.codes(animation.codes(model.latents))
-    async with batch(workers, caller, shapes_size(model, len(codes), animation.mesh)) as work:
-        found = await shapes(work, model, codes, inside, animation.mesh, quality)
-        faces = model.mesh(animation.mesh).faces
-        surface = shown(model.surface(animation.mesh), topology)
-        frames = Frames(found.vertices, found.diagnostics, faces, animation.positions, codes, surface, fps)
+    number, mesh = len(codes), animation.mesh
+    if colour_by and colour_by.against is not None:  # the last of the shapes, then
+        code, within = colour_by.against
+        codes, inside = np.concatenate([codes, code[None]]), np.append(inside, within)
+    # Colours take as much as positions.
+    async with batch(workers, caller, shapes_size(model, len(codes) * (2 if colour_by else 1), mesh)) as work:
+        found = await shapes(work, model, codes, inside, mesh, quality)
+        whole, surface = model.mesh(mesh), shown(model.surface(mesh), topology)
 
         def encode() -> tuple[Iterator[Buffer], dict[str, Any]]:
-            return SEQUENCE_FORMATS[format].encode(frames)
+            colourings: list[Colouring] = []
+            if colour_by:
+                reference = colour_by.against is None
+                against = model.reference_shape(mesh).vertices if reference else found.vertices[-1].astype(np.float64)
+                colourings = Colouring.of_frames(
+                    colour_by.quantity, found.vertices[:number], against, whole.connectivity
+                )
+            return SEQUENCE_FORMATS[format].encode(
+                Frames(
+                    found.vertices[:number],
+                    found.diagnostics[:number],
+                    whole.faces,
+                    animation.positions,
+                    codes[:number],
+                    surface,
+                    fps,
+                    colourings,
+                )
+            )
 
-        return await work.write(encode, found.seconds, worst(found.diagnostics))
+        return await work.write(encode, found.seconds, worst(found.diagnostics[:number]))
 
 
 async def sequence_lines(

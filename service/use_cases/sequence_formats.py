@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from shapespace.arrays import FloatArray, IntArray
 from shapespace.files.animated_gltf import FRAMES_PER_SECOND, animated_glb
 from shapespace.files.archives import Buffer, npz_pieces, zip_pieces
+from shapespace.files.colouring import Colouring
 from shapespace.files.formats import OCTET_STREAM
 from shapespace.files.point_cache import point_cache
 from shapespace.files.surfaces.obj import obj_faces, obj_files, obj_vertices
@@ -35,6 +36,7 @@ class Frames:
         codes: (n, m).
         surface: of the mesh, where its file had more than triangles.
         fps: frames in a second.
+        colourings: of each frame, or of none.
     """
 
     vertices: NDArray[np.float32]
@@ -44,6 +46,7 @@ class Frames:
     codes: Codes
     surface: Surface | None = None
     fps: float = FRAMES_PER_SECOND
+    colourings: Sequence[Colouring] = ()
 
 
 @dataclass(frozen=True)
@@ -54,7 +57,7 @@ class SequenceFormat:
         media_type: as IANA has it.
         encode: a sequence to the pieces of the file, and facts for the diagnostics.
         polygons: whether faces are those of the surface, where there is one; otherwise they are triangles.
-        timed: whether files say how long a frame is shown.
+        timed: whether files say how long a frame is shown, and can carry colours that change.
     """
 
     media_type: str
@@ -73,7 +76,7 @@ def json_line(k: int, t: float, shape: Shape, faces: IntArray | None) -> bytes:
 
 
 def _glb(frames: Frames) -> tuple[Iterator[Buffer], dict[str, Any]]:
-    animated = animated_glb(frames.vertices, frames.faces, frames.surface, frames.fps)
+    animated = animated_glb(frames.vertices, frames.faces, frames.surface, frames.fps, frames.colourings)
     return iter([animated.data]), {"targets": animated.targets, "max_vertex_error": animated.max_vertex_error}
 
 
@@ -95,7 +98,9 @@ def _point_cache(frames: Frames) -> tuple[Iterator[Buffer], dict[str, Any]]:
 def _usd(frames: Frames, *, packed: bool = False) -> tuple[Iterator[Buffer], dict[str, Any]]:
     def pieces() -> Iterator[Buffer]:
         with writing():
-            yield from animated_usd(frames.vertices, frames.faces, frames.surface, frames.fps, packed=packed)
+            yield from animated_usd(
+                frames.vertices, frames.faces, frames.surface, frames.fps, frames.colourings, packed=packed
+            )
 
     return pieces(), {}
 

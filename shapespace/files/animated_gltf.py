@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from shapespace.arrays import FloatArray, IntArray
+from shapespace.files.colouring import Colouring
 from shapespace.files.gltf_writing import Document
 from shapespace.mesh.surface import Surface
 from shapespace.mesh.triangle_mesh import diagonal
@@ -41,9 +42,13 @@ class AnimatedGLB:
 
 
 def animated_glb(
-    frames: NDArray[np.floating], faces: IntArray, surface: Surface | None = None, fps: float = FRAMES_PER_SECOND
+    frames: NDArray[np.floating],
+    faces: IntArray,
+    surface: Surface | None = None,
+    fps: float = FRAMES_PER_SECOND,
+    colourings: Sequence[Colouring] = (),
 ) -> AnimatedGLB:
-    """Encode shapes (n, V, 3), with their surface where there is one.
+    """Encode shapes (n, V, 3), with their surface where there is one, and with a colouring of each or of none.
 
     Key k, at ``k / fps`` seconds, shows frame k.
     The mesh at rest is frame 0. Up to DENSE_FRAMES each later frame is a target of its own, so that keys are
@@ -73,10 +78,11 @@ def animated_glb(
         targets[:, block] = np.tensordot(fit, displacements, 1)
         shown = np.tensordot(keys[1:].astype(np.float64), targets[:, block], 1)
         error = max(error, float(np.linalg.norm(shown - displacements, axis=-1).max(initial=0)))
-    document = Document(rest, faces, "animation", surface=surface)
+    first = colourings[0] if colourings else None
+    document = Document(rest, faces, "animation", first, surface)
     normal_targets = _normal_targets(frames, document.normals, fit)
     if len(targets):
-        document.add_targets(targets, normal_targets)
+        document.add_targets(targets, normal_targets, colors=_colour_targets(colourings, fit) if first else None)
         times = np.arange(len(frames)) / fps
         document.tree["animations"] = [
             {
@@ -119,6 +125,13 @@ def _normal_targets(
         for k in np.flatnonzero(part.any(axis=1)):
             targets[k] += np.tensordot(part[k], normals, 1).astype(np.float32)
     return targets
+
+
+def _colour_targets(colourings: Sequence[Colouring], fit: FloatArray) -> Iterator[NDArray[np.float32]]:
+    """What each target (V, 3) adds to the colours, given how targets come from frames (K, n − 1)."""
+    rest = colourings[0].linear
+    changes = np.stack([(each.linear - rest).astype(np.float32) for each in colourings[1:]])
+    return (np.tensordot(row, changes, 1).astype(np.float32) for row in fit)
 
 
 def _basis_weights(frames: NDArray[np.floating], tolerance: float) -> FloatArray:

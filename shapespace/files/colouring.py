@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 
 import numpy as np
@@ -78,6 +78,19 @@ class Colouring:
         )
         values = total / np.where(weight > 0, weight, 1.0)
         return cls(quantity, values, _round_up(float(np.quantile(np.abs(values), _QUANTILE))))
+
+    @classmethod
+    def of_frames(
+        cls,
+        quantity: Quantity,
+        frames: NDArray[np.floating],
+        against: FloatArray,
+        connectivity: Connectivity,
+    ) -> list[Colouring]:
+        """Each of shapes (n, V, 3) as `between` has it, with the largest of their legends for all."""
+        found = [cls.between(quantity, frame.astype(np.float64), against, connectivity) for frame in frames]
+        limit = max(each.limit for each in found)
+        return [replace(each, limit=limit) for each in found]
 
     @classmethod
     def of_spread(cls, values: FloatArray) -> Colouring:

@@ -244,13 +244,20 @@ class Document:
         self.accessors.append(accessor)
         return len(self.accessors) - 1
 
-    def add_targets(self, moves: Iterable[NDArray], normals: Iterable[NDArray], names: Sequence[str] = ()) -> None:
+    def add_targets(
+        self,
+        moves: Iterable[NDArray],
+        normals: Iterable[NDArray],
+        names: Sequence[str] = (),
+        colors: Iterable[NDArray] | None = None,
+    ) -> None:
         """Add morph targets, at rest with weights 0.
 
         Args:
             moves: of each (V, 3) what it adds to the positions.
             normals: of each (V', 3) what it adds to the normals of the document's vertices.
             names: of each, where they have some.
+            colors: of each (V, 3) what it adds to the colours, where there are some.
         """
         self.primitive["targets"] = [
             {
@@ -259,6 +266,8 @@ class Document:
             }
             for move, normal in zip(moves, normals, strict=True)
         ]
+        for target, change in zip(self.primitive["targets"], colors or (), strict=colors is not None):
+            target["COLOR_0"] = self.add(change[self.rows], target=ARRAY_BUFFER)
         self.mesh["weights"] = [0.0] * len(self.primitive["targets"])
         if names:
             self.mesh.setdefault("extras", {})["targetNames"] = [*names]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
@@ -48,7 +48,8 @@ def still_usd(
         surface: with polygons, materials and textures.
         packed: see `animated_usd`.
     """
-    return b"".join(_pieces(vertices[None], faces, surface, None, colouring, packed=packed))
+    colourings = [colouring] if colouring else []
+    return b"".join(_pieces(vertices[None], faces, surface, None, colourings, packed=packed))
 
 
 def animated_usd(
@@ -56,6 +57,7 @@ def animated_usd(
     faces: IntArray,
     surface: Surface | None = None,
     fps: float = FRAMES_PER_SECOND,
+    colourings: Sequence[Colouring] = (),
     *,
     packed: bool = False,
 ) -> Iterator[bytes]:
@@ -69,13 +71,14 @@ def animated_usd(
         faces: (F, 3).
         surface: with polygons, materials and textures.
         fps: time codes in a second.
+        colourings: of each frame, instead of materials, or of none.
         packed: whether the layer comes in a USDZ package, as phones want it, with the textures beside it.
 
     Raises:
         ImportError: ``usd-core`` is not installed.
         OSError: there is no room for a temporary file.
     """
-    return _pieces(frames, faces, surface, fps, None, packed=packed)
+    return _pieces(frames, faces, surface, fps, colourings, packed=packed)
 
 
 def _pieces(
@@ -83,7 +86,7 @@ def _pieces(
     faces: IntArray,
     surface: Surface | None,
     fps: float | None,
-    colouring: Colouring | None,
+    colourings: Sequence[Colouring],
     *,
     packed: bool,
 ) -> Iterator[bytes]:
@@ -108,8 +111,8 @@ def _pieces(
         mesh = UsdGeom.Mesh.Define(stage, f"/{name}")
         stage.SetDefaultPrim(mesh.GetPrim())
         shown = surface or Surface.of_triangles(faces)
-        if colouring:
-            shown = replace(shown, colors=srgb(colouring.linear), material_of=None, materials=(), textures={})
+        if colourings:
+            shown = replace(shown, colors=srgb(colourings[0].linear), material_of=None, materials=(), textures={})
         mesh.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(shown.sizes.astype(np.int32)))
         mesh.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(shown.corners.astype(np.int32)))
         mesh.CreateOrientationAttr(UsdGeom.Tokens.rightHanded)
@@ -126,6 +129,7 @@ def _pieces(
                 Path(folder, textures[name]).write_bytes(data)
         add_surface(stage, mesh, shown, textures)
         points, normals, extent = mesh.CreatePointsAttr(), mesh.CreateNormalsAttr(), mesh.CreateExtentAttr()
+        colors = mesh.GetDisplayColorPrimvar()
         frames = frames.astype(np.float32, copy=False)
         for start in range(0, len(frames), _FRAMES_AT_ONCE):
             # One notification at the end, instead of three for each frame.
@@ -134,14 +138,17 @@ def _pieces(
                     box = np.stack([frame.min(axis=0), frame.max(axis=0)])
                     around = surface_normals(frame.astype(np.float64), shown).astype(np.float32)
                     around = around[shown.normal_corners] if apart else around
-                    for attribute, rows in ((points, frame), (normals, around), (extent, box)):
+                    written = [(points, frame), (normals, around), (extent, box)]
+                    if colourings and fps is not None:
+                        written.append((colors, colourings[k].linear.astype(np.float32)))
+                    for attribute, rows in written:
                         time = Usd.TimeCode.Default() if fps is None else Usd.TimeCode(k)
                         attribute.Set(Vt.Vec3fArray.FromNumpy(rows), time)
             try:
                 stage.GetRootLayer().Save()  # what is saved is in the file and no longer in memory
             except Tf.ErrorException as error:
                 raise OSError(f"can't write {path}") from error
-        del stage, mesh, points, normals, extent
+        del stage, mesh, points, normals, extent, colors
         if packed:
             package = Path(folder, f"{name}.usdz")
             # The layer first. Versions of USD differ in where they have the writer.

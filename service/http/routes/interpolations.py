@@ -48,6 +48,12 @@ from shapespace.service.use_cases.shape_formats import SHAPE_FORMATS, UNAVAILABL
 
 router = APIRouter(prefix="/v1", tags=["interpolations"])
 
+#: Why a format isn't among those of a coloured animation.
+_UNCOLOURED = {
+    name: f"Whole animations in {name.upper()} carry no colours; single frames do"
+    for name in MEDIA_TYPES
+    if name not in SEQUENCE_FORMATS or not SEQUENCE_FORMATS[name].timed
+}
 #: Most frames in a second: more than any screen shows.
 MOST_FPS = 240
 Id = Annotated[str, Path(description="An interpolation's id.")]
@@ -85,6 +91,7 @@ async def get_interpolation(
     caller: CallerDependency,
     id: Id,
     quality: QualityQuery = Quality.FULL,
+    color: ColorQuery = NO_COLOR,
     topology: TopologyQuery = None,
     fps: Annotated[
         float | None,
@@ -95,7 +102,9 @@ async def get_interpolation(
     """The animation: GLB, arrays, a zip of OBJ files, a point cache, USD, or JSON lines as they get ready."""
     # Who asks for OBJ gets one a frame, in a zip.
     accept = request.headers.get("accept")
-    chosen = choose(writable(MEDIA_TYPES), "zip" if format == "obj" else format, accept, UNAVAILABLE)
+    types = {name: kind for name, kind in MEDIA_TYPES.items() if color.quantity is None or name not in _UNCOLOURED}
+    why = UNAVAILABLE if color.quantity is None else _UNCOLOURED | UNAVAILABLE
+    chosen = choose(writable(types), "zip" if format == "obj" else format, accept, why)
     animation, model = find_interpolation(service.repository, id, service.settings.max_frames)
     written_as = SEQUENCE_FORMATS.get(chosen)
     if fps is not None and not (written_as and written_as.timed):
@@ -104,8 +113,11 @@ async def get_interpolation(
         raise ProblemError("invalid-request", f"{said} For fps ask for one of {timed}.")
     polygons = bool(written_as and written_as.polygons)
     faces = choose_topology(topology, chosen, model, animation.mesh, polygons=polygons)
-    options = [*draft_option(quality), *([faces] if faces is Topology.TRIANGLES else [])]
+    options: list[str | bytes] = [*draft_option(quality), *([faces] if faces is Topology.TRIANGLES else [])]
     options += [] if fps is None else [f"{fps} frames a second"]
+    colour_by = color.on(model)
+    if colour_by:
+        options += [colour_by.quantity, "reference" if colour_by.against is None else colour_by.against[0].tobytes()]
     tag = entity_tag("animation", id, chosen, *options)
     if answer := not_modified(request, tag):
         return answer
@@ -114,7 +126,7 @@ async def get_interpolation(
         first = await anext(lines)  # what goes wrong up to here still has a status of its own
         return StreamingResponse(_resume(request, first, lines), headers=cache_headers(tag), media_type=JSON_LINES)
     written = await sequence_file(
-        service.workers, caller, model, animation, quality, chosen, faces, fps or FRAMES_PER_SECOND
+        service.workers, caller, model, animation, quality, chosen, faces, fps or FRAMES_PER_SECOND, colour_by
     )
     diagnostics = {**(written.diagnostics or {}), **written.facts}
     headers = cache_headers(tag) | file_headers(diagnostics, f"{model.manifest.name}-animation.{chosen}")

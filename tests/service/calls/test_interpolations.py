@@ -16,6 +16,7 @@ from typing import Any
 import httpx
 import numpy as np
 import pytest
+from pxr import UsdGeom
 
 from shapespace.bundle.reader import read_bundle
 from shapespace.files.formats import read_arrays
@@ -282,6 +283,42 @@ def test_frames_a_second_are_those_that_are_asked_for(client: httpx.Client, tmp_
         answer = client.get(links["self"], params=query)
         assert answer.status_code == 422, query
         assert "fps" in answer.json()["detail"]
+
+
+def test_a_whole_animation_is_coloured_as_its_frames_are(client: httpx.Client, tmp_path: Path) -> None:
+    links = create(client, keyframes=[A, B], frames=4)["links"]
+    plain = client.get(links["glb"]).raise_for_status()
+    legends, tags = set(), {plain.headers["ETag"]}
+    for query in ({"color": "stretch"}, {"color": "stretch", "against": ",".join(map(str, A))}, {"color": "bending"}):
+        answer = client.get(links["self"], params={"format": "glb", **query}).raise_for_status()
+        tags.add(answer.headers["ETag"])
+        (tmp_path / "animation.glb").write_bytes(answer.content)
+        assert not khronos_report(tmp_path / "animation.glb")["issues"]["numErrors"]
+        glb = GLB(answer.content)
+        rest = glb.array(glb.primitive["attributes"]["COLOR_0"])
+        changes = [glb.array(target["COLOR_0"]) for target in glb.primitive["targets"]]
+        legend = glb.tree["meshes"][0]["extras"]["color"]
+        legends.add((legend["quantity"], *legend["range"]))
+        path = tmp_path / "animation.usdc"
+        path.write_bytes(client.get(links["self"], params={"format": "usd", **query}).raise_for_status().content)
+        _, stage = read_usd(path)
+        shown = UsdGeom.Mesh(stage.GetDefaultPrim()).GetDisplayColorPrimvar()
+        for k in range(4):
+            frame = client.get(links["frames"].replace("{k}", str(k)), params={"format": "glb", **query})
+            still = GLB(frame.raise_for_status().content)
+            own = still.array(still.primitive["attributes"]["COLOR_0"])
+            found = rest + changes[k - 1] if k else rest
+            np.testing.assert_allclose(found, np.array(shown.Get(k)), atol=1e-6)
+            # One legend serves all frames; a single frame may have a narrower one.
+            if still.tree["meshes"][0]["extras"]["color"] == legend:
+                np.testing.assert_allclose(found, own, atol=1e-6)
+    assert len(tags) == 4
+    assert len(legends) >= 2
+    for format in ("npz", "zip", "pc2", "jsonl"):
+        answer = client.get(links["self"], params={"format": format, "color": "stretch"})
+        assert answer.status_code == 406
+        assert "carry no colours" in answer.json()["detail"]
+    assert client.get(links["self"], params={"color": "spread"}).status_code == 422
 
 
 def test_usdz_holds_the_layer_as_phones_want_it(client: httpx.Client, tmp_path: Path) -> None:
