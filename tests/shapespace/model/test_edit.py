@@ -187,7 +187,7 @@ def test_the_prior_holds_a_code_back_as_much_as_it_weighs(model: ShapeModel) -> 
 def test_anchored_the_whole_stays_though_a_target_is_out_of_reach(figure: ShapeModel) -> None:
     before = figure.decode(np.zeros(20))
     hand, size = int(before[:, 0].argmax()), np.linalg.norm(np.ptp(before, axis=0))
-    leg = next(factor for factor in figure.manifest.factors if factor.name == "lower left front")
+    leg = next(factor for factor in figure.manifest.factors if factor.name == "left knee")
     locked = {k: 0.0 for k in range(20) if not leg.start <= k < leg.stop}
     target = {hand: before[hand] + [0, 0.25, 0]}
     away = {
