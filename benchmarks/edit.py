@@ -1,4 +1,4 @@
-"""docs/editing.md: whether an edit moves what is meant. ``python -m benchmarks.edit``.
+"""docs/measurements/editing.md: whether an edit moves what is meant. ``python -m benchmarks.edit``.
 
 Pulls a fingertip, an elbow or a knee of the bundled figure, each to where it is on the shape of a code of which one
 factor alone differs, one that moves hardly anything but that limb, and measures what else moves.
@@ -188,7 +188,7 @@ def main() -> None:
     some = pulls(model, given.count, 0)
     rows = "\n".join(row(model, some, kind) for kind in PriorKind)
     page = PAGE.format(count=given.count, pull=PULL, rows=rows)
-    (ROOT / "docs" / "editing.md").write_text(page, encoding="utf-8")
+    (ROOT / "docs" / "measurements" / "editing.md").write_text(page, encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""docs/fit.md: how near fits of scans come to the truth, how sure they rightly are, and what they cost.
+"""docs/measurements/fit.md: how near fits of scans come to the truth, how sure they rightly are, and what they cost.
 
 ``python -m benchmarks.fit`` measures the bundled models. With ``--data FOLDER`` also each bundle FOLDER/NAME that has
 shapes it has not seen beside it, FOLDER/NAME.npz with ``vertices`` (n, V, 3) in its order.
@@ -322,7 +322,7 @@ def main() -> None:
         rows="\n".join(row for each in every for row in each["rows"]),
         intervals="\n".join(row for each in every for row in each["intervals"]),
     )
-    (ROOT / "docs" / "fit.md").write_text(page, encoding="utf-8")
+    (ROOT / "docs" / "measurements" / "fit.md").write_text(page, encoding="utf-8")
 
 
 if __name__ == "__main__":

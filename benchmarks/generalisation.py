@@ -1,4 +1,4 @@
-"""docs/generalisation.md: how near spaces come to shapes that they were found without, beside principal components.
+"""docs/measurements/generalisation.md: how near spaces come to unseen shapes, beside principal components.
 
 Five folds of each collection, each with mean, logarithms and modes of its own, for as many modes as the example has and
 half of that. Exponentials stand for networks. A fold that is done is kept under ``--out`` and not done again.
@@ -88,7 +88,7 @@ def main() -> None:
         measure(name, given.data, given.out)
         table = "\n".join(row for each in COLLECTIONS for row in rows(each, given.out))
         page = INTRODUCTION.format(steps=stages.LIGHT_STEPS) + table + "\n"
-        (ROOT / "docs" / "generalisation.md").write_text(page, encoding="utf-8")
+        (ROOT / "docs" / "measurements" / "generalisation.md").write_text(page, encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""docs/results.md: every collection from its meshes to the figures of the paper's tables, in one command.
+"""docs/measurements/results.md: every collection from its meshes to the figures of the paper's tables, in one command.
 
 Each collection is a run of its own under ``--out``, so what is done is not done again, and a killed call goes on where
 it was. Bundles are written beside the runs: they hold the collections' geometry.
@@ -209,7 +209,7 @@ def main() -> None:
             study(name, runs[name])
     rows = {name: Row(name, run) for name, run in runs.items() if run.directory.evaluation.exists()}
     real, ours = ([rows[name] for name in names if name in rows] for names in (COLLECTIONS, OWN))
-    docs = ROOT / "docs"
+    docs = ROOT / "docs" / "measurements"
     draw_strips([rows[name] for name in PICTURED if name in rows], docs / "results-shapes.png")
     if some := [row for row in real if row.evaluation["fractions"]]:
         plot_samples(some, docs / "results-samples.png")

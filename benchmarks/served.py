@@ -1,4 +1,4 @@
-"""docs/served.md: how near served models come to shapes that they have not seen, beside principal components.
+"""docs/measurements/served.md: how near served models come to unseen shapes, beside principal components.
 
 ``python -m benchmarks.served --data FOLDER`` trains a model on four fifths of each collection, exports it, and has its
 ``encode`` find the codes of the other fifth and of the shapes that it was trained on. What is done is kept under
@@ -123,7 +123,7 @@ def main() -> None:
         done = {each: given.out / f"{each}.json" for each in COLLECTIONS}
         rows = [row(each, json.loads(path.read_text())) for each, path in done.items() if path.exists()]
         page = PAGE.format(joint=JOINT, factors=OF_FACTORS, codes=CODES) + "\n".join(rows) + "\n"
-        (ROOT / "docs" / "served.md").write_text(page, encoding="utf-8")
+        (ROOT / "docs" / "measurements" / "served.md").write_text(page, encoding="utf-8")
 
 
 if __name__ == "__main__":

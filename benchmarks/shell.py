@@ -117,7 +117,7 @@ def row(name: str, case: Case, task: Callable[[], object], repeats: int) -> str:
 
 
 def main() -> None:
-    """Print the tables of docs/performance.md."""
+    """Print the tables of docs/measurements/performance.md."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--sizes", type=int, nargs="+", default=[500, 1000, 2000])
     parser.add_argument("--growth", type=int, nargs="*", default=[500, 1000, 2000, 5000, 10000])

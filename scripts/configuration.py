@@ -1,4 +1,4 @@
-"""Write ``docs/configuration.md``: every setting of a configuration, from the models that read it."""
+"""Write ``docs/reference/configuration.md``: every setting of a configuration, from the models that read it."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from pydantic_core import PydanticUndefined
 
 from shapespace.training.runs.config import Config
 
-TARGET = Path(__file__).parents[1] / "docs" / "configuration.md"
+TARGET = Path(__file__).parents[1] / "docs" / "reference" / "configuration.md"
 HEAD = """\
 # Configuration
 

@@ -46,7 +46,7 @@ def _serve(validator: BundleValidator) -> None:
     logs.configure(settings.log_format)
     log = logging.getLogger(__name__)
     for name in unknown_variables():
-        log.warning("%s is no setting: the README lists those there are", name)
+        log.warning("%s is no setting: docs/reference/settings.md lists those there are", name)
     if settings.models_dir == BUNDLED:
         log.info("serving what is installed with the package; a folder models or SHAPESPACE_MODELS_DIR gives others")
     if hasattr(signal, "SIGHUP"):

@@ -1,4 +1,4 @@
-"""Every fault by its name, and what came of it: the table of docs/reliability.md."""
+"""Every fault by its name, and what came of it: the table of docs/measurements/reliability.md."""
 
 from __future__ import annotations
 

@@ -14,7 +14,7 @@ import shapespace
 
 ROOT = Path(__file__).parents[2]
 LIBRARY = ROOT / "shapespace"
-#: Modules with examples; those of the client need a server, and the README's run against one.
+#: Modules with examples; those of the client need a server, and those of the pages run against one.
 MODULES = sorted(
     ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
     for path in LIBRARY.rglob("*.py")

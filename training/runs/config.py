@@ -32,7 +32,7 @@ class ConfigError(ValueError):
 
 
 class _Section(BaseModel):
-    # Docstrings under the fields are their descriptions, from which docs/configuration.md is written.
+    # Docstrings under the fields are their descriptions, from which docs/reference/configuration.md is written.
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, use_attribute_docstrings=True)
 
 

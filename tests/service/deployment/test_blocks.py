@@ -1,4 +1,4 @@
-"""Every block of code in the documentation does what it says; the README's list of settings is whole.
+"""Every block of code in the documentation does what it says; the list of settings is whole.
 
 Calls and Python run as they stand, against a real server. Commands that take minutes or other machines are held against
 what would read them: the Makefile, the command line's parser, a program's own help.
@@ -23,15 +23,16 @@ import pytest
 from shapespace.service.settings import PREFIX, Settings
 from shapespace.training.__main__ import parser
 from tests.service.conftest import ROOT, Server, starting
-from tests.test_docs import PAGES, text_of
+from tests.test_docs import NAMES, PAGES, text_of
 
 MAKEFILE = (ROOT / "Makefile").read_text(encoding="utf-8")
 
 #: First lines of the blocks that nothing here tries, by page, and why.
 UNTRIED = {
-    ("README.md", "docker build -t shapespace . && docker run --rm --read-only -p 8000:8000 shapespace"): (
+    ("docs/how-to/serve.md", "docker build -t shapespace . && docker run --rm --read-only -p 8000:8000 shapespace"): (
         "needs a container engine; `make image-test` builds and tries the same"
     ),
+    ("docs/how-to/call.md", "using System.Net.Http.Json;"): "needs .NET; the same request is in the README",
 }
 
 
@@ -50,8 +51,8 @@ class Block:
 
 
 BLOCKS = [
-    Block(page.name, language, text)
-    for page in PAGES
+    Block(name, language, text)
+    for page, name in zip(PAGES, NAMES, strict=True)
     for language, text in re.findall(
         r"^ *```(.*?)\n(.*?)^ *```$", page.read_text(encoding="utf-8"), re.DOTALL | re.MULTILINE
     )
@@ -71,6 +72,9 @@ def run(command: list[str], server: Server, folder: Path) -> None:
 def try_command(line: str) -> None:
     """Hold a command against what would read it."""
     program, *words = shlex.split(line)
+    while program.startswith(PREFIX):  # the environment of what follows
+        assert program.partition("=")[0].removeprefix(PREFIX).lower() in Settings.model_fields, program
+        program, *words = words
     match Path(program).name:
         case "make":
             for word in words:
@@ -107,6 +111,10 @@ def try_python(text: str, server: Server, folder: Path) -> None:
     run([sys.executable, "-c", text], server, folder)
 
 
+def try_javascript(text: str, server: Server, folder: Path) -> None:
+    run(["node", "--input-type=module", "--eval", text], server, folder)
+
+
 def try_log_line(text: str, server: Server, folder: Path) -> None:
     """The one kind of JSON that the pages show: what a server with SHAPESPACE_LOG_FORMAT=json writes of a request."""
     shown = json.loads(text)
@@ -138,6 +146,7 @@ def try_drawing(text: str, server: Server, folder: Path) -> None:
 TRIALS: dict[str, Callable[[str, Server, Path], None]] = {
     "sh": try_shell,
     "python": try_python,
+    "js": try_javascript,
     "json": try_log_line,
     "": try_map,
     "text": try_drawing,
@@ -177,5 +186,7 @@ def test_options_within_the_text_exist() -> None:
 
 
 def test_every_setting_is_listed_and_none_else() -> None:
-    listed = set(re.findall(rf"`({PREFIX}[A-Z_]+)`", (ROOT / "README.md").read_text(encoding="utf-8")))
+    listed = set(
+        re.findall(rf"`({PREFIX}[A-Z_]+)`", (ROOT / "docs" / "reference" / "settings.md").read_text(encoding="utf-8"))
+    )
     assert listed == {(PREFIX + name).upper() for name in Settings.model_fields}

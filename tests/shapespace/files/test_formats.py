@@ -204,7 +204,7 @@ def test_usd_holds_every_frame_with_its_normals(tmp_path: Path) -> None:
 
 
 def test_few_frames_are_exact_and_many_are_within_the_tolerance() -> None:
-    assert DENSE_FRAMES == 64, "as the README says"
+    assert DENSE_FRAMES == 64, "as docs/reference/http.md says"
     faces = freaky_torus.connectivity().faces
     for count in (DENSE_FRAMES, DENSE_FRAMES + 1):
         codes = np.linspace([0, 0, 1, 1], [0.5, 0.3, 1.1, 1], count)

@@ -1,4 +1,4 @@
-"""docs/configuration.md has every setting, as the models of the configuration have it."""
+"""docs/reference/configuration.md has every setting, as the models of the configuration have it."""
 
 from typing import Literal
 

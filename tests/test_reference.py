@@ -1,0 +1,55 @@
+"""docs/reference is complete: what the code reads, writes or answers is on its page, and nothing else."""
+
+import inspect
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+from shapespace.bundle.schema import ARRAYS, MANIFEST, Manifest
+from shapespace.files.formats import MESH_FORMATS, SCAN_FORMATS, USD_FORMATS
+from shapespace.training.runs.directory import RunDirectory
+
+ROOT = Path(__file__).parents[1]
+
+
+def page(name: str) -> str:
+    return (ROOT / "docs" / "reference" / f"{name}.md").read_text(encoding="utf-8")
+
+
+def first_cells(text: str) -> set[str]:
+    """What stands in code in the first column of the tables."""
+    rows = re.findall(r"^\| (`[^|]*) \|", text, re.MULTILINE)
+    return {name for row in rows for name in re.findall(r"`([^`]+)`", row)}
+
+
+def test_every_member_and_array_of_a_bundle() -> None:
+    text = page("bundle")
+    files, rest = text.split("## The manifest")
+    manifest, arrays = rest.split("## The arrays")
+    assert first_cells(manifest) == {field.alias or name for name, field in Manifest.model_fields.items()}
+    assert first_cells(arrays) == set(ARRAYS)
+    bundled = {re.sub(r"\d+", "J", path.name) for path in (ROOT / "models").glob("*/*/*")}
+    assert bundled | {MANIFEST} <= first_cells(files)
+
+
+def test_every_file_of_a_run_directory() -> None:
+    run = RunDirectory(Path("RUN"))
+    properties = inspect.getmembers(RunDirectory, lambda member: isinstance(member, property))
+    files: list[Any] = [getattr(run, name) for name, _ in properties]
+    files += [run.stamp("STAGE"), run.factor_samples(0), run.network("NAME")]
+    names = {str(getattr(file, "path", file)).removeprefix("RUN/").replace("factor-0", "factor-J") for file in files}
+    table = page("run-directory").split("| file | holds |")[1]
+    assert {name.rstrip("/") for name in first_cells(table)} == names
+
+
+def test_every_call() -> None:
+    text = page("http")
+    told = {re.split(r"[ ?]", call)[1] for call in first_cells(text) if re.match(r"(GET|POST) ", call)}
+    assert told == set(json.loads((ROOT / "openapi" / "openapi.json").read_text(encoding="utf-8"))["paths"])
+
+
+def test_every_format() -> None:
+    text = page("http") + page("files")
+    for name in {*MESH_FORMATS, *USD_FORMATS, *SCAN_FORMATS}:
+        assert re.search(rf"\b{name}\b", text, re.IGNORECASE), name
