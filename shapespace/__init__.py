@@ -66,7 +66,7 @@ if TYPE_CHECKING:
     from shapespace.shell.space import ShellSpace
     from shapespace.shell.transport import parallel_transport
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 __all__ = [
     "ExponentialDerivative",
     "Material",
