@@ -286,7 +286,7 @@ def test_pointing_at_a_factor_colours_where_it_changes_lengths_and_angles(window
 
     studio["#canvas"].hover()
     assert not orange(studio.picture()).any()
-    studio[".factor h2"].filter(has_text="upper").first.hover()  # an arm, on one side of the picture
+    studio[".factor h2"].filter(has_text="shoulder").first.hover()  # an arm, on one side of the picture
     coloured = orange(studio.eventually(lambda: p if orange(p := studio.picture()).any() else None))
     half = coloured.shape[1] // 2
     less, more = sorted(int(side.sum()) for side in (coloured[:, :half], coloured[:, half:]))
