@@ -195,6 +195,8 @@ def read_collection(path: Path, wanted: Sequence[str] = ()) -> MeshCollection:
     with _refusing(raw.labels[0], used[kept]):
         connectivity = Connectivity(faces, len(kept))
     seams = _seams(vertices, connectivity)
+    if raw.vertices.shape[1] > len(used):
+        notes.append(f"dropped {raw.vertices.shape[1] - len(used)} vertices that belong to no face")
     if len(kept) < len(used):
         notes.append(f"welded {len(used)} vertices into {len(kept)}: the others coincide with these in every shape")
     parts, left_out = _parts(raw, path, wanted, vertices, connectivity, kept_pairs, seams)
@@ -206,8 +208,6 @@ def read_collection(path: Path, wanted: Sequence[str] = ()) -> MeshCollection:
         vertices, faces = some_vertices(vertices, remaining), np.searchsorted(remaining, faces[chosen])
         connectivity, kept = Connectivity(faces, len(remaining)), kept[remaining]
         parts = [Part(part.name, np.searchsorted(chosen, part.faces)) for part in parts]
-    if raw.vertices.shape[1] > len(used):
-        notes.append(f"dropped {raw.vertices.shape[1] - len(used)} vertices that belong to no face")
     if len(seams):
         notes.append(
             f"{len(seams)} pairs of border vertices almost coincide in every shape, to {SEAM_TOLERANCE:g} of the size, "
