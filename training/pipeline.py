@@ -142,9 +142,11 @@ def factors(run: Run) -> None:
         _discover(run, space.factors)
 
 
-def _draw(run: Run, folder: Path, latents: FloatArray, title: str, *, shorten: bool) -> None:
+def _draw(
+    run: Run, folder: Path, latents: FloatArray, title: str, *, shorten: bool, collection: Collection | None = None
+) -> None:
     size = run.config.samples.part_size
-    parts = draw(run.collection, folder, latents, size, title, shorten=shorten, scheduler=run.scheduler)
+    parts = draw(collection or run.collection, folder, latents, size, title, shorten=shorten, scheduler=run.scheduler)
     for done, total, failed in parts:
         run.directory.log("progress", what=title, done=done, total=total, failed=failed)
 
@@ -218,9 +220,9 @@ def generalisation(run: Run) -> None:
 def evaluation(run: Run) -> None:
     """evaluation.json and gallery.npz."""
 
-    def exact(name: str, latents: FloatArray) -> NDArray[np.float32]:
+    def exact(name: str, latents: FloatArray, collection: Collection | None = None) -> NDArray[np.float32]:
         folder = run.directory.exact / name
-        _draw(run, folder, latents, f"exact shapes, {name}", shorten=False)
+        _draw(run, folder, latents, f"exact shapes, {name}", shorten=False, collection=collection)
         samples = read(folder)
         result = np.full((len(latents), samples.nric.shape[1]), np.nan, dtype=np.float32)
         result[samples.index] = samples.nric

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
+import hashlib
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.interpolate import RegularGridInterpolator
 from torch import nn
 
 from shapespace.arrays import FloatArray, IntArray
@@ -20,12 +19,12 @@ from shapespace.coordinates.nric import WeightedNorm, nric
 from shapespace.coordinates.reconstruction import Reconstructor
 from shapespace.mesh.rigid_motion import align
 from shapespace.mesh.triangle_mesh import TriangleMesh
+from shapespace.training.learning.baselines import Exact, factor_grids
 from shapespace.training.learning.gallery import extremes, strip
 from shapespace.training.learning.layers import narrowest
 from shapespace.training.learning.learner import Learner
 from shapespace.training.learning.networks import Composite, affine_sum, predict
-from shapespace.training.runs.config import Config, EvaluationSettings
-from shapespace.training.runs.latent_coordinates import Coordinates
+from shapespace.training.runs.config import Config
 from shapespace.training.runs.progress import progress
 from shapespace.training.runs.sampling import Collection
 
@@ -54,57 +53,8 @@ def alone(latents: FloatArray, factor: list[int]) -> FloatArray:
     return result
 
 
-#: Of each coordinate of a grid: with two it would be linear.
-FEWEST_NODES = 3
-
 #: A map from codes (n, m) to NRIC (n, 2E), or to those of the factors (n, J, 2E).
 Model = Callable[[torch.Tensor], torch.Tensor]
-
-#: Exact NRIC (n, 2E) of codes (n, m), which are saved under a name; NaN for a code whose shape was not found.
-Exact = Callable[[str, FloatArray], NDArray[np.float32]]
-
-
-@dataclass(frozen=True)
-class MultilinearGrid:
-    """Multilinear interpolation of exact shapes on a regular grid of one factor (Sassen et al. 2020).
-
-    Attributes:
-        factor: indices of the factor's latents.
-        interpolate: NRIC (n, 2E) of these latents (n, m_j).
-        size: bytes of the values at the nodes.
-    """
-
-    factor: list[int]
-    interpolate: RegularGridInterpolator
-    size: int
-
-    def __call__(self, latents: FloatArray) -> FloatArray:
-        """NRIC (n, 2E) of the factor's part of codes (n, m)."""
-        result: FloatArray = self.interpolate(latents[:, self.factor])
-        return result
-
-    @classmethod
-    def of(
-        cls, coordinates: Coordinates, factor: list[int], nodes: int, shapes: Callable[[FloatArray], NDArray]
-    ) -> MultilinearGrid:
-        """Evaluate the nodes exactly.
-
-        Args:
-            coordinates: of all latents.
-            factor: indices of the factor's.
-            nodes: number along each of them; the end of a period is its beginning and does not count.
-            shapes: exact NRIC (n, 2E) of codes (n, m).
-        """
-        own = coordinates[factor]
-        ends = np.isfinite(own.period).astype(int)
-        axes = [np.linspace(a, b, nodes + end) for a, b, end in zip(own.lower, own.upper, ends, strict=True)]
-        latents = np.zeros((nodes ** len(factor), len(coordinates)))
-        at_nodes = np.meshgrid(*(axis[:nodes] for axis in axes), indexing="ij")
-        latents[:, factor] = np.stack(at_nodes, axis=-1).reshape(-1, len(factor))
-        values = shapes(latents).reshape(*[nodes] * len(factor), -1)
-        closed = np.pad(values, [*((0, end) for end in ends), (0, 0)], mode="wrap")
-        # Rounding may move a code to just outside of the grid.
-        return cls(factor, RegularGridInterpolator(axes, closed, bounds_error=False, fill_value=None), values.nbytes)
 
 
 @dataclass(frozen=True)
@@ -141,11 +91,6 @@ class Reconstructions:
             "iterations": float(np.mean(self.iterations)),
             "status": dict(Counter(self.statuses)),
         }
-
-
-def grid_nodes(dimension: int, settings: EvaluationSettings) -> int:
-    """Nodes along each coordinate of a factor's grid; where these are less than FEWEST_NODES there is none."""
-    return min(settings.grid_nodes, int(settings.grid_size ** (1 / dimension) + 1e-9))
 
 
 @dataclass(frozen=True)
@@ -213,13 +158,14 @@ def evaluate(
         baselines["paper"] = main.paper()
     shapes, found = exact_factors(main, test.rows[: settings.exact_factors], exact)
     learned, predicted = test.predicted(composite.factor_shapes), test.predicted(composite)
+    models: dict[str, Composite | nn.Module] = {"composite": composite, **baselines}
     r2 = {
         "composite": test.r2_of(predicted),
         **{name: test.r2(model) for name, model in baselines.items()},
         "affine": test.r2_of(affine_sum(z_reference, shapes), found),
         "affine of learned factors": test.r2_of(affine_sum(z_reference, learned)),
     }
-    sizes = {name: size_bytes(model) for name, model in {"composite": composite, **baselines}.items()}
+    sizes = {name: size_bytes(model) for name, model in models.items()}
     if grids := factor_grids(collection, settings, exact):
         interpolated = affine_sum(z_reference, np.stack([grid(test.latents) for grid in grids], axis=1))
         # A node without a shape leaves NaN around it.
@@ -232,6 +178,7 @@ def evaluate(
         "eta": settings.eta,
         "test_samples": len(test.rows),
         "r2": r2,
+        "fresh": on_fresh_codes(models, main, min(settings.fresh, len(test.rows)), exact),
         "affine_samples": len(found),
         "r2_factors": {
             name: r_squared(learned[found, j], shapes[:, j], test.norm) for j, name in enumerate(collection.factors)
@@ -250,6 +197,48 @@ def evaluate(
     }
     gallery = extremes(reconstructed.vertices, test.vertices[first], reconstructed.errors, test.rows[first])
     return figures, gallery | strip(collection, composite, eta) | {"faces": reference.faces}
+
+
+#: Share of the fresh codes whose exponentials are computed once more, with twice as many steps.
+FINER = 0.2
+
+
+def on_fresh_codes(
+    models: Mapping[str, Composite | nn.Module], learner: Learner, count: int, exact: Exact
+) -> dict[str, Any] | None:
+    """R² of models on codes that could not be chosen on: they follow from the digest of the first, the composite.
+
+    Returns:
+        ``seed``, the first 32 bits of that digest; the SHA-256 of the ``count`` codes as doubles; how many ``failed``,
+        and R² on the others. Where exponentials are made by steps, ``steps``: R² of theirs to those with twice as many.
+        None if there are fewer than two.
+    """
+    collection, coordinates = learner.collection, learner.collection.coordinates
+    digest = hashlib.sha256()
+    for part in learner.main().parts:
+        for _, tensor in sorted(part.state_dict().items()):
+            digest.update(tensor.contiguous().numpy().tobytes())
+    seed = int(digest.hexdigest()[:8], 16)
+    codes = coordinates.uniform(count, np.random.default_rng(seed))
+    z = exact("fresh", codes) if count else np.empty((0, 0))
+    found = np.flatnonzero(np.isfinite(z).all(axis=1))
+    if len(found) < 2:
+        return None
+    norm = WeightedNorm.of(collection.reference, learner.config.evaluation.eta)
+    latents = torch.as_tensor(codes[found], dtype=torch.float32)
+    result = {
+        "seed": seed,
+        "sha256": hashlib.sha256(codes.tobytes()).hexdigest(),
+        "codes": count,
+        "failed": count - len(found),
+        "r2": {name: r_squared(predict(model, latents).numpy(), z[found], norm) for name, model in models.items()},
+    }
+    if collection.finer:
+        some = found[: max(2, round(FINER * count))]
+        finer = exact("fresh, finer", codes[some], collection.finer)
+        both = np.flatnonzero(np.isfinite(finer).all(axis=1))
+        result["steps"] = r_squared(z[some][both], finer[both], norm) if len(both) > 1 else None
+    return result
 
 
 def _fraction(learner: Callable[..., Learner], fraction: float, test: TestSplit) -> dict[str, Any]:
@@ -301,18 +290,6 @@ def _exact_factor(learner: Learner, rows: IntArray, j: int, exact: Exact) -> NDA
     if beyond.any():
         result[beyond] = exact(f"factor-{j}", alone(learner.joint.latents[rows[beyond]], index))
     return result
-
-
-def factor_grids(collection: Collection, settings: EvaluationSettings, exact: Exact) -> list[MultilinearGrid]:
-    """A grid for each factor; none at all where one of them would be too coarse."""
-    factors = list(collection.factors.values())
-    nodes = [grid_nodes(len(index), settings) for index in factors]
-    if min(nodes) < FEWEST_NODES:
-        return []
-    return [
-        MultilinearGrid.of(collection.coordinates, index, count, partial(exact, f"grid-{j}"))
-        for j, (index, count) in enumerate(zip(factors, nodes, strict=True))
-    ]
 
 
 def size_bytes(model: Composite | nn.Module) -> int:

@@ -282,9 +282,9 @@ class CombinerSettings(_Section):
 
     correction: CorrectionSettings = AutoSettings()
     """What is learned of the difference between the joint shape and the affine sum."""
-    symmetries: bool = True
-    """Whether the images of the training samples under the collection's symmetries, if it has any, are training samples
-    too."""
+    images: int = Field(16, ge=0)
+    """Images of each training sample under symmetries of the collection, if it has any, that are training samples too.
+    Each is under one that is drawn at random."""
 
     @model_validator(mode="before")
     @classmethod
@@ -383,6 +383,9 @@ class EvaluationSettings(_Section):
     """Test codes whose factors' own exponentials are computed, for the affine sum of exact factors."""
     reconstructions: int = Field(100, ge=1)
     """Test shapes whose vertices are reconstructed."""
+    fresh: int = Field(100, ge=0)
+    """Codes that are drawn when all networks are learned, from a digest of these, and on which every model is measured
+    once more; as many as there are test codes, at most. 0 leaves them out."""
 
 
 #: An axis of the collection's coordinates, with its direction.

@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from shapespace.arrays import FloatArray, IntArray
+from shapespace.arrays import FloatArray
 from shapespace.mesh.triangle_mesh import TriangleMesh
 from shapespace.shell.energy import Material
 from shapespace.shell.exponential import exponential
 from shapespace.shell.space import ShellSpace
 from shapespace.training.runs.latent_coordinates import Coordinates
-from shapespace.training.runs.sampling import Shapes
+from shapespace.training.runs.sampling import Shapes, Symmetry
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,9 +67,14 @@ class ShellCollection:
         return Coordinates(self.lower, self.upper, np.full(len(self.modes), np.nan))
 
     @property
-    def symmetries(self) -> list[IntArray]:
+    def symmetries(self) -> Sequence[Symmetry]:
         """None is known."""
         return []
+
+    @property
+    def finer(self) -> ShellCollection:
+        """The same by exponentials of twice as many steps."""
+        return replace(self, steps=2 * self.steps)
 
     def shapes(self, latents: FloatArray) -> Shapes:
         """Exponentials of codes (n, m), with one BLAS thread; angles are unwrapped along each geodesic."""

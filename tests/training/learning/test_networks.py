@@ -16,10 +16,10 @@ from torch import nn
 
 from shapespace.coordinates.nric import WeightedNorm, nric
 from shapespace.mesh.triangle_mesh import Connectivity, TriangleMesh
+from shapespace.training.learning.baselines import LatentKernel
 from shapespace.training.learning.convolutions import EdgeConvolution, Flaps, Star, flaps
 from shapespace.training.learning.corrections import JointSamples
 from shapespace.training.learning.fitting import read_network, save_network
-from shapespace.training.learning.latent_kernel import LatentKernel
 from shapespace.training.learning.layers import (
     FourierProducts,
     LatentFeatures,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import shutil
@@ -16,11 +17,13 @@ import onnxruntime
 import pytest
 import torch
 
+import shapespace
 from shapespace.bundle.geometry import Geometry
 from shapespace.bundle.reader import read_bundle
 from shapespace.coordinates.nric import WeightedNorm, nric
 from shapespace.model.shape_model import ShapeModel
 from shapespace.training.collection.freaky_torus import FreakyTorus, vertices
+from shapespace.training.learning.evaluation import r_squared
 from shapespace.training.learning.export import ExportError, export
 from shapespace.training.pipeline import Run, learner_of
 from shapespace.training.runs.config import load, parse
@@ -115,6 +118,20 @@ def test_the_bundle_is_one_the_server_takes_and_computes_the_same(tiny_run: Path
     answer = combiner.run(None, {"factors": np.stack(shapes, axis=1)})[0]
     norm = WeightedNorm.of(FreakyTorus().reference, 1e-2)
     assert np.sqrt(norm.square(answer - expected) / norm.square(expected)).max() < 1e-4
+
+
+def test_fresh_codes_follow_from_the_networks_and_their_figure_is_that_of_the_bundle(tiny_run: Path) -> None:
+    fresh = json.loads((tiny_run / "evaluation.json").read_text())["fresh"]
+    torus, model = FreakyTorus(), shapespace.load(tiny_run / "models" / "tiny-torus")
+    assert fresh["codes"] == 12, "as many as test codes"
+    codes = torus.coordinates.uniform(12, np.random.default_rng(fresh["seed"]))
+    assert hashlib.sha256(codes.tobytes()).hexdigest() == fresh["sha256"]
+    assert not set(map(tuple, codes)) & set(map(tuple, read(tiny_run / "samples").latents))
+    norm = WeightedNorm.of(torus.reference, 1e-2)
+    found = r_squared(np.stack([model.nric(code) for code in codes]), torus.shapes(codes).nric, norm)
+    assert found == pytest.approx(fresh["r2"]["composite"], abs=1e-4)
+    assert set(fresh["r2"]) == {"composite", "monolithic", "monolithic_paper", "kernel"}
+    assert "steps" not in fresh, "a formula has none"
 
 
 def test_export_refuses_where_onnx_and_torch_disagree(tiny_run: Path, tmp_path: Path) -> None:

@@ -1,0 +1,68 @@
+"""docs/measurements/bundled.md: what the committed runs of the bundled models measured.
+
+``python -m benchmarks.bundled`` writes the page from ``runs/figure`` and ``runs/freaky-torus``; it trains nothing.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+from unittest import mock
+
+import jinja2
+import numpy as np
+
+from shapespace.coordinates.nric import WeightedNorm
+from shapespace.training.collection import freaky_torus
+from shapespace.training.learning.evaluation import r_squared
+from shapespace.training.runs.config import load
+
+ROOT = Path(__file__).resolve().parents[1]
+PAGE = ROOT / "docs" / "measurements" / "bundled.md"
+#: Models of `evaluation.json` in the order of the tables, in words.
+MODELS = {
+    "composite": "**composite**",
+    "monolithic": "our recipe with all coordinates in one factor, from the same joint samples",
+    "kernel": "kernel ridge regression on the codes, likewise",
+    "paper": "the paper's own system, trained to convergence",
+    "monolithic_paper": "the paper's monolithic network, trained to convergence",
+    "affine": "affine sum of exact factors",
+    "affine of learned factors": "affine sum of learned factors",
+    "grid": "multilinear grid of each factor",
+}
+
+
+def record(name: str) -> dict[str, Any]:
+    """What a committed run holds, by the names of its files."""
+    folder = ROOT / "runs" / name
+    found: dict[str, Any] = {path.stem: json.loads(path.read_text()) for path in folder.glob("*.json")}
+    return found | {"config": load(folder / "config.toml")[0]}
+
+
+def without_bump() -> float:
+    """R² of the torus without its bump, on random codes."""
+    torus = freaky_torus.FreakyTorus()
+    codes = torus.coordinates.uniform(500, np.random.default_rng(0))
+    exact, norm = torus.shapes(codes).nric, WeightedNorm.of(torus.reference, 1e-2)
+    with mock.patch.object(freaky_torus, "BUMP_HEIGHT", 0.0):
+        return r_squared(torus.shapes(codes).nric, exact, norm)["total"]
+
+
+def page() -> str:
+    """The text of the page."""
+    environment = jinja2.Environment(
+        loader=jinja2.FileSystemLoader(ROOT / "benchmarks"),
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
+        autoescape=False,  # noqa: S701 - Markdown of our own
+    )
+    environment.filters["percent"] = lambda share, digits=2: f"{100 * share:.{digits}f} %"
+    runs = {"figure": record("figure"), "torus": record("freaky-torus")}
+    return environment.get_template("bundled.md.jinja").render(models=MODELS, bumpless=without_bump(), **runs)
+
+
+if __name__ == "__main__":
+    PAGE.write_text(page(), encoding="utf-8")

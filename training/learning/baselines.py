@@ -1,0 +1,149 @@
+"""Baselines without networks: kernel ridge regression on codes, and multilinear interpolation of each factor."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import Protocol
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.interpolate import RegularGridInterpolator
+from torch import Tensor, nn
+
+from shapespace.arrays import FloatArray
+from shapespace.training.learning.layers import LatentFeatures, Scaling
+from shapespace.training.learning.linear import Ridge, principal_axes, ridge
+from shapespace.training.runs.config import EvaluationSettings
+from shapespace.training.runs.latent_coordinates import Coordinates
+from shapespace.training.runs.sampling import Collection
+
+#: Candidates for the length of the kernel, in multiples of the root of the number of inputs, and for the penalty.
+LENGTHS = (0.5, 1.0, 2.0, 4.0, 8.0)
+PENALTIES = tuple(10.0**k for k in range(-11, -1))
+#: Principal coefficients of the shapes by which these are chosen.
+CHOSEN_BY = 128
+#: Of each coordinate of a grid: with two it would be linear.
+FEWEST_NODES = 3
+
+
+class Exact(Protocol):
+    """Exact shapes of codes, which are saved under a name."""
+
+    def __call__(self, name: str, latents: FloatArray, collection: Collection | None = None) -> NDArray[np.float32]:
+        """NRIC (n, 2E) of codes (n, m), NaN for a code without a shape; of the run's collection unless one is given."""
+        ...
+
+
+class LatentKernel(nn.Module):
+    """``z = mean + Σ_i k(x, x_i) w_i`` with the Gaussian kernel ``exp(−½ |x − x_i|² / ℓ²)``, in double precision.
+
+    The inputs x are bounded coordinates in [−1, 1], and cosine and sine of periodic ones. Length ℓ and penalty are
+    those that suit held-out codes best.
+
+    Args:
+        coordinates: of the codes.
+        scaling: of the values.
+        own: codes (n, m) to fit to, and their NRIC (n, 2E).
+        held_out: pairs that choose length and penalty.
+    """
+
+    anchors: Tensor
+    weights: Tensor
+    mean: Tensor
+
+    def __init__(
+        self,
+        coordinates: Coordinates,
+        scaling: Scaling,
+        own: tuple[Tensor, Tensor],
+        held_out: tuple[Tensor, Tensor],
+    ) -> None:
+        super().__init__()
+        self.features, self.scaling = LatentFeatures(coordinates, order=1), scaling
+        x, others = (self.features(codes).double() for codes, _ in (own, held_out))
+        y, wanted = (scaling.down(z).double() for _, z in (own, held_out))
+        mean = y.mean(dim=0)
+        axes = principal_axes(y - mean, by="rows")[1][:CHOSEN_BY]
+        few, known = (y - mean) @ axes.T, (wanted - mean) @ axes.T
+
+        def fitted(length: float) -> tuple[Ridge, float]:
+            return ridge(_kernel(x, x, length), few, (_kernel(others, x, length), known), PENALTIES), length
+
+        lengths = [times * self.features.size**0.5 for times in LENGTHS]
+        best, self.length = min(map(fitted, lengths), key=lambda fit: fit[0].error)
+        gram = _kernel(x, x, self.length) + best.penalty * torch.eye(len(x))
+        self.register_buffer("anchors", x)
+        self.register_buffer("weights", torch.cholesky_solve(y - mean, torch.linalg.cholesky(gram)))
+        self.register_buffer("mean", mean)
+
+    def forward(self, codes: Tensor) -> Tensor:
+        """NRIC (n, 2E) of codes (n, m)."""
+        kernel = _kernel(self.features(codes).double(), self.anchors, self.length)
+        return self.scaling.up((self.mean + kernel @ self.weights).float())
+
+
+def _kernel(x: Tensor, anchors: Tensor, length: float) -> Tensor:
+    return torch.exp(-0.5 * torch.cdist(x, anchors).square() / length**2)
+
+
+@dataclass(frozen=True)
+class MultilinearGrid:
+    """Multilinear interpolation of exact shapes on a regular grid of one factor (Sassen et al. 2020).
+
+    Attributes:
+        factor: indices of the factor's latents.
+        interpolate: NRIC (n, 2E) of these latents (n, m_j).
+        size: bytes of the values at the nodes.
+    """
+
+    factor: list[int]
+    interpolate: RegularGridInterpolator
+    size: int
+
+    def __call__(self, latents: FloatArray) -> FloatArray:
+        """NRIC (n, 2E) of the factor's part of codes (n, m)."""
+        result: FloatArray = self.interpolate(latents[:, self.factor])
+        return result
+
+    @classmethod
+    def of(
+        cls, coordinates: Coordinates, factor: list[int], nodes: int, shapes: Callable[[FloatArray], NDArray]
+    ) -> MultilinearGrid:
+        """Evaluate the nodes exactly.
+
+        Args:
+            coordinates: of all latents.
+            factor: indices of the factor's.
+            nodes: number along each of them; the end of a period is its beginning and does not count.
+            shapes: exact NRIC (n, 2E) of codes (n, m).
+        """
+        own = coordinates[factor]
+        ends = np.isfinite(own.period).astype(int)
+        axes = [np.linspace(a, b, nodes + end) for a, b, end in zip(own.lower, own.upper, ends, strict=True)]
+        latents = np.zeros((nodes ** len(factor), len(coordinates)))
+        at_nodes = np.meshgrid(*(axis[:nodes] for axis in axes), indexing="ij")
+        latents[:, factor] = np.stack(at_nodes, axis=-1).reshape(-1, len(factor))
+        values = shapes(latents).reshape(*[nodes] * len(factor), -1)
+        closed = np.pad(values, [*((0, end) for end in ends), (0, 0)], mode="wrap")
+        # Rounding may move a code to just outside of the grid.
+        return cls(factor, RegularGridInterpolator(axes, closed, bounds_error=False, fill_value=None), values.nbytes)
+
+
+def grid_nodes(dimension: int, settings: EvaluationSettings) -> int:
+    """Nodes along each coordinate of a factor's grid; where these are less than FEWEST_NODES there is none."""
+    return min(settings.grid_nodes, int(settings.grid_size ** (1 / dimension) + 1e-9))
+
+
+def factor_grids(collection: Collection, settings: EvaluationSettings, exact: Exact) -> list[MultilinearGrid]:
+    """A grid for each factor; none at all where one of them would be too coarse."""
+    factors = list(collection.factors.values())
+    nodes = [grid_nodes(len(index), settings) for index in factors]
+    if min(nodes) < FEWEST_NODES:
+        return []
+    return [
+        MultilinearGrid.of(collection.coordinates, index, count, partial(exact, f"grid-{j}"))
+        for j, (index, count) in enumerate(zip(factors, nodes, strict=True))
+    ]
