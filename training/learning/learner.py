@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
@@ -249,7 +249,8 @@ class Learner:
             combiner = CombinerNetwork.load(saved.metadata, reference, saved.tensors)
         else:
             scaling = self._scaling(self.joint.nric[self.rows["train"]])
-            own, held_out = (JointSamples(*data.part(name), scaling) for name in ("train", "validation"))
+            plain = replace(data, rows=self.rows)
+            own, held_out = (JointSamples(*plain.part(name), scaling) for name in ("train", "validation"))
             combiner = CombinerNetwork.fit(settings.correction, reference, own, held_out, self.seed)
         if descent := combiner.correction.descent:
             state = self._fit(combiner, data, descent, path, self._fraction)

@@ -283,8 +283,8 @@ class CombinerSettings(_Section):
     correction: CorrectionSettings = AutoSettings()
     """What is learned of the difference between the joint shape and the affine sum."""
     images: int = Field(16, ge=0)
-    """Images of each training sample under symmetries of the collection, if it has any, that are training samples too.
-    Each is under one that is drawn at random."""
+    """Images of each training sample under symmetries of the collection, if it has any, from which gradient descent
+    learns too. Each is under one that is drawn at random."""
 
     @model_validator(mode="before")
     @classmethod

@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 
-from shapespace.coordinates.nric import dihedral_angles, nric
+from shapespace.coordinates.nric import dihedral_angles
 from shapespace.training.collection import freaky_torus
 
 # The paper's choice, and how finely it is sampled.
