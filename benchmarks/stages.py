@@ -1,0 +1,137 @@
+"""docs/measurements/growth.md: seconds and memory of every stage of training, by the size of the collection.
+
+``python -m benchmarks.stages`` runs the real command, stage after stage, on capsules that bend and bulge, with one size
+changed at a time. What is done is kept under ``--out``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import trimesh
+
+from shapespace.arrays import FloatArray
+from shapespace.training.runs.stages import STAGES
+
+ROOT = Path(__file__).resolve().parents[1]
+#: Exponentials, joint and of each factor: their time grows in proportion to them.
+JOINT, OF_FACTORS = 100, 50
+
+PAGE = """# How training grows
+
+`python -m benchmarks.stages` writes this page: the real command on capsules that bend and bulge, with {joint} joint
+exponentials and {factors} of each factor. The first row is the base; in each of the others one size is another:
+vertices of the files, shapes n, modes m, or vertices of the coarse mesh. Seconds of each stage are by the clock, on two
+cores, of one run; those of `samples` and `networks` grow with the number of exponentials, which is 1000 and more in a
+real run. Memory is the largest resident set of a process, of `ingest` and of whatever stage has most.
+
+"""
+
+
+@dataclass(frozen=True)
+class Size:
+    """Of a collection and its model."""
+
+    fine: int = 10_000
+    shapes: int = 20
+    modes: int = 8
+    coarse: int = 500
+
+
+BASE = Size()
+SIZES = [
+    BASE,
+    *(replace(BASE, fine=fine) for fine in (40_000, 160_000, 500_000)),
+    *(replace(BASE, shapes=shapes) for shapes in (40, 80, 160)),
+    *(replace(BASE, modes=modes) for modes in (4, 16)),
+    *(replace(BASE, coarse=coarse) for coarse in (1000, 2000)),
+]
+
+
+def collection(size: Size) -> tuple[FloatArray, FloatArray]:
+    """Vertices (n, V, 3) and faces of random smooth deformations of a capsule."""
+    count = round(np.sqrt(size.fine))
+    mesh = trimesh.creation.capsule(height=3, radius=0.5, count=[count, count])
+    rng, x = np.random.default_rng(0), np.asarray(mesh.vertices)
+    waves = 1.5 * rng.standard_normal((2 * size.modes, 3))
+    axes, phases = rng.standard_normal((2 * size.modes, 3)), rng.uniform(0, 6, 2 * size.modes)
+    fields = np.sin(x @ waves.T + phases)[..., None] * axes
+    weights = 0.08 * rng.standard_normal((size.shapes, 2 * size.modes)) / np.sqrt(size.modes)
+    shapes = x + np.einsum("nk,vkd->nvd", weights, fields)
+    return shapes.astype(np.float32), np.asarray(mesh.faces, np.int32)
+
+
+def config(size: Size, data: Path) -> str:
+    """Of a run."""
+    return f"""
+[collection]
+data = "{data}"
+coarse_vertices = {size.coarse}
+[modes]
+count = {size.modes}
+[samples]
+count = {JOINT}
+factor_counts = {OF_FACTORS}
+part_size = 10
+[evaluation]
+reconstructions = 10
+[export]
+name = "capsules"
+title = "Capsules"
+description = "For a benchmark."
+licence = "MIT"
+"""
+
+
+def measure(size: Size, folder: Path) -> dict[str, tuple[float, float]]:
+    """Of each stage wall seconds and MB of the largest process."""
+    folder.mkdir(parents=True, exist_ok=True)
+    data, file = folder / "data.npz", folder / "config.toml"
+    vertices, faces = collection(size)
+    np.savez(data, vertices=vertices, faces=faces)
+    file.write_text(config(size, data), encoding="utf-8")
+    found = {}
+    for stage in STAGES:
+        where = ["--out", str(folder / "run"), "--models", str(folder), "--until", stage]
+        command = [sys.executable, "-m", "shapespace.training", "run", str(file), *where]
+        child = subprocess.Popen(command, stdout=subprocess.DEVNULL)  # noqa: S603 - our own
+        _, status, used = os.wait4(child.pid, 0)
+        if status:
+            raise RuntimeError(f"{stage} of {size} ended with {os.waitstatus_to_exitcode(status)}")
+        stamp = json.loads((folder / "run" / "stages" / f"{stage}.json").read_text())
+        found[stage] = (stamp["seconds"], used.ru_maxrss / 1024)
+    data.unlink()
+    return found
+
+
+def main() -> None:
+    """Measure and write."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--out", type=Path, default=ROOT / "build" / "stages")
+    given = parser.parse_args()
+    shown = [stage for stage in STAGES if stage != "factors"]
+    head = ["files' V", "n", "m", "coarse V", *shown, "ingest MB", "most MB"]
+    rows = [head, ["---"] * len(head)]
+    for size in SIZES:
+        name = "-".join(map(str, asdict(size).values()))
+        path = given.out / f"{name}.json"
+        if not path.exists():
+            found = measure(size, given.out / name)
+            path.write_text(json.dumps(found), encoding="utf-8")
+        found = json.loads(path.read_text())
+        seconds = [f"{found[stage][0]:.1f}" for stage in shown]
+        memory = [found["ingest"][1], max(most for _, most in found.values())]
+        rows.append([*map(str, asdict(size).values()), *seconds, *(f"{mb:.0f}" for mb in memory)])
+    text = PAGE.format(joint=JOINT, factors=OF_FACTORS) + "\n".join(f"| {' | '.join(row)} |" for row in rows) + "\n"
+    (ROOT / "docs" / "measurements" / "growth.md").write_text(text, encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
