@@ -126,6 +126,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
             "eta": 0.01,
             "test_samples": 80,
             "r2": {"composite": score(0.9876), "monolithic": score(0.8765)},
+            "fresh": {"codes": 50, "failed": 1, "r2": {"composite": score(0.6789)}, "steps": score(0.7891)},
             "affine_samples": 80,
             "r2_factors": {"head": score(0.9), NASTY: score(0.8)},
             "variants": {"v": {"title": "without <i>this</i>", "r2": score(0.7)}},
@@ -233,6 +234,8 @@ def test_every_section_is_there_with_its_figures(page: Page) -> None:
     assert "4,321" in words  # a figure the page has never heard of
     assert "seeds · 0 · r2 · composite · total" in words
     assert "0.5432" in words
+    assert "49 codes that were drawn when all was learned" in words
+    assert "0.7891" in words
     labels = {attributes["aria-label"] for attributes in page.all("svg")}
     assert {f"Losses of {name} by epoch" for name in ("head", NASTY, "combiner", "monolithic")} <= labels
     assert {f"{key} of the SPGA by iteration" for key in ("objective", "support")} <= labels
