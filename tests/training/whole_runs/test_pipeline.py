@@ -25,6 +25,7 @@ from shapespace.model.shape_model import ShapeModel
 from shapespace.training.collection.freaky_torus import FreakyTorus, vertices
 from shapespace.training.learning.evaluation import r_squared
 from shapespace.training.learning.export import ExportError, export
+from shapespace.training.learning.fitting import read_network
 from shapespace.training.pipeline import Run, learner_of
 from shapespace.training.runs.config import load, parse
 from shapespace.training.runs.sampling import read
@@ -216,24 +217,22 @@ def test_networks_that_are_not_needed_any_more_are_removed(tiny_run: Path, tmp_p
     assert json.loads((copy / "networks" / "histories.json").read_text()).keys() == after
 
 
-def test_a_run_killed_in_samples_and_in_networks_ends_with_the_same_figures(tiny_run: Path, tmp_path: Path) -> None:
+def test_a_run_killed_in_descent_ends_with_the_same_networks(tiny_run: Path, tmp_path: Path) -> None:
     config, copy = tmp_path / "tiny.toml", tmp_path / "run"
     config.write_text(TINY)
-    for sign in ("samples/factor-2/part-00001.npz", "networks/combiner-*.safetensors"):
-        process = subprocess.Popen(
-            command(config, copy, "--until", "evaluation"), stdout=subprocess.DEVNULL, start_new_session=True
-        )
-        while not list(copy.glob(sign)):
-            assert process.poll() is None, "the run ended before it could be killed"
-            time.sleep(0.02)
-        os.killpg(process.pid, signal.SIGKILL)
-        process.wait()
-    subprocess.run(command(config, copy, "--until", "evaluation"), check=True, capture_output=True)
-    one, other = (json.loads((run / "evaluation.json").read_text()) for run in (tiny_run, copy))
-    one.pop("times"), other.pop("times")
+    until = command(config, copy, "--until", "networks")
+    process = subprocess.Popen(until, stdout=subprocess.DEVNULL, start_new_session=True)
+    while not list(copy.glob("networks/combiner-*.safetensors")):
+        assert process.poll() is None, "the run ended before it could be killed"
+        time.sleep(0.02)
+    os.killpg(process.pid, signal.SIGKILL)
+    process.wait()
+    subprocess.run(until, check=True, capture_output=True)
+    one, other = (json.loads((run / "networks" / "histories.json").read_text()) for run in (tiny_run, copy))
     assert one == other
-    with np.load(tiny_run / "samples/part-00002.npz") as a, np.load(copy / "samples/part-00002.npz") as b:
-        assert all(np.array_equal(a[k], b[k]) for k in a)
+    for network in one:
+        own, again = (read_network(run / "networks" / f"{network}.safetensors") for run in (tiny_run, copy))
+        assert all(torch.equal(tensor, again.tensors[name]) for name, tensor in own.tensors.items())
 
 
 def test_faults_of_the_user_s_making_are_one_message(tmp_path: Path) -> None:
