@@ -35,9 +35,6 @@ patches = 8
 energy = 0.95
 fit = { batch_size = 20, max_epochs = 6 }
 
-[networks.combiner]
-images = 2
-
 [networks.combiner.correction]
 kind = "convolutions"
 neighbourhood = "flaps"

@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Sequence
-
 import numpy as np
-from numpy.typing import NDArray
 
 from shapespace.arrays import FloatArray, IntArray
 from shapespace.coordinates.nric import nric, unwrap
 from shapespace.mesh.triangle_mesh import Connectivity, TriangleMesh
 from shapespace.training.runs.latent_coordinates import Coordinates
-from shapespace.training.runs.sampling import Shapes, Symmetry
+from shapespace.training.runs.sampling import Shapes
 
 U_COUNT, V_COUNT = 64, 32
 MAJOR_RADIUS, MINOR_RADIUS = 0.375, 0.125
@@ -81,33 +77,6 @@ def edge_permutation(mesh: Connectivity, vertex_map: IntArray) -> IntArray:
     return np.searchsorted(key, image[:, 0] * mesh.vertex_count + image[:, 1])
 
 
-class TorusSymmetry:
-    """A turn about the z-axis by some columns of the grid, after a half turn about the x-axis or not.
-
-    The half turn takes the shape of (α, β, γ, ζ) to that of (−α, −β, −γ, −ζ); the turn by δ takes that to the one of
-    (α + 2δ, β, γ + δ, ζ), because an ellipse turns by half its angle.
-
-    Args:
-        mesh: the reference.
-        columns: of the 64, by which it is turned.
-        turned: whether the half turn comes first.
-    """
-
-    def __init__(self, mesh: TriangleMesh, columns: int, turned: bool) -> None:
-        i, j = np.divmod(np.arange(U_COUNT * V_COUNT), V_COUNT)
-        i, j = (-i, -j) if turned else (i, j)
-        i = i + columns if turned else i - columns
-        source = edge_permutation(mesh.connectivity, i % U_COUNT * V_COUNT + j % V_COUNT)
-        self._source = np.concatenate([source, len(source) + source])
-        self._rest = nric(mesh.vertices, mesh.connectivity)
-        delta = PERIOD * columns / U_COUNT
-        self._sign, self._shift = -1.0 if turned else 1.0, np.array([2 * delta, 0, delta, 0])
-
-    def __call__(self, latents: FloatArray, z: NDArray) -> tuple[FloatArray, NDArray]:
-        """See sampling.Symmetry; codes are in [0, 2π)."""
-        return (self._sign * latents + self._shift) % PERIOD, unwrap(z[..., self._source], self._rest)
-
-
 class FreakyTorus:
     """The collection of `vertices`, normalised to a reference of unit area; see sampling.Collection."""
 
@@ -121,10 +90,11 @@ class FreakyTorus:
         self.reference = mesh.with_vertices(mesh.vertices / self.scale)
 
     @property
-    def symmetries(self) -> Sequence[Symmetry]:
-        """All of them but the identity, 127."""
-        group = itertools.product(range(U_COUNT), (False, True))
-        return [TorusSymmetry(self.reference, columns, turned) for columns, turned in group if columns or turned]
+    def symmetries(self) -> list[IntArray]:
+        """The half turn about the x-axis, which takes the shape of (α, β, γ, ζ) to that of (−α, −β, −γ, −ζ)."""
+        i, j = np.divmod(np.arange(U_COUNT * V_COUNT), V_COUNT)
+        turned = -i % U_COUNT * V_COUNT + -j % V_COUNT
+        return [edge_permutation(self.reference.connectivity, turned)]
 
     @property
     def finer(self) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
@@ -18,9 +18,9 @@ from torch import Tensor
 
 from shapespace.arrays import FloatArray, IntArray
 from shapespace.coordinates.nric import WeightedNorm, nric
-from shapespace.training.learning.baselines import LatentKernel
 from shapespace.training.learning.corrections import JointSamples
 from shapespace.training.learning.fitting import fit, read_network, save_network
+from shapespace.training.learning.baselines import LatentKernel
 from shapespace.training.learning.layers import PatchBasis, Scaling
 from shapespace.training.learning.networks import (
     CombinerNetwork,
@@ -231,26 +231,29 @@ class Learner:
         decides = [*factors, *choices(recipe.combiner.correction)]
         path = self._path("combiner", [self._fraction, self._factor_fraction], recipe.combiner, *decides)
 
-        shapes = partial(factor_shapes, networks, indices)
+        def shapes() -> Tensor:
+            latents = torch.as_tensor(self.joint.latents, dtype=torch.float32)
+            return predict(partial(factor_shapes, networks, indices), latents)
+
         return Composite(indices, networks, self._combiner(recipe.combiner, path, shapes))
 
-    def _combiner(self, settings: CombinerSettings, path: Path, shapes: Callable[[Tensor], Tensor]) -> CombinerNetwork:
-        """Ψ, read from ``path`` or fitted to the factors' shapes (n, J, 2E) of codes (n, m)."""
+    def _combiner(self, settings: CombinerSettings, path: Path, shapes: Callable[[], Tensor]) -> CombinerNetwork:
+        """Ψ, read from ``path`` or fitted to the factors' shapes (n, J, 2E) of all joint samples."""
         saved, reference = read_network(path) if path.exists() else None, self.collection.reference
         if saved and saved.done:
             combiner = CombinerNetwork.load(saved.metadata, reference, saved.tensors)
             combiner.eval()
             self._record(path, saved.state)
             return combiner
-        latents, z, rows = self._with_images(settings.images)
-        data = _Data(predict(shapes, latents), z, rows)
+        data = _Data(shapes(), self.joint.nric, self.rows)
+        if settings.symmetries:
+            data = self._with_images(data)
         torch.manual_seed(self.seed)
         if saved:
             combiner = CombinerNetwork.load(saved.metadata, reference, saved.tensors)
         else:
             scaling = self._scaling(self.joint.nric[self.rows["train"]])
-            plain = replace(data, rows=self.rows)
-            own, held_out = (JointSamples(*plain.part(name), scaling) for name in ("train", "validation"))
+            own, held_out = (JointSamples(*data.part(name), scaling) for name in ("train", "validation"))
             combiner = CombinerNetwork.fit(settings.correction, reference, own, held_out, self.seed)
         if descent := combiner.correction.descent:
             state = self._fit(combiner, data, descent, path, self._fraction)
@@ -261,17 +264,16 @@ class Learner:
         self._record(path, state)
         return combiner
 
-    def _with_images(self, count: int) -> tuple[Tensor, NDArray[np.float32], dict[str, IntArray]]:
-        """Codes, NRIC and rows of the joint samples and of so many images of each training sample."""
-        latents, z, rows = self.joint.latents, self.joint.nric, dict(self.rows)
-        symmetries = self.collection.symmetries
-        train = np.tile(rows["train"], count if symmetries else 0)
-        which = np.random.default_rng(self.seed).integers(max(len(symmetries), 1), size=len(train))
-        images = [symmetries[k](latents[[row]], z[[row]]) for k, row in zip(which, train, strict=True)]
-        rows["train"] = np.concatenate([rows["train"], len(z) + np.arange(len(images))])
-        codes = np.concatenate([latents, *(code for code, _ in images)])
-        every = np.concatenate([z, *(image.astype(z.dtype) for _, image in images)])
-        return torch.as_tensor(codes, dtype=torch.float32), every, rows
+    def _with_images(self, data: _Data) -> _Data:
+        """The same, with the images of the training samples under each symmetry of the collection."""
+        inputs, z, train = data.inputs, data.z, data.rows["train"]
+        rows = dict(data.rows)
+        for edges in self.collection.symmetries:
+            both_halves = np.concatenate([edges, len(edges) + edges])
+            rows["train"] = np.concatenate([rows["train"], len(z) + np.arange(len(train))])
+            inputs = torch.cat([inputs, data.inputs[train][:, :, both_halves]])
+            z = np.concatenate([z, data.z[train][:, both_halves]])
+        return _Data(inputs, z, rows)
 
     def main(self) -> Composite:
         """By the main recipe, which is exported."""
@@ -292,7 +294,10 @@ class Learner:
         decides = [self.config.monolithic, *choices(combiner.correction)]
         path = self._path("monolithic-combiner", [self._fraction], combiner, *decides)
 
-        shapes = partial(factor_shapes, [network], [index])
+        def shapes() -> Tensor:
+            latents = torch.as_tensor(self.joint.latents, dtype=torch.float32)
+            return predict(partial(factor_shapes, [network], [index]), latents)
+
         return Composite([index], [network], self._combiner(combiner, path, shapes))
 
     def monolithic_paper(self) -> FactorNetwork:

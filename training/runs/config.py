@@ -282,9 +282,9 @@ class CombinerSettings(_Section):
 
     correction: CorrectionSettings = AutoSettings()
     """What is learned of the difference between the joint shape and the affine sum."""
-    images: int = Field(16, ge=0)
-    """Images of each training sample under symmetries of the collection, if it has any, from which gradient descent
-    learns too. Each is under one that is drawn at random."""
+    symmetries: bool = True
+    """Whether the images of the training samples under the collection's symmetries, if it has any, are training samples
+    too."""
 
     @model_validator(mode="before")
     @classmethod

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -47,14 +47,6 @@ class Shapes:
     reasons: list[str]
 
 
-class Symmetry(Protocol):
-    """A symmetry of a collection."""
-
-    def __call__(self, latents: FloatArray, z: NDArray) -> tuple[FloatArray, NDArray]:
-        """Codes (n, m) and NRIC (n, 2E) of the images of shapes that have these."""
-        ...
-
-
 class Collection(Protocol):
     """A shape manifold with a parametrisation by codes: what the stages from `factors` on need to know.
 
@@ -64,8 +56,8 @@ class Collection(Protocol):
         factors: latent indices of each factor, by name; consecutive.
         latent_names: (m,) names of the coordinates.
         coordinates: bounds and periods.
-        symmetries: what takes shapes of the collection to shapes of the collection, but the identity; the combiner
-            sees images of the training samples too.
+        symmetries: involutions of the edges, (E,) each, that take shapes of the collection to shapes of the collection
+            and the reference to itself; the combiner sees each training sample's images too.
         finer: the same by exponentials of twice as many steps; None where shapes are not made by steps.
     """
 
@@ -80,7 +72,7 @@ class Collection(Protocol):
     @property
     def coordinates(self) -> Coordinates: ...  # noqa: D102
     @property
-    def symmetries(self) -> Sequence[Symmetry]: ...  # noqa: D102
+    def symmetries(self) -> list[IntArray]: ...  # noqa: D102
     @property
     def finer(self) -> Collection | None: ...  # noqa: D102
 

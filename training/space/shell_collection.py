@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -10,13 +9,13 @@ from typing import Any
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from shapespace.arrays import FloatArray
+from shapespace.arrays import FloatArray, IntArray
 from shapespace.mesh.triangle_mesh import TriangleMesh
 from shapespace.shell.energy import Material
 from shapespace.shell.exponential import exponential
 from shapespace.shell.space import ShellSpace
 from shapespace.training.runs.latent_coordinates import Coordinates
-from shapespace.training.runs.sampling import Shapes, Symmetry
+from shapespace.training.runs.sampling import Shapes
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,7 +66,7 @@ class ShellCollection:
         return Coordinates(self.lower, self.upper, np.full(len(self.modes), np.nan))
 
     @property
-    def symmetries(self) -> Sequence[Symmetry]:
+    def symmetries(self) -> list[IntArray]:
         """None is known."""
         return []
 

@@ -105,7 +105,7 @@ def test_a_variant_is_what_differs_from_its_base() -> None:
         """
         [variants.a]
         title = ""
-        combiner = { images = 0, correction = { width = 3 } }
+        combiner = { symmetries = false, correction = { width = 3 } }
         [variants.b]
         title = ""
         base = "a"
@@ -114,7 +114,7 @@ def test_a_variant_is_what_differs_from_its_base() -> None:
     )
     first, second = (config.recipes[name].combiner for name in "ab")
     assert second.correction == first.correction.model_copy(update={"layers": 1})
-    assert second.images == 0
+    assert not second.symmetries
 
 
 def test_a_correction_of_another_kind_starts_from_its_defaults() -> None:
