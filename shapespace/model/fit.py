@@ -15,7 +15,7 @@ from shapespace.mesh.closest_points import Fans, Surface
 from shapespace.mesh.rigid_motion import Placement
 from shapespace.model.decoder import Decoder, MeshChoice, Shape
 from shapespace.model.latent_space import Bounds, Codes
-from shapespace.model.placement import Start, coarse, evenly
+from shapespace.model.placement import NARROW, WIDE, Breadth, Start, coarse, evenly
 from shapespace.model.population import Population
 from shapespace.model.posterior import Posterior
 from shapespace.model.scan import InvalidScanError, Scan, scan_of
@@ -29,8 +29,8 @@ from shapespace.solve.outcome import Status
 STARTS, DRAWN, SHOWN = 16, 200, 150
 #: Vertices of the model that look for points of the scan: of the coarse and of the fine mesh.
 LOOKING_ROUGHLY, LOOKING = 500, 1000
-#: Placed starts that are followed, and steps of each; steps of the two best from there, and of the best at last.
-FOLLOWED, FIRST_STEPS, MORE_STEPS, LAST_STEPS = 5, 4, 6, 10
+#: Steps of each start that is followed, of the two best from there, and of the best at last.
+FIRST_STEPS, MORE_STEPS, LAST_STEPS = 4, 6, 10
 #: Where a limb stays unexplained: attempts to bring it over, their steps, and those in which it is drawn.
 ATTEMPTS, ATTEMPT_STEPS, DRAWING = 4, 9, 4
 #: A scan so many times as large or as small as the model's shapes is in other units, unless its size is free.
@@ -274,7 +274,7 @@ class _Fit:
             self._require_units()
         with self.model.solver() as reconstruct:
             rough = self._search(reconstruct, self.scan, self.options, ROUGH)
-            best, others = self._roughly(rough)
+            best, others = self._roughly(rough, NARROW, *([WIDE] if self.options.partial else []))
             full = self._search(reconstruct, self.scan, self.options, FULL)
             final, rival = self._fully(full, best, others)
             ratio = None
@@ -284,7 +284,7 @@ class _Fit:
                 flip = np.array([-1, 1, 1])
                 scan = replace(self.scan, points=self.scan.points * flip, normals=self.scan.normals * flip)
                 options = replace(self.options, places=self.options.places * flip)
-                twin, _ = self._roughly(self._search(reconstruct, scan, options, ROUGH))
+                twin, _ = self._roughly(self._search(reconstruct, scan, options, ROUGH), NARROW)
                 ratio = twin.cost / best.cost
         # The model lends its solver again for the shape that is answered.
         return self._answer(full, final, posterior, explained, seen, ratio, rival, rough.count)
@@ -341,12 +341,12 @@ class _Fit:
         fans, looking = self.fitter.reach[level.mesh]
         return Search(self.model, reconstruct, scan, options, level, fans, looking, self.deadline)
 
-    def _placed(self, search: Search) -> list[Start]:
+    def _placed(self, search: Search, breadth: Breadth) -> list[Start]:
         """Where a search begins."""
         options = search.options
         if len(options.landmarks) < 3:
             shown = self.shapes[:, self.fitter.shown]
-            return coarse(search.scan, shown, partial=options.partial, free=self.free, count=FOLLOWED)
+            return coarse(search.scan, shown, partial=options.partial, free=self.free, breadth=breadth)
         rows, starts = search.landmark_rows(), list[Start]()
         for k, shape in enumerate(self.shapes):
             own = rows @ shape
@@ -355,29 +355,33 @@ class _Fit:
                 starts.append(Start(k, placement, float(np.linalg.norm(placement(own) - options.places))))
         if not starts:
             raise InvalidScanError("All landmarks lie at one place, which tells no size. Send others, or scale=fixed.")
-        return sorted(starts, key=lambda start: start.score)[:FOLLOWED]
+        return sorted(starts, key=lambda start: start.score)[: breadth.count]
 
-    def _roughly(self, search: Search) -> tuple[State, list[State]]:
-        """The best fit of rough shapes, and others."""
+    def _roughly(self, search: Search, *breadths: Breadth) -> tuple[State, list[State]]:
+        """The best fit of rough shapes, and others; from more places where those of the first breadth give none."""
+        states: list[State] = []
+        for breadth in breadths:
+            states = sorted([*states, *self._followed(search, breadth)], key=lambda state: state.cost)
+            for k in range(ATTEMPTS):
+                if self._late or not self._is_poor(*search.shares(states[0])):
+                    return states[0], states[1:]
+                # The best once more, what came of that, and then the others.
+                base = states[0] if k < 2 or k - 1 >= len(states) else states[k - 1]
+                again = search.run(base, ATTEMPT_STEPS, first=False, drawn=DRAWING)
+                if again.cost < states[0].cost:
+                    states[0] = again
+        return states[0], states[1:]
+
+    def _followed(self, search: Search, breadth: Breadth) -> list[State]:
+        """Fits of rough shapes from so many places, the best first."""
         begun = [
             search.start(self.codes[start.shape], start.placement, self.shapes[start.shape])
-            for start in self._placed(search)
+            for start in self._placed(search, breadth)
         ]
         states = [search.run(state, FIRST_STEPS, first=True) for state in begun if state is not None]
         states.sort(key=lambda state: state.cost)
         states[:2] = [search.run(state, MORE_STEPS, first=True) for state in states[:2]]
-        states.sort(key=lambda state: state.cost)
-        others = states[1:]
-        best = states[0]
-        for k in range(ATTEMPTS):
-            if self._late or not self._is_poor(*search.shares(best)):
-                break
-            # The best once more, what came of that, and then the others.
-            base = best if k < 2 or k - 2 >= len(others) else others[k - 2]
-            again = search.run(base, ATTEMPT_STEPS, first=False, drawn=DRAWING)
-            if again.cost < best.cost:
-                best = again
-        return best, others
+        return sorted(states, key=lambda state: state.cost)
 
     def _fully(self, search: Search, best: State, others: list[State]) -> tuple[State, State | None]:
         """The best fit of answered shapes, and another that is nearly as good, if there is one."""

@@ -12,16 +12,37 @@ from shapespace.arrays import FloatArray, IntArray
 from shapespace.mesh.rigid_motion import Placement
 from shapespace.model.scan import Scan, near
 
-#: Points of the scan and of each shape that coarse placements are scored by, and rotations tried beside principal axes.
-POINTS, ROTATIONS = 150, 60
 #: Share of the distances that count: the farthest may belong to a limb bent otherwise, or to something else.
 TRIMMED = 0.8
-#: Placements and codes that are kept from one stage to the next.
-KEPT, POLISHED, STEPS = 8, 12, 6
 #: Shapes that rotations are tried on. The others are tried at the best of them.
 FIRST = 4
 #: How far apart placements have to be to count as different, in radians.
 DIFFERENT = 0.35
+
+
+@dataclass(frozen=True)
+class Breadth:
+    """How widely placements are looked for.
+
+    Attributes:
+        points: of the scan, that they are scored by.
+        rotations: tried beside principal axes.
+        kept, polished: placements, and more with other shapes, that go on to the next stage.
+        steps: of closest points there.
+        count: starts, at most.
+    """
+
+    points: int
+    rotations: int
+    kept: int
+    polished: int
+    steps: int
+    count: int
+
+
+#: What serves most scans; and what those of a part may need, since from one side a flat shape looks like its other side.
+NARROW = Breadth(points=150, rotations=60, kept=8, polished=12, steps=6, count=5)
+WIDE = Breadth(points=300, rotations=240, kept=48, polished=48, steps=20, count=32)
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,7 +60,7 @@ class Start:
     score: float
 
 
-def coarse(scan: Scan, shapes: FloatArray, *, partial: bool, free: bool, count: int) -> list[Start]:
+def coarse(scan: Scan, shapes: FloatArray, *, partial: bool, free: bool, breadth: Breadth) -> list[Start]:
     """The best placements of some shapes in a scan, each clearly different from the ones before.
 
     Args:
@@ -47,23 +68,26 @@ def coarse(scan: Scan, shapes: FloatArray, *, partial: bool, free: bool, count: 
         shapes: (k, n, 3) points evenly spread on shapes of a model.
         partial: whether the scan shows a part of the shape only: then nothing has to be near each of its points.
         free: whether the size may change too.
-        count: how many at most.
+        breadth: how widely they are looked for.
     """
-    some = scan.some(POINTS).points
-    turns = np.concatenate([_grid(ROTATIONS), *(_principal(shape, some) for shape in shapes[:1])])
+    some = scan.some(breadth.points).points
+    turns = np.concatenate([_grid(breadth.rotations), *(_principal(shape, some) for shape in shapes[:1])])
     tried: list[Start] = []
     for k, shape in enumerate(shapes[:FIRST]):
         tried += _scored(k, shape, some, turns, partial=partial, free=free)
-    kept = _different(tried, KEPT, DIFFERENT)
+    kept = _different(tried, breadth.kept, DIFFERENT)
     again = np.stack([start.placement.rotation for start in kept])
     for k, shape in enumerate(shapes[FIRST:], FIRST):
         tried += _scored(k, shape, some, again, partial=partial, free=free)
     tree = cKDTree(some)
     # One of each rotation at least, so that a wrong one with the right code doesn't take all places.
-    chosen = [*kept, *sorted(tried, key=lambda start: start.score)[: 2 * POLISHED]]
-    unique = list({(start.shape, id(start.placement)): start for start in chosen}.values())[: KEPT + POLISHED]
-    polished = [_polished(start, shapes[start.shape], some, tree, partial=partial, free=free) for start in unique]
-    return _different(polished, count, DIFFERENT / 2)
+    chosen = [*kept, *sorted(tried, key=lambda start: start.score)[: 2 * breadth.polished]]
+    unique = list({(start.shape, id(start.placement)): start for start in chosen}.values())
+    polished = [
+        _polished(start, shapes[start.shape], some, tree, breadth.steps, partial=partial, free=free)
+        for start in unique[: breadth.kept + breadth.polished]
+    ]
+    return _different(polished, breadth.count, DIFFERENT / 2)
 
 
 def _different(starts: list[Start], count: int, apart: float) -> list[Start]:
@@ -97,10 +121,12 @@ def _scored(
     ]
 
 
-def _polished(start: Start, shape: FloatArray, some: FloatArray, tree: cKDTree, *, partial: bool, free: bool) -> Start:
+def _polished(
+    start: Start, shape: FloatArray, some: FloatArray, tree: cKDTree, steps: int, *, partial: bool, free: bool
+) -> Start:
     """A few steps of closest points, for the motion alone."""
     placement, own = start.placement, cKDTree(shape)
-    for _ in range(STEPS):
+    for _ in range(steps):
         to_shape, nearest = near(own, placement.back(some))
         pairs = [(shape[nearest], some, to_shape)]
         if not partial:

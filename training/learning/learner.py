@@ -18,9 +18,9 @@ from torch import Tensor
 
 from shapespace.arrays import FloatArray, IntArray
 from shapespace.coordinates.nric import WeightedNorm, nric
+from shapespace.training.learning.baselines import LatentKernel
 from shapespace.training.learning.corrections import JointSamples
 from shapespace.training.learning.fitting import fit, read_network, save_network
-from shapespace.training.learning.baselines import LatentKernel
 from shapespace.training.learning.layers import PatchBasis, Scaling
 from shapespace.training.learning.networks import (
     CombinerNetwork,

@@ -133,6 +133,13 @@ def test_noise_and_outliers_are_told_from_the_shape(figure: ShapeModel) -> None:
     assert told.noise == pytest.approx(0.005 * given.size)
 
 
+def test_more_places_are_tried_where_the_first_explain_too_little_of_a_part(figure: ShapeModel) -> None:
+    moved = Moved.of(figure, 51)
+    found = figure.fit(moved.seen_from(0), partial=True)
+    assert found.status is FitStatus.CONVERGED
+    assert moved.error(found) < 0.005
+
+
 def test_what_one_camera_sees_is_enough_and_the_rest_is_less_certain(figure: ShapeModel) -> None:
     given = Moved.of(figure, 3)
     points = given.seen_from(2)
