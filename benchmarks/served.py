@@ -47,15 +47,15 @@ FOLDER` trains, measures and writes this page; what it measured is in `runs/coll
 
 ## Networks and exponentials
 
-R² of the same models in the weighted norm with η = 1e-2, on codes that follow from a digest of the finished networks, so
-that nothing can have been chosen on them. **exponentials** are all that the composite saw, joint ones and those of
+R² of the same models in the weighted norm with η = 1e-2, on codes that follow from a digest of the finished networks,
+so that nothing can have been chosen on them. **exponentials** are all that the composite saw, joint ones and those of
 factors. The others see the joint ones: **one factor** is our recipe without a product, **kernel** is kernel ridge
 regression on the codes, **paper's** is the paper's monolithic network, trained to convergence. **affine** is the sum of
 the learned factors, on test codes. **steps**: 1 − R² of the exponentials to those of twice as many steps. Where
 1 − R² of the composite is less, it is nearer to these exponentials than these are to the limit.
 
-| | factors | exponentials | composite | one factor | kernel | paper's | affine | steps | failed | learned by | size | one factor | kernel |
-|---|---|---|---|---|---|---|---|---|---|---|---|---|---|
+| | factors | exponentials | composite | one factor | kernel | paper's | affine | steps | failed | learned by | MB |
+|---|---|---|---|---|---|---|---|---|---|---|---|
 {networks}
 """
 
@@ -132,7 +132,7 @@ def network_row(name: str, found: dict[str, Any]) -> str:
     cells = [name, str(len(figures["r2_factors"])), str(figures["exponentials"]), *(f"{each:.4f}" for each in r2)]
     cells += [f"{figures['r2']['affine of learned factors']['total']:.4f}", f"{1 - fresh['steps']['total']:.1e}"]
     cells += [f"{fresh['failed']} of {fresh['codes']}", figures["correction"]["kind"]]
-    cells += [f"{sizes[each] / 1e6:.1f} MB" for each in ("composite", "monolithic", "kernel")]
+    cells.append(f"{sizes['composite'] / 1e6:.1f}")
     return f"| {' | '.join(cells)} |"
 
 
