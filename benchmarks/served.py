@@ -57,6 +57,12 @@ the learned factors, on test codes. **steps**: 1 − R² of the exponentials to 
 | | factors | exponentials | composite | one factor | kernel | paper's | affine | steps | failed | learned by | MB |
 |---|---|---|---|---|---|---|---|---|---|---|---|
 {networks}
+
+![Hands of four fresh codes: exact, and by each model with the distance of vertices in colours](hand-models.png)
+
+![The hand's principal geodesic modes and its sparse ones](hand-modes.png)
+
+`python -m benchmarks.pictures` draws these from a run.
 """
 
 

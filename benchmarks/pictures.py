@@ -1,0 +1,113 @@
+"""docs/measurements/NAME-models.png and NAME-modes.png: what the models of a run make of codes, and its modes.
+
+``python -m benchmarks.pictures CONFIG RUN`` draws them from a finished run, after figures 4 and 5 of the paper.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import matplotlib.pyplot as plt
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from PIL import Image
+
+from shapespace.arrays import FloatArray
+from shapespace.coordinates.nric import nric
+from shapespace.coordinates.reconstruction import Reconstructor
+from shapespace.mesh.rigid_motion import align
+from shapespace.training.learning.networks import affine_sum, predict
+from shapespace.training.pipeline import Run, learner_of
+from shapespace.training.report.pictures import CLAY, ERROR, MODE_REACH, Studio, ramp, tint
+from shapespace.training.report.record import Record
+from shapespace.training.runs.config import load
+from shapespace.training.runs.sampling import read
+
+ROOT = Path(__file__).resolve().parents[1]
+#: Codes that are shown, the first of the fresh ones; modes, the strongest; and pixels of a picture's side.
+CODES, MODES, SIZE = 4, 6, 260
+#: Errors between which colours change, as shares of the diagonal, on a logarithmic scale.
+LEAST, MOST = 1e-4, 3e-2
+
+
+def models(run: Run, studio: Studio, path: Path) -> None:
+    """Shapes of fresh codes: exact, and by each model, with colours of the distance of vertices from the exact ones."""
+    learner, samples = learner_of(run), read(run.directory.exact / "fresh")
+    codes, exact = samples.latents[:CODES], align(samples.vertices[:CODES].astype(np.float64), studio.base)
+    latents, composite = torch.as_tensor(codes, dtype=torch.float32), learner.main()
+    reference, eta = learner.collection.reference, run.config.export.eta_reconstruction
+    rest = nric(reference.vertices, reference.connectivity)
+    found: dict[str, NDArray] = {
+        "composite": predict(composite, latents).numpy(),
+        "our recipe, one factor": predict(learner.monolithic(), latents).numpy(),
+        "the paper's monolithic": predict(learner.monolithic_paper(), latents).numpy(),
+        "affine sum of factors": affine_sum(rest, predict(composite.factor_shapes, latents).numpy()),
+    }
+    reconstruct = Reconstructor(reference, eta)
+    columns: list[tuple[str, list[NDArray[np.uint8]]]] = [("exact", [studio.pixels(x, SIZE, CLAY) for x in exact])]
+    for name, z in found.items():
+        shapes = align(np.stack([reconstruct(row, tolerance=1e-6).vertices for row in z]), exact)
+        away = np.linalg.norm(shapes - exact, axis=2) / reference.diagonal
+        level = np.log(np.maximum(away, LEAST) / LEAST) / np.log(MOST / LEAST)
+        pictures = [studio.pixels(x, SIZE, tint(ERROR, row)) for x, row in zip(shapes, level, strict=True)]
+        columns.append((f"{name}\nmean {100 * away.mean():.3f} %", pictures))
+    save(columns, path, f"distance of vertices: {LEAST:.2%} of the diagonal and less, to {MOST:.0%} and more")
+
+
+def modes(run: Run, studio: Studio, path: Path) -> None:
+    """The strongest principal geodesic modes, and sparse ones, each at its largest displacement that is shown."""
+    found, mean = run.directory.modes_by_strength.read(), run.directory.mean.read()["vertices"]
+    rows = {"principal geodesic modes": found["pga_vertices"], "sparse modes": found["vertices"]}
+    pictures: list[list[NDArray[np.uint8]]] = [[] for _ in range(MODES)]
+    closer = studio.closer(mean)
+    for fields in rows.values():
+        for column, field in zip(pictures, fields[:MODES], strict=False):
+            column.append(moved(closer, mean, field))
+    columns = [(f"mode {k + 1}", column) for k, column in enumerate(pictures)]
+    save(columns, path, f"top: {', bottom: '.join(rows)}; colour: how far a vertex moves")
+
+
+def moved(studio: Studio, mean: FloatArray, field: FloatArray) -> NDArray[np.uint8]:
+    """A mode (V, 3) as far as it is shown."""
+    lengths = np.linalg.norm(field, axis=1)
+    size = float(np.linalg.norm(np.ptp(mean, axis=0)))
+    shape = mean + MODE_REACH * size / lengths.max() * field
+    return studio.pixels(align(shape, studio.base), SIZE, tint(ramp("#1f6f8b"), lengths / lengths.max()))
+
+
+def save(columns: list[tuple[str, list[NDArray[np.uint8]]]], path: Path, words: str) -> None:
+    """A table of pictures."""
+    height, width = columns[0][1][0].shape[:2]
+    count = len(columns[0][1])
+    size = (len(columns) * width / 110, count * height / 110 + 0.7)
+    figure, axes = plt.subplots(count, len(columns), figsize=size, squeeze=False, layout="constrained")
+    for (title, pictures), column in zip(columns, axes.T, strict=True):
+        column[0].set_title(title, fontsize="small")
+        for picture, axis in zip(pictures, column, strict=True):
+            axis.imshow(picture)
+            axis.set_axis_off()
+    figure.supxlabel(words, fontsize="small")
+    figure.savefig(path, dpi=110, facecolor="white")
+    plt.close(figure)
+    Image.open(path).quantize(256).save(path, optimize=True)
+
+
+def main() -> None:
+    """Draw both."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("config", type=Path)
+    parser.add_argument("run", type=Path)
+    given = parser.parse_args()
+    run = Run(given.run, *load(given.config), given.run / "models")
+    studio = Studio.of(Record(run.directory))
+    if studio is None:
+        raise SystemExit("Nothing to draw with: install embreex.")
+    folder, name = ROOT / "docs" / "measurements", run.config.export.name
+    models(run, studio, folder / f"{name}-models.png")
+    modes(run, studio, folder / f"{name}-modes.png")
+
+
+if __name__ == "__main__":
+    main()
