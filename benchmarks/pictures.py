@@ -12,7 +12,6 @@ import matplotlib.pyplot as plt
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from PIL import Image
 
 from shapespace.arrays import FloatArray
 from shapespace.coordinates.nric import nric
@@ -91,7 +90,6 @@ def save(columns: list[tuple[str, list[NDArray[np.uint8]]]], path: Path, words: 
     figure.supxlabel(words, fontsize="small")
     figure.savefig(path, dpi=110, facecolor="white")
     plt.close(figure)
-    Image.open(path).quantize(256).save(path, optimize=True)
 
 
 def main() -> None:
