@@ -20,6 +20,7 @@ import { Pull } from "./pull.js";
 import { Ghost } from "./scan/ghost.js";
 import { Reader } from "./scan/reader.js";
 import { ShapeLoop } from "./shape-loop.js";
+import { Welcome } from "./show/welcome.js";
 import { Skin } from "./skin.js";
 import { Sliders } from "./sliders.js";
 import { LatentSpace } from "./space.js";
@@ -58,6 +59,7 @@ new Reader(store, {
 });
 new Pins(store, viewer, new Pull(store, viewer), { layer: find("#pins"), clear: find("#clear-pins") });
 new ShapeLoop(store);
+const welcome = new Welcome(store, find("#welcome"));
 tabs(find("[role=tablist]"));
 
 // The shape and its colours.
@@ -169,6 +171,7 @@ async function openModel({ model, code, keyframes = [], locked, view, state = {}
     }
     if (store.model !== model) return;
   }
+  welcome.play();
   await modes.draw();
 }
 
@@ -176,7 +179,7 @@ async function openModel({ model, code, keyframes = [], locked, view, state = {}
 let soon = 0;
 function remember() {
   clearTimeout(soon);
-  if (store.model && !store.playing) history.replaceState(null, "", toHash(store, turned ? viewer.view : null));
+  if (store.model && !store.playing && !welcome.alone) history.replaceState(null, "", toHash(store, turned ? viewer.view : null));
 }
 const rememberSoon = () => { clearTimeout(soon); soon = setTimeout(remember, 250); };
 store.on(["model", "code", "locked", "keyframes", "loop", "beyond", "colour", "against", "wireframe", "normals", "fine", "playing"], rememberSoon);
@@ -185,6 +188,7 @@ addEventListener("hashchange", reporting(restore));
 
 async function restore() {
   const asked = fromHash(location.hash, models);
+  if (!asked.code) welcome.open();
   if (asked.model) return openModel(asked);
   const model = models.find(({ name }) => name === PREFERRED) ?? models[0];
   if (asked.missing) {

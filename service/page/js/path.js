@@ -3,7 +3,8 @@
 import * as api from "./api.js";
 import { clone, find, sharp } from "./dom.js";
 import { report, reporting } from "./messages.js";
-import { meshOf, motionOf } from "./shape-loop.js";
+import { showAt } from "./reel.js";
+import { meshOf } from "./shape-loop.js";
 
 const PICTURE = 64;
 const SEGMENT = 24; // frames
@@ -165,21 +166,10 @@ export class Path {
     if (document.activeElement !== this.timeline || !this.timeline.matches(":active")) this.pause();
   }
 
-  /** The shape at the time it is, between two frames a mixture of both. */
+  /** The shape at the time it is. */
   #show() {
-    const { mesh, shapes, codes } = this.#frames;
     const [start, stop] = this.#ends;
-    const steps = this.store.loop ? shapes.length : shapes.length - 1;
-    const at = ((this.#t - start) / (stop - start)) * steps;
-    const k = Math.min(Math.floor(at), steps - 1);
-    const share = at - k;
-    const next = shapes[(k + 1) % shapes.length];
-    const positions = shapes[k].map((x, i) => x + share * (next[i] - x));
-    const code = codes[(share < 0.5 ? k : k + 1) % codes.length];
-    const { model, placement } = this.store;
-    const motion = motionOf(this.store, mesh, code, positions);
-    const shape = { model, mesh, code, placement, motion, positions, diagnostics: null, began: performance.now() };
-    this.store.set({ code, shape });
+    showAt(this.store, this.#frames, (this.#t - start) / (stop - start), this.store.loop);
     this.timeline.value = this.#t;
     this.#tell();
   }
