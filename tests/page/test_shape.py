@@ -281,22 +281,22 @@ def test_pointing_at_a_factor_colours_where_it_changes_lengths_and_angles(window
     every = studio[".pictures canvas"].count()
     studio.eventually(lambda: studio[".pictures canvas.drawn"].count() == every)
 
-    def orange(picture: np.ndarray) -> np.ndarray:
-        return (picture[..., 0] - picture[..., 2]) > 50
+    def blue(picture: np.ndarray) -> np.ndarray:
+        return (picture[..., 2] - picture[..., 0]) > 50
 
     studio["#canvas"].hover()
-    assert not orange(studio.picture()).any()
+    assert not blue(studio.picture()).any()
     studio[".factor h2"].filter(has_text="shoulder").first.hover()  # an arm, on one side of the picture
-    coloured = orange(studio.eventually(lambda: p if orange(p := studio.picture()).any() else None))
+    coloured = blue(studio.eventually(lambda: p if blue(p := studio.picture()).any() else None))
     half = coloured.shape[1] // 2
     less, more = sorted(int(side.sum()) for side in (coloured[:, :half], coloured[:, half:]))
     assert more > 1000
     assert less < 0.05 * more
     studio["#canvas"].hover()
-    studio.eventually(lambda: not orange(studio.picture()).any())
+    studio.eventually(lambda: not blue(studio.picture()).any())
     # A hip: alignment moves head, hands and feet with it, but there nothing is longer or bent.
     studio[".factor h2"].first.hover()
-    coloured = orange(studio.eventually(lambda: p if orange(p := studio.picture()).any() else None))
+    coloured = blue(studio.eventually(lambda: p if blue(p := studio.picture()).any() else None))
     height = len(coloured)
     assert not coloured[: int(0.4 * height)].any()
     assert not coloured[int(0.75 * height) :].any()
@@ -357,10 +357,23 @@ def test_a_phone_and_a_finger(window: Open) -> None:
     assert studio["#add-keyframe"].is_visible()
 
 
-def test_dark_and_light(window: Open) -> None:
-    light, dark = (window(color_scheme=scheme).open().picture()[:5].mean() for scheme in ("light", "dark"))
-    assert light > 200
-    assert dark < 60
+def test_a_stage_in_dark_and_light(window: Open) -> None:
     studio = window(color_scheme="dark").open()
+
+    def stage() -> tuple[float, float, float]:
+        """How bright the paper is, the ground beside the shape, and the darkest place there below it."""
+        picture = studio.picture()
+        grey = picture.mean(axis=2)
+        shape = (picture[..., 0] - picture[..., 2] > 20).any(axis=1)  # of warm clay
+        ground = grey[np.flatnonzero(shape)[-1] + 3 :]
+        return grey[:5].mean(), float(np.median(ground[:5, 60:90])), ground[:5].min()
+
+    paper, ground, shadow = stage()
+    assert paper < 60
+    assert ground > paper + 8
+    assert shadow < ground - 8
     studio["#theme"].click()
-    assert studio.picture()[:5].mean() > 200
+    paper, ground, shadow = stage()
+    assert paper > 200
+    assert ground < paper - 8
+    assert shadow < ground - 8

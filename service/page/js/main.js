@@ -100,10 +100,13 @@ for (const radio of document.querySelectorAll("[name=colour]")) {
 const root = document.documentElement;
 const theme = always.kept("theme");
 if (theme) root.dataset.theme = theme;
+viewer.recolour();
+matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => viewer.recolour());
 find("#theme").addEventListener("click", () => {
   const dark = root.dataset.theme ? root.dataset.theme === "dark" : matchMedia("(prefers-color-scheme: dark)").matches;
   root.dataset.theme = dark ? "light" : "dark";
   always.keep("theme", root.dataset.theme);
+  viewer.recolour();
 });
 
 // Codes from elsewhere than the sliders.

@@ -1,7 +1,7 @@
 /** Small pictures of shapes, all drawn by one renderer outside the page. */
 
 import * as THREE from "three";
-import { frame, geometryOf, litCamera, move, paint, sphereOf, surfaceMaterial } from "./scene.js";
+import { face, frame, geometryOf, litCamera, move, paint, sideOf, sphereOf, surfaceMaterial } from "./scene.js";
 
 export class Pictures {
   constructor() {
@@ -16,6 +16,7 @@ export class Pictures {
   open({ vertices, faces }) {
     this.mesh.geometry.dispose();
     this.mesh.geometry = geometryOf(faces, vertices.length / 3);
+    face(this.mesh.material, sideOf(faces, vertices.length / 3));
     const { center, radius } = sphereOf(vertices);
     this.sphere = { center, radius: 0.95 * radius };
   }

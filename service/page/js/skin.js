@@ -52,7 +52,7 @@ export class Skin {
       const { pbrMetallicRoughness: look, alphaMode } = tree.materials[material];
       const [red, green, blue, opacity] = look.baseColorFactor;
       return new THREE.MeshStandardMaterial({
-        color: new THREE.Color(red, green, blue), opacity, transparent: alphaMode === "BLEND", side: THREE.DoubleSide,
+        color: new THREE.Color(red, green, blue), opacity, transparent: alphaMode === "BLEND",
         roughness: look.roughnessFactor, metalness: look.metallicFactor,
         map: look.baseColorTexture ? this.textures[tree.textures[look.baseColorTexture.index].source] : null,
         polygonOffset: true, polygonOffsetFactor: 1, polygonOffsetUnits: 1,
