@@ -127,7 +127,7 @@ def test_everything_is_reached_by_keyboard(studio: Studio) -> None:
 
     reached = set()
     studio["#model"].focus()
-    for _ in range(40):
+    for _ in range(50):
         reached.add(focused())
         studio.page.keyboard.press("Tab")
     assert {

@@ -87,6 +87,12 @@ def test_past_the_ends_and_the_shorter_way_round(studio: Studio) -> None:
         step = 2 * np.pi - 6
         angle = 3 + t * step
         studio.until_code([0.1 * t, angle if angle < np.pi else angle - 2 * np.pi, 0], 0.01)
+    # Slow at the keyframes: a tenth of the time is less than a twentieth of the way.
+    studio["#easing"].select_option("soft")
+    for t, share in ((0.1, 0.028), (0.5, 0.5), (0.9, 0.972)):
+        timeline.fill(str(t))
+        studio.eventually(lambda share=share: abs(studio.code[0] - 0.1 * share) < 0.003)
+    assert studio.hash["easing"] == "soft"
 
 
 def test_keyframes_can_be_visited_replaced_and_removed(studio: Studio) -> None:

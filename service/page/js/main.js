@@ -34,24 +34,26 @@ const PREFERRED = "figure";
 const store = new Store({
   model: null, space: null, names: null, references: {}, hasFine: false,
   code: null, locked: [], placement: null, moving: false, playing: false, shape: null,
-  keyframes: [], loop: false, beyond: 0,
+  keyframes: [], loop: false, beyond: 0, seconds: null, easing: "even",
   colour: "none", against: -1, highlight: null, regions: null, repaint: null,
   wireframe: false, normals: false, fine: true, pull: false, pins: [], scan: null, ghost: true,
 });
 
-const viewer = new Viewer(find("#canvas"));
+const embedded = document.documentElement.classList.contains("embed");
+const viewer = new Viewer(find("#canvas"), embedded ? 24 : 100);
 const pictures = new Pictures();
 const sliders = new Sliders(store, find("#factors"));
 const modes = new Modes(store, sliders, pictures);
 const colouring = new Colouring(store, { legend: find("#legend"), against: find("#against") });
 const path = new Path(store, pictures, {
   list: find("#keyframes"), add: find("#add-keyframe"), play: find("#play"), loop: find("#loop"),
-  beyond: find("#beyond"), timeline: find("#timeline"), time: find("#time"), status: find("#path-status"),
+  beyond: find("#beyond"), seconds: find("#seconds"), easing: find("#easing"), timeline: find("#timeline"), time: find("#time"),
+  status: find("#path-status"),
 });
 const strip = new Strip(store, pictures, { button: find("#draw-strip"), table: find("#strip") });
 new Names(store, { dialog: find("#names"), button: find("#name") });
 new History(store, { undo: find("#undo"), redo: find("#redo") });
-new Files(store, path, find("#tab-files"));
+new Files(store, path, viewer, find("#tab-files"));
 new Ghost(store, viewer);
 new Reader(store, {
   box: find("#verdict"), input: find("#mesh-file"), readAs: find("#read-as"), ownScale: find("#own-scale"),
@@ -138,7 +140,7 @@ picker.addEventListener("change", reporting(async () => {
   }
 }));
 
-async function openModel({ model, code, keyframes = [], locked, view, state = {} }) {
+async function openModel({ model, code, keyframes = [], locked, view, pins = [], state = {} }) {
   const space = new LatentSpace(model);
   opening = model;
   const coarse = await api.reference(model, "coarse");
@@ -164,6 +166,9 @@ async function openModel({ model, code, keyframes = [], locked, view, state = {}
     store.set({ references: { coarse, fine }, pose: new Pose(coarse.vertices, fine.vertices), hasFine: true });
   }
   find("#fine").disabled = !store.hasFine;
+  const { references } = store;
+  const held = pins.filter(({ mesh, vertex }) => 3 * vertex < references[mesh]?.vertices.length);
+  if (held.length && store.pins.length === 0) store.set({ pins: held });
   if (model.surface?.materials.some(({ texture }) => texture)) {
     try {
       const skin = await Skin.of(await api.textured(model));
@@ -174,6 +179,7 @@ async function openModel({ model, code, keyframes = [], locked, view, state = {}
     }
     if (store.model !== model) return;
   }
+  if (embedded) return;
   welcome.play();
   await modes.draw();
 }
@@ -182,16 +188,20 @@ async function openModel({ model, code, keyframes = [], locked, view, state = {}
 let soon = 0;
 function remember() {
   clearTimeout(soon);
-  if (store.model && !store.playing && !welcome.alone) history.replaceState(null, "", toHash(store, turned ? viewer.view : null));
+  if (!store.model || store.playing || welcome.alone) return;
+  const hash = toHash(store, turned ? viewer.view : null);
+  history.replaceState(null, "", hash);
+  find("#whole").href = location.pathname + hash;
 }
 const rememberSoon = () => { clearTimeout(soon); soon = setTimeout(remember, 250); };
-store.on(["model", "code", "locked", "keyframes", "loop", "beyond", "colour", "against", "wireframe", "normals", "fine", "playing"], rememberSoon);
+store.on(["model", "code", "locked", "keyframes", "loop", "beyond", "seconds", "easing", "colour", "against", "wireframe", "normals",
+  "fine", "playing", "pins", "placement"], rememberSoon);
 viewer.canvas.addEventListener("turned", () => { turned = true; rememberSoon(); });
 addEventListener("hashchange", reporting(restore));
 
 async function restore() {
   const asked = fromHash(location.hash, models);
-  if (!asked.code) welcome.open();
+  if (!asked.code && !embedded) welcome.open();
   if (asked.model) return openModel(asked);
   const model = models.find(({ name }) => name === PREFERRED) ?? models[0];
   if (asked.missing) {

@@ -1,16 +1,16 @@
 /** Keyframes, the path through them, and its player. */
 
 import * as api from "./api.js";
-import { clone, find, sharp } from "./dom.js";
+import { clone, find, readable, sharp } from "./dom.js";
 import { report, reporting } from "./messages.js";
-import { showAt } from "./reel.js";
+import { eased, showAt } from "./reel.js";
 import { meshOf } from "./shape-loop.js";
 
 const PICTURE = 64;
 const SEGMENT = 24; // frames
 const LONGEST = 120; // frames
 const MOST_VERTICES = 2 ** 21; // of all frames: where they would be more, the coarse mesh plays
-const PACE = 1.8; // seconds for a segment
+const PACE = 1.8; // seconds for a segment, where nobody says how long the path takes
 
 export class Path {
   #frames = null; // of the path as it is now
@@ -19,8 +19,17 @@ export class Path {
   #t = 0;
   #clock = 0;
 
-  constructor(store, pictures, { list, add, play, loop, beyond, timeline, time, status }) {
+  constructor(store, pictures, { list, add, play, loop, beyond, seconds, easing, timeline, time, status }) {
     Object.assign(this, { store, pictures, list, play, beyond, timeline, time, status });
+    const tell = () => { seconds.value = store.keyframes.length > 1 ? readable(this.seconds) : ""; };
+    store.on(["seconds", "keyframes", "loop", "beyond", "model"], tell);
+    seconds.addEventListener("change", () => {
+      const said = seconds.validity.valid && seconds.value !== "";
+      store.set({ seconds: said ? seconds.valueAsNumber : null });
+      tell();
+    });
+    easing.addEventListener("change", () => store.set({ easing: easing.value }));
+    store.on(["easing"], () => { easing.value = store.easing; });
     store.on(["keyframes", "loop", "beyond", "model", "fine", "hasFine"], () => this.#changed());
     store.on(["keyframes", "model"], () => this.#list());
     store.on(["playing"], () => this.#showPlaying());
@@ -41,10 +50,15 @@ export class Path {
     return { keyframes, frames, start, stop, loop };
   }
 
+  /** How long it takes from its start to its end. */
+  get seconds() {
+    const [start, stop] = this.#ends;
+    return this.store.seconds ?? PACE * this.#segments * (stop - start);
+  }
+
   /** How many of its frames the player shows in a second. */
   get fps() {
-    const { frames, start, stop } = this.request;
-    return (frames - 1) / (PACE * this.#segments * (stop - start));
+    return (this.request.frames - 1) / this.seconds;
   }
 
   get #segments() {
@@ -127,17 +141,31 @@ export class Path {
     }
   }
 
+  /** The path for a video: how long it takes, and what shows the shape at a share of it until somebody else plays. */
+  async film() {
+    this.pause();
+    await this.#load();
+    const [start, stop] = this.#ends;
+    this.store.set({ playing: true });
+    const show = (share) => {
+      if (!this.store.playing) return false;
+      this.#t = start + share * (stop - start);
+      this.#show();
+      return true;
+    };
+    return { seconds: this.seconds, show };
+  }
+
   async #play() {
     await this.#load();
     if (this.store.playing) return; // another click waited for the same frames
     const [start, stop] = this.#ends;
     if (this.#t >= stop - 1e-6) this.#t = start;
     this.store.set({ playing: true });
-    const segments = this.#segments;
     let before = performance.now();
     const step = (now) => {
       if (!this.store.playing) return;
-      this.#t += Math.max(now - before, 0) / (1000 * PACE * segments);
+      this.#t += (Math.max(now - before, 0) / (1000 * this.seconds)) * (stop - start);
       before = now;
       if (this.#t > stop && this.store.loop) this.#t = start + ((this.#t - start) % (stop - start));
       this.#t = Math.min(this.#t, stop);
@@ -169,9 +197,17 @@ export class Path {
   /** The shape at the time it is. */
   #show() {
     const [start, stop] = this.#ends;
-    showAt(this.store, this.#frames, (this.#t - start) / (stop - start), this.store.loop);
+    const t = this.store.easing === "soft" ? this.#slowed(this.#t) : this.#t;
+    showAt(this.store, this.#frames, (t - start) / (stop - start), this.store.loop);
     this.timeline.value = this.#t;
     this.#tell();
+  }
+
+  /** A time of the path at which the shape comes to each keyframe slowly, and leaves it slowly. */
+  #slowed(t) {
+    const along = t * this.#segments;
+    const keyframe = Math.floor(along);
+    return (keyframe + eased(along - keyframe)) / this.#segments;
   }
 
   #tell() {

@@ -10,15 +10,15 @@ import { distanceTo, face, frame, geometryOf, litCamera, move, paint, sideOf, sp
 import { Stage } from "./stage.js";
 
 const TURN = Math.PI / 24;
-const MARGIN = 100; // pixels of the height that buttons and words take
 const ROOM = 1.08; // for shapes that are larger than the reference
 
 export class Viewer {
   #scheduled = false;
   #share = 1; // of the height that is free for the shape
 
-  constructor(canvas) {
-    this.canvas = canvas;
+  /** `margin`: pixels of the canvas's height that buttons and words take. */
+  constructor(canvas, margin) {
+    Object.assign(this, { canvas, margin });
     this.renderer = new THREE.WebGLRenderer({ canvas, antialias: true, alpha: true });
     this.renderer.setPixelRatio(Math.min(devicePixelRatio, 2));
     this.scene = new THREE.Scene();
@@ -226,7 +226,7 @@ export class Viewer {
     if (!width || !height) return;
     const before = this.reference && this.#distance;
     this.camera.aspect = width / height;
-    this.#share = Math.max(1 - MARGIN / height, 0.4);
+    this.#share = Math.max(1 - this.margin / height, 0.4);
     this.renderer.setSize(width, height, false);
     // A smaller window must show as much: the distance follows.
     const { target } = this.controls;
