@@ -74,6 +74,7 @@ def test_a_picture_a_turntable_and_the_path_as_a_video(window: Open) -> None:
     seconds, (first, middle, last) = stills(plain, content)
     assert 0.4 < seconds < 5
     assert min(difference(first, middle), difference(middle, last)) > 0.02
+    studio["#messages button:visible"].first.click()
     studio.eventually(lambda: difference(studio.picture(), seen) < 0.001)
     assert "view" not in studio.hash
 

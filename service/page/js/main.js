@@ -4,7 +4,7 @@ import { fromHash, toHash } from "./address.js";
 import * as api from "./api.js";
 import { openCard } from "./card.js";
 import { Colouring } from "./colouring.js";
-import { inWords } from "./diagnostics.js";
+import { inShort, inWords } from "./diagnostics.js";
 import { element, find, toggle } from "./dom.js";
 import { copy, Files } from "./files.js";
 import { History } from "./history.js";
@@ -35,7 +35,7 @@ const store = new Store({
   model: null, space: null, names: null, references: {}, hasFine: false,
   code: null, locked: [], placement: null, moving: false, playing: false, shape: null,
   keyframes: [], loop: false, beyond: 0, seconds: null, easing: "even",
-  colour: "none", against: -1, highlight: null, regions: null, repaint: null,
+  usual: null, colour: "none", against: -1, highlight: null, regions: null, repaint: null,
   wireframe: false, normals: false, fine: true, pull: false, pins: [], scan: null, ghost: true,
 });
 
@@ -77,6 +77,7 @@ store.on(["wireframe", "normals"], () => viewer.style(store));
 
 // What is said about it.
 let timed = null;
+let told = {}; // diagnostics of the last full shape
 viewer.canvas.addEventListener("drawn", () => {
   const { shape } = store;
   if (!shape || shape === timed) return;
@@ -86,10 +87,14 @@ viewer.canvas.addEventListener("drawn", () => {
   find("#frame-time").textContent = `${shape.positions.length / 3} vertices · ${frame}`;
   Object.assign(find(".stage").dataset, { shown: shape.mesh, quality: shape.quality ?? "draft" });
 });
-store.on(["shape"], () => {
-  if (!store.shape?.diagnostics) return;
-  const words = inWords(store.shape.diagnostics);
-  find("#diagnostics").replaceChildren(...words.map(([how, text]) => element("li", { className: how, textContent: text })));
+store.on(["shape", "usual"], () => {
+  if (store.shape?.diagnostics) told = store.shape.diagnostics;
+  const words = inWords(told, store.usual);
+  const { how, line } = inShort(words);
+  find("#diagnostics").className = how;
+  find("#diagnostics summary").textContent = line;
+  find("#diagnostics ul").replaceChildren(
+    ...words.map(([is, , textContent]) => element("li", { className: is, textContent })));
 });
 
 // Switches.
@@ -152,7 +157,7 @@ async function openModel({ model, code, keyframes = [], locked, view, pins = [],
   turned = Boolean(view);
   if (view) viewer.view = view;
   store.set({
-    model, space, names: namesOf(model), references: { coarse }, hasFine: false, regions: null, highlight: null,
+    model, space, names: namesOf(model), references: { coarse }, hasFine: false, regions: null, usual: null, highlight: null,
     code: space.wrapAll(code ?? space.home), locked: locked ?? space.home.map(() => false),
     keyframes, against: -1, ...state,
   });

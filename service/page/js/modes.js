@@ -1,8 +1,11 @@
-/** Pictures of each coordinate, and the region where each factor changes lengths and angles: from the same few shapes. */
+/** Pictures of each coordinate and factor, where each factor changes lengths and angles, and how well shapes of the model
+ * fit as a rule: all from the same few shapes. */
 
 import * as api from "./api.js";
+import { tint } from "./colours.js";
 import { percentile } from "./dom.js";
 import { report } from "./messages.js";
+import { sphereOf } from "./scene.js";
 import { Surface } from "./surface.js";
 
 /** Fetches the shapes of a model factor by factor, while nothing else is wanted of the server. */
@@ -24,20 +27,25 @@ export class Modes {
     try {
       const { shapes: [home] } = await api.shapes(model, [space.home], "coarse", { signal });
       const rest = surface.measure(home);
+      const residuals = [];
       for (const [j, factor] of model.factors.entries()) {
         const changes = [];
         for (let k = factor.start; k < factor.stop; k += 1) {
           const [down, , up] = space.stations(k);
           changes.push({ [k]: down }, { [k]: up });
         }
-        const { shapes } = await api.shapes(model, changes.map((change) => space.homeBut(change)), "coarse", { signal });
+        const codes = changes.map((change) => space.homeBut(change));
+        const { shapes, diagnostics } = await api.shapes(model, codes, "coarse", { signal });
+        residuals.push(diagnostics.residual);
         for (let k = factor.start; k < factor.stop; k += 1) {
           const [down, up] = shapes.splice(0, 2);
           this.#draw(k, [down, home, up]);
           this.#grow(j, surface, rest, [down, up]);
         }
+        this.#regions[j] = smooth(this.#regions[j]);
+        this.pictures.draw(this.sliders.picture(j), home, tint(this.#regions[j]), around(home, this.#regions[j]));
       }
-      this.store.set({ regions: this.#regions.map(smooth) });
+      this.store.set({ regions: this.#regions, usual: percentile(residuals, 0.5) });
     } catch (error) {
       report(error);
     }
@@ -66,6 +74,12 @@ function smooth(region) {
     const share = Math.min(Math.max((change / most - 0.15) / 0.35, 0), 1);
     return share * share * (3 - 2 * share);
   });
+}
+
+/** The sphere around where a region is, in positions (3V numbers). */
+function around(positions, region) {
+  const inside = [...region.keys()].filter((vertex) => region[vertex] > 0.5);
+  return sphereOf(Float32Array.from(inside.flatMap((vertex) => [...positions.subarray(3 * vertex, 3 * vertex + 3)])));
 }
 
 /** For each vertex of `fine` the nearest one of `coarse` (positions of one shape). */

@@ -3,6 +3,8 @@
 import * as THREE from "three";
 import { face, frame, geometryOf, litCamera, move, paint, sideOf, sphereOf, surfaceMaterial } from "./scene.js";
 
+const LEAST = 0.36; // of the whole shape's radius, so that one sees where a part is
+
 export class Pictures {
   constructor() {
     this.renderer = new THREE.WebGLRenderer({ antialias: true, alpha: true, preserveDrawingBuffer: true });
@@ -21,12 +23,13 @@ export class Pictures {
     this.sphere = { center, radius: 0.95 * radius };
   }
 
-  /** Draw a shape into a canvas of the page, which keeps its size. */
-  draw(canvas, positions, colours) {
+  /** Draw a shape into a canvas of the page, which keeps its size: whole, or what is around a sphere. */
+  draw(canvas, positions, colours, part) {
     const { width, height } = canvas;
     this.renderer.setSize(width, height, false);
     this.camera.aspect = width / height;
-    frame(this.camera, this.sphere);
+    const { center, radius } = part ?? this.sphere;
+    frame(this.camera, { center, radius: Math.max(radius, LEAST * this.sphere.radius) });
     move(this.mesh.geometry, positions);
     paint(this.mesh.geometry, colours);
     this.renderer.render(this.scene, this.camera);
