@@ -32,8 +32,8 @@ const fromPin = ({ mesh, vertex, position }) => [mesh, vertex, list(position.toA
 function toPin(text) {
   const [mesh, ...rest] = text.split(",");
   const [vertex, ...position] = rest.map(Number);
-  const makesSense = Number.isInteger(vertex) && vertex >= 0 && position.length === 3 && position.every(Number.isFinite);
-  return makesSense ? [{ mesh, vertex, position: new Vector3(...position) }] : [];
+  const isPoint = position.length === 3 && position.every(Number.isFinite);
+  return isPoint && Number.isInteger(vertex) && vertex >= 0 ? [{ mesh, vertex, position: new Vector3(...position) }] : [];
 }
 
 /** A motion as where it takes the origin, and a quaternion. */
@@ -49,7 +49,11 @@ function toPlacement(numbers) {
   return new Matrix4().compose(new Vector3(...numbers), rotation.normalize(), new Vector3(1, 1, 1));
 }
 
-/** What an address asks for; parts that make no sense for the model are left out. */
+/**
+ * What an address asks for; parts that make no sense for the model are left out.
+ * @returns {{model?: any, missing?: string, code?: number[], keyframes?: number[][], locked?: boolean[],
+ *   view?: number[], pins?: import("./pull.js").Pin[], state?: Partial<import("./store.js").State>}}
+ */
 export function fromHash(hash, models) {
   const parts = new URLSearchParams(hash.replace(/^#/, ""));
   const model = models.find(({ name }) => name === parts.get("model"));
@@ -64,6 +68,7 @@ export function fromHash(hash, models) {
   const view = unlist(parts.get("view") ?? "");
   const beyond = Number(parts.get("beyond"));
   const seconds = Number(parts.get("seconds"));
+  const colour = parts.get("colour");
   return {
     model,
     code: isCode(code) ? code : null,
@@ -75,7 +80,7 @@ export function fromHash(hash, models) {
       placement: toPlacement(unlist(parts.get("place") ?? "")),
       ...Object.fromEntries(FLAGS.map((flag) => [flag, flags.includes(flag)])),
       fine: !flags.includes("coarse"),
-      colour: ["stretch", "bending"].includes(parts.get("colour")) ? parts.get("colour") : "none",
+      colour: colour === "stretch" || colour === "bending" ? colour : "none",
       against: Number.isInteger(against) && against < keyframes.length ? against : -1,
       seconds: seconds >= 0.5 && seconds <= 120 ? seconds : null,
       easing: parts.get("easing") === "soft" ? "soft" : "even",

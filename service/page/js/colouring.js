@@ -31,8 +31,11 @@ export class Colouring {
   #nearest = null;
   #limit = 0;
 
+  /** @param {import("./store.js").Page} store */
   constructor(store, { legend, against }) {
-    Object.assign(this, { store, legend, against });
+    this.store = store;
+    this.legend = legend;
+    this.against = against;
     find(".scale", legend).style.backgroundImage = gradient;
     store.on(["model"], () => { this.#surfaces.clear(); this.#bases.clear(); this.#nearest = null; });
     store.on(["model", "colour", "against"], () => { this.#limit = 0; });

@@ -7,11 +7,13 @@ const HARDLY = 0.05;
 const MUCH = 2; // times as much as is usual for the model
 const TOO_MUCH = 5;
 
+/** @typedef {["good" | "fair" | "poor", string, string]} News */
+
 /**
  * What the server says of a shape: how good the news is, a word for it, and a sentence.
  * @param {object} diagnostics
  * @param {number | null} usual the model's own residual, at codes of the training range; null while it isn't known
- * @returns {["good" | "fair" | "poor", string, string][]}
+ * @returns {News[]}
  */
 export function inWords(diagnostics, usual) {
   const { status, residual, inside_bounds: inside, flipped_faces: flipped, plausibility } = diagnostics;
@@ -35,7 +37,10 @@ export function inShort(words) {
   return { how, line: line.charAt(0).toUpperCase() + line.slice(1) };
 }
 
-/** A model is as good as it is: what is usual for it is no fault of a shape. */
+/**
+ * A model is as good as it is: what is usual for it is no fault of a shape.
+ * @returns {News}
+ */
 function fits(residual, usual) {
   const off = `Lengths and angles are off by ${percent(residual)}`;
   if (residual < Math.max(FITS, MUCH * usual)) {
@@ -46,7 +51,10 @@ function fits(residual, usual) {
   return ["poor", "hardly exists", `${off}: this shape hardly exists.`];
 }
 
-/** By the distance to the nearest training shape, in multiples of what these have from each other. */
+/**
+ * By the distance to the nearest training shape, in multiples of what these have from each other.
+ * @returns {News}
+ */
 function plausible(distance) {
   if (distance < 1.05) return ["good", "usual", "As near to the training shapes as these are to each other."];
   const times = `${readable(distance, 2)} times as far from the training shapes as these lie apart`;

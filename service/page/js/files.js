@@ -31,8 +31,11 @@ function keep(blob, name) {
 }
 
 export class Files {
+  /** @param {import("./store.js").Page} store */
   constructor(store, path, viewer, root) {
-    Object.assign(this, { store, path, viewer });
+    this.store = store;
+    this.path = path;
+    this.viewer = viewer;
     this.format = find("#format", root);
     this.format.append(...SHAPE_FORMATS.map((name) => element("option", { textContent: name })));
     this.code = find("#code", root);
@@ -108,7 +111,8 @@ export class Files {
     if (this.recording) return;
     this.recording = true;
     try {
-      const { blob, extension } = await make((seconds) => say(`Recording, for ${readable(seconds)} s …`, { key: "video" }));
+      const tell = (seconds) => say(`Recording, for ${readable(seconds)} s …`, { key: "video" });
+      const { blob, extension } = await make(tell);
       keep(blob, `${this.store.model.name}-${what}.${extension}`);
       say("The video is saved.", { key: "video" });
     } catch (error) {

@@ -31,13 +31,14 @@ import { Viewer } from "./viewer.js";
 
 const PREFERRED = "figure";
 
-const store = new Store({
-  model: null, space: null, names: null, references: {}, hasFine: false,
+/** @type {import("./store.js").Page} */
+const store = /** @type {any} */ (new Store({
+  model: null, space: null, names: null, references: {}, hasFine: false, pose: null,
   code: null, locked: [], placement: null, moving: false, playing: false, shape: null,
   keyframes: [], loop: false, beyond: 0, seconds: null, easing: "even",
   usual: null, colour: "none", against: -1, highlight: null, regions: null, repaint: null,
   wireframe: false, normals: false, fine: true, pull: false, pins: [], scan: null, ghost: true,
-});
+}));
 
 const embedded = document.documentElement.classList.contains("embed");
 const viewer = new Viewer(find("#canvas"), embedded ? 24 : 100);
@@ -47,8 +48,8 @@ const modes = new Modes(store, sliders, pictures);
 const colouring = new Colouring(store, { legend: find("#legend"), against: find("#against") });
 const path = new Path(store, pictures, {
   list: find("#keyframes"), add: find("#add-keyframe"), play: find("#play"), loop: find("#loop"),
-  beyond: find("#beyond"), seconds: find("#seconds"), easing: find("#easing"), timeline: find("#timeline"), time: find("#time"),
-  status: find("#path-status"),
+  beyond: find("#beyond"), seconds: find("#seconds"), easing: find("#easing"), timeline: find("#timeline"),
+  time: find("#time"), status: find("#path-status"),
 });
 const strip = new Strip(store, pictures, { button: find("#draw-strip"), table: find("#strip") });
 new Names(store, { dialog: find("#names"), button: find("#name") });
@@ -100,7 +101,9 @@ store.on(["shape", "usual"], () => {
 // Switches.
 for (const key of ["wireframe", "normals", "fine", "pull"]) toggle(find(`#${key}`), store, key);
 find("#reset-view").addEventListener("click", () => { viewer.resetView(); remember(); });
-for (const radio of document.querySelectorAll("[name=colour]")) {
+/** @type {NodeListOf<any>} */
+const radios = document.querySelectorAll("[name=colour]");
+for (const radio of radios) {
   radio.addEventListener("change", () => store.set({ colour: radio.value }));
   store.on(["colour"], () => { radio.checked = radio.value === store.colour; });
 }
@@ -117,7 +120,10 @@ find("#theme").addEventListener("click", () => {
 });
 
 // Codes from elsewhere than the sliders.
-const take = (code) => store.set({ code: store.space.wrapAll(code).map((value, k) => (store.locked[k] ? store.code[k] : value)) });
+const take = (code) => {
+  const { locked, space } = store;
+  store.set({ code: space.wrapAll(code).map((value, k) => (locked[k] ? store.code[k] : value)) });
+};
 const seed = find("#seed");
 seed.value = here.kept("seed") ?? 0;
 const draw = reporting(async () => {
@@ -145,6 +151,10 @@ picker.addEventListener("change", reporting(async () => {
   }
 }));
 
+/**
+ * Take on a model, at its home, or as an address asks for it.
+ * @param {ReturnType<typeof fromHash>} asked
+ */
 async function openModel({ model, code, keyframes = [], locked, view, pins = [], state = {} }) {
   const space = new LatentSpace(model);
   opening = model;
@@ -157,11 +167,12 @@ async function openModel({ model, code, keyframes = [], locked, view, pins = [],
   turned = Boolean(view);
   if (view) viewer.view = view;
   store.set({
-    model, space, names: namesOf(model), references: { coarse }, hasFine: false, regions: null, usual: null, highlight: null,
+    model, space, names: namesOf(model), references: { coarse }, hasFine: false, pose: null,
+    regions: null, usual: null, highlight: null,
     code: space.wrapAll(code ?? space.home), locked: locked ?? space.home.map(() => false),
     keyframes, against: -1, ...state,
   });
-  for (const part of document.querySelectorAll("[inert]")) part.inert = false;
+  for (const part of document.querySelectorAll("[inert]")) part.removeAttribute("inert");
   find("#canvas").setAttribute("aria-label", `${model.title}, the shape of the code that the sliders give`);
   document.title = `${model.title} · shapespace`;
   const fine = await api.reference(model, "fine");
@@ -199,8 +210,8 @@ function remember() {
   find("#whole").href = location.pathname + hash;
 }
 const rememberSoon = () => { clearTimeout(soon); soon = setTimeout(remember, 250); };
-store.on(["model", "code", "locked", "keyframes", "loop", "beyond", "seconds", "easing", "colour", "against", "wireframe", "normals",
-  "fine", "playing", "pins", "placement"], rememberSoon);
+store.on(["model", "code", "locked", "keyframes", "loop", "beyond", "seconds", "easing", "colour", "against",
+  "wireframe", "normals", "fine", "playing", "pins", "placement"], rememberSoon);
 viewer.canvas.addEventListener("turned", () => { turned = true; rememberSoon(); });
 addEventListener("hashchange", reporting(restore));
 

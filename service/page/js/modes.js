@@ -1,5 +1,7 @@
-/** Pictures of each coordinate and factor, where each factor changes lengths and angles, and how well shapes of the model
- * fit as a rule: all from the same few shapes. */
+/**
+ * Pictures of each coordinate and factor, where each factor changes lengths and angles, and how well shapes of the
+ * model fit as a rule: all from the same few shapes.
+ */
 
 import * as api from "./api.js";
 import { tint } from "./colours.js";
@@ -13,8 +15,11 @@ export class Modes {
   #abort = new AbortController();
   #regions = [];
 
+  /** @param {import("./store.js").Page} store */
   constructor(store, sliders, pictures) {
-    Object.assign(this, { store, sliders, pictures });
+    this.store = store;
+    this.sliders = sliders;
+    this.pictures = pictures;
     store.on(["model"], () => { this.#abort.abort(); this.#regions = []; });
   }
 
@@ -79,7 +84,8 @@ function smooth(region) {
 /** The sphere around where a region is, in positions (3V numbers). */
 function around(positions, region) {
   const inside = [...region.keys()].filter((vertex) => region[vertex] > 0.5);
-  return sphereOf(Float32Array.from(inside.flatMap((vertex) => [...positions.subarray(3 * vertex, 3 * vertex + 3)])));
+  const corners = inside.flatMap((vertex) => [...positions.subarray(3 * vertex, 3 * vertex + 3)]);
+  return sphereOf(Float32Array.from(corners));
 }
 
 /** For each vertex of `fine` the nearest one of `coarse` (positions of one shape). */
@@ -88,7 +94,8 @@ export function nearest(fine, coarse) {
   for (let v = 0; v < found.length; v += 1) {
     let least = Infinity;
     for (let i = 0; i < coarse.length; i += 3) {
-      const d = (fine[3 * v] - coarse[i]) ** 2 + (fine[3 * v + 1] - coarse[i + 1]) ** 2 + (fine[3 * v + 2] - coarse[i + 2]) ** 2;
+      let d = 0;
+      for (let axis = 0; axis < 3; axis += 1) d += (fine[3 * v + axis] - coarse[i + axis]) ** 2;
       if (d < least) [least, found[v]] = [d, i / 3];
     }
   }

@@ -19,8 +19,16 @@ export class Path {
   #t = 0;
   #clock = 0;
 
+  /** @param {import("./store.js").Page} store */
   constructor(store, pictures, { list, add, play, loop, beyond, seconds, easing, timeline, time, status }) {
-    Object.assign(this, { store, pictures, list, play, beyond, timeline, time, status });
+    this.store = store;
+    this.pictures = pictures;
+    this.list = list;
+    this.play = play;
+    this.beyond = beyond;
+    this.timeline = timeline;
+    this.time = time;
+    this.status = status;
     const tell = () => { seconds.value = store.keyframes.length > 1 ? readable(this.seconds) : ""; };
     store.on(["seconds", "keyframes", "loop", "beyond", "model"], tell);
     seconds.addEventListener("change", () => {

@@ -94,7 +94,8 @@ export function geometryOf(faces, vertexCount) {
   const Index = vertexCount < 65536 ? Uint16Array : Uint32Array;
   geometry.setIndex(new THREE.BufferAttribute(Index.from(faces), 1));
   for (const name of ["position", "normal", "color"]) {
-    geometry.setAttribute(name, new THREE.BufferAttribute(new Float32Array(3 * vertexCount), 3).setUsage(THREE.DynamicDrawUsage));
+    const values = new THREE.BufferAttribute(new Float32Array(3 * vertexCount), 3);
+    geometry.setAttribute(name, values.setUsage(THREE.DynamicDrawUsage));
   }
   return geometry;
 }

@@ -11,8 +11,10 @@ export class Sliders {
   #held = false; // whether a slider is being dragged, or moved by keys
   #timer = 0;
 
+  /** @param {import("./store.js").Page} store */
   constructor(store, list) {
-    Object.assign(this, { store, list });
+    this.store = store;
+    this.list = list;
     store.on(["space"], () => this.#build());
     store.on(["names"], () => this.#label());
     store.on(["code", "locked"], () => this.#show());
@@ -111,7 +113,8 @@ export class Sliders {
       sharp(find("canvas", button), PICTURE);
       button.addEventListener("click", () => this.#set(k, value));
     });
-    this.#rows[k] = { root, slider, box, lock, reset, signs, controls: [slider, box, reset, ...root.querySelectorAll(".pictures button")] };
+    const controls = [slider, box, reset, ...root.querySelectorAll(".pictures button")];
+    this.#rows[k] = { root, slider, box, lock, reset, signs, controls };
     return root;
   }
 

@@ -13,6 +13,7 @@ export class Stage extends THREE.Group {
   #disc;
   #shadow;
   #radius = 1;
+  #alpha = new Uint8Array(4 * CELLS * CELLS); // of black pixels
   #seen = new Float32Array(CELLS * CELLS);
   #spare = new Float32Array(CELLS * CELLS);
 
@@ -26,7 +27,7 @@ export class Stage extends THREE.Group {
     const colours = Float32Array.from({ length: 4 * fade.length }, (_, i) => (i % 4 < 3 ? 1 : fade[(i - 3) / 4]));
     disc.setAttribute("color", new THREE.BufferAttribute(colours, 4));
     this.#disc = new THREE.Mesh(disc, new THREE.MeshBasicMaterial({ ...flat, vertexColors: true }));
-    const map = new THREE.DataTexture(new Uint8Array(4 * CELLS * CELLS), CELLS, CELLS);
+    const map = new THREE.DataTexture(this.#alpha, CELLS, CELLS);
     map.magFilter = map.minFilter = THREE.LinearFilter;
     this.#shadow = new THREE.Mesh(new THREE.PlaneGeometry(2, 2), new THREE.MeshBasicMaterial({ ...flat, map }));
     this.#disc.renderOrder = -2;
@@ -66,9 +67,8 @@ export class Stage extends THREE.Group {
       this.#cast(middle(0), middle(1), middle(2));
     }
     for (let times = 0; times < 3; times += 1) this.#blur();
-    const { map } = this.#shadow.material;
-    for (let i = 0; i < this.#seen.length; i += 1) map.image.data[4 * i + 3] = 255 * this.#seen[i];
-    map.needsUpdate = true;
+    for (let i = 0; i < this.#seen.length; i += 1) this.#alpha[4 * i + 3] = 255 * this.#seen[i];
+    this.#shadow.material.map.needsUpdate = true;
   }
 
   /** Darken the cell under a point; of several above each other the lowest counts. */

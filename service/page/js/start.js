@@ -7,3 +7,5 @@ if (document.createElement("canvas").getContext("webgl2")) {
   document.documentElement.classList.add("draws");
   await import("./main.js");
 }
+
+export {};

@@ -18,7 +18,8 @@ export class Viewer {
 
   /** `margin`: pixels of the canvas's height that buttons and words take. */
   constructor(canvas, margin) {
-    Object.assign(this, { canvas, margin });
+    this.canvas = canvas;
+    this.margin = margin;
     this.renderer = new THREE.WebGLRenderer({ canvas, antialias: true, alpha: true });
     this.renderer.setPixelRatio(Math.min(devicePixelRatio, 2));
     this.scene = new THREE.Scene();
@@ -29,6 +30,7 @@ export class Viewer {
     this.controls.addEventListener("end", () => this.canvas.dispatchEvent(new Event("turned")));
 
     this.materials = { surface: surfaceMaterial(), normals: new THREE.MeshNormalMaterial() };
+    /** @type {THREE.Mesh<THREE.BufferGeometry, THREE.Material>} */
     this.mesh = new THREE.Mesh(new THREE.BufferGeometry(), this.materials.surface);
     const wires = new THREE.MeshBasicMaterial({ wireframe: true, color: 0x1f2a37, transparent: true, opacity: 0.55 });
     this.wires = new THREE.Mesh(this.mesh.geometry, wires);

@@ -36,6 +36,7 @@ const file = await answer.arrayBuffer();
 
   "a frame in a page": ({ embed, title }) => {
     const plain = (text) => text.replace(/[&<>"]/g, (sign) => `&#${sign.charCodeAt(0)};`);
-    return `<iframe src="${plain(embed)}" title="${plain(title)}" width="480" height="480" style="border:0"></iframe>`;
+    const look = 'width="480" height="480" style="border:0"';
+    return `<iframe src="${plain(embed)}" title="${plain(title)}" ${look}></iframe>`;
   },
 };

@@ -10,14 +10,16 @@ const MOVES = 3; // one in each of the first factors, which are the strongest
 const REACH = 0.8; // of the way to the bound
 const FRAMES = 8; // of the way there, and as many back
 const PACE = 1.2; // seconds of the same
-const TOUCHES = ["pointerdown", "keydown", "wheel", "focusin", "drop", "hashchange"];
+const TOUCHES = ["pointerdown", "click", "keydown", "wheel", "focusin", "drop", "hashchange"];
 
 export class Welcome {
   #touched = null; // its signal says when anything has been
   #begun = false;
 
+  /** @param {import("../store.js").Page} store */
   constructor(store, box) {
-    Object.assign(this, { store, box });
+    this.store = store;
+    this.box = box;
     find("[data-do=close]", box).addEventListener("click", () => {
       box.hidden = true;
       always.keep("welcomed", "yes");
