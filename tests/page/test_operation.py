@@ -31,6 +31,7 @@ def test_the_models_and_their_cards(studio: Studio) -> None:
         "unseen shapes",
         "3 %",
         "5 %",
+        "a linear model with as many numbers",
     ):
         assert fact in card
     studio.page.keyboard.press("Escape")
