@@ -18,6 +18,7 @@ export class Path {
   #loading = null;
   #t = 0;
   #clock = 0;
+  #carried = null; // index of the keyframe that is dragged
 
   /** @param {import("./store.js").Page} store */
   constructor(store, pictures, { list, add, play, loop, beyond, seconds, easing, timeline, time, status }) {
@@ -115,6 +116,7 @@ export class Path {
       remove.setAttribute("aria-label", `Remove ${name}`);
       remove.addEventListener("click", () => this.store.set({ keyframes: keyframes.toSpliced(i, 1) }));
       sharp(find("canvas", item), PICTURE);
+      this.#carry(item, i);
       return item;
     }));
     if (keyframes.length === 0) return;
@@ -122,6 +124,32 @@ export class Path {
       if (this.store.keyframes !== keyframes) return;
       this.list.querySelectorAll("canvas").forEach((canvas, i) => this.pictures.draw(canvas, shapes[i]));
     }).catch(report);
+  }
+
+  /** Have an item of the list go to another place, by hand and by keys. */
+  #carry(item, i) {
+    item.draggable = true;
+    item.addEventListener("dragstart", ({ dataTransfer }) => {
+      this.#carried = i;
+      dataTransfer.setData("text/plain", `keyframe ${i + 1}`); // or some browsers drag nothing
+    });
+    item.addEventListener("dragend", () => { this.#carried = null; });
+    item.addEventListener("dragover", (event) => { if (this.#carried !== null) event.preventDefault(); });
+    item.addEventListener("drop", () => { if (this.#carried !== null) this.#move(this.#carried, i); });
+    item.addEventListener("keydown", (event) => {
+      const by = { ArrowLeft: -1, ArrowRight: 1 }[event.key];
+      if (!event.altKey || !by) return;
+      event.preventDefault(); // which would leave the page
+      this.#move(i, i + by);
+    });
+  }
+
+  #move(from, to) {
+    const { against, keyframes } = this.store;
+    if (!keyframes[to] || from === to) return;
+    const order = [...keyframes.keys()].toSpliced(from, 1).toSpliced(to, 0, from);
+    this.store.set({ keyframes: order.map((i) => keyframes[i]), against: order.indexOf(against) });
+    find(`li:nth-child(${to + 1}) [data-do=go]`, this.list).focus();
   }
 
   #load() {
