@@ -79,6 +79,7 @@ def main() -> None:
 
         devtools.on("Network.requestWillBeSent", asked)
         devtools.on("Network.loadingFinished", finished)
+        page.emulate_media(reduced_motion="reduce")  # the shape would move by itself
         began = time.perf_counter()
         page.goto(str(client.base_url))
         page.wait_for_selector(".stage[data-shown]")

@@ -94,6 +94,9 @@ class Settings(BaseSettings):
     )
     api_key: SecretStr | None = Field(default=None, description="key that requests must bring; by default none")
     cors_origins: Names = Field(default=(), description="origins whose pages may call, separated by commas, or *")
+    embed_origins: Names = Field(
+        default=(), description="origins whose pages may show the page's viewer in a frame, separated by commas, or *"
+    )
     log_format: LogFormat = Field(default=LogFormat.TEXT, description="text, or json for one object a line")
 
     @field_validator("api_key")
@@ -109,7 +112,7 @@ class Settings(BaseSettings):
         # With host bits set a network would be taken for a name.
         return tuple(str(ipaddress.ip_network(proxy, strict=False)) for proxy in proxies)
 
-    @field_validator("cors_origins")
+    @field_validator("cors_origins", "embed_origins")
     @classmethod
     def _as_browsers_say_them(cls, origins: tuple[str, ...]) -> tuple[str, ...]:
         for origin in origins:

@@ -105,8 +105,10 @@ class Studio:
             raise AssertionError(f"the code is {self.code}, not {expected}") from None
 
     def coordinate(self, k: int) -> Locator:
-        """The row of a coordinate."""
-        return self.page.locator(".coordinate").nth(k)
+        """The row of a coordinate, of which the factor is unfolded."""
+        row = self.page.locator(".coordinate").nth(k)
+        row.evaluate("row => { row.closest('details').open = true; }")
+        return row
 
     def slide(self, k: int, value: float) -> None:
         """Move a slider as a hand does, and let go."""

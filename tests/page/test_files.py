@@ -5,6 +5,8 @@ from __future__ import annotations
 import io
 import json
 import shlex
+import subprocess
+import sys
 import zipfile
 from pathlib import Path
 from zipfile import ZipFile
@@ -79,20 +81,30 @@ def test_a_download_of_the_path(studio: Studio, expected: np.ndarray) -> None:
             assert content.startswith(begins[format])
 
 
-def test_the_copied_call_answers_the_shape(studio: Studio, expected: np.ndarray) -> None:
+def test_the_copied_calls_answer_the_shape(studio: Studio, expected: np.ndarray, tmp_path: Path) -> None:
     studio.page.context.grant_permissions(["clipboard-read", "clipboard-write"])
     move(studio)
     studio.tab("Files")
     studio["#format"].select_option("obj")
-    studio["#copy-curl"].click()
-    studio.eventually(lambda: "Copied the call" in studio.messages)
-    command = shlex.split(studio.page.evaluate("navigator.clipboard.readText()"))
+
+    def copied(language: str) -> str:
+        studio["#language"].select_option(language)
+        studio["#copy-code"].click()
+        text = studio["#code"].text_content()
+        studio.eventually(lambda: studio.page.evaluate("navigator.clipboard.readText()") == text)
+        return text or ""
+
+    command = shlex.split(copied("curl"))
     assert command[0] == "curl"
     options = dict(zip(command[2::2], command[3::2], strict=True))
     name, _, value = options["-H"].partition(": ")
     answer = httpx.post(command[1], content=options["-d"], headers={name: value}, timeout=60).raise_for_status()
     assert options["-o"] == "with-fine.obj"
-    assert np.allclose(read_arrays(answer.content, "obj")[0], expected, atol=1e-5)
+    subprocess.run([sys.executable, "-c", copied("Python")], cwd=tmp_path, check=True)
+    script = f"async () => {{ {copied('JavaScript')}; return new TextDecoder().decode(file); }}"
+    files = [answer.content, (tmp_path / "with-fine.obj").read_bytes(), studio.page.evaluate(script).encode()]
+    for content in files:
+        assert np.allclose(read_arrays(content, "obj")[0], expected, atol=1e-5)
 
 
 def test_the_address_restores_everything(studio: Studio, window: Open) -> None:

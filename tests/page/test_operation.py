@@ -31,6 +31,7 @@ def test_the_models_and_their_cards(studio: Studio) -> None:
         "unseen shapes",
         "3 %",
         "5 %",
+        "a linear model with as many numbers",
     ):
         assert fact in card
     studio.page.keyboard.press("Escape")
@@ -127,7 +128,7 @@ def test_everything_is_reached_by_keyboard(studio: Studio) -> None:
 
     reached = set()
     studio["#model"].focus()
-    for _ in range(40):
+    for _ in range(50):
         reached.add(focused())
         studio.page.keyboard.press("Tab")
     assert {

@@ -87,10 +87,25 @@ def test_past_the_ends_and_the_shorter_way_round(studio: Studio) -> None:
         step = 2 * np.pi - 6
         angle = 3 + t * step
         studio.until_code([0.1 * t, angle if angle < np.pi else angle - 2 * np.pi, 0], 0.01)
+    # Slow at the keyframes: a tenth of the time is less than a twentieth of the way.
+    studio["#easing"].select_option("soft")
+    for t, share in ((0.1, 0.028), (0.5, 0.5), (0.9, 0.972)):
+        timeline.fill(str(t))
+        studio.eventually(lambda share=share: abs(studio.code[0] - 0.1 * share) < 0.003)
+    assert studio.hash["easing"] == "soft"
 
 
-def test_keyframes_can_be_visited_replaced_and_removed(studio: Studio) -> None:
+def test_keyframes_can_be_visited_reordered_replaced_and_removed(studio: Studio) -> None:
     keyframes(studio, (0, 0, 0), (0.1, 0, 0), (0.2, 1, 0))
+    items = studio["#keyframes > li"]
+    items.nth(2).drag_to(items.nth(0))
+    studio.eventually(lambda: studio.hash.get("keys") == "0.2,1,0;0,0,0;0.1,0,0")
+    studio.page.keyboard.press("Alt+ArrowRight")  # it has the focus
+    studio.page.keyboard.press("Alt+ArrowRight")
+    studio.page.keyboard.press("Alt+ArrowRight")  # nowhere else to go
+    studio.eventually(lambda: studio.hash.get("keys") == "0,0,0;0.1,0,0;0.2,1,0")
+    assert items.nth(2).locator("[data-do=go]").evaluate("b => document.activeElement === b")
+    assert studio.messages == ""
     studio.page.get_by_role("button", name="Go to keyframe 1").click()
     studio.until_code([0, 0, 0])
     studio.page.get_by_role("button", name="Take the shape as it is for keyframe 2").click()

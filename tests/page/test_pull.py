@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from playwright.sync_api import Locator
 
 from tests.page.conftest import Open
 from tests.page.studio import Studio, difference
@@ -38,6 +39,13 @@ def edits(studio: Studio) -> list[dict[str, Any]]:
     return sent
 
 
+def corners(pins: Locator) -> list[list[float]]:
+    """Upper left corners of pins in the window."""
+    return pins.evaluate_all(
+        "all => all.map((pin) => { const { x, y } = pin.getBoundingClientRect(); return [x, y]; })"
+    )
+
+
 def test_pins_stay_are_pulled_together_and_removed_by_mouse_and_key(window: Open) -> None:
     studio = window().open("#model=figure")
     sent = edits(studio)
@@ -60,6 +68,17 @@ def test_pins_stay_are_pulled_together_and_removed_by_mouse_and_key(window: Open
     assert pins.count() == 2
     studio.page.evaluate(AXE.read_text())
     check(studio, "pins")
+
+    # A link brings them back, and the shape to where they left it.
+    places = corners(pins)
+    studio.eventually(lambda: studio.hash.get("pins", "").count(";") == 1 and "place" in studio.hash)
+    address = studio.hash
+    studio.page.reload()
+    studio.rest()
+    studio.eventually(lambda: pins.count() == 2)
+    studio.eventually(lambda: np.allclose(corners(pins), places, atol=2))
+    studio.page.wait_for_timeout(400)
+    assert studio.hash == address
 
     # A pin is pulled on by itself.
     box = pins.nth(1).bounding_box()

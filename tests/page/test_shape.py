@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import time
 
 import numpy as np
@@ -27,10 +28,10 @@ def test_the_figure_is_there_first_and_follows_a_slider(window: Open) -> None:
     assert 0.01 < difference(before, after) < 0.6
     # The picture comes first, the address when the hand rests.
     studio.eventually(lambda: studio.code[4] == pytest.approx(0.9, abs=1e-3))
-    words = studio["#diagnostics"].inner_text()
+    words = studio["#diagnostics"].text_content() or ""
     assert "Fits its lengths and angles to" in words
     assert "Inside the range" in words
-    assert "ms to the picture" in studio["#frame-time"].inner_text()
+    assert "ms to the picture" in (studio["#frame-time"].text_content() or "")
 
 
 def test_several_coordinates_at_once_number_lock_and_reset(studio: Studio) -> None:
@@ -71,7 +72,7 @@ def test_the_range_of_the_training_data_is_marked_and_leaving_it_is_said(studio:
     assert "outside" not in (studio.coordinate(2).get_attribute("class") or "")
     studio.slide(2, 1.2)
     assert "outside" in (studio.coordinate(2).get_attribute("class") or "")
-    studio.eventually(lambda: "Outside the range" in studio["#diagnostics"].inner_text())
+    studio.eventually(lambda: "Outside the range" in (studio["#diagnostics"].text_content() or ""))
 
 
 def test_an_angle_goes_round(studio: Studio) -> None:
@@ -140,7 +141,7 @@ def test_a_draft_that_was_solved_after_all_is_not_asked_for_again(window: Open) 
     studio.page.wait_for_timeout(1000)
     fine = [asked for asked in studio.asked if len(asked["latents"]) == 1 and asked["mesh"] == "fine"]
     assert {asked["quality"] for asked in fine} == {"draft"}
-    assert "folded over" in studio["#diagnostics"].inner_text()
+    assert "folded over" in (studio["#diagnostics"].text_content() or "")
 
 
 def test_nothing_jumps_as_a_draft_comes_to_rest(window: Open) -> None:
@@ -164,6 +165,34 @@ def test_nothing_jumps_as_a_draft_comes_to_rest(window: Open) -> None:
     studio.rest()
     assert difference(start, draft) > 0.01
     assert difference(draft, studio.picture()) < 0.25 * difference(start, draft)
+
+
+def test_one_line_says_how_good_the_shape_is_by_what_is_usual_for_the_model(window: Open) -> None:
+    studio = window()
+    residual = 0.02
+
+    def off(route: Route) -> None:
+        answer = route.fetch()
+        told = json.loads(answer.headers["shape-diagnostics"]) | {"residual": residual, "plausibility": 1}
+        route.fulfill(response=answer, headers={**answer.headers, "shape-diagnostics": json.dumps(told)})
+
+    studio.page.route("**/vertices*", off)
+    studio.open()
+    studio.eventually(lambda: studio[".pictures canvas.drawn"].count() == 9)
+    chip = studio["#diagnostics summary"]
+    assert chip.inner_text() == "Fits, inside, usual", "all shapes of this model are off by as much"
+    assert studio["#diagnostics"].get_attribute("class") == "good"
+    assert studio["#found"].is_hidden()
+    chip.click()
+    assert "as is usual for this model" in studio["#found"].inner_text()
+    residual = 0.06
+    studio.type(2, 0.4)
+    studio.eventually(lambda: chip.inner_text() == "Fits less well")
+    assert studio["#diagnostics"].get_attribute("class") == "fair"
+    residual = 0.2
+    studio.type(2, 0.5)
+    studio.eventually(lambda: chip.inner_text() == "Hardly exists")
+    assert studio["#diagnostics"].get_attribute("class") == "poor"
 
 
 def test_a_slider_is_dragged(studio: Studio) -> None:
@@ -255,7 +284,7 @@ def test_wireframe_normals_and_the_coarse_mesh(studio: Studio) -> None:
         studio.until_different(before, 0.005)
         if switch == "fine":
             studio.eventually(lambda: studio.shown == "coarse")
-            assert "64 vertices" in studio["#frame-time"].inner_text()
+            assert "64 vertices" in (studio["#frame-time"].text_content() or "")
     for switch in ("wireframe", "normals", "fine"):
         studio[f"#{switch}"].click()
     studio.eventually(lambda: difference(start, studio.picture()) < 0.001)
@@ -281,22 +310,33 @@ def test_pointing_at_a_factor_colours_where_it_changes_lengths_and_angles(window
     every = studio[".pictures canvas"].count()
     studio.eventually(lambda: studio[".pictures canvas.drawn"].count() == every)
 
-    def orange(picture: np.ndarray) -> np.ndarray:
-        return (picture[..., 0] - picture[..., 2]) > 50
+    def blue(picture: np.ndarray) -> np.ndarray:
+        return (picture[..., 2] - picture[..., 0]) > 50
+
+    # Factors fold; each has a picture of what it moves, of that part of the shape.
+    folds = studio[".factor details"]
+    assert [fold.get_attribute("open") is not None for fold in folds.all()] == [True] + [False] * (folds.count() - 1)
+    pictures = [body(canvas) for canvas in studio[".factor summary canvas"].all()]
+    for picture in pictures:
+        assert 0.01 < (blue(picture) & (picture[..., 3] > 0)).mean() < 0.5
+    # No two alike, which those of the whole shape nearly were.
+    assert all(np.abs(a - b).mean() > 5 for i, a in enumerate(pictures) for b in pictures[:i])
+    studio[".factor summary"].nth(1).click()
+    assert studio["#z2"].is_visible()
 
     studio["#canvas"].hover()
-    assert not orange(studio.picture()).any()
+    studio.eventually(lambda: not blue(studio.picture()).any())
     studio[".factor h2"].filter(has_text="shoulder").first.hover()  # an arm, on one side of the picture
-    coloured = orange(studio.eventually(lambda: p if orange(p := studio.picture()).any() else None))
+    coloured = blue(studio.eventually(lambda: p if blue(p := studio.picture()).any() else None))
     half = coloured.shape[1] // 2
     less, more = sorted(int(side.sum()) for side in (coloured[:, :half], coloured[:, half:]))
     assert more > 1000
     assert less < 0.05 * more
     studio["#canvas"].hover()
-    studio.eventually(lambda: not orange(studio.picture()).any())
+    studio.eventually(lambda: not blue(studio.picture()).any())
     # A hip: alignment moves head, hands and feet with it, but there nothing is longer or bent.
     studio[".factor h2"].first.hover()
-    coloured = orange(studio.eventually(lambda: p if orange(p := studio.picture()).any() else None))
+    coloured = blue(studio.eventually(lambda: p if blue(p := studio.picture()).any() else None))
     height = len(coloured)
     assert not coloured[: int(0.4 * height)].any()
     assert not coloured[int(0.75 * height) :].any()
@@ -357,10 +397,23 @@ def test_a_phone_and_a_finger(window: Open) -> None:
     assert studio["#add-keyframe"].is_visible()
 
 
-def test_dark_and_light(window: Open) -> None:
-    light, dark = (window(color_scheme=scheme).open().picture()[:5].mean() for scheme in ("light", "dark"))
-    assert light > 200
-    assert dark < 60
+def test_a_stage_in_dark_and_light(window: Open) -> None:
     studio = window(color_scheme="dark").open()
+
+    def stage() -> tuple[float, float, float]:
+        """How bright the paper is, the ground beside the shape, and the darkest place there below it."""
+        picture = studio.picture()
+        grey = picture.mean(axis=2)
+        shape = (picture[..., 0] - picture[..., 2] > 20).any(axis=1)  # of warm clay
+        ground = grey[np.flatnonzero(shape)[-1] + 3 :]
+        return grey[:5].mean(), float(np.median(ground[:5, 60:90])), ground[:5].min()
+
+    paper, ground, shadow = stage()
+    assert paper < 60
+    assert ground > paper + 8
+    assert shadow < ground - 8
     studio["#theme"].click()
-    assert studio.picture()[:5].mean() > 200
+    paper, ground, shadow = stage()
+    assert paper > 200
+    assert ground < paper - 8
+    assert shadow < ground - 8

@@ -18,6 +18,7 @@ from starlette.staticfiles import NotModifiedResponse, StaticFiles
 from starlette.types import Scope
 
 from shapespace.service.http.caching import entity_tag
+from shapespace.service.http.dependencies import ServiceDependency
 
 FOLDER = Path(__file__).parents[2] / "page"
 
@@ -48,10 +49,12 @@ _FILES = TaggedFiles(directory=FOLDER)
 
 
 @router.api_route("/", methods=["GET", "HEAD"])
-async def page(request: Request) -> Response:
-    """Shapes to move by hand."""
+async def page(request: Request, service: ServiceDependency) -> Response:
+    """Shapes to move by hand; with ``?embed`` their viewer alone, for pages that may show it in a frame."""
     response = await _FILES.get_response("index.html", request.scope)
-    response.headers["Content-Security-Policy"] = _policy()
+    framing = service.settings.embed_origins if "embed" in request.query_params else ()
+    ancestors = " ".join(framing) or "'none'"
+    response.headers["Content-Security-Policy"] = f"{_policy()}; frame-ancestors {ancestors}"
     return response
 
 
@@ -66,4 +69,4 @@ def _policy() -> str:
     maps = re.findall(r'<script type="importmap">(.*?)</script>', (FOLDER / "index.html").read_text("utf-8"), re.DOTALL)
     digests = (base64.b64encode(hashlib.sha256(text.encode()).digest()).decode() for text in maps)
     scripts = " ".join(["'self'", *(f"'sha256-{digest}'" for digest in digests)])
-    return f"default-src 'self'; script-src {scripts}; object-src 'none'; base-uri 'none'; frame-ancestors 'none'"
+    return f"default-src 'self'; script-src {scripts}; object-src 'none'; base-uri 'none'"

@@ -1,5 +1,7 @@
 /** The state of the page as the part of its address after the #, and back. */
 
+import { Matrix4, Quaternion, Vector3 } from "three";
+
 const FLAGS = ["wireframe", "normals", "loop"];
 const number = (value) => String(Number(value.toFixed(5)));
 const list = (numbers) => numbers.map(number).join(",");
@@ -14,13 +16,44 @@ export function toHash(store, view) {
   if (store.locked.some(Boolean)) parts.set("locked", store.locked.flatMap((is, k) => (is ? [k] : [])).join(","));
   if (store.keyframes.length) parts.set("keys", store.keyframes.map(list).join(";"));
   if (store.beyond) parts.set("beyond", number(store.beyond));
+  if (store.seconds) parts.set("seconds", number(store.seconds));
+  if (store.easing !== "even") parts.set("easing", store.easing);
   if (store.colour !== "none") parts.set("colour", store.colour);
   if (store.against >= 0) parts.set("against", store.against);
+  if (store.pins.length) parts.set("pins", store.pins.map(fromPin).join(";"));
+  if (store.placement) parts.set("place", list(fromPlacement(store.placement)));
   if (view) parts.set("view", list(view));
   return `#${parts.toString().replaceAll("%2C", ",").replaceAll("%3B", ";")}`;
 }
 
-/** What an address asks for; parts that make no sense for the model are left out. */
+const fromPin = ({ mesh, vertex, position }) => [mesh, vertex, list(position.toArray())].join(",");
+
+/** A pin; whether the mesh has its vertex is known when the mesh is there. */
+function toPin(text) {
+  const [mesh, ...rest] = text.split(",");
+  const [vertex, ...position] = rest.map(Number);
+  const isPoint = position.length === 3 && position.every(Number.isFinite);
+  return isPoint && Number.isInteger(vertex) && vertex >= 0 ? [{ mesh, vertex, position: new Vector3(...position) }] : [];
+}
+
+/** A motion as where it takes the origin, and a quaternion. */
+function fromPlacement(placement) {
+  const [position, rotation] = [new Vector3(), new Quaternion()];
+  placement.decompose(position, rotation, new Vector3());
+  return [...position.toArray(), ...rotation.toArray()];
+}
+
+function toPlacement(numbers) {
+  const rotation = new Quaternion(...numbers.slice(3));
+  if (numbers.length !== 7 || !numbers.every(Number.isFinite) || rotation.length() === 0) return null;
+  return new Matrix4().compose(new Vector3(...numbers), rotation.normalize(), new Vector3(1, 1, 1));
+}
+
+/**
+ * What an address asks for; parts that make no sense for the model are left out.
+ * @returns {{model?: any, missing?: string, code?: number[], keyframes?: number[][], locked?: boolean[],
+ *   view?: number[], pins?: import("./pull.js").Pin[], state?: Partial<import("./store.js").State>}}
+ */
 export function fromHash(hash, models) {
   const parts = new URLSearchParams(hash.replace(/^#/, ""));
   const model = models.find(({ name }) => name === parts.get("model"));
@@ -34,17 +67,23 @@ export function fromHash(hash, models) {
   const against = Number(parts.get("against") ?? -1);
   const view = unlist(parts.get("view") ?? "");
   const beyond = Number(parts.get("beyond"));
+  const seconds = Number(parts.get("seconds"));
+  const colour = parts.get("colour");
   return {
     model,
     code: isCode(code) ? code : null,
     keyframes,
     locked: Array.from({ length: m }, (_, k) => locked.includes(k)),
+    pins: (parts.get("pins") ?? "").split(";").flatMap(toPin),
     view: view.length === 6 && view.every(Number.isFinite) ? view : null,
     state: {
+      placement: toPlacement(unlist(parts.get("place") ?? "")),
       ...Object.fromEntries(FLAGS.map((flag) => [flag, flags.includes(flag)])),
       fine: !flags.includes("coarse"),
-      colour: ["stretch", "bending"].includes(parts.get("colour")) ? parts.get("colour") : "none",
+      colour: colour === "stretch" || colour === "bending" ? colour : "none",
       against: Number.isInteger(against) && against < keyframes.length ? against : -1,
+      seconds: seconds >= 0.5 && seconds <= 120 ? seconds : null,
+      easing: parts.get("easing") === "soft" ? "soft" : "even",
       beyond: beyond > 0 && beyond <= 1 ? beyond : 0,
     },
   };

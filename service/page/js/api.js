@@ -11,7 +11,8 @@ const KEY = "shapespace-key";
 export class Problem extends Error {
   constructor(message, status, type) {
     super(message);
-    Object.assign(this, { status, type });
+    this.status = status;
+    this.type = type;
   }
 
   get offline() {
@@ -70,7 +71,13 @@ export async function reference(model, mesh) {
 /** The reference as GLB, with the materials and textures of the model's files. */
 export const textured = async (model) => (await call(`${model.links.mesh}?format=glb`)).arrayBuffer();
 
-/** Positions (3V numbers each) of some codes, and the worst of their diagnostics. */
+/**
+ * Positions (3V numbers each) of some codes, and the worst of their diagnostics.
+ * @param {object} model as the server lists it
+ * @param {number[][]} latents
+ * @param {"coarse" | "fine"} mesh
+ * @param {{quality?: "draft" | "full", signal?: AbortSignal}} [options]
+ */
 export async function shapes(model, latents, mesh, { quality = "full", signal } = {}) {
   const body = { latents, mesh, quality, faces: false };
   const response = await post(`${model.links.vertices}?format=npz`, body, signal);
@@ -83,7 +90,8 @@ export async function frames(model, path, signal) {
   const { id, links } = await interpolation(model, path, signal);
   const response = await call(`${links.self}?format=npz&quality=draft`, { signal });
   const { vertices, latents, t } = await readNpz(await response.arrayBuffer(), ["vertices", "latents", "t"]);
-  return { id, mesh: path.mesh, shapes: split(vertices), codes: split(latents).map((code) => Array.from(code)), t: Array.from(t.data) };
+  const codes = split(latents).map((code) => Array.from(code));
+  return { id, mesh: path.mesh, shapes: split(vertices), codes, t: Array.from(t.data) };
 }
 
 export const interpolation = (model, path, signal) => json(post(model.links.interpolations, path, signal));

@@ -3,9 +3,19 @@
 import * as api from "./api.js";
 import { element, find, readable } from "./dom.js";
 
-const rows = (pairs) => pairs.map(([name, value]) => element("div", {},
-  element("dt", { textContent: name }), element("dd", { textContent: value })));
+const rows = (facts) => facts.map(([name, value, meaning = ""]) => element("div", {},
+  element("dt", { textContent: name }), element("dd", { textContent: value }),
+  ...(meaning ? [element("dd", { className: "hint", textContent: meaning })] : [])));
 const percent = (share) => `${readable(100 * share)} %`;
+
+/** What figures mean, for those who have not read the paper. */
+const MEANINGS = {
+  r2: "How much of the change of lengths and angles the networks get right: 1 is all of it.",
+  unseen: "From shapes that training has not seen, in shares of the diagonal.",
+  components: "The same by a linear model with as many numbers.",
+  draft: "From what is shown while something moves to the full shape.",
+  error: "From the networks’ shapes to exact ones, in shares of the diagonal.",
+};
 
 /** Numbers of a nested object with the path to each, such as ["r2 composite total", 0.99]. */
 function flatten(value, path = []) {
@@ -26,11 +36,11 @@ export async function openCard(dialog, model) {
     ["factors", card.factors.length],
     ["vertices", card.vertices],
     ["faces", card.faces],
-    ...(r2?.composite ? [["variance explained (R²)", readable(r2.composite.total, 4)]] : []),
-    ...(unseen ? [["unseen shapes, mean distance", percent(unseen.mean)],
-      ["as many principal components", percent(unseen.components.mean)]] : []),
-    ...(draft ? [["drafts, mean distance", percent(draft.mean)]] : []),
-    ...(error?.mean ? [["mean vertex error, of the diagonal", percent(error.mean)]] : []),
+    ...(r2?.composite ? [["variance explained (R²)", readable(r2.composite.total, 4), MEANINGS.r2]] : []),
+    ...(unseen ? [["unseen shapes, mean distance", percent(unseen.mean), MEANINGS.unseen],
+      ["as many principal components", percent(unseen.components.mean), MEANINGS.components]] : []),
+    ...(draft ? [["drafts, mean distance", percent(draft.mean), MEANINGS.draft]] : []),
+    ...(error?.mean ? [["mean vertex error", percent(error.mean), MEANINGS.error]] : []),
   ]));
   const cells = (...texts) => texts.map((textContent) => element("td", { textContent }));
   find(".compared tbody", dialog).replaceChildren(...Object.entries(r2 ?? {}).map(([name, { total, lengths, angles }]) =>

@@ -23,6 +23,7 @@ const KINDS = {
   },
 };
 
+const SMOOTHED = 4; // times, about as far as coarse vertices lie apart
 const SMALLEST = 0.01; // end of the legend, in either measure
 
 export class Colouring {
@@ -31,8 +32,11 @@ export class Colouring {
   #nearest = null;
   #limit = 0;
 
+  /** @param {import("./store.js").Page} store */
   constructor(store, { legend, against }) {
-    Object.assign(this, { store, legend, against });
+    this.store = store;
+    this.legend = legend;
+    this.against = against;
     find(".scale", legend).style.backgroundImage = gradient;
     store.on(["model"], () => { this.#surfaces.clear(); this.#bases.clear(); this.#nearest = null; });
     store.on(["model", "colour", "against"], () => { this.#limit = 0; });
@@ -88,10 +92,14 @@ export class Colouring {
     return this.#bases.get(key);
   }
 
+  /** A region's weights at fine vertices: those of the nearest coarse ones, with its rim smoothed. */
   #onFine(region) {
     const { coarse, fine } = this.store.references;
     this.#nearest ??= nearest(fine.vertices, coarse.vertices);
-    return Float32Array.from(this.#nearest, (vertex) => region[vertex]);
+    const surface = this.#surface("fine");
+    let weights = Float32Array.from(this.#nearest, (vertex) => region[vertex]);
+    for (let times = 0; times < SMOOTHED; times += 1) weights = surface.smooth(weights);
+    return weights;
   }
 
   #tell({ shown, unit, ends, title }, edges) {

@@ -2,28 +2,65 @@
 
 import { readable } from "./dom.js";
 
-/** Sentences for what the server says of a shape, each with how good the news is. */
-export function inWords(diagnostics) {
+const FITS = 0.01; // residual up to which nobody need know more
+const HARDLY = 0.05;
+const MUCH = 2; // times as much as is usual for the model
+const TOO_MUCH = 5;
+
+/** @typedef {["good" | "fair" | "poor", string, string]} News */
+
+/**
+ * What the server says of a shape: how good the news is, a word for it, and a sentence.
+ * @param {object} diagnostics
+ * @param {number | null} usual the model's own residual, at codes of the training range; null while it isn't known
+ * @returns {News[]}
+ */
+export function inWords(diagnostics, usual) {
   const { status, residual, inside_bounds: inside, flipped_faces: flipped, plausibility } = diagnostics;
   if (residual === undefined) return [];
-  const words = [];
-  if (residual < 0.01) words.push(["good", `Fits its lengths and angles to ${percent(residual)}.`]);
-  else if (residual < 0.05) words.push(["fair", `Lengths and angles are off by ${percent(residual)}.`]);
-  else words.push(["poor", `Lengths and angles are off by ${percent(residual)}: this shape hardly exists.`]);
+  const words = [fits(residual, usual ?? HARDLY)];
   words.push(inside
-    ? ["good", "Inside the range of the training data."]
-    : ["fair", "Outside the range of the training data: extrapolated."]);
+    ? ["good", "inside", "Inside the range of the training data."]
+    : ["fair", "outside", "Outside the range of the training data: extrapolated."]);
   if (typeof plausibility === "number") words.push(plausible(plausibility));
-  if (flipped > 0) words.push(["poor", `${flipped} ${flipped === 1 ? "face is" : "faces are"} folded over.`]);
-  if (status && status !== "converged") words.push(["poor", `The solver did not finish (${status.replace("_", " ")}).`]);
+  if (flipped > 0) words.push(["poor", "folded", `${flipped} ${flipped === 1 ? "face is" : "faces are"} folded over.`]);
+  if (status && status !== "converged") {
+    words.push(["poor", "unfinished", `The solver did not finish (${status.replace("_", " ")}).`]);
+  }
   return words;
 }
 
-/** By the distance to the nearest training shape, in multiples of what these have from each other. */
+/** The worst of them, and a line for all: what is wrong, or else what is right. */
+export function inShort(words) {
+  const how = ["poor", "fair"].find((each) => words.some(([is]) => is === each)) ?? "good";
+  const line = words.filter(([is]) => (is === "good") === (how === "good")).map(([, word]) => word).join(", ");
+  return { how, line: line.charAt(0).toUpperCase() + line.slice(1) };
+}
+
+/**
+ * A model is as good as it is: what is usual for it is no fault of a shape.
+ * @returns {News}
+ */
+function fits(residual, usual) {
+  const off = `Lengths and angles are off by ${percent(residual)}`;
+  if (residual < Math.max(FITS, MUCH * usual)) {
+    const all = residual < FITS ? "" : ", as is usual for this model";
+    return ["good", "fits", `Fits its lengths and angles to ${percent(residual)}${all}.`];
+  }
+  if (residual < Math.max(HARDLY, TOO_MUCH * usual)) return ["fair", "fits less well", `${off}.`];
+  return ["poor", "hardly exists", `${off}: this shape hardly exists.`];
+}
+
+/**
+ * By the distance to the nearest training shape, in multiples of what these have from each other.
+ * @returns {News}
+ */
 function plausible(distance) {
-  if (distance < 1.05) return ["good", "As near to the training shapes as these are to each other."];
+  if (distance < 1.05) return ["good", "usual", "As near to the training shapes as these are to each other."];
   const times = `${readable(distance, 2)} times as far from the training shapes as these lie apart`;
-  return distance <= 2 ? ["fair", `Unusual: ${times}.`] : ["poor", `Hardly plausible: ${times}.`];
+  return distance <= 2
+    ? ["fair", "unusual", `Unusual: ${times}.`]
+    : ["poor", "implausible", `Hardly plausible: ${times}.`];
 }
 
 const percent = (share) => `${readable(100 * share, 2)} %`;

@@ -1,7 +1,8 @@
 /** Small helpers for building the page. Text only ever goes in as text. */
 
+/** @type {(selector: string, root?: ParentNode) => any} */
 export const find = (selector, root = document) => root.querySelector(selector);
-export const clone = (name) => document.querySelector(`template#${name}`).content.firstElementChild.cloneNode(true);
+export const clone = (name) => find(`template#${name}`).content.firstElementChild.cloneNode(true);
 export const element = (name, properties = {}, ...children) => {
   const made = Object.assign(document.createElement(name), properties);
   made.append(...children);

@@ -1,8 +1,11 @@
-/** Files to keep, and calls to copy. */
+/** Files to keep, pictures and videos among them, and calls to copy. */
 
+import { toHash } from "./address.js";
 import * as api from "./api.js";
-import { element, find } from "./dom.js";
+import { element, find, readable } from "./dom.js";
 import { reporting, say } from "./messages.js";
+import { CODE } from "./show/code.js";
+import { picture, record, turntable } from "./show/video.js";
 
 /** What the server offers for one shape. */
 export const SHAPE_FORMATS = ["glb", "gltf", "obj", "ply", "stl", "npz", "zip", "json"];
@@ -28,18 +31,28 @@ function keep(blob, name) {
 }
 
 export class Files {
-  constructor(store, path, root) {
-    Object.assign(this, { store, path });
+  /** @param {import("./store.js").Page} store */
+  constructor(store, path, viewer, root) {
+    this.store = store;
+    this.path = path;
+    this.viewer = viewer;
     this.format = find("#format", root);
     this.format.append(...SHAPE_FORMATS.map((name) => element("option", { textContent: name })));
-    this.curl = find("#curl", root);
+    this.code = find("#code", root);
+    this.language = find("#language", root);
+    this.language.append(...Object.keys(CODE).map((name) => element("option", { textContent: name })));
+    this.language.addEventListener("change", () => this.#tell());
+    this.seconds = find("#turntable-seconds", root);
     this.animation = find("#animation-format");
-    store.on(["code", "model", "fine", "colour", "against", "keyframes"], () => this.#tell());
+    store.on(["code", "model", "fine", "colour", "against", "keyframes", "placement"], () => this.#tell());
     this.format.addEventListener("change", () => this.#tell());
     find("#download", root).addEventListener("click", reporting(() => this.#shape()));
     find("#download-animation").addEventListener("click", reporting(() => this.#animation()));
     store.on(["keyframes"], reporting(() => this.#animationFormats()));
-    find("#copy-curl", root).addEventListener("click", () => copy(this.curl.textContent, "the call"));
+    find("#copy-code", root).addEventListener("click", () => copy(this.code.textContent, "the call"));
+    find("#picture", root).addEventListener("click", reporting(() => this.#picture()));
+    find("#turntable", root).addEventListener("click", reporting(() => this.#turntable()));
+    find("#film").addEventListener("click", reporting(() => this.#film()));
   }
 
   /** Path and body of the call that answers the shape as a file. */
@@ -57,8 +70,10 @@ export class Files {
   #tell() {
     if (!this.store.model) return;
     const { path, body } = this.#call;
-    this.curl.textContent = `curl '${api.origin}${path}' -H 'content-type: application/json' `
-      + `-d '${JSON.stringify(body)}' -o ${this.store.model.name}.${this.format.value}`;
+    const { model: { name, title } } = this.store;
+    const embed = `${api.origin}/?embed${toHash(this.store, null)}`;
+    const file = `${name}.${this.format.value}`;
+    this.code.textContent = CODE[this.language.value]({ url: api.origin + path, body, file, embed, title });
   }
 
   async #shape() {
@@ -66,10 +81,51 @@ export class Files {
     keep(await api.file(path, body), `${this.store.model.name}.${this.format.value}`);
   }
 
+  async #picture() {
+    keep(await picture(this.viewer), `${this.store.model.name}.png`);
+  }
+
+  #turntable() {
+    const { seconds: { value, valueAsNumber: seconds, validity } } = this;
+    if (!validity.valid || value === "") throw new Error("Say how many seconds a turn takes, from 1 to 60.");
+    return this.#video("turntable", (tell) => {
+      tell(seconds);
+      return turntable(this.viewer, seconds);
+    });
+  }
+
+  #film() {
+    return this.#video("animation", async (tell) => {
+      const { seconds, show } = await this.path.film();
+      tell(seconds);
+      try {
+        return await record(this.viewer, seconds, show);
+      } finally {
+        this.path.pause();
+      }
+    });
+  }
+
+  /** Keep what is recorded, which takes as long as it lasts. */
+  async #video(what, make) {
+    if (this.recording) return;
+    this.recording = true;
+    try {
+      const tell = (seconds) => say(`Recording, for ${readable(seconds)} s …`, { key: "video" });
+      const { blob, extension } = await make(tell);
+      keep(blob, `${this.store.model.name}-${what}.${extension}`);
+      say("The video is saved.", { key: "video" });
+    } catch (error) {
+      say(error.message, { kind: "error", key: "video" });
+    } finally {
+      this.recording = false;
+    }
+  }
+
   /** Offer what the server has for a path: that depends on what is installed with it. */
   async #animationFormats() {
     const { keyframes, model } = this.store;
-    find("#download-animation").disabled = keyframes.length < 2;
+    for (const button of ["#download-animation", "#film"]) find(button).disabled = keyframes.length < 2;
     if (keyframes.length < 2 || this.animation.options.length) return;
     const { links } = await api.interpolation(model, { keyframes });
     const names = Object.keys(links).filter((name) => !["self", "frames"].includes(name));

@@ -8,14 +8,19 @@ export class History {
   #steps = [];
   #at = -1;
 
+  /** @param {import("./store.js").Page} store */
   constructor(store, { undo, redo }) {
-    Object.assign(this, { store, undo, redo });
+    this.store = store;
+    this.undo = undo;
+    this.redo = redo;
     store.on(["space"], () => { this.#steps = []; this.#at = -1; });
     store.on(["space", "code", "moving", "playing", "pins"], () => this.#record());
     undo.addEventListener("click", () => this.#go(-1));
     redo.addEventListener("click", () => this.#go(1));
     addEventListener("keydown", (event) => {
-      if (!(event.ctrlKey || event.metaKey) || event.altKey || event.target.matches("input[type=number], textarea")) return;
+      if (!(event.ctrlKey || event.metaKey) || event.altKey) return;
+      const { target } = /** @type {{target: any}} */ (event);
+      if (target.matches?.("input[type=number], textarea")) return;
       const key = event.key.toLowerCase();
       if (key !== "z" && key !== "y") return;
       event.preventDefault();

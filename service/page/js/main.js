@@ -4,7 +4,7 @@ import { fromHash, toHash } from "./address.js";
 import * as api from "./api.js";
 import { openCard } from "./card.js";
 import { Colouring } from "./colouring.js";
-import { inWords } from "./diagnostics.js";
+import { inShort, inWords } from "./diagnostics.js";
 import { element, find, toggle } from "./dom.js";
 import { copy, Files } from "./files.js";
 import { History } from "./history.js";
@@ -20,6 +20,7 @@ import { Pull } from "./pull.js";
 import { Ghost } from "./scan/ghost.js";
 import { Reader } from "./scan/reader.js";
 import { ShapeLoop } from "./shape-loop.js";
+import { Welcome } from "./show/welcome.js";
 import { Skin } from "./skin.js";
 import { Sliders } from "./sliders.js";
 import { LatentSpace } from "./space.js";
@@ -30,27 +31,30 @@ import { Viewer } from "./viewer.js";
 
 const PREFERRED = "figure";
 
-const store = new Store({
-  model: null, space: null, names: null, references: {}, hasFine: false,
+/** @type {import("./store.js").Page} */
+const store = /** @type {any} */ (new Store({
+  model: null, space: null, names: null, references: {}, hasFine: false, pose: null,
   code: null, locked: [], placement: null, moving: false, playing: false, shape: null,
-  keyframes: [], loop: false, beyond: 0,
-  colour: "none", against: -1, highlight: null, regions: null, repaint: null,
+  keyframes: [], loop: false, beyond: 0, seconds: null, easing: "even",
+  usual: null, colour: "none", against: -1, highlight: null, regions: null, repaint: null,
   wireframe: false, normals: false, fine: true, pull: false, pins: [], scan: null, ghost: true,
-});
+}));
 
-const viewer = new Viewer(find("#canvas"));
+const embedded = document.documentElement.classList.contains("embed");
+const viewer = new Viewer(find("#canvas"), embedded ? 24 : 100);
 const pictures = new Pictures();
 const sliders = new Sliders(store, find("#factors"));
 const modes = new Modes(store, sliders, pictures);
 const colouring = new Colouring(store, { legend: find("#legend"), against: find("#against") });
 const path = new Path(store, pictures, {
   list: find("#keyframes"), add: find("#add-keyframe"), play: find("#play"), loop: find("#loop"),
-  beyond: find("#beyond"), timeline: find("#timeline"), time: find("#time"), status: find("#path-status"),
+  beyond: find("#beyond"), seconds: find("#seconds"), easing: find("#easing"), timeline: find("#timeline"),
+  time: find("#time"), status: find("#path-status"),
 });
 const strip = new Strip(store, pictures, { button: find("#draw-strip"), table: find("#strip") });
 new Names(store, { dialog: find("#names"), button: find("#name") });
 new History(store, { undo: find("#undo"), redo: find("#redo") });
-new Files(store, path, find("#tab-files"));
+new Files(store, path, viewer, find("#tab-files"));
 new Ghost(store, viewer);
 new Reader(store, {
   box: find("#verdict"), input: find("#mesh-file"), readAs: find("#read-as"), ownScale: find("#own-scale"),
@@ -58,6 +62,7 @@ new Reader(store, {
 });
 new Pins(store, viewer, new Pull(store, viewer), { layer: find("#pins"), clear: find("#clear-pins") });
 new ShapeLoop(store);
+const welcome = new Welcome(store, find("#welcome"));
 tabs(find("[role=tablist]"));
 
 // The shape and its colours.
@@ -73,6 +78,7 @@ store.on(["wireframe", "normals"], () => viewer.style(store));
 
 // What is said about it.
 let timed = null;
+let told = {}; // diagnostics of the last full shape
 viewer.canvas.addEventListener("drawn", () => {
   const { shape } = store;
   if (!shape || shape === timed) return;
@@ -82,30 +88,42 @@ viewer.canvas.addEventListener("drawn", () => {
   find("#frame-time").textContent = `${shape.positions.length / 3} vertices · ${frame}`;
   Object.assign(find(".stage").dataset, { shown: shape.mesh, quality: shape.quality ?? "draft" });
 });
-store.on(["shape"], () => {
-  if (!store.shape?.diagnostics) return;
-  const words = inWords(store.shape.diagnostics);
-  find("#diagnostics").replaceChildren(...words.map(([how, text]) => element("li", { className: how, textContent: text })));
+store.on(["shape", "usual"], () => {
+  if (store.shape?.diagnostics) told = store.shape.diagnostics;
+  const words = inWords(told, store.usual);
+  const { how, line } = inShort(words);
+  find("#diagnostics").className = how;
+  find("#diagnostics summary").textContent = line;
+  find("#diagnostics ul").replaceChildren(
+    ...words.map(([is, , textContent]) => element("li", { className: is, textContent })));
 });
 
 // Switches.
 for (const key of ["wireframe", "normals", "fine", "pull"]) toggle(find(`#${key}`), store, key);
 find("#reset-view").addEventListener("click", () => { viewer.resetView(); remember(); });
-for (const radio of document.querySelectorAll("[name=colour]")) {
+/** @type {NodeListOf<any>} */
+const radios = document.querySelectorAll("[name=colour]");
+for (const radio of radios) {
   radio.addEventListener("change", () => store.set({ colour: radio.value }));
   store.on(["colour"], () => { radio.checked = radio.value === store.colour; });
 }
 const root = document.documentElement;
 const theme = always.kept("theme");
 if (theme) root.dataset.theme = theme;
+viewer.recolour();
+matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => viewer.recolour());
 find("#theme").addEventListener("click", () => {
   const dark = root.dataset.theme ? root.dataset.theme === "dark" : matchMedia("(prefers-color-scheme: dark)").matches;
   root.dataset.theme = dark ? "light" : "dark";
   always.keep("theme", root.dataset.theme);
+  viewer.recolour();
 });
 
 // Codes from elsewhere than the sliders.
-const take = (code) => store.set({ code: store.space.wrapAll(code).map((value, k) => (store.locked[k] ? store.code[k] : value)) });
+const take = (code) => {
+  const { locked, space } = store;
+  store.set({ code: space.wrapAll(code).map((value, k) => (locked[k] ? store.code[k] : value)) });
+};
 const seed = find("#seed");
 seed.value = here.kept("seed") ?? 0;
 const draw = reporting(async () => {
@@ -133,7 +151,11 @@ picker.addEventListener("change", reporting(async () => {
   }
 }));
 
-async function openModel({ model, code, keyframes = [], locked, view, state = {} }) {
+/**
+ * Take on a model, at its home, or as an address asks for it.
+ * @param {ReturnType<typeof fromHash>} asked
+ */
+async function openModel({ model, code, keyframes = [], locked, view, pins = [], state = {} }) {
   const space = new LatentSpace(model);
   opening = model;
   const coarse = await api.reference(model, "coarse");
@@ -145,11 +167,12 @@ async function openModel({ model, code, keyframes = [], locked, view, state = {}
   turned = Boolean(view);
   if (view) viewer.view = view;
   store.set({
-    model, space, names: namesOf(model), references: { coarse }, hasFine: false, regions: null, highlight: null,
+    model, space, names: namesOf(model), references: { coarse }, hasFine: false, pose: null,
+    regions: null, usual: null, highlight: null,
     code: space.wrapAll(code ?? space.home), locked: locked ?? space.home.map(() => false),
     keyframes, against: -1, ...state,
   });
-  for (const part of document.querySelectorAll("[inert]")) part.inert = false;
+  for (const part of document.querySelectorAll("[inert]")) part.removeAttribute("inert");
   find("#canvas").setAttribute("aria-label", `${model.title}, the shape of the code that the sliders give`);
   document.title = `${model.title} · shapespace`;
   const fine = await api.reference(model, "fine");
@@ -159,6 +182,9 @@ async function openModel({ model, code, keyframes = [], locked, view, state = {}
     store.set({ references: { coarse, fine }, pose: new Pose(coarse.vertices, fine.vertices), hasFine: true });
   }
   find("#fine").disabled = !store.hasFine;
+  const { references } = store;
+  const held = pins.filter(({ mesh, vertex }) => 3 * vertex < references[mesh]?.vertices.length);
+  if (held.length && store.pins.length === 0) store.set({ pins: held });
   if (model.surface?.materials.some(({ texture }) => texture)) {
     try {
       const skin = await Skin.of(await api.textured(model));
@@ -169,6 +195,8 @@ async function openModel({ model, code, keyframes = [], locked, view, state = {}
     }
     if (store.model !== model) return;
   }
+  if (embedded) return;
+  welcome.play();
   await modes.draw();
 }
 
@@ -176,15 +204,20 @@ async function openModel({ model, code, keyframes = [], locked, view, state = {}
 let soon = 0;
 function remember() {
   clearTimeout(soon);
-  if (store.model && !store.playing) history.replaceState(null, "", toHash(store, turned ? viewer.view : null));
+  if (!store.model || store.playing || welcome.alone) return;
+  const hash = toHash(store, turned ? viewer.view : null);
+  history.replaceState(null, "", hash);
+  find("#whole").href = location.pathname + hash;
 }
 const rememberSoon = () => { clearTimeout(soon); soon = setTimeout(remember, 250); };
-store.on(["model", "code", "locked", "keyframes", "loop", "beyond", "colour", "against", "wireframe", "normals", "fine", "playing"], rememberSoon);
+store.on(["model", "code", "locked", "keyframes", "loop", "beyond", "seconds", "easing", "colour", "against",
+  "wireframe", "normals", "fine", "playing", "pins", "placement"], rememberSoon);
 viewer.canvas.addEventListener("turned", () => { turned = true; rememberSoon(); });
 addEventListener("hashchange", reporting(restore));
 
 async function restore() {
   const asked = fromHash(location.hash, models);
+  if (!asked.code && !embedded) welcome.open();
   if (asked.model) return openModel(asked);
   const model = models.find(({ name }) => name === PREFERRED) ?? models[0];
   if (asked.missing) {

@@ -2,7 +2,11 @@
 
 const box = document.querySelector("#messages");
 
-/** Say something; a message with a `key` replaces the one before, and stays until it is taken back. */
+/**
+ * Say something; a message with a `key` replaces the one before, and stays until it is taken back.
+ * @param {string} text
+ * @param {{kind?: "note" | "error", key?: string}} [how]
+ */
 export function say(text, { kind = "note", key } = {}) {
   takeBack(key);
   const line = document.createElement("div");
@@ -13,7 +17,9 @@ export function say(text, { kind = "note", key } = {}) {
   close.addEventListener("click", () => line.remove());
   line.append(Object.assign(document.createElement("p"), { textContent: text }), close);
   box.append(line);
-  for (const old of [...box.querySelectorAll(":scope > :not([hidden])")].slice(0, -3)) old.hidden = true;
+  /** @type {NodeListOf<HTMLElement>} */
+  const shown = box.querySelectorAll(":scope > :not([hidden])");
+  for (const old of [...shown].slice(0, -3)) old.hidden = true;
   // A log keeps what it has said, out of sight.
   if (kind === "note") setTimeout(() => { line.hidden = true; }, 6000);
   while (box.children.length > 30) box.firstChild.remove();

@@ -1,8 +1,13 @@
-/** Pictures of each coordinate, and the region where each factor changes lengths and angles: from the same few shapes. */
+/**
+ * Pictures of each coordinate and factor, where each factor changes lengths and angles, and how well shapes of the
+ * model fit as a rule: all from the same few shapes.
+ */
 
 import * as api from "./api.js";
+import { tint } from "./colours.js";
 import { percentile } from "./dom.js";
 import { report } from "./messages.js";
+import { sphereOf } from "./scene.js";
 import { Surface } from "./surface.js";
 
 /** Fetches the shapes of a model factor by factor, while nothing else is wanted of the server. */
@@ -10,8 +15,11 @@ export class Modes {
   #abort = new AbortController();
   #regions = [];
 
+  /** @param {import("./store.js").Page} store */
   constructor(store, sliders, pictures) {
-    Object.assign(this, { store, sliders, pictures });
+    this.store = store;
+    this.sliders = sliders;
+    this.pictures = pictures;
     store.on(["model"], () => { this.#abort.abort(); this.#regions = []; });
   }
 
@@ -24,20 +32,25 @@ export class Modes {
     try {
       const { shapes: [home] } = await api.shapes(model, [space.home], "coarse", { signal });
       const rest = surface.measure(home);
+      const residuals = [];
       for (const [j, factor] of model.factors.entries()) {
         const changes = [];
         for (let k = factor.start; k < factor.stop; k += 1) {
           const [down, , up] = space.stations(k);
           changes.push({ [k]: down }, { [k]: up });
         }
-        const { shapes } = await api.shapes(model, changes.map((change) => space.homeBut(change)), "coarse", { signal });
+        const codes = changes.map((change) => space.homeBut(change));
+        const { shapes, diagnostics } = await api.shapes(model, codes, "coarse", { signal });
+        residuals.push(diagnostics.residual);
         for (let k = factor.start; k < factor.stop; k += 1) {
           const [down, up] = shapes.splice(0, 2);
           this.#draw(k, [down, home, up]);
           this.#grow(j, surface, rest, [down, up]);
         }
+        this.#regions[j] = smooth(this.#regions[j]);
+        this.pictures.draw(this.sliders.picture(j), home, tint(this.#regions[j]), around(home, this.#regions[j]));
       }
-      this.store.set({ regions: this.#regions.map(smooth) });
+      this.store.set({ regions: this.#regions, usual: percentile(residuals, 0.5) });
     } catch (error) {
       report(error);
     }
@@ -68,13 +81,21 @@ function smooth(region) {
   });
 }
 
+/** The sphere around where a region is, in positions (3V numbers). */
+function around(positions, region) {
+  const inside = [...region.keys()].filter((vertex) => region[vertex] > 0.5);
+  const corners = inside.flatMap((vertex) => [...positions.subarray(3 * vertex, 3 * vertex + 3)]);
+  return sphereOf(Float32Array.from(corners));
+}
+
 /** For each vertex of `fine` the nearest one of `coarse` (positions of one shape). */
 export function nearest(fine, coarse) {
   const found = new Uint32Array(fine.length / 3);
   for (let v = 0; v < found.length; v += 1) {
     let least = Infinity;
     for (let i = 0; i < coarse.length; i += 3) {
-      const d = (fine[3 * v] - coarse[i]) ** 2 + (fine[3 * v + 1] - coarse[i + 1]) ** 2 + (fine[3 * v + 2] - coarse[i + 2]) ** 2;
+      let d = 0;
+      for (let axis = 0; axis < 3; axis += 1) d += (fine[3 * v + axis] - coarse[i + axis]) ** 2;
       if (d < least) [least, found[v]] = [d, i / 3];
     }
   }

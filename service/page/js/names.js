@@ -40,8 +40,10 @@ function labels({ factors, latent_names: names }) {
 
 /** The dialog in which people name things; `store.names` is what comes of it. */
 export class Names {
+  /** @param {import("./store.js").Page} store */
   constructor(store, { dialog, button }) {
-    Object.assign(this, { store, dialog });
+    this.store = store;
+    this.dialog = dialog;
     button.addEventListener("click", () => this.#open());
     find("form", dialog).addEventListener("submit", () => this.#keep(true));
     find("[data-do=forget]", dialog).addEventListener("click", () => { this.#keep(false); dialog.close(); });

@@ -1,15 +1,16 @@
 /** Keyframes, the path through them, and its player. */
 
 import * as api from "./api.js";
-import { clone, find, sharp } from "./dom.js";
+import { clone, find, readable, sharp } from "./dom.js";
 import { report, reporting } from "./messages.js";
-import { meshOf, motionOf } from "./shape-loop.js";
+import { eased, showAt } from "./reel.js";
+import { meshOf } from "./shape-loop.js";
 
 const PICTURE = 64;
 const SEGMENT = 24; // frames
 const LONGEST = 120; // frames
 const MOST_VERTICES = 2 ** 21; // of all frames: where they would be more, the coarse mesh plays
-const PACE = 1.8; // seconds for a segment
+const PACE = 1.8; // seconds for a segment, where nobody says how long the path takes
 
 export class Path {
   #frames = null; // of the path as it is now
@@ -17,9 +18,27 @@ export class Path {
   #loading = null;
   #t = 0;
   #clock = 0;
+  #carried = null; // index of the keyframe that is dragged
 
-  constructor(store, pictures, { list, add, play, loop, beyond, timeline, time, status }) {
-    Object.assign(this, { store, pictures, list, play, beyond, timeline, time, status });
+  /** @param {import("./store.js").Page} store */
+  constructor(store, pictures, { list, add, play, loop, beyond, seconds, easing, timeline, time, status }) {
+    this.store = store;
+    this.pictures = pictures;
+    this.list = list;
+    this.play = play;
+    this.beyond = beyond;
+    this.timeline = timeline;
+    this.time = time;
+    this.status = status;
+    const tell = () => { seconds.value = store.keyframes.length > 1 ? readable(this.seconds) : ""; };
+    store.on(["seconds", "keyframes", "loop", "beyond", "model"], tell);
+    seconds.addEventListener("change", () => {
+      const said = seconds.validity.valid && seconds.value !== "";
+      store.set({ seconds: said ? seconds.valueAsNumber : null });
+      tell();
+    });
+    easing.addEventListener("change", () => store.set({ easing: easing.value }));
+    store.on(["easing"], () => { easing.value = store.easing; });
     store.on(["keyframes", "loop", "beyond", "model", "fine", "hasFine"], () => this.#changed());
     store.on(["keyframes", "model"], () => this.#list());
     store.on(["playing"], () => this.#showPlaying());
@@ -40,10 +59,15 @@ export class Path {
     return { keyframes, frames, start, stop, loop };
   }
 
+  /** How long it takes from its start to its end. */
+  get seconds() {
+    const [start, stop] = this.#ends;
+    return this.store.seconds ?? PACE * this.#segments * (stop - start);
+  }
+
   /** How many of its frames the player shows in a second. */
   get fps() {
-    const { frames, start, stop } = this.request;
-    return (frames - 1) / (PACE * this.#segments * (stop - start));
+    return (this.request.frames - 1) / this.seconds;
   }
 
   get #segments() {
@@ -92,6 +116,7 @@ export class Path {
       remove.setAttribute("aria-label", `Remove ${name}`);
       remove.addEventListener("click", () => this.store.set({ keyframes: keyframes.toSpliced(i, 1) }));
       sharp(find("canvas", item), PICTURE);
+      this.#carry(item, i);
       return item;
     }));
     if (keyframes.length === 0) return;
@@ -99,6 +124,32 @@ export class Path {
       if (this.store.keyframes !== keyframes) return;
       this.list.querySelectorAll("canvas").forEach((canvas, i) => this.pictures.draw(canvas, shapes[i]));
     }).catch(report);
+  }
+
+  /** Have an item of the list go to another place, by hand and by keys. */
+  #carry(item, i) {
+    item.draggable = true;
+    item.addEventListener("dragstart", ({ dataTransfer }) => {
+      this.#carried = i;
+      dataTransfer.setData("text/plain", `keyframe ${i + 1}`); // or some browsers drag nothing
+    });
+    item.addEventListener("dragend", () => { this.#carried = null; });
+    item.addEventListener("dragover", (event) => { if (this.#carried !== null) event.preventDefault(); });
+    item.addEventListener("drop", () => { if (this.#carried !== null) this.#move(this.#carried, i); });
+    item.addEventListener("keydown", (event) => {
+      const by = { ArrowLeft: -1, ArrowRight: 1 }[event.key];
+      if (!event.altKey || !by) return;
+      event.preventDefault(); // which would leave the page
+      this.#move(i, i + by);
+    });
+  }
+
+  #move(from, to) {
+    const { against, keyframes } = this.store;
+    if (!keyframes[to] || from === to) return;
+    const order = [...keyframes.keys()].toSpliced(from, 1).toSpliced(to, 0, from);
+    this.store.set({ keyframes: order.map((i) => keyframes[i]), against: order.indexOf(against) });
+    find(`li:nth-child(${to + 1}) [data-do=go]`, this.list).focus();
   }
 
   #load() {
@@ -126,17 +177,31 @@ export class Path {
     }
   }
 
+  /** The path for a video: how long it takes, and what shows the shape at a share of it until somebody else plays. */
+  async film() {
+    this.pause();
+    await this.#load();
+    const [start, stop] = this.#ends;
+    this.store.set({ playing: true });
+    const show = (share) => {
+      if (!this.store.playing) return false;
+      this.#t = start + share * (stop - start);
+      this.#show();
+      return true;
+    };
+    return { seconds: this.seconds, show };
+  }
+
   async #play() {
     await this.#load();
     if (this.store.playing) return; // another click waited for the same frames
     const [start, stop] = this.#ends;
     if (this.#t >= stop - 1e-6) this.#t = start;
     this.store.set({ playing: true });
-    const segments = this.#segments;
     let before = performance.now();
     const step = (now) => {
       if (!this.store.playing) return;
-      this.#t += Math.max(now - before, 0) / (1000 * PACE * segments);
+      this.#t += (Math.max(now - before, 0) / (1000 * this.seconds)) * (stop - start);
       before = now;
       if (this.#t > stop && this.store.loop) this.#t = start + ((this.#t - start) % (stop - start));
       this.#t = Math.min(this.#t, stop);
@@ -165,23 +230,20 @@ export class Path {
     if (document.activeElement !== this.timeline || !this.timeline.matches(":active")) this.pause();
   }
 
-  /** The shape at the time it is, between two frames a mixture of both. */
+  /** The shape at the time it is. */
   #show() {
-    const { mesh, shapes, codes } = this.#frames;
     const [start, stop] = this.#ends;
-    const steps = this.store.loop ? shapes.length : shapes.length - 1;
-    const at = ((this.#t - start) / (stop - start)) * steps;
-    const k = Math.min(Math.floor(at), steps - 1);
-    const share = at - k;
-    const next = shapes[(k + 1) % shapes.length];
-    const positions = shapes[k].map((x, i) => x + share * (next[i] - x));
-    const code = codes[(share < 0.5 ? k : k + 1) % codes.length];
-    const { model, placement } = this.store;
-    const motion = motionOf(this.store, mesh, code, positions);
-    const shape = { model, mesh, code, placement, motion, positions, diagnostics: null, began: performance.now() };
-    this.store.set({ code, shape });
+    const t = this.store.easing === "soft" ? this.#slowed(this.#t) : this.#t;
+    showAt(this.store, this.#frames, (t - start) / (stop - start), this.store.loop);
     this.timeline.value = this.#t;
     this.#tell();
+  }
+
+  /** A time of the path at which the shape comes to each keyframe slowly, and leaves it slowly. */
+  #slowed(t) {
+    const along = t * this.#segments;
+    const keyframe = Math.floor(along);
+    return (keyframe + eased(along - keyframe)) / this.#segments;
   }
 
   #tell() {

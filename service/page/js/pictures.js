@@ -1,7 +1,9 @@
 /** Small pictures of shapes, all drawn by one renderer outside the page. */
 
 import * as THREE from "three";
-import { frame, geometryOf, litCamera, move, paint, sphereOf, surfaceMaterial } from "./scene.js";
+import { face, frame, geometryOf, litCamera, move, paint, sideOf, sphereOf, surfaceMaterial } from "./scene.js";
+
+const LEAST = 0.36; // of the whole shape's radius, so that one sees where a part is
 
 export class Pictures {
   constructor() {
@@ -16,16 +18,18 @@ export class Pictures {
   open({ vertices, faces }) {
     this.mesh.geometry.dispose();
     this.mesh.geometry = geometryOf(faces, vertices.length / 3);
+    face(this.mesh.material, sideOf(faces, vertices.length / 3));
     const { center, radius } = sphereOf(vertices);
     this.sphere = { center, radius: 0.95 * radius };
   }
 
-  /** Draw a shape into a canvas of the page, which keeps its size. */
-  draw(canvas, positions, colours) {
+  /** Draw a shape into a canvas of the page, which keeps its size: whole, or what is around a sphere. */
+  draw(canvas, positions, colours, part) {
     const { width, height } = canvas;
     this.renderer.setSize(width, height, false);
     this.camera.aspect = width / height;
-    frame(this.camera, this.sphere);
+    const { center, radius } = part ?? this.sphere;
+    frame(this.camera, { center, radius: Math.max(radius, LEAST * this.sphere.radius) });
     move(this.mesh.geometry, positions);
     paint(this.mesh.geometry, colours);
     this.renderer.render(this.scene, this.camera);

@@ -7,8 +7,13 @@ const STILL = 4; // pixels that a press may move
 export class Pins {
   #buttons = [];
 
+  /** @param {import("./store.js").Page} store */
   constructor(store, viewer, pull, { layer, clear }) {
-    Object.assign(this, { store, viewer, pull, layer, clear });
+    this.store = store;
+    this.viewer = viewer;
+    this.pull = pull;
+    this.layer = layer;
+    this.clear = clear;
     store.on(["pins"], () => this.#show());
     viewer.canvas.addEventListener("drawn", () => this.#place());
     clear.addEventListener("click", () => { store.set({ pins: [] }); find("#pull").focus(); });

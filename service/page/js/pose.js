@@ -42,7 +42,11 @@ function frame(positions, corners) {
   return new Matrix4().makeBasis(x, z.clone().cross(x), z).setPosition(a);
 }
 
-/** A placement as the server answers it, as a Matrix4. */
+/**
+ * A placement as the server answers it, as a Matrix4.
+ * @typedef {[number, number, number]} Row
+ * @param {{rotation: [Row, Row, Row], translation: Row, scale: number}} placement
+ */
 export function matrixOf({ rotation: [a, b, c], translation: [x, y, z], scale }) {
   const motion = new Matrix4().set(...a, x, ...b, y, ...c, z, 0, 0, 0, 1);
   return motion.multiply(new Matrix4().makeScale(scale, scale, scale));

@@ -26,8 +26,10 @@ export class Pull {
   #busy = false;
   #answer = null;
 
+  /** @param {import("./store.js").Page} store */
   constructor(store, viewer) {
-    Object.assign(this, { store, viewer });
+    this.store = store;
+    this.viewer = viewer;
     const { canvas } = viewer;
     store.on(["pull"], () => canvas.classList.toggle("pulling", store.pull));
     // Before the controls see it, which would turn the view.

@@ -5,20 +5,25 @@ import * as THREE from "three";
 /** Towards the viewer, from which models are seen first. */
 export const VIEW = new THREE.Vector3(0.45, 0.28, 1).normalize();
 const FIELD = 28; // degrees
-export const BASE = new THREE.Color(0xc7d0da);
+/** Clay. */
+export const BASE = new THREE.Color(0xdac6b4);
 
 export function surfaceMaterial() {
-  return new THREE.MeshStandardMaterial({ vertexColors: true, roughness: 0.62, metalness: 0, side: THREE.DoubleSide });
+  return new THREE.MeshStandardMaterial({ vertexColors: true, roughness: 0.8, metalness: 0 });
 }
 
 /** A camera that carries its lights along, so that what one looks at is lit. */
 export function litCamera() {
   const camera = new THREE.PerspectiveCamera(FIELD, 1, 0.01, 100);
-  const key = new THREE.DirectionalLight(0xfff6ea, 2.3);
-  key.position.set(-1.2, 1.6, 1.4);
-  const fill = new THREE.DirectionalLight(0xdfe9ff, 0.55);
-  fill.position.set(1.6, -0.4, 1);
-  camera.add(key, key.target, fill, fill.target, new THREE.HemisphereLight(0xffffff, 0x6d7786, 1.15));
+  const light = (colour, strength, x, y, z) => {
+    const made = new THREE.DirectionalLight(colour, strength);
+    made.position.set(x, y, z);
+    camera.add(made, made.target);
+  };
+  light(0xfff1e0, 2.1, -1.2, 1.7, 1.5); // key
+  light(0xe4ecff, 0.4, 1.8, -0.2, 1); // fill
+  light(0xdce8ff, 2.2, 1.1, 0.9, -1.5); // rim, from behind
+  camera.add(new THREE.HemisphereLight(0xffffff, 0x8a7a70, 1.05));
   return camera;
 }
 
@@ -65,13 +70,32 @@ export function sphereOf(positions) {
 /** Of the box around positions (3V numbers). */
 export const diagonalOf = (positions) => new THREE.Box3().setFromArray(positions).getSize(new THREE.Vector3()).length();
 
+/**
+ * The side of faces to draw: of closed surfaces the outer one, as the inner would shine through along silhouettes.
+ * @param {ArrayLike<number>} faces
+ * @param {number} vertexCount
+ */
+export function sideOf(faces, vertexCount) {
+  const directed = new Set();
+  const next = (i) => (i % 3 < 2 ? i + 1 : i - 2);
+  for (let i = 0; i < faces.length; i += 1) directed.add(faces[i] * vertexCount + faces[next(i)]);
+  for (let i = 0; i < faces.length; i += 1) {
+    if (!directed.has(faces[next(i)] * vertexCount + faces[i])) return THREE.DoubleSide;
+  }
+  return THREE.FrontSide;
+}
+
+/** Have a material draw a side. */
+export const face = (material, side) => Object.assign(material, { side, needsUpdate: true });
+
 /** A geometry for shapes with these faces; positions and colours come later. */
 export function geometryOf(faces, vertexCount) {
   const geometry = new THREE.BufferGeometry();
   const Index = vertexCount < 65536 ? Uint16Array : Uint32Array;
   geometry.setIndex(new THREE.BufferAttribute(Index.from(faces), 1));
   for (const name of ["position", "normal", "color"]) {
-    geometry.setAttribute(name, new THREE.BufferAttribute(new Float32Array(3 * vertexCount), 3).setUsage(THREE.DynamicDrawUsage));
+    const values = new THREE.BufferAttribute(new Float32Array(3 * vertexCount), 3);
+    geometry.setAttribute(name, values.setUsage(THREE.DynamicDrawUsage));
   }
   return geometry;
 }

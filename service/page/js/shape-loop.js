@@ -51,6 +51,7 @@ export class ShapeLoop {
   #current = null;
   #timer = 0;
 
+  /** @param {import("./store.js").Page} store */
   constructor(store) {
     this.store = store;
     store.on(["code", "model"], () => this.#moved());

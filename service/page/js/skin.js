@@ -25,10 +25,13 @@ export class Skin {
     const { primitives } = tree.meshes[0];
     const { attributes } = primitives[0];
     const count = tree.accessors[attributes.POSITION].count;
-    this.rows = attributes._VERTEX === undefined ? Array.from({ length: count }, (_, k) => k) : array(attributes._VERTEX, Float32Array);
+    this.rows = attributes._VERTEX === undefined
+      ? Array.from({ length: count }, (_, k) => k)
+      : array(attributes._VERTEX, Float32Array);
     this.geometry = new THREE.BufferGeometry();
     for (const name of ["position", "normal"]) {
-      this.geometry.setAttribute(name, new THREE.BufferAttribute(new Float32Array(3 * count), 3).setUsage(THREE.DynamicDrawUsage));
+      const values = new THREE.BufferAttribute(new Float32Array(3 * count), 3);
+      this.geometry.setAttribute(name, values.setUsage(THREE.DynamicDrawUsage));
     }
     if (attributes.TEXCOORD_0 !== undefined) {
       this.geometry.setAttribute("uv", new THREE.BufferAttribute(array(attributes.TEXCOORD_0, Float32Array), 2));
@@ -52,7 +55,7 @@ export class Skin {
       const { pbrMetallicRoughness: look, alphaMode } = tree.materials[material];
       const [red, green, blue, opacity] = look.baseColorFactor;
       return new THREE.MeshStandardMaterial({
-        color: new THREE.Color(red, green, blue), opacity, transparent: alphaMode === "BLEND", side: THREE.DoubleSide,
+        color: new THREE.Color(red, green, blue), opacity, transparent: alphaMode === "BLEND",
         roughness: look.roughnessFactor, metalness: look.metallicFactor,
         map: look.baseColorTexture ? this.textures[tree.textures[look.baseColorTexture.index].source] : null,
         polygonOffset: true, polygonOffsetFactor: 1, polygonOffsetUnits: 1,

@@ -3,6 +3,7 @@
 import { clone, find, readable, sharp } from "./dom.js";
 
 const PICTURE = 44;
+const FEW = 8; // coordinates up to which all factors stand open
 const REST = 700; // ms without a key until a movement by keys has ended
 
 export class Sliders {
@@ -10,8 +11,10 @@ export class Sliders {
   #held = false; // whether a slider is being dragged, or moved by keys
   #timer = 0;
 
+  /** @param {import("./store.js").Page} store */
   constructor(store, list) {
-    Object.assign(this, { store, list });
+    this.store = store;
+    this.list = list;
     store.on(["space"], () => this.#build());
     store.on(["names"], () => this.#label());
     store.on(["code", "locked"], () => this.#show());
@@ -24,6 +27,11 @@ export class Sliders {
     return [...this.#rows[k].root.querySelectorAll("canvas")];
   }
 
+  /** The canvas of factor j, for what it moves. */
+  picture(j) {
+    return find("summary canvas", this.list.children[j]);
+  }
+
   #build() {
     const { model, space } = this.store;
     this.#rows = [];
@@ -32,7 +40,9 @@ export class Sliders {
       const rows = [];
       for (let k = factor.start; k < factor.stop; k += 1) rows.push(this.#row(k));
       find(".rows", group).append(...rows);
-      find("[data-do=reset]", group).addEventListener("click", () => {
+      find("details", group).open = j === 0 || model.latent_dimension <= FEW;
+      sharp(find("summary canvas", group), PICTURE);
+      find(":scope > [data-do=reset]", group).addEventListener("click", () => {
         this.#change(this.store.code.map((value, k) => (k >= factor.start && k < factor.stop ? space.home[k] : value)));
       });
       const light = (on) => () => this.store.set({ highlight: on ? j : null });
@@ -50,7 +60,7 @@ export class Sliders {
     const { names: { factors, labels, coordinates }, space } = this.store;
     this.list.querySelectorAll(".factor").forEach((group, j) => {
       find("h2", group).textContent = factors[j];
-      find("[data-do=reset]", group).setAttribute("aria-label", `Reset all of ${factors[j]}`);
+      find(":scope > [data-do=reset]", group).setAttribute("aria-label", `Reset all of ${factors[j]}`);
     });
     this.#rows.forEach(({ root, slider, box, lock, reset, signs }, k) => {
       const name = coordinates[k];
@@ -103,7 +113,8 @@ export class Sliders {
       sharp(find("canvas", button), PICTURE);
       button.addEventListener("click", () => this.#set(k, value));
     });
-    this.#rows[k] = { root, slider, box, lock, reset, signs, controls: [slider, box, reset, ...root.querySelectorAll(".pictures button")] };
+    const controls = [slider, box, reset, ...root.querySelectorAll(".pictures button")];
+    this.#rows[k] = { root, slider, box, lock, reset, signs, controls };
     return root;
   }
 
@@ -144,7 +155,7 @@ export class Sliders {
   }
 
   #show() {
-    const { code, locked, space } = this.store;
+    const { code, locked, model, space } = this.store;
     if (!code || code.length !== this.#rows.length) return;
     this.#rows.forEach(({ root, slider, box, lock, controls }, k) => {
       if (Number(slider.value) !== code[k]) slider.value = code[k];
@@ -153,6 +164,10 @@ export class Sliders {
       root.classList.toggle("locked", locked[k]);
       lock.setAttribute("aria-pressed", String(locked[k]));
       for (const control of controls) control.disabled = locked[k];
+    });
+    model.factors.forEach(({ start, stop }, j) => {
+      const moved = code.slice(start, stop).some((value, i) => Math.abs(value - space.home[start + i]) > 1e-4);
+      this.list.children[j].classList.toggle("moved", moved);
     });
   }
 }

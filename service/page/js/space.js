@@ -4,7 +4,10 @@ const mod = (a, n) => ((a % n) + n) % n;
 
 export class LatentSpace {
   constructor({ lower, upper, period, factors }) {
-    Object.assign(this, { lower, upper, period, factors });
+    this.lower = lower;
+    this.upper = upper;
+    this.period = period;
+    this.factors = factors;
     /** Zero, the mean, where it lies inside the bounds, else the middle. */
     this.home = lower.map((low, k) => (low <= 0 && upper[k] >= 0 ? 0 : (low + upper[k]) / 2));
   }

@@ -1,17 +1,73 @@
-/** The page's state and who wants to know when it changes. */
+/**
+ * The page's state and who wants to know when it changes.
+ *
+ * @typedef {object} Shape what is shown
+ * @property {object} model
+ * @property {"coarse" | "fine"} mesh
+ * @property {number[]} code
+ * @property {Float32Array} positions 3V numbers
+ * @property {import("three").Matrix4 | null} placement where a pull has left it
+ * @property {import("three").Matrix4} motion from where the server has it to where it is shown
+ * @property {object | null} diagnostics of full shapes
+ * @property {"draft" | "full"} [quality]
+ * @property {number} began when it was asked for
+ *
+ * @typedef {object} State
+ * @property {any} model as the server lists it
+ * @property {import("./space.js").LatentSpace | null} space
+ * @property {{factors: string[], labels: string[], coordinates: string[]} | null} names
+ * @property {{coarse?: Reference, fine?: Reference}} references
+ * @property {boolean} hasFine
+ * @property {import("./pose.js").Pose | null} pose where there is a fine mesh
+ * @property {number[] | null} code
+ * @property {boolean[]} locked by coordinate
+ * @property {import("three").Matrix4 | null} placement
+ * @property {boolean} moving whether a hand is at it: what comes meanwhile is one step
+ * @property {boolean} playing
+ * @property {Shape | null} shape
+ * @property {number[][]} keyframes
+ * @property {boolean} loop
+ * @property {number} beyond share of the path that is played before its start, and after its end
+ * @property {number | null} seconds that the path takes, where somebody has said so
+ * @property {"even" | "soft"} easing
+ * @property {number | null} usual residual of the model's own shapes
+ * @property {"none" | "stretch" | "bending"} colour
+ * @property {number} against index of the keyframe that colours compare with; −1 for the mean
+ * @property {number | null} highlight index of the factor that is pointed at
+ * @property {Float32Array[] | null} regions weights of each factor at coarse vertices
+ * @property {object | null} repaint new where colours have to be made again
+ * @property {boolean} wireframe
+ * @property {boolean} normals
+ * @property {boolean} fine
+ * @property {boolean} pull
+ * @property {import("./pull.js").Pin[]} pins
+ * @property {any} scan
+ * @property {boolean} ghost
+ *
+ * @typedef {{vertices: Float32Array, faces: Int32Array}} Reference
+ * @typedef {Store & State} Page what the parts of the page are given
+ */
 export class Store {
   #listeners = [];
 
+  /** @param {State} values */
   constructor(values) {
     Object.assign(this, values);
   }
 
-  /** Call `listener` after each change of one of the `keys`. */
+  /**
+   * Call `listener` after each change of one of the `keys`.
+   * @param {(keyof State)[]} keys
+   * @param {() => void} listener
+   */
   on(keys, listener) {
     this.#listeners.push([new Set(keys), listener]);
   }
 
-  /** Change some values at once; who listens to several of them is called once. */
+  /**
+   * Change some values at once; who listens to several of them is called once.
+   * @param {Partial<State>} patch
+   */
   set(patch) {
     const changed = Object.keys(patch).filter((key) => !Object.is(this[key], patch[key]));
     Object.assign(this, patch);

@@ -7,8 +7,12 @@ const COLUMNS = 5;
 const PICTURE = 56;
 
 export class Strip {
+  /** @param {import("./store.js").Page} store */
   constructor(store, pictures, { button, table }) {
-    Object.assign(this, { store, pictures, table, button });
+    this.store = store;
+    this.pictures = pictures;
+    this.table = table;
+    this.button = button;
     store.on(["keyframes", "model", "names"], () => {
       table.hidden = true;
       button.disabled = store.keyframes.length < 2;

@@ -49,6 +49,19 @@ export class Surface {
     });
   }
 
+  /** The mean of values at vertices over each and its neighbours. */
+  smooth(values) {
+    const sums = Float32Array.from(values);
+    const counts = new Float32Array(this.vertexCount).fill(1);
+    for (const [a, b] of this.edges) {
+      sums[a] += values[b];
+      sums[b] += values[a];
+      counts[a] += 1;
+      counts[b] += 1;
+    }
+    return sums.map((sum, vertex) => sum / counts[vertex]);
+  }
+
   /** The mean of the values at each vertex's edges, weighted by what their lengths were. */
   atVertices(values, { lengths }, interiorOnly) {
     const sums = new Float32Array(this.vertexCount);

@@ -6,18 +6,20 @@
 
 import * as THREE from "three";
 import { OrbitControls } from "three/addons/OrbitControls.js";
-import { distanceTo, frame, geometryOf, litCamera, move, paint, sphereOf, surfaceMaterial } from "./scene.js";
+import { distanceTo, face, frame, geometryOf, litCamera, move, paint, sideOf, sphereOf, surfaceMaterial } from "./scene.js";
+import { Stage } from "./stage.js";
 
 const TURN = Math.PI / 24;
-const MARGIN = 100; // pixels of the height that buttons and words take
 const ROOM = 1.08; // for shapes that are larger than the reference
 
 export class Viewer {
   #scheduled = false;
   #share = 1; // of the height that is free for the shape
 
-  constructor(canvas) {
+  /** `margin`: pixels of the canvas's height that buttons and words take. */
+  constructor(canvas, margin) {
     this.canvas = canvas;
+    this.margin = margin;
     this.renderer = new THREE.WebGLRenderer({ canvas, antialias: true, alpha: true });
     this.renderer.setPixelRatio(Math.min(devicePixelRatio, 2));
     this.scene = new THREE.Scene();
@@ -27,7 +29,8 @@ export class Viewer {
     this.controls.addEventListener("change", () => this.draw());
     this.controls.addEventListener("end", () => this.canvas.dispatchEvent(new Event("turned")));
 
-    this.materials = { surface: surfaceMaterial(), normals: new THREE.MeshNormalMaterial({ side: THREE.DoubleSide }) };
+    this.materials = { surface: surfaceMaterial(), normals: new THREE.MeshNormalMaterial() };
+    /** @type {THREE.Mesh<THREE.BufferGeometry, THREE.Material>} */
     this.mesh = new THREE.Mesh(new THREE.BufferGeometry(), this.materials.surface);
     const wires = new THREE.MeshBasicMaterial({ wireframe: true, color: 0x1f2a37, transparent: true, opacity: 0.55 });
     this.wires = new THREE.Mesh(this.mesh.geometry, wires);
@@ -40,7 +43,9 @@ export class Viewer {
     // Instead of the mesh where there are textures and no colours; what the mesh is, is still what one points at.
     this.skinned = new THREE.Mesh();
     this.skinned.frustumCulled = this.skinned.visible = false;
-    this.scene.add(this.mesh, this.wires, this.skinned);
+    this.stage = new Stage();
+    this.scene.add(this.mesh, this.wires, this.skinned, this.stage);
+    this.recolour();
     this.geometries = {};
 
     new ResizeObserver(() => this.#resize()).observe(canvas.parentElement);
@@ -59,6 +64,9 @@ export class Viewer {
     this.addMesh("coarse", reference);
     this.sphere = sphereOf(reference.vertices);
     this.reference = reference.vertices;
+    this.stage.open(this.sphere);
+    this.side = sideOf(reference.faces, reference.vertices.length / 3);
+    for (const material of Object.values(this.materials)) face(material, this.side);
     this.resetView();
   }
 
@@ -68,6 +76,7 @@ export class Viewer {
 
   /** Materials and textures for one of the model's meshes. */
   dress(name, skin) {
+    for (const material of skin.materials) face(material, this.side);
     this.skin = skin;
     this.skinOf = name;
     Object.assign(this.skinned, { geometry: skin.geometry, material: skin.materials });
@@ -95,6 +104,7 @@ export class Viewer {
       mesh.matrix.copy(placement ?? new THREE.Matrix4());
       mesh.updateMatrixWorld(true);
     }
+    this.stage.under(positions, geometry.index.array, this.mesh.matrix);
     this.coloured = Boolean(colours);
     this.#wear();
     this.draw();
@@ -112,6 +122,12 @@ export class Viewer {
     this.wires.visible = wireframe;
     this.mesh.material = normals ? this.materials.normals : this.materials.surface;
     this.#wear();
+    this.draw();
+  }
+
+  /** Take the colours of the theme. */
+  recolour() {
+    this.stage.colour = getComputedStyle(this.canvas).color;
     this.draw();
   }
 
@@ -141,15 +157,38 @@ export class Viewer {
     this.draw();
   }
 
+  /** Look from where a view does, but for an angle (radians) about the axis that is up. */
+  turn(view, angle) {
+    const [position, target] = [new THREE.Vector3().fromArray(view), new THREE.Vector3().fromArray(view, 3)];
+    const there = position.sub(target).applyAxisAngle(this.camera.up, angle).add(target);
+    this.view = [...there.toArray(), ...target.toArray()];
+  }
+
   /** Draw before the next picture of the screen. */
   draw() {
     if (this.#scheduled) return;
     this.#scheduled = true;
     requestAnimationFrame(() => {
       this.#scheduled = false;
-      this.renderer.render(this.scene, this.camera);
-      this.canvas.dispatchEvent(new Event("drawn"));
+      this.render();
     });
+  }
+
+  /** Draw now. */
+  render() {
+    this.renderer.render(this.scene, this.camera);
+    this.canvas.dispatchEvent(new Event("drawn"));
+  }
+
+  /** Do something while the canvas isn't transparent: files know nothing of the paper behind it. */
+  async opaquely(work) {
+    this.scene.background = new THREE.Color(getComputedStyle(this.canvas.parentElement).backgroundColor);
+    try {
+      return await work();
+    } finally {
+      this.scene.background = null;
+      this.draw();
+    }
   }
 
   /** The vertex nearest to where a ray through a point of the window meets the surface, or null. */
@@ -189,7 +228,7 @@ export class Viewer {
     if (!width || !height) return;
     const before = this.reference && this.#distance;
     this.camera.aspect = width / height;
-    this.#share = Math.max(1 - MARGIN / height, 0.4);
+    this.#share = Math.max(1 - this.margin / height, 0.4);
     this.renderer.setSize(width, height, false);
     // A smaller window must show as much: the distance follows.
     const { target } = this.controls;

@@ -137,7 +137,13 @@ asyncio.run(main())
 
 @pytest.mark.parametrize(
     ("name", "value"),
-    [("PORT", "http"), ("CORS_ORIGINS", "a.example"), ("CORS_ORIGINS", "https://a.example/page"), ("DEADLINE", "inf")],
+    [
+        ("PORT", "http"),
+        ("CORS_ORIGINS", "a.example"),
+        ("CORS_ORIGINS", "https://a.example/page"),
+        ("EMBED_ORIGINS", "a.example; x"),
+        ("DEADLINE", "inf"),
+    ],
 )
 def test_settings_that_make_no_sense_are_named(small_models: Path, name: str, value: str) -> None:
     found = subprocess.run(

@@ -11,8 +11,10 @@ const SIZE = 0.04; // of a point, as three.js has it, in the model's radius: abo
 export class Ghost {
   #scan = null;
 
+  /** @param {import("../store.js").Page} store */
   constructor(store, viewer) {
-    Object.assign(this, { store, viewer });
+    this.store = store;
+    this.viewer = viewer;
     const material = new THREE.PointsMaterial({ vertexColors: true, transparent: true, opacity: 0.85 });
     this.points = new THREE.Points(new THREE.BufferGeometry(), material);
     this.points.frustumCulled = this.points.visible = this.points.matrixAutoUpdate = false;

@@ -18,8 +18,12 @@ export class Reader {
   #abort = new AbortController();
   #found = null; // what the file was found to be, and the shape before
 
+  /** @param {import("../store.js").Page} store */
   constructor(store, { box, input, readAs, ownScale, stage }) {
-    Object.assign(this, { store, readAs, ownScale, verdict: new Verdict(box, () => this.#leave()) });
+    this.store = store;
+    this.readAs = readAs;
+    this.ownScale = ownScale;
+    this.verdict = new Verdict(box, () => this.#leave());
     this.shown = find("#ghost", box);
     this.shown.addEventListener("change", () => store.set({ ghost: this.shown.checked }));
     store.on(["ghost"], () => { this.shown.checked = store.ghost; });

@@ -1,0 +1,42 @@
+/** One call of the server as text to take along: for the shell, for programs, and for other pages. */
+
+const json = (body) => JSON.stringify(body);
+
+/**
+ * @typedef {object} Call
+ * @property {string} url
+ * @property {object} body numbers and strings, which Python writes as JSON does
+ * @property {string} file to keep the answer in
+ * @property {string} embed address of the viewer alone
+ * @property {string} title of the model
+ */
+
+/** What each kind of text is, by its name for people. @type {Record<string, (call: Call) => string>} */
+export const CODE = {
+  curl: ({ url, body, file }) =>
+    `curl '${url}' -H 'content-type: application/json' -d '${json(body)}' -o ${file}`,
+
+  Python: ({ url, body, file }) => `import json
+from urllib.request import Request, urlopen
+
+body = ${json(body)}
+request = Request("${url}", json.dumps(body).encode(), {"Content-Type": "application/json"})
+with urlopen(request) as answer, open("${file}", "wb") as file:
+    file.write(answer.read())
+`,
+
+  JavaScript: ({ url, body }) => `const answer = await fetch("${url}", {
+  method: "POST",
+  headers: { "Content-Type": "application/json" },
+  body: JSON.stringify(${json(body)}),
+});
+if (!answer.ok) throw new Error(await answer.text());
+const file = await answer.arrayBuffer();
+`,
+
+  "a frame in a page": ({ embed, title }) => {
+    const plain = (text) => text.replace(/[&<>"]/g, (sign) => `&#${sign.charCodeAt(0)};`);
+    const look = 'width="480" height="480" style="border:0"';
+    return `<iframe src="${plain(embed)}" title="${plain(title)}" ${look}></iframe>`;
+  },
+};

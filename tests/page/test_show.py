@@ -1,0 +1,133 @@
+"""What people keep of the page to show it to others: pictures, videos, and frames in pages of their own."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Iterator
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from threading import Thread
+
+import httpx
+import numpy as np
+import pytest
+from playwright.sync_api import Page
+
+from tests.page.conftest import Open
+from tests.page.studio import Studio, difference, pixels
+from tests.service.conftest import Start
+
+#: Pictures of a video at its beginning, in the middle and at the end, as PNG.
+STILLS = """async (content) => {
+    const video = document.createElement('video');
+    const next = (name) => new Promise((resolve, reject) => {
+        video.addEventListener(name, resolve, { once: true });
+        video.addEventListener('error', () => reject(video.error), { once: true });
+    });
+    video.muted = true;
+    video.src = `data:video/webm;base64,${content}`;
+    await next('loadeddata');
+    video.currentTime = 1e6; // what is recorded doesn't say how long it is
+    await next('seeked');
+    const { currentTime: end, videoWidth, videoHeight } = video;
+    const canvas = Object.assign(document.createElement('canvas'), { width: videoWidth, height: videoHeight });
+    const stills = [];
+    for (const time of [0, end / 2, end]) {
+        video.currentTime = time;
+        await next('seeked');
+        canvas.getContext('2d').drawImage(video, 0, 0);
+        stills.push(canvas.toDataURL('image/png').split(',')[1]);
+    }
+    return [end, ...stills];
+}"""
+
+
+def kept(studio: Studio, button: str) -> tuple[str, bytes]:
+    """Name and content of the file that a button gives."""
+    with studio.page.expect_download() as download:
+        studio[button].click()
+    return download.value.suggested_filename, Path(download.value.path()).read_bytes()
+
+
+def stills(page: Page, video: bytes) -> tuple[float, list[np.ndarray]]:
+    """How long a video is, and its pictures at the beginning, in the middle and at the end."""
+    end, *pictures = page.evaluate(STILLS, base64.b64encode(video).decode())
+    return end, [pixels(base64.b64decode(picture)) for picture in pictures]
+
+
+def test_a_picture_a_turntable_and_the_path_as_a_video(window: Open) -> None:
+    studio = window().open("#model=with-fine&z=0,0,0.5&keys=-0.2,0,0;0.2,0,1&seconds=1")
+    studio.tab("Files")
+    seen = studio.picture()
+    name, content = kept(studio, "#picture")
+    assert name == "with-fine.png"
+    picture = pixels(content)
+    assert list(picture.shape[:2]) == studio["#canvas"].evaluate("c => [c.height, c.width]")
+    assert difference(picture[60 : 60 + len(seen)], seen) < 0.05, "it isn't what is seen, paper and all"
+
+    plain = window().page  # without this page's policy
+    plain.goto("about:blank")
+    studio["#turntable-seconds"].fill("1")
+    name, content = kept(studio, "#turntable")
+    assert name == "with-fine-turntable.webm"
+    seconds, (first, middle, last) = stills(plain, content)
+    assert 0.4 < seconds < 5
+    assert min(difference(first, middle), difference(middle, last)) > 0.02
+    studio["#messages button:visible"].first.click()
+    studio.eventually(lambda: difference(studio.picture(), seen) < 0.001)
+    assert "view" not in studio.hash
+
+    studio.tab("Path")
+    assert studio["#seconds"].input_value() == "1"
+    name, content = kept(studio, "#film")
+    assert name == "with-fine-animation.webm"
+    seconds, (first, middle, last) = stills(plain, content)
+    assert 0.4 < seconds < 5
+    assert min(difference(first, middle), difference(middle, last)) > 0.01
+    assert "The video is saved" in studio.messages
+    studio.until_code([0.2, 0, 1])
+    studio.rest()
+
+
+@pytest.fixture
+def theirs(tmp_path: Path) -> Iterator[str]:
+    """The origin of another server, which serves a folder."""
+    handler = partial(SimpleHTTPRequestHandler, directory=tmp_path)
+    with ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
+        Thread(target=server.serve_forever).start()
+        yield f"http://127.0.0.1:{server.server_port}"
+        server.shutdown()
+
+
+def test_the_viewer_in_a_page_of_another_origin(
+    window: Open, start: Start, models: Path, theirs: str, tmp_path: Path
+) -> None:
+    studio = window().open("#model=with-fine&z=0.1,1,0.5")
+    studio.tab("Files")
+    studio["#language"].select_option("a frame in a page")
+    code = studio["#code"].text_content() or ""
+    server = start(models, embed_origins=theirs)
+    policies = [
+        httpx.get(f"{url}/{query}").headers["Content-Security-Policy"].rpartition("frame-ancestors ")[2]
+        for url in (studio.url, server.url)
+        for query in ("", "?embed")
+    ]
+    assert policies == ["'none'", "'none'", "'none'", theirs]
+
+    (tmp_path / "index.html").write_text(
+        f"<!doctype html><title>Theirs</title><link rel=icon href=data:,>{code.replace(studio.url, server.url)}"
+    )
+    other = window(theirs)
+    other.page.goto(theirs)
+    frame = other.page.frame_locator("iframe")
+    other.eventually(lambda: frame.locator(".stage[data-quality=full]").count() == 1)
+    for name in ("header", ".panel", ".tools", ".status"):
+        assert frame.locator(name).is_hidden(), name
+    whole = frame.locator("#whole")
+    other.eventually(lambda: (whole.get_attribute("href") or "").endswith("/#model=with-fine&z=0.1,1,0.5"))
+    picture = pixels(other.page.locator("iframe").screenshot())
+    shown = np.abs(picture - picture[5, 5]).max(axis=2) > 60
+    assert np.ptp(np.flatnonzero(shown[:, 10:-10].any(axis=1))) > 0.4 * len(picture)
+    assert all(address.startswith(server.url) for address in other.foreign)
+    other.foreign.clear()
