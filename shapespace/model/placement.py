@@ -40,7 +40,7 @@ class Breadth:
     count: int
 
 
-#: What serves most scans; and what those of a part may need, since from one side a flat shape looks like its other side.
+#: What serves most scans; and what those of a part may need, since a flat shape looks alike from both sides.
 NARROW = Breadth(points=150, rotations=60, kept=8, polished=12, steps=6, count=5)
 WIDE = Breadth(points=300, rotations=240, kept=48, polished=48, steps=20, count=32)
 
