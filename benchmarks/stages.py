@@ -49,10 +49,11 @@ class Size:
 BASE = Size()
 SIZES = [
     BASE,
-    *(replace(BASE, fine=fine) for fine in (40_000, 160_000, 500_000)),
-    *(replace(BASE, shapes=shapes) for shapes in (40, 80, 160)),
+    *(replace(BASE, fine=fine) for fine in (40_000, 160_000)),
+    *(replace(BASE, shapes=shapes) for shapes in (40, 80)),
     *(replace(BASE, modes=modes) for modes in (4, 16)),
     *(replace(BASE, coarse=coarse) for coarse in (1000, 2000)),
+    replace(BASE, fine=500_000),
 ]
 
 
