@@ -59,8 +59,9 @@ lint: $(VENV)/.all $(BIN)/hadolint ## check style, types, doors between packages
 QUICK = tests/shapespace tests/service/use_cases/test_use_cases.py tests/training/runs/test_config.py \
 	$(wildcard tests/test_[cdm]*.py)
 
-# What the libraries of serving take part in, and training doesn't; processes, signals and fits are the same with all.
-NOT_SERVING = blocks bundled_files clients deployment proxy replicas draining operation reloading fit
+# What the libraries of serving take part in, and training doesn't; processes, signals, slow strangers and fits are the same
+# with all.
+NOT_SERVING = blocks bundled_files clients deployment proxy replicas draining operation reloading strangers fit
 SERVING = $(filter-out $(foreach name,$(NOT_SERVING),%/test_$(name).py), \
 	$(wildcard tests/service/*/test_*.py)) $(foreach name,files/test_formats files/test_polygon_reading files/test_gltf_reading \
 	coordinates/test_reconstruction solve/test_cholesky,tests/shapespace/$(name).py)
