@@ -103,7 +103,9 @@ def measure(size: Size, folder: Path) -> dict[str, tuple[float, float]]:
     def until(stage: str) -> tuple[float, float]:
         where = ["--out", str(folder / "run"), "--models", str(folder), "--until", stage]
         command = [sys.executable, "-m", "shapespace.training", "run", str(file), *where]
-        child = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)  # noqa: S603 - our own
+        one_thread = os.environ | {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
+        silent = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+        child = subprocess.Popen(command, env=one_thread, **silent)  # noqa: S603 - our own
         _, status, used = os.wait4(child.pid, 0)
         if status:
             raise RuntimeError(f"{stage} of {size} ended with {os.waitstatus_to_exitcode(status)}")
