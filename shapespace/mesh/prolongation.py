@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
@@ -167,12 +167,12 @@ class Prolongation:
     def _around(self) -> sp.csr_array:
         return _around(self.faces, self.weights.shape[1] // 2)
 
-    def errors(self, coarse: FloatArray, fine: FloatArray) -> dict[str, float]:
+    def errors(self, coarse: FloatArray, fine: Iterable[FloatArray]) -> dict[str, float]:
         """``mean`` and ``max`` distance to the true fine shapes, after rigid alignment.
 
         Args:
             coarse: (n, V, 3) shapes.
-            fine: (n, Vf, 3) what they should become.
+            fine: n times (Vf, 3), what they should become.
 
         Returns:
             Distances as fractions of the diagonal of each shape's bounding box, over all vertices and shapes.
@@ -181,7 +181,7 @@ class Prolongation:
         means, largest = zip(*found, strict=True)
         return {"mean": float(np.mean(means)), "max": float(np.max(largest))}
 
-    def distances(self, coarse: FloatArray, fine: FloatArray) -> Iterator[FloatArray]:
+    def distances(self, coarse: FloatArray, fine: Iterable[FloatArray]) -> Iterator[FloatArray]:
         """For each shape how far its fine vertices are (Vf,), as `errors` counts."""
         for y, x in zip(coarse, fine, strict=True):
             yield np.linalg.norm(align(self(y), x) - x, axis=1) / diagonal(x)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy import sparse
 
 from shapespace.arrays import FloatArray, IntArray
 from shapespace.mesh.triangle_mesh import Connectivity, face_normals
@@ -26,28 +27,36 @@ def quadrics_of(connectivity: Connectivity, shapes: FloatArray) -> tuple[FloatAr
         around the vertices, both averaged over the shapes.
     """
     count, (i, j) = connectivity.vertex_count, np.triu_indices(4)
+    faces, rim = connectivity.faces, connectivity.edges[~connectivity.interior]
+    face = connectivity.edge_faces[~connectivity.interior].max(axis=1)
+    at_faces, at_rim = _at_vertices(faces, count), _at_vertices(rim, count)
 
-    def gather(normals: FloatArray, points: FloatArray, weights: FloatArray, corners: IntArray) -> FloatArray:
+    def gather(normals: FloatArray, points: FloatArray, weights: FloatArray, at: sparse.csr_array) -> FloatArray:
         plane = np.concatenate([normals, -(normals * points).sum(axis=-1, keepdims=True)], axis=-1)
-        values = plane[..., i] * plane[..., j] * weights[..., None] / len(shapes)
-        values = np.moveaxis(values, 0, 1).reshape(len(corners), -1)
-        out = np.zeros((count, values.shape[1]))
-        for column in corners.T:
-            np.add.at(out, column, values)
-        return out
+        gathered: FloatArray = at @ (plane[:, i] * plane[:, j] * weights[:, None] / len(shapes))
+        return gathered
 
-    faces = connectivity.faces
-    normals = face_normals(shapes, faces, normalised=False)
-    doubled = np.linalg.norm(normals, axis=-1)
-    normals /= np.maximum(doubled, 1e-300)[..., None]
-    quadrics = gather(normals, shapes[:, faces[:, 0]], doubled / 2, faces)
-    areas = np.bincount(faces.ravel(), np.repeat(doubled.mean(axis=0) / 2, 3), minlength=count)
+    quadrics, areas = np.empty((count, 10 * len(shapes))), np.zeros(len(faces))
+    # Shape by shape: normals of all faces in all shapes take much memory.
+    for k, shape in enumerate(shapes):
+        normals = face_normals(shape, faces, normalised=False)
+        doubled = np.linalg.norm(normals, axis=-1)
+        normals /= np.maximum(doubled, 1e-300)[:, None]
+        found = gather(normals, shape[faces[:, 0]], doubled / 2, at_faces)
+        areas += doubled
+        if len(rim):
+            along = shape[rim[:, 1]] - shape[rim[:, 0]]
+            squared = (along**2).sum(axis=-1)
+            across = np.cross(normals[face], along) / np.sqrt(np.maximum(squared, 1e-300))[:, None]
+            found += gather(across, shape[rim[:, 0]], BOUNDARY_WEIGHT * squared, at_rim)
+        quadrics[:, 10 * k : 10 * (k + 1)] = found
+    around = np.bincount(faces.ravel(), np.repeat(areas / len(shapes) / 2, 3), minlength=count)
+    return quadrics, around / len(shapes)
 
-    rim = connectivity.edges[~connectivity.interior]
-    if len(rim):
-        face = connectivity.edge_faces[~connectivity.interior].max(axis=1)
-        along = shapes[:, rim[:, 1]] - shapes[:, rim[:, 0]]
-        squared = (along**2).sum(axis=-1)
-        across = np.cross(normals[:, face], along) / np.sqrt(np.maximum(squared, 1e-300))[..., None]
-        quadrics += gather(across, shapes[:, rim[:, 0]], BOUNDARY_WEIGHT * squared, rim)
-    return quadrics, areas / len(shapes)
+
+def _at_vertices(corners: IntArray, count: int) -> sparse.csr_array:
+    """(count, k) 1 where a vertex is a corner of an element, given the corners (k, d) of each."""
+    elements = len(corners)
+    entries = (np.ones(corners.size), corners.T.ravel(), np.arange(corners.size + 1))
+    by_vertex = sparse.csr_array(entries, shape=(corners.size, count)).tocsc()  # a counting sort
+    return sparse.csr_array((by_vertex.data, by_vertex.indices % elements, by_vertex.indptr), shape=(count, elements))

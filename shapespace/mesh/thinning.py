@@ -26,7 +26,7 @@ MOTION_WEIGHT = 0.1
 CHEAPEST = 0.5
 #: How often further vertices are chosen, far from those already chosen.
 SWEEPS = 3
-#: Faces looked at together.
+#: Faces, or collapses, looked at together.
 CHUNK = 50_000
 #: A round that removes less than this share of the vertices is in vain; after so many of those thinning ends.
 FEWEST, VAIN = 0.001, 5
@@ -92,7 +92,10 @@ class _Round:
         self.rim[np.repeat(np.arange(self.count), degree)[self.neighbours.data == 1]] = True
         # Where sheets touch, a vertex has more edges than its one fan of faces needs.
         self.touching = degree != self.valence + self.rim
-        self._corner = np.argsort(faces.ravel(), kind="stable") // 3
+        corners = (np.ones(3 * len(faces), bool), faces.ravel(), np.arange(3 * len(faces) + 1))
+        # The faces around each vertex, one vertex after the other: a counting sort.
+        self._around = sparse.csr_array(corners, shape=(3 * len(faces), self.count)).tocsc().indices // 3
+        self._starts = np.cumsum(self.valence) - self.valence
 
     def apart(self, rng: np.random.Generator) -> IntArray:
         """Vertices (k,) that may go, more than two edges from each other."""
@@ -102,11 +105,9 @@ class _Round:
         for _ in range(SWEEPS):
             lowest = rank
             for _ in range(2):
-                of_face = lowest[self.faces].min(axis=1)
-                around = lowest.copy()
-                for corner in self.faces.T:
-                    np.minimum.at(around, corner, of_face)
-                lowest = around
+                # Every vertex has a face.
+                of_face = np.minimum.reduce([lowest[corner] for corner in self.faces.T])
+                lowest = np.minimum.reduceat(of_face[self._around], self._starts)
             wins = (lowest == rank) & (rank >= 0) & ~self.touching
             chosen |= wins
             rank[wins] = -1  # nothing near these can win any more
@@ -126,11 +127,10 @@ class _Round:
 
     def stars(self, vertices: IntArray) -> tuple[IntArray, IntArray]:
         """The faces around some vertices, and for each face which of these it is around."""
-        ends = np.cumsum(self.valence)
         counts = self.valence[vertices]
         which = np.repeat(np.arange(len(vertices)), counts)
         offset = np.arange(len(which)) - np.repeat(np.cumsum(counts) - counts, counts)
-        return self._corner[(ends - self.valence)[vertices][which] + offset], which
+        return self._around[self._starts[vertices][which] + offset], which
 
 
 def _proper(faces: IntArray) -> NDArray[np.bool_]:
@@ -148,8 +148,7 @@ def _collapses(
     if not len(pairs):
         return pairs
     u, v = pairs.T
-    costs = dots(quadrics[u] + quadrics[v], monomials(mesh.points[v]))
-    costs += MOTION_WEIGHT * areas[u] * ((mesh.points[u] - mesh.points[v]) ** 2).sum(axis=(1, 2))
+    costs = np.concatenate([_costs(mesh.points, quadrics, areas, some) for some in _chunks(pairs)])
     # The cheapest half-edge of each vertex, and of these the cheaper ones.
     order = np.lexsort((costs, u))
     first = order[np.flatnonzero(np.diff(u[order], prepend=-1))]
@@ -157,6 +156,19 @@ def _collapses(
     pairs = np.stack([u[first], v[first]], axis=1)
     pairs = pairs[_keep_shape(mesh, pairs, sine)][:most]
     return _without_folds(mesh, pairs)
+
+
+def _costs(points: FloatArray, quadrics: FloatArray, areas: FloatArray, pairs: IntArray) -> FloatArray:
+    """What collapses (k, 2) cost."""
+    u, v = pairs.T
+    costs: FloatArray = dots(quadrics[u] + quadrics[v], monomials(points[v]))
+    costs += MOTION_WEIGHT * areas[u] * ((points[u] - points[v]) ** 2).sum(axis=(1, 2))
+    return costs
+
+
+def _chunks(pairs: IntArray) -> list[IntArray]:
+    """Some at a time: what is computed of all of them in all shapes takes much memory."""
+    return np.array_split(pairs, -(-len(pairs) // CHUNK))
 
 
 def _keep_shape(mesh: _Round, pairs: IntArray, sine: float) -> NDArray[np.bool_]:

@@ -6,11 +6,9 @@ corners. Faces keep their winding, even where it is inside out, so that served s
 
 from __future__ import annotations
 
-import os
 import re
 import shlex
-import tempfile
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,6 +24,7 @@ from shapespace.files.surfaces.reading import FORMATS
 from shapespace.mesh.rigid_motion import align
 from shapespace.mesh.triangle_mesh import Connectivity, MeshError, PlaceError, TriangleMesh, diagonal, face_areas
 from shapespace.training.collection import parts as separate_parts
+from shapespace.training.collection.large_arrays import some_vertices, stacked
 from shapespace.training.collection.parts import Part
 from shapespace.training.collection.suspicions import Placements, suspicions
 from shapespace.training.runs.progress import progress
@@ -42,8 +41,6 @@ SEAM_TOLERANCE = 1e-4
 
 #: Files that lie beside meshes: buffers of glTF, materials of OBJ, and textures.
 _BESIDE = ("bin", "mtl", "png", "jpg", "jpeg")
-#: A collection with more bytes of vertices is kept in a temporary file, not in memory.
-IN_MEMORY = 2**28
 
 #: A volume below this share of area^(3/2) (a ball has 0.094) is too small to tell inside from outside.
 CLEAR_VOLUME = 1e-3
@@ -251,33 +248,6 @@ def data_files(path: Path) -> list[Path]:
     )
 
 
-def _stacked(count: int, shapes: Iterable[FloatArray]) -> FloatArray:
-    """Shapes (V, 3) as one array (count, V, 3), a large one in a temporary file: it need not fit into memory."""
-    array: FloatArray = np.zeros(0)
-    for k, shape in enumerate(shapes):
-        if k == 0:
-            array = _room((count, *shape.shape))
-        array[k] = shape
-    return array
-
-
-def _room(shape: tuple[int, ...]) -> FloatArray:
-    size = int(np.prod(shape)) * np.dtype(np.float64).itemsize
-    if size <= IN_MEMORY:
-        return np.empty(shape)
-    with tempfile.TemporaryFile() as file:
-        # Reserved now: a full disk is an error here, where writing to the map later would kill the process.
-        os.posix_fallocate(file.fileno(), 0, size) if hasattr(os, "posix_fallocate") else file.truncate(size)
-        return np.memmap(file, np.float64, "r+", shape=shape)
-
-
-def some_vertices(vertices: FloatArray, chosen: IntArray) -> FloatArray:
-    """Some vertices of all shapes (n, V, 3)."""
-    if len(chosen) == vertices.shape[1]:
-        return vertices
-    return _stacked(len(vertices), (shape[chosen] for shape in vertices))
-
-
 def normalised(collection: MeshCollection, reference: int) -> tuple[FloatArray, float]:
     """Scale all shapes about the origin, so that the reference's shell has unit area; they are not centred.
 
@@ -285,7 +255,7 @@ def normalised(collection: MeshCollection, reference: int) -> tuple[FloatArray, 
         Vertices (n, V, 3) and the scale in the user's units: ``collection.vertices == scale * vertices``.
     """
     scale = float(np.sqrt(face_areas(collection.vertices[reference], collection.shell_faces).sum()))
-    return _stacked(len(collection.vertices), (shape / scale for shape in collection.vertices)), scale
+    return stacked(len(collection.vertices), (shape / scale for shape in collection.vertices)), scale
 
 
 def _natural(path: Path) -> tuple[list[str | int], str]:
@@ -341,7 +311,7 @@ def _read_folder(folder: Path) -> _Raw:
                 raise
             yield v
 
-    return _Raw([str(path) for path in paths], list(by_name), _stacked(len(paths), shapes()), faces, all(soups))
+    return _Raw([str(path) for path in paths], list(by_name), stacked(len(paths), shapes()), faces, all(soups))
 
 
 def _read(path: Path, vertex_count: int = 0, faces: IntArray | None = None) -> tuple[FloatArray, IntArray]:
@@ -401,11 +371,13 @@ def _read_npz(path: Path) -> _Raw:
         if (counts > 1).any():
             raise MeshError(f"two shapes are called {values[counts.argmax()]!s}; each needs a name of its own")
     labels = [f"{path}{_SHAPE}{name}" for name in names]
-    checked = []
-    for label, shape in zip(labels, shapes, strict=True):
-        with _refusing(label):
-            checked.append(_checked(shape, arrays["faces"]))
-    return _Raw(labels, names.tolist(), np.stack([vertices for vertices, _ in checked]), checked[0][1])
+
+    def checked() -> Iterator[FloatArray]:
+        for label, shape in zip(labels, shapes, strict=True):
+            with _refusing(label):
+                yield _checked(shape, arrays["faces"])[0]
+
+    return _Raw(labels, names.tolist(), stacked(len(labels), checked()), arrays["faces"].astype(np.int64))
 
 
 def _first_number(label: str) -> int:

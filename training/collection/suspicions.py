@@ -18,6 +18,7 @@ from scipy.spatial import KDTree
 
 from shapespace.arrays import FloatArray, IntArray
 from shapespace.mesh.triangle_mesh import Connectivity, face_areas
+from shapespace.training.collection.large_arrays import TOGETHER, columns, room
 
 #: Areas that differ from the median by more than this factor suggest another unit.
 AREA_FACTOR = 3.0
@@ -193,9 +194,10 @@ class _Edges:
         tail, head = tail[order], head[order]
         starts = np.flatnonzero(np.diff(tail, prepend=-1))
         count = connectivity.vertex_count
-        shortest, longest = (np.empty((len(vertices), count), np.float32) for _ in range(2))
+        shortest, longest = (room((len(vertices), count), np.float32) for _ in range(2))
         extent, self._middle = np.empty((2, len(vertices)))
-        some = np.unique(np.linspace(0, connectivity.edge_count - 1, 20 * SAMPLE).astype(int))
+        most = min(20 * SAMPLE, TOGETHER // len(vertices))
+        some = np.unique(np.linspace(0, connectivity.edge_count - 1, most).astype(int))
         i, j = connectivity.edges[some].T
         sample = np.empty((len(vertices), len(some)))
         for k, shape in enumerate(vertices):
@@ -214,8 +216,13 @@ class _Edges:
             return np.minimum(raw, (values / relative) / np.quantile(usual / relative, QUANTILE, axis=0))
 
         self.scrambled = np.flatnonzero(np.median(beside(sample, sample), axis=1) > SCRAMBLED)
-        stretched = (beside(shortest, longest) > STRETCH) & (shortest > LONG * self._middle[:, None])
-        self.out_of_place = {int(k): np.flatnonzero(stretched[k]) for k in np.flatnonzero(stretched.any(axis=1))}
+        places = []
+        for part in columns(*shortest.shape):
+            short, long = shortest[:, part], longest[:, part]
+            stretched = (beside(short, long) > STRETCH) & (short > LONG * self._middle[:, None])
+            places.append(np.argwhere(stretched) + np.array([0, part.start]))
+        shape_of, vertex_of = np.concatenate(places).T
+        self.out_of_place = {int(k): vertex_of[shape_of == k] for k in np.unique(shape_of)}
 
     def suspicions(self) -> list[Suspicion]:
         """Vertices in another order, wholly or in part, and vertices far off."""

@@ -31,7 +31,8 @@ from shapespace.solve.cholesky import NotPositiveDefiniteError
 from shapespace.solve.outcome import Status
 from shapespace.training.collection.appearance import kept, reference_surface, texture_bytes
 from shapespace.training.collection.generators import MESHES
-from shapespace.training.collection.ingest import MeshCollection, normalised, read_collection, some_vertices
+from shapespace.training.collection.ingest import MeshCollection, normalised, read_collection
+from shapespace.training.collection.large_arrays import some_vertices
 from shapespace.training.runs.config import Config, ConfigError
 from shapespace.training.runs.directory import RunDirectory
 from shapespace.training.runs.progress import progress, waiting
@@ -155,25 +156,24 @@ def _prolong(
     prolong = trial = Prolongation.of(reference, fine, riders)
     every = np.arange(len(exact))
     fitted = prolong.fitted(coarse, exact, own, np.setdiff1d(every, held))
-    found, plain = (each.errors(coarse[held], exact[held]) for each in (fitted, prolong))
-    if found["mean"] < plain["mean"]:
+    learned, plain = (each.errors(coarse[held], (exact[k] for k in held)) for each in (fitted, prolong))
+    if learned["mean"] < plain["mean"]:
         prolong, trial = prolong.fitted(coarse, exact, own, every), fitted
     run.prolongation.write(**prolong.arrays())
-    facts: dict[str, Any] = {"prolongation": min(found, plain, key=lambda errors: errors["mean"])}
+    facts: dict[str, Any] = {"prolongation": min(learned, plain, key=lambda errors: errors["mean"])}
     if riders:
-        away = np.stack(list(trial.distances(coarse[held], exact[held])))
+        indices = [own, *(rider.vertices for rider in riders)]
+        found = np.array(
+            [
+                [(away[index].mean(), away[index].max()) for index in indices]
+                for away in trial.distances(coarse[held], (exact[k] for k in held))
+            ]
+        )
+        how = ["shell", *("rigidly" if rider.rigid else "affinely" for rider in riders)]
         facts["prolongation"]["parts"] = [
-            {
-                "name": part.name,
-                "carried": how,
-                "mean": float(away[:, index].mean()),
-                "max": float(away[:, index].max()),
-            }
-            for part, how, index in zip(
-                meshes.parts,
-                ("shell", *("rigidly" if rider.rigid else "affinely" for rider in riders)),
-                (own, *(rider.vertices for rider in riders)),
-                strict=True,
+            {"name": part.name, "carried": carried, "mean": mean, "max": most}
+            for part, carried, mean, most in zip(
+                meshes.parts, how, found[..., 0].mean(axis=0).tolist(), found[..., 1].max(axis=0).tolist(), strict=True
             )
         ]
     return facts

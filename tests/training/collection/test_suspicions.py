@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from shapespace.files.formats import MESH_FORMATS
-from shapespace.training.collection import figure, ingest
+from shapespace.training.collection import figure, large_arrays
 from shapespace.training.collection.ingest import IngestError, MeshCollection, read_collection
 from tests.training.whole_runs.test_collection import bars
 
@@ -112,12 +112,16 @@ def test_shapes_that_only_differ_are_not_odd(tmp_path: Path) -> None:
 
 
 def test_a_collection_beyond_memory_is_read_as_well(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    before = write(tmp_path / "meshes", SHAPES)
-    monkeypatch.setattr(ingest, "IN_MEMORY", 1000)
+    shapes = SHAPES.copy()
+    shapes[ODD] = far_off(SHAPES[ODD])
+    before = write(tmp_path / "meshes", shapes)
+    monkeypatch.setattr(large_arrays, "IN_MEMORY", 1000)
+    monkeypatch.setattr(large_arrays, "TOGETHER", 20 * len(shapes))
     found = read_collection(tmp_path / "meshes")
     assert isinstance(found.vertices, np.memmap)
     np.testing.assert_array_equal(found.vertices, before.vertices)
-    assert (found.names, found.central) == (before.names, before.central)
+    assert len(found.warnings) == 1
+    assert (found.names, found.central, found.warnings) == (before.names, before.central, before.warnings)
 
 
 def test_the_most_central_shape_is_the_reference_wherever_it_stands(tmp_path: Path) -> None:
