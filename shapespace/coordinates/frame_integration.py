@@ -3,7 +3,11 @@
 Lengths give every triangle its form and an angle the rotation between two neighbours, so that a tree gives a frame to
 each face, and with it the vectors of its sides; the vertices that fit these vectors best solve a Poisson equation with
 a fixed matrix (Lipman, Sorkine, Levin and Cohen-Or 2005). Exact where z is integrable. Where it isn't, each path
-through the tree adds up its errors: good as a start of Gauss–Newton, which sees all edges alike.
+through the tree adds up its errors, and at the hinges that are not in the tree frames don't fit each other. Rotating
+each face a little spreads these misfits over all hinges: with small rotations ω, frames across the hinge from face f to
+face g fit where ``ω_g − ω_f`` is the rotation e_fg by which they miss, and the least squares of all hinges are a linear
+equation with a fixed matrix again, the Laplacian of the faces. As a start of Gauss–Newton the shape is then two to six
+times nearer to the one it leads to.
 
 **Half angles.** A rotation by φ about a unit axis a is the quaternion (cos φ/2, a sin φ/2), so all that is needed of an
 inner angle γ is half of it: from its cosine, by the law of cosines ``cos γ = (b² + c² − a²) / 2bc``, follow
@@ -19,6 +23,7 @@ from scipy.spatial.transform import Rotation
 
 from shapespace.arrays import FloatArray, IntArray
 from shapespace.coordinates import quaternions
+from shapespace.coordinates.nric import WeightedNorm
 from shapespace.mesh.triangle_mesh import TriangleMesh, face_normals
 from shapespace.solve.cholesky import Backend, SymmetricPattern, analyse
 
@@ -27,14 +32,14 @@ class FrameIntegration:
     """Shapes from NRIC of one connectivity, without iterating.
 
     Everything that depends on the connectivity is found here, once: the tree, the order in which rotations are
-    multiplied, and the factor of the Poisson matrix. Holds a factor: use one per thread.
+    multiplied, and the factors of the two matrices. Holds these factors: use one per thread.
 
     Args:
         reference: gives lengths to the tree, weights to the sides, and a place to each connected part.
         backend: Cholesky backend.
     """
 
-    #: Weight of the reference in the Poisson equation, which only fixes its translations.
+    #: Weight of the reference in the Poisson equation, which only fixes its translations; and of no rotation.
     ANCHOR = 1e-9
 
     def __init__(self, reference: TriangleMesh, backend: Backend = "auto") -> None:
@@ -47,23 +52,25 @@ class FrameIntegration:
         self._place = np.argsort(order)
         self._roots = int((depths == 0).sum())
         self._root_frames = _face_frames(reference, order[: self._roots])
-        self._hinges_to_parents(order[self._roots :], parents)
+        self._hinges(order[self._roots :], parents)
         self._rounds = _rounds(depths[order], self._place[parents[order]])
         self._poisson_equation(reference, backend)
+        self._rotation_equation(reference, backend)
 
-    def _hinges_to_parents(self, children: IntArray, parents: IntArray) -> None:
-        """For each face but the roots, the edge to its parent, and which side of either face that edge is."""
+    def _hinges(self, children: IntArray, parents: IntArray) -> None:
+        """Which side of its two faces each hinge is; and for each face but the roots, the hinge to its parent."""
         c = self._connectivity
-        edge_of = {(a, b): e for (a, b), e in zip(c.edge_faces[c.hinge_edges].tolist(), c.hinge_edges, strict=True)}
-        edge_of |= {(b, a): e for (a, b), e in edge_of.items()}
-        pairs = zip(parents[children].tolist(), children.tolist(), strict=True)
-        self._tree_edges: IntArray = np.array([edge_of[pair] for pair in pairs], dtype=np.int64)
         self._left_sides, self._right_sides = (
-            (c.face_edges[faces] == self._tree_edges[:, None]).argmax(axis=1) * self._count + faces
-            for faces in c.edge_faces[self._tree_edges].T
+            (c.face_edges[faces] == c.hinge_edges[:, None]).argmax(axis=1) * self._count + faces
+            for faces in c.edge_faces[c.hinge_edges].T
         )
+        pairs = c.edge_faces[c.hinge_edges].tolist()
+        hinge_of = {(a, b): h for h, (a, b) in enumerate(pairs)} | {(b, a): h for h, (a, b) in enumerate(pairs)}
+        to_parents = zip(parents[children].tolist(), children.tolist(), strict=True)
+        self._tree: IntArray = np.array([hinge_of[pair] for pair in to_parents], dtype=np.int64)
         #: 1 where the parent is the left face of the edge, −1 where the rotation is to be reversed.
-        self._direction = np.where(c.edge_faces[self._tree_edges, 0] == parents[children], 1.0, -1.0)
+        self._direction = np.where(c.edge_faces[c.hinge_edges[self._tree], 0] == parents[children], 1.0, -1.0)
+        self._others = np.setdiff1d(np.arange(len(pairs)), self._tree)
 
     def _poisson_equation(self, reference: TriangleMesh, backend: Backend) -> None:
         """The right-hand side's matrix and the factor of the left-hand side's."""
@@ -85,6 +92,28 @@ class FrameIntegration:
         self._anchored = anchor * reference.vertices
         self._poisson = analyse(pattern, backend).factorise(entries)
 
+    def _rotation_equation(self, reference: TriangleMesh, backend: Backend) -> None:
+        """The same for the rotations that make frames fit; an angle counts as in the norm of lengths and angles."""
+        c = self._connectivity
+        left, right = c.edge_faces[c.hinge_edges].T
+        weights = WeightedNorm.of(reference, 1.0).squared[c.edge_count + c.hinge_edges]
+        count, others = len(self._others), self._others
+        self._left, self._right = left[others], right[others]
+        self._misfits = sparse.csr_array(
+            (
+                np.concatenate([-weights[others], weights[others]]),
+                (np.concatenate([self._left, self._right]), np.tile(np.arange(count), 2)),
+            ),
+            shape=(self._count, count),
+        )
+        if count:
+            pattern = SymmetricPattern(
+                self._count, np.concatenate([left, right, left]), np.concatenate([left, right, right])
+            )
+            entries = pattern.scatter(np.concatenate([weights, weights, -weights]))
+            entries[pattern.diagonal] += self.ANCHOR * weights.mean()
+            self._laplacian = analyse(pattern, backend).factorise(entries)
+
     @np.errstate(divide="ignore", over="ignore", invalid="ignore")
     def __call__(self, z: FloatArray) -> FloatArray:
         """Vertices (V, 3) for lengths and angles (2E,); not finite where lengths are 0 or not finite."""
@@ -98,7 +127,7 @@ class FrameIntegration:
         halves = np.empty((2, 3, self._count))
         halves[0] = sin_1, -sin_0, np.ones_like(sin_0)
         halves[1] = cos_1, cos_0, np.zeros_like(sin_0)
-        w, x, y, n = self._face_frames(halves.reshape(2, -1), z.take(c.edge_count + self._tree_edges) / 2)
+        w, x, y, n = self._face_frames(halves.reshape(2, -1), z.take(c.edge_count + c.hinge_edges) / 2)
         first = np.stack([1 - 2 * (y * y + n * n), 2 * (x * y + w * n), 2 * (x * n - w * y)])
         second = np.stack([2 * (x * y - w * n), 1 - 2 * (x * x + n * n), 2 * (y * n + w * x)])
         sides = np.empty((3, 3, self._count))
@@ -116,7 +145,7 @@ class FrameIntegration:
 
         Args:
             halves: (2, 3F) cosines and sines of half the directions of their sides.
-            angles: (F − roots,) halves of the angles between each face and its parent.
+            angles: (H,) halves of the angles of the hinges.
         """
         # Across a hinge: rotate its direction α in the left face to the first axis, fold by θ, rotate to its direction
         # β in the right face, where it runs the other way. As quaternions z(α) x(θ) z(−β), where (a, b) are cosine and
@@ -125,18 +154,40 @@ class FrameIntegration:
         d, c = halves.take(self._right_sides, axis=1)
         np.negative(c, out=c)
         cosine, sine = np.cos(angles), np.sin(angles)
-        q = np.empty((4, self._count))
-        q[:, : self._roots] = self._root_frames
-        across = q[:, self._roots :]
+        across = np.empty((4, len(angles)))
         np.multiply(cosine, a * c + b * d, out=across[0])
         np.multiply(sine, a * c - b * d, out=across[1])
         np.multiply(sine, b * c + a * d, out=across[2])
         np.multiply(cosine, b * c - a * d, out=across[3])
-        across[1:] *= self._direction
+        q = np.empty((4, self._count))
+        q[:, : self._roots] = self._root_frames
+        from_parents = q[:, self._roots :]
+        across.take(self._tree, axis=1, out=from_parents)
+        from_parents[1:] *= self._direction
         # Products along the paths from the roots, twice as long in each round.
         for first, ancestors in self._rounds:
             q[:, first:] = quaternions.product(q.take(ancestors, axis=1), q[:, first:])
-        return q.take(self._place, axis=1)
+        return self._fitting(q.take(self._place, axis=1), across)
+
+    def _fitting(self, frames: FloatArray, across: FloatArray) -> FloatArray:
+        """Frames (4, F), each rotated a little, so that they fit at all hinges as well as can be.
+
+        Args:
+            frames: that fit at the hinges of the tree.
+            across: (4, H) rotations from the left to the right face of each hinge.
+        """
+        if not len(self._others):
+            return frames
+        arrived = quaternions.product(frames.take(self._left, axis=1), across.take(self._others, axis=1))
+        missed = quaternions.product(arrived, quaternions.conjugate(frames.take(self._right, axis=1)))
+        # A quaternion and its negative are the same rotation: the one by less than half a turn is meant.
+        vectors = 2 * missed[1:] * np.copysign(1, missed[0])
+        right = self._misfits @ vectors.T
+        turns = np.ones((4, self._count))
+        for k, column in enumerate(right.T):
+            turns[k + 1] = self._laplacian.solve(column) / 2
+        turns /= np.sqrt((turns * turns).sum(axis=0))
+        return quaternions.product(turns, frames)
 
 
 def _spanning_forest(mesh: TriangleMesh) -> IntArray:

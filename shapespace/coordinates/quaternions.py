@@ -35,6 +35,11 @@ def product(p: FloatArray, q: FloatArray) -> FloatArray:
     )
 
 
+def conjugate(q: FloatArray) -> FloatArray:
+    """The inverses of rotations (4, n)."""
+    return q * np.array([[1], [-1], [-1], [-1]])
+
+
 def chain(q: FloatArray) -> FloatArray:
     """The products (4, n) of k quaternions each, (4, k, n), from first to last: neighbours, then their products."""
     while q.shape[1] > 1:
@@ -47,5 +52,4 @@ def axis(q: FloatArray, index: int) -> FloatArray:
     """A coordinate axis (3, n) as the rotations turn it."""
     unit = np.zeros_like(q)
     unit[1 + index] = 1
-    conjugate = q * np.array([[1], [-1], [-1], [-1]])
-    return product(product(q, unit), conjugate)[1:]
+    return product(product(q, unit), conjugate(q))[1:]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Iterable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -17,7 +18,7 @@ from shapespace.coordinates.nric import HingeGeometry, NRICGradients, NRICJacobi
 from shapespace.mesh.rigid_motion import rigid_motions
 from shapespace.mesh.triangle_mesh import TriangleMesh, face_areas
 from shapespace.solve.anderson import Anderson
-from shapespace.solve.cholesky import Backend, Factor, NotPositiveDefiniteError, analyse
+from shapespace.solve.cholesky import Backend, Cholesky, Factor, NotPositiveDefiniteError, analyse
 from shapespace.solve.deadline import Deadline
 from shapespace.solve.line_search import backtrack, sufficient_decrease
 from shapespace.solve.outcome import Outcome, Status
@@ -29,6 +30,11 @@ DEFAULT_ETA = 1e-2
 #: A factor serves shapes around its own up to this distance of any vertex, a fraction of the diagonal; and this many
 #: steps, which is about what a new one costs.
 REACH, LIFE = 1e-2, 16
+#: With an old factor, how long the last step may be, as a share of that with a new one: in the softest motions there is
+#: more left than it goes.
+OLD = 0.25
+#: Share by which diagonal entries are raised for a factor in single precision: ten times what its rounding may take away.
+LIFT = 1e-6
 #: Where Gauss–Newton stalls, damping as a share of each diagonal entry: the first, the factor by which it rises where a
 #: step fails and falls where one succeeds, and the largest. A step within the tolerance means a minimum only while the
 #: damping is not above the last number, which slows but the softest motions (the matrix of a torus of 2048 vertices
@@ -39,7 +45,8 @@ LEAST_AREA = 0.1
 #: Face frames with a larger relative misfit have gone astray, and so have those that fold a face: inside the bounds of
 #: our models it is 0.004 (figure) to 0.16 (torus), and beyond 0.2 shapes are off by several percent of their size.
 ASTRAY = 0.2
-#: A first guess from face frames with a smaller relative misfit is good enough not to look for another.
+#: A first guess from face frames with a smaller relative misfit is good enough not to look for another, and near enough to
+#: the solution for factors in single precision.
 GOOD_GUESS = 0.05
 
 
@@ -83,15 +90,21 @@ class Reconstructor:
         self.norm = WeightedNorm.of(reference, eta)
         self.jacobian = NRICJacobian(reference.connectivity)
         self.normal_matrix = NormalMatrix(reference.connectivity)
-        self._cholesky = analyse(self.normal_matrix.pattern, backend)
         self._backend: Backend = backend
+        self._single = analyse(self.normal_matrix.pattern, backend, precision=np.float32)
 
     def another(self) -> Reconstructor:
         """One more for another thread, which shares with this one all that never changes."""
         twin = copy.copy(self)
-        twin._cholesky = analyse(self.normal_matrix.pattern, self._backend)
-        twin.__dict__.pop("integrate", None)
+        twin._single = analyse(self.normal_matrix.pattern, self._backend, precision=np.float32)
+        for own in ("integrate", "_double"):
+            twin.__dict__.pop(own, None)
         return twin
+
+    @cached_property
+    def _double(self) -> Cholesky:
+        """In double precision, for what no iteration corrects, and for matrices that single precision can't factorise."""
+        return analyse(self.normal_matrix.pattern, self._backend)
 
     @cached_property
     def integrate(self) -> FrameIntegration:
@@ -108,7 +121,7 @@ class Reconstructor:
 
     def _guess(self, target: FloatArray, others: Iterable[Callable[[], FloatArray]]) -> _Point:
         integrated = self._point(self.integrate(target), target)
-        if integrated.energy <= GOOD_GUESS**2 * self.norm.square(target):
+        if self._is_good(integrated, target):
             return integrated
         return self._nearest(target, integrated, [*(other() for other in others), self.reference.vertices])
 
@@ -214,7 +227,7 @@ class Reconstructor:
             new = factor is None
             if factor is None:
                 try:
-                    factor = _GaussNewtonFactor(self._factor(here), here.vertices)
+                    factor = _GaussNewtonFactor(self._factor(here, target), here.vertices)
                 except NotPositiveDefiniteError as error:
                     return _stalled(here, iterations, str(error))
             iterations += 1
@@ -227,7 +240,7 @@ class Reconstructor:
                 t, trial = self._line_search(target, here, forces, step, limits.step)
             else:
                 return _stalled(here, iterations, "a step is not finite")
-            helps, tiny = trial.energy <= here.energy, size * t <= limits.step
+            helps, tiny = trial.energy <= here.energy, size * t <= limits.step * (1 if new else OLD)
             if not (helps or new or tiny):
                 factor = None
                 continue
@@ -263,7 +276,7 @@ class Reconstructor:
         areas = face_areas(here.vertices, self.reference.faces)
         while (reached := limits.reached(iterations)) is None:
             try:
-                step = self._factor(here, damping).solve(self._forces(here).ravel()).reshape(-1, 3)
+                step = self._damped_factor(here, damping).solve(self._forces(here).ravel()).reshape(-1, 3)
             except NotPositiveDefiniteError as error:
                 return _stalled(here, iterations, str(error))
             iterations += 1
@@ -283,12 +296,25 @@ class Reconstructor:
         """The negative gradient (V, 3) of half the energy."""
         return -self.jacobian.pull_back(here.gradients, self.norm.squared * here.misfit)
 
-    def _factor(self, here: _Point, damping: float = 0.0) -> Factor:
-        """The normal matrix, its diagonal raised by a share; raises NotPositiveDefiniteError."""
+    def _factor(self, here: _Point, target: FloatArray) -> Factor:
+        """The normal matrix, near a solution in single precision if that can be; raises NotPositiveDefiniteError."""
         entries = self.normal_matrix.entries(here.gradients, self.norm)
-        if damping:
-            entries[self.normal_matrix.pattern.diagonal] *= 1 + damping
-        return self._cholesky.factorise(entries)
+        if self._is_good(here, target):
+            with suppress(NotPositiveDefiniteError):
+                return self._single.factorise(self._damped(entries, LIFT))
+        return self._double.factorise(entries)
+
+    def _is_good(self, here: _Point, target: FloatArray) -> bool:
+        return bool(here.energy <= GOOD_GUESS**2 * self.norm.square(target))
+
+    def _damped_factor(self, here: _Point, damping: float) -> Factor:
+        """The normal matrix, its diagonal raised by a share; raises NotPositiveDefiniteError."""
+        return self._double.factorise(self._damped(self.normal_matrix.entries(here.gradients, self.norm), damping))
+
+    def _damped(self, entries: FloatArray, share: float) -> FloatArray:
+        damped = entries.copy()
+        damped[self.normal_matrix.pattern.diagonal] *= 1 + share
+        return damped
 
     @np.errstate(divide="ignore", over="ignore", invalid="ignore")
     def _point(self, vertices: FloatArray, target: FloatArray) -> _Point:
@@ -323,7 +349,7 @@ class Reconstructor:
     def _linearised_at(self, vertices: FloatArray) -> tuple[sparse.csr_array, Factor]:
         """J and the factor of JᵀWJ."""
         gradients = self.jacobian.gradients(vertices)
-        factor = self._cholesky.factorise(self.normal_matrix.entries(gradients, self.norm))
+        factor = self._double.factorise(self.normal_matrix.entries(gradients, self.norm))
         return self.jacobian.matrix(gradients), factor
 
     def _flipped(self, misfit: FloatArray) -> int:

@@ -18,13 +18,14 @@ from importlib import metadata
 from typing import Literal, Protocol
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from scipy import linalg, sparse
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
 from shapespace.arrays import FloatArray, IntArray
 
 Backend = Literal["auto", "banded", "pardiso"]
+Precision = type[np.float32] | type[np.float64]
 
 _MKL_SEQUENTIAL = 1
 _MINIMUM_DEGREE, _NESTED_DISSECTION = 0, 2
@@ -99,8 +100,8 @@ class Cholesky(Protocol):
 class BandedCholesky:
     """LAPACK's banded factorisation after a reverse Cuthill–McKee ordering."""
 
-    def __init__(self, pattern: SymmetricPattern) -> None:
-        n = pattern.size
+    def __init__(self, pattern: SymmetricPattern, precision: Precision = np.float64) -> None:
+        n, self._precision = pattern.size, precision
         graph = pattern.matrix(np.ones(len(pattern)))
         self._order: IntArray = reverse_cuthill_mckee(sparse.csr_matrix(graph), symmetric_mode=True).astype(np.int64)
         place = np.empty(n, dtype=np.int64)
@@ -114,9 +115,9 @@ class BandedCholesky:
 
     def factorise(self, entries: FloatArray, number: int = 0) -> Factor:
         """See Cholesky; every factor has memory of its own, and the number doesn't matter."""
-        band = np.zeros(self._shape, order="F")
+        band = np.zeros(self._shape, self._precision, order="F")
         band.ravel(order="K")[self._slots] = entries
-        if not np.isfinite(entries).all():
+        if not np.isfinite(band).all():
             raise NotPositiveDefiniteError("the matrix has an entry that is not finite")
         try:
             factor = linalg.cholesky_banded(band, overwrite_ab=True, lower=True, check_finite=False)
@@ -127,12 +128,12 @@ class BandedCholesky:
 
 @dataclass(frozen=True)
 class _BandedFactor:
-    band: FloatArray
+    band: NDArray
     order: IntArray
 
     def solve(self, right: ArrayLike) -> FloatArray:
         """See Factor."""
-        right = np.asarray(right)
+        right = np.asarray(right, self.band.dtype)
         x = np.empty(right.shape)
         x[..., self.order] = linalg.cho_solve_banded(
             (self.band, True), right[..., self.order].T, check_finite=False, overwrite_b=True
@@ -170,13 +171,13 @@ class PardisoCholesky:
 
     _POSITIVE_DEFINITE = 2
 
-    def __init__(self, pattern: SymmetricPattern, factors: int = 1) -> None:
-        self._size = pattern.size
+    def __init__(self, pattern: SymmetricPattern, factors: int = 1, precision: Precision = np.float64) -> None:
+        self._size, self._precision = pattern.size, precision
         self._structure = pattern.indptr + np.int32(1), pattern.indices + np.int32(1)
         #: How many factors there have been of each number. The factors themselves refer to this object: to hold them
         #: here would be a cycle, and MKL's memory would wait for the garbage collector.
         self._versions = [0] * factors
-        entries = np.ones(len(pattern))
+        entries = np.ones(len(pattern), precision)
         entries[pattern.diagonal] = len(pattern)
         # Minimum degree is faster for shapes like limbs, nested dissection for shapes like balls: up to a third of the
         # time.
@@ -192,12 +193,12 @@ class PardisoCholesky:
             self._run(-1, entries)
         self._handle = np.zeros(64, dtype=np.int64)
         self._options = np.zeros(64, dtype=np.int32)
-        self._options[[0, 1, 17]] = 1, ordering, -1
+        self._options[[0, 1, 17, 27]] = 1, ordering, -1, self._precision is np.float32
         self._run(11, entries)
         return int(self._options[17])
 
-    def _run(self, phase: int, entries: FloatArray, right: FloatArray | None = None, number: int = 0) -> FloatArray:
-        b = np.zeros(self._size) if right is None else right
+    def _run(self, phase: int, entries: NDArray, right: NDArray | None = None, number: int = 0) -> NDArray:
+        b = np.zeros(self._size, self._precision) if right is None else right
         x = np.empty_like(b)
         error = ctypes.c_int32(0)
         numbers = [len(self._versions), number + 1, self._POSITIVE_DEFINITE, phase, self._size]
@@ -216,9 +217,9 @@ class PardisoCholesky:
 
     def factorise(self, entries: FloatArray, number: int = 0) -> Factor:
         """See Cholesky."""
-        if not np.isfinite(entries).all():
+        kept = np.array(entries, self._precision)
+        if not np.isfinite(kept).all():
             raise NotPositiveDefiniteError("the matrix has an entry that is not finite")
-        kept = np.array(entries, dtype=np.float64)
         self._versions[number] += 1
         self._run(22, kept, number=number)
         return _PardisoFactor(self, kept, number, self._versions[number])
@@ -227,12 +228,13 @@ class PardisoCholesky:
         """Solve with a factor made here; raises RuntimeError where another has taken its place."""
         if self._versions[factor.number] != factor.version:
             raise RuntimeError(f"factor {factor.number} has been replaced by a later factorisation")
-        return self._run(33, factor.entries, np.ascontiguousarray(right, dtype=np.float64), factor.number)
+        solved = self._run(33, factor.entries, np.ascontiguousarray(right, self._precision), factor.number)
+        return solved.astype(np.float64, copy=False)
 
     def __del__(self, finalizing: Callable[[], bool] = sys.is_finalizing) -> None:
         # MKL keeps the factors outside Python's memory until told otherwise. At the end `sys` itself may be gone.
         if hasattr(self, "_versions") and not finalizing():
-            self._run(-1, np.zeros(1))
+            self._run(-1, np.zeros(1, self._precision))
 
 
 @dataclass(frozen=True, eq=False)
@@ -240,7 +242,7 @@ class _PardisoFactor:
     """One of MKL's factors, with the entries behind it: Pardiso looks at them again when it solves."""
 
     cholesky: PardisoCholesky
-    entries: FloatArray
+    entries: NDArray
     number: int
     version: int
 
@@ -249,14 +251,20 @@ class _PardisoFactor:
         return self.cholesky.solve(self, right)
 
 
-def analyse(pattern: SymmetricPattern, backend: Backend = "auto", factors: int = 1) -> Cholesky:
+def analyse(
+    pattern: SymmetricPattern, backend: Backend = "auto", factors: int = 1, precision: Precision = np.float64
+) -> Cholesky:
     """Do the symbolic work for a pattern once; ``auto`` takes Pardiso where it is installed.
 
     Args:
         pattern: of the matrices to come.
         backend: which library.
         factors: how many factors are kept side by side.
+        precision: of the factors. Single precision takes two thirds of the time, and is enough for steps of an
+            iteration that corrects itself; more matrices are then not positive definite.
     """
     if backend == "auto":
         backend = "pardiso" if importlib.util.find_spec("pypardiso") else "banded"
-    return PardisoCholesky(pattern, factors) if backend == "pardiso" else BandedCholesky(pattern)
+    if backend == "pardiso":
+        return PardisoCholesky(pattern, factors, precision)
+    return BandedCholesky(pattern, precision)

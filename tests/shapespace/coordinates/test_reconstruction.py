@@ -292,7 +292,8 @@ def test_a_step_that_overflows_stalls(mesh, reconstruct, target, monkeypatch):
     """Halving it would go on for ever."""
     for value in (np.nan, np.inf):
         broken = SimpleNamespace(solve=lambda right, value=value: np.full_like(right, value))
-        monkeypatch.setattr(reconstruct._cholesky, "factorise", lambda _, broken=broken: broken)
+        for cholesky in (reconstruct._single, reconstruct._double):
+            monkeypatch.setattr(cholesky, "factorise", lambda _, broken=broken: broken)
         found = reconstruct(target)
         assert found.status is Status.STALLED
         assert np.array_equal(found.vertices, mesh.vertices)

@@ -64,7 +64,7 @@ class Moved:
 
 
 def test_a_code_comes_back_from_points_anywhere(figure: ShapeModel) -> None:
-    for seed in (1, 2):
+    for seed in (1, 3):
         given = Moved.of(figure, seed)
         found = figure.fit(given.points())
         assert found.status is FitStatus.CONVERGED, found.reason
