@@ -33,7 +33,7 @@ REACH, LIFE = 1e-2, 16
 #: With an old factor, how long the last step may be, as a share of that with a new one: in the softest motions there is
 #: more left than it goes.
 OLD = 0.25
-#: Share by which diagonal entries are raised for a factor in single precision: ten times what its rounding may take away.
+#: Share by which diagonal entries are raised for a factor in single precision: ten times what rounding may take away.
 LIFT = 1e-6
 #: Where Gauss–Newton stalls, damping as a share of each diagonal entry: the first, the factor by which it rises where a
 #: step fails and falls where one succeeds, and the largest. A step within the tolerance means a minimum only while the
@@ -45,8 +45,8 @@ LEAST_AREA = 0.1
 #: Face frames with a larger relative misfit have gone astray, and so have those that fold a face: inside the bounds of
 #: our models it is 0.004 (figure) to 0.16 (torus), and beyond 0.2 shapes are off by several percent of their size.
 ASTRAY = 0.2
-#: A first guess from face frames with a smaller relative misfit is good enough not to look for another, and near enough to
-#: the solution for factors in single precision.
+#: A first guess from face frames with a smaller relative misfit is good enough not to look for another, and near enough
+#: to the solution for factors in single precision.
 GOOD_GUESS = 0.05
 
 
@@ -103,7 +103,7 @@ class Reconstructor:
 
     @cached_property
     def _double(self) -> Cholesky:
-        """In double precision, for what no iteration corrects, and for matrices that single precision can't factorise."""
+        """In double precision, for what no iteration corrects, and where single precision doesn't do."""
         return analyse(self.normal_matrix.pattern, self._backend)
 
     @cached_property
