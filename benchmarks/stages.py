@@ -11,18 +11,24 @@ import json
 import os
 import subprocess
 import sys
+import time
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import trimesh
+from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
 
 from shapespace.arrays import FloatArray
+from shapespace.bundle.reader import read_bundle
+from shapespace.model.decoder import MeshChoice
+from shapespace.model.latent_space import Distribution
+from shapespace.model.shape_model import ShapeModel
 from shapespace.training.runs.stages import STAGES
 
 ROOT = Path(__file__).resolve().parents[1]
-#: Exponentials, joint and of each factor: their time grows in proportion to them.
-JOINT, OF_FACTORS = 100, 50
+#: Exponentials, joint and of each factor: their time grows in proportion to them; and codes for each median.
+JOINT, OF_FACTORS, CODES = 100, 50, 30
 
 PAGE = """# How training grows
 
@@ -31,7 +37,8 @@ exponentials and {factors} of each factor. The first row is the base; in each of
 vertices of the files, shapes n, modes m, or vertices of the coarse mesh. For each stage processor seconds, those of its
 workers included and those of starting left out, of one run, with one BLAS thread; those of `samples` and `networks`
 grow with the number of exponentials, which is 1000 and more in a real run. Memory is the largest resident set of a
-process, of `ingest` and of whatever stage has most.
+process, of `ingest` and of whatever stage has most. The last two columns are of the model that comes out: processor
+milliseconds of a shape on the coarse mesh, and what carrying the fine mesh along adds, medians over {codes} codes.
 
 """
 
@@ -118,25 +125,47 @@ def measure(size: Size, folder: Path) -> dict[str, tuple[float, float]]:
     return {stage: (max(seconds - start, 0.0), most) for stage, (seconds, most) in found.items()}
 
 
+def serving(folder: Path) -> tuple[float, float]:
+    """Processor ms of a coarse shape of the bundle in a folder, and of what the fine mesh adds."""
+    model = ShapeModel(read_bundle(next(folder.glob("capsules/*"))))
+    times: dict[MeshChoice, list[float]] = {choice: [] for choice in MeshChoice}
+    for code in model.latents.sample(CODES + 3, 0, Distribution.UNIFORM):
+        for choice, found in times.items():
+            began = time.thread_time()
+            model.shape(code, mesh=choice)
+            found.append(1e3 * (time.thread_time() - began))
+    fine, coarse = (float(np.median(times[choice][3:])) for choice in (MeshChoice.FINE, MeshChoice.COARSE))
+    return coarse, fine - coarse
+
+
 def main() -> None:
     """Measure and write."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--out", type=Path, default=ROOT / "build" / "stages")
     given = parser.parse_args()
     shown = [stage for stage in STAGES if stage != "factors"]
-    head = ["files' V", "n", "m", "coarse V", *shown, "ingest MB", "most MB"]
+    head = ["files' V", "n", "m", "coarse V", *shown, "ingest MB", "most MB", "shape ms", "fine mesh ms"]
     rows = [head, ["---"] * len(head)]
     for size in SIZES:
         name = "-".join(map(str, asdict(size).values()))
         path = given.out / f"{name}.json"
         if not path.exists():
-            found = measure(size, given.out / name)
-            path.write_text(json.dumps(found), encoding="utf-8")
-        found = json.loads(path.read_text())
+            measured = measure(size, given.out / name)
+            with threadpool_limits(1):
+                path.write_text(
+                    json.dumps({"stages": measured, "serving": serving(given.out / name)}), encoding="utf-8"
+                )
+        kept = json.loads(path.read_text(encoding="utf-8"))
+        found = kept["stages"]
         seconds = [f"{found[stage][0]:.1f}" for stage in shown]
         memory = [found["ingest"][1], max(most for _, most in found.values())]
         rows.append([*map(str, asdict(size).values()), *seconds, *(f"{mb:.0f}" for mb in memory)])
-    text = PAGE.format(joint=JOINT, factors=OF_FACTORS) + "\n".join(f"| {' | '.join(row)} |" for row in rows) + "\n"
+        rows[-1] += [f"{ms:.1f}" for ms in kept["serving"]]
+    text = (
+        PAGE.format(joint=JOINT, factors=OF_FACTORS, codes=CODES)
+        + "\n".join(f"| {' | '.join(row)} |" for row in rows)
+        + "\n"
+    )
     (ROOT / "docs" / "measurements" / "growth.md").write_text(text, encoding="utf-8")
 
 

@@ -187,7 +187,7 @@ class PardisoCholesky:
         # No iterative refinement: it doubles the cost of a solve, and every caller iterates itself.
         self._options[7] = 0
 
-    def _analyse(self, ordering: int, entries: FloatArray) -> int:
+    def _analyse(self, ordering: int, entries: NDArray) -> int:
         """Analyse, instead of what has been analysed before; returns how many entries the factor will have."""
         if hasattr(self, "_handle"):
             self._run(-1, entries)
