@@ -1,16 +1,17 @@
 """What a request costs, by stage and as a whole: ``python -m benchmarks.serving [stages starts growth http]``.
 
-Prints Markdown tables. ``stages``, ``starts`` and ``growth`` run in this process on one thread and count its processor
-seconds, so that other programs on the machine matter little. Beside them, turn by turn, stand one SuperLU
-factorisation of the model's own Gauss–Newton matrix, which is the yardstick that travels between machines, and what one
-would run otherwise: linear blend shapes (a sum of m fields and the same file), which are the floor, and for
-collections with a tangent space the exact exponential, which is the ceiling. ``http`` asks a server process of its own,
-by the clock.
+Prints Markdown tables; ``--page`` writes them all as docs/measurements/serving.md. ``stages``, ``starts`` and
+``growth`` run in this process on one thread and count its processor seconds, so that other programs on the machine
+matter little. Beside them, turn by turn, stand one SuperLU factorisation of the model's own Gauss–Newton matrix, which
+is the yardstick that travels between machines, and what one would run otherwise: linear blend shapes (a sum of m fields
+and the same file), which are the floor, and for collections with a tangent space the exact exponential, which is the
+ceiling. ``http`` asks a server process of its own, by the clock.
 """
 
 from __future__ import annotations
 
 import argparse
+import io
 import os
 import re
 import statistics
@@ -19,8 +20,9 @@ import sys
 import tempfile
 import threading
 import time
+import unittest.mock
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, redirect_stdout
 from pathlib import Path
 
 import httpx
@@ -32,7 +34,7 @@ from benchmarks import synthetic
 from benchmarks.yardstick import superlu
 from shapespace.arrays import FloatArray
 from shapespace.bundle.reader import read_bundle
-from shapespace.coordinates.nric import NRICJacobian, WeightedNorm
+from shapespace.coordinates.nric import NRICJacobian, WeightedNorm, nric
 from shapespace.coordinates.reconstruction import Reconstruction, Reconstructor
 from shapespace.files.formats import MESH_FORMATS
 from shapespace.mesh.rigid_motion import align
@@ -43,7 +45,17 @@ from shapespace.shell.exponential import exponential
 from shapespace.shell.space import ShellSpace
 from shapespace.solve.outcome import Status
 
+ROOT = Path(__file__).resolve().parents[1]
 GLB = MESH_FORMATS["glb"].encode
+#: Coarse vertices up to which LAPACK's band is tried too.
+BANDED = 5000
+PAGE = """# Serving
+
+`python -m benchmarks.serving --page` measures and writes this page. In process: on one thread, in processor seconds of
+that thread. *SuperLU* is one factorisation (symmetric mode) of the model's own normal matrix, run in turn. *Blend
+shapes* is a sum of m fields and the same file, the floor; the *exponential* is what networks stand for, the ceiling.
+[performance.md](performance.md) has the aims, and why it is as fast as it is.
+"""
 #: Two results of one code agree up to this fraction of the diagonal.
 AGREEMENT = 1e-4
 
@@ -89,12 +101,22 @@ def bundles(folder: Path) -> list[Path]:
     return sorted(found, key=lambda path: (path.parent.name, int(path.name)))
 
 
-def measure(model: ShapeModel, codes: FloatArray) -> dict[str, list[float]]:
-    """Times of code → GLB by stage, and of the yardsticks in turn with them."""
+@contextmanager
+def without_mkl() -> Iterator[None]:
+    """As where MKL has no wheel: what is made here solves by LAPACK."""
+    missing: dict[str, object] = {"pypardiso": None}
+    with unittest.mock.patch.dict(sys.modules, missing):
+        yield
+
+
+def measure(path: Path, model: ShapeModel, codes: FloatArray) -> dict[str, list[float]]:
+    """Times of code → GLB by stage, and of the yardsticks in turn with them; of the model of a bundle."""
     fine = model.mesh(MeshChoice.FINE)
     shape = model.shape(codes[0], mesh=MeshChoice.COARSE)
     yardstick = superlu(normal_matrix(model, shape.vertices / model.manifest.scale))
     fields = np.random.default_rng(1).standard_normal((model.latents.dimension, 3 * len(fine.vertices)))
+    with without_mkl():
+        plain = ShapeModel(read_bundle(path)) if model.manifest.vertices <= BANDED else None
     times: dict[str, list[float]] = {}
     for code in codes:
 
@@ -116,6 +138,9 @@ def measure(model: ShapeModel, codes: FloatArray) -> dict[str, list[float]]:
             "iterations": shape.diagnostics.iterations,
             "blend shapes": seconds(blend),
         }
+        if plain:
+            with without_mkl():
+                found["without MKL"] = seconds(lambda code=code: plain.shape(code)) + encode
         if len(times.get("SuperLU", ())) < 5 or found["sum"] > times["SuperLU"][-1] / 10:
             found["SuperLU"] = seconds(yardstick)  # of large meshes five have to do
         for name, value in found.items():
@@ -123,9 +148,24 @@ def measure(model: ShapeModel, codes: FloatArray) -> dict[str, list[float]]:
     return times
 
 
-def stages(models: Path, count: int) -> None:
-    """Stage by stage, for every bundle of a folder."""
-    print("\nCode → GLB of the fine mesh in process, medians, ms; in brackets steps of Gauss–Newton.\n")
+def away(model: ShapeModel, codes: FloatArray) -> list[float]:
+    """How far shapes end from a solution of tolerance 1e-10: the furthest vertex, in millionths of the diagonal."""
+    found = []
+    with model.solver() as reconstruct:
+        for code in codes:
+            target, others = model._networks(code[None])[1][0], list(model._learned_start(code))
+            ours, exact = (reconstruct.from_guess(target, *others, tolerance=t).vertices for t in (TOLERANCE, 1e-10))
+            found.append(
+                1e6 * float(np.linalg.norm(align(ours, exact) - exact, axis=1).max()) / model.reference.diagonal
+            )
+    return found
+
+
+def stages(folders: list[Path], count: int) -> None:
+    """Stage by stage, for every bundle of some folders."""
+    print("\nCode → GLB of the fine mesh in process, ms, medians; in brackets steps of Gauss–Newton. *Without MKL*: a")
+    print("multiple of the sum. *Away*: the furthest vertex from a solution of tolerance 1e-10, in millionths of the")
+    print("diagonal, median and most over the codes.\n")
     columns = (
         "network",
         "reconstruct",
@@ -137,14 +177,17 @@ def stages(models: Path, count: int) -> None:
         "SuperLU",
         "sum / SuperLU",
         "draft / SuperLU",
+        "without MKL",
+        "away",
         "blend shapes",
     )
     table("model", *columns, "exponential, K = 16")
-    for path in bundles(models):
+    for path in (path for folder in folders for path in bundles(folder)):
         model = ShapeModel(read_bundle(path))
         codes = draw(model, count + 3)
-        times = measure(model, codes)
+        times = measure(path, model, codes)
         median = {name: statistics.median(values[3:]) for name, values in times.items()}
+        distances = away(model, codes)
         row(
             f"{model.manifest.name}, V = {model.manifest.vertices}",
             median["network"],
@@ -155,6 +198,8 @@ def stages(models: Path, count: int) -> None:
             median["draft"],
             median["SuperLU"],
             *(f"{median[name] / median['SuperLU']:.2f}" for name in ("sum", "draft")),
+            f"{median['without MKL'] / median['sum']:.2f}",
+            f"{statistics.median(distances):.1f}, {max(distances):.1f}",
             median["blend shapes"],
             ceiling(model, codes[:5]),
         )
@@ -231,26 +276,59 @@ def growth(count: int) -> None:
     """How times grow with the number of vertices and with the dimension."""
     with tempfile.TemporaryDirectory() as folder:
         for kind, cases in (
-            ("V", [(v, 20) for v in (500, 1000, 2000, 5000, 10000)]),
+            ("V", [(v, 20) for v in (500, 1000, 2000, 5000, 10_000, 20_000, 50_000)]),
             ("m", [(1000, m) for m in (4, 20, 40, 80)]),
         ):
-            print(f"\nSynthetic capsules, growing {kind}; medians, ms.\n")
-            table(
-                "V", "m", "network", "reconstruct (steps)", "encode", "sum", "SuperLU", "sum / SuperLU", "blend shapes"
+            print(
+                f"\nSynthetic capsules, growing {kind}; medians, ms. *Factor*: one of Gauss–Newton, as it is served.\n"
             )
-            sums = []
+            columns = (
+                "network",
+                "reconstruct (steps)",
+                "factor",
+                "encode",
+                "sum",
+                "SuperLU",
+                "sum / SuperLU",
+                "blend shapes",
+            )
+            table("V", "m", *columns, "MB")
+            sizes, sums, factors = [], [], []
             for vertices, latents in cases:
-                model = ShapeModel(read_bundle(synthetic.write(Path(folder) / kind, vertices, latents)))
-                times = measure(model, draw(model, count + 2))
+                path = synthetic.write(Path(folder) / kind, vertices, latents)
+                model = ShapeModel(read_bundle(path))
+                times = measure(path, model, draw(model, count + 2))
                 median = {name: statistics.median(values[2:]) for name, values in times.items()}
                 steps = statistics.mean(times["iterations"][2:])
-                sums.append((vertices if kind == "V" else latents, median["sum"]))
-                reconstruct = f"{1e3 * median['reconstruct']:.1f} ({steps:.1f})"
-                ratio = f"{median['sum'] / median['SuperLU']:.2f}"
-                ends = median["encode"], median["sum"], median["SuperLU"], ratio, median["blend shapes"]
-                row(model.manifest.vertices, latents, median["network"], reconstruct, *ends)
-            exponent = np.polyfit(*np.log(np.array(sums).T), 1)[0]
-            print(f"\nThe sum grows with {kind}^{exponent:.2f} (least squares in logarithms).")
+                sizes.append(vertices if kind == "V" else latents)
+                sums.append(median["sum"])
+                factors.append(factor(model))
+                row(
+                    model.manifest.vertices,
+                    latents,
+                    median["network"],
+                    f"{1e3 * median['reconstruct']:.1f} ({steps:.1f})",
+                    factors[-1],
+                    median["encode"],
+                    median["sum"],
+                    median["SuperLU"],
+                    f"{median['sum'] / median['SuperLU']:.2f}",
+                    median["blend shapes"],
+                    f"{resident(os.getpid()):.0f}",
+                )
+            grown = {"The sum": sums, "one factor": factors, "the sum without one factor": np.subtract(sums, factors)}
+            laws = [f"{name} as {kind}^{np.polyfit(np.log(sizes), np.log(y), 1)[0]:.2f}" for name, y in grown.items()]
+            print(
+                f"\n{', '.join(laws)} (least squares in logarithms). Memory is of this process, other sizes' included."
+            )
+
+
+def factor(model: ShapeModel) -> float:
+    """Time of one factor of Gauss–Newton, of the reference."""
+    target = nric(model.reference.vertices, model.reference.connectivity)
+    with model.solver() as reconstruct:
+        point = reconstruct._point(model.reference.vertices, target)
+        return statistics.median(seconds(lambda: reconstruct._factor(point, target)) for _ in range(5))
 
 
 @contextmanager
@@ -385,12 +463,24 @@ def main() -> None:
     parts = ("stages", "starts", "growth", "http")
     parser.add_argument("parts", nargs="*", choices=[*parts, []], default=list(parts), help="default: all")
     parser.add_argument("--models", type=Path, default=Path("models"), help="folder of bundles")
+    parser.add_argument("--more", type=Path, nargs="*", default=[], help="further ones, for stages only")
     parser.add_argument("--count", type=int, default=30, help="codes for each median")
     parser.add_argument("--seconds", type=float, default=60, help="how long sixteen clients ask")
+    parser.add_argument("--page", action="store_true", help="write the page instead")
     arguments = parser.parse_args()
+    if not arguments.page:
+        run(arguments)
+        return
+    with redirect_stdout(io.StringIO()) as text:
+        run(arguments)
+    (ROOT / "docs" / "measurements" / "serving.md").write_text(PAGE + text.getvalue(), encoding="utf-8")
+
+
+def run(arguments: argparse.Namespace) -> None:
+    """Print the tables."""
     with threadpool_limits(1):
         if "stages" in arguments.parts:
-            stages(arguments.models, arguments.count)
+            stages([arguments.models, *arguments.more], arguments.count)
         if "starts" in arguments.parts:
             starts(arguments.models, arguments.count)
         if "growth" in arguments.parts:
