@@ -28,7 +28,7 @@ BUILD_SYSTEM := $(shell sed -n 's/^requires = \["\(.*\)"\]$$/\1/p' pyproject.tom
 COMPILE = $(BIN)/uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-annotate \
 	--no-emit-index-url --no-emit-find-links --custom-compile-command 'make lock' $(ARGS)
 
-.PHONY: help serve install train test check lint lowest lock faults folders soak fuzz fuzz-api mutants coverage audit sbom bench results clients openapi configuration docs image-test wheel clean
+.PHONY: help serve install train test check lint lowest lock faults folders soak fuzz fuzz-api mutants coverage audit sbom bench results clients firefox openapi configuration docs image-test wheel clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-12s%s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -125,6 +125,10 @@ results: $(VENV)/.train ## compute what is missing of docs/measurements/results.
 clients: $(VENV)/.all $(MODULES) $(VENV)-blender/.bpy ## have Blender and three.js open what the server answers
 	PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/python -m tests.clients $(VENV)-blender/bin/python
 
+firefox: $(VENV)/.all ## try the page in Firefox (Debian: firefox-esr, xvfb and libegl1 with libgl1-mesa-dri)
+	PATH="$(CURDIR)/$(BIN):$$PATH" npm ci --prefix tests/firefox
+	PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/python -m tests.firefox
+
 wheel: $(VENV)/.created ## build dist/shapespace-….whl, which holds the figure too
 	rm -rf build/lib # what is there would go into the wheel
 	$(BIN)/python -m pip wheel --no-deps --wheel-dir dist .
@@ -142,7 +146,7 @@ image-test: $(VENV)/.client ## build the container image, try it for real, and a
 	PATH="$(CURDIR)/$(BIN):$$PATH" scripts/image-test.sh
 
 clean: ## remove what these targets made, except runs/
-	rm -rf $(VENV) $(VENV)-lowest $(VENV)-blender tests/node_modules build dist *.egg-info .*_cache
+	rm -rf $(VENV) $(VENV)-lowest $(VENV)-blender tests/node_modules tests/firefox/node_modules build dist *.egg-info .*_cache
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 # A stamp says which extras the environment holds, so that a second call starts at once.

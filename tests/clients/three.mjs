@@ -27,14 +27,19 @@ function distance(mesh, vertices) {
   const seen = new Vector3();
   return Math.max(
     ...vertices.map((vertex, k) =>
-      mesh.getVertexPosition(k, seen).applyMatrix4(mesh.matrixWorld).distanceTo(new Vector3(...vertex)),
+      mesh
+        .getVertexPosition(k, seen)
+        .applyMatrix4(mesh.matrixWorld)
+        .distanceTo(new Vector3(...vertex)),
     ),
   );
 }
 
 function report(name, error, tolerance) {
   const good = error <= tolerance;
-  console.log(`three.js  ${name}: largest distance of a vertex ${error.toExponential(1)}${good ? "" : ": WRONG"}`);
+  console.log(
+    `three.js  ${name}: largest distance of a vertex ${error.toExponential(1)}${good ? "" : ": WRONG"}`,
+  );
   if (!good) process.exitCode = 1;
 }
 
@@ -45,7 +50,10 @@ const { mesh: colored } = await load("colored.glb");
 const uncolored = !colored.material.vertexColors || colored.geometry.attributes.color?.itemSize !== 3;
 report("colored.glb", uncolored ? Infinity : distance(colored, expected.shape.vertices), expected.tolerance);
 
-for (const [name, tolerance] of [["animation", expected.tolerance], ["long", expected.basis_tolerance]]) {
+for (const [name, tolerance] of [
+  ["animation", expected.tolerance],
+  ["long", expected.basis_tolerance],
+]) {
   const { scene, mesh, animations } = await load(`${name}.glb`);
   const mixer = new AnimationMixer(scene);
   const action = mixer.clipAction(animations[0]).setLoop(LoopOnce);

@@ -21,7 +21,7 @@ def test_people_name_things_for_themselves(window: Open) -> None:
     check(studio, "names")
     studio.page.get_by_label("Name for the factor form").fill("  Figure and twist ")
     studio.page.get_by_label("Name for turn").fill("<b>Turn</b>")
-    studio.page.get_by_role("button", name="Keep").click()
+    studio.page.get_by_role("button", name="Keep", exact=True).click()
     assert headings(studio) == [own[0], "Figure and twist"]
     assert studio.coordinate(1).locator(".name").inner_text() == "<b>Turn</b>"
     assert slider.get_attribute("aria-label") == "Figure and twist, <b>Turn</b>"

@@ -1,10 +1,28 @@
-"""The page's scripts keep to the types that their comments state."""
+"""The page's scripts keep to the types that their comments state, and to one form."""
 
 from __future__ import annotations
 
 import subprocess
 
 from tests.service.conftest import ROOT
+
+#: Characters in a line.
+WIDTH = 110
+
+
+def test_the_scripts_have_the_form_that_prettier_gives_them() -> None:
+    formatter = ROOT / "tests" / "node_modules" / "prettier" / "bin" / "prettier.cjs"
+    scripts = [*(ROOT / "service" / "page" / "js").rglob("*.js"), *(ROOT / "tests").glob("[cf]*/*.mjs")]
+    command = ["node", str(formatter), "--print-width", str(WIDTH), "--check", *map(str, scripts)]
+    found = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert found.returncode == 0, f"{found.stderr}\nprettier --print-width {WIDTH} --write mends that"
+    lines = [
+        (path.name, k)
+        for path in scripts
+        for k, line in enumerate(path.read_text().splitlines(), 1)
+        if len(line) > WIDTH
+    ]
+    assert lines == [], "comments and sentences are not wrapped by it"
 
 
 def test_the_scripts_are_sound_by_their_types() -> None:

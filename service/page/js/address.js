@@ -1,7 +1,9 @@
 /** The state of the page as the part of its address after the #, and back. */
 
 import { Matrix4, Quaternion, Vector3 } from "three";
+import { OTHER } from "./colouring.js";
 
+const COLOURS = ["stretch", "bending", "distance"];
 const FLAGS = ["wireframe", "normals", "loop"];
 const number = (value) => String(Number(value.toFixed(5)));
 const list = (numbers) => numbers.map(number).join(",");
@@ -13,13 +15,15 @@ export function toHash(store, view) {
   const flags = FLAGS.filter((flag) => store[flag]);
   if (!store.fine) flags.push("coarse");
   if (flags.length) parts.set("show", flags.join(","));
-  if (store.locked.some(Boolean)) parts.set("locked", store.locked.flatMap((is, k) => (is ? [k] : [])).join(","));
+  if (store.locked.some(Boolean))
+    parts.set("locked", store.locked.flatMap((is, k) => (is ? [k] : [])).join(","));
   if (store.keyframes.length) parts.set("keys", store.keyframes.map(list).join(";"));
   if (store.beyond) parts.set("beyond", number(store.beyond));
   if (store.seconds) parts.set("seconds", number(store.seconds));
   if (store.easing !== "even") parts.set("easing", store.easing);
   if (store.colour !== "none") parts.set("colour", store.colour);
-  if (store.against >= 0) parts.set("against", store.against);
+  if (store.other) parts.set("other", list(store.other));
+  if (store.against !== -1) parts.set("against", store.against);
   if (store.pins.length) parts.set("pins", store.pins.map(fromPin).join(";"));
   if (store.placement) parts.set("place", list(fromPlacement(store.placement)));
   if (view) parts.set("view", list(view));
@@ -33,7 +37,9 @@ function toPin(text) {
   const [mesh, ...rest] = text.split(",");
   const [vertex, ...position] = rest.map(Number);
   const isPoint = position.length === 3 && position.every(Number.isFinite);
-  return isPoint && Number.isInteger(vertex) && vertex >= 0 ? [{ mesh, vertex, position: new Vector3(...position) }] : [];
+  return isPoint && Number.isInteger(vertex) && vertex >= 0
+    ? [{ mesh, vertex, position: new Vector3(...position) }]
+    : [];
 }
 
 /** A motion as where it takes the origin, and a quaternion. */
@@ -65,6 +71,8 @@ export function fromHash(hash, models) {
   const flags = (parts.get("show") ?? "").split(",");
   const locked = (parts.get("locked") ?? "").split(",").filter(Boolean).map(Number);
   const against = Number(parts.get("against") ?? -1);
+  const other = unlist(parts.get("other") ?? "");
+  const isThere = against === OTHER ? isCode(other) : Number.isInteger(against) && against < keyframes.length;
   const view = unlist(parts.get("view") ?? "");
   const beyond = Number(parts.get("beyond"));
   const seconds = Number(parts.get("seconds"));
@@ -80,8 +88,9 @@ export function fromHash(hash, models) {
       placement: toPlacement(unlist(parts.get("place") ?? "")),
       ...Object.fromEntries(FLAGS.map((flag) => [flag, flags.includes(flag)])),
       fine: !flags.includes("coarse"),
-      colour: colour === "stretch" || colour === "bending" ? colour : "none",
-      against: Number.isInteger(against) && against < keyframes.length ? against : -1,
+      colour: COLOURS.includes(colour) ? colour : "none",
+      against: isThere ? Math.max(against, OTHER) : -1,
+      other: isCode(other) ? other : null,
       seconds: seconds >= 0.5 && seconds <= 120 ? seconds : null,
       easing: parts.get("easing") === "soft" ? "soft" : "even",
       beyond: beyond > 0 && beyond <= 1 ? beyond : 0,

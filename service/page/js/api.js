@@ -1,4 +1,6 @@
-/** The calls of the server that the page makes. Every failure becomes a Problem with a sentence for people. */
+/**
+ * The calls of the server that the page makes. Every failure becomes a Problem with a sentence for people.
+ */
 
 import { here } from "./memory.js";
 import { readNpz } from "./npz.js";
@@ -20,7 +22,10 @@ export class Problem extends Error {
   }
 }
 
-const wait = (seconds) => new Promise((resolve) => { setTimeout(resolve, 1000 * seconds); });
+const wait = (seconds) =>
+  new Promise((resolve) => {
+    setTimeout(resolve, 1000 * seconds);
+  });
 
 /** Send a key with every call from now on, as long as the tab is open. */
 export const useKey = (key) => here.keep(KEY, key);
@@ -43,21 +48,30 @@ async function call(path, options = {}) {
       continue;
     }
     const problem = await response.json().catch(() => ({}));
-    throw new Problem(problem.detail ?? `The server answers ${response.status}.`, response.status, problem.type);
+    throw new Problem(
+      problem.detail ?? `The server answers ${response.status}.`,
+      response.status,
+      problem.type,
+    );
   }
 }
 
-const post = (path, body, signal) => call(path, {
-  method: "POST",
-  headers: { "Content-Type": "application/json" },
-  body: JSON.stringify(body),
-  signal,
-});
+const post = (path, body, signal) =>
+  call(path, {
+    method: "POST",
+    headers: { "Content-Type": "application/json" },
+    body: JSON.stringify(body),
+    signal,
+  });
 const json = async (response) => (await response).json();
 
 export const models = async () => (await json(call("/v1/models"))).models;
 export const modelCard = (model) => json(call(model.links.self));
-export const ready = () => call("/v2/health/ready").then(() => true, () => false);
+export const ready = () =>
+  call("/v2/health/ready").then(
+    () => true,
+    () => false,
+  );
 
 const diagnosticsOf = (response) => JSON.parse(response.headers.get("Shape-Diagnostics") ?? "{}");
 
@@ -98,7 +112,9 @@ export const interpolation = (model, path, signal) => json(post(model.links.inte
 
 /** A random code of a seed. */
 export async function sample(model, seed) {
-  const { latents } = await json(post(`${model.links.self}/sample`, { count: 1, seed, distribution: "uniform" }));
+  const { latents } = await json(
+    post(`${model.links.self}/sample`, { count: 1, seed, distribution: "uniform" }),
+  );
   return latents[0];
 }
 

@@ -3,9 +3,16 @@
 import * as api from "./api.js";
 import { element, find, readable } from "./dom.js";
 
-const rows = (facts) => facts.map(([name, value, meaning = ""]) => element("div", {},
-  element("dt", { textContent: name }), element("dd", { textContent: value }),
-  ...(meaning ? [element("dd", { className: "hint", textContent: meaning })] : [])));
+const rows = (facts) =>
+  facts.map(([name, value, meaning = ""]) =>
+    element(
+      "div",
+      {},
+      element("dt", { textContent: name }),
+      element("dd", { textContent: value }),
+      ...(meaning ? [element("dd", { className: "hint", textContent: meaning })] : []),
+    ),
+  );
 const percent = (share) => `${readable(100 * share)} %`;
 
 /** What figures mean, for those who have not read the paper. */
@@ -31,24 +38,40 @@ export async function openCard(dialog, model) {
   find("h2", dialog).textContent = card.title;
   find(".kind", dialog).textContent = `${card.name} · version ${card.version} · ${card.licence}`;
   find(".description", dialog).textContent = card.description;
-  find(".facts", dialog).replaceChildren(...rows([
-    ["coordinates", card.latent_dimension],
-    ["factors", card.factors.length],
-    ["vertices", card.vertices],
-    ["faces", card.faces],
-    ...(r2?.composite ? [["variance explained (R²)", readable(r2.composite.total, 4), MEANINGS.r2]] : []),
-    ...(unseen ? [["unseen shapes, mean distance", percent(unseen.mean), MEANINGS.unseen],
-      ["as many principal components", percent(unseen.components.mean), MEANINGS.components]] : []),
-    ...(draft ? [["drafts, mean distance", percent(draft.mean), MEANINGS.draft]] : []),
-    ...(error?.mean ? [["mean vertex error", percent(error.mean), MEANINGS.error]] : []),
-  ]));
+  find(".facts", dialog).replaceChildren(
+    ...rows([
+      ["coordinates", card.latent_dimension],
+      ["factors", card.factors.length],
+      ["vertices", card.vertices],
+      ["faces", card.faces],
+      ...(r2?.composite ? [["variance explained (R²)", readable(r2.composite.total, 4), MEANINGS.r2]] : []),
+      ...(unseen
+        ? [
+            ["unseen shapes, mean distance", percent(unseen.mean), MEANINGS.unseen],
+            ["as many principal components", percent(unseen.components.mean), MEANINGS.components],
+          ]
+        : []),
+      ...(draft ? [["drafts, mean distance", percent(draft.mean), MEANINGS.draft]] : []),
+      ...(error?.mean ? [["mean vertex error", percent(error.mean), MEANINGS.error]] : []),
+    ]),
+  );
   const cells = (...texts) => texts.map((textContent) => element("td", { textContent }));
-  find(".compared tbody", dialog).replaceChildren(...Object.entries(r2 ?? {}).map(([name, { total, lengths, angles }]) =>
-    element("tr", {}, element("th", { scope: "row", textContent: name }),
-      ...cells(...[total, lengths, angles].map((value) => (value === undefined ? "" : readable(value, 4)))))));
+  find(".compared tbody", dialog).replaceChildren(
+    ...Object.entries(r2 ?? {}).map(([name, { total, lengths, angles }]) =>
+      element(
+        "tr",
+        {},
+        element("th", { scope: "row", textContent: name }),
+        ...cells(...[total, lengths, angles].map((value) => (value === undefined ? "" : readable(value, 4)))),
+      ),
+    ),
+  );
   find(".compared", dialog).hidden = !r2;
-  find(".figures tbody", dialog).replaceChildren(...flatten(card.figures).map(([name, value]) =>
-    element("tr", {}, element("th", { scope: "row", textContent: name }), ...cells(readable(value, 4)))));
+  find(".figures tbody", dialog).replaceChildren(
+    ...flatten(card.figures).map(([name, value]) =>
+      element("tr", {}, element("th", { scope: "row", textContent: name }), ...cells(readable(value, 4))),
+    ),
+  );
   find(".digest", dialog).textContent = card.digest;
   dialog.showModal();
 }

@@ -5,9 +5,13 @@ import { diverging, gradient, tint } from "./colours.js";
 import { element, find, percentile, readable } from "./dom.js";
 import { report } from "./messages.js";
 import { nearest } from "./modes.js";
+import { diagonalOf } from "./scene.js";
 import { Surface } from "./surface.js";
 
-/** The measures and the legend are those of the server's coloured files; here they are told in units for people. */
+/**
+ * The measures and the legend are those of the server's coloured files; here they are told in units for
+ * people.
+ */
 const KINDS = {
   stretch: {
     shown: (value) => 100 * Math.expm1(value),
@@ -21,10 +25,22 @@ const KINDS = {
     ends: ["concave", "convex"],
     title: "Bending: change of angle",
   },
+  distance: {
+    shown: (value) => 100 * value,
+    unit: " %",
+    ends: ["", ""],
+    title: "Distance, in percent of the diagonal",
+  },
 };
+
+/** What stands for the shape beside among the shapes that colours compare with. */
+export const OTHER = -2;
+/** The code that colours compare with; undefined for the mean. */
+export const baseOf = ({ against, keyframes, other }) => (against === OTHER ? other : keyframes[against]);
 
 const SMOOTHED = 4; // times, about as far as coarse vertices lie apart
 const SMALLEST = 0.01; // end of the legend, in either measure
+const NEAREST = 0.001; // the same for distances, a share of the diagonal
 
 export class Colouring {
   #surfaces = new Map();
@@ -38,9 +54,15 @@ export class Colouring {
     this.legend = legend;
     this.against = against;
     find(".scale", legend).style.backgroundImage = gradient;
-    store.on(["model"], () => { this.#surfaces.clear(); this.#bases.clear(); this.#nearest = null; });
-    store.on(["model", "colour", "against"], () => { this.#limit = 0; });
-    store.on(["keyframes", "against", "model"], () => this.#choices());
+    store.on(["model"], () => {
+      this.#surfaces.clear();
+      this.#bases.clear();
+      this.#nearest = null;
+    });
+    store.on(["model", "colour", "against", "other"], () => {
+      this.#limit = 0;
+    });
+    store.on(["keyframes", "against", "other", "model"], () => this.#choices());
     against.addEventListener("change", () => store.set({ against: Number(against.value) }));
   }
 
@@ -59,6 +81,7 @@ export class Colouring {
     const surface = this.#surface(mesh);
     const base = this.#base(mesh, surface);
     if (!base) return null;
+    if (this.store.colour === "distance") return this.#distances(kind, mesh, base.positions, positions);
     const edges = surface[this.store.colour](base, surface.measure(positions));
     const values = surface.atVertices(edges, base, this.store.colour === "bending");
     const most = nice(Math.max(SMALLEST, percentile(values.map(Math.abs), 0.98)));
@@ -66,6 +89,18 @@ export class Colouring {
     this.#limit = this.store.moving || this.store.playing ? Math.max(this.#limit, most) : most;
     this.#tell(kind, edges);
     return values;
+  }
+
+  /** How far vertices are from those of another shape, so that none is blue and the furthest are red. */
+  #distances(kind, mesh, from, to) {
+    const diagonal = diagonalOf(this.store.references[mesh].vertices);
+    const values = Float32Array.from({ length: to.length / 3 }, (_, v) => distanceAt(from, to, v) / diagonal);
+    const most = nice(Math.max(NEAREST, percentile(values, 0.98)));
+    this.#limit = this.store.moving || this.store.playing ? Math.max(this.#limit, most) : most;
+    this.#tell(kind, values);
+    find(".low", this.legend).textContent = "0";
+    find(".middle", this.legend).textContent = `${readable(kind.shown(this.#limit / 2), 2)}${kind.unit}`;
+    return values.map((value) => 2 * value - this.#limit);
   }
 
   #surface(mesh) {
@@ -78,16 +113,23 @@ export class Colouring {
 
   /** Lengths and angles to compare with; null until they have come from the server. */
   #base(mesh, surface) {
-    const { against, keyframes, model, references } = this.store;
-    const code = keyframes[against];
+    const { model, references } = this.store;
+    const code = baseOf(this.store);
     const key = `${mesh} ${code ?? "mean"}`;
     if (!this.#bases.has(key)) {
       this.#bases.set(key, null);
-      const shape = code ? api.shapes(model, [code], mesh).then(({ shapes }) => shapes[0]) : references[mesh].vertices;
-      Promise.resolve(shape).then((positions) => {
-        this.#bases.set(key, surface.measure(positions));
-        this.store.set({ repaint: {} });
-      }).catch((error) => { this.#bases.delete(key); report(error); });
+      const shape = code
+        ? api.shapes(model, [code], mesh).then(({ shapes }) => shapes[0])
+        : references[mesh].vertices;
+      Promise.resolve(shape)
+        .then((positions) => {
+          this.#bases.set(key, { positions, ...surface.measure(positions) });
+          this.store.set({ repaint: {} });
+        })
+        .catch((error) => {
+          this.#bases.delete(key);
+          report(error);
+        });
     }
     return this.#bases.get(key);
   }
@@ -108,6 +150,7 @@ export class Colouring {
     const text = (value) => readable(shown(value), 2).replace("-", "−");
     const signed = (value) => `${value > 0 ? "+" : ""}${text(value)}`;
     find(".title", this.legend).textContent = title;
+    find(".middle", this.legend).textContent = "0";
     find(".low", this.legend).textContent = `${signed(-this.#limit)}${unit} ${ends[0]}`;
     find(".high", this.legend).textContent = `${signed(this.#limit)}${unit} ${ends[1]}`;
     find(".numbers", this.legend).textContent =
@@ -115,15 +158,18 @@ export class Colouring {
   }
 
   #choices() {
-    const { against, keyframes } = this.store;
+    const { against, keyframes, other } = this.store;
     this.against.replaceChildren(
       element("option", { value: -1, textContent: "the mean" }),
+      ...(other ? [element("option", { value: OTHER, textContent: "the shape beside" })] : []),
       ...keyframes.map((_, i) => element("option", { value: i, textContent: `keyframe ${i + 1}` })),
     );
-    if (against >= keyframes.length) this.store.set({ against: -1 });
+    if (against >= keyframes.length || (against === OTHER && !other)) this.store.set({ against: -1 });
     this.against.value = this.store.against;
   }
 }
+
+const distanceAt = (from, to, v) => Math.hypot(...[0, 1, 2].map((i) => to[3 * v + i] - from[3 * v + i]));
 
 /** The next of 1, 2, 5, 10, … times a power of ten. */
 function nice(value) {

@@ -4,7 +4,17 @@ import * as THREE from "three";
 import { BASE } from "./scene.js";
 
 /** Moreland's "coolwarm", as in the server's coloured files. */
-const DIVERGING = ["#3b4cc0", "#6282ea", "#8db0fe", "#b9d0f9", "#dddcdc", "#f5c4ac", "#f4987a", "#dd5f4b", "#b40426"];
+const DIVERGING = [
+  "#3b4cc0",
+  "#6282ea",
+  "#8db0fe",
+  "#b9d0f9",
+  "#dddcdc",
+  "#f5c4ac",
+  "#f4987a",
+  "#dd5f4b",
+  "#b40426",
+];
 const stops = DIVERGING.map((colour) => new THREE.Color(colour));
 const accent = new THREE.Color("#1f7fc4");
 export const gradient = `linear-gradient(to right, ${DIVERGING.join(", ")})`;

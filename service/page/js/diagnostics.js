@@ -12,18 +12,22 @@ const TOO_MUCH = 5;
 /**
  * What the server says of a shape: how good the news is, a word for it, and a sentence.
  * @param {object} diagnostics
- * @param {number | null} usual the model's own residual, at codes of the training range; null while it isn't known
+ * @param {number | null} usual the model's own residual, at codes of the training range; null while it isn't
+ *   known
  * @returns {News[]}
  */
 export function inWords(diagnostics, usual) {
   const { status, residual, inside_bounds: inside, flipped_faces: flipped, plausibility } = diagnostics;
   if (residual === undefined) return [];
   const words = [fits(residual, usual ?? HARDLY)];
-  words.push(inside
-    ? ["good", "inside", "Inside the range of the training data."]
-    : ["fair", "outside", "Outside the range of the training data: extrapolated."]);
+  words.push(
+    inside
+      ? ["good", "inside", "Inside the range of the training data."]
+      : ["fair", "outside", "Outside the range of the training data: extrapolated."],
+  );
   if (typeof plausibility === "number") words.push(plausible(plausibility));
-  if (flipped > 0) words.push(["poor", "folded", `${flipped} ${flipped === 1 ? "face is" : "faces are"} folded over.`]);
+  if (flipped > 0)
+    words.push(["poor", "folded", `${flipped} ${flipped === 1 ? "face is" : "faces are"} folded over.`]);
   if (status && status !== "converged") {
     words.push(["poor", "unfinished", `The solver did not finish (${status.replace("_", " ")}).`]);
   }
@@ -33,7 +37,10 @@ export function inWords(diagnostics, usual) {
 /** The worst of them, and a line for all: what is wrong, or else what is right. */
 export function inShort(words) {
   const how = ["poor", "fair"].find((each) => words.some(([is]) => is === each)) ?? "good";
-  const line = words.filter(([is]) => (is === "good") === (how === "good")).map(([, word]) => word).join(", ");
+  const line = words
+    .filter(([is]) => (is === "good") === (how === "good"))
+    .map(([, word]) => word)
+    .join(", ");
   return { how, line: line.charAt(0).toUpperCase() + line.slice(1) };
 }
 

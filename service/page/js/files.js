@@ -2,6 +2,7 @@
 
 import { toHash } from "./address.js";
 import * as api from "./api.js";
+import { baseOf } from "./colouring.js";
 import { element, find, readable } from "./dom.js";
 import { reporting, say } from "./messages.js";
 import { CODE } from "./show/code.js";
@@ -44,24 +45,46 @@ export class Files {
     this.language.addEventListener("change", () => this.#tell());
     this.seconds = find("#turntable-seconds", root);
     this.animation = find("#animation-format");
-    store.on(["code", "model", "fine", "colour", "against", "keyframes", "placement"], () => this.#tell());
+    store.on(["code", "model", "fine", "colour", "against", "keyframes", "other", "placement"], () =>
+      this.#tell(),
+    );
     this.format.addEventListener("change", () => this.#tell());
-    find("#download", root).addEventListener("click", reporting(() => this.#shape()));
-    find("#download-animation").addEventListener("click", reporting(() => this.#animation()));
-    store.on(["keyframes"], reporting(() => this.#animationFormats()));
+    find("#download", root).addEventListener(
+      "click",
+      reporting(() => this.#shape()),
+    );
+    find("#download-animation").addEventListener(
+      "click",
+      reporting(() => this.#animation()),
+    );
+    store.on(
+      ["keyframes"],
+      reporting(() => this.#animationFormats()),
+    );
     find("#copy-code", root).addEventListener("click", () => copy(this.code.textContent, "the call"));
-    find("#picture", root).addEventListener("click", reporting(() => this.#picture()));
-    find("#turntable", root).addEventListener("click", reporting(() => this.#turntable()));
-    find("#film").addEventListener("click", reporting(() => this.#film()));
+    find("#picture", root).addEventListener(
+      "click",
+      reporting(() => this.#picture()),
+    );
+    find("#turntable", root).addEventListener(
+      "click",
+      reporting(() => this.#turntable()),
+    );
+    find("#film").addEventListener(
+      "click",
+      reporting(() => this.#film()),
+    );
   }
 
   /** Path and body of the call that answers the shape as a file. */
   get #call() {
-    const { model, code, fine, colour, against, keyframes } = this.store;
+    const { model, code, fine, colour } = this.store;
+    const base = baseOf(this.store);
     const query = new URLSearchParams({ format: this.format.value });
-    if (colour !== "none" && this.format.value !== "stl") { // which has no place for colours
+    // STL has no place for colours, and the server none for distances.
+    if (["stretch", "bending"].includes(colour) && this.format.value !== "stl") {
       query.set("color", colour);
-      if (keyframes[against]) query.set("against", rounded(keyframes[against]));
+      if (base) query.set("against", rounded(base));
     }
     const latent = rounded(code);
     return { path: `${model.links.mesh}?${query}`, body: fine ? { latent } : { latent, mesh: "coarse" } };
@@ -70,7 +93,9 @@ export class Files {
   #tell() {
     if (!this.store.model) return;
     const { path, body } = this.#call;
-    const { model: { name, title } } = this.store;
+    const {
+      model: { name, title },
+    } = this.store;
     const embed = `${api.origin}/?embed${toHash(this.store, null)}`;
     const file = `${name}.${this.format.value}`;
     this.code.textContent = CODE[this.language.value]({ url: api.origin + path, body, file, embed, title });
@@ -86,7 +111,9 @@ export class Files {
   }
 
   #turntable() {
-    const { seconds: { value, valueAsNumber: seconds, validity } } = this;
+    const {
+      seconds: { value, valueAsNumber: seconds, validity },
+    } = this;
     if (!validity.valid || value === "") throw new Error("Say how many seconds a turn takes, from 1 to 60.");
     return this.#video("turntable", (tell) => {
       tell(seconds);
@@ -138,7 +165,10 @@ export class Files {
     try {
       await this.#animationFormats(); // they are not there yet where the server was away
       const format = this.animation.value;
-      const { links } = await api.interpolation(model, { ...this.path.request, mesh: fine ? "fine" : "coarse" });
+      const { links } = await api.interpolation(model, {
+        ...this.path.request,
+        mesh: fine ? "fine" : "coarse",
+      });
       const speed = TIMED.includes(format) ? `&fps=${Math.max(this.path.fps, 1)}` : "";
       keep(await api.file(links[format] + speed), `${model.name}-animation.${format}`);
       say("The animation is saved.", { key: "animation" });

@@ -13,7 +13,10 @@ export class History {
     this.store = store;
     this.undo = undo;
     this.redo = redo;
-    store.on(["space"], () => { this.#steps = []; this.#at = -1; });
+    store.on(["space"], () => {
+      this.#steps = [];
+      this.#at = -1;
+    });
     store.on(["space", "code", "moving", "playing", "pins"], () => this.#record());
     undo.addEventListener("click", () => this.#go(-1));
     redo.addEventListener("click", () => this.#go(1));

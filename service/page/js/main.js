@@ -20,6 +20,8 @@ import { Pull } from "./pull.js";
 import { Ghost } from "./scan/ghost.js";
 import { Reader } from "./scan/reader.js";
 import { ShapeLoop } from "./shape-loop.js";
+import { Beside } from "./shelf/beside.js";
+import { Shelf } from "./shelf/shelf.js";
 import { Welcome } from "./show/welcome.js";
 import { Skin } from "./skin.js";
 import { Sliders } from "./sliders.js";
@@ -32,13 +34,41 @@ import { Viewer } from "./viewer.js";
 const PREFERRED = "figure";
 
 /** @type {import("./store.js").Page} */
-const store = /** @type {any} */ (new Store({
-  model: null, space: null, names: null, references: {}, hasFine: false, pose: null,
-  code: null, locked: [], placement: null, moving: false, playing: false, shape: null,
-  keyframes: [], loop: false, beyond: 0, seconds: null, easing: "even",
-  usual: null, colour: "none", against: -1, highlight: null, regions: null, repaint: null,
-  wireframe: false, normals: false, fine: true, pull: false, pins: [], scan: null, ghost: true,
-}));
+const store = /** @type {any} */ (
+  new Store({
+    model: null,
+    space: null,
+    names: null,
+    references: {},
+    hasFine: false,
+    pose: null,
+    code: null,
+    locked: [],
+    placement: null,
+    moving: false,
+    playing: false,
+    shape: null,
+    keyframes: [],
+    loop: false,
+    beyond: 0,
+    seconds: null,
+    easing: "even",
+    usual: null,
+    colour: "none",
+    against: -1,
+    other: null,
+    highlight: null,
+    regions: null,
+    repaint: null,
+    wireframe: false,
+    normals: false,
+    fine: true,
+    pull: false,
+    pins: [],
+    scan: null,
+    ghost: true,
+  })
+);
 
 const embedded = document.documentElement.classList.contains("embed");
 const viewer = new Viewer(find("#canvas"), embedded ? 24 : 100);
@@ -47,17 +77,29 @@ const sliders = new Sliders(store, find("#factors"));
 const modes = new Modes(store, sliders, pictures);
 const colouring = new Colouring(store, { legend: find("#legend"), against: find("#against") });
 const path = new Path(store, pictures, {
-  list: find("#keyframes"), add: find("#add-keyframe"), play: find("#play"), loop: find("#loop"),
-  beyond: find("#beyond"), seconds: find("#seconds"), easing: find("#easing"), timeline: find("#timeline"),
-  time: find("#time"), status: find("#path-status"),
+  list: find("#keyframes"),
+  add: find("#add-keyframe"),
+  play: find("#play"),
+  loop: find("#loop"),
+  beyond: find("#beyond"),
+  seconds: find("#seconds"),
+  easing: find("#easing"),
+  timeline: find("#timeline"),
+  time: find("#time"),
+  status: find("#path-status"),
 });
 const strip = new Strip(store, pictures, { button: find("#draw-strip"), table: find("#strip") });
+new Shelf(store, pictures, { list: find("#shelf"), add: find("#keep-shape") });
+new Beside(store, viewer);
 new Names(store, { dialog: find("#names"), button: find("#name") });
 new History(store, { undo: find("#undo"), redo: find("#redo") });
 new Files(store, path, viewer, find("#tab-files"));
 new Ghost(store, viewer);
 new Reader(store, {
-  box: find("#verdict"), input: find("#mesh-file"), readAs: find("#read-as"), ownScale: find("#own-scale"),
+  box: find("#verdict"),
+  input: find("#mesh-file"),
+  readAs: find("#read-as"),
+  ownScale: find("#own-scale"),
   stage: find(".stage"),
 });
 new Pins(store, viewer, new Pull(store, viewer), { layer: find("#pins"), clear: find("#clear-pins") });
@@ -69,7 +111,12 @@ tabs(find("[role=tablist]"));
 store.on(["shape"], () => {
   if (!store.shape) return;
   const { mesh, positions, placement, motion } = store.shape;
-  viewer.show(mesh, positions, colouring.of(store.shape), placement ? placement.clone().multiply(motion) : motion);
+  viewer.show(
+    mesh,
+    positions,
+    colouring.of(store.shape),
+    placement ? placement.clone().multiply(motion) : motion,
+  );
 });
 store.on(["colour", "against", "highlight", "regions", "repaint", "moving"], () => {
   if (store.shape) viewer.paint(colouring.of(store.shape));
@@ -95,17 +142,23 @@ store.on(["shape", "usual"], () => {
   find("#diagnostics").className = how;
   find("#diagnostics summary").textContent = line;
   find("#diagnostics ul").replaceChildren(
-    ...words.map(([is, , textContent]) => element("li", { className: is, textContent })));
+    ...words.map(([is, , textContent]) => element("li", { className: is, textContent })),
+  );
 });
 
 // Switches.
 for (const key of ["wireframe", "normals", "fine", "pull"]) toggle(find(`#${key}`), store, key);
-find("#reset-view").addEventListener("click", () => { viewer.resetView(); remember(); });
+find("#reset-view").addEventListener("click", () => {
+  viewer.resetView();
+  remember();
+});
 /** @type {NodeListOf<any>} */
 const radios = document.querySelectorAll("[name=colour]");
 for (const radio of radios) {
   radio.addEventListener("change", () => store.set({ colour: radio.value }));
-  store.on(["colour"], () => { radio.checked = radio.value === store.colour; });
+  store.on(["colour"], () => {
+    radio.checked = radio.value === store.colour;
+  });
 }
 const root = document.documentElement;
 const theme = always.kept("theme");
@@ -113,7 +166,9 @@ if (theme) root.dataset.theme = theme;
 viewer.recolour();
 matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => viewer.recolour());
 find("#theme").addEventListener("click", () => {
-  const dark = root.dataset.theme ? root.dataset.theme === "dark" : matchMedia("(prefers-color-scheme: dark)").matches;
+  const dark = root.dataset.theme
+    ? root.dataset.theme === "dark"
+    : matchMedia("(prefers-color-scheme: dark)").matches;
   root.dataset.theme = dark ? "light" : "dark";
   always.keep("theme", root.dataset.theme);
   viewer.recolour();
@@ -130,26 +185,43 @@ const draw = reporting(async () => {
   here.keep("seed", seed.value);
   take(await api.sample(store.model, Number(seed.value)));
 });
-find("#random").addEventListener("click", () => { seed.value = Number(seed.value) + 1; draw(); });
-seed.addEventListener("change", () => { if (seed.validity.valid && seed.value !== "") draw(); });
+find("#random").addEventListener("click", () => {
+  seed.value = Number(seed.value) + 1;
+  draw();
+});
+seed.addEventListener("change", () => {
+  if (seed.validity.valid && seed.value !== "") draw();
+});
 find("#reset-all").addEventListener("click", () => take(store.space.home));
-find("#draw-strip").addEventListener("click", reporting(() => strip.draw()));
-find("#about").addEventListener("click", reporting(() => openCard(find("#card"), store.model)));
-find("#share").addEventListener("click", () => { remember(); copy(location.href, "the address of this shape"); });
+find("#draw-strip").addEventListener(
+  "click",
+  reporting(() => strip.draw()),
+);
+find("#about").addEventListener(
+  "click",
+  reporting(() => openCard(find("#card"), store.model)),
+);
+find("#share").addEventListener("click", () => {
+  remember();
+  copy(location.href, "the address of this shape");
+});
 
 // Models.
 const picker = find("#model");
 let models = [];
 let opening;
 let turned = false;
-picker.addEventListener("change", reporting(async () => {
-  try {
-    await openModel({ model: models.find(({ name }) => name === picker.value) });
-  } catch (error) {
-    picker.value = store.model.name; // which is still shown
-    throw error;
-  }
-}));
+picker.addEventListener(
+  "change",
+  reporting(async () => {
+    try {
+      await openModel({ model: models.find(({ name }) => name === picker.value) });
+    } catch (error) {
+      picker.value = store.model.name; // which is still shown
+      throw error;
+    }
+  }),
+);
 
 /**
  * Take on a model, at its home, or as an address asks for it.
@@ -167,10 +239,21 @@ async function openModel({ model, code, keyframes = [], locked, view, pins = [],
   turned = Boolean(view);
   if (view) viewer.view = view;
   store.set({
-    model, space, names: namesOf(model), references: { coarse }, hasFine: false, pose: null,
-    regions: null, usual: null, highlight: null,
-    code: space.wrapAll(code ?? space.home), locked: locked ?? space.home.map(() => false),
-    keyframes, against: -1, ...state,
+    model,
+    space,
+    names: namesOf(model),
+    references: { coarse },
+    hasFine: false,
+    pose: null,
+    regions: null,
+    usual: null,
+    highlight: null,
+    code: space.wrapAll(code ?? space.home),
+    locked: locked ?? space.home.map(() => false),
+    keyframes,
+    against: -1,
+    other: null,
+    ...state,
   });
   for (const part of document.querySelectorAll("[inert]")) part.removeAttribute("inert");
   find("#canvas").setAttribute("aria-label", `${model.title}, the shape of the code that the sliders give`);
@@ -179,7 +262,11 @@ async function openModel({ model, code, keyframes = [], locked, view, pins = [],
   if (store.model !== model) return;
   if (fine.vertices.length !== coarse.vertices.length) {
     viewer.addMesh("fine", fine);
-    store.set({ references: { coarse, fine }, pose: new Pose(coarse.vertices, fine.vertices), hasFine: true });
+    store.set({
+      references: { coarse, fine },
+      pose: new Pose(coarse.vertices, fine.vertices),
+      hasFine: true,
+    });
   }
   find("#fine").disabled = !store.hasFine;
   const { references } = store;
@@ -190,7 +277,8 @@ async function openModel({ model, code, keyframes = [], locked, view, pins = [],
       const skin = await Skin.of(await api.textured(model));
       if (store.model !== model) skin.dispose();
       else viewer.dress(store.hasFine ? "fine" : "coarse", skin);
-    } catch (error) { // all but the look is there without it
+    } catch (error) {
+      // all but the look is there without it
       report(error);
     }
     if (store.model !== model) return;
@@ -209,10 +297,36 @@ function remember() {
   history.replaceState(null, "", hash);
   find("#whole").href = location.pathname + hash;
 }
-const rememberSoon = () => { clearTimeout(soon); soon = setTimeout(remember, 250); };
-store.on(["model", "code", "locked", "keyframes", "loop", "beyond", "seconds", "easing", "colour", "against",
-  "wireframe", "normals", "fine", "playing", "pins", "placement"], rememberSoon);
-viewer.canvas.addEventListener("turned", () => { turned = true; rememberSoon(); });
+const rememberSoon = () => {
+  clearTimeout(soon);
+  soon = setTimeout(remember, 250);
+};
+store.on(
+  [
+    "model",
+    "code",
+    "locked",
+    "keyframes",
+    "loop",
+    "beyond",
+    "seconds",
+    "easing",
+    "colour",
+    "against",
+    "other",
+    "wireframe",
+    "normals",
+    "fine",
+    "playing",
+    "pins",
+    "placement",
+  ],
+  rememberSoon,
+);
+viewer.canvas.addEventListener("turned", () => {
+  turned = true;
+  rememberSoon();
+});
 addEventListener("hashchange", reporting(restore));
 
 async function restore() {
@@ -221,7 +335,9 @@ async function restore() {
   if (asked.model) return openModel(asked);
   const model = models.find(({ name }) => name === PREFERRED) ?? models[0];
   if (asked.missing) {
-    const instead = `The address asks for the model ${asked.missing}, which is not served here. This is ${model.title}.`;
+    const instead =
+      `The address asks for the model ${asked.missing}, which is not served here. ` +
+      `This is ${model.title}.`;
     say(instead, { kind: "error", key: "missing" });
   }
   return openModel({ model });
@@ -234,8 +350,11 @@ find("#key form").addEventListener("submit", () => {
 
 try {
   models = await api.models();
-  picker.replaceChildren(...models.map(({ name, title }) => element("option", { value: name, textContent: title })));
-  if (models.length === 0) throw new Error("No model is served. Put a bundle into the models folder and start again.");
+  picker.replaceChildren(
+    ...models.map(({ name, title }) => element("option", { value: name, textContent: title })),
+  );
+  if (models.length === 0)
+    throw new Error("No model is served. Put a bundle into the models folder and start again.");
   await restore();
 } catch (error) {
   if (error.status === 401) find("#key").showModal();

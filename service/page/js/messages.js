@@ -21,7 +21,10 @@ export function say(text, { kind = "note", key } = {}) {
   const shown = box.querySelectorAll(":scope > :not([hidden])");
   for (const old of [...shown].slice(0, -3)) old.hidden = true;
   // A log keeps what it has said, out of sight.
-  if (kind === "note") setTimeout(() => { line.hidden = true; }, 6000);
+  if (kind === "note")
+    setTimeout(() => {
+      line.hidden = true;
+    }, 6000);
   while (box.children.length > 30) box.firstChild.remove();
 }
 
@@ -32,15 +35,18 @@ export function takeBack(key) {
 /** Tell of an error; what was merely superseded is none. */
 export function report(error) {
   if (error.name === "AbortError") return;
-  if (error.offline) say(`${error.message} Is it running? Then try again.`, { kind: "error", key: "offline" });
+  if (error.offline)
+    say(`${error.message} Is it running? Then try again.`, { kind: "error", key: "offline" });
   else say(error.message, { kind: "error" });
 }
 
 /** A handler that reports what goes wrong in it. */
-export const reporting = (work) => async (...parameters) => {
-  try {
-    await work(...parameters);
-  } catch (error) {
-    report(error);
-  }
-};
+export const reporting =
+  (work) =>
+  async (...parameters) => {
+    try {
+      await work(...parameters);
+    } catch (error) {
+      report(error);
+    }
+  };

@@ -1,6 +1,6 @@
 /**
- * Pictures of each coordinate and factor, where each factor changes lengths and angles, and how well shapes of the
- * model fit as a rule: all from the same few shapes.
+ * Pictures of each coordinate and factor, where each factor changes lengths and angles, and how well shapes
+ * of the model fit as a rule: all from the same few shapes.
  */
 
 import * as api from "./api.js";
@@ -20,17 +20,26 @@ export class Modes {
     this.store = store;
     this.sliders = sliders;
     this.pictures = pictures;
-    store.on(["model"], () => { this.#abort.abort(); this.#regions = []; });
+    store.on(["model"], () => {
+      this.#abort.abort();
+      this.#regions = [];
+    });
   }
 
   /** Draw every coordinate's pictures; the home shape is in all of them. */
   async draw() {
-    const { model, space, references: { coarse } } = this.store;
+    const {
+      model,
+      space,
+      references: { coarse },
+    } = this.store;
     const surface = new Surface(coarse.faces, coarse.vertices.length / 3);
     this.#abort = new AbortController();
     const { signal } = this.#abort;
     try {
-      const { shapes: [home] } = await api.shapes(model, [space.home], "coarse", { signal });
+      const {
+        shapes: [home],
+      } = await api.shapes(model, [space.home], "coarse", { signal });
       const rest = surface.measure(home);
       const residuals = [];
       for (const [j, factor] of model.factors.entries()) {
@@ -48,7 +57,12 @@ export class Modes {
           this.#grow(j, surface, rest, [down, up]);
         }
         this.#regions[j] = smooth(this.#regions[j]);
-        this.pictures.draw(this.sliders.picture(j), home, tint(this.#regions[j]), around(home, this.#regions[j]));
+        this.pictures.draw(
+          this.sliders.picture(j),
+          home,
+          tint(this.#regions[j]),
+          around(home, this.#regions[j]),
+        );
       }
       this.store.set({ regions: this.#regions, usual: percentile(residuals, 0.5) });
     } catch (error) {
@@ -67,7 +81,9 @@ export class Modes {
       const now = surface.measure(shape);
       const [stretch, bending] = [surface.stretch(rest, now), surface.bending(rest, now)];
       const change = stretch.map((value, edge) => Math.hypot(value, bending[edge]));
-      surface.atVertices(change, rest, false).forEach((value, v) => { region[v] = Math.max(region[v], value); });
+      surface.atVertices(change, rest, false).forEach((value, v) => {
+        region[v] = Math.max(region[v], value);
+      });
     }
   }
 }

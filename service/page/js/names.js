@@ -1,4 +1,7 @@
-/** What factors and coordinates are called: as the model says, or as people call them for themselves in this browser. */
+/**
+ * What factors and coordinates are called: as the model says, or as people call them for themselves in this
+ * browser.
+ */
 
 import { element, find } from "./dom.js";
 import { always } from "./memory.js";
@@ -20,22 +23,30 @@ function own(model) {
  * The names to show.
  * @param {object} model as the server lists it
  * @param {Record<string, string>} said what people call its factors and coordinates
- * @returns {{factors: string[], labels: string[], coordinates: string[]}} labels stand below the factor's name
+ * @returns {{factors: string[], labels: string[], coordinates: string[]}} labels stand below the factor's
+ *   name
  */
 export function namesOf(model, said = own(model)) {
   const factors = model.factors.map(({ name }) => said[`factor ${name}`] ?? name);
   const all = labels(model).map((label, k) => said[`coordinate ${model.latent_names[k]}`] ?? label);
-  const coordinates = model.factors.flatMap(({ name, start, stop }, j) => all.slice(start, stop).map((label, i) => {
-    const same = factors[j] === name && label === labels(model)[start + i];
-    return same ? model.latent_names[start + i] : [factors[j], label].filter(Boolean).join(", ");
-  }));
+  const coordinates = model.factors.flatMap(({ name, start, stop }, j) =>
+    all.slice(start, stop).map((label, i) => {
+      const same = factors[j] === name && label === labels(model)[start + i];
+      return same ? model.latent_names[start + i] : [factors[j], label].filter(Boolean).join(", ");
+    }),
+  );
   return { factors, labels: all, coordinates };
 }
 
 /** Names of coordinates without that of their factor, which stands above. */
 function labels({ factors, latent_names: names }) {
-  return factors.flatMap((factor) => names.slice(factor.start, factor.stop).map((name) =>
-    (name.startsWith(factor.name) ? name.slice(factor.name.length).replace(/^[\s,]+/, "") : name)));
+  return factors.flatMap((factor) =>
+    names
+      .slice(factor.start, factor.stop)
+      .map((name) =>
+        name.startsWith(factor.name) ? name.slice(factor.name.length).replace(/^[\s,]+/, "") : name,
+      ),
+  );
 }
 
 /** The dialog in which people name things; `store.names` is what comes of it. */
@@ -46,7 +57,10 @@ export class Names {
     this.dialog = dialog;
     button.addEventListener("click", () => this.#open());
     find("form", dialog).addEventListener("submit", () => this.#keep(true));
-    find("[data-do=forget]", dialog).addEventListener("click", () => { this.#keep(false); dialog.close(); });
+    find("[data-do=forget]", dialog).addEventListener("click", () => {
+      this.#keep(false);
+      dialog.close();
+    });
     find("[data-do=close]", dialog).addEventListener("click", () => dialog.close());
   }
 
@@ -55,18 +69,34 @@ export class Names {
     const said = own(model);
     const short = labels(model);
     const line = (key, name, shown, placeholder = shown) => {
-      const input = element("input", { type: "text", maxLength: LONGEST, placeholder, value: said[key] ?? "" });
+      const input = element("input", {
+        type: "text",
+        maxLength: LONGEST,
+        placeholder,
+        value: said[key] ?? "",
+      });
       input.dataset.key = key;
       input.setAttribute("aria-label", `Name for ${name}`);
       return element("label", { className: "line" }, shown, input);
     };
-    find(".list", this.dialog).replaceChildren(...model.factors.map((factor) => {
-      const ks = model.latent_names.slice(factor.start, factor.stop).map((name, i) => [name, short[factor.start + i]]);
-      // A factor of one coordinate, which has its name, is named once.
-      const parts = ks.filter(([, label]) => label).map(([name, label]) => line(`coordinate ${name}`, name, label));
-      return element("fieldset", {}, element("legend", { textContent: factor.name }),
-        line(`factor ${factor.name}`, `the factor ${factor.name}`, "the factor", factor.name), ...parts);
-    }));
+    find(".list", this.dialog).replaceChildren(
+      ...model.factors.map((factor) => {
+        const ks = model.latent_names
+          .slice(factor.start, factor.stop)
+          .map((name, i) => [name, short[factor.start + i]]);
+        // A factor of one coordinate, which has its name, is named once.
+        const parts = ks
+          .filter(([, label]) => label)
+          .map(([name, label]) => line(`coordinate ${name}`, name, label));
+        return element(
+          "fieldset",
+          {},
+          element("legend", { textContent: factor.name }),
+          line(`factor ${factor.name}`, `the factor ${factor.name}`, "the factor", factor.name),
+          ...parts,
+        );
+      }),
+    );
     this.dialog.showModal();
   }
 

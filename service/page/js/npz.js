@@ -40,7 +40,9 @@ function directory(view) {
 function content(buffer, { start, size, deflated }) {
   const bytes = buffer.slice(start, start + size);
   if (!deflated) return bytes;
-  return new Response(new Blob([bytes]).stream().pipeThrough(new DecompressionStream("deflate-raw"))).arrayBuffer();
+  return new Response(
+    new Blob([bytes]).stream().pipeThrough(new DecompressionStream("deflate-raw")),
+  ).arrayBuffer();
 }
 
 function readNpy(buffer) {
@@ -49,7 +51,11 @@ function readNpy(buffer) {
   const start = (wide ? 12 : 10) + (wide ? view.getUint32(8, true) : view.getUint16(8, true));
   const header = new TextDecoder("latin1").decode(new Uint8Array(buffer, 10, start - 10));
   const type = /'descr': '([^']+)'/.exec(header)[1];
-  const shape = /'shape': \(([^)]*)\)/.exec(header)[1].split(",").filter((part) => part.trim()).map(Number);
+  const shape = /'shape': \(([^)]*)\)/
+    .exec(header)[1]
+    .split(",")
+    .filter((part) => part.trim())
+    .map(Number);
   if (!READERS[type]) throw new Error(`An array of type ${type} is none that this page reads.`);
   return { shape, data: READERS[type](buffer.slice(start)) };
 }

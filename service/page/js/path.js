@@ -30,7 +30,9 @@ export class Path {
     this.timeline = timeline;
     this.time = time;
     this.status = status;
-    const tell = () => { seconds.value = store.keyframes.length > 1 ? readable(this.seconds) : ""; };
+    const tell = () => {
+      seconds.value = store.keyframes.length > 1 ? readable(this.seconds) : "";
+    };
     store.on(["seconds", "keyframes", "loop", "beyond", "model"], tell);
     seconds.addEventListener("change", () => {
       const said = seconds.validity.valid && seconds.value !== "";
@@ -38,16 +40,26 @@ export class Path {
       tell();
     });
     easing.addEventListener("change", () => store.set({ easing: easing.value }));
-    store.on(["easing"], () => { easing.value = store.easing; });
+    store.on(["easing"], () => {
+      easing.value = store.easing;
+    });
     store.on(["keyframes", "loop", "beyond", "model", "fine", "hasFine"], () => this.#changed());
     store.on(["keyframes", "model"], () => this.#list());
     store.on(["playing"], () => this.#showPlaying());
     add.addEventListener("click", () => store.set({ keyframes: [...store.keyframes, store.code] }));
-    play.addEventListener("click", reporting(() => (store.playing ? this.pause() : this.#play())));
+    play.addEventListener(
+      "click",
+      reporting(() => (store.playing ? this.pause() : this.#play())),
+    );
     loop.addEventListener("change", () => store.set({ loop: loop.checked }));
-    store.on(["loop"], () => { loop.checked = store.loop; });
+    store.on(["loop"], () => {
+      loop.checked = store.loop;
+    });
     beyond.addEventListener("change", () => store.set({ beyond: Number(beyond.value) }));
-    timeline.addEventListener("input", reporting(() => this.#scrub(Number(timeline.value))));
+    timeline.addEventListener(
+      "input",
+      reporting(() => this.#scrub(Number(timeline.value))),
+    );
     timeline.addEventListener("change", () => this.pause());
   }
 
@@ -102,28 +114,35 @@ export class Path {
 
   #list() {
     const { keyframes, model } = this.store;
-    this.list.replaceChildren(...keyframes.map((code, i) => {
-      const item = clone("keyframe");
-      const name = `keyframe ${i + 1}`;
-      find(".number", item).textContent = i + 1;
-      const go = find("[data-do=go]", item);
-      go.setAttribute("aria-label", `Go to ${name}`);
-      go.addEventListener("click", () => this.store.set({ code: [...code] }));
-      const replace = find("[data-do=replace]", item);
-      replace.setAttribute("aria-label", `Take the shape as it is for ${name}`);
-      replace.addEventListener("click", () => this.store.set({ keyframes: keyframes.with(i, this.store.code) }));
-      const remove = find("[data-do=remove]", item);
-      remove.setAttribute("aria-label", `Remove ${name}`);
-      remove.addEventListener("click", () => this.store.set({ keyframes: keyframes.toSpliced(i, 1) }));
-      sharp(find("canvas", item), PICTURE);
-      this.#carry(item, i);
-      return item;
-    }));
+    this.list.replaceChildren(
+      ...keyframes.map((code, i) => {
+        const item = clone("keyframe");
+        const name = `keyframe ${i + 1}`;
+        find(".number", item).textContent = i + 1;
+        const go = find("[data-do=go]", item);
+        go.setAttribute("aria-label", `Go to ${name}`);
+        go.addEventListener("click", () => this.store.set({ code: [...code] }));
+        const replace = find("[data-do=replace]", item);
+        replace.setAttribute("aria-label", `Take the shape as it is for ${name}`);
+        replace.addEventListener("click", () =>
+          this.store.set({ keyframes: keyframes.with(i, this.store.code) }),
+        );
+        const remove = find("[data-do=remove]", item);
+        remove.setAttribute("aria-label", `Remove ${name}`);
+        remove.addEventListener("click", () => this.store.set({ keyframes: keyframes.toSpliced(i, 1) }));
+        sharp(find("canvas", item), PICTURE);
+        this.#carry(item, i);
+        return item;
+      }),
+    );
     if (keyframes.length === 0) return;
-    api.shapes(model, keyframes, "coarse").then(({ shapes }) => {
-      if (this.store.keyframes !== keyframes) return;
-      this.list.querySelectorAll("canvas").forEach((canvas, i) => this.pictures.draw(canvas, shapes[i]));
-    }).catch(report);
+    api
+      .shapes(model, keyframes, "coarse")
+      .then(({ shapes }) => {
+        if (this.store.keyframes !== keyframes) return;
+        this.list.querySelectorAll("canvas").forEach((canvas, i) => this.pictures.draw(canvas, shapes[i]));
+      })
+      .catch(report);
   }
 
   /** Have an item of the list go to another place, by hand and by keys. */
@@ -133,9 +152,15 @@ export class Path {
       this.#carried = i;
       dataTransfer.setData("text/plain", `keyframe ${i + 1}`); // or some browsers drag nothing
     });
-    item.addEventListener("dragend", () => { this.#carried = null; });
-    item.addEventListener("dragover", (event) => { if (this.#carried !== null) event.preventDefault(); });
-    item.addEventListener("drop", () => { if (this.#carried !== null) this.#move(this.#carried, i); });
+    item.addEventListener("dragend", () => {
+      this.#carried = null;
+    });
+    item.addEventListener("dragover", (event) => {
+      if (this.#carried !== null) event.preventDefault();
+    });
+    item.addEventListener("drop", () => {
+      if (this.#carried !== null) this.#move(this.#carried, i);
+    });
     item.addEventListener("keydown", (event) => {
       const by = { ArrowLeft: -1, ArrowRight: 1 }[event.key];
       if (!event.altKey || !by) return;
@@ -148,7 +173,10 @@ export class Path {
     const { against, keyframes } = this.store;
     if (!keyframes[to] || from === to) return;
     const order = [...keyframes.keys()].toSpliced(from, 1).toSpliced(to, 0, from);
-    this.store.set({ keyframes: order.map((i) => keyframes[i]), against: order.indexOf(against) });
+    this.store.set({
+      keyframes: order.map((i) => keyframes[i]),
+      against: against < 0 ? against : order.indexOf(against),
+    });
     find(`li:nth-child(${to + 1}) [data-do=go]`, this.list).focus();
   }
 
@@ -177,7 +205,10 @@ export class Path {
     }
   }
 
-  /** The path for a video: how long it takes, and what shows the shape at a share of it until somebody else plays. */
+  /**
+   * The path for a video: how long it takes, and what shows the shape at a share of it until somebody else
+   * plays.
+   */
   async film() {
     this.pause();
     await this.#load();

@@ -1,7 +1,17 @@
 /** Small pictures of shapes, all drawn by one renderer outside the page. */
 
 import * as THREE from "three";
-import { face, frame, geometryOf, litCamera, move, paint, sideOf, sphereOf, surfaceMaterial } from "./scene.js";
+import {
+  face,
+  frame,
+  geometryOf,
+  litCamera,
+  move,
+  paint,
+  sideOf,
+  sphereOf,
+  surfaceMaterial,
+} from "./scene.js";
 
 const LEAST = 0.36; // of the whole shape's radius, so that one sees where a part is
 

@@ -16,7 +16,10 @@ export class Pins {
     this.clear = clear;
     store.on(["pins"], () => this.#show());
     viewer.canvas.addEventListener("drawn", () => this.#place());
-    clear.addEventListener("click", () => { store.set({ pins: [] }); find("#pull").focus(); });
+    clear.addEventListener("click", () => {
+      store.set({ pins: [] });
+      find("#pull").focus();
+    });
   }
 
   #show() {
@@ -28,7 +31,11 @@ export class Pins {
   }
 
   #add(i) {
-    const button = element("button", { type: "button", className: "pin", title: "Drag to pull on, press to remove" });
+    const button = element("button", {
+      type: "button",
+      className: "pin",
+      title: "Drag to pull on, press to remove",
+    });
     button.setAttribute("aria-label", `Remove pin ${i + 1}`);
     let from = null;
     button.addEventListener("pointerdown", (event) => {
@@ -42,7 +49,9 @@ export class Pins {
       const moved = detail > 0 && from && Math.hypot(clientX - from.clientX, clientY - from.clientY) > STILL;
       if (!moved) this.#remove(i);
     });
-    button.addEventListener("keydown", ({ key }) => { if (["Delete", "Backspace"].includes(key)) this.#remove(i); });
+    button.addEventListener("keydown", ({ key }) => {
+      if (["Delete", "Backspace"].includes(key)) this.#remove(i);
+    });
     this.#buttons.push(button);
     this.layer.append(button);
   }

@@ -6,8 +6,8 @@ import { nearest } from "./modes.js";
 const at = (positions, vertex) => new Vector3().fromArray(positions, 3 * vertex);
 
 /**
- * Every mesh that the server answers is aligned to its own reference, over its own vertices, which are denser here than
- * there. Shown one after the other, the coarse and the fine shape of one code would jump.
+ * Every mesh that the server answers is aligned to its own reference, over its own vertices, which are denser
+ * here than there. Shown one after the other, the coarse and the fine shape of one code would jump.
  */
 export class Pose {
   #coarse;
@@ -17,7 +17,8 @@ export class Pose {
   constructor(coarse, fine) {
     const farthest = (distance) => {
       let best = 0;
-      for (let v = 1; v < coarse.length / 3; v += 1) if (distance(at(coarse, v)) > distance(at(coarse, best))) best = v;
+      for (let v = 1; v < coarse.length / 3; v += 1)
+        if (distance(at(coarse, v)) > distance(at(coarse, best))) best = v;
       return best;
     };
     const a = farthest((x) => x.distanceTo(at(coarse, 0)));

@@ -1,4 +1,6 @@
-/** Edits the shape by pulling at vertices: each stays pinned, and the server finds the code that follows best. */
+/**
+ * Edits the shape by pulling at vertices: each stays pinned, and the server finds the code that follows best.
+ */
 
 import { Matrix4, Vector3 } from "three";
 import * as api from "./api.js";
@@ -54,7 +56,8 @@ export class Pull {
     const { shape, code, playing } = this.store;
     if (playing || !shape) return;
     const { mesh, motion, placement, positions } = shape;
-    const there = (placement ?? new Matrix4()).clone().multiply(motion); // from where the server has the shape
+    // From where the server has the shape
+    const there = (placement ?? new Matrix4()).clone().multiply(motion);
     const before = { code, placement: this.store.placement };
     this.#held = { pin, mesh, motion, there, positions, pointer: event.pointerId, before };
     this.#last = this.#held;
@@ -105,13 +108,16 @@ export class Pull {
   #targets(pins, mesh, there) {
     const back = there.clone().invert();
     const { references } = this.store;
-    const found = new Map(pins.map((pin) => {
-      const on = (name) => references[name].vertices;
-      const vertex = pin.mesh === mesh || !references.fine
-        ? pin.vertex
-        : nearest(on(pin.mesh).subarray(3 * pin.vertex, 3 * pin.vertex + 3), on(mesh))[0];
-      return [vertex, pin.position.clone().applyMatrix4(back).toArray()];
-    }));
+    const found = new Map(
+      pins.map((pin) => {
+        const on = (name) => references[name].vertices;
+        const vertex =
+          pin.mesh === mesh || !references.fine
+            ? pin.vertex
+            : nearest(on(pin.mesh).subarray(3 * pin.vertex, 3 * pin.vertex + 3), on(mesh))[0];
+        return [vertex, pin.position.clone().applyMatrix4(back).toArray()];
+      }),
+    );
     return [...found].map(([vertex, position]) => ({ vertex, position }));
   }
 
@@ -125,7 +131,10 @@ export class Pull {
     this.store.set({ moving: false });
     if (!this.#answer) return;
     const { distances, follows } = this.#answer;
-    const { references: { coarse }, locked } = this.store;
+    const {
+      references: { coarse },
+      locked,
+    } = this.store;
     this.#answer = null;
     const shares = distances.map((distance) => distance / diagonalOf(coarse.vertices));
     const missed = shares.filter((share) => share > MET);
@@ -135,16 +144,21 @@ export class Pull {
       say(`The shape has followed: it is ${far} from where you pulled it.`, { key: "pull" });
       return;
     }
-    const which = shares.length === 1 ? "The pin was not met" : `${missed.length} of ${shares.length} pins were not met`;
+    const which =
+      shares.length === 1 ? "The pin was not met" : `${missed.length} of ${shares.length} pins were not met`;
     const why = locked.some(Boolean)
       ? "Unlock coordinates that move this place, or pull less."
       : "Pull less, or remove a pin.";
-    say(`${which}: the shape stays ${far} away${follows ? "" : ", and was left as it was"}. ${why}`, { key: "pull" });
+    say(`${which}: the shape stays ${far} away${follows ? "" : ", and was left as it was"}. ${why}`, {
+      key: "pull",
+    });
   }
 }
 
 /** How far each target is from its vertex among positions (3V numbers). */
-const awayFrom = (targets, positions) => targets.map(({ vertex, position }) =>
-  new Vector3().fromArray(positions, 3 * vertex).distanceTo(new Vector3(...position)));
+const awayFrom = (targets, positions) =>
+  targets.map(({ vertex, position }) =>
+    new Vector3().fromArray(positions, 3 * vertex).distanceTo(new Vector3(...position)),
+  );
 
 const rootMeanSquare = (values) => Math.hypot(...values) / Math.sqrt(values.length);

@@ -31,12 +31,16 @@ export function litCamera() {
 const slope = (camera) => Math.tan((camera.fov * Math.PI) / 360);
 
 /** How far a camera must be from a sphere to have it in view. */
-const distanceOf = (camera, { radius }) => radius / Math.sin(Math.atan(slope(camera) * Math.min(camera.aspect, 1)));
+const distanceOf = (camera, { radius }) =>
+  radius / Math.sin(Math.atan(slope(camera) * Math.min(camera.aspect, 1)));
 
-/** How far it must be to have positions (3V numbers) in the width of its view and in a share of its height. */
+/**
+ * How far it must be to have positions (3V numbers) in the width of its view and in a share of its height.
+ */
 export function distanceTo(camera, positions, center, share) {
-  const back = new THREE.Quaternion().setFromRotationMatrix(
-    new THREE.Matrix4().lookAt(VIEW, new THREE.Vector3(), camera.up)).invert();
+  const back = new THREE.Quaternion()
+    .setFromRotationMatrix(new THREE.Matrix4().lookAt(VIEW, new THREE.Vector3(), camera.up))
+    .invert();
   const high = slope(camera) * share;
   const wide = slope(camera) * camera.aspect;
   const point = new THREE.Vector3();
@@ -62,16 +66,21 @@ export function sphereOf(positions) {
   const center = box.getCenter(new THREE.Vector3());
   let squared = 0;
   for (let i = 0; i < positions.length; i += 3) {
-    squared = Math.max(squared, center.distanceToSquared({ x: positions[i], y: positions[i + 1], z: positions[i + 2] }));
+    squared = Math.max(
+      squared,
+      center.distanceToSquared({ x: positions[i], y: positions[i + 1], z: positions[i + 2] }),
+    );
   }
   return new THREE.Sphere(center, Math.sqrt(squared));
 }
 
 /** Of the box around positions (3V numbers). */
-export const diagonalOf = (positions) => new THREE.Box3().setFromArray(positions).getSize(new THREE.Vector3()).length();
+export const diagonalOf = (positions) =>
+  new THREE.Box3().setFromArray(positions).getSize(new THREE.Vector3()).length();
 
 /**
- * The side of faces to draw: of closed surfaces the outer one, as the inner would shine through along silhouettes.
+ * The side of faces to draw: of closed surfaces the outer one, as the inner would shine through along
+ * silhouettes.
  * @param {ArrayLike<number>} faces
  * @param {number} vertexCount
  */

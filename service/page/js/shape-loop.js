@@ -1,11 +1,12 @@
 /**
- * Keeps the shape shown abreast of the code: a draft as it moves, the full shape when it rests, both on one mesh.
+ * Keeps the shape shown abreast of the code: a draft as it moves, the full shape when it rests, both on one
+ * mesh.
  *
- * One request is under way at a time; what is asked for meanwhile supersedes what waited, so nothing queues. A full
- * shape on its way is dropped as soon as the code moves on, and so is a draft that takes too long. A draft that is
- * quick is let finish: dropping it for each pixel of a drag would show nothing until the hand rests. Where the server
- * has answered a draft by the full shape, nothing more is asked for. From a draft to its full shape vertices move in steps
- * of a pixel, so that nothing jumps.
+ * One request is under way at a time; what is asked for meanwhile supersedes what waited, so nothing queues.
+ * A full shape on its way is dropped as soon as the code moves on, and so is a draft that takes too long. A
+ * draft that is quick is let finish: dropping it for each pixel of a drag would show nothing until the hand
+ * rests. Where the server has answered a draft by the full shape, nothing more is asked for. From a draft to
+ * its full shape vertices move in steps of a pixel, so that nothing jumps.
  */
 
 import { Matrix4 } from "three";
@@ -22,9 +23,9 @@ const MOST = 24; // steps
 export const meshOf = ({ fine, hasFine }) => (fine && hasFine ? "fine" : "coarse");
 
 /**
- * The motion (Matrix4) from where the server has a shape to where it is shown. Each mesh is aligned over its own
- * vertices, so that the fine and the coarse shape of one code lie a few degrees apart: fine ones are shown where they
- * are, and coarse ones in their place, as far as that was known when the mesh was changed.
+ * The motion (Matrix4) from where the server has a shape to where it is shown. Each mesh is aligned over its
+ * own vertices, so that the fine and the coarse shape of one code lie a few degrees apart: fine ones are
+ * shown where they are, and coarse ones in their place, as far as that was known when the mesh was changed.
  */
 export function motionOf({ shape, pose }, mesh, code, positions) {
   if (mesh === "fine" || !shape?.motion || !pose) return new Matrix4();
@@ -44,7 +45,10 @@ export function* between(draft, full) {
   for (let k = 1; k < steps; k += 1) yield draft.map((x, i) => x + (k / steps) * (full[i] - x));
 }
 
-const nextPicture = () => new Promise((resolve) => { requestAnimationFrame(resolve); });
+const nextPicture = () =>
+  new Promise((resolve) => {
+    requestAnimationFrame(resolve);
+  });
 
 export class ShapeLoop {
   #wanted = null;
@@ -55,13 +59,16 @@ export class ShapeLoop {
   constructor(store) {
     this.store = store;
     store.on(["code", "model"], () => this.#moved());
-    store.on(["fine", "hasFine"], () => { if (this.store.shape?.mesh !== meshOf(this.store)) this.#moved(); });
+    store.on(["fine", "hasFine"], () => {
+      if (this.store.shape?.mesh !== meshOf(this.store)) this.#moved();
+    });
   }
 
   #moved() {
     if (this.store.playing || !this.store.model) return;
     const current = this.#current;
-    if (current && (current.quality === "full" || performance.now() - current.began > TOO_LONG)) current.abort.abort();
+    if (current && (current.quality === "full" || performance.now() - current.began > TOO_LONG))
+      current.abort.abort();
     clearTimeout(this.#timer);
     this.#want("draft");
   }
@@ -116,7 +123,8 @@ export class ShapeLoop {
       for (const positions of between(before.positions, shape.positions)) {
         this.store.set({ shape: { ...before, positions } });
         await nextPicture();
-        if (this.store.code !== shape.code || this.store.playing || this.store.shape?.mesh !== shape.mesh) return;
+        if (this.store.code !== shape.code || this.store.playing || this.store.shape?.mesh !== shape.mesh)
+          return;
       }
     }
     // How long it takes to settle is no part of how long it took to come.
@@ -124,8 +132,14 @@ export class ShapeLoop {
   }
 
   async #untilReady(asked) {
-    say("The server does not answer. The shape comes back as soon as it does.", { kind: "error", key: "offline" });
-    do await new Promise((resolve) => { setTimeout(resolve, 500); });
+    say("The server does not answer. The shape comes back as soon as it does.", {
+      kind: "error",
+      key: "offline",
+    });
+    do
+      await new Promise((resolve) => {
+        setTimeout(resolve, 500);
+      });
     while (!(await api.ready()));
     takeBack("offline");
     say("The server is back.");

@@ -1,4 +1,6 @@
-/** The surface as the model's files have it: materials and textures, on vertices that are split along seams. */
+/**
+ * The surface as the model's files have it: materials and textures, on vertices that are split along seams.
+ */
 
 import * as THREE from "three";
 
@@ -14,10 +16,14 @@ export class Skin {
       const { bufferView, count, type } = tree.accessors[index];
       return new Type(buffer, start + tree.bufferViews[bufferView].byteOffset, count * WIDTH[type]);
     };
-    const pictures = await Promise.all(tree.images.map(({ bufferView, mimeType }) => {
-      const { byteOffset, byteLength } = tree.bufferViews[bufferView];
-      return createImageBitmap(new Blob([new Uint8Array(buffer, start + byteOffset, byteLength)], { type: mimeType }));
-    }));
+    const pictures = await Promise.all(
+      tree.images.map(({ bufferView, mimeType }) => {
+        const { byteOffset, byteLength } = tree.bufferViews[bufferView];
+        return createImageBitmap(
+          new Blob([new Uint8Array(buffer, start + byteOffset, byteLength)], { type: mimeType }),
+        );
+      }),
+    );
     return new Skin(tree, array, pictures);
   }
 
@@ -25,16 +31,20 @@ export class Skin {
     const { primitives } = tree.meshes[0];
     const { attributes } = primitives[0];
     const count = tree.accessors[attributes.POSITION].count;
-    this.rows = attributes._VERTEX === undefined
-      ? Array.from({ length: count }, (_, k) => k)
-      : array(attributes._VERTEX, Float32Array);
+    this.rows =
+      attributes._VERTEX === undefined
+        ? Array.from({ length: count }, (_, k) => k)
+        : array(attributes._VERTEX, Float32Array);
     this.geometry = new THREE.BufferGeometry();
     for (const name of ["position", "normal"]) {
       const values = new THREE.BufferAttribute(new Float32Array(3 * count), 3);
       this.geometry.setAttribute(name, values.setUsage(THREE.DynamicDrawUsage));
     }
     if (attributes.TEXCOORD_0 !== undefined) {
-      this.geometry.setAttribute("uv", new THREE.BufferAttribute(array(attributes.TEXCOORD_0, Float32Array), 2));
+      this.geometry.setAttribute(
+        "uv",
+        new THREE.BufferAttribute(array(attributes.TEXCOORD_0, Float32Array), 2),
+      );
     }
     const parts = primitives.map(({ indices }) => array(indices, Uint32Array));
     const index = new Uint32Array(parts.reduce((sum, part) => sum + part.length, 0));
@@ -55,10 +65,15 @@ export class Skin {
       const { pbrMetallicRoughness: look, alphaMode } = tree.materials[material];
       const [red, green, blue, opacity] = look.baseColorFactor;
       return new THREE.MeshStandardMaterial({
-        color: new THREE.Color(red, green, blue), opacity, transparent: alphaMode === "BLEND",
-        roughness: look.roughnessFactor, metalness: look.metallicFactor,
+        color: new THREE.Color(red, green, blue),
+        opacity,
+        transparent: alphaMode === "BLEND",
+        roughness: look.roughnessFactor,
+        metalness: look.metallicFactor,
         map: look.baseColorTexture ? this.textures[tree.textures[look.baseColorTexture.index].source] : null,
-        polygonOffset: true, polygonOffsetFactor: 1, polygonOffsetUnits: 1,
+        polygonOffset: true,
+        polygonOffsetFactor: 1,
+        polygonOffsetUnits: 1,
       });
     });
   }

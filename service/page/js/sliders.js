@@ -35,29 +35,36 @@ export class Sliders {
   #build() {
     const { model, space } = this.store;
     this.#rows = [];
-    this.list.replaceChildren(...model.factors.map((factor, j) => {
-      const group = clone("factor");
-      const rows = [];
-      for (let k = factor.start; k < factor.stop; k += 1) rows.push(this.#row(k));
-      find(".rows", group).append(...rows);
-      find("details", group).open = j === 0 || model.latent_dimension <= FEW;
-      sharp(find("summary canvas", group), PICTURE);
-      find(":scope > [data-do=reset]", group).addEventListener("click", () => {
-        this.#change(this.store.code.map((value, k) => (k >= factor.start && k < factor.stop ? space.home[k] : value)));
-      });
-      const light = (on) => () => this.store.set({ highlight: on ? j : null });
-      group.addEventListener("pointerenter", light(true));
-      group.addEventListener("pointerleave", light(false));
-      group.addEventListener("focusin", light(true));
-      group.addEventListener("focusout", light(false));
-      return group;
-    }));
+    this.list.replaceChildren(
+      ...model.factors.map((factor, j) => {
+        const group = clone("factor");
+        const rows = [];
+        for (let k = factor.start; k < factor.stop; k += 1) rows.push(this.#row(k));
+        find(".rows", group).append(...rows);
+        find("details", group).open = j === 0 || model.latent_dimension <= FEW;
+        sharp(find("summary canvas", group), PICTURE);
+        find(":scope > [data-do=reset]", group).addEventListener("click", () => {
+          this.#change(
+            this.store.code.map((value, k) => (k >= factor.start && k < factor.stop ? space.home[k] : value)),
+          );
+        });
+        const light = (on) => () => this.store.set({ highlight: on ? j : null });
+        group.addEventListener("pointerenter", light(true));
+        group.addEventListener("pointerleave", light(false));
+        group.addEventListener("focusin", light(true));
+        group.addEventListener("focusout", light(false));
+        return group;
+      }),
+    );
     this.#show();
   }
 
   /** Say what everything is called. */
   #label() {
-    const { names: { factors, labels, coordinates }, space } = this.store;
+    const {
+      names: { factors, labels, coordinates },
+      space,
+    } = this.store;
     this.list.querySelectorAll(".factor").forEach((group, j) => {
       find("h2", group).textContent = factors[j];
       find(":scope > [data-do=reset]", group).setAttribute("aria-label", `Reset all of ${factors[j]}`);
@@ -90,17 +97,23 @@ export class Sliders {
     slider.style.setProperty("--low", percent(space.lower[k]));
     slider.style.setProperty("--high", percent(space.upper[k]));
     slider.style.setProperty("--home", percent(space.home[k]));
-    slider.title = `Training data from ${readable(space.lower[k])} to ${readable(space.upper[k])}`
-      + (space.period[k] ? `, period ${readable(space.period[k])}` : "");
+    slider.title =
+      `Training data from ${readable(space.lower[k])} to ${readable(space.upper[k])}` +
+      (space.period[k] ? `, period ${readable(space.period[k])}` : "");
 
     slider.addEventListener("pointerdown", () => {
       this.#held = true;
       this.store.set({ moving: true });
     });
     slider.addEventListener("input", () => this.#set(k, Number(slider.value)));
-    slider.addEventListener("keydown", (event) => { this.#typed(event); this.#wrapAtTheEnd(event, k, slider); });
+    slider.addEventListener("keydown", (event) => {
+      this.#typed(event);
+      this.#wrapAtTheEnd(event, k, slider);
+    });
     slider.addEventListener("blur", () => this.#let());
-    box.addEventListener("input", () => { if (box.value !== "") this.#set(k, Number(box.value)); });
+    box.addEventListener("input", () => {
+      if (box.value !== "") this.#set(k, Number(box.value));
+    });
     box.addEventListener("change", () => this.#show());
     reset.addEventListener("click", () => this.#set(k, space.home[k]));
     lock.addEventListener("click", () => {
@@ -159,14 +172,17 @@ export class Sliders {
     if (!code || code.length !== this.#rows.length) return;
     this.#rows.forEach(({ root, slider, box, lock, controls }, k) => {
       if (Number(slider.value) !== code[k]) slider.value = code[k];
-      if (document.activeElement !== box || Number(box.value) !== code[k]) box.value = Number(code[k].toFixed(4));
+      if (document.activeElement !== box || Number(box.value) !== code[k])
+        box.value = Number(code[k].toFixed(4));
       root.classList.toggle("outside", !space.inside(k, code[k]));
       root.classList.toggle("locked", locked[k]);
       lock.setAttribute("aria-pressed", String(locked[k]));
       for (const control of controls) control.disabled = locked[k];
     });
     model.factors.forEach(({ start, stop }, j) => {
-      const moved = code.slice(start, stop).some((value, i) => Math.abs(value - space.home[start + i]) > 1e-4);
+      const moved = code
+        .slice(start, stop)
+        .some((value, i) => Math.abs(value - space.home[start + i]) > 1e-4);
       this.list.children[j].classList.toggle("moved", moved);
     });
   }

@@ -1,4 +1,7 @@
-/** The coordinates of a model's codes: bounds, periods, and the code at home. Mirrors what the server does with them. */
+/**
+ * The coordinates of a model's codes: bounds, periods, and the code at home. Mirrors what the server does
+ * with them.
+ */
 
 const mod = (a, n) => ((a % n) + n) % n;
 
@@ -51,7 +54,8 @@ export class LatentSpace {
   }
 }
 
-export const sameCode = (a, b) => a.length === b.length && a.every((value, k) => Math.abs(value - b[k]) < 1e-7);
+export const sameCode = (a, b) =>
+  a.length === b.length && a.every((value, k) => Math.abs(value - b[k]) < 1e-7);
 
 /** The locked coordinates of a code, as the server takes what is fixed. */
 export const fixedBy = (locked, code) =>

@@ -22,14 +22,21 @@ export class Stage extends THREE.Group {
     const flat = { transparent: true, depthWrite: false, toneMapped: false };
     const disc = new THREE.RingGeometry(0, 1, 64, 24);
     const { position } = disc.attributes;
-    const fade = Float32Array.from({ length: position.count }, (_, i) =>
-      1 - THREE.MathUtils.smoothstep(Math.hypot(position.getX(i), position.getY(i)), 0.25, 0.9));
-    const colours = Float32Array.from({ length: 4 * fade.length }, (_, i) => (i % 4 < 3 ? 1 : fade[(i - 3) / 4]));
+    const fade = Float32Array.from(
+      { length: position.count },
+      (_, i) => 1 - THREE.MathUtils.smoothstep(Math.hypot(position.getX(i), position.getY(i)), 0.25, 0.9),
+    );
+    const colours = Float32Array.from({ length: 4 * fade.length }, (_, i) =>
+      i % 4 < 3 ? 1 : fade[(i - 3) / 4],
+    );
     disc.setAttribute("color", new THREE.BufferAttribute(colours, 4));
     this.#disc = new THREE.Mesh(disc, new THREE.MeshBasicMaterial({ ...flat, vertexColors: true }));
     const map = new THREE.DataTexture(this.#alpha, CELLS, CELLS);
     map.magFilter = map.minFilter = THREE.LinearFilter;
-    this.#shadow = new THREE.Mesh(new THREE.PlaneGeometry(2, 2), new THREE.MeshBasicMaterial({ ...flat, map }));
+    this.#shadow = new THREE.Mesh(
+      new THREE.PlaneGeometry(2, 2),
+      new THREE.MeshBasicMaterial({ ...flat, map }),
+    );
     this.#disc.renderOrder = -2;
     this.#shadow.renderOrder = -1;
     this.add(this.#disc, this.#shadow);

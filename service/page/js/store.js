@@ -31,8 +31,9 @@
  * @property {number | null} seconds that the path takes, where somebody has said so
  * @property {"even" | "soft"} easing
  * @property {number | null} usual residual of the model's own shapes
- * @property {"none" | "stretch" | "bending"} colour
- * @property {number} against index of the keyframe that colours compare with; −1 for the mean
+ * @property {string} colour "none", "stretch", "bending" or "distance"
+ * @property {number} against index of the keyframe that colours compare with; −1 the mean, −2 `other`
+ * @property {number[] | null} other code of the shape beside, which is compared with
  * @property {number | null} highlight index of the factor that is pointed at
  * @property {Float32Array[] | null} regions weights of each factor at coarse vertices
  * @property {object | null} repaint new where colours have to be made again

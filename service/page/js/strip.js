@@ -24,15 +24,28 @@ export class Strip {
     const { codes, shapes, t } = await api.frames(model, { keyframes, frames: COLUMNS, mesh: "coarse" });
     const rows = [["all factors", null], ...model.factors.map((factor, j) => [names.factors[j], factor])];
     find("thead tr", this.table).replaceChildren(
-      element("td"), ...t.map((time) => element("th", { scope: "col", textContent: time.toFixed(2) })));
-    const made = rows.map(([name]) => element("tr", {},
-      element("th", { scope: "row", textContent: name }),
-      ...t.map(() => element("td", {}, sharp(element("canvas"), PICTURE)))));
+      element("td"),
+      ...t.map((time) => element("th", { scope: "col", textContent: time.toFixed(2) })),
+    );
+    const made = rows.map(([name]) =>
+      element(
+        "tr",
+        {},
+        element("th", { scope: "row", textContent: name }),
+        ...t.map(() => element("td", {}, sharp(element("canvas"), PICTURE))),
+      ),
+    );
     find("tbody", this.table).replaceChildren(...made);
     this.table.hidden = false;
     for (const [i, [, factor]] of rows.entries()) {
       const drawn = factor
-        ? (await api.shapes(model, codes.map((code) => space.alone(factor, code)), "coarse")).shapes
+        ? (
+            await api.shapes(
+              model,
+              codes.map((code) => space.alone(factor, code)),
+              "coarse",
+            )
+          ).shapes
         : shapes;
       if (this.store.keyframes !== keyframes || this.store.model !== model) return;
       made[i].querySelectorAll("canvas").forEach((canvas, k) => this.pictures.draw(canvas, drawn[k]));

@@ -1,6 +1,8 @@
 /** Lengths and angles of a mesh's edges, and how much they differ between two shapes. */
 
-/** What a mesh's faces say once for all: its edges, the faces beside them, and the edges around each vertex. */
+/**
+ * What a mesh's faces say once for all: its edges, the faces beside them, and the edges around each vertex.
+ */
 export class Surface {
   constructor(faces, vertexCount) {
     const known = new Map();

@@ -1,6 +1,9 @@
 import { here } from "./memory.js";
 
-/** Tabs by the pattern of the WAI-ARIA practices: one stop, arrows go between them. A reload keeps the one chosen. */
+/**
+ * Tabs by the pattern of the WAI-ARIA practices: one stop, arrows go between them. A reload keeps the one
+ * chosen.
+ */
 export function tabs(list) {
   const all = [...list.querySelectorAll("[role=tab]")];
   const select = (chosen) => {

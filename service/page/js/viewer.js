@@ -6,7 +6,18 @@
 
 import * as THREE from "three";
 import { OrbitControls } from "three/addons/OrbitControls.js";
-import { distanceTo, face, frame, geometryOf, litCamera, move, paint, sideOf, sphereOf, surfaceMaterial } from "./scene.js";
+import {
+  distanceTo,
+  face,
+  frame,
+  geometryOf,
+  litCamera,
+  move,
+  paint,
+  sideOf,
+  sphereOf,
+  surfaceMaterial,
+} from "./scene.js";
 import { Stage } from "./stage.js";
 
 const TURN = Math.PI / 24;
@@ -32,15 +43,29 @@ export class Viewer {
     this.materials = { surface: surfaceMaterial(), normals: new THREE.MeshNormalMaterial() };
     /** @type {THREE.Mesh<THREE.BufferGeometry, THREE.Material>} */
     this.mesh = new THREE.Mesh(new THREE.BufferGeometry(), this.materials.surface);
-    const wires = new THREE.MeshBasicMaterial({ wireframe: true, color: 0x1f2a37, transparent: true, opacity: 0.55 });
+    const wires = new THREE.MeshBasicMaterial({
+      wireframe: true,
+      color: 0x1f2a37,
+      transparent: true,
+      opacity: 0.55,
+    });
     this.wires = new THREE.Mesh(this.mesh.geometry, wires);
     // Lines lie on the surface: a little nearer to the eye they don't flicker.
-    Object.assign(this.materials.surface, { polygonOffset: true, polygonOffsetFactor: 1, polygonOffsetUnits: 1 });
-    Object.assign(this.materials.normals, { polygonOffset: true, polygonOffsetFactor: 1, polygonOffsetUnits: 1 });
+    Object.assign(this.materials.surface, {
+      polygonOffset: true,
+      polygonOffsetFactor: 1,
+      polygonOffsetUnits: 1,
+    });
+    Object.assign(this.materials.normals, {
+      polygonOffset: true,
+      polygonOffsetFactor: 1,
+      polygonOffsetUnits: 1,
+    });
     this.mesh.frustumCulled = this.wires.frustumCulled = false;
     // Not drawn while empty: three.js would take the lack of normals for flat shading, and keep to it.
     this.mesh.visible = this.wires.visible = false;
-    // Instead of the mesh where there are textures and no colours; what the mesh is, is still what one points at.
+    // Instead of the mesh where there are textures and no colours; what the mesh is, is still what one points
+    // at.
     this.skinned = new THREE.Mesh();
     this.skinned.frustumCulled = this.skinned.visible = false;
     this.stage = new Stage();
@@ -63,7 +88,8 @@ export class Viewer {
     this.skinned.visible = false;
     this.addMesh("coarse", reference);
     this.sphere = sphereOf(reference.vertices);
-    this.reference = reference.vertices;
+    this.reference = this.seen = reference.vertices;
+    this.middle = this.sphere.center;
     this.stage.open(this.sphere);
     this.side = sideOf(reference.faces, reference.vertices.length / 3);
     for (const material of Object.values(this.materials)) face(material, this.side);
@@ -132,17 +158,24 @@ export class Viewer {
   }
 
   resetView() {
-    frame(this.camera, this.sphere, this.#distance);
-    this.controls.target.copy(this.sphere.center);
+    frame(this.camera, { center: this.middle, radius: this.sphere.radius }, this.#distance);
+    this.controls.target.copy(this.middle);
     this.controls.minDistance = 0.2 * this.sphere.radius;
     this.controls.maxDistance = 20 * this.sphere.radius;
     this.controls.update();
     this.draw();
   }
 
-  /** From which the reference fills what is free of the picture. */
+  /** Have positions (3V numbers) in view beside the reference; null leaves it alone again. */
+  makeRoom(positions) {
+    this.seen = positions ? joined(this.reference, positions) : this.reference;
+    this.middle = sphereOf(this.seen).center;
+    this.resetView();
+  }
+
+  /** From which what is to be seen fills what is free of the picture. */
   get #distance() {
-    return ROOM * distanceTo(this.camera, this.reference, this.sphere.center, this.#share);
+    return ROOM * distanceTo(this.camera, this.seen, this.middle, this.#share);
   }
 
   /** Where the camera is and looks, as six numbers. */
@@ -195,7 +228,9 @@ export class Viewer {
   pick({ clientX, clientY }) {
     const box = this.canvas.getBoundingClientRect();
     const point = new THREE.Vector2(
-      ((clientX - box.left) / box.width) * 2 - 1, 1 - ((clientY - box.top) / box.height) * 2);
+      ((clientX - box.left) / box.width) * 2 - 1,
+      1 - ((clientY - box.top) / box.height) * 2,
+    );
     const caster = new THREE.Raycaster();
     caster.setFromCamera(point, this.camera);
     const hit = caster.intersectObject(this.mesh)[0];
@@ -204,7 +239,9 @@ export class Viewer {
     const at = (vertex) =>
       new THREE.Vector3().fromBufferAttribute(geometry.attributes.position, vertex).applyMatrix4(matrixWorld);
     const corners = [hit.face.a, hit.face.b, hit.face.c];
-    const vertex = corners.reduce((a, b) => (at(a).distanceTo(hit.point) <= at(b).distanceTo(hit.point) ? a : b));
+    const vertex = corners.reduce((a, b) =>
+      at(a).distanceTo(hit.point) <= at(b).distanceTo(hit.point) ? a : b,
+    );
     return { vertex, position: at(vertex) };
   }
 
@@ -219,7 +256,9 @@ export class Viewer {
     const box = this.canvas.getBoundingClientRect();
     const { z } = depth.clone().project(this.camera);
     return new THREE.Vector3(
-      ((clientX - box.left) / box.width) * 2 - 1, 1 - ((clientY - box.top) / box.height) * 2, z,
+      ((clientX - box.left) / box.width) * 2 - 1,
+      1 - ((clientY - box.top) / box.height) * 2,
+      z,
     ).unproject(this.camera);
   }
 
@@ -232,7 +271,11 @@ export class Viewer {
     this.renderer.setSize(width, height, false);
     // A smaller window must show as much: the distance follows.
     const { target } = this.controls;
-    if (before) this.camera.position.sub(target).multiplyScalar(this.#distance / before).add(target);
+    if (before)
+      this.camera.position
+        .sub(target)
+        .multiplyScalar(this.#distance / before)
+        .add(target);
     this.camera.updateProjectionMatrix();
     this.draw();
   }
@@ -260,4 +303,11 @@ export class Viewer {
     this.draw();
     this.canvas.dispatchEvent(new Event("turned"));
   }
+}
+
+function joined(a, b) {
+  const both = new Float32Array(a.length + b.length);
+  both.set(a);
+  both.set(b, a.length);
+  return both;
 }

@@ -5,9 +5,12 @@ import { diverging } from "../colours.js";
 import { matrixOf } from "../pose.js";
 import { sameCode } from "../space.js";
 
-const SIZE = 0.04; // of a point, as three.js has it, in the model's radius: about a hundredth of it in the picture
+// Of a point, as three.js has it, in the model's radius: about a hundredth of it in the picture
+const SIZE = 0.04;
 
-/** Shows `store.scan` while `store.ghost` is on; its colours are distances as long as its own shape is shown. */
+/**
+ * Shows `store.scan` while `store.ghost` is on; its colours are distances as long as its own shape is shown.
+ */
 export class Ghost {
   #scan = null;
 
@@ -38,7 +41,10 @@ export class Ghost {
     this.points.geometry = new THREE.BufferGeometry();
     const attribute = new THREE.Float32BufferAttribute(scan.used.positions.flat(), 3);
     this.points.geometry.setAttribute("position", attribute);
-    this.points.geometry.setAttribute("color", new THREE.BufferAttribute(new Float32Array(attribute.array.length), 3));
+    this.points.geometry.setAttribute(
+      "color",
+      new THREE.BufferAttribute(new Float32Array(attribute.array.length), 3),
+    );
     const there = matrixOf(scan.placement);
     this.points.matrix.copy(there).invert();
     this.points.updateMatrixWorld(true);
@@ -47,7 +53,13 @@ export class Ghost {
 
   #paint({ used, limit }, own) {
     const { color } = this.points.geometry.attributes;
-    if (own) color.array.set(diverging(used.distances.map((distance) => 2 * distance - limit), limit));
+    if (own)
+      color.array.set(
+        diverging(
+          used.distances.map((distance) => 2 * distance - limit),
+          limit,
+        ),
+      );
     else color.array.fill(0.25);
     color.needsUpdate = true;
   }

@@ -1,6 +1,7 @@
 /**
- * Files that become shapes. One with the model's vertices in their order has its code at once; any other is a scan,
- * which is fitted. A shape that doesn't fit never replaces that of the user, and to that there is a way back.
+ * Files that become shapes. One with the model's vertices in their order has its code at once; any other is a
+ * scan, which is fitted. A shape that doesn't fit never replaces that of the user, and to that there is a way
+ * back.
  */
 
 import * as api from "../api.js";
@@ -26,16 +27,26 @@ export class Reader {
     this.verdict = new Verdict(box, () => this.#leave());
     this.shown = find("#ghost", box);
     this.shown.addEventListener("change", () => store.set({ ghost: this.shown.checked }));
-    store.on(["ghost"], () => { this.shown.checked = store.ghost; });
-    store.on(["model"], () => { this.verdict.close(); this.#leave(); });
+    store.on(["ghost"], () => {
+      this.shown.checked = store.ghost;
+    });
+    store.on(["model"], () => {
+      this.verdict.close();
+      this.#leave();
+    });
     store.on(["code"], () => this.#offer());
-    input.addEventListener("change", () => { if (input.files[0]) this.read(input.files[0]); input.value = ""; });
+    input.addEventListener("change", () => {
+      if (input.files[0]) this.read(input.files[0]);
+      input.value = "";
+    });
     addEventListener("dragover", (event) => {
       if (!event.dataTransfer.types.includes("Files")) return;
       event.preventDefault();
       stage.classList.add("dropping");
     });
-    addEventListener("dragleave", (event) => { if (!event.relatedTarget) stage.classList.remove("dropping"); });
+    addEventListener("dragleave", (event) => {
+      if (!event.relatedTarget) stage.classList.remove("dropping");
+    });
     addEventListener("drop", (event) => {
       event.preventDefault();
       stage.classList.remove("dropping");
@@ -51,7 +62,11 @@ export class Reader {
       refuse("No model is there yet. Drop the file again when its shape is shown.");
     } else if (locked.every(Boolean)) {
       refuse("All coordinates are locked. Unlock those that may change, then choose the file again.");
-    } else if (this.readAs.value === "auto" && !this.ownScale.checked && !POINTS_ONLY.includes(formatOf(file))) {
+    } else if (
+      this.readAs.value === "auto" &&
+      !this.ownScale.checked &&
+      !POINTS_ONLY.includes(formatOf(file))
+    ) {
       await this.#encode(file);
     } else await this.#fit(file, this.#asked);
   }
@@ -61,7 +76,10 @@ export class Reader {
   }
 
   get #about() {
-    const { model, references: { fine, coarse } } = this.store;
+    const {
+      model,
+      references: { fine, coarse },
+    } = this.store;
     return { model: model.title, diagonal: diagonalOf((fine ?? coarse).vertices) };
   }
 
@@ -84,7 +102,12 @@ export class Reader {
     try {
       const options = { ...asked, used: true, fixed: JSON.stringify(fixedBy(locked, code)) };
       const answer = await api.fit(model, file, formatOf(file), options, signal);
-      const { distances: { scan: { p95 } }, placement } = answer;
+      const {
+        distances: {
+          scan: { p95 },
+        },
+        placement,
+      } = answer;
       const { diagonal: size } = this.#about;
       answer.limit = Math.max(p95, 1e-3 * size * placement.scale);
       this.#tell(file, answer, fitInWords(answer, { file: file.name, ...this.#about }), asked);
@@ -96,7 +119,10 @@ export class Reader {
 
   #begin(what) {
     this.#leave();
-    this.verdict.await(what, () => { this.verdict.close(); this.#leave(); });
+    this.verdict.await(what, () => {
+      this.verdict.close();
+      this.#leave();
+    });
     return this.#abort.signal;
   }
 
@@ -120,12 +146,15 @@ export class Reader {
     const words = ratio
       ? `It is about ${readable(Number(ratio))} times as large as the shapes of ${this.#about.model}.`
       : "Its size is another than that of the model's shapes.";
-    this.verdict.say({
-      how: "fair",
-      title: `${file.name} seems to be in other units`,
-      words: [words, "Nothing was changed. Its shape can be found all the same, with its size."],
-      more: [],
-    }, [["Fit it with its own scale", () => this.#fit(file, { ...asked, scale: "free" })]]);
+    this.verdict.say(
+      {
+        how: "fair",
+        title: `${file.name} seems to be in other units`,
+        words: [words, "Nothing was changed. Its shape can be found all the same, with its size."],
+        more: [],
+      },
+      [["Fit it with its own scale", () => this.#fit(file, { ...asked, scale: "free" })]],
+    );
   }
 
   #tell(file, answer, words, asked) {
@@ -133,10 +162,13 @@ export class Reader {
     answer.latent = space.wrapAll(answer.latent).map((value, k) => (locked[k] ? code[k] : value));
     const scan = answer.used ? answer : null;
     const tries = [];
-    const again = (label, change) => tries.push([label, () => this.#fit(file, { ...this.#asked, ...asked, ...change })]);
+    const again = (label, change) =>
+      tries.push([label, () => this.#fit(file, { ...this.#asked, ...asked, ...change })]);
     if (!scan) again("Fit it as a scan", {});
-    if (scan && words.how === "poor" && !asked.partial) again("Fit it as a part of a shape", { partial: true });
-    if (scan && words.how === "poor" && asked.scale !== "free") again("Fit it with its own scale", { scale: "free" });
+    if (scan && words.how === "poor" && !asked.partial)
+      again("Fit it as a part of a shape", { partial: true });
+    if (scan && words.how === "poor" && asked.scale !== "free")
+      again("Fit it with its own scale", { scale: "free" });
     const before = { code, placement };
     this.#found = { code: answer.latent, before, scan, tries };
     this.verdict.say(words, []);

@@ -1,4 +1,6 @@
-/** The box that says what came of a file, with what can be done about it; also while the answer is awaited. */
+/**
+ * The box that says what came of a file, with what can be done about it; also while the answer is awaited.
+ */
 
 import { gradient } from "../colours.js";
 import { element, find } from "../dom.js";
@@ -10,7 +12,10 @@ export class Verdict {
   constructor(box, leave) {
     this.box = box;
     find(".scale", box).style.backgroundImage = gradient;
-    find("[data-do=close]", box).addEventListener("click", () => { this.close(); leave(); });
+    find("[data-do=close]", box).addEventListener("click", () => {
+      this.close();
+      leave();
+    });
   }
 
   close() {
@@ -38,13 +43,17 @@ export class Verdict {
     find("h2", this.box).textContent = title;
     find(".words", this.box).replaceChildren(...words.map((textContent) => element("p", { textContent })));
     find("details", this.box).hidden = more.length === 0;
-    find("details div", this.box).replaceChildren(...more.map((textContent) => element("p", { textContent })));
+    find("details div", this.box).replaceChildren(
+      ...more.map((textContent) => element("p", { textContent })),
+    );
     this.offer(actions);
     this.scale(null);
   }
 
   offer(actions) {
-    const buttons = actions.map(([textContent, onclick]) => element("button", { type: "button", textContent, onclick }));
+    const buttons = actions.map(([textContent, onclick]) =>
+      element("button", { type: "button", textContent, onclick }),
+    );
     find(".actions", this.box).replaceChildren(...buttons);
   }
 

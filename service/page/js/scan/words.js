@@ -19,7 +19,8 @@ const FAIR = 0.03;
 /**
  * Of a mesh in correspondence.
  * @param {{residual: number, vertex_error: {mean: number, max: number}}} answer of `encode`
- * @param {{file: string, model: string, diagonal: number}} about the file's and the model's names, the model's diagonal
+ * @param {{file: string, model: string, diagonal: number}} about the file's and the model's names, the
+ *   model's diagonal
  * @returns {Verdict}
  */
 export function encodeInWords({ residual, vertex_error: error }, { file, model, diagonal }) {
@@ -34,9 +35,11 @@ export function encodeInWords({ residual, vertex_error: error }, { file, model, 
     how,
     title,
     words: [
-      `Its vertices are off by ${percent(off)} of the diagonal on average (${readable(error.mean)} units),`
-        + ` by ${percent(error.max / diagonal)} at most.`,
-      ...(how === "poor" ? [`${model} has nothing nearer that matches vertex by vertex. Your shape was left as it was.`] : []),
+      `Its vertices are off by ${percent(off)} of the diagonal on average (${readable(error.mean)} units),` +
+        ` by ${percent(error.max / diagonal)} at most.`,
+      ...(how === "poor"
+        ? [`${model} has nothing nearer that matches vertex by vertex. Your shape was left as it was.`]
+        : []),
     ],
     more: [`Lengths and angles are off by ${percent(residual)}.`],
   };
@@ -45,11 +48,20 @@ export function encodeInWords({ residual, vertex_error: error }, { file, model, 
 /**
  * Of a scan without correspondence.
  * @param {object} answer of `fit`
- * @param {{file: string, model: string, diagonal: number}} about the file's and the model's names, the model's diagonal
+ * @param {{file: string, model: string, diagonal: number}} about the file's and the model's names, the
+ *   model's diagonal
  * @returns {Verdict}
  */
 export function fitInWords(answer, { file, model, diagonal }) {
-  const { status, distances: { scan, model: back }, explained, seen, placement, mirrored, noise } = answer;
+  const {
+    status,
+    distances: { scan, model: back },
+    explained,
+    seen,
+    placement,
+    mirrored,
+    noise,
+  } = answer;
   const size = diagonal * placement.scale; // in the scan's units, as distances are
   const titles = {
     converged: ["good", `${model} explains ${file}`],
@@ -59,8 +71,8 @@ export function fitInWords(answer, { file, model, diagonal }) {
   };
   const [how, title] = titles[status] ?? ["fair", `The fit of ${file} ended as “${status}”`];
   const words = [
-    `Its points lie ${percent(scan.mean / size)} of the diagonal (${readable(scan.mean)} units) from the shape on`
-      + ` average, 95 % of them within ${percent(scan.p95 / size)}.`,
+    `Its points lie ${percent(scan.mean / size)} of the diagonal (${readable(scan.mean)} units) from the ` +
+      `shape on average, 95 % of them within ${percent(scan.p95 / size)}.`,
     `${percent(explained)} of the scan lie at the shape; the scan covers ${percent(seen)} of the shape.`,
   ];
   if (status === "ambiguous") words.push(`The server says: ${sentence(answer.reason)}`);
@@ -82,6 +94,7 @@ const sentence = (reason) => `${reason.split(/\.\s/)[0].replace(/\.$/, "")}.`;
 function place({ rotation: [[a], [, b], [, , c]], translation, scale }) {
   const angle = (180 / Math.PI) * Math.acos(Math.min(Math.max((a + b + c - 1) / 2, -1), 1));
   const to = translation.map((value) => readable(value).replace("-", "−")).join(", ");
-  const times = Math.abs(scale - 1) < 1e-6 ? "in the model's units" : `${readable(scale)} times the model's size`;
+  const times =
+    Math.abs(scale - 1) < 1e-6 ? "in the model's units" : `${readable(scale)} times the model's size`;
   return `In the file it is turned by ${angle.toFixed(0)}°, moved by (${to}), ${times}.`;
 }

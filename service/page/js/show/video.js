@@ -9,12 +9,15 @@ const REST = 200; // ms at the end, as the last pictures come late
 export function picture(viewer) {
   return viewer.opaquely(() => {
     viewer.render();
-    return new Promise((resolve) => { viewer.canvas.toBlob(resolve, "image/png"); });
+    return new Promise((resolve) => {
+      viewer.canvas.toBlob(resolve, "image/png");
+    });
   });
 }
 
 /**
- * A video of the stage, while `show` is called with shares (0 … 1) of its time; where that answers false it ends.
+ * A video of the stage, while `show` is called with shares (0 … 1) of its time; where that answers false it
+ * ends.
  * @returns {Promise<{blob: Blob, extension: string}>}
  */
 export function record(viewer, seconds, show) {
@@ -25,10 +28,14 @@ export function record(viewer, seconds, show) {
     const recorder = new MediaRecorder(stream, { mimeType: type, videoBitsPerSecond: BITS });
     const parts = [];
     recorder.addEventListener("dataavailable", ({ data }) => parts.push(data));
-    const stopped = new Promise((resolve) => { recorder.addEventListener("stop", resolve); });
+    const stopped = new Promise((resolve) => {
+      recorder.addEventListener("stop", resolve);
+    });
     recorder.start();
     await through(seconds, show);
-    await new Promise((resolve) => { setTimeout(resolve, REST); });
+    await new Promise((resolve) => {
+      setTimeout(resolve, REST);
+    });
     recorder.stop();
     await stopped;
     for (const track of stream.getTracks()) track.stop();

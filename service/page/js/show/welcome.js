@@ -1,4 +1,7 @@
-/** The first seconds: what this is, in a line, and moves of the shape along single coordinates until a hand comes. */
+/**
+ * The first seconds: what this is, in a line, and moves of the shape along single coordinates until a hand
+ * comes.
+ */
 
 import * as api from "../api.js";
 import { find } from "../dom.js";
@@ -34,7 +37,11 @@ export class Welcome {
     const touched = new AbortController();
     this.#touched = touched;
     for (const touch of TOUCHES) {
-      addEventListener(touch, () => touched.abort(), { capture: true, passive: true, signal: touched.signal });
+      addEventListener(touch, () => touched.abort(), {
+        capture: true,
+        passive: true,
+        signal: touched.signal,
+      });
     }
   }
 

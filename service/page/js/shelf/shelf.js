@@ -1,0 +1,110 @@
+/** Shapes that people keep by name in this browser, for each model. */
+
+import * as api from "../api.js";
+import { OTHER } from "../colouring.js";
+import { clone, find, sharp } from "../dom.js";
+import { always } from "../memory.js";
+import { report } from "../messages.js";
+import { sameCode } from "../space.js";
+
+const PICTURE = 64;
+const MOST = 50;
+const LONGEST = 60; // characters of a name
+const place = (model) => `shelf:${model.name}`;
+
+/** What is on a model's shelf; codes of versions with other coordinates are left out. */
+function kept(model) {
+  const isCode = (code) => code?.length === model.latent_dimension && code.every(Number.isFinite);
+  try {
+    const found = JSON.parse(always.kept(place(model)) ?? "[]");
+    return found.filter(({ name, code }) => typeof name === "string" && isCode(code)).slice(0, MOST);
+  } catch {
+    return [];
+  }
+}
+
+export class Shelf {
+  /** @type {{name: string, code: number[]}[]} */
+  #shapes = [];
+
+  /** @param {import("../store.js").Page} store */
+  constructor(store, pictures, { list, add }) {
+    this.store = store;
+    this.pictures = pictures;
+    this.list = list;
+    this.add = add;
+    add.addEventListener("click", () => {
+      const numbers = this.#shapes.map(({ name }) => Number(/^Shape (\d+)$/.exec(name)?.[1] ?? 0));
+      this.#put([...this.#shapes, { name: `Shape ${Math.max(0, ...numbers) + 1}`, code: store.code }]);
+      find("li:last-child input", list).select();
+    });
+    store.on(["model"], () => {
+      this.#shapes = kept(store.model);
+      this.#list();
+    });
+    store.on(["other"], () => this.#mark());
+  }
+
+  #put(shapes) {
+    this.#shapes = shapes;
+    always.keep(place(this.store.model), JSON.stringify(shapes));
+    this.#list();
+  }
+
+  #list() {
+    const { model } = this.store;
+    const shapes = this.#shapes;
+    this.add.disabled = shapes.length >= MOST;
+    this.list.replaceChildren(...shapes.map((shape, i) => this.#item(shape, i)));
+    this.#mark();
+    if (shapes.length === 0) return;
+    api
+      .shapes(
+        model,
+        shapes.map(({ code }) => code),
+        "coarse",
+      )
+      .then(({ shapes: drawn }) => {
+        if (this.#shapes !== shapes || this.store.model !== model) return;
+        this.list.querySelectorAll("canvas").forEach((canvas, i) => this.pictures.draw(canvas, drawn[i]));
+      })
+      .catch(report);
+  }
+
+  #item({ name, code }, i) {
+    const item = clone("kept");
+    const part = (what, says) => {
+      const found = find(`[data-do=${what}]`, item);
+      found.setAttribute("aria-label", `${says} ${name}`);
+      return found;
+    };
+    part("go", "Go to").addEventListener("click", () => this.store.set({ code: [...code] }));
+    part("compare", "Compare with").addEventListener("click", () => {
+      const { other } = this.store;
+      const off = other && sameCode(other, code);
+      this.store.set(off ? { other: null } : { other: code, against: OTHER });
+    });
+    part("remove", "Remove").addEventListener("click", () => {
+      this.#put(this.#shapes.toSpliced(i, 1));
+      (
+        find(`li:nth-child(${Math.min(i + 1, this.#shapes.length)}) [data-do=go]`, this.list) ?? this.add
+      ).focus();
+    });
+    const input = part("rename", "Name of");
+    Object.assign(input, { value: name, maxLength: LONGEST });
+    input.addEventListener("change", () => {
+      const said = input.value.trim();
+      if (said) this.#put(this.#shapes.with(i, { name: said, code }));
+      else input.value = name;
+    });
+    sharp(find("canvas", item), PICTURE);
+    return item;
+  }
+
+  #mark() {
+    const { other } = this.store;
+    this.list.querySelectorAll("[data-do=compare]").forEach((button, i) => {
+      button.setAttribute("aria-pressed", String(Boolean(other) && sameCode(other, this.#shapes[i].code)));
+    });
+  }
+}

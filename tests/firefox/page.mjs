@@ -1,0 +1,130 @@
+// The page in Firefox: `node page.mjs FIREFOX URL FOLDER`, with an empty folder for what it downloads.
+// Prints a line for each thing that a person does; exits 1 where one of them doesn't lead where it should.
+
+import { readdirSync, readFileSync } from "node:fs";
+import { join } from "node:path";
+import { setTimeout as sleep } from "node:timers/promises";
+import puppeteer from "puppeteer-core";
+
+const PATIENCE = 120_000; // ms; the machine may be busy with other things
+const [executablePath, url, folder] = process.argv.slice(2);
+
+const browser = await puppeteer.launch({
+  browser: "firefox",
+  executablePath,
+  headless: false, // headless it has no WebGL in software
+  extraPrefsFirefox: {
+    "webgl.force-enabled": true,
+    "browser.download.folderList": 2,
+    "browser.download.dir": folder,
+    "browser.helperApps.neverAsk.saveToDisk": "model/gltf-binary,application/octet-stream",
+    "ui.prefersReducedMotion": 1,
+  },
+});
+const page = await browser.newPage();
+const complaints = [];
+page.on("pageerror", (error) => complaints.push(error.message));
+page.on("console", (message) => message.type() === "error" && complaints.push(message.text()));
+
+async function eventually(what) {
+  for (const end = Date.now() + PATIENCE; Date.now() < end; await sleep(50)) {
+    const value = await what();
+    if (value) return value;
+  }
+  throw new Error(`it never came true: ${what}`);
+}
+
+const code = () =>
+  new URLSearchParams(new URL(page.url()).hash.slice(1)).get("z")?.split(",").map(Number) ?? [];
+const near = (a, b) => a.length === b.length && a.every((x, k) => Math.abs(x - b[k]) < 2e-3);
+const rests = () => page.$eval(".stage", (stage) => stage.dataset.quality === "full");
+const tab = (name) => page.click(`#to-${name}`);
+const picture = () => page.screenshot({ encoding: "base64" });
+
+async function slide(k, value) {
+  await page.evaluate(
+    (index, to) => {
+      const row = document.querySelectorAll(".coordinate")[index];
+      row.closest("details").open = true;
+      const slider = row.querySelector("input[type=range]");
+      slider.dispatchEvent(new PointerEvent("pointerdown", { bubbles: true }));
+      slider.value = to;
+      slider.dispatchEvent(new Event("input", { bubbles: true }));
+      slider.dispatchEvent(new PointerEvent("pointerup", { bubbles: true }));
+    },
+    k,
+    value,
+  );
+}
+
+async function downloaded(button) {
+  const before = new Set(readdirSync(folder));
+  await page.click(button);
+  const name = await eventually(() => {
+    const names = readdirSync(folder);
+    return !names.some((each) => each.endsWith(".part")) && names.find((each) => !before.has(each));
+  });
+  return join(folder, name);
+}
+
+let file;
+const STEPS = {
+  "the first shape": async () => {
+    await page.goto(url);
+    await eventually(rests);
+    const drawn = await page.$eval("#canvas", (canvas) => canvas.width * canvas.height > 0);
+    return drawn && (await page.$eval("#without", (section) => getComputedStyle(section).display === "none"));
+  },
+  "a slider moves the shape, and the address tells": async () => {
+    const before = await picture();
+    await slide(4, 0.9);
+    await eventually(() => Math.abs((code()[4] ?? 0) - 0.9) < 1e-2);
+    await eventually(rests);
+    return before !== (await picture());
+  },
+  "undo and redo": async () => {
+    const then = code();
+    await page.click("#undo");
+    await eventually(() => !near(code(), then));
+    await page.click("#redo");
+    return eventually(() => near(code(), then));
+  },
+  "the shape as GLB": async () => {
+    await tab("files");
+    file = await downloaded("#download");
+    return readFileSync(file).subarray(0, 4).toString() === "glTF";
+  },
+  "a file comes back as its code": async () => {
+    const then = code();
+    await tab("shape");
+    await page.click("#reset-all");
+    await eventually(() => !near(code(), then));
+    await tab("files");
+    await (await page.$("#mesh-file")).uploadFile(file);
+    return eventually(() => near(code(), then));
+  },
+  "a path plays": async () => {
+    await tab("path");
+    await page.click("#add-keyframe");
+    await page.click("#random");
+    await eventually(rests);
+    await page.click("#add-keyframe");
+    const before = await picture();
+    await page.click("#play");
+    return eventually(async () => before !== (await picture()));
+  },
+  "nothing complained": async () => !complaints.length,
+};
+
+let good = true;
+for (const [name, step] of Object.entries(STEPS)) {
+  const found = await step().catch((error) => {
+    console.log(error.message);
+    return false;
+  });
+  console.log(`${found ? "good" : "WRONG"}: ${name}`);
+  good &&= Boolean(found);
+}
+for (const complaint of complaints) console.log(complaint);
+await browser.close();
+process.exit(good ? 0 : 1);

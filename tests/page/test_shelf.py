@@ -1,0 +1,115 @@
+"""Shapes kept by name, and two shapes side by side."""
+
+from __future__ import annotations
+
+import httpx
+import numpy as np
+import pytest
+
+from shapespace.files.formats import read_arrays
+from tests.page.conftest import Open
+from tests.page.studio import Studio, difference
+
+
+def kept(studio: Studio) -> list[str]:
+    names: list[str] = studio["#shelf input"].evaluate_all("boxes => boxes.map((box) => box.value)")
+    return names
+
+
+def test_shapes_are_kept_by_name_for_each_model(window: Open) -> None:
+    studio = window().open("#model=with-fine&z=0.1,1,0.5")
+    studio["#keep-shape"].click()
+    studio.page.keyboard.type("Thin")  # the name is selected
+    studio.page.keyboard.press("Tab")
+    assert kept(studio) == ["Thin"]
+    studio.slide(0, -0.1)
+    studio.until_code([-0.1, 1, 0.5])
+    studio["#keep-shape"].click()
+    assert kept(studio) == ["Thin", "Shape 1"]
+    pictures = [studio["#shelf canvas.drawn"].nth(k) for k in range(2)]
+    first, second = (picture.evaluate("c => c.toDataURL()") for picture in pictures)
+    assert first != second
+
+    studio.page.get_by_role("button", name="Go to Thin").click()
+    studio.until_code([0.1, 1, 0.5])
+    studio["#undo"].click()
+    studio.until_code([-0.1, 1, 0.5])
+
+    studio.page.reload()
+    studio.rest()
+    assert kept(studio) == ["Thin", "Shape 1"]
+    studio["#shelf input"].first.fill(" ")
+    studio["#shelf input"].first.blur()
+    assert kept(studio)[0] == "Thin", "a name that is none"
+    studio.page.get_by_role("button", name="Remove Thin").click()
+    assert kept(studio) == ["Shape 1"]
+    assert studio.page.evaluate("document.activeElement.getAttribute('aria-label')") == "Go to Shape 1"
+
+    studio["#model"].select_option("figure")
+    studio.eventually(lambda: kept(studio) == [])
+    studio["#model"].select_option("with-fine")
+    studio.eventually(lambda: kept(studio) == ["Shape 1"])
+
+
+def test_a_shelf_that_was_spoilt_is_empty(window: Open) -> None:
+    studio = window()
+    studio.open("#model=with-fine")
+    for spoilt in ("{", "7", "null", '[{"name": 3, "code": [0, 0, 0]}, {"name": "a", "code": [1]}, null]'):
+        studio.page.evaluate("text => localStorage.setItem('shelf:with-fine', text)", spoilt)
+        studio.page.reload()
+        studio.rest()
+        assert kept(studio) == []
+    studio["#keep-shape"].click()
+    assert kept(studio) == ["Shape 1"]
+
+
+def test_two_shapes_beside_each_other(window: Open) -> None:
+    studio = window().open("#model=with-fine&z=0.2,1,0.5")
+    studio["#keep-shape"].click()
+    studio["#reset-all"].click()
+    studio.until_code([0, 0, 0])
+    studio.rest()
+    alone = studio.picture()
+    button = studio.page.get_by_role("button", name="Compare with Shape 1")
+    button.click()
+    assert button.get_attribute("aria-pressed") == "true"
+    both = studio.until_different(alone, 0.02)
+    half = both.shape[1] // 2
+    paper = np.median(both, axis=(0, 1))
+    for side in (both[:, :half], both[:, half:]):
+        assert (np.abs(side - paper).max(axis=2) > 40).mean() > 0.02, "a shape on each side"
+    studio.eventually(lambda: studio.hash.get("against") == "-2")
+
+    studio.tab("Colour")
+    assert studio["#against"].input_value() == "-2"
+    studio.page.get_by_label("distance").check()
+    studio.eventually(lambda: "diagonal" in (studio["#legend"].text_content() or ""))
+    told = studio["#legend .numbers"].text_content() or ""
+    most = float(told.rpartition("to +")[2].rstrip("%").strip())
+    assert most == pytest.approx(furthest(studio), rel=0.15)
+
+    studio.eventually(lambda: studio.hash.get("colour") == "distance")
+    address = studio.page.url
+    again = window().open(address.removeprefix(studio.url + "/"))
+    again.eventually(lambda: difference(studio.picture(), again.picture()) < 0.03)
+    assert again.hash["other"] == "0.2,1,0.5"
+    studio.page.get_by_label("nothing", exact=True).check()
+    studio.tab("Shape")
+    button.click()
+    studio["#canvas"].hover()
+    studio.eventually(lambda: difference(studio.picture(), alone) < 0.002)
+    assert studio["#against"].input_value() == "-1"
+
+
+def furthest(studio: Studio) -> float:
+    """Largest distance between the two shapes, in percent of the reference's diagonal, as the server has them."""
+
+    def vertices(*code: float) -> np.ndarray:
+        latent = ",".join(map(str, code))
+        query = {"format": "obj"} | ({"latent": latent} if latent else {})
+        answer = httpx.get(f"{studio.url}/v1/models/with-fine/mesh", params=query)
+        return read_arrays(answer.content, "obj")[0]
+
+    reference = vertices()
+    apart = np.linalg.norm(vertices(0, 0, 0) - vertices(0.2, 1, 0.5), axis=1).max()
+    return float(100 * apart / np.linalg.norm(np.ptp(reference, axis=0)))
