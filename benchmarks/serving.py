@@ -279,9 +279,7 @@ def growth(count: int) -> None:
             ("V", [(v, 20) for v in (500, 1000, 2000, 5000, 10_000, 20_000, 50_000)]),
             ("m", [(1000, m) for m in (4, 20, 40, 80)]),
         ):
-            print(
-                f"\nSynthetic capsules, growing {kind}; medians, ms. *Factor*: one of Gauss–Newton, as it is served.\n"
-            )
+            print(f"\nSynthetic capsules, growing {kind}; medians, ms. *Factor*: one of Gauss–Newton.\n")
             columns = (
                 "network",
                 "reconstruct (steps)",
@@ -318,9 +316,7 @@ def growth(count: int) -> None:
                 )
             grown = {"The sum": sums, "one factor": factors, "the sum without one factor": np.subtract(sums, factors)}
             laws = [f"{name} as {kind}^{np.polyfit(np.log(sizes), np.log(y), 1)[0]:.2f}" for name, y in grown.items()]
-            print(
-                f"\n{', '.join(laws)} (least squares in logarithms). Memory is of this process, other sizes' included."
-            )
+            print(f"\n{', '.join(laws)} (least squares in logarithms). Memory is this process's, all sizes so far.")
 
 
 def factor(model: ShapeModel) -> float:
@@ -461,13 +457,14 @@ def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parts = ("stages", "starts", "growth", "http")
-    parser.add_argument("parts", nargs="*", choices=[*parts, []], default=list(parts), help="default: all")
+    parser.add_argument("parts", nargs="*", choices=[*parts, []], default=[], help="default: all")
     parser.add_argument("--models", type=Path, default=Path("models"), help="folder of bundles")
     parser.add_argument("--more", type=Path, nargs="*", default=[], help="further ones, for stages only")
     parser.add_argument("--count", type=int, default=30, help="codes for each median")
     parser.add_argument("--seconds", type=float, default=60, help="how long sixteen clients ask")
     parser.add_argument("--page", action="store_true", help="write the page instead")
     arguments = parser.parse_args()
+    arguments.parts = arguments.parts or parts
     if not arguments.page:
         run(arguments)
         return

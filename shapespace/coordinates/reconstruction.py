@@ -33,8 +33,8 @@ REACH, LIFE = 1e-2, 16
 #: With an old factor, how long the last step may be, as a share of that with a new one: in the softest motions there is
 #: more left than it goes.
 OLD = 0.25
-#: Share by which diagonal entries are raised for a factor in single precision: ten times what rounding may take away.
-LIFT = 1e-6
+#: Share by which diagonal entries are raised for a factor in single precision: a few times what rounding takes away.
+LIFT = 2e-7
 #: Where Gauss–Newton stalls, damping as a share of each diagonal entry: the first, the factor by which it rises where a
 #: step fails and falls where one succeeds, and the largest. A step within the tolerance means a minimum only while the
 #: damping is not above the last number, which slows but the softest motions (the matrix of a torus of 2048 vertices
