@@ -12,6 +12,7 @@ from shapespace.coordinates.nric import NRICJacobian, nric
 from shapespace.coordinates.reconstruction import DEFAULT_ETA, Reconstructor
 from shapespace.mesh.rigid_motion import align, without_rigid_motion
 from shapespace.mesh.triangle_mesh import TriangleMesh
+from shapespace.solve.cholesky import NotPositiveDefiniteError
 from shapespace.solve.deadline import Deadline
 from shapespace.solve.outcome import Status
 from shapespace.training.collection.freaky_torus import FreakyTorus
@@ -255,6 +256,24 @@ def test_a_hopeless_target_ends_with_finite_vertices_and_no_claim(mesh, reconstr
     assert np.isfinite(found.vertices).all()
     # Equal lengths may well exist, even that large; a single one of them, or negative ones, don't.
     assert found.residual > 0.5 or kind == "all lengths"
+
+
+def test_shapes_end_within_the_tolerance_of_the_exact_solution(mesh, pose, reconstruct, target, rng):
+    for noise in 10 ** rng.uniform(-4, -2, 12):
+        noisy = target * (1 + noise * rng.standard_normal(len(target)))
+        found, exact = (reconstruct.from_guess(noisy, tolerance=tolerance) for tolerance in (2e-5, 1e-9))
+        assert found.converged
+        assert exact.converged
+        assert np.abs(align(found.vertices, exact.vertices) - exact.vertices).max() < 2e-5 * mesh.diagonal
+
+
+@pytest.mark.parametrize("precision", ["_single", "_double"])
+def test_where_single_precision_does_not_do_double_does(mesh, pose, reconstruct, target, monkeypatch, precision):
+    def refuse(_: object) -> None:
+        raise NotPositiveDefiniteError("refused")
+
+    monkeypatch.setattr(getattr(reconstruct, precision), "factorise", refuse)
+    assert_found(reconstruct(target, pose + 1e-3 * mesh.diagonal * np.sin(7 * pose)), pose, mesh)
 
 
 def test_a_target_of_nothing_does_not_converge(reconstruct, target):

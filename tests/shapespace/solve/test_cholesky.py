@@ -103,6 +103,23 @@ def test_several_right_hand_sides_at_once(backend, pattern, positive, rng):
         np.testing.assert_allclose(found, np.linalg.solve(dense, rows.T).T, rtol=1e-10, atol=1e-13)
 
 
+def test_single_precision_rounds_more_and_holds_less(backend, pattern, positive, rng):
+    entries, right = positive(), rng.standard_normal(40)
+    cholesky = analyse(pattern, backend, precision=np.float32)
+    found = cholesky.factorise(entries).solve(right)
+    assert found.dtype == np.float64
+    away = np.linalg.norm(pattern.matrix(entries) @ found - right) / np.linalg.norm(right)
+    assert 1e-9 < away < 1e-5
+    entries[0] = 1e39  # more than it can hold
+    with pytest.raises(NotPositiveDefiniteError, match="not finite"), np.errstate(over="ignore"):
+        cholesky.factorise(entries)
+    nearly = SymmetricPattern(2, np.array([0]), np.array([1]))
+    almost_singular = np.array([1.0, 1.0, 1 + 1e-9])
+    analyse(nearly, backend).factorise(almost_singular)
+    with pytest.raises(NotPositiveDefiniteError):
+        analyse(nearly, backend, precision=np.float32).factorise(almost_singular)
+
+
 @pytest.mark.parametrize("name", MESHES)
 def test_backends_agree_on_normal_matrices(name, rng):
     normal, entries, *_ = normal_matrix(name)
