@@ -438,7 +438,7 @@ def test_any_star_matches_nothing(client: httpx.Client) -> None:
     star = {"If-None-Match": "*"}
     assert client.post(f"{MODEL}/mesh", json={"latent": CODE}, headers=star).status_code == 200
     assert client.get(f"{MODEL}/mesh?latent=0.1,1e30,0.4", headers=star).status_code in {200, 422}
-    assert client.get(f"{MODEL}/mesh?latent=3.4e38,0,3.4e38", headers=star).status_code == 422
+    assert client.get(f"{MODEL}/mesh?latent=3.4e38,0,0", headers=star).status_code == 422
 
 
 def test_answers_are_what_they_say(client: httpx.Client) -> None:

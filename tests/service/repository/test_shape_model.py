@@ -90,9 +90,9 @@ def bundled(request: pytest.FixtureRequest) -> ShapeModel:
 
 
 def wide_codes(model: ShapeModel, count: int) -> np.ndarray:
-    """In a box 1.5 times as wide as the bounds."""
+    """In a box a quarter wider than the bounds: further out a few have two shapes that are as near."""
     centre, radius = (model.latents.upper + model.latents.lower) / 2, (model.latents.upper - model.latents.lower) / 2
-    offsets = 1.5 * radius * np.random.default_rng(6).uniform(-1, 1, (count, len(radius)))
+    offsets = 1.25 * radius * np.random.default_rng(6).uniform(-1, 1, (count, len(radius)))
     return model.latents.codes((centre + offsets).tolist())[0]
 
 
