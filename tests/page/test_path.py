@@ -169,7 +169,7 @@ def test_lengths_and_angles_in_the_page_are_those_of_the_server(studio: Studio) 
     from shapespace.mesh.triangle_mesh import TriangleMesh
 
     script = """async () => {
-        const [{ Surface }, api] = await Promise.all([import('/page/js/surface.js'), import('/page/js/api.js')]);
+        const [{ Surface }, api] = await Promise.all([import('/page/js/view/surface.js'), import('/page/js/server/api.js')]);
         const model = (await api.models()).find(({ name }) => name === 'with-fine');
         const { faces, vertices } = await api.reference(model, 'coarse');
         const { shapes: [x] } = await api.shapes(model, [[0.1, 1, 0.5]], 'coarse');

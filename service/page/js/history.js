@@ -1,6 +1,6 @@
 /** Undo and redo of codes, of where pulls left their shapes, and of pins: each rest of the hand is a step. */
 
-import { sameCode } from "./space.js";
+import { sameCode } from "./server/space.js";
 
 const LONGEST = 200;
 

@@ -1,35 +1,35 @@
 /** Puts the page together: one store, and everything that shows or changes what is in it. */
 
 import { fromHash, toHash } from "./address.js";
-import * as api from "./api.js";
-import { openCard } from "./card.js";
-import { Colouring } from "./colouring.js";
-import { inShort, inWords } from "./diagnostics.js";
 import { element, find, toggle } from "./dom.js";
-import { copy, Files } from "./files.js";
 import { History } from "./history.js";
 import { always, here } from "./memory.js";
 import { report, reporting, say } from "./messages.js";
-import { Modes } from "./modes.js";
-import { Names, namesOf } from "./names.js";
-import { Path } from "./path.js";
-import { Pictures } from "./pictures.js";
-import { Pins } from "./pins.js";
-import { Pose } from "./pose.js";
-import { Pull } from "./pull.js";
+import { Store } from "./store.js";
+import { tabs } from "./tabs.js";
+import { Path } from "./path/path.js";
+import { Strip } from "./path/strip.js";
 import { Ghost } from "./scan/ghost.js";
 import { Reader } from "./scan/reader.js";
-import { ShapeLoop } from "./shape-loop.js";
+import * as api from "./server/api.js";
+import { ShapeLoop } from "./server/shape-loop.js";
+import { LatentSpace } from "./server/space.js";
+import { openCard } from "./shape/card.js";
+import { inShort, inWords } from "./shape/diagnostics.js";
+import { Names, namesOf } from "./shape/names.js";
+import { Pins } from "./shape/pins.js";
+import { Pull } from "./shape/pull.js";
+import { Sliders } from "./shape/sliders.js";
 import { Beside } from "./shelf/beside.js";
 import { Shelf } from "./shelf/shelf.js";
+import { copy, Files } from "./show/files.js";
 import { Welcome } from "./show/welcome.js";
-import { Skin } from "./skin.js";
-import { Sliders } from "./sliders.js";
-import { LatentSpace } from "./space.js";
-import { Store } from "./store.js";
-import { Strip } from "./strip.js";
-import { tabs } from "./tabs.js";
-import { Viewer } from "./viewer.js";
+import { Colouring } from "./view/colouring.js";
+import { Modes } from "./view/modes.js";
+import { Pictures } from "./view/pictures.js";
+import { Pose } from "./view/pose.js";
+import { Skin } from "./view/skin.js";
+import { Viewer } from "./view/viewer.js";
 
 const PREFERRED = "figure";
 

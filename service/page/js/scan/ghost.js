@@ -1,9 +1,9 @@
 /** A scan as points over the shape, at the place where the fit has found it. */
 
 import * as THREE from "three";
-import { diverging } from "../colours.js";
-import { matrixOf } from "../pose.js";
-import { sameCode } from "../space.js";
+import { diverging } from "../view/colours.js";
+import { matrixOf } from "../view/pose.js";
+import { sameCode } from "../server/space.js";
 
 // Of a point, as three.js has it, in the model's radius: about a hundredth of it in the picture
 const SIZE = 0.04;

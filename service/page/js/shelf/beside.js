@@ -1,10 +1,10 @@
 /** Another shape beside the one of the sliders, to compare them. */
 
 import * as THREE from "three";
-import * as api from "../api.js";
+import * as api from "../server/api.js";
 import { report } from "../messages.js";
-import { VIEW, face, geometryOf, move, paint, surfaceMaterial } from "../scene.js";
-import { meshOf } from "../shape-loop.js";
+import { VIEW, face, geometryOf, move, paint, surfaceMaterial } from "../view/scene.js";
+import { meshOf } from "../server/shape-loop.js";
 
 const APART = 1.1; // of the reference's width, from middle to middle
 /** Across the view that shapes are seen from first, so that both are as near. */

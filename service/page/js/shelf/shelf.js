@@ -1,11 +1,11 @@
 /** Shapes that people keep by name in this browser, for each model. */
 
-import * as api from "../api.js";
-import { OTHER } from "../colouring.js";
+import * as api from "../server/api.js";
+import { OTHER } from "../view/colouring.js";
 import { clone, find, sharp } from "../dom.js";
 import { always } from "../memory.js";
 import { report } from "../messages.js";
-import { sameCode } from "../space.js";
+import { sameCode } from "../server/space.js";
 
 const PICTURE = 64;
 const MOST = 50;

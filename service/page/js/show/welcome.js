@@ -3,11 +3,11 @@
  * comes.
  */
 
-import * as api from "../api.js";
+import * as api from "../server/api.js";
 import { find } from "../dom.js";
 import { always } from "../memory.js";
-import { eased, showAt } from "../reel.js";
-import { meshOf } from "../shape-loop.js";
+import { eased, showAt } from "../path/reel.js";
+import { meshOf } from "../server/shape-loop.js";
 
 const MOVES = 3; // one in each of the first factors, which are the strongest
 const REACH = 0.8; // of the way to the bound

@@ -1,10 +1,10 @@
 /** Keyframes, the path through them, and its player. */
 
-import * as api from "./api.js";
-import { clone, find, readable, sharp } from "./dom.js";
-import { report, reporting } from "./messages.js";
+import * as api from "../server/api.js";
+import { clone, find, readable, sharp } from "../dom.js";
+import { report, reporting } from "../messages.js";
 import { eased, showAt } from "./reel.js";
-import { meshOf } from "./shape-loop.js";
+import { meshOf } from "../server/shape-loop.js";
 
 const PICTURE = 64;
 const SEGMENT = 24; // frames
@@ -20,7 +20,7 @@ export class Path {
   #clock = 0;
   #carried = null; // index of the keyframe that is dragged
 
-  /** @param {import("./store.js").Page} store */
+  /** @param {import("../store.js").Page} store */
   constructor(store, pictures, { list, add, play, loop, beyond, seconds, easing, timeline, time, status }) {
     this.store = store;
     this.pictures = pictures;

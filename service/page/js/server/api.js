@@ -2,7 +2,7 @@
  * The calls of the server that the page makes. Every failure becomes a Problem with a sentence for people.
  */
 
-import { here } from "./memory.js";
+import { here } from "../memory.js";
 import { readNpz } from "./npz.js";
 
 export const origin = new URL(".", document.baseURI).href.replace(/\/$/, "");

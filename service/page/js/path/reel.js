@@ -1,6 +1,6 @@
 /** Frames of a path as the server has answered them, shown at any time between them. */
 
-import { motionOf } from "./shape-loop.js";
+import { motionOf } from "../server/shape-loop.js";
 
 /** From 0 to 1, slow at both ends. */
 export const eased = (share) => share * share * (3 - 2 * share);

@@ -11,7 +11,7 @@
 
 import { Matrix4 } from "three";
 import * as api from "./api.js";
-import { report, say, takeBack } from "./messages.js";
+import { report, say, takeBack } from "../messages.js";
 
 const REST = 160; // ms without movement until the full shape is asked for
 const TOO_LONG = 400; // ms after which a draft is given up for a newer one
@@ -55,7 +55,7 @@ export class ShapeLoop {
   #current = null;
   #timer = 0;
 
-  /** @param {import("./store.js").Page} store */
+  /** @param {import("../store.js").Page} store */
   constructor(store) {
     this.store = store;
     store.on(["code", "model"], () => this.#moved());

@@ -1,13 +1,13 @@
 /** The elements of a path's factors: the whole shape along the path, and below it each factor alone. */
 
-import * as api from "./api.js";
-import { element, find, sharp } from "./dom.js";
+import * as api from "../server/api.js";
+import { element, find, sharp } from "../dom.js";
 
 const COLUMNS = 5;
 const PICTURE = 56;
 
 export class Strip {
-  /** @param {import("./store.js").Page} store */
+  /** @param {import("../store.js").Page} store */
   constructor(store, pictures, { button, table }) {
     this.store = store;
     this.pictures = pictures;

@@ -1,6 +1,6 @@
 /** A slider for each coordinate, grouped by factor. */
 
-import { clone, find, readable, sharp } from "./dom.js";
+import { clone, find, readable, sharp } from "../dom.js";
 
 const PICTURE = 44;
 const FEW = 8; // coordinates up to which all factors stand open
@@ -11,7 +11,7 @@ export class Sliders {
   #held = false; // whether a slider is being dragged, or moved by keys
   #timer = 0;
 
-  /** @param {import("./store.js").Page} store */
+  /** @param {import("../store.js").Page} store */
   constructor(store, list) {
     this.store = store;
     this.list = list;

@@ -1,9 +1,9 @@
 /** What colours the shape: the region of a factor, stretch, bending, or nothing. */
 
-import * as api from "./api.js";
+import * as api from "../server/api.js";
 import { diverging, gradient, tint } from "./colours.js";
-import { element, find, percentile, readable } from "./dom.js";
-import { report } from "./messages.js";
+import { element, find, percentile, readable } from "../dom.js";
+import { report } from "../messages.js";
 import { nearest } from "./modes.js";
 import { diagonalOf } from "./scene.js";
 import { Surface } from "./surface.js";
@@ -48,7 +48,7 @@ export class Colouring {
   #nearest = null;
   #limit = 0;
 
-  /** @param {import("./store.js").Page} store */
+  /** @param {import("../store.js").Page} store */
   constructor(store, { legend, against }) {
     this.store = store;
     this.legend = legend;
