@@ -19,7 +19,10 @@ const TOO_LONG = 400; // ms after which a draft is given up for a newer one
 const LINES = 1080; // of a screen that a shape fills: a step is as large as one
 const MOST = 24; // steps
 
-/** The mesh that the switch and the model give. */
+/**
+ * The mesh that the switch and the model give.
+ * @returns {"coarse" | "fine"}
+ */
 export const meshOf = ({ fine, hasFine }) => (fine && hasFine ? "fine" : "coarse");
 
 /**
