@@ -147,7 +147,7 @@ def test_frames_that_never_come_are_told_and_can_be_asked_for_again(window: Open
 
 @pytest.mark.parametrize("path", ["beyond=0", "beyond=0.25", "beyond=0.25&easing=soft", "show=loop&easing=soft"])
 def test_a_saved_path_goes_where_the_player_goes(window: Open, path: str) -> None:
-    codes = "0,3,0;0.1,-3,1;-0.1,-2,0.5;0.2,1,0.2"
+    codes = "0,3,0;0.1,-2.7,1;-0.1,-2,0.5;0.2,1,0.2"
     studio = window().open(f"#model=with-fine&z=0,0,0.7&keys={codes}&{path}")
     studio.tab("Path")
     studio.eventually(lambda: studio["#animation-format option"].count() > 0)
