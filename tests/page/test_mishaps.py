@@ -224,3 +224,7 @@ def test_a_browser_that_keeps_nothing_shows_the_page_all_the_same(window: Open) 
     studio["#random"].click()
     studio.rest()
     assert studio.messages == ""
+    studio.tab("Shape")
+    studio["#keep-shape"].click()
+    studio.eventually(lambda: "This browser lets the page keep nothing" in studio.messages)
+    assert studio["#shelf input"].input_value() == "Shape 1"

@@ -64,8 +64,8 @@ export class Path {
   }
 
   /**
-   * What the server is asked for a file that moves as the player does. The server goes evenly from keyframe to
-   * keyframe: where the player does not, each frame is one, or as many as an address holds.
+   * What the server is asked for a file that moves as the player does. The server goes evenly from keyframe
+   * to keyframe: where the player does not, each frame is one, or as many as an address holds.
    */
   get request() {
     const { easing, keyframes, loop, model } = this.store;
@@ -217,7 +217,8 @@ export class Path {
     const large = codes.length * store.references[wanted].vertices.length > 3 * MOST_VERTICES;
     const mesh = large ? "coarse" : wanted;
     const tell = (there) => {
-      this.status.textContent = there < codes.length ? `Computing frames: ${there} of ${codes.length} …` : "";
+      const { length } = codes;
+      this.status.textContent = there < length ? `Computing frames: ${there} of ${length} …` : "";
     };
     tell(0);
     return new Reel(store, codes, mesh, { loop: store.loop, tell });
