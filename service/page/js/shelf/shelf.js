@@ -36,7 +36,9 @@ export class Shelf {
     add.addEventListener("click", () => {
       const numbers = this.#shapes.map(({ name }) => Number(/^Shape (\d+)$/.exec(name)?.[1] ?? 0));
       this.#put([...this.#shapes, { name: `Shape ${Math.max(0, ...numbers) + 1}`, code: store.code }]);
-      find("li:last-child input", list).select();
+      const input = find("li:last-child input", list);
+      input.focus(); // which selecting need not do
+      input.select();
     });
     store.on(["model"], () => {
       this.#shapes = kept(store.model);
