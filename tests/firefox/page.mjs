@@ -17,6 +17,7 @@ const browser = await puppeteer.launch({
     "webgl.force-enabled": true,
     "browser.download.folderList": 2,
     "browser.download.dir": folder,
+    "browser.download.alwaysOpenPanel": false, // which would take the focus away from the page
     "browser.helperApps.neverAsk.saveToDisk": "model/gltf-binary,application/octet-stream",
     "ui.prefersReducedMotion": 1,
   },
@@ -41,20 +42,21 @@ const rests = () => page.$eval(".stage", (stage) => stage.dataset.quality === "f
 const tab = (name) => page.click(`#to-${name}`);
 const picture = () => page.screenshot({ encoding: "base64" });
 
-async function slide(k, value) {
-  await page.evaluate(
-    (index, to) => {
-      const row = document.querySelectorAll(".coordinate")[index];
-      row.closest("details").open = true;
-      const slider = row.querySelector("input[type=range]");
-      slider.dispatchEvent(new PointerEvent("pointerdown", { bubbles: true }));
-      slider.value = to;
-      slider.dispatchEvent(new Event("input", { bubbles: true }));
-      slider.dispatchEvent(new PointerEvent("pointerup", { bubbles: true }));
-    },
-    k,
-    value,
-  );
+/** Drag a coordinate's slider from where it is to a share of its length, by the mouse. */
+async function drag(k, share) {
+  const slider = await page.evaluateHandle((index) => {
+    const row = document.querySelectorAll(".coordinate")[index];
+    row.closest("details").open = true;
+    row.scrollIntoView({ block: "center" });
+    return row.querySelector("input[type=range]");
+  }, k);
+  const { x, y, width, height } = await slider.boundingBox();
+  const at = await slider.evaluate(({ min, max, value }) => (value - min) / (max - min));
+  const along = (part) => x + 8 + part * (width - 16); // a thumb's width less, as its middle travels
+  await page.mouse.move(along(at), y + height / 2);
+  await page.mouse.down();
+  for (const part of [0.3, 0.6, 1]) await page.mouse.move(along(at + part * (share - at)), y + height / 2);
+  await page.mouse.up();
 }
 
 async function downloaded(button) {
@@ -77,15 +79,15 @@ const STEPS = {
   },
   "a slider moves the shape, and the address tells": async () => {
     const before = await picture();
-    await slide(4, 0.9);
-    await eventually(() => Math.abs((code()[4] ?? 0) - 0.9) < 1e-2);
+    await drag(4, 0.9);
+    await eventually(() => code()[4] > 0.3 && code().every((value, k) => k === 4 || value === 0));
     await eventually(rests);
     return before !== (await picture());
   },
-  "undo and redo": async () => {
+  "undo, which takes back the whole drag, and redo": async () => {
     const then = code();
     await page.click("#undo");
-    await eventually(() => !near(code(), then));
+    await eventually(() => code().every((value) => value === 0));
     await page.click("#redo");
     return eventually(() => near(code(), then));
   },
@@ -112,6 +114,19 @@ const STEPS = {
     const before = await picture();
     await page.click("#play");
     return eventually(async () => before !== (await picture()));
+  },
+  "the path comes to its end": () =>
+    eventually(async () => (await page.$eval("#time", (time) => time.textContent)) === "t = 1.00"),
+  "a shape is kept by name, compared, and there after a reload": async () => {
+    await tab("shape");
+    await page.click("#keep-shape");
+    await page.keyboard.type("Mine");
+    await page.keyboard.press("Tab");
+    await page.click("[aria-label='Compare with Mine']");
+    await eventually(() => page.$eval("#blend", (slider) => !slider.hidden));
+    await page.reload();
+    await eventually(rests);
+    return page.$eval("#shelf input", (box) => box.value === "Mine");
   },
   "nothing complained": async () => !complaints.length,
 };

@@ -93,14 +93,21 @@ def test_a_model_that_is_not_served_is_told(window: Open) -> None:
 def test_a_second_click_on_play_waits_for_the_same_frames(studio: Studio) -> None:
     keyframes(studio, (-0.2, 0, 0), (0.2, 0, 1))
     held: list[Route] = []
-    studio.page.route("**/v1/interpolations/**", lambda route: held.append(route) or None)
+    frames: list[int] = []
+
+    def hold(route: Route) -> None:
+        number = len(route.request.post_data_json["latents"])
+        held.append(route) if number > 1 and not frames else route.continue_()
+        frames.append(number)
+
+    studio.page.route("**/vertices?*", hold)
     studio["#play"].click()
     studio.eventually(lambda: bool(held))
     studio["#play"].click()
     studio.page.wait_for_timeout(200)
     held[0].continue_()
-    studio.until_code([0.2, 0, 1])
-    assert len(held) == 1
+    studio.eventually(lambda: frames[:3] == [12, 12, 1])
+    studio.eventually(lambda: studio["#time"].inner_text() == "t = 1.00")
     assert studio.messages == ""
 
 
@@ -217,3 +224,7 @@ def test_a_browser_that_keeps_nothing_shows_the_page_all_the_same(window: Open) 
     studio["#random"].click()
     studio.rest()
     assert studio.messages == ""
+    studio.tab("Shape")
+    studio["#keep-shape"].click()
+    studio.eventually(lambda: "This browser lets the page keep nothing" in studio.messages)
+    assert studio["#shelf input"].input_value() == "Shape 1"

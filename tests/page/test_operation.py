@@ -105,6 +105,11 @@ def test_axe_finds_no_fault(window: Open, scheme: str) -> None:
     studio.page.keyboard.press("Escape")
     for tab in ("Shape", "Path", "Colour", "Files"):
         studio.tab(tab)
+        if tab == "Shape":
+            studio["#keep-shape"].click()
+            studio["#keep-shape"].click()
+            studio.page.get_by_role("button", name="Compare with Shape 1").click()
+            studio.eventually(studio["#blend"].is_visible)
         if tab == "Path":
             studio["#add-keyframe"].click()
             studio["#add-keyframe"].click()

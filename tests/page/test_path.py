@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import io
 import re
 from itertools import pairwise
 
+import httpx
 import numpy as np
 import pytest
+from playwright.sync_api import Route
 
+from tests.page.conftest import Open
 from tests.page.studio import Studio, body, difference
 
 #: Presses play and, a little later, pause; in the page, so that a busy machine doesn't come too late.
@@ -42,7 +46,8 @@ def test_play_pause_and_the_sliders_follow(studio: Studio) -> None:
     studio["#play"].evaluate(PLAY_A_WHILE)
     studio.until_different(before)
     assert "Play" in studio["#play"].inner_text()
-    assert any("quality=draft" in address for address in studio.addresses)
+    drafts = [len(asked["latents"]) for asked in studio.asked if asked["quality"] == "draft"]
+    assert max(drafts) == 12
     assert studio.shown == "fine"
     studio.eventually(lambda: studio.code[2] not in {0, 1})
     size, angle, twist = studio.code
@@ -51,12 +56,13 @@ def test_play_pause_and_the_sliders_follow(studio: Studio) -> None:
     t = float(studio["#time"].inner_text().removeprefix("t = "))
     assert twist == pytest.approx(t, abs=0.03)
     studio.rest()
+    studio.eventually(lambda: not studio["#path-status"].inner_text())
     asked = len(studio.asked)
     studio["#play"].click()
     studio.eventually(lambda: studio["#time"].inner_text() == "t = 1.00")
     studio.eventually(lambda: "Play" in studio["#play"].inner_text())
     studio.until_code([0.2, 0, 1])
-    assert len(studio.asked) <= asked + 2, "frames come in one go"
+    assert len(studio.asked) <= asked + 2, "frames come once"
 
 
 def test_a_loop_goes_on_and_back_to_the_start(studio: Studio) -> None:
@@ -93,6 +99,73 @@ def test_past_the_ends_and_the_shorter_way_round(studio: Studio) -> None:
         timeline.fill(str(t))
         studio.eventually(lambda share=share: abs(studio.code[0] - 0.1 * share) < 0.003)
     assert studio.hash["easing"] == "soft"
+
+
+def test_frames_are_played_as_they_come(studio: Studio) -> None:
+    keyframes(studio, (-0.2, 0, 0), (0.2, 0, 1))
+    held: list[Route] = []
+
+    def hold(route: Route) -> None:
+        later = len(route.request.post_data_json["latents"]) == 12 and "12 of 25" in status()
+        held.append(route) if later else route.continue_()
+
+    def status() -> str:
+        return studio["#path-status"].inner_text()
+
+    def time() -> float:
+        return float(studio["#time"].inner_text().removeprefix("t = "))
+
+    studio.page.route("**/vertices?*", hold)
+    studio["#play"].click()
+    studio.eventually(lambda: bool(held) and time() > 0.3)
+    assert "Pause" in studio["#play"].inner_text()
+    studio.page.wait_for_timeout(500)
+    assert time() <= 11 / 24 + 0.01, "it shows frames that aren't there"
+    held[0].continue_()
+    studio.eventually(lambda: time() == 1)
+    studio.eventually(lambda: "Play" in studio["#play"].inner_text())
+    assert status() == ""
+
+
+def test_frames_that_never_come_are_told_and_can_be_asked_for_again(window: Open) -> None:
+    studio = window(complains=True).open("#model=with-fine&keys=-0.2,0,0;0.2,0,1")
+    studio.tab("Path")
+
+    def refuse(route: Route) -> None:
+        later = "12 of 25" in studio["#path-status"].inner_text()
+        problem = {"status": 504, "content_type": "application/problem+json", "body": '{"detail": "Too late."}'}
+        route.fulfill(**problem) if later else route.continue_()
+
+    studio.page.route("**/vertices?*", refuse)
+    studio["#play"].click()
+    studio.eventually(lambda: "Too late." in studio.messages)
+    studio.eventually(lambda: "Play" in studio["#play"].inner_text())
+    studio.page.unroute("**/vertices?*")
+    studio["#play"].click()
+    studio.until_code([0.2, 0, 1])
+
+
+@pytest.mark.parametrize("path", ["beyond=0", "beyond=0.25", "beyond=0.25&easing=soft", "show=loop&easing=soft"])
+def test_a_saved_path_goes_where_the_player_goes(window: Open, path: str) -> None:
+    codes = "0,3,0;0.1,-2.7,1;-0.1,-2,0.5;0.2,1,0.2"
+    studio = window().open(f"#model=with-fine&z=0,0,0.7&keys={codes}&{path}")
+    studio.tab("Path")
+    studio.eventually(lambda: studio["#animation-format option"].count() > 0)
+    studio["#animation-format"].select_option("npz")
+    with studio.page.expect_download() as download:
+        studio["#download-animation"].click()
+    latents = np.load(download.value.path())["latents"]
+    soft, loop, beyond = "soft" in path, "loop" in path, 0.25 if "0.25" in path else 0.0
+    assert len(latents) == (96 if loop else 72 * (1 + 2 * beyond) + 1)
+    for frame in (5, 30, 50, 70):
+        share = frame / (len(latents) - (not loop))
+        studio["#timeline"].fill(str(-beyond + (1 + 2 * beyond) * share))
+        # The player's frames are even: it says the code of the nearest, at most 3 / 24 / 2 away.
+        studio.until_code(latents[frame], 0.07 if soft else 1e-4)
+    at_first = round(beyond / (1 + 2 * beyond) * (len(latents) - 1))
+    assert np.allclose(latents[at_first], [0, 3, 0], atol=1e-5)
+    pace = np.abs(np.diff(latents[:, 0]))[at_first:]
+    assert (pace[0] < 0.1 * pace.max()) == soft, "slow at keyframes, or even"
 
 
 def test_keyframes_can_be_visited_reordered_replaced_and_removed(studio: Studio) -> None:
@@ -169,7 +242,8 @@ def test_lengths_and_angles_in_the_page_are_those_of_the_server(studio: Studio) 
     from shapespace.mesh.triangle_mesh import TriangleMesh
 
     script = """async () => {
-        const [{ Surface }, api] = await Promise.all([import('/page/js/surface.js'), import('/page/js/api.js')]);
+        const [{ Surface }, api] = await Promise.all([
+            import('/page/js/view/surface.js'), import('/page/js/server/api.js')]);
         const model = (await api.models()).find(({ name }) => name === 'with-fine');
         const { faces, vertices } = await api.reference(model, 'coarse');
         const { shapes: [x] } = await api.shapes(model, [[0.1, 1, 0.5]], 'coarse');
@@ -186,6 +260,25 @@ def test_lengths_and_angles_in_the_page_are_those_of_the_server(studio: Studio) 
     half = mesh.connectivity.edge_count
     assert np.allclose(np.array(lengths)[order], expected[:half], atol=1e-5)
     assert np.allclose(np.array(angles)[order], expected[half:], atol=1e-4)
+
+
+@pytest.mark.parametrize("loop", [False, True])
+def test_codes_along_a_path_are_those_of_the_server(studio: Studio, loop: bool) -> None:
+    codes = [[0.1, 3, 0], [0.2, -3, 0.5], [0, 0.1, 1], [0.1, -3.1, 1]]
+    ends = (0, 1) if loop else (-0.5, 1.25)
+    asked = {"keyframes": codes, "frames": 30, "start": ends[0], "stop": ends[1], "loop": loop, "mesh": "coarse"}
+    made = httpx.post(f"{studio.url}/v1/models/with-fine/interpolations", json=asked).raise_for_status().json()
+    answer = httpx.get(f"{studio.url}{made['links']['npz']}&quality=draft", timeout=60).raise_for_status()
+    arrays = np.load(io.BytesIO(answer.content))
+    script = """async ([keyframes, times]) => {
+        const [{ LatentSpace }, api] = await Promise.all([
+            import('/page/js/server/space.js'), import('/page/js/server/api.js')]);
+        const model = (await api.models()).find(({ name }) => name === 'with-fine');
+        return new LatentSpace(model).along(keyframes, times);
+    }"""
+    closed = [*codes, codes[0]] if loop else codes
+    times = arrays["t"] * (len(closed) - 1)
+    assert np.allclose(studio.page.evaluate(script, [closed, times.tolist()]), arrays["latents"], atol=1e-5)
 
 
 def test_pictures_of_keyframes_differ(studio: Studio) -> None:

@@ -105,7 +105,7 @@ def test_drafts_as_it_moves_the_full_shape_as_it_rests_and_nothing_queues(studio
 
 def test_a_draft_turns_into_the_full_shape_pixel_by_pixel(studio: Studio) -> None:
     script = """async ([draft, full]) => {
-        const { between } = await import('/page/js/shape-loop.js');
+        const { between } = await import('/page/js/server/shape-loop.js');
         return Array.from(between(Float64Array.from(draft), Float64Array.from(full)), (x) => Array.from(x));
     }"""
     full = np.random.default_rng(0).uniform(-1, 1, 300)

@@ -16,12 +16,21 @@ def kept(studio: Studio) -> list[str]:
     return names
 
 
+def focused(studio: Studio) -> str:
+    label: str = studio.page.evaluate("document.activeElement.getAttribute('aria-label') ?? ''")
+    return label
+
+
 def test_shapes_are_kept_by_name_for_each_model(window: Open) -> None:
     studio = window().open("#model=with-fine&z=0.1,1,0.5")
     studio["#keep-shape"].click()
     studio.page.keyboard.type("Thin")  # the name is selected
+    studio.page.keyboard.press("Control+z")  # of the name, not of the shape
+    studio.page.keyboard.type("Thin")
     studio.page.keyboard.press("Tab")
     assert kept(studio) == ["Thin"]
+    assert focused(studio) == "Compare with Thin"
+    studio.until_code([0.1, 1, 0.5])
     studio.slide(0, -0.1)
     studio.until_code([-0.1, 1, 0.5])
     studio["#keep-shape"].click()
@@ -43,7 +52,7 @@ def test_shapes_are_kept_by_name_for_each_model(window: Open) -> None:
     assert kept(studio)[0] == "Thin", "a name that is none"
     studio.page.get_by_role("button", name="Remove Thin").click()
     assert kept(studio) == ["Shape 1"]
-    assert studio.page.evaluate("document.activeElement.getAttribute('aria-label')") == "Go to Shape 1"
+    assert focused(studio) == "Go to Shape 1"
 
     studio["#model"].select_option("figure")
     studio.eventually(lambda: kept(studio) == [])
@@ -85,7 +94,7 @@ def test_two_shapes_beside_each_other(window: Open) -> None:
     studio.page.get_by_label("distance").check()
     studio.eventually(lambda: "diagonal" in (studio["#legend"].text_content() or ""))
     told = studio["#legend .numbers"].text_content() or ""
-    most = float(told.rpartition("to +")[2].rstrip("%").strip())
+    most = float(told.rpartition("to ")[2].rstrip("%").strip())
     assert most == pytest.approx(furthest(studio), rel=0.15)
 
     studio.eventually(lambda: studio.hash.get("colour") == "distance")
@@ -99,6 +108,83 @@ def test_two_shapes_beside_each_other(window: Open) -> None:
     studio["#canvas"].hover()
     studio.eventually(lambda: difference(studio.picture(), alone) < 0.002)
     assert studio["#against"].input_value() == "-1"
+
+
+def test_from_the_shape_to_the_one_beside(studio: Studio) -> None:
+    assert studio["#blend"].is_hidden()
+    studio.type(1, -3)
+    studio.until_code([0, -3, 0])
+    studio["#keep-shape"].click()
+    studio.type(1, 3)
+    studio.type(2, 0.8)
+    studio.until_code([0, 3, 0.8])
+    studio.coordinate(0).locator("input[type=range]").blur()
+    studio.page.get_by_role("button", name="Compare with Shape 1").click()
+    steps = studio["#undo"].get_attribute("title")
+    slider = studio["#blend input"]
+    studio.page.wait_for_timeout(800)  # one movement by keys has ended
+    slider.focus()
+    for _ in range(3):
+        studio.page.keyboard.press("PageUp")
+    share = studio.eventually(lambda: slider.input_value() != "0" and float(slider.input_value()))
+    assert slider.get_attribute("aria-valuetext") == f"{share:.0%}".replace("%", " %")
+    angle = 3 + share * (2 * np.pi - 6)  # the shorter way round
+    studio.until_code([0, angle - 2 * np.pi * (angle > np.pi), 0.8 * (1 - share)], 1e-3)
+    slider.blur()
+    studio["#undo"].click()
+    studio.until_code([0, 3, 0.8])
+    assert studio["#undo"].get_attribute("title") == steps
+    assert slider.input_value() == "0"
+
+    studio.coordinate(2).locator("[data-do=lock]").click()
+    slider.fill("1")
+    studio.until_code([0, -3, 0.8])
+    slider.fill("0")
+    studio.until_code([0, 3, 0.8])
+    slider.fill("1")
+    studio.slide(0, 0.1)
+    assert slider.input_value() == "0", "it begins anew where a shape comes from elsewhere"
+    studio.page.get_by_role("button", name="Compare with Shape 1").click()
+    assert studio["#blend"].is_hidden()
+
+
+def test_the_view_stays_as_it_was_turned(studio: Studio, window: Open) -> None:
+    studio["#keep-shape"].click()
+    studio.slide(0, 0.2)
+    studio["#canvas"].focus()
+    studio.page.keyboard.press("ArrowRight")
+
+    def direction() -> np.ndarray:
+        view = np.array([float(x) for x in studio.eventually(lambda: studio.hash.get("view")).split(",")])
+        way = view[:3] - view[3:]
+        return np.concatenate([way / np.linalg.norm(way), [np.linalg.norm(way)]])
+
+    before = direction()
+    alone = studio.hash["view"]
+    compare = studio.page.get_by_role("button", name="Compare with Shape 1")
+    compare.click()
+    studio.eventually(lambda: studio.hash["view"] != alone)
+    after = direction()
+    assert np.allclose(before[:3], after[:3], atol=1e-3)
+    assert after[3] > before[3], "from farther away, as there are two"
+    studio.rest()
+    studio["#canvas"].hover()
+    there = studio.picture()
+    again = window().open(studio.page.url.removeprefix(studio.url + "/"))
+    again.eventually(lambda: difference(there, again.picture()) < 0.01)
+    assert again.hash["view"] == studio.hash["view"]
+    compare.click()
+    studio.eventually(lambda: np.allclose(direction(), before, atol=1e-3))
+    studio["#reset-view"].click()
+    studio.eventually(lambda: "view" not in studio.hash)
+
+
+def test_two_windows_have_one_shelf(studio: Studio) -> None:
+    other = Studio(studio.page.context.new_page(), studio.url).open()
+    studio["#keep-shape"].click()
+    other.eventually(lambda: kept(other) == ["Shape 1"])
+    other["#keep-shape"].click()
+    studio.eventually(lambda: kept(studio) == ["Shape 1", "Shape 2"])
 
 
 def furthest(studio: Studio) -> float:

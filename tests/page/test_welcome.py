@@ -55,4 +55,4 @@ def test_where_motion_is_not_wanted_or_a_shape_is_asked_for_nothing_moves(window
     assert linked["#welcome"].is_hidden()
     for studio in (calm, linked):
         studio.eventually(lambda studio=studio: studio[".pictures canvas.drawn"].count() == 9)
-        assert not any("/interpolations" in address for address in studio.addresses)
+        assert {len(asked["latents"]) for asked in studio.asked if asked["mesh"] == "fine"} == {1}

@@ -1,7 +1,7 @@
 /** The state of the page as the part of its address after the #, and back. */
 
 import { Matrix4, Quaternion, Vector3 } from "three";
-import { OTHER } from "./colouring.js";
+import { OTHER } from "./view/colouring.js";
 
 const COLOURS = ["stretch", "bending", "distance"];
 const FLAGS = ["wireframe", "normals", "loop"];
@@ -58,7 +58,7 @@ function toPlacement(numbers) {
 /**
  * What an address asks for; parts that make no sense for the model are left out.
  * @returns {{model?: any, missing?: string, code?: number[], keyframes?: number[][], locked?: boolean[],
- *   view?: number[], pins?: import("./pull.js").Pin[], state?: Partial<import("./store.js").State>}}
+ *   view?: number[], pins?: import("./shape/pull.js").Pin[], state?: Partial<import("./store.js").State>}}
  */
 export function fromHash(hash, models) {
   const parts = new URLSearchParams(hash.replace(/^#/, ""));

@@ -1,8 +1,9 @@
 /** Undo and redo of codes, of where pulls left their shapes, and of pins: each rest of the hand is a step. */
 
-import { sameCode } from "./space.js";
+import { sameCode } from "./server/space.js";
 
 const LONGEST = 200;
+const TYPED = "input:not([type=range], [type=checkbox], [type=radio])";
 
 export class History {
   #steps = [];
@@ -23,7 +24,7 @@ export class History {
     addEventListener("keydown", (event) => {
       if (!(event.ctrlKey || event.metaKey) || event.altKey) return;
       const { target } = /** @type {{target: any}} */ (event);
-      if (target.matches?.("input[type=number], textarea")) return;
+      if (target.matches?.(TYPED)) return; // which undoes what was typed
       const key = event.key.toLowerCase();
       if (key !== "z" && key !== "y") return;
       event.preventDefault();

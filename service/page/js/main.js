@@ -1,35 +1,37 @@
 /** Puts the page together: one store, and everything that shows or changes what is in it. */
 
 import { fromHash, toHash } from "./address.js";
-import * as api from "./api.js";
-import { openCard } from "./card.js";
-import { Colouring } from "./colouring.js";
-import { inShort, inWords } from "./diagnostics.js";
 import { element, find, toggle } from "./dom.js";
-import { copy, Files } from "./files.js";
+import { Hand } from "./hand.js";
 import { History } from "./history.js";
 import { always, here } from "./memory.js";
 import { report, reporting, say } from "./messages.js";
-import { Modes } from "./modes.js";
-import { Names, namesOf } from "./names.js";
-import { Path } from "./path.js";
-import { Pictures } from "./pictures.js";
-import { Pins } from "./pins.js";
-import { Pose } from "./pose.js";
-import { Pull } from "./pull.js";
+import { Store } from "./store.js";
+import { tabs } from "./tabs.js";
+import { Path } from "./path/path.js";
+import { Strip } from "./path/strip.js";
 import { Ghost } from "./scan/ghost.js";
 import { Reader } from "./scan/reader.js";
-import { ShapeLoop } from "./shape-loop.js";
+import * as api from "./server/api.js";
+import { ShapeLoop } from "./server/shape-loop.js";
+import { LatentSpace } from "./server/space.js";
+import { openCard } from "./shape/card.js";
+import { inShort, inWords } from "./shape/diagnostics.js";
+import { Names, namesOf } from "./shape/names.js";
+import { Pins } from "./shape/pins.js";
+import { Pull } from "./shape/pull.js";
+import { Sliders } from "./shape/sliders.js";
 import { Beside } from "./shelf/beside.js";
+import { Blend } from "./shelf/blend.js";
 import { Shelf } from "./shelf/shelf.js";
+import { copy, Files } from "./show/files.js";
 import { Welcome } from "./show/welcome.js";
-import { Skin } from "./skin.js";
-import { Sliders } from "./sliders.js";
-import { LatentSpace } from "./space.js";
-import { Store } from "./store.js";
-import { Strip } from "./strip.js";
-import { tabs } from "./tabs.js";
-import { Viewer } from "./viewer.js";
+import { Colouring } from "./view/colouring.js";
+import { Modes } from "./view/modes.js";
+import { Pictures } from "./view/pictures.js";
+import { Pose } from "./view/pose.js";
+import { Skin } from "./view/skin.js";
+import { Viewer } from "./view/viewer.js";
 
 const PREFERRED = "figure";
 
@@ -73,7 +75,8 @@ const store = /** @type {any} */ (
 const embedded = document.documentElement.classList.contains("embed");
 const viewer = new Viewer(find("#canvas"), embedded ? 24 : 100);
 const pictures = new Pictures();
-const sliders = new Sliders(store, find("#factors"));
+const hand = new Hand(store);
+const sliders = new Sliders(store, hand, find("#factors"));
 const modes = new Modes(store, sliders, pictures);
 const colouring = new Colouring(store, { legend: find("#legend"), against: find("#against") });
 const path = new Path(store, pictures, {
@@ -91,6 +94,7 @@ const path = new Path(store, pictures, {
 const strip = new Strip(store, pictures, { button: find("#draw-strip"), table: find("#strip") });
 new Shelf(store, pictures, { list: find("#shelf"), add: find("#keep-shape") });
 new Beside(store, viewer);
+new Blend(store, hand, find("#blend"));
 new Names(store, { dialog: find("#names"), button: find("#name") });
 new History(store, { undo: find("#undo"), redo: find("#redo") });
 new Files(store, path, viewer, find("#tab-files"));
@@ -210,7 +214,6 @@ find("#share").addEventListener("click", () => {
 const picker = find("#model");
 let models = [];
 let opening;
-let turned = false;
 picker.addEventListener(
   "change",
   reporting(async () => {
@@ -236,8 +239,7 @@ async function openModel({ model, code, keyframes = [], locked, view, pins = [],
   store.set({ shape: null, playing: false, placement: null, pins: [] });
   viewer.open(coarse);
   pictures.open(coarse);
-  turned = Boolean(view);
-  if (view) viewer.view = view;
+  if (view) Object.assign(viewer, { view, turned: true });
   store.set({
     model,
     space,
@@ -293,7 +295,7 @@ let soon = 0;
 function remember() {
   clearTimeout(soon);
   if (!store.model || store.playing || welcome.alone) return;
-  const hash = toHash(store, turned ? viewer.view : null);
+  const hash = toHash(store, viewer.turned ? viewer.view : null);
   history.replaceState(null, "", hash);
   find("#whole").href = location.pathname + hash;
 }
@@ -323,10 +325,7 @@ store.on(
   ],
   rememberSoon,
 );
-viewer.canvas.addEventListener("turned", () => {
-  turned = true;
-  rememberSoon();
-});
+viewer.canvas.addEventListener("turned", rememberSoon);
 addEventListener("hashchange", reporting(restore));
 
 async function restore() {

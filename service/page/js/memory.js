@@ -1,11 +1,12 @@
-/** What the browser keeps of the page; nothing, and without a word, where it lets pages keep nothing. */
+/** What the browser keeps of the page; `keep` answers whether it does, as some let pages keep nothing. */
 
 const memory = (storage) => ({
   keep(name, value) {
     try {
       storage().setItem(name, value);
+      return true;
     } catch {
-      // Reading the storage throws already where it is blocked.
+      return false; // reading the storage throws already where it is blocked
     }
   },
   kept(name) {

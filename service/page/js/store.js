@@ -14,11 +14,11 @@
  *
  * @typedef {object} State
  * @property {any} model as the server lists it
- * @property {import("./space.js").LatentSpace | null} space
+ * @property {import("./server/space.js").LatentSpace | null} space
  * @property {{factors: string[], labels: string[], coordinates: string[]} | null} names
  * @property {{coarse?: Reference, fine?: Reference}} references
  * @property {boolean} hasFine
- * @property {import("./pose.js").Pose | null} pose where there is a fine mesh
+ * @property {import("./view/pose.js").Pose | null} pose where there is a fine mesh
  * @property {number[] | null} code
  * @property {boolean[]} locked by coordinate
  * @property {import("three").Matrix4 | null} placement
@@ -41,7 +41,7 @@
  * @property {boolean} normals
  * @property {boolean} fine
  * @property {boolean} pull
- * @property {import("./pull.js").Pin[]} pins
+ * @property {import("./shape/pull.js").Pin[]} pins
  * @property {any} scan
  * @property {boolean} ghost
  *

@@ -1,9 +1,9 @@
 /** A scan as points over the shape, at the place where the fit has found it. */
 
 import * as THREE from "three";
-import { diverging } from "../colours.js";
-import { matrixOf } from "../pose.js";
-import { sameCode } from "../space.js";
+import { distant } from "../view/colours.js";
+import { matrixOf } from "../view/pose.js";
+import { sameCode } from "../server/space.js";
 
 // Of a point, as three.js has it, in the model's radius: about a hundredth of it in the picture
 const SIZE = 0.04;
@@ -53,13 +53,7 @@ export class Ghost {
 
   #paint({ used, limit }, own) {
     const { color } = this.points.geometry.attributes;
-    if (own)
-      color.array.set(
-        diverging(
-          used.distances.map((distance) => 2 * distance - limit),
-          limit,
-        ),
-      );
+    if (own) color.array.set(distant(used.distances, limit));
     else color.array.fill(0.25);
     color.needsUpdate = true;
   }

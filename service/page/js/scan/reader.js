@@ -4,11 +4,11 @@
  * back.
  */
 
-import * as api from "../api.js";
+import * as api from "../server/api.js";
 import { find, readable } from "../dom.js";
 import { report, say } from "../messages.js";
-import { diagonalOf } from "../scene.js";
-import { fixedBy, sameCode } from "../space.js";
+import { diagonalOf } from "../view/scene.js";
+import { fixedBy, sameCode } from "../server/space.js";
 import { encodeInWords, fitInWords } from "./words.js";
 import { Verdict } from "./verdict.js";
 

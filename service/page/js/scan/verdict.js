@@ -2,7 +2,7 @@
  * The box that says what came of a file, with what can be done about it; also while the answer is awaited.
  */
 
-import { gradient } from "../colours.js";
+import { gradient } from "../view/colours.js";
 import { element, find } from "../dom.js";
 
 export class Verdict {

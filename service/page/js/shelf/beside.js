@@ -1,35 +1,48 @@
 /** Another shape beside the one of the sliders, to compare them. */
 
 import * as THREE from "three";
-import * as api from "../api.js";
+import * as api from "../server/api.js";
 import { report } from "../messages.js";
-import { VIEW, face, geometryOf, move, paint, surfaceMaterial } from "../scene.js";
-import { meshOf } from "../shape-loop.js";
+import { VIEW, face, geometryOf, move, paint, surfaceMaterial } from "../view/scene.js";
+import { meshOf } from "../server/shape-loop.js";
 
 const APART = 1.1; // of the reference's width, from middle to middle
 /** Across the view that shapes are seen from first, so that both are as near. */
 const SIDEWAYS = new THREE.Vector3(VIEW.z, 0, -VIEW.x).normalize();
 
 export class Beside {
+  #model = null;
   #asked = null;
+  #given = false; // whether the view comes with the shape, both from an address
 
   /** @param {import("../store.js").Page} store */
   constructor(store, viewer) {
     this.store = store;
     this.viewer = viewer;
     this.mesh = new THREE.Mesh(new THREE.BufferGeometry(), surfaceMaterial());
-    this.mesh.frustumCulled = this.mesh.visible = false;
+    this.mesh.frustumCulled = false;
+    this.ground = viewer.ground();
+    this.#appear(false);
     viewer.scene.add(this.mesh);
     store.on(["other", "model", "fine", "hasFine"], () => this.#fetch());
+  }
+
+  #appear(is) {
+    this.mesh.visible = this.ground.visible = is;
   }
 
   #fetch() {
     const { model, other, references } = this.store;
     const mesh = meshOf(this.store);
     this.#asked = other;
+    if (this.#model !== model) {
+      this.#model = model;
+      this.#given = Boolean(other);
+      this.#appear(false); // the viewer has begun anew
+    }
     if (!other) {
       if (this.mesh.visible) this.viewer.makeRoom(null);
-      this.mesh.visible = false;
+      this.#appear(false);
       this.viewer.draw();
       return;
     }
@@ -41,28 +54,29 @@ export class Beside {
       .catch(report);
   }
 
-  /** Positions where they are seen. */
-  #places(positions) {
-    const point = new THREE.Vector3();
-    const there = new Float32Array(positions.length);
-    for (let i = 0; i < positions.length; i += 3) {
-      point.fromArray(positions, i).add(this.mesh.position).toArray(there, i);
-    }
-    return there;
-  }
-
   #show({ faces, vertices }, positions) {
-    this.mesh.geometry.dispose();
+    const { geometry, material, position } = this.mesh;
+    geometry.dispose();
     this.mesh.geometry = geometryOf(faces, vertices.length / 3);
     move(this.mesh.geometry, positions);
     paint(this.mesh.geometry, null);
-    face(this.mesh.material, this.viewer.side);
-    this.mesh.position.copy(SIDEWAYS).multiplyScalar(APART * extent(vertices, SIDEWAYS));
+    face(material, this.viewer.side);
+    position.copy(SIDEWAYS).multiplyScalar(APART * extent(vertices, SIDEWAYS));
     this.mesh.updateMatrixWorld(true);
-    if (!this.mesh.visible) this.viewer.makeRoom(this.#places(positions));
-    this.mesh.visible = true;
+    const { center, radius } = this.viewer.sphere;
+    this.ground.open({ center: center.clone().add(position), radius });
+    this.ground.under(positions, faces, this.mesh.matrixWorld);
+    if (!this.mesh.visible) this.viewer.makeRoom(moved(positions, position), this.#given);
+    this.#given = false;
+    this.#appear(true);
     this.viewer.draw();
   }
+}
+
+/** Positions (3V numbers) elsewhere. */
+function moved(positions, by) {
+  const axes = by.toArray();
+  return positions.map((x, i) => x + axes[i % 3]);
 }
 
 /** How far positions (3V numbers) reach along a direction. */

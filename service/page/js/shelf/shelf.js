@@ -1,11 +1,11 @@
 /** Shapes that people keep by name in this browser, for each model. */
 
-import * as api from "../api.js";
-import { OTHER } from "../colouring.js";
+import * as api from "../server/api.js";
+import { OTHER } from "../view/colouring.js";
 import { clone, find, sharp } from "../dom.js";
 import { always } from "../memory.js";
-import { report } from "../messages.js";
-import { sameCode } from "../space.js";
+import { report, say } from "../messages.js";
+import { sameCode } from "../server/space.js";
 
 const PICTURE = 64;
 const MOST = 50;
@@ -36,19 +36,34 @@ export class Shelf {
     add.addEventListener("click", () => {
       const numbers = this.#shapes.map(({ name }) => Number(/^Shape (\d+)$/.exec(name)?.[1] ?? 0));
       this.#put([...this.#shapes, { name: `Shape ${Math.max(0, ...numbers) + 1}`, code: store.code }]);
-      find("li:last-child input", list).select();
+      const input = find("li:last-child input", list);
+      input.focus(); // which selecting need not do
+      input.select();
     });
     store.on(["model"], () => {
       this.#shapes = kept(store.model);
       this.#list();
     });
     store.on(["other"], () => this.#mark());
+    // Another window has changed it: what is kept here from now on must not undo that.
+    addEventListener("storage", ({ key }) => {
+      if (!store.model || key !== place(store.model)) return;
+      this.#shapes = kept(store.model);
+      this.#list();
+    });
   }
 
   #put(shapes) {
-    this.#shapes = shapes;
-    always.keep(place(this.store.model), JSON.stringify(shapes));
+    this.#keep(shapes);
     this.#list();
+  }
+
+  #keep(shapes) {
+    this.#shapes = shapes;
+    if (always.keep(place(this.store.model), JSON.stringify(shapes))) return;
+    const advice = "Share copies an address that has the shape.";
+    const lost = `This browser lets the page keep nothing: the shelf is gone when the page closes. ${advice}`;
+    say(lost, { kind: "error", key: "shelf" });
   }
 
   #list() {
@@ -73,30 +88,26 @@ export class Shelf {
 
   #item({ name, code }, i) {
     const item = clone("kept");
-    const part = (what, says) => {
-      const found = find(`[data-do=${what}]`, item);
-      found.setAttribute("aria-label", `${says} ${name}`);
-      return found;
-    };
-    part("go", "Go to").addEventListener("click", () => this.store.set({ code: [...code] }));
-    part("compare", "Compare with").addEventListener("click", () => {
+    const part = (what) => find(`[data-do=${what}]`, item);
+    part("go").addEventListener("click", () => this.store.set({ code: [...code] }));
+    part("compare").addEventListener("click", () => {
       const { other } = this.store;
       const off = other && sameCode(other, code);
       this.store.set(off ? { other: null } : { other: code, against: OTHER });
     });
-    part("remove", "Remove").addEventListener("click", () => {
+    part("remove").addEventListener("click", () => {
       this.#put(this.#shapes.toSpliced(i, 1));
-      (
-        find(`li:nth-child(${Math.min(i + 1, this.#shapes.length)}) [data-do=go]`, this.list) ?? this.add
-      ).focus();
+      const next = `li:nth-child(${Math.min(i + 1, this.#shapes.length)}) [data-do=go]`;
+      (find(next, this.list) ?? this.add).focus();
     });
-    const input = part("rename", "Name of");
-    Object.assign(input, { value: name, maxLength: LONGEST });
+    const input = part("rename");
+    input.maxLength = LONGEST;
     input.addEventListener("change", () => {
       const said = input.value.trim();
-      if (said) this.#put(this.#shapes.with(i, { name: said, code }));
-      else input.value = name;
+      if (said) this.#keep(this.#shapes.with(i, { name: said, code }));
+      label(item, this.#shapes[i].name); // in its place: the focus is here, or next to it
     });
+    label(item, name);
     sharp(find("canvas", item), PICTURE);
     return item;
   }
@@ -107,4 +118,13 @@ export class Shelf {
       button.setAttribute("aria-pressed", String(Boolean(other) && sameCode(other, this.#shapes[i].code)));
     });
   }
+}
+
+/** Say what a shape is called. */
+function label(item, name) {
+  const says = { go: "Go to", compare: "Compare with", remove: "Remove", rename: "Name of" };
+  for (const [what, words] of Object.entries(says)) {
+    find(`[data-do=${what}]`, item).setAttribute("aria-label", `${words} ${name}`);
+  }
+  Object.assign(find("input", item), { value: name, title: name });
 }

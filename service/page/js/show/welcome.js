@@ -3,11 +3,10 @@
  * comes.
  */
 
-import * as api from "../api.js";
 import { find } from "../dom.js";
 import { always } from "../memory.js";
-import { eased, showAt } from "../reel.js";
-import { meshOf } from "../shape-loop.js";
+import { eased, Reel } from "../path/reel.js";
+import { meshOf } from "../server/shape-loop.js";
 
 const MOVES = 3; // one in each of the first factors, which are the strongest
 const REACH = 0.8; // of the way to the bound
@@ -60,8 +59,10 @@ export class Welcome {
     const keyframes = this.#keyframes();
     const ways = keyframes.length - 1;
     try {
-      const frames = FRAMES * ways + 1;
-      const reel = await api.frames(store.model, { keyframes, frames, mesh: meshOf(store) }, signal);
+      const times = Array.from({ length: FRAMES * ways + 1 }, (_, k) => k / FRAMES);
+      const reel = new Reel(store, store.space.along(keyframes, times), meshOf(store));
+      signal.addEventListener("abort", () => reel.stop());
+      await reel.reach(1);
       signal.throwIfAborted();
       signal.addEventListener("abort", () => store.set({ playing: false, code: home }));
       store.set({ playing: true });
@@ -69,7 +70,7 @@ export class Welcome {
       const step = (now) => {
         if (signal.aborted) return;
         const way = (Math.max(now - began, 0) / (1000 * PACE)) % ways;
-        showAt(store, reel, (Math.floor(way) + eased(way % 1)) / ways);
+        reel.show((Math.floor(way) + eased(way % 1)) / ways);
         requestAnimationFrame(step);
       };
       requestAnimationFrame(step);

@@ -31,6 +31,13 @@ export function diverging(values, limit) {
   return colours;
 }
 
+/** Colours (3V) of distances (V) between 0, blue, and limit, red. */
+export const distant = (distances, limit) =>
+  diverging(
+    distances.map((distance) => 2 * distance - limit),
+    limit,
+  );
+
 /** Colours (3V) of weights (V) between 0, the surface's own colour, and 1. */
 export function tint(weights) {
   const colours = new Float32Array(3 * weights.length);

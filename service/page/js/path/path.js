@@ -1,26 +1,26 @@
 /** Keyframes, the path through them, and its player. */
 
-import * as api from "./api.js";
-import { clone, find, readable, sharp } from "./dom.js";
-import { report, reporting } from "./messages.js";
-import { eased, showAt } from "./reel.js";
-import { meshOf } from "./shape-loop.js";
+import * as api from "../server/api.js";
+import { clone, find, readable, sharp } from "../dom.js";
+import { report, reporting } from "../messages.js";
+import { eased, Reel } from "./reel.js";
+import { meshOf } from "../server/shape-loop.js";
 
 const PICTURE = 64;
 const SEGMENT = 24; // frames
 const LONGEST = 120; // frames
 const MOST_VERTICES = 2 ** 21; // of all frames: where they would be more, the coarse mesh plays
+const MOST_NUMBERS = 2400; // of keyframes in an address
 const PACE = 1.8; // seconds for a segment, where nobody says how long the path takes
 
 export class Path {
-  #frames = null; // of the path as it is now
-  #coming = null; // the promise of these frames
-  #loading = null;
+  /** @type {Reel | null} frames of the path as it is now */
+  #reel = null;
   #t = 0;
   #clock = 0;
   #carried = null; // index of the keyframe that is dragged
 
-  /** @param {import("./store.js").Page} store */
+  /** @param {import("../store.js").Page} store */
   constructor(store, pictures, { list, add, play, loop, beyond, seconds, easing, timeline, time, status }) {
     this.store = store;
     this.pictures = pictures;
@@ -63,12 +63,26 @@ export class Path {
     timeline.addEventListener("change", () => this.pause());
   }
 
-  /** What the server is asked for; the same for the file to keep. */
+  /**
+   * What the server is asked for a file that moves as the player does. The server goes evenly from keyframe
+   * to keyframe: where the player does not, each frame is one, or as many as an address holds.
+   */
   get request() {
-    const { keyframes, loop } = this.store;
+    const { easing, keyframes, loop, model } = this.store;
+    const frames = this.#frames;
     const [start, stop] = this.#ends;
-    const frames = Math.min(Math.ceil(SEGMENT * this.#segments * (stop - start)) + 1, LONGEST);
-    return { keyframes, frames, start, stop, loop };
+    if (easing === "even") return { keyframes, frames, start, stop, loop };
+    const held = Math.floor(MOST_NUMBERS / model.latent_dimension);
+    const knots = Math.min(frames, Math.max(held, 4 * this.#segments + 1));
+    const times = this.#times(knots).map((t) => this.#slowed(t));
+    const codes = this.#codes(times).map((code) => code.map((value) => Number(value.toPrecision(5))));
+    return { keyframes: codes, frames, loop };
+  }
+
+  /** How many frames it has. */
+  get #frames() {
+    const [start, stop] = this.#ends;
+    return Math.min(Math.ceil(SEGMENT * this.#segments * (stop - start)) + 1, LONGEST);
   }
 
   /** How long it takes from its start to its end. */
@@ -79,7 +93,7 @@ export class Path {
 
   /** How many of its frames the player shows in a second. */
   get fps() {
-    return (this.request.frames - 1) / this.seconds;
+    return (this.#frames - 1) / this.seconds;
   }
 
   get #segments() {
@@ -93,9 +107,7 @@ export class Path {
 
   #changed() {
     if (this.store.playing) this.pause();
-    this.#frames = null;
-    this.#loading?.abort();
-    this.#loading = this.#coming = null;
+    this.#forget();
     const { keyframes, loop } = this.store;
     const ready = keyframes.length > 1;
     const [start, stop] = this.#ends;
@@ -180,29 +192,55 @@ export class Path {
     find(`li:nth-child(${to + 1}) [data-do=go]`, this.list).focus();
   }
 
-  #load() {
-    this.#coming ??= this.#fetch();
-    return this.#coming;
+  /** Times of frames from start to end, in segments; a loop leaves its end, which is its start, out. */
+  #times(frames) {
+    const [start, stop] = this.#ends;
+    const length = frames - Number(this.store.loop);
+    return Array.from({ length }, (_, k) => start + (k * (stop - start)) / (frames - 1));
   }
 
-  async #fetch() {
-    const { request } = this;
-    const loading = new AbortController();
-    this.#loading = loading;
-    this.status.textContent = `Computing ${request.frames} frames …`;
+  /** Codes at times of the path. */
+  #codes(times) {
+    const { keyframes, loop, space } = this.store;
+    const closed = loop ? [...keyframes, keyframes[0]] : keyframes;
+    return space.along(
+      closed,
+      times.map((t) => t * this.#segments),
+    );
+  }
+
+  #ask() {
+    const { store } = this;
+    const frames = this.#frames;
+    const codes = this.#codes(this.#times(frames));
+    const wanted = meshOf(store);
+    const large = codes.length * store.references[wanted].vertices.length > 3 * MOST_VERTICES;
+    const mesh = large ? "coarse" : wanted;
+    const tell = (there) => {
+      const { length } = codes;
+      this.status.textContent = there < length ? `Computing frames: ${there} of ${length} …` : "";
+    };
+    tell(0);
+    return new Reel(store, codes, mesh, { loop: store.loop, tell });
+  }
+
+  /** The path's frames, as soon as those up to a share of it are there. */
+  async #load(share) {
+    this.#reel ??= this.#ask();
+    const reel = this.#reel;
     try {
-      const { model, references } = this.store;
-      let mesh = meshOf(this.store);
-      if (request.frames * references[mesh].vertices.length > 3 * MOST_VERTICES) mesh = "coarse";
-      const frames = await api.frames(model, { ...request, mesh }, loading.signal);
-      loading.signal.throwIfAborted();
-      this.#frames = frames;
+      await reel.reach(share);
     } catch (error) {
-      if (this.#loading === loading) this.#coming = null;
+      if (this.#reel === reel) this.#forget();
       throw error;
-    } finally {
-      if (this.#loading === loading) this.status.textContent = "";
     }
+    return reel;
+  }
+
+  #forget() {
+    this.#reel?.stop();
+    this.#reel = null;
+    this.status.textContent = "";
   }
 
   /**
@@ -211,36 +249,42 @@ export class Path {
    */
   async film() {
     this.pause();
-    await this.#load();
+    await this.#load(1);
     const [start, stop] = this.#ends;
     this.store.set({ playing: true });
     const show = (share) => {
       if (!this.store.playing) return false;
-      this.#t = start + share * (stop - start);
-      this.#show();
+      this.#show(start + share * (stop - start));
       return true;
     };
     return { seconds: this.seconds, show };
   }
 
+  /** Play as far as frames are there, and on as they come. */
   async #play() {
-    await this.#load();
-    if (this.store.playing) return; // another click waited for the same frames
     const [start, stop] = this.#ends;
-    if (this.#t >= stop - 1e-6) this.#t = start;
+    const reel = await this.#load(0);
+    if (this.store.playing) return; // another click waited for the same frames
     this.store.set({ playing: true });
     let before = performance.now();
     const step = (now) => {
       if (!this.store.playing) return;
-      this.#t += (Math.max(now - before, 0) / (1000 * this.seconds)) * (stop - start);
+      let t = this.#t + (Math.max(now - before, 0) / (1000 * this.seconds)) * (stop - start);
       before = now;
-      if (this.#t > stop && this.store.loop) this.#t = start + ((this.#t - start) % (stop - start));
-      this.#t = Math.min(this.#t, stop);
-      this.#show();
+      if (t > stop && this.store.loop) t = start + ((t - start) % (stop - start));
+      t = Math.min(t, stop);
+      if (reel.has(this.#share(t))) this.#show(t);
       if (this.#t >= stop) this.pause();
       else this.#clock = requestAnimationFrame(step);
     };
+    if (this.#t >= stop - 1e-6) this.#t = start;
     this.#clock = requestAnimationFrame(step);
+    try {
+      await this.#load(1);
+    } catch (error) {
+      this.pause();
+      throw error;
+    }
   }
 
   /** Rest at the nearest frame: the sliders take its code. */
@@ -254,27 +298,35 @@ export class Path {
     cancelAnimationFrame(this.#clock);
     this.#t = t;
     this.#tell();
-    if (!this.#frames && this.#coming) return;
-    await this.#load();
+    await this.#load(this.#share(t));
+    if (this.#t !== t) return; // it has been moved on
     this.store.set({ playing: true });
-    this.#show();
+    this.#show(t);
     if (document.activeElement !== this.timeline || !this.timeline.matches(":active")) this.pause();
   }
 
-  /** The shape at the time it is. */
-  #show() {
-    const [start, stop] = this.#ends;
-    const t = this.store.easing === "soft" ? this.#slowed(this.#t) : this.#t;
-    showAt(this.store, this.#frames, (t - start) / (stop - start), this.store.loop);
-    this.timeline.value = this.#t;
+  /** Show the shape at a time. */
+  #show(t) {
+    this.#t = t;
+    this.#reel.show(this.#share(t));
+    this.timeline.value = t;
     this.#tell();
   }
 
-  /** A time of the path at which the shape comes to each keyframe slowly, and leaves it slowly. */
+  /** How far along its frames the path is at a time. */
+  #share(t) {
+    const [start, stop] = this.#ends;
+    return ((this.store.easing === "soft" ? this.#slowed(t) : t) - start) / (stop - start);
+  }
+
+  /** Where a path is that is slow at its keyframes and ends, when an even one is at t. */
   #slowed(t) {
-    const along = t * this.#segments;
-    const keyframe = Math.floor(along);
-    return (keyframe + eased(along - keyframe)) / this.#segments;
+    const [start, stop] = this.#ends;
+    const before = Math.floor(t * this.#segments) / this.#segments;
+    let [low, high] = [before, before + 1 / this.#segments];
+    if (t < 0) [low, high] = [start, 0];
+    if (t > 1) [low, high] = [1, stop];
+    return low + (high - low) * eased((t - low) / (high - low));
   }
 
   #tell() {

@@ -3,10 +3,10 @@
  * of the model fit as a rule: all from the same few shapes.
  */
 
-import * as api from "./api.js";
+import * as api from "../server/api.js";
 import { tint } from "./colours.js";
-import { percentile } from "./dom.js";
-import { report } from "./messages.js";
+import { percentile } from "../dom.js";
+import { report } from "../messages.js";
 import { sphereOf } from "./scene.js";
 import { Surface } from "./surface.js";
 
@@ -15,7 +15,7 @@ export class Modes {
   #abort = new AbortController();
   #regions = [];
 
-  /** @param {import("./store.js").Page} store */
+  /** @param {import("../store.js").Page} store */
   constructor(store, sliders, pictures) {
     this.store = store;
     this.sliders = sliders;

@@ -3,8 +3,8 @@
  * browser.
  */
 
-import { element, find } from "./dom.js";
-import { always } from "./memory.js";
+import { element, find } from "../dom.js";
+import { always } from "../memory.js";
 
 const LONGEST = 60;
 const place = (model) => `names:${model.name}`;
@@ -51,7 +51,7 @@ function labels({ factors, latent_names: names }) {
 
 /** The dialog in which people name things; `store.names` is what comes of it. */
 export class Names {
-  /** @param {import("./store.js").Page} store */
+  /** @param {import("../store.js").Page} store */
   constructor(store, { dialog, button }) {
     this.store = store;
     this.dialog = dialog;

@@ -1,13 +1,13 @@
 /** The pins of pulls as buttons over the shape: dragged they pull on, pressed they go. */
 
-import { element, find } from "./dom.js";
+import { element, find } from "../dom.js";
 
 const STILL = 4; // pixels that a press may move
 
 export class Pins {
   #buttons = [];
 
-  /** @param {import("./store.js").Page} store */
+  /** @param {import("../store.js").Page} store */
   constructor(store, viewer, pull, { layer, clear }) {
     this.store = store;
     this.viewer = viewer;

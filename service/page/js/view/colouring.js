@@ -1,35 +1,44 @@
 /** What colours the shape: the region of a factor, stretch, bending, or nothing. */
 
-import * as api from "./api.js";
-import { diverging, gradient, tint } from "./colours.js";
-import { element, find, percentile, readable } from "./dom.js";
-import { report } from "./messages.js";
+import * as api from "../server/api.js";
+import { distant, diverging, gradient, tint } from "./colours.js";
+import { element, find, percentile, readable } from "../dom.js";
+import { report } from "../messages.js";
 import { nearest } from "./modes.js";
 import { diagonalOf } from "./scene.js";
 import { Surface } from "./surface.js";
 
 /**
  * The measures and the legend are those of the server's coloured files; here they are told in units for
- * people.
+ * people. `least`: the smallest end of a legend; distances, shares of the diagonal, have no sign.
  */
 const KINDS = {
   stretch: {
     shown: (value) => 100 * Math.expm1(value),
-    unit: " %",
+    unit: "\u00a0%",
     ends: ["shorter", "longer"],
     title: "Stretch: change of length",
+    signed: true,
+    least: 0.01,
+    paint: diverging,
   },
   bending: {
     shown: (value) => (180 / Math.PI) * value,
     unit: "°",
     ends: ["concave", "convex"],
     title: "Bending: change of angle",
+    signed: true,
+    least: 0.01,
+    paint: diverging,
   },
   distance: {
     shown: (value) => 100 * value,
-    unit: " %",
+    unit: "\u00a0%",
     ends: ["", ""],
-    title: "Distance, in percent of the diagonal",
+    title: "Distance, of the diagonal",
+    signed: false,
+    least: 0.001,
+    paint: distant,
   },
 };
 
@@ -39,8 +48,6 @@ export const OTHER = -2;
 export const baseOf = ({ against, keyframes, other }) => (against === OTHER ? other : keyframes[against]);
 
 const SMOOTHED = 4; // times, about as far as coarse vertices lie apart
-const SMALLEST = 0.01; // end of the legend, in either measure
-const NEAREST = 0.001; // the same for distances, a share of the diagonal
 
 export class Colouring {
   #surfaces = new Map();
@@ -48,7 +55,7 @@ export class Colouring {
   #nearest = null;
   #limit = 0;
 
-  /** @param {import("./store.js").Page} store */
+  /** @param {import("../store.js").Page} store */
   constructor(store, { legend, against }) {
     this.store = store;
     this.legend = legend;
@@ -74,33 +81,24 @@ export class Colouring {
     this.legend.hidden = !kind;
     const values = kind && this.#values(kind, mesh, positions);
     if (region) return tint(mesh === "fine" ? this.#onFine(region) : region);
-    return values ? diverging(values, this.#limit) : null;
+    return values ? kind.paint(values, this.#limit) : null;
   }
 
   #values(kind, mesh, positions) {
     const surface = this.#surface(mesh);
     const base = this.#base(mesh, surface);
     if (!base) return null;
-    if (this.store.colour === "distance") return this.#distances(kind, mesh, base.positions, positions);
-    const edges = surface[this.store.colour](base, surface.measure(positions));
-    const values = surface.atVertices(edges, base, this.store.colour === "bending");
-    const most = nice(Math.max(SMALLEST, percentile(values.map(Math.abs), 0.98)));
+    const { colour, moving, playing, references } = this.store;
+    const far = colour === "distance";
+    const measured = far
+      ? apart(base.positions, positions, diagonalOf(references[mesh].vertices))
+      : surface[colour](base, surface.measure(positions));
+    const values = far ? measured : surface.atVertices(measured, base, colour === "bending");
+    const most = nice(Math.max(kind.least, percentile(values.map(Math.abs), 0.98)));
     // While something moves the scale only grows: colours that change their meaning can't be read.
-    this.#limit = this.store.moving || this.store.playing ? Math.max(this.#limit, most) : most;
-    this.#tell(kind, edges);
+    this.#limit = moving || playing ? Math.max(this.#limit, most) : most;
+    this.#tell(kind, measured);
     return values;
-  }
-
-  /** How far vertices are from those of another shape, so that none is blue and the furthest are red. */
-  #distances(kind, mesh, from, to) {
-    const diagonal = diagonalOf(this.store.references[mesh].vertices);
-    const values = Float32Array.from({ length: to.length / 3 }, (_, v) => distanceAt(from, to, v) / diagonal);
-    const most = nice(Math.max(NEAREST, percentile(values, 0.98)));
-    this.#limit = this.store.moving || this.store.playing ? Math.max(this.#limit, most) : most;
-    this.#tell(kind, values);
-    find(".low", this.legend).textContent = "0";
-    find(".middle", this.legend).textContent = `${readable(kind.shown(this.#limit / 2), 2)}${kind.unit}`;
-    return values.map((value) => 2 * value - this.#limit);
   }
 
   #surface(mesh) {
@@ -144,17 +142,20 @@ export class Colouring {
     return weights;
   }
 
-  #tell({ shown, unit, ends, title }, edges) {
-    const size = edges.reduce((sum, value) => sum + Math.abs(value), 0) / edges.length;
-    const [low, high] = [edges.reduce((a, b) => Math.min(a, b)), edges.reduce((a, b) => Math.max(a, b))];
+  /** Fill the legend, from values at edges or vertices. */
+  #tell({ shown, unit, ends, title, signed }, values) {
+    const mean = values.reduce((sum, value) => sum + Math.abs(value), 0) / values.length;
+    const [low, high] = [Math.min, Math.max].map((end) => values.reduce((a, b) => end(a, b)));
     const text = (value) => readable(shown(value), 2).replace("-", "−");
-    const signed = (value) => `${value > 0 ? "+" : ""}${text(value)}`;
+    const both = (value) => `${signed && value > 0 ? "+" : ""}${text(value)}`;
+    const at = (value) => (value === 0 ? "0" : `${both(value)}${unit}`);
+    const [least, middle, most] = [-1, 0, 1].map((k) => this.#limit * (signed ? k : (k + 1) / 2));
     find(".title", this.legend).textContent = title;
-    find(".middle", this.legend).textContent = "0";
-    find(".low", this.legend).textContent = `${signed(-this.#limit)}${unit} ${ends[0]}`;
-    find(".high", this.legend).textContent = `${signed(this.#limit)}${unit} ${ends[1]}`;
+    find(".low", this.legend).textContent = `${at(least)} ${ends[0]}`;
+    find(".middle", this.legend).textContent = at(middle);
+    find(".high", this.legend).textContent = `${at(most)} ${ends[1]}`;
     find(".numbers", this.legend).textContent =
-      `On average ${text(size)}${unit}, from ${signed(low)} to ${signed(high)}${unit}`;
+      `Mean ${text(mean)}${unit}, from ${both(low)} to ${both(high)}${unit}`;
   }
 
   #choices() {
@@ -169,7 +170,12 @@ export class Colouring {
   }
 }
 
-const distanceAt = (from, to, v) => Math.hypot(...[0, 1, 2].map((i) => to[3 * v + i] - from[3 * v + i]));
+/** How far vertices are between two shapes, as shares of a diagonal. */
+const apart = (from, to, diagonal) =>
+  Float32Array.from({ length: to.length / 3 }, (_, v) => {
+    const [x, y, z] = [3 * v, 3 * v + 1, 3 * v + 2].map((i) => to[i] - from[i]);
+    return Math.hypot(x, y, z) / diagonal;
+  });
 
 /** The next of 1, 2, 5, 10, … times a power of ten. */
 function nice(value) {

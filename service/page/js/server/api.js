@@ -2,7 +2,7 @@
  * The calls of the server that the page makes. Every failure becomes a Problem with a sentence for people.
  */
 
-import { here } from "./memory.js";
+import { here } from "../memory.js";
 import { readNpz } from "./npz.js";
 
 export const origin = new URL(".", document.baseURI).href.replace(/\/$/, "");
@@ -99,16 +99,8 @@ export async function shapes(model, latents, mesh, { quality = "full", signal } 
   return { shapes: split(vertices), diagnostics: diagnosticsOf(response) };
 }
 
-/** Positions and codes of the frames of a path, as drafts. */
-export async function frames(model, path, signal) {
-  const { id, links } = await interpolation(model, path, signal);
-  const response = await call(`${links.self}?format=npz&quality=draft`, { signal });
-  const { vertices, latents, t } = await readNpz(await response.arrayBuffer(), ["vertices", "latents", "t"]);
-  const codes = split(latents).map((code) => Array.from(code));
-  return { id, mesh: path.mesh, shapes: split(vertices), codes, t: Array.from(t.data) };
-}
-
-export const interpolation = (model, path, signal) => json(post(model.links.interpolations, path, signal));
+/** The id and links of an animation. */
+export const interpolation = (model, path) => json(post(model.links.interpolations, path));
 
 /** A random code of a seed. */
 export async function sample(model, seed) {

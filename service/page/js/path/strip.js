@@ -1,13 +1,13 @@
 /** The elements of a path's factors: the whole shape along the path, and below it each factor alone. */
 
-import * as api from "./api.js";
-import { element, find, sharp } from "./dom.js";
+import * as api from "../server/api.js";
+import { element, find, sharp } from "../dom.js";
 
 const COLUMNS = 5;
 const PICTURE = 56;
 
 export class Strip {
-  /** @param {import("./store.js").Page} store */
+  /** @param {import("../store.js").Page} store */
   constructor(store, pictures, { button, table }) {
     this.store = store;
     this.pictures = pictures;
@@ -21,7 +21,11 @@ export class Strip {
 
   async draw() {
     const { keyframes, model, names, space } = this.store;
-    const { codes, shapes, t } = await api.frames(model, { keyframes, frames: COLUMNS, mesh: "coarse" });
+    const t = Array.from({ length: COLUMNS }, (_, i) => i / (COLUMNS - 1));
+    const codes = space.along(
+      keyframes,
+      t.map((share) => share * (keyframes.length - 1)),
+    );
     const rows = [["all factors", null], ...model.factors.map((factor, j) => [names.factors[j], factor])];
     find("thead tr", this.table).replaceChildren(
       element("td"),
@@ -38,17 +42,10 @@ export class Strip {
     find("tbody", this.table).replaceChildren(...made);
     this.table.hidden = false;
     for (const [i, [, factor]] of rows.entries()) {
-      const drawn = factor
-        ? (
-            await api.shapes(
-              model,
-              codes.map((code) => space.alone(factor, code)),
-              "coarse",
-            )
-          ).shapes
-        : shapes;
+      const alone = factor ? codes.map((code) => space.alone(factor, code)) : codes;
+      const { shapes } = await api.shapes(model, alone, "coarse", { quality: "draft" });
       if (this.store.keyframes !== keyframes || this.store.model !== model) return;
-      made[i].querySelectorAll("canvas").forEach((canvas, k) => this.pictures.draw(canvas, drawn[k]));
+      made[i].querySelectorAll("canvas").forEach((canvas, k) => this.pictures.draw(canvas, shapes[k]));
     }
   }
 }

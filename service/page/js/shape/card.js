@@ -1,7 +1,7 @@
 /** The card of a model: what it is, how good it is, and how to call it. */
 
-import * as api from "./api.js";
-import { element, find, readable } from "./dom.js";
+import * as api from "../server/api.js";
+import { element, find, readable } from "../dom.js";
 
 const rows = (facts) =>
   facts.map(([name, value, meaning = ""]) =>

@@ -1,6 +1,6 @@
 /** How well a shape was found, in words. */
 
-import { readable } from "./dom.js";
+import { readable } from "../dom.js";
 
 const FITS = 0.01; // residual up to which nobody need know more
 const HARDLY = 0.05;

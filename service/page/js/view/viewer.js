@@ -26,6 +26,7 @@ const ROOM = 1.08; // for shapes that are larger than the reference
 export class Viewer {
   #scheduled = false;
   #share = 1; // of the height that is free for the shape
+  #grounds = [];
 
   /** `margin`: pixels of the canvas's height that buttons and words take. */
   constructor(canvas, margin) {
@@ -38,7 +39,9 @@ export class Viewer {
     this.scene.add(this.camera);
     this.controls = new OrbitControls(this.camera, canvas);
     this.controls.addEventListener("change", () => this.draw());
-    this.controls.addEventListener("end", () => this.canvas.dispatchEvent(new Event("turned")));
+    this.controls.addEventListener("end", () => this.#turned());
+    /** Whether the view is another than the one that shapes are seen from first. */
+    this.turned = false;
 
     this.materials = { surface: surfaceMaterial(), normals: new THREE.MeshNormalMaterial() };
     /** @type {THREE.Mesh<THREE.BufferGeometry, THREE.Material>} */
@@ -68,8 +71,8 @@ export class Viewer {
     // at.
     this.skinned = new THREE.Mesh();
     this.skinned.frustumCulled = this.skinned.visible = false;
-    this.stage = new Stage();
-    this.scene.add(this.mesh, this.wires, this.skinned, this.stage);
+    this.stage = this.ground();
+    this.scene.add(this.mesh, this.wires, this.skinned);
     this.recolour();
     this.geometries = {};
 
@@ -151,13 +154,27 @@ export class Viewer {
     this.draw();
   }
 
+  /** A ground for a shape to stand on. */
+  ground() {
+    const made = new Stage();
+    this.#grounds.push(made);
+    this.scene.add(made);
+    return made;
+  }
+
   /** Take the colours of the theme. */
   recolour() {
-    this.stage.colour = getComputedStyle(this.canvas).color;
+    for (const ground of this.#grounds) ground.colour = getComputedStyle(this.canvas).color;
     this.draw();
   }
 
+  #turned() {
+    this.turned = true;
+    this.canvas.dispatchEvent(new Event("turned"));
+  }
+
   resetView() {
+    this.turned = false;
     frame(this.camera, { center: this.middle, radius: this.sphere.radius }, this.#distance);
     this.controls.target.copy(this.middle);
     this.controls.minDistance = 0.2 * this.sphere.radius;
@@ -166,11 +183,26 @@ export class Viewer {
     this.draw();
   }
 
-  /** Have positions (3V numbers) in view beside the reference; null leaves it alone again. */
-  makeRoom(positions) {
+  /**
+   * Have positions (3V numbers) in view beside the reference; null leaves it alone again. One goes on looking
+   * from where one has turned the view to, and where it is `given` from the very point.
+   */
+  makeRoom(positions, given = false) {
+    const { middle } = this;
+    const before = this.#distance;
     this.seen = positions ? joined(this.reference, positions) : this.reference;
     this.middle = sphereOf(this.seen).center;
-    this.resetView();
+    if (!this.turned) this.resetView();
+    else if (!given) this.#move(this.middle.clone().sub(middle), this.#distance / before);
+  }
+
+  /** Move what one looks at, and be as many times as far from it. */
+  #move(by, times) {
+    const { target } = this.controls;
+    const offset = this.camera.position.clone().sub(target).multiplyScalar(times);
+    target.add(by);
+    this.camera.position.copy(target).add(offset);
+    this.controls.update();
   }
 
   /** From which what is to be seen fills what is free of the picture. */
@@ -270,12 +302,7 @@ export class Viewer {
     this.#share = Math.max(1 - this.margin / height, 0.4);
     this.renderer.setSize(width, height, false);
     // A smaller window must show as much: the distance follows.
-    const { target } = this.controls;
-    if (before)
-      this.camera.position
-        .sub(target)
-        .multiplyScalar(this.#distance / before)
-        .add(target);
+    if (before) this.#move(new THREE.Vector3(), this.#distance / before);
     this.camera.updateProjectionMatrix();
     this.draw();
   }
@@ -301,7 +328,7 @@ export class Viewer {
     this.camera.position.copy(this.controls.target).add(offset);
     this.controls.update();
     this.draw();
-    this.canvas.dispatchEvent(new Event("turned"));
+    this.#turned();
   }
 }
 

@@ -1,25 +1,21 @@
 /** A slider for each coordinate, grouped by factor. */
 
-import { clone, find, readable, sharp } from "./dom.js";
+import { clone, find, readable, sharp } from "../dom.js";
 
 const PICTURE = 44;
 const FEW = 8; // coordinates up to which all factors stand open
-const REST = 700; // ms without a key until a movement by keys has ended
 
 export class Sliders {
   #rows = [];
-  #held = false; // whether a slider is being dragged, or moved by keys
-  #timer = 0;
 
-  /** @param {import("./store.js").Page} store */
-  constructor(store, list) {
+  /** @param {import("../store.js").Page} store */
+  constructor(store, hand, list) {
     this.store = store;
+    this.hand = hand;
     this.list = list;
     store.on(["space"], () => this.#build());
     store.on(["names"], () => this.#label());
     store.on(["code", "locked"], () => this.#show());
-    // The end of a drag, wherever it ends.
-    for (const end of ["pointerup", "pointercancel", "blur"]) addEventListener(end, () => this.#let());
   }
 
   /** The canvases of coordinate k for shapes at its three stations. */
@@ -101,16 +97,9 @@ export class Sliders {
       `Training data from ${readable(space.lower[k])} to ${readable(space.upper[k])}` +
       (space.period[k] ? `, period ${readable(space.period[k])}` : "");
 
-    slider.addEventListener("pointerdown", () => {
-      this.#held = true;
-      this.store.set({ moving: true });
-    });
+    this.hand.on(slider);
     slider.addEventListener("input", () => this.#set(k, Number(slider.value)));
-    slider.addEventListener("keydown", (event) => {
-      this.#typed(event);
-      this.#wrapAtTheEnd(event, k, slider);
-    });
-    slider.addEventListener("blur", () => this.#let());
+    slider.addEventListener("keydown", (event) => this.#wrapAtTheEnd(event, k, slider));
     box.addEventListener("input", () => {
       if (box.value !== "") this.#set(k, Number(box.value));
     });
@@ -129,24 +118,6 @@ export class Sliders {
     const controls = [slider, box, reset, ...root.querySelectorAll(".pictures button")];
     this.#rows[k] = { root, slider, box, lock, reset, signs, controls };
     return root;
-  }
-
-  /** Keys one after the other are one movement; a shortcut such as undo ends it. */
-  #typed({ key, ctrlKey, metaKey }) {
-    if (ctrlKey || metaKey) this.#let();
-    else if (/^(Arrow|Page|Home|End)/.test(key)) {
-      this.#held = true;
-      this.store.set({ moving: true });
-      clearTimeout(this.#timer);
-      this.#timer = setTimeout(() => this.#let(), REST);
-    }
-  }
-
-  #let() {
-    clearTimeout(this.#timer);
-    if (!this.#held) return;
-    this.#held = false;
-    this.store.set({ moving: false });
   }
 
   #set(k, value) {

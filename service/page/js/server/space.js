@@ -43,6 +43,35 @@ export class LatentSpace {
     return value >= this.lower[k] - slack && value <= this.upper[k] + slack;
   }
 
+  /**
+   * The codes at some times of a path through keyframes: 0 is the first of these, 1 the next, and so on;
+   * before the first and past the last it goes straight on, and angles take the shorter way round.
+   * @param {number[][]} keyframes
+   * @param {number[]} times
+   */
+  along(keyframes, times) {
+    const way = this.#unroll(keyframes);
+    return times.map((t) => {
+      const k = Math.min(Math.max(Math.floor(t), 0), way.length - 2);
+      return this.wrapAll(way[k].map((value, i) => (1 - t + k) * value + (t - k) * way[k + 1][i]));
+    });
+  }
+
+  /** Keyframes with angles moved by whole periods, so that no step is longer than half of one. */
+  #unroll(keyframes) {
+    const way = [keyframes[0]];
+    for (const code of keyframes.slice(1)) {
+      const before = way.at(-1);
+      way.push(code.map((value, k) => before[k] + this.#shorter(k, value - before[k])));
+    }
+    return way;
+  }
+
+  #shorter(k, step) {
+    const period = this.period[k];
+    return period ? period / 2 - mod(period / 2 - step, period) : step;
+  }
+
   /** Home but for some coordinates. */
   homeBut(changes) {
     return this.home.map((value, k) => changes[k] ?? value);

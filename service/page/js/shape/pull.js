@@ -3,13 +3,13 @@
  */
 
 import { Matrix4, Vector3 } from "three";
-import * as api from "./api.js";
-import { readable } from "./dom.js";
-import { report, say, takeBack } from "./messages.js";
-import { nearest } from "./modes.js";
-import { matrixOf } from "./pose.js";
-import { diagonalOf } from "./scene.js";
-import { fixedBy } from "./space.js";
+import * as api from "../server/api.js";
+import { readable } from "../dom.js";
+import { report, say, takeBack } from "../messages.js";
+import { nearest } from "../view/modes.js";
+import { matrixOf } from "../view/pose.js";
+import { diagonalOf } from "../view/scene.js";
+import { fixedBy } from "../server/space.js";
 
 const MET = 0.01; // distance from a pin, as a share of the diagonal, at which it is met
 const NEARER = 0.9; // a code that leaves more of the distance than this isn't worth a change of shape
@@ -28,7 +28,7 @@ export class Pull {
   #busy = false;
   #answer = null;
 
-  /** @param {import("./store.js").Page} store */
+  /** @param {import("../store.js").Page} store */
   constructor(store, viewer) {
     this.store = store;
     this.viewer = viewer;

@@ -11,7 +11,7 @@
 
 import { Matrix4 } from "three";
 import * as api from "./api.js";
-import { report, say, takeBack } from "./messages.js";
+import { report, say, takeBack } from "../messages.js";
 
 const REST = 160; // ms without movement until the full shape is asked for
 const TOO_LONG = 400; // ms after which a draft is given up for a newer one
@@ -19,7 +19,10 @@ const TOO_LONG = 400; // ms after which a draft is given up for a newer one
 const LINES = 1080; // of a screen that a shape fills: a step is as large as one
 const MOST = 24; // steps
 
-/** The mesh that the switch and the model give. */
+/**
+ * The mesh that the switch and the model give.
+ * @returns {"coarse" | "fine"}
+ */
 export const meshOf = ({ fine, hasFine }) => (fine && hasFine ? "fine" : "coarse");
 
 /**
@@ -55,7 +58,7 @@ export class ShapeLoop {
   #current = null;
   #timer = 0;
 
-  /** @param {import("./store.js").Page} store */
+  /** @param {import("../store.js").Page} store */
   constructor(store) {
     this.store = store;
     store.on(["code", "model"], () => this.#moved());

@@ -1,12 +1,12 @@
 /** Files to keep, pictures and videos among them, and calls to copy. */
 
-import { toHash } from "./address.js";
-import * as api from "./api.js";
-import { baseOf } from "./colouring.js";
-import { element, find, readable } from "./dom.js";
-import { reporting, say } from "./messages.js";
-import { CODE } from "./show/code.js";
-import { picture, record, turntable } from "./show/video.js";
+import { toHash } from "../address.js";
+import * as api from "../server/api.js";
+import { baseOf } from "../view/colouring.js";
+import { element, find, readable } from "../dom.js";
+import { reporting, say } from "../messages.js";
+import { CODE } from "./code.js";
+import { picture, record, turntable } from "./video.js";
 
 /** What the server offers for one shape. */
 export const SHAPE_FORMATS = ["glb", "gltf", "obj", "ply", "stl", "npz", "zip", "json"];
@@ -32,7 +32,7 @@ function keep(blob, name) {
 }
 
 export class Files {
-  /** @param {import("./store.js").Page} store */
+  /** @param {import("../store.js").Page} store */
   constructor(store, path, viewer, root) {
     this.store = store;
     this.path = path;

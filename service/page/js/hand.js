@@ -1,0 +1,44 @@
+/** What a hand does to a slider in one go is one step: a drag, or keys one after the other. */
+
+const REST = 700; // ms without a key until a movement by keys has ended
+
+export class Hand {
+  #held = false;
+  #timer = 0;
+
+  /** @param {import("./store.js").Page} store whose `moving` says that a hand is at it */
+  constructor(store) {
+    this.store = store;
+    // The end of a drag, wherever it ends.
+    for (const end of ["pointerup", "pointercancel", "blur"]) addEventListener(end, () => this.#let());
+  }
+
+  /** Watch a slider. */
+  on(slider) {
+    slider.addEventListener("pointerdown", () => this.#take());
+    slider.addEventListener("keydown", (event) => this.#typed(event));
+    slider.addEventListener("blur", () => this.#let());
+  }
+
+  /** A shortcut such as undo ends a movement. */
+  #typed({ key, ctrlKey, metaKey }) {
+    if (ctrlKey || metaKey) this.#let();
+    else if (/^(Arrow|Page|Home|End)/.test(key)) {
+      this.#take();
+      clearTimeout(this.#timer);
+      this.#timer = setTimeout(() => this.#let(), REST);
+    }
+  }
+
+  #take() {
+    this.#held = true;
+    this.store.set({ moving: true });
+  }
+
+  #let() {
+    clearTimeout(this.#timer);
+    if (!this.#held) return;
+    this.#held = false;
+    this.store.set({ moving: false });
+  }
+}

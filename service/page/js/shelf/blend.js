@@ -1,0 +1,43 @@
+/** A slider from the shape as it was to the one beside it. */
+
+import { find } from "../dom.js";
+
+export class Blend {
+  #from = null; // the code at its one end
+  #own = null; // the code that it has made
+
+  /** @param {import("../store.js").Page} store */
+  constructor(store, hand, box) {
+    this.store = store;
+    this.slider = find("input", box);
+    hand.on(this.slider);
+    this.slider.addEventListener("input", () => this.#move(this.slider.valueAsNumber));
+    store.on(["other"], () => {
+      box.hidden = !store.other;
+      this.#start();
+    });
+    store.on(["code"], () => {
+      if (store.code !== this.#own) this.#start();
+    });
+  }
+
+  /** Begin anew, at the shape as it is. */
+  #start() {
+    this.#from = this.#own = null;
+    this.slider.value = 0;
+    this.#tell();
+  }
+
+  #move(share) {
+    const { code, locked, other, space } = this.store;
+    this.#from ??= code;
+    const [there] = space.along([this.#from, other], [share]);
+    this.#own = there.map((value, k) => (locked[k] ? code[k] : value));
+    this.store.set({ code: this.#own });
+    this.#tell();
+  }
+
+  #tell() {
+    this.slider.setAttribute("aria-valuetext", `${Math.round(100 * this.slider.valueAsNumber)} %`);
+  }
+}
