@@ -40,7 +40,7 @@ def measure(run: RunDirectory, config: Config) -> dict[str, Any]:
     fields = logarithms(space, mean, shapes, config.modes.log_steps).fields
 
     def explained(span: FloatArray) -> list[float]:
-        return [modes.projected(space, mean, fields, span[:k], config.modes.norm)[1] for k in counts]
+        return [modes.coefficients(space, mean, fields, span[:k], config.modes.norm)[1] for k in counts]
 
     return {
         "modes": counts,

@@ -22,8 +22,6 @@ from shapespace.training.runs.workers import run
 TOLERANCE, GAIN, EXPONENTIALS = 1e-3, 1e-3, 40
 #: Where an exponential isn't found at the start, the search begins from these shares of it.
 SHARES = (1.0, 0.75, 0.5, 0.25, 0.0)
-#: Of rough codes: what a square of 1 costs, as a share of the mean square of a mode.
-RIDGE = 0.02
 #: What bounds have to spare on each side of the shapes' codes, as a share of their range; and what a side has at least,
 #: as a share of the other.
 ROOM, MARGIN = 0.05, 0.1
@@ -76,20 +74,6 @@ def nearest_codes(
     found = dict(progress(results, "codes", "shape", len(items)))
     codes, vertices, counts, status = zip(*(found[k] for k in range(len(items))), strict=True)
     return Codes(np.stack(codes), np.stack(vertices), counts, status)
-
-
-def rough_codes(mean: FloatArray, modes: FloatArray, shapes: FloatArray) -> FloatArray:
-    """Codes (n, m) to start a search from: small ones that bring ``z̄ + Σ_j w_j u_j`` near shapes (n, V, 3).
-
-    Those that bring it nearest are many times as large as any shape's where modes are many and shapes few, and faces
-    collapse on the way to them.
-    """
-    flat = modes.reshape(len(modes), -1)
-    away = (align(shapes, mean) - mean).reshape(len(shapes), -1)
-    gram = flat @ flat.T
-    ridge = RIDGE * gram.diagonal().mean() * np.eye(len(modes))
-    codes: FloatArray = np.linalg.solve(gram + ridge, flat @ away.T).T
-    return codes
 
 
 def box_of(codes: FloatArray) -> tuple[FloatArray, FloatArray]:

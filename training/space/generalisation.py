@@ -19,9 +19,9 @@ from shapespace.shell.mean import elastic_mean
 from shapespace.shell.space import ShellSpace
 from shapespace.solve.outcome import Status
 from shapespace.training.runs.config import ModeSettings
-from shapespace.training.space.codes import nearest_codes, rough_codes
+from shapespace.training.space.codes import nearest_codes
 from shapespace.training.space.logarithms import logarithms
-from shapespace.training.space.modes import ModeError, find_modes, mode_count
+from shapespace.training.space.modes import ModeError, coefficients, find_modes, mode_count
 
 #: Shapes are held out in so many folds, or one by one where there are fewer than twice as many.
 FOLDS = 5
@@ -152,10 +152,12 @@ def held_out(
         count = mode_count(settings, space, mean, fields)
         counts = [-(-count // 2), count]
     counts = [min(count, len(kept) - 1) for count in counts]
+    # Codes are sought from here: on the straight way to a far shape faces collapse.
+    towards = logarithms(space, mean, unseen, steps).fields
     reached, by_modes, by_components = [], [], []
     for count in counts:
         modes = find_modes(settings, space, mean, fields, count)
-        start = rough_codes(mean, modes.vertices, unseen)
+        start, _ = coefficients(space, mean, towards, modes.vertices, settings.norm)
         by_modes.append(nearest_codes(space, mean, modes.vertices, unseen, start, steps).vertices)
         by_components.append(components.nearest(unseen, len(modes)))
         reached.append(len(modes))

@@ -255,21 +255,27 @@ def _judged(norm: Norm) -> Norm:
     return "shell" if norm == "shell" else "vertices"
 
 
-def projected(
-    space: ShellSpace, mean: FloatArray, fields: FloatArray, span: FloatArray, norm: Norm = "vertices"
+def coefficients(
+    space: ShellSpace, mean: FloatArray, fields: FloatArray, modes: FloatArray, norm: Norm
 ) -> tuple[FloatArray, float]:
-    """The parts (n, V, 3) of fields (n, V, 3) in the span of others (k, V, 3), orthogonal in a norm.
+    """Of the orthogonal projections of logarithms to the span of modes.
+
+    Args:
+        space: the shape space.
+        mean: X̄ (V, 3).
+        fields: (n, V, 3) logarithms.
+        modes: (m, V, 3) vertex fields.
+        norm: in which.
 
     Returns:
-        The parts, and the share of ``Σ ‖v^i‖²`` that they keep.
+        (n, m), and the share of ``Σ ‖v^i‖²`` that the projections keep.
 
     Raises:
-        ModeError: fields that can't be used.
+        ModeError: logarithms that can't be used.
     """
     problem = _Problem(space, mean, fields, 1, norm)
-    D = problem.balanced(span)
-    W, explained = problem.project(D)
-    return (W.T @ D).reshape(fields.shape), explained
+    W, explained = problem.project(problem.balanced(modes))
+    return W.T, explained
 
 
 def edge_magnitudes(nric: FloatArray, norm: WeightedNorm) -> FloatArray:

@@ -19,7 +19,7 @@ from shapespace.shell.geodesic import geodesic
 from shapespace.shell.space import ShellSpace
 from shapespace.solve.outcome import Status
 from shapespace.training.space.logarithms import logarithms
-from shapespace.training.space.modes import ModeError, Modes, Norm, _fit_in_box, localisation, pga, projected, spga
+from shapespace.training.space.modes import ModeError, Modes, Norm, _fit_in_box, coefficients, localisation, pga, spga
 from tests.shapespace.conftest import bent
 
 
@@ -171,7 +171,7 @@ def test_modes_are_as_sparse_as_shapes_that_are_held_out_allow(bumps, rng):
         lost += gram[held, held].sum() - np.vdot(inner, np.linalg.solve(seen.inner(axes, axes), inner.T).T)
 
     def left(modes: Modes) -> float:
-        return gram.trace() * (1 - projected(bumps.space, bumps.mean, fields, modes.vertices, judged)[1])
+        return gram.trace() * (1 - coefficients(bumps.space, bumps.mean, fields, modes.vertices, judged)[1])
 
     plain = bumps.pga(fields, 3)
     assert left(plain) < left(noisy) <= left(plain) + 0.03 * lost
