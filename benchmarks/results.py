@@ -24,7 +24,7 @@ from shapespace.training.report.pictures import COMPOSITE, Studio
 from shapespace.training.report.record import Record
 from shapespace.training.runs.config import load
 from shapespace.training.runs.directory import RunDirectory
-from shapespace.training.runs.sampling import DONE, columns
+from shapespace.training.runs.sampling import DONE, KNOWN, columns
 
 ROOT = Path(__file__).resolve().parents[1]
 #: Collections of real meshes, in the order of the tables; then the hand without what the method rests on.
@@ -83,7 +83,8 @@ class Row:
         """Exponentials drawn: ``joint`` and of the ``factors``, and how many of each ``failed``."""
         found = {"joint": 0, "factors": 0, "joint failed": 0, "factors failed": 0}
         own = [("factors", self.directory.factor_samples(j)) for j in range(len(self.sizes))]
-        for kind, folder in [("joint", self.directory.samples), *own]:
+        joint = [("joint", self.directory.samples), ("joint", self.directory.samples / KNOWN)]
+        for kind, folder in joint + own:
             status = columns(folder, "status").get("status", np.array([]))
             found[kind] += len(status)
             found[f"{kind} failed"] += int((status != DONE).sum())

@@ -195,7 +195,7 @@ from shapespace.training.space.shell_collection import ShellCollection
 corners = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], float)
 mesh = TriangleMesh.from_arrays(corners, [[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]])
 ends = -np.ones(1), np.ones(1)
-collection = ShellCollection(mesh, 0.1 * corners[None], *ends, {"size": [0]}, 4, Material(), 1.0)
+collection = ShellCollection(mesh, 0.1 * corners[None], *ends, {"size": [0]}, 4, Material(), 1.0, np.empty((0, 1)))
 part = sampling._part(collection, False, np.array([[0.5]]))
 assert part["status"] == [sampling.DONE], part["reason"]
 """

@@ -25,7 +25,7 @@ from shapespace.training.report.page import write_report
 from shapespace.training.runs.config import Config
 from shapespace.training.runs.directory import RunDirectory
 from shapespace.training.runs.progress import waiting
-from shapespace.training.runs.sampling import FEWEST, Collection, SamplesError, draw, indices, read, split, used
+from shapespace.training.runs.sampling import FEWEST, KNOWN, Collection, SamplesError, draw, indices, read, split, used
 from shapespace.training.runs.shortfalls import refuse, shortfalls
 from shapespace.training.runs.stages import STAGES, stage_keys
 from shapespace.training.space import stages as space
@@ -159,6 +159,12 @@ def samples(run: Run) -> None:
     own = settings.own(len(run.collection.factors))
     codes = coordinates.uniform(max(settings.count, *own), code_rng)
     _draw(run, folder, codes[: settings.count], "joint samples", shorten=True)
+    known = run.collection.codes
+    if wanted := min(len(known), settings.count // 4) * settings.shapes:
+        some = np.linspace(0, len(known) - 1, wanted).round().astype(int)
+        _draw(run, folder / KNOWN, known[some], "samples at the collection's shapes", shorten=True)
+    else:
+        shutil.rmtree(folder / KNOWN, ignore_errors=True)
     codes = used(folder, codes)
     for j, (index, count) in enumerate(zip(run.collection.factors.values(), own, strict=True)):
         _draw(run, directory.factor_samples(j), alone(codes[:count], index), f"samples of factor {j}", shorten=True)

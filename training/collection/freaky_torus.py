@@ -84,6 +84,8 @@ class FreakyTorus:
     latent_names = LATENTS
     coordinates = Coordinates(np.zeros(4), np.full(4, PERIOD), np.full(4, PERIOD))
 
+    codes = np.empty((0, 4))
+
     def __init__(self) -> None:
         mesh = reference()
         self.scale = float(np.sqrt(mesh.area))

@@ -107,10 +107,11 @@ class Learner:
 
     @cached_property
     def split(self) -> dict[str, IntArray]:
-        """Rows of the joint samples: train, validation, test."""
+        """Rows of the joint samples that were drawn: train, validation, test."""
         if self.seed != self.config.networks.seed:
             settings, rng = self.config.samples, np.random.default_rng(self.seed)
-            return split(np.arange(len(self.joint.index)), settings.test_fraction, settings.validation_fraction, rng)
+            drawn = np.flatnonzero(self.joint.index >= 0)
+            return split(drawn, settings.test_fraction, settings.validation_fraction, rng)
         return {name: np.searchsorted(self.joint.index, index) for name, index in self.run.split.read().items()}
 
     @cached_property
@@ -128,7 +129,11 @@ class Learner:
 
     @property
     def rows(self) -> dict[str, IntArray]:
-        """The split, with only the share of it to learn from: the first rows, since codes are independent."""
+        """The split, with the collection's shapes to learn from as well; or only the share of it to learn from, the
+        first rows, since codes are independent.
+        """
+        if self._fraction == 1:
+            return self.split | {"train": np.concatenate([np.flatnonzero(self.joint.index < 0), self.split["train"]])}
         return {
             name: index if name == "test" else index[: max(4, round(self._fraction * len(index)))]
             for name, index in self.split.items()

@@ -101,7 +101,7 @@ class FactorSettings(_Section):
 
 
 class SampleSettings(_Section):
-    """Codes drawn uniformly from the hypercube, and how they are split."""
+    """Codes whose shapes are computed: drawn uniformly from the hypercube, and split; and those of the collection."""
 
     count: int = Field(4000, ge=10)
     """Joint samples: random codes whose shapes are computed. They take most of a run's time."""
@@ -111,6 +111,9 @@ class SampleSettings(_Section):
     """Samples of each factor alone, one number for all or one for each. They have the factor's part of the joint
     codes, and of further codes beyond ``count``. By default 1000, or ``count`` where that is less; the paper takes
     ``count``."""
+    shapes: bool = True
+    """Whether the codes of the collection's own shapes are samples too, always to learn from: few random codes lie
+    where shapes do. At most a quarter as many as ``count``, spread evenly over the shapes."""
     part_size: int = Field(50, ge=1)
     """Samples in a file: what a worker is given at a time, and what is lost with it."""
     test_fraction: float = Field(0.2, gt=0, lt=1)

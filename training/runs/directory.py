@@ -151,7 +151,7 @@ class RunDirectory:
 
     @property
     def samples(self) -> Path:
-        """Folder of the joint samples."""
+        """Folder of the joint samples; in ``shapes/`` those at the codes of the collection's shapes."""
         return self.folder / "samples"
 
     def factor_samples(self, j: int) -> Path:

@@ -23,6 +23,8 @@ DONE, FAILED = "done", "failed"
 #: A code whose shape can't be computed is multiplied by this factor, at most so many times. Faces collapse mostly at
 #: codes near the corners of the box, which lie farther out than the training shapes do.
 SHORTER, SHORTENINGS = 0.85, 3
+#: Folder inside that of the joint samples: those of the codes of the collection's shapes.
+KNOWN = "shapes"
 #: Fewest samples to learn from: each part of the split needs some.
 FEWEST = 10
 
@@ -56,6 +58,7 @@ class Collection(Protocol):
         factors: latent indices of each factor, by name; consecutive.
         latent_names: (m,) names of the coordinates.
         coordinates: bounds and periods.
+        codes: (n, m) of the shapes that the collection was made from, none where it is by design.
         symmetries: involutions of the edges, (E,) each, that take shapes of the collection to shapes of the collection
             and the reference to itself; the combiner sees each training sample's images too.
         finer: the same by exponentials of twice as many steps; None where shapes are not made by steps.
@@ -72,6 +75,8 @@ class Collection(Protocol):
     @property
     def coordinates(self) -> Coordinates: ...  # noqa: D102
     @property
+    def codes(self) -> FloatArray: ...  # noqa: D102
+    @property
     def symmetries(self) -> list[IntArray]: ...  # noqa: D102
     @property
     def finer(self) -> Collection | None: ...  # noqa: D102
@@ -86,7 +91,8 @@ class Samples:
     """Finished samples, in the order of their index; failed ones are left out.
 
     Attributes:
-        index: (n,) increasing; samples of two folders with the same index belong to the same joint code.
+        index: (n,) increasing; samples of two folders with the same index belong to the same joint code. Below 0 for
+            codes of the collection's own shapes.
         latents: (n, m) codes that the shapes have.
         asked: (n, m) codes that were asked for; farther from 0 than ``latents`` where they had no shape.
         nric: (n, 2E).
@@ -223,13 +229,16 @@ def indices(folder: Path) -> IntArray:
 
 
 def read(folder: Path) -> Samples:
-    """Read all parts of a folder."""
+    """Read all parts of a folder, and before them those of the collection's shapes, where it has some."""
     fields = "index", "latents", "asked", "nric", "vertices"
     found: dict[str, list[NDArray]] = {name: [] for name in fields}
-    for part in parts(folder):
-        done = part["status"] == DONE
-        for name in fields:
-            found[name].append((asked_for(part) if name == "asked" else part[name])[done])
+    known = len(columns(folder / KNOWN, "index").get("index", ()))
+    for place, first in ((folder / KNOWN, -known), (folder, 0)):
+        for part in parts(place):
+            done = part["status"] == DONE
+            for name in fields:
+                found[name].append((asked_for(part) if name == "asked" else part[name])[done])
+            found["index"][-1] = found["index"][-1] + first
     return Samples(*(np.concatenate(found[name]) for name in fields))
 
 

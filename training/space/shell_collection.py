@@ -32,6 +32,7 @@ class ShellCollection:
         steps: K of the exponential.
         material: μ, λ, η.
         scale: length of one unit of the reference in the user's units.
+        codes: (n, m) of the shapes that it was made from.
     """
 
     reference: TriangleMesh
@@ -42,6 +43,7 @@ class ShellCollection:
     steps: int
     material: Material
     scale: float
+    codes: FloatArray
 
     def __getstate__(self) -> dict[str, Any]:
         return {name: value for name, value in self.__dict__.items() if name != "space"}

@@ -369,6 +369,7 @@ def collection(run: RunDirectory, config: Config) -> ShellCollection:
         steps=config.samples.steps,
         material=material(config),
         scale=float(run.reference.read()["scale"]),
+        codes=modes["coefficients"],
     )
 
 

@@ -45,7 +45,8 @@ def collection() -> ShellCollection:
     (x, y, z), o = mesh.vertices.T, np.zeros(162)
     modes = [np.stack(field, axis=1) for field in ((o, o, x**2), (o, x * z, -x * y), (x * y, o, o))]
     factors = {"bend": [0], "twist and swell": [1, 2]}
-    return ShellCollection(mesh, np.stack(modes), np.full(3, -0.5), np.full(3, 0.5), factors, 8, Material(), 2.0)
+    ends, codes = (np.full(3, -0.5), np.full(3, 0.5)), np.array([[0.3, -0.2, 0.1], [0.0, 0.4, -0.4]])
+    return ShellCollection(mesh, np.stack(modes), *ends, factors, 8, Material(), 2.0, codes)
 
 
 @pytest.fixture(scope="module")
@@ -265,7 +266,9 @@ def test_angles_follow_the_geodesic_past_half_a_turn() -> None:
     )
     close = np.zeros((1, 4, 3))
     close[0, 2:, 2] = -2.0
-    collection = ShellCollection(book, close, -np.ones(1), np.ones(1), {"close": [0]}, 32, Material(), 1.0)
+    collection = ShellCollection(
+        book, close, -np.ones(1), np.ones(1), {"close": [0]}, 32, Material(), 1.0, np.empty((0, 1))
+    )
     shapes = collection.shapes(np.array([[0.5], [1.0]]))
     assert shapes.reasons == ["", ""]
     hinge = book.connectivity.edge_count + int(np.flatnonzero(book.connectivity.interior)[0])

@@ -23,6 +23,9 @@ from safetensors.numpy import load_file
 from shapespace.files.surfaces.reading import read_surface
 from shapespace.mesh.rigid_motion import align
 from shapespace.mesh.triangle_mesh import TriangleMesh
+from shapespace.training.pipeline import Run, learner_of
+from shapespace.training.runs.config import load
+from shapespace.training.runs.sampling import read
 from shapespace.training.runs.stages import STAGES
 from tests.service.conftest import starting
 from tests.service.glb import GLB
@@ -195,6 +198,23 @@ def test_a_factor_s_samples_are_the_parts_of_the_joint_codes(run: Path) -> None:
         with np.load(run / "samples" / f"factor-{j}" / "part-00002.npz") as part:
             np.testing.assert_array_equal(part["latents"][:, members], joint[:, members])
             assert not np.delete(part["latents"], members, axis=1).any()
+
+
+def test_the_collection_s_shapes_are_learned_from_but_not_measured_on(run: Path) -> None:
+    opened = Run(run, *load(run / "config.toml"), run / "models")
+    samples = read(run / "samples")
+    known = np.flatnonzero(samples.index < 0)
+    with np.load(run / "modes.npz") as modes:
+        np.testing.assert_array_equal(samples.latents[known], modes["coefficients"])
+    expected = opened.collection.shapes(samples.latents[known]).nric
+    np.testing.assert_allclose(samples.nric[known], expected, atol=1e-6)
+    rows = learner_of(opened).rows
+    assert set(known) < set(rows["train"])
+    assert not set(known) & {*rows["validation"], *rows["test"]}
+    assert not set(known) & set(learner_of(opened, fraction=0.5).rows["train"]), "shares are of random codes"
+    other = learner_of(opened, seed=1).rows
+    assert set(known) < set(other["train"])
+    assert not set(known) & {*other["validation"], *other["test"]}
 
 
 @pytest.fixture
