@@ -48,6 +48,12 @@ def main() -> None:
         drawn(page, "#strip")
         page.screenshot(path=DOCS / "page-dark.png")
 
+        page = open_page(f"{FIGURE}&other={OTHER}&against=-2&colour=distance", viewport=desktop)
+        page.get_by_role("tab", name="Colour").click()
+        page.wait_for_selector("#legend .numbers:not(:empty)")
+        page.wait_for_timeout(3000)
+        page.screenshot(path=DOCS / "page-beside.png")
+
         page = open_page(TORUS, viewport=phone, device_scale_factor=2, is_mobile=True, has_touch=True)
         drawn(page, ".pictures")
         page.screenshot(path=DOCS / "page-phone.png")
