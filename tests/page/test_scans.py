@@ -106,6 +106,41 @@ def test_a_scan_is_fitted_and_lies_over_its_shape(window: Open, given: Given, na
     assert studio["#verdict"].is_hidden()
 
 
+def test_how_sure_the_shape_of_a_scan_is_shows_where_it_was_not_seen(window: Open, given: Given) -> None:
+    studio = window(complains=True).open(FIGURE)
+    assert studio["#sure"].is_hidden()
+    up = given.vertices[:, 1]
+    seen = (up > np.quantile(up, 0.25))[given.faces].all(axis=1)  # not the lower legs
+    used, index = np.unique(given.faces[seen], return_inverse=True)
+    studio.tab("Files")
+    studio["#read-as"].select_option("part")
+    choose(studio, Given(given.vertices[used], index.reshape(-1, 3)).file("top.ply"))
+    until_said(studio, "Figure explains top.ply")
+    studio["#ghost"].uncheck()
+    studio.tab("Colour")
+    before = studio.picture()
+    studio["#sure input"].check()
+    coloured = studio.until_different(before)
+    assert "May be off by" in studio["#legend"].inner_text()
+    red, _, blue = np.moveaxis(coloured.astype(int), 2, 0)
+    body = np.abs(coloured - coloured[0, 0]).max(axis=2) > 40
+    low, high = np.flatnonzero(body.any(axis=1))[[0, -1]]
+    legs, top = (slice(high - (high - low) // 5, high), slice(low, low + (high - low) // 3))
+    warm = [float((red - blue)[rows][body[rows]].mean()) for rows in (legs, top)]
+    assert warm[0] > warm[1] + 40, "legs, which nobody has seen, are the red end"
+    studio.page.evaluate(AXE.read_text())
+    check(studio, "certainty")
+    assert "spread" not in studio.hash, "an address has no scan"
+
+    studio.tab("Shape")
+    studio["#random"].click()
+    studio.eventually(studio["#legend"].is_hidden)
+    studio["#verdict [data-do=close]"].click()
+    assert studio["#sure"].is_hidden()
+    studio.tab("Colour")
+    assert studio["[name=colour][value=none]"].is_checked()
+
+
 def test_other_units_are_told_and_the_size_is_found(window: Open, given: Given) -> None:
     studio = window(complains=True).open(FIGURE)
     choose(studio, given.file("millimetres.stl", scale=1000))

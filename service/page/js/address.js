@@ -21,7 +21,7 @@ export function toHash(store, view) {
   if (store.beyond) parts.set("beyond", number(store.beyond));
   if (store.seconds) parts.set("seconds", number(store.seconds));
   if (store.easing !== "even") parts.set("easing", store.easing);
-  if (store.colour !== "none") parts.set("colour", store.colour);
+  if (COLOURS.includes(store.colour)) parts.set("colour", store.colour);
   if (store.other) parts.set("other", list(store.other));
   if (store.against !== -1) parts.set("against", store.against);
   if (store.pins.length) parts.set("pins", store.pins.map(fromPin).join(";"));

@@ -68,6 +68,7 @@ const store = /** @type {any} */ (
     pull: false,
     pins: [],
     scan: null,
+    found: null,
     ghost: true,
   })
 );
@@ -164,6 +165,9 @@ for (const radio of radios) {
     radio.checked = radio.value === store.colour;
   });
 }
+store.on(["found"], () => {
+  find("#sure").hidden = !store.found;
+});
 const root = document.documentElement;
 const theme = always.kept("theme");
 if (theme) root.dataset.theme = theme;

@@ -31,7 +31,7 @@
  * @property {number | null} seconds that the path takes, where somebody has said so
  * @property {"even" | "soft"} easing
  * @property {number | null} usual residual of the model's own shapes
- * @property {string} colour "none", "stretch", "bending" or "distance"
+ * @property {string} colour "none", "stretch", "bending", "distance" or "spread"
  * @property {number} against index of the keyframe that colours compare with; −1 the mean, −2 `other`
  * @property {number[] | null} other code of the shape beside, which is compared with
  * @property {number | null} highlight index of the factor that is pointed at
@@ -43,6 +43,7 @@
  * @property {boolean} pull
  * @property {import("./shape/pull.js").Pin[]} pins
  * @property {any} scan
+ * @property {{code: number[], covariance: number[][]} | null} found the shape of a file
  * @property {boolean} ghost
  *
  * @typedef {{vertices: Float32Array, faces: Int32Array}} Reference

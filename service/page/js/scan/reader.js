@@ -131,7 +131,7 @@ export class Reader {
     this.#abort.abort();
     this.#abort = new AbortController();
     this.#found = null;
-    this.store.set({ scan: null });
+    this.store.set({ scan: null, found: null, ...(this.store.colour === "spread" && { colour: "none" }) });
   }
 
   #fail(file, error) {
@@ -170,18 +170,26 @@ export class Reader {
     if (scan && words.how === "poor" && asked.scale !== "free")
       again("Fit it with its own scale", { scale: "free" });
     const before = { code, placement };
-    this.#found = { code: answer.latent, before, scan, tries };
+    this.#found = { code: answer.latent, covariance: answer.covariance, before, scan, tries };
     this.verdict.say(words, []);
     if (words.how === "poor") this.#offer();
     else this.#show();
   }
 
   #show() {
-    const { code, scan } = this.#found;
+    const { code, covariance, scan } = this.#found;
     const { hasFine, fine } = this.store;
     // The scan is placed by the fine mesh's frame.
     const finer = fine || (hasFine && Boolean(scan));
-    this.store.set({ playing: false, code, placement: null, scan, ghost: true, fine: finer });
+    this.store.set({
+      playing: false,
+      code,
+      placement: null,
+      scan,
+      ghost: true,
+      fine: finer,
+      found: { code, covariance },
+    });
     this.#offer();
   }
 

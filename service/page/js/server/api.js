@@ -119,6 +119,16 @@ export const encode = (model, file, format, fixed, signal) => {
   return json(call(`${model.links.self}/encode?${query}`, { method: "POST", body: file, signal }));
 };
 
+/** How far each vertex may be off (V) by the covariance of a code, in the model's units. */
+export async function spread(model, { code, covariance }, mesh) {
+  const response = await post(`${model.links.mesh}?color=spread&format=npz`, {
+    latent: code,
+    covariance,
+    mesh,
+  });
+  return (await readNpz(await response.arrayBuffer(), ["color_values"])).color_values.data;
+}
+
 /** The code, the place and the size that explain a scan. */
 export const fit = (model, file, format, options, signal) => {
   const query = new URLSearchParams({ format, ...options });

@@ -1,9 +1,10 @@
-/** What colours the shape: the region of a factor, stretch, bending, or nothing. */
+/** What colours the shape: the region of a factor, a change, how sure it is, or nothing. */
 
 import * as api from "../server/api.js";
 import { distant, diverging, gradient, tint } from "./colours.js";
 import { element, find, percentile, readable } from "../dom.js";
 import { report } from "../messages.js";
+import { sameCode } from "../server/space.js";
 import { nearest } from "./modes.js";
 import { diagonalOf } from "./scene.js";
 import { Surface } from "./surface.js";
@@ -40,6 +41,15 @@ const KINDS = {
     least: 0.001,
     paint: distant,
   },
+  spread: {
+    shown: (value) => 100 * value,
+    unit: "\u00a0%",
+    ends: ["", ""],
+    title: "May be off by, of the diagonal",
+    signed: false,
+    least: 0.001,
+    paint: distant,
+  },
 };
 
 /** What stands for the shape beside among the shapes that colours compare with. */
@@ -51,7 +61,7 @@ const SMOOTHED = 4; // times, about as far as coarse vertices lie apart
 
 export class Colouring {
   #surfaces = new Map();
-  #bases = new Map();
+  #answers = new Map(); // of the server; null while they are on their way
   #nearest = null;
   #limit = 0;
 
@@ -63,10 +73,11 @@ export class Colouring {
     find(".scale", legend).style.backgroundImage = gradient;
     store.on(["model"], () => {
       this.#surfaces.clear();
-      this.#bases.clear();
+      this.#answers.clear();
       this.#nearest = null;
     });
-    store.on(["model", "colour", "against", "other"], () => {
+    store.on(["found"], () => this.#answers.clear());
+    store.on(["model", "colour", "against", "other", "found"], () => {
       this.#limit = 0;
     });
     store.on(["keyframes", "against", "other", "model"], () => this.#choices());
@@ -78,27 +89,47 @@ export class Colouring {
     const { colour, highlight, regions, moving } = this.store;
     const region = highlight !== null && !(moving && colour !== "none") && regions?.[highlight];
     const kind = KINDS[colour];
-    this.legend.hidden = !kind;
     const values = kind && this.#values(kind, mesh, positions);
+    this.legend.hidden = !kind || (colour === "spread" && !values);
     if (region) return tint(mesh === "fine" ? this.#onFine(region) : region);
     return values ? kind.paint(values, this.#limit) : null;
   }
 
   #values(kind, mesh, positions) {
-    const surface = this.#surface(mesh);
-    const base = this.#base(mesh, surface);
-    if (!base) return null;
-    const { colour, moving, playing, references } = this.store;
-    const far = colour === "distance";
-    const measured = far
-      ? apart(base.positions, positions, diagonalOf(references[mesh].vertices))
-      : surface[colour](base, surface.measure(positions));
-    const values = far ? measured : surface.atVertices(measured, base, colour === "bending");
+    const { colour, moving, playing } = this.store;
+    const [measured, values] =
+      (colour === "spread" ? this.#spread(mesh) : this.#change(mesh, positions)) ?? [];
+    if (!values) return null;
     const most = nice(Math.max(kind.least, percentile(values.map(Math.abs), 0.98)));
     // While something moves the scale only grows: colours that change their meaning can't be read.
     this.#limit = moving || playing ? Math.max(this.#limit, most) : most;
     this.#tell(kind, measured);
     return values;
+  }
+
+  /** What has changed, where it is measured and at vertices. */
+  #change(mesh, positions) {
+    const { colour, references } = this.store;
+    const surface = this.#surface(mesh);
+    const base = this.#base(mesh, surface);
+    if (!base) return null;
+    if (colour === "distance") {
+      const far = apart(base.positions, positions, diagonalOf(references[mesh].vertices));
+      return [far, far];
+    }
+    const measured = surface[colour](base, surface.measure(positions));
+    return [measured, surface.atVertices(measured, base, colour === "bending")];
+  }
+
+  /** How sure the shape of a file is, as long as it is the one shown. */
+  #spread(mesh) {
+    const { model, found, code, references } = this.store;
+    if (!found || !sameCode(found.code, code)) return null;
+    const diagonal = diagonalOf(references[mesh].vertices);
+    const values = this.#asked(`spread ${mesh} ${found.code}`, async () =>
+      (await api.spread(model, found, mesh)).map((value) => value / diagonal),
+    );
+    return values && [values, values];
   }
 
   #surface(mesh) {
@@ -113,23 +144,27 @@ export class Colouring {
   #base(mesh, surface) {
     const { model, references } = this.store;
     const code = baseOf(this.store);
-    const key = `${mesh} ${code ?? "mean"}`;
-    if (!this.#bases.has(key)) {
-      this.#bases.set(key, null);
-      const shape = code
-        ? api.shapes(model, [code], mesh).then(({ shapes }) => shapes[0])
-        : references[mesh].vertices;
-      Promise.resolve(shape)
-        .then((positions) => {
-          this.#bases.set(key, { positions, ...surface.measure(positions) });
+    return this.#asked(`${mesh} ${code ?? "mean"}`, async () => {
+      const positions = code ? (await api.shapes(model, [code], mesh)).shapes[0] : references[mesh].vertices;
+      return { positions, ...surface.measure(positions) };
+    });
+  }
+
+  /** An answer of the server by a name; null until it has come. */
+  #asked(name, ask) {
+    if (!this.#answers.has(name)) {
+      this.#answers.set(name, null);
+      ask()
+        .then((answer) => {
+          this.#answers.set(name, answer);
           this.store.set({ repaint: {} });
         })
         .catch((error) => {
-          this.#bases.delete(key);
+          this.#answers.delete(name);
           report(error);
         });
     }
-    return this.#bases.get(key);
+    return this.#answers.get(name);
   }
 
   /** A region's weights at fine vertices: those of the nearest coarse ones, with its rim smoothed. */
