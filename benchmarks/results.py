@@ -79,6 +79,12 @@ class Row:
         return [len(members) for members in self.directory.factors.read()["factors"]]
 
     @cached_property
+    def of_factors(self) -> list[int]:
+        """Exponentials drawn of each factor alone, every number once."""
+        folders = map(self.directory.factor_samples, range(len(self.sizes)))
+        return list(dict.fromkeys(len(columns(folder, "status").get("status", ())) for folder in folders))
+
+    @cached_property
     def samples(self) -> dict[str, int]:
         """Exponentials drawn: ``joint`` and of the ``factors``, and how many of each ``failed``."""
         found = {"joint": 0, "factors": 0, "joint failed": 0, "factors failed": 0}
