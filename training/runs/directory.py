@@ -120,7 +120,7 @@ class RunDirectory:
 
     @property
     def mean(self) -> NpzFile:
-        """``vertices (V, 3)`` of the elastic mean, ``status``, ``iterations``, ``residual``."""
+        """``vertices (V, 3)`` of the elastic mean, centred; and its ``status``, ``iterations``, ``residual``."""
         return self._npz("mean")
 
     @property

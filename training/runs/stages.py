@@ -57,7 +57,7 @@ STAGES: dict[str, Stage] = {
         ],
     ),
     "mean": Stage(
-        version=1,
+        version=2,
         settings=lambda config: [config.material],
         results=lambda run: [run.mean.path],
     ),

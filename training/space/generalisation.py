@@ -15,12 +15,12 @@ from shapespace.arrays import FloatArray, IntArray
 from shapespace.mesh.rigid_motion import align
 from shapespace.mesh.triangle_mesh import TriangleMesh
 from shapespace.shell.energy import Material
-from shapespace.shell.mean import elastic_mean
 from shapespace.shell.space import ShellSpace
 from shapespace.solve.outcome import Status
 from shapespace.training.runs.config import ModeSettings
 from shapespace.training.space.codes import nearest_codes
 from shapespace.training.space.logarithms import logarithms
+from shapespace.training.space.mean import centred_mean
 from shapespace.training.space.modes import ModeError, coefficients, find_modes, mode_count
 
 #: Shapes are held out in so many folds, or one by one where there are fewer than twice as many.
@@ -141,7 +141,7 @@ def held_out(
         ModeError: the shapes that are left have no mean, or no modes.
     """
     kept, unseen = np.delete(shapes, index, axis=0), shapes[index]
-    found = elastic_mean(ShellSpace(reference, material), kept)
+    found = centred_mean(reference, kept, material, steps)
     if found.status is not Status.CONVERGED:
         raise ModeError(f"without some shapes the others have no mean: {found.reason}")
     mean = found.vertices

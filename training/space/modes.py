@@ -11,7 +11,7 @@ and how close they come is said by one sparse matrix, ``‖u‖² = dᵀ M d``:
 - "mixed": the first and a tenth of the second, scaled so that the logarithms weigh the same in both.
 
 The logarithms are not centred. The mean is the point that the modes start from, and the logarithms at the Riemannian
-centre of mass sum to nothing; at the elastic mean nearly so.
+centre of mass sum to nothing; at a collection's mean nearly so.
 
 **Sparse modes.** Minimise over tangent u_j and coefficients w
 

@@ -25,7 +25,7 @@ from shapespace.mesh.rigid_motion import align
 from shapespace.mesh.surface import Surface
 from shapespace.mesh.triangle_mesh import TriangleMesh, face_areas
 from shapespace.shell.energy import Material
-from shapespace.shell.mean import Mean, elastic_mean
+from shapespace.shell.mean import Mean
 from shapespace.shell.space import ShellSpace
 from shapespace.solve.cholesky import NotPositiveDefiniteError
 from shapespace.solve.outcome import Status
@@ -48,6 +48,7 @@ from shapespace.training.space.generalisation import (
     vertex_distances,
 )
 from shapespace.training.space.logarithms import logarithms
+from shapespace.training.space.mean import centred_mean
 from shapespace.training.space.modes import ModeError, find_modes, localisation, mode_count, pga
 from shapespace.training.space.shell_collection import ShellCollection
 
@@ -189,14 +190,13 @@ class MeanError(ValueError):
 
 
 def mean(run: RunDirectory, config: Config) -> dict[str, Any]:
-    """``mean.npz``: the elastic mean of all shapes, where the tangent space is attached.
+    """``mean.npz``: the elastic mean of all shapes, centred: where the tangent space is attached.
 
     Raises:
         MeanError: it isn't found.
     """
     reference, shapes = run.reference_mesh(), run.shapes.read()["vertices"]
-    with waiting("elastic mean"):
-        found = elastic_mean(ShellSpace(reference, material(config)), shapes)
+    found = centred_mean(reference, shapes, material(config), LIGHT_STEPS)
     if found.status is not Status.CONVERGED:
         raise MeanError(_where(run, found))
     facts = {"status": str(found.status), "iterations": found.iterations, "residual": found.residual}

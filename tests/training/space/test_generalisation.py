@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-import trimesh
 
 from shapespace.mesh.rigid_motion import without_rigid_motion
 from shapespace.mesh.triangle_mesh import TriangleMesh
@@ -24,9 +23,8 @@ STEPS = 4
 
 
 @pytest.fixture(scope="module")
-def reference() -> TriangleMesh:
-    ball = trimesh.creation.icosphere(subdivisions=2)
-    return TriangleMesh.from_arrays(ball.vertices * [3, 1, 1], ball.faces)
+def reference(ellipsoid: TriangleMesh) -> TriangleMesh:
+    return ellipsoid
 
 
 @pytest.fixture(scope="module")

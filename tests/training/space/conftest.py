@@ -1,0 +1,13 @@
+from __future__ import annotations
+
+import pytest
+import trimesh
+
+from shapespace.mesh.triangle_mesh import TriangleMesh
+
+
+@pytest.fixture(scope="module")
+def ellipsoid() -> TriangleMesh:
+    """Long, of 162 vertices."""
+    ball = trimesh.creation.icosphere(subdivisions=2)
+    return TriangleMesh.from_arrays(ball.vertices * [3, 1, 1], ball.faces)

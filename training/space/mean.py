@@ -1,0 +1,44 @@
+"""The shape where the tangent space of a collection is attached."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from shapespace.arrays import FloatArray
+from shapespace.mesh.triangle_mesh import TriangleMesh
+from shapespace.shell.energy import Material
+from shapespace.shell.exponential import exponential
+from shapespace.shell.mean import Mean, elastic_mean
+from shapespace.shell.space import ShellSpace
+from shapespace.solve.outcome import Status
+from shapespace.training.runs.progress import waiting
+from shapespace.training.space.logarithms import logarithms
+
+
+def centred_mean(
+    reference: TriangleMesh, shapes: FloatArray, material: Material, steps: int, workers: int = -1
+) -> Mean:
+    """The elastic mean, moved by the mean of the logarithms there.
+
+    That is one step of Karcher's iteration towards the Riemannian centre of mass (paper, section 3). Modes start at the
+    mean: what all logarithms have in common would cost one of them, and on faces is worth a tenth of what twelve modes
+    leave of unseen shapes.
+
+    Args:
+        reference: gives connectivity.
+        shapes: (n, V, 3), in any position.
+        material: of the shell.
+        steps: K of logarithms and exponential.
+        workers: processes, by default one a core; the result does not depend on it.
+
+    Returns:
+        As the elastic mean ended. Where there is no exponential the elastic mean stays.
+    """
+    with waiting("elastic mean"):
+        found = elastic_mean(ShellSpace(reference, material), shapes)
+    if found.status is not Status.CONVERGED:
+        return found
+    space = ShellSpace(reference.with_vertices(found.vertices), material)
+    common = logarithms(space, found.vertices, shapes, steps, workers).fields.mean(axis=0)
+    path = exponential(space, found.vertices, common, steps)
+    return replace(found, vertices=path.vertices[-1]) if path.converged else found
