@@ -26,20 +26,22 @@ from shapespace.solve.outcome import Status
 PRIOR = 1e-4
 #: Standard deviation of a target where none is given, as a fraction of the diagonal, and the smallest.
 SIGMA, LEAST_SIGMA = 5e-3, 1e-6
-#: Weight of how far vertices move on average, beside the targets' distances; and the fraction of the diagonal beyond
-#: which the cost of a vertex grows with its distance and no more with the square: a limb that has to move may.
+#: Weight of the mean movement of all vertices beside the targets' distances; and the fraction of the diagonal beyond
+#: which that cost grows linearly instead of with the square, so that a limb that has to move can.
 STILL, SMALL = 3e-2, 1e-2
-#: Share of the bounds' width that is added to every factor's change, so that none has a weight of its own without end.
+#: Share of the bounds' width that is added to each factor's change before its weight is computed: otherwise a factor at
+#: rest would have an infinite weight.
 UNMOVED = 3e-3
-#: At most so many times the weights that stand for the prior and for what stays are chosen anew, from rough shapes and
-#: from answered ones, and until no coordinate moves by more than this fraction of the bounds.
+#: Rounds of reweighting, at most: with rough shapes, and with solved ones. They end once no coordinate moves by more
+#: than this fraction of the bounds' width.
 ROUNDS, REFINED, SETTLED = 8, 2, 2e-3
-#: At most so many other starts are tried while the misfit is above these fractions of the diagonal (of rough shapes, of
-#: answered ones). Another start or fit counts only if it leaves at most the fraction PROMISING of what can be reduced.
+#: Other starts, at most, that are tried while the misfit is above these fractions of the diagonal (with rough shapes,
+#: with solved ones). Another result is preferred only if it leaves at most PROMISING of the cost that can still be
+#: reduced.
 STARTS, GOOD_ROUGHLY, GOOD, PROMISING = 4, 2e-2, 2e-3, 0.9
-#: Most targets by which another start is chosen: each costs three linear solves.
+#: Most targets that take part in choosing another start: each costs three linear solves.
 RANKED = 32
-#: Most shapes of a round, rough ones and answered ones: what takes longer follows a valley that hardly descends.
+#: Most shapes computed in a round, rough and solved ones: a search that takes longer hardly improves any more.
 SEARCHED, REFINEMENTS = 3, 8
 
 

@@ -22,19 +22,19 @@ from shapespace.solve.deadline import Deadline
 from shapespace.solve.least_squares import Box, Fit, Stopping, least_squares
 from shapespace.solve.outcome import Status
 
-#: Times that each factor may be moved on its grid while the others stay, and the factor by which a move must explain
-#: more of the misfit than the present place does.
+#: Sweeps over the factors, in which one at a time is moved on its grid while the others stay; and the factor by which a
+#: move has to explain more of the misfit than the present place.
 SWEEPS, PROMISING = 4, 1.2
-#: Of the search by vertices: it ends once no coordinate would move further than this fraction of the bounds, or the sum
-#: of squares would shrink by less than this, or after so many shapes.
+#: The search by vertices ends when no coordinate would move by more than this fraction of the bounds' width, when the
+#: sum of squares would fall by less than this share, or after so many shapes.
 TOLERANCE, GAIN, SHAPES = 1e-4, 1e-4, 25
-#: A code may leave the bounds by this fraction of their width where that is allowed,
+#: Where codes outside the bounds are allowed: by how much, a fraction of the bounds' width.
 MARGIN = 0.5
-#: and if after so many shapes none inside is found whose mean distance is less than so many times as large.
+#: A code inside is preferred if so many more shapes find one whose mean distance is less than this many times as large.
 INSIDE, AS_NEAR = 5, 1.02
-#: A mesh so many times as large as the reference, or as small, is in other units.
+#: A mesh this many times larger or smaller than the reference is taken to be in other units.
 UNITS = 3.0
-#: Standard deviation of a vertex that the posterior assumes at least, as a fraction of the diagonal.
+#: Least standard deviation of a vertex that the posterior assumes, as a fraction of the diagonal.
 TOLERANCE_OF_SHAPES = 2e-5
 
 

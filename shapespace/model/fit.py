@@ -25,28 +25,30 @@ from shapespace.solve.cholesky import NotPositiveDefiniteError
 from shapespace.solve.deadline import Deadline
 from shapespace.solve.outcome import Status
 
-#: Shapes on which a scan is first placed, the farthest from each other of so many random ones; and points of each.
+#: Start shapes: this many, chosen as far apart as possible from so many random ones; and sampled points of each.
 STARTS, DRAWN, SHOWN = 16, 200, 150
-#: Vertices of the model that look for points of the scan: of the coarse and of the fine mesh.
+#: Vertices of the model for which a nearest scan point is sought: on the coarse mesh, and on the fine mesh at the end.
 LOOKING_ROUGHLY, LOOKING = 500, 1000
-#: Steps of each start that is followed, of the two best from there, and of the best at last.
+#: Iterations: of every start, then of the two best, then of the best one.
 FIRST_STEPS, MORE_STEPS, LAST_STEPS = 4, 6, 10
-#: Where a limb stays unexplained: attempts to bring it over, their steps, and those in which it is drawn.
+#: Where a limb of the scan stays unmatched: attempts to move the model's limb there, the iterations of each, and how
+#: many of these pull it by target points.
 ATTEMPTS, ATTEMPT_STEPS, DRAWING = 4, 9, 4
-#: A scan so many times as large or as small as the model's shapes is in other units, unless its size is free.
+#: A scan this many times larger or smaller than the model's shapes is taken to be in other units, unless its scale is
+#: free; the second for scans of a part.
 UNITS, UNITS_OF_PART = 3.0, 20.0
-#: A fit is poor where more of the scan than the first has no place on the model while more of the model than the second
-#: has none on the scan: outliers are more of the one and holes of the other, but a limb astray is of both. Of a scan
-#: that shows a part, the most that may have no place.
+#: A fit is poor if a larger share of the scan than the first is far from the model, and a larger share of the model
+#: than the second is far from the scan. Outliers raise only the first, holes only the second, a limb in the wrong place
+#: both. The third is the limit of the first for a scan of a part.
 MISSED, UNSEEN, MISSED_OF_PART = 0.015, 0.008, 0.03
-#: A fit whose last step was longer, as a fraction of the diagonal, has not come to rest.
+#: A fit has not converged if its last step was longer than this fraction of the diagonal.
 RESTLESS = 5e-3
-#: Another fit counts if it is so far away on average, as a fraction of the diagonal, and its cost no larger than by
-#: this factor and this share.
+#: A fit is ambiguous if another one differs by this mean distance, a fraction of the diagonal, and costs at most this
+#: factor, plus this share, more.
 ELSEWHERE, NEARLY, BESIDE = 0.05, 1.1, 3e-3
 #: A scan counts as mirrored where its mirror image costs less than this share.
 MIRRORED = 0.6
-#: Other fits that are followed to the end where they are nearly as good.
+#: How many other fits are refined to the end if they are nearly as good as the best.
 RIVALS = 2
 #: Points whose distances are computed at once.
 CHUNK = 50_000

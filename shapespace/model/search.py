@@ -25,27 +25,29 @@ from shapespace.model.searched_shapes import SearchedShapes
 from shapespace.solve.cholesky import NotPositiveDefiniteError
 from shapespace.solve.deadline import Deadline
 
-#: Distances at which a pair counts half as much as one without distance, in standard deviations of what is left; they
-#: begin at the share FARTHEST of all distances and shrink by a factor a step.
+#: The robust weight of a pair is one half at this distance, in standard deviations of the present distances. The first
+#: such distance is the quantile FARTHEST of all; it shrinks by a factor in each iteration.
 WIDTH, FARTHEST, SHRINKING = 3.0, 0.95, 0.7
-#: Pairs whose normals are farther apart than the first cosine don't count; beyond the second they count fully.
+#: Cosine of the angle between the normals of a pair: below the first its weight is 0, above the second it is 1.
 APART, ALIKE = 0.2, 0.6
-#: Share of the distance between paired points that counts beside that from the plane, at the first steps and later: it
-#: keeps a shape from sliding along itself.
+#: Weight of the point-to-point distance beside the point-to-plane distance, at first and later. It keeps a shape from
+#: sliding along its own surface.
 SLIDING, SLIDING_AT_LAST = 0.3, 0.01
-#: Largest step, in standard deviations of the population and in radians; a smaller one than the last ends the search.
+#: Longest step, in standard deviations of the population, and largest rotation, in radians; a step shorter than the
+#: third ends the search.
 LONGEST, TURN, SHORTEST = 1.5, 0.5, 0.01
-#: Movement of the shape that ends it too, as a fraction of the diagonal.
+#: So does a movement of the shape by less than this fraction of the diagonal.
 STILL = 2e-4
-#: Derivatives serve steps as long as the code has moved by no more than so many standard deviations since.
+#: Derivatives are used again until the code has moved this far from where they were computed, in standard deviations.
 KEPT = 0.3
 #: Usual standard deviation of a landmark, as a fraction of the diagonal.
 LANDMARK = 0.01
-#: Share of the diagonal within which points are near, beside up to as much for what is left.
+#: Points within this fraction of the diagonal count as explained; up to as much again is added for the scan's noise.
 NEAR = 0.01
-#: At this distance a point counts as half unexplained where fits are compared, as a fraction of the diagonal.
+#: Where fits are compared, a point at this distance, a fraction of the diagonal, counts as half explained.
 COMPARED = 0.02
-#: Weight of a code's plausibility there: a code four standard deviations off is as bad as so much of the scan missed.
+#: Weight of the code's plausibility in that comparison: being four standard deviations off costs as much as leaving
+#: this share of the scan unexplained.
 PLAUSIBLE = 0.001
 
 
