@@ -27,11 +27,11 @@ from shapespace.solve.preconditioner import Preconditioner
 #: Weight of the angles in the reconstruction's norm. A parameter of its own: the metric's η is far too small here,
 #: because this norm is dimensionless and sums over edges.
 DEFAULT_ETA = 1e-2
-#: A factor serves shapes around its own up to this distance of any vertex, a fraction of the diagonal; and this many
-#: steps, which is about what a new one costs.
+#: A factor is used again for shapes that lie no further than this from its own, by the largest distance of a vertex as
+#: a fraction of the diagonal; and for at most this many steps, which cost about as much as a new factor.
 REACH, LIFE = 1e-2, 16
-#: With an old factor, how long the last step may be, as a share of that with a new one: in the softest motions there is
-#: more left than it goes.
+#: With an old factor the last step has to be shorter, by this factor: in the softest motions the error that is left is
+#: longer than the step.
 OLD = 0.25
 #: Share by which diagonal entries are raised for a factor in single precision: a few times what rounding takes away.
 LIFT = 2e-7

@@ -17,13 +17,13 @@ from shapespace.solve.outcome import Status
 from shapespace.training.runs.progress import progress
 from shapespace.training.runs.workers import run
 
-#: Of the search: it ends once no coefficient would move further than this, or the sum of squares would shrink by less
-#: than this, or after so many exponentials.
+#: The search ends when no coefficient would move by more than this, when the sum of squares would fall by less than
+#: this share, or after so many exponentials.
 TOLERANCE, GAIN, EXPONENTIALS = 1e-3, 1e-3, 40
-#: Where an exponential isn't found at the start, the search begins from these shares of it.
+#: Where there is no exponential at the start, the first of these multiples of it that has one is the start.
 SHARES = (1.0, 0.75, 0.5, 0.25, 0.0)
-#: What bounds have to spare on each side of the shapes' codes, as a share of their range; and what a side has at least,
-#: as a share of the other.
+#: Margin of the bounds on each side of the shapes' codes, as a share of their range; and the least width of the
+#: negative or positive side, as a share of the other.
 ROOM, MARGIN = 0.05, 0.1
 
 

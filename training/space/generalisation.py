@@ -23,9 +23,9 @@ from shapespace.training.space.logarithms import logarithms
 from shapespace.training.space.mean import centred_mean
 from shapespace.training.space.modes import ModeError, coefficients, find_modes, mode_count
 
-#: Shapes are held out in so many folds, or one by one where there are fewer than twice as many.
+#: Number of folds; of fewer than twice as many shapes each is held out by itself.
 FOLDS = 5
-#: Of vertices, the share whose distance is told beside the mean.
+#: Percentile of the vertices' distances that is reported beside their mean.
 SHARE = 95
 
 
@@ -152,7 +152,7 @@ def held_out(
         count = mode_count(settings, space, mean, fields)
         counts = [-(-count // 2), count]
     counts = [min(count, len(kept) - 1) for count in counts]
-    # Codes are sought from here: on the straight way to a far shape faces collapse.
+    # The search for codes starts from projected logarithms: on the straight line to a far shape faces collapse.
     towards = logarithms(space, mean, unseen, steps).fields
     reached, by_modes, by_components = [], [], []
     for count in counts:

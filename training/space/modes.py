@@ -92,20 +92,20 @@ OVERRELAXATION = 1.6
 VARIMAX_ITERATIONS, SWEEPS = 200, 100
 #: The objective is compared with that of so many iterations ago.
 PATIENCE = 10
-#: See spga. By vertices it ends sooner: the objective is a thousandth of the shell's, and falls on for long by what
-#: changes no mode.
+#: Default tolerances of spga, by norm. In vertices it may end sooner: there the objective is a thousandth of that in
+#: the shell's metric, and keeps falling long after the modes have stopped changing.
 TOLERANCE: dict[Norm, float] = {"mixed": 5e-3, "vertices": 5e-3, "shell": 1e-3}
-#: What the logarithms weigh in the shell's metric, where it is mixed with the norm of vertices, beside what in that.
+#: In the mixed norm: square norm of the logarithms in the shell's metric, as a share of that in the norm of vertices.
 SHELL = 0.1
 #: Modes with a smaller share of the total energy are dropped: they are round-off.
 NEGLIGIBLE = 1e-9
-#: Of a mode's square, the share whose edges say how local it is.
+#: A mode is as local as the share of the edges that carries this part of its square norm.
 LOCAL = 0.95
-#: How many parts of the shapes are held out in turn to see how many modes pay, and what a mode has to bring: a share of
-#: the mean distance of shapes from the mean.
+#: To choose the number of modes: number of inner folds, and by how much a further mode has to lower the mean error of
+#: held-out logarithms, as a share of their mean length.
 INNER_FOLDS, WORTH = 5, 0.005
-#: What sparsity may add to the square of what as many principal modes leave of logarithms that are held out, as a share
-#: of that; and what is tried, the largest first.
+#: To choose the sparsity: how much it may add to the squared error of held-out logarithms, as a share of the error of
+#: as many principal modes; and the candidates, of which the largest that does not add more is taken.
 SPENT = 0.03
 SPARSITIES = [0.128, 0.064, 0.032, 0.016, 0.008, 0.004, 0.002, 0.001, 0.0005]
 
