@@ -40,12 +40,12 @@ from shapespace.service.repository.repository import ModelRepository
 from shapespace.service.repository.validation import BundleValidator
 from shapespace.service.settings import Settings, is_loopback
 
-#: What pages of other origins may send, and see in answers.
+#: Headers that pages of other origins may send, and those of answers that they may read.
 CORS_REQUEST = ["Authorization", "Content-Type", "If-None-Match", "Inference-Header-Content-Length"]
 CORS_REQUEST += ["X-API-Key", "X-Request-ID"]
 CORS_ANSWER = ["Content-Disposition", "ETag", "Inference-Header-Content-Length", "Location", "Retry-After"]
 CORS_ANSWER += ["Server-Timing", "Shape-Color", "Shape-Diagnostics", "X-Request-ID"]
-#: What a machine calls itself.
+#: Names of the loopback interface.
 LOOPBACK = ("localhost", "127.0.0.1", "[::1]")
 
 

@@ -28,23 +28,23 @@ logger = logging.getLogger(__name__)
 
 #: Longest head of a request, or trailers, in bytes and lines; other servers have 8 to 64 KiB.
 HEAD_BYTES, HEAD_LINES = 32 * 2**10, 100
-#: Requests on one connection that are parsed before those ahead of them are answered, and bytes that wait for that.
+#: Pipelined requests that are parsed ahead on one connection, and bytes that may wait behind them.
 PIPELINED, WAITING_BYTES = 32, 2**20
-#: Bytes given to the parser at once: how far a head may overshoot its limit.
+#: Bytes given to the parser at once; a head may exceed its limit by as much.
 PIECE = 8 * 2**10
-#: Seconds for a head, and for a client to take anything of what is written to it.
+#: Seconds within which a client has to send a whole head, and to accept at least a part of what is written to it.
 HEAD_SECONDS, STALL_SECONDS = 10.0, 30.0
-#: Bytes of a connection that the kernel may hold unsent; its default is megabytes.
+#: Bytes that the kernel may buffer unsent for one connection; by default it buffers megabytes.
 UNSENT = 128 * 2**10
-#: Seconds between looks at all connections.
+#: Seconds between two checks of all connections.
 SWEEP_SECONDS = 1.0
-#: Seconds after a refusal in which what still comes is read and dropped, as closing at once could destroy the answer.
+#: Seconds after a refusal during which further bytes are read and dropped: closing at once could lose the answer.
 LINGER_SECONDS = 1.0
-#: File handles that are kept for other things than connections.
+#: File handles that are reserved for other uses than connections.
 SPARE_HANDLES = 100
-#: The same line is logged so often at most.
+#: Least number of seconds between two equal log lines.
 LOG_SECONDS = 1.0
-#: As for `localhost` in a container without IPv6.
+#: Errors of an address that the machine doesn't have, as `localhost` by IPv6 in a container without it.
 _NO_SUCH_ADDRESS = frozenset({errno.EAFNOSUPPORT, errno.EADDRNOTAVAIL})
 _OUT_OF_HANDLES = frozenset({errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM})
 

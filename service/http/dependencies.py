@@ -43,7 +43,7 @@ class Service:
     draining: bool = False
 
 
-# Coroutines, all of them: plain functions would each take a turn in a pool of threads.
+# All dependencies are coroutines: FastAPI runs plain functions in a pool of threads, which takes longer.
 async def _service(request: Request) -> Service:
     service: Service = request.app.state.service
     return service
@@ -82,7 +82,7 @@ Format = Annotated[
 ]
 
 
-# Not by ServiceDependency: FastAPI goes through a dependency's own ones every time, also where it knows the result.
+# Calls _service itself: FastAPI would resolve nested dependencies again for every parameter, even cached ones.
 async def _model(request: Request, name: ModelName, version: Version = None) -> ShapeModel:
     return (await _service(request)).repository.get(name, version)
 

@@ -22,17 +22,17 @@ from shapespace.service.limits.quota import UPLOADS, Quota, QuotaError, client_n
 
 logger = logging.getLogger(__name__)
 REQUEST_ID = re.compile(r"[A-Za-z0-9._-]{1,64}")
-#: What answers without a key: orchestrators ask for health, and the others say nothing about the models.
+#: Paths that need no key: health checks of orchestrators, and pages that say nothing about the models.
 OPEN = re.compile(r"/|/page/.*|/openapi\.json|/v2/health/(live|ready)")
-#: Bytes of answers that are held while they are read, and bytes that are sent at once.
+#: Most bytes of all answers that are waiting to be sent, and bytes that are sent at once.
 ANSWERS, PIECE = 256 * 2**20, 2**18
-#: Characters of a path that go into the log.
+#: Most characters of a path that are logged.
 LONGEST_PATH = 1000
-#: Seconds from a wrong key to the next key of the same address that is looked at, seconds that one waits for its turn,
-#: and addresses kept.
+#: After a wrong key the next key from the same address is checked only after this many seconds; a request waits for
+#: that at most so many seconds; and so many addresses are remembered.
 KEY_INTERVAL, KEY_WAIT, KEY_ADDRESSES = 0.1, 1.0, 10_000
 HEALTH = frozenset({"/v2/health/live", "/v2/health/ready"})
-#: Called every few seconds, so that their lines are of no interest.
+#: Paths whose requests are logged at the level of debugging only: they come every few seconds.
 QUIET = HEALTH | {"/metrics"}
 
 

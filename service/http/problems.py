@@ -112,14 +112,14 @@ _OF_EXCEPTION: dict[type[Exception], str] = {
     EndingError: "not-ready",
 }
 DOMAIN_ERRORS = tuple(_OF_EXCEPTION)
-#: Longest sentence in an answer: what was sent may stand in it.
+#: Longest detail, in characters: it may quote what was sent.
 _LONGEST = 1000
 _HEADERS = {
     "busy": {"Retry-After": "1"},
     "not-ready": {"Retry-After": "1"},
     "unauthorized": {"WWW-Authenticate": "Bearer"},
 }
-#: Below it an answer to an error also has the one member that the Open Inference Protocol wants.
+#: Under this path answers to errors also have the member ``error`` of the Open Inference Protocol.
 _INFERENCE_PATHS = "/v2"
 
 

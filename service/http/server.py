@@ -21,8 +21,8 @@ from shapespace.service.http.connections import Connection, Listener
 from shapespace.service.settings import Settings
 
 logger = logging.getLogger(__name__)
-#: Seconds for a client to send the request for which it has opened a connection or kept one open; for what runs then;
-#: and for the process to be gone, all from the end of the drain on.
+#: Seconds from the end of the drain: until when requests on open connections are still accepted, until when running
+#: ones have to finish, and until when the process ends.
 LINGER, FINISH, GONE = 1.0, 1.5, 2.3
 #: Status of a process that could not start; uvicorn's own.
 STARTUP_FAILURE = 3

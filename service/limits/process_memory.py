@@ -8,7 +8,8 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
-#: Bytes of one thing from which on it isn't on the heap, and goes back to the system at once.
+#: Allocations of at least this many bytes are mapped instead of taken from the heap, so that freeing them returns the
+#: memory to the system at once.
 MMAP_THRESHOLD = 4 * 2**20
 _TRIM_THRESHOLD, _MMAP_THRESHOLD, _ARENA_MAX = -1, -3, -8  # malloc.h
 

@@ -8,9 +8,9 @@ from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-#: Share that one client's address may have: whoever takes all it can get leaves room for the others.
+#: Share of a resource that the address of one client may take, so that the others always have some left.
 SHARE = 0.75
-#: Largest bodies that are held in memory, and read, at one time.
+#: Number of bodies of the largest size that may be in memory, being received or read, at one time.
 UPLOADS = 4
 #: Leading bits of an IPv6 address that one customer of a provider usually has to himself.
 _IPV6_NETWORK = 64

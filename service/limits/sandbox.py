@@ -44,22 +44,22 @@ from shapespace.service.limits.sandbox_wire import (
 )
 from shapespace.solve.deadline import Deadline
 
-#: What children can do, by name: functions ``(body: bytearray, **facts) -> (facts, arrays)``. What they find wrong they
-#: say by FailedError. Names and no imports: only the children that need a module import it, and it is of a layer above.
+#: The tasks of children, by name: functions ``(body: bytearray, **facts) -> (facts, arrays)`` that raise FailedError
+#: for bad input. Given as strings, because only children import these modules, which belong to a layer above this one.
 TASKS = {
-    # A bundle that is to be served, loaded and run once.
+    # Load a bundle that is to be served, and run its networks once.
     "validate": "shapespace.service.repository.validation_task:validate_bundle",
-    # A mesh file that somebody has sent.
+    # Read an uploaded mesh file.
     "read": "shapespace.service.use_cases.uploads:read_in_sandbox",
 }
-#: A body on its way.
+#: The part of a body that hasn't been sent to the child yet.
 Pieces = deque[memoryview]
 
-#: A child that keeps so much more than it began with is replaced.
+#: A child is replaced once it holds this many bytes more than at its start.
 GROWTH = 128 * 2**20
-#: Milliseconds between looks at the deadline, which may be called off.
+#: Milliseconds between two checks of the deadline, because a request may be cancelled.
 _LOOK = 200
-#: Seconds for a child to be gone that has closed its connection.
+#: Seconds within which a child that has closed its connection has to end.
 _END = 5.0
 
 
@@ -185,7 +185,7 @@ class _Child:
     def __init__(self, path: str) -> None:
         hidden = {name for name in os.environ if name.startswith("SHAPESPACE_")}
         environment = {name: value for name, value in os.environ.items() if name not in hidden}
-        # What runs here runs there; and one thread each, as everywhere.
+        # The same modules as in this process, and one thread for each library, as everywhere in the server.
         own, paths = str(Path(__file__).parents[3]), [path for path in sys.path if path]
         environment["PYTHONPATH"] = os.pathsep.join(paths if own in paths else [own, *paths])
         environment |= dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
@@ -198,7 +198,7 @@ class _Child:
                 pass_fds=[theirs.fileno()],
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,
-                # Libraries quote there what they read.
+                # Libraries print parts of the uploaded file there.
                 stderr=subprocess.DEVNULL,
             )
         except OSError:

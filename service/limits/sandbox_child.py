@@ -26,14 +26,14 @@ from shapespace.service.limits.sandbox_wire import LONGEST_SENTENCE, Arrays, Fac
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-#: ``(body, **facts)`` to facts and arrays.
+#: A function ``(body, **facts)`` that returns facts and arrays.
 Task = Callable[..., tuple[Facts, Arrays]]
 
 
 def main() -> None:
     """Serve the parent's calls until it is gone."""
     connection = socket.socket(fileno=int(sys.argv[1]))
-    # A terminal, or whoever ends a whole group, sends signals to the children as well: the parent decides.
+    # Ctrl-C in a terminal, or a signal to the process group, reaches the children too; only the parent ends them.
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)
     threading.Thread(target=_end_with, args=[connection], daemon=True).start()

@@ -23,10 +23,10 @@ from shapespace.solve.deadline import Deadline
 logger = logging.getLogger(__name__)
 S = TypeVar("S")
 T = TypeVar("T")
-#: Seconds in which a thread should notice that its deadline has passed, and threads that may be given up because they
+#: Seconds after its deadline within which a thread should stop, and how many threads may be abandoned because they
 #: don't.
 PATIENCE, SPARE = 2.0, 16
-#: Bytes that all answers of many shapes may take together.
+#: Memory, in bytes, that all answers with many shapes may take together.
 MEMORY = 384 * 2**20
 
 

@@ -12,11 +12,11 @@ from shapespace.service.limits.sandbox import Sandbox
 from shapespace.service.limits.sandbox_errors import ClosedError
 from shapespace.solve.deadline import Deadline
 
-#: What validating one bundle may take: seconds, and bytes beside so many times those of its files. Each byte of a
-#: network is there as it was read, parsed, checked, and three times in ONNX Runtime while it loads. The solver's share
-#: comes on top, once the mesh has been read.
+#: Limits of validating one bundle: seconds, and memory in bytes, to which this many times the size of its files is
+#: added: a network is in memory as read, as parsed, as checked, and three times in ONNX Runtime while that loads it.
+#: The memory of the solver is added once the size of the mesh is known.
 SECONDS, MEMORY, MEMORY_PER_BYTE = 60.0, 512 * 2**20, 6
-#: Bytes of files that count, as a bundle may have no more.
+#: Largest size of the files that counts towards that, which is also the largest that a bundle may have.
 _MOST = 2**30
 
 

@@ -13,9 +13,10 @@ from shapespace.service.limits.sandbox_errors import FailedError
 from shapespace.service.limits.sandbox_wire import Arrays, Facts
 from shapespace.solve.cholesky import SymmetricPattern, analyse
 
-#: Bytes that the solver may take for each vertex of the coarse mesh, about twice what it does, and for all of them.
+#: Memory, in bytes, that the solver may take for each vertex of the coarse mesh (about twice what it needs), and in
+#: all.
 OF_A_VERTEX, MOST_OF_VERTICES = 64 * 2**10, 4 * 2**30
-# The library for factorisations takes time to load, and room: before the first bundle, and not at its expense.
+# Loads the library for factorisations now: its time and memory must not count against the first bundle.
 analyse(SymmetricPattern(1, np.array([0]), np.array([0])))
 
 

@@ -21,7 +21,7 @@ from shapespace.solve.outcome import Status
 #: Seconds by stage. ``network``: inference; ``reconstruct``: Gauss–Newton; ``encode``: writing the file;
 #: ``read``: reading an uploaded file; ``search``: looking for a code.
 Timings = dict[str, float]
-#: Bytes of what an answer is made from, up to which it is made whole.
+#: An answer whose arrays take at most this many bytes is made in one piece.
 WHOLE = 2**22
 S = TypeVar("S")
 T = TypeVar("T")

@@ -9,7 +9,7 @@ from typing import Annotated
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
 Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
-#: JSON knows one kind of number only, where 3.0 is as whole as 3.
+#: A whole number. JSON has one type for all numbers, so 3.0 is accepted as 3.
 Whole = Annotated[
     int,
     Field(strict=True),
@@ -18,7 +18,7 @@ Whole = Annotated[
 
 
 def _by_index(given: object) -> object:
-    # Told at the first fault: there may be as many as members.
+    # Stops at the first fault, because there may be as many faults as members.
     if isinstance(given, dict):
         for index, value in given.items():
             if not re.fullmatch("[0-9]{1,6}", str(index)):
@@ -28,13 +28,13 @@ def _by_index(given: object) -> object:
     return given
 
 
-#: Numbers by index; the members of a JSON object have names only, so that these are digits.
+#: Numbers by index. Members of a JSON object have strings as names, so an index is written in digits.
 NumbersByIndex = Annotated[
     dict[int, float],
     BeforeValidator(_by_index),
     Field(json_schema_extra={"propertyNames": {"pattern": "^[0-9]{1,6}$"}}),
 ]
-#: Members that an object may have: each unknown one is a fault.
+#: Most members of an object, because each unknown one is reported.
 _MEMBERS = 32
 
 

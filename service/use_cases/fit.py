@@ -16,7 +16,7 @@ from shapespace.service.use_cases.codes import Found, Upload, placement, read_up
 from shapespace.service.use_cases.shape_formats import dump_json, float32
 from shapespace.solve.deadline import Deadline
 
-#: How large scans may be, and bytes that reading one may take beside its file.
+#: Largest numbers of vertices and faces of a scan; and memory, in bytes, that reading it may take besides the file.
 LIMITS, MEMORY = Limits(2**21, 2**21), 256 * 2**20
 
 

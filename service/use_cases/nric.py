@@ -17,7 +17,7 @@ from shapespace.service.limits.workers import Call, Caller, Workers
 from shapespace.service.use_cases.batch import Batch, TooManyCodesError, Written, batch
 from shapespace.service.use_cases.shape_formats import float32, json_pieces
 
-#: Bytes of the predictions of one answer: networks with convolutions need room beside their answers.
+#: Most bytes of the predictions in one answer; networks with convolutions need memory besides their outputs.
 MOST_BYTES = 2**25
 
 

@@ -140,9 +140,9 @@ async def sequence_lines(
         return json_line(k, t, shape, None if k else faces)
 
     frames = zip(count(), animation.positions.tolist(), codes, map(bool, inside))
-    # Each frame has the deadline to itself: a stream may take as long as its reader likes.
+    # The deadline holds for each frame: a stream may take as long as its reader does.
     with workers.stream(caller):
-        # The first alone: beside the second, with which it would share the interpreter, it takes half as long again.
+        # The first frame is computed alone: in parallel with the second it would take half as long again.
         yield await workers.piece(partial(line, next(frames)), None)
         async with aclosing(workers.map(line, frames, None)) as lines:
             async for ready in lines:

@@ -18,7 +18,7 @@ from shapespace.mesh.surface import Surface, Topology
 from shapespace.model.decoder import Diagnostics, Quality
 from shapespace.model.exact_shapes import ExactShape
 
-#: Bytes that are counted at once: where there are too many values, few of these pieces are looked at.
+#: Size of the pieces, in bytes, in which values are counted; counting ends as soon as there are too many.
 _PIECE = 2**16
 
 

@@ -37,13 +37,15 @@ MEDIA_TYPES = {
     "application/x-npz": "npz",
 } | {media_type: name for name, media_type in FORMATS.items() if media_type != OCTET_STREAM}
 _MAGIC = {b"glTF": "glb", b"ply": "ply", b"PK": "npz", b"OFF": "off"}
-#: Characters of a header that says what a body or a part is.
+#: Most characters of a Content-Type or Content-Disposition header.
 _LONGEST_HEADER = 1000
 _MOST_FIELDS = 16
 _LONGEST_OPTIONS = 2**18
-#: Of JSON: bytes for each vertex and face, with digits and spaces to spare; bytes, lists, objects and quotes beside.
+#: Limits of a mesh as JSON: bytes for each vertex and face, with all digits; and besides these bytes, lists, objects
+#: and quotation marks.
 _BYTES_OF_EACH, _BYTES_BESIDE, _LISTS_BESIDE, _OBJECTS, _QUOTES = 128, 2**20, 1000, 1000, 4000
-#: What isn't ASCII stands in names only, which are of no interest, but would make every character take four bytes.
+#: Replaces characters outside ASCII, which occur only in names, and names are ignored: with them Python would store the
+#: whole text with four bytes a character.
 _TO_ASCII = bytes(range(128)) + b"?" * 128
 _PIECE = 2**20
 

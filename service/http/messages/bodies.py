@@ -21,13 +21,14 @@ from shapespace.service.http.problems import ProblemError
 from shapespace.service.use_cases.shape_formats import holds_more_values
 
 M = TypeVar("M", bound=BaseModel)
-#: Values that a body may hold, counted by what separates them: parsed they take 20 MB at most.
+#: Most values in a body, counted by their separators; parsed, they take at most 20 MB.
 MOST_VALUES = 2**18
-#: Bytes of a body that is parsed on the event loop, where that is quicker than to have a thread do it.
+#: Bodies up to this many bytes are parsed on the event loop, which is faster than handing them to a thread.
 SMALL = 2**12
-#: Bytes up to which NaN is understood: the parser that knows it keeps all threads waiting, 40 ms for a MiB of escapes.
+#: NaN is accepted in bodies up to this many bytes: the parser that knows it holds the interpreter's lock, up to 40 ms
+#: for a MiB.
 LENIENT = 2**20
-#: Bytes in which a body is gathered, and given on.
+#: Size of the pieces, in bytes, in which a body is received and passed on.
 _PIECE = 4 * 2**20
 
 
