@@ -43,6 +43,33 @@ def test_the_models_and_their_cards(studio: Studio) -> None:
     assert "Figure" in studio.page.title()
 
 
+def test_back_goes_to_the_shape_before_and_to_the_model_before(window: Open) -> None:
+    studio = window().open("#model=with-fine&z=0,0,0.5")
+    start = studio.picture()
+    studio.slide(0, 0.3)
+    studio.until_code([0.3, 0, 0.5])
+    studio.slide(1, -0.2)
+    studio.until_code([0.3, -0.2, 0.5])
+    studio["#wireframe"].click()
+    studio.eventually(lambda: studio.hash.get("show"))
+    studio["#model"].select_option("Figure")
+    studio.eventually(lambda: studio.hash.get("model") == "figure" and len(studio.code) == 20)
+
+    studio.page.go_back()
+    studio.eventually(lambda: studio.hash.get("model") == "with-fine" and studio.code == [0.3, -0.2, 0.5])
+    studio.rest()
+    assert studio["#wireframe"].get_attribute("aria-pressed") == "true", "how it was shown then"
+    studio.page.go_back()
+    studio.until_code([0.3, 0, 0.5])
+    assert studio["#undo"].is_enabled()
+    studio.page.go_back()
+    studio.until_code([0, 0, 0.5])
+    studio.rest()
+    studio.eventually(lambda: difference(studio.picture(), start) < 0.002)
+    studio.page.go_forward()
+    studio.until_code([0.3, 0, 0.5])
+
+
 def test_errors_of_the_server_are_said_in_the_page(window: Open) -> None:
     studio = window(complains=True).open()
     before = studio.picture()

@@ -118,10 +118,11 @@ def test_how_sure_the_shape_of_a_scan_is_shows_where_it_was_not_seen(window: Ope
     until_said(studio, "Figure explains top.ply")
     studio["#ghost"].uncheck()
     studio.tab("Colour")
-    before = studio.picture()
-    studio["#sure input"].check()
-    coloured = studio.until_different(before)
-    assert "May be off by" in studio["#legend"].inner_text()
+    studio["[name=colour][value=distance]"].check()
+    studio.page.keyboard.press("ArrowDown")
+    assert studio["#sure input"].is_checked()
+    studio.eventually(lambda: "May be off by" in studio["#legend"].inner_text())
+    coloured = studio.picture()
     red, _, blue = np.moveaxis(coloured.astype(int), 2, 0)
     body = np.abs(coloured - coloured[0, 0]).max(axis=2) > 40
     low, high = np.flatnonzero(body.any(axis=1))[[0, -1]]
@@ -135,10 +136,13 @@ def test_how_sure_the_shape_of_a_scan_is_shows_where_it_was_not_seen(window: Ope
     studio.tab("Shape")
     studio["#random"].click()
     studio.eventually(studio["#legend"].is_hidden)
+    studio.tab("Colour")
+    assert studio["[name=colour][value=none]"].is_checked(), "it is known of what was found, and of no other shape"
+    assert studio["#sure"].is_hidden()
+    studio.page.get_by_role("button", name="Show what was found").click()
+    studio.eventually(studio["#sure"].is_visible)
     studio["#verdict [data-do=close]"].click()
     assert studio["#sure"].is_hidden()
-    studio.tab("Colour")
-    assert studio["[name=colour][value=none]"].is_checked()
 
 
 def test_other_units_are_told_and_the_size_is_found(window: Open, given: Given) -> None:

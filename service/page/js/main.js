@@ -14,7 +14,7 @@ import { Ghost } from "./scan/ghost.js";
 import { Reader } from "./scan/reader.js";
 import * as api from "./server/api.js";
 import { ShapeLoop } from "./server/shape-loop.js";
-import { LatentSpace } from "./server/space.js";
+import { LatentSpace, sameCode } from "./server/space.js";
 import { openCard } from "./shape/card.js";
 import { inShort, inWords } from "./shape/diagnostics.js";
 import { Names, namesOf } from "./shape/names.js";
@@ -165,8 +165,11 @@ for (const radio of radios) {
     radio.checked = radio.value === store.colour;
   });
 }
-store.on(["found"], () => {
-  find("#sure").hidden = !store.found;
+store.on(["found", "code"], () => {
+  const { found, code, colour } = store;
+  const isShown = Boolean(found && code && sameCode(found.code, code));
+  find("#sure").hidden = !isShown;
+  if (!isShown && colour === "spread") store.set({ colour: "none" });
 });
 const root = document.documentElement;
 const theme = always.kept("theme");
@@ -230,6 +233,20 @@ picker.addEventListener(
   }),
 );
 
+/** Whether a pin's mesh has its vertex. */
+const isThere = ({ mesh, vertex }) => 3 * vertex < store.references[mesh]?.vertices.length;
+
+/**
+ * Show what an address asks for of the model that is shown.
+ * @param {ReturnType<typeof fromHash>} asked
+ */
+function goTo({ code, keyframes, locked, view, pins, state }) {
+  if (view) Object.assign(viewer, { view, turned: true });
+  const { space } = store;
+  const wrapped = space.wrapAll(code ?? space.home);
+  store.set({ playing: false, code: wrapped, keyframes, locked, pins: pins.filter(isThere), ...state });
+}
+
 /**
  * Take on a model, at its home, or as an address asks for it.
  * @param {ReturnType<typeof fromHash>} asked
@@ -275,8 +292,7 @@ async function openModel({ model, code, keyframes = [], locked, view, pins = [],
     });
   }
   find("#fine").disabled = !store.hasFine;
-  const { references } = store;
-  const held = pins.filter(({ mesh, vertex }) => 3 * vertex < references[mesh]?.vertices.length);
+  const held = pins.filter(isThere);
   if (held.length && store.pins.length === 0) store.set({ pins: held });
   if (model.surface?.materials.some(({ texture }) => texture)) {
     try {
@@ -294,13 +310,17 @@ async function openModel({ model, code, keyframes = [], locked, view, pins = [],
   await modes.draw();
 }
 
-// The address.
+// The address. Each rest of the hand at another shape is an entry of the browser's history.
 let soon = 0;
+let remembered = null;
 function remember() {
   clearTimeout(soon);
-  if (!store.model || store.playing || welcome.alone) return;
+  if (!store.model || store.playing || store.moving || welcome.alone) return;
   const hash = toHash(store, viewer.turned ? viewer.view : null);
-  history.replaceState(null, "", hash);
+  const shape = `${store.model.name} ${store.code}`;
+  const isNext = remembered !== null && remembered !== shape && !embedded;
+  if (hash !== location.hash) history[isNext ? "pushState" : "replaceState"](null, "", hash);
+  remembered = shape;
   find("#whole").href = location.pathname + hash;
 }
 const rememberSoon = () => {
@@ -323,6 +343,7 @@ store.on(
     "wireframe",
     "normals",
     "fine",
+    "moving",
     "playing",
     "pins",
     "placement",
@@ -334,7 +355,9 @@ addEventListener("hashchange", reporting(restore));
 
 async function restore() {
   const asked = fromHash(location.hash, models);
+  remembered = null;
   if (!asked.code && !embedded) welcome.open();
+  if (asked.model && asked.model === store.model) return goTo(asked);
   if (asked.model) return openModel(asked);
   const model = models.find(({ name }) => name === PREFERRED) ?? models[0];
   if (asked.missing) {

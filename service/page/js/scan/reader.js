@@ -131,7 +131,7 @@ export class Reader {
     this.#abort.abort();
     this.#abort = new AbortController();
     this.#found = null;
-    this.store.set({ scan: null, found: null, ...(this.store.colour === "spread" && { colour: "none" }) });
+    this.store.set({ scan: null, found: null });
   }
 
   #fail(file, error) {

@@ -4,7 +4,6 @@ import * as api from "../server/api.js";
 import { distant, diverging, gradient, tint } from "./colours.js";
 import { element, find, percentile, readable } from "../dom.js";
 import { report } from "../messages.js";
-import { sameCode } from "../server/space.js";
 import { nearest } from "./modes.js";
 import { diagonalOf } from "./scene.js";
 import { Surface } from "./surface.js";
@@ -73,10 +72,12 @@ export class Colouring {
     find(".scale", legend).style.backgroundImage = gradient;
     store.on(["model"], () => {
       this.#surfaces.clear();
-      this.#answers.clear();
+      this.#answers = new Map();
       this.#nearest = null;
     });
-    store.on(["found"], () => this.#answers.clear());
+    store.on(["found"], () => {
+      this.#answers = new Map();
+    });
     store.on(["model", "colour", "against", "other", "found"], () => {
       this.#limit = 0;
     });
@@ -121,10 +122,9 @@ export class Colouring {
     return [measured, surface.atVertices(measured, base, colour === "bending")];
   }
 
-  /** How sure the shape of a file is, as long as it is the one shown. */
+  /** How far the vertices of a file's shape may be off. */
   #spread(mesh) {
-    const { model, found, code, references } = this.store;
-    if (!found || !sameCode(found.code, code)) return null;
+    const { model, found, references } = this.store;
     const diagonal = diagonalOf(references[mesh].vertices);
     const values = this.#asked(`spread ${mesh} ${found.code}`, async () =>
       (await api.spread(model, found, mesh)).map((value) => value / diagonal),
@@ -152,19 +152,20 @@ export class Colouring {
 
   /** An answer of the server by a name; null until it has come. */
   #asked(name, ask) {
-    if (!this.#answers.has(name)) {
-      this.#answers.set(name, null);
+    const answers = this.#answers; // an answer that comes too late goes into a map that is no longer used
+    if (!answers.has(name)) {
+      answers.set(name, null);
       ask()
         .then((answer) => {
-          this.#answers.set(name, answer);
+          answers.set(name, answer);
           this.store.set({ repaint: {} });
         })
         .catch((error) => {
-          this.#answers.delete(name);
+          answers.delete(name);
           report(error);
         });
     }
-    return this.#answers.get(name);
+    return answers.get(name);
   }
 
   /** A region's weights at fine vertices: those of the nearest coarse ones, with its rim smoothed. */
