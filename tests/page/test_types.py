@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 
 from tests.service.conftest import ROOT
@@ -31,3 +32,11 @@ def test_the_scripts_are_sound_by_their_types() -> None:
     found = subprocess.run(command, capture_output=True, text=True, check=False)
     assert found.stdout == ""
     assert found.returncode == 0
+
+
+def test_every_module_is_loaded_ahead() -> None:
+    """Otherwise a browser finds out file by file what else it needs."""
+    page = ROOT / "service" / "page"
+    ahead = set(re.findall(r'rel="modulepreload" href="page/(.+?)"', (page / "index.html").read_text()))
+    modules = [*(page / "js").rglob("*.js"), *(page / "vendor").rglob("*.js")]
+    assert ahead == {path.relative_to(page).as_posix() for path in modules} - {"js/start.js"}
