@@ -474,7 +474,9 @@ class Config(_Section):
 
 def _faults(error: ValidationError) -> list[str]:
     """One line for each setting that can't be used."""
-    return [": ".join(filter(None, (".".join(map(str, e["loc"])), e["msg"]))) for e in error.errors()]
+    words = {"extra_forbidden": "there is no such setting here"}
+    faults = ((".".join(map(str, e["loc"])), words.get(e["type"], e["msg"])) for e in error.errors())
+    return [": ".join(filter(None, fault)) for fault in faults]
 
 
 def parse(text: str, source: str) -> Config:

@@ -29,7 +29,7 @@ def test_every_example_is_a_configuration(path: Path) -> None:
 @pytest.mark.parametrize(
     ("old", "new", "says"),
     [
-        ("count = 60", "count = 60\ncuont = 3", "samples.cuont"),
+        ("count = 60", "count = 60\ncuont = 3", "samples.cuont: there is no such setting here"),
         ("count = 60", "count = 'many'", "samples.count"),
         ("count = 60", "count = 2", "samples.count"),
         ('generator = "freaky-torus"', 'generator = "teapot"', "collection.generator"),
