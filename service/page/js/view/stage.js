@@ -3,11 +3,12 @@
 import * as THREE from "three";
 
 const WIDTH = 1.5; // of the disc, and of what can cast shadow, in the model's radius
-const CELLS = 72; // of a side of the shadow
-const BLUR = 2; // cells, three times over
-// Darkness under what lies on the ground and under what is above it, and the heights where each ends.
-const CONTACT = { dark: 0.5, end: 0.1 };
-const BODY = { dark: 0.24, end: 1.6 };
+const CELLS = 96; // of a side of the shadow
+const BLUR = 2; // cells to each side of one, that it is averaged with
+// Darkness under what lies on the ground and under what is above it, the heights where each ends, and how
+// many times it is blurred: where feet touch the ground their shadow is sharper.
+const CONTACT = { dark: 0.62, end: 0.08, blurred: 1 };
+const BODY = { dark: 0.26, end: 1.6, blurred: 5 };
 
 export class Stage extends THREE.Group {
   #disc;
@@ -15,6 +16,7 @@ export class Stage extends THREE.Group {
   #radius = 1;
   #alpha = new Uint8Array(4 * CELLS * CELLS); // of black pixels
   #seen = new Float32Array(CELLS * CELLS);
+  #touched = new Float32Array(CELLS * CELLS);
   #spare = new Float32Array(CELLS * CELLS);
 
   constructor() {
@@ -66,6 +68,7 @@ export class Stage extends THREE.Group {
     }
     this.position.y = low;
     this.#seen.fill(0);
+    this.#touched.fill(0);
     for (let i = 0; i < points.length; i += 3) this.#cast(points[i], points[i + 1], points[i + 2]);
     // Corners alone would leave holes where faces are large.
     for (let f = 0; f < faces.length; f += 3) {
@@ -73,7 +76,10 @@ export class Stage extends THREE.Group {
       const middle = (axis) => (points[a + axis] + points[b + axis] + points[c + axis]) / 3;
       this.#cast(middle(0), middle(1), middle(2));
     }
-    for (let times = 0; times < 3; times += 1) this.#blur();
+    for (let times = BODY.blurred; times > 0; times -= 1) {
+      if (times === CONTACT.blurred) this.#touched.forEach((dark, i) => (this.#seen[i] += dark));
+      this.#blur();
+    }
     for (let i = 0; i < this.#seen.length; i += 1) this.#alpha[4 * i + 3] = 255 * this.#seen[i];
     this.#shadow.material.map.needsUpdate = true;
   }
@@ -84,9 +90,12 @@ export class Stage extends THREE.Group {
     const [column, row] = [cell(x - this.position.x), cell(this.position.z - z)];
     if (column < 0 || row < 0 || column >= CELLS || row >= CELLS) return;
     const height = ((y - this.position.y) / this.#radius) * WIDTH;
-    const under = ({ dark, end }) => dark * Math.max(1 - height / end, 0) ** 2;
     const at = row * CELLS + column;
-    this.#seen[at] = Math.max(this.#seen[at], under(CONTACT) + under(BODY));
+    const darken = (cells, { dark, end }) => {
+      cells[at] = Math.max(cells[at], dark * Math.max(1 - height / end, 0) ** 2);
+    };
+    darken(this.#seen, BODY);
+    darken(this.#touched, CONTACT);
   }
 
   /** The mean of the cells around each, along one axis; turned over in between, along both. */
