@@ -28,7 +28,7 @@ from shapespace.solve.outcome import Status
 #: Start shapes: this many, chosen as far apart as possible from so many random ones; and sampled points of each.
 STARTS, DRAWN, SHOWN = 16, 200, 150
 #: Vertices of the model for which a nearest scan point is sought: on the coarse mesh, and on the fine mesh at the end.
-LOOKING_ROUGHLY, LOOKING = 500, 1000
+LOOKING_ROUGHLY, LOOKING = 500, 2000
 #: Iterations: of every start, then of the two best, then of the best one.
 FIRST_STEPS, MORE_STEPS, LAST_STEPS = 4, 6, 10
 #: Where a limb of the scan stays unmatched: attempts to move the model's limb there, the iterations of each, and how
