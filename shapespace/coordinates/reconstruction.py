@@ -12,9 +12,11 @@ import numpy as np
 from scipy import sparse
 
 from shapespace.arrays import FloatArray
-from shapespace.coordinates.frame_integration import FrameIntegration
+from shapespace.coordinates import compiled
+from shapespace.coordinates.frame_integration import CompiledFrameIntegration, FrameIntegration
+from shapespace.coordinates.least_squares import CompiledLeastSquares, LeastSquares, Point
 from shapespace.coordinates.normal_matrix import NormalMatrix
-from shapespace.coordinates.nric import HingeGeometry, NRICGradients, NRICJacobian, WeightedNorm
+from shapespace.coordinates.nric import NRICJacobian, WeightedNorm
 from shapespace.mesh.rigid_motion import rigid_motions
 from shapespace.mesh.triangle_mesh import TriangleMesh, face_areas
 from shapespace.solve.anderson import Anderson
@@ -82,15 +84,25 @@ class Reconstructor:
         reference: gives the weights, and the default start.
         eta: weight of the angles, see DEFAULT_ETA.
         backend: Cholesky backend.
+        kernels: NumPy or compiled loops.
     """
 
-    def __init__(self, reference: TriangleMesh, eta: float = DEFAULT_ETA, backend: Backend = "auto") -> None:
+    def __init__(
+        self,
+        reference: TriangleMesh,
+        eta: float = DEFAULT_ETA,
+        backend: Backend = "auto",
+        kernels: compiled.Kernels = "auto",
+    ) -> None:
         self.reference = reference
         self._diagonal = reference.diagonal
         self.norm = WeightedNorm.of(reference, eta)
         self.jacobian = NRICJacobian(reference.connectivity)
         self.normal_matrix = NormalMatrix(reference.connectivity)
         self._backend: Backend = backend
+        self._compiled = compiled.are_used(kernels)
+        squares = CompiledLeastSquares if self._compiled else LeastSquares
+        self._squares = squares(reference.connectivity, self.norm, self.normal_matrix)
         self._single = analyse(self.normal_matrix.pattern, backend, precision=np.float32)
 
     def another(self) -> Reconstructor:
@@ -109,7 +121,8 @@ class Reconstructor:
     @cached_property
     def integrate(self) -> FrameIntegration:
         """The shape of integrable z, without iterating."""
-        return FrameIntegration(self.reference, self._backend)
+        integration = CompiledFrameIntegration if self._compiled else FrameIntegration
+        return integration(self.reference, self._backend)
 
     def guess(self, target: FloatArray, *others: Callable[[], FloatArray]) -> FloatArray:
         """A start (V, 3) near the shape of z* (2E,), which depends on nothing but z*.
@@ -119,8 +132,8 @@ class Reconstructor:
         """
         return self._guess(target, others).vertices
 
-    def _guess(self, target: FloatArray, others: Iterable[Callable[[], FloatArray]]) -> _Point:
-        integrated = self._point(self.integrate(target), target)
+    def _guess(self, target: FloatArray, others: Iterable[Callable[[], FloatArray]]) -> Point:
+        integrated = self._squares(self.integrate(target), target)
         if self._is_good(integrated, target):
             return integrated
         return self._nearest(target, integrated, [*(other() for other in others), self.reference.vertices])
@@ -130,7 +143,7 @@ class Reconstructor:
 
         It is as far from the reconstructed shape as z* is from being integrable.
         """
-        found = self._point(self.integrate(target), target)
+        found = self._squares(self.integrate(target), target)
         residual, flipped = float(np.sqrt(found.energy / self.norm.square(target))), self._flipped(found.misfit)
         if not residual <= ASTRAY or flipped:
             return None
@@ -140,11 +153,11 @@ class Reconstructor:
 
     def nearest(self, target: FloatArray, *shapes: FloatArray) -> FloatArray:
         """The shape (V, 3) among some whose misfit is the smallest; the last where none has a finite one."""
-        return self._nearest(target, self._point(shapes[0], target), shapes[1:]).vertices
+        return self._nearest(target, self._squares(shapes[0], target), shapes[1:]).vertices
 
-    def _nearest(self, target: FloatArray, best: _Point, shapes: Iterable[FloatArray]) -> _Point:
+    def _nearest(self, target: FloatArray, best: Point, shapes: Iterable[FloatArray]) -> Point:
         for vertices in shapes:
-            point = self._point(vertices, target)
+            point = self._squares(vertices, target)
             if not best.energy <= point.energy < np.inf:
                 best = point
         return best
@@ -167,7 +180,7 @@ class Reconstructor:
             max_iterations: most steps.
             deadline: after which no iteration begins.
         """
-        here = self._point(self.reference.vertices if start is None else np.asarray(start, np.float64), target)
+        here = self._squares(self.reference.vertices if start is None else np.asarray(start, np.float64), target)
         return self._iterate(target, here, tolerance, max_iterations, deadline)
 
     def from_guess(
@@ -193,7 +206,7 @@ class Reconstructor:
         for other in starts:
             if np.array_equal(start := other(), guess.vertices):
                 continue
-            again = self._iterate(target, self._point(start, target), tolerance, max_iterations, deadline)
+            again = self._iterate(target, self._squares(start, target), tolerance, max_iterations, deadline)
             iterations += again.iterations
             if again.converged or again.status is Status.DEADLINE:
                 return replace(again, iterations=iterations)
@@ -201,10 +214,10 @@ class Reconstructor:
 
     @np.errstate(divide="ignore", over="ignore", invalid="ignore")
     def _iterate(
-        self, target: FloatArray, start: _Point, tolerance: float, max_iterations: int, deadline: Deadline | None
+        self, target: FloatArray, start: Point, tolerance: float, max_iterations: int, deadline: Deadline | None
     ) -> Reconstruction:
-        if not np.isfinite(start.energy):
-            reason = "lengths and angles of the start are not finite, or those asked for"
+        if not (np.isfinite(start.energy) and target.any()):
+            reason = "lengths and angles of the start are not finite, or those asked for are not, or all are zero"
             return Reconstruction(vertices=self.reference.vertices, status=Status.NOT_FINITE, reason=reason)
         limits = _Limits(tolerance * self._diagonal, REACH * self._diagonal, max_iterations, deadline)
         ended = self._gauss_newton(target, start, limits)
@@ -219,7 +232,7 @@ class Reconstructor:
             flipped_faces=self._flipped(ended.point.misfit),
         )
 
-    def _gauss_newton(self, target: FloatArray, here: _Point, limits: _Limits) -> _Found:
+    def _gauss_newton(self, target: FloatArray, here: Point, limits: _Limits) -> _Found:
         """Steps with new factors in a line search; with old ones accelerated, and only as long as they help."""
         iterations = 0
         factor: _GaussNewtonFactor | None = None
@@ -231,11 +244,11 @@ class Reconstructor:
                 except NotPositiveDefiniteError as error:
                     return _stalled(here, iterations, str(error))
             iterations += 1
-            forces = self._forces(here)
+            forces = here.forces()
             step, mixed = factor.step(here.vertices, forces)
             size = float(np.abs(step).max())
             if not new:
-                t, trial = 1.0, self._point(mixed, target)
+                t, trial = 1.0, self._squares(mixed, target)
             elif np.isfinite(size):
                 t, trial = self._line_search(target, here, forces, step, limits.step)
             else:
@@ -255,12 +268,12 @@ class Reconstructor:
         return _Found(point=here, status=reached, iterations=iterations)
 
     def _line_search(
-        self, target: FloatArray, here: _Point, forces: FloatArray, step: FloatArray, shortest: float
-    ) -> tuple[float, _Point]:
+        self, target: FloatArray, here: Point, forces: FloatArray, step: FloatArray, shortest: float
+    ) -> tuple[float, Point]:
         """The share of a step that lowers the energy enough, or moves no vertex further than ``shortest``."""
         slope, size = 2 * float(np.vdot(forces, step)), np.abs(step).max()
         found = backtrack(
-            lambda t: self._point(here.vertices + t * step, target),
+            lambda t: self._squares(here.vertices + t * step, target),
             lambda t, trial: sufficient_decrease(here.energy, trial.energy, t, slope) or size * t <= shortest,
             smallest=0,
         )
@@ -276,11 +289,11 @@ class Reconstructor:
         areas = face_areas(here.vertices, self.reference.faces)
         while (reached := limits.reached(iterations)) is None:
             try:
-                step = self._damped_factor(here, damping).solve(self._forces(here).ravel()).reshape(-1, 3)
+                step = self._damped_factor(here, damping).solve(here.forces().ravel()).reshape(-1, 3)
             except NotPositiveDefiniteError as error:
                 return _stalled(here, iterations, str(error))
             iterations += 1
-            trial = self._point(here.vertices + step, target)
+            trial = self._squares(here.vertices + step, target)
             left = face_areas(trial.vertices, self.reference.faces)
             helps = trial.energy < here.energy and bool((left >= LEAST_AREA * areas).all())
             if helps:
@@ -292,39 +305,25 @@ class Reconstructor:
                 return _stalled(here, iterations, "no damped step lowers the misfit")
         return _Found(point=here, status=reached, iterations=iterations)
 
-    def _forces(self, here: _Point) -> FloatArray:
-        """The negative gradient (V, 3) of half the energy."""
-        return -self.jacobian.pull_back(here.gradients, self.norm.squared * here.misfit)
-
-    def _factor(self, here: _Point, target: FloatArray) -> Factor:
+    def _factor(self, here: Point, target: FloatArray) -> Factor:
         """The normal matrix, near a solution in single precision if that can be; raises NotPositiveDefiniteError."""
-        entries = self.normal_matrix.entries(here.gradients, self.norm)
+        entries = here.entries()
         if self._is_good(here, target):
             with suppress(NotPositiveDefiniteError):
                 return self._single.factorise(self._damped(entries, LIFT))
         return self._double.factorise(entries)
 
-    def _is_good(self, here: _Point, target: FloatArray) -> bool:
+    def _is_good(self, here: Point, target: FloatArray) -> bool:
         return bool(here.energy <= GOOD_GUESS**2 * self.norm.square(target))
 
-    def _damped_factor(self, here: _Point, damping: float) -> Factor:
+    def _damped_factor(self, here: Point, damping: float) -> Factor:
         """The normal matrix, its diagonal raised by a share; raises NotPositiveDefiniteError."""
-        return self._double.factorise(self._damped(self.normal_matrix.entries(here.gradients, self.norm), damping))
+        return self._double.factorise(self._damped(here.entries(), damping))
 
     def _damped(self, entries: FloatArray, share: float) -> FloatArray:
         damped = entries.copy()
         damped[self.normal_matrix.pattern.diagonal] *= 1 + share
         return damped
-
-    @np.errstate(divide="ignore", over="ignore", invalid="ignore")
-    def _point(self, vertices: FloatArray, target: FloatArray) -> _Point:
-        geometry = HingeGeometry(vertices, self.reference.connectivity)
-        misfit = geometry.nric()
-        misfit -= target
-        half = len(misfit) // 2
-        # As `wrap`, in place and ten times faster; half a turn counts the same either way round.
-        misfit[half:] -= 2 * np.pi * np.rint(misfit[half:] / (2 * np.pi))
-        return _Point(vertices, misfit, float(self.norm.square(misfit)), geometry)
 
     def differential(self, vertices: FloatArray, changes: FloatArray) -> FloatArray:
         """How a reconstructed shape (V, 3) moves, (n, V, 3), where what it was asked for changes by (n, 2E).
@@ -358,29 +357,14 @@ class Reconstructor:
         return len(np.unique(connectivity.edge_faces[folded]))
 
 
-@dataclass(frozen=True)
-class _Point:
-    """A shape on the way: the misfit ``z(X) − z*`` (2E,), its squared norm, and what derivatives are made of."""
-
-    vertices: FloatArray
-    misfit: FloatArray
-    energy: float
-    geometry: HingeGeometry
-
-    @cached_property
-    def gradients(self) -> NRICGradients:
-        """The derivatives, which the last shape doesn't need."""
-        return self.geometry.gradients()
-
-
 @dataclass(frozen=True, kw_only=True)
 class _Found(Outcome):
     """Where one of the two iterations ended."""
 
-    point: _Point
+    point: Point
 
 
-def _stalled(point: _Point, iterations: int, reason: str) -> _Found:
+def _stalled(point: Point, iterations: int, reason: str) -> _Found:
     return _Found(point=point, status=Status.STALLED, iterations=iterations, reason=reason)
 
 

@@ -15,7 +15,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
 from importlib import metadata
-from typing import Literal, Protocol
+from typing import Any, Literal, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -162,6 +162,12 @@ def _mkl() -> ctypes.CDLL:
     return library
 
 
+@cache
+def _reference(number: int) -> Any:
+    """A pointer to an integer, for arguments that MKL only reads."""
+    return ctypes.byref(ctypes.c_int32(number))
+
+
 class PardisoCholesky:
     """MKL Pardiso: phase 11 analyses, 22 factorises, 33 solves.
 
@@ -201,14 +207,14 @@ class PardisoCholesky:
         b = np.zeros(self._size, self._precision) if right is None else right
         x = np.empty_like(b)
         error = ctypes.c_int32(0)
-        numbers = [len(self._versions), number + 1, self._POSITIVE_DEFINITE, phase, self._size]
-        factors, number_, kind, phase_, size, columns, quiet = (
-            ctypes.byref(ctypes.c_int32(n)) for n in (*numbers, b.size // self._size, 0)
+        columns = b.size // self._size
+        factors, number_, kind, phase_, size, columns_, quiet = map(
+            _reference, (len(self._versions), number + 1, self._POSITIVE_DEFINITE, phase, self._size, columns, 0)
         )
         indptr, indices = (a.ctypes.data for a in self._structure)
         _mkl().pardiso(
             *(self._handle.ctypes.data, factors, number_, kind, phase_, size),
-            *(entries.ctypes.data, indptr, indices, None, columns, self._options.ctypes.data, quiet),
+            *(entries.ctypes.data, indptr, indices, None, columns_, self._options.ctypes.data, quiet),
             *(b.ctypes.data, x.ctypes.data, ctypes.byref(error)),
         )
         if error.value:
