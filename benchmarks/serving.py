@@ -174,13 +174,9 @@ def away(model: ShapeModel, codes: FloatArray) -> list[float]:
 
 def stages(folders: list[Path], count: int) -> None:
     """Stage by stage, for every bundle of some folders."""
-    print(
-        "\nCode → GLB of the fine mesh in process, ms, medians; in brackets steps of Gauss–Newton. *Without MKL*, *without"
-    )
-    print(
-        "Numba*: multiples of the sum. *Away*: the furthest vertex from a solution of tolerance 1e-10, in millionths of the"
-    )
-    print("diagonal, median and most over the codes.\n")
+    print("\nCode → GLB of the fine mesh in process, ms, medians; in brackets steps of Gauss–Newton. *Without MKL* and")
+    print("*without Numba*: multiples of the sum. *Away*: the furthest vertex from a solution of tolerance 1e-10, in")
+    print("millionths of the diagonal, median and most over the codes.\n")
     columns = (
         "network",
         "reconstruct",
