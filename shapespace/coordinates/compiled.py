@@ -31,41 +31,51 @@ def are_used(kernels: Kernels) -> bool:
 
 
 if AVAILABLE and not TYPE_CHECKING:
-    from numba import njit
+    from numba import njit, types
 
-    def _loops(**options: str) -> Callable[[Function], Function]:
+    _NUMBERS = {"f": types.float64, "i": types.int64, "j": types.int32}
+
+    def _types(arguments: str) -> tuple[types.Type, ...]:
+        """Of arguments such as ``f2 i``: an array (n, k) of floating point numbers, then an integer."""
+        kinds = [(_NUMBERS[word[0]], int(word[1:] or 0)) for word in arguments.split()]
+        return tuple(types.Array(number, ndim, "C", readonly=True) if ndim else number for number, ndim in kinds)
+
+    def _loops(arguments: str = "") -> Callable[[Function], Function]:
         # Divisions by zero give infinity, as NumPy's do: who calls looks at what is finite.
-        options |= {"nogil": True, "error_model": "numpy"}
+        options = {"nogil": True, "error_model": "numpy"}
+        if not arguments:
+            return njit(inline="always", **options)
 
         def compiling(function: Function) -> Function:
+            # At once, as servers don't let themselves write files later.
             try:
-                return njit(cache=True, **options)(function)
-            except RuntimeError:  # no folder can be written to: every process compiles for itself
-                return njit(**options)(function)
+                return njit([_types(arguments)], cache=True, **options)(function)
+            except (RuntimeError, OSError):  # no folder can be written to: every process compiles for itself
+                return njit([_types(arguments)], **options)(function)
 
         return compiling
 else:
 
-    def _loops(**options: str) -> Callable[[Function], Function]:
+    def _loops(arguments: str = "") -> Callable[[Function], Function]:
         return lambda function: function
 
 
-@_loops(inline="always")
+@_loops()
 def _cross(a: Vector, b: Vector) -> tuple[float, float, float]:
     return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
 
-@_loops(inline="always")
+@_loops()
 def _dot(a: Vector, b: Vector) -> float:
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-@_loops(inline="always")
+@_loops()
 def _between(x: FloatArray, tail: int, head: int) -> tuple[float, float, float]:
     return x[head, 0] - x[tail, 0], x[head, 1] - x[tail, 1], x[head, 2] - x[tail, 2]
 
 
-@_loops(inline="always")
+@_loops()
 def _product(p: Vector, q: Vector) -> tuple[float, float, float, float]:
     """Of two quaternions."""
     return (
@@ -76,7 +86,7 @@ def _product(p: Vector, q: Vector) -> tuple[float, float, float, float]:
     )
 
 
-@_loops()
+@_loops("f2 i2 i2 i1 f1 f1")
 def misfit(
     x: FloatArray, edges: IntArray, hinges: IntArray, hinge_edges: IntArray, target: FloatArray, squared: FloatArray
 ) -> tuple[FloatArray, float]:
@@ -111,7 +121,7 @@ def misfit(
     return found, energy
 
 
-@_loops()
+@_loops("f2 i2 i2")
 def gradients(x: FloatArray, edges: IntArray, hinges: IntArray) -> tuple[FloatArray, FloatArray]:
     """(E, 3) derivatives of lengths by heads, and (H, 12) of angles by tail, head, left and right vertex."""
     lengths, angles = np.empty((len(edges), 3)), np.empty((len(hinges), 12))
@@ -136,7 +146,7 @@ def gradients(x: FloatArray, edges: IntArray, hinges: IntArray) -> tuple[FloatAr
     return lengths, angles
 
 
-@_loops()
+@_loops("f2 f2 i2 i2 i1 i f1")
 def pull_back(
     lengths: FloatArray,
     angles: FloatArray,
@@ -161,7 +171,7 @@ def pull_back(
     return out
 
 
-@_loops()
+@_loops("f2 f2 i1 f1 j2 j2 i")
 def normal_entries(
     lengths: FloatArray,
     angles: FloatArray,
@@ -206,7 +216,7 @@ def normal_entries(
     return out
 
 
-@_loops(inline="always")
+@_loops()
 def _half(cosine: float) -> tuple[float, float]:
     """Cosine and sine of half the angle with this cosine, which is moved into [−1, 1] first."""
     if cosine > 1:
@@ -216,7 +226,7 @@ def _half(cosine: float) -> tuple[float, float]:
     return np.sqrt((1 + cosine) / 2), np.sqrt((1 - cosine) / 2)
 
 
-@_loops()
+@_loops("f1 i2")
 def planes(z: FloatArray, face_edges: IntArray) -> FloatArray:
     """(F, 10) of each triangle in its own plane, corner 0 at the origin, corner 1 on the first axis.
 
@@ -237,7 +247,7 @@ def planes(z: FloatArray, face_edges: IntArray) -> FloatArray:
     return out
 
 
-@_loops()
+@_loops("f2 f1 i2 i1 i1 i1 f1 f2")
 def frames(
     halves: FloatArray,
     angles: FloatArray,
@@ -281,7 +291,7 @@ def frames(
     return q, across
 
 
-@_loops()
+@_loops("f2 f2 i1 i2 f1")
 def misfits(q: FloatArray, across: FloatArray, others: IntArray, sides: IntArray, weights: FloatArray) -> FloatArray:
     """(3, F) right-hand sides of the rotations that make frames fit at the hinges (n,) outside the tree.
 
@@ -311,7 +321,7 @@ def misfits(q: FloatArray, across: FloatArray, others: IntArray, sides: IntArray
     return right
 
 
-@_loops()
+@_loops("f2 f2")
 def turned(q: FloatArray, turns: FloatArray) -> FloatArray:
     """(F, 4) frames q, each rotated a little more, by the vectors (3, F)."""
     out, turn = np.empty_like(q), np.empty(4)
@@ -323,7 +333,7 @@ def turned(q: FloatArray, turns: FloatArray) -> FloatArray:
     return out
 
 
-@_loops()
+@_loops("f2 f2 i2 f2 f2")
 def divergence(
     q: FloatArray, triangles: FloatArray, faces: IntArray, weights: FloatArray, anchored: FloatArray
 ) -> FloatArray:
@@ -355,7 +365,7 @@ def divergence(
     return right
 
 
-@_loops()
+@_loops("f1 i2 i2 i1")
 def closing(z: FloatArray, face_edges: IntArray, fans: IntArray, crossed: IntArray) -> FloatArray:
     """(n, 3) closing conditions at interior vertices.
 

@@ -208,7 +208,7 @@ class CompiledFrameIntegration(FrameIntegration):
     @np.errstate(divide="ignore", over="ignore", invalid="ignore")
     def __call__(self, z: FloatArray) -> FloatArray:
         """See FrameIntegration."""
-        c = self._connectivity
+        c, z = self._connectivity, np.ascontiguousarray(z, np.float64)
         triangles = compiled.planes(z, c.face_edges)
         frames, across = compiled.frames(
             *(triangles, z.take(c.edge_count + c.hinge_edges), self._sides, self._order, self._from),

@@ -77,7 +77,9 @@ class Integrability:
     def at_vertices(self, z: FloatArray) -> FloatArray:
         """Q(z) at the interior vertices, (n, 3): as long as the sine of half the angle left after a turn around."""
         if self._compiled:
-            found: FloatArray = compiled.closing(z, self.connectivity.face_edges, self._fans, self._exit)
+            found: FloatArray = compiled.closing(
+                np.ascontiguousarray(z, np.float64), self.connectivity.face_edges, self._fans, self._exit
+            )
             return found
         cos_gamma, theta = self._cosines(z), z[self.connectivity.edge_count :]
         cos_z, sin_z = np.sqrt((1 + cos_gamma) / 2), np.sqrt((1 - cos_gamma) / 2)

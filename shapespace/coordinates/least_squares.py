@@ -87,7 +87,8 @@ class CompiledLeastSquares(LeastSquares):
 
     def __call__(self, vertices: FloatArray, target: FloatArray) -> Point:
         """See LeastSquares."""
-        c = self.connectivity
+        c, vertices = self.connectivity, np.ascontiguousarray(vertices, np.float64)
+        target = np.ascontiguousarray(target, np.float64)
         misfit, energy = compiled.misfit(vertices, c.edges, c.hinges, c.hinge_edges, target, self.norm.squared)
         return _CompiledPoint(vertices, misfit, energy, self)
 

@@ -18,7 +18,7 @@ from shapespace.mesh.triangle_mesh import Connectivity, TriangleMesh
 
 def components(vertices: FloatArray) -> FloatArray:
     """(3, …, V): whole arrays of x, y and z are several times faster to work on than rows of three."""
-    return np.ascontiguousarray(np.moveaxis(vertices, -1, 0))
+    return np.ascontiguousarray(vertices.T if vertices.ndim == 2 else np.moveaxis(vertices, -1, 0))
 
 
 def dot(a: FloatArray, b: FloatArray) -> FloatArray:
