@@ -1,4 +1,4 @@
-"""Parallel transport: one step, none, and vectors that are none."""
+"""Parallel transport: over one step and none, and of vectors that aren't tangent vectors."""
 
 from dataclasses import replace
 
