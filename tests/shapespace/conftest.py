@@ -42,7 +42,7 @@ TETRAHEDRON = [[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]]
 
 
 def hinge(angle: float = 0.0, length: float = 2.0) -> TriangleMesh:
-    """Two triangles of height 1 with a common edge along x, folded by an angle, convex where it is positive."""
+    """Two triangles of height 1 at a common edge along x, folded by an angle; positive is convex."""
     tip = [length / 2, np.cos(angle), -np.sin(angle)]
     return TriangleMesh.from_arrays([[0, 0, 0], [length, 0, 0], tip, [length / 2, -1, 0]], [[0, 1, 2], [1, 0, 3]])
 
