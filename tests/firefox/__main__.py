@@ -15,7 +15,7 @@ FIREFOX = next(filter(None, map(shutil.which, ("firefox-esr", "firefox"))), None
 def main() -> int:
     """Start a server, run page.mjs with it, and return the script's exit status."""
     if FIREFOX is None:
-        print("There is no Firefox: install Debian's firefox-esr, or another as `firefox`.", file=sys.stderr)
+        print("There is no Firefox: install Debian's firefox-esr, or another one as `firefox`.", file=sys.stderr)
         return 2
     screen = [] if "DISPLAY" in os.environ else ["xvfb-run", "--auto-servernum"]
     with TemporaryDirectory() as scratch, starting() as start:

@@ -32,7 +32,7 @@ def test_shapes_too_far_apart_for_a_straight_start_are_connected(space, mesh):
     assert true_residuals(space, path).max() <= 1e-9
     assert distance(space, path.vertices[-1], end) < 1e-12
     half = [space.energy.rest(a).value(b) for a, b in pairwise(path.nric)]
-    assert max(half) < 1.5 * min(half), "all steps have about the same length"
+    assert max(half) < 1.5 * min(half), "all steps have similar energies"
 
 
 def test_the_logarithm_is_also_a_change_of_lengths_and_angles(space, mesh, velocity, move):

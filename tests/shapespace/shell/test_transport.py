@@ -1,4 +1,4 @@
-"""Parallel transport: over one step and none, and of vectors that aren't tangent vectors."""
+"""Parallel transport: over one step and none, and of vectors that are zero or not finite."""
 
 from dataclasses import replace
 
