@@ -1,4 +1,4 @@
-"""A ball of triangles and quads with texture, materials and names; OBJ files of it, by other code than ours."""
+"""A ball of triangles and quads with texture, materials and names; OBJ files of it, not by our writers."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Crops: loss and gradients are those of the whole mesh, and they are drawn where the error is large."""
+"""Crops: on inner edges their loss is that of the whole mesh, and they are drawn where the error is large."""
 
 from __future__ import annotations
 

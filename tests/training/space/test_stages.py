@@ -1,4 +1,4 @@
-"""Results of the stages mean and modes on a collection, and their messages on failure."""
+"""The stage mean: where a collection has none, the message names the place; otherwise it converges."""
 
 from pathlib import Path
 
