@@ -1,7 +1,7 @@
-"""What a stranger can send to stop a service, against any address: ``python -m tests.attacks URL [--seconds 60]``.
+"""Denial-of-service attacks on a server, to test it: ``python -m tests.attacks URL [--seconds 60]``.
 
-Each attack goes on for some seconds from a few clients at once, while somebody else asks for health and for ordinary
-shapes. Needs httpx alone. Send it to servers of your own only.
+Each attack lasts some seconds, from a few clients at once, while another client asks for health and for
+ordinary shapes. This module needs only httpx. Use it on servers of your own only.
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ import httpx
 
 #: Seconds within which health has to answer, whatever else happens.
 PROMPT = 1.0
-#: Seconds that somebody waits for health and for a shape before giving up.
+#: Timeouts in seconds of the calls for health and for a shape.
 HEALTH_PATIENCE, SHAPE_PATIENCE = 10.0, 70.0
-#: Bytes that one connection of `f2` sends at most, clients of the other attacks, and streams of `f4`.
+#: Most bytes that a connection of `f2` sends; clients of the other attacks; streams of `f4`.
 ENDLESS, CLIENTS, READERS = 200 * 2**20, 4, 34
 #: Connections that one attack makes at most.
 CONNECTIONS = 20_000
@@ -39,13 +39,13 @@ CONNECTIONS = 20_000
 
 @dataclass
 class Outcome:
-    """What came of an attack.
+    """The outcome of an attack.
 
     Attributes:
-        answers: how often the attackers got which answer: a status, or why there was none.
-        health: seconds that each call of health took; infinite where none came.
-        shapes: how often an ordinary shape ended in which status.
-        slowest_shape: seconds that the slowest shape took that came.
+        answers: number of the attackers' answers by status, or by the reason why there was none.
+        health: seconds of each call of health; infinite for one without an answer.
+        shapes: number of ordinary shapes by status.
+        slowest_shape: seconds of the slowest shape that was answered.
     """
 
     answers: Counter[str] = field(default_factory=Counter)
@@ -55,12 +55,12 @@ class Outcome:
 
     @property
     def worst_health(self) -> float:
-        """Seconds of the slowest call of health; infinite where one had no answer."""
+        """Seconds of the slowest call of health; infinite if one had no answer."""
         return max(self.health, default=float("inf"))
 
     @property
     def held(self) -> bool:
-        """Whether health answered promptly throughout, and most of the ordinary shapes came."""
+        """Whether health always answered promptly, and most of the ordinary shapes were answered."""
         return self.worst_health < PROMPT and self.shapes["200"] > self.shapes.total() / 2
 
     def __str__(self) -> str:
@@ -77,10 +77,10 @@ class Outcome:
 
 @dataclass
 class Target:
-    """Where an attack goes, for how long, with which key, and from which address of this machine.
+    """The server that is attacked, for how long, with which key, and from which local address.
 
     Attributes:
-        stranger: whether the attackers lack the key that the others bring.
+        stranger: whether the attackers lack the key that the other client sends.
         end: time.monotonic() when it is over, once it has begun.
     """
 
@@ -97,7 +97,7 @@ class Target:
         return time.monotonic() < self.end
 
     def client(self, *, attacks: bool = False) -> httpx.Client:
-        """For whole requests; proxies of the environment are not asked."""
+        """A client for whole requests; it ignores proxies that the environment names."""
         transport = httpx.HTTPTransport(local_address=self.source if attacks else None)
         headers = self._headers(attacks=attacks)
         return httpx.Client(base_url=self.url, headers=headers, timeout=SHAPE_PATIENCE, transport=transport)
@@ -106,7 +106,7 @@ class Target:
         return {"X-API-Key": self.key} if self.key and not (attacks and self.stranger) else {}
 
     def connect(self, receive: int | None = None) -> socket.socket:
-        """For parts of requests; ``receive`` is how many bytes may wait to be read."""
+        """A connection for parts of requests; ``receive`` is the size of its receive buffer in bytes."""
         place = urlsplit(self.url)
         port = place.port or (443 if place.scheme == "https" else 80)
         connection = socket.socket(socket.AF_INET6 if ":" in (place.hostname or "") else socket.AF_INET)
@@ -133,7 +133,7 @@ class Target:
 
 
 def f1(url: str, seconds: float, key: str | None = None, **of_target: Any) -> Outcome:
-    """Scene graphs that cost far more than they weigh, to be encoded: long chains, and many edges between few nodes."""
+    """Scene graphs that cost more than their size suggests: long chains, and few nodes with many edges."""
     target = Target(url, seconds, key, **of_target)
     name, _ = target.model()
     with target.client() as client:
@@ -143,7 +143,7 @@ def f1(url: str, seconds: float, key: str | None = None, **of_target: Any) -> Ou
 
 
 def f2(url: str, seconds: float, key: str | None = None, **of_target: Any) -> Outcome:
-    """Heads and trailers without end: of many lines, and of one."""
+    """Endless heads and trailers: with many lines, and with one."""
     target = Target(url, seconds, key, **of_target)
     get = target.head("GET /v1/models HTTP/1.1")
     chunked = target.head("POST /v1/models/x/mesh HTTP/1.1") + b"Transfer-Encoding: chunked\r\n"
@@ -170,7 +170,7 @@ def f2(url: str, seconds: float, key: str | None = None, **of_target: Any) -> Ou
 
 
 def f3(url: str, seconds: float, key: str | None = None, **of_target: Any) -> Outcome:
-    """JSON of 1 and 8 MiB in which every element is a mistake, or none is."""
+    """JSON of 1 and 8 MiB in which every element is invalid, or none."""
     target = Target(url, seconds, key, **of_target)
     name, dimension = target.model()
     mesh, infer = f"/v1/models/{name}/mesh", f"/v2/models/{name}/infer"
@@ -189,7 +189,7 @@ def f3(url: str, seconds: float, key: str | None = None, **of_target: Any) -> Ou
 
 
 def f4(url: str, seconds: float, key: str | None = None, **of_target: Any) -> Outcome:
-    """Readers that ask for a stream of frames and read none of it."""
+    """Clients that request a stream of frames and read nothing."""
     target = Target(url, seconds, key, **of_target)
     name, dimension = target.model()
     with target.client() as client:
@@ -231,7 +231,7 @@ ATTACKS: dict[str, Callable[..., Outcome]] = {"f1": f1, "f2": f2, "f3": f3, "f4"
 
 
 def chain(glb: bytes, length: int) -> bytes:
-    """A GLB whose meshes hang at the end of a chain of nodes, each with a matrix."""
+    """A GLB whose meshes are at the end of a chain of nodes, each with a matrix."""
     identity = [1.0 if k % 5 == 0 else 0.0 for k in range(16)]
     tree, rest = _taken_apart(glb)
     tree["nodes"] = [{"matrix": identity, "children": [k + 1]} for k in range(length)] + [{"mesh": 0}]
@@ -239,7 +239,7 @@ def chain(glb: bytes, length: int) -> bytes:
 
 
 def dense(glb: bytes, size: int) -> bytes:
-    """A GLB of about so many bytes with few nodes, each of which has many of the later ones as children."""
+    """A GLB of about this many bytes with few nodes, each with many of the later ones as children."""
     tree, rest = _taken_apart(glb)
     count = 9000
     each = size // count // 5
@@ -248,7 +248,7 @@ def dense(glb: bytes, size: int) -> bytes:
 
 
 def doubled(glb: bytes, depth: int) -> bytes:
-    """A GLB whose mesh is reached in 2**depth ways, as each node has the next one as its child twice."""
+    """A GLB whose mesh is reached on 2**depth paths, as each node has the next one as child twice."""
     tree, rest = _taken_apart(glb)
     tree["nodes"] = [{"children": [k + 1, k + 1]} for k in range(depth)] + [{"mesh": 0}]
     return _put_together(tree, rest)
@@ -288,7 +288,7 @@ _JSON = {"Content-Type": "application/json"}
 
 @contextlib.contextmanager
 def _counted(outcome: Outcome) -> Iterator[Callable[[str], None]]:
-    """Count one answer, or the kind of failure that came instead."""
+    """Count one answer, or the kind of failure."""
     found: list[str] = []
     try:
         yield found.append
@@ -349,7 +349,7 @@ def main() -> int:
     parser.add_argument("--source", help="address of this machine that the attackers come from")
     parser.add_argument("--stranger", action="store_true", help="the attackers don't know the key")
     given = parser.parse_args()
-    # The key is no argument: everybody on a machine can read those.
+    # The key is not an argument, as all users of a machine can read arguments.
     key = os.environ.get("SHAPESPACE_API_KEY")
     held = True
     for name in given.only:

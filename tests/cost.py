@@ -1,7 +1,7 @@
-"""What reading an upload costs: a process that reads each in a child of its own, and tells memory and time.
+"""Cost of reading uploads: a process that reads each in a child of its own, and reports memory and time.
 
-``python -m tests.cost`` takes, again and again, a line of JSON with the length of a body and what it is said to be, and
-the body; it answers with a line of JSON.
+``python -m tests.cost`` reads, repeatedly, a line of JSON with the length and declared format of a body, and
+then the body; it answers with a line of JSON.
 """
 
 from __future__ import annotations
@@ -20,21 +20,21 @@ from typing import Any
 from shapespace.files.limits import Limits
 from shapespace.service.use_cases.uploads import UploadError, read_mesh_file
 
-#: Seconds of a processor after which a child is ended.
+#: Seconds of CPU time after which a child is killed.
 SECONDS = 30
-#: What a model asks for whose meshes are no larger.
+#: Limits for a model with meshes no larger than this.
 LIMITS = Limits(2**15, 2**16)
 
 
 def most_memory() -> int:
-    """Most bytes that this process ever had in memory at once."""
+    """Peak resident memory of this process so far, in bytes."""
     found = re.search(r"VmHWM:\s+(\d+) kB", Path("/proc/self/status").read_text())
     assert found
     return int(found[1]) * 1024
 
 
 def read(body: bytearray, said: str) -> str:
-    """What comes of a body: a sentence, or the mesh's size."""
+    """The result of reading a body: the error in a sentence, or the mesh's size."""
     try:
         form = "/" in said
         vertices, faces, *_ = read_mesh_file(body, said if form else "", None if form else said, LIMITS)
@@ -62,7 +62,7 @@ def main() -> None:
     while True:
         line = b""
         while not line.endswith(b"\n"):
-            line += (one := os.read(0, 1))  # no more than the line: the body is for the child
+            line += (one := os.read(0, 1))  # not beyond the line, as the child reads the body
             if not one:
                 return
         process = os.fork()
@@ -75,13 +75,13 @@ def main() -> None:
 
 
 class Costs:
-    """Asks that process."""
+    """Sends bodies to that process."""
 
     def __init__(self, process: subprocess.Popen[bytes]) -> None:
         self._process = process
 
     def __call__(self, body: bytes, said: str) -> dict[str, Any]:
-        """The memory that reading a body took beyond it, and what was said to it; or how its process ended."""
+        """The memory that reading took in addition to the body, and its result; or how the child ended."""
         assert self._process.stdin
         assert self._process.stdout
         self._process.stdin.write(json.dumps({"length": len(body), "said": said}).encode() + b"\n")
@@ -93,7 +93,7 @@ class Costs:
 
 @contextmanager
 def costs() -> Iterator[Costs]:
-    """A process to ask."""
+    """Starts the process, and ends it afterwards."""
     root = Path(__file__).parents[1]
     with subprocess.Popen(
         [sys.executable, "-m", "tests.cost"], cwd=root, stdin=subprocess.PIPE, stdout=subprocess.PIPE

@@ -1,6 +1,6 @@
-"""Mesh files that would cost far more than a mesh: bodies up to the limit of an upload, made to need time or memory.
+"""Mesh files up to the limit of uploads, generated to need far more time or memory than a mesh.
 
-A body is made when it is asked for; each says which reader it is for, and what it may hope for.
+Bodies are generated on demand, each with the format that it is sent as.
 """
 
 from __future__ import annotations
@@ -15,14 +15,14 @@ from collections.abc import Callable
 import numpy as np
 
 MIB = 2**20
-#: What an upload may weigh.
+#: Largest upload, in bytes.
 MOST = 64 * MIB
 #: A mesh of a few faces.
 VERTICES = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], "<f4")
 FACES = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]], "<u4")
 FORM = "multipart/form-data; boundary=b"
 
-#: Makes the format, or the content type, and a body of that size at most.
+#: Returns the format, or the content type, and a body of at most the given size.
 Make = Callable[[int], tuple[str, bytes]]
 HOSTILE: dict[str, Make] = {}
 
@@ -33,12 +33,12 @@ def hostile(make: Make) -> Make:
 
 
 def filled(size: int, start: bytes, repeated: bytes, end: bytes = b"") -> bytes:
-    """As many repetitions as go into that many bytes."""
+    """``start``, as many repetitions as fit into the size, and ``end``."""
     return start + repeated * ((size - len(start) - len(end)) // len(repeated)) + end
 
 
 def repeating(format: str, start: bytes, repeated: bytes, end: bytes = b"") -> Make:
-    """One thing again and again."""
+    """A body in which one piece is repeated up to the size."""
     return lambda size: (format, filled(size, start, repeated, end))
 
 
@@ -112,7 +112,7 @@ def glb(tree: object, data: bytes = b"") -> bytes:
 
 
 def document(**more: object) -> dict[str, object]:
-    """A glTF document with one mesh in a buffer; its scene has the nodes that are given, and begins with the first."""
+    """A glTF document with a mesh in a buffer, and the given members; the scene's root is the first node."""
     return {
         "asset": {"version": "2.0"},
         "buffers": [{"byteLength": VERTICES.nbytes + FACES.nbytes}],
@@ -136,24 +136,24 @@ MATRIX = [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 1, 0, 0, 1]
 
 
 def chain(count: int, matrices: bool = True) -> bytes:
-    """Nodes one inside the other, the last of which has the mesh."""
+    """A chain of nodes, the last of which has the mesh."""
     extra = {"matrix": MATRIX} if matrices else {}
     nodes = [{"children": [k + 1], **extra} for k in range(count - 1)]
     return glb(document(nodes=[*nodes, {"mesh": 0}]), BINARY)
 
 
 def doubling(deep: int) -> bytes:
-    """Nodes that hold the next one twice: a thousand million places in a kilobyte."""
+    """Nodes that have the next one as child twice: a thousand million paths in a kilobyte."""
     return glb(document(nodes=[*({"children": [k + 1, k + 1]} for k in range(deep)), {"mesh": 0}]), BINARY)
 
 
 def ring() -> bytes:
-    """A node among its own descendants."""
+    """A node that is its own descendant."""
     return glb(document(nodes=[{"children": [1], "mesh": 0}, {"children": [0]}]), BINARY)
 
 
 def graph(count: int) -> bytes:
-    """Half of the nodes hold all of the other half: as many ways as a quarter of the square of the nodes."""
+    """Half of the nodes have all others as children: count² / 4 paths."""
     half = count // 2
     nodes = [
         {"children": list(range(1, half))},
@@ -166,7 +166,7 @@ def graph(count: int) -> bytes:
 
 @hostile
 def ply_of_lists(size: int) -> tuple[str, bytes]:
-    """Faces of different lengths, which have to be looked at one by one, with lists of other things."""
+    """Faces of different sizes, which have to be read one by one, and lists of other properties."""
     lists = [f"property list uchar uchar l{k}" for k in range(3)]
     scalars = [f"property uchar s{k}" for k in range(250)]
     head = ply_head("binary_big_endian", "element vertex 1", *XYZ, "element face 65000", *lists, *scalars, INDICES)
@@ -196,7 +196,7 @@ def stl_that_boasts(size: int) -> tuple[str, bytes]:
 def archive(
     members: dict[str, bytes], method: int = zipfile.ZIP_DEFLATED, patch: tuple[int, int, str] | None = None
 ) -> bytes:
-    """An archive; all entries of its directory may get another value of a field: place, value, type."""
+    """An archive; ``patch`` (offset, value, struct type) changes a field in all entries of its directory."""
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w", method, compresslevel=1) as file:
         for name, content in members.items():
@@ -218,31 +218,31 @@ ZEROS = npy("(2796202, 3)", bytes(64 * MIB))
 
 
 def twice(member: bytes, method: int = zipfile.ZIP_DEFLATED, patch: tuple[int, int, str] | None = None) -> bytes:
-    """An archive with the same for vertices and faces."""
+    """An archive with the same member for vertices and faces."""
     return archive({"vertices.npy": member, "faces.npy": member}, method, patch)
 
 
 HOSTILE |= {
-    # Sixty-four MiB of nothing, which deflate to sixty-four KiB; said to be of a few bytes; and encrypted.
+    # 64 MiB of zeros, which deflate to 64 KiB; declared as a few bytes; and declared as encrypted.
     "npz_of_zeros": lambda _: ("npz", twice(ZEROS)),
     "npz_whose_directory_lies": lambda _: ("npz", twice(ZEROS, patch=(24, 1000, "<I"))),
     "npz_that_is_encrypted": lambda _: ("npz", twice(ZEROS, patch=(8, 1, "<H"))),
     "npz_whose_array_boasts": lambda _: ("npz", twice(npy(f"({10**17}, 3)", bytes(24)))),
     # A few entries of half a MiB each, which deflate well.
     "npz_of_long_text": lambda _: ("npz", twice(npy("(64, 3)", bytes(96 * MIB), f"<U{MIB // 8}"))),
-    # A head of 96 MiB, which deflates to half a MiB.
+    # A header of 96 MiB, which deflates to half a MiB.
     "npz_with_a_long_head": lambda _: (
         "npz",
         twice(b"\x93NUMPY\x02\x00" + struct.pack("<I", 96 * MIB) + bytes(96 * MIB)),
     ),
-    # LZMA takes as much memory as its head says.
+    # LZMA allocates as much memory as its header declares.
     "npz_by_another_method": lambda _: ("npz", twice(npy("(10922, 3)", bytes(MIB // 4)), zipfile.ZIP_LZMA)),
 }
 
 
 @hostile
 def npz_of_many_members(size: int) -> tuple[str, bytes]:
-    """As many entries as its directory has room for."""
+    """As many members as fit into the directory."""
     entry = struct.pack("<4s4B4HL2L5H2L", b"PK\1\2", 20, 3, 20, 0, 0, 0, 0, 0, 0, 0, 0, 1, 0, 0, 0, 0, 0, 0) + b"a"
     directory = entry * ((size - 100) // len(entry))
     return "npz", directory + struct.pack("<4s4H2LH", b"PK\5\6", 0, 0, 65535, 65535, len(directory), 0, 0)
@@ -250,7 +250,7 @@ def npz_of_many_members(size: int) -> tuple[str, bytes]:
 
 @hostile
 def npz_of_a_thousand_members(size: int) -> tuple[str, bytes]:
-    """Each of which unpacks to a head and a quarter of a MiB."""
+    """Each member unpacks to a header and a quarter of a MiB."""
     more = {f"{k}.npy": npy("(32768,)", bytes(MIB // 4)) for k in range(990)}
     small = {"vertices.npy": npy("(4, 3)", bytes(96)), "faces.npy": npy("(4, 3)", bytes(96), "<i8")}
     return "npz", archive(more | small)
@@ -258,13 +258,13 @@ def npz_of_a_thousand_members(size: int) -> tuple[str, bytes]:
 
 @hostile
 def json_of_one_wide_string(size: int) -> tuple[str, bytes]:
-    """One character beyond the first plane, and every other takes four bytes too."""
+    """With one character outside the basic plane, every character of a Python string takes four bytes."""
     return "json", filled(min(size, 13 * MIB), b'{"name": "\xf0\x9f\x98\x80', b"a", b'"}')
 
 
 @hostile
 def json_with_an_escape(size: int) -> tuple[str, bytes]:
-    """The same in ASCII, and wrong at its end, where the error holds all of it."""
+    """The same with ASCII escapes, and invalid at its end, so that the error contains the whole text."""
     return "json", filled(min(size, 13 * MIB), b'{"name": "\\ud83d\\ude00', b"a", b'"}}')
 
 
@@ -281,7 +281,7 @@ def glb_of_nodes(size: int) -> tuple[str, bytes]:
 
 @hostile
 def glb_of_many_places(size: int) -> tuple[str, bytes]:
-    """As many nodes as its JSON may have values, each with a transformation."""
+    """As many nodes as JSON values are allowed, each with a transformation."""
     nodes: list[dict[str, object]] = [{"scale": [1, 2, 1], "translation": [k, 1, 2]} for k in range(24_000)]
     return "glb", glb(document(nodes=nodes, scenes=[{"nodes": list(range(len(nodes)))}]), BINARY)
 
@@ -314,7 +314,7 @@ def glb_of_a_wide_name(size: int) -> tuple[str, bytes]:
 
 @hostile
 def glb_of_vertices(size: int) -> tuple[str, bytes]:
-    """An accessor onto all there is, with a thousand primitives."""
+    """An accessor to the whole buffer, used by a thousand primitives."""
     data = bytes(size - 3000)
     count = len(data) // 12
     tree = document(
@@ -328,7 +328,7 @@ def glb_of_vertices(size: int) -> tuple[str, bytes]:
 
 @hostile
 def glb_of_nothing(size: int) -> tuple[str, bytes]:
-    """Matrices without any data behind them."""
+    """Accessors of matrices without data."""
     tree = document(accessors=[{"componentType": 5126, "type": "MAT4", "count": 10**9}] * 2)
     return "glb", glb(tree, bytes(size - 3000))
 
@@ -342,7 +342,7 @@ def embedded(data: bytes, **more: object) -> bytes:
 
 @hostile
 def gltf_of_one_buffer(size: int) -> tuple[str, bytes]:
-    """A mesh at both ends of as much data as there can be."""
+    """A mesh whose data are at both ends of the largest possible buffer."""
     data = VERTICES.tobytes() + bytes((size - 3000) // 4 * 3 - len(BINARY)) + FACES.tobytes()
     places = (0, VERTICES.nbytes), (len(data) - FACES.nbytes, FACES.nbytes)
     return "gltf", embedded(data, bufferViews=[{"buffer": 0, "byteOffset": a, "byteLength": b} for a, b in places])
@@ -350,7 +350,7 @@ def gltf_of_one_buffer(size: int) -> tuple[str, bytes]:
 
 @hostile
 def gltf_of_strides(size: int) -> tuple[str, bytes]:
-    """Vertices as far from each other as they may be."""
+    """Vertices with the largest stride allowed."""
     count = 32_000
     data = bytes(252 * count)
     return "gltf", embedded(

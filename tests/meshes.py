@@ -1,4 +1,4 @@
-"""Mesh files as the checked meshes that they hold."""
+"""Reading mesh files as checked meshes."""
 
 from __future__ import annotations
 
@@ -9,5 +9,5 @@ from shapespace.mesh.triangle_mesh import TriangleMesh
 
 
 def read_mesh(source: bytes | Path, format: str | None = None) -> TriangleMesh:
-    """Arguments and errors as ``read_arrays`` and ``TriangleMesh.from_arrays`` have them."""
+    """A file's mesh; arguments and errors are those of ``read_arrays`` and ``TriangleMesh.from_arrays``."""
     return TriangleMesh.from_arrays(*read_arrays(source, format))

@@ -1,4 +1,4 @@
-"""Reading sequences of shapes by the letter of their formats, independently of what wrote them."""
+"""Reading sequences of shapes by their specifications, independently of the code that wrote them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A ball of triangles and quads with texture, materials and names; OBJ files of it, not by the project's writers."""
+"""A ball of triangles and quads with texture, materials and names; OBJ files of it, not by our writers."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from shapespace.mesh.surface import Labels, Material, Surface
 
 
 def png(seed: int = 0, size: int = 4, color: tuple[int, int, int] | None = None) -> bytes:
-    """A picture of a few pixels, of one colour or of any."""
+    """A PNG picture of a few pixels, of one colour or of random ones."""
 
     def chunk(kind: bytes, data: bytes) -> bytes:
         return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
@@ -27,13 +27,13 @@ def png(seed: int = 0, size: int = 4, color: tuple[int, int, int] | None = None)
 
 
 def ball(subdivisions: int = 3) -> tuple[np.ndarray, Surface]:
-    """An icosphere of as many quads as half its triangles, each of 20 charts by itself in the texture.
+    """An icosphere of triangles and quads, with 20 charts that are separate in the texture.
 
     Returns:
         Vertices (V, 3), and the surface; five charts are of a material without texture.
     """
     sphere = trimesh.creation.icosphere(subdivisions, 1.0)
-    # Each triangle was cut in four; the last two of them make a quad.
+    # Each triangle was split into four; the last two of these are joined to a quad.
     first, second, third, middle = sphere.faces.reshape(-1, 4, 3).transpose(1, 0, 2)
     quads = np.hstack([middle[:, [2, 0, 1]], third[:, 2:]])
     corners = np.hstack([first, second, quads]).ravel()
@@ -61,11 +61,11 @@ def ball(subdivisions: int = 3) -> tuple[np.ndarray, Surface]:
 
 
 def with_parts(body: tuple[np.ndarray, Surface]) -> tuple[np.ndarray, Surface]:
-    """A ball with an eye before and a nail behind it in the order of the file: parts of their own on it.
+    """A ball with two separate parts, an eye before it and a nail after it in the file's order.
 
     Returns:
         Vertices (V, 3) of the eye, a small ball half inside on the left; the body; and the nail, a square of quads that
-        hovers above the body on the right. And the surface.
+        is above the body on the right. And the surface.
     """
     eye, eye_surface = ball(1)
     x, y = np.meshgrid(np.linspace(0.5, 0.7, 4), np.linspace(-0.1, 0.1, 3), indexing="ij")
@@ -101,7 +101,7 @@ def with_parts(body: tuple[np.ndarray, Surface]) -> tuple[np.ndarray, Surface]:
 
 
 def write_files(path: Path, vertices: np.ndarray, surface: Surface) -> None:
-    """An OBJ file, and beside it materials and textures."""
+    """Write an OBJ file with its materials and textures in the same folder."""
     lines = [f"mtllib {path.parent.name}.mtl"]
     lines += ["v {!r} {!r} {!r}".format(*row) for row in vertices.tolist()]
     lines += ["vt {!r} {!r}".format(*row) for row in surface.uv.tolist()]
@@ -131,7 +131,7 @@ def write_files(path: Path, vertices: np.ndarray, surface: Surface) -> None:
 
 
 def parse_obj(text: str) -> dict:
-    """What an OBJ file holds, word by word: polygons as (vertices, texture coordinates, normals, names by keyword)."""
+    """Contents of an OBJ file by keyword; polygons as (vertices, texture coordinates, normals, names)."""
     found: dict = {"v": [], "vt": [], "vn": [], "polygons": [], "mtllib": []}
     names: dict[str, str] = {}
     for line in filter(None, text.splitlines()):
@@ -150,7 +150,7 @@ def parse_obj(text: str) -> dict:
 
 
 def corner_uv(surface: Surface) -> dict[tuple[int, ...], tuple[str, np.ndarray]]:
-    """By the vertices of each triangle the name of its material, and texture coordinates (3, 2)."""
+    """For the vertices of each triangle, the name of its material and texture coordinates (3, 2)."""
     uv = surface.uv[surface.uv_corners[surface.triangle_corners]]
     named = surface.material_of is not None
     names = [surface.materials[surface.material_of[k]].name if named else "" for k in surface.triangle_polygons]
@@ -158,7 +158,7 @@ def corner_uv(surface: Surface) -> dict[tuple[int, ...], tuple[str, np.ndarray]]
 
 
 def same_corners(found: dict, wanted: dict) -> None:
-    """Hold what `corner_uv` gives of two surfaces against each other."""
+    """Assert that the results of `corner_uv` for two surfaces agree."""
     assert found.keys() == wanted.keys()
     for triangle, (name, uv) in wanted.items():
         assert found[triangle][0] == name

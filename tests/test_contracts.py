@@ -1,4 +1,4 @@
-"""Every library that the code imports is under a contract of ``[tool.importlinter]``; NumPy and SciPy are for all."""
+"""Every library imported, except NumPy and SciPy, is named in a contract of ``[tool.importlinter]``."""
 
 import sys
 import tomllib

@@ -1,4 +1,4 @@
-"""The documentation leads nowhere that is not there."""
+"""Links, tests and pages that the documentation names exist."""
 
 import re
 import tomllib
@@ -19,7 +19,7 @@ def text_of(page: Path) -> str:
 
 
 def anchors(page: Path) -> set[str]:
-    """What can stand behind # in a link to a page, as GitHub names its headings."""
+    """The anchors of a page's headings, as GitHub names them."""
     headings = re.findall(r"^#+ (.*)$", text_of(page), re.MULTILINE)
     return {re.sub(r"[^\w\- ]", "", heading.lower()).strip().replace(" ", "-") for heading in headings}
 

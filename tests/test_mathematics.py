@@ -1,4 +1,4 @@
-"""docs/explanation/mathematics.md names functions: they are there, and none of the modules that compute is missing."""
+"""docs/explanation/mathematics.md: the functions that it names exist, and it has every numerical module."""
 
 import importlib
 import re
@@ -15,12 +15,12 @@ def test_every_function_of_the_page_exists() -> None:
     assert len(NAMED) > 30
 
 
-#: Rooms that compute.
+#: Packages with numerical modules.
 ROOMS = {
     "shapespace": ("solve", "coordinates", "mesh", "shell", "model"),
     "training": ("space", "learning"),
 }
-#: Modules there that compute nothing that a formula says: they hold, name, choose, run or write.
+#: Modules in them that implement no formula: they store, name, choose, run or write.
 NO_MATHEMATICS = {
     "shapespace.solve.deadline",
     "shapespace.mesh.surface",
@@ -44,4 +44,4 @@ def test_every_module_that_computes_is_on_the_page() -> None:
         if path.stem != "__init__"
     }
     named = {module for module, _ in NAMED}
-    assert modules - named == NO_MATHEMATICS, "name what it computes on the page, or say here that it computes nothing"
+    assert modules - named == NO_MATHEMATICS, "add the module to the page, or to NO_MATHEMATICS"

@@ -1,4 +1,4 @@
-"""docs/reference is complete: what the code reads, writes or answers is on its page, and nothing else."""
+"""docs/reference has everything that the code reads, writes or answers, and nothing else."""
 
 import inspect
 import json
@@ -18,7 +18,7 @@ def page(name: str) -> str:
 
 
 def first_cells(text: str) -> set[str]:
-    """What stands in code in the first column of the tables."""
+    """All text in backquotes in the first columns of the tables."""
     rows = re.findall(r"^\| (`[^|]*) \|", text, re.MULTILINE)
     return {name for row in rows for name in re.findall(r"`([^`]+)`", row)}
 

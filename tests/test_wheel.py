@@ -1,4 +1,4 @@
-"""The wheel: `shapespace` alone at its top, and everything that serving the figure takes."""
+"""The wheel: `shapespace` is its only top-level package, and it has all that serving the figure needs."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ from tests.service.conftest import ROOT
 
 SOURCES = ("pyproject.toml", "setup.py", "README.md", "LICENSE", "shapespace", "service", "training", "models")
 PIP = (sys.executable, "-m", "pip", "--disable-pip-version-check", "--quiet")
-HERE = ("--no-deps", "--no-index", "--no-build-isolation")  # with what is installed already, and no network
-#: What Python is started with, so that nothing of this environment counts but what the tests say.
+HERE = ("--no-deps", "--no-index", "--no-build-isolation")  # uses installed packages and no network
+#: Environment of the programs, without variables that would change Python's or the server's behaviour.
 ENVIRONMENT = {key: value for key, value in os.environ.items() if not key.startswith(("PYTHON", "SHAPESPACE_"))}
 
 
@@ -33,7 +33,7 @@ def run(*command: str | Path, cwd: Path) -> str:
 
 
 def checkout(folder: Path, *left_out: str) -> Path:
-    """The sources as git has them: without what builds and runs leave behind, and with links as links."""
+    """A copy of the sources as in git: without build products, and with symbolic links kept."""
     folder.mkdir()
     for name in set(SOURCES) - set(left_out):
         if (ROOT / name).is_dir():
@@ -50,7 +50,7 @@ def build(sources: Path) -> Path:
 
 
 def content(wheel: Path) -> dict[str, int]:
-    """Checksums of files by name, but for those about the wheel itself."""
+    """Checksums of files by name, except those of the wheel's metadata."""
     with zipfile.ZipFile(wheel) as archive:
         return {entry.filename: entry.CRC for entry in archive.infolist() if ".dist-info/" not in entry.filename}
 
@@ -62,13 +62,13 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with the programs of an environment of its own, whose dependencies are those of this one."""
+    """The programs' folder of a new environment that takes its dependencies from this one."""
     folder = tmp_path_factory.mktemp("installed") / "venv"
     run(sys.executable, "-m", "venv", "--without-pip", folder, cwd=folder.parent)
     python = folder / "bin" / "python"
     run(*PIP, "--python", python, "install", *HERE, wheel, cwd=folder.parent)
     (packages,) = folder.glob("lib/python*/site-packages")
-    # Files with this ending that lie in the folder named here are not read: an editable install stays unknown.
+    # Only the folder named here is added; .pth files in it are not read, so an editable install is not found.
     (packages / "dependencies.pth").write_text(sysconfig.get_path("purelib") + "\n")
     return folder / "bin"
 
@@ -112,7 +112,7 @@ def test_a_checkout_without_links_is_refused_in_a_sentence(tmp_path: Path) -> No
     sources = checkout(tmp_path / "sources", "models")
     link = sources / "shapespace" / "service"
     link.unlink()
-    link.write_text("../service")  # as git does where it can't make links
+    link.write_text("../service")  # as git does where it can't create links
     with pytest.raises(AssertionError, match=r"shapespace/service is a text file where a link to \.\./service should"):
         build(sources)
 
@@ -134,7 +134,7 @@ shapespace.lode
         "user.py",
     )
     told = subprocess.run(checker, cwd=tmp_path, env=ENVIRONMENT, capture_output=True, text=True, check=False).stdout
-    # The stubs of libraries are their own affair.
+    # Errors in stubs of other libraries don't matter.
     found = [
         line.split(": ", 2)[::2] for line in told.splitlines() if line.startswith("user.py:") and ": error: " in line
     ]

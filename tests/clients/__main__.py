@@ -1,6 +1,6 @@
-"""``python -m tests.clients BLENDER_PYTHON``: other programs open what the server answers for every bundled model.
+"""``python -m tests.clients BLENDER_PYTHON``: open the server's files of all bundled models elsewhere.
 
-``make clients`` sets up Blender's package in an environment of its own and calls this.
+``make clients`` installs Blender's package in an environment of its own and calls this.
 """
 
 import subprocess
@@ -17,7 +17,7 @@ HERE = Path(__file__).parent
 
 
 def main(blender: str) -> bool:
-    """Whether all of them see the right vertices."""
+    """Whether every program finds all vertices in the right place."""
     good = True
     with TemporaryDirectory() as scratch, starting() as start:
         models = Path(scratch, "models")
@@ -29,7 +29,7 @@ def main(blender: str) -> bool:
                 write_files(client, model, folder)
                 print(f"{model}:", flush=True)
                 for command in (["node", HERE / "three.mjs"], [blender, HERE / "blender.py"]):
-                    # Blender talks a lot on its standard output.
+                    # Blender prints much on standard output.
                     output = subprocess.DEVNULL if command[0] == blender else None
                     found = subprocess.run([*command, folder], stdout=output, check=False)
                     good &= found.returncode == 0

@@ -1,4 +1,4 @@
-"""What Blender sees in our files: ``python blender.py FOLDER``, a folder that files.py has filled.
+"""Compare vertices in Blender with the expected ones: ``python blender.py FOLDER``, filled by files.py.
 
 Runs in an environment of its own, with the package ``bpy``. Prints a line for each file; exits 1 where a vertex is not
 where it should be.
@@ -36,12 +36,12 @@ def seen(time: float, *, y_up: bool) -> np.ndarray:
     mesh.vertices.foreach_get("co", flat)
     world = np.array(evaluated.matrix_world)
     x, y, z = world[:3, :3] @ flat.reshape(-1, 3).T + world[:3, 3:]
-    # Blender turns what is y up, to have z up.
+    # Blender rotates files with y up, so that z is up.
     return np.stack([x, z, -y] if y_up else [x, y, z], axis=1)
 
 
 def report(name: str, positions: list[np.ndarray], wanted: list[list], tolerance: float) -> bool:
-    """Whether all positions are right."""
+    """Print the largest error and return whether it is within the tolerance."""
     pairs = list(zip(positions, map(np.array, wanted), strict=True))
     same = all(a.shape == b.shape for a, b in pairs)
     error = max(np.linalg.norm(a - b, axis=1).max() for a, b in pairs) if same else math.inf

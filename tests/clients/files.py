@@ -1,4 +1,4 @@
-"""The files that other programs are to open, and what they must see in them."""
+"""The files that other programs open, and the positions that they must find in them."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ from pathlib import Path
 import httpx
 import numpy as np
 
-#: Frames of the animation with a morph target each, and of the one that is spanned by few.
+#: Frames of the animation with a morph target for each, and of the one with a basis of fewer targets.
 SHORT, LONG = 12, 70
 
 
 def write_files(client: httpx.Client, model: str, folder: Path) -> None:
     """Ask a server for a shape and two animations of a model, and write them with ``expected.json``.
 
-    That holds the shape's positions, and for each animation what it shows at four times, counted in frames: at both
-    ends, in the middle, and half-way between two frames, where players blend linearly.
+    ``expected.json`` has the shape's positions, and those of each animation at four times, in frames: at
+    both ends, in the middle, and half-way between two frames, where players interpolate linearly.
     """
     card = client.get(f"/v1/models/{model}").raise_for_status().json()
     low, high = np.array(card["lower"]), np.array(card["upper"])
@@ -44,7 +44,7 @@ def write_files(client: httpx.Client, model: str, folder: Path) -> None:
             save("colored.glb", last, color="stretch")
             save("first.obj", links["frames"].format(k=0), format="obj")
             expected["shape"] = {"vertices": seen[-1].tolist()}
-    # Short ones are exact; a basis keeps every vertex within 1e-4 of the diagonal.
+    # Short animations are exact; a basis is within 1e-4 of the diagonal at every vertex.
     diagonal = float(np.linalg.norm(np.ptp(seen[0], axis=0)))
     expected |= {"tolerance": 1e-5 * diagonal, "basis_tolerance": 1.1e-4 * diagonal}
     (folder / "expected.json").write_text(json.dumps(expected))

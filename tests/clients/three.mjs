@@ -1,4 +1,4 @@
-// What three.js sees in our files: `node three.mjs FOLDER`, a folder that files.py has filled.
+// Compare vertices in three.js with the expected ones: `node three.mjs FOLDER`, filled by files.py.
 // Prints a line for each file; exits 1 where a vertex is not where it should be.
 
 import { readFileSync } from "node:fs";
@@ -57,10 +57,10 @@ for (const [name, tolerance] of [
   const { scene, mesh, animations } = await load(`${name}.glb`);
   const mixer = new AnimationMixer(scene);
   const action = mixer.clipAction(animations[0]).setLoop(LoopOnce);
-  action.clampWhenFinished = true; // or the last key would be the first one again
+  action.clampWhenFinished = true; // or the action would jump back to the first key at its end
   action.play();
   const errors = expected[name].times.map((frame, k) => {
-    action.reset(); // times need not increase
+    action.reset(); // so that times may be set in any order
     mixer.setTime(frame / FRAMES_PER_SECOND);
     return distance(mesh, expected[name].vertices[k]);
   });

@@ -1,4 +1,4 @@
-"""Every fault by its name, and what came of it: the table of docs/measurements/reliability.md."""
+"""All faults by name, and their outcomes: the table of docs/measurements/reliability.md."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from tests.service.conftest import Start
 
 @dataclass(frozen=True)
 class Arena:
-    """Where a fault is inflicted.
+    """What a fault is injected into.
 
     Attributes:
         folder: an empty one.
         steady: a server that has to answer afterwards as it did before.
         start: starts further servers.
-        undisturbed: gives a training run that nothing has happened to.
+        undisturbed: returns a training run without faults.
     """
 
     folder: Path
@@ -32,16 +32,16 @@ class Arena:
     undisturbed: Callable[[], Undisturbed]
 
 
-#: Inflicts a fault at random, checks that nothing is lost, and says in a few words what happened.
+#: Injects a random instance of a fault, checks that nothing is lost, and returns the outcome in a few words.
 Inflict = Callable[[Arena, np.random.Generator], str]
 FAULTS: dict[str, Inflict] = {}
 OUTCOMES: defaultdict[str, Counter[str]] = defaultdict(Counter)
-#: How often each fault is inflicted, differently each time.
+#: How often each fault is injected, each time a different instance.
 SEEDS = int(os.environ.get("FAULT_SEEDS", "1"))
 
 
 def fault(name: str) -> Callable[[Inflict], Inflict]:
-    """Enter a fault into the catalogue."""
+    """A decorator that adds a fault to the catalogue."""
 
     def enter(inflict: Inflict) -> Inflict:
         FAULTS[name] = inflict
@@ -51,7 +51,7 @@ def fault(name: str) -> Callable[[Inflict], Inflict]:
 
 
 def table() -> str:
-    """What happened so far, as Markdown."""
+    """The outcomes so far, as a Markdown table."""
     rows = ["| fault | tries | what happened |", "|---|---|---|"]
     for name, outcomes in OUTCOMES.items():
         told = "; ".join(f"{says} ({count} ×)" if len(outcomes) > 1 else says for says, count in outcomes.most_common())

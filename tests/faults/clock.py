@@ -1,4 +1,4 @@
-"""A clock that jumps for one process and its children, and not for the whole machine."""
+"""A system clock that jumps for one process and its children only."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 YEAR = 365.25 * 86400
-#: Python runs it before anything else. Monotonic clocks stay as they are, as they do when a clock is set.
+#: Run by Python at its start. Monotonic clocks are not changed, as when a system's clock is set.
 _SHIM = """
 import os, time
 def offset():
@@ -32,12 +32,12 @@ class Clock:
 
     @property
     def environment(self) -> dict[str, str]:
-        """What a process needs to follow it."""
+        """Environment variables with which a process uses this clock."""
         paths = [str(self.file.parent), os.environ.get("PYTHONPATH", ""), str(Path(__file__).parents[2])]
         return os.environ | {"CLOCK_OFFSET": str(self.file), "PYTHONPATH": os.pathsep.join(filter(None, paths))}
 
     def jump(self, years: float) -> None:
-        """Set it so far from the real one, all at once."""
+        """Set its offset from the real clock."""
         part = self.file.with_suffix(".part")
         part.write_text(str(years * YEAR))
         part.replace(self.file)
@@ -45,7 +45,7 @@ class Clock:
 
 @contextmanager
 def jumping_clock(folder: Path) -> Iterator[Clock]:
-    """A clock at the right time, ready to jump."""
+    """A clock without an offset yet."""
     (folder / "clock").mkdir()
     (folder / "clock" / "sitecustomize.py").write_text(_SHIM)
     clock = Clock(folder / "clock" / "offset")

@@ -1,4 +1,4 @@
-"""What faults are inflicted on: one steady server, and one training run that nothing happens to."""
+"""Shared by all faults: a server to inject them into, and a training run without faults to compare with."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Bundles that are not what they say: each is refused in one line, and everything else is served as before."""
+"""Bundles that don't agree with their manifests are refused with one line each; others are not affected."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from tests.faults.serving import Steady, eventually, peak_memory
 from tests.service import hostile
 from tests.service.truth import Truth, bad_calls, good_calls
 
-#: Bundles that are damaged at once.
+#: Number of bundles damaged at the same time.
 BATCH = 8
 Facts = dict[str, Any]
 
 
 def require_refusals(steady: Steady, spoil: Callable[[Path, int], None], *, files: str = "") -> None:
-    """Add spoiled bundles to those of a running server, and have it look: it refuses each, in one line."""
+    """Add damaged bundles to those of a running server and reload: it refuses each with one line."""
     sound = steady.models / "small" / "1"
     folders = [steady.models / f"spoilt-{k}" / "1" for k in range(BATCH)]
     try:
@@ -50,7 +50,7 @@ def require_refusals(steady: Steady, spoil: Callable[[Path, int], None], *, file
 
 
 def reload(steady: Steady) -> list[str]:
-    """Have a server look at its folder; what it logged."""
+    """Let the server reload its folder, and return what it logged."""
     before = len(steady.server.log)
     steady.server.process.send_signal(signal.SIGHUP)
     eventually(lambda: "reloaded: " in steady.server.log[before:])
@@ -58,7 +58,7 @@ def reload(steady: Steady) -> list[str]:
 
 
 def victims(folder: Path) -> list[Path]:
-    """Files that the manifest vouches for."""
+    """Files whose digests are in the manifest."""
     return sorted(path for path in folder.iterdir() if path.name != "manifest.json")
 
 
@@ -223,7 +223,7 @@ def ways_out(arena: Arena, rng: np.random.Generator) -> str:
     finally:
         for outside in steady.models.glob(".outside-*"):
             outside.unlink()
-    # The same from outside: paths that climb, in every spelling that a client may send.
+    # The same by HTTP: paths with `..`, in every spelling that a client may send.
     secret = steady.models / "small" / "1" / "manifest.json"
     for climb in ("../" * 8, "%2e%2e/" * 8, "..%2f" * 8, "..\\" * 8, "%252e%252e/" * 8, "//", "....//" * 8):
         for base in ("/page/", "/v1/models/", "/v1/interpolations/", "/v2/models/", "/"):

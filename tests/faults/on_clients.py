@@ -1,4 +1,4 @@
-"""Clients that are slow, or leave: they hold a connection, and nobody else waits for them."""
+"""Clients that are slow or disconnect: they occupy a connection, and no other client waits for them."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def slow(arena: Arena, rng: np.random.Generator) -> str:
         for reader in readers:
             reader.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
             reader.sendall(f"GET {link} HTTP/1.1\r\nHost: localhost\r\n\r\n".encode())
-        # Each has stopped somewhere else, behind its head: for that one has ten seconds only.
+        # Each has stopped at another byte after its head, which has to arrive within ten seconds.
         places = [int(rng.integers(len(REQUEST) - len(CODE), len(REQUEST) - 1)) for _ in writers]
         for writer, place in zip(writers, places, strict=True):
             writer.sendall(REQUEST[:place])
@@ -53,7 +53,7 @@ def slow(arena: Arena, rng: np.random.Generator) -> str:
                     places[k] += 1
             for reader in readers:
                 assert reader.recv(1)
-        # In the end every one of them gets what it asked for.
+        # In the end all slow clients get their answers.
         for writer, place in zip(writers, places, strict=True):
             writer.sendall(REQUEST[place:])
             assert writer.recv(12) == b"HTTP/1.1 200"
@@ -80,10 +80,10 @@ def vanishing(arena: Arena, rng: np.random.Generator) -> str:
             elif k % 4 == 2:  # after a part of a stream
                 client.sendall(f"GET {link} HTTP/1.1\r\nHost: localhost\r\n\r\n".encode())
                 client.recv(int(rng.integers(1, 10_000)))
-            else:  # behind its own back
+            else:  # with further requests in the pipeline
                 client.sendall(REQUEST * 3)
             time.sleep(rng.uniform(0, 0.05))
-            if rng.random() < 0.5:  # with a reset, as a machine that lost its memory
+            if rng.random() < 0.5:  # with a TCP reset, as from a machine that restarted
                 client.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, b"\1\0\0\0\0\0\0\0")
     steady.check()
     return "40 at a time: every place and file handle given back"

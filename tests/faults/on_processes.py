@@ -1,4 +1,4 @@
-"""Faults of the server's machine: ends under load, a clock that jumps, a disk that is full or can't be written to."""
+"""Faults of the server's machine: signals under load, a clock that jumps, a full or read-only disk."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def terminated(arena: Arena, rng: np.random.Generator) -> str:
 
 
 class Askers:
-    """Clients that ask the same calls again and again, and compare; they begin again where a connection breaks."""
+    """Clients that repeat the same calls, compare the answers, and reconnect when a connection breaks."""
 
     def __init__(self, truth: Truth, urls: list[str], count: int) -> None:
         self.outcomes: Counter[str] = Counter()
@@ -101,10 +101,10 @@ def clock(arena: Arena, rng: np.random.Generator) -> str:
             finally:
                 askers.end()
             assert askers.outcomes.keys() == {"right"}, askers.outcomes
-            # It must have felt the jump; uvicorn looks at the clock once a second.
+            # The server must have seen the jump; uvicorn reads the clock once a second.
             year = str(time.gmtime(time.time() + years * YEAR).tm_year)
             eventually(lambda: year in client.get("/v2/health/live").headers["date"])
-            # A bundle that comes with times from the past or the future is taken up as any other.
+            # A bundle with file times in the past or the future is loaded like any other.
             rescale(bundle, 2 * SCALE)
             for file in bundle.iterdir():
                 os.utime(file, (1e9, time.time() + years * YEAR))
@@ -115,7 +115,7 @@ def clock(arena: Arena, rng: np.random.Generator) -> str:
 
 @fault("the server's disk is full")
 def full_disk(arena: Arena, rng: np.random.Generator) -> str:
-    # No file may grow any more, the log included; that holds for root as well.
+    # No file can grow, not even the log; the limit applies to root too.
     server = arena.start(arena.steady.models, workers=2, log_format=rng.choice(["text", "json"]))
     with httpx.Client(base_url=server.url, timeout=60) as client:
         resource.prlimit(server.process.pid, resource.RLIMIT_FSIZE, (0, resource.RLIM_INFINITY))
@@ -146,7 +146,7 @@ def read_only_folders(arena: Arena, rng: np.random.Generator) -> str:
     with read_only(models) as reason, httpx.Client(base_url=server.url, timeout=60) as client:
         server.process.send_signal(signal.SIGHUP)
         assert arena.steady.truth.differing(client) == []
-        if reason != "Not a directory":  # then there is nothing that another server could read
+        if reason != "Not a directory":  # otherwise the folder is a file, which no server can read
             with httpx.Client(base_url=arena.start(models, workers=2).url, timeout=60) as other:
                 assert arena.steady.truth.differing(other) == []
     assert server.process.poll() is None

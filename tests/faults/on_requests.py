@@ -1,4 +1,4 @@
-"""Requests that are too much: refused at once, without the memory that they ask for."""
+"""Requests that ask for too much: refused at once, without allocating the memory that they need."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from tests.hostile import HOSTILE
 from tests.service.truth import Call, post
 
 MIB = 2**20
-#: MiB of the two gigabytes that are really sent.
+#: How many MiB of the two gigabytes are sent.
 SENT = 2000 if SEEDS > 1 else 300
-#: All of them take minutes.
+#: Frames; 10,000 take minutes.
 FRAMES = 10_000 if SEEDS > 1 else 300
 MODEL = "/v1/models/small"
 PATH = '"keyframes": [[0, 0, 0], [1, 1, 1]], "frames": 3'
 
 
-#: Memory that a server may take for an upload of 64 MiB, as it comes, and for what it makes of it.
+#: Memory that a server may take for an upload of 64 MiB: its bytes and what is read from them.
 MOST = 160 * MIB
-#: Of the bodies in tests/hostile.py, for each try.
+#: How many bodies of tests/hostile.py are sent in each try.
 SAMPLE = 20
 
 
@@ -41,7 +41,7 @@ def bomb(arena: Arena, rng: np.random.Generator) -> str:
             headers={"Content-Type": said} if form else {},
             content=body,
         )
-        # Some are sound, but no mesh of the model's.
+        # Some are valid meshes, but not of this model.
         assert answer.status_code in {400, 415, 422}, (name, answer.text)
         kinds = ("malformed-request", "unsupported-media-type", "invalid-mesh")
         assert answer.json()["type"].rpartition(":")[2] in kinds
@@ -67,7 +67,7 @@ def huge_body(arena: Arena, rng: np.random.Generator) -> str:
                     if not answer:
                         told_after.append(sent)
                     answer += connection.recv(65536)
-                connection.sendall(piece)  # and goes on in spite of the answer
+                connection.sendall(piece)  # continues in spite of the answer
         head, _, body = answer.partition(b"\r\n\r\n")
         assert head.split()[1] == b"413"
         assert json.loads(body)["type"] == "urn:shapespace:problem:body-too-large"
@@ -78,7 +78,7 @@ def huge_body(arena: Arena, rng: np.random.Generator) -> str:
 
 
 def bodies(number: str) -> list[Call]:
-    """Every call that takes a number, with that one in it."""
+    """Every call that has a number, with this one in its place."""
     code = f"[0.1, {number}, 0.2]"
     return [
         Call("GET", f"{MODEL}/mesh?latent=0.1,{number},0.2"),
@@ -125,7 +125,7 @@ def numbers(arena: Arena, rng: np.random.Generator) -> str:
                 link = answer.json()["links"]["frames"].replace("{k}", "1")
                 followed = arena.steady.client.get(link)
                 assert followed.status_code in {200, 422}, (call, link, followed.text)
-    assert 200 in told["1e30"], "beyond the bounds is extrapolated"
+    assert 200 in told["1e30"], "codes beyond the bounds are extrapolated"
     arena.steady.check()
     return "NaN and infinities 400 or 422; large ones 422 or an answer with its diagnostics"
 
@@ -136,7 +136,7 @@ def frames(arena: Arena, rng: np.random.Generator) -> str:
     body = {"keyframes": rng.uniform(0, 0.2, (3, 3)).tolist(), "frames": 10_000, "mesh": "coarse"}
     answer = steady.client.post(f"{MODEL}/interpolations", json=body)
     assert (answer.status_code, answer.json()["type"]) == (422, "urn:shapespace:problem:too-many-frames")
-    # An id that another server gave out, which allowed as many.
+    # An id from another server with a higher limit.
     generous = arena.start(steady.models, max_frames=10_000, workers=2)
     with httpx.Client(base_url=generous.url, timeout=300) as client:
         links = client.post(f"{MODEL}/interpolations", json=body).raise_for_status().json()["links"]

@@ -1,4 +1,4 @@
-"""Faults of machines that train: the same command goes on, and ends with the same bits."""
+"""Faults of a training machine: the same command continues the run and ends with the same bits."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def kill(arena: Arena, rng: np.random.Generator) -> str:
         except subprocess.TimeoutExpired:
             kills += 1
         finally:
-            with suppress(ProcessLookupError):  # it was done before
+            with suppress(ProcessLookupError):  # it had already ended
                 os.killpg(process.pid, signal.SIGKILL)
             process.wait()
     done = train(whole.config, run, "--until", LAST)
@@ -53,10 +53,10 @@ def kill(arena: Arena, rng: np.random.Generator) -> str:
 
 @contextmanager
 def small_disk(folder: Path, size: int) -> Iterator[list[str]]:
-    """A folder with room for so many bytes; gives what a command needs in front of it to feel that.
+    """A folder that can hold this many bytes; yields the command prefix with which the limit applies.
 
-    A file system of that size where mounting is permitted. Elsewhere a limit on the size of each file, which root is
-    bound to as well.
+    It is a file system of that size if mounting is permitted, otherwise a limit on the size of each file,
+    which applies to root too.
     """
     folder.mkdir()
     mounted = subprocess.run(
@@ -92,7 +92,7 @@ def full_disk(arena: Arena, rng: np.random.Generator) -> str:
 
 @contextmanager
 def read_only(folder: Path) -> Iterator[str]:
-    """A folder that can't be written to, by root either: mounted so, or by its mode, or with a file in its place."""
+    """Make a folder read-only, for root too: by a mount, by its mode, or by a file in its place."""
     bind = ["mount", "--bind", str(folder), str(folder)]
     if subprocess.run(bind, capture_output=True, check=False).returncode == 0:
         subprocess.run(["mount", "-o", "remount,bind,ro", str(folder)], check=True)

@@ -1,4 +1,4 @@
-"""A server that faults are inflicted on, and that must be as it was once they are over."""
+"""A server into which faults are injected, and which must be in its former state afterwards."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from tests.service.bundles import write_bundle
 from tests.service.conftest import Server, Start
 from tests.service.truth import Truth, bad_calls, good_calls
 
-#: Longer than elsewhere: what is waited for comes after a fault.
+#: With a longer limit than elsewhere, as recovery from a fault takes time.
 eventually = partial(watching.eventually, seconds=60)
 
 
 def peak_memory(server: Server) -> int:
-    """Most bytes that the process ever had in memory at once."""
+    """Peak resident memory of the process so far, in bytes."""
     status = Path(f"/proc/{server.process.pid}/status").read_text()
     found = re.search(r"VmHWM:\s+(\d+) kB", status)
     assert found
@@ -27,7 +27,7 @@ def peak_memory(server: Server) -> int:
 
 
 class Steady:
-    """A server whose answers were written down before anything happened to it."""
+    """A server whose answers were recorded before any fault."""
 
     def __init__(self, folder: Path, start: Start, **settings: object) -> None:
         self.models = folder / "models"
@@ -46,7 +46,7 @@ class Steady:
 
     @property
     def handles(self) -> int:
-        """Files and sockets that the process has open."""
+        """Number of files and sockets that the process has open."""
         return len(list(Path(f"/proc/{self.server.process.pid}/fd").iterdir()))
 
     @property
@@ -57,13 +57,13 @@ class Steady:
         self.client.close()
 
     def check(self) -> None:
-        """It runs, answers as it did, is busy with nothing, holds no more than before, and has met no mistake."""
+        """Assert that it is idle, answers as before, has no more handles or threads, and logged no error."""
         assert self.server.process.poll() is None, self.server.log
         assert self.truth.differing() == []
         eventually(lambda: watching.admitted(self.client) == 0)
         eventually(lambda: self.handles <= self._handles + 2)
-        # Workers' threads, and those that read bodies, begin one by one as work comes.
+        # Threads of workers and for reading bodies are started when they are first needed.
         assert self.threads <= self._threads + 4
-        # One fault's mistake is not the next one's.
+        # An error is reported for the fault that caused it, not for later ones.
         log, self._read = self.server.log[self._read :], len(self.server.log)
         assert "Traceback" not in log, log

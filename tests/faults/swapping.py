@@ -1,4 +1,4 @@
-"""A folder of models that changes under load."""
+"""Faults in a folder of models that changes under load."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ CODE = {"latents": [[0.1, 0.7, 0.4]]}
 
 
 def swap(arena: Arena, rng: np.random.Generator) -> str:
-    """Change a bundle in twelve ways while four clients ask; every answer is a whole one of one of its versions."""
+    """Change a bundle twelve times under load from four clients; each answer must be of one version."""
     folder = arena.folder / "models"
     small = write_bundle(folder, "small")
     aside = arena.folder / "aside"
@@ -75,7 +75,7 @@ def swap(arena: Arena, rng: np.random.Generator) -> str:
             thread.join(60)
     with httpx.Client(base_url=server.url, timeout=60) as client:
         eventually(lambda: client.post("/v1/models/small/vertices", json=CODE).status_code == 200)
-    # While the bundle was gone, 404 is the truth; nothing else may fail.
+    # 404 is right while the bundle was gone; no other failure is allowed.
     assert statuses.keys() <= {200, 404}, statuses
     assert all(len(found) == 1 for found in answers.values()), "one version, one answer"
     assert server.process.poll() is None

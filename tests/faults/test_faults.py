@@ -1,6 +1,6 @@
-"""Faults of every kind, inflicted on real processes: whatever happens, nothing is lost.
+"""Fault injection into real processes: after every fault, nothing is lost.
 
-One of each in the whole suite; ``make faults`` inflicts twenty, all different, and prints the table.
+The suite injects each fault once; ``make faults`` twenty different instances of each, and prints the table.
 """
 
 import zlib
@@ -8,7 +8,7 @@ import zlib
 import numpy as np
 import pytest
 
-# Modules that enter their faults.
+# These modules add their faults to the catalogue.
 from tests.faults import on_bundles, on_clients, on_processes, on_requests, on_training  # noqa: F401
 from tests.faults.catalogue import FAULTS, OUTCOMES, SEEDS, Arena
 

@@ -1,4 +1,4 @@
-"""Small runs of the training command: one that nothing happens to, and others that must end like it."""
+"""Small runs of the training command: one without faults, and others that must end with the same files."""
 
 from __future__ import annotations
 
@@ -60,12 +60,12 @@ tolerance = 0.01
 """
 
 
-#: How far runs go. The suite kills one in each later stage elsewhere, in tests/training/whole_runs/test_collection.py.
+#: Last stage of the runs. tests/training/whole_runs/test_collection.py tests kills in later stages.
 LAST = "export" if int(os.environ.get("FAULT_SEEDS", "1")) > 1 else "samples"
 
 
 def bars(count: int = 5) -> tuple[np.ndarray, np.ndarray]:
-    """A bar (V, 3) whose two ends bend by themselves, in some poses."""
+    """Shapes (n, V, 3) of a bar whose two ends bend independently, and its faces."""
     ball = trimesh.creation.icosphere(2, 1.0)
     x, y, z = (ball.vertices * [3.0, 0.8, 0.6]).T
     rng = np.random.default_rng(1)
@@ -77,7 +77,7 @@ def bars(count: int = 5) -> tuple[np.ndarray, np.ndarray]:
 
 
 def write_collection(folder: Path) -> Path:
-    """A collection and its configuration, which is returned."""
+    """Write a collection and its configuration, and return the configuration's path."""
     vertices, faces = bars()
     np.savez(folder / "bars.npz", vertices=vertices, faces=faces)
     config = folder / "bars.toml"
@@ -88,12 +88,12 @@ def write_collection(folder: Path) -> Path:
 def train(
     config: Path, out: Path, *more: str, env: Mapping[str, str] | None = None
 ) -> subprocess.CompletedProcess[str]:
-    """Run the command to its end, whatever that is."""
+    """Run the command until it ends or fails."""
     return subprocess.run(command(config, out, *more), capture_output=True, text=True, check=False, env=env)
 
 
 class Undisturbed:
-    """A run that nothing happened to, and what it left."""
+    """A run without faults, and its files."""
 
     def __init__(self, folder: Path) -> None:
         self.config = write_collection(folder)
@@ -105,7 +105,7 @@ class Undisturbed:
         self.bytes = sum(path.stat().st_size for path in (folder / "run").rglob("*") if path.is_file())
 
     def require_the_same(self, run: Path, until: str = LAST) -> None:
-        """A run that was disturbed has everything up to that stage, and none of it is another bit."""
+        """Assert that a run with faults has the same files up to that stage, bit for bit."""
         stamps = [stage for stage in STAGES if (run / "stages" / f"{stage}.json").exists()]
         assert stamps == list(STAGES)[: list(STAGES).index(until) + 1]
         found = results(run)

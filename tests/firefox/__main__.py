@@ -13,7 +13,7 @@ FIREFOX = next(filter(None, map(shutil.which, ("firefox-esr", "firefox"))), None
 
 
 def main() -> int:
-    """The script's exit status."""
+    """Start a server, run page.mjs with it, and return the script's exit status."""
     if FIREFOX is None:
         print("There is no Firefox: install Debian's firefox-esr, or another one as `firefox`.", file=sys.stderr)
         return 2

@@ -1,5 +1,5 @@
 // The page in Firefox: `node page.mjs FIREFOX URL FOLDER`, with an empty folder for what it downloads.
-// Prints a line for each thing that a person does; exits 1 where one of them doesn't lead where it should.
+// Prints a line for each user action tested; exits 1 if one has a wrong result.
 
 import { readdirSync, readFileSync } from "node:fs";
 import { join } from "node:path";
@@ -12,12 +12,12 @@ const [executablePath, url, folder] = process.argv.slice(2);
 const browser = await puppeteer.launch({
   browser: "firefox",
   executablePath,
-  headless: false, // headless it has no WebGL in software
+  headless: false, // a headless Firefox has no WebGL in software
   extraPrefsFirefox: {
     "webgl.force-enabled": true,
     "browser.download.folderList": 2,
     "browser.download.dir": folder,
-    "browser.download.alwaysOpenPanel": false, // which would take the focus away from the page
+    "browser.download.alwaysOpenPanel": false, // the panel would take the focus from the page
     "browser.helperApps.neverAsk.saveToDisk": "model/gltf-binary,application/octet-stream",
     "ui.prefersReducedMotion": 1,
   },
@@ -32,7 +32,7 @@ async function eventually(what) {
     const value = await what();
     if (value) return value;
   }
-  throw new Error(`it never came true: ${what}`);
+  throw new Error(`the condition did not become true in time: ${what}`);
 }
 
 const code = () =>
@@ -42,7 +42,7 @@ const rests = () => page.$eval(".stage", (stage) => stage.dataset.quality === "f
 const tab = (name) => page.click(`#to-${name}`);
 const picture = () => page.screenshot({ encoding: "base64" });
 
-/** Drag a coordinate's slider from where it is to a share of its length, by the mouse. */
+/** Drag a coordinate's slider with the mouse, from its present position to a share of its length. */
 async function drag(k, share) {
   const slider = await page.evaluateHandle((index) => {
     const row = document.querySelectorAll(".coordinate")[index];
@@ -52,7 +52,7 @@ async function drag(k, share) {
   }, k);
   const { x, y, width, height } = await slider.boundingBox();
   const at = await slider.evaluate(({ min, max, value }) => (value - min) / (max - min));
-  const along = (part) => x + 8 + part * (width - 16); // a thumb's width less, as its middle travels
+  const along = (part) => x + 8 + part * (width - 16); // the track less the thumb's width
   await page.mouse.move(along(at), y + height / 2);
   await page.mouse.down();
   for (const part of [0.3, 0.6, 1]) await page.mouse.move(along(at + part * (share - at)), y + height / 2);

@@ -1,4 +1,4 @@
-"""Some fifty folders with one fault each: ``python -m tests.folders [PART OF A NAME]``."""
+"""Train on some fifty folders with one fault each: ``python -m tests.folders [PART OF A NAME]``."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Folders with one fault each: what a run says of them, its exit code, and whether a bundle comes of it."""
+"""Folders with one fault each: the messages of a run, its exit code, and whether it exports a bundle."""
 
 from __future__ import annotations
 
@@ -10,22 +10,22 @@ import numpy as np
 
 from tests.folders.shapes import Meshes, figures, full, head, large, seam, twins, write
 
-#: Which of the shapes is odd, and its name.
+#: Number of the shape with the fault, and its name.
 ODD, NAME = 4, ("pose4",)
 
 
 @dataclass(frozen=True)
 class Folder:
-    """One folder and what must come of it.
+    """One folder and the expected outcome.
 
     Attributes:
         build: makes the folder of meshes.
-        says: a pattern that is found in what the run says, and init where it already stops there or warns.
-        codes: exit codes that will do.
+        says: a pattern that the run's messages contain, or those of init if it already stops or warns.
+        codes: exit codes that are right.
         arguments: of the run.
-        later: changes the folder after a first run, of which the second tells.
-        back: the share of the diagonal to which the encoded training shapes come back, on average.
-        odd: names of shapes that need not come back.
+        later: changes the folder after a first run; the second run's messages are tested.
+        back: largest mean distance of training shapes from those of their codes, as a share of the diagonal.
+        odd: names of shapes that are left out of ``back``.
     """
 
     name: str
@@ -39,12 +39,12 @@ class Folder:
 
     @property
     def quick(self) -> bool:
-        """Whether it ends in words, before anything is computed."""
+        """Whether it ends with a message before anything is computed."""
         return self.codes == (1,)
 
 
 def of_one(change: Callable[[np.ndarray], np.ndarray]) -> Callable[[Path], None]:
-    """A change of the odd shape."""
+    """A folder in which one shape's vertices are changed."""
 
     def build(folder: Path) -> None:
         vertices, faces = figures()
@@ -55,12 +55,12 @@ def of_one(change: Callable[[np.ndarray], np.ndarray]) -> Callable[[Path], None]
 
 
 def of_all(change: Callable[[Meshes], Meshes], format: str = "obj") -> Callable[[Path], None]:
-    """A change of all shapes alike."""
+    """A folder in which all shapes are changed in the same way."""
     return lambda folder: write(folder, change(figures()), format)
 
 
 def of_file(change: Callable[[bytes], bytes], format: str = "obj") -> Callable[[Path], None]:
-    """A change of the odd shape's file."""
+    """A folder in which the bytes of one file are changed."""
 
     def build(folder: Path) -> None:
         write(folder, figures(), format)
@@ -71,7 +71,7 @@ def of_file(change: Callable[[bytes], bytes], format: str = "obj") -> Callable[[
 
 
 def of_faces(change: Callable[[np.ndarray], np.ndarray]) -> Callable[[Path], None]:
-    """Other faces in the odd shape's file."""
+    """A folder in which the faces of one file are changed."""
 
     def build(folder: Path) -> None:
         vertices, faces = figures()
@@ -102,7 +102,7 @@ def exchanged(count: int | None) -> Callable[[np.ndarray], np.ndarray]:
 
 
 def folded_lid(shape: np.ndarray) -> np.ndarray:
-    """A patch in the face is turned over onto what is below it."""
+    """A shape with a patch of the face folded onto the surface below it."""
     shape = shape.copy()
     front = (np.abs(shape[:, 0]) < 0.06) & (shape[:, 2] > 0.02) & (shape[:, 1] > 1.62) & (shape[:, 1] < 1.70)
     shape[front, 1] = 2 * 1.62 - shape[front, 1]
@@ -187,7 +187,7 @@ def one_npz(folder: Path) -> None:
     vertices, faces = figures()
     folder.mkdir()
     np.savez(folder / "all.npz", vertices=vertices, faces=faces)
-    # What is named is the file.
+    # The configuration names the file, not the folder.
     (folder / "all.npz").rename(folder.with_name("all.npz"))
     folder.rmdir()
     folder.with_name("all.npz").rename(folder.with_suffix(".npz"))
@@ -218,7 +218,7 @@ UMLAUTS = ["Ä b", "ö'c", "日本", "é", "ñ", "x y z", "#7", "%s", "ß", "&"]
 SIZE, ORDER = r"pose4\.obj: is of another size", r"pose4\.obj: has its vertices in another order"
 SOME = r"pose4\.obj: has some vertices in another order"
 UP = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
-#: By what stops them and what comes of them.
+#: Grouped by the kind of fault and its outcome.
 FOLDERS = [
     # Nothing to learn from.
     Folder("empty", lambda folder: folder.mkdir(), "holds no meshes", (1,)),
@@ -264,7 +264,7 @@ FOLDERS = [
     Folder("one face turned", of_all(lambda m: (m[0], one_turned(m[1]))), "are oriented oppositely", (1,)),
     Folder("a face without area", of_all(flat_face), r"pose4\.obj: face \d+ has no area", (1,)),
     Folder("mirrored", of_one(lambda shape: shape * [-1, 1, 1]), r"pose4\.obj: is inside out", (1,)),
-    # A bundle, and something to say.
+    # These end with a bundle and a note.
     Folder("nothing wrong", of_all(lambda meshes: meshes)),
     Folder("a file added", of_all(lambda meshes: meshes), r"data: 1 added \(pose11\.obj\)", later=add),
     Folder("a file removed", of_all(lambda meshes: meshes), r"data: 1 removed \(pose7\.obj\)", later=remove),

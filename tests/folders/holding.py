@@ -1,4 +1,4 @@
-"""Runs the command on a folder, and holds what must be: words, exit code, and a bundle that serves sound shapes."""
+"""Run the command on a folder, and check messages, exit code and the shapes of the bundle."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from shapespace.training import __main__ as training
 from shapespace.training.collection.ingest import read_collection
 from tests.folders.catalogue import Folder
 
-#: Codes that are served, and training shapes that are encoded, at most.
+#: Largest numbers of codes to compute shapes of, and of training shapes to encode.
 CODES, ENCODED = 100, 10
 CONFIG = """
 [collection]
@@ -70,17 +70,17 @@ licence = "MIT"
 
 
 def command(arguments: Sequence[str]) -> tuple[int, str]:
-    """Exit code and words of ``shapespace-train``, in this process: most of a short run is the import of torch."""
+    """Exit code and output of ``shapespace-train``, run in this process, as importing torch takes long."""
     words = io.StringIO()
     with patch("sys.argv", ["shapespace-train", *arguments]), redirect_stdout(words), redirect_stderr(words):
         return training.main(), words.getvalue()
 
 
 def hold(folder: Folder, place: Path) -> str:
-    """Build a folder, run the command on it and check what comes of it; what came, in a few words.
+    """Build a folder, run the command on it, check the outcome and return it in a few words.
 
     Raises:
-        AssertionError: with what isn't as it must be.
+        AssertionError: the outcome isn't the expected one.
     """
     meshes = place / "meshes"
     folder.build(meshes)
@@ -104,24 +104,24 @@ def hold(folder: Folder, place: Path) -> str:
         assert not (place / "models").exists()
     if code:
         return f"code {code}: {words.strip().splitlines()[-1][:100]}"
-    # A shape with crossed faces that somebody insists on may fold others, if the run says so.
+    # A shape with crossed faces, accepted with --accept, may fold served shapes if the run says so.
     insists = "--accept" in folder.arguments and "where no shape has a crease" in words
     return sound(folder, place, data, may_fold=insists)
 
 
 def sound(folder: Folder, place: Path, data: Path, *, may_fold: bool) -> str:
-    """Whether the bundle serves sound shapes, and training shapes come back."""
+    """Check shapes that the bundle decodes and training shapes that it encodes; return errors in words."""
     model = ShapeModel(read_bundle(place / "models" / "figure" / "2"))
     faces = Connectivity(model.reference.faces, len(model.reference.vertices))
     left, right = faces.edge_faces[faces.interior].T
 
     def bends(shape: np.ndarray) -> np.ndarray:
-        """Cosines between neighbouring normals."""
+        """Cosines of the angles between normals of neighbouring faces."""
         normals = face_normals(shape, faces.faces)
         return dots(normals[left], normals[right])
 
     with np.load(place / "run" / "shapes.npz") as file:
-        # Where the collection has a crease, a served shape may be folded.
+        # Served shapes may be folded only where a shape of the collection has a crease.
         crease = np.min([bends(shape) for shape in file["vertices"]], axis=0) < 0
     codes = np.random.default_rng(0).uniform(
         model.latents.lower, model.latents.upper, (CODES, len(model.latents.lower))

@@ -1,4 +1,4 @@
-"""The bundled figure in a few poses, in few triangles or in many, and what can be done to meshes and files."""
+"""The bundled figure in a few poses, at several resolutions, and changes of meshes and files."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from shapespace.mesh.thinning import thin
 from shapespace.mesh.triangle_mesh import Connectivity
 from shapespace.training.collection import figure
 
-#: What bends, so that a few modes describe it all.
+#: The joints that move; few, so that a few modes describe all shapes.
 BENDS = {"left elbow": 1.2, "right arm raise": 0.8, "head turn": 0.6, "left leg swing": 0.7}
 
 Meshes = tuple[np.ndarray, np.ndarray]
@@ -46,7 +46,7 @@ def figures(count: int = 10, seed: int = 0, target: int = 600) -> Meshes:
 
 
 def subdivided(meshes: Meshes) -> Meshes:
-    """Each triangle in four."""
+    """Meshes with each triangle split into four."""
     vertices, faces = meshes
     connectivity = Connectivity(faces, vertices.shape[1])
     middles = vertices[:, connectivity.edges].mean(axis=2)
@@ -63,7 +63,7 @@ def large(count: int) -> Meshes:
 
 
 def head(count: int = 10) -> Meshes:
-    """An open surface: the head, that turns a little."""
+    """An open surface: the head, turned a little in each shape."""
     angles = np.zeros((count, len(figure.ANGLES)))
     names = list(figure.ANGLES)
     angles[:, names.index("head nod")] = np.linspace(-0.2, 0.2, count)
@@ -75,7 +75,7 @@ def head(count: int = 10) -> Meshes:
 
 
 def twins(meshes: Meshes, seam: np.ndarray, distance: float) -> Meshes:
-    """The faces at x > 0 get vertices of their own along a seam, so far away as a share of the diagonal."""
+    """Give faces at x > 0 copies of the seam's vertices, at a distance given as a share of the diagonal."""
     vertices, faces = meshes
     left = vertices[0][faces].mean(axis=1)[:, 0] > 0
     twin = np.arange(vertices.shape[1])
@@ -95,7 +95,7 @@ def seam(meshes: Meshes) -> np.ndarray:
 def write(
     folder: Path, meshes: Meshes, format: str = "obj", names: Sequence[str] | None = None, *, first: int = 0
 ) -> None:
-    """A file for each shape, pose0 and so on."""
+    """Write a file for each shape: pose0, pose1 and so on."""
     folder.mkdir(parents=True, exist_ok=True)
     for k, shape in enumerate(meshes[0], first):
         name = names[k] if names else f"pose{k}"

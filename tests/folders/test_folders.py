@@ -1,4 +1,4 @@
-"""The folders that end in words, before anything is computed; ``python -m tests.folders`` runs the others too."""
+"""Folders that end with a message before anything is computed; ``python -m tests.folders`` runs all."""
 
 from __future__ import annotations
 

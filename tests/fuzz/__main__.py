@@ -1,6 +1,6 @@
-"""What requests cost: ``python -m tests.fuzz [PART OF A KIND'S NAME] [--examples N] [--seed SEED] …``.
+"""Measure requests' cost: ``python -m tests.fuzz [PART OF A KIND'S NAME] [--examples N] [--seed SEED] …``.
 
-Tries requests that are made up to be expensive, one after the other, and prints the worst of them.
+Sends requests generated to be expensive, one after the other, and prints the most expensive ones.
 """
 
 from __future__ import annotations

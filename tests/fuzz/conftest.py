@@ -1,4 +1,4 @@
-"""The table of what requests have cost, at the end."""
+"""Prints the table of request costs at the end of the tests."""
 
 from __future__ import annotations
 

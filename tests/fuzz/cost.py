@@ -1,4 +1,4 @@
-"""What one request costs a server: time of its event loop, memory, and time until there is an answer."""
+"""What one request costs a server: time on its event loop, memory, and time until the answer."""
 
 from __future__ import annotations
 
@@ -23,16 +23,16 @@ from tests.service.bundles import write_bundle
 from tests.service.conftest import ROOT, Server
 
 MIB = 2**20
-#: What a request may cost: seconds of the loop in one piece, and bytes at the peak beyond those that it sends.
+#: Budgets of a request: seconds of one callback of the event loop, and peak bytes in addition to those sent.
 LOOP, MEMORY = 0.05, 64 * MIB
-#: Seconds for which something else may keep the loop from running: a thread that computes asks for the interpreter's
-#: lock as well, and holds it for a while.
+#: Seconds for which threads may keep the event loop from running: a computing thread takes the interpreter
+#: lock too, and holds it for a while.
 STALL = 0.1
-#: Seconds that a request may take, by the setting of the server that is tried.
+#: Deadline of the tested server, in seconds.
 DEADLINE = 8.0
 #: Seconds after its deadline in which an answer still counts as on time.
 LATE = 4.0
-#: Further tries of a request that is over a budget.
+#: Repetitions of a request that exceeds a budget.
 AGAIN = 5
 #: Seconds that the longest answer may take.
 LONGEST = 600.0
@@ -41,7 +41,7 @@ SETTLING = 5.0
 #: Seconds within which SIGTERM ends a server that doesn't drain.
 ENDING = 3.0
 _STATUS = re.compile(rb"HTTP/1\.1 (\d{3}) ")
-#: Statuses of a server's own that are answers to a request all the same.
+#: Statuses of 500 and more that are no errors of the server.
 _BUSY = {503, 504, 507}
 _KEPT = 2**16
 
@@ -52,8 +52,8 @@ class Request:
 
     Attributes:
         parts: what is sent, one after the other; a number is a pause in seconds.
-        broken: whether it isn't sound HTTP, so that the connection may be closed without an answer.
-        half_closed: whether the client closes its own direction when it has sent everything.
+        broken: whether it isn't valid HTTP, so that the connection may be closed without an answer.
+        half_closed: whether the client closes its sending direction after the last byte.
         wrong: whether it has to be refused.
     """
 
@@ -65,7 +65,7 @@ class Request:
 
 @dataclass
 class Cost:
-    """What a request came to.
+    """The measured cost of a request.
 
     Attributes:
         name: what kind of request.
@@ -76,12 +76,12 @@ class Cost:
         seconds: until the last byte of the answer.
         statuses: of the answers.
         loop: longest callback of the loop, in seconds of CPU time.
-        where: which that was.
+        where: name of that callback.
         stall: longest time for which the loop could not run.
         collecting: longest run of the garbage collector within a callback, which ``loop`` includes.
-        memory: bytes at the peak beyond those that were there before and those that were sent.
+        memory: peak bytes in addition to those before the request and to those sent.
         computing: seconds of CPU time of all threads and child processes.
-        faults: what went wrong, beside a budget.
+        faults: errors other than exceeded budgets.
     """
 
     name: str
@@ -101,7 +101,7 @@ class Cost:
 
     @property
     def over(self) -> list[str]:
-        """Everything that is not as it should be."""
+        """All faults and exceeded budgets, in words."""
         found = list(self.faults)
         if self.loop > LOOP:
             found.append(f"{1e3 * self.loop:.0f} ms of the loop in {self.where}")
@@ -113,12 +113,12 @@ class Cost:
 
     @property
     def badness(self) -> float:
-        """How many budgets it takes, to put the worst first."""
+        """The largest cost as a multiple of its budget, to sort by."""
         return max(self.loop / LOOP, self.stall / STALL, self.memory / MEMORY, 1e3 * len(self.faults))
 
 
 class Measured(Server):
-    """A server with a meter.
+    """A server that measures itself, see `tests.fuzz.measured`.
 
     Args:
         models: folder of bundles.
@@ -126,7 +126,7 @@ class Measured(Server):
         settings: as of Server.
     """
 
-    #: Bytes of the smallest child process that was ever seen between two requests.
+    #: Bytes of the smallest child process ever seen between two requests.
     children = 0
 
     def __init__(self, models: Path, deadline: float, **settings: object) -> None:
@@ -153,7 +153,7 @@ class Measured(Server):
         return log
 
     def ask(self, word: str) -> dict[str, float | str]:
-        """Ask the meter; raises TimeoutError where the interpreter doesn't come to it."""
+        """Send a word to the meter and return its answer; raises TimeoutError if the interpreter is stuck."""
         with socket.socket(socket.AF_UNIX) as connection:
             connection.settimeout(10)
             connection.connect(self._meter)
@@ -163,7 +163,7 @@ class Measured(Server):
 
     @property
     def pids(self) -> list[int]:
-        """The server's process and those that it has started, parents first."""
+        """Ids of the server's process and its children, parents first."""
         found = [self.process.pid]
         for pid in found:
             with contextlib.suppress(OSError):
@@ -176,12 +176,12 @@ class Measured(Server):
         total = 0.0
         for pid in self.pids:
             with contextlib.suppress(OSError):
-                total += time.clock_gettime((~pid << 3) | 2)  # CPUCLOCK_SCHED: what clock_getcpuclockid(3) gives
+                total += time.clock_gettime((~pid << 3) | 2)  # as clock_getcpuclockid(3)
         return total
 
     @property
     def busy(self) -> bool:
-        """Whether any thread computes, or would if it had a processor."""
+        """Whether any thread is running or ready to run."""
         for pid in self.pids:
             for place in Path(f"/proc/{pid}/task").glob("*/stat"):
                 with contextlib.suppress(OSError):
@@ -190,7 +190,7 @@ class Measured(Server):
         return False
 
     def settle(self) -> bool:
-        """Wait until nothing computes any more, but for a beat; gives whether that is so."""
+        """Wait until no thread computes, except the meter's beat; returns whether that happened in time."""
         clock = Clock(self.process.pid)
         while clock.seconds < SETTLING:
             looks = []
@@ -208,7 +208,7 @@ class Measured(Server):
         return log
 
     def cost(self, name: str, seed: int, request: Request) -> Cost:
-        """Send a request and measure everything, alone."""
+        """Send a request, without others at the same time, and measure its cost."""
         cost = Cost(name, seed)
         self.ask("reset")
         computing, peaks = self.computing(), Peaks(self)
@@ -242,7 +242,7 @@ class Measured(Server):
             piece, resume, open, heard = memoryview(b""), 0.0, True, 0.0
             while True:
                 now = clock.seconds
-                # A stream has its deadline for each frame.
+                # In a stream each frame has a deadline of its own.
                 if now - heard > patience or now > LONGEST:
                     fault = "no answer" if not answer else "its answer has no end"
                     cost.faults.append(f"{fault} {now:.0f} s later")
@@ -273,7 +273,7 @@ class Measured(Server):
                         count = connection.send(piece[: 2**20])
                         cost.sent += count
                         piece = piece[count:]
-                except OSError:  # it may refuse without reading on, and what it had said is read first
+                except OSError:  # it may refuse and close before it has read all; its answer is read first
                     piece, open = memoryview(b""), False
                     if not readable:
                         continue
@@ -288,7 +288,7 @@ class Measured(Server):
 
 
 class Clock:
-    """Seconds since now, but for those for which this thread or a server's loop stood ready without a processor."""
+    """Seconds since its creation, less those in which this thread or a server's waited for a processor."""
 
     def __init__(self, pid: int) -> None:
         self._places = ("/proc/thread-self/schedstat", f"/proc/{pid}/schedstat")
@@ -306,17 +306,18 @@ class Clock:
 
     @property
     def seconds(self) -> float:
-        """Nearly always one of the two waits for the other, so that the longer wait counts."""
+        """Only the longer of both waits is subtracted: usually one thread waits while the other runs."""
         waited = max(now - before for now, before in zip(self._waiting(), self._waited, strict=True))
         return time.monotonic() - self._began - waited
 
 
 class Peaks:
-    """The largest memory of a group of processes since now, together, beyond what they have now.
+    """The growth of a group of processes' memory, together, from its creation to the peak.
 
-    The kernel keeps the peak of each (VmHWM), which is set to the present size at every look: the sum of the peaks
-    between two looks is never less than what all had at one time, and hardly more. A process that begins later counts
-    from the smallest that others had before a request, or without those from the first that is seen of it.
+    The kernel keeps the peak of each process (VmHWM), which is reset at every reading: the sum of the peaks
+    between two readings is never less than the true common peak, and hardly more. For a process that starts
+    later, growth is counted from the smallest size of other children before a request, or without these
+    from its first reading.
     """
 
     def __init__(self, server: Measured) -> None:
@@ -339,7 +340,7 @@ class Peaks:
 
     @contextlib.contextmanager
     def watching(self) -> Iterator[None]:
-        """Look every now and then meanwhile: of a process that ends nothing is left."""
+        """Read regularly meanwhile, as a process that ends leaves no reading."""
         done = threading.Event()
 
         def look() -> None:
@@ -366,7 +367,7 @@ class Peaks:
 
 
 class Arena:
-    """A server that is there whatever the requests before have done to it.
+    """A server that is replaced when a request has brought it down.
 
     Args:
         start: starts one.
@@ -377,9 +378,9 @@ class Arena:
         self.server = start()
 
     def try_out(self, name: str, seed: int, make: Callable[[], Request]) -> Cost:
-        """Measure a request; a server that it brought down is replaced, which counts as a fault.
+        """Measure a request; if it brings the server down, that is a fault and the server is replaced.
 
-        What is over a budget is measured again, as a busy machine makes the measures too large and never too small.
+        A request over a budget is measured again, as a busy machine makes measurements too large.
         """
         cost = self.server.cost(name, seed, make())
         for _ in range(AGAIN):
@@ -395,7 +396,7 @@ class Arena:
         return cost
 
     def _end(self) -> list[str]:
-        """Ask it to end, which it has to do whatever it computes."""
+        """Send SIGTERM, on which it has to end whatever it computes; returns the faults."""
         self.server.process.terminate()
         clock = Clock(self.server.process.pid)
         while self.server.process.poll() is None:
@@ -410,15 +411,15 @@ class Arena:
 
 
 def warm_up(url: str) -> None:
-    """Have everything made that is made once: what each worker keeps of each model, exact shapes too, a process for
-    uploads, and the library for USD.
+    """Cause all one-time costs: what each worker keeps for each model, also for exact shapes, the process
+    for uploads, and the USD library.
     """
     with httpx.Client(base_url=url, timeout=300) as client:
         for model in client.get("/v1/models").raise_for_status().json()["models"]:
             path = f"/v1/models/{model['name']}"
             codes = {"latents": [model["lower"], model["upper"]] * 4}
-            client.post(f"{path}/vertices", json=codes)  # it may be late
-            client.post(f"{path}/vertices", json=codes | {"exact": True})  # so may this be, or refused
+            client.post(f"{path}/vertices", json=codes)  # may exceed the deadline
+            client.post(f"{path}/vertices", json=codes | {"exact": True})  # may too, or be refused
             animation = client.post(f"{path}/interpolations", json={"keyframes": codes["latents"][:2], "frames": 2})
             client.get(animation.raise_for_status().json()["links"]["usd"]).raise_for_status()
         mesh = client.get("/v1/models/small/mesh?format=obj").raise_for_status().content
@@ -427,7 +428,7 @@ def warm_up(url: str) -> None:
 
 @contextlib.contextmanager
 def serving(deadline: float = DEADLINE, **settings: object) -> Iterator[Arena]:
-    """A server with the bundled models and two small ones, for as long as it is wanted."""
+    """A server with the bundled models and two small ones."""
     with TemporaryDirectory() as folder:
         models = Path(folder, "models")
         shutil.copytree(ROOT / "models", models)
@@ -446,12 +447,12 @@ def serving(deadline: float = DEADLINE, **settings: object) -> Iterator[Arena]:
             arena.server.kill()
 
 
-#: What has been measured in this run.
+#: All measurements of this run.
 COSTS: list[Cost] = []
 
 
 def summary(costs: Sequence[Cost], most: int = 20) -> str:
-    """How many requests were over a budget, and the worst of all as Markdown."""
+    """The number of requests over a budget, and a Markdown table of the most expensive ones."""
     rows = [
         f"{len(costs)} requests, {sum(bool(cost.over) for cost in costs)} of them over a budget; the worst:",
         "",

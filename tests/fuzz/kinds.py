@@ -1,7 +1,7 @@
-"""Requests that are made up to be expensive, kind by kind.
+"""Generators of requests that are expensive for a server, by kind.
 
-Each kind is a function of a random generator and of what the server has, entered by ``kind``; one seed always gives
-the same bytes.
+Each kind is a function of a random generator and of what is known of the server, registered by ``kind``;
+the same seed always gives the same bytes.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ class Model:
     """What is known of a model.
 
     Attributes:
-        card: as the server gives it.
+        card: the server's model card.
         counts: vertices of the fine and of the coarse mesh.
         files: its fine mesh by format.
     """
@@ -93,7 +93,7 @@ class World:
         return cls(sorted(models, key=lambda model: model.counts["fine"]))
 
     def quick(self, rng: Rng) -> Model:
-        """A model of a test."""
+        """One of the models whose shapes take milliseconds."""
         return self.models[int(rng.integers(len(self.models) // 2))]
 
     def any(self, rng: Rng) -> Model:
@@ -112,9 +112,9 @@ class Kind:
     """A kind of request.
 
     Attributes:
-        make: makes one up.
+        make: generates a request.
         long: whether it may take the server its whole deadline, or the client seconds to send.
-        limit: whether it asks for as much as one may.
+        limit: whether it asks for as much as is allowed.
     """
 
     make: Make
@@ -126,7 +126,7 @@ KINDS: dict[str, Kind] = {}
 
 
 def kind(name: str, *, long: bool = False, limit: bool = False) -> Callable[[Make], Make]:
-    """Enter a kind into the list."""
+    """A decorator that adds a kind to the list."""
 
     def enter(make: Make) -> Make:
         KINDS[name] = Kind(make, long or limit, limit)
@@ -151,7 +151,7 @@ def post(target: str, body: bytes, headers: dict[str, str] = JSON_TYPE, *, wrong
 
 
 def size(rng: Rng, most: int = BODY) -> int:
-    """A hundred bytes to the limit; the limit itself every third time."""
+    """A random size between a hundred bytes and the limit; the limit itself every third time."""
     return most if rng.random() < 1 / 3 else int(math.exp(rng.uniform(math.log(100), math.log(most))))
 
 
@@ -159,7 +159,7 @@ def pick(rng: Rng, *choices: Any) -> Any:
     return choices[int(rng.integers(len(choices)))]
 
 
-# The falls of the first attack, at their sizes.
+# Requests that once brought the server down, at their sizes then.
 
 
 @kind("eight MiB of empty strings for a latent")
@@ -168,7 +168,7 @@ def empty_strings(rng: Rng, world: World) -> Request:
     return post(target, spliced(body, "latent", repeated(b'""', BODY - 300)), wrong=True)
 
 
-#: A node's matrix that no parser can leave out.
+#: A node's matrix that is not the identity, so that no parser can skip it.
 ROTATION = [0.8, 0.6, 0, 0, -0.6, 0.8, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]
 
 
@@ -204,7 +204,7 @@ def header_lines(rng: Rng, world: World) -> Request:
 
 
 def calls(model: Model, rng: Rng) -> dict[str, tuple[str, dict[str, Any]]]:
-    """Every call that takes JSON: its target, and a small body that it answers."""
+    """Every call that takes JSON: its target, and a small valid body."""
     path, code = f"/v1/models/{model.name}", model.code(rng)
     infer = {"inputs": [{"name": "latent", "shape": [1, len(code)], "datatype": "FP32", "data": code}]}
     version = model.card["version"]
@@ -233,7 +233,7 @@ _PLACE = "\ue000"
 
 
 def spliced(body: dict[str, Any], member: str, text: bytes) -> bytes:
-    """A body as JSON with raw text for a member."""
+    """A body as JSON in which one member is replaced by raw text."""
     whole = json.dumps({**body, member: _PLACE}, ensure_ascii=False).encode()
     return whole.replace(f'"{_PLACE}"'.encode(), text, 1)
 
@@ -243,12 +243,12 @@ def a_member(rng: Rng, body: dict[str, Any]) -> str:
 
 
 def repeated(element: bytes, size: int, before: bytes = b"[", after: bytes = b"]") -> bytes:
-    """As many elements with commas between them as come to a size."""
+    """A list of equal elements of about a given size in bytes."""
     count = max(1, (size - len(before) - len(after)) // (len(element) + 1))
     return before + b",".join([element] * count) + after
 
 
-#: Elements that are right nowhere, right somewhere, or as short as can be.
+#: Elements that are invalid in every list, valid in some, or as short as possible.
 ELEMENTS = (
     b'""', b"null", b"true", b"{}", b"[]", b"0", b"-1", b"1e400", b"0.1", b"NaN", b"Infinity", b'"\\ud800"', b'"a"',
     b"[0]", b"[0,0,0]", b'{"a":0}', b"[[]]", b"1e-400", b"9007199254740993", b'"\\u0000"', b"[null]", b'{"":{}}',
@@ -265,7 +265,7 @@ def many_elements(rng: Rng, world: World) -> Request:
 
 @kind("JSON: the list that the call takes, with very many elements")
 def many_right_elements(rng: Rng, world: World) -> Request:
-    """What gets through the first checks."""
+    """Long lists of valid elements, which pass the first checks."""
     model = world.quick(rng)
     found = calls(model, rng)
     code = json.dumps(model.code(rng)).encode()
@@ -375,7 +375,7 @@ def noise(rng: Rng, world: World) -> Request:
     return post(target, rng.bytes(size(rng)))
 
 
-# Sound requests that are as large as may be.
+# Valid requests that are as large as allowed.
 
 
 @kind("edit with a target at every vertex", limit=True)
@@ -386,7 +386,7 @@ def every_vertex(rng: Rng, world: World) -> Request:
     count = model.counts[mesh]
     places = vertices[:count] + rng.normal(0, 0.01 * np.ptp(vertices), (min(count, len(vertices)), 3))
     targets = [{"vertex": k, "position": place} for k, place in enumerate(places.tolist())]
-    if rng.random() < 0.3:  # as many as may be, all alike
+    if rng.random() < 0.3:  # as many as allowed, all equal
         targets = targets[:1] * count
     body = {"latent": model.code(rng), "targets": targets, "mesh": mesh, "prior": float(rng.uniform(0, 1e-3))}
     return post(f"/v1/models/{model.name}/edit", json.dumps(body).encode())
@@ -493,7 +493,7 @@ def many_keyframes(rng: Rng, world: World) -> Request:
 
 @kind("interpolation with numbers at their limits")
 def extreme_path(rng: Rng, world: World) -> Request:
-    """By an address that was made up where it would not be given out."""
+    """A path with extreme numbers; where the server would not issue an id for it, with a forged one."""
     model = world.quick(rng)
 
     def number() -> float:
@@ -508,11 +508,11 @@ def extreme_path(rng: Rng, world: World) -> Request:
     return get(f"/v1/interpolations/{forged(json.dumps(body).encode())}{pick(rng, '/frames/0', '', '?format=jsonl')}")
 
 
-# Ids of interpolations that nobody gave out.
+# Forged ids of interpolations.
 
 
 def forged(content: bytes) -> str:
-    """An id with a checksum that is right, as it is given out by version 0.1."""
+    """An id with a correct checksum, in the format of version 0.1."""
     packed = hashlib.sha256(content).digest()[:9] + zlib.compress(content, 9)
     return base64.urlsafe_b64encode(packed).rstrip(b"=").decode()
 
@@ -740,7 +740,7 @@ def long_latent(rng: Rng, world: World) -> Request:
 
 
 def upload(world: World, rng: Rng, format: str, data: bytes) -> Request:
-    """A file to be encoded or fitted, in one of the ways to send it."""
+    """An upload of a file to `encode` or `fit`, in one of the ways to send it."""
     target = searching(world, rng, format)
     data = data[:UPLOAD]
     way = rng.random()
@@ -756,14 +756,14 @@ def upload(world: World, rng: Rng, format: str, data: bytes) -> Request:
 
 
 def searching(world: World, rng: Rng, format: str = "") -> str:
-    """The address of a call that takes files; of a quick model where many shapes may be solved."""
+    """The path of a call that takes files; of a quick model if many shapes may be computed."""
     if format not in POINTS and rng.random() < 0.5:
         return f"/v1/models/{world.any(rng).name}/encode"
     return f"/v1/models/{world.quick(rng).name}/fit"
 
 
 def chunks(data: bytes, each: int) -> Iterator[bytes]:
-    """A body in chunks."""
+    """A body in chunked transfer encoding."""
     view = memoryview(data)
     for start in range(0, len(view), each):
         piece = view[start : start + each]
@@ -790,7 +790,7 @@ TEXTS = {
     "xyz": (b"1 2 3\n", b"1 2 3 0 0 1\n", b"# x\n", b"\n", b"1e999 nan -\n", b"1 2 ", b"4000000\n"),
     "off": (b"0 0 0\n", b"3 0 1 2\n", b"\n", b"# x\n", b"1 ", b"8000000 1 0\n"),
 }  # fmt: skip
-#: Formats that `encode` does not take.
+#: Formats of points for `fit`.
 POINTS = ("xyz", "off")
 STARTS = {
     "obj": b"", "npz": b"", "json": b'{"vertices": [',
@@ -821,7 +821,7 @@ def one_line(rng: Rng, world: World) -> Request:
 
 @kind("an upload with more than its mesh")
 def padded_upload(rng: Rng, world: World) -> Request:
-    """A mesh in correspondence, and what a parser doesn't need."""
+    """A mesh in correspondence, padded with data that a parser doesn't need."""
     model = world.any(rng)
     format = pick(rng, "obj", "ply", "stl", "npz", "glb", "gltf", "json")
     data, most = model.files[format], size(rng, UPLOAD)
@@ -845,7 +845,7 @@ def sound_upload(rng: Rng, world: World) -> Request:
 
 @kind("fit of points that lie anywhere", long=True)
 def any_points(rng: Rng, world: World) -> Request:
-    """Some of a model's size, with options that may be as large or as many as they can."""
+    """Random points of a model's size, with options that may be as large or as many as allowed."""
     model = world.any(rng)
     vertices = np.array(json.loads(model.files["json"])["vertices"])
     size = float(vertices.std()) * 10.0 ** pick(rng, 0, 0, 0, rng.uniform(-300, 300))
@@ -871,7 +871,7 @@ def any_points(rng: Rng, world: World) -> Request:
 
 
 def archive(members: dict[str, bytes], old: bytes = b"") -> bytes:
-    """A zip, deflated, with further members in an old one."""
+    """A deflated zip; its members are added to those of ``old``."""
     buffer = io.BytesIO(old)
     with zipfile.ZipFile(buffer, "a", zipfile.ZIP_DEFLATED) as file:
         for name, data in members.items():
@@ -900,7 +900,7 @@ def npz_bomb(rng: Rng, world: World) -> Request:
         lambda: {"vertices.npy": b"\x93NUMPY\x02\x00" + struct.pack("<I", most) + b" " * most},
     )
     data = bytearray(archive(variants[int(rng.integers(len(variants)))]()))
-    if rng.random() < 0.3:  # the directory tells a lie
+    if rng.random() < 0.3:  # the directory has wrong sizes
         place = data.find(b"PK\x01\x02")
         while place >= 0:
             struct.pack_into("<I", data, place + 24, 1000)
@@ -985,7 +985,7 @@ def gltf_scene(rng: Rng, world: World) -> Request:
 
 @kind("a sound glTF file with an image")
 def gltf_image(rng: Rng, world: World) -> Request:
-    """A picture of a few kilobytes that would be gigapixels."""
+    """A picture of a few kilobytes that unpacks to gigapixels."""
     side = int(rng.integers(1000, 30_000))
     row = zlib.compress(bytes(min(10**8, (side // 8 + 1) * side)), 9)
 
@@ -1081,7 +1081,7 @@ def endless_chunks(rng: Rng, world: World) -> Request:
 
 @kind("very many requests in one go")
 def pipelined(rng: Rng, world: World) -> Request:
-    """A part of them may be left unanswered."""
+    """Pipelined requests, some of which may be left unanswered."""
     targets = ("/v2/health/live", "/nowhere", "/v2", "/metrics", "/v1/models", f"/v1/models/{world.models[0].name}")
     one, count = f"GET {pick(rng, *targets)} HTTP/1.1\r\n", pick(rng, 14_000, 10, 100, 300)
     return Request([(one + "Host: x\r\n\r\n").encode() * count, head("GET", "/v2/health/live")], broken=True)
@@ -1112,7 +1112,7 @@ def half_a_body(rng: Rng, world: World) -> Request:
 @kind("a whole request, and the end")
 def half_closed(rng: Rng, world: World) -> Request:
     target, body = a_call(world, rng)
-    # The server's protocol takes the end of one direction for that of both.
+    # The server treats the end of one direction as that of the connection.
     return Request(post(target, json.dumps(body).encode()).parts, broken=True, half_closed=True)
 
 
@@ -1155,11 +1155,11 @@ def odd_lengths(rng: Rng, world: World) -> Request:
 
 
 def made(name: str, seed: int, world: World) -> Request:
-    """The request of a kind and a seed."""
+    """The request generated for a kind and a seed."""
     return KINDS[name].make(np.random.default_rng([seed, zlib.crc32(name.encode())]), world)
 
 
 def shares(examples: int) -> dict[str, int]:
-    """How many examples of each kind make up a number of them; those that take long are a quarter as many."""
+    """How many examples to take of each kind for a total; of kinds that take long a quarter as many."""
     whole = sum(0.25 if kind.long else 1 for kind in KINDS.values())
     return {name: math.ceil(examples / whole * (0.25 if kind.long else 1)) for name, kind in KINDS.items()}

@@ -1,7 +1,8 @@
-"""The server with a meter beside it: ``python -m tests.fuzz.measured SOCKET``.
+"""The server with a meter of its event loop: ``python -m tests.fuzz.measured SOCKET``.
 
-It answers as ``python -m shapespace.service`` does. Over a unix socket it takes two words, each on its own connection:
-``reset`` gives garbage and free memory back and sets the meter to nought, ``read`` answers with it as JSON.
+It answers as ``python -m shapespace.service`` does. Over a unix socket it takes two words, each on its own
+connection: ``reset`` collects garbage, returns free memory to the system and resets the meter; ``read``
+answers its values as JSON.
 """
 
 from __future__ import annotations
@@ -24,11 +25,11 @@ BEAT = 0.01
 class Meter:
     """What the event loop of this process has done since the last reset.
 
-    ``loop`` is the longest single callback in seconds of CPU time of the loop's own thread: neither neighbours on the
-    machine nor other threads of the process count. ``wall`` is the longest by the clock. ``stall`` is how long the
-    loop was kept from running at most, whoever it was: a callback of its own, or a thread that held the interpreter's
-    lock. It is the delay of a beat, less the time for which the loop's thread stood ready and the machine gave it no
-    processor, and no more than the CPU time that all threads of this process took meanwhile.
+    ``loop`` is the longest single callback in seconds of CPU time of the loop's own thread, so that neither
+    other processes nor other threads count. ``wall`` is the longest in wall-clock time. ``stall`` is the
+    longest time for which the loop could not run, because of a callback or of a thread that held the
+    interpreter lock. It is the delay of a beat, less the time for which the loop's thread was ready but had
+    no processor, and at most the CPU time that all threads of this process took meanwhile.
     """
 
     def __init__(self) -> None:
@@ -42,7 +43,7 @@ class Meter:
         self._run = events.Handle._run
 
     def install(self) -> None:
-        """Time every callback of every loop; to be called before there is one."""
+        """Time every callback of every event loop; to be called before a loop is created."""
         run, meter = self._run, self
 
         def timed(handle: events.Handle) -> None:
@@ -51,7 +52,7 @@ class Meter:
                     meter._loop = handle._loop  # type: ignore[attr-defined]
                 run(handle)
                 return
-            # The callback itself: a handle may be cancelled meanwhile, and forgets it then.
+            # Keep the callback: a handle that is cancelled meanwhile loses it.
             meter._running = handle._callback, time.perf_counter(), time.thread_time()
             run(handle)
             meter._took(*meter._running)
@@ -72,7 +73,7 @@ class Meter:
 
     def read(self) -> dict[str, float | str]:
         self.watching = False
-        if running := self._running:  # for who knows how long
+        if running := self._running:  # a callback that has not ended yet counts too
             self._took(*running)
         return {**self._times, "where": self._name}
 
@@ -105,12 +106,12 @@ class Meter:
 
 
 def _kept_waiting() -> float:
-    """Seconds for which the main thread stood ready without a processor."""
+    """Seconds for which the main thread was ready but had no processor."""
     return int(Path("/proc/self/schedstat").read_text().split()[1]) / 1e9
 
 
 def _name(callback: object) -> str:
-    """Whose step it was: the coroutine of a task, or the function."""
+    """The name of a callback: that of a task's coroutine, or of the function."""
     task = getattr(callback, "__self__", None)
     if hasattr(task, "get_coro"):
         return str(getattr(task.get_coro(), "__qualname__", task))
@@ -118,7 +119,7 @@ def _name(callback: object) -> str:
 
 
 def attend(meter: Meter, place: str) -> None:
-    """Answer over the socket for ever."""
+    """Answer words on the socket, forever."""
     with socket.socket(socket.AF_UNIX) as listener:
         listener.bind(place)
         listener.listen()
@@ -137,7 +138,7 @@ def main() -> None:
     meter = Meter()
     meter.install()
     threading.Thread(target=attend, args=(meter, place), daemon=True).start()
-    # Imported only now, so that nothing of it escapes the meter.
+    # Imported after the meter is installed, so that all of it is measured.
     from shapespace.service.__main__ import main as serve
 
     serve()

@@ -1,7 +1,7 @@
-"""What requests cost that are made up to be expensive: none is over its budget, whatever it asks for.
+"""Requests generated to be expensive: none may exceed its budget.
 
-One of each kind that is quick, the same each time, in the whole suite; ``make fuzz`` tries thousands of new ones, and
-prints the worst. ``python -m tests.fuzz`` tries single kinds and seeds.
+The suite sends one request of each quick kind, always the same; ``make fuzz`` sends thousands of new ones
+and prints the most expensive. ``python -m tests.fuzz`` sends single kinds and seeds.
 """
 
 from __future__ import annotations

@@ -1,8 +1,9 @@
-"""How many small mistakes in the library its tests notice: ``python -m tests.mutants [COUNT] [--seed N] [--only T]``.
+"""Mutation testing of the library: ``python -m tests.mutants [COUNT] [--seed N] [--only T]``.
 
-Cosmic Ray makes the mistakes, one at a time, in a copy of the code. Of all that are possible a random sample is tried,
-spread over the modules by their lines, no two at one place. A mutant meets the tests that run its line, those of its
-own module first. What survived ends as diffs in build/mutants.diff, to be read.
+Cosmic Ray makes mutants, each a copy of the code with one small change. Of all possible mutants a random
+sample is tested, with a share for each module by its number of lines, and no two at one position. A mutant
+is run with the tests that cover its line, those of its own module first. The diffs of surviving mutants are
+in build/mutants.diff.
 """
 
 from __future__ import annotations
@@ -29,11 +30,11 @@ from coverage import CoverageData
 
 ROOT = Path(__file__).parents[2]
 PYTEST = [sys.executable, "-m", "pytest", "-q", "-x", "--no-header", "-p", "no:cacheprovider"]
-#: A mutant may take this many times what all tests take without one.
+#: Time limit for a mutant, as a multiple of the time of all tests on the unchanged code.
 PATIENCE = 1.5
 
-#: Mistakes that may go unnoticed. Left out is what no test could miss (a sum that becomes a shift), what is nearly the
-#: same twice (seven ways to turn a comparison), and `|`, which stands mostly in annotations.
+#: Changes that tests might miss. Left out are those that every test detects (a sum that becomes a shift),
+#: near duplicates (seven ways to change a comparison), and `|`, which is mostly in annotations.
 OPERATORS = {
     *(f"ReplaceBinaryOperator_{pair}" for pair in ("Add_Sub", "Sub_Add", "Mul_Div", "Div_Mul", "Pow_Mul", "Mod_Mul")),
     *(f"ReplaceBinaryOperator_{pair}" for pair in ("FloorDiv_Mul", "BitAnd_BitOr")),
@@ -54,7 +55,7 @@ def name_of(mutation: MutationSpec) -> str:
 
 
 def sample(modules: list[Path], count: int, seed: int) -> tuple[int, list[MutationSpec]]:
-    """How many mutants there are, and some of them, in an order in which every beginning is a sample too."""
+    """The number of possible mutants, and a sample in random order, whose beginnings are samples too."""
     possible: dict[Path, list[MutationSpec]] = defaultdict(list)
     with tempfile.TemporaryDirectory() as folder:
         database = WorkDB(Path(folder) / "all.sqlite", WorkDB.Mode.create)
@@ -78,7 +79,7 @@ def sample(modules: list[Path], count: int, seed: int) -> tuple[int, list[Mutati
 
 
 class Tests:
-    """Which tests run a line, as a run of all of them under coverage has it."""
+    """Which tests run a line, from the coverage data of a run of all tests."""
 
     def __init__(self) -> None:
         data = CoverageData("build/coverage")
@@ -90,7 +91,8 @@ class Tests:
         by_line = self._contexts.get(module.absolute(), {})
         lines = statements(module).get(mutation.start_pos[0], ())
         found = functions(by_line.get(line, []) for line in lines)
-        if not lines or any("" in by_line.get(line, []) for line in lines):  # it runs when the module is imported
+        # A line that runs on import may be detected by every test of the module.
+        if not lines or any("" in by_line.get(line, []) for line in lines):
             found = functions(by_line.values())
         own = f"tests/{module.parent}/test_{module.stem}.py"
         return sorted(found, key=lambda test: (not test.startswith(own), test))
@@ -102,9 +104,9 @@ def functions(contexts: Iterable[list[str]]) -> set[str]:
 
 
 def statements(module: Path) -> dict[int, range]:
-    """For each line the lines of the innermost statement there, without its body."""
+    """For each line number, the lines of the innermost statement at it, without the statement's body."""
     found = {}
-    for node in ast.walk(ast.parse(module.read_text(encoding="utf-8"))):  # outer ones first
+    for node in ast.walk(ast.parse(module.read_text(encoding="utf-8"))):  # outer statements come first
         if isinstance(node, ast.stmt):
             end = node.body[0].lineno if hasattr(node, "body") else node.end_lineno + 1
             found |= dict.fromkeys(range(node.lineno, end), range(node.lineno, end))

@@ -1,4 +1,4 @@
-"""One server for all tests of the page, a browser for each file of them, and a fresh window for each test."""
+"""One server for all tests of the page, a browser for each file of tests, and a new window for each test."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from tests.service.bundles import write_bundle
 from tests.service.conftest import ROOT, Server, Start, starting
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
-#: WebGL in software, so that it is there on every machine.
+#: WebGL in software, which works on every machine.
 FLAGS = ["--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
 
 #: A code of the small torus.
@@ -29,7 +29,7 @@ Open = Callable[..., Studio]
 
 @pytest.fixture(scope="session")
 def models(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The bundled figure, and a small torus with an angle among its coordinates and a finer mesh."""
+    """The bundled figure, and a small torus with an angle among its coordinates and a fine mesh."""
     folder = tmp_path_factory.mktemp("page") / "models"
     shutil.copytree(ROOT / "models" / "figure", folder / "figure")
     write_bundle(folder, "with-fine", fine=True)
@@ -51,9 +51,9 @@ def start() -> Iterator[Start]:
 
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Browser]:
-    """Chromium of the system; where there is none, the one that `playwright install chromium` fetches.
+    """The system's Chromium, or else the one that `playwright install chromium` downloads.
 
-    It ends with the file, since no other event loop runs in this thread while it is there.
+    It is closed after each file of tests, since no other event loop can run in this thread while it is open.
     """
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
@@ -63,7 +63,7 @@ def browser() -> Iterator[Browser]:
 
 @pytest.fixture
 def window(browser: Browser, server: Server) -> Iterator[Open]:
-    """Open windows, and see at the end that none of them complained or asked another host for anything."""
+    """Opens windows; checks at the end that none had errors or sent requests to another host."""
     windows: list[tuple[Studio, bool]] = []
 
     def open(url: str = server.url, *, complains: bool = False, **options: Any) -> Studio:
@@ -83,7 +83,7 @@ def window(browser: Browser, server: Server) -> Iterator[Open]:
 
 @pytest.fixture
 def studio(window: Open) -> Studio:
-    """The page with the small torus, at rest."""
+    """The page with the small torus, after its shape has been drawn."""
     return window().open()
 
 

@@ -1,4 +1,4 @@
-"""The page in a real browser, as a person sees and moves it."""
+"""The page in a real browser, as a user sees and operates it."""
 
 from __future__ import annotations
 
@@ -18,13 +18,14 @@ PATIENCE = 120.0  # seconds; the machine may be busy with other things
 
 
 class Studio:
-    """A page that is open, and what happened to it.
+    """An open page, with its errors and requests.
 
-    Playwright's own waiting for conditions would need `eval`, which the page forbids.
+    Playwright's own way to wait for conditions needs `eval`, which the page's content security policy
+    forbids.
 
     Attributes:
-        complaints: errors in the console, and those that nobody caught.
-        foreign: addresses on other hosts that it asked for.
+        complaints: errors in the console, and uncaught exceptions.
+        foreign: requested addresses on other hosts.
         asked: bodies of the requests for vertices.
     """
 
@@ -56,30 +57,30 @@ class Studio:
         """The first value of `what` that is neither None nor False."""
         end = time.monotonic() + patience
         while (value := what()) is None or value is False:
-            assert time.monotonic() < end, "it never came true"
-            self.page.wait_for_timeout(30)  # lets what happens in the browser be heard of
+            assert time.monotonic() < end, "the condition did not become true in time"
+            self.page.wait_for_timeout(30)  # also processes the browser's events
         return value
 
     def open(self, hash: str = "#model=with-fine") -> Studio:
-        """Load the page and wait until its shape rests."""
+        """Load the page and wait until its full shape is drawn."""
         self.page.goto(f"{self.url}/{hash}")
         self.rest()
         return self
 
     def rest(self) -> None:
-        """Wait until the full shape is shown, on the fine mesh or that of a model with one only."""
+        """Wait until the full shape, no draft, is drawn, on the fine mesh if the model has one."""
         fine = "document.querySelector('#fine')"
         script = f"{fine}.disabled || {fine}.getAttribute('aria-pressed') === 'false' ? 'coarse' : 'fine'"
         self.eventually(lambda: (self.shown, self.quality) == (self.page.evaluate(script), "full"))
 
     @property
     def shown(self) -> str | None:
-        """The mesh in the picture."""
+        """Which mesh is drawn, fine or coarse."""
         return self.page.locator(".stage").get_attribute("data-shown")
 
     @property
     def quality(self) -> str | None:
-        """Whether the shape in the picture is a draft."""
+        """Whether the drawn shape is a draft or full."""
         return self.page.locator(".stage").get_attribute("data-quality")
 
     def __getitem__(self, selector: str) -> Locator:
@@ -87,16 +88,16 @@ class Studio:
 
     @property
     def hash(self) -> dict[str, str]:
-        """The state as the address has it."""
+        """The page's state, from its address."""
         return {key: values[0] for key, values in parse_qs(urlsplit(self.page.url).fragment).items()}
 
     @property
     def code(self) -> list[float]:
-        """The code as the address has it."""
+        """The code in the page's address."""
         return [float(part) for part in self.hash["z"].split(",")] if "z" in self.hash else []
 
     def until_code(self, expected: Any, tolerance: float = 1e-4) -> None:
-        """Wait until the address holds a code."""
+        """Wait until the address has this code."""
         try:
             self.eventually(
                 lambda: len(self.code) == len(expected) and np.allclose(self.code, expected, atol=tolerance)
@@ -105,13 +106,13 @@ class Studio:
             raise AssertionError(f"the code is {self.code}, not {expected}") from None
 
     def coordinate(self, k: int) -> Locator:
-        """The row of a coordinate, of which the factor is unfolded."""
+        """The row of a coordinate; unfolds its factor."""
         row = self.page.locator(".coordinate").nth(k)
         row.evaluate("row => { row.closest('details').open = true; }")
         return row
 
     def slide(self, k: int, value: float) -> None:
-        """Move a slider as a hand does, and let go."""
+        """Drag a slider to a value and release it."""
         script = """(slider, value) => {
             slider.dispatchEvent(new PointerEvent('pointerdown', {bubbles: true}));
             slider.value = value;
@@ -129,14 +130,14 @@ class Studio:
         self.page.get_by_role("tab", name=name).click()
 
     def picture(self) -> np.ndarray:
-        """Pixels (h, w, 3) of the middle of the stage, without the buttons and words around it."""
+        """Pixels (h, w, 3) of the middle of the stage, without the buttons and text around it."""
         box = self.page.locator("#canvas").bounding_box()
         assert box
         clip = {"x": box["x"], "y": box["y"] + 60, "width": box["width"], "height": box["height"] - 110}
         return pixels(self.page.screenshot(clip=clip))
 
     def until_different(self, before: np.ndarray, share: float = 0.002) -> np.ndarray:
-        """The next picture that isn't the same as another."""
+        """Wait until the picture differs from another, and return it."""
 
         def changed() -> np.ndarray | None:
             now = self.picture()
@@ -146,17 +147,17 @@ class Studio:
 
     @property
     def messages(self) -> str:
-        """What the page has said to people, also what is out of sight by now."""
+        """The page's messages to the user, including those no longer visible."""
         return self.page.locator("#messages").text_content() or ""
 
 
 def pixels(png: bytes) -> np.ndarray:
-    """(h, w, 3)."""
+    """Pixels (h, w, 3) of a PNG file."""
     return np.asarray(Image.open(io.BytesIO(png)).convert("RGB")).astype(int)
 
 
 def difference(a: np.ndarray, b: np.ndarray) -> float:
-    """Share of pixels that differ visibly."""
+    """Share of pixels in which two pictures differ visibly."""
     return float((np.abs(a - b).max(axis=2) > 12).mean())
 
 

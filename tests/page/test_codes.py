@@ -1,4 +1,4 @@
-"""Codes that the server finds: of a file, of a pull at a vertex, at random."""
+"""Codes from the server: of a file, of a pull at a vertex, and random ones."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def test_a_file_is_encoded(studio: Studio, expected: np.ndarray, server: Server,
     studio.page.get_by_role("button", name="Show what was found").click()
     studio.until_code(CODE, 0.02)
 
-    # The same by dropping it, after the shape has moved on.
+    # The same by drag and drop, after another change of the shape.
     studio.tab("Shape")
     studio["#reset-all"].click()
     studio.until_code([0, 0, 0])
@@ -45,7 +45,7 @@ def test_a_file_is_encoded(studio: Studio, expected: np.ndarray, server: Server,
 
 
 def test_a_file_that_is_none_is_refused_in_the_page(window: Open) -> None:
-    studio = window(complains=True).open()  # the browser's console names every refusal
+    studio = window(complains=True).open()  # the browser logs every refused request in its console
     studio.tab("Files")
     studio["#mesh-file"].set_input_files({"name": "x.obj", "mimeType": "model/obj", "buffer": b"v 0 0 0\n"})
     message = studio.eventually(lambda: studio["#messages .error"].first.inner_text() or None)
@@ -111,6 +111,6 @@ def test_pulling_at_a_vertex_takes_the_shape_along(studio: Studio) -> None:
     studio.rest()
     after = studio.until_different(before)
     reach = int(np.flatnonzero((np.abs(after - after[0, 0]).max(axis=2) > 40).any(axis=0))[-1])
-    assert reach > x + 8, "the shape did not follow the hand"
+    assert reach > x + 8, "the shape did not follow the pointer"
     studio["#undo"].click()
     studio.until_code([0, 0, 0])

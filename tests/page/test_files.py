@@ -1,4 +1,4 @@
-"""Meshes and codes in and out of the page."""
+"""Saving and opening meshes and codes on the page."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def test_a_download_in_every_format(studio: Studio, expected: np.ndarray, tmp_pa
             vertices = np.array(json.loads(path.read_text())["vertices"])
         else:
             vertices, faces = read_arrays(path)
-            if format == "stl":  # corner by corner
+            if format == "stl":  # STL has the corners of each triangle
                 vertices, around = np.unique(vertices.astype(np.float32), axis=0, return_inverse=True)
                 assert len(np.unique(around[faces], axis=0)) == len(faces)
                 assert np.allclose(vertices, np.unique(expected.astype(np.float32), axis=0), atol=1e-5)
@@ -143,7 +143,7 @@ def test_the_address_restores_everything(studio: Studio, window: Open) -> None:
     studio["#theme"].focus()
     other.eventually(lambda: difference(studio.picture(), other.picture()) < 0.03)
 
-    # Back in the first window, by hand in the address bar.
+    # In the first window again, as if typed into the address bar.
     studio.page.evaluate("location.hash = '#model=with-fine&z=0.05,0,0'")
     studio.eventually(lambda: studio.coordinate(0).locator("input[type=number]").input_value() == "0.05")
     assert studio["#keyframes > li"].count() == 0

@@ -1,4 +1,4 @@
-"""How large the shape is in windows of all sizes."""
+"""Size of the shape in windows of all sizes."""
 
 from __future__ import annotations
 
@@ -28,6 +28,6 @@ def test_the_figure_is_large_and_nothing_lies_over_it(window: Open, width: int, 
     assert tools
     assert status
     assert tools["y"] + tools["height"] <= stage["y"] + rows[0]
-    assert stage["y"] + rows[-1] <= status["y"] + 8  # the padding of the words
+    assert stage["y"] + rows[-1] <= status["y"] + 8  # the text's padding
     assert studio.page.evaluate("document.documentElement.scrollWidth <= innerWidth")
     assert studio["#tab-shape"].evaluate("e => e.scrollWidth <= e.clientWidth")

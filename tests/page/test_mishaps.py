@@ -1,4 +1,4 @@
-"""What the page makes of browsers, servers and hands that aren't as it would like them."""
+"""The page with missing browser features, failing servers and unusual user input."""
 
 from __future__ import annotations
 
@@ -118,7 +118,7 @@ def test_numbers_are_not_cut(window: Open, width: int) -> None:
     box.fill("-3.1234")
     assert box.evaluate("b => b.scrollWidth <= b.clientWidth")
     script = "b => { b.value = '-300000.1234'; return b.scrollWidth <= b.clientWidth; }"
-    assert not box.evaluate(script), "the measure sees what is cut"
+    assert not box.evaluate(script), "the measurement must detect a number that is cut off"
 
 
 def test_every_kind_of_file_that_is_offered_is_read(studio: Studio, server: Server) -> None:
@@ -206,7 +206,7 @@ def test_the_file_lasts_as_long_as_the_player(studio: Studio, loop: bool) -> Non
         studio["#download-animation"].click()
     content = Path(download.value.path()).read_bytes()
     facts = json.loads(content[20 : 20 + int.from_bytes(content[12:16], "little")])["asset"]["extras"]
-    # The player takes 1.8 s from one keyframe to the next, where nobody says otherwise; a loop comes back to its first.
+    # By default the player takes 1.8 s from one keyframe to the next; a loop returns to the first keyframe.
     steps, segments = (facts["frames"], 3) if loop else (facts["frames"] - 1, 2)
     assert steps / facts["frames_per_second"] == pytest.approx(4 if loop else 1.8 * segments)
 

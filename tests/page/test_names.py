@@ -1,4 +1,4 @@
-"""What factors and coordinates are called by those who use them."""
+"""Names that users give to factors and coordinates."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What holds for the whole page: models, errors, a server that comes and goes, accessibility, weight."""
+"""The page as a whole: models, errors, a server that stops and starts, accessibility, download size."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def test_back_goes_to_the_shape_before_and_to_the_model_before(window: Open) -> 
     studio.page.go_back()
     studio.eventually(lambda: studio.hash.get("model") == "with-fine" and studio.code == [0.3, -0.2, 0.5])
     studio.rest()
-    assert studio["#wireframe"].get_attribute("aria-pressed") == "true", "how it was shown then"
+    assert studio["#wireframe"].get_attribute("aria-pressed") == "true", "shown as it was then"
     studio.page.go_back()
     studio.until_code([0.3, 0, 0.5])
     assert studio["#undo"].is_enabled()

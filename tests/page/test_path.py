@@ -1,4 +1,4 @@
-"""Keyframes, the path through them, and colours that compare shapes."""
+"""Keyframes, the path through them, and colours for differences of shapes."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from playwright.sync_api import Route
 from tests.page.conftest import Open
 from tests.page.studio import Studio, body, difference
 
-#: Presses play and, a little later, pause; in the page, so that a busy machine doesn't come too late.
+#: Presses play and, a little later, pause; run in the page, so that a busy machine doesn't press too late.
 PLAY_A_WHILE = """async (button) => {
     const frame = () => new Promise(requestAnimationFrame);
     button.click();
@@ -25,7 +25,7 @@ PLAY_A_WHILE = """async (button) => {
 
 
 def keyframes(studio: Studio, *codes: tuple[float, float, float]) -> None:
-    """Make shapes the keyframes, one after the other."""
+    """Set codes and make each a keyframe."""
     for i, code in enumerate(codes):
         for k, value in enumerate(code):
             studio.type(k, value)
@@ -52,7 +52,7 @@ def test_play_pause_and_the_sliders_follow(studio: Studio) -> None:
     studio.eventually(lambda: studio.code[2] not in {0, 1})
     size, angle, twist = studio.code
     assert angle == 0
-    assert size == pytest.approx(-0.2 + 0.4 * twist, abs=1e-3), "off the line between the keyframes"
+    assert size == pytest.approx(-0.2 + 0.4 * twist, abs=1e-3), "on the line between the keyframes"
     t = float(studio["#time"].inner_text().removeprefix("t = "))
     assert twist == pytest.approx(t, abs=0.03)
     studio.rest()
@@ -62,7 +62,7 @@ def test_play_pause_and_the_sliders_follow(studio: Studio) -> None:
     studio.eventually(lambda: studio["#time"].inner_text() == "t = 1.00")
     studio.eventually(lambda: "Play" in studio["#play"].inner_text())
     studio.until_code([0.2, 0, 1])
-    assert len(studio.asked) <= asked + 2, "frames come once"
+    assert len(studio.asked) <= asked + 2, "frames are requested only once"
 
 
 def test_a_loop_goes_on_and_back_to_the_start(studio: Studio) -> None:
@@ -93,7 +93,7 @@ def test_past_the_ends_and_the_shorter_way_round(studio: Studio) -> None:
         step = 2 * np.pi - 6
         angle = 3 + t * step
         studio.until_code([0.1 * t, angle if angle < np.pi else angle - 2 * np.pi, 0], 0.01)
-    # Slow at the keyframes: a tenth of the time is less than a twentieth of the way.
+    # Slow at keyframes: after a tenth of the time, less than a twentieth of the way.
     studio["#easing"].select_option("soft")
     for t, share in ((0.1, 0.028), (0.5, 0.5), (0.9, 0.972)):
         timeline.fill(str(t))
@@ -120,7 +120,7 @@ def test_frames_are_played_as_they_come(studio: Studio) -> None:
     studio.eventually(lambda: bool(held) and time() > 0.3)
     assert "Pause" in studio["#play"].inner_text()
     studio.page.wait_for_timeout(500)
-    assert time() <= 11 / 24 + 0.01, "it shows frames that aren't there"
+    assert time() <= 11 / 24 + 0.01, "it shows frames that haven't arrived"
     held[0].continue_()
     studio.eventually(lambda: time() == 1)
     studio.eventually(lambda: "Play" in studio["#play"].inner_text())
@@ -160,12 +160,12 @@ def test_a_saved_path_goes_where_the_player_goes(window: Open, path: str) -> Non
     for frame in (5, 30, 50, 70):
         share = frame / (len(latents) - (not loop))
         studio["#timeline"].fill(str(-beyond + (1 + 2 * beyond) * share))
-        # The player's frames are even: it says the code of the nearest, at most 3 / 24 / 2 away.
+        # The player's frames are evenly spaced; it shows the code of the nearest, at most 3 / 24 / 2 away.
         studio.until_code(latents[frame], 0.07 if soft else 1e-4)
     at_first = round(beyond / (1 + 2 * beyond) * (len(latents) - 1))
     assert np.allclose(latents[at_first], [0, 3, 0], atol=1e-5)
     pace = np.abs(np.diff(latents[:, 0]))[at_first:]
-    assert (pace[0] < 0.1 * pace.max()) == soft, "slow at keyframes, or even"
+    assert (pace[0] < 0.1 * pace.max()) == soft, "slow at keyframes only with the soft pace"
 
 
 def test_keyframes_can_be_visited_reordered_replaced_and_removed(studio: Studio) -> None:
@@ -173,9 +173,9 @@ def test_keyframes_can_be_visited_reordered_replaced_and_removed(studio: Studio)
     items = studio["#keyframes > li"]
     items.nth(2).drag_to(items.nth(0))
     studio.eventually(lambda: studio.hash.get("keys") == "0.2,1,0;0,0,0;0.1,0,0")
-    studio.page.keyboard.press("Alt+ArrowRight")  # it has the focus
+    studio.page.keyboard.press("Alt+ArrowRight")  # the dragged keyframe has the focus
     studio.page.keyboard.press("Alt+ArrowRight")
-    studio.page.keyboard.press("Alt+ArrowRight")  # nowhere else to go
+    studio.page.keyboard.press("Alt+ArrowRight")  # it is already the last one
     studio.eventually(lambda: studio.hash.get("keys") == "0,0,0;0.1,0,0;0.2,1,0")
     assert items.nth(2).locator("[data-do=go]").evaluate("b => document.activeElement === b")
     assert studio.messages == ""
@@ -198,8 +198,8 @@ def test_the_strip_shows_each_factor_alone(studio: Studio) -> None:
     changes = [np.abs(first - last).mean() for first, last in rows]
     assert changes[0] > 1
     assert changes[1] > 1
-    assert changes[2] == 0, "this factor rests on this path"
-    assert np.abs(rows[2][0] - rows[1][0]).mean() > 1, "and it isn't where the other's is"
+    assert changes[2] == 0, "this factor doesn't move on this path"
+    assert np.abs(rows[2][0] - rows[1][0]).mean() > 1, "and its shape differs from the other factor's"
 
 
 def test_colours_by_stretch_and_bending(studio: Studio) -> None:
@@ -213,7 +213,7 @@ def test_colours_by_stretch_and_bending(studio: Studio) -> None:
     studio.until_different(plain, 0.01)
     assert studio["#legend .title"].inner_text().startswith("Stretch")
     average, low, high = numbers(studio)
-    assert average == low == high == 20, "lengths of the first factor grow alike"
+    assert average == low == high == 20, "the first factor scales all lengths equally"
     studio.page.get_by_label("bending").check()
     studio.eventually(lambda: studio["#legend .title"].inner_text().startswith("Bending"))
     assert max(map(abs, numbers(studio))) < 0.1
@@ -232,7 +232,7 @@ def test_colours_by_stretch_and_bending(studio: Studio) -> None:
 
 
 def numbers(studio: Studio) -> list[float]:
-    """Average, least and most, of the legend."""
+    """Average, minimum and maximum in the legend."""
     text = studio["#legend .numbers"].inner_text().replace("−", "-")
     return [float(part) for part in re.findall(r"[-+]?\d+\.?\d*(?:e-?\d+)?", text)]
 

@@ -1,4 +1,4 @@
-"""Pulls at the surface, which stay pinned: what follows, what stays, and what is said of it."""
+"""Pulls at the surface, which leave pins: what follows, what stays, and the page's messages."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from tests.page.test_operation import AXE, check
 
 
 def hand(studio: Studio, right: bool = True) -> tuple[float, float]:
-    """Where the hand on one side of the picture is in the window."""
+    """Window position of the figure's hand on one side of the picture."""
     picture, box = studio.picture(), studio["#canvas"].bounding_box()
     assert box
     ink = np.abs(picture - picture[0, 0]).max(axis=2) > 40
-    ink = ink[: len(ink) // 2]  # words stand below
+    ink = ink[: len(ink) // 2]  # text is below
     columns = np.flatnonzero(ink.any(axis=0))
     x = int(columns[-1] - 6 if right else columns[0] + 6)
     return box["x"] + x, box["y"] + 60 + int(np.median(np.flatnonzero(ink[:, x])))
@@ -33,14 +33,14 @@ def pull(studio: Studio, place: tuple[float, float], by: tuple[float, float]) ->
 
 
 def edits(studio: Studio) -> list[dict[str, Any]]:
-    """Bodies of all pulls that are asked for from now on."""
+    """A list to which the bodies of all later `edit` requests are added."""
     sent: list[dict[str, Any]] = []
     studio.page.on("request", lambda request: "/edit" in request.url and sent.append(request.post_data_json))
     return sent
 
 
 def corners(pins: Locator) -> list[list[float]]:
-    """Upper left corners of pins in the window."""
+    """Upper left corners of pins, in window coordinates."""
     return pins.evaluate_all(
         "all => all.map((pin) => { const { x, y } = pin.getBoundingClientRect(); return [x, y]; })"
     )
@@ -69,7 +69,7 @@ def test_pins_stay_are_pulled_together_and_removed_by_mouse_and_key(window: Open
     studio.page.evaluate(AXE.read_text())
     check(studio, "pins")
 
-    # A link brings them back, and the shape to where they left it.
+    # A link restores the pins and the shape with its placement.
     places = corners(pins)
     studio.eventually(lambda: studio.hash.get("pins", "").count(";") == 1 and "place" in studio.hash)
     address = studio.hash
@@ -80,7 +80,7 @@ def test_pins_stay_are_pulled_together_and_removed_by_mouse_and_key(window: Open
     studio.page.wait_for_timeout(400)
     assert studio.hash == address
 
-    # A pin is pulled on by itself.
+    # A single pin can be dragged further.
     box = pins.nth(1).bounding_box()
     assert box
     pull(studio, (box["x"] + 12, box["y"] + 12), (0, 25))

@@ -1,4 +1,4 @@
-"""Files that are no meshes in correspondence: scans over the shape, verdicts, and the way back."""
+"""Files not in correspondence: scans shown over the shape, verdicts, and undo."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ FIGURE = "#model=figure"
 
 @dataclass(frozen=True)
 class Given:
-    """A shape of the figure as a scan would come: turned, moved, its faces and vertices thrown together anew."""
+    """A shape of the figure like a scan: rotated, moved, with faces and vertices in random order."""
 
     vertices: FloatArray
     faces: np.ndarray
@@ -62,7 +62,7 @@ def until_said(studio: Studio, text: str) -> str:
 
 
 def ghost(studio: Studio) -> float:
-    """How much of the picture the scan changes."""
+    """Share of pixels that the scan changes."""
     box = studio["#ghost"]
     with_it = studio.picture()
     box.uncheck()
@@ -73,7 +73,7 @@ def ghost(studio: Studio) -> float:
 
 @pytest.mark.parametrize("name", ["scan.ply", "points.xyz"])
 def test_a_scan_is_fitted_and_lies_over_its_shape(window: Open, given: Given, name: str) -> None:
-    studio = window(complains=name.endswith("ply")).open(FIGURE)  # the console names what `encode` refuses
+    studio = window(complains=name.endswith("ply")).open(FIGURE)  # the console logs that `encode` refuses it
     start = studio.picture()
     choose(studio, given.file(name))
     words = until_said(studio, f"Figure explains {name}")
@@ -86,7 +86,7 @@ def test_a_scan_is_fitted_and_lies_over_its_shape(window: Open, given: Given, na
     studio.page.evaluate(AXE.read_text())
     check(studio, "scan")
     assert ghost(studio) > 0.01
-    # Where it was put the points lie at the shape: none beside its outline.
+    # The placed points lie on the shape: hardly any is drawn outside its outline.
     shown = studio.picture()
     studio["#ghost"].uncheck()
     alone = studio.until_different(shown)
@@ -128,16 +128,16 @@ def test_how_sure_the_shape_of_a_scan_is_shows_where_it_was_not_seen(window: Ope
     low, high = np.flatnonzero(body.any(axis=1))[[0, -1]]
     legs, top = (slice(high - (high - low) // 5, high), slice(low, low + (high - low) // 3))
     warm = [float((red - blue)[rows][body[rows]].mean()) for rows in (legs, top)]
-    assert warm[0] > warm[1] + 40, "legs, which nobody has seen, are the red end"
+    assert warm[0] > warm[1] + 40, "the legs, which the scan lacks, are the most uncertain"
     studio.page.evaluate(AXE.read_text())
     check(studio, "certainty")
-    assert "spread" not in studio.hash, "an address has no scan"
+    assert "spread" not in studio.hash, "an address can't restore the scan"
 
     studio.tab("Shape")
     studio["#random"].click()
     studio.eventually(studio["#legend"].is_hidden)
     studio.tab("Colour")
-    assert studio["[name=colour][value=none]"].is_checked(), "it is known of what was found, and of no other shape"
+    assert studio["[name=colour][value=none]"].is_checked(), "uncertainty is known only for the fitted shape"
     assert studio["#sure"].is_hidden()
     studio.page.get_by_role("button", name="Show what was found").click()
     studio.eventually(studio["#sure"].is_visible)

@@ -12,7 +12,7 @@ from playwright.sync_api import Route
 from tests.page.conftest import Open
 from tests.page.studio import Studio, body, difference
 
-BACKGROUND = 12  # how far the paper's own colours reach
+BACKGROUND = 12  # largest difference between colours of the background
 
 
 def test_the_figure_is_there_first_and_follows_a_slider(window: Open) -> None:
@@ -22,11 +22,11 @@ def test_the_figure_is_there_first_and_follows_a_slider(window: Open) -> None:
     before = studio.picture()
     paper = before[:8].reshape(-1, 3)
     drawn = (np.abs(before - paper.mean(axis=0)).max(axis=2) > 4 * BACKGROUND).mean()
-    assert 0.05 < drawn < 0.6, "the canvas is blank, or all covered"
+    assert 0.05 < drawn < 0.6, "the canvas must be neither blank nor filled"
     studio.slide(4, 0.9)
     after = studio.until_different(before, 0.01)
     assert 0.01 < difference(before, after) < 0.6
-    # The picture comes first, the address when the hand rests.
+    # The picture changes first, the address after the last movement.
     studio.eventually(lambda: studio.code[4] == pytest.approx(0.9, abs=1e-3))
     words = studio["#diagnostics"].text_content() or ""
     assert "Fits its lengths and angles to" in words
@@ -50,7 +50,7 @@ def test_several_coordinates_at_once_number_lock_and_reset(studio: Studio) -> No
     studio.coordinate(0).locator("[data-do=lock]").click()
     studio.coordinate(0).locator("[data-do=reset]").click()
     studio.until_code([0, 0, 0])
-    studio["#canvas"].hover()  # away from the factor, which colours what it moves
+    studio["#canvas"].hover()  # leave the factor, which colours what it changes
     studio.eventually(lambda: difference(start, studio.picture()) < 0.001)
 
     studio.type(1, 1)
@@ -97,7 +97,7 @@ def test_drafts_as_it_moves_the_full_shape_as_it_rests_and_nothing_queues(studio
         values,
     )
     studio.eventually(lambda: studio.asked[-1]["quality"] == "full" and studio.quality == "full")
-    # All that came while the first was under way is superseded by the last.
+    # Of the changes during the first request only the last is sent.
     assert [asked["quality"] for asked in studio.asked] == ["draft", "draft", "full"]
     assert {asked["mesh"] for asked in studio.asked} == {"fine"}
     assert [asked["latents"][0][0] for asked in studio.asked] == pytest.approx([0.01, 0.15, 0.15])
@@ -136,7 +136,7 @@ def test_shapes_that_take_their_time_are_asked_for_once(studio: Studio) -> None:
 
 
 def test_a_draft_that_was_solved_after_all_is_not_asked_for_again(window: Open) -> None:
-    # So far outside the bounds, face frames go astray.
+    # So far outside the bounds, face frames give a bad shape.
     studio = window().open(f"#model=figure&z={','.join(['3,-3'] * 10)}")
     studio.page.wait_for_timeout(1000)
     fine = [asked for asked in studio.asked if len(asked["latents"]) == 1 and asked["mesh"] == "fine"]
@@ -155,7 +155,7 @@ def test_nothing_jumps_as_a_draft_comes_to_rest(window: Open) -> None:
     )
     start = studio.picture()
     studio.type(3, 0.6)
-    # Away from the factor, which colours what it moves while it is pointed at or written in.
+    # Leave the factor, which colours what it changes while it is pointed at or edited.
     studio.coordinate(3).locator("input[type=number]").blur()
     studio["#canvas"].hover()
     studio.eventually(lambda: bool(held) and (studio.shown, studio.quality) == ("fine", "draft"))
@@ -180,7 +180,7 @@ def test_one_line_says_how_good_the_shape_is_by_what_is_usual_for_the_model(wind
     studio.open()
     studio.eventually(lambda: studio[".pictures canvas.drawn"].count() == 9)
     chip = studio["#diagnostics summary"]
-    assert chip.inner_text() == "Fits, inside, usual", "all shapes of this model are off by as much"
+    assert chip.inner_text() == "Fits, inside, usual", "all shapes of this model have as large a residual"
     assert studio["#diagnostics"].get_attribute("class") == "good"
     assert studio["#found"].is_hidden()
     chip.click()
@@ -205,7 +205,7 @@ def test_a_slider_is_dragged(studio: Studio) -> None:
     for i in range(10):
         studio.page.mouse.move(x + 8 * i, y)
     during = studio.until_different(before)
-    assert studio["#undo"].is_disabled(), "a drag is one step, once it has ended"
+    assert studio["#undo"].is_disabled(), "a drag becomes one undo step when it ends"
     studio.page.mouse.up()
     studio.eventually(lambda: studio["#undo"].is_enabled() and studio.code[0] > 0.05)
     studio["#undo"].click()
@@ -249,7 +249,7 @@ def test_undo_and_redo(studio: Studio) -> None:
     studio["#undo"].click()
     studio.type(1, 1)
     studio.until_code([0.1, 1, 0])
-    assert studio["#redo"].is_disabled(), "a new step ends what could be done again"
+    assert studio["#redo"].is_disabled(), "a new step clears the redo steps"
 
 
 def test_turn_and_zoom_by_mouse_and_keyboard(studio: Studio) -> None:
@@ -270,7 +270,7 @@ def test_turn_and_zoom_by_mouse_and_keyboard(studio: Studio) -> None:
         zoomed = studio.until_different(zoomed, 0.005)
     studio.eventually(lambda: "view" in studio.hash)
     studio.page.keyboard.press("0")
-    studio["#wireframe"].focus()  # no ring around the canvas
+    studio["#wireframe"].focus()  # so that the canvas has no focus ring
     studio.eventually(lambda: difference(start, studio.picture()) < 0.001)
     assert studio.code == [0, 0, 0]
 
@@ -291,7 +291,7 @@ def test_wireframe_normals_and_the_coarse_mesh(studio: Studio) -> None:
 
 
 def test_the_fine_shape_lies_where_the_coarse_one_does(window: Open) -> None:
-    # Each is aligned over its own vertices: by 5 degrees about the figure's height, and more elsewhere, they differ.
+    # Aligned over its own vertices each, they would differ by 5 degrees about the vertical axis.
     studio = window().open(f"#model=figure&z={','.join(['0.6'] * 20)}")
 
     def ink() -> np.ndarray:
@@ -313,13 +313,13 @@ def test_pointing_at_a_factor_colours_where_it_changes_lengths_and_angles(window
     def blue(picture: np.ndarray) -> np.ndarray:
         return (picture[..., 2] - picture[..., 0]) > 50
 
-    # Factors fold; each has a picture of what it moves, of that part of the shape.
+    # Folded factors show a picture of the part of the shape that they change.
     folds = studio[".factor details"]
     assert [fold.get_attribute("open") is not None for fold in folds.all()] == [True] + [False] * (folds.count() - 1)
     pictures = [body(canvas) for canvas in studio[".factor summary canvas"].all()]
     for picture in pictures:
         assert 0.01 < (blue(picture) & (picture[..., 3] > 0)).mean() < 0.5
-    # No two alike, which those of the whole shape nearly were.
+    # No two pictures are alike; pictures of the whole shape nearly would be.
     assert all(np.abs(a - b).mean() > 5 for i, a in enumerate(pictures) for b in pictures[:i])
     studio[".factor summary"].nth(1).click()
     assert studio["#z2"].is_visible()
@@ -334,7 +334,7 @@ def test_pointing_at_a_factor_colours_where_it_changes_lengths_and_angles(window
     assert less < 0.05 * more
     studio["#canvas"].hover()
     studio.eventually(lambda: not blue(studio.picture()).any())
-    # A hip: alignment moves head, hands and feet with it, but there nothing is longer or bent.
+    # A hip: rigid alignment moves head, hands and feet too, but their lengths and angles don't change.
     studio[".factor h2"].first.hover()
     coloured = blue(studio.eventually(lambda: p if blue(p := studio.picture()).any() else None))
     height = len(coloured)
@@ -346,7 +346,7 @@ def test_pictures_of_each_coordinate(studio: Studio) -> None:
     studio.eventually(lambda: studio[".pictures canvas.drawn"].count() == 9)
     less, mean, more = (body(studio.coordinate(0).locator("canvas").nth(i)) for i in range(3))
     covered = [(picture[..., 3] > 0).mean() for picture in (less, mean, more)]
-    assert covered[0] < covered[1] < covered[2], "this coordinate is the size"
+    assert covered[0] < covered[1] < covered[2], "this coordinate scales the shape"
     studio.coordinate(0).locator(".pictures button").nth(2).click()
     studio.until_code([0.2, 0, 0])
 
@@ -392,7 +392,7 @@ def test_a_phone_and_a_finger(window: Open) -> None:
     slider = studio.coordinate(0).locator("input[type=range]")
     slider.scroll_into_view_if_needed()
     slider.tap(position={"x": 200, "y": 12})
-    studio.eventually(lambda: bool(studio.code) and studio.code[0] > 0)  # the picture may still change by the fingers
+    studio.eventually(lambda: bool(studio.code) and studio.code[0] > 0)  # the picture may still change
     studio.page.get_by_role("tab", name="Path").tap()
     assert studio["#add-keyframe"].is_visible()
 
@@ -401,10 +401,10 @@ def test_a_stage_in_dark_and_light(window: Open) -> None:
     studio = window(color_scheme="dark").open()
 
     def stage() -> tuple[float, float, float]:
-        """How bright the paper is, the ground beside the shape, and the darkest place there below it."""
+        """Brightness of the background, the ground beside the shape, and the darkest place of the ground."""
         picture = studio.picture()
         grey = picture.mean(axis=2)
-        shape = (picture[..., 0] - picture[..., 2] > 20).any(axis=1)  # of warm clay
+        shape = (picture[..., 0] - picture[..., 2] > 20).any(axis=1)  # the shape's clay colour is warm
         ground = grey[np.flatnonzero(shape)[-1] + 3 :]
         return grey[:5].mean(), float(np.median(ground[:5, 60:90])), ground[:5].min()
 

@@ -1,4 +1,4 @@
-"""Shapes kept by name, and two shapes side by side."""
+"""The shelf of named shapes, and two shapes side by side."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def test_shapes_are_kept_by_name_for_each_model(window: Open) -> None:
     studio = window().open("#model=with-fine&z=0.1,1,0.5")
     studio["#keep-shape"].click()
     studio.page.keyboard.type("Thin")  # the name is selected
-    studio.page.keyboard.press("Control+z")  # of the name, not of the shape
+    studio.page.keyboard.press("Control+z")  # undoes the typing, not the shape
     studio.page.keyboard.type("Thin")
     studio.page.keyboard.press("Tab")
     assert kept(studio) == ["Thin"]
@@ -49,7 +49,7 @@ def test_shapes_are_kept_by_name_for_each_model(window: Open) -> None:
     assert kept(studio) == ["Thin", "Shape 1"]
     studio["#shelf input"].first.fill(" ")
     studio["#shelf input"].first.blur()
-    assert kept(studio)[0] == "Thin", "a name that is none"
+    assert kept(studio)[0] == "Thin", "a blank name is refused"
     studio.page.get_by_role("button", name="Remove Thin").click()
     assert kept(studio) == ["Shape 1"]
     assert focused(studio) == "Go to Shape 1"
@@ -86,7 +86,7 @@ def test_two_shapes_beside_each_other(window: Open) -> None:
     half = both.shape[1] // 2
     paper = np.median(both, axis=(0, 1))
     for side in (both[:, :half], both[:, half:]):
-        assert (np.abs(side - paper).max(axis=2) > 40).mean() > 0.02, "a shape on each side"
+        assert (np.abs(side - paper).max(axis=2) > 40).mean() > 0.02, "there must be a shape on each side"
     studio.eventually(lambda: studio.hash.get("against") == "-2")
 
     studio.tab("Colour")
@@ -122,7 +122,7 @@ def test_from_the_shape_to_the_one_beside(studio: Studio) -> None:
     studio.page.get_by_role("button", name="Compare with Shape 1").click()
     steps = studio["#undo"].get_attribute("title")
     slider = studio["#blend input"]
-    studio.page.wait_for_timeout(800)  # one movement by keys has ended
+    studio.page.wait_for_timeout(800)  # so that the keys before count as an undo step of their own
     slider.focus()
     for _ in range(3):
         studio.page.keyboard.press("PageUp")
@@ -143,7 +143,7 @@ def test_from_the_shape_to_the_one_beside(studio: Studio) -> None:
     studio.until_code([0, 3, 0.8])
     slider.fill("1")
     studio.slide(0, 0.1)
-    assert slider.input_value() == "0", "it begins anew where a shape comes from elsewhere"
+    assert slider.input_value() == "0", "it is reset when the shape changes by other means"
     studio.page.get_by_role("button", name="Compare with Shape 1").click()
     assert studio["#blend"].is_hidden()
 
@@ -166,7 +166,7 @@ def test_the_view_stays_as_it_was_turned(studio: Studio, window: Open) -> None:
     studio.eventually(lambda: studio.hash["view"] != alone)
     after = direction()
     assert np.allclose(before[:3], after[:3], atol=1e-3)
-    assert after[3] > before[3], "from farther away, as there are two"
+    assert after[3] > before[3], "the camera moves back to show both"
     studio.rest()
     studio["#canvas"].hover()
     there = studio.picture()
@@ -188,7 +188,7 @@ def test_two_windows_have_one_shelf(studio: Studio) -> None:
 
 
 def furthest(studio: Studio) -> float:
-    """Largest distance between the two shapes, in percent of the reference's diagonal, as the server has them."""
+    """Largest distance between the two shapes, from the server, in percent of the reference's diagonal."""
 
     def vertices(*code: float) -> np.ndarray:
         latent = ",".join(map(str, code))

@@ -1,4 +1,4 @@
-"""What people keep of the page to show it to others: pictures, videos, and frames in pages of their own."""
+"""Sharing what the page shows: pictures, videos, and frames in other pages."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from tests.page.conftest import Open
 from tests.page.studio import Studio, difference, pixels
 from tests.service.conftest import Start
 
-#: Pictures of a video at nine times from its beginning to its end, as PNG.
+#: A script that returns pictures of a video at nine times from its beginning to its end, as PNG.
 STILLS = """async (content) => {
     const video = document.createElement('video');
     const next = (name) => new Promise((resolve, reject) => {
@@ -45,20 +45,20 @@ STILLS = """async (content) => {
 
 
 def kept(studio: Studio, button: str) -> tuple[str, bytes]:
-    """Name and content of the file that a button gives."""
+    """Name and content of the file that a button downloads."""
     with studio.page.expect_download() as download:
         studio[button].click()
     return download.value.suggested_filename, Path(download.value.path()).read_bytes()
 
 
 def stills(page: Page, video: bytes) -> tuple[float, list[np.ndarray]]:
-    """How long a video is, and its pictures at nine times from its beginning to its end."""
+    """The length of a video in seconds, and its pictures at nine times from its beginning to its end."""
     end, *pictures = page.evaluate(STILLS, base64.b64encode(video).decode())
     return end, [pixels(base64.b64decode(picture)) for picture in pictures]
 
 
 def changes(pictures: list[np.ndarray], least: float) -> int:
-    """How often a video shows something else than before; a busy machine records few pictures of a second."""
+    """How many successive pictures differ; a busy machine records few pictures in a second."""
     return sum(difference(one, other) > least for one, other in pairwise(pictures))
 
 
@@ -70,16 +70,16 @@ def test_a_picture_a_turntable_and_the_path_as_a_video(window: Open) -> None:
     assert name == "with-fine.png"
     picture = pixels(content)
     assert list(picture.shape[:2]) == studio["#canvas"].evaluate("c => [c.height, c.width]")
-    assert difference(picture[60 : 60 + len(seen)], seen) < 0.05, "it isn't what is seen, paper and all"
+    assert difference(picture[60 : 60 + len(seen)], seen) < 0.05, "as on the page, with background"
 
-    plain = window().page  # without this page's policy
+    plain = window().page  # a page without content security policy
     plain.goto("about:blank")
     studio["#turntable-seconds"].fill("1")
     name, content = kept(studio, "#turntable")
     assert name == "with-fine-turntable.webm"
     seconds, pictures = stills(plain, content)
     assert 0 < seconds < 5, "a busy machine records few pictures, and the first one late"
-    assert changes(pictures, 0.02) >= 2, "there and back"
+    assert changes(pictures, 0.02) >= 2, "the turntable must move"
     studio["#messages button:visible"].first.click()
     studio.eventually(lambda: difference(studio.picture(), seen) < 0.001)
     assert "view" not in studio.hash

@@ -17,7 +17,7 @@ from tests.surfaces import png
 
 
 def dressed(folder: Path, picture: bytes) -> Path:
-    """A torus whose finer mesh has a red picture on one half and a green material on the other, with a seam."""
+    """A torus whose fine mesh has a red texture on one half, a green material on the other, and a seam."""
     mesh = fine_reference()
     faces = mesh.faces
     half = mesh.vertices[faces].mean(axis=1)[:, 0] > 0
@@ -37,7 +37,7 @@ def dressed(folder: Path, picture: bytes) -> Path:
 
 
 def share(picture: np.ndarray, channel: int) -> float:
-    """Of the pixels in which one colour is much stronger than the others."""
+    """Share of pixels in which one colour channel is much stronger than the others."""
     others = np.delete(picture, channel, axis=2).max(axis=2)
     return float((picture[:, :, channel] > others + 60).mean())
 
@@ -48,13 +48,13 @@ def test_the_fine_mesh_wears_its_texture(tmp_path: Path, start: Start, window: O
     first = studio.picture()
     assert share(first, 1) > 0.02, "the other material"
     studio.type(2, 0.8)
-    # Away from the factor, which colours what it moves while it is written in.
+    # Leave the factor, which colours what it changes while it is edited.
     studio.coordinate(2).locator("input[type=number]").blur()
     studio.rest()
     moved = studio.until_different(first)
     studio.eventually(lambda: share(studio.picture(), 0) > 0.02)
     assert share(moved, 2) < 0.001
-    # Colours and the coarse mesh are without.
+    # Coloured shapes and the coarse mesh have no texture.
     studio["#normals"].click()
     studio.eventually(lambda: share(studio.picture(), 2) > 0.01)
     studio["#normals"].click()

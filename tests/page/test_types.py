@@ -1,4 +1,4 @@
-"""The page's scripts keep to the types that their comments state, and to one form."""
+"""The page's scripts agree with the types in their comments, and are formatted by prettier."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ def test_the_scripts_have_the_form_that_prettier_gives_them() -> None:
     scripts = [*(ROOT / "service" / "page" / "js").rglob("*.js"), *(ROOT / "tests").glob("[cf]*/*.mjs")]
     command = ["node", str(formatter), "--print-width", str(WIDTH), "--check", *map(str, scripts)]
     found = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert found.returncode == 0, f"{found.stderr}\nprettier --print-width {WIDTH} --write mends that"
+    assert found.returncode == 0, f"{found.stderr}\nprettier --print-width {WIDTH} --write formats them"
     lines = [
         (path.name, k)
         for path in scripts
         for k, line in enumerate(path.read_text().splitlines(), 1)
         if len(line) > WIDTH
     ]
-    assert lines == [], "comments and sentences are not wrapped by it"
+    assert lines == [], "prettier does not wrap comments and strings"
 
 
 def test_the_scripts_are_sound_by_their_types() -> None:
@@ -35,7 +35,7 @@ def test_the_scripts_are_sound_by_their_types() -> None:
 
 
 def test_every_module_is_loaded_ahead() -> None:
-    """Otherwise a browser finds out file by file what else it needs."""
+    """Otherwise a browser would find the imports only one file after the other."""
     page = ROOT / "service" / "page"
     ahead = set(re.findall(r'rel="modulepreload" href="page/(.+?)"', (page / "index.html").read_text()))
     modules = [*(page / "js").rglob("*.js"), *(page / "vendor").rglob("*.js")]

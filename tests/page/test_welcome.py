@@ -1,4 +1,4 @@
-"""The first seconds of somebody who has no link to a shape."""
+"""The first seconds on the page without a code in its address."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from tests.page.studio import Studio, difference
 
 
 def values(studio: Studio) -> list[float]:
-    """Where the sliders stand."""
+    """The sliders' values."""
     return studio[".coordinate input[type=range]"].evaluate_all("all => all.map(({ value }) => Number(value))")
 
 
@@ -31,7 +31,7 @@ def test_the_shape_moves_by_itself_until_anything_is_touched(window: Open) -> No
 
     studio.eventually(one_after_the_other)
     assert "z" not in studio.hash
-    studio.page.keyboard.press("Shift")  # anything
+    studio.page.keyboard.press("Shift")  # any input ends the animation
     studio.until_code([0, 0, 0])
     studio.rest()
     assert values(studio) == [0, 0, 0]

@@ -1,4 +1,4 @@
-"""Small bundles with networks written down by hand, so that lengths and angles are known in closed form."""
+"""Small bundles with networks built by hand, whose lengths and angles are known in closed form."""
 
 from __future__ import annotations
 
@@ -31,13 +31,13 @@ def reference() -> TriangleMesh:
 
 
 def fine_reference() -> TriangleMesh:
-    """A finer torus at the same place; every other vertex of every fourth ring is one of the coarse one."""
+    """A finer torus in the same position; every other vertex of every fourth ring is a coarse vertex."""
     mesh = torus(32, 16)
     return mesh.with_vertices(mesh.vertices / np.sqrt(torus(8, 8).area))
 
 
 def torus(n: int, m: int) -> TriangleMesh:
-    """Of n rings with m vertices each."""
+    """A torus of n rings with m vertices each."""
     v = freaky_torus.reference().vertices.reshape(64, 32, 3)[:: 64 // n, :: 32 // m].reshape(-1, 3)
     i, j = np.meshgrid(np.arange(n), np.arange(m), indexing="ij")
 
@@ -59,7 +59,7 @@ def directions(mesh: TriangleMesh) -> np.ndarray:
 
 
 def expected_nric(code: np.ndarray) -> np.ndarray:
-    """(2E,) what the bundle's networks say to a code (3,), normalised."""
+    """(2E,) the bundle's lengths and angles for a code (3,), normalised."""
     mesh = reference()
     a = np.array([code[0], np.sin(code[1]), code[2]])
     return nric(mesh.vertices, mesh.connectivity) + a @ directions(mesh)
@@ -81,12 +81,12 @@ def network(nodes: list[Any], weights: dict[str, np.ndarray], row_in: tuple, row
 
 
 def networks(idle: int = 0) -> dict[str, onnx.ModelProto]:
-    """Factor 0 takes ``size``; factor 1 takes ``turn``, an angle, ``twist``, and idle ones; the combiner adds up."""
+    """Factor 0 is ``size``; factor 1 the angle ``turn``, ``twist`` and idle ones; the combiner is the sum."""
     mesh = reference()
     z = nric(mesh.vertices, mesh.connectivity)
     d = directions(mesh)
     wide = len(z)
-    # sin of the first coordinate and the second as it is: masks pick them.
+    # The sine of the first coordinate and the second itself, selected by masks.
     periodic = [
         helper.make_node("Sin", ["latent"], ["sine"]),
         helper.make_node("Mul", ["sine", "first"], ["angle"]),
@@ -129,7 +129,7 @@ def networks(idle: int = 0) -> dict[str, onnx.ModelProto]:
 
 
 def start_network() -> onnx.ModelProto:
-    """A start for Gauss–Newton that knows about ``size`` only."""
+    """A start network for Gauss–Newton that uses ``size`` only."""
     mesh = reference()
     flat = mesh.vertices.reshape(1, -1)
     weights = {"D": np.concatenate([flat, 0 * flat, 0 * flat]), "x": flat}
@@ -158,7 +158,7 @@ def network_with_shape(nodes: list[Any], weights: dict[str, np.ndarray], mesh: T
 
 
 def facts(name: str = "small", version: str = "1", *, idle: int = 0) -> Facts:
-    """What the manifest says beside what follows from the files."""
+    """Facts for the manifest, except those that follow from the files."""
     return Facts(
         name=name,
         version=version,
@@ -190,7 +190,7 @@ def facts(name: str = "small", version: str = "1", *, idle: int = 0) -> Facts:
 
 
 def geometry(*, fine: bool = False) -> Geometry:
-    """The reference; where it has a finer mesh, with modes and codes beside it."""
+    """The reference; if ``fine``, also a fine mesh, modes and training codes."""
     mesh = reference()
     if not fine:
         return Geometry(reference=mesh)
@@ -206,14 +206,14 @@ def geometry(*, fine: bool = False) -> Geometry:
 def write_bundle(
     models: Path, name: str = "small", version: str = "1", *, start: bool = False, fine: bool = False, idle: int = 0
 ) -> Path:
-    """Write a whole bundle and return its folder; idle coordinates come last and change nothing."""
+    """Write a complete bundle and return its folder; idle coordinates come last and have no effect."""
     *factors, combiner = (model.SerializeToString() for model in networks(idle).values())
     files = Networks(factors=factors, combiner=combiner, start=start_network().SerializeToString() if start else None)
     return writer.write_bundle(models, facts(name, version, idle=idle), files, geometry(fine=fine))
 
 
 def seal(folder: Path) -> None:
-    """Give the manifest the digests of the files as they are, after something was done to them."""
+    """Update the manifest's digests after files have been changed."""
     path = folder / MANIFEST
     files = sorted(file for file in folder.iterdir() if file.is_file() and file != path)
     entries = {file.name: writer.entry(file.read_bytes()).model_dump() for file in files}
@@ -221,7 +221,7 @@ def seal(folder: Path) -> None:
 
 
 def rescale(folder: Path, scale: float) -> None:
-    """Turn a bundle into another one, all of whose lengths are in other units, in one step as `export` does it."""
+    """Replace a bundle by one whose lengths are in other units, in one step as `export` does."""
     facts = json.loads((folder / MANIFEST).read_text()) | {"scale": scale}
     part = folder.parent / ".manifest.json"
     part.write_text(json.dumps(facts))

@@ -26,14 +26,14 @@ ROOT = Path(__file__).parents[2]
 class Server:
     """A running ``python -m shapespace.service``."""
 
-    #: What Python is started with.
+    #: Arguments of Python.
     program: tuple[str, ...] = ("-m", "shapespace.service")
 
     def __init__(self, models: Path, **settings: object) -> None:
         self._log = Path(tempfile.gettempdir(), f"shapespace-{uuid4().hex}.log")  # a pipe would fill up
         weakref.finalize(self, self._log.unlink, missing_ok=True)
         environment = {key: value for key, value in os.environ.items() if not key.startswith("SHAPESPACE_")}
-        settings = {"drain": 0, "watch": 0} | settings  # so that tests neither wait nor reload unasked
+        settings = {"drain": 0, "watch": 0} | settings  # no wait at the end, and no reload without SIGHUP
         environment |= {"SHAPESPACE_MODELS_DIR": str(models), "SHAPESPACE_PORT": "0"}
         environment |= {f"SHAPESPACE_{key.upper()}": str(value) for key, value in settings.items()}
         with self._log.open("w") as log:
@@ -51,7 +51,7 @@ class Server:
         self.url = announced.group().rstrip("/")
 
     def stop(self) -> str:
-        """End it as an orchestrator does, and give back its log."""
+        """End it by SIGTERM, as an orchestrator does, and return its log."""
         self.process.send_signal(signal.SIGTERM)
         self.process.communicate(timeout=60)
         return self.log
@@ -92,7 +92,7 @@ def start() -> Iterator[Start]:
 
 @pytest.fixture(scope="session")
 def models(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The bundled models, and beside them a small one in versions 1, 2 and 10, and one with a finer mesh."""
+    """The bundled models, a small one in versions 1, 2 and 10, and one with a fine mesh."""
     folder = tmp_path_factory.mktemp("served") / "models"
     shutil.copytree(ROOT / "models", folder)
     write_bundle(folder, "small", "1")
@@ -104,7 +104,7 @@ def models(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def small_models(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The small model alone, with which a server is ready seconds sooner."""
+    """The small model alone, with which a server starts seconds faster."""
     folder = tmp_path_factory.mktemp("small") / "models"
     write_bundle(folder, "small", "10")
     return folder
@@ -112,7 +112,7 @@ def small_models(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def server(models: Path) -> Iterator[Server]:
-    """One server for every test that leaves it as it is."""
+    """A server shared by all tests that don't change its state."""
     with starting() as start:
         yield start(models, workers=2, max_codes=20, max_frames=200, max_body=100_000, deadline=300)
 

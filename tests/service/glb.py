@@ -1,4 +1,4 @@
-"""Reading a GLB by the letter of its specification, independently of what wrote it."""
+"""Reading a GLB by its specification, independently of the code that wrote it."""
 
 from __future__ import annotations
 

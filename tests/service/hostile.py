@@ -1,4 +1,4 @@
-"""Bundles that are well formed, with true digests, and do harm when they are loaded or run."""
+"""Bundles that are well formed, with correct digests, but harmful when they are loaded or run."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from onnx import TensorProto, helper, numpy_helper
 
 from tests.service.bundles import directions, networks, reference, seal, write_bundle
 
-#: Codes of the bundles' first coordinate end at 0.2: what happens beyond this happens where no trial looks.
+#: The first coordinate's bound is 0.2: harm beyond this value is not seen in the validation run.
 BEYOND = 0.3
-#: A code there.
+#: A code beyond it.
 HARMFUL = [0.5, 0.7, 0.4]
 _ALWAYS = -1e30
 
@@ -35,7 +35,7 @@ def _graph(name: str, nodes: list[onnx.NodeProto], inputs: list[Any], outputs: l
 def spoil_factor(
     folder: Path, nodes: list[onnx.NodeProto], weights: Mapping[str, np.ndarray] | None = None, beyond: float = _ALWAYS
 ) -> None:
-    """Have factor 0 add ``harm``, which nodes make of ``trigger``: whether its latent is larger than some number."""
+    """Let factor 0 add ``harm``, computed by the nodes from ``trigger``, which is: latent > beyond."""
     mesh = reference()
     model = networks()["factor-0.onnx"]
     z = numpy_helper.to_array(next(w for w in model.graph.initializer if w.name == "z"))
@@ -61,7 +61,7 @@ def spoil_factor(
 
 
 def loops(folder: Path, beyond: float = _ALWAYS, nest: str = "") -> None:
-    """A loop that never ends once it is triggered, alone or with an If or a Scan inside."""
+    """A loop that never ends once it is triggered, alone or with an If or a Scan in it."""
     body = [node("Identity", ["on"], ["on_again"])]
     if nest == "if":
         branches = {
@@ -91,7 +91,7 @@ def loops(folder: Path, beyond: float = _ALWAYS, nest: str = "") -> None:
 
 
 def allocates(folder: Path, beyond: float = _ALWAYS, gigabytes: float = 8) -> None:
-    """Memory for nothing."""
+    """Allocates much memory without using it."""
     nodes = [
         node("Cast", ["trigger"], ["times"], to=TensorProto.INT64),
         node("Mul", ["times", "many"], ["count"]),
@@ -102,7 +102,7 @@ def allocates(folder: Path, beyond: float = _ALWAYS, gigabytes: float = 8) -> No
 
 
 def fails(folder: Path, beyond: float = _ALWAYS) -> None:
-    """An index far out of range."""
+    """Fails with an index far out of range."""
     nodes = [
         node("Cast", ["trigger"], ["times"], to=TensorProto.INT64),
         node("Mul", ["times", "far"], ["index"]),
@@ -112,7 +112,7 @@ def fails(folder: Path, beyond: float = _ALWAYS) -> None:
 
 
 def changes_shape(folder: Path, beyond: float = _ALWAYS) -> None:
-    """An answer with a row for each of many nothings."""
+    """Answers two rows instead of one once it is triggered."""
     nodes = [
         node("Cast", ["trigger"], ["times"], to=TensorProto.INT64),
         node("Add", ["times", "one"], ["count"]),
@@ -123,7 +123,7 @@ def changes_shape(folder: Path, beyond: float = _ALWAYS) -> None:
 
 
 def not_finite(folder: Path, beyond: float = _ALWAYS) -> None:
-    """One by zero."""
+    """Answers NaN, from 0/0."""
     nodes = [
         node("Cast", ["trigger"], ["times"], to=TensorProto.FLOAT),
         node("Sub", ["one", "times"], ["rest"]),
@@ -134,7 +134,7 @@ def not_finite(folder: Path, beyond: float = _ALWAYS) -> None:
 
 
 def doubles(folder: Path) -> None:
-    """Forty functions, each of which is the next one twice: a terabyte of nodes once they are put in place."""
+    """Forty functions, each of which calls the next one twice: inlined they are a terabyte of nodes."""
     own = [helper.make_opsetid("", 18), helper.make_opsetid("own", 1)]
     functions = [
         helper.make_function(
@@ -155,12 +155,12 @@ def doubles(folder: Path) -> None:
 
 
 def no_codes(folder: Path) -> None:
-    """An array of training codes that holds none."""
+    """An empty array of training codes."""
     add_arrays(folder, training_codes=np.zeros((0, 3)))
 
 
 def unpacks(folder: Path, size: int = 1_700_000_000) -> None:
-    """Zeros, packed to a thousandth."""
+    """An array of zeros that is compressed to a thousandth of its size."""
     path = folder / "geometry.npz"
     header = io.BytesIO()
     np.lib.format.write_array_header_1_0(header, {"descr": "|u1", "fortran_order": False, "shape": (size,)})
@@ -176,7 +176,7 @@ def unpacks(folder: Path, size: int = 1_700_000_000) -> None:
 
 
 def add_arrays(folder: Path, **arrays: np.ndarray) -> None:
-    """Put more arrays into the geometry, or others in the place of those there are."""
+    """Add arrays to the geometry, or replace some."""
     path = folder / "geometry.npz"
     with np.load(path) as known:
         every = {**known, **arrays}
@@ -186,13 +186,13 @@ def add_arrays(folder: Path, **arrays: np.ndarray) -> None:
 
 
 def hostile(models: Path, name: str, harm: Any, *args: Any, **options: Any) -> Path:
-    """A small bundle of that name with something bad in it."""
+    """A small bundle of that name with this harm in it."""
     folder = write_bundle(models, name)
     harm(folder, *args, **options)
     return folder
 
 
 def manifest(folder: Path, **changes: object) -> None:
-    """Change facts of a manifest; the digests of the files stay."""
+    """Change members of a manifest; the files' digests stay the same."""
     path = folder / "manifest.json"
     path.write_text(json.dumps(json.loads(path.read_text()) | changes))

@@ -1,11 +1,11 @@
-"""A check for schemathesis, which loads it by schemathesis.toml."""
+"""A check for schemathesis, loaded by schemathesis.toml."""
 
 import schemathesis
 from schemathesis import Case, CheckContext, Response
 
 from shapespace.service.http.problems import KINDS
 
-#: Kinds of problems that a request may have although it is as openapi.json says.
+#: Problem types possible for requests that are valid by openapi.json.
 BEYOND_SCHEMAS = {
     "no-tangent-space",
     "not-finite",  # beyond single precision
@@ -18,9 +18,9 @@ BEYOND_SCHEMAS = {
 }
 
 
-#: Further ones of calls whose parts depend on each other, or on the model: a header on the body's length, the number of
-#: a vertex on the mesh, a file on its format, one time on another, a temperature on its distribution; `{k}` comes from
-#: a link that is a template.
+#: Further ones, by call, because parameters depend on each other or on the model: a header on the body's length,
+#: a vertex number on the mesh, a file on its format, one time on another, a temperature on its distribution.
+#: `{k}` is from a link template.
 OF_CALLS = {
     "/interpolations": {"invalid-request"},
     "/{k}": {"invalid-request"},
@@ -34,13 +34,13 @@ OF_CALLS = {
 
 @schemathesis.check
 def refusals_are_beyond_schemas(ctx: CheckContext, response: Response, case: Case) -> None:
-    """What the schema allows is refused only for what no schema can say."""
+    """A request that the schema allows is refused only for reasons that a schema can't express."""
     if case.meta and case.meta.generation.mode.is_positive and response.status_code in {400, 422}:
         kind = response.json()["type"].rpartition(":")[2]
         allowed = BEYOND_SCHEMAS | OF_CALLS.get(case.operation.path[case.operation.path.rindex("/") :], set())
         query, body = case.query or {}, case.body if isinstance(case.body, dict) else {}
-        # What compares needs a colour, a spread a covariance and the other way round; a place is JSON in a string.
-        # Not every format has polygons, or tells how long a frame is shown.
+        # `against` needs a colour; a spread needs a covariance and the reverse; a place is JSON in a string.
+        # Not every format has polygons or frame times.
         if (
             "against" in query
             or "place" in query

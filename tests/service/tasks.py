@@ -1,4 +1,4 @@
-"""Tasks for a sandbox: good ones, and such as break what they run in."""
+"""Tasks for a sandbox: good ones, and ones that break their process."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def spin(body: bytearray) -> Answer:
 
 
 def hold(body: bytearray) -> Answer:
-    """Never let go of the interpreter."""
+    """Never release the interpreter lock."""
     ctypes.PyDLL(None).pause()
     return {}, {}
 
@@ -94,7 +94,7 @@ def babble(body: bytearray) -> Answer:
 
 
 def lie(body: bytearray) -> Answer:
-    """Write into the connection, whichever handle it has."""
+    """Write into the connection, by trying all handles."""
     for handle in range(3, 1000):
         try:
             os.write(handle, b"\0\0\0\x0bnot JSON ..")

@@ -1,4 +1,4 @@
-"""Calls whose answers are known beforehand, so that later ones can be held against them, byte for byte."""
+"""Calls whose answers are recorded first, so that later answers can be compared byte for byte."""
 
 from __future__ import annotations
 
@@ -101,13 +101,13 @@ def fingerprint(answer: httpx.Response) -> Fingerprint:
 
 
 class Truth:
-    """What calls are answered while nothing disturbs the server."""
+    """The answers of calls while nothing disturbs the server."""
 
     def __init__(self, client: httpx.Client, calls: Iterable[Call]) -> None:
         self._client = client
         self.answers: dict[Call, Fingerprint] = {call: fingerprint(call.send(client)) for call in calls}
 
     def differing(self, client: httpx.Client | None = None) -> list[Call]:
-        """Calls that are answered in another way than then."""
+        """Calls whose answers now differ from the recorded ones."""
         client = client or self._client
         return [call for call, then in self.answers.items() if fingerprint(call.send(client)) != then]

@@ -1,4 +1,4 @@
-"""What is seen of a server from outside: what comes true in time, and its metrics."""
+"""Observing a server from outside: waiting for a condition, and reading metrics."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ ENDING = 3
 def eventually(holds: Callable[[], bool], seconds: float = 30) -> None:
     end = time.monotonic() + seconds
     while not holds():
-        assert time.monotonic() < end, "it never came true"
+        assert time.monotonic() < end, "the condition did not become true in time"
         time.sleep(0.02)
 
 
 def samples(client: httpx.Client) -> Samples:
-    """What ``/metrics`` says, which takes no place in the queue."""
+    """The samples of ``/metrics``, a call that takes no place in the queue."""
     text = client.get("/metrics").raise_for_status().text
     families = text_string_to_metric_families(text)
     return {(s.name, frozenset(s.labels.items())): s.value for family in families for s in family.samples}
@@ -34,5 +34,5 @@ def value(found: Samples, name: str, **labels: str) -> float:
 
 
 def admitted(client: httpx.Client) -> float:
-    """Requests at work or waiting."""
+    """Number of requests running or waiting."""
     return samples(client)["shapespace_admitted", frozenset()]

@@ -1,4 +1,4 @@
-"""HTTP as bytes on a socket, for what a decent client doesn't send."""
+"""HTTP as bytes on a socket, for requests that HTTP clients don't send."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def connect(server: Server, source: str = "127.0.0.1") -> socket.socket:
 
 
 def rest(connection: socket.socket) -> bytes:
-    """All that still comes, until the server closes."""
+    """Everything that the server still sends until it closes."""
     found = b""
     with contextlib.suppress(ConnectionResetError):
         while piece := connection.recv(2**16):
@@ -28,14 +28,14 @@ def rest(connection: socket.socket) -> bytes:
 
 
 def exchange(server: Server, data: bytes) -> bytes:
-    """What comes back for some bytes."""
+    """The server's answer to some bytes on a new connection."""
     with connect(server) as connection:
         connection.sendall(data)
         return rest(connection)
 
 
 def status_and_problem(answer: bytes) -> tuple[int, dict[str, Any]]:
-    """Of the first answer in some bytes."""
+    """Status and problem document of the first answer in some bytes."""
     head, _, body = answer.partition(b"\r\n\r\n")
     assert b"application/problem+json" in head, answer[:500]
     return int(head.split()[1]), json.loads(body)

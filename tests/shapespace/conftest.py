@@ -1,4 +1,4 @@
-"""Meshes that every law is tried on: closed, with boundary, of genus 1, each nearly flat and strongly bent."""
+"""Meshes on which laws are tested: closed, with boundary, of genus 1, each nearly flat and strongly bent."""
 
 from __future__ import annotations
 
@@ -42,12 +42,11 @@ def torus() -> TriangleMesh:
     return TriangleMesh.from_arrays(vertices, grid_faces(16, 8, around_u=True, around_v=True))
 
 
-#: Faces on four vertices.
 TETRAHEDRON = [[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]]
 
 
 def hinge(angle: float = 0.0, length: float = 2.0) -> TriangleMesh:
-    """Two triangles of height 1 at an edge along x, folded by an angle, convex where it is positive."""
+    """Two triangles of height 1 at a common edge along x, folded by an angle; positive is convex."""
     tip = [length / 2, np.cos(angle), -np.sin(angle)]
     return TriangleMesh.from_arrays([[0, 0, 0], [length, 0, 0], tip, [length / 2, -1, 0]], [[0, 1, 2], [1, 0, 3]])
 
@@ -64,7 +63,7 @@ def bent(vertices: FloatArray, angle: float) -> FloatArray:
 
 @pytest.fixture(params=MESHES)
 def mesh(request: pytest.FixtureRequest, rng: np.random.Generator) -> TriangleMesh:
-    """Without symmetries, which hide mistakes, and of an area that is not 1."""
+    """A mesh without symmetries, which hide mistakes, and with an area other than 1."""
     plain = MESHES[request.param]()
     size = plain.diagonal / np.sqrt(len(plain.vertices))
     return plain.with_vertices(plain.vertices + 0.04 * size * rng.standard_normal(plain.vertices.shape))
@@ -72,7 +71,7 @@ def mesh(request: pytest.FixtureRequest, rng: np.random.Generator) -> TriangleMe
 
 @pytest.fixture(params=[0.1, 1.3], ids=["nearly-flat", "strongly-bent"])
 def pose(request: pytest.FixtureRequest, mesh: TriangleMesh) -> FloatArray:
-    """Another shape of the mesh, (V, 3)."""
+    """Another shape of the mesh, (V, 3), bent a little or strongly."""
     return bent(mesh.vertices, request.param)
 
 
@@ -83,13 +82,13 @@ def space(mesh: TriangleMesh) -> ShellSpace:
 
 @pytest.fixture
 def velocity(space: ShellSpace, mesh: TriangleMesh, pose: FloatArray) -> FloatArray:
-    """Towards the pose, tangent at the mesh."""
+    """A tangent vector at the mesh, (V, 3), that points towards the pose."""
     z = space.nric(mesh.vertices)
     return space.project(mesh.vertices, unwrap(space.nric(pose), z) - z)
 
 
 def turned(vertices: FloatArray, rng: np.random.Generator) -> FloatArray:
-    """Moved rigidly, at random."""
+    """The vertices after a random rigid motion."""
     q, r = np.linalg.qr(rng.standard_normal((3, 3)))
     q *= np.sign(np.diag(r))
     q[:, 0] *= np.linalg.det(q)

@@ -1,4 +1,4 @@
-"""What ``import shapespace`` gives: public names, each with an example that runs, and nothing before it is used."""
+"""``import shapespace``: public names, each with an example that runs, and lazy imports."""
 
 import doctest
 import importlib
@@ -14,7 +14,7 @@ import shapespace
 
 ROOT = Path(__file__).parents[2]
 LIBRARY = ROOT / "shapespace"
-#: Modules with examples; those of the client need a server, and those of the pages run against one.
+#: Modules whose examples run here; the client's need a server, and test_blocks.py runs those of the pages.
 MODULES = sorted(
     ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
     for path in LIBRARY.rglob("*.py")

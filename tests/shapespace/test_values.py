@@ -1,4 +1,4 @@
-"""Meshes, shapes and results are values: nobody changes one that another holds."""
+"""Meshes, shapes and results are immutable values: code that holds one can't change it for others."""
 
 import dataclasses
 import importlib

@@ -1,9 +1,10 @@
-"""A mixed load for some minutes: ``python -m tests.soak [MINUTES] [--bad SHARE] [--clients N] [--attacks NAME …]``.
+"""A mixed load: ``python -m tests.soak [MINUTES] [--bad SHARE] [--clients N] [--attacks NAME …]``.
 
-Calls of every kind about every bundled model, a share of them bad, in random order from several clients, while
-strangers from another address attack the server every other minute. Each answer is held against that of another
-server, asked alone beforehand, byte for byte. Ends by itself, with status 1 where an answer was wrong, an attack was
-felt by others, health took longer than a second, or memory, threads or file handles grew.
+Several clients send calls of every kind for every bundled model in random order, a share of them invalid,
+while the server is attacked from another address in every other minute. Each answer is compared byte for
+byte with that of another server, which was asked beforehand without load. The exit status is 1 if an answer
+was wrong, an attack affected other clients, health took longer than a second, or memory, threads or file
+handles grew.
 """
 
 from __future__ import annotations
@@ -30,18 +31,18 @@ from tests.service.bundles import write_bundle
 from tests.service.conftest import ROOT, Server, starting
 from tests.service.truth import Truth, bad_calls, fingerprint, good_calls
 
-#: What may come on top between the second quarter of the time and the last, while nobody attacks.
+#: Largest growth between the second quarter of the time and the last, measured between attacks.
 GROWTH = {"MiB": 16.0, "threads": 0.0, "handles": 4.0}
-#: Answers that say nothing about the call.
+#: Status of answers that are not compared: the server was busy.
 BUSY = 503
 #: Seconds within which SIGTERM ends a server that doesn't drain.
 ENDING = 3.0
-#: Longest attack in seconds, and where it comes from: what a server allows one address is for all others to use.
+#: Longest attack in seconds, and its address, other than the clients', as limits are for each address.
 ATTACK, STRANGER = 60.0, "127.0.0.2"
 
 
 def processes(server: Server) -> list[Path]:
-    """Where the system tells of a server's process, and of those that it has started."""
+    """The folders in /proc of a server's process and of its children."""
     found = [Path(f"/proc/{server.process.pid}")]
     for place in found:
         with contextlib.suppress(OSError):
@@ -63,7 +64,7 @@ def measure(server: Server) -> dict[str, float]:
 
 
 def truth_of(url: str) -> tuple[Truth, int]:
-    """What a server answers while nobody else asks, good calls first, and how many those are."""
+    """The answers of a server without load, those of valid calls first, and the number of valid calls."""
     rng = np.random.default_rng(0)
     with httpx.Client(base_url=url, timeout=300) as client:
         names = [model["name"] for model in client.get("/v1/models").json()["models"]]
@@ -74,7 +75,7 @@ def truth_of(url: str) -> tuple[Truth, int]:
 
 
 def load(url: str, truth: Truth, good: int, share: float, end: float, seed: int, outcomes: Counter[str]) -> None:
-    """One client, until its time is over."""
+    """One client, which sends calls until the time is over."""
     rng, calls = np.random.default_rng(seed), list(truth.answers.items())
     with httpx.Client(base_url=url, timeout=300) as client:
         while time.monotonic() < end:
@@ -108,10 +109,10 @@ def ask_health(url: str, end: float, outcomes: Counter[str]) -> None:
 
 
 class Strangers:
-    """Attacks, one after the other, with as long a pause before each.
+    """Attacks, one after the other, each after a pause of the same length.
 
     Attributes:
-        at_work: whether one is going on.
+        at_work: whether an attack is running.
     """
 
     def __init__(self, url: str, names: list[str], end: float, outcomes: Counter[str]) -> None:
@@ -119,7 +120,7 @@ class Strangers:
         self.at_work = False
 
     def run(self) -> None:
-        """Until the time is over; each attack is tried twice at least."""
+        """Attack until the time is over, so that each attack runs at least twice."""
         seconds = min(ATTACK, (self._end - time.monotonic()) / (4 * len(self._names) + 1))
         for name in itertools.cycle(self._names):
             time.sleep(seconds)
@@ -155,7 +156,7 @@ def main() -> int:
         other = start(models, workers=1, cache=0, deadline=300)
         truth, good = truth_of(other.url)
         other.stop()
-        # A small cache is full before memory is compared.
+        # The cache is small, so that it is full before memory is compared.
         server = start(models, workers=2, deadline=300, watch=1, cache=2**22)
         end, outcomes = time.monotonic() + 60 * given.minutes, Counter[str]()
         strangers = Strangers(server.url, [name for name in given.attacks if name != "none"], end, outcomes)

@@ -1,4 +1,4 @@
-"""A run of the real command, small enough for the suite, shared by the tests that look at what it left."""
+"""A run of the real command, small enough for the suite, whose files several tests examine."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``blendshapes``: sliders for programs that know no networks, read by the letter of glTF."""
+"""``blendshapes``: morph targets for programs that can't run networks, checked by the glTF specification."""
 
 import asyncio
 import json

@@ -1,4 +1,4 @@
-"""``edit``, ``sample``, exact exponentials and what diagnostics say of a code."""
+"""``edit``, ``sample``, exact exponentials and the diagnostics of a code."""
 
 import io
 import json
@@ -76,7 +76,7 @@ def test_an_edit_goes_as_far_as_it_can_towards_a_target_out_of_reach(client: htt
 
 
 def test_an_edit_leaves_a_valley_that_ends_above_its_targets(client: httpx.Client) -> None:
-    # From this start the descent ends 1.4 % from them, and no single factor's move promises less.
+    # From this start descent ends 1.4 % from the targets, and changing a single factor does not help.
     path = "/v1/models/figure"
     start, goal = (
         client.post(f"{path}/sample", json={"count": 14, "seed": seed}).json()["latents"][13] for seed in (1, 2)
@@ -154,7 +154,7 @@ def test_samples_depend_on_their_seed_alone_and_lie_inside_the_bounds(client: ht
         kind: np.concatenate([sample(count=20, seed=s, distribution=kind) for s in range(20)]).std(axis=0)
         for kind in ("uniform", "gaussian")
     }
-    # Of the bounds' width: 1/√12, and 0.88/4 for a bell cut off at two standard deviations.
+    # Shares of the bounds' width: 1/√12, and 0.88/4 for a Gaussian truncated at two standard deviations.
     np.testing.assert_allclose(spread["uniform"] / (UPPER - LOWER), 0.2887, rtol=0.1)
     np.testing.assert_allclose(spread["gaussian"] / (UPPER - LOWER), 0.2199, rtol=0.1)
     np.testing.assert_array_equal(sample(), sample(count=1, seed=0, distribution="uniform"))
@@ -167,7 +167,7 @@ def test_samples_of_the_population_are_like_the_training_codes(client: httpx.Cli
         return np.concatenate([answer.json()["latents"] for answer in drawn])
 
     codes = sample()
-    # Of the first and last coordinates that tests.service.bundles writes; the second is an angle, which goes round.
+    # First and last coordinates of the training codes in tests.service.bundles; the second is an angle.
     training = np.array([[0, 0], [0, 0.1], [0, 0.2], [0.1, 0.5], [0.1, 0.5]])
     np.testing.assert_allclose(codes[:, [0, 2]].mean(axis=0), training.mean(axis=0), atol=0.15 * 0.1)
     np.testing.assert_allclose(codes[:, [0, 2]].std(axis=0), training.std(axis=0), rtol=0.1)
@@ -254,5 +254,5 @@ def test_diagnostics_tell_how_plausible_a_code_and_how_integrable_its_lengths_an
         q = conditions(expected_nric(np.array(code)))[: 3 * len(mesh.vertices)].reshape(-1, 3)
         assert diagnostics["integrability"] == pytest.approx(np.sqrt((q**2).sum(axis=1).mean()), rel=1e-3)
     size = client.post("/v1/models/small/mesh", json={"latent": [0.1, 0, 0]}).headers["Shape-Diagnostics"]
-    assert json.loads(size)["integrability"] < 1e-5, "a uniform scaling is a surface's"
+    assert json.loads(size)["integrability"] < 1e-5, "a uniform scaling is integrable"
     assert json.loads(size)["plausibility"] is None

@@ -1,4 +1,4 @@
-"""``?color=``: how a shape differs from the reference or from another code, vertex by vertex."""
+"""``?color=``: difference of a shape from the reference or from another code, at each vertex."""
 
 import io
 import json
@@ -29,7 +29,7 @@ def mesh(client: httpx.Client, **params: Any) -> dict[str, Any]:
 
 
 def expected(client: httpx.Client, quantity: str, choice: str, other: dict[str, str]) -> np.ndarray:
-    """The values from the two meshes as they leave, vertex by vertex in a plain loop."""
+    """The values computed from the two meshes in the answers, in a plain loop over vertices."""
     shape, against = (mesh(client, mesh=choice, **which) for which in ({"latent": text(CODE)}, other))
     a, b = (np.array(m["vertices"]) for m in (shape, against))
     connectivity = Connectivity(np.array(shape["faces"]), len(a))
@@ -54,7 +54,7 @@ def test_values_are_those_of_the_meshes_that_leave(
     found = mesh(client, **asked)
     values = expected(client, quantity, choice, {"latent": text(against)} if against else {})
     np.testing.assert_allclose(found["color"]["values"], values, atol=2e-4)
-    assert np.ptp(values) > 0.01, "a shape that doesn't change proves nothing"
+    assert np.ptp(values) > 0.01, "the test needs a shape that differs"
     low, high = found["color"]["range"]
     assert -low == high >= np.quantile(np.abs(values), 0.97)
     assert found["vertices"] == mesh(client, latent=text(CODE), mesh=choice)["vertices"]
@@ -81,7 +81,7 @@ def test_every_format_says_the_same(client: httpx.Client) -> None:
     for format in ("ply", "obj"):
         found = trimesh.load_mesh(io.BytesIO(get(format).content), file_type=format, process=False)
         np.testing.assert_allclose(found.visual.vertex_colors[:, :3] / 255, shown, atol=1.01 / 255)
-    # Red where it got more convex, blue where less.
+    # Red where it became more convex, blue where less.
     ends = shown[[np.argmax(values), np.argmin(values)]]
     assert (np.sign(ends[:, 0] - ends[:, 2]) == [1, -1]).all()
 
@@ -153,7 +153,7 @@ def test_spread_is_how_far_the_vertices_of_random_codes_are(client: httpx.Client
         drawn.append(client.post(f"{MODEL}/vertices", json=body).raise_for_status().json()["vertices"])
     deviation = np.sqrt(np.concatenate(drawn).var(axis=0).sum(axis=1))
     np.testing.assert_allclose(found["values"], deviation, rtol=0.2, atol=2e-3)
-    assert np.ptp(deviation) > 0.005, "the same everywhere proves nothing"
+    assert np.ptp(deviation) > 0.005, "the test needs deviations that differ"
     assert found["quantity"] == "spread"
     assert found["range"][0] == 0
     assert found["range"][1] >= np.quantile(found["values"], 0.97)

@@ -1,4 +1,4 @@
-"""``quality=draft``: shapes from face frames, quicker than solved ones and nearly the same; and positions alone."""
+"""``quality=draft``: shapes from face frames, faster than solved ones and nearly equal; omitted faces."""
 
 import io
 import json
@@ -19,7 +19,7 @@ from tests.service.conftest import ROOT, Server, Start
 MODEL = "/v1/models/figure"
 CODE = [0.3, -0.2] * 10
 LATENT = ",".join(map(str, CODE))
-#: So far outside the bounds that face frames go astray.
+#: A code so far outside the bounds that face frames give a bad shape.
 FAR = [3.0, -3.0] * 10
 
 

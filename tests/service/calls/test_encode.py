@@ -1,4 +1,4 @@
-"""``encode``: from a mesh, however it lies and whatever file it is in, back to the code that it was made from."""
+"""``encode``: from a mesh, in any pose and any file format, back to its code."""
 
 import json
 import re
@@ -100,7 +100,7 @@ def test_off_is_read_though_it_is_never_written(client: httpx.Client) -> None:
 
 def test_the_page_lets_choose_every_format(client: httpx.Client) -> None:
     (accepted,) = re.findall(r'id="mesh-file" accept="(.*?)"', client.get("/").text)
-    # Those of scans too, which are fitted.
+    # XYZ is for scans, which `fit` reads.
     assert set(accepted.split(",")) == {f".{format}" for format in FORMATS} | {".xyz"}
 
 
@@ -113,7 +113,7 @@ def test_what_the_query_says_wins(client: httpx.Client) -> None:
 
 
 def test_residual_and_vertex_error_tell_how_far_a_mesh_is_from_the_model(client: httpx.Client) -> None:
-    # A uniform scaling is a code of this model, so that nothing is left.
+    # A uniform scaling is a shape of this model, so no error remains.
     mesh = reference()
     found = encode(client, as_json(1.1 * SCALE * mesh.vertices, mesh.faces))
     np.testing.assert_allclose([found["latent"][0], found["latent"][2]], [0.1, 0], atol=1e-4)
@@ -264,7 +264,7 @@ def test_meshes_that_are_hardly_surfaces_are_answered_too(client: httpx.Client) 
 
 @pytest.fixture
 def of_files(tmp_path: Path) -> ShapeModel:
-    """A model whose files have a vertex in no face in front, and two vertices where the mesh has its vertex 7."""
+    """A model whose files have an unused vertex first, and a copy of the mesh's vertex 7 at the end."""
     folder = write_bundle(tmp_path)
     with np.load(folder / "geometry.npz") as file:
         arrays = dict(file)
@@ -289,17 +289,17 @@ def test_files_like_those_that_the_model_was_made_of(of_files: ShapeModel) -> No
     np.testing.assert_allclose(found.vertices, MESH.vertices, atol=1e-7)
     welded = matched(of_files, written("obj"), "obj")
     np.testing.assert_array_equal(welded.vertices, found.vertices)
-    # A part that the model was told to leave out is no fault.
+    # Faces of a part that the model leaves out are accepted.
     with_part = np.concatenate([faces, [[0, 0, 0]]])
     again = matched(of_files, MESH_FORMATS["obj"].encode(vertices, with_part), "obj")
     np.testing.assert_array_equal(again.vertices, found.vertices)
-    faces[0, 0] = 0  # the vertex that belongs to no face
+    faces[0, 0] = 0  # the unused vertex
     with pytest.raises(InvalidMeshError, match="No face joins"):
         matched(of_files, MESH_FORMATS["obj"].encode(vertices, faces), "obj")
 
 
 def bent(x: np.ndarray, length: float) -> np.ndarray:
-    """A shape (V, 3) pushed to and fro by waves of such a length, as no code does it."""
+    """A shape (V, 3) displaced by waves of this length, which no code can represent."""
     return x + 0.1 * length * np.sin(x / length)[:, [1, 2, 0]]
 
 
@@ -328,7 +328,7 @@ def test_the_code_is_the_minimum_over_vertices(client: httpx.Client) -> None:
     found = encode(client, as_json(target, mesh.faces))
     code = np.array(found["latent"])
     assert squares(code) == pytest.approx(float(np.square(found["vertex_errors"]).sum()), rel=1e-3)
-    # Outside the bounds there may be nearer ones, by 2 % at most.
+    # Codes outside the bounds may be nearer, by 2 % at most.
     lower, upper = np.array([-0.2, -np.pi, 0]), np.array([0.2, np.pi, 1])
     for step in [*0.02 * np.eye(len(code)), *-0.02 * np.eye(len(code))]:
         inside = ((lower <= code + step) & (code + step <= upper)).all()

@@ -1,4 +1,4 @@
-"""Models with a finer mesh: every call that takes ``mesh`` answers the one that was asked for."""
+"""Models with a fine mesh: every call with the parameter ``mesh`` answers the mesh that it names."""
 
 import io
 import json
@@ -23,13 +23,13 @@ MESHES = {"fine": fine_reference, "coarse": reference}
 
 @pytest.fixture(params=[*MESHES, None], ids=["fine", "coarse", "default"])
 def choice(request: pytest.FixtureRequest) -> dict[str, str]:
-    """What to ask with."""
+    """The query's ``mesh`` parameter, or none."""
     return {"mesh": request.param} if request.param else {}
 
 
 @pytest.fixture
 def rest(choice: dict[str, str]) -> TriangleMesh:
-    """The mesh that is to be answered, at rest."""
+    """The expected mesh, at the reference."""
     return MESHES[choice.get("mesh", "fine")]()
 
 
@@ -104,7 +104,7 @@ def test_both_meshes_are_one_shape_each_aligned_over_its_own_vertices(client: ht
     np.testing.assert_allclose(align(on_fine, coarse), coarse, atol=1e-6)
     for found, rest in ((fine, fine_reference()), (coarse, reference())):
         np.testing.assert_allclose(align(found, SCALE * rest.vertices), found, atol=1e-6)
-    assert np.abs(coarse - SCALE * reference().vertices).max() > 0.05, "a shape that doesn't move proves nothing"
+    assert np.abs(coarse - SCALE * reference().vertices).max() > 0.05, "the test needs a shape that differs"
 
 
 def test_the_fine_mesh_grows_with_the_coarse_one(client: httpx.Client) -> None:

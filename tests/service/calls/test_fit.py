@@ -1,4 +1,4 @@
-"""``fit``: from points anywhere to the code of their shape, by every way that a file and its options can come."""
+"""``fit``: from points in any pose to the code of their shape, for every way to send a file and options."""
 
 import json
 
@@ -72,7 +72,7 @@ def test_points_in_every_format_give_what_the_library_gives(
         assert (found["status"], found["reason"]) == (expected.status, expected.reason)
         assert found["distances"]["scan"]["p95"] == pytest.approx(expected.scan.p95)
         assert "samples" not in found
-        # The model's own shape, taken by the answer to where the scan is.
+        # The shape of the code found, placed on the scan.
         there = place["scale"] * figure.decode(found["latent"]) @ np.array(place["rotation"]).T + place["translation"]
         assert np.linalg.norm(points[:, None] - there[None, ::7], axis=-1).min(axis=1).max() < 0.15
 

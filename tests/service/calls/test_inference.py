@@ -1,4 +1,4 @@
-"""The Open Inference Protocol, through the client that Triton's users have."""
+"""The Open Inference Protocol, tested with Triton's client."""
 
 import json
 from collections.abc import Iterator

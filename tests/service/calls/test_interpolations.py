@@ -61,7 +61,7 @@ def test_both_ends_are_keyframes_and_steps_are_equal(client: httpx.Client) -> No
 
 def test_the_path_is_linear_between_keyframes(client: httpx.Client) -> None:
     found = codes(client, keyframes=[A, B, C], frames=9)
-    # C's angle is reached backwards or forwards, whichever is shorter: −2 − 1.5 = −3.5 is longer than 2.78.
+    # The angle of C is reached the shorter way: −2 − 1.5 = −3.5 is longer than 2.78.
     assert np.array_equal(found[4], np.array(B, np.float32))
     np.testing.assert_allclose(found[:5], np.linspace(A, B, 5), atol=1e-7)
     plain = found[:, [0, 2]]
@@ -125,7 +125,7 @@ def test_frames_are_the_same_alone_and_in_every_whole(client: httpx.Client, tmp_
         assert zipped[k] == still.raise_for_status().content
         np.testing.assert_allclose(read_arrays(zipped[k], "obj")[0], packed[k], rtol=1e-7)
         np.testing.assert_allclose(animated.key(k), packed[k], atol=3e-7)
-    assert np.abs(packed[0] - packed[5]).max() > 0.05, "a shape that doesn't move proves nothing"
+    assert np.abs(packed[0] - packed[5]).max() > 0.05, "the test needs a shape that moves"
     code = client.post("/v1/models/small/mesh", json={"latent": B}, params={"format": "json"}).json()["vertices"]
     middle = create(client, keyframes=[A, B], frames=3)["id"]
     assert np.array_equal(code, frame(client, middle, 2))
@@ -186,8 +186,8 @@ def test_ids_can_not_be_made_to_unpack_without_end(client: httpx.Client) -> None
     id = create(client, keyframes=[A, B], frames=3)["id"]
     payload = zlib.decompress(base64.urlsafe_b64decode(id + "=" * (-len(id) % 4))[9:])
     assert packed(payload) == id
-    bomb = packed(payload + b" " * 8_000_000)  # the same content, if it were ever unpacked
-    assert len(bomb) < 15_000, "it must be refused for what it unpacks to"
+    bomb = packed(payload + b" " * 8_000_000)  # unpacked, it would have the same content
+    assert len(bomb) < 15_000, "it must be refused for its unpacked size, not its own"
     assert client.get(f"/v1/interpolations/{bomb}").status_code == 404
 
 
@@ -209,7 +209,7 @@ def test_an_animation_has_an_entity_tag(client: httpx.Client) -> None:
 
 
 def test_frames_arrive_as_they_get_ready(models: Path, start: Start) -> None:
-    # A stream has its place among streams, and one among others only while it computes.
+    # A stream counts among streams; it occupies the worker only while it computes a frame.
     with httpx.Client(base_url=start(models, workers=1, queue=0).url, timeout=60) as client:
         links = create(client, keyframes=[A, B, C], frames=400)["links"]
         with client.stream("GET", links["jsonl"]) as stream:
@@ -243,7 +243,7 @@ def test_a_reader_who_leaves_gives_the_place_back(models: Path, start: Start) ->
 
 
 def status(client: httpx.Client, link: str) -> int:
-    """Of an answer that isn't read."""
+    """Status of an answer whose body isn't read."""
     with client.stream("GET", link) as answer:
         return answer.status_code
 
@@ -256,7 +256,7 @@ def test_work_ends_when_nobody_waits_for_it(models: Path, start: Start) -> None:
         with socket.create_connection((place.host, place.port)) as impatient:
             impatient.sendall(f"GET {link} HTTP/1.1\r\nHost: {place.host}\r\n\r\n".encode())
             while not admitted(client):
-                assert not select.select([impatient], [], [], 0)[0], "answered before it was seen at work"
+                assert not select.select([impatient], [], [], 0)[0], "answered before it was seen running"
         while_waiting = 0
         while admitted(client):
             while_waiting += 1
@@ -309,7 +309,7 @@ def test_a_whole_animation_is_coloured_as_its_frames_are(client: httpx.Client, t
             own = still.array(still.primitive["attributes"]["COLOR_0"])
             found = rest + changes[k - 1] if k else rest
             np.testing.assert_allclose(found, np.array(shown.Get(k)), atol=1e-6)
-            # One legend serves all frames; a single frame may have a narrower one.
+            # All frames of an animation have one legend; a single frame may have a narrower one.
             if still.tree["meshes"][0]["extras"]["color"] == legend:
                 np.testing.assert_allclose(found, own, atol=1e-6)
     assert len(tags) == 4
@@ -329,7 +329,7 @@ def test_usdz_holds_the_layer_as_phones_want_it(client: httpx.Client, tmp_path: 
         (layer,) = archive.infolist()
         assert layer.compress_type == zipfile.ZIP_STORED
         named, more = struct.unpack_from("<HH", answer.content, layer.header_offset + 26)
-        assert (layer.header_offset + 30 + named + more) % 64 == 0, "contents begin at multiples of 64 bytes"
+        assert (layer.header_offset + 30 + named + more) % 64 == 0, "USDZ aligns contents to 64 bytes"
     path = tmp_path / "animation.usdz"
     path.write_bytes(answer.content)
     with np.load(io.BytesIO(client.get(links["npz"]).content)) as arrays:

@@ -1,4 +1,4 @@
-"""``?place=``: meshes and positions where somebody wants them."""
+"""``?place=``: meshes and positions after a similarity transformation."""
 
 import io
 import json

@@ -33,7 +33,7 @@ def test_the_reference_is_the_answer_without_a_code(client: httpx.Client) -> Non
 
 def test_a_uniform_scaling_comes_out_exactly_in_the_users_units(client: httpx.Client) -> None:
     answer = client.post(MESH, json={"latent": [0.15, 0, 0]}, params={"format": "json"})
-    # It grows about the middle: the reference is where every shape is aligned to.
+    # It grows about its centre, as every shape is aligned to the reference.
     x = SCALE * reference().vertices
     np.testing.assert_allclose(positions(answer), x.mean(axis=0) + 1.15 * (x - x.mean(axis=0)), atol=1e-5)
     diagnostics = json.loads(answer.headers["Shape-Diagnostics"])
@@ -55,7 +55,7 @@ def test_the_residual_is_that_of_the_answered_shape(client: httpx.Client) -> Non
     misfit = norm.square(nric(positions(answer) / SCALE, mesh.connectivity) - target) / norm.square(target)
     reported = json.loads(answer.headers["Shape-Diagnostics"])["residual"]
     assert reported == pytest.approx(np.sqrt(misfit), rel=1e-3)
-    assert reported > 1e-6, "this code is not integrable, or the comparison says nothing"
+    assert reported > 1e-6, "the test needs a code whose lengths and angles are not integrable"
 
 
 def test_every_mesh_is_rigidly_aligned_to_the_reference(client: httpx.Client) -> None:
@@ -63,7 +63,7 @@ def test_every_mesh_is_rigidly_aligned_to_the_reference(client: httpx.Client) ->
     for code in ([0.2, 1.5, 1.0], [-0.2, -3.0, 0.3], [0.5, 2.0, 2.0]):
         found = positions(client.post(MESH, json={"latent": code}, params={"format": "json"}))
         np.testing.assert_allclose(found, align(found, target), atol=2e-6)
-    # Over its own vertices, which are denser here than there.
+    # Each mesh is aligned over its own vertices, whose density varies.
     for mesh in ("coarse", "fine"):
         answer = client.post(
             "/v1/models/figure/vertices", json={"latents": [[0.6] * 20], "mesh": mesh}
@@ -128,7 +128,7 @@ def test_formats_hold_the_same_mesh(client: httpx.Client, format: str) -> None:
     if format == "json":
         return
     mesh = read_mesh(answer.content, format)
-    if format == "stl":  # a soup of triangles
+    if format == "stl":  # triangles without shared vertices
         np.testing.assert_allclose(mesh.vertices, expected[reference().faces].reshape(-1, 3), atol=1e-6)
     else:
         np.testing.assert_allclose(mesh.vertices, expected, atol=1e-6)
@@ -190,7 +190,7 @@ def test_get_and_post_share_a_strong_entity_tag(client: httpx.Client) -> None:
         assert answer.status_code == 304
         assert answer.content == b""
         assert answer.headers["ETag"] == tag
-        assert "Server-Timing" not in answer.headers, "nothing may be solved for a 304"
+        assert "Server-Timing" not in answer.headers, "a 304 needs no computation"
     assert client.post(MESH, json={"latent": CODE}, headers={"If-None-Match": '"else"'}).status_code == 200
 
 
@@ -204,7 +204,7 @@ def test_entity_tags_tell_different_answers_apart(client: httpx.Client) -> None:
     ]
     tags = [client.get(MESH, params=params).headers["ETag"] for params in asked]
     assert len(set(tags)) == len(tags)
-    # The same shape by another name: −0, and a code beyond the bound that is clamped to it.
+    # Other codes of the same shape: −0, and a code beyond the bounds that is clamped.
     assert client.get(MESH, params={"latent": "0,-0.0,0"}).headers["ETag"] == tags[1]
     clamped = client.get(MESH, params={"latent": "0.9,0,0", "bounds": "clamp"})
     assert clamped.headers["ETag"] == client.get(MESH, params={"latent": "0.2,0,0"}).headers["ETag"]
@@ -233,7 +233,7 @@ def test_far_out_the_answer_is_finite_or_a_problem(client: httpx.Client) -> None
     answer = client.post(MESH, json={"latent": [-1.5, 1.0, 30.0]}, params={"format": "json"})
     assert np.isfinite(positions(answer)).all()
     diagnostics = json.loads(answer.headers["Shape-Diagnostics"])
-    assert diagnostics["residual"] > 0.01, "lengths can't be negative, so the fit must be said to be bad"
+    assert diagnostics["residual"] > 0.01, "lengths can't be negative, so the residual must be large"
     overflow = client.post(MESH, json={"latent": [3.4e38, 0.0, 0.0]})
     assert overflow.status_code == 422
     assert overflow.json()["type"].endswith("not-finite")

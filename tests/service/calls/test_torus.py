@@ -1,4 +1,4 @@
-"""The bundled Freaky Torus over HTTP, beside the formula it was learned from."""
+"""The bundled Freaky Torus over HTTP, compared with the formula it was learned from."""
 
 import io
 from pathlib import Path
@@ -14,7 +14,7 @@ MODEL = "/v1/models/freaky-torus"
 
 
 def distances(found: np.ndarray, expected: np.ndarray) -> np.ndarray:
-    """(…, V) between vertices, after the best rigid motion."""
+    """(…, V) distances between vertices after rigid alignment."""
     aligned: list[np.ndarray] = [align(x, y) for x, y in zip(found, expected, strict=True)]
     return np.linalg.norm(np.array(aligned) - expected, axis=-1)
 
@@ -46,7 +46,7 @@ def test_fresh_codes_come_within_a_hundredth_of_the_formula(client: httpx.Client
         with np.load(io.BytesIO(answer.raise_for_status().content)) as arrays:
             statuses += arrays["status"].tolist()
             found.append(arrays["vertices"].astype(float))
-    # Where the bump lies inside a pinched ellipse angles are near π, and what the networks say of them may be no shape.
+    # If the bump is inside a narrow ellipse, angles are near π, and predicted z may be far from any shape.
     assert statuses == ["converged"] * 100
     expected = freaky_torus.vertices(codes)
     diagonals = np.linalg.norm(np.ptp(expected, axis=1), axis=1)

@@ -1,7 +1,7 @@
-"""Every block of code in the documentation does what it says; the list of settings is whole.
+"""Every block of code in the documentation works; the list of settings is complete.
 
-Calls and Python run as they stand, against a real server. Commands that take minutes or other machines are held against
-what would read them: the Makefile, the command line's parser, a program's own help.
+Calls and Python run unchanged, with a real server. Commands that need minutes or other machines are only checked
+against the Makefile, the command line's parser, or a program's own help.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from tests.test_docs import NAMES, PAGES, text_of
 
 MAKEFILE = (ROOT / "Makefile").read_text(encoding="utf-8")
 
-#: First lines of the blocks that nothing here tries, by page, and why.
+#: Blocks that are not tested, by page and first line, and why.
 UNTRIED = {
     ("docs/how-to/serve.md", "docker build -t shapespace . && docker run --rm --read-only -p 8000:8000 shapespace"): (
         "needs a container engine; `make image-test` builds and tries the same"
@@ -70,9 +70,9 @@ def run(command: list[str], server: Server, folder: Path) -> None:
 
 
 def try_command(line: str) -> None:
-    """Hold a command against what would read it."""
+    """Check a command without running it: its targets, options and variables exist."""
     program, *words = shlex.split(line)
-    while program.startswith(PREFIX):  # the environment of what follows
+    while program.startswith(PREFIX):  # environment variables before the command
         assert program.partition("=")[0].removeprefix(PREFIX).lower() in Settings.model_fields, program
         program, *words = words
     match Path(program).name:
@@ -93,7 +93,7 @@ def try_command(line: str) -> None:
             told = subprocess.run([dask, words[0], "--help"], capture_output=True, text=True, check=True).stdout
             assert {word for word in words if word.startswith("--")} <= set(re.findall(r"--[\w-]+", told))
         case other:
-            pytest.fail(f"say here how {other} is tried, or list the block in UNTRIED")
+            pytest.fail(f"add a case here that checks {other}, or list the block in UNTRIED")
 
 
 def try_shell(text: str, server: Server, folder: Path) -> None:
@@ -116,7 +116,7 @@ def try_javascript(text: str, server: Server, folder: Path) -> None:
 
 
 def try_log_line(text: str, server: Server, folder: Path) -> None:
-    """The one kind of JSON that the pages show: what a server with SHAPESPACE_LOG_FORMAT=json writes of a request."""
+    """The only JSON on the pages is a log line for a request, as with SHAPESPACE_LOG_FORMAT=json."""
     shown = json.loads(text)
     (folder / "models").mkdir()
     with starting() as start:
@@ -129,13 +129,13 @@ def try_log_line(text: str, server: Server, folder: Path) -> None:
 
 
 def try_map(text: str, server: Server, folder: Path) -> None:
-    """A block in no language shows places of the repository, one a line."""
+    """A block without a language lists paths of the repository, one a line."""
     for line in text.splitlines():
         assert (ROOT / line.split()[0]).exists(), line
 
 
 def try_drawing(text: str, server: Server, folder: Path) -> None:
-    """The drawing of the rooms: each is there, and none is missing."""
+    """The drawing of the packages has all of them, and no others."""
     tops = [ROOT / name for name in ("shapespace", "service", "training")]
     drawn = set(re.findall(r"│ ([a-z_]+) {2,}", text))
     rooms = {init.parent.name for top in tops for init in top.glob("*/__init__.py")} - {"service", "training"}
@@ -155,7 +155,7 @@ TRIALS: dict[str, Callable[[str, Server, Path], None]] = {
 
 @pytest.mark.parametrize("block", [block for block in BLOCKS if block.place not in UNTRIED], ids=str)
 def test_blocks_do_what_they_say(server: Server, tmp_path: Path, block: Block) -> None:
-    assert block.language in TRIALS, "say here how it is tried, or list it in UNTRIED"
+    assert block.language in TRIALS, "add a trial for its language, or list it in UNTRIED"
     TRIALS[block.language](block.text, server, tmp_path)
 
 

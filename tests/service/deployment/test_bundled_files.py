@@ -1,4 +1,4 @@
-"""Files of the bundled models, read by others: trimesh, and Khronos' validator for everything that is glTF."""
+"""Files of the bundled models, read by trimesh, and those in glTF by the Khronos validator."""
 
 import io
 import json
@@ -52,7 +52,7 @@ def test_trimesh_reads_every_format_of_a_shape(client: httpx.Client, model: str)
     for format, content in found.items():
         mesh = trimesh.load_mesh(io.BytesIO(content), file_type=format, process=False)
         np.testing.assert_allclose(mesh.triangles, vertices[faces], atol=tolerance, err_msg=format)
-        if format == "stl":  # has normals of its own, one a face
+        if format == "stl":  # STL has one normal for each face
             stored = np.frombuffer(content, np.dtype("<3f4, <9f4, <u2"), offset=84)["f0"]
             unit = normals / np.linalg.norm(normals, axis=1, keepdims=True)
             np.testing.assert_allclose(stored, unit, atol=1e-3)

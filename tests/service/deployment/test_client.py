@@ -1,4 +1,4 @@
-"""The Python client, against a server and without the rest of the project."""
+"""The Python client, with a server and without the rest of the project."""
 
 import json
 import subprocess

@@ -1,4 +1,4 @@
-"""Other programs open our files; ``make clients`` has Blender do the same."""
+"""three.js opens files of the server; ``make clients`` does the same in Blender."""
 
 import json
 import subprocess
@@ -23,5 +23,5 @@ def test_three_js_sees_every_vertex_where_it_should_be(client: httpx.Client, tmp
     expected["animation"]["vertices"][2][7][1] += 1e-3
     (tmp_path / "expected.json").write_text(json.dumps(expected))
     wrong = subprocess.run(["node", THREE, tmp_path], capture_output=True, text=True, check=False)
-    assert wrong.returncode == 1, "it would be blind to a vertex in the wrong place"
+    assert wrong.returncode == 1, "a vertex in the wrong place must be detected"
     assert wrong.stdout.count("WRONG") == 1

@@ -1,4 +1,4 @@
-"""What others run the service with: manifests that the server understands, and nothing that isn't pinned."""
+"""Kubernetes, Compose, Dockerfile and requirements: settings that exist, and pinned versions only."""
 
 import json
 import re
@@ -21,7 +21,7 @@ NAMES = {(PREFIX + name).upper() for name in Settings.model_fields}
 DIGEST = re.compile(r"[a-z0-9./-]+:[\w.-]+@sha256:[0-9a-f]{64}")
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
 EXTRAS = PROJECT["project"]["optional-dependencies"]
-#: Of what is locked, the extras. Torch is not: its builds differ between indexes, and so do their hashes.
+#: Extras in each locked file. Torch is not locked: its builds, and so their hashes, differ between indexes.
 LOCKED = {"serve": {"serve"}, "dev": EXTRAS.keys(), "lowest": {"serve", "client", "usd", "dev"}}
 UNLOCKED = {"torch"}
 
@@ -42,7 +42,7 @@ def test_the_kubernetes_manifest_fits_the_server() -> None:
     for probe in ("startupProbe", "readinessProbe", "livenessProbe"):
         assert container[probe]["httpGet"]["path"] in served
         assert container[probe]["httpGet"]["port"] == container["ports"][0]["name"]
-    # Readiness turns before the port closes, or traffic would be lost.
+    # Readiness has to change before the port closes, or requests would be lost.
     readiness = container["readinessProbe"]
     assert readiness["periodSeconds"] * readiness["failureThreshold"] < float(environment["SHAPESPACE_DRAIN"])
     assert container["resources"]["limits"].keys() == {"cpu", "memory"}
@@ -90,7 +90,7 @@ def test_images_of_others_are_named_by_their_digest() -> None:
 
 
 def locked(name: str) -> dict[str, set[Version]]:
-    """Versions by package of a file of ``requirements/``, which names nothing else than these and their hashes."""
+    """Versions by package in a file of ``requirements/``; asserts that it has only these and hashes."""
     found: dict[str, set[Version]] = {}
     for line in (ROOT / "requirements" / f"{name}.txt").read_text().replace("\\\n", " ").splitlines():
         if line.startswith("#"):

@@ -1,4 +1,4 @@
-"""The committed nginx configuration in a real nginx, before real replicas."""
+"""The committed nginx configuration in a real nginx, in front of real replicas."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from tests.service.conftest import ROOT, Server, starting
 from tests.service.watching import admitted, eventually, samples, value
 
 NGINX = shutil.which("nginx", path=os.environ.get("PATH", "") + ":/usr/sbin:/usr/local/sbin")
-# Continuous integration installs it; the tests also need more than one address on loopback.
+# Continuous integration installs nginx. Linux, as the tests need several addresses on loopback.
 pytestmark = pytest.mark.skipif(not NGINX or sys.platform != "linux", reason="needs Linux and nginx (nginx-light)")
 
 CONFIGURATION = ROOT / "deploy" / "nginx.conf"
@@ -50,7 +50,7 @@ http {{
 
 
 def rendered(replicas: list[str], port: int) -> str:
-    """The committed file with this test's addresses in place of Docker's, and nothing else changed."""
+    """The committed file with this test's addresses instead of Docker's, otherwise unchanged."""
     text = CONFIGURATION.read_text()
     servers = "".join(rf"server {httpx.URL(url).netloc.decode()}\1; " for url in replicas)
     for pattern, place in (
@@ -65,7 +65,7 @@ def rendered(replicas: list[str], port: int) -> str:
 
 @contextmanager
 def proxying(folder: Path, *replicas: str) -> Iterator[str]:
-    """An nginx before some replicas; gives its address."""
+    """An nginx in front of some replicas; yields its address."""
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
@@ -98,7 +98,7 @@ def small(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def pair(small: Path) -> Iterator[list[Server]]:
-    """Two replicas with a worker and no queue, for tests that leave them as they are."""
+    """Two replicas with one worker and no queue, for tests that don't change their state."""
     with starting() as start:
         yield [start(small, workers=1, queue=0, cache=0, max_frames=50_000) for _ in range(2)]
 
@@ -141,7 +141,8 @@ def test_a_burst_is_told_to_come_back_and_makes_nothing_unreachable(proxy: str) 
     seen: Counter[int] = Counter()
 
     def burst(k: int) -> httpx.Response:
-        with client(proxy, f"127.0.0.{10 + k % 10}") as own:  # ten addresses, as one may not have so many at once
+        # Ten addresses, as one may not have this many requests at once.
+        with client(proxy, f"127.0.0.{10 + k % 10}") as own:
             return own.post(VERTICES, json=codes(20, 100 * k))
 
     with ThreadPoolExecutor(100) as pool, client(proxy) as other:
@@ -153,7 +154,7 @@ def test_a_burst_is_told_to_come_back_and_makes_nothing_unreachable(proxy: str) 
             seen[other.get("/v1/models").status_code] += 1
     statuses = Counter(answer.status_code for answer in found)
     assert statuses.keys() == {200, 503}
-    assert statuses[503] > 10, "the burst was none"
+    assert statuses[503] > 10, "the burst must be too much for the replicas"
     assert all(answer.headers["Retry-After"] for answer in found if answer.status_code == 503)
     assert seen.keys() == {200}
 
@@ -170,7 +171,7 @@ def test_a_post_that_broke_a_replica_is_not_sent_to_the_next(small: Path, tmp_pa
         assert answer.result().status_code == 502
         assert answer.result().headers["Content-Type"] == "application/problem+json"
         assert admitted(asking[1 - broken]) == posts(replicas[1 - broken]) == 0
-        # It is still passed over where nothing can have been sent, whatever the method.
+        # If the replica can't be reached nothing was sent, so the next one is tried, whatever the method.
         for k in range(6):
             assert httpx.post(proxy + VERTICES, json=codes(1, k)).status_code == 200
             assert httpx.get(proxy + MESH).status_code == 200
@@ -214,8 +215,8 @@ def test_the_end_of_a_replica_under_load_loses_nothing(small: Path, tmp_path: Pa
         for one in clients:
             one.join()
     assert outcomes["GET"].keys() == late["GET"].keys() == late["POST"].keys() == {"200"}
-    # A replica that is killed takes the POSTs with it that it works on or that the kernel accepts while it dies:
-    # nobody else knows whether they were carried out.
+    # POSTs that a killed replica was working on, or that the kernel had accepted for it, are lost: nobody can
+    # know whether they were carried out.
     assert outcomes["POST"].keys() <= ({"200"} if ending == "terminate" else {"200", "502"})
     assert min(outcomes[method]["200"] + late[method]["200"] for method in outcomes) > 20
 
@@ -229,7 +230,7 @@ def test_idle_connections_end_before_the_replicas_end_them() -> None:
 def test_a_client_has_so_many_requests_at_once_and_others_go_on(pair: list[Server], tmp_path: Path) -> None:
     half = f"POST {MESH} HTTP/1.1\r\nHost: x\r\nContent-Type: application/json\r\nContent-Length: 100\r\n\r\n{{"
     with ExitStack() as stack:
-        # One that has counted nothing yet.
+        # A new proxy, whose counters are zero.
         proxy = stack.enter_context(proxying(tmp_path / "it", *(server.url for server in pair)))
         same, other = (stack.enter_context(client(proxy, f"127.0.0.{k}")) for k in (3, 4))
         holding: list[socket.socket] = []
@@ -277,7 +278,7 @@ def test_who_sends_or_reads_nothing_is_closed(proxy: str) -> None:
             "/v1/models/larger/interpolations", json={"keyframes": [[0.0] * 3, [0.4] * 3], "frames": 50_000}
         )
         link = httpx.URL(made.raise_for_status().json()["links"]["jsonl"])
-    # Each with the seconds after which it may not be there any more.
+    # Each with the seconds after which it must have been closed.
     kinds = {
         b"GET /v1/models HTTP/1.1\r\nHost: x\r\nX-Slow: a": 15,
         b"POST %s HTTP/1.1\r\nHost: x\r\nContent-Length: 100\r\n\r\n{" % MESH.encode(): 15,
@@ -302,7 +303,7 @@ def test_who_sends_or_reads_nothing_is_closed(proxy: str) -> None:
 
 @contextmanager
 def listening(answer: Callable[[http.server.BaseHTTPRequestHandler], bytes]) -> Iterator[str]:
-    """A replica that says what it was sent."""
+    """A replica that records and answers what it was sent."""
 
     class Handler(http.server.BaseHTTPRequestHandler):
         def do_GET(self) -> None:
@@ -338,7 +339,7 @@ def test_replicas_are_told_the_address_that_a_client_has_not_what_it_says(tmp_pa
     said = [(name.lower(), text) for name, text in sent if "forwarded" in name.lower()]
     assert sorted(said) == [("x-forwarded-for", "127.0.0.7"), ("x-forwarded-proto", "http")]
     assert ["Host", httpx.URL(proxy).netloc.decode()] in sent
-    # The client's own id for its request stays; without one it gets one.
+    # The client's own request id is passed on; without one the proxy makes one.
     assert ["X-Request-ID", "mine"] in sent
     assert re.fullmatch(r"[0-9a-f]{32}", dict(named)["X-Request-ID"])
 

@@ -1,4 +1,4 @@
-"""Two servers behind a proxy that takes turns: nobody can tell which one answers."""
+"""Two servers behind a round-robin proxy: answers don't depend on which one is asked."""
 
 import itertools
 import threading
@@ -18,7 +18,7 @@ HOP = {"connection", "transfer-encoding", "keep-alive", "host", "content-length"
 
 @contextmanager
 def round_robin(servers: list[Server]) -> Iterator[str]:
-    """A proxy that gives every request to the next server, which it names in a header."""
+    """A proxy that sends each request to the next server, and names that server in a header."""
     turns = itertools.cycle(range(len(servers)))
     lock = threading.Lock()
 

@@ -1,4 +1,4 @@
-"""Malformed requests: each gets its status, the type of its problem, and a sentence that says what to do."""
+"""Malformed requests: each gets a status, a problem type, and a sentence that says what to do."""
 
 from dataclasses import dataclass, field
 from typing import Any
@@ -15,7 +15,7 @@ LONG_PATH = [[round(x, 5) for x in (k / 7, k / 3, 1 / (k + 1))] for k in range(2
 
 @dataclass
 class Bad:
-    """A request, and what its answer must be."""
+    """A request and its expected answer."""
 
     method: str
     path: str
@@ -167,4 +167,4 @@ def test_refusals_list_the_choices(client: httpx.Client) -> None:
 
 def test_every_fault_of_a_body_is_listed(client: httpx.Client) -> None:
     problem = client.post(MESH, json={"latent": ["a", 0, None], "extra": 1}).json()
-    assert [error["pointer"] for error in problem["errors"]] == ["#/latent/0", "#/extra"], "a list's first"
+    assert [error["pointer"] for error in problem["errors"]] == ["#/latent/0", "#/extra"], "one for each list"

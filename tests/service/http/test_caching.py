@@ -1,4 +1,4 @@
-"""Answers kept for who asks again: never more bytes than allowed, never another answer than a fresh one."""
+"""Cached answers: never more bytes than allowed, and never different from a fresh answer."""
 
 import re
 from pathlib import Path

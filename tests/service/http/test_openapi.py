@@ -1,4 +1,4 @@
-"""The description of the interface: complete, with examples that work, and held by the server under schemathesis."""
+"""The OpenAPI document: complete, with examples that work, and tested on the server by schemathesis."""
 
 import json
 import os
@@ -24,7 +24,7 @@ CALLS = {
 
 @pytest.fixture(scope="module")
 def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
-    """A model that answers to the examples and takes milliseconds a shape."""
+    """A server of a model on which the examples work and that takes milliseconds a shape."""
     folder = tmp_path_factory.mktemp("described") / "models"
     write_bundle(folder, "freaky-torus", idle=1)
     with starting() as start:
@@ -56,7 +56,7 @@ def test_every_call_is_described_whole(name: str) -> None:
     if "requestBody" in call:
         assert {"413", "422"} <= answers.keys()
         for media_type, content in call["requestBody"]["content"].items():
-            if media_type == "application/json" and not name.endswith(("/encode", "/fit")):  # which take whole meshes
+            if media_type == "application/json" and not name.endswith(("/encode", "/fit")):  # which take files
                 assert examples(content), "a body in JSON needs an example"
 
 
@@ -68,7 +68,7 @@ def resolve(schema: dict[str, Any]) -> dict[str, Any]:
 
 
 def examples(content: dict[str, Any]) -> list[Any]:
-    """Examples of a whole body, or one made of those of its parts."""
+    """The examples of a whole body, or one composed of examples of its members."""
     schema = resolve(content["schema"])
     named = [example["value"] for example in content.get("examples", {}).values()]
     parts = {name: part["examples"][0] for name, part in schema.get("properties", {}).items() if "examples" in part}
@@ -106,7 +106,7 @@ def test_examples_are_as_described_and_answered_as_described(served: Server, nam
                 validator(contents["application/json"]["schema"]).validate(body)
             answer = client.request(method, path, json=body)
             described = call["responses"][str(answer.status_code)]
-            # The example's model has an angle; tests/service/calls/test_blend_shapes.py asks another one.
+            # The model of the examples has an angle, so this is 422; test_blend_shapes.py uses another model.
             assert answer.is_success or path.endswith("/blendshapes"), answer.text
             media_type = answer.headers["Content-Type"].partition(";")[0]
             if media_type == "application/json":
@@ -115,7 +115,7 @@ def test_examples_are_as_described_and_answered_as_described(served: Server, nam
 
 
 def test_schemathesis_finds_nothing(served: Server, tmp_path: Path) -> None:
-    """Every check of schemathesis over every call; `make fuzz-api` takes more examples, and always others."""
+    """All checks of schemathesis on every call; `make fuzz-api` uses more examples, each time new ones."""
     count = os.environ.get("FUZZ_EXAMPLES")
     share = ["--max-examples", count or "10"]
     if not count:

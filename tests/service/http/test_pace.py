@@ -1,4 +1,4 @@
-"""Large answers: sent as fast as they are read, and held within limits."""
+"""Large answers: sent as fast as they are read, with a limit on the memory that they take."""
 
 import asyncio
 import io
@@ -60,7 +60,7 @@ def test_answers_that_nobody_reads_are_limited_together(monkeypatch: pytest.Monk
             if message["type"] == "http.response.start":
                 statuses.append(message["status"])
             elif len(message["body"]) == PIECE:
-                await go_on.wait()  # a reader who doesn't read
+                await go_on.wait()  # a client that doesn't read
 
         waiting = [asyncio.create_task(pace(scope(client), nothing, send)) for client in ["a"] * 8 + ["b"] * 2]
         await asyncio.sleep(0.1)
@@ -87,7 +87,7 @@ def test_archives_in_pieces_are_archives() -> None:
 
 
 def test_answers_in_pieces_are_the_same_as_whole_ones(models: Path, start: Start) -> None:
-    """More than four MiB of shapes come in pieces, fewer at once."""
+    """More than four MiB of shapes are sent in pieces, less as a whole."""
     with httpx.Client(base_url=start(models, workers=2).url, timeout=120) as client:
         model = "/v1/models/figure"
         card = client.get(model).json()

@@ -1,4 +1,4 @@
-"""What a stranger can send, at the sizes that once stopped the server: refused, and others are answered meanwhile."""
+"""Harmful requests, of sizes that once stopped the server, are refused while other clients are answered."""
 
 import base64
 import contextlib
@@ -36,7 +36,7 @@ CODE = [0.1, 0.7, 0.4]
 
 @pytest.fixture
 def quiet(small_models: Path, start: Start) -> Server:
-    """A server of its own, so that its memory is its own."""
+    """A server for one test, so that its memory can be measured."""
     server = start(small_models, workers=2)
     httpx.post(f"{server.url}{MODEL}/mesh", json={"latent": CODE}, timeout=60).raise_for_status()
     return server
@@ -44,7 +44,7 @@ def quiet(small_models: Path, start: Start) -> Server:
 
 @contextlib.contextmanager
 def cheap(server: Server, most: int = 64 * MIB) -> Iterator[None]:
-    """Memory doesn't grow by more than that, and nothing goes wrong."""
+    """Assert that memory grows by at most ``most`` bytes and that the log has no error."""
     before = peak_memory(server)
     yield
     assert peak_memory(server) - before < most
@@ -76,14 +76,14 @@ def test_a_head_that_is_too_long_and_malformed_is_refused_once(quiet: Server) ->
 
 
 def keep_sending(connection: socket.socket, block: bytes, most: int) -> bytes:
-    """Send without looking, until the server closes; what it said."""
+    """Send until the server answers or closes, and return its answer."""
     with contextlib.suppress(ConnectionError):
         for _ in range(most // len(block)):
             connection.sendall(block)
             if select.select([connection], [], [], 0)[0]:
                 break
         else:
-            raise AssertionError("all of it was taken")
+            raise AssertionError("the server has read everything")
     return rest(connection)
 
 
@@ -105,7 +105,7 @@ def test_requests_that_wait_on_one_connection_are_limited(quiet: Server) -> None
     with cheap(quiet, 16 * MIB), connect(quiet) as connection:
         last = request.replace(b"\r\n\r\n", b"\r\nConnection: close\r\n\r\n")
         connection.sendall(request * 3000 + last)
-        assert rest(connection).count(b"HTTP/1.1 200") == 3001, "each in its turn"
+        assert rest(connection).count(b"HTTP/1.1 200") == 3001, "all are answered, one after the other"
 
 
 def test_trailers_are_no_headers(quiet: Server) -> None:
@@ -187,7 +187,7 @@ def test_the_end_of_file_handles_is_told_once_a_second(small_models: Path) -> No
     ):
         assert process.stdout
         address = process.stdout.readline().split()[-1].rstrip("/")
-        # Lowered only now: the limit on connections, which goes by it, would not let it come to that.
+        # Lowered after the start: the limit on connections is set from it, and would prevent the situation.
         resource.prlimit(process.pid, resource.RLIMIT_NOFILE, (handles(process.pid) + 20, 4096))
         began = time.monotonic()
         place = httpx.URL(address)
@@ -218,7 +218,7 @@ def answers(address: str) -> bool:
 
 
 def test_who_sends_no_head_is_let_go(models: Path, start: Start) -> None:
-    """But for those whose last request is still being answered."""
+    """Not, however, a client whose last request is still being answered."""
     server = start(models, workers=2)
     card = httpx.get(f"{server.url}/v1/models/figure").json()
     path = {"keyframes": [card["lower"], card["upper"]], "frames": 600}
@@ -234,7 +234,7 @@ def test_who_sends_no_head_is_let_go(models: Path, start: Start) -> None:
         time.sleep(3)
         assert b" 408 " not in reading.recv(MIB)
         select.select([reading], [], [], 10)
-        assert reading.recv(MIB), "it goes on"
+        assert reading.recv(MIB), "the stream continues"
 
 
 def test_who_sends_no_body_is_let_go_by_the_deadline(small_models: Path, start: Start) -> None:
@@ -292,7 +292,7 @@ def test_health_answers_while_large_bodies_are_read(quiet: Server) -> None:
         assert {post.result().status_code for post in posts} <= {413, 503}
         stop.set()
         looking.result()
-    # It took half a minute; a second is what orchestrators wait.
+    # Once it took half a minute; orchestrators wait a second.
     assert slowest[0] < 1
 
 
@@ -326,7 +326,7 @@ def test_bodies_are_limited_together(small_models: Path, start: Start) -> None:
             sender.sendall(head % (MODEL.encode(), 4 * MIB))
             sender.sendall(bytes(4 * MIB - 1))
         refused = select.select(senders, [], [], 10)[0]
-        assert refused, "24 MiB are over the limit of 16, of which one address has 12"
+        assert refused, "24 MiB exceed the limit of 16, of which one address may have 12"
         assert {sender.recv(12) for sender in refused} == {b"HTTP/1.1 503"}
 
 
@@ -336,7 +336,7 @@ def test_bodies_are_limited_together(small_models: Path, start: Start) -> None:
 def test_readers_who_do_not_read_keep_nobody_waiting(models: Path, start: Start) -> None:
     server = start(models, workers=2)
     with httpx.Client(base_url=server.url, timeout=60) as client, contextlib.ExitStack() as stack:
-        card = client.get("/v1/models/figure").json()  # whose frames are larger than what the system keeps for a socket
+        card = client.get("/v1/models/figure").json()  # frames larger than a socket's buffers
         path = {"keyframes": [card["lower"], card["upper"]], "frames": 200}
         link = client.post("/v1/models/figure/interpolations", json=path).json()["links"]["jsonl"]
         for _ in range(34):
@@ -349,7 +349,7 @@ def test_readers_who_do_not_read_keep_nobody_waiting(models: Path, start: Start)
         with connect(server, "127.0.0.2") as other:
             other.sendall(f"GET {link} HTTP/1.1\r\nHost: localhost\r\n\r\n".encode())
             assert other.recv(15) == b"HTTP/1.1 200 OK"
-        # And in the end they are let go.
+        # At last they are disconnected.
         eventually(lambda: value(samples(client), "shapespace_streams") == 0, STALL_SECONDS + 40)
     assert "Traceback" not in server.log
 
@@ -372,11 +372,11 @@ def test_a_forged_id_is_not_unpacked_further_than_ids_go(quiet: Server, keyframe
     assert len(id) < 15_000
     with cheap(quiet, 8 * MIB):
         assert httpx.get(f"{quiet.url}/v1/interpolations/{id}").status_code == 404
-    assert cost(id) < 0.005, "an id costs 5 ms of the event loop at most"
+    assert cost(id) < 0.005, "an id takes at most 5 ms of the event loop"
 
 
 def cost(id: str) -> float:
-    """Processor time that an id takes, without what neighbours on the machine add to it."""
+    """Processor seconds to unpack an id; the minimum of several runs, as other processes disturb."""
 
     def once() -> float:
         began = time.thread_time()
@@ -490,7 +490,7 @@ def test_a_key_that_no_header_can_carry_is_refused_at_the_start(small_models: Pa
 
 
 def test_a_server_for_all_says_that_it_has_no_key(small_models: Path, start: Start) -> None:
-    assert "there is no key" in start(small_models, host="0.0.0.0").stop()  # noqa: S104 - that is what is tried
+    assert "there is no key" in start(small_models, host="0.0.0.0").stop()  # noqa: S104 - under test
     assert "no key" not in start(small_models).stop()
 
 
@@ -505,8 +505,8 @@ def test_keys_after_a_wrong_one_wait_their_turn(small_models: Path, start: Start
         found = list(pool.map(ask, [f"guess {k}" for k in range(200)]))
         seconds = time.monotonic() - began
         assert set(found) == {401, 503}
-        assert found.count(401) < 10 * seconds + 15, "ten a second, and those of the first second"
-    # Who doesn't wait for answers finds out no sooner, even with the right key.
+        assert found.count(401) < 10 * seconds + 15, "ten a second, after the first second's allowance"
+    # Not waiting for answers doesn't help: even the right key has to wait its turn.
     for key in [b"guess"] * 50 + [b"open sesame"]:
         with connect(server) as impatient:
             impatient.sendall(b"GET /v1/models HTTP/1.1\r\nHost: localhost\r\nX-API-Key: %s\r\n\r\n" % key)
@@ -555,7 +555,7 @@ def test_sigterm_ends_it_soon_whatever_it_is_doing(models: Path, start: Start, b
         began = time.monotonic()
         server.process.send_signal(signal.SIGTERM)
         assert server.process.wait(60) == 0
-        assert time.monotonic() - began < 2 * ENDING, "there is no drain here; a busy machine is given as long again"
+        assert time.monotonic() - began < 2 * ENDING, "without a drain; twice the time, for a busy machine"
         for call in asked:
             answer = call.result()
             assert isinstance(answer, httpx.Response)

@@ -1,4 +1,4 @@
-"""What runs in a process of its own: what comes back, what it may take, and that nothing of it stays."""
+"""Tasks in a separate process: their results, their limits, and that no process is left over."""
 
 import os
 import signal
@@ -52,7 +52,7 @@ def call(box: Sandbox, task: str, body: bytes = b"", seconds: float = 60, memory
 
 
 def all_children() -> set[int]:
-    """Processes that this one has, zombies among them."""
+    """Ids of this process's children, zombies included."""
     return {
         int(pid)
         for task in Path("/proc/self/task").iterdir()
@@ -62,7 +62,7 @@ def all_children() -> set[int]:
 
 @pytest.fixture
 def children() -> Callable[[], set[int]]:
-    """Those that came with the test: servers of other tests' files may be there as well."""
+    """A function for the children started since the test began; servers of other tests may run too."""
     before = all_children()
     return lambda: all_children() - before
 
@@ -131,7 +131,7 @@ def test_what_nobody_waits_for_any_more_is_ended(box: Sandbox) -> None:
 
 
 def test_a_process_that_does_not_listen_is_no_trap(children: Callable[[], set[int]], box: Sandbox) -> None:
-    """It is ended while it is still being sent its body."""
+    """The child is killed while its body is still being sent."""
     box.prepare("echo")
     (pid,) = children()
     os.kill(pid, signal.SIGSTOP)
@@ -180,7 +180,7 @@ def test_memory_is_limited_for_each_task(box: Sandbox) -> None:
         pid = call(box, "take", size=100 * MIB, memory=150 * MIB)[0]["taken"]
         with pytest.raises(OutOfMemoryError):
             call(box, "take", size=200 * MIB, memory=150 * MIB)
-    # What was there before, the body included, does not count.
+    # The limit is on the growth; memory used before, the body included, does not count.
     assert call(box, "echo", bytes(50 * MIB), memory=30 * MIB)[0]["pid"] != pid
 
 
@@ -207,7 +207,7 @@ def test_it_knows_no_settings_writes_no_file_and_shares_no_stream(
 def test_a_process_that_died_meanwhile_is_replaced(box: Sandbox) -> None:
     pid = call(box, "echo")[0]["pid"]
     os.kill(pid, signal.SIGKILL)
-    # All of it: a thread may outlive the first one by a moment, and until then nobody can wait for the process.
+    # All threads: one may end a moment after the main thread, and until then the process can't be waited for.
     eventually(lambda: len(os.listdir(f"/proc/{pid}/task")) == 1)
     eventually(lambda: Path(f"/proc/{pid}/stat").read_text().split()[2] == "Z")
     assert call(box, "echo")[0]["pid"] != pid

@@ -1,4 +1,4 @@
-"""The end of a server: readiness first, and nothing that it has accepted is lost."""
+"""Shutdown: readiness changes first, and no accepted request is lost."""
 
 import fcntl
 import os
@@ -22,7 +22,7 @@ MESH = "/v1/models/small/mesh"
 
 
 class Load:
-    """Clients that ask without a pause, each over a connection that it keeps, until the port is closed."""
+    """Clients that send requests without a pause, each on a kept connection, until the port is closed."""
 
     def __init__(self, server: Server, clients: int) -> None:
         self.outcomes: Counter[str] = Counter()
@@ -78,8 +78,8 @@ def test_readiness_turns_first_and_everything_is_still_answered(small_models: Pa
         assert httpx.get(f"{server.url}/v2/health/live").status_code == 200
         answer = kept.post(MESH, json={"latent": [0.1, 0.7, 0.4]})
         assert answer.status_code == 200
-        assert answer.headers["Connection"] == "close", "so that the client goes elsewhere"
-    server.process.send_signal(signal.SIGTERM)  # who asks twice doesn't want to wait
+        assert answer.headers["Connection"] == "close", "so that the client connects to another replica"
+    server.process.send_signal(signal.SIGTERM)  # the second signal skips the drain
     assert server.process.wait(60) == 0
 
 
@@ -87,7 +87,8 @@ def test_a_connection_opened_before_the_end_is_answered_after_it(small_models: P
     server = start(small_models, drain=0)
     host, port = server.url.removeprefix("http://").split(":")
     with socket.create_connection((host, int(port))) as connection:
-        assert httpx.get(f"{server.url}/v2/health/live").status_code == 200  # by now it is accepted
+        # Once this is answered, the earlier connection has been accepted too.
+        assert httpx.get(f"{server.url}/v2/health/live").status_code == 200
         server.process.send_signal(signal.SIGTERM)
         time.sleep(0.5)
         connection.sendall(b"GET /v1/models/small HTTP/1.1\r\nHost: localhost\r\n\r\n")
@@ -113,7 +114,7 @@ def test_it_ends_with_its_terminal(small_models: Path) -> None:
     with process:
         assert process.stdout
         assert b"http://" in process.stdout.readline()
-        os.kill(process.pid, signal.SIGHUP)  # with the terminal still there, a reload
+        os.kill(process.pid, signal.SIGHUP)  # while the terminal exists, SIGHUP means reload
         time.sleep(0.5)
         assert process.poll() is None
         os.close(terminal)

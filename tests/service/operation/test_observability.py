@@ -1,4 +1,4 @@
-"""Figures, log lines, request ids; keys and origins."""
+"""Metrics, log lines, request ids, keys and origins."""
 
 import json
 import re
@@ -82,7 +82,7 @@ def test_a_log_in_json_has_one_object_a_line(small_models: Path, start: Start) -
     lines = [json.loads(line) for line in server.stop().splitlines()]
     assert all({"time", "level", "logger", "message"} <= line.keys() for line in lines)
     requests = [line for line in lines if line["logger"] == "shapespace.service.http.middleware"]
-    assert [line["path"] for line in requests] == [MESH, "/v1/models/la%0Arge"], "health checks say nothing"
+    assert [line["path"] for line in requests] == [MESH, "/v1/models/la%0Arge"], "no health checks"
     assert requests[0]["request_id"] == "mine"
     assert (requests[0]["method"], requests[0]["status"]) == ("POST", 200)
     assert requests[0]["route"] == "/v1/models/{name}/mesh"
@@ -132,7 +132,7 @@ def test_pages_of_named_origins_may_call(small_models: Path, start: Start) -> No
             assert preflight.is_success is allowed
             answer = client.get("/v1/models", headers={"Origin": origin})
             assert (answer.headers.get("Access-Control-Allow-Origin") == origin) is allowed
-            assert answer.status_code == 401, "an origin is no key"
+            assert answer.status_code == 401, "an allowed origin does not replace the key"
         exposed = answer.headers["Access-Control-Expose-Headers"]
         assert {"ETag", "Shape-Diagnostics", "X-Request-ID"} <= set(exposed.split(", "))
 

@@ -1,4 +1,4 @@
-"""The server under load, at its limits, and at its end."""
+"""The server under load, at its limits, and at shutdown."""
 
 import signal
 import subprocess
@@ -59,7 +59,7 @@ def test_a_full_queue_is_busy_and_says_when_to_come_back(small_models: Path, sta
         assert answer.json()["type"] == "urn:shapespace:problem:busy"
         assert "Try again" in answer.json()["detail"]
         assert int(answer.headers["Retry-After"]) >= 1
-    assert after.status_code == 200, "a place in the queue is given back"
+    assert after.status_code == 200, "places in the queue are free again"
 
 
 def test_a_mesh_file_has_a_limit_of_its_own(small_models: Path, start: Start) -> None:
@@ -112,7 +112,7 @@ def test_sigterm_ends_it_cleanly_after_the_running_request(small_models: Path, s
 
 
 def test_a_mistake_of_the_server_shows_no_traceback(small_models: Path, tmp_path: Path) -> None:
-    # A route that fails is not to be had from outside, so one is added to the real application.
+    # No request is known to cause an internal error, so a route that does is added to the real application.
     program = """
 import sys, httpx, asyncio
 from shapespace.service.http.app import create_app

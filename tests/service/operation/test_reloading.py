@@ -1,4 +1,4 @@
-"""Bundles that come, change and go while requests run."""
+"""Bundles that are added, changed and removed while requests run."""
 
 import asyncio
 import json
@@ -45,7 +45,7 @@ def connected(server: Server) -> Iterator[httpx.Client]:
 
 
 def reload(server: Server) -> None:
-    """Send SIGHUP and wait for the line that says it is done."""
+    """Send SIGHUP and wait for the log line that says that the reload is done."""
     before = server.log.count("reloaded:")
     server.process.send_signal(signal.SIGHUP)
     eventually(lambda: server.log.count("reloaded:") > before)
@@ -59,7 +59,7 @@ def test_sighup_takes_up_new_changed_and_removed_bundles(folder: Path, start: St
         shutil.rmtree(folder / "other")
         write_bundle(folder, "small", "2")
         rescale(folder / "small" / "1", 2 * SCALE)
-        assert len(client.get("/v1/models").json()["models"]) == 2, "nothing changes unasked"
+        assert len(client.get("/v1/models").json()["models"]) == 2, "nothing changes without SIGHUP"
         reload(server)
         assert [model["name"] for model in client.get("/v1/models").json()["models"]] == ["small"]
         assert client.get("/v1/models/small").json()["versions"] == ["1", "2"]
@@ -117,19 +117,19 @@ def test_bundles_that_do_harm_are_refused_while_the_others_are_served(folder: Pa
         assert value(found, "shapespace_bundles_refused") == 5
         assert value(found, "shapespace_reloaded_bundles_total", result="refused") == 5
         assert value(found, "shapespace_reloaded_bundles_total", result="loaded") == 1
-        # The next one works as well.
+        # The next reload works too.
         shutil.rmtree(folder / "loops")
         write_bundle(folder, "small", "3")
         reload(server)
         assert client.get("/v1/models/small").json()["versions"] == ["1", "2", "3"]
         assert value(samples(client), "shapespace_bundles_refused") == 4
     assert peak_memory(server) < 300 * 2**20
-    assert len(children(server)) <= 1, "the one that waits for uploads"
+    assert len(children(server)) <= 1, "only the process that waits for uploads"
     assert "Traceback" not in server.log
 
 
 def test_a_reload_that_fails_whole_is_counted(tmp_path: Path) -> None:
-    # No way is known to bring this about from outside.
+    # No request or bundle is known to cause this.
     write_bundle(tmp_path, "small")
     repository = ModelRepository(tmp_path)
     metrics = Metrics(repository, Workers(1, 0, 1), Quota(10))
@@ -148,7 +148,7 @@ def test_the_end_of_a_server_ends_the_trial_of_a_bundle(folder: Path, start: Sta
     server = start(folder)
     hostile.hostile(folder, "endless", hostile.doubles)
     server.process.send_signal(signal.SIGHUP)
-    eventually(lambda: len(children(server)) == 2)  # with the one that waits for uploads
+    eventually(lambda: len(children(server)) == 2)  # one of them waits for uploads
     pids = children(server)
     server.process.send_signal(number)
     assert server.process.wait(20) == (0 if number == signal.SIGTERM else -number)
@@ -179,7 +179,7 @@ def children(server: Server) -> list[int]:
 
 
 def children_of(pid: int) -> list[int]:
-    """Processes that a process has, zombies among them."""
+    """Ids of a process's children, zombies included."""
     tasks = Path(f"/proc/{pid}/task").iterdir()
     return [int(child) for task in tasks for child in (task / "children").read_text().split()]
 
@@ -190,7 +190,7 @@ def test_watching_takes_up_a_bundle_once_it_is_whole(folder: Path, start: Start,
     target = folder / "small" / "2"
     target.mkdir()
     with connected(server) as client:
-        for k in range(50):  # a slow copy, over several looks
+        for k in range(50):  # a slow copy, during several checks
             (target / "geometry.npz").write_bytes(bytes(k))
             time.sleep(0.05)
         for file in source.iterdir():
@@ -198,7 +198,7 @@ def test_watching_takes_up_a_bundle_once_it_is_whole(folder: Path, start: Start,
         eventually(lambda: client.get("/v1/models/small").json()["versions"] == ["1", "2"])
         shutil.rmtree(target)
         eventually(lambda: client.get("/v1/models/small").json()["versions"] == ["1"])
-    assert "is not served" not in server.log, "half a bundle must not be looked at"
+    assert "is not served" not in server.log, "an incomplete bundle must not be loaded"
 
 
 def test_a_reload_under_load_mixes_no_versions(folder: Path, start: Start) -> None:
@@ -214,7 +214,7 @@ def test_a_reload_under_load_mixes_no_versions(folder: Path, start: Start) -> No
                 statuses.add(answer.status_code)
                 models = {diagnostics["model"] for diagnostics in answer.json()["diagnostics"]}
                 assert len(models) == 1
-                # One digest, one answer: an answer is a digest's alone if no other digest has it.
+                # To check that each digest has one answer, and each answer one digest.
                 answers.setdefault(models.pop(), set()).add(json.dumps(answer.json()["vertices"]))
 
     threads = [threading.Thread(target=ask) for _ in range(4)]
@@ -231,8 +231,8 @@ def test_a_reload_under_load_mixes_no_versions(folder: Path, start: Start) -> No
         stop.set()
     for thread in threads:
         thread.join(timeout=60)
-    assert statuses == {200}, "a reload must fail no request"
-    assert len(answers) == 5, "load on every one of five bundles"
+    assert statuses == {200}, "no request may fail because of a reload"
+    assert len(answers) == 5, "requests must have reached all five bundles"
     assert all(len(found) == 1 for found in answers.values())
     sizes = sorted(np.ptp(np.array(json.loads(next(iter(found))))[1]) for found in answers.values())
     expected = np.ptp(reference().vertices) * np.array([SCALE, *scales])
@@ -273,6 +273,6 @@ def test_reloads_leave_no_memory_behind(folder: Path, start: Start) -> None:
             reload(server)
             client.post("/v1/models/small/vertices", json={"latents": CODES}).raise_for_status()
             sizes.append(resident(server))
-    # The first ones fill caches and the allocator's pools.
+    # The first reloads fill caches and the allocator's pools.
     growth = (np.mean(sizes[-4:]) - np.mean(sizes[8:12])) / 14
     assert growth < 100_000, f"{growth:.0f} bytes a reload"

@@ -1,4 +1,4 @@
-"""The writer of bundles and their schema: what one side writes the other reads, byte for byte the same each time."""
+"""Writer and reader of bundles agree, and equal bundles are written byte for byte the same."""
 
 import json
 from dataclasses import replace

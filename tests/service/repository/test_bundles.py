@@ -1,4 +1,4 @@
-"""What the loader refuses, and that one bad bundle takes nothing else down."""
+"""What the loader refuses; one bad bundle does not affect others."""
 
 import io
 import json
@@ -195,7 +195,7 @@ def too_few_weights(folder: Path) -> None:
 
 
 def long_name_inside(folder: Path) -> None:
-    """The first array's header says that its name has 1500 bytes, and zipfile quotes them all."""
+    """The first member's header has a name of 1500 bytes, all of which zipfile quotes in its error."""
     path = folder / "geometry.npz"
     data = bytearray(path.read_bytes())
     data[26:28] = (1500).to_bytes(2, "little")
@@ -311,7 +311,7 @@ def too_large_for_its_file(folder: Path) -> None:
 
 
 def repack(folder: Path, change: Callable[[bytearray, int], None]) -> None:
-    """Alter the directory of the geometry, from the place of its first entry."""
+    """Change the ZIP directory of the geometry, from the offset of its first entry."""
     path = folder / "geometry.npz"
     data = bytearray(path.read_bytes())
     change(data, data.index(b"PK\x01\x02"))
@@ -327,7 +327,7 @@ def less_than_it_unpacks_to(folder: Path) -> None:
 
 
 def more_than_it_holds(folder: Path) -> None:
-    """An array whose header promises a thousand million rows."""
+    """An array whose header declares a thousand million rows."""
     header = io.BytesIO()
     promise = {"descr": "<f8", "fortran_order": False, "shape": (999_999_999, 3)}
     np.lib.format.write_array_header_1_0(header, promise)
@@ -470,7 +470,7 @@ def of(harm: Callable[..., None], **options: object) -> Callable[[Path], object]
     return lambda models: hostile.hostile(models, "bad", harm, **options)
 
 
-#: Bundles that are what they say, and what the log says of them.
+#: Harmful bundles with correct manifests, and the log line expected for each.
 ATTACKS: dict[str, tuple[Callable[[Path], object], str]] = {
     "loops": (of(hostile.loops), "bad/1 is not served: factor-0.onnx does not answer in time, for zeros"),
     "loops, with an if": (of(hostile.loops, nest="if"), "does not answer in time"),
@@ -532,7 +532,7 @@ def test_a_validation_that_never_ends_or_dies_keeps_no_other_bundle_out(
 
 
 class Swapping(BundleValidator):
-    """Changes each bundle in the moment between its validation and its use."""
+    """Changes each bundle between its validation and its use."""
 
     def digest(self, folder: Path) -> str:
         digest = super().digest(folder)

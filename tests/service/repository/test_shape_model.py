@@ -1,4 +1,4 @@
-"""A bundle at work, without HTTP in between."""
+"""A loaded bundle, without HTTP."""
 
 import dataclasses
 from pathlib import Path
@@ -23,13 +23,13 @@ from tests.service.bundles import networks, seal, start_network, write_bundle
 
 @pytest.fixture
 def steep(tmp_path: Path) -> ShapeModel:
-    """A model whose networks overflow long before the codes do."""
+    """A model whose networks overflow at finite codes."""
     folder = write_bundle(tmp_path, start=True)
     for file, model in (("factor-0.onnx", networks()["factor-0.onnx"]), ("start.onnx", start_network())):
         weight = model.graph.initializer[0]
         values = numpy_helper.to_array(weight).copy()
         if file == "start.onnx":
-            values[2] = 3e38  # by ``twist``, of which the factors keep their head
+            values[2] = 3e38  # the weight of ``twist``, for which the factors don't overflow
         else:
             values *= 1e10
         weight.CopyFrom(numpy_helper.from_array(values, weight.name))
@@ -90,14 +90,14 @@ def bundled(request: pytest.FixtureRequest) -> ShapeModel:
 
 
 def wide_codes(model: ShapeModel, count: int) -> np.ndarray:
-    """In a box a quarter wider than the bounds: further out a few have two shapes that are as near."""
+    """Codes in a box a quarter wider than the bounds; farther out some have two equally near shapes."""
     centre, radius = (model.latents.upper + model.latents.lower) / 2, (model.latents.upper - model.latents.lower) / 2
     offsets = 1.25 * radius * np.random.default_rng(6).uniform(-1, 1, (count, len(radius)))
     return model.latents.codes((centre + offsets).tolist())[0]
 
 
 def test_every_start_ends_in_one_shape(bundled: ShapeModel) -> None:
-    """To 1e-4 of the diagonal: the product's own, the reference, and the shape of another code."""
+    """To 1e-4 of the diagonal, from the server's initial guess, the reference, and another code's shape."""
     reference, codes = bundled.reference, wide_codes(bundled, 4)
     solver = Reconstructor(reference, bundled.manifest.eta_reconstruction)
     other = bundled.shape(codes[-1], mesh=MeshChoice.COARSE).vertices / bundled.manifest.scale

@@ -1,4 +1,4 @@
-"""Bundles with what the files of a collection had beside triangles: read as they were written, or refused."""
+"""Bundles with what files have beside triangles: read as they were written, or refused."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ RNG = np.random.default_rng(0)
 
 
 def surface() -> Surface:
-    """Everything that there can be on the finer torus, but for larger polygons."""
+    """Everything that a surface can have, on the finer torus, except polygons of more corners."""
     faces = MESH.faces
     count = len(faces)
     return Surface(
@@ -72,7 +72,7 @@ def test_a_surface_is_read_as_it_was_written(folder: Path) -> None:
 
 
 def entry(**changes: object) -> Callable[[Path], None]:
-    """Other facts about the surface in the manifest."""
+    """A function that changes the manifest's entry about the surface."""
 
     def spoil(folder: Path) -> None:
         path = folder / "manifest.json"
@@ -84,7 +84,7 @@ def entry(**changes: object) -> Callable[[Path], None]:
 
 
 def arrays(**changes: object) -> Callable[[Path], None]:
-    """Other arrays, None for no such array."""
+    """A function that replaces arrays, or removes those that are None."""
 
     def spoil(folder: Path) -> None:
         with np.load(folder / "geometry.npz") as file:

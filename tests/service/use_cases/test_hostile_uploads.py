@@ -1,4 +1,4 @@
-"""Uploads that are made to cost: none takes more than 64 MiB beyond itself, and all are over in seconds."""
+"""Uploads made to be expensive: each takes at most 64 MiB in addition to the file, and a few seconds."""
 
 import os
 import subprocess
@@ -36,7 +36,7 @@ def test_what_reading_costs(name: str, cost: Costs) -> None:
 
 
 def test_the_reader_is_light() -> None:
-    """A process that does nothing else has no use for a server, for networks or for sparse matrices."""
+    """The process that only reads files needs no server, networks or sparse matrices."""
     heavy = ("fastapi", "starlette", "pydantic", "onnxruntime", "torch", "trimesh", "scipy")
     module = "shapespace.service.use_cases.uploads"
     program = f"import sys, {module}; print([name for name in {heavy} if name in sys.modules])"
@@ -54,7 +54,7 @@ def small(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
 
 def processor_seconds(server: Server) -> float:
     fields = Path(f"/proc/{server.process.pid}/stat").read_text().rpartition(")")[2].split()
-    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")  # user's and system's
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")  # user and system time
 
 
 SPARSE = {"count": 1, "indices": {"bufferView": 1, "componentType": 5125}, "values": {"bufferView": 0}}
@@ -62,7 +62,7 @@ ACCESSORS = [
     {"bufferView": 0, "componentType": 5126, "type": "VEC3", "count": 4, "sparse": SPARSE},
     {"bufferView": 1, "componentType": 5125, "type": "SCALAR", "count": 12},
 ]
-#: As they were found, with their sizes in bytes, and what is said.
+#: Scene graphs that once stopped the server, with their sizes in bytes and the messages expected now.
 GRAPHS = {
     "a chain of 3000 nodes with matrices": (lambda: chain(3000), 230_000, "more than 100 deep"),
     "a chain of 9,990 nodes with matrices": (lambda: chain(9990), 780_000, "more than 100 deep"),

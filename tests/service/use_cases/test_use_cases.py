@@ -1,4 +1,4 @@
-"""Use cases without HTTP: answers, diagnostics and timings as data, and errors that name no status."""
+"""Use cases without HTTP: answers, diagnostics and timings as data, and errors without HTTP status."""
 
 import asyncio
 import io
@@ -115,7 +115,7 @@ def test_without_a_code_it_is_the_reference_and_colours_come_with_a_legend(model
     assert found.legend
     assert found.legend["quantity"] == "stretch"
     assert len(answer["color"]["values"]) == len(answer["vertices"])
-    assert found.seconds["reconstruct"] > 0, "that of the other shape"
+    assert found.seconds["reconstruct"] > 0, "the time to reconstruct the other shape"
 
 
 def test_many_shapes_are_those_of_each_code(model: ShapeModel) -> None:
@@ -161,7 +161,7 @@ def test_lengths_and_angles_come_with_those_of_each_factor(model: ShapeModel) ->
     assert np.allclose(answer["lengths"][1], SCALE * expected[:half], atol=1e-5)
     assert np.allclose(answer["angles"][1], expected[half:], atol=1e-5)
     assert np.shape(answer["factors"]) == (2, 2, 2 * half)
-    # The combiner adds up how far each factor is from the reference.
+    # The combiner is the affine sum of the factors.
     lengths = np.array(answer["factors"][1])[:, :half]
     reference = SCALE * nric(model.reference.vertices, model.reference.connectivity)[:half]
     assert np.allclose(lengths.sum(axis=0) - reference, answer["lengths"][1], atol=1e-5)

@@ -1,4 +1,4 @@
-"""Shapes by frames along a tree: exact where z is integrable, in place, near where it nearly is."""
+"""Shapes by integrating frames along a tree: exact where z is integrable, near where it nearly is."""
 
 import numpy as np
 import pytest

@@ -8,7 +8,7 @@ from tests.shapespace.conftest import KERNELS, grid_faces
 
 
 def cylinder(turn: float, n: int = 10, m: int = 5) -> np.ndarray:
-    """Vertices of a strip, one column more than the cylinder's, rolled so that n columns turn by this angle."""
+    """Vertices of a strip of one column more than the cylinder, rolled so that n columns span this angle."""
     u, v = np.meshgrid(np.arange(n + 1) * turn / n, np.arange(m) / m, indexing="ij")
     radius = 2 * np.pi / turn
     return np.stack([radius * np.cos(u), radius * np.sin(u), v], -1)
@@ -78,7 +78,7 @@ def test_the_kernel_is_the_tangent_space_of_immersed_meshes(surface, conditions)
 
 
 def test_a_cylinder_that_does_not_close_fails_along_its_loop_only():
-    """Vertices see nothing: every fan is that of a cylinder, only of too large a radius."""
+    """The conditions at vertices hold: each star of faces is that of a cylinder of a larger radius."""
     n, m = 10, 5
     closed = TriangleMesh.from_arrays(
         cylinder(2 * np.pi)[:-1].reshape(-1, 3), grid_faces(n, m, around_u=True, around_v=False)
@@ -86,7 +86,7 @@ def test_a_cylinder_that_does_not_close_fails_along_its_loop_only():
     opened = cylinder(1.8 * np.pi)
     rolled = TriangleMesh.from_arrays(opened.reshape(-1, 3), grid_faces(n + 1, m, around_u=False, around_v=False))
     z, connectivity = nric(rolled.vertices, rolled.connectivity), closed.connectivity
-    # Carry lengths and angles over by vertices modulo n columns, from the columns where they are all there.
+    # Copy z to the cylinder's edges, with columns modulo n, from columns that have all edges.
     found = {tuple(edge): k for k, edge in enumerate(rolled.edges.tolist())}
     e_rolled = rolled.connectivity.edge_count
     target = np.zeros(2 * connectivity.edge_count)
@@ -94,7 +94,7 @@ def test_a_cylinder_that_does_not_close_fails_along_its_loop_only():
         columns = [i // m, j // m]
         if max(columns) - min(columns) > 1:
             columns[columns.index(0)] = n
-        shift = 1 - min(columns)  # every column looks alike; take the one at 1
+        shift = 1 - min(columns)  # all columns are alike; take the one at 1
         pair = sorted((c + shift) * m + vertex % m for c, vertex in zip(columns, (i, j), strict=True))
         same = found[tuple(pair)]
         target[k], target[connectivity.edge_count + k] = z[same], z[e_rolled + same]

@@ -64,14 +64,14 @@ def test_lengths_and_angles_come_in_edge_order():
     ids=["tetrahedron", "octahedron", "icosahedron"],
 )
 def test_platonic_solids(solid, cosine):
-    """The angle between normals is π less the one between faces."""
+    """The angle between normals is π minus the interior angle between the faces, whose cosine is given."""
     _, angles = halves(mesh_of(solid))
     np.testing.assert_allclose(angles, np.pi - np.arccos(cosine), rtol=1e-12)
 
 
 @pytest.mark.parametrize("phi", [1e-9, 1e-3, 0.5, np.pi / 2, 2.5, np.pi - 1e-9])
 def test_convex_is_positive_and_concave_negative(phi):
-    """Also where arccos would have lost half of its digits."""
+    """Also at small angles, where arccos loses half of the digits."""
     for angle in (phi, -phi):
         _, angles = halves(hinge(angle))
         assert angles[0] == pytest.approx(angle, rel=1e-6, abs=1e-15)
@@ -81,14 +81,14 @@ def test_convex_is_positive_and_concave_negative(phi):
 @pytest.mark.parametrize("tip", [[1, 1, 0], [1, 0.9, 0], [-3, 0.5, 0]])
 @pytest.mark.parametrize("faces", [[[0, 1, 2], [1, 0, 3]], [[1, 0, 2], [0, 1, 3]]])
 def test_a_hinge_folded_flat_has_the_angle_pi(tip, faces):
-    """The range is (−π, π], on either side of the sheet."""
+    """It is never −π, on either side: the range is (−π, π]."""
     folded = TriangleMesh.from_arrays([[0, 0, 0], [2, 0, 0], tip, [1, 1, 0]], faces)
     _, angles = halves(folded)
     assert angles[0] == np.pi
 
 
 def test_the_mean_curvature_of_a_convex_body_is_that_of_its_support_function(rng):
-    """Steiner: ½ Σ lθ = ∫ h over the directions, whatever the body."""
+    """Steiner: ½ Σ lθ is the integral over all directions of the support function h, for any convex body."""
     for _ in range(3):
         mesh = mesh_of(trimesh.convex.convex_hull(rng.standard_normal((30, 3)) * [3, 2, 1]))
         lengths, angles = halves(mesh)
@@ -107,7 +107,7 @@ def test_the_mean_curvature_of_icospheres_approaches_that_of_the_sphere_from_bel
         mesh = mesh_of(trimesh.creation.icosphere(subdivisions))
         lengths, angles = halves(mesh)
         found.append(lengths @ angles / 2)
-        # The ball inside all faces is contained in it, and it is contained in the unit ball.
+        # The body lies between its inscribed ball and the unit ball.
         inside = (face_normals(mesh.vertices, mesh.faces) * mesh.vertices[mesh.faces[:, 0]]).sum(axis=1).min()
         assert 4 * np.pi * inside < found[-1] < 4 * np.pi
     errors = 4 * np.pi - np.array(found)
@@ -138,7 +138,7 @@ def test_mirroring_keeps_lengths_and_changes_the_sign_of_the_angles(mesh, pose, 
     found = nric(mirrored, mesh.connectivity)
     np.testing.assert_allclose(found[:e], z[:e], atol=1e-12)
     np.testing.assert_allclose(found[e:], -z[e:], atol=1e-12)
-    # Seen in a mirror and turned inside out it is the same surface.
+    # Mirrored and turned inside out, it has the same lengths and angles.
     both = flipped(mesh.with_vertices(mirrored))
     np.testing.assert_allclose(nric(both.vertices, both.connectivity), z, atol=1e-12)
 
@@ -222,7 +222,7 @@ def test_the_jacobian_has_the_slopes_of_a_derivative(mesh, pose, rng, slope):
     def at(h):
         return unwrap(nric(pose + h * direction, c), z)
 
-    # For lengths and angles apart: one must not hide behind the other.
+    # Lengths and angles separately: a small error of one must not be masked by the other.
     for half in (slice(c.edge_count), slice(c.edge_count, None)):
         taylor = slope(lambda h, half=half: (at(h) - z - h * change)[half], 1e-3)
         central = slope(lambda h, half=half: ((at(h) - at(-h)) / (2 * h) - change)[half], 1e-3)

@@ -1,4 +1,4 @@
-"""Vertices from lengths and angles: exact ones, noisy ones, hopeless ones."""
+"""Vertices from lengths and angles that are exact, noisy, or far from those of any shape."""
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -50,7 +50,7 @@ def assert_found(result, expected, mesh):
 
 
 def gradient(reconstruct, vertices, target):
-    """Of the misfit, by vertices, beside how large its terms are."""
+    """Gradient of the misfit by the vertices, and the size of its terms, which it is compared with."""
     c = reconstruct.reference.connectivity
     misfit = nric(vertices, c) - target
     misfit[c.edge_count :] = np.angle(np.exp(1j * misfit[c.edge_count :]))
@@ -109,7 +109,7 @@ def test_where_it_starts_does_not_matter_up_to_a_rigid_motion(mesh, pose, recons
     found = reconstruct(target, start)
     assert_found(found, pose, mesh)
     assert np.array_equal(start, kept)
-    # It stays beside its start: a frame of an animation beside the frame before.
+    # It stays aligned with its start, as a frame of an animation does with the frame before.
     beside = align(found.vertices, start)
     assert np.abs(beside - found.vertices).max() < 0.25 * mesh.diagonal
     assert np.abs(start - mesh.vertices).max() > 0.25 * mesh.diagonal
@@ -140,7 +140,7 @@ def test_angles_count_modulo_full_turns_and_not_at_all_on_the_boundary(mesh, pos
 
 
 def test_the_unit_of_length_does_not_matter(mesh, pose, reconstruct, target):
-    unit = 2.0**20  # which rounds nothing
+    unit = 2.0**20  # a power of two, so that scaling rounds nothing
     large = mesh.with_vertices(unit * mesh.vertices)
     found = Reconstructor(large)(nric(unit * pose, mesh.connectivity))
     assert_found(found, unit * pose, large)
@@ -151,7 +151,7 @@ def test_the_unit_of_length_does_not_matter(mesh, pose, reconstruct, target):
 
 
 def test_noise_is_left_over_and_nothing_else(mesh, reconstruct, target, rng):
-    """What comes out is stationary, as near as the exact shape or nearer, and says how far it is."""
+    """The result is stationary, not farther from the target than the exact shape, and tells its misfit."""
     e = mesh.connectivity.edge_count
     noise = np.concatenate([0.01 * target[:e] * rng.standard_normal(e), 0.02 * rng.standard_normal(e)])
     noisy = target + noise
@@ -172,7 +172,7 @@ def test_the_residual_is_the_misfit_in_the_norm_relative_to_the_target(mesh, pos
 
 
 def test_no_iteration_makes_it_worse(capsule):
-    """Full steps would: the first ones are shortened. A step that is tried in vain counts too."""
+    """Full steps would: the first ones are shortened. A rejected step counts as an iteration too."""
     reconstruct = Reconstructor(capsule)
     target = nric(bent(capsule.vertices, 3.0), capsule.connectivity)
     residuals = [reconstruct(target, max_iterations=n).residual for n in range(20)]
@@ -183,7 +183,7 @@ def test_no_iteration_makes_it_worse(capsule):
 
 @pytest.mark.parametrize("seed", [0, 3])
 def test_faces_that_no_triangle_fits_do_not_stop_it(seed):
-    """The shape that comes closest has faces with hardly any height, where angles change too fast for plain steps."""
+    """The closest shape has faces of almost no height, where angles change too fast for undamped steps."""
     mesh = MESHES["closed"]()
     c, reconstruct = mesh.connectivity, Reconstructor(mesh)
     target = nric(mesh.vertices, c)
@@ -193,14 +193,14 @@ def test_faces_that_no_triangle_fits_do_not_stop_it(seed):
         target[longest] = 1.6 * (target[sides].sum() - target[longest])
     found = reconstruct(target, tolerance=2e-5)
     assert found.status is Status.CONVERGED
-    # A minimum: smooth changes of the shape, however small, only make it worse.
+    # It is a minimum: small smooth changes of the shape increase the misfit.
     for change in mesh.vertices**2, mesh.vertices * [1, -1, 0]:
         for size in (1e-3, -1e-3):
             assert reconstruct(target, found.vertices + size * change, max_iterations=0).residual > found.residual
 
 
 def test_another_shape_than_the_one_asked_for_is_told_by_its_residual(capsule):
-    """Nearly closed to a ring, from the straight capsule: Gauss–Newton ends in another minimum."""
+    """The target is bent almost to a ring; from the straight capsule Gauss–Newton ends in another minimum."""
     reconstruct = Reconstructor(capsule)
     found = reconstruct(nric(bent(capsule.vertices, 5.0), capsule.connectivity))
     assert found.residual > 0.01
@@ -211,7 +211,7 @@ def test_faces_folded_the_wrong_way_are_counted(mesh, reconstruct):
     c = mesh.connectivity
     target = nric(mesh.vertices, c)
     assert reconstruct(target, max_iterations=0).flipped_faces == 0
-    # Two sides of one face, which counts once, and an edge elsewhere.
+    # Two sides of one face, which is counted once, and an edge elsewhere.
     first, second = next(sides[c.interior[sides]][:2] for sides in c.face_edges if c.interior[sides].sum() > 1)
     apart = next(
         e for e in np.flatnonzero(c.interior)[::-1] if not np.isin(c.edge_faces[e], c.edge_faces[[first, second]]).any()
@@ -228,7 +228,7 @@ def test_faces_folded_the_wrong_way_are_counted(mesh, reconstruct):
 @pytest.mark.parametrize("half", [0, 1], ids=["length", "angle"])
 def test_a_target_that_is_not_finite_or_too_large_to_square_is_refused(mesh, pose, reconstruct, target, half, value):
     if half and np.isfinite(value):
-        value = np.nan  # any finite angle is some angle
+        value = np.nan  # every finite number is a valid angle
     target[half * mesh.connectivity.edge_count + 3] = value
     for start in (None, pose):
         found = reconstruct(target, start)
@@ -255,7 +255,7 @@ def test_a_hopeless_target_ends_with_finite_vertices_and_no_claim(mesh, reconstr
     assert found.status is Status.ITERATION_LIMIT
     assert found.iterations == 20
     assert np.isfinite(found.vertices).all()
-    # Equal lengths may well exist, even that large; a single one of them, or negative ones, don't.
+    # A shape with all lengths this large may exist; one with a single such length, or negative ones, doesn't.
     assert found.residual > 0.5 or kind == "all lengths"
 
 
@@ -301,7 +301,7 @@ def test_where_the_guess_stalls_others_are_tried(mesh, pose, reconstruct, target
     assert reconstruct(target, reconstruct.guess(target)).status is Status.STALLED
     assert_found(reconstruct.from_guess(target), pose, mesh)
     assert reconstruct.from_guess(target, deadline=Deadline(-1)).status is Status.DEADLINE
-    # Where none leads anywhere, what the first guess led to is the answer.
+    # If all guesses stall, the result is that of the first.
     stalled = reconstruct(target, collapsed)
     monkeypatch.setattr(reconstruct, "_iterate", lambda *_: replace(stalled, iterations=5))
     found = reconstruct.from_guess(target, lambda: pose)
@@ -310,7 +310,7 @@ def test_where_the_guess_stalls_others_are_tried(mesh, pose, reconstruct, target
 
 
 def test_a_step_that_overflows_stalls(mesh, reconstruct, target, monkeypatch):
-    """Halving it would go on for ever."""
+    """Without a check, the line search would halve it forever."""
     for value in (np.nan, np.inf):
         broken = SimpleNamespace(solve=lambda right, value=value: np.full_like(right, value))
         for cholesky in (reconstruct._single, reconstruct._double):
@@ -339,7 +339,7 @@ def test_one_iteration_is_a_step_on_the_way(mesh, pose, reconstruct, target):
     assert found.iterations == 1
     assert 1e-10 < found.residual < before.residual
     assert np.isfinite(found.vertices).all()
-    # Going on from there ends where it would have.
+    # Continued from there, it ends at the same shape.
     assert_found(reconstruct(target, found.vertices), pose, mesh)
 
 

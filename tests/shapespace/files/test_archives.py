@@ -1,4 +1,4 @@
-"""Archives in pieces: what readers find in them, and that they come piece by piece."""
+"""Archives written in pieces: standard readers read them; each piece is ready before the next is made."""
 
 import io
 import zipfile

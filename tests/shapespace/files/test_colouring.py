@@ -1,4 +1,4 @@
-"""What colours say about a shape, against closed forms."""
+"""Values and colours of shapes, against closed forms."""
 
 import matplotlib as mpl
 import numpy as np
@@ -52,9 +52,9 @@ def test_a_uniform_scaling_stretches_by_its_logarithm_and_bends_nothing() -> Non
 def test_bending_is_the_change_of_the_angle_at_the_hinge() -> None:
     for before, after in ((0.0, 0.7), (0.3, -0.4), (-0.2, -0.9)):
         values = between(Quantity.BENDING, folded(after), folded(before), HINGE).values
-        # The tips have no interior edge.
+        # The two tips are at no interior edge.
         np.testing.assert_allclose(values, [after - before, after - before, 0, 0], atol=1e-12)
-    # Through the fold at π: the short way.
+    # Across the fold at π the change is the shorter one.
     values = between(Quantity.BENDING, folded(-3.0), folded(3.0), HINGE).values
     np.testing.assert_allclose(values[:2], 2 * np.pi - 6, atol=1e-12)
 
@@ -93,7 +93,9 @@ def test_linear_light_is_what_screens_show() -> None:
     shown = np.where(found.linear <= 0.0031308, 12.92 * found.linear, 1.055 * found.linear ** (1 / 2.4) - 0.055)
     np.testing.assert_allclose(shown, found.srgb, atol=1e-4)
     middle = Colouring(Quantity.STRETCH, np.zeros(1), 1.0).linear
-    assert middle == pytest.approx(np.full((1, 3), 0.716), abs=0.02), "light isn't its encoding, which is 0.865"
+    assert middle == pytest.approx(np.full((1, 3), 0.716), abs=0.02), (
+        "linear light, not its sRGB encoding, which is 0.865"
+    )
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""Mesh files: written by us and read by others, written by others and read by us."""
+"""Mesh files: written here and read by other libraries, and the reverse."""
 
 import io
 import json
@@ -104,7 +104,7 @@ def test_faulty_files_are_refused_with_the_reason(data: bytes, format: str, faul
 
 
 class Intruder:
-    """Something that does harm when it is unpickled."""
+    """An object that creates a file when it is unpickled."""
 
     def __init__(self, mark: Path) -> None:
         self.mark = mark
@@ -155,14 +155,14 @@ def test_others_read_our_colours(format: str) -> None:
     data = MESH_FORMATS[format].encode(mesh.vertices, mesh.faces, colouring)
     plain = MESH_FORMATS[format].encode(mesh.vertices, mesh.faces)
     for a, b in zip(read_arrays(data, format), read_arrays(plain, format), strict=True):
-        assert np.array_equal(a, b), "colours may not move anything"
+        assert np.array_equal(a, b), "colours may not change positions"
     if format == "npz":
         with np.load(io.BytesIO(data)) as arrays:
             assert arrays["color_quantity"] == "stretch"
             assert arrays["color_range"].tolist() == [-0.5, 0.5]
             np.testing.assert_allclose(arrays["color_values"], colouring.values, atol=1e-7)
         return
-    if format in {"glb", "gltf"}:  # trimesh sets them aside for those with a material
+    if format in {"glb", "gltf"}:  # trimesh ignores colours of a mesh with a material
         scene = trimesh.load_scene(io.BytesIO(data), file_type=format, process=False)
         (found,) = scene.geometry.values()
         np.testing.assert_allclose(found.visual.vertex_attributes["color"], colouring.linear, atol=1e-6)
@@ -193,9 +193,9 @@ def test_usd_holds_every_frame_with_its_normals(tmp_path: Path) -> None:
     np.testing.assert_array_equal(found, frames.astype(np.float32))
     assert np.array_equal(np.reshape(mesh.GetFaceVertexIndicesAttr().Get(), (-1, 3)), faces)
     assert set(mesh.GetFaceVertexCountsAttr().Get()) == {3}
-    assert mesh.GetSubdivisionSchemeAttr().Get() == "none", "viewers would round the shape off"
+    assert mesh.GetSubdivisionSchemeAttr().Get() == "none", "viewers would subdivide and smooth the shape"
     assert stage.GetTimeCodesPerSecond() == FRAMES_PER_SECOND
-    assert UsdGeom.GetStageMetersPerUnit(stage) == 1, "its default is centimetres, and others scale"
+    assert UsdGeom.GetStageMetersPerUnit(stage) == 1, "the default is centimetres, and other programs scale"
     assert UsdGeom.GetStageUpAxis(stage) == "Y"
     for k, frame in enumerate(frames):
         np.testing.assert_allclose(mesh.GetNormalsAttr().Get(k), vertex_normals(frame, faces), atol=1e-5)
@@ -248,7 +248,7 @@ def test_where_an_animation_takes_place_does_not_matter() -> None:
 
 
 def test_weights_of_what_goes_both_ways_lie_between_0_and_1() -> None:
-    # Others cut them off, as Blender does.
+    # Blender and other programs clamp weights outside.
     count = DENSE_FRAMES + 6
     swing = np.sin(np.linspace(0, 4 * np.pi, count))
     codes = np.stack([swing, 0.3 * swing, 1 + 0.2 * swing**2, 1 - 0.1 * swing], axis=1)
@@ -265,7 +265,7 @@ def test_weights_of_what_goes_both_ways_lie_between_0_and_1() -> None:
     assert error < 1.1e-4 * np.linalg.norm(np.ptp(frames.reshape(-1, 3), axis=0))
     for k in (0, 1, count // 2, count - 1):
         off = glb.key(k, "NORMAL") - vertex_normals(frames[k], freaky_torus.connectivity().faces)
-        assert np.abs(off).max() < 0.02, "normals move along"
+        assert np.abs(off).max() < 0.02, "normals are animated too"
 
 
 def test_more_ways_to_move_than_targets_leave_an_error_that_is_told(rng: np.random.Generator) -> None:

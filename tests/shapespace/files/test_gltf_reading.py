@@ -1,4 +1,4 @@
-"""glTF as its specification has it: known answers, what others read in the same files, and what is refused."""
+"""Reading glTF as specified: known answers, comparison with other readers, and what is refused."""
 
 import base64
 import io
@@ -32,7 +32,7 @@ def placed(**node: Any) -> np.ndarray:
 
 
 def primitive(mode: int | None, indices: list[int] | None, count: int = 6) -> tuple[np.ndarray, np.ndarray]:
-    """A primitive of six vertices in a row, with indices of one byte or none."""
+    """Vertices and faces read from a primitive of six vertices in a row, with one-byte indices or none."""
     data = np.arange(3 * count, dtype="<f4").tobytes()
     part: dict[str, Any] = {"attributes": {"POSITION": 0}} | ({} if mode is None else {"mode": mode})
     views = [{"buffer": 0, "byteLength": len(data)}]
@@ -49,7 +49,7 @@ def primitive(mode: int | None, indices: list[int] | None, count: int = 6) -> tu
 
 
 def numbered(numbers: list[float], kind: int = 5126) -> tuple[np.ndarray, np.ndarray]:
-    """Two triangles on six vertices in a row, the last three at the places of the first, with numbers of their own."""
+    """Two triangles read from six vertices with `_VERTEX` numbers, the last three where the first are."""
     places = np.tile(np.arange(9, dtype="<f4").reshape(3, 3), (2, 1)).tobytes()
     given = np.array(numbers, {5126: "<f4", 5121: "u1"}[kind]).tobytes()
     tree = document(
@@ -187,7 +187,7 @@ def test_without_scenes_every_node_counts_and_without_nodes_the_mesh() -> None:
 def test_triangles_strips_and_fans(mode: int | None, indices: list[int] | None, faces: list[list[int]]) -> None:
     vertices, found = primitive(mode, indices)
     np.testing.assert_array_equal(vertices, np.arange(18).reshape(6, 3))
-    # A triangle may begin with any of its corners.
+    # Faces are equal up to cyclic permutation of their corners.
     assert [min(f[k:] + f[:k] for k in range(3)) for f in found.tolist()] == [
         min(f[k:] + f[:k] for k in range(3)) for f in faces
     ]
@@ -204,7 +204,7 @@ def test_components_of_every_kind_as_they_are_and_normalised(kind: str, normaliz
         info = np.iinfo(kind)
         given = np.array([[info.min, info.max, 1], [0, 2, 3], [4, 5, info.max // 2]], f"<{kind}")
         expected = np.maximum(given / info.max, -1) if normalized else given.astype(float)
-    for stride in (3 * given.itemsize, 16):  # one after the other, and among other things
+    for stride in (3 * given.itemsize, 16):  # contiguous, and interleaved with other data
         row = np.dtype({"names": ["p"], "formats": [(given.dtype, 3)], "offsets": [0], "itemsize": stride})
         table = np.zeros(3, row)
         table["p"] = given
@@ -277,7 +277,7 @@ def test_buffers_beside_a_file_and_nowhere_else(tmp_path: Path) -> None:
 
 
 def accessor(index: int = 0, **more: Any) -> dict[str, Any]:
-    """A document whose positions, or indices, are described otherwise."""
+    """A document with changed members in the accessor of its positions (0) or indices (1)."""
     given: Any = document()["accessors"]
     given[index] |= more
     return document(accessors=given)
@@ -395,7 +395,7 @@ TRANSFORMATIONS = st.fixed_dictionaries(
 @settings(max_examples=60, deadline=None, derandomize=True, database=None)
 @given(st.lists(st.tuples(st.integers(0, 9), TRANSFORMATIONS, st.booleans()), min_size=1, max_size=10))
 def test_trees_as_trimesh_reads_them(given_nodes: list[tuple[int, dict[str, Any], bool]]) -> None:
-    """Every node lies in one before it, and some have the mesh, of two materials."""
+    """Each node is a child of one before it, and some have the mesh, which has two materials."""
     nodes: list[dict[str, Any]] = []
     for k, (parent, transformation, has_mesh) in enumerate(given_nodes):
         nodes.append(transformation | ({"mesh": 0} if has_mesh or k == len(given_nodes) - 1 else {}))

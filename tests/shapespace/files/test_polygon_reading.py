@@ -1,4 +1,4 @@
-"""OBJ, OFF, PLY, STL and NPZ: known answers, what others write, and where reading ends."""
+"""Reading OBJ, OFF, PLY, STL and NPZ: known answers, files of other programs, limits and refusals."""
 
 import io
 import struct
@@ -17,7 +17,7 @@ from tests.hostile import INDICES, XYZ, archive, npy, ply_head
 
 BALL = trimesh.creation.icosphere(2)
 BALL.vertices += 0.1 * np.random.default_rng(0).normal(size=BALL.vertices.shape)
-#: Five corners of a pyramid: a square, and four triangles.
+#: Corners of a pyramid, whose faces are a square and four triangles.
 CORNERS = [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0.5, 0.5, 1]]
 SIDES = [[0, 3, 2, 1], [0, 1, 4], [1, 2, 4], [2, 3, 4], [3, 0, 4]]
 TRIANGLES = [[0, 3, 2], [0, 2, 1], *SIDES[1:]]
@@ -26,7 +26,7 @@ SIDE_LINES = "".join(" ".join(map(str, [len(side), *side])) + "\n" for side in S
 
 
 def of_binary_ply(order: str, kinds: str, count: str, index: str) -> bytes:
-    """The pyramid with colours in front of its coordinates, lists of two lengths and one of something else."""
+    """The pyramid with colours before coordinates, faces of two sizes, and a list that is not read."""
     types = {"f": "float", "d": "double", "B": "uchar", "H": "ushort", "i": "int", "I": "uint", "b": "char"}
     head = ply_head(
         {"<": "binary_little_endian", ">": "binary_big_endian"}[order],

@@ -1,4 +1,4 @@
-"""What files have beside triangles: read from files that others write, written so that others read it."""
+"""What files have beside triangles: read from files of other programs, and written for them."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def file(tmp_path: Path) -> Path:
 
 
 def same(found: Surface | None, wanted: Surface) -> None:
-    """All that OBJ and MTL can say."""
+    """Assert that two surfaces agree in everything that OBJ and MTL can express."""
     assert found
     for name in ("starts", "corners", "uv_corners", "material_of"):
         np.testing.assert_array_equal(getattr(found, name), getattr(wanted, name), err_msg=name)
@@ -56,7 +56,7 @@ def same(found: Surface | None, wanted: Surface) -> None:
 
 
 def cube(lines: list[str], faces: list[str], tmp_path: Path) -> tuple[Surface | None, list[str]]:
-    """What is read of a cube with further lines before its faces."""
+    """Surface and notes read from a cube with further lines before its faces."""
     points = [f"v {x} {y} {z}" for x, y, z in CUBE]
     path = tmp_path / "cube.obj"
     path.write_text("\n".join([*points, *lines, *faces]) + "\n")
@@ -70,7 +70,9 @@ def test_a_file_of_others_is_read_whole(file: Path) -> None:
     found, faults = read_surface(file)
     assert not faults
     same(found, SURFACE)
-    assert np.array_equal(SURFACE.triangles, read_arrays(file)[1]), "triangles are cut as they are for the model"
+    assert np.array_equal(SURFACE.triangles, read_arrays(file)[1]), (
+        "polygons are split into the same triangles as for the model"
+    )
 
 
 def test_an_archive_of_obj_comes_back_whole(tmp_path: Path) -> None:
@@ -120,7 +122,7 @@ def test_others_see_texture_and_materials_in_gltf(format: str) -> None:
     assert looks["skin"].baseColorTexture.size == (4, 4)
     assert looks["cap"].baseColorTexture is None
     np.testing.assert_allclose(looks["cap"].baseColorFactor[:3], np.array([0.1, 0.2, 0.3]) * 255, atol=1)
-    # Ours sees the vertices that were split as the ones that they are.
+    # Our reader merges the vertices that were split.
     limits = Limits(len(SURFACE.split.vertex), len(SURFACE.triangles))  # those of both materials are the same
     vertices, faces = read_arrays(data, format, limits)
     np.testing.assert_allclose(vertices, VERTICES, atol=1e-6)
@@ -128,7 +130,7 @@ def test_others_see_texture_and_materials_in_gltf(format: str) -> None:
 
 
 def corners_seen(mesh: trimesh.Trimesh, material: str) -> dict:
-    """What `corner_uv` says, of a mesh that others have read; vertices are known by where they are."""
+    """As `corner_uv`, of a mesh that trimesh has read; vertices are identified by their positions."""
     apart, vertices = KDTree(VERTICES).query(mesh.vertices)
     assert apart.max() < 1e-6
     uv = mesh.visual.uv[mesh.faces]
@@ -139,7 +141,7 @@ def test_the_khronos_validator_finds_nothing_in_a_textured_animation(tmp_path: P
     frames = np.stack([VERTICES, VERTICES * [1, 1, 2], VERTICES * [2, 1, 1]])
     path = tmp_path / "animation.glb"
     path.write_bytes(animated_glb(frames, SURFACE.triangles, SURFACE).data)
-    # Texture coordinates where there is no picture are no fault.
+    # Texture coordinates without a texture are no error.
     told = {message["code"] for message in khronos_report(path)["issues"]["messages"]}
     assert told == {"UNUSED_OBJECT"}
     glb = GLB(path.read_bytes())
@@ -184,7 +186,7 @@ def test_ply_keeps_polygons_and_texture_coordinates(tmp_path: Path) -> None:
     places = {tuple(row) for row in np.hstack([VERTICES, VERTICES[:, :2]]).round(5).tolist()}
     assert {tuple(row) for row in np.hstack([other.vertices, other.visual.uv]).round(5).tolist()} == places
 
-    # Seams: lists at the faces, which others read where all faces are alike.
+    # Seams: texture coordinates as lists of the faces, which others read if all faces have the same size.
     triangles = SURFACE.triangulated
     path.write_bytes(MESH_FORMATS["ply"].encode(VERTICES, SURFACE.triangles, None, triangles))
     found, _ = read_surface(path)
@@ -193,7 +195,7 @@ def test_ply_keeps_polygons_and_texture_coordinates(tmp_path: Path) -> None:
     same_corners(corner_uv(found), corner_uv(unnamed))
     other = trimesh.load_mesh(path, process=False, fix_texture=True)
     same_corners(corners_seen(other, ""), corner_uv(unnamed))
-    # Both kinds of faces and seams: text, which everybody reads, without texture.
+    # Faces of several sizes and seams: text, which every reader can read, without texture coordinates.
     path.write_bytes(MESH_FORMATS["ply"].encode(VERTICES, SURFACE.triangles, None, SURFACE))
     assert len(trimesh.load_mesh(path, process=False).faces) == len(SURFACE.triangles)
 
@@ -215,7 +217,7 @@ def test_usd_has_quads_texture_coordinates_materials_and_names(tmp_path: Path) -
         material = UsdShade.MaterialBindingAPI(part).ComputeBoundMaterial()[0]
         look = UsdShade.Shader(material.GetPrim().GetChild("surface"))
         parts[material.GetPrim().GetDisplayName()] = np.array(part.GetIndicesAttr().Get())
-        assert not look.GetInput("diffuseColor").HasConnectedSource(), "a layer has no pictures beside it"
+        assert not look.GetInput("diffuseColor").HasConnectedSource(), "a USD layer alone has no textures"
     assert parts.keys() == {"skin", "cap"}
     for k, name in enumerate(("skin", "cap")):
         np.testing.assert_array_equal(parts[name], np.flatnonzero(SURFACE.material_of == k))
@@ -410,13 +412,13 @@ def test_usdz_packs_the_textures_that_its_materials_read(tmp_path: Path) -> None
 def test_usd_of_a_shape_is_the_same_at_any_time(colored: bool, tmp_path: Path) -> None:
     colouring = Colouring(Quantity.STRETCH, np.linspace(-1, 1, len(VERTICES)), 1.0) if colored else None
     first = {name: kind.encode(VERTICES, SURFACE.triangles, colouring, SURFACE) for name, kind in USD_FORMATS.items()}
-    time.sleep(2.1)  # ZIP counts in steps of two seconds
+    time.sleep(2.1)  # ZIP stores times in steps of two seconds
     for name, kind in USD_FORMATS.items():
         assert kind.encode(VERTICES.copy(), SURFACE.triangles, colouring, SURFACE) == first[name]
     path = tmp_path / "shape.usdz"
     path.write_bytes(first["usdz"])
     with zipfile.ZipFile(path) as package:
-        assert len(package.namelist()) == (1 if colored else 2), "colours stand in place of textures"
+        assert len(package.namelist()) == (1 if colored else 2), "colours replace textures"
     stage = Usd.Stage.Open(str(path))
     mesh = UsdGeom.Mesh(stage.GetDefaultPrim())
     shown = np.array(mesh.GetDisplayColorPrimvar().Get())

@@ -1,4 +1,4 @@
-"""Closest points on triangles: against trimesh's, in every region around a triangle."""
+"""Closest points on triangles, compared with trimesh's in every region around a triangle."""
 
 import numpy as np
 import trimesh

@@ -1,4 +1,4 @@
-"""One coarse connectivity for all shapes: what it keeps, what it refuses, and that it says so."""
+"""Coarsening all shapes to one connectivity: what it preserves, and which collapses it refuses."""
 
 import numpy as np
 import pytest
@@ -125,11 +125,13 @@ def test_what_bends_in_any_shape_is_kept():
 
     exact = face_areas(ridge, mesh.faces).sum()
     assert exact - area(seeing) < 0.01 * exact
-    assert exact - area(seeing) < 0.5 * (exact - area(blind)), "a ridge that is not missed proves nothing"
+    assert exact - area(seeing) < 0.5 * (exact - area(blind)), (
+        "the test needs a ridge that is lost when the shape isn't given"
+    )
 
 
 def test_limits_hold_however_few_vertices_are_asked_for(fine):
-    """In the shapes it is pulled thin, each in another direction, and pleated; the reference has none of it."""
+    """The shapes are squeezed, each in another direction, and pleated; the reference isn't."""
     x, y, z = fine.vertices.T
     pleats = np.stack([x, y, z + 0.15 * np.abs(np.mod(4 * x, 2) - 1)], axis=1)
     thin = [fine.vertices * stretch for stretch in ([1, 0.2, 1], [0.2, 1, 1], [1, 1, 0.2])]
@@ -200,7 +202,7 @@ def test_slivers_of_the_fine_mesh_are_healed(rng):
 
 @pytest.mark.parametrize("seed", [0, 2])
 def test_a_crumpled_place_smaller_than_a_coarse_face_is_cleared_away(seed):
-    """A corner of a mouth: in some shapes many small faces lie folded on one another."""
+    """As at the corner of a mouth, where in some shapes many small faces are folded onto one another."""
     ball = trimesh.creation.icosphere(subdivisions=4)
     mesh = TriangleMesh.from_arrays(ball.vertices, ball.faces)
     place = np.linalg.norm(mesh.vertices - mesh.vertices[100], axis=1) < 0.15
@@ -255,7 +257,7 @@ def test_a_thin_part_is_left_to_the_fine_mesh_where_it_would_be_all_slivers():
     assert found.smallest_area > 0.009
     assert (areas / areas.mean(axis=0)).min() > 0.09
     assert angles(kept, found.faces).min() > np.deg2rad(1.4)
-    # Few vertices are lost for it, and that is said.
+    # This costs few vertices, and the reason says so.
     assert 130 <= len(found.fine_index) <= 150
     assert bool(found.reason) == (len(found.fine_index) != 150)
 

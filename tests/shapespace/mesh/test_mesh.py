@@ -15,7 +15,7 @@ CORNERS = [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]
 
 
 def sides(face):
-    """Directed, the one opposite to corner k at place k."""
+    """Directed sides of a face; side k is opposite to corner k."""
     a, b, c = (int(v) for v in face)
     return [(b, c), (c, a), (a, b)]
 
@@ -136,7 +136,7 @@ def test_vertices_of_another_mesh_are_refused(shape):
 
 
 def test_a_small_mesh_is_as_good_as_a_large_one():
-    """Whether a face has area is asked relative to the others."""
+    """Whether a face has no area is decided relative to the other faces."""
     for scale in (1e-12, 1e12):
         mesh = TriangleMesh.from_arrays(scale * np.array(CORNERS), TETRAHEDRON)
         assert mesh.area == pytest.approx(scale**2 * (1.5 + np.sqrt(3) / 2))
@@ -203,7 +203,7 @@ def test_alignment_is_the_best_rigid_motion(mesh, pose, move, rng):
     assert misfit(found, mesh.vertices) == pytest.approx(best, rel=1e-9)
     assert misfit(found, mesh.vertices) <= misfit(x, mesh.vertices)
     np.testing.assert_allclose(found.mean(axis=0), mesh.vertices.mean(axis=0), atol=1e-13)
-    # It is a motion: all distances stay.
+    # It is a rigid motion: all distances are preserved.
     np.testing.assert_allclose(
         np.linalg.norm(found[1:] - found[:-1], axis=1), np.linalg.norm(x[1:] - x[:-1], axis=1), atol=1e-13
     )
@@ -236,6 +236,6 @@ def test_aligning_many_is_aligning_each(mesh, pose, move):
     together = align(shapes, mesh.vertices)
     for shape, found in zip(shapes, together, strict=True):
         np.testing.assert_allclose(found, align(shape, mesh.vertices), atol=1e-13)
-    # To a target each, as well.
+    # Each shape to a target of its own, too.
     for shape, target, found in zip(shapes, shapes[::-1], align(shapes, shapes[::-1]), strict=True):
         np.testing.assert_allclose(found, align(shape, target), atol=1e-13)

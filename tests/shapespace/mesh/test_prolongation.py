@@ -1,4 +1,4 @@
-"""The fine surface, carried along with a coarse one."""
+"""Prolongation: the fine surface computed from a coarse one."""
 
 import io
 
@@ -56,7 +56,7 @@ def test_moves_rigidly_and_grows_with_the_shape(pair, shape, move):
 
 @pytest.fixture
 def fitted(pair: Pair) -> Prolongation:
-    """Of bends by other angles than the shape's."""
+    """The prolongation fitted to bends by other angles than the shape's."""
     fine = np.stack([bent(pair.fine.vertices, angle) for angle in (0.4, 0.8, 1.1, 1.6, 9.0)])
     some = np.arange(0, len(pair.fine.vertices), 2)
     return pair.prolong.fitted(fine[:, pair.index], fine, some, np.arange(4))
@@ -66,7 +66,7 @@ def test_fitted_weights_come_nearer_to_shapes_that_they_were_not_fitted_to(pair,
     coarse = shape[pair.index]
     before, after = (np.linalg.norm(each(coarse) - shape, axis=1)[::2].mean() for each in (pair.prolong, fitted))
     assert after < 0.5 * before
-    # The others are where they were.
+    # The others are not affected.
     np.testing.assert_array_equal(fitted(coarse)[1::2], pair.prolong(coarse)[1::2])
 
 
@@ -85,7 +85,7 @@ def test_fitting_to_what_a_prolongation_does_changes_nothing(pair, shape):
 
 
 def test_follows_affine_maps_of_flat_places_exactly():
-    """In a plane the local maps are the map itself, stretch and shear included."""
+    """In a plane the local affine maps are the global map itself, stretch and shear included."""
     mesh = MESHES["sheet"]()
     flat = TriangleMesh.from_arrays(mesh.vertices * [1, 1, 0], mesh.faces)
     pair = Pair(flat)
@@ -99,12 +99,14 @@ def test_the_closest_point_of_a_triangle_is_the_one_that_trimesh_finds(rng):
     closest = trimesh.triangles.closest_point(corners, points)
     np.testing.assert_allclose(np.einsum("ki,kix->kx", weights, corners), closest, atol=1e-9)
     np.testing.assert_allclose(squared, ((points - closest) ** 2).sum(axis=1), atol=1e-9)
-    assert {int(count) for count in (weights > 0).sum(axis=1)} == {1, 2, 3}, "corners, sides and insides"
+    assert {int(count) for count in (weights > 0).sum(axis=1)} == {1, 2, 3}, (
+        "vertices at corners, on sides and inside of coarse faces"
+    )
 
 
 def tube(around: int, along: int) -> TriangleMesh:
     t, x = np.meshgrid(np.arange(around) * 2 * np.pi / around, np.linspace(-2, 2, along), indexing="ij")
-    t = t + 0.2 * x  # no vertex of the coarse one is above another
+    t = t + 0.2 * x  # so that no two vertices of the coarse mesh have the same angle
     vertices = np.stack([x, 0.4 * np.cos(t), 0.4 * np.sin(t)], -1).reshape(-1, 3)
     return TriangleMesh.from_arrays(vertices, grid_faces(around, along, around_u=True, around_v=False)[:, ::-1])
 
@@ -119,12 +121,12 @@ def test_a_bent_limb_stays_round():
     inner = np.abs(fine.vertices[:, 0]) < 1.7
     np.testing.assert_allclose(around[inner], 0.4, atol=0.012)
     assert np.linalg.norm(found - exact, axis=1)[inner].max() < 0.015
-    # Flat facets would be this far inside.
+    # Flat facets would be this far inside the tube.
     assert 0.4 * (1 - np.cos(np.pi / 8)) > 0.03
 
 
 def test_neighbours_in_space_that_are_far_on_the_surface_do_not_stick():
-    """A strip folded back onto itself, the ends almost touching, opens up."""
+    """A strip folded onto itself, its ends almost touching, opens."""
     fine, coarse = strip(61, 7), strip(16, 4)
     closed, opened = (fold(mesh, gap) for mesh, gap in ((fine, 0.02), (fine, 3.0)))
     prolong = Prolongation.of(fold(coarse, 0.02), closed)
@@ -140,9 +142,9 @@ def strip(n: int, m: int) -> TriangleMesh:
 
 
 def fold(mesh: TriangleMesh, gap: float) -> TriangleMesh:
-    """Both halves of a strip lie above one another, ``gap`` apart; the bend is a step of that height."""
+    """A strip with one half above the other, at distance ``gap``; the bend is a step of that height."""
     x, y, _ = mesh.vertices.T
-    # Waves that the coarse strip misses: to each half, the other one's coarse faces come closer than its own.
+    # The coarse strip misses these waves, so fine vertices are closer to coarse faces of the other half.
     z = gap / 2 * np.tanh(8 * x) + 0.05 * np.sin(3 * np.pi * y)
     return mesh.with_vertices(np.stack([np.sqrt(x**2 + 0.01), y, z], axis=1))
 

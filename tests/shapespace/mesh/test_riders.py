@@ -1,4 +1,4 @@
-"""Parts beside a surface: what carries them, and that they go where it goes."""
+"""Parts that are not connected to the surface: which of its vertices they follow, and where to."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ BALL = trimesh.creation.icosphere(1, 0.2)
 
 
 def bent(points: np.ndarray, angle: float) -> np.ndarray:
-    """Beyond x = 1 all turns about an axis there, the more the farther it is."""
+    """Points beyond x = 1 turned about an axis there, by an angle that grows with the distance."""
     x, y, z = points.T
     turn = angle * np.clip(x - 1, 0, None)
     return np.stack([np.where(x > 1, 1 + (x - 1) * np.cos(turn) - z * np.sin(turn), x), y,
@@ -42,7 +42,7 @@ def ridden(part: np.ndarray, moved: np.ndarray, faces: np.ndarray = BALL.faces) 
 
 
 def hard(part: np.ndarray) -> np.ndarray:
-    """Where a part is that goes along as a rigid body."""
+    """Positions of a part that moves rigidly with the body."""
     return np.stack([align(part, bent(part, angle)) for angle in ANGLES])
 
 
@@ -59,7 +59,7 @@ def test_a_hard_part_keeps_its_form_and_comes_near() -> None:
         there = prolong(shape)[index]
         np.testing.assert_allclose(align(EYE, there), there, atol=1e-12)
         assert np.linalg.norm(there - truth, axis=1).mean() < 0.02
-    # And the rest is where it would be without it.
+    # All other vertices are where they would be without the part.
     np.testing.assert_array_equal(prolong(SHAPES[1])[: len(BODY.vertices)], Prolongation.of(BODY, BODY)(SHAPES[1]))
 
 
@@ -75,7 +75,7 @@ def test_a_part_that_changes_its_form_is_carried_affinely() -> None:
 
 
 def test_a_part_is_carried_by_what_moves_with_it_not_by_what_is_nearest() -> None:
-    # The ball hovers above the part that bends, and stays with the part that does not.
+    # The ball is above the end that bends, and moves with the end that does not.
     part = BALL.vertices + np.array([2.0, 0, 1.1])
     moved = np.repeat(part[None], len(ANGLES), axis=0)
     rider, prolong = ridden(part, moved)

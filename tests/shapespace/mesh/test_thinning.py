@@ -1,4 +1,4 @@
-"""Thinning: as many vertices as asked for, the same topology, and no fold or sliver in any shape."""
+"""Thinning: the number of vertices asked for, the same topology, and no fold or sliver in any shape."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from shapespace.mesh.triangle_quality import folded_pairs, normals_and_sides, sq
 
 
 def bent(opened: bool, subdivisions: int = 4) -> tuple[TriangleMesh, np.ndarray]:
-    """A ball, or one with a round hole, and three bent ellipsoids of it."""
+    """A ball, or one with a round hole, and three shapes of it: bent ellipsoids."""
     ball = trimesh.creation.icosphere(subdivisions=subdivisions)
     faces = np.array(ball.faces)
     if opened:
@@ -37,7 +37,7 @@ def test_thinning_keeps_the_topology_and_the_shapes(opened: bool) -> None:
     normals, squares = normals_and_sides(shapes[:, kept].swapaxes(0, 1)[faces.T])
     assert np.rad2deg(np.arcsin(np.sqrt(squared_sines(normals, squares).min()))) > 9.9
     assert not len(folded_pairs(thinned, normals))
-    # It is the same surface: the middles of its faces lie close to the fine vertices.
+    # It is the same surface: the centres of its faces are close to fine vertices.
     for shape in shapes:
         away = KDTree(shape).query(shape[kept][faces].mean(axis=1))[0]
         assert away.max() < 0.05 * mesh.diagonal
@@ -95,7 +95,7 @@ def test_sheets_that_touch_at_vertices_stay_together() -> None:
     ("faces", "allowed"),
     [
         ([[0, 1, 2], [0, 2, 3], [0, 3, 1], [3, 2, 1]], set()),  # a tetrahedron
-        # A strip: along its border, not across.
+        # A strip: only edges of its boundary, none across it.
         ([[0, 1, 2], [2, 1, 3], [2, 3, 4], [4, 3, 5]], {(0, 1), (0, 2), (1, 3), (2, 4), (3, 5), (4, 5)}),
         ([[0, 1, 2]], set()),
     ],

@@ -1,4 +1,4 @@
-"""Models that tests of searches for codes share."""
+"""Models shared by the tests of `encode`, `edit` and `fit`."""
 
 import pytest
 
@@ -9,7 +9,7 @@ from tests.service.conftest import ROOT
 
 @pytest.fixture(scope="package")
 def model(tmp_path_factory: pytest.TempPathFactory) -> ShapeModel:
-    """A model of random networks with a finer mesh."""
+    """A model with random networks and a fine mesh."""
     folder = tmp_path_factory.mktemp("with-fine")
     write_bundle(folder, "with-fine", fine=True)
     return load(folder / "with-fine")
@@ -17,5 +17,5 @@ def model(tmp_path_factory: pytest.TempPathFactory) -> ShapeModel:
 
 @pytest.fixture(scope="package")
 def figure() -> ShapeModel:
-    """The bundled one."""
+    """The bundled figure."""
     return load(ROOT / "models" / "figure")

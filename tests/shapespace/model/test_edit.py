@@ -1,4 +1,4 @@
-"""Edits: what is pulled follows, what is not stays, what is fixed is kept, and how sure the code is then."""
+"""Edits: targets are reached, other vertices and fixed coordinates stay, and the covariance is right."""
 
 import numpy as np
 import pytest
@@ -28,7 +28,7 @@ def test_a_limb_follows_and_the_others_stay(figure: ShapeModel, kind: PriorKind)
         change = np.abs(found.code - pull.start) / figure.latents.width
         changed.append(sum(change[f.start : f.stop].max() > 0.01 for f in figure.manifest.factors))
     assert np.mean(moved) < 0.02
-    # Three factors suffice where few change; the smallest change takes a little of many.
+    # With GROUPS few factors change, three at most; with RIDGE many change a little.
     assert (np.mean(changed) < 3) == (kind is PriorKind.GROUPS)
 
 
@@ -54,7 +54,7 @@ def test_the_placement_takes_the_new_shape_to_where_the_old_one_is(model: ShapeM
 def objective(
     model: ShapeModel, code: FloatArray, pulled: dict[int, FloatArray], prior: float, kind: PriorKind, mesh: str
 ) -> float:
-    """What an edit from CODE minimises, in one line after the other, and over motions by a plain minimiser."""
+    """What an edit from CODE minimises, term by term, with a general minimiser over rigid motions."""
     diagonal = model.manifest.scale * model.reference.diagonal
     vertices, choice = list(pulled), MeshChoice(mesh)
     coarse = model.fine.prolong.coarse_vertices if model.fine and mesh == "fine" else slice(None)
@@ -123,7 +123,7 @@ def test_targets_count_by_their_sigma(model: ShapeModel) -> None:
     pulled = [Target(3, (shape[3] - apart).tolist(), 0.001), Target(3, (shape[3] + apart).tolist(), 0.002)]
     start = CODE.astype(np.float32)
     found = edited(model, start, pulled)
-    # Four times the weight: a fifth of the way from the surer one.
+    # Half the sigma has four times the weight: a fifth of the way from that target.
     np.testing.assert_allclose(found.distances, [0.008, 0.032], atol=1e-3)
     everywhere = model.edit(CODE, {3: shape[3] + apart, 20: shape[20]}, sigma=SIGMA * shape_diagonal(model))
     plain = model.edit(CODE, {3: shape[3] + apart, 20: shape[20]})
@@ -144,7 +144,7 @@ def test_the_covariance_is_the_inverse_of_what_differences_find(model: ShapeMode
     found = model.edit(CODE, targets, sigma=sigma, fixed=fixed, prior=1e-8)
     vertices, h = list(targets), 2e-3 * model.latents.width
 
-    # Where they are reached to first order in codes, with the pose known.
+    # The positions reached, in a fixed pose.
     def reached(code: FloatArray) -> FloatArray:
         placed: FloatArray = found.placement(model.decode(code))[vertices]
         return placed.ravel()
@@ -198,7 +198,7 @@ def test_anchored_the_whole_stays_though_a_target_is_out_of_reach(figure: ShapeM
     assert np.median(away[False]) > 0.03 * size
     assert np.median(away[True]) < 0.005 * size
     assert away[True][hand] < 0.01 * size
-    # What is in reach is met all the same.
+    # A target within reach is still met.
     assert figure.edit(np.zeros(20), target, anchored=True).residual < 1e-3 * size
 
 

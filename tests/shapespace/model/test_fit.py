@@ -1,4 +1,4 @@
-"""Fits: a scan's code, place and size come back, whatever is done to it; what is no such shape is told so."""
+"""Fits: code, placement and size of a scan are found again; a scan of another shape is reported."""
 
 from dataclasses import dataclass
 
@@ -24,7 +24,7 @@ def ring() -> ShapeModel:
 
 @dataclass(frozen=True)
 class Moved:
-    """A shape of a known code, elsewhere."""
+    """A shape of a known code after a known similarity transformation."""
 
     code: FloatArray
     shape: FloatArray
@@ -40,7 +40,7 @@ class Moved:
         return cls(drawn, there, model.faces, float(diagonal(there)))
 
     def points(self, count: int = 4000, seed: int = 0) -> FloatArray:
-        """At random all over the surface."""
+        """Random points of the whole surface."""
         rng = np.random.default_rng(seed)
         a, b, c = (self.shape[self.faces[:, k]] for k in range(3))
         areas = np.linalg.norm(np.cross(b - a, c - a), axis=1)
@@ -49,7 +49,7 @@ class Moved:
         return np.einsum("nk,nkx->nx", shares, self.shape[self.faces[chosen]])
 
     def seen_from(self, axis: int) -> FloatArray:
-        """Points that no others hide from a camera far away on an axis."""
+        """Points that are not occluded from a camera far away on an axis."""
         points = self.points(30_000)
         cells = np.floor(np.delete(points, axis, 1) / (self.size / 120)).astype(np.int64)
         _, cell = np.unique(cells, axis=0, return_inverse=True)
@@ -58,7 +58,7 @@ class Moved:
         return points[points[:, axis] > front[cell] - 0.02 * self.size][::4]
 
     def error(self, found: Fitted) -> float:
-        """Mean distance of vertices from where they are, as a fraction of the diagonal."""
+        """Mean distance of the vertices found from the true ones, as a fraction of the diagonal."""
         away = found.placement(found.shape.vertices) - self.shape
         return float(np.linalg.norm(away, axis=1).mean() / self.size)
 
@@ -76,18 +76,18 @@ def test_a_code_comes_back_from_points_anywhere(figure: ShapeModel) -> None:
         assert found.model.max < 0.05 * given.size
         np.testing.assert_allclose(found.placement.rotation @ found.placement.rotation.T, np.eye(3), atol=1e-9)
         assert np.linalg.det(found.placement.rotation) == pytest.approx(1)
-        # It costs what is promised: a rough shape a third of a solved one.
+        # The cost is as documented, counting a rough shape as a third of a solved one.
         assert found.solved + found.rough / 3 < 60
 
 
 def test_landmarks_tell_a_ring_how_it_is_turned(ring: ShapeModel) -> None:
-    # After half a turn, or upside down, a ring is that of another code; so only landmarks tell which vertex is where.
+    # A ring turned by 180° or upside down is that of another code: only landmarks tell vertices apart.
     given = Moved.of(ring, 2)
     points = given.points()
     landmarks = [Landmark(k, given.shape[k].tolist()) for k in (0, 300, 700, 1000, 1400, 1900)]
     found = ring.fit(points, landmarks=landmarks)
     assert given.error(found) < 5e-3
-    # A bump of two percent of its surface may stay where it isn't, which then is told.
+    # A bump of two percent of the surface may be found in the wrong place, but then the status says so.
     for fit in (found, ring.fit(points)):
         assert fit.scan.mean < 3e-3 * given.size
         assert fit.status is FitStatus.POOR or fit.scan.p95 < 5e-3 * given.size
@@ -168,7 +168,7 @@ def test_landmarks_decide_where_a_fit_begins_and_what_it_holds_on_to(figure: Sha
     landmarks = [Landmark(k, given.shape[k].tolist(), 0.01) for k in chosen]
     found = figure.fit(given.points(), landmarks=landmarks)
     assert given.error(found) < 1e-3
-    # One that is elsewhere, and certain, moves the shape there.
+    # A landmark moved elsewhere, with a small sigma, pulls the shape there.
     away = given.shape[chosen[0]] + 0.03 * given.size
     moved = figure.fit(given.points(), landmarks=[Landmark(chosen[0], away.tolist(), 1e-4)])
     there = [f.placement(f.shape.vertices)[chosen[0]] for f in (found, moved)]
@@ -202,7 +202,7 @@ def test_the_covariance_is_that_of_the_samples_and_holds_the_truth(figure: Shape
     off = np.abs(found.code - given.code) / deviations
     assert (off < 1.645).mean() >= 0.7
     assert off.max() < 6
-    # Much narrower than what is known without a scan.
+    # Much narrower than the prior.
     assert (deviations < 0.5 * np.sqrt(figure.population.covariance.diagonal())).all()
 
 
@@ -226,7 +226,7 @@ def test_what_is_no_such_shape_is_told_so(figure: ShapeModel, name: str) -> None
 
 
 def test_a_mirrored_scan_is_told_so(figure: ShapeModel) -> None:
-    # Coordinates of arms and legs that are fixed tell left from right.
+    # Fixed coordinates of arms and legs distinguish left from right.
     given = Moved.of(figure, 2)
     fixed = {k: float(value) for k, value in enumerate(given.code) if k < 18}
     found = figure.fit(given.points() * [-1, 1, 1], fixed=fixed)

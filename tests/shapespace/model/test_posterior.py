@@ -1,4 +1,4 @@
-"""How sure a code is: by data and population, from residuals that correlate, and of meshes in their units."""
+"""Covariance of codes: from data and population, with correlated residuals, and in the units of meshes."""
 
 import numpy as np
 import pytest
@@ -68,7 +68,7 @@ def test_residuals_of_neighbours_count_less_the_more_they_are_alike(
 
 
 def bumps(figure: ShapeModel, size: float, width: float, rng: np.random.Generator) -> FloatArray:
-    """Noise (V, 3) of one size at every vertex that is alike within a distance."""
+    """Noise (V, 3) of equal size at all vertices, correlated within a distance."""
     x = figure.vertices
     places = x[rng.choice(len(x), 300, replace=False)]
     near = np.exp(-((x[:, None] - places) ** 2).sum(axis=2) / (2 * width**2))
@@ -101,7 +101,7 @@ def test_encode_keeps_what_is_fixed_and_draws_around_the_code(model: ShapeModel)
                 assert (found.samples[:, index] == np.float32(value)).all()
             assert found.distances.mean() > free.distances.mean()
             assert found.samples.shape == (5, 3)
-    # The others make up for it, as far as they can.
+    # The free coordinates compensate for it as far as they can.
     moved = model.encode(shape, fixed={2: 0.7})
     halfway = np.linalg.norm(model.decode([-0.1, 0.9, 0.7]) - shape, axis=1)
     assert (moved.distances**2).sum() <= (halfway**2).sum()
@@ -132,7 +132,7 @@ def test_samples_of_the_population_have_its_moments(figure: ShapeModel) -> None:
     np.testing.assert_allclose((codes.mean(axis=0) - population.mean) / spread, 0, atol=0.07)
     found = np.cov(codes.T) / np.outer(spread, spread)
     np.testing.assert_allclose(found, population.covariance / np.outer(spread, spread), atol=0.09)
-    assert (codes > figure.upper).any(), "they are not cut off"
+    assert (codes > figure.upper).any(), "they are not truncated at the bounds"
     half = figure.sample(10, 1, "population", 0.5)
     np.testing.assert_allclose(half - population.mean, (codes[:10] - population.mean) / 2, atol=1e-6)
     for temperature in (-1, np.inf, np.nan, 1e300):

@@ -1,4 +1,4 @@
-"""The model as a library: it is found by its folder, and answers what the server answers."""
+"""The model in Python: it is loaded from its folder, and its results are those of the server."""
 
 import os
 import shutil
@@ -159,7 +159,7 @@ def test_shapes_that_were_not_found_are_told(model: ShapeModel, monkeypatch: pyt
 
 
 def test_a_code_outside_is_answered_only_where_none_inside_is_as_near(figure: ShapeModel) -> None:
-    """Rough shapes of codes on the bounds: what is nearest to them lies on either side."""
+    """Rough shapes of codes on the bounds, whose nearest codes may lie on either side."""
     rng = np.random.default_rng(2)
     latents = figure.latents
     away = 0.004 * np.linalg.norm(np.ptp(figure.vertices, axis=0))
@@ -169,7 +169,7 @@ def test_a_code_outside_is_answered_only_where_none_inside_is_as_near(figure: Sh
         found = figure.encode(shape + away * rng.normal(size=shape.shape))
         assert found.inside_bounds, k
         assert found.distances.mean() < 2.5 * away
-    # What is clearly outside is found there.
+    # A code clearly outside the bounds is found there.
     beyond = latents.lower + 1.1 * latents.width * (np.arange(latents.dimension) == 3)
     outside = figure.encode(figure.decode(beyond))
     assert not outside.inside_bounds

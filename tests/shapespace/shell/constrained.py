@@ -1,7 +1,7 @@
 """The exponential as the paper writes it: lengths and angles under integrability constraints, with multipliers.
 
-Plain, dense and slow: what ``shapespace.shell.exponential`` is held against, on small simply connected meshes. It
-shares with it the energy and nothing of the parametrisation by vertices.
+A simple, dense and slow reference for ``shapespace.shell.exponential``, for small simply connected meshes.
+The two share the energy, but not the parametrisation by vertices.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ def constrained_exponential(
         ∂₂W[z_{k−1}, z_k] + ∂₁W[z_k, z_{k+1}] + DQ(z_k)ᵀ λ = 0,   Q(z_{k+1}) = 0,
 
     by iterating with the matrix at z_k, ``[[−Hess₂W, DQᵀ], [DQ, 0]]``. Six rows of DQ are redundant on a
-    closed surface, and boundary angles have no energy, so the matrix is singular: its pseudoinverse leaves
-    those alone. Newton's matrix with DQ(z_{k+1}) would have six *nearly* dependent rows instead, and be worse.
+    closed surface, and boundary angles have no energy, so the matrix is singular, and its pseudoinverse is
+    used. Newton's matrix with DQ(z_{k+1}) would have six *nearly* dependent rows instead, which is worse.
 
     Raises:
         ArithmeticError: a step did not converge.

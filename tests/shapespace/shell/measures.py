@@ -1,4 +1,4 @@
-"""How far shapes are apart, and paths from being solutions."""
+"""Distances between shapes, and residuals of paths."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from shapespace.solve.preconditioner import step_length
 
 
 def distance(space: ShellSpace, first: FloatArray, second: FloatArray) -> float:
-    """Largest difference of lengths, relative to their mean, and of angles; the same for all poses in space."""
+    """Largest difference of lengths, relative to their mean, and of angles; invariant under rigid motions."""
     a, b = space.nric(first), space.nric(second)
     e = space.connectivity.edge_count
     turn = np.angle(np.exp(1j * (a[..., e:] - b[..., e:])))
@@ -18,7 +18,7 @@ def distance(space: ShellSpace, first: FloatArray, second: FloatArray) -> float:
 
 
 def true_residuals(space: ShellSpace, path: DiscretePath) -> FloatArray:
-    """``sqrt(F_kᵀ A_k⁻¹ F_k)`` of the discrete Euler–Lagrange equation, with a fresh factor for each shape."""
+    """``sqrt(F_kᵀ A_k⁻¹ F_k)`` of the discrete Euler–Lagrange equation, each with its own factor."""
     points = [space.point(x) for x in path.vertices]
     found = []
     for before, here, after in zip(points, points[1:], points[2:], strict=False):

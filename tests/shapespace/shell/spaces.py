@@ -1,4 +1,4 @@
-"""The spaces that the laws are held against, behind one interface: the space of shells, and one without curvature."""
+"""The spaces in which the laws are tested, with one interface: the space of shells, and a flat one."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ Ended = TypeVar("Ended", bound=Outcome)
 
 
 def found(outcome: Ended) -> Ended:
-    """What has converged."""
+    """The outcome, which must have converged."""
     assert outcome.converged, outcome.reason
     return outcome
 
@@ -29,7 +29,7 @@ def found(outcome: Ended) -> Ended:
 class Space(Protocol):
     """A Riemannian manifold with time-discrete operations on points and vectors (V, 3).
 
-    Points that differ by a rigid motion may be the same; ``distance`` says how far others are apart.
+    Points that differ by a rigid motion may count as the same; then their ``distance`` is 0.
 
     Attributes:
         tolerance: of distances, where equations are solved exactly.
@@ -48,7 +48,7 @@ class Space(Protocol):
     def transport(self, path: FloatArray, velocity: FloatArray) -> FloatArray: ...
 
     def means(self, shapes: FloatArray, weights: FloatArray, start: FloatArray, steps: int) -> list[FloatArray]:
-        """By all definitions that there are, the centre of mass last."""
+        """The weighted mean by every definition that the space has, the centre of mass last."""
 
     def energy(self, path: FloatArray) -> float: ...
 
@@ -57,10 +57,10 @@ class Space(Protocol):
     def distance(self, first: FloatArray, second: FloatArray) -> float: ...
 
     def difference(self, end: FloatArray, start: FloatArray) -> FloatArray:
-        """The vector at a start that leads to a neighbouring point, to first order."""
+        """The vector at ``start`` that leads to the neighbouring point ``end``, to first order."""
 
     def scaled(self, factor: float) -> Space:
-        """The same space of things that many times as large."""
+        """The same space for shapes scaled by this factor."""
 
 
 @dataclass(frozen=True)
@@ -103,7 +103,7 @@ class FlatSpace:
 
 @dataclass(frozen=True)
 class Shells:
-    """The space of shells; everything has to converge."""
+    """The space of shells; every operation must converge."""
 
     space: ShellSpace
     tolerance = 1e-6

@@ -25,7 +25,7 @@ def other(mesh, pose):
 
 @pytest.fixture
 def direction(mesh, z, rng):
-    """Any change of lengths and angles, integrable or not; none of angles that aren't there."""
+    """Any change of lengths and angles, integrable or not, with zeros for the angles of boundary edges."""
     e = mesh.connectivity.edge_count
     return np.concatenate([0.1 * z[:e] * rng.standard_normal(e), mesh.connectivity.interior * rng.standard_normal(e)])
 
@@ -57,7 +57,7 @@ def test_rigid_motions_cost_nothing(energy, mesh, pose, z, other, move):
 
 @pytest.mark.parametrize("s", [0.7, 0.99, 1.01, 1.5])
 def test_uniform_scaling_has_the_corrected_membrane_energy(energy, mesh, z, s):
-    """A = s² I. With the logarithm's factor as printed in the paper, the smaller of two shapes would win."""
+    """A = s² I. With the logarithm's factor as printed in the paper, s = 1 would not be the minimum."""
     e = mesh.connectivity.edge_count
     scaled = np.concatenate([s * z[:e], z[e:]])
     mu, lambda_ = MATERIAL.mu, MATERIAL.lambda_

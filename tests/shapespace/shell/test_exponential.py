@@ -1,4 +1,4 @@
-"""Shooting: its equations, its ends and what it tells where there is no way on."""
+"""The exponential: its equations, its end points, and its reasons where it can't be continued."""
 
 import numpy as np
 import pytest
@@ -102,7 +102,7 @@ def test_a_velocity_that_tears_the_mesh_is_told(space, mesh, rng):
 
 @pytest.mark.parametrize("pose", [1.3], indirect=True)
 def test_a_long_way_ends_in_a_finite_path_whatever_happens(mesh, velocity):
-    """Bending so stiff that faces collapse before the end: the shapes until then are there, and a reason."""
+    """Bending is so stiff that faces collapse on the way: the result has the shapes so far, and a reason."""
     space = ShellSpace(mesh, Material(eta=1.0))
     path = exponential(space, mesh.vertices, 5 * velocity, K)
     assert np.isfinite(path.vertices).all()

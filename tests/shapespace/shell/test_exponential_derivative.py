@@ -1,4 +1,4 @@
-"""The derivative of the exponential map, beside central differences of the map itself."""
+"""The derivative of the exponential map, compared with central differences."""
 
 import numpy as np
 import pytest

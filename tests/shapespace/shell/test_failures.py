@@ -1,4 +1,4 @@
-"""Input that cannot work ends in a value with a reason, in every operation."""
+"""For invalid input every operation returns a failed outcome with a reason."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Connecting: its equations, its first paths and where there is no geodesic."""
+"""Geodesics between two shapes: their equations, initial paths, and pairs without a geodesic."""
 
 from itertools import pairwise
 
@@ -32,7 +32,7 @@ def test_shapes_too_far_apart_for_a_straight_start_are_connected(space, mesh):
     assert true_residuals(space, path).max() <= 1e-9
     assert distance(space, path.vertices[-1], end) < 1e-12
     half = [space.energy.rest(a).value(b) for a, b in pairwise(path.nric)]
-    assert max(half) < 1.5 * min(half), "equal times"
+    assert max(half) < 1.5 * min(half), "all steps have similar energies"
 
 
 def test_the_logarithm_is_also_a_change_of_lengths_and_angles(space, mesh, velocity, move):
@@ -60,7 +60,7 @@ def test_a_geodesic_begins_as_one_to_a_neighbour_or_in_fewer_steps(space, mesh, 
         assert found.converged
         expected = geodesic(space, mesh.vertices, end, steps)
         assert distance(space, found.vertices, expected.vertices) < 1e-5
-        # As near as one could hope for, and exact at the ends.
+        # A good initial path is near the geodesic, and exact at the ends.
         assert distance(space, first, expected.vertices) < 0.3 * distance(space, mesh.vertices, end)
         assert distance(space, found.vertices[-1], end) < 1e-12
     assert len(halved(space, path).vertices) == 9

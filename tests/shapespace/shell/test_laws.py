@@ -1,7 +1,7 @@
-"""Laws of Riemannian geometry, each written once and held in every space.
+"""Laws of Riemannian geometry, each written once and tested in every space.
 
 Those of time-discrete operations (Rumpf and Wirth 2015) hold either exactly, to the tolerance of the solvers, or to
-first order in the step: then what is missed halves when the number of steps doubles, and vanishes in a flat space.
+first order in the step: then the error halves when the number of steps doubles, and vanishes in a flat space.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ def move(shapes: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True)
 class Case:
-    """Two points, and the velocity at the first that leads about to the second."""
+    """Two points, and the velocity at the first that leads approximately to the second."""
 
     space: Space
     start: FloatArray
@@ -43,7 +43,7 @@ class Case:
 
     @property
     def slower(self) -> Case:
-        """Half as far: first order is seen where steps are not too large."""
+        """With half the velocity: first-order convergence shows only if steps are not too large."""
         return replace(self, velocity=0.5 * self.velocity)
 
 
@@ -55,7 +55,7 @@ class Laws:
         return max(distances) < case.space.tolerance
 
     def halves(self, case: Case, misses: list[float], size: float) -> bool:
-        """Whether what is missed halves when K doubles, relative to a size, or is nothing."""
+        """Whether errors halve when K doubles, or are zero relative to a size."""
         if case.space.flat:
             return max(misses) < 1e-12 * size
         return misses[1] < 0.65 * misses[0] + 1e-7 * size
@@ -167,7 +167,7 @@ class Laws:
     # ------------------------------------------------------------ transport
 
     def test_transport_along_a_geodesic_carries_its_velocity(self, case: Case) -> None:
-        """To first order: so much is a discrete geodesic's velocity itself known."""
+        """To first order, the accuracy of a discrete geodesic's velocity."""
         case, misses = case.slower, []
         for steps in (4, 8):
             path = case.space.exponential(case.start, case.velocity, steps)
@@ -214,7 +214,7 @@ class Laws:
 
 
 class TestShells(Laws):
-    """On every mesh, nearly flat and strongly bent."""
+    """For every mesh, with a nearly flat and a strongly bent pose."""
 
     @pytest.fixture
     def case(self, space, mesh, pose, velocity) -> Case:
@@ -222,7 +222,7 @@ class TestShells(Laws):
 
 
 class TestFlatSpace(Laws):
-    """Where everything is exact: a law that fails here is no law, or written wrongly."""
+    """In flat space all laws hold exactly: one that fails here is wrong, or its test is."""
 
     @pytest.fixture
     def case(self, rng: np.random.Generator) -> Case:

@@ -1,4 +1,4 @@
-"""The tangent space, the metric, and factors that serve neighbouring shapes."""
+"""The tangent space, the metric, and Cholesky factors used at neighbouring shapes."""
 
 import numpy as np
 import pytest
@@ -50,7 +50,7 @@ def test_a_factor_rotated_with_a_rigid_motion_is_that_of_the_moved_shape(space, 
 
 @pytest.mark.parametrize("pose", [1.3], indirect=True)
 def test_rotating_a_factor_along_brings_it_nearer(space, mesh, pose, velocity):
-    """``A⁻¹`` of a bent shape, applied to the forces that a known field of displacements needs."""
+    """``A⁻¹`` at a bent shape, approximated by the factor of another, on ``A d`` with a known ``d``."""
     there = space.point(pose)
     field = without_rigid_motion(velocity, pose)
     forces = there.pull_back(there.lower(there.push_forward(field)))

@@ -1,4 +1,4 @@
-"""Parallel transport: one step, none, and vectors that are none."""
+"""Parallel transport: over one step and none, and of vectors that are zero or not finite."""
 
 from dataclasses import replace
 

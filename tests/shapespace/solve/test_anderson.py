@@ -1,4 +1,4 @@
-"""Acceleration and preconditioner on equations whose solution is known."""
+"""Anderson acceleration and the preconditioner on equations whose solution is known."""
 
 import numpy as np
 import pytest
@@ -23,7 +23,7 @@ def test_an_affine_equation_is_solved_in_as_many_iterations_as_by_gmres(spectrum
         x = mixing(x, forces, forces)
         errors.append(np.abs(x - solution).max())
     assert errors[2] > 1e-3
-    assert errors[4] < 1e-9, "four eigenvalues, and a last step that is taken at the solution"
+    assert errors[4] < 1e-9, "one iteration for each of four eigenvalues, and a last step at the solution"
 
 
 def test_the_first_iterate_is_the_plain_one_and_nothing_given_is_changed(rng):
@@ -35,7 +35,7 @@ def test_the_first_iterate_is_the_plain_one_and_nothing_given_is_changed(rng):
 
 
 def test_the_preconditioner_solves_what_is_left_of_forces_without_the_null_space(rng):
-    """The matrix is diag(1 … 6) but for its last row and column, which are nearly zero: a null space of e_6."""
+    """The matrix is diag(1, …, 5, 1e-9), whose null space is almost that of e_6."""
     pattern = SymmetricPattern(6, np.arange(6), np.arange(6))
     entries = np.array([1, 2, 3, 4, 5, 1e-9])
     inverse = Preconditioner(analyse(pattern).factorise(entries), np.eye(6)[5:])

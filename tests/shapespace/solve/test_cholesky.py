@@ -1,4 +1,4 @@
-"""Both Cholesky backends beside dense algebra, on the normal matrices they are made for."""
+"""Both Cholesky backends, compared with dense algebra on the normal matrices that they are used for."""
 
 import importlib.util
 import weakref
@@ -29,14 +29,14 @@ def backend(request):
 
 @pytest.fixture
 def pattern(rng):
-    """About four entries a row, and rows of only a diagonal."""
+    """About four entries a row, and some rows with the diagonal only."""
     rows, columns = rng.integers(0, 35, (2, 80))
     return SymmetricPattern(40, rows, columns)
 
 
 @pytest.fixture
 def positive(pattern, rng):
-    """A function that draws entries of a positive definite matrix: by dominance of the diagonal."""
+    """A function that draws entries of a diagonally dominant, hence positive definite, matrix."""
 
     def draw():
         entries = rng.standard_normal(len(pattern))
@@ -62,7 +62,7 @@ def test_contributions_add_up_and_those_below_the_diagonal_are_mirrored():
     pattern = SymmetricPattern(3, np.array([0, 1, 1, 0, 2]), np.array([1, 0, 1, 1, 2]))
     entries = pattern.scatter(np.array([1.0, 10, 5, 100, 7]))
     assert pattern.matrix(entries).toarray().tolist() == [[0, 111, 0], [111, 5, 0], [0, 0, 7]]
-    # (0, 0) is there although nothing was contributed.
+    # The diagonal is always stored: (0, 0) is there without a contribution.
     assert len(pattern) == 4
     assert pattern.rows.tolist() == [0, 0, 1, 2]
     assert pattern.indices.tolist() == [0, 1, 1, 2]
@@ -110,7 +110,7 @@ def test_single_precision_rounds_more_and_holds_less(backend, pattern, positive,
     assert found.dtype == np.float64
     away = np.linalg.norm(pattern.matrix(entries) @ found - right) / np.linalg.norm(right)
     assert 1e-9 < away < 1e-5
-    entries[0] = 1e39  # more than it can hold
+    entries[0] = 1e39  # too large for single precision
     with pytest.raises(NotPositiveDefiniteError, match="not finite"), np.errstate(over="ignore"):
         cholesky.factorise(entries)
     nearly = SymmetricPattern(2, np.array([0]), np.array([1]))
@@ -123,7 +123,7 @@ def test_single_precision_rounds_more_and_holds_less(backend, pattern, positive,
 @pytest.mark.parametrize("name", MESHES)
 def test_backends_agree_on_normal_matrices(name, rng):
     normal, entries, *_ = normal_matrix(name)
-    # Orthogonal to translations, as forces are: what is left is well conditioned enough to compare.
+    # Orthogonal to translations, as forces are: on these the matrix is well conditioned enough to compare.
     right = rng.standard_normal((normal.pattern.size // 3, 3))
     right = (right - right.mean(axis=0)).ravel()
     entries[normal.pattern.diagonal] *= 1 + 1e-4
@@ -147,7 +147,7 @@ def test_one_analysis_serves_many_factors_side_by_side(backend, pattern, positiv
     for number, entries in enumerate(matrices):
         given = entries.copy()
         factors.append(cholesky.factorise(given, number))
-        given[:] = np.nan  # a factor doesn't depend on what becomes of its matrix
+        given[:] = np.nan  # later changes of the matrix don't affect its factor
     check()
     matrices[1] = positive()
     factors[1] = cholesky.factorise(matrices[1], 1)
@@ -163,7 +163,7 @@ def test_two_analyses_do_not_meet(backend, pattern, positive, rng):
 
 
 def test_at_the_end_of_python_mkl_is_left_alone(pattern, positive):
-    """Its library may be gone before the factors are."""
+    """MKL may be unloaded before the factors are deleted."""
     cholesky = PardisoCholesky(pattern)
     entries = positive()
     factor = cholesky.factorise(entries)
@@ -207,7 +207,7 @@ def test_a_factor_that_has_been_replaced_is_not_taken_for_the_new_one(backend, p
     old = cholesky.factorise(entries)
     expected = old.solve(right)
     cholesky.factorise(positive())
-    if backend == "banded":  # each has memory of its own
+    if backend == "banded":  # each factor has memory of its own
         assert np.array_equal(old.solve(right), expected)
     else:
         with pytest.raises(RuntimeError, match="replaced"):
@@ -225,7 +225,7 @@ def test_a_factor_that_failed_leaves_none_behind(pattern, positive):
 
 
 def test_the_memory_of_factors_is_not_held_by_a_cycle(pattern, positive):
-    """MKL's memory is freed with the last factor, not when the garbage collector comes by."""
+    """MKL's memory is freed with the last factor, not at the next run of the garbage collector."""
     cholesky = PardisoCholesky(pattern)
     factor, gone = cholesky.factorise(positive()), weakref.ref(cholesky)
     del cholesky
@@ -246,7 +246,7 @@ def test_pardiso_is_taken_where_it_is_installed(pattern, monkeypatch):
 
 
 def any_form(mesh):
-    """Blocks that couple the lengths of a face, other weights everywhere."""
+    """Random blocks that couple the lengths of each face, and random weights of angles."""
     rng = np.random.default_rng(3)
     c = mesh.connectivity
     roots = rng.standard_normal((3, 3, len(c.faces)))
@@ -282,7 +282,7 @@ def test_the_normal_matrix_of_any_form_is_the_sparse_product(name):
 
 
 def test_the_pattern_stays_where_entries_cancel(backend):
-    """A flat square along the axes: angles feel z only, and sparse products would drop the rest."""
+    """A flat square in the x-y plane: angles depend on z only; sparse products would drop other entries."""
     flat = TriangleMesh.from_arrays([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], [[0, 1, 2], [0, 2, 3]])
     normal = NormalMatrix(flat.connectivity)
     jacobian = NRICJacobian(flat.connectivity)
@@ -290,7 +290,7 @@ def test_the_pattern_stays_where_entries_cancel(backend):
     symmetric = normal.entries(jacobian.gradients(flat.vertices), form)
     assert len(symmetric) == len(normal.pattern) == 12 * 13 / 2
     assert (symmetric == 0).sum() > 20
-    # One analysis serves this and every other shape.
+    # The symbolic analysis is the same for every shape.
     cholesky = analyse(normal.pattern, backend)
     other = flat.vertices + 0.1 * np.random.default_rng(0).standard_normal((4, 3))
     for shape in (flat.vertices, other, flat.vertices):

@@ -1,4 +1,4 @@
-"""Least squares in a box, against SciPy's, which makes a Jacobian at every step."""
+"""Least squares in a box, compared with SciPy's, which computes a Jacobian at every step."""
 
 import numpy as np
 import pytest
@@ -95,13 +95,13 @@ def test_failures_are_values() -> None:
     assert broken.status is Status.NOT_FINITE
 
     def never(x: np.ndarray, r: np.ndarray) -> np.ndarray:
-        raise AssertionError("there is nothing to derive")
+        raise AssertionError("the Jacobian is not needed here")
 
     box = Box(np.full(2, -2.0), np.full(2, 2.0), np.ones(2))
     assert least_squares(lambda x: x * np.nan, never, np.zeros(2), box).status is Status.NOT_FINITE
 
     def cliff(x: np.ndarray) -> np.ndarray:
-        """Not finite where the first steps would lead."""
+        """Not finite where the first full steps lead."""
         return np.where(x > 0.5, np.nan, 1.0) * (x - 2)
 
     stopped = solve(cliff, [0.0], [-np.inf], [np.inf])

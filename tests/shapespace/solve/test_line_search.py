@@ -1,4 +1,4 @@
-"""Backtracking: which share of a step is taken."""
+"""Backtracking: the share of a step that is taken."""
 
 import numpy as np
 import pytest
@@ -15,7 +15,7 @@ def test_the_longest_halving_that_is_accepted_is_taken(longest: float, expected:
         return f"at {t}"
 
     assert backtrack(trial, lambda t, found: t <= longest and found == f"at {t}", 0) == (expected, f"at {expected}")
-    assert tried == [2.0**-k for k in range(len(tried))], "and nothing is tried after it"
+    assert tried == [2.0**-k for k in range(len(tried))], "no share is tried after the accepted one"
 
 
 def test_the_smallest_step_is_still_tried_and_no_smaller_one() -> None:

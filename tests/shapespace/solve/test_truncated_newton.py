@@ -1,4 +1,4 @@
-"""Newton's descent on energies whose minimum is known."""
+"""Truncated Newton descent on energies whose minimum is known."""
 
 from collections.abc import Callable
 
@@ -9,7 +9,7 @@ from shapespace.solve.truncated_newton import descend
 
 
 class Barrier:
-    """``Σ c_i (x_i − log x_i)`` with weights over six orders of magnitude: least at 1, infinite from 0 on down."""
+    """``Σ c_i (x_i − log x_i)`` , weights over six orders of magnitude; least at 1, infinite for x_i ≤ 0."""
 
     length = 1.0
     weights = np.geomspace(1e-3, 1e3, 20)

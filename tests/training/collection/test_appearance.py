@@ -1,4 +1,4 @@
-"""What the reference's file has beside triangles, through reading, welding and choosing it."""
+"""What the reference's file has beside triangles is kept in reading, welding and choosing the reference."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def with_numbers(shape: np.ndarray) -> bytes:
 
 
 def of_others(shape: np.ndarray) -> bytes:
-    """Vertices split along the seams, and nothing that tells which of them are one."""
+    """A GLB as other programs write it: vertices split along seams, without `_VERTEX` numbers."""
     split = SURFACE.split
     look = trimesh.visual.TextureVisuals(uv=split.uv)
     mesh = trimesh.Trimesh(shape[split.vertex], split.faces, process=False, visual=look)
@@ -61,12 +61,12 @@ def test_seams_that_are_welded_stay_seams_of_the_texture(encode: Callable[[np.nd
     assert found
     assert meshes.vertices.shape[1] == len(REST)
     found.check(len(REST), meshes.faces)
-    # Vertices of these files are in the order of the ball's.
+    # All these files have vertices in the order of the ball's.
     named = encode is with_numbers
     wanted = SURFACE if named else replace(SURFACE, material_of=None, materials=())
     found = found if named else replace(found, material_of=None, materials=())
     same_corners(corner_uv(found), corner_uv(wanted))
-    assert found.shading is None, "what is smooth in the file is smooth across the seam"
+    assert found.shading is None, "smooth normals in the file stay smooth across the seam"
 
 
 def test_vertices_that_are_dropped_leave_polygons_where_they_are(tmp_path: Path) -> None:
@@ -121,10 +121,10 @@ def test_a_run_says_what_it_keeps_and_what_it_leaves_out(tmp_path: Path) -> None
     assert "ball" in warning.partition(": ")[0]
     assert "the texture skin.png of material skin is left out: No such file" in warning
     assert any("skin.png" in line for line in said)
-    assert any(line.startswith("data: 1 changed (balls.mtl)") for line in said), "materials count as data"
+    assert any(line.startswith("data: 1 changed (balls.mtl)") for line in said), "materials are data"
     names = json.loads((tmp_path / "run" / "surface.json").read_text())
     assert [material["texture"] for material in names["materials"]] == [None, None]
-    # Nothing is left of what a collection had before.
+    # Results of the collection's former files are deleted.
     for k, shape in enumerate(SHAPES):
         plain = MESH_FORMATS["obj"].encode(shape, SURFACE.triangles)
         (tmp_path / "balls" / f"ball{k}.obj").write_bytes(plain)

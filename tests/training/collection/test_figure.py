@@ -9,7 +9,7 @@ from shapespace.training.collection import figure, mannequin
 
 
 def smallest_angles(vertices: FloatArray, faces: np.ndarray) -> FloatArray:
-    """Of each face, in degrees."""
+    """Smallest angle of each face, in degrees."""
     p = vertices[faces]
     a, b = np.roll(p, -1, axis=1) - p, np.roll(p, 1, axis=1) - p
     return np.degrees(np.arctan2(np.linalg.norm(np.cross(a, b), axis=2), (a * b).sum(axis=2))).min(axis=1)
@@ -36,7 +36,7 @@ def collection() -> tuple[list[str], FloatArray, np.ndarray]:
 
 @pytest.fixture
 def some(rng: np.random.Generator) -> FloatArray:
-    """Angles (20, D) anywhere between the bounds."""
+    """Random joint angles (20, D) between their bounds."""
     lower, upper = np.array(list(figure.ANGLES.values())).T
     return rng.uniform(lower, upper, (20, len(lower)))
 

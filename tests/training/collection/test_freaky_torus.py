@@ -1,4 +1,4 @@
-"""The generator beside the paper's formula, written down a second time as it is printed."""
+"""The generator, compared with a second implementation of the formula as the paper prints it."""
 
 import cmath
 import math
@@ -9,7 +9,7 @@ import pytest
 from shapespace.coordinates.nric import dihedral_angles, nric
 from shapespace.training.collection import freaky_torus
 
-# The paper's choice, and how finely it is sampled.
+# The paper's parameters and resolution.
 A_R = A_r = 1.0
 B_R = B_r = 0.5
 R, r, H, EPSILON = 0.375, 0.125, 0.075, 0.05
@@ -34,7 +34,7 @@ def f(alpha, beta, u, v):
 
 
 def normal(alpha, beta, u, v):
-    """By complex steps, so that no derivative is written down."""
+    """Unit normal, with derivatives by complex steps instead of formulas."""
     h = 1e-30
     by_u = [x.imag / h for x in f(alpha, beta, complex(u, h), v)]
     by_v = [x.imag / h for x in f(alpha, beta, u, complex(v, h))]
@@ -90,7 +90,7 @@ def test_shapes_are_those_of_the_paper_at_index_32_i_plus_j(codes):
 
 def test_the_reference_is_the_code_of_zeros(reference):
     np.testing.assert_allclose(reference.vertices.reshape(N, M, 3), transcribed(0, 0, 0, 0), atol=1e-14)
-    # The tip of the bump, at the end of both long axes.
+    # The tip of the bump is where the long axes of both ellipses end.
     np.testing.assert_allclose(reference.vertices[0], [R * A_R + r * A_r + H, 0, 0], atol=1e-15)
 
 
@@ -100,7 +100,7 @@ def test_every_latent_has_the_period_of_a_full_turn(codes, latent):
     turn = np.eye(4)[latent] * 2 * np.pi
     for turns in (1, -1, 3):
         np.testing.assert_allclose(freaky_torus.vertices(codes + turns * turn), shapes, atol=1e-13)
-    # And no shorter one.
+    # No shorter period.
     for part in (2, 3):
         assert np.abs(freaky_torus.vertices(codes + turn / part) - shapes).max(axis=(1, 2)).min() > 0.01
     assert pytest.approx(2 * np.pi) == freaky_torus.PERIOD
@@ -116,7 +116,7 @@ def test_the_tip_of_the_bump_is_farthest_from_the_plain_torus(codes):
         assert distance[tip] == pytest.approx(H)
         assert np.sort(distance)[-2] < 0.999 * H
         assert np.median(distance) < 1e-6 * H
-        # Everything moves along the one normal at the tip.
+        # All vertices move along the normal at the tip.
         np.testing.assert_allclose(moved, distance[:, None] * normal(alpha, beta, gamma, zeta), atol=1e-14)
 
 
@@ -156,7 +156,7 @@ def test_every_quad_is_split_along_the_same_diagonal(reference):
 def test_faces_look_outward(reference, codes):
     for shape in [reference.vertices, *freaky_torus.vertices(codes)]:
         assert volume(shape, reference.faces) > 0
-    # Also each by itself: like the normal of the smooth surface.
+    # Each face alone too: its normal is near that of the smooth surface.
     smooth = plain(0.3, 0).reshape(-1, 3)
     a, b, c = np.moveaxis(smooth[reference.faces], 1, 0)
     n = [normal(0.3, 0, 2 * math.pi * (k // M) / N, 2 * math.pi * (k % M) / M) for k in reference.faces[:, 0]]

@@ -1,4 +1,4 @@
-"""Collections of mesh files: what is one, in which order, with which vertices, and what is refused in one line."""
+"""Collections of mesh files: what counts as one, the order of files and vertices, and one-line refusals."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def sheet(n: int = 5) -> tuple[np.ndarray, np.ndarray]:
 
 
 def split_at(faces: np.ndarray, vertex: int, count: int) -> np.ndarray:
-    """Faces whose second half uses vertex ``count`` instead of the given one, as exporters do along a seam."""
+    """Faces whose second half uses vertex ``count`` instead of ``vertex``, as exporters split seams."""
     split = faces.copy()
     half = split[len(split) // 2 :]
     half[half == vertex] = count
@@ -93,7 +93,7 @@ def test_formats_mix_and_other_files_are_ignored(formats: tuple[str, ...], tmp_p
     found = read_collection(tmp_path)
     assert found.names == NAMES
     same_surfaces(found)
-    assert np.array_equal(found.faces, FACES), "STL takes the shared vertices of the others"
+    assert np.array_equal(found.faces, FACES), "faces of STL get the other files' vertices"
 
 
 def test_names_are_in_natural_order(tmp_path: Path) -> None:
@@ -118,7 +118,7 @@ def test_one_npz_is_a_collection(named: bool, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("format", ["obj", "glb", "ply"])
 def test_seams_are_welded_and_unused_vertices_dropped(format: str, tmp_path: Path) -> None:
-    # Vertex 7 has a twin at 42; 43 belongs to no face and is elsewhere in each shape.
+    # Vertex 42 is a copy of 7; 43 is in no face, and in another place in each shape.
     extra = np.random.default_rng(1).standard_normal((3, 1, 3))
     shapes = np.concatenate([SHAPES, SHAPES[:, 7:8], extra], axis=1)
     found = read_collection(write(tmp_path, shapes, split_at(FACES, 7, 42), [format] * 3))
@@ -139,11 +139,11 @@ def test_a_vertex_of_a_file_is_found_again_behind_those_left_out(tmp_path: Path)
 def test_vertices_that_coincide_in_one_shape_only_stay_apart(touching: int, tmp_path: Path) -> None:
     flat, faces = sheet()
     shapes = np.stack([flat * [1, s, 1] for s in (1, 2, 3)])
-    shapes[touching, 0] = shapes[touching, 4] = [1, 2, 3]  # two corners meet over the sheet
+    shapes[touching, 0] = shapes[touching, 4] = [1, 2, 3]  # two corners coincide
     found = read_collection(write(tmp_path, shapes, faces))
     assert found.vertices.shape == (3, 25, 3)
     same_surfaces(found, shapes, faces)
-    assert len(found.notes) == (touching == 0), "the first shape tells where a weld might have been"
+    assert len(found.notes) == (touching == 0), "only coincidences in the first shape are noted"
 
 
 def test_vertices_a_hair_apart_are_welded_but_not_more(tmp_path: Path) -> None:
@@ -157,7 +157,7 @@ def test_vertices_a_hair_apart_are_welded_but_not_more(tmp_path: Path) -> None:
 def test_rough_meshes_pass(tmp_path: Path) -> None:
     flat, faces = sheet()
     shapes = np.stack([flat, flat * [1, 1.3, 1], flat * [2, 1, 1]])
-    shapes[1, 20:] = shapes[1, 10:15] + [1e-3, 0, 1e-3]  # the last row folded back onto its neighbours
+    shapes[1, 20:] = shapes[1, 10:15] + [1e-3, 0, 1e-3]  # the last row is folded onto the one before
     shapes[2, 6] = shapes[2, 7] + [0, 1e-4, 0]  # slivers
     same_surfaces(read_collection(write(tmp_path, shapes, faces)), shapes, faces)
 
@@ -214,7 +214,7 @@ def written(*arguments: object, **named: object) -> Callable[[Path], Path]:
 
 
 def with_other(name: str, vertices: np.ndarray, faces: np.ndarray) -> Callable[[Path], Path]:
-    """A folder of three OBJ files, or STL ones where the other one is STL, one of them replaced."""
+    """A folder of three OBJ files (or STL files, if ``name`` is one) of which one is replaced."""
     format = name.rpartition(".")[2]
 
     def build(folder: Path) -> Path:
@@ -226,13 +226,13 @@ def with_other(name: str, vertices: np.ndarray, faces: np.ndarray) -> Callable[[
 
 
 def ball_and(vertices: Sequence[Sequence[float]], faces: Sequence[Sequence[int]]) -> Callable[[Path], Path]:
-    """The collection with vertices 42 … more in every shape, and faces."""
+    """The collection with further vertices, numbered from 42, in every shape, and further faces."""
     more = np.repeat(np.array(vertices, dtype=float).reshape(1, -1, 3), 3, axis=0)
     return written(np.concatenate([SHAPES, more], axis=1), np.concatenate([FACES, faces]))
 
 
 def third_face(seam: bool) -> Callable[[Path], Path]:
-    """A face too many on A–B, or on its twins across a seam; two vertices of no face go before, so numbers differ."""
+    """A third face on edge A–B, or on its copy across a seam; two unused vertices first shift the numbers."""
 
     def build(folder: Path) -> Path:
         shapes = np.concatenate([np.zeros((3, 2, 3)), SHAPES, SHAPES[:, [A, B]], np.full((3, 1, 3), 9.0)], axis=1)

@@ -1,4 +1,4 @@
-"""``init``: a folder of meshes in, a configuration out that works as it is."""
+"""``init`` writes, for a folder of meshes, a configuration that works without changes."""
 
 from __future__ import annotations
 

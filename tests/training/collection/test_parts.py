@@ -1,4 +1,4 @@
-"""Collections of several parts: which is the shell, what rides along, and what is refused."""
+"""Collections of several parts: which is the shell, which parts follow it, and what is refused."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ NAMES = ("Eye", "Bar", "Nail")
 
 
 def stretched(k: int) -> np.ndarray:
-    """A shape of the collection; its eye keeps its form."""
+    """A shape of the collection; its eye moves rigidly."""
     shape = REST * [1, 1, 1 + 0.3 * k]
     eye = np.unique(FACES[OBJECT == 0])
     shape[eye] = align(REST[eye], shape[eye])
@@ -46,7 +46,7 @@ def test_the_largest_is_the_shell_and_the_others_ride_along(tmp_path: Path) -> N
         assert part.faces.tolist() == np.flatnonzero(np.array(NAMES)[OBJECT] == part.name).tolist()
     np.testing.assert_array_equal(meshes.faces, FACES)
     assert any("3 separate parts" in note and "'Eye', 'Nail' ride along" in note for note in meshes.notes)
-    # Area 1 is the shell's.
+    # Normalisation gives the shell area 1.
     vertices, scale = normalised(meshes, 0)
     shell = trimesh.Trimesh(vertices[0], meshes.shell_faces, process=False)
     assert shell.area == pytest.approx(1)

@@ -1,4 +1,4 @@
-"""Odd shapes among good ones: each is named, with what is odd about it, and the good ones are left alone."""
+"""Suspicious shapes among good ones: each is named with what is wrong, and no good one is."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def far_off(shape: np.ndarray) -> np.ndarray:
 
 
 UPRIGHT = np.array([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]])
-#: What is done to one shape, what is said of it, and whether that stops a run.
+#: A change of one shape, what the message says of it, and whether it stops a run.
 ODDITIES: dict[str, tuple[Callable[[np.ndarray], np.ndarray], str, bool]] = {
     "millimetres": (lambda shape: 1000 * shape, r"another size: its lengths are (1,0|9)\d+ times the median's", True),
     "a tenth": (lambda shape: shape / 10, r"another size: its lengths are 0\.(1|09)\d* times the median's", True),
@@ -93,7 +93,7 @@ def test_a_mirrored_sheet_is_named(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("format", ["obj", "ply"])
 def test_vertices_are_numbered_as_in_the_file(format: str, tmp_path: Path) -> None:
-    # Two vertices in no face go before.
+    # Two vertices that no face uses come first.
     shapes = np.concatenate([np.zeros((len(SHAPES), 2, 3)), SHAPES], axis=1)
     shapes[ODD, 2:] = far_off(SHAPES[ODD])
     (warned,) = write(tmp_path / "meshes", shapes, FACES + 2, format).warnings
@@ -134,7 +134,7 @@ def test_the_most_central_shape_is_the_reference_wherever_it_stands(tmp_path: Pa
 
 
 def test_parts_that_almost_meet_are_told_from_separate_ones(tmp_path: Path) -> None:
-    # The faces of one half get vertices of their own along the seam.
+    # The faces of one half get copies of the vertices along the seam.
     left = SHAPES[0][FACES].mean(axis=1)[:, 0] < 1000
     seam = np.intersect1d(FACES[left], FACES[~left])
     twin = np.arange(SHAPES.shape[1])

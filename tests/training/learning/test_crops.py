@@ -1,4 +1,4 @@
-"""Crops: what they learn is what the whole mesh would, and they lie where the most is missed."""
+"""Crops: on inner edges their loss is that of the whole mesh, and they are drawn where the error is large."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def crops(mesh: TriangleMesh, size: int) -> Crops:
 
 
 def combiner(mesh: TriangleMesh) -> tuple[CombinerNetwork, torch.Tensor, torch.Tensor]:
-    """A network that is no sum of the factors, shapes of two factors, and what it ought to make of them."""
+    """A network that is not the affine sum, shapes of two factors as inputs, and target shapes."""
     torch.manual_seed(0)
     noise = np.random.default_rng(0).normal(size=(12, *mesh.vertices.shape))
     z = nric(mesh.vertices + 0.02 * noise, mesh.connectivity).astype(np.float32)
@@ -66,7 +66,7 @@ def test_a_crop_of_everything_is_the_whole_mesh(mesh: TriangleMesh) -> None:
     whole = network.loss(inputs, target)
     network.correction.crops = crops(mesh, 10**6)
     assert network.correction.crops.about(torch.tensor([7])).inner.all()
-    torch.testing.assert_close(network.loss(inputs, target), whole, rtol=1e-4, atol=0)  # sums in another order
+    torch.testing.assert_close(network.loss(inputs, target), whole, rtol=1e-4, atol=0)  # order of summation
 
 
 def test_an_edge_is_inner_where_all_within_reach_is_in_the_crop(mesh: TriangleMesh) -> None:

@@ -1,4 +1,4 @@
-"""R² and the multilinear grid, where their values are known."""
+"""R² and the multilinear grid, in cases with known values."""
 
 from __future__ import annotations
 

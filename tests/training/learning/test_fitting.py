@@ -1,4 +1,4 @@
-"""The training loop: it learns, and a killed one ends where an undisturbed one does."""
+"""The training loop: it learns, and after a kill it continues to the same result."""
 
 from __future__ import annotations
 

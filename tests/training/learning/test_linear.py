@@ -11,7 +11,7 @@ PENALTIES = (1e-3, 1e-1, 1e1, 1e3)
 
 
 def samples(n: int, p: int, q: int = 3) -> tuple[torch.Tensor, torch.Tensor, tuple[torch.Tensor, torch.Tensor]]:
-    """Features, noisy values of a linear map, and the same held out; in double precision."""
+    """Features and noisy values of a linear map, and held-out ones; in double precision."""
     rng = torch.Generator().manual_seed(n + p)
     x, other, true = (torch.randn(shape, generator=rng, dtype=torch.float64) for shape in ((n, p), (50, p), (p, q)))
     noise, held = (torch.randn((k, q), generator=rng, dtype=torch.float64) for k in (n, 50))
@@ -19,7 +19,7 @@ def samples(n: int, p: int, q: int = 3) -> tuple[torch.Tensor, torch.Tensor, tup
 
 
 def held_out_error(x: torch.Tensor, y: torch.Tensor, held_out: tuple[torch.Tensor, torch.Tensor], p: float) -> float:
-    """By the definition: least squares of the samples and √λ W = 0."""
+    """By definition: least squares of the samples together with √λ W = 0."""
     rows = torch.cat([x, p**0.5 * torch.eye(x.shape[1], dtype=x.dtype)])
     weights = torch.linalg.lstsq(rows, torch.cat([y, torch.zeros(x.shape[1], y.shape[1], dtype=x.dtype)])).solution
     return float((held_out[0] @ weights - held_out[1]).square().mean())
@@ -59,7 +59,7 @@ def test_ridge_regression_takes_the_penalty_that_held_out_pairs_ask_for() -> Non
     found = regression(x, x @ true, (other, other @ true))
     torch.testing.assert_close(found.weights, true.double(), atol=1e-3, rtol=0)
     found = regression(x, torch.randn(30, 3), (other, torch.zeros(200, 3)))
-    assert (other.double() @ found.weights).square().mean() < 0.01, "noise is not followed"
+    assert (other.double() @ found.weights).square().mean() < 0.01, "noise is not fitted"
 
 
 @pytest.mark.parametrize(("n", "p"), [(10, 30), (30, 10)])

@@ -1,4 +1,4 @@
-"""What factors and coordinates are called in a bundle."""
+"""Names of factors and coordinates in a bundle."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Laws of the networks: what they are at the start, what they can't see, and gradients made by hand."""
+"""Laws of the networks: initial values, invariances, closed-form fits, and gradients coded by hand."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ def test_flaps_are_the_other_edges_of_the_two_faces_in_order(mesh: str, request:
 
 
 def star(connectivity: Connectivity) -> np.ndarray:
-    """(E, E) which edges share a vertex, the edge itself left out."""
+    """(E, E): 1 where two different edges share a vertex."""
     a, b = connectivity.edges[:, None, :, None], connectivity.edges[None, :, None, :]
     shared = (a == b).any(axis=(2, 3))
     return shared & ~np.eye(len(shared), dtype=bool)
@@ -117,7 +117,7 @@ def test_the_gradient_of_a_convolution_is_right(sheet: TriangleMesh, neighbourho
 
 
 def fitted(mesh: TriangleMesh, settings: Any, factors: torch.Tensor, z: torch.Tensor, own: int) -> CombinerNetwork:
-    """All of its closed form, from the first ``own`` samples; the others choose."""
+    """A combiner fitted in closed form to the first ``own`` samples; the others select its settings."""
     scale = scaling(mesh, z.numpy())
     parts = (JointSamples(factors[part], z[part], scale) for part in (slice(own), slice(own, None)))
     with torch.no_grad():
@@ -138,7 +138,7 @@ Missed = Callable[[NDArray, NDArray, NDArray, NDArray], NDArray]
 
 
 def interplay(ball: TriangleMesh, count: int, missed: Missed) -> tuple[torch.Tensor, torch.Tensor]:
-    """Shapes z̄ + a d and z̄ + b e of two factors, and joint ones that miss their sum by ``missed(a, b, f, g)``."""
+    """Shapes z̄ + a d and z̄ + b e of two factors, and joint ones, their sum plus ``missed(a, b, f, g)``."""
     rng = np.random.default_rng(0)
     reference = nric(ball.vertices, ball.connectivity)
     d, e, f, g = 0.01 * rng.normal(size=(4, len(reference)))
@@ -172,7 +172,7 @@ KINDS = [
 def test_every_correction_finds_an_interplay_from_factors_alone(
     ball: TriangleMesh, settings: Any, missed: Missed, left: float
 ) -> None:
-    """At codes that it has not seen, of a size that no affine sum reaches."""
+    """On new codes its squared error is less than ``left`` times that of the affine sum."""
     x, z = interplay(ball, 260, missed)
     network, unseen = fitted(ball, settings, x[:180], z[:180], 150), slice(180, None)
     with torch.no_grad():
@@ -222,7 +222,7 @@ def test_auto_takes_what_is_better_on_codes_that_it_has_not_seen(ball: TriangleM
 
 
 def test_kernel_regression_on_codes_finds_a_smooth_map(ball: TriangleMesh) -> None:
-    """Of an angle and a bounded coordinate; the same map with noise only as far as the noise leaves it."""
+    """A map of an angle and a bounded coordinate; fitted to noisy values, its error is below the noise."""
     coordinates = Coordinates(np.array([0.0, -3.0]), np.array([2 * np.pi, 5.0]), np.array([2 * np.pi, np.nan]))
     codes = torch.as_tensor(coordinates.uniform(300, np.random.default_rng(0)), dtype=torch.float32)
     rng = np.random.default_rng(1)
@@ -242,7 +242,7 @@ def test_kernel_regression_on_codes_finds_a_smooth_map(ball: TriangleMesh) -> No
 
 
 def polynomials(mesh: TriangleMesh, coefficients: int, monomials: int) -> tuple[PolynomialCorrection, torch.Tensor]:
-    """Fitted ones, and shapes of factors."""
+    """A fitted polynomial correction, and scaled shapes of factors."""
     x, z = interplay(mesh, 60, cubic)
     network = fitted(mesh, PolynomialSettings(coefficients=coefficients, monomials=monomials), x, z, 40)
     assert isinstance(network.correction, PolynomialCorrection)
@@ -264,7 +264,7 @@ def test_polynomials_look_at_no_other_patch(ball: TriangleMesh) -> None:
 
 
 def test_a_learned_metric_finds_the_direction_that_matters() -> None:
-    """Of twenty, from samples too few to tell a quadratic in twenty variables."""
+    """One of twenty directions, from fewer samples than a quadratic in twenty variables has coefficients."""
     rng = torch.Generator().manual_seed(0)
     x, other = (torch.randn(n, 20, generator=rng, dtype=torch.float64) for n in (120, 200))
     direction = nn.functional.normalize(torch.randn(20, generator=rng, dtype=torch.float64), dim=0)
@@ -303,7 +303,7 @@ def test_a_patch_basis_keeps_the_variance_it_promises(ball: TriangleMesh, patche
         kept = basis(basis.encode(x))
         lost = ((x - kept).square().sum() / (x - x.mean(dim=0)).square().sum()).item()
         assert 0 < lost <= 1 - energy + 1e-5
-    # Orthonormal but for the rounding to 16 bits.
+    # Orthonormal up to rounding to 16 bits.
     torch.testing.assert_close(basis.encode(kept), basis.encode(x), atol=1e-3, rtol=1e-3)
 
 
@@ -320,7 +320,7 @@ def test_fourier_products_hold_each_wave_of_the_ellipse_once() -> None:
     products = FourierProducts(TORUS, [3, 2])
     x = torch.rand(400, 2) * 2 * np.pi
     values = products(x).double()
-    assert torch.linalg.matrix_rank(values) == products.size, "no wave twice"
+    assert torch.linalg.matrix_rank(values) == products.size, "no product occurs twice"
     for wave in (torch.cos(3 * x[:, 0]), torch.sin(2 * x[:, 1]), torch.sin(2 * x[:, 0]) * torch.cos(x[:, 1])):
         solution = torch.linalg.lstsq(values, wave.double()[:, None]).solution
         torch.testing.assert_close(values @ solution, wave.double()[:, None], atol=1e-5, rtol=0)

@@ -1,4 +1,4 @@
-"""The start network: what it can represent it finds, turned and moved samples notwithstanding."""
+"""The start network: it learns a map that it can represent, also from rigidly moved samples."""
 
 import json
 from pathlib import Path
@@ -19,7 +19,7 @@ COORDINATES = Coordinates(np.array([-1.0, 0.0, 2.0]), np.array([1.0, 6.0, 5.0]),
 
 
 def shapes(latents: np.ndarray) -> np.ndarray:
-    """(n, V, 3), quadratic in the bounded coordinates and in the waves of the periodic one."""
+    """(n, V, 3), quadratic in the bounded coordinates and in cosine and sine of the periodic one."""
     mesh, rng = torus(), np.random.default_rng(3)
     x, angle, y = latents.T
     features = np.stack([x, np.cos(angle), np.sin(angle) * y, x * y, y**2, x * np.cos(angle)], axis=1)
@@ -37,10 +37,10 @@ def test_a_quadratic_map_is_found_from_shapes_that_lie_anywhere() -> None:
     with torch.no_grad():
         found = network(torch.as_tensor(new, dtype=torch.float32)).numpy()
         plain = network(torch.as_tensor(new + np.array([0, 2 * np.pi, 0]), dtype=torch.float32)).numpy()
-    np.testing.assert_allclose(plain, found, atol=1e-4)  # periods are known
+    np.testing.assert_allclose(plain, found, atol=1e-4)  # the angle counts modulo its period
     expected = align(shapes(new), torus().vertices)
     spread = np.abs(expected - torus().vertices).max()
-    # Turning shapes to the reference is not quadratic, so the rest is small, not zero.
+    # Alignment to the reference is not quadratic, so the error is small, not zero.
     assert np.abs(align(found.astype(float), torus().vertices) - expected).max() < 0.05 * spread
 
 

@@ -1,4 +1,4 @@
-"""The page of a made-up run: what it shows, what it leaves out, and that its pictures show something."""
+"""The report of an artificial run: what it shows, what it omits, and that its pictures aren't empty."""
 
 from __future__ import annotations
 
@@ -155,7 +155,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 class Page(HTMLParser):
-    """Elements of a page; complains where one isn't closed, or closed in the wrong order."""
+    """Elements of a page; parsing fails if one isn't closed, or is closed in the wrong order."""
 
     def __init__(self, path: Path) -> None:
         super().__init__()
@@ -191,7 +191,7 @@ class Page(HTMLParser):
 
     @property
     def pictures(self) -> dict[str, np.ndarray]:
-        """Pixels by alternative text."""
+        """Pixels of each picture, by its alternative text."""
         found = {}
         for attributes in self.all("img"):
             head, _, data = (attributes["src"] or "").partition(",")
@@ -218,7 +218,7 @@ def page(run: Path) -> Page:
 
 
 def partial(run: Path, folder: Path, *names: str) -> Page:
-    """The page of a run that has come no further than the named files."""
+    """The page of a run that has only the named files."""
     (folder / "stages").mkdir(parents=True)
     for name in ("config.toml", *names):
         shutil.copy(run / name, folder / name)
@@ -231,7 +231,7 @@ def test_every_section_is_there_with_its_figures(page: Page) -> None:
     for said in ("Sphere & Co <b>", "0.9876", "0.8765", "0.7765", "1.2 %", "4.2 ms", "12.3 MB", "without <i>this</i>",
                  "SPGA 0.7531, PGA 0.8531"):  # fmt: skip
         assert said in words
-    assert "4,321" in words  # a figure the page has never heard of
+    assert "4,321" in words  # a figure that the page's code doesn't name
     assert "seeds · 0 · r2 · composite · total" in words
     assert "0.5432" in words
     assert "49 codes that were drawn when all was learned" in words
@@ -294,7 +294,7 @@ def test_pictures_show_something_and_different_shapes_differ(page: Page) -> None
         covered = pixels[..., 3] > 250
         assert 0.1 < covered.mean() < 0.95, alt
         assert pixels[covered][:, :3].std(axis=0).max() > 8, alt
-        assert pixels[0, :, 3].max() == pixels[:, 0, 3].max() == 0, alt  # nothing is cut off
+        assert pixels[0, :, 3].max() == pixels[:, 0, 3].max() == 0, alt  # the border is empty
     for one, other in (("Best test shape, exact", "Median test shape, exact"),
                        ("Mode 0 of SPGA by its support", "Mode 1 of SPGA by its support"),
                        ("Support of head", f"Support of {NASTY}")):  # fmt: skip
@@ -308,7 +308,7 @@ def test_errors_go_from_clay_to_red_where_they_are_large(page: Page) -> None:
         upper, lower = np.array_split(surplus[np.isfinite(surplus).any(axis=1)], 2)
         return float(np.nanmean(upper)), float(np.nanmean(lower))
 
-    assert redness("Worst")[0] > redness("Worst")[1] + 10  # the error grows upwards
+    assert redness("Worst")[0] > redness("Worst")[1] + 10  # its error grows towards the top
     assert redness("Worst")[0] > redness("Best")[0] + 40  # one scale for all three
 
 

@@ -1,4 +1,4 @@
-"""Configurations that can't be used are refused in words; those that we ship can."""
+"""Invalid configurations are refused with a sentence; those in the repository are valid."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""docs/reference/configuration.md has every setting, as the models of the configuration have it."""
+"""docs/reference/configuration.md is up to date with the settings in training/runs/config.py."""
 
 from typing import Literal
 

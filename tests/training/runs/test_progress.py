@@ -1,4 +1,4 @@
-"""Progress: silence at first, then lines that a log can keep."""
+"""Progress: nothing for the first seconds, then whole lines, suitable for a log."""
 
 from __future__ import annotations
 

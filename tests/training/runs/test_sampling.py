@@ -1,4 +1,4 @@
-"""Samples drawn by real processes that get killed, here and on a cluster of this machine."""
+"""Samples computed by real processes that are killed, without and with a local Dask cluster."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def serial(collection: ShellCollection, latents: FloatArray, tmp_path_factory: p
 
 
 def assert_same(folder: Path, other: Path) -> None:
-    """The same samples bit for bit, none missing and none twice."""
+    """Assert that both folders have the same samples bit for bit, none missing and none twice."""
     a, b = read(folder), read(other)
     assert a.index.tolist() == list(range(20))
     for name in ("index", "latents", "asked", "nric", "vertices"):
@@ -149,7 +149,7 @@ def test_a_killed_process_costs_nothing_but_what_kills_all_ends_the_run(
 
 @pytest.fixture
 def dask(tmp_path: Path) -> Iterator[Callable[..., subprocess.Popen]]:
-    """Start ``dask scheduler`` or ``dask worker``, which meet by a file."""
+    """Start ``dask scheduler`` or ``dask worker``; workers find the scheduler by a file."""
     started = []
 
     def start(*arguments: str) -> subprocess.Popen:
@@ -174,7 +174,7 @@ def scheduler_address(dask: Callable[..., subprocess.Popen], folder: Path) -> tu
     while True:
         try:
             return process, json.loads((folder / "scheduler.json").read_text())["address"]
-        except json.JSONDecodeError:  # not yet written to its end
+        except json.JSONDecodeError:  # not completely written yet
             time.sleep(0.01)
 
 
@@ -211,7 +211,7 @@ def test_a_cluster_without_workers_is_given_up(dask: Callable, tmp_path: Path, m
 def test_a_scheduler_that_does_not_answer_is_one_line(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from shapespace.training import __main__  # imports torch, which the processes of this module can do without
+    from shapespace.training import __main__  # imports torch, which worker processes don't need
 
     monkeypatch.setattr(workers, "CONNECT", 0.5)
     (tmp_path / "tiny.toml").write_text(TINY)
@@ -288,7 +288,7 @@ def test_it_travels_without_its_analysis(collection: ShellCollection, latents: F
 def test_codes_without_a_shape_are_shortened_and_say_so(collection: ShellCollection, tmp_path: Path) -> None:
     asked = collection.coordinates.uniform(6, np.random.default_rng(3))
     reach = next(s for s in np.geomspace(1, 100, 60) if collection.shapes(s * asked[:1]).reasons[0])
-    asked[0] *= reach  # just beyond the last shape
+    asked[0] *= reach  # just too far for a shape
     asked[1] *= 20 * reach
     assert list(draw(collection, tmp_path / "plain", asked, 3, "samples", workers=1))[-1] == (6, 6, 2)
     assert list(draw(collection, tmp_path / "short", asked, 3, "samples", shorten=True, workers=1))[-1] == (6, 6, 1)
@@ -303,7 +303,7 @@ def test_codes_without_a_shape_are_shortened_and_say_so(collection: ShellCollect
     codes = used(tmp_path / "short", asked)
     assert np.array_equal(codes[samples.index], samples.latents)
     assert np.array_equal(codes[1], asked[1])
-    # What is there is not drawn again.
+    # Existing samples are not computed again.
     before = {path: path.stat().st_mtime_ns for path in (tmp_path / "short").iterdir()}
     assert list(draw(collection, tmp_path / "short", asked, 3, "samples", shorten=True, workers=1)) == [(6, 6, 1)]
     assert {path: path.stat().st_mtime_ns for path in (tmp_path / "short").iterdir()} == before

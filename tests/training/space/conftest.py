@@ -8,6 +8,6 @@ from shapespace.mesh.triangle_mesh import TriangleMesh
 
 @pytest.fixture(scope="module")
 def ellipsoid() -> TriangleMesh:
-    """Long, of 162 vertices."""
+    """A long ellipsoid of 162 vertices."""
     ball = trimesh.creation.icosphere(subdivisions=2)
     return TriangleMesh.from_arrays(ball.vertices * [3, 1, 1], ball.faces)

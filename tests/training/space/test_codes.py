@@ -1,4 +1,4 @@
-"""Codes of shapes and bounds around them, on an ellipsoid with planted modes."""
+"""Codes of shapes and their bounds, on an ellipsoid with known modes."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ def test_bounds_hold_every_code_with_room_and_the_mean():
 
 
 def test_as_many_modes_as_pay(space, rng):
-    """Three strong directions and many weak ones: more than three would hardly come nearer."""
+    """Three strong directions and many weak ones: more than three modes hardly reduce the error."""
     x = space.reference.vertices
     strong = np.stack([np.sin(x @ rng.standard_normal((3, 3))) for _ in range(3)])
     weak = 0.003 * np.stack([np.sin(x @ (3 * rng.standard_normal((3, 3)))) for _ in range(20)])

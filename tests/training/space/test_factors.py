@@ -1,4 +1,4 @@
-"""Factors of planted supports."""
+"""Factors of modes with known supports."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ PLANTED = [[0, 2, 5], [1, 4], [3, 6]]
 
 @pytest.fixture(scope="module")
 def mesh() -> TriangleMesh:
-    """Six wide, two high, one deep."""
+    """A box, six wide, two high, one deep."""
     ball = trimesh.creation.icosphere(subdivisions=2)
     return TriangleMesh.from_arrays(ball.vertices * [3, 1, 0.5] + [10, 20, 30], ball.faces)
 
@@ -30,7 +30,7 @@ def norm(mesh: TriangleMesh) -> WeightedNorm:
 
 @pytest.fixture(scope="module")
 def modes(mesh: TriangleMesh) -> FloatArray:
-    """(7, 2E), each somewhere in its region and a little everywhere."""
+    """(7, 2E): modes, each large in a part of its region and small everywhere else."""
     rng = np.random.default_rng(2)
     x = mesh.edge_midpoints[:, 0]
     region = np.digitize(x, [9, 11])

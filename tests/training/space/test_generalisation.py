@@ -1,4 +1,4 @@
-"""How near spaces come to shapes that are held out, beside principal components, on an ellipsoid that bends."""
+"""Distance of held-out shapes from the space and from principal components, on a bending ellipsoid."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def reference(ellipsoid: TriangleMesh) -> TriangleMesh:
 
 @pytest.fixture(scope="module")
 def shapes(reference: TriangleMesh) -> np.ndarray:
-    """A curved family of one parameter: far bends to both sides."""
+    """A curved family with one parameter: large bends to both sides."""
     space, x = ShellSpace(reference), reference.vertices
     bend = without_rigid_motion(np.stack([0 * x[:, 0], 0 * x[:, 0], 0.25 * x[:, 0] ** 2], axis=1), x)
     paths = [exponential(space, x, t * bend, STEPS) for t in np.linspace(-1, 1, 6)]
@@ -49,13 +49,13 @@ def test_two_modes_follow_a_curved_family_where_components_cut_across(reference,
 
 
 def test_nothing_is_known_of_what_is_held_out(reference, shapes):
-    """Another shape in place of the one that is held out changes neither mean nor modes: what its pair becomes."""
+    """Replacing one of two held-out shapes changes neither mean nor modes, so the other's result stays."""
     others = shapes.copy()
     others[4] = reference.vertices * [1, 1.3, 1]
     how = (np.array([1, 4]), None, ModeSettings(count=1), Material(), 2)
     found, again = (held_out(reference, each, *how) for each in (shapes, others))
     assert found.counts == again.counts == [1, 1]
-    # Where the search starts depends on the pair, where it ends hardly.
+    # The start of the search depends on both held-out shapes, its end hardly.
     assert found.by_modes[0][0] == pytest.approx(again.by_modes[0][0], abs=1e-4)
     assert found.by_components[0][0] == pytest.approx(again.by_components[0][0], abs=1e-12)
 

@@ -25,14 +25,14 @@ def reference(ellipsoid: TriangleMesh) -> TriangleMesh:
 
 @pytest.fixture(scope="module")
 def shapes(reference: TriangleMesh) -> np.ndarray:
-    """Some far bends to one side, and nearer ones to the other."""
+    """One large bend to one side, and smaller bends, most of them to the other side."""
     space, x = ShellSpace(reference), reference.vertices
     bend = without_rigid_motion(np.stack([0 * x[:, 0], 0 * x[:, 0], 0.25 * x[:, 0] ** 2], axis=1), x)
     return np.stack([exponential(space, x, t * bend, STEPS).vertices[-1] for t in (-1.2, -0.2, 0.1, 0.3, 0.4)])
 
 
 def common(reference: TriangleMesh, mean: np.ndarray, shapes: np.ndarray) -> float:
-    """Size of the mean of the logarithms, as a share of theirs."""
+    """Norm of the logarithms' mean, as a share of their root mean square norm."""
     fields = logarithms(ShellSpace(reference.with_vertices(mean)), mean, shapes, STEPS, workers=1).fields
     return float(np.linalg.norm(fields.mean(axis=0)) / np.sqrt((fields**2).sum(axis=(1, 2)).mean()))
 
@@ -46,7 +46,7 @@ def test_logarithms_have_next_to_nothing_in_common(reference, shapes):
 
 
 def test_with_more_steps_it_comes_to_the_centre_of_mass(reference, shapes):
-    """Discrete logarithms and the discrete centre differ by what is of first order in a step."""
+    """Centred mean and discrete centre of mass differ to first order in the step."""
     space = ShellSpace(reference)
 
     def away(steps: int) -> float:

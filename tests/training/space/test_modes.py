@@ -25,7 +25,7 @@ from tests.shapespace.conftest import bent
 
 @dataclass(frozen=True)
 class Bumps:
-    """Fields (n, V, 3) mixed from three planted ones (3, V, 3) that share no edge, all about equally strong."""
+    """Fields (n, V, 3), mixtures of three known ones (3, V, 3) without common edges, about equally strong."""
 
     space: ShellSpace
     mean: FloatArray
@@ -34,7 +34,7 @@ class Bumps:
     misfit: Norm
 
     def inner(self, a: FloatArray, b: FloatArray) -> FloatArray:
-        """Of fields (n, V, 3) and (k, V, 3), in the norm of the misfit."""
+        """Inner products (n, k) of fields (n, V, 3) and (k, V, 3), in the norm of the misfit."""
         if self.misfit == "shell":
             return self.inner_shell(a, b)
         if self.misfit == "vertices":
@@ -156,7 +156,7 @@ def test_the_objective_never_rises_and_is_that_of_the_problem(bumps, sparsity):
 
 
 def test_modes_are_as_sparse_as_shapes_that_are_held_out_allow(bumps, rng):
-    """They cost 3 % of the square of what is lost on these, and next to nothing where nothing is lost."""
+    """Sparsity adds at most 3 % of the squared held-out error; without such an error it is almost 0."""
     fields = without_rigid_motion(bumps.fields + 0.02 * rng.standard_normal(bumps.fields.shape), bumps.mean)
     exact, noisy = bumps.spga(bumps.fields, 3, None), bumps.spga(fields, 3, None)
     assert exact.sparsity < noisy.sparsity < 0.2
@@ -186,7 +186,7 @@ def test_an_iteration_cut_short_says_so(bumps):
 
 
 def test_one_mode_of_one_shape_is_a_minimum(bumps, rng):
-    """Then the problem is convex, min ‖u − v‖² + λ ‖u‖_1, and no tangent vector may be better than the one found."""
+    """The problem is convex then, min ‖u − v‖² + λ ‖u‖_1, and no tangent vector is better than the result."""
     v, share, eta = bumps.fields[0], 0.3, bumps.space.material.eta
     bumps = replace(bumps, fields=v[None])
     lengths, bending = np.sqrt(bumps.norm.squared.reshape(2, -1))
@@ -199,7 +199,7 @@ def test_one_mode_of_one_shape_is_a_minimum(bumps, rng):
     price = share * 2 * whole / one_norm(v)
 
     def best_multiple(d: FloatArray) -> float:
-        """The least objective among the multiples of d, as a share of ‖v‖²."""
+        """The least objective of all multiples of d, as a share of ‖v‖²."""
         along = bumps.inner(v[None], d[None])[0, 0]
         gain = max(abs(along) - price * one_norm(d) / 2, 0) ** 2
         return 1 - gain / bumps.length(d) ** 2 / whole
@@ -322,7 +322,7 @@ def test_processes_give_what_one_gives(bumps):
 
 
 def test_far_shapes_are_reached_by_way_of_their_neighbours():
-    """From a rod rolled up one way to rods rolled up the other way; the straight line leads through what is no rod."""
+    """From a rod rolled up one way to rods rolled the other way; the straight lines degenerate on the way."""
     ball = trimesh.creation.icosphere(subdivisions=2)
     rod = TriangleMesh.from_arrays(ball.vertices * [4, 0.5, 0.5], ball.faces)
     space, start = ShellSpace(rod), bent(rod.vertices, -7)
@@ -339,7 +339,7 @@ def test_far_shapes_are_reached_by_way_of_their_neighbours():
         end = exponential(space, start, field, 8)
         assert end.converged
         assert align(end.vertices[-1], shape) == pytest.approx(shape, abs=1e-3 * rod.diagonal)
-        # A path that takes a detour, or passes over a fold, is longer than what the shapes differ by.
+        # A path with a detour or across a fold would be longer than the distance of the shapes.
         whole = geodesic(space, start, shape, 8, tolerance=1e-6, first=end.vertices)
         assert space.norm(start, field) == pytest.approx(np.sqrt(whole.energy), rel=0.3)
 

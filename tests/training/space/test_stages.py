@@ -1,4 +1,4 @@
-"""What the stages find in a collection, and what they say where they can't."""
+"""The stage mean: where a collection has none, the message names the place; otherwise it converges."""
 
 from pathlib import Path
 
@@ -29,7 +29,7 @@ def test_a_run_without_a_mean_ends_with_the_place(tmp_path: Path) -> None:
     shapes = np.stack([mesh.vertices * [1, 1, s] for s in (1, 1.1, 1.2)])
     i, j = mesh.edges[20]
     shapes[1, i] = shapes[1, j]
-    # Coarse vertex v is the fine one 2 v + 1, and a file has 5 more that are in no face.
+    # Coarse vertex v is fine vertex 2 v + 1; files have 5 more vertices, which no face uses.
     fine_index = 2 * np.arange(len(mesh.vertices)) + 1
     file_vertices = np.concatenate([np.full(5, -1), np.arange(2 * len(mesh.vertices))])
     run = RunDirectory(tmp_path)

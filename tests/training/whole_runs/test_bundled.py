@@ -1,4 +1,4 @@
-"""The bundled model is the one its committed run made."""
+"""The bundled models are those that their committed runs exported."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ ROOT = Path(__file__).parents[3]
 MODELS = {"freaky-torus": "1", "figure": "2"}
 
 
-#: Settings of a combiner that version 0.1 took where the configuration did not say.
+#: Defaults of version 0.1 for the combiner.
 COMBINER_OF_0_1 = {
     "layers": 0, "kernel": 12, "polynomial": 0, "monomials": 1800, "pairwise": 0, "symmetries": True,
     "width": 24, "neighbourhood": "star", "crop": 0, "residual": True, "edge_channels": 4, "dropout": 0.0,
@@ -39,7 +39,7 @@ COMBINER_OF_0_1 = {
 
 
 def combiner(written: dict[str, Any]) -> dict[str, Any]:
-    """Of 0.1, as it is written today."""
+    """Settings of a combiner of 0.1 in today's form."""
     old = COMBINER_OF_0_1 | written
     if not old["layers"]:
         assert old["kernel"]
@@ -55,7 +55,7 @@ def combiner(written: dict[str, Any]) -> dict[str, Any]:
 
 
 def latent_network(written: dict[str, Any]) -> dict[str, Any]:
-    """Of 0.1, as it is written today; what is not written has not changed."""
+    """Settings of a latent network of 0.1 in today's form; settings not given have the same default."""
     no_layer = {"skip_orders": []} if written.get("skip_orders", ()) is None else {}
     return LatentNetworkSettings.model_validate(written | no_layer).model_dump()
 
@@ -67,7 +67,7 @@ def recipe(written: dict[str, Any]) -> dict[str, Any]:
 
 
 def today(config: dict[str, Any]) -> Config:
-    """A configuration, of 0.1 if it is that of a product: there a variant was whole."""
+    """A configuration in today's form; those of products are of version 0.1, whose variants were complete."""
     if config["collection"]["generator"] not in PRODUCTS:
         return Config.model_validate(config)
     networks = config.get("networks", {})
@@ -129,7 +129,7 @@ def test_a_run_of_version_0_1_can_be_looked_at(
 
 
 def test_the_figures_networks_follow_exponentials_that_nobody_drew_before() -> None:
-    """From the committed ONNX files; the affine sum of the factors, which is no model of the figure, does not."""
+    """R² of the committed ONNX files; the affine sum of the factors alone has a lower one."""
     model = shapespace.load(ROOT / "models" / "figure")
     codes, reference = model.sample(16, seed=20261123), model.reference
     answers = model.decode(codes, mesh="coarse").astype(np.float32)
@@ -147,7 +147,7 @@ def test_the_figures_networks_follow_exponentials_that_nobody_drew_before() -> N
 
 
 def test_the_torus_networks_know_shape_and_bump_at_fresh_codes(monkeypatch: pytest.MonkeyPatch) -> None:
-    """From the committed ONNX files; a torus without its bump, and one whose ellipse is off by 0.1, do not pass."""
+    """The committed ONNX files pass; a torus without its bump, or with an ellipse turned by 0.1, does not."""
     model, torus = shapespace.load(ROOT / "models" / "freaky-torus"), freaky_torus.FreakyTorus()
     codes = torus.coordinates.uniform(40, np.random.default_rng(20261123))
     exact, norm = torus.shapes(codes), WeightedNorm.of(torus.reference, 1e-2)

@@ -87,9 +87,9 @@ EYE, BAR, NAIL = (np.unique(SURFACE.corners[np.repeat(SURFACE.objects.of == k, S
 
 
 def bars(count: int = 8) -> tuple[np.ndarray, np.ndarray]:
-    """A thick bar in some poses, far from the origin and in large units: each end bends by itself.
+    """A thick bar in several poses, far from the origin and in large units, whose ends bend independently.
 
-    Its files have textured quads, and an eye and a nail as parts of their own; the faces here are these as triangles.
+    The files have textured quads, with an eye and a nail as separate parts; returned are their triangles.
     """
     rest = SPHERE * [300.0, 80.0, 60.0]
     centre = rest[EYE].mean(axis=0)
@@ -107,7 +107,7 @@ def bars(count: int = 8) -> tuple[np.ndarray, np.ndarray]:
 
     for pose in np.vstack([np.zeros(3), rng.uniform(-0.8, 0.8, (count - 1, 3))]):
         shape = bent(rest, *pose)
-        # An eye is hard: it goes where the skin around it goes.
+        # An eye is rigid and follows the skin around it.
         shape[EYE] = align(rest[EYE], shape[EYE])
         shapes.append(shape)
     return np.array(shapes), SURFACE.triangles
@@ -146,7 +146,7 @@ def test_a_run_leaves_what_the_contract_promises(run: Path) -> None:
         assert fine.face_areas[shell].sum() == pytest.approx(1)
         np.testing.assert_allclose(reference["scale"] * fine.vertices, vertices[0], atol=1e-4)
     with np.load(run / "mean.npz") as mean:
-        # Shapes are served where the mean stands.
+        # Served shapes are in the position of the mean.
         np.testing.assert_allclose(align(mean["vertices"], mesh.vertices), mean["vertices"], atol=1e-9)
     with np.load(run / "modes.npz") as modes:
         assert modes["nric"].shape == (3, 2 * len(mesh.edges))
@@ -211,7 +211,7 @@ def test_the_collection_s_shapes_are_learned_from_but_not_measured_on(run: Path)
     rows = learner_of(opened).rows
     assert set(known) < set(rows["train"])
     assert not set(known) & {*rows["validation"], *rows["test"]}
-    assert not set(known) & set(learner_of(opened, fraction=0.5).rows["train"]), "shares are of random codes"
+    assert not set(known) & set(learner_of(opened, fraction=0.5).rows["train"]), "shares have random codes only"
     other = learner_of(opened, seed=1).rows
     assert set(known) < set(other["train"])
     assert not set(known) & {*other["validation"], *other["test"]}
@@ -275,13 +275,13 @@ def test_what_the_files_had_comes_back(url: str, run: Path, folder: Path, tmp_pa
         ("cap", None),
     ]
 
-    # Each file of the collection is what the model keeps, but for its positions.
+    # But for positions, the answer equals each file of the collection.
     answer = parse_obj(ask(format="obj").raise_for_status().text)
     for k in range(len(shapes)):
         file = parse_obj((folder / "meshes" / f"bar{k}.obj").read_text())
         assert answer["polygons"] == file["polygons"]
         np.testing.assert_allclose(answer["vt"], file["vt"], atol=1e-7)
-    assert not answer["mtllib"], "it refers to no files that are not there"
+    assert not answer["mtllib"], "a single OBJ file refers to no other files"
     positions = np.array(ask(format="json").json()["vertices"])
     np.testing.assert_allclose(answer["v"], positions, rtol=1e-6)
     archive = zipfile.ZipFile(io.BytesIO(ask(format="zip").content))
@@ -303,7 +303,7 @@ def test_what_the_files_had_comes_back(url: str, run: Path, folder: Path, tmp_pa
         path.write_bytes(ask(format=format, topology=topology).raise_for_status().content)
         stage = Usd.Stage.Open(str(path))
         prim = UsdGeom.Mesh(stage.GetDefaultPrim())
-        assert not prim.GetPointsAttr().GetTimeSamples(), "it does not move"
+        assert not prim.GetPointsAttr().GetTimeSamples(), "a single shape has no time samples"
         np.testing.assert_array_equal(prim.GetPointsAttr().Get(), positions.astype("f4"))
         np.testing.assert_array_equal(prim.GetFaceVertexCountsAttr().Get(), sizes)
         assert {each.GetDisplayName() for each in stage.GetDefaultPrim().GetChildren()} >= {
@@ -315,7 +315,7 @@ def test_what_the_files_had_comes_back(url: str, run: Path, folder: Path, tmp_pa
     with zipfile.ZipFile(tmp_path / "original.usdz") as package:
         assert given.textures["skin.png"] in [package.read(name) for name in package.namelist()]
 
-    # Triangles where they are asked for, or where a format has no others.
+    # Triangles on request, and in formats without polygons.
     triangles = ask(format="obj", topology="triangles")
     assert [polygon[0] for polygon in parse_obj(triangles.text)["polygons"]] == given.triangles.tolist()
     tags = [ask(format="obj", **more).headers["ETag"] for more in ({}, {"topology": "original"})]
@@ -328,7 +328,7 @@ def test_what_the_files_had_comes_back(url: str, run: Path, folder: Path, tmp_pa
     assert {len(polygon[0]) for polygon in coarse["polygons"]} == {3}
     assert not coarse["vt"]
 
-    # GLB: others see the texture in its place, and our own one encodes.
+    # GLB: another reader gets the texture coordinates, and `encode` accepts the file.
     glb = ask(format="glb").content
     scene = trimesh.load_scene(io.BytesIO(glb), file_type="glb", process=False)
     assert {part.visual.material.name for part in scene.geometry.values()} == {"skin", "cap"}
@@ -344,7 +344,7 @@ def test_what_the_files_had_comes_back(url: str, run: Path, folder: Path, tmp_pa
     headers = {"Content-Type": "model/gltf-binary"}
     found = httpx.post(f"{url}/v1/models/bars/encode", content=glb, headers=headers, timeout=60).raise_for_status()
     assert found.json()["vertex_error"]["max"] < 0.01 * np.ptp(positions)
-    # What is coloured shows its colours, not the texture.
+    # A coloured shape has colours instead of the texture.
     tree = GLB(ask(format="glb", color="stretch").content).tree
     assert "images" not in tree
     assert len(tree["materials"]) == 1
@@ -395,7 +395,7 @@ def test_the_server_has_the_exponentials_that_the_networks_learned_from(url: str
 
 
 def results(run: Path) -> dict[str, object]:
-    """Everything a run leaves, times, logs and the report aside."""
+    """Contents of all files of a run, except times, logs and the report."""
     found: dict[str, object] = {}
     for path in sorted(run.rglob("*")):
         name = str(path.relative_to(run))

@@ -1,4 +1,4 @@
-"""The real command on a small torus: what it leaves, what it repeats, what a kill costs."""
+"""The real command on a small torus: its files, which stages it repeats, and what a kill costs."""
 
 from __future__ import annotations
 
@@ -104,7 +104,7 @@ def test_the_bundle_is_one_the_server_takes_and_computes_the_same(tiny_run: Path
     assert bundle.manifest.draft_error
     assert bundle.manifest.draft_error.model_dump() == pytest.approx(ShapeModel(bundle).draft_error(), rel=1e-6)
     text = b"".join(path.read_bytes() for path in folder.iterdir())
-    assert str(Path(__file__).parents[3]).encode() not in text, "a bundle tells nothing of the machine it was made on"
+    assert str(Path(__file__).parents[3]).encode() not in text, "a bundle has no paths of its machine"
 
     run = Run(tiny_run, *load(tiny_run / "config.toml"), tiny_run / "models")
     composite = learner_of(run).main()
@@ -132,7 +132,7 @@ def test_fresh_codes_follow_from_the_networks_and_their_figure_is_that_of_the_bu
     found = r_squared(np.stack([model.nric(code) for code in codes]), torus.shapes(codes).nric, norm)
     assert found == pytest.approx(fresh["r2"]["composite"], abs=1e-4)
     assert set(fresh["r2"]) == {"composite", "monolithic", "monolithic_paper", "kernel"}
-    assert "steps" not in fresh, "a formula has none"
+    assert "steps" not in fresh, "shapes of a formula have no steps"
 
 
 def test_export_refuses_where_onnx_and_torch_disagree(tiny_run: Path, tmp_path: Path) -> None:
@@ -198,7 +198,7 @@ def test_more_samples_are_drawn_beside_those_that_are_there(tiny_run: Path, tmp_
     draw(TINY.replace("\ncount = 60", "\ncount = 80"))
     assert all(" done " not in line for line in status(copy)[-3:])
     shown = ("evaluation.json", "gallery.npz", "report.html", "networks/histories.json")
-    assert not any((copy / name).exists() for name in shown), "figures of other samples"
+    assert not any((copy / name).exists() for name in shown), "figures of the former samples"
     assert len(read(copy / "samples").index) == 80
     assert {path: path.stat().st_mtime_ns for path in files} == before
     draw(TINY.replace("\ncount = 60", "\ncount = 80\nsteps = 5"))

@@ -1,4 +1,4 @@
-"""What a run says: which data are new, what each stage gave up, where a fault was written, and what comes next."""
+"""Messages of a run: changed data, what failed in each stage, where a traceback is, and what comes next."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def write(path: Path, vertices: np.ndarray) -> None:
 
 @pytest.fixture
 def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A folder to stand in, with a configuration and meshes."""
+    """A working directory with a configuration and meshes."""
     (tmp_path / "meshes").mkdir()
     for k, shape in enumerate(SHAPES[:5]):
         write(tmp_path / "meshes" / f"bar{k}.obj", shape)
@@ -43,7 +43,7 @@ def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 class Said:
-    """Runs the command in this process, which needn't import torch again."""
+    """Runs the command in this process, which saves importing torch again, and returns its output."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
         self._monkeypatch, self._capsys = monkeypatch, capsys
@@ -81,7 +81,7 @@ def test_changed_data_are_read_again_and_it_is_said(place: Path, said: Said) -> 
     assert names() == ["bar0", "bar1", "bar2", "bar3", "bar4", "bar9"]
     read(None)
     os.utime(meshes / "bar2.obj", (0, 0))
-    read(None)  # another time alone is no change
+    read(None)  # a new modification time alone is no change
     size = (meshes / "bar2.obj").stat().st_size
     write(meshes / "bar2.obj", SHAPES[5])
     write(meshes / "bar9.obj", SHAPES[2])
@@ -124,7 +124,7 @@ def test_a_stage_of_another_version_is_done_again_with_all_that_follows(
     assert words.count("another version") == 1
     assert "modes: another version of shapespace computed it otherwise; it and all that follows is done again" in words
     assert [name for name in STAGES if f"{name}: done before" in words] == ["ingest", "mean"]
-    # As releases wrote them before stages had versions.
+    # The format of releases before stages had versions.
     RunDirectory(place / "runs" / "bars").stamp("factors").write({"key": "0", "basis": "0", "seconds": 1.0})
     words = said(*until_factors)
     assert "factors: another version" in words
