@@ -26,29 +26,30 @@ from shapespace.solve.line_search import backtrack, sufficient_decrease
 from shapespace.solve.outcome import Outcome, Status
 from shapespace.solve.preconditioner import Preconditioner
 
-#: Weight of the angles in the reconstruction's norm. A parameter of its own: the metric's η is far too small here,
-#: because this norm is dimensionless and sums over edges.
+#: Weight of the angles in the reconstruction's norm. It is not the metric's η, which would be far too small here:
+#: this norm is dimensionless and a sum over edges.
 DEFAULT_ETA = 1e-2
-#: A factor is used again for shapes that lie no further than this from its own, by the largest distance of a vertex as
-#: a fraction of the diagonal; and for at most this many steps, which cost about as much as a new factor.
+#: A factor is reused for at most LIFE steps, which together cost about as much as a new factor, and only while no
+#: vertex is further than REACH, a fraction of the diagonal, from where it was when the factor was computed.
 REACH, LIFE = 1e-2, 16
-#: With an old factor the last step has to be shorter, by this factor: in the softest motions the error that is left is
-#: longer than the step.
+#: With a reused factor the tolerance of the last step is multiplied by this: along the directions in which the energy
+#: hardly changes, the remaining error is then longer than the step.
 OLD = 0.25
-#: Share by which diagonal entries are raised for a factor in single precision: a few times what rounding takes away.
+#: Relative increase of the diagonal for a factor in single precision: a few times its rounding error, so that the
+#: matrix stays positive definite.
 LIFT = 2e-7
-#: Where Gauss–Newton stalls, damping as a share of each diagonal entry: the first, the factor by which it rises where a
-#: step fails and falls where one succeeds, and the largest. A step within the tolerance means a minimum only while the
-#: damping is not above the last number, which slows but the softest motions (the matrix of a torus of 2048 vertices
-#: has entries of 1e-6).
+#: Damping where Gauss–Newton stalls, as a share of each diagonal entry: its first value, the factor by which it
+#: increases after a failed step and decreases after a successful one, and its largest value. A step within the tolerance
+#: counts as a minimum only while the damping is at most the last number: more damping would shorten every step.
 FIRST_DAMPING, DAMPING_FACTOR, LARGEST_DAMPING, DAMPING_AT_A_MINIMUM = 1e-6, 10, 1e3, 1e-4
-#: Least share of its area that a damped step leaves to a face.
+#: A damped step may not shrink a face to less than this share of its area.
 LEAST_AREA = 0.1
-#: Face frames with a larger relative misfit have gone astray, and so have those that fold a face: inside the bounds of
-#: our models it is 0.004 (figure) to 0.16 (torus), and beyond 0.2 shapes are off by several percent of their size.
+#: A shape from face frames is not used as a draft if its relative misfit is larger than this, or if a face is folded
+#: over. Inside the bounds of the bundled models the misfit is 0.004 (figure) to 0.16 (torus); beyond 0.2 shapes are off
+#: by several percent of their size.
 ASTRAY = 0.2
-#: A first guess from face frames with a smaller relative misfit is good enough not to look for another, and near enough
-#: to the solution for factors in single precision.
+#: Below this relative misfit a first guess from face frames is used without trying others, and factors are computed in
+#: single precision.
 GOOD_GUESS = 0.05
 
 
@@ -74,11 +75,11 @@ class Reconstructor:
     Minimises ``½ ‖z(X) − z*‖²_{2,z̄}`` over X in R^{3V} (angles compared modulo 2π) by Gauss–Newton with a
     backtracking line search. The normal matrix is symmetric positive definite with a fixed pattern, so its symbolic
     analysis happens here, once. Near the shape at which it was made a factor is used again (a modified Newton method),
-    with Anderson acceleration: where z* is no shape's, Gauss–Newton itself converges only linearly, and a step with
-    an old factor costs an eighth of one with a new factor. Where not even a short step with a new factor helps, a face
-    has all but collapsed, and angles change too fast for any linearisation: Levenberg and Marquardt's damped steps
-    lead on from there, past the collapse or along it. Works for any genus and with boundary, because it never asks
-    that z* be integrable. Holds work space: use one per thread.
+    with Anderson acceleration: where z* is not integrable, Gauss–Newton itself converges only linearly, and a step with
+    an old factor costs an eighth of one with a new factor. Where not even a short step with a new factor lowers the
+    misfit, a face has nearly collapsed, and angles change too fast for a linearisation: then Levenberg and Marquardt's
+    damped steps continue. Works for any genus and with boundary, because z* need not be integrable. Holds work space:
+    use one per thread.
 
     Args:
         reference: gives the weights, and the default start.
@@ -106,7 +107,7 @@ class Reconstructor:
         self._single = analyse(self.normal_matrix.pattern, backend, precision=np.float32)
 
     def another(self) -> Reconstructor:
-        """One more for another thread, which shares with this one all that never changes."""
+        """A reconstructor for another thread. It shares with this one everything that is never modified."""
         twin = copy.copy(self)
         twin._single = analyse(self.normal_matrix.pattern, self._backend, precision=np.float32)
         for own in ("integrate", "_double"):
@@ -115,7 +116,7 @@ class Reconstructor:
 
     @cached_property
     def _double(self) -> Cholesky:
-        """In double precision, for what no iteration corrects, and where single precision doesn't do."""
+        """Factors in double precision: for solves without an iteration, and where single precision is not enough."""
         return analyse(self.normal_matrix.pattern, self._backend)
 
     @cached_property
@@ -127,8 +128,9 @@ class Reconstructor:
     def guess(self, target: FloatArray, *others: Callable[[], FloatArray]) -> FloatArray:
         """A start (V, 3) near the shape of z* (2E,), which depends on nothing but z*.
 
-        Integrated face frames are exact for integrable z*, but errors of z* add up along them. Where they have gone
-        astray, it is the start with the smallest misfit among them, ``others`` (called only then) and the reference.
+        Integrated face frames are exact for integrable z*, but errors of z* accumulate along the tree. Where their
+        misfit is large, the start with the smallest misfit is chosen among them, ``others`` (called only then) and the
+        reference.
         """
         return self._guess(target, others).vertices
 
@@ -139,7 +141,7 @@ class Reconstructor:
         return self._nearest(target, integrated, [*(other() for other in others), self.reference.vertices])
 
     def draft(self, target: FloatArray) -> Reconstruction | None:
-        """The shape from face frames alone, without an iteration; None where they have gone astray.
+        """The shape from face frames alone, without an iteration; None where its misfit is too large (see ASTRAY).
 
         It is as far from the reconstructed shape as z* is from being integrable.
         """
@@ -152,7 +154,7 @@ class Reconstructor:
         )
 
     def nearest(self, target: FloatArray, *shapes: FloatArray) -> FloatArray:
-        """The shape (V, 3) among some whose misfit is the smallest; the last where none has a finite one."""
+        """The one of some shapes (V, 3) whose misfit is smallest; the last one if no misfit is finite."""
         return self._nearest(target, self._squares(shapes[0], target), shapes[1:]).vertices
 
     def _nearest(self, target: FloatArray, best: Point, shapes: Iterable[FloatArray]) -> Point:
@@ -191,11 +193,11 @@ class Reconstructor:
         max_iterations: int = 200,
         deadline: Deadline | None = None,
     ) -> Reconstruction:
-        """Reconstruct one shape from its own ``guess``, whose misfit is then known already; otherwise as a call.
+        """Reconstruct one shape from ``guess``, without computing the guess's misfit twice; otherwise as a call.
 
-        Where that stalls, the other starts and the reference are tried, each with as many iterations: frames that went
-        astray may lead to the edge of a face without height, with a smaller misfit on the other side of it. Raises what
-        the other starts raise.
+        Where that stalls, the other starts and the reference are tried, each with as many iterations: a bad guess can
+        lead to a face that degenerates, where a smaller misfit lies beyond the degeneration. Raises what the other
+        starts raise.
         """
         guess = self._guess(target, others)
         found = self._iterate(target, guess, tolerance, max_iterations, deadline)
@@ -233,7 +235,7 @@ class Reconstructor:
         )
 
     def _gauss_newton(self, target: FloatArray, here: Point, limits: _Limits) -> _Found:
-        """Steps with new factors in a line search; with old ones accelerated, and only as long as they help."""
+        """Steps with a new factor use a line search; those with an old one are accelerated, until one doesn't help."""
         iterations = 0
         factor: _GaussNewtonFactor | None = None
         while (reached := limits.reached(iterations)) is None:
@@ -282,8 +284,8 @@ class Reconstructor:
     def _levenberg_marquardt(self, target: FloatArray, begun: _Found, limits: _Limits) -> _Found:
         """Levenberg and Marquardt's iteration (Marquardt 1963), from where Gauss–Newton stalled.
 
-        A step is taken if it lowers the energy and lets no face collapse. The angles asked for may be those of no
-        shape, and then the least energy may belong to a face without height: there the steps end at its edge.
+        A step is taken if it lowers the energy and no face loses most of its area (LEAST_AREA). If no shape has the
+        angles asked for, the minimum may have a degenerate face; then the steps end before that.
         """
         here, iterations, damping = begun.point, begun.iterations, FIRST_DAMPING
         areas = face_areas(here.vertices, self.reference.faces)
@@ -306,7 +308,7 @@ class Reconstructor:
         return _Found(point=here, status=reached, iterations=iterations)
 
     def _factor(self, here: Point, target: FloatArray) -> Factor:
-        """The normal matrix, near a solution in single precision if that can be; raises NotPositiveDefiniteError."""
+        """A factor of the normal matrix, in single precision where possible; raises NotPositiveDefiniteError."""
         entries = here.entries()
         if self._is_good(here, target):
             with suppress(NotPositiveDefiniteError):
@@ -317,7 +319,7 @@ class Reconstructor:
         return bool(here.energy <= GOOD_GUESS**2 * self.norm.square(target))
 
     def _damped_factor(self, here: Point, damping: float) -> Factor:
-        """The normal matrix, its diagonal raised by a share; raises NotPositiveDefiniteError."""
+        """A factor of the normal matrix with its diagonal increased by a share; raises NotPositiveDefiniteError."""
         return self._double.factorise(self._damped(here.entries(), damping))
 
     def _damped(self, entries: FloatArray, share: float) -> FloatArray:
@@ -326,7 +328,7 @@ class Reconstructor:
         return damped
 
     def differential(self, vertices: FloatArray, changes: FloatArray) -> FloatArray:
-        """How a reconstructed shape (V, 3) moves, (n, V, 3), where what it was asked for changes by (n, 2E).
+        """How a reconstructed shape (V, 3) moves, (n, V, 3), when its target z* changes by (n, 2E).
 
         ``dX = (JᵀWJ)⁻¹ JᵀW dz``, from the implicit function theorem at a minimum whose residual is small; without rigid
         motion. Raises NotPositiveDefiniteError.
@@ -338,8 +340,8 @@ class Reconstructor:
     def sensitivity(self, vertices: FloatArray, fields: FloatArray) -> FloatArray:
         """The transpose of ``differential``.
 
-        How products of a reconstructed shape (V, 3) with vertex fields (n, V, 3) depend on what it was asked for,
-        (n, 2E).
+        The derivatives (n, 2E), by the target z*, of a reconstructed shape's (V, 3) products with vertex fields
+        (n, V, 3).
         """
         jacobian, factor = self._linearised_at(vertices)
         solved = factor.solve(fields.reshape(len(fields), -1))
@@ -359,7 +361,7 @@ class Reconstructor:
 
 @dataclass(frozen=True, kw_only=True)
 class _Found(Outcome):
-    """Where one of the two iterations ended."""
+    """The point at which one of the two iterations ended, and how."""
 
     point: Point
 
@@ -373,10 +375,10 @@ class _Limits:
     """When to stop: the lengths are in the mesh's unit.
 
     Attributes:
-        step: movement of a vertex that counts as none.
-        reach: movement of a vertex after which a factor is made anew.
-        iterations: most of them, both kinds together.
-        deadline: after which none begins.
+        step: the iteration has converged once no vertex moves further.
+        reach: a factor is computed anew once a vertex has moved further.
+        iterations: most iterations, of both kinds together.
+        deadline: after which no iteration begins.
     """
 
     step: float
@@ -385,7 +387,7 @@ class _Limits:
     deadline: Deadline | None
 
     def reached(self, iterations: int) -> Status | None:
-        """The limit that is reached after so many iterations, if one is."""
+        """Which limit is reached after so many iterations, or None."""
         if iterations >= self.iterations:
             return Status.ITERATION_LIMIT
         return Status.DEADLINE if self.deadline is not None and self.deadline.passed else None
@@ -399,7 +401,7 @@ class _GaussNewtonFactor:
         self._inverse, self._mixing = Preconditioner(factor, rigid_motions(at)), Anderson()
 
     def step(self, vertices: FloatArray, forces: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """The step from a shape, and the next shape, into which the steps so far are mixed."""
+        """The step from a shape, and the next shape by Anderson acceleration."""
         self._steps += 1
         step = self._inverse(forces)
         return step, self._mixing(vertices, forces, step)

@@ -14,7 +14,7 @@ class Anderson:
     ``G − ΔG γ``, where γ solves ``(ΔFᵀ P ΔF) γ = ΔFᵀ P F``: the unconstrained form of Walker and Ni, "Anderson
     acceleration for fixed-point iterations" (SIAM J. Numer. Anal. 49, 2011), with P's norm for the Euclidean one. For
     an affine F it amounts to GMRES preconditioned by P, as they show; it costs a few dot products and needs no
-    derivative. The chord iteration it serves contracts by 0.03 to 0.3, and faster with every mixed iterate.
+    derivative. The chord iteration that uses it contracts by 0.03 to 0.3 per step, and faster with each iterate mixed.
     """
 
     #: How many earlier iterates are mixed.
@@ -35,7 +35,7 @@ class Anderson:
         np.subtract(now, self._last, out=self._history[:, self._count % self.DEPTH])
         self._last, self._count = now, self._count + 1
         images, df, ds = self._history[:, : self._count]
-        # The pseudo-inverse of a small symmetric matrix, in a fifth of the time that NumPy's least squares take.
+        # By the pseudo-inverse of a small symmetric matrix: a fifth of the time of numpy.linalg.lstsq.
         sizes, axes = np.linalg.eigh(ds @ df.T)
         kept = np.abs(sizes) > np.finfo(float).eps * len(sizes) * np.abs(sizes).max()
         mix = axes[:, kept] @ ((ds @ now[1] @ axes[:, kept]) / sizes[kept])

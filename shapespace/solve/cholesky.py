@@ -41,12 +41,12 @@ class SymmetricPattern:
     Args:
         size: N.
         rows: (C,) row of each contribution; an entry may receive many.
-        columns: (C,) column of each contribution. An entry below the diagonal is counted to its mirror image.
+        columns: (C,) column of each contribution. One below the diagonal is added to the entry it mirrors.
 
     Attributes:
         slots: (C,) index into the pattern's entries of each contribution.
         indptr, indices: CSR structure of the upper triangle, every diagonal entry included.
-        diagonal: (N,) entry of each diagonal element.
+        diagonal: (N,) index of each diagonal element among the entries.
     """
 
     def __init__(self, size: int, rows: IntArray, columns: IntArray) -> None:
@@ -89,8 +89,8 @@ class Factor(Protocol):
 class Cholesky(Protocol):
     """Factorises symmetric positive definite matrices of one pattern. Not for use by two threads at once.
 
-    It has room for several factors side by side, by number. A new factor replaces the one with the same number, which
-    must not be used afterwards: a backend that has overwritten its memory raises RuntimeError.
+    It can hold several factors at a time, each under a number. A new factor replaces the one with the same number,
+    which must not be used afterwards: a backend that has overwritten its memory raises RuntimeError.
     """
 
     def factorise(self, entries: FloatArray, number: int = 0) -> Factor:
@@ -114,7 +114,7 @@ class BandedCholesky:
         self._shape = (self.bandwidth + 1, n)
 
     def factorise(self, entries: FloatArray, number: int = 0) -> Factor:
-        """See Cholesky; every factor has memory of its own, and the number doesn't matter."""
+        """See Cholesky; every factor has its own memory here, so the number is ignored."""
         band = np.zeros(self._shape, self._precision, order="F")
         band.ravel(order="K")[self._slots] = entries
         if not np.isfinite(band).all():
@@ -180,21 +180,21 @@ class PardisoCholesky:
     def __init__(self, pattern: SymmetricPattern, factors: int = 1, precision: Precision = np.float64) -> None:
         self._size, self._precision = pattern.size, precision
         self._structure = pattern.indptr + np.int32(1), pattern.indices + np.int32(1)
-        #: How many factors there have been of each number. The factors themselves refer to this object: to hold them
-        #: here would be a cycle, and MKL's memory would wait for the garbage collector.
+        #: How many factors have been made under each number. Factors refer to this object; holding them here too would
+        #: be a reference cycle, and MKL's memory would stay until the garbage collector runs.
         self._versions = [0] * factors
         entries = np.ones(len(pattern), precision)
         entries[pattern.diagonal] = len(pattern)
-        # Minimum degree is faster for shapes like limbs, nested dissection for shapes like balls: up to a third of the
-        # time.
+        # Minimum degree gives smaller factors for long, thin shapes, nested dissection for compact ones. The better
+        # ordering saves up to a third of the time.
         sizes = {ordering: self._analyse(ordering, entries) for ordering in (_MINIMUM_DEGREE, _NESTED_DISSECTION)}
         if sizes[_MINIMUM_DEGREE] < sizes[_NESTED_DISSECTION]:
             self._analyse(_MINIMUM_DEGREE, entries)
-        # No iterative refinement: it doubles the cost of a solve, and every caller iterates itself.
+        # No iterative refinement: it doubles the cost of a solve, and all callers are iterations that correct errors.
         self._options[7] = 0
 
     def _analyse(self, ordering: int, entries: NDArray) -> int:
-        """Analyse, instead of what has been analysed before; returns how many entries the factor will have."""
+        """Analyse with an ordering, discarding any earlier analysis; returns how many entries the factor will have."""
         if hasattr(self, "_handle"):
             self._run(-1, entries)
         self._handle = np.zeros(64, dtype=np.int64)
@@ -245,7 +245,7 @@ class PardisoCholesky:
 
 @dataclass(frozen=True, eq=False)
 class _PardisoFactor:
-    """One of MKL's factors, with the entries behind it: Pardiso looks at them again when it solves."""
+    """One of MKL's factors, with the matrix entries, which Pardiso reads again when it solves."""
 
     cholesky: PardisoCholesky
     entries: NDArray
@@ -265,9 +265,9 @@ def analyse(
     Args:
         pattern: of the matrices to come.
         backend: which library.
-        factors: how many factors are kept side by side.
-        precision: of the factors. Single precision takes two thirds of the time, and is enough for steps of an
-            iteration that corrects itself; more matrices are then not positive definite.
+        factors: how many factors can be kept at a time.
+        precision: of the factors. Single precision takes two thirds of the time and is enough for steps of an
+            iteration that corrects errors, but fails on some matrices that have a factor in double precision.
     """
     if backend == "auto":
         backend = "pardiso" if importlib.util.find_spec("pypardiso") else "banded"

@@ -1,4 +1,4 @@
-"""Until when an iteration may go on."""
+"""How long an iteration may go on."""
 
 from __future__ import annotations
 
@@ -25,5 +25,5 @@ class Deadline:
         return self._called_off or time.monotonic() > self.time
 
     def call_off(self) -> None:
-        """Nobody waits for the result any more."""
+        """Stop the work now, because nobody waits for the result any more."""
         self._called_off = True

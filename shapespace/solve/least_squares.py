@@ -12,14 +12,14 @@ from shapespace.arrays import FloatArray
 from shapespace.solve.deadline import Deadline
 from shapespace.solve.outcome import Outcome, Status
 
-#: An updated Jacobian is believed at a minimum if that is no further than this, as a fraction of the scale, from where
-#: it was made; otherwise a new one is made there.
+#: At a minimum, an updated Jacobian is trusted only within this distance, as a fraction of the scale, of the point
+#: where it was computed; further away a new one is computed.
 TRUSTED = 0.05
-#: Shares of the gain that the Jacobian promised. A step must reach the first to be taken, the second for an updated
-#: Jacobian to be kept, the third for the damping to fall.
+#: Thresholds for the ratio of a step's actual gain to the gain that the Jacobian predicts: above the first the step is
+#: taken, above the second an updated Jacobian is kept, above the third the damping decreases.
 TAKEN, POOR, GOOD = 1e-3, 0.25, 0.5
-#: Damping relative to the largest diagonal entry of JᵀJ: what is always added, the first value after a failed step, the
-#: largest; and the factor by which it rises and falls.
+#: Damping as a share of the largest diagonal entry of JᵀJ: the smallest value, the first after a failed step, and the
+#: largest; then the factor by which it increases or decreases.
 SMALLEST_DAMPING, FIRST_DAMPING, LARGEST_DAMPING, DAMPING_FACTOR = 1e-10, 1e-3, 1e3, 10
 
 
@@ -28,9 +28,9 @@ class Box:
     """Where the unknowns may be, each (m,).
 
     Attributes:
-        lower: sides of the box, infinite where there is none.
-        upper: the opposite ones.
-        scale: lengths that count as equally long in each coordinate.
+        lower: lower bounds, −∞ where there is none.
+        upper: upper bounds, ∞ where there is none.
+        scale: for each coordinate the length that counts as one unit.
     """
 
     lower: FloatArray
@@ -57,7 +57,7 @@ class Stopping:
     deadline: Deadline | None = None
 
     def nothing_to_gain(self, step: FloatArray, predicted: float, cost: float) -> bool:
-        """Whether a step, in units of the scale, is not worth an evaluation."""
+        """Whether a step, in units of the scale, would gain too little to be worth an evaluation."""
         return bool(
             np.abs(step).max() <= self.tolerance or predicted <= self.gain_tolerance * shrinkable(cost, self.large)
         )
@@ -99,18 +99,18 @@ def least_squares(
 ) -> Fit:
     """Minimise ``‖r(x)‖²`` over a box by Gauss–Newton with damping (Levenberg and Marquardt).
 
-    A Jacobian here costs as much as m residuals. It is made once and then follows by Broyden's secant updates
-    (Nocedal and Wright 2006, section 11.1). A new one is made where a step disappoints, after as many steps as it
-    costs, and at the end if the point has moved far since: the minimum of a residual that doesn't vanish is only as
-    right as the Jacobian. ``scipy.optimize.least_squares`` would make one at each step.
+    A Jacobian here costs as much as m residuals. It is computed once and then updated by Broyden's secant formula
+    (Nocedal and Wright 2006, section 11.1). A new one is computed where a step gains less than predicted, after m
+    steps, and at the end if the point has moved far since: where residuals don't vanish, the minimum found is only as
+    accurate as the Jacobian. ``scipy.optimize.least_squares`` would compute one at each step.
 
     Args:
         residuals: r, (m,) to (n,).
         jacobian: x and r(x) to (n, m).
-        start: (m,); what lies outside the box is moved to its side.
-        box: where to look, and in what units.
+        start: (m,); coordinates outside the box are moved to its nearest side.
+        box: bounds and scales of the unknowns.
         stopping: when to end.
-        secant: whether Jacobians are worth saving; otherwise one is made at each step.
+        secant: whether to save Jacobians by secant updates; otherwise one is computed at each step.
     """
     stopping = stopping or Stopping()
     scale, low, high = box.scale, box.lower / box.scale, box.upper / box.scale
@@ -154,11 +154,11 @@ def least_squares(
 
 
 class _Jacobian:
-    """A Jacobian that is made at some points and follows by Broyden's updates from there.
+    """A Jacobian that is computed at some points and updated by Broyden's formula between them.
 
     Attributes:
         matrix: (n, m), in units of the scale.
-        updates: steps that it has followed since it was made.
+        updates: how many steps it has been updated for since it was computed.
     """
 
     matrix: FloatArray
@@ -171,7 +171,7 @@ class _Jacobian:
         self.renew(u, r)
 
     def renew(self, u: FloatArray, r: FloatArray) -> None:
-        """Make it at a point."""
+        """Compute it at a point."""
         self.matrix, self._made_at, self.updates = self._make(u, r), u, 0
 
     def is_outdated(self, u: FloatArray) -> bool:
@@ -179,15 +179,15 @@ class _Jacobian:
         return self.updates > 0 and bool(np.abs(u - self._made_at).max() > TRUSTED)
 
     def follow(self, step: FloatArray, change: FloatArray) -> None:
-        """Agree with how the residuals have changed along a step that is taken.
+        """Update it so that it predicts how the residuals have changed along a step that was taken.
 
-        Failed steps don't count: one may have met a cliff, whose slope says nothing about other places.
+        Steps that were not taken are ignored: residuals may jump along them, which says nothing of the slope elsewhere.
         """
         if self._secant:
             self.matrix += np.outer(change - self.matrix @ step, step / (step @ step))
 
     def renew_or_keep(self, u: FloatArray, r: FloatArray, taken: bool, gain: float) -> None:
-        """Make it anew if it is time, after a step that has gained this share of what was promised."""
+        """Compute it anew if that is due, after a step that has gained this share of the predicted gain."""
         disappointing = self.updates > 0 and not gain > POOR
         if (taken and not self._secant) or disappointing or self.updates == len(u):
             self.renew(u, r)
@@ -203,14 +203,15 @@ def shrinkable(cost: float, large: float) -> float:
 def _step(J: FloatArray, r: FloatArray, low: FloatArray, high: FloatArray, damping: float) -> FloatArray:
     """The minimiser of ``‖J d + r‖² + μ‖d‖²`` with low ≤ d ≤ high."""
     H, g = J.T @ J, J.T @ r
-    # A Jacobian may be all zero: nothing is free.
+    # Where the Jacobian is all zero, no step is determined.
     shift = max(damping, SMALLEST_DAMPING) * max(H.diagonal().max(), np.sqrt(np.finfo(float).tiny))
     R = cholesky(H + shift * np.eye(len(g)))
     b = -solve_triangular(R, g, trans="T")
     d: FloatArray = solve_triangular(R, b)
     if ((d < low) | (d > high)).any():
-        from scipy.optimize import lsq_linear  # 9 MB and a tenth of a second that most servers never need
+        # Imported here: it takes 9 MB and a tenth of a second, and most servers never need it.
+        from scipy.optimize import lsq_linear
 
-        # The solver refuses a box with a side of no length.
+        # The solver refuses bounds that are equal.
         d = lsq_linear(R, b, (low, np.maximum(high, low + np.finfo(float).eps)), method="bvls").x
     return d

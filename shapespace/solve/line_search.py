@@ -17,7 +17,7 @@ def backtrack(
     """The first of t = 1, 1/2, 1/4, … whose trial is accepted (Nocedal and Wright 2006, algorithm 3.1).
 
     Args:
-        trial: what a step of t leads to.
+        trial: computes the candidate at step length t.
         accepts: the acceptance rule, of t and its trial.
         smallest: t that is still tried; 0 only with a rule that accepts every step that is short enough.
 
@@ -41,6 +41,6 @@ def sufficient_decrease(before: float, after: float, t: float, slope: float, rou
         after: the value at t.
         t: share of the step.
         slope: −(derivative along the step), positive for a direction of descent.
-        rounding: error of the values that is forgiven.
+        rounding: numerical error of the two values, which the rule tolerates.
     """
     return after <= before - ARMIJO * t * slope + rounding

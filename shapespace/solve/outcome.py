@@ -1,4 +1,4 @@
-"""What every iteration returns besides its result: how it ended is a value, not an exception."""
+"""What every iteration returns besides its result. How it ended is a value, not an exception."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ class Status(StrEnum):
 
 @dataclass(frozen=True, kw_only=True)
 class Outcome:
-    """How an iteration ended. Drivers extend it by what they have found, which is finite whatever the status.
+    """How an iteration ended. Subclasses add the result, which is finite whatever the status.
 
     Attributes:
         status: CONVERGED, or why the iteration ended before that.
         iterations: steps tried.
-        residual: what is left, in the norm that the driver names; infinite where nothing has been computed.
-        reason: in words, why it did not converge; may be empty where the status says all.
+        residual: of the equations or of the target, in the norm that the subclass names; ∞ where none was computed.
+        reason: in words, why it did not converge; may be empty.
     """
 
     status: Status

@@ -11,10 +11,10 @@ from shapespace.solve.cholesky import Factor
 class Preconditioner:
     """``P ≈ A⁻¹`` for vertex fields, by the factor of a regularised matrix A whose null space is known.
 
-    For an energy that no rigid motion changes the null space is the six infinitesimal rigid motions of the shape that
-    A belongs to. At a neighbouring shape they are other motions, so forces that balance there don't balance here, and
-    solving as they stand would turn the shape without bound. Leaving out that part of the forces fixes the gauge: the
-    equation left still determines the shape.
+    For an energy that is invariant under rigid motions, the null space of A is spanned by the six infinitesimal rigid
+    motions of the shape at which A was computed. Forces at a neighbouring shape are orthogonal to that shape's motions,
+    not to these, so a solve would rotate the shape by a huge amount. Removing this component of the forces fixes the
+    gauge, and the remaining equation still determines the shape.
 
     Args:
         factor: of ``A + εI``.

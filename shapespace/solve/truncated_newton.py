@@ -1,4 +1,4 @@
-"""Least energy where a barrier is near: Newton's steps by conjugate gradients, each in a line search."""
+"""Minimises an energy with a barrier: Newton steps by conjugate gradients, each followed by a line search."""
 
 from __future__ import annotations
 
@@ -13,12 +13,13 @@ from shapespace.solve.line_search import backtrack, sufficient_decrease
 from shapespace.solve.outcome import Outcome, Status
 from shapespace.solve.preconditioner import step_length
 
-#: Most iterations of conjugate gradients in a step; and the part of the forces that may be left: at most, at least.
+#: Most iterations of conjugate gradients in a step, and the largest and smallest relative residual that ends them.
 GRADIENTS = 60
 LOOSEST, TIGHTEST = 0.3, 1e-3
-#: Displacement by which the Hessian is felt, as a share of the length that the problem gives.
+#: Displacement for the difference quotients of forces that stand for Hessian products, as a share of the energy's
+#: ``length``.
 PROBE = 1e-6
-#: What rounding adds to an energy, as a share of it, and the smallest step tried.
+#: Relative rounding error of an energy, and the smallest step length tried.
 ROUNDING, SMALLEST_STEP = 1e-15, 1e-6
 
 
@@ -36,10 +37,10 @@ class Energy(Protocol):
         """Its negative gradient."""
 
     def admits(self, x: FloatArray, step: FloatArray) -> bool:
-        """Whether a step stays on this side of the barrier, which a straight line may jump over."""
+        """Whether a step stays on this side of the barrier. A straight step can land beyond it."""
 
     def precondition(self, x: FloatArray) -> Callable[[FloatArray], FloatArray]:
-        """Forces to a step: symmetric positive definite, near the inverse of the Hessian at x."""
+        """Map forces to a step, by a symmetric positive definite approximation of the inverse Hessian at x."""
 
 
 @dataclass(frozen=True, kw_only=True)
