@@ -22,11 +22,11 @@ from shapespace.model.shape_model import ShapeModel, load
 from shapespace.training.collection.mannequin import ARM, ELBOW, HIP, KNEE, LEG, SHOULDER, rest
 
 ROOT = Path(__file__).resolve().parents[1]
-#: How far each vertex is pulled, in the figure's units, which are metres; how many are.
+#: How far each vertex is pulled, in metres, the figure's unit; and how many pulls there are.
 PULL, PULLS = 0.25, 40
-#: A factor is one limb's if it moves that limb so many times as far as any other.
+#: A factor belongs to a limb if it moves that limb at least this many times as far as any other.
 OWN = 5.0
-#: Codes at which that is looked at, and directions that are tried for one pull.
+#: At how many codes that is measured, and how many directions are tried for one pull.
 LOOKED_AT, TRIED = 4, 20
 
 PAGE = """# What an edit moves

@@ -30,7 +30,7 @@ from shapespace.training.collection import figure
 
 #: Points of a scan; its noise as a share of the diagonal, and the share of outliers.
 POINTS, NOISE, OUTLIERS = 4000, 0.005, 0.02
-#: How far a try may be off, in medians, and the half width of a 90 % interval in standard deviations.
+#: A try has failed if its error exceeds this many medians; half the width of a 90 % interval, in standard deviations.
 FAILED, NINETY = 2.0, 1.645
 VARIANTS = ("whole", "noisy", "camera")
 #: Steps of the closest-point fit with principal components, and how strongly it holds on to the mean.

@@ -13,7 +13,7 @@ from shapespace.training.learning.learner import Learner
 from shapespace.training.learning.networks import affine_sum, predict
 from shapespace.training.runs.workers import run
 
-#: How far beyond, in half widths of the hypercube, and codes drawn there.
+#: Factors by which the hypercube is enlarged, and how many codes are drawn in each.
 REACHES = (1.0, 1.25, 1.5)
 CODES = 100
 SEED = 7

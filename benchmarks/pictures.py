@@ -25,7 +25,7 @@ from shapespace.training.runs.config import load
 from shapespace.training.runs.sampling import read
 
 ROOT = Path(__file__).resolve().parents[1]
-#: Codes that are shown, the first of the fresh ones; modes, the strongest; and pixels of a picture's side.
+#: How many codes are shown (the first fresh ones), how many modes (the strongest), and pixels of a picture's side.
 CODES, MODES, SIZE = 4, 6, 260
 #: Errors between which colours change, as shares of the diagonal, on a logarithmic scale.
 LEAST, MOST = 1e-4, 3e-2

@@ -27,14 +27,14 @@ from shapespace.training.runs.directory import RunDirectory
 from shapespace.training.runs.sampling import DONE, KNOWN, columns
 
 ROOT = Path(__file__).resolve().parents[1]
-#: Collections of real meshes, in the order of the tables; then the hand without what the method rests on.
+#: Collections of real meshes, in the order of the tables; then the hand without sparse modes, and with one factor.
 COLLECTIONS = ("hand", "faces", "samba", "makehuman", "horse", "hippocampus")
 CONTRASTS = ("hand-pga", "hand-one-factor")
-#: Models of our own, whose runs leave the bundles that are committed.
+#: The bundled models, whose runs write the committed bundles.
 OWN = ("freaky-torus", "figure")
-#: Those whose terms let their pictures be shown, and our own.
+#: Collections whose terms permit pictures of them, and the bundled models.
 PICTURED = ("hand", "faces", "makehuman", "figure", "freaky-torus")
-#: Runs whose extrapolation is measured: one that is easy and one that isn't.
+#: Runs whose extrapolation is measured: an easy and a difficult one.
 EXTRAPOLATED = ("hand", "samba")
 #: Studies, each with the last stage whose results it measures.
 STUDIES = {"space": "samples", "limits": "evaluation"}

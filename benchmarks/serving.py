@@ -48,7 +48,7 @@ from shapespace.solve.outcome import Status
 
 ROOT = Path(__file__).resolve().parents[1]
 GLB = MESH_FORMATS["glb"].encode
-#: Coarse vertices up to which LAPACK's band is tried too.
+#: Largest number of coarse vertices at which LAPACK's banded solver is measured too.
 BANDED = 5000
 PAGE = """# Serving
 

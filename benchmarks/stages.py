@@ -27,7 +27,7 @@ from shapespace.model.shape_model import ShapeModel
 from shapespace.training.runs.stages import STAGES
 
 ROOT = Path(__file__).resolve().parents[1]
-#: Exponentials, joint and of each factor: their time grows in proportion to them; and codes for each median.
+#: How many joint exponentials, and of each factor (the time is proportional to them), and codes for each median.
 JOINT, OF_FACTORS, CODES = 100, 50, 30
 
 PAGE = """# How training grows

@@ -27,7 +27,7 @@ from shapespace.training.space.factors import FactorError
 from shapespace.training.space.modes import ModeError
 from shapespace.training.space.stages import MeanError
 
-#: Exit codes: a fault of the input or of the machine, one of ours (EX_SOFTWARE), and Ctrl+C as shells have it.
+#: Exit codes: a fault of the input or of the machine, a defect of the program (EX_SOFTWARE), and Ctrl+C as in shells.
 FAILURE, DEFECT, STOPPED = 1, 70, 130
 #: Errors whose message is a sentence for the user.
 EXPECTED = (

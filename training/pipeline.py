@@ -269,7 +269,7 @@ def export_bundle(run: Run) -> None:
         directory.log("encoded", **space.encoded(directory, folder))
 
 
-#: The function of each stage; it continues what an interrupted call has left.
+#: The function of each stage. It continues from what an interrupted call has left.
 _DO: dict[str, Callable[[Run], None]] = {
     "ingest": ingest,
     "mean": mean,

@@ -26,9 +26,9 @@ MANIFEST_LIMIT = 4 * 2**20
 #: Most bytes of a bundle's files together.
 LARGEST = 2**30
 #: Limit on the unpacked arrays of an NPZ file: so many times its own length, and so many bytes more. Compression makes
-#: meshes two to six times smaller; data that shrink much more are no mesh.
+#: meshes two to six times smaller; data that shrink much more are not a mesh.
 UNPACKED, BESIDE = 16, 2**20
-#: Characters of a reason. Libraries quote what they can't read, and names inside a file may be of any length.
+#: Most characters of a reason: libraries quote what they can't read, and names inside a file may be of any length.
 LONGEST_REASON = 300
 
 

@@ -22,7 +22,7 @@ SCHEMA_VERSION = 1
 MANIFEST = "manifest.json"
 NAME_PATTERN = r"^[a-z0-9][a-z0-9._-]{0,63}$"
 VERSION_PATTERN = r"^[1-9][0-9]{0,8}$"
-#: A plain file name: no folder, no way out of the bundle, nothing hidden.
+#: A plain file name: without a folder, so that it can't leave the bundle, and not hidden.
 FileName = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]*(\.[A-Za-z0-9_-]+)*$", max_length=100)]
 
 
@@ -136,7 +136,7 @@ class Manifest(_Strict):
     lambda_: NonNegativeFloat = Field(alias="lambda")
     eta: PositiveFloat
     eta_reconstruction: PositiveFloat
-    #: K of the exponentials that a code stands for, where the bundle has modes.
+    #: K, the number of time steps of the exponentials that codes stand for, where the bundle has modes.
     exponential_steps: PositiveInt | None = None
     scale: PositiveFloat
     combiner: Network

@@ -39,8 +39,8 @@ OLD = 0.25
 #: matrix stays positive definite.
 LIFT = 2e-7
 #: Damping where Gauss–Newton stalls, as a share of each diagonal entry: its first value, the factor by which it
-#: increases after a failed step and decreases after a successful one, and its largest value. A step within the tolerance
-#: counts as a minimum only while the damping is at most the last number: more damping would shorten every step.
+#: increases after a failed step and decreases after a successful one, and its largest value. A step within the
+#: tolerance counts as a minimum only while the damping is at most the last number: more would shorten every step.
 FIRST_DAMPING, DAMPING_FACTOR, LARGEST_DAMPING, DAMPING_AT_A_MINIMUM = 1e-6, 10, 1e3, 1e-4
 #: A damped step may not shrink a face to less than this share of its area.
 LEAST_AREA = 0.1

@@ -14,12 +14,12 @@ from shapespace.files.gltf_writing import Document
 from shapespace.mesh.surface import Surface
 from shapespace.mesh.triangle_mesh import diagonal
 
-#: Up to this many frames each frame has a target of its own; beyond it, a basis of this many vectors at most. Keying
-#: every target in every frame takes N² weights, and viewers keep targets in a texture of at most 256 layers.
+#: Up to this many frames each frame is a morph target of its own. Longer animations have a basis of at most this many
+#: targets: every target has a weight in every frame, and viewers keep targets in a texture of at most 256 layers.
 DENSE_FRAMES = 64
-#: Enough targets are kept to bring every vertex this close, as a fraction of the bounding box's diagonal.
+#: Enough targets are kept for every vertex to be within this distance, a fraction of the bounding box's diagonal.
 BASIS_TOLERANCE = 1e-4
-#: Where nobody says otherwise.
+#: The default.
 FRAMES_PER_SECOND = 30.0
 #: Bytes of displacements, and frames of normals, that are held in memory at once.
 BLOCK, _FRAMES_AT_ONCE = 2**21, 16

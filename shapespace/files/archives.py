@@ -9,9 +9,9 @@ from collections.abc import Iterable, Iterator
 import numpy as np
 
 Buffer = bytes | bytearray | memoryview
-#: Harder compression takes longer than to compute the shapes, and saves a tenth of the size.
+#: Compression level of zlib. Higher levels take longer than computing the shapes, and save a tenth of the size.
 LEVEL = 1
-#: Bytes of an array that are written at once, nearly: a write for each row of three indices takes longer than a shape.
+#: About how many bytes of an array are written at once: writing row by row takes longer than computing a shape.
 PIECE = 2**16
 
 

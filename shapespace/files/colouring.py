@@ -23,9 +23,9 @@ _COOLWARM = (
 )
 #: The legend ends at this quantile of the sizes, so that one stray vertex doesn't take the colour from all others.
 _QUANTILE = 0.98
-#: It never ends below this, in either unit: what hasn't changed is grey, whatever the rounding.
+#: Smallest end of the legend, in percent or degrees: rounding errors of unchanged vertices stay grey.
 _SMALLEST = 0.01
-#: Of a spread, whose units may be any.
+#: The same for a standard deviation, in any unit.
 _SMALLEST_SPREAD = 1e-9
 
 

@@ -20,7 +20,7 @@ from shapespace.mesh.triangle_mesh import MeshError
 if TYPE_CHECKING:
     from shapespace.files.colouring import Colouring
 
-#: Formats that IANA doesn't know.
+#: Media type of formats that have none registered at IANA.
 OCTET_STREAM = "application/octet-stream"
 
 

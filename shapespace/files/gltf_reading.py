@@ -24,16 +24,16 @@ from shapespace.arrays import FloatArray, IntArray
 from shapespace.files.limits import PIECE, Limits, clipped
 from shapespace.mesh.triangle_mesh import MeshError
 
-#: Most bytes of the JSON, without data; and most values in it. A rig with animations has a hundred thousand.
+#: Most bytes of the JSON, data URIs not counted, and most values in it. A rig with animations has a hundred thousand.
 _MOST_TEXT, _MOST_VALUES = 4 * 2**20, 250_000
 #: Most data URIs in the JSON; most primitives, counted at each of their places; and how deep nodes may be nested.
 _MOST_URIS, _MOST_PARTS, _DEEPEST = 1000, 1000, 100
-#: Extensions that a file may require: the first is read, and those that begin like the others change no triangle.
+#: Extensions that a file may require: the first one is implemented; those with the other prefixes change no triangle.
 _QUANTIZATION = "KHR_mesh_quantization"
 _APPEARANCE = ("KHR_materials_", "KHR_texture_", "EXT_texture_", "KHR_lights_", "EXT_lights_")
 _TYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _POSITIONS, _INDICES = (5120, 5121, 5122, 5123, 5126), (5121, 5123, 5125)
-#: Of an attribute whose elements are whole numbers; glTF has no longer integers there (3.7.2.1).
+#: Component types of attributes whose elements are integers: glTF allows no larger ones there (3.7.2.1).
 _NUMBERS = (5121, 5123, 5126)
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 _TRIANGLES, _STRIP, _FAN = 4, 5, 6

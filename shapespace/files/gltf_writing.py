@@ -31,7 +31,7 @@ MATERIAL = {
         "roughnessFactor": 0.75,
     },
 }
-#: Vertex colours are multiplied with the material's.
+#: For meshes with vertex colours, which are multiplied with the material's colour.
 WHITE = MATERIAL | {
     "name": "coloured",
     "pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 0.75},
@@ -144,9 +144,9 @@ class Document:
             "POSITION": self.add(vertices[self.rows], bounds=True, target=ARRAY_BUFFER),
             "NORMAL": self.add(self.normals(vertices), target=ARRAY_BUFFER),
         }
-        #: What all primitives have; there is one for each material.
+        #: Common to all primitives; there is one for each material.
         self.primitive: dict[str, Any] = {"attributes": attributes}
-        #: What all meshes have.
+        #: Common to all meshes.
         self.mesh: dict[str, Any] = {}
         colors = colouring.linear if colouring else None
         if colouring:
@@ -179,7 +179,7 @@ class Document:
                 self.tree["materials"] = looks
         else:
             used = [NONE]
-        #: By the number of the object.
+        #: Primitives by the index of the object that they belong to.
         self._primitives: dict[int, list[dict[str, int]]] = {}
         for piece in pieces:
             some = triangles if len(pieces) == 1 else triangles[piece.triangles]

@@ -9,7 +9,7 @@ import numpy as np
 
 from shapespace.mesh.triangle_mesh import MeshError
 
-#: Bytes that are looked at together.
+#: How many bytes are examined at a time.
 PIECE = 2**20
 
 

@@ -16,9 +16,9 @@ from shapespace.files.limits import PIECE, UNLIMITED, Limits, clipped
 from shapespace.mesh.triangle_mesh import MeshError
 
 _MOST_ARRAYS = 1000
-#: Bytes that contain the head of an array; NumPy accepts heads of ten thousand bytes at most.
+#: How many bytes are read for an array's header; NumPy accepts headers of at most ten thousand bytes.
 _HEAD = 12_000
-#: Most bytes that deflate can make of one; and bytes of NumPy's longest number.
+#: Largest expansion factor of deflate, and bytes of NumPy's largest number.
 _DEFLATION, _LONGEST_NUMBER = 1032, 32
 _READ_HEAD = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
 

@@ -22,7 +22,7 @@ from shapespace.arrays import FloatArray, IntArray
 from shapespace.files.limits import Limits, clipped, count_bytes
 from shapespace.mesh.triangle_mesh import MeshError
 
-#: Bytes of the longest line and of the longest head of a PLY file.
+#: Most bytes of a line, and of the header of a PLY file.
 LONGEST_LINE, LONGEST_HEAD = 2**20, 2**16
 #: Most ends of lines for each vertex and face, and beside these: an ASCII STL file has seven lines for a face, an OBJ
 #: file up to seven with texture and normals, and each may end in two characters.
@@ -196,7 +196,7 @@ _PLY_TYPES = {
     "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4", "int64": "i8",
     "uint64": "u8", "double": "f8", "float32": "f4", "float64": "f8",
 }  # fmt: skip
-#: Rows are looked at one by one, where their lists are of different lengths.
+#: Most properties of a PLY element, and most lists among them: rows with lists of unequal length are read one by one.
 _MOST_PROPERTIES, _MOST_LISTS = 256, 4
 _PLY_ORDERS = {b"binary_little_endian": "<", b"binary_big_endian": ">", b"ascii": ""}
 

@@ -20,7 +20,8 @@ from shapespace.files.surfaces.usd import add_surface
 from shapespace.mesh.surface import Surface, srgb
 
 _PIECE, _FRAMES_AT_ONCE = 2**20, 32
-#: Of the files in a package: noon in Greenwich on the second day that ZIP can name, so that it can in every zone.
+#: Modification time of all files in a package: noon UTC on the second day that ZIP can represent, so that it is
+#: representable in every time zone.
 _TIME = 315_662_400
 #: The colour of the glTF writer's material.
 _COLOUR = (0.72, 0.76, 0.82)

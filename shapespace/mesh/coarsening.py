@@ -12,25 +12,25 @@ from shapespace.mesh.thinning import thin
 from shapespace.mesh.triangle_mesh import Connectivity, MeshError, TriangleMesh, face_areas
 from shapespace.mesh.triangle_quality import folded_pairs
 
-#: Smallest angles (degrees) that a collapse may leave in any shape: the first limit holds until no collapse is left,
-#: then the next. Stricter limits cost accuracy: cheap collapses wait while expensive ones are made.
+#: Smallest angles (degrees) that an edge collapse may leave in any shape: the first limit holds until no collapse meets
+#: it, then the next. Stricter limits cost accuracy, as expensive collapses are then made before cheap ones.
 ANGLE_LIMITS = (10.0, 6.0, 3.0, 1.5)
-#: Length below which crumpled places may collapse (``Decimation``), as a share of the coarse mesh's mean edge.
+#: In crumpled places edges below this length may collapse (see ``Decimation``); in mean edges of the coarse mesh.
 SMALL = 1.0
-#: Share of the vertices kept back to heal slivers and folds that the fine mesh has already.
+#: Share of the vertices reserved for removing slivers and folds that the fine mesh has already.
 HEALING_SHARE = 0.1
-#: Share of the target that remains at least, however many vertices thin parts lose because of slivers.
+#: At least this share of the target number of vertices is left, however many are removed because of slivers.
 LEAST_SHARE = 0.5
-#: Weights of motion (``Decimation``) that are tried. A large one makes faces even, which networks learn better, but a
-#: geodesic ends where a face collapses. So among the meshes with the fewest specks and folds the first is taken whose
-#: worst face keeps nearly as much of its area as that of the best of them: at least this share of it.
+#: Weights of motion (see ``Decimation``) that are tried. A large weight makes triangles uniform, which networks learn
+#: better, but can leave tiny faces, at which geodesics end. So among the meshes with the fewest specks and folds the
+#: first is taken whose smallest face has at least NEARLY times the area that it has in the best of them.
 MOTION_WEIGHTS, NEARLY = (1.0, 0.1, 0.01), 0.9
 
 #: A mesh with more vertices than the first number, and more than the second times the target, is thinned first:
 LARGE, PLENTY = 20_000, 20
 #: to the first number of vertices here, or the second times the target, whichever is more.
 THINNED, ENOUGH = 5000, 8
-#: Shapes, spread evenly, that thinning looks at.
+#: How many shapes, evenly spaced in the collection, thinning takes into account.
 THINNED_SHAPES = 4
 
 

@@ -20,9 +20,9 @@ from shapespace.mesh.triangle_mesh import Connectivity, MeshError, TriangleMesh,
 #: Weight of a vertex normal against that of an edge in the fit of a vertex' local affine map.
 NORMAL_WEIGHT = 0.1
 PREFIX = "prolongation_"
-#: Ridge of `fitted`, as a share of the mean square of what it regresses on, and numbers in memory at a time, thirds.
+#: Ridge of `fitted`, relative to the mean square of its regressors, and how many vectors it holds in memory at a time.
 RIDGE, FITTED = 1e-3, 2**20
-#: Fine vertices that are bound at a time: each is compared with dozens of faces, which takes memory.
+#: How many fine vertices are bound to faces at a time: each is compared with dozens of faces, which takes memory.
 CHUNK = 10_000
 
 

@@ -12,9 +12,10 @@ from shapespace.mesh.prolongation import Prolongation, Rider, hung
 from shapespace.mesh.rigid_motion import align
 from shapespace.mesh.triangle_mesh import TriangleMesh, diagonal
 
-#: Coarse vertices near the part that may carry it; points of the part that are compared; and how many carry it.
+#: How many coarse vertices near a part are candidates for carrying it, how many points of the part are compared, and
+#: the numbers of carrying vertices that are tried.
 NEAR, SAMPLE, ANCHORS = 64, 100, (1, 2, 4, 8, 16)
-#: A part keeps its form unless an affine map comes closer than this share of the rigid motion's error.
+#: A part moves rigidly unless an affine map's error is less than this share of the rigid motion's.
 CLOSER = 0.9
 
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from shapespace.arrays import FloatArray
 
-#: Singular values of rigid motions below this share of the largest count as none.
+#: Singular values of rigid motions below this share of the largest are treated as zero.
 RANK = 1e-9
 
 

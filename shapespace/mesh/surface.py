@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from shapespace.arrays import FloatArray, IntArray
 from shapespace.mesh.triangle_mesh import MeshError
 
-#: Of a number that a corner or a polygon doesn't have.
+#: Stands for an index that a corner or a polygon doesn't have.
 NONE = -1
 
 

@@ -20,15 +20,15 @@ from shapespace.mesh.triangle_quality import FOLD_LIMIT, dots, normals_and_sides
 ANGLE_LIMITS, SLOW = (10.0, 5.0, 2.5), 0.01
 #: Largest turn of a face's normal.
 TURN = np.cos(np.deg2rad(45))
-#: Weight of the motion of a vertex against the planes of its faces: even triangles are a good start.
+#: Weight of a vertex's motion relative to the plane errors of its faces: it keeps triangles uniform.
 MOTION_WEIGHT = 0.1
-#: Of the vertices that are tried in a round, the share whose collapses are cheapest and are done.
+#: In each round the cheapest of the candidate collapses are made: this share of them.
 CHEAPEST = 0.5
 #: How often further vertices are chosen, far from those already chosen.
 SWEEPS = 3
 #: Faces, or collapses, looked at together.
 CHUNK = 50_000
-#: A round that removes less than this share of the vertices is in vain; after so many of those thinning ends.
+#: Thinning ends after VAIN rounds that each remove less than the share FEWEST of the vertices.
 FEWEST, VAIN = 0.001, 5
 
 

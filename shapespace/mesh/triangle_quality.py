@@ -11,7 +11,7 @@ from shapespace.mesh.triangle_mesh import Connectivity, cross
 
 #: Largest angle between the normals of two neighbours, as a cosine.
 FOLD_LIMIT = np.cos(np.deg2rad(140))
-#: Numbers of neighbouring faces.
+#: Indices of pairs of neighbouring faces.
 Pairs = list[tuple[int, int]]
 #: Least area of a face, as a share of the mean area of the coarse mesh's faces in the same shape.
 SMALLEST_AREA = 0.01

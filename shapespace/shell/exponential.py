@@ -20,16 +20,17 @@ from shapespace.solve.line_search import backtrack
 from shapespace.solve.outcome import Outcome, Status
 from shapespace.solve.preconditioner import step_length
 
-#: Shapes from which a first guess is extrapolated: with eight its error is of eighth order in the step.
+#: How many shapes the first guess of the next one is extrapolated from: with eight its error is of eighth order in the
+#: time step.
 EXTRAPOLATED = 8
-#: What making a factor costs, in iterations.
+#: The cost of a new factor, in iterations.
 COST = 8
-#: Once a step has taken so many more iterations than with a new factor, old factors are rotated along.
+#: Once a step needs so many more iterations than the step with a new factor did, old factors are rotated to each shape.
 PATIENCE = 1
-#: If two iterations leave more than this part of the residual, the factor at hand is given up.
+#: If two iterations leave more than this share of the residual, the present factor is replaced.
 SLOW = 0.5
-#: Iterations of exact Newton, and the smallest step tried. Those that converge need 4 to 8; where it takes more, a face
-#: is collapsing, and a path that is dragged on ends a few steps later (measured on posed bodies).
+#: Most iterations of exact Newton, and the smallest step length tried. Where it converges it needs 4 to 8 iterations;
+#: where it needs more, a face is collapsing, and the path would end a few steps later anyway (as posed bodies show).
 NEWTON_ITERATIONS = 12
 SMALLEST_STEP = 1 / 16
 

@@ -28,20 +28,20 @@ from shapespace.solve.line_search import backtrack
 from shapespace.solve.outcome import Status
 from shapespace.solve.truncated_newton import descend
 
-#: Iterations from one set of factors, and how often the factors are renewed before it is given up.
+#: Most iterations with one set of factors, and how often factors are renewed before the attempt is given up.
 ITERATIONS = 40
 RENEWALS = 20
-#: Newton steps for the energy of a path.
+#: Most Newton steps of the minimisation of the path energy.
 DESCENTS = 30
-#: A step of a path with more than this times the mean energy of all is a jump: a geodesic has constant speed.
+#: A time step whose energy is more than this many times the mean is a jump: a geodesic has constant speed.
 JUMP = 4.0
-#: For the shapes of a first path, which need not be exact.
+#: Iterations and tolerance for the shapes of an initial path, which need not be exact.
 MIDDLE_ITERATIONS, MIDDLE_TOLERANCE = 30, 1e-2
-#: New factors are made after three iterations that leave more than this part of the residual.
+#: Factors are renewed after three iterations that leave more than this share of the residual.
 SLOW = 0.1
-#: Gauss–Newton steps towards each shape of the first path, which need not be exact, and the smallest one tried.
+#: Most Gauss–Newton steps to each shape of the initial path, which need not be exact, and the smallest step length.
 NEAREST_ITERATIONS, SMALLEST_STEP = 4, 1 / 32
-#: Part of the squared misfit that such a step must take away for another one to follow.
+#: These steps end once one reduces the squared misfit by less than this share.
 WORTHWHILE = 0.1
 
 

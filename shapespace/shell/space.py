@@ -32,13 +32,13 @@ from shapespace.solve.cholesky import Backend, Cholesky, analyse
 from shapespace.solve.outcome import Outcome
 from shapespace.solve.preconditioner import Preconditioner
 
-#: Solved to here: ``sqrt(Fᵀ A⁻¹ F)``, the distance that a Newton step would still go, as a length in the metric.
+#: Tolerance of equations F = 0: on ``sqrt(Fᵀ A⁻¹ F)``, the length in the metric of a further Newton step.
 TOLERANCE = 1e-9
-#: A face below this part of its area after one step has collapsed; the energy's barrier is near.
+#: A face has collapsed if a time step leaves less than this share of its area; the energy is near its barrier.
 SMALLEST_AREA_RATIO = 1e-3
-#: Most of its area that a face may lose in a step of a descent.
+#: Largest share of its area that a face may lose in one step of a descent.
 LARGEST_LOSS = 0.8
-#: An angle that changes by more than this in one step has passed through a fold or a collapsed face.
+#: If an angle changes by more than this in one time step, the surface has passed through a fold or a collapsed face.
 LARGEST_TURN = 0.75 * np.pi
 
 
@@ -161,7 +161,7 @@ class ChordSolver:
         return field if self.rotations is None else np.einsum("vji,...vj->...vi", self.rotations, field)
 
 
-#: Factorises A at a shape; raises NotPositiveDefiniteError. What it has returned before can't solve any more then.
+#: Factorises A at a shape; raises NotPositiveDefiniteError. The factor that it returned before becomes unusable.
 Factorise = Callable[[Point], ChordSolver]
 
 

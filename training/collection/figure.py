@@ -143,7 +143,7 @@ def _joints() -> tuple[Joint, ...]:
     )
 
 
-#: From the tips to the root, the pelvis, which never moves.
+#: Joints in order from the tips of the limbs to the root, the pelvis, which never moves.
 JOINTS = _joints()
 
 
@@ -185,7 +185,7 @@ def pose(angles: ArrayLike) -> FloatArray:
     return vertices
 
 
-#: Poses with a name, each by its angles that are not zero.
+#: Poses with a name, each given by its nonzero angles.
 NAMED: dict[str, dict[str, float]] = {
     "rest": {},
     "walking": {

@@ -30,16 +30,16 @@ from shapespace.training.collection.suspicions import Placements, suspicions
 from shapespace.training.runs.progress import progress
 
 MIN_SHAPES = 3
-#: Between the name of an NPZ and that of a shape in it.
+#: Separates the name of an NPZ file from that of a shape in it.
 _SHAPE = ": shape "
 TOO_FEW = f"has {{}} shapes; at least {MIN_SHAPES} are needed"
 
 #: Vertices closer than this share of the bounding box's diagonal coincide; float32 rounds a coordinate to 6e-8 of it.
 WELD_TOLERANCE = 1e-6
-#: Vertices of borders that are closer than this share of it were probably meant to be joined.
+#: Vertices on borders that are closer than this share of it were probably meant to be one vertex.
 SEAM_TOLERANCE = 1e-4
 
-#: Files that lie beside meshes: buffers of glTF, materials of OBJ, and textures.
+#: Extensions of files that accompany meshes: buffers of glTF, materials of OBJ, and textures.
 _BESIDE = ("bin", "mtl", "png", "jpg", "jpeg")
 
 #: A volume below this share of area^(3/2) (a ball has 0.094) is too small to tell inside from outside.

@@ -13,7 +13,7 @@ from shapespace.arrays import FloatArray, IntArray
 
 #: A larger array, in bytes, is kept in a temporary file.
 IN_MEMORY = 2**27
-#: Numbers that are looked at together.
+#: How many numbers are processed at a time.
 TOGETHER = 2**22
 
 

@@ -16,11 +16,12 @@ from shapespace.mesh.rigid_motion import align
 from shapespace.mesh.surface import Labels, Surface
 from shapespace.mesh.triangle_mesh import Connectivity, MeshError, diagonal, face_areas
 
-#: A part with more than this share of the shell's area rides along only if it keeps its form.
+#: A part with more than this share of the shell's area may only be carried along if it moves rigidly.
 LARGE = 0.2
-#: It does where it is never further than this share of its diagonal, on average, from one of its shapes moved rigidly.
+#: It moves rigidly if each of its shapes is within this mean distance, a share of its diagonal, of one of them moved
+#: rigidly.
 RIGID = 0.005
-#: Most parts, each of which takes time in every answer.
+#: Most parts: each takes time in every answer.
 MOST = 100
 
 

@@ -22,19 +22,20 @@ from shapespace.training.collection.large_arrays import TOGETHER, columns, room
 
 #: Areas that differ from the median by more than this factor suggest another unit.
 AREA_FACTOR = 3.0
-#: A vertex is out of place where its shortest edge is longer than so many times its longest one elsewhere,
+#: A vertex is misplaced in a shape if its shortest edge there is longer than STRETCH times its longest in other shapes,
 STRETCH = 2.0
-#: and than so many times the shape's mean edge.
+#: and longer than LONG times the shape's mean edge.
 LONG = 3.0
-#: Where half of all edges are longer than so many times those of the others, no vertex is in its place.
+#: If half of all edges are longer than this many times those of other shapes, the vertices have another order.
 SCRAMBLED = 2.5
-#: "Elsewhere" is this quantile over the shapes, so that faults are found even where only a quarter of the shapes are
-#: right.
+#: "In other shapes" means this quantile over all shapes, so that faults are found even if only a quarter of the shapes
+#: are right.
 QUANTILE = 0.25
-#: Ratios of squared distances below which a reflection, or a rotation, explains why a shape differs from the others.
+#: A reflection, or a rotation, explains why a shape differs from the others if it reduces the squared distance to less
+#: than this share.
 MIRRORED, TURNED = 0.5, 0.1
-#: Largest angle, in degrees, between a rotation and one that exchanges axes for it to count as that; and between
-#: shapes that count as standing alike.
+#: Largest angles, in degrees: between a rotation and one that exchanges coordinate axes, to count as it; and between
+#: shapes that count as having the same orientation.
 QUARTER_TURN, ALIKE = 25.0, 30.0
 #: Number of vertices, spread evenly, that rigid motions between shapes are computed from.
 SAMPLE = 2000

@@ -23,9 +23,9 @@ from shapespace.training.runs.sampling import Collection
 #: Candidates for the length of the kernel, in multiples of the root of the number of inputs, and for the penalty.
 LENGTHS = (0.5, 1.0, 2.0, 4.0, 8.0)
 PENALTIES = tuple(10.0**k for k in range(-11, -1))
-#: Principal coefficients of the shapes by which these are chosen.
+#: These are chosen by the errors of this many principal coefficients of the shapes.
 CHOSEN_BY = 128
-#: Of each coordinate of a grid: with two it would be linear.
+#: Fewest nodes of a grid along each coordinate: with two it would be linear.
 FEWEST_NODES = 3
 
 

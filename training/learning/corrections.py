@@ -101,15 +101,15 @@ class KernelCorrection(Correction):
     weights: Tensor
     mean: Tensor
     basis: Tensor
-    #: Samples to fit to, at most: the time grows with their cube, the size of the network with their number.
+    #: Most samples to fit to: the time grows with their cube, the size of the network with their number.
     ANCHORS = 4000
     #: Candidates for the length ℓ and for the penalty, where the kernel's largest value is 1. With penalties below 1e-4
     #: the weights are too large for single precision.
     LENGTHS = (2.0, 4.0, 8.0, 16.0)
     PENALTIES = tuple(10.0 ** (k / 2) for k in range(-8, -1))
-    #: Samples that the principal axes of factors are computed from, at most.
+    #: Most samples that the principal axes of factors are computed from.
     AXES = 500
-    #: Share of the variance that the basis of the correction keeps, and its largest rank.
+    #: Share of the variance that the correction's output basis keeps, and its largest rank.
     ENERGY, RANK = 0.995, 512
 
     def __init__(self, factor_count: int, coefficients: int, size: int, anchors: int, rank: int) -> None:

@@ -43,7 +43,7 @@ from shapespace.training.runs.config import (
 from shapespace.training.runs.directory import RunDirectory
 from shapespace.training.runs.sampling import Collection, Samples, read, split
 
-#: The paper's factor networks.
+#: Settings that make factor networks those of the paper.
 PAPER_FACTORS = LatentNetworkSettings(fourier=0, skip_degree=0, energy=1, fit=FitSettings())
 
 

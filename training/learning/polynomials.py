@@ -20,7 +20,7 @@ from shapespace.training.learning.linear import SpectralRidge, principal_axes, r
 from shapespace.training.runs.config import PolynomialSettings
 from shapespace.training.runs.progress import progress
 
-#: Factor shapes (n, J, 2E), and what their affine sum misses of the joint shape (n, 2E), as scaled differences.
+#: Factor shapes (n, J, 2E), and the residual (n, 2E) of their affine sum to the joint shape, as scaled differences.
 Pairs = tuple[Tensor, Tensor]
 
 
@@ -63,11 +63,11 @@ class PolynomialCorrection(Correction):
     gains: Tensor
     basis: Tensor
     mean: Tensor
-    #: Edges of a patch, on average.
+    #: Mean number of edges of a patch.
     EDGES = 24
-    #: Samples that the principal axes of factors are computed from, at most.
+    #: Most samples that the principal axes of factors are computed from.
     AXES = 500
-    #: How much the low rank of the output may add to the squared error on held-out samples, as a share of it.
+    #: The output's rank is the lowest that increases the squared error on held-out samples by at most this share.
     SLACK = 0.125
 
     def __init__(self, tensors: Mapping[str, Tensor]) -> None:
@@ -302,14 +302,14 @@ def _roots(index: NDArray) -> Tensor:
 
 #: Candidates for the penalty, where the kernel is 1 at the centre.
 PENALTIES = tuple(10.0 ** (k / 2) for k in range(-14, 1))
-#: Samples that a metric is learned from, at most, and those of them at which gradients are taken.
+#: Most samples that a metric is learned from, and at how many of them gradients are computed.
 SAMPLES, GRADIENTS = 800, 150
 #: How often the metric is updated, and the power of the mean outer product of gradients that it is set to. With the
-#: consistent power 1/2 it follows noise.
+#: consistent power 1/2 it fits noise.
 STEPS, POWER = 4, 0.25
-#: Principal components of the values whose gradients count.
+#: The gradients are those of this many principal components of the values.
 OUTPUTS = 16
-#: Root mean square of the strongest coefficient in the first metric.
+#: The first metric is scaled so that the strongest coefficient has this root mean square.
 SCALE = 1 / 8
 
 

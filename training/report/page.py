@@ -33,7 +33,7 @@ from shapespace.training.runs.atomic_files import NpzFile
 from shapespace.training.runs.directory import RunDirectory
 from shapespace.training.runs.stages import STAGES
 
-#: Pixels of a picture's longer side; shown at half of it or less, so that it is sharp on a phone.
+#: Pixels of a picture's longer side. Pictures are shown at half that size or less, so that they are sharp on phones.
 LARGE, SMALL = 480, 300
 #: Most modes that are drawn.
 MODES_SHOWN = 40

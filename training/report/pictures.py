@@ -19,7 +19,7 @@ from shapespace.mesh.rigid_motion import align
 from shapespace.training.report.record import Record
 from shapespace.training.report.rendering import Camera
 
-#: Largest displacement at which a mode is shown, in diagonals.
+#: Largest displacement in the picture of a mode, as a fraction of the diagonal.
 MODE_REACH = 0.1
 #: Colours of shapes: exact ones, those from networks (yellow in the paper too), and modes without a factor.
 CLAY, COMPOSITE, NEUTRAL = "#d3ccc1", "#e3b23c", "#4b5a6b"

@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, MaxNLocator, NullFormatter
 from numpy.typing import ArrayLike
 
-#: Stands for the page's text colour, light or dark, until the SVG is written.
+#: A placeholder for the page's text colour, light or dark, which replaces it in the written SVG.
 INK = "#010203"
 STYLE: dict[Any, Any] = {
     "axes.edgecolor": INK, "axes.labelcolor": INK, "axes.linewidth": 0.6, "axes.spines.right": False,

@@ -72,7 +72,7 @@ class Record:
             _readable(file.path, file.read_if_written) for file in (run.generalisation, run.encoded)
         )
         self.mean: FloatArray | None = mean.get("vertices")
-        #: (V, 3) what tangent vectors start from: the mean, or the reference where there is none.
+        #: (V, 3) the base point of tangent vectors: the mean, or the reference where there is none.
         self.base = self.reference.get("vertices") if self.mean is None else self.mean
         groups = grouping.get("factors", [])
         self.factors = [
@@ -80,7 +80,7 @@ class Record:
             for name, hue, group in zip(grouping.get("names", []), cycle(HUES), groups, strict=False)
         ]
         self.overlap = np.array(grouping.get("overlap", []))
-        #: Seconds of the stages that are done, None for one at work.
+        #: Seconds of the stages that are done, None for one that is running.
         stamps = {name: _readable(run.stamp(name).path, run.stamp(name).read_if_written) for name in STAGES}
         self.seconds = {name: stamp.get("seconds") for name, stamp in stamps.items() if "key" in stamp}
 

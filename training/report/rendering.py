@@ -15,20 +15,20 @@ from shapespace.mesh.triangle_mesh import diagonal, face_normals
 
 #: Degrees from which a shape is seen, to the right of its front and above it.
 AZIMUTH, ELEVATION = 25.0, 18.0
-#: Distance of the eye in diagonals of everything that is to be seen: a long lens distorts little.
+#: Distance of the camera, in diagonals of all that is shown: from far away perspective distorts little.
 DISTANCE = 2.5
 #: Directions of lights in (right, up, towards the viewer), and their brightness.
 LIGHTS = (((-0.55, 0.75, 0.65), 0.78), ((0.85, 0.10, 0.50), 0.20))
-#: Light from everywhere, at surfaces that look down and up.
+#: Ambient light on surfaces that face down, and on those that face up.
 AMBIENT = (0.20, 0.46)
-#: How far light reaches round a surface's own shadow line; 0 is a bare cosine, hard as in a vacuum.
+#: Wrap of diffuse light beyond the line where a surface turns away from it; 0 is plain Lambertian shading.
 WRAP = 0.3
-#: Directions in which a vertex looks for what keeps the ambient light from it.
+#: Rays from each vertex that test what occludes its ambient light.
 OCCLUSION_RAYS = 96
-#: Rays for a pixel along each side: what smooths the outlines.
+#: Rays per pixel along each side, which smooths outlines.
 SUPERSAMPLING = 2
 GAMMA = 2.2
-#: Around the shapes, a fraction of the picture's longer side.
+#: Margin around the shapes, a fraction of the picture's longer side.
 MARGIN = 0.03
 
 

@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 
 from tqdm import tqdm
 
-#: Seconds without output at the start; and between two lines where there is no terminal.
+#: Seconds before the first progress output, and between two lines where there is no terminal.
 DELAY, PAUSE = 5, 10
 
 Item = TypeVar("Item")

@@ -20,10 +20,10 @@ from shapespace.training.runs.progress import bar
 from shapespace.training.runs.workers import run
 
 DONE, FAILED = "done", "failed"
-#: A code whose shape can't be computed is multiplied by this factor, at most so many times. Faces collapse mostly at
+#: A code whose shape can't be computed is multiplied by SHORTER, up to SHORTENINGS times. Faces collapse mostly at
 #: codes near the corners of the box, which lie farther out than the training shapes do.
 SHORTER, SHORTENINGS = 0.85, 3
-#: Folder inside that of the joint samples: those of the codes of the collection's shapes.
+#: Subfolder of the joint samples: the samples at the codes of the collection's own shapes.
 KNOWN = "shapes"
 #: Fewest samples to learn from: each part of the split needs some.
 FEWEST = 10

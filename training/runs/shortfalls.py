@@ -16,7 +16,7 @@ from shapespace.mesh.triangle_quality import FOLD_LIMIT
 from shapespace.training.runs.directory import RunDirectory
 from shapespace.training.runs.sampling import DONE, columns, parts
 
-#: A larger share of logarithms or samples lost stops the run.
+#: The run stops if a larger share of logarithms or samples could not be computed.
 MOST_LOST = 0.25
 #: A factor is named as the cause where, in it, lost codes lie farther from 0 than the others by this share of the box.
 CLEARLY = 0.05

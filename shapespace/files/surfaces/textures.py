@@ -10,7 +10,7 @@ from shapespace.files.limits import clipped
 
 #: Most bytes of one picture, and of all pictures of a surface together: every answer holds them.
 LARGEST, ALL = 16 * 2**20, 32 * 2**20
-#: Of PNG and JPEG.
+#: The first bytes of PNG and JPEG files.
 BEGINNINGS = (b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff")
 
 
