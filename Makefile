@@ -45,7 +45,7 @@ train: $(VENV)/.train ## train the bundled models from their generators
 	$(BIN)/shapespace-train run examples/figure.toml
 
 test: $(VENV)/.all $(MODULES) $(VENV)/.browser ## run the whole suite (ARGS="-k glb" for a part of it, JOBS=3 at once)
-	PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/python -m pytest --numprocesses $(JOBS) --dist loadfile $(ARGS)
+	PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/python -m pytest --numprocesses $(JOBS) --dist loadfile --no-loadscope-reorder $(ARGS)
 
 check: lint ## what is quick: style, types and doors, then the library, use cases and pages; no torch, Node or browser
 	PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/python -m pytest --numprocesses $(JOBS) --dist loadfile $(QUICK) $(ARGS)

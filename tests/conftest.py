@@ -6,6 +6,11 @@ import numpy as np
 import pytest
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    # Whole runs take minutes in a few tests: begun last, they would keep one process busy after all others are done.
+    items.sort(key=lambda item: "whole_runs" not in item.path.parts)
+
+
 @pytest.fixture
 def rng() -> np.random.Generator:
     return np.random.default_rng(7)
