@@ -37,10 +37,10 @@ class _Section(BaseModel):
 
 
 class CollectionSettings(_Section):
-    """Where the shapes come from: a generator of ours, or meshes in correspondence."""
+    """Where the shapes come from: a built-in generator, or meshes in correspondence."""
 
     generator: Literal["freaky-torus", "figure"] | None = None
-    """A collection of ours, made by a program; see training/collection/generators.py."""
+    """A built-in generator of a collection; see training/collection/generators.py."""
     data: Path | None = None
     """Folder of OBJ, PLY, STL, OFF or glTF files, or one NPZ file with ``vertices`` (n, V, 3) and ``faces``; relative
     to the configuration's own folder. The command's ``--data`` takes precedence."""
@@ -49,8 +49,8 @@ class CollectionSettings(_Section):
     most central one."""
     parts: list[str] = []
     """Of meshes of several parts, the names of those to keep: the first is the shell that the model computes with, the
-    others ride along. By default all are kept, and the largest is the shell. Names are those of the file's objects,
-    groups or materials, or ``part 1``, ``part 2`` and so on; ``run --until ingest`` prints them."""
+    others are carried along with it. By default all are kept, and the largest is the shell. Names are those of the
+    file's objects, groups or materials, or ``part 1``, ``part 2`` and so on; ``run --until ingest`` prints them."""
     coarse_vertices: int = Field(1000, ge=0)
     """Vertices to compute with: meshes with more are simplified to about this number. 0 computes with all vertices."""
 
@@ -77,20 +77,21 @@ class ModeSettings(_Section):
     """Sparse principal geodesic analysis of the collection at its mean."""
 
     count: Annotated[int, Field(ge=1)] | Literal["auto"] = "auto"
-    """Number of modes m; at most the number of shapes less one. ``auto`` takes as many as pay: one more would lower the
-    error of shapes that are held out by less than half a percent of how far shapes lie from the mean."""
+    """Number of modes m, at most one less than the number of shapes. ``auto`` adds modes until one more would lower the
+    mean error of held-out shapes by less than half a percent of the mean distance of shapes from the mean shape."""
     norm: Literal["mixed", "vertices", "shell"] = "mixed"
-    """In which modes come close to the shapes: ``vertices``, weighted by area; ``shell``, the metric, as in the paper,
-    which pays for wrinkles; or ``mixed``, the first and a tenth of the second."""
+    """The norm in which modes approximate the shapes: ``vertices``, distances of vertices weighted by area; ``shell``,
+    the metric of the shell space, as in the paper, in which small wrinkles count much; or ``mixed``, the first plus a
+    tenth of the second."""
     sparsity: Annotated[float, Field(ge=0, lt=1)] | Literal["auto"] = "auto"
     """Weight λ of the sparsity term, as a share of the weight at which every principal mode would vanish. Larger
-    values make each mode move a smaller part; 0 is plain principal geodesic analysis. ``auto`` takes the largest
-    that costs shapes which are held out next to nothing: it adds 3 % at most to the square of their error."""
+    values make each mode move a smaller part; 0 is plain principal geodesic analysis. ``auto`` takes the largest of
+    some candidates that increases the squared error of held-out shapes by at most 3 %."""
     log_steps: int = Field(16, ge=2)
     """Time steps K of the discrete logarithms. Best equal to ``samples.steps``: only logarithms and exponentials with
     the same K are inverse to each other."""
     max_iterations: int = Field(200, ge=1)
-    """Most rounds of the sparse analysis through all modes."""
+    """Most iterations of the sparse analysis, each over all modes."""
 
 
 class FactorSettings(_Section):
@@ -101,10 +102,11 @@ class FactorSettings(_Section):
 
 
 class SampleSettings(_Section):
-    """Codes whose shapes are computed: drawn uniformly from the hypercube, and split; and those of the collection."""
+    """The samples to learn from: shapes of codes drawn uniformly from the hypercube, and of the collection's own
+    codes."""
 
     count: int = Field(4000, ge=10)
-    """Joint samples: random codes whose shapes are computed. They take most of a run's time."""
+    """Number of joint samples: shapes of random codes. Computing them takes most of a run's time."""
     steps: int = Field(16, ge=2)
     """Time steps K of the discrete exponentials."""
     factor_counts: list[int] | int | None = None
@@ -112,16 +114,16 @@ class SampleSettings(_Section):
     codes, and of further codes beyond ``count``. By default 1000, or ``count`` where that is less; the paper takes
     ``count``."""
     shapes: bool = True
-    """Whether the codes of the collection's own shapes are samples too, always to learn from: few random codes lie
-    where shapes do. At most a quarter as many as ``count``, spread evenly over the shapes."""
+    """Whether the codes of the collection's own shapes are training samples too, as few random codes lie near the
+    shapes. At most a quarter as many as ``count``, spread evenly over the shapes."""
     part_size: int = Field(50, ge=1)
-    """Samples in a file: what a worker is given at a time, and what is lost with it."""
+    """Number of samples per file: as many as a worker computes at a time, and as are lost if it dies."""
     test_fraction: float = Field(0.2, gt=0, lt=1)
-    """Share of the joint samples that only the evaluation sees."""
+    """Share of the joint samples that are used for the evaluation only."""
     validation_fraction: float = Field(0.1, gt=0, lt=1)
-    """Share of the other joint samples that chooses the learning rate and the best epoch."""
+    """Share of the other joint samples that are used to choose the learning rate and the best epoch."""
     seed: int = 0
-    """Of the codes and of the split."""
+    """Seed of the random codes and of their split."""
 
     def own(self, factors: int) -> list[int]:
         """Samples of each factor alone."""
@@ -133,25 +135,25 @@ class FitSettings(_Section):
     """Gradient descent with Adam."""
 
     schedule: Literal["plateau", "cosine"] = "plateau"
-    """Of the learning rate. ``plateau`` divides it by ten whenever the validation loss has not fallen for ``patience``
-    epochs, as in the paper (section 4). ``cosine`` lets it fall along half a cosine, to zero after ``max_epochs``:
-    fewer epochs are needed."""
+    """Schedule of the learning rate. ``plateau`` divides it by ten whenever the validation loss has not fallen for
+    ``patience`` epochs, as in the paper (section 4). ``cosine`` lets it fall along half a cosine, to zero after
+    ``max_epochs``: fewer epochs are needed."""
     learning_rate: float = Field(1e-3, gt=0)
-    """At the start."""
+    """Initial learning rate."""
     final_rate: float = Field(1e-6, gt=0)
     """Training ends when the learning rate falls below this."""
     patience: int = Field(10, ge=1)
     """Epochs without a smaller validation loss before ``plateau`` divides the rate."""
     max_epochs: int = Field(500, ge=1)
-    """Passes over the training samples, at most."""
+    """Most passes over the training samples."""
     batch_size: int = Field(64, ge=2)
-    """Samples in a step."""
+    """Number of samples per step."""
 
 
 class LatentNetworkSettings(_Section):
     """A network from latents to NRIC: a factor network, or a baseline on all latents.
 
-    The baselines are ``monolithic``, our recipe with one factor, and ``monolithic_paper``, the paper's.
+    The baselines are ``monolithic``, this network with one factor, and ``monolithic_paper``, the paper's.
     """
 
     hidden: list[int] = [128, 128]
@@ -168,7 +170,7 @@ class LatentNetworkSettings(_Section):
     energy: float = Field(0.9999, gt=0, le=1)
     """Share of the variance that this basis keeps; 1 makes the last layer dense, as in the paper."""
     fit: FitSettings = FitSettings(schedule="cosine", learning_rate=2e-3, max_epochs=60)
-    """How it is trained."""
+    """How the network is trained."""
 
 
 class KernelSettings(_Section):
@@ -180,9 +182,9 @@ class KernelSettings(_Section):
 
 
 class PolynomialSettings(_Section):
-    """Cubic polynomials in principal coefficients of the factors' shapes, for each patch of edges its own.
+    """Cubic polynomials in principal coefficients of the factors' shapes, separate ones for each patch of edges.
 
-    For many factors, each of which changes the others a little and locally.
+    Suited to many factors that each influence the others a little and locally.
     """
 
     kind: Literal["polynomials"] = "polynomials"
@@ -205,9 +207,9 @@ class ConvolutionSettings(_Section):
 
     kind: Literal["convolutions"] = "convolutions"
     layers: int = Field(3, ge=1)
-    """Convolutions, one after the other."""
+    """Number of successive convolutions."""
     width: int = Field(24, ge=1)
-    """Features of each edge after each layer."""
+    """Number of features of each edge after each layer."""
     neighbourhood: Neighbourhood = "star"
     """What a convolution sees beside an edge itself: the sum over all edges at its ends (``star``, as in the paper), or
     the edges of its two faces, each with weights of its own (``flaps``)."""
@@ -218,14 +220,14 @@ class ConvolutionSettings(_Section):
     """Whether the network learns the difference from the affine sum of the factors, and each layer the difference from
     its input. Otherwise it learns the joint shape itself, as in the paper."""
     edge_channels: int = Field(4, ge=0)
-    """Learned constants of each edge, inputs of the first layer beside the factors' shapes."""
+    """Number of learned constants of each edge, inputs of the first layer beside the factors' shapes."""
     products: int = Field(0, ge=0)
     """Principal coefficients of each factor whose products correct the affine sum first, as the kind ``products`` does;
     0 leaves them out. Needs ``residual``."""
     dropout: float = Field(0.0, ge=0, lt=1)
     """Share of the features that are set to zero after each layer during training."""
     fit: FitSettings = FitSettings(schedule="cosine", learning_rate=2e-3, batch_size=16, max_epochs=12)
-    """How it is trained."""
+    """How the network is trained."""
 
     @model_validator(mode="after")
     def _consistent(self) -> ConvolutionSettings:
@@ -243,11 +245,11 @@ class PaperSettings(_Section):
 
     kind: Literal["paper"] = "paper"
     layers: int = Field(3, ge=1)
-    """Convolutions, one after the other."""
+    """Number of successive convolutions."""
     width: int = Field(24, ge=1)
-    """Features of each edge after each layer."""
+    """Number of features of each edge after each layer."""
     fit: FitSettings = FitSettings()
-    """How it is trained."""
+    """How the network is trained."""
 
     @property
     def convolutions(self) -> ConvolutionSettings:
@@ -281,13 +283,12 @@ _COMBINER_OF_0_1 = {
 
 
 class CombinerSettings(_Section):
-    """From J factor shapes to the joint one: their affine sum, and a correction of it."""
+    """The map from J factor shapes to the joint one: their affine sum, plus a correction."""
 
     correction: CorrectionSettings = AutoSettings()
-    """What is learned of the difference between the joint shape and the affine sum."""
+    """How the difference between the joint shape and the affine sum is learned."""
     symmetries: bool = True
-    """Whether the images of the training samples under the collection's symmetries, if it has any, are training samples
-    too."""
+    """Whether the training samples include their images under the collection's symmetries, if it has any."""
 
     @model_validator(mode="before")
     @classmethod
@@ -304,19 +305,19 @@ class CombinerSettings(_Section):
 
 
 class Recipe(_Section):
-    """What the composite network is made of."""
+    """The parts of the composite network."""
 
     factors: list[LatentNetworkSettings] | LatentNetworkSettings = LatentNetworkSettings()
-    """One table for each factor, or one for all."""
+    """Settings of the factor networks: one table for each factor, or one for all."""
     combiner: CombinerSettings = CombinerSettings()
     """The network that joins the factors' shapes."""
 
 
 class NetworkSettings(Recipe):
-    """The main recipe, which is exported, and what else is learned from the samples for comparison."""
+    """The networks that are exported, and those that are trained for comparison."""
 
     seed: int = 0
-    """Of the networks' first weights and the order of the samples."""
+    """Seed of the networks' initial weights and of the order of the samples."""
     fractions: list[Annotated[float, Field(gt=0, lt=1)]] = []
     """Shares of the training codes to learn from as well, for the study of their number: each once with the factors'
     parts of these codes only, as the paper does, and once with all the samples of the factors."""
@@ -331,7 +332,7 @@ class VariantSettings(_Section):
     """One row of the ablation: what differs from the main recipe, or from another variant."""
 
     title: str
-    """What the report and the tables call it."""
+    """Its name in the report and the tables."""
     base: str | None = None
     """Name of the variant that this one differs from; it must stand before this one. None is the main recipe."""
     factors: list[dict[str, Any]] | dict[str, Any] = {}
@@ -377,18 +378,18 @@ class EvaluationSettings(_Section):
     eta: float = Field(1e-2, gt=0)
     """Weight of angles against lengths in the norm of all figures."""
     grid_nodes: Annotated[int, Field(ge=0), AfterValidator(_grid)] = 0
-    """Nodes per coordinate, at most, of the multilinear grid of Sassen et al. 2020, a baseline whose nodes may take as
+    """Most nodes per coordinate of the multilinear grid of Sassen et al. 2020, a baseline whose nodes may take as
     long as all samples; 0 leaves it out."""
     grid_size: int = Field(1000, ge=1)
-    """Nodes of the grid of one factor, at most; a factor for which that leaves fewer than 3 per coordinate gets no
+    """Most nodes of the grid of one factor; a factor for which that leaves fewer than 3 per coordinate gets no
     grid."""
     exact_factors: int = Field(200, ge=2)
-    """Test codes whose factors' own exponentials are computed, for the affine sum of exact factors."""
+    """Number of test codes for which the affine sum of exact factors is computed."""
     reconstructions: int = Field(100, ge=1)
-    """Test shapes whose vertices are reconstructed."""
+    """Number of test shapes whose vertices are reconstructed."""
     fresh: int = Field(100, ge=0)
-    """Codes that are drawn when all networks are learned, from a digest of these, and on which every model is measured
-    once more; as many as there are test codes, at most. 0 leaves them out."""
+    """Number of fresh codes on which every model is measured once more. They are drawn after training, with a digest of
+    the networks as seed; at most as many as there are test codes. 0 leaves them out."""
 
 
 #: An axis of the collection's coordinates, with its direction.
@@ -396,18 +397,18 @@ Axis = Literal["+x", "-x", "+y", "-y", "+z", "-z"]
 
 
 class ExportSettings(_Section):
-    """What the bundle says of itself."""
+    """Name and description of the exported bundle."""
 
     name: str = Field(pattern=r"^[a-z0-9][a-z0-9-]*$", max_length=64)
-    """In addresses and file names."""
+    """Name of the model in addresses and file names."""
     version: int = Field(1, ge=1, lt=10**9)
-    """The bundle is ``models/NAME/VERSION``; one of the same version is replaced."""
+    """The bundle is written to ``models/NAME/VERSION``, replacing one that is there."""
     title: str
-    """Name of the model for people."""
+    """Title of the model, shown to people."""
     description: str
-    """A sentence on the model for people."""
+    """A sentence that describes the model, shown to people."""
     licence: str
-    """Of the meshes, and so of the model."""
+    """Licence of the meshes, and so of the model."""
     eta_reconstruction: float = Field(DEFAULT_ETA, gt=0)
     """Weight η of angles against lengths when vertices are found from them (Gauss–Newton)."""
     tolerance: float = Field(1e-4, gt=0)
