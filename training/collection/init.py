@@ -33,8 +33,8 @@ data = {data}    # folder of meshes, or one NPZ; relative to this file
 # eta = {material.eta:g}    # bending against stretching; larger makes stiffer shells, whose triangles may collapse
 
 [modes]
-# count = "{mode.count}"    # numbers that describe a shape: as many as pay; or say how many, {most} at most
-# norm = "{mode.norm}"    # in which modes come close to the shapes; "shell" is the paper's, and costs accuracy
+# count = "{mode.count}"    # how many numbers describe a shape: "auto" stops where more hardly help; {most} at most
+# norm = "{mode.norm}"    # measures how near modes come to the shapes; "shell", the paper's, is less accurate
 
 [factors]
 # count = 4    # groups of modes with a network each; left out, it follows from how much the modes overlap

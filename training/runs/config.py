@@ -103,7 +103,8 @@ class FactorSettings(_Section):
 
 class SampleSettings(_Section):
     """The samples to learn from: shapes of codes drawn uniformly from the hypercube, and of the collection's own
-    codes."""
+    codes.
+    """
 
     count: int = Field(4000, ge=10)
     """Number of joint samples: shapes of random codes. Computing them takes most of a run's time."""

@@ -3,15 +3,15 @@
 The shapes z^i are carried to the tangent space at their mean z̄ by the discrete logarithm, v^i = log_z̄ z^i, and a few
 modes u_j are sought whose combinations come close to them (paper, section 3). Everything is computed in vertex fields d
 (V, 3), of which ``u = J d`` with ``J = Dz(X̄)`` are the changes of lengths and angles: then u is tangent whatever d is,
-and how close they come is said by one sparse matrix, ``‖u‖² = dᵀ M d``:
+and the misfit of modes is measured by one sparse matrix M, ``‖u‖² = dᵀ M d``:
 
-- "vertices": M holds the areas of the vertices, and d the least motion with these changes. It sees a leg that points
-  elsewhere as users do, and no crease: exponentials of sparse modes soon collapse a face there.
-- "shell", the paper's: the metric, ``M = ½ Jᵀ Hess₂W[z̄, z̄] J``. It pays for wrinkles, hardly for where a leg points.
-- "mixed": the first and a tenth of the second, scaled so that the logarithms weigh the same in both.
+- "vertices": M holds the areas of the vertices, and d is the smallest motion with these changes. It measures where a
+  limb points, as users see it, but hardly creases: exponentials of sparse modes then soon collapse a face.
+- "shell", the paper's: the metric, ``M = ½ Jᵀ Hess₂W[z̄, z̄] J``. It weighs wrinkles strongly, and hardly where a limb
+  points.
+- "mixed": the first plus a tenth of the second, scaled so that the logarithms weigh the same in both.
 
-The logarithms are not centred. The mean is the point that the modes start from, and the logarithms at the Riemannian
-centre of mass sum to nothing; at a collection's mean nearly so.
+The logarithms are not centred again: at the Riemannian centre of mass their sum is zero, and at the centred mean nearly.
 
 **Sparse modes.** Minimise over tangent u_j and coefficients w
 
