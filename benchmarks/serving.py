@@ -55,7 +55,8 @@ PAGE = """# Serving
 `python -m benchmarks.serving --page` measures and writes this page. In process: on one thread, in processor seconds of
 that thread. *SuperLU* is one factorisation (symmetric mode) of the model's own normal matrix, run in turn. *Blend
 shapes* is a sum of m fields and the same file, the floor; the *exponential* is what networks stand for, the ceiling.
-[performance.md](performance.md) has the aims, and why it is as fast as it is.
+[performance.md](performance.md) has the aims, and why it is as fast as it is. Everything but the column *without Numba*
+was measured {kernels} Numba.
 """
 #: Two results of one code agree up to this fraction of the diagonal.
 AGREEMENT = 1e-4
@@ -482,7 +483,8 @@ def main() -> None:
         return
     with redirect_stdout(io.StringIO()) as text:
         run(arguments)
-    (ROOT / "docs" / "measurements" / "serving.md").write_text(PAGE + text.getvalue(), encoding="utf-8")
+    page = PAGE.format(kernels="with" if compiled.AVAILABLE else "without")
+    (ROOT / "docs" / "measurements" / "serving.md").write_text(page + text.getvalue(), encoding="utf-8")
 
 
 def run(arguments: argparse.Namespace) -> None:

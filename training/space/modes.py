@@ -7,11 +7,11 @@ and the misfit of modes is measured by one sparse matrix M, ``‖u‖² = dᵀ M
 
 - "vertices": M holds the areas of the vertices, and d is the smallest motion with these changes. It measures where a
   limb points, as users see it, but hardly creases: exponentials of sparse modes then soon collapse a face.
-- "shell", the paper's: the metric, ``M = ½ Jᵀ Hess₂W[z̄, z̄] J``. It weighs wrinkles strongly, and hardly where a limb
-  points.
+- "shell", the paper's: the metric, ``M = ½ Jᵀ Hess₂W[z̄, z̄] J``. It weighs wrinkles strongly, and where a limb points
+  hardly at all.
 - "mixed": the first plus a tenth of the second, scaled so that the logarithms weigh the same in both.
 
-The logarithms are not centred again: at the Riemannian centre of mass their sum is zero, and at the centred mean nearly.
+The logarithms are not centred again: at the Riemannian centre of mass their sum is zero, at the centred mean nearly so.
 
 **Sparse modes.** Minimise over tangent u_j and coefficients w
 
