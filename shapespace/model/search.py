@@ -293,7 +293,7 @@ class Search:
             there, trust = self.scan.normals[nearest] @ place.rotation, self.scan.trust[nearest]
             agree = self._alike(there, across, trust)
             if not self._level.rough:
-                across = _between(across, there, trust)
+                across = _blended(across, there, trust)
             rows.append((np.ones(k), n + np.arange(k), self._vertices))
             parts.append((gaps, across, distances, places, agree, np.full(k, 1 / k)))
         gaps, across, distances, places, agree, mass = (np.concatenate([part[i] for part in parts]) for i in range(6))
@@ -501,17 +501,17 @@ class Search:
         return step
 
 
-def _between(normals: FloatArray, others: FloatArray, trust: FloatArray) -> FloatArray:
-    """(n, 3) means of the normals (n, 3) at both ends of pairs, of the others as far as these are trusted (n,).
+def _blended(normals: FloatArray, others: FloatArray, trust: FloatArray) -> FloatArray:
+    """(n, 3) normals of pairs that begin at vertices: those of the scan (n, 3) as far as these are trusted (n,).
 
-    The nearest point of a scan lies beside a vertex, and on a curved surface below the plane there: heights over that
-    plane shrink the model. Over the mean of both planes they vanish to second order (Rusinkiewicz 2019, A symmetric
-    objective function for ICP).
+    A vertex of a convex surface lies outside of its neighbourhood. Over the plane at the vertex its nearest scan point,
+    which lies beside it, would have a negative height, and the model would shrink; over the plane at the scan point the
+    vertex has none.
     """
     sides = np.sign((normals * others).sum(axis=1))
-    both = normals + (sides * trust)[:, None] * others
-    means: FloatArray = both / np.linalg.norm(both, axis=1, keepdims=True)
-    return means
+    both = (1 - trust)[:, None] * normals + (sides * trust)[:, None] * others
+    found: FloatArray = both / np.maximum(np.linalg.norm(both, axis=1, keepdims=True), np.finfo(float).tiny)
+    return found
 
 
 def _robust(distances: FloatArray, width: float) -> FloatArray:
