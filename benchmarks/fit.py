@@ -39,7 +39,7 @@ COMPONENT_STEPS, HOLD = 40, 1e-3
 PAGE = """# Fits of scans
 
 How near `fit` comes to a shape whose vertices are known, from a scan without correspondence: each shape is sampled
-anew, turned at random and moved. **whole**: in turn {points} points all over, and a decimated mesh of jittered
+anew, turned at random and moved. **whole**: alternately {points} points all over, and a decimated mesh of jittered
 vertices. **noisy**: {points} points with noise of {noise:.1%} of the bounding box's diagonal and {outliers:.0%}
 outliers. **camera**: at most so many points, those that one camera sees, with the same noise, and `partial=true`.
 **unseen** shapes of the figure are poses from its generator that no training knows, those of the collections the fifth
@@ -51,8 +51,8 @@ the distance of its surface, which four codes share in as many places, each with
 of `encode`, which is given the vertices in their order. **failed**: tries further off than {failed:g} times the median
 of their row. **told**: those of them whose status is not `converged`. **false alarms**: others whose status is not.
 **shapes**: solved ones at the median, three rough ones counted as one; **time**: in solved shapes. **components**:
-what one would do otherwise, closest points with as many principal components, of 60 drawn shapes; they begin with the
-mean in the place that `fit` has found, which helps them.
+the usual alternative, an iterated closest-point fit with as many principal components of 60 drawn shapes; it begins
+with the mean shape, placed as `fit` has found it, which helps it.
 
 | model | shapes | scan | tries | error | encode | ratio | failed | told | false alarms | shapes | time | components |
 |---|---|---|---|---|---|---|---|---|---|---|---|---|
