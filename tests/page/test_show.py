@@ -24,7 +24,8 @@ STILLS = """async (content) => {
     const video = document.createElement('video');
     const next = (name) => new Promise((resolve, reject) => {
         video.addEventListener(name, resolve, { once: true });
-        video.addEventListener('error', () => reject(video.error), { once: true });
+        const failed = () => reject(new Error(`${video.error.code}: ${video.error.message}`));
+        video.addEventListener('error', failed, { once: true });
     });
     video.muted = true;
     video.src = `data:video/webm;base64,${content}`;
@@ -94,6 +95,20 @@ def test_a_picture_a_turntable_and_the_path_as_a_video(window: Open) -> None:
     assert "The video is saved" in studio.messages
     studio.until_code([0.2, 0, 1])
     studio.rest()
+
+
+def test_a_browser_that_records_no_pictures_keeps_no_empty_video(window: Open) -> None:
+    studio = window().open("#model=with-fine")
+    studio.page.evaluate(
+        "() => { const { captureStream } = HTMLCanvasElement.prototype;"
+        "HTMLCanvasElement.prototype.captureStream ="
+        " (rate) => captureStream.call(document.createElement('canvas'), rate); }"
+    )
+    studio.tab("Files")
+    studio["#turntable-seconds"].fill("1")
+    studio["#turntable"].click()
+    studio.eventually(lambda: "This browser records no pictures of the shape." in studio.messages, 30)
+    assert "saved" not in studio.messages
 
 
 @pytest.fixture
