@@ -1,7 +1,8 @@
 """docs/measurements/generalisation.md: how near spaces come to unseen shapes, beside principal components.
 
-Five folds of each collection, each with mean, logarithms and modes of its own, for as many modes as the example has and
-half of that. Exponentials stand for networks. A fold that is done is kept under ``--out`` and not done again.
+Five folds of each collection, each with mean, logarithms and modes of its own, for as many modes as the example has
+and half of that. Exponentials stand for networks. A fold that is done is kept under ``--out`` and not done again; a
+collection whose folds are all done has its figures in ``runs/folds/``, and is not measured again while they are there.
 """
 
 from __future__ import annotations
@@ -9,12 +10,16 @@ from __future__ import annotations
 import argparse
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from benchmarks.results import COLLECTIONS, ROOT, open_run
 from shapespace.training.space import stages
-from shapespace.training.space.generalisation import FOLDS, folds, held_out
+from shapespace.training.space.generalisation import folds, held_out, summary
+
+#: What was measured, a file for each collection.
+FIGURES = ROOT / "runs" / "folds"
 
 INTRODUCTION = """# Shapes that a space has not seen
 
@@ -23,15 +28,15 @@ percentile over all vertices of all shapes, each held out in one of five folds t
 without it. **Modes**: the code whose exponential comes closest in vertices, in {steps} time steps; no networks.
 **Components**: principal components of the aligned vertices, as many. On coarse meshes of at most a thousand vertices.
 Folds choose nothing: settings are those of `examples/collections`. `python -m benchmarks.generalisation --data FOLDER`
-measures and writes this page; a collection is in it once all its folds are measured.
+measures and writes this page; a collection is in it once all its folds are measured, with figures in `runs/folds/`.
 
 | | shapes | coordinates | modes: mean | 95 % | components: mean | 95 % | modes / components |
 |---|---|---|---|---|---|---|---|
 """
 
 
-def measure(name: str, data: Path, out: Path) -> None:
-    """Leave a file of figures for each fold of a collection."""
+def measure(name: str, data: Path, out: Path) -> dict[str, Any]:
+    """Figures of a collection, by number of coordinates: of all its shapes, each in the fold that held it out."""
     opened = open_run(name, data, out)
     run, config = opened.directory, opened.config
     if not run.shapes.exists():
@@ -40,40 +45,36 @@ def measure(name: str, data: Path, out: Path) -> None:
     shapes, reference = run.shapes.read()["vertices"], run.reference_mesh()
     m = config.modes.count
     counts = None if m == "auto" else [-(-m // 2), m]
+    every = []
     for k, index in enumerate(folds(len(shapes))):
         file = run.study(f"fold-{k}")
-        if file.exists():
-            continue
-        material = stages.material(config)
-        found = held_out(reference, shapes, index, counts, config.modes, material, stages.LIGHT_STEPS)
-        away = {
-            name: [each.tolist() for each in rows] for name, rows in found.distances(shapes, reference.diagonal).items()
-        }
-        file.write({"counts": found.counts, **away})
-        print(
-            name,
-            k,
-            {kind: [round(100 * float(np.mean(each)), 4) for each in rows] for kind, rows in away.items()},
-            flush=True,
-        )
+        if not file.exists():
+            material = stages.material(config)
+            found = held_out(reference, shapes, index, counts, config.modes, material, stages.LIGHT_STEPS)
+            away = found.distances(shapes, reference.diagonal)
+            file.write(
+                {"counts": found.counts} | {kind: [each.tolist() for each in rows] for kind, rows in away.items()}
+            )
+            means = {kind: [round(100 * float(np.mean(each)), 4) for each in rows] for kind, rows in away.items()}
+            print(name, k, means, flush=True)
+        every.append(file.read())
+    return {
+        "shapes": len(shapes),
+        "counts": every[0]["counts"],
+        **{
+            kind: [summary(np.concatenate(some)) for some in zip(*(fold[kind] for fold in every), strict=True)]
+            for kind in ("modes", "components")
+        },
+    }
 
 
-def rows(name: str, out: Path) -> list[str]:
-    """Of the table, once all folds are there."""
-    files = sorted((out / name).glob("fold-*.json"))
-    if len(files) < FOLDS:
-        return []
-    every = [json.loads(file.read_text()) for file in files]
-    result = []
-    for k, count in enumerate(every[0]["counts"]):
-        distances = (
-            100 * np.concatenate([np.array(fold[kind][k]) for fold in every]) for kind in ("modes", "components")
-        )
-        (own, own95), (other, other95) = ((each.mean(), np.percentile(each, 95)) for each in distances)
-        shapes = sum(len(fold["modes"][k]) for fold in every)
-        figures = [f"{figure:.3f}" for figure in (own, own95, other, other95)]
-        cells = [name if k == 0 else "", str(shapes), str(count), *figures, f"{own / other:.2f}"]
-        result.append(f"| {' | '.join(cells)} |")
+def rows(name: str, found: dict[str, Any]) -> list[str]:
+    """Of the table."""
+    result: list[str] = []
+    for count, own, other in zip(found["counts"], found["modes"], found["components"], strict=True):
+        figures = [f"{100 * figure:.3f}" for figure in (own["mean"], own["p95"], other["mean"], other["p95"])]
+        cells = [name if not result else "", str(found["shapes"]), str(count), *figures]
+        result.append(f"| {' | '.join(cells)} | {own['mean'] / other['mean']:.2f} |")
     return result
 
 
@@ -85,8 +86,15 @@ def main() -> None:
     parser.add_argument("names", nargs="*", default=COLLECTIONS)
     given = parser.parse_args()
     for name in given.names:
-        measure(name, given.data, given.out)
-        table = "\n".join(row for each in COLLECTIONS for row in rows(each, given.out))
+        file = FIGURES / f"{name}.json"
+        if not file.exists():
+            found = measure(name, given.data, given.out)
+            file.parent.mkdir(exist_ok=True)
+            file.write_text(json.dumps(found, indent=1), encoding="utf-8")
+        done = {
+            each: json.loads(path.read_text()) for each in COLLECTIONS if (path := FIGURES / f"{each}.json").exists()
+        }
+        table = "\n".join(row for each in done.items() for row in rows(*each))
         page = INTRODUCTION.format(steps=stages.LIGHT_STEPS) + table + "\n"
         (ROOT / "docs" / "measurements" / "generalisation.md").write_text(page, encoding="utf-8")
 

@@ -1,7 +1,8 @@
-"""What kind of space a collection's modes span: compactness, generalisation and specificity (Davies et al. 2002).
+"""What kind of space a collection's modes span: compactness and specificity (Davies et al. 2002).
 
 Beside principal component analysis of the aligned vertices, which is what a user would otherwise take. Distances of
 shapes are means over vertices after rigid alignment, as shares of the reference's bounding-box diagonal.
+Generalisation, the third, is `benchmarks.generalisation`.
 """
 
 from __future__ import annotations
@@ -11,13 +12,12 @@ from typing import Any
 import numpy as np
 
 from shapespace.arrays import FloatArray
-from shapespace.mesh.triangle_mesh import TriangleMesh
 from shapespace.shell.space import ShellSpace
 from shapespace.training.runs.config import Config
 from shapespace.training.runs.directory import RunDirectory
 from shapespace.training.runs.sampling import read
 from shapespace.training.space import modes
-from shapespace.training.space.generalisation import PrincipalComponents, folds, held_out, joined, vertex_distances
+from shapespace.training.space.generalisation import PrincipalComponents, vertex_distances
 from shapespace.training.space.logarithms import logarithms
 from shapespace.training.space.stages import material
 
@@ -26,7 +26,7 @@ CODES = 200
 
 
 def measure(run: RunDirectory, config: Config) -> dict[str, Any]:
-    """The three of a run whose samples are drawn, by the number of modes where that is a choice."""
+    """Both of a run whose samples are drawn; compactness by the number of modes."""
     shapes, reference, mean = run.shapes.read()["vertices"], run.reference_mesh(), run.mean.read()["vertices"]
     found = run.modes_by_strength.read()
     sparse, principal = found["vertices"], found["pga_vertices"]
@@ -49,7 +49,6 @@ def measure(run: RunDirectory, config: Config) -> dict[str, Any]:
             "principal geodesics": explained(principal),
             "components": [float(energy[:k].sum() / energy.sum()) for k in counts],
         },
-        "generalisation": generalisation(reference, shapes, config, counts),
         "specificity": {
             "modes": to_nearest(drawn, shapes, reference.diagonal),
             "components": to_nearest(others, shapes, reference.diagonal),
@@ -61,14 +60,3 @@ def to_nearest(shapes: FloatArray, collection: FloatArray, diagonal: float) -> f
     """Mean distance of shapes (k, V, 3) from the nearest of a collection (n, V, 3)."""
     distances = [vertex_distances(shapes, other, diagonal).mean(axis=1) for other in collection]
     return float(np.min(distances, axis=0).mean())
-
-
-def generalisation(reference: TriangleMesh, shapes: FloatArray, config: Config, counts: list[int]) -> dict[str, Any]:
-    """Mean distance of each shape from what the modes of the other folds' shapes make of it, by exponentials.
-
-    Everything is found anew without the fold: mean, logarithms, modes.
-    """
-    how = (counts, config.modes, material(config), config.samples.steps)
-    found = joined([held_out(reference, shapes, index, *how) for index in folds(len(shapes))])
-    away = found.distances(shapes, reference.diagonal)
-    return {name: [float(each.mean()) for each in rows] for name, rows in away.items()}
