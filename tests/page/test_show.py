@@ -64,7 +64,7 @@ def changes(pictures: list[np.ndarray], least: float) -> int:
 
 
 def test_a_picture_a_turntable_and_the_path_as_a_video(window: Open) -> None:
-    studio = window().open("#model=with-fine&z=0,0,0.5&keys=-0.2,0,0;0.2,0,1&seconds=1")
+    studio = window().open("#model=with-fine&z=0,0,0.5&keys=-0.2,0,0;0.2,0,1&seconds=2")
     studio.tab("Files")
     seen = studio.picture()
     name, content = kept(studio, "#picture")
@@ -75,22 +75,22 @@ def test_a_picture_a_turntable_and_the_path_as_a_video(window: Open) -> None:
 
     plain = window().page  # a page without content security policy
     plain.goto("about:blank")
-    studio["#turntable-seconds"].fill("1")
+    studio["#turntable-seconds"].fill("5")  # long enough for a busy machine to record some of it
     name, content = kept(studio, "#turntable")
     assert name == "with-fine-turntable.webm"
     seconds, pictures = stills(plain, content)
-    assert 0 < seconds < 5, "a busy machine records few pictures, and the first one late"
+    assert 0 < seconds < 15
     assert changes(pictures, 0.02) >= 2, "the turntable must move"
     studio["#messages button:visible"].first.click()
     studio.eventually(lambda: difference(studio.picture(), seen) < 0.001)
     assert "view" not in studio.hash
 
     studio.tab("Path")
-    assert studio["#seconds"].input_value() == "1"
+    assert studio["#seconds"].input_value() == "2"
     name, content = kept(studio, "#film")
     assert name == "with-fine-animation.webm"
     seconds, pictures = stills(plain, content)
-    assert 0 < seconds < 5, "a busy machine records few pictures, and the first one late"
+    assert 0 < seconds < 10
     assert changes(pictures, 0.01) >= 1
     assert "The video is saved" in studio.messages
     studio.until_code([0.2, 0, 1])
