@@ -153,7 +153,7 @@ image-test: $(VENV)/.client ## build the container image, try it for real, and a
 	PATH="$(CURDIR)/$(BIN):$$PATH" scripts/image-test.sh
 
 clean: ## remove what these targets made, except runs/
-	rm -rf $(VENV) $(VENV)-lowest $(VENV)-blender tests/node_modules tests/firefox/node_modules build dist *.egg-info .*_cache
+	rm -rf $(VENV) $(VENV)-lowest $(VENV)-blender $(VENV)-compiled tests/node_modules tests/firefox/node_modules build dist *.egg-info .*_cache
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 # A stamp says which extras the environment holds, so that a second call starts at once.

@@ -10,6 +10,7 @@ side.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
@@ -32,6 +33,18 @@ def are_used(kernels: Kernels) -> bool:
 
 if AVAILABLE and not TYPE_CHECKING:
     from numba import njit, types
+    from numba.core.caching import InTreeCacheLocator
+
+    class BesideTheModule(InTreeCacheLocator):
+        """Numba's cache beside this module, also where nothing can be written: of an image that was built with it.
+
+        NUMBA_CACHE_LOCATOR_CLASSES names it.
+        """
+
+        def ensure_cache_path(self) -> None:
+            """See numba.core.caching; it would pass over a folder that can only be read."""
+            with suppress(OSError):
+                super().ensure_cache_path()
 
     _NUMBERS = {"f": types.float64, "i": types.int64, "j": types.int32}
 

@@ -1,8 +1,15 @@
 """Compiled loops beside the NumPy code that says what they compute."""
 
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
 import numpy as np
 import pytest
 
+import shapespace
 from shapespace.coordinates import compiled
 from shapespace.coordinates.frame_integration import CompiledFrameIntegration, FrameIntegration
 from shapespace.coordinates.integrability import Integrability
@@ -58,3 +65,20 @@ def test_the_choice_is_made_by_what_is_installed():
     assert compiled.are_used("auto") is compiled.AVAILABLE
     assert compiled.are_used("compiled")
     assert not compiled.are_used("numpy")
+
+
+@pytest.mark.skipif(not compiled.AVAILABLE, reason="Numba is an extra: `make compiled` runs this")
+def test_machine_code_is_found_where_nothing_can_be_written(tmp_path, monkeypatch):
+    """As in an image: made once beside the package, and found by processes that can write no file."""
+    shutil.copytree(Path(shapespace.__path__[0]), tmp_path / "shapespace", ignore=shutil.ignore_patterns("__pycache__"))
+    script = "import shapespace.coordinates.compiled as c; print(c.__file__, sum(c.misfit.stats.cache_hits.values()))"
+    nowhere = "import tempfile\ndef f(*_, **__): raise OSError('read-only')\ntempfile.TemporaryFile = f\n"
+    monkeypatch.setenv("NUMBA_CACHE_LOCATOR_CLASSES", "shapespace.coordinates.compiled.BesideTheModule")
+    monkeypatch.setenv("PYTHONPATH", f"{tmp_path}{os.pathsep}{os.environ.get('PYTHONPATH', '')}")
+    for prefix, hits in (("", 0), (nowhere, 1)):
+        called = subprocess.run(
+            [sys.executable, "-c", prefix + script], cwd=tmp_path, capture_output=True, text=True, check=True
+        )
+        file, found = called.stdout.split()
+        assert Path(file).is_relative_to(tmp_path)
+        assert int(found) == hits
