@@ -1,7 +1,11 @@
 """Studies of `benchmarks.results`: measured once, and again only after their run has changed."""
 
+import json
 from pathlib import Path
 
+import pytest
+
+from benchmarks import results
 from benchmarks.results import have, measured
 from shapespace.training.runs.directory import RunDirectory
 
@@ -16,3 +20,19 @@ def test_a_study_is_measured_again_when_what_it_measured_has_changed(tmp_path: P
         assert measured(run, "space") == {"key": key, "figure": figure}
     run.stamp("samples").write({"basis": "another"})
     assert measured(run, "space") == {}
+
+
+def test_the_page_of_results_says_what_was_measured(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    committed = results.FIGURES / "horse.json"
+    row = json.loads(committed.read_text())
+    row["evaluation"]["fresh"]["r2"]["composite"]["total"] = 0.87654
+    (tmp_path / "horse.json").write_text(json.dumps(row))
+    monkeypatch.setattr(results, "FIGURES", tmp_path)
+    monkeypatch.setattr(results, "DOCS", tmp_path)
+    results.write_page()
+    page = (tmp_path / "results.md").read_text()
+    assert "| horse | 35 | 20 | 5 |" in page
+    assert "**0.8765**" in page
+    assert "yet: hand, faces, samba, makehuman, hippocampus." in page
+    assert results.spread(row, "composite")[1] <= results.spread(row, "composite")[0]
+    assert "| bodies" not in page, "aims of what was not measured"
