@@ -27,13 +27,16 @@ from shapespace.training.space.generalisation import PrincipalComponents, folds,
 #: Most exponentials to learn from: joint, and of each factor.
 JOINT, OF_FACTORS = 1000, 300
 COLUMNS = ("unseen", "trained on")
+#: What the names of runs with half as many modes end in.
+HALF = "-half"
 #: What was measured, a file for each collection; one that is there is not measured again.
 FIGURES = ROOT / "runs" / "collections"
 
 PAGE = """# Served models and shapes that they have not seen
 
 For each collection a model was trained on four fifths of the shapes, with the settings of `examples/collections` but
-at most {joint} joint exponentials and {factors} of each factor, and exported. Its `encode`, as it is served, was
+at most {joint} joint exponentials and {factors} of each factor, and exported; where there is a second row, another
+model with half as many modes. Its `encode`, as it is served, was
 given each shape's fine mesh. **unseen**: mean and 95th percentile over all vertices of the other fifth of the shapes,
 of the distance to the shape of the code, in percent of the bounding box's diagonal; **components**: of as many
 principal components of the same four fifths' fine meshes. **trained on**: the same of the shapes that made the model.
@@ -54,8 +57,8 @@ regression on the codes, **paper's** is the paper's monolithic network, trained 
 the learned factors, on test codes. **steps**: 1 − R² of the exponentials to those of twice as many steps. Where
 1 − R² of the composite is less, it is nearer to these exponentials than these are to the limit.
 
-| | factors | exponentials | composite | one factor | kernel | paper's | affine | steps | failed | learned by | MB |
-|---|---|---|---|---|---|---|---|---|---|---|---|
+| | m | factors | exponentials | composite | one factor | kernel | paper's | affine | steps | failed | learned by | MB |
+|---|---|---|---|---|---|---|---|---|---|---|---|---|
 {networks}
 
 ![Hands of four fresh codes: exact, and by each model with the distance of vertices in colours](hand-models.png)
@@ -67,18 +70,24 @@ the learned factors, on test codes. **steps**: 1 − R² of the exponentials to 
 
 
 def four_fifths(name: str, data: Path, out: Path) -> tuple[Run, FloatArray, FloatArray]:
-    """The run of a collection without its first fold, the fine meshes (n, V, 3) that it knows, and the others."""
-    example = open_run(name, data, out)
+    """The run of a collection without its first fold, the fine meshes (n, V, 3) that it knows, and the others.
+
+    With half as many modes where the name ends in ``HALF``.
+    """
+    collection = name.removesuffix(HALF)
+    example = open_run(collection, data, out)
     with np.load(str(example.config.collection.data), allow_pickle=False) as arrays:
         whole = {key: arrays[key] for key in arrays.files}
     held = folds(len(whole["vertices"]))[0]
     known = {key: array if key == "faces" else np.delete(array, held, axis=0) for key, array in whole.items()}
-    file = out / "data" / f"{name}.npz"
+    file = out / "data" / f"{collection}.npz"
     if not file.exists():
         file.parent.mkdir(parents=True, exist_ok=True)
         np.savez(file, **known)
     document: Any = tomlkit.parse(example.source)
     document["collection"]["data"] = str(file.resolve())
+    if name != collection:
+        document["modes"]["count"] = -(-document["modes"]["count"] // 2)
     joint, factors = example.config.samples.count, example.config.samples.factor_counts
     document["samples"]["count"] = min(joint, JOINT)
     document["samples"]["factor_counts"] = min(factors, OF_FACTORS) if isinstance(factors, int) else OF_FACTORS
@@ -120,7 +129,7 @@ def measure(name: str, data: Path, out: Path) -> dict[str, Any]:
 
 def row(name: str, found: dict[str, Any]) -> str:
     """Of the table."""
-    cells = [name, str(found["modes"])]
+    cells = ["" if name.endswith(HALF) else name, str(found["modes"])]
     for kind in COLUMNS:
         own, other = found[kind], found[kind]["components"]
         both = [(own["mean"], own["p95"]), (other["mean"], other["p95"])]
@@ -135,7 +144,13 @@ def network_row(name: str, found: dict[str, Any]) -> str:
     figures = found["evaluation"]
     fresh, sizes = figures["fresh"], figures["sizes"]
     r2 = [fresh["r2"][each]["total"] for each in ("composite", "monolithic", "kernel", "monolithic_paper")]
-    cells = [name, str(len(figures["r2_factors"])), str(figures["exponentials"]), *(f"{each:.4f}" for each in r2)]
+    cells = [
+        "" if name.endswith(HALF) else name,
+        str(found["modes"]),
+        str(len(figures["r2_factors"])),
+        str(figures["exponentials"]),
+        *(f"{each:.4f}" for each in r2),
+    ]
     cells += [f"{figures['r2']['affine of learned factors']['total']:.4f}", f"{1 - fresh['steps']['total']:.1e}"]
     cells += [f"{fresh['failed']} of {fresh['codes']}", figures["correction"]["kind"]]
     cells.append(f"{sizes['composite'] / 1e6:.1f}")
@@ -147,7 +162,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--data", type=Path, required=True, help="folder of the collections")
     parser.add_argument("--out", type=Path, default=ROOT / "build" / "served")
-    parser.add_argument("names", nargs="*", default=COLLECTIONS)
+    parser.add_argument("names", nargs="*", default=COLLECTIONS, help=f"collections, with {HALF} for half of the modes")
     given = parser.parse_args()
     for name in given.names:
         file = FIGURES / f"{name}.json"
@@ -155,9 +170,8 @@ def main() -> None:
             found = measure(name, given.data, given.out)
             file.parent.mkdir(exist_ok=True)
             file.write_text(json.dumps(found, indent=1), encoding="utf-8")
-        done = {
-            each: json.loads(path.read_text()) for each in COLLECTIONS if (path := FIGURES / f"{each}.json").exists()
-        }
+        names = [each + ending for each in COLLECTIONS for ending in ("", HALF)]
+        done = {each: json.loads(path.read_text()) for each in names if (path := FIGURES / f"{each}.json").exists()}
         page = PAGE.format(
             joint=JOINT,
             factors=OF_FACTORS,
