@@ -25,7 +25,18 @@ from shapespace.training.report.page import write_report
 from shapespace.training.runs.config import Config
 from shapespace.training.runs.directory import RunDirectory
 from shapespace.training.runs.progress import waiting
-from shapespace.training.runs.sampling import FEWEST, KNOWN, Collection, SamplesError, draw, indices, read, split, used
+from shapespace.training.runs.sampling import (
+    DERIVATIVES,
+    FEWEST,
+    KNOWN,
+    Collection,
+    SamplesError,
+    draw,
+    indices,
+    read,
+    split,
+    used,
+)
 from shapespace.training.runs.shortfalls import refuse, shortfalls
 from shapespace.training.runs.stages import STAGES, stage_keys
 from shapespace.training.space import stages as space
@@ -145,8 +156,8 @@ def factors(run: Run) -> None:
 def _draw(
     run: Run, folder: Path, latents: FloatArray, title: str, *, shorten: bool, collection: Collection | None = None
 ) -> None:
-    size = run.config.samples.part_size
-    parts = draw(collection or run.collection, folder, latents, size, title, shorten=shorten, scheduler=run.scheduler)
+    collection, size = collection or run.collection, run.config.samples.part_size
+    parts = draw(collection, folder, latents, size, title, shorten=shorten, scheduler=run.scheduler)
     for done, total, failed in parts:
         run.directory.log("progress", what=title, done=done, total=total, failed=failed)
 
@@ -170,6 +181,12 @@ def samples(run: Run) -> None:
         _draw(run, directory.factor_samples(j), alone(codes[:count], index), f"samples of factor {j}", shorten=True)
     rows = split(indices(folder), settings.test_fraction, settings.validation_fraction, split_rng)
     directory.split.write(**rows)
+    differentiated, some = run.collection.differentiated, rows["train"][: settings.differentiated]
+    if differentiated and len(some):
+        place = folder / DERIVATIVES
+        _draw(run, place, codes[some], "derivatives", shorten=False, collection=differentiated)
+    else:
+        shutil.rmtree(folder / DERIVATIVES, ignore_errors=True)
 
 
 def learner_of(run: Run, **how: Any) -> Learner:

@@ -103,6 +103,11 @@ class FreakyTorus:
         """None: a formula has no steps."""
         return None
 
+    @property
+    def differentiated(self) -> None:
+        """None: the convolutions that this collection needs do not learn from derivatives."""
+        return None
+
     def shapes(self, latents: FloatArray) -> Shapes:
         """Shapes of codes (n, 4), angles as near as they can be to the reference's; the formula never fails."""
         mesh, points = self.reference, vertices(latents) / self.scale

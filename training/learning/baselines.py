@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Protocol
@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from shapespace.arrays import FloatArray
 from shapespace.training.learning.layers import LatentFeatures, Scaling
-from shapespace.training.learning.linear import Ridge, principal_axes, ridge
+from shapespace.training.learning.linear import Ridge, kernel_ridge, principal_axes
 from shapespace.training.runs.config import EvaluationSettings
 from shapespace.training.runs.latent_coordinates import Coordinates
 from shapespace.training.runs.sampling import Collection
@@ -48,6 +48,7 @@ class LatentKernel(nn.Module):
         scaling: of the values.
         own: codes (n, m) to fit to, and their NRIC (n, 2E).
         held_out: pairs that choose length and penalty.
+        slopes: codes (k, m) and derivatives (k, m, 2E) there, to fit to as well, of coordinates without a period.
     """
 
     anchors: Tensor
@@ -60,6 +61,7 @@ class LatentKernel(nn.Module):
         scaling: Scaling,
         own: tuple[Tensor, Tensor],
         held_out: tuple[Tensor, Tensor],
+        slopes: tuple[Tensor, Tensor] | None = None,
     ) -> None:
         super().__init__()
         self.features, self.scaling = LatentFeatures(coordinates, order=1), scaling
@@ -67,16 +69,23 @@ class LatentKernel(nn.Module):
         y, wanted = (scaling.down(z).double() for _, z in (own, held_out))
         mean = y.mean(dim=0)
         axes = principal_axes(y - mean, by="rows")[1][:CHOSEN_BY]
-        few, known = (y - mean) @ axes.T, (wanted - mean) @ axes.T
 
-        def fitted(length: float) -> tuple[Ridge, float]:
-            return ridge(_kernel(x, x, length), few, (_kernel(others, x, length), known), PENALTIES), length
+        def solved(length: float, penalties: Sequence[float], project: Callable[[Tensor], Tensor]) -> Ridge:
+            rows = None
+            if slopes:
+                at = self.features(slopes[0]).double()
+                values = project((slopes[1] * (self.features.radius[:, None] * scaling.factor)).double())
+                rows = _kernel_slopes(at, x, length), values.flatten(0, 1)
+            held_out = _kernel(others, x, length), project(wanted - mean)
+            return kernel_ridge(_kernel(x, x, length), project(y - mean), rows, held_out, penalties)
 
         lengths = [times * self.features.size**0.5 for times in LENGTHS]
-        best, self.length = min(map(fitted, lengths), key=lambda fit: fit[0].error)
-        gram = _kernel(x, x, self.length) + best.penalty * torch.eye(len(x))
+        best, self.length = min(
+            ((solved(length, PENALTIES, lambda values: values @ axes.T), length) for length in lengths),
+            key=lambda fit: fit[0].error,
+        )
         self.register_buffer("anchors", x)
-        self.register_buffer("weights", torch.cholesky_solve(y - mean, torch.linalg.cholesky(gram)))
+        self.register_buffer("weights", solved(self.length, [best.penalty], lambda values: values).weights)
         self.register_buffer("mean", mean)
 
     def forward(self, codes: Tensor) -> Tensor:
@@ -87,6 +96,13 @@ class LatentKernel(nn.Module):
 
 def _kernel(x: Tensor, anchors: Tensor, length: float) -> Tensor:
     return torch.exp(-0.5 * torch.cdist(x, anchors).square() / length**2)
+
+
+def _kernel_slopes(x: Tensor, anchors: Tensor, length: float) -> Tensor:
+    """(k p, n) derivatives by the inputs x (k, p)."""
+    apart = anchors - x[:, None]
+    slopes = apart * (_kernel(x, anchors, length) / length**2)[:, :, None]
+    return slopes.transpose(1, 2).flatten(0, 1)
 
 
 @dataclass(frozen=True)

@@ -9,12 +9,42 @@ from dataclasses import dataclass
 from typing import Any, Self
 
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from shapespace.mesh.triangle_mesh import TriangleMesh
 from shapespace.training.learning.layers import Scaling, half_precision
-from shapespace.training.learning.linear import Ridge, principal_axes, regression, ridge
+from shapespace.training.learning.linear import Ridge, kernel_ridge, principal_axes, regression
 from shapespace.training.runs.config import FitSettings, KernelSettings, ProductSettings
+
+
+@dataclass(frozen=True)
+class Slopes:
+    """Derivatives at some joint samples by the latents, each in halves of its bounds' width; scaled differences.
+
+    Attributes:
+        inputs: (k, J, 2E) the factors' shapes of these samples.
+        latents: of each factor; no other factor's shape depends on them.
+        own: (k, m, 2E) derivatives of that factor's shape.
+        missed: (k, m, 2E) derivatives of the difference between the joint shape and the affine sum.
+    """
+
+    inputs: Tensor
+    latents: list[list[int]]
+    own: Tensor
+    missed: Tensor
+
+    def coefficients(self, axes: Tensor, columns: NDArray | slice = slice(None)) -> Tensor:
+        """(k m, J d) derivatives of coefficients of the factors' shapes, along axes (J, S, d) in S entries of NRIC."""
+        own = self.own[:, :, columns].to(axes.dtype)
+        result = torch.zeros(*own.shape[:2], len(axes), axes.shape[2], dtype=axes.dtype)
+        for j, index in enumerate(self.latents):
+            result[:, index, j] = own[:, index] @ axes[j]
+        return result.flatten(2).flatten(0, 1)
+
+    def repeated(self, inputs: Tensor) -> Tensor:
+        """(k m, …) something (k, …) of each sample, once for each latent."""
+        return inputs.repeat_interleave(self.own.shape[1], dim=0)
 
 
 @dataclass(frozen=True)
@@ -25,11 +55,13 @@ class JointSamples:
         factors: (n, J, 2E) NRIC of the factors' shapes.
         joint: (n, 2E) NRIC of the joint shapes.
         scaling: to scaled differences.
+        slopes: derivatives to fit to as well, where there are some.
     """
 
     factors: Tensor
     joint: Tensor
     scaling: Scaling
+    slopes: Slopes | None = None
 
     @property
     def inputs(self) -> Tensor:
@@ -146,7 +178,9 @@ class KernelCorrection(Correction):
         result._fit_inputs(y)
         result.anchors.copy_(result._inputs(y))
         result._fit_weights(
-            result._values(residual), (result._inputs(held_out.inputs), result._values(held_out.missed))
+            result._values(residual),
+            (result._inputs(held_out.inputs), result._values(held_out.missed)),
+            own.slopes,
         )
         return result
 
@@ -159,17 +193,25 @@ class KernelCorrection(Correction):
             count = min(self.axes.shape[2], len(s))
             self.axes[j, :, :count] = half_precision(axes[:count].T * (len(some) ** 0.5 / s[0].clamp_min(1e-12)))
 
-    def _fit_weights(self, target: Tensor, held_out: tuple[Tensor, Tensor]) -> None:
+    def _fit_weights(self, target: Tensor, held_out: tuple[Tensor, Tensor], slopes: Slopes | None) -> None:
         """The length and the penalty that suit held-out inputs and values best, and the weights (anchors, rank)."""
 
         def fitted(length: float) -> tuple[Ridge, Tensor]:
             gamma = torch.tensor(0.5 / length**2)
             kernel, other = self._kernel(self.anchors, gamma), self._kernel(held_out[0], gamma)
-            return ridge(kernel, target, (other, held_out[1]), self.PENALTIES), gamma
+            rows = self._slopes(slopes, gamma) if slopes else None
+            return kernel_ridge(kernel, target, rows, (other, held_out[1]), self.PENALTIES), gamma
 
         best, gamma = min(map(fitted, self.LENGTHS), key=lambda fit: fit[0].error)
         self.gamma.copy_(gamma)
         self.weights.copy_(best.weights)
+
+    def _slopes(self, slopes: Slopes, gamma: Tensor) -> tuple[Tensor, Tensor]:
+        """Derivatives of the kernel (k m, anchors) and of the values (k m, rank)."""
+        x, along = slopes.repeated(self._inputs(slopes.inputs)).double(), slopes.coefficients(self.axes).double()
+        towards = along @ self.anchors.T.double() - (x * along).sum(dim=1, keepdim=True)
+        rows = 2 * gamma.double() * towards * self._kernel(x, gamma)
+        return rows, (slopes.missed.flatten(0, 1) @ self.basis.T).double()
 
     def _values(self, residual: Tensor) -> Tensor:
         """(n, rank) coefficients of residuals (n, 2E), in double precision."""

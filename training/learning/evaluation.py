@@ -188,6 +188,7 @@ def evaluate(
             for name, variant in main.variants().items()
         },
         "exponentials": main.exponentials(),
+        "derivatives": len(main.differentiated()[0]),
         "correction": {"kind": composite.combiner.settings.kind, "tried": composite.combiner.tried},
         "fractions": [_fraction(learner, fraction, test) for fraction in config.networks.fractions],
         "seeds": [_other_seed(learner(seed=seed)) for seed in config.networks.seeds],
@@ -247,6 +248,7 @@ def _fraction(learner: Callable[..., Learner], fraction: float, test: TestSplit)
     return {
         "fraction": fraction,
         "training_samples": len(some.rows["train"]),
+        "derivatives": len(some.differentiated()[0]),
         "exponentials": {"composite": some.exponentials(), "all of factors": free.exponentials()},
         "r2": {
             "composite": test.r2(some.main()),
@@ -311,7 +313,10 @@ def median_seconds(function: Callable[[], Any], repeat: int = 20) -> float:
 
 
 def model_times(collection: Collection, composite: Model, eta: float) -> dict[str, float]:
-    """Median seconds for one code: exact shape, composite network, reconstruction from the reference (one thread)."""
+    """Median seconds for one code: exact shape, composite network, reconstruction from the reference (one thread).
+
+    Where shapes have derivatives, those of the exact shape with these too.
+    """
     rng = np.random.default_rng(0)
     latents = collection.coordinates.uniform(1, rng)
     z = collection.shapes(latents).nric[0]
@@ -321,10 +326,13 @@ def model_times(collection: Collection, composite: Model, eta: float) -> dict[st
     try:
         with torch.no_grad():
             code = torch.as_tensor(latents, dtype=torch.float32)
-            return {
+            times = {
                 "exact": median_seconds(lambda: collection.shapes(latents)),
                 "networks": median_seconds(lambda: composite(code)),
                 "reconstruction": median_seconds(lambda: reconstruct(z, tolerance=1e-6), repeat=5),
             }
+            if differentiated := collection.differentiated:
+                times["exact, with derivatives"] = median_seconds(lambda: differentiated.shapes(latents), repeat=5)
+            return times
     finally:
         torch.set_num_threads(threads)

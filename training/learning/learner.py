@@ -19,7 +19,7 @@ from torch import Tensor
 from shapespace.arrays import FloatArray, IntArray
 from shapespace.coordinates.nric import WeightedNorm, nric
 from shapespace.training.learning.baselines import LatentKernel
-from shapespace.training.learning.corrections import JointSamples
+from shapespace.training.learning.corrections import JointSamples, Slopes
 from shapespace.training.learning.fitting import fit, read_network, save_network
 from shapespace.training.learning.layers import PatchBasis, Scaling
 from shapespace.training.learning.networks import (
@@ -41,7 +41,7 @@ from shapespace.training.runs.config import (
     Recipe,
 )
 from shapespace.training.runs.directory import RunDirectory
-from shapespace.training.runs.sampling import Collection, Samples, read, split
+from shapespace.training.runs.sampling import DERIVATIVES, DONE, Collection, Samples, columns, read, split
 
 #: Settings that make factor networks those of the paper.
 PAPER_FACTORS = LatentNetworkSettings(fourier=0, skip_degree=0, energy=1, fit=FitSettings())
@@ -235,22 +235,20 @@ class Learner:
         networks = [self.factor(j, settings) for j, settings in enumerate(factors)]
         decides = [*factors, *choices(recipe.combiner.correction)]
         path = self._path("combiner", [self._fraction, self._factor_fraction], recipe.combiner, *decides)
+        return Composite(indices, networks, self._combiner(recipe.combiner, path, indices, networks))
 
-        def shapes() -> Tensor:
-            latents = torch.as_tensor(self.joint.latents, dtype=torch.float32)
-            return predict(partial(factor_shapes, networks, indices), latents)
-
-        return Composite(indices, networks, self._combiner(recipe.combiner, path, shapes))
-
-    def _combiner(self, settings: CombinerSettings, path: Path, shapes: Callable[[], Tensor]) -> CombinerNetwork:
-        """Ψ, read from ``path`` or fitted to the factors' shapes (n, J, 2E) of all joint samples."""
+    def _combiner(
+        self, settings: CombinerSettings, path: Path, indices: list[list[int]], networks: list[FactorNetwork]
+    ) -> CombinerNetwork:
+        """Ψ, read from ``path`` or fitted to what the networks of factors make of the joint samples."""
         saved, reference = read_network(path) if path.exists() else None, self.collection.reference
         if saved and saved.done:
             combiner = CombinerNetwork.load(saved.metadata, reference, saved.tensors)
             combiner.eval()
             self._record(path, saved.state)
             return combiner
-        data = _Data(shapes(), self.joint.nric, self.rows)
+        latents = torch.as_tensor(self.joint.latents, dtype=torch.float32)
+        data = _Data(predict(partial(factor_shapes, networks, indices), latents), self.joint.nric, self.rows)
         if settings.symmetries:
             data = self._with_images(data)
         torch.manual_seed(self.seed)
@@ -258,7 +256,9 @@ class Learner:
             combiner = CombinerNetwork.load(saved.metadata, reference, saved.tensors)
         else:
             scaling = self._scaling(self.joint.nric[self.rows["train"]])
-            own, held_out = (JointSamples(*data.part(name), scaling) for name in ("train", "validation"))
+            slopes = self._slopes(indices, networks, data.inputs, scaling)
+            own = JointSamples(*data.part("train"), scaling, slopes)
+            held_out = JointSamples(*data.part("validation"), scaling)
             combiner = CombinerNetwork.fit(settings.correction, reference, own, held_out, self.seed)
         if descent := combiner.correction.descent:
             state = self._fit(combiner, data, descent, path, self._fraction)
@@ -268,6 +268,34 @@ class Learner:
             save_network(path, combiner, state)
         self._record(path, state)
         return combiner
+
+    def differentiated(self) -> tuple[IntArray, NDArray[np.float32]]:
+        """Rows (k,) of the joint samples to learn from that have derivatives, and these (k, m, 2E)."""
+        found = columns(self.run.samples / DERIVATIVES, "index", "status", "derivatives")
+        if not found:
+            return np.empty(0, dtype=int), np.empty((0, 0, 0), np.float32)
+        rows = np.searchsorted(self.joint.index, self.run.split.read()["train"][found["index"]])
+        some = (found["status"] == DONE) & np.isin(rows, self.rows["train"])
+        return rows[some], found["derivatives"][some]
+
+    def _slopes(
+        self, indices: list[list[int]], networks: list[FactorNetwork], shapes: Tensor, scaling: Scaling
+    ) -> Slopes | None:
+        """The derivatives, and those of what networks make of the factors (n, J, 2E); None where there are none."""
+        rows, derivatives = self.differentiated()
+        if not len(rows):
+            return None
+        coordinates = self.collection.coordinates
+        radius = torch.as_tensor((coordinates.upper - coordinates.lower) / 2, dtype=torch.float32)
+        latents = torch.as_tensor(self.joint.latents[rows], dtype=torch.float32)
+        own = torch.empty(derivatives.shape)
+        for index, network in zip(indices, networks, strict=True):
+            for k, latent in enumerate(index):
+                direction = torch.zeros(len(rows), len(index))
+                direction[:, k] = radius[latent]
+                _, own[:, latent] = torch.autograd.functional.jvp(network, latents[:, index], direction)
+        missed = torch.from_numpy(derivatives) * radius[:, None] - own
+        return Slopes(scaling.down(shapes[rows]), indices, own * scaling.factor, missed * scaling.factor)
 
     def _with_images(self, data: _Data) -> _Data:
         """The same, with the images of the training samples under each symmetry of the collection."""
@@ -298,12 +326,7 @@ class Learner:
         index, combiner = list(range(len(self.collection.coordinates))), self.config.networks.combiner
         decides = [self.config.monolithic, *choices(combiner.correction)]
         path = self._path("monolithic-combiner", [self._fraction], combiner, *decides)
-
-        def shapes() -> Tensor:
-            latents = torch.as_tensor(self.joint.latents, dtype=torch.float32)
-            return predict(partial(factor_shapes, [network], [index]), latents)
-
-        return Composite([index], [network], self._combiner(combiner, path, shapes))
+        return Composite([index], [network], self._combiner(combiner, path, [index], [network]))
 
     def monolithic_paper(self) -> FactorNetwork:
         """Φ̃, the paper's fully connected baseline."""
@@ -320,7 +343,9 @@ class Learner:
         latents = torch.as_tensor(self.joint.latents, dtype=torch.float32)
         z, rows = torch.from_numpy(self.joint.nric), self.rows
         own, held_out = ((latents[rows[part]], z[rows[part]]) for part in ("train", "validation"))
-        return LatentKernel(self.collection.coordinates, self._scaling(own[1].numpy()), own, held_out)
+        at, derivatives = self.differentiated()
+        slopes = (latents[at], torch.from_numpy(derivatives)) if len(at) else None
+        return LatentKernel(self.collection.coordinates, self._scaling(own[1].numpy()), own, held_out, slopes)
 
     def start(self) -> StartNetwork:
         """The start network, from the joint samples: in closed form, in seconds, and not saved."""

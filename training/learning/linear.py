@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import torch
@@ -46,6 +46,36 @@ def ridge(gram: Tensor, right: Tensor, held_out: tuple[Tensor, Tensor], penaltie
         return Ridge(weights, penalty, float((features @ weights - wanted).square().mean()))
 
     return min(map(solved, penalties), key=lambda fit: fit.error)
+
+
+def kernel_ridge(
+    kernel: Tensor,
+    target: Tensor,
+    slopes: tuple[Tensor, Tensor] | None,
+    held_out: tuple[Tensor, Tensor],
+    penalties: Sequence[float],
+) -> Ridge:
+    """Kernel ridge regression of values, and of derivatives where there are some; see `ridge` for the rest.
+
+    Args:
+        kernel: (n, n) of samples.
+        target: (n, q) values.
+        slopes: derivatives at some samples, of the kernel (s, n) and of the values (s, q).
+        held_out: kernels (m, n) of held-out samples with the others, and values (m, q).
+        penalties: candidates.
+
+    Returns:
+        Weights (n, q) of the samples.
+    """
+    if slopes is None:
+        return ridge(kernel, target, held_out, penalties)
+    # Orthonormal functions in the kernel's space: in these the penalty is that of the dual form.
+    s, vectors = torch.linalg.eigh(kernel)
+    kept = s > 1e-12 * s[-1]
+    to = vectors[:, kept] * s[kept].rsqrt()
+    features, values = torch.cat([kernel, slopes[0]]) @ to, torch.cat([target, slopes[1]])
+    found = ridge(features.T @ features, features.T @ values, (held_out[0] @ to, held_out[1]), penalties)
+    return replace(found, weights=to @ found.weights)
 
 
 @dataclass(frozen=True)

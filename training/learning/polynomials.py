@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from shapespace.mesh.triangle_mesh import TriangleMesh
-from shapespace.training.learning.corrections import Correction, JointSamples
+from shapespace.training.learning.corrections import Correction, JointSamples, Slopes
 from shapespace.training.learning.layers import half_precision, patch_entries
 from shapespace.training.learning.linear import SpectralRidge, principal_axes, ridge
 from shapespace.training.runs.config import PolynomialSettings
@@ -96,7 +96,7 @@ class PolynomialCorrection(Correction):
         spread = torch.stack([patch.spread for patch in patches]).clamp_min(1e-30).log().mean(dim=0)
         monomials = _Monomials.strongest(spread.numpy(), settings.monomials)
         for patch in progress(patches, "polynomials", "patch"):
-            patch.fit(pairs, others, monomials)
+            patch.fit(pairs, others, monomials, own.slopes)
         return cls(_assembled(patches, monomials, pairs[1].shape[1], cls.SLACK))
 
     def difference(self, y: Tensor) -> Tensor:
@@ -173,6 +173,15 @@ def _products(u: Tensor, factors: Tensor) -> Tensor:
     result = u.index_select(0, factors[0])
     for index in factors[1:]:
         result = result * u.index_select(0, index)
+    return result
+
+
+def _product_slopes(u: Tensor, along: Tensor, factors: Tensor) -> Tensor:
+    """(k, …) derivatives of `_products` as the coordinates change by ``along`` (r, …)."""
+    result = torch.zeros(())
+    for i, index in enumerate(factors):
+        others = [other for j, other in enumerate(factors) if j != i]
+        result = result + along.index_select(0, index) * _products(u, torch.stack(others))
     return result
 
 
@@ -276,10 +285,24 @@ class _Patch:
         products = (_products(u, torch.as_tensor(index.T)) for index in (monomials.pairs, monomials.triples))
         return torch.cat([torch.ones_like(u[:1]), torch.cat([u, *products]) * monomials.roots[:, None]]).T
 
-    def fit(self, own: Pairs, held_out: Pairs, monomials: _Monomials) -> None:
+    def _slopes(self, slopes: Slopes, monomials: _Monomials) -> Pairs:
+        """(k m, 1 + M) derivatives of the monomials, and (k m, S) of what they are to be."""
+        metric, axes = self.metric[: monomials.rank].double(), self.axes.double().transpose(1, 2)
+        u = metric @ slopes.repeated(self._inputs(slopes.inputs)).T
+        along = metric @ (slopes.coefficients(axes, self.columns) * self.units).T
+        products = (
+            _product_slopes(u, along, torch.as_tensor(index.T)) for index in (monomials.pairs, monomials.triples)
+        )
+        rows = torch.cat([torch.zeros_like(u[:1]), torch.cat([along, *products]) * monomials.roots[:, None]]).T
+        return rows, slopes.missed[:, :, self.columns].flatten(0, 1).double()
+
+    def fit(self, own: Pairs, held_out: Pairs, monomials: _Monomials, slopes: Slopes | None) -> None:
         """Ridge regression on the monomials, with the kernel's penalty or one ten times smaller or larger."""
         x, other = (self._features(y, monomials) for y in (own[0], held_out[0]))
         wanted, theirs = (residual[:, self.columns].double() - self.mean for _, residual in (own, held_out))
+        if slopes:
+            rows, derivatives = self._slopes(slopes, monomials)
+            x, wanted = torch.cat([x, rows]), torch.cat([wanted, derivatives])
         penalties = max(self.penalty / 10, PENALTIES[0]), self.penalty, 10 * self.penalty
         if len(x) < x.shape[1]:
             found = ridge(x @ x.T, wanted, (other @ x.T, theirs), penalties)
@@ -289,7 +312,7 @@ class _Patch:
             weights = found.weights
         self.mean = self.mean + weights[0]
         self.error = found.error * theirs.shape[1]
-        values = x[:, 1:] @ weights[1:]
+        values = x[: len(own[0]), 1:] @ weights[1:]
         s, axes = principal_axes(values, by="columns")
         self.energy, self.basis = s.square() / len(values), axes.T.float()
         self.weights = (weights[1:] * monomials.roots[:, None]).T.float()

@@ -20,6 +20,9 @@ Neighbourhood = Literal["star", "flaps"]
 #: Default number of samples of each factor alone: few suffice, as a factor has few modes.
 FACTOR_SAMPLES = 1000
 
+#: Default number of joint samples with derivatives.
+DERIVATIVES = 60
+
 
 def _grid(nodes: int) -> int:
     if 0 < nodes < 3:
@@ -117,6 +120,10 @@ class SampleSettings(_Section):
     shapes: bool = True
     """Whether the codes of the collection's own shapes are training samples too, as few random codes lie near the
     shapes. At most a quarter as many as ``count``, spread evenly over the shapes."""
+    derivatives: int | None = Field(None, ge=0)
+    """Number of joint samples that are learned from together with their derivatives by the code. With tens of modes
+    these take as long as 5 to 10 samples each and say more than so many. By default 60, or a tenth of ``count`` where
+    that is less."""
     part_size: int = Field(50, ge=1)
     """Number of samples per file: as many as a worker computes at a time, and as are lost if it dies."""
     test_fraction: float = Field(0.2, gt=0, lt=1)
@@ -125,6 +132,11 @@ class SampleSettings(_Section):
     """Share of the other joint samples that are used to choose the learning rate and the best epoch."""
     seed: int = 0
     """Seed of the random codes and of their split."""
+
+    @property
+    def differentiated(self) -> int:
+        """Joint samples with derivatives."""
+        return min(DERIVATIVES, self.count // 10) if self.derivatives is None else self.derivatives
 
     def own(self, factors: int) -> list[int]:
         """Samples of each factor alone."""

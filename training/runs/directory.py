@@ -151,7 +151,9 @@ class RunDirectory:
 
     @property
     def samples(self) -> Path:
-        """Folder of the joint samples; in ``shapes/`` those at the codes of the collection's shapes."""
+        """Folder of the joint samples; in ``shapes/`` those at the codes of the collection's shapes, in
+        ``derivatives/`` those of the first training codes with ``derivatives (n, m, 2E)``.
+        """
         return self.folder / "samples"
 
     def factor_samples(self, j: int) -> Path:

@@ -25,6 +25,8 @@ DONE, FAILED = "done", "failed"
 SHORTER, SHORTENINGS = 0.85, 3
 #: Subfolder of the joint samples: the samples at the codes of the collection's own shapes.
 KNOWN = "shapes"
+#: Subfolder of the joint samples: derivatives at some of the training codes, in the order of these.
+DERIVATIVES = "derivatives"
 #: Fewest samples to learn from: each part of the split needs some.
 FEWEST = 10
 
@@ -42,11 +44,13 @@ class Shapes:
         nric: (n, 2E) lengths and angles. Angles are defined up to 2π, and the collection says which value is meant: the
             nearest to the reference's, or the one at the end of a path from the reference.
         reasons: for each why it failed, or an empty string.
+        derivatives: (n, m, 2E) of ``nric`` by the code, zero where a shape failed; None where they are not computed.
     """
 
     vertices: FloatArray
     nric: FloatArray
     reasons: list[str]
+    derivatives: FloatArray | None = None
 
 
 class Collection(Protocol):
@@ -62,6 +66,7 @@ class Collection(Protocol):
         symmetries: involutions of the edges, (E,) each, that take shapes of the collection to shapes of the collection
             and the reference to itself; the combiner sees each training sample's images too.
         finer: the same by exponentials of twice as many steps; None where shapes are not made by steps.
+        differentiated: the same, whose shapes come with their derivatives; None where these are not known.
     """
 
     @property
@@ -80,6 +85,8 @@ class Collection(Protocol):
     def symmetries(self) -> list[IntArray]: ...  # noqa: D102
     @property
     def finer(self) -> Collection | None: ...  # noqa: D102
+    @property
+    def differentiated(self) -> Collection | None: ...  # noqa: D102
 
     def shapes(self, latents: FloatArray) -> Shapes:
         """The shapes of codes (n, m), each depending on nothing but its own code."""
@@ -181,7 +188,8 @@ def _part(collection: Collection, shorten: bool, asked: FloatArray) -> dict[str,
         reasons[left[found]] = ""
     failed = reasons != ""
     latents[failed] = asked[failed]
-    return {
+    slopes = {} if shapes.derivatives is None else {"derivatives": shapes.derivatives.astype(np.float32)}
+    return slopes | {
         "latents": latents,
         "nric": nric.astype(np.float32),
         "vertices": vertices.astype(np.float32),

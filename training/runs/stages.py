@@ -75,7 +75,7 @@ STAGES: dict[str, Stage] = {
         version=1,
         settings=lambda config: [config.samples],
         results=lambda run: [run.samples],
-        amounts=frozenset({"count", "factor_counts", "shapes"}),
+        amounts=frozenset({"count", "factor_counts", "shapes", "derivatives"}),
     ),
     # Networks are in files named by what decides their contents, so that a change leaves alone those it doesn't touch.
     "networks": Stage(

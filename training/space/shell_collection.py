@@ -13,7 +13,8 @@ from shapespace.arrays import FloatArray, IntArray
 from shapespace.mesh.triangle_mesh import TriangleMesh
 from shapespace.shell.energy import Material
 from shapespace.shell.exponential import exponential
-from shapespace.shell.space import ShellSpace
+from shapespace.shell.exponential_derivative import ExponentialDerivative
+from shapespace.shell.space import DiscretePath, ShellSpace
 from shapespace.training.runs.latent_coordinates import Coordinates
 from shapespace.training.runs.sampling import Shapes
 
@@ -33,6 +34,7 @@ class ShellCollection:
         material: μ, λ, η.
         scale: length of one unit of the reference in the user's units.
         codes: (n, m) of the shapes that it was made from.
+        with_derivatives: whether shapes come with their derivatives.
     """
 
     reference: TriangleMesh
@@ -44,6 +46,7 @@ class ShellCollection:
     material: Material
     scale: float
     codes: FloatArray
+    with_derivatives: bool = False
 
     def __getstate__(self) -> dict[str, Any]:
         return {name: value for name, value in self.__dict__.items() if name != "space"}
@@ -77,15 +80,31 @@ class ShellCollection:
         """The same by exponentials of twice as many steps."""
         return replace(self, steps=2 * self.steps)
 
+    @property
+    def differentiated(self) -> ShellCollection:
+        """The same, whose shapes come with their derivatives."""
+        return replace(self, with_derivatives=True)
+
     def shapes(self, latents: FloatArray) -> Shapes:
         """Exponentials of codes (n, m), with one BLAS thread; angles are unwrapped along each geodesic."""
         # One code at a time: a product with all of them would round differently with their number.
         velocities = np.stack([np.tensordot(code, self.modes, axes=1) for code in latents])
         with threadpool_limits(1):
             paths = [exponential(self.space, self.reference.vertices, v, self.steps) for v in velocities]
-        found = [
-            (path.vertices[-1], path.nric[-1], "" if path.converged else f"{path.status}: {path.reason}")
-            for path in paths
-        ]
-        vertices, z, reasons = zip(*found, strict=True)
-        return Shapes(np.stack(vertices), np.stack(z), list(reasons))
+            reasons = ["" if path.converged else f"{path.status}: {path.reason}" for path in paths]
+            derivatives = None
+            if self.with_derivatives:
+                derivatives = np.zeros((len(paths), len(self.modes), paths[0].nric.shape[1]))
+                for k, path in enumerate(paths):
+                    if path.converged:
+                        try:
+                            derivatives[k] = self._derivative(path)
+                        except RuntimeError as error:
+                            reasons[k] = f"no derivative: {error}"
+        vertices, z = (np.stack(ends) for ends in zip(*((p.vertices[-1], p.nric[-1]) for p in paths), strict=True))
+        return Shapes(vertices, z, reasons, derivatives)
+
+    def _derivative(self, path: DiscretePath) -> FloatArray:
+        """(m, 2E) of the end of a path by the code; raises RuntimeError, see `ExponentialDerivative`."""
+        end = path.space.point(path.vertices[-1])
+        return np.stack([end.push_forward(x) for x in ExponentialDerivative(path).push_forward(self.modes)])

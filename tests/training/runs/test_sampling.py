@@ -21,7 +21,7 @@ from shapespace.arrays import FloatArray
 from shapespace.mesh.triangle_mesh import TriangleMesh
 from shapespace.shell.energy import Material
 from shapespace.training.runs import workers
-from shapespace.training.runs.sampling import draw, read, split, used
+from shapespace.training.runs.sampling import columns, draw, read, split, used
 from shapespace.training.runs.workers import WorkersError
 from shapespace.training.space.shell_collection import ShellCollection
 from tests.training.conftest import TINY
@@ -283,6 +283,24 @@ def test_it_travels_without_its_analysis(collection: ShellCollection, latents: F
     pickled = pickle.dumps(collection)
     assert b"ShellSpace" not in pickled
     assert np.array_equal(pickle.loads(pickled).shapes(code).nric, expected.nric)  # noqa: S301
+
+
+def test_derivatives_are_those_of_the_shapes(collection: ShellCollection, latents: FloatArray) -> None:
+    h, codes = 1e-4, latents[:2]
+    found = collection.differentiated.shapes(codes)
+    assert np.array_equal(found.nric, collection.shapes(codes).nric)
+    for j, step in enumerate(h * np.eye(3)):
+        ahead, behind = (collection.shapes(codes + side).nric for side in (step, -step))
+        assert found.derivatives[:, j] == pytest.approx((ahead - behind) / (2 * h), abs=1e-5)
+
+
+def test_a_code_without_a_shape_has_no_derivative(collection: ShellCollection, tmp_path: Path) -> None:
+    codes = np.array([[1e3, 0, 0], [0.1, 0, 0]])
+    assert list(draw(collection.differentiated, tmp_path, codes, 2, "samples", workers=1)) == [(2, 2, 1)]
+    found = columns(tmp_path, "status", "derivatives")
+    assert found["status"].tolist() == ["failed", "done"]
+    assert not found["derivatives"][0].any()
+    assert found["derivatives"][1].any(axis=1).all()
 
 
 def test_codes_without_a_shape_are_shortened_and_say_so(collection: ShellCollection, tmp_path: Path) -> None:

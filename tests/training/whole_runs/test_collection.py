@@ -217,6 +217,21 @@ def test_the_collection_s_shapes_are_learned_from_but_not_measured_on(run: Path)
     assert not set(known) & {*other["validation"], *other["test"]}
 
 
+def test_derivatives_are_learned_from_at_training_codes_only(run: Path) -> None:
+    opened = Run(run, *load(run / "config.toml"), run / "models")
+    learner, half, other = (learner_of(opened, **how) for how in ({}, {"fraction": 0.5}, {"seed": 1}))
+    rows, derivatives = learner.differentiated()
+    assert rows.tolist() == learner.split["train"][:6].tolist(), "a tenth of the joint samples"
+    expected = opened.collection.differentiated.shapes(learner.joint.latents[rows[:1]]).derivatives
+    np.testing.assert_allclose(derivatives[:1], expected, atol=1e-6)
+    assert half.differentiated()[0].tolist() == rows.tolist()
+    some = other.differentiated()[0]
+    assert set(some) == set(rows) & set(other.split["train"])
+    figures = json.loads((run / "evaluation.json").read_text())
+    assert figures["derivatives"] == figures["fractions"][0]["derivatives"] == 6
+    assert figures["times"]["exact, with derivatives"] > figures["times"]["exact"] > 0
+
+
 @pytest.fixture
 def url(run: Path) -> Iterator[str]:
     with starting() as start:
