@@ -7,7 +7,10 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
+
+#: Eigenvalues below this share of the largest are rounding errors.
+ROUNDING = 1e-12
 
 
 @dataclass(frozen=True)
@@ -71,7 +74,7 @@ def kernel_ridge(
         return ridge(kernel, target, held_out, penalties)
     # Orthonormal functions in the kernel's space: in these the penalty is that of the dual form.
     s, vectors = torch.linalg.eigh(kernel)
-    kept = s > 1e-12 * s[-1]
+    kept = s > ROUNDING * s[-1]
     to = vectors[:, kept] * s[kept].rsqrt()
     features, values = torch.cat([kernel, slopes[0]]) @ to, torch.cat([target, slopes[1]])
     found = ridge(features.T @ features, features.T @ values, (held_out[0] @ to, held_out[1]), penalties)
@@ -83,9 +86,9 @@ class SpectralRidge:
     """Ridge regression by the eigenvectors of G, which serve all penalties: for many of them, or a map of low rank.
 
     Attributes:
-        values: eigenvalues of G (p,), none negative.
-        vectors: V (p, p), its eigenvectors.
-        projected: VᵀR (p, q).
+        values: eigenvalues of G (k,), none negative.
+        vectors: V (p, k), its eigenvectors; where k < p, those of all values that count.
+        projected: VᵀR (k, q).
         penalty: λ, which suits held-out pairs best.
         error: mean square of what the solution misses of them.
     """
@@ -102,7 +105,31 @@ class SpectralRidge:
     ) -> SpectralRidge:
         """See `ridge` for the arguments."""
         values, vectors = torch.linalg.eigh(gram)
-        values, projected = values.clamp_min(0), vectors.T @ right
+        return cls._chosen(values.clamp_min(0), vectors, vectors.T @ right, held_out, penalties)
+
+    @classmethod
+    def of_samples(
+        cls, x: Tensor, y: Tensor, held_out: tuple[Tensor, Tensor], penalties: Sequence[float]
+    ) -> SpectralRidge:
+        """The same for G = XᵀX and R = XᵀY, by the smaller of XᵀX and XXᵀ: features x (n, p), values y (n, q)."""
+        if len(x) >= x.shape[1]:
+            return cls.fit(x.T @ x, x.T @ y, held_out, penalties)
+        values, left = torch.linalg.eigh(x @ x.T)
+        kept = values > ROUNDING * values[-1]
+        values, left = values[kept], left[:, kept]
+        return cls._chosen(
+            values, x.T @ left * values.rsqrt(), left.T @ y * values.sqrt()[:, None], held_out, penalties
+        )
+
+    @classmethod
+    def _chosen(
+        cls,
+        values: Tensor,
+        vectors: Tensor,
+        projected: Tensor,
+        held_out: tuple[Tensor, Tensor],
+        penalties: Sequence[float],
+    ) -> SpectralRidge:
         features, wanted = held_out[0] @ vectors, held_out[1]
         errors = {
             penalty: float((features @ (projected / (values + penalty)[:, None]) - wanted).square().mean())
@@ -122,6 +149,7 @@ class SpectralRidge:
         scale = (self.values + self.penalty).rsqrt()
         h, b = self.vectors * scale, self.projected * scale[:, None]
         strongest = torch.linalg.eigh(b @ b.T)[1][:, -rank:]
+        strongest = nn.functional.pad(strongest, (0, rank - strongest.shape[1]))
         return h @ strongest, strongest.T @ b
 
 
@@ -131,8 +159,8 @@ PENALTIES = tuple(10.0**k for k in range(-6, 3))
 
 def regression(x: Tensor, y: Tensor, held_out: tuple[Tensor, Tensor]) -> SpectralRidge:
     """Ridge regression from features x (n, p), of a mean square of about one, to y (n, q), in double precision."""
-    x, y = x.double(), y.double()
-    return SpectralRidge.fit(x.T @ x / len(x), x.T @ y / len(x), (held_out[0].double(), held_out[1]), PENALTIES)
+    x, y = (values.double() / len(x) ** 0.5 for values in (x, y))
+    return SpectralRidge.of_samples(x, y, (held_out[0].double(), held_out[1]), PENALTIES)
 
 
 def principal_axes(x: Tensor, by: Literal["svd", "rows", "columns"]) -> tuple[Tensor, Tensor]:

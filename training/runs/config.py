@@ -121,9 +121,9 @@ class SampleSettings(_Section):
     """Whether the codes of the collection's own shapes are training samples too, as few random codes lie near the
     shapes. At most a quarter as many as ``count``, spread evenly over the shapes."""
     derivatives: int | None = Field(None, ge=0)
-    """Number of joint samples that are learned from together with their derivatives by the code. Each of these
-    takes as long as about ten others, and beside some hundred others says more than so many. By default 60, or a tenth of ``count`` where
-    that is less."""
+    """Number of joint samples that are learned from together with their derivatives by the code. Each of these takes as
+    long as about ten others, and beside some hundred others says more than so many. By default 60, or a tenth of
+    ``count`` where that is less."""
     part_size: int = Field(50, ge=1)
     """Number of samples per file: as many as a worker computes at a time, and as are lost if it dies."""
     test_fraction: float = Field(0.2, gt=0, lt=1)

@@ -33,11 +33,17 @@ def test_primal_dual_and_spectral_ridge_regression_are_the_same(n: int, p: int) 
     primal = ridge(x.T @ x, x.T @ y, held_out, PENALTIES)
     dual = ridge(x @ x.T, y, (held_out[0] @ x.T, held_out[1]), PENALTIES)
     spectral = SpectralRidge.fit(x.T @ x, x.T @ y, held_out, PENALTIES)
-    for found in (primal, dual, spectral):
+    of_samples = SpectralRidge.of_samples(x, y, held_out, PENALTIES)
+    for found in (primal, dual, spectral, of_samples):
         assert found.penalty == best
         assert found.error == pytest.approx(errors[best], rel=1e-6)
     torch.testing.assert_close(x.T @ dual.weights, primal.weights)
     torch.testing.assert_close(spectral.weights, primal.weights)
+    torch.testing.assert_close(of_samples.weights, primal.weights)
+    for found in (spectral, of_samples):
+        h, b = found.low_rank(30)
+        assert h.shape == (p, 30)
+        torch.testing.assert_close(h @ b, primal.weights)
 
 
 def test_a_map_of_low_rank_has_the_nearest_values() -> None:
