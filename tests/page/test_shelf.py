@@ -169,9 +169,8 @@ def test_the_view_stays_as_it_was_turned(studio: Studio, window: Open) -> None:
     assert after[3] > before[3], "the camera moves back to show both"
     studio.rest()
     studio["#canvas"].hover()
-    there = studio.picture()
     again = window().open(studio.page.url.removeprefix(studio.url + "/"))
-    again.eventually(lambda: difference(there, again.picture()) < 0.01)
+    again.eventually(lambda: difference(studio.picture(), again.picture()) < 0.01)
     assert again.hash["view"] == studio.hash["view"]
     compare.click()
     studio.eventually(lambda: np.allclose(direction(), before, atol=1e-3))

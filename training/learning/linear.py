@@ -11,6 +11,8 @@ from torch import Tensor, nn
 
 #: Eigenvalues below this share of the largest are rounding errors.
 ROUNDING = 1e-12
+#: Likewise singular values that are roots of eigenvalues.
+RESOLVED = 1e-8
 
 
 @dataclass(frozen=True)
@@ -171,8 +173,8 @@ def principal_axes(x: Tensor, by: Literal["svd", "rows", "columns"]) -> tuple[Te
     Args:
         x: n samples.
         by: ``svd``, accurate to rounding, k = min(n, p). ``rows``, by the eigenvectors of x xᵀ, k = n: the fastest for
-            n much less than p. ``columns``, by those of xᵀ x, k = p: the fastest for n much greater than p. The last
-            two, in double precision, resolve no singular value below 1e-8 of the largest.
+            n much less than p; axes whose singular value is below 1e-8 of the largest are 0, as rounding makes them.
+            ``columns``, by those of xᵀ x, k = p: the fastest for n much greater than p; such values are inaccurate.
     """
     if by == "svd":
         _, s, vt = torch.linalg.svd(x, full_matrices=False)
@@ -182,5 +184,7 @@ def principal_axes(x: Tensor, by: Literal["svd", "rows", "columns"]) -> tuple[Te
         value, vector = torch.linalg.eigh(wide.T @ wide)
         return value.flip(0).clamp_min(0).sqrt().to(x.dtype), vector.flip(1).T.to(x.dtype)
     value, vector = torch.linalg.eigh(wide @ wide.T)
-    s = value.flip(0).clamp_min(1e-30).sqrt()
-    return s.to(x.dtype), (vector.flip(1).T @ wide / s[:, None]).to(x.dtype)
+    s = value.flip(0).clamp_min(0).sqrt()
+    s[s <= RESOLVED * s[0]] = 0
+    axes = vector.flip(1).T @ wide * torch.where(s > 0, 1 / s, 0)[:, None]
+    return s.to(x.dtype), axes.to(x.dtype)

@@ -79,3 +79,12 @@ def test_principal_axes_are_the_singular_vectors(by: str, n: int, p: int) -> Non
     torch.testing.assert_close(axes @ axes.T, torch.eye(10, dtype=x.dtype))
     torch.testing.assert_close((x @ axes.T).square().sum(dim=0).sqrt(), s[:10])
     assert principal_axes(x.float(), by)[1].dtype == torch.float32
+
+
+def test_principal_axes_by_rows_make_no_axes_of_rounding_errors() -> None:
+    x = torch.outer(torch.linspace(1, 2, 20, dtype=torch.float64), torch.linspace(-1, 3, 40, dtype=torch.float64))
+    s, axes = principal_axes(x, "rows")
+    assert s[0] > 0
+    assert not s[1:].any()
+    assert not axes[1:].any()
+    assert not torch.cat([values.flatten() for values in principal_axes(0 * x, "rows")]).any()

@@ -276,6 +276,7 @@ def test_kernel_regression_on_codes_finds_a_smooth_map(ball: TriangleMesh) -> No
 
 
 def test_derivatives_teach_kernel_regression_on_codes(ball: TriangleMesh) -> None:
+    """From noisy values and the derivatives of what is behind the noise."""
     coordinates = Coordinates(np.array([-1.0, -3.0]), np.array([1.0, 5.0]), np.full(2, np.nan))
     codes = torch.as_tensor(coordinates.uniform(120, np.random.default_rng(0)), dtype=torch.float32)
     rng = np.random.default_rng(1)
@@ -285,8 +286,9 @@ def test_derivatives_teach_kernel_regression_on_codes(ball: TriangleMesh) -> Non
         a, b = codes.T
         return torch.stack([torch.cos(2 * a), torch.sin(a) * b, torch.exp(b / 5)], dim=1) @ maps
 
-    z, some = shapes(codes), codes[:12]
-    own, held_out, unseen = ((codes[part], z[part]) for part in (slice(12), slice(12, 40), slice(40, None)))
+    z, some = shapes(codes), codes[:24]
+    held_out, unseen = ((codes[part], z[part]) for part in (slice(24, 60), slice(60, None)))
+    own = some, z[:24] + 0.3 * z.std() * torch.randn(24, z.shape[1], generator=torch.Generator().manual_seed(0))
     along = [torch.autograd.functional.jvp(shapes, some, unit.expand_as(some))[1] for unit in torch.eye(2)]
     derivatives = torch.stack(along, dim=1)
     scale = Scaling.of(np.zeros(z.shape[1]), np.ones(z.shape[1]), z.numpy())
