@@ -11,8 +11,7 @@ const APART = 1.1; // of the reference's width, from middle to middle
 const SIDEWAYS = new THREE.Vector3(VIEW.z, 0, -VIEW.x).normalize();
 
 export class Beside {
-  #model = null;
-  #asked = null;
+  #asked = { model: null, other: null, mesh: null };
   #given = false; // whether the view comes with the shape, both from an address
 
   /** @param {import("../store.js").Page} store */
@@ -33,13 +32,13 @@ export class Beside {
 
   #fetch() {
     const { model, other, references } = this.store;
-    const mesh = meshOf(this.store);
-    this.#asked = other;
-    if (this.#model !== model) {
-      this.#model = model;
+    const before = this.#asked;
+    const asked = { model, other, mesh: meshOf(this.store) };
+    this.#asked = asked;
+    if (before.model !== model) {
       this.#given = Boolean(other);
       this.#appear(false); // the viewer has begun anew
-    }
+    } else if (before.other !== other) this.#given = false;
     if (!other) {
       if (this.mesh.visible) this.viewer.makeRoom(null);
       this.#appear(false);
@@ -47,9 +46,10 @@ export class Beside {
       return;
     }
     api
-      .shapes(model, [other], mesh)
+      .shapes(model, [other], asked.mesh)
       .then(({ shapes }) => {
-        if (this.#asked === other && this.store.model === model) this.#show(references[mesh], shapes[0]);
+        // Answers may come in another order: a coarse shape after the fine one.
+        if (this.#asked === asked) this.#show(references[asked.mesh], shapes[0]);
       })
       .catch(report);
   }
@@ -66,8 +66,7 @@ export class Beside {
     const { center, radius } = this.viewer.sphere;
     this.ground.open({ center: center.clone().add(position), radius });
     this.ground.under(positions, faces, this.mesh.matrixWorld);
-    if (!this.mesh.visible) this.viewer.makeRoom(moved(positions, position), this.#given);
-    this.#given = false;
+    this.viewer.makeRoom(moved(positions, position), this.#given);
     this.#appear(true);
     this.viewer.draw();
   }
