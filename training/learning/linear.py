@@ -11,8 +11,6 @@ from torch import Tensor, nn
 
 #: Eigenvalues below this share of the largest are rounding errors.
 ROUNDING = 1e-12
-#: Likewise singular values that are roots of eigenvalues.
-RESOLVED = 1e-8
 
 
 @dataclass(frozen=True)
@@ -173,8 +171,9 @@ def principal_axes(x: Tensor, by: Literal["svd", "rows", "columns"]) -> tuple[Te
     Args:
         x: n samples.
         by: ``svd``, accurate to rounding, k = min(n, p). ``rows``, by the eigenvectors of x xᵀ, k = n: the fastest for
-            n much less than p; axes whose singular value is below 1e-8 of the largest are 0, as rounding makes them.
-            ``columns``, by those of xᵀ x, k = p: the fastest for n much greater than p; such values are inaccurate.
+            n much less than p; axes that are rounding errors (`ROUNDING`), and their singular values, are 0.
+            ``columns``, by those of xᵀ x, k = p: the fastest for n much greater than p. The last two, in double
+            precision, resolve no singular value below 1e-8 of the largest.
     """
     if by == "svd":
         _, s, vt = torch.linalg.svd(x, full_matrices=False)
@@ -184,7 +183,6 @@ def principal_axes(x: Tensor, by: Literal["svd", "rows", "columns"]) -> tuple[Te
         value, vector = torch.linalg.eigh(wide.T @ wide)
         return value.flip(0).clamp_min(0).sqrt().to(x.dtype), vector.flip(1).T.to(x.dtype)
     value, vector = torch.linalg.eigh(wide @ wide.T)
-    s = value.flip(0).clamp_min(0).sqrt()
-    s[s <= RESOLVED * s[0]] = 0
+    s = torch.where(value > ROUNDING * value[-1], value, 0).flip(0).sqrt()
     axes = vector.flip(1).T @ wide * torch.where(s > 0, 1 / s, 0)[:, None]
     return s.to(x.dtype), axes.to(x.dtype)
