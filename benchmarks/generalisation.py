@@ -8,13 +8,14 @@ collection whose folds are all done has its figures in ``runs/folds/``, and is n
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from benchmarks.results import COLLECTIONS, ROOT, open_run
+from benchmarks.results import COLLECTIONS, MIRRORED, ROOT, SYMMETRIC, open_run
 from shapespace.training.space import stages
 from shapespace.training.space.generalisation import folds, held_out, summary
 
@@ -27,12 +28,16 @@ Distance of a vertex from its place after rigid alignment, in percent of the bou
 percentile over all vertices of all shapes, each held out in one of five folds that found mean, logarithms and modes
 without it. **Modes**: the code whose exponential comes closest in vertices, in {steps} time steps; no networks.
 **Components**: principal components of the aligned vertices, as many. On coarse meshes of at most a thousand vertices.
+Rows *with mirror images* also learn from the images of the shapes that they know, which both collections' symmetric
+template gives; components are without and, in the last columns, with them too.
 Folds choose nothing: settings are those of `examples/collections`. `python -m benchmarks.generalisation --data FOLDER`
 measures and writes this page; a collection is in it once all its folds are measured, with figures in `runs/folds/`.
 
-| | shapes | coordinates | modes: mean | 95 % | components: mean | 95 % | modes / components |
-|---|---|---|---|---|---|---|---|
+| | shapes | m | modes: mean | 95 % | components: mean | 95 % | modes / components | with images: mean | modes / these |
+|---|---|---|---|---|---|---|---|---|---|
 """
+#: Rows of the table.
+ROWS = tuple(itertools.chain(*((name, name + MIRRORED) if name in SYMMETRIC else (name,) for name in COLLECTIONS)))
 
 
 def measure(name: str, data: Path, out: Path) -> dict[str, Any]:
@@ -42,15 +47,16 @@ def measure(name: str, data: Path, out: Path) -> dict[str, Any]:
     if not run.shapes.exists():
         run.folder.mkdir(parents=True, exist_ok=True)
         stages.ingest(run, config)
-    shapes, reference = run.shapes.read()["vertices"], run.reference_mesh()
+    reference, given = run.reference_mesh(), run.shapes.read()
+    shapes, original, own = given["vertices"], given["original"], run.own_shapes()
     m = config.modes.count
     counts = None if m == "auto" else [-(-m // 2), m]
     every = []
-    for k, index in enumerate(folds(len(shapes))):
+    for k, index in enumerate(folds(len(own))):
         file = run.study(f"fold-{k}")
         if not file.exists():
             material = stages.material(config)
-            found = held_out(reference, shapes, index, counts, config.modes, material, stages.LIGHT_STEPS)
+            found = held_out(reference, shapes, index, counts, config.modes, material, stages.LIGHT_STEPS, original)
             away = found.distances(shapes, reference.diagonal)
             file.write(
                 {"counts": found.counts} | {kind: [each.tolist() for each in rows] for kind, rows in away.items()}
@@ -59,11 +65,12 @@ def measure(name: str, data: Path, out: Path) -> dict[str, Any]:
             print(name, k, means, flush=True)
         every.append(file.read())
     return {
-        "shapes": len(shapes),
+        "shapes": len(own),
         "counts": every[0]["counts"],
         **{
             kind: [summary(np.concatenate(some)) for some in zip(*(fold[kind] for fold in every), strict=True)]
-            for kind in ("modes", "components")
+            for kind in every[0]
+            if kind != "counts"
         },
     }
 
@@ -71,10 +78,14 @@ def measure(name: str, data: Path, out: Path) -> dict[str, Any]:
 def rows(name: str, found: dict[str, Any]) -> list[str]:
     """Of the table."""
     result: list[str] = []
-    for count, own, other in zip(found["counts"], found["modes"], found["components"], strict=True):
+    mirrored = found.get("mirrored_components", [None] * len(found["counts"]))
+    each = zip(found["counts"], found["modes"], found["components"], mirrored, strict=True)
+    for count, own, other, images in each:
         figures = [f"{100 * figure:.3f}" for figure in (own["mean"], own["p95"], other["mean"], other["p95"])]
-        cells = [name if not result else "", str(found["shapes"]), str(count), *figures]
-        result.append(f"| {' | '.join(cells)} | {own['mean'] / other['mean']:.2f} |")
+        title = name.replace(MIRRORED, ", with mirror images") if not result else ""
+        cells = [title, str(found["shapes"]), str(count), *figures, f"{own['mean'] / other['mean']:.2f}"]
+        cells += [f"{100 * images['mean']:.3f}", f"{own['mean'] / images['mean']:.2f}"] if images else ["", ""]
+        result.append(f"| {' | '.join(cells)} |")
     return result
 
 
@@ -83,7 +94,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--data", type=Path, required=True, help="folder of the collections")
     parser.add_argument("--out", type=Path, default=ROOT / "build" / "generalisation")
-    parser.add_argument("names", nargs="*", default=COLLECTIONS)
+    parser.add_argument("names", nargs="*", default=ROWS)
     given = parser.parse_args()
     for name in given.names:
         file = FIGURES / f"{name}.json"
@@ -91,9 +102,7 @@ def main() -> None:
             found = measure(name, given.data, given.out)
             file.parent.mkdir(exist_ok=True)
             file.write_text(json.dumps(found, indent=1), encoding="utf-8")
-        done = {
-            each: json.loads(path.read_text()) for each in COLLECTIONS if (path := FIGURES / f"{each}.json").exists()
-        }
+        done = {each: json.loads(path.read_text()) for each in ROWS if (path := FIGURES / f"{each}.json").exists()}
         table = "\n".join(row for each in done.items() for row in rows(*each))
         page = INTRODUCTION.format(steps=stages.LIGHT_STEPS) + table + "\n"
         (ROOT / "docs" / "measurements" / "generalisation.md").write_text(page, encoding="utf-8")

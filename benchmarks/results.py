@@ -16,11 +16,12 @@ from typing import Any
 import jinja2
 import matplotlib.pyplot as plt
 import numpy as np
+import tomlkit
 
 import shapespace
 from benchmarks import limits, space
 from shapespace.training.pipeline import Run, execute, learner_of
-from shapespace.training.runs.config import load
+from shapespace.training.runs.config import load, parse
 from shapespace.training.runs.directory import RunDirectory
 from shapespace.training.runs.sampling import DONE, KNOWN, columns
 
@@ -28,6 +29,9 @@ ROOT = Path(__file__).resolve().parents[1]
 #: Collections of real meshes, in the order of the tables; then the hand without sparse modes, and with one factor.
 COLLECTIONS = ("hand", "faces", "samba", "makehuman", "horse", "hippocampus")
 CONTRASTS = ("hand-pga", "hand-one-factor")
+#: What the names of runs with mirror images end in, and the collections that have a symmetric shape.
+MIRRORED = "-mirrored"
+SYMMETRIC = ("faces", "makehuman")
 #: Runs whose extrapolation is measured: an easy and a difficult one.
 EXTRAPOLATED = ("hand", "samba")
 #: Studies, each with the last stage whose results it measures.
@@ -51,10 +55,16 @@ def have(run: RunDirectory, name: str, measure: Callable[[], dict[str, Any]]) ->
 
 
 def open_run(name: str, data: Path, out: Path) -> Run:
-    """The run of a collection."""
-    path = ROOT / "examples" / "collections" / f"{name}.toml"
+    """The run of a collection; with mirror images of its shapes where the name ends in ``MIRRORED``."""
+    path = ROOT / "examples" / "collections" / f"{name.removesuffix(MIRRORED)}.toml"
     meshes = load(path)[0].collection.data.relative_to(path.parent)
-    return Run(out / name, *load(path, data / meshes), out / "models")
+    config, text = load(path, data / meshes)
+    if name.endswith(MIRRORED):
+        document: Any = tomlkit.parse(text)
+        document["collection"]["mirror"] = True
+        text = tomlkit.dumps(document)
+        config = parse(text, name)
+    return Run(out / name, config, text, out / "models")
 
 
 def figures(name: str, run: Run) -> dict[str, Any]:

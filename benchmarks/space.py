@@ -27,7 +27,7 @@ CODES = 200
 
 def measure(run: RunDirectory, config: Config) -> dict[str, Any]:
     """Both of a run whose samples are drawn; compactness by the number of modes."""
-    shapes, reference, mean = run.shapes.read()["vertices"], run.reference_mesh(), run.mean.read()["vertices"]
+    shapes, reference, mean = run.own_shapes(), run.reference_mesh(), run.mean.read()["vertices"]
     found = run.modes_by_strength.read()
     sparse, principal = found["vertices"], found["pga_vertices"]
     m = len(sparse)

@@ -8,7 +8,7 @@ from shapespace.arrays import FloatArray, IntArray
 from shapespace.coordinates.nric import nric, unwrap
 from shapespace.mesh.triangle_mesh import Connectivity, TriangleMesh
 from shapespace.training.runs.latent_coordinates import Coordinates
-from shapespace.training.runs.sampling import Shapes
+from shapespace.training.runs.sampling import Places, Shapes
 
 U_COUNT, V_COUNT = 64, 32
 MAJOR_RADIUS, MINOR_RADIUS = 0.375, 0.125
@@ -97,6 +97,24 @@ class FreakyTorus:
         i, j = np.divmod(np.arange(U_COUNT * V_COUNT), V_COUNT)
         turned = -i % U_COUNT * V_COUNT + -j % V_COUNT
         return [edge_permutation(self.reference.connectivity, turned)]
+
+    @property
+    def places(self) -> Places:
+        """What each code moves: the ellipses, which turn by half its angle, and the bump.
+
+        Where all shapes move by some columns of the grid, α by twice their angle and γ by this angle, edges have the
+        constants that they had: their row, and their direction in the grid.
+        """
+        counts = np.array([U_COUNT, V_COUNT])
+        start, end = np.moveaxis(np.stack(np.divmod(self.reference.connectivity.edges, V_COUNT), axis=-1), 1, 0)
+        step = (end - start + counts // 2) % counts - counts // 2
+        surface = 2 * np.pi / counts * (start + step / 2)
+        row = surface[:, 1, None] * [1, 2]
+        return Places(
+            surface=surface,
+            multiples=np.array([[2, 0], [0, 2], [1, 0], [0, 1]]),
+            constants=np.concatenate([step == 0, np.cos(row), np.sin(row)], axis=1),
+        )
 
     @property
     def finer(self) -> None:

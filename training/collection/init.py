@@ -28,6 +28,7 @@ data = {data}    # folder of meshes, or one NPZ; relative to this file
 # The shape whose area becomes 1 inside, and where served shapes stand: the most central one, {reference},
 # unless another is named here, as in: reference = {other}
 {coarse}{parts}
+# mirror = true    # where a shape is symmetric, mirror images of all are learned from as well
 
 [material]
 # eta = {material.eta:g}    # bending against stretching; larger makes stiffer shells, whose triangles may collapse

@@ -16,6 +16,7 @@ from shapespace.mesh.triangle_mesh import TriangleMesh
 from shapespace.training.learning.layers import Scaling, half_precision
 from shapespace.training.learning.linear import Ridge, kernel_ridge, principal_axes, regression
 from shapespace.training.runs.config import FitSettings, KernelSettings, ProductSettings
+from shapespace.training.runs.sampling import Places
 
 
 @dataclass(frozen=True)
@@ -48,6 +49,21 @@ class Slopes:
 
 
 @dataclass(frozen=True)
+class Motion:
+    """Where features are that codes move over the surface.
+
+    Attributes:
+        codes: (n, m) of the joint samples, as angles; images under symmetries have none and come after.
+        factors: latents of each factor.
+        places: of these latents at the edges.
+    """
+
+    codes: Tensor
+    factors: list[list[int]]
+    places: Places
+
+
+@dataclass(frozen=True)
 class JointSamples:
     """What a correction is fitted to, or chosen by.
 
@@ -56,12 +72,14 @@ class JointSamples:
         joint: (n, 2E) NRIC of the joint shapes.
         scaling: to scaled differences.
         slopes: derivatives to fit to as well, where there are some.
+        motion: of features, where codes move them.
     """
 
     factors: Tensor
     joint: Tensor
     scaling: Scaling
     slopes: Slopes | None = None
+    motion: Motion | None = None
 
     @property
     def inputs(self) -> Tensor:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,7 @@ import torch
 from safetensors import safe_open
 from safetensors.torch import save
 from torch import Tensor, nn
+from torch.optim import Adam, Muon, Optimizer
 from torch.optim.lr_scheduler import CosineAnnealingLR, ReduceLROnPlateau
 
 from shapespace.training.learning.networks import ShapeNetwork, predict
@@ -79,7 +81,7 @@ def fit(
 
     The loss is the mean square difference of `coefficients` and `target`. With a last layer of low rank and orthonormal
     basis it differs by a constant from the loss on z. An unfinished file at ``path`` is continued: it holds parameters,
-    Adam's moments, schedule, random state and history.
+    moments, schedule, random state and history.
 
     Args:
         network: with its initial parameters.
@@ -97,8 +99,8 @@ def fit(
     """
     with torch.no_grad():
         target = network.target(z)
-    optimiser = torch.optim.Adam(network.parameters(), settings.learning_rate)
-    schedule = _schedule(optimiser, settings)
+    optimisers = _optimisers(network, settings)
+    schedules = [_schedule(optimiser, settings) for optimiser in optimisers]
     torch.manual_seed(seed)
     if path.exists():
         saved = read_network(path)
@@ -107,7 +109,7 @@ def fit(
         if saved.done:
             network.eval()
             return state
-        best = _restore(optimiser, schedule, state, saved.extra)
+        best = _restore(optimisers, schedules, state, saved.extra)
     else:
         # What was fitted in closed form may be better than any epoch.
         network.eval()
@@ -117,24 +119,25 @@ def fit(
 
     epochs = bar(title, "epoch", settings.max_epochs, initial=state["epoch"])
     while not state["done"]:
-        total = _epoch(network, optimiser, inputs, target, train, settings.batch_size)
+        total = _epoch(network, optimisers, inputs, target, train, settings.batch_size)
         network.eval()
         error = _error(network, inputs[validation], target[validation], settings.batch_size)
-        if isinstance(schedule, ReduceLROnPlateau):
-            schedule.step(error)
-        else:
-            schedule.step()
+        for schedule in schedules:
+            if isinstance(schedule, ReduceLROnPlateau):
+                schedule.step(error)
+            else:
+                schedule.step()
         state["epoch"] += 1
         state["history"].append([total, error])
         if error < state["best"]:
             state["best"] = error
             best = _copied(network)
-        rate = optimiser.param_groups[0]["lr"]
+        rate = optimisers[0].param_groups[0]["lr"]
         epochs.set_postfix(train=f"{total:.2e}", validation=f"{error:.2e}", rate=f"{rate:.0e}")
         epochs.update()
         state["done"] = state["epoch"] >= settings.max_epochs or rate < settings.final_rate
         if not state["done"] and state["epoch"] % CHECKPOINT_EPOCHS == 0:
-            _checkpoint(path, network, optimiser, schedule, state, best)
+            _checkpoint(path, network, optimisers, schedules, state, best)
     epochs.close()
     network.load_state_dict(best)
     network.eval()
@@ -142,7 +145,23 @@ def fit(
     return state
 
 
-def _schedule(optimiser: torch.optim.Optimizer, settings: FitSettings) -> ReduceLROnPlateau | CosineAnnealingLR:
+def _optimisers(network: nn.Module, settings: FitSettings) -> list[Optimizer]:
+    """What updates the parameters, each some of them."""
+    parameters = list(network.parameters())
+    if settings.optimiser == "adam":
+        return [Adam(parameters, settings.learning_rate)]
+    matrices = [p for p in parameters if p.ndim == 2]
+    others = [p for p in parameters if p.ndim != 2]
+    # One rate suits both where Muon's steps are as large as Adam's.
+    muon = Muon(matrices, settings.learning_rate, weight_decay=0, adjust_lr_fn="match_rms_adamw")
+    return [muon, Adam(others, settings.learning_rate)]
+
+
+#: How a learning rate falls.
+Schedule = ReduceLROnPlateau | CosineAnnealingLR
+
+
+def _schedule(optimiser: Optimizer, settings: FitSettings) -> Schedule:
     if settings.schedule == "plateau":
         return ReduceLROnPlateau(optimiser, factor=0.1, patience=settings.patience, threshold=1e-3)
     return CosineAnnealingLR(optimiser, T_max=settings.max_epochs)
@@ -150,7 +169,7 @@ def _schedule(optimiser: torch.optim.Optimizer, settings: FitSettings) -> Reduce
 
 def _epoch(
     network: ShapeNetwork,
-    optimiser: torch.optim.Optimizer,
+    optimisers: Sequence[Optimizer],
     inputs: Tensor,
     target: Tensor,
     train: Tensor,
@@ -164,9 +183,10 @@ def _epoch(
     batches = [b for b in order.split(batch_size) if len(b) == batch_size] or [order]
     for batch in batches:
         loss = network.loss(inputs[batch], target[batch])
-        optimiser.zero_grad()
+        network.zero_grad()
         loss.backward()
-        optimiser.step()
+        for optimiser in optimisers:
+            optimiser.step()
         total += loss.item() / len(batches)
     return total
 
@@ -182,36 +202,39 @@ def _error(network: ShapeNetwork, inputs: Tensor, target: Tensor, batch_size: in
 def _checkpoint(
     path: Path,
     network: ShapeNetwork,
-    optimiser: torch.optim.Optimizer,
-    schedule: ReduceLROnPlateau | CosineAnnealingLR,
+    optimisers: Sequence[Optimizer],
+    schedules: Sequence[Schedule],
     state: dict[str, Any],
     best: dict[str, Tensor],
 ) -> None:
     moments = {
-        f"adam.{index}.{key}": value
+        f"optimiser.{k}.{index}.{key}": value
+        for k, optimiser in enumerate(optimisers)
         for index, values in optimiser.state_dict()["state"].items()
         for key, value in values.items()
     }
     extra = {f"best.{k}": v for k, v in best.items()} | moments | {"rng": torch.get_rng_state()}
-    rate = optimiser.param_groups[0]["lr"]
-    save_network(path, network, state | {"rate": rate, "schedule": schedule.state_dict()}, extra)
+    rates = [optimiser.param_groups[0]["lr"] for optimiser in optimisers]
+    save_network(path, network, state | {"rates": rates, "schedules": [s.state_dict() for s in schedules]}, extra)
 
 
 def _restore(
-    optimiser: torch.optim.Optimizer,
-    schedule: ReduceLROnPlateau | CosineAnnealingLR,
+    optimisers: Sequence[Optimizer],
+    schedules: Sequence[Schedule],
     state: dict[str, Any],
     extra: dict[str, Tensor],
 ) -> dict[str, Tensor]:
     """Restore all but the network from a checkpoint; returns the best parameters so far."""
     torch.set_rng_state(extra["rng"])
-    schedule.load_state_dict(state.pop("schedule"))
-    moments: dict[int, dict[str, Tensor]] = {}
-    for key, value in extra.items():
-        if key.startswith("adam."):
-            _, index, name = key.split(".")
-            moments.setdefault(int(index), {})[name] = value
-    groups = optimiser.state_dict()["param_groups"]
-    groups[0]["lr"] = state.pop("rate")
-    optimiser.load_state_dict({"state": moments, "param_groups": groups})
+    rates, schedules_before = state.pop("rates"), state.pop("schedules")
+    for k, (optimiser, schedule) in enumerate(zip(optimisers, schedules, strict=True)):
+        schedule.load_state_dict(schedules_before[k])
+        moments: dict[int, dict[str, Tensor]] = {}
+        for key, value in extra.items():
+            if key.startswith(f"optimiser.{k}."):
+                *_, index, name = key.split(".")
+                moments.setdefault(int(index), {})[name] = value
+        groups = optimiser.state_dict()["param_groups"]
+        groups[0]["lr"] = rates[k]
+        optimiser.load_state_dict({"state": moments, "param_groups": groups})
     return {k.removeprefix("best."): v for k, v in extra.items() if k.startswith("best.")}

@@ -19,7 +19,7 @@ from torch import Tensor
 from shapespace.arrays import FloatArray, IntArray
 from shapespace.coordinates.nric import WeightedNorm, nric
 from shapespace.training.learning.baselines import LatentKernel
-from shapespace.training.learning.corrections import JointSamples, Slopes
+from shapespace.training.learning.corrections import JointSamples, Motion, Slopes
 from shapespace.training.learning.fitting import fit, read_network, save_network
 from shapespace.training.learning.layers import PatchBasis, Scaling
 from shapespace.training.learning.networks import (
@@ -257,8 +257,8 @@ class Learner:
         else:
             scaling = self._scaling(self.joint.nric[self.rows["train"]])
             slopes = self._slopes(indices, networks, data.inputs, scaling)
-            own = JointSamples(*data.part("train"), scaling, slopes)
-            held_out = JointSamples(*data.part("validation"), scaling)
+            own = JointSamples(*data.part("train"), scaling, slopes, self._motion(indices, "train"))
+            held_out = JointSamples(*data.part("validation"), scaling, motion=self._motion(indices, "validation"))
             combiner = CombinerNetwork.fit(settings.correction, reference, own, held_out, self.seed)
         if descent := combiner.correction.descent:
             state = self._fit(combiner, data, descent, path, self._fraction)
@@ -268,6 +268,14 @@ class Learner:
             save_network(path, combiner, state)
         self._record(path, state)
         return combiner
+
+    def _motion(self, indices: list[list[int]], part: str) -> Motion | None:
+        """Of a part of the joint samples."""
+        places = self.collection.places
+        if places is None:
+            return None
+        angles = self.joint.latents[self.rows[part]] * (2 * np.pi / self.collection.coordinates.period)
+        return Motion(torch.as_tensor(angles, dtype=torch.float32), indices, places)
 
     def differentiated(self) -> tuple[IntArray, NDArray[np.float32]]:
         """Rows (k,) of the joint samples to learn from that have derivatives, and these (k, m, 2E)."""
@@ -318,7 +326,8 @@ class Learner:
 
     def paper(self) -> Composite:
         """The paper's own system (section 4): perceptrons of bare angles with dense last layers, and its combiner."""
-        return self.composite(Recipe(factors=PAPER_FACTORS, combiner=CombinerSettings(correction=PaperSettings())))
+        combiner = CombinerSettings(correction=PaperSettings(), symmetries=False)
+        return self.composite(Recipe(factors=PAPER_FACTORS, combiner=combiner))
 
     def monolithic(self) -> Composite:
         """Our recipe with one factor: what it makes of the joint samples without a product."""

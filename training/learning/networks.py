@@ -20,6 +20,7 @@ from shapespace.mesh.rigid_motion import align
 from shapespace.mesh.triangle_mesh import TriangleMesh
 from shapespace.training.learning.convolutions import ConvolutionCorrection
 from shapespace.training.learning.corrections import Correction, JointSamples, KernelCorrection, ProductCorrection
+from shapespace.training.learning.fields import FieldCorrection
 from shapespace.training.learning.layers import (
     FourierProducts,
     LatentFeatures,
@@ -127,6 +128,7 @@ CORRECTIONS: dict[str, type[Correction]] = {
     "polynomials": PolynomialCorrection,
     "products": ProductCorrection,
     "convolutions": ConvolutionCorrection,
+    "field": FieldCorrection,
 }
 
 

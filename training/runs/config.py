@@ -56,6 +56,9 @@ class CollectionSettings(_Section):
     file's objects, groups or materials, or ``part 1``, ``part 2`` and so on; ``run --until ingest`` prints them."""
     coarse_vertices: int = Field(1000, ge=0)
     """Vertices to compute with: meshes with more are simplified to about this number. 0 computes with all vertices."""
+    mirror: bool = True
+    """Whether to learn from the shapes' mirror images too, if one of the shapes is symmetric: its vertices say which
+    vertex each is the mirror image of. So a pose of the left arm is one of the right arm as well."""
 
     @model_validator(mode="after")
     def _one_source(self) -> CollectionSettings:
@@ -145,8 +148,11 @@ class SampleSettings(_Section):
 
 
 class FitSettings(_Section):
-    """Gradient descent with Adam."""
+    """Gradient descent."""
 
+    optimiser: Literal["adam", "muon"] = "adam"
+    """``adam``, as in the paper; or ``muon``, which updates matrices by their orthogonalised momentum, and all else as
+    Adam does: fewer steps of large batches are needed."""
     schedule: Literal["plateau", "cosine"] = "plateau"
     """Schedule of the learning rate. ``plateau`` divides it by ten whenever the validation loss has not fallen for
     ``patience`` epochs, as in the paper (section 4). ``cosine`` lets it fall along half a cosine, to zero after
@@ -251,6 +257,31 @@ class ConvolutionSettings(_Section):
         return self
 
 
+class FieldSettings(_Section):
+    """A perceptron at every edge, which sees how far the features that codes move over the surface are from this edge,
+    trained by gradient descent. For collections that know where their features are: Freaky Torus.
+    """
+
+    kind: Literal["field"] = "field"
+    layers: int = Field(4, ge=1)
+    """Number of hidden layers."""
+    width: int = Field(128, ge=1)
+    """Width of each."""
+    concentrations: list[Annotated[float, Field(gt=0)]] = [1, 4, 16, 64]
+    """Concentrations κ of the densities exp(κ (cos r − 1)) of the angle r to a feature, inputs beside the cosine and
+    the sine of r. Narrow features need large ones."""
+    relative: bool = True
+    """Whether inputs are functions of the angles from an edge to features, so that symmetries which move both need not
+    be learned; otherwise of features and edges apart."""
+    edges: int = Field(128, ge=1)
+    """Edges of each shape that the loss of a training step is computed on, half of them drawn in proportion to the
+    squared error of the affine sum."""
+    fit: FitSettings = FitSettings(
+        optimiser="muon", schedule="cosine", learning_rate=2e-2, batch_size=64, max_epochs=80
+    )
+    """How the network is trained."""
+
+
 class PaperSettings(_Section):
     """The paper's combiner (section 4): convolutions on stars that learn the joint shape itself, dropout 0.1, Adam with
     a rate of 1e-3 that is divided by ten on a plateau.
@@ -280,7 +311,8 @@ class AutoSettings(_Section):
 
 #: The kinds that a network can be of; ``auto`` and ``paper`` stand for one of them.
 ResolvedCorrection = Annotated[
-    KernelSettings | PolynomialSettings | ProductSettings | ConvolutionSettings, Field(discriminator="kind")
+    KernelSettings | PolynomialSettings | ProductSettings | ConvolutionSettings | FieldSettings,
+    Field(discriminator="kind"),
 ]
 CorrectionSettings = Annotated[ResolvedCorrection | PaperSettings | AutoSettings, Field(discriminator="kind")]
 

@@ -9,6 +9,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+from shapespace.arrays import FloatArray
 from shapespace.mesh.triangle_mesh import TriangleMesh
 from shapespace.training.runs.atomic_files import JsonFile, NpzFile, TextFile
 
@@ -98,7 +99,10 @@ class RunDirectory:
 
     @property
     def shapes(self) -> NpzFile:
-        """``names (n)``, ``vertices (n, V, 3)`` normalised, ``files (n)``, ``first (n)`` number of a vertex in each."""
+        """``names (n)``, ``vertices (n, V, 3)`` normalised, ``files (n)``, ``first (n)`` number of a vertex in each.
+
+        Mirror images come last; ``original (n)`` says which shape each is, or is the image of.
+        """
         return self._npz("shapes")
 
     @property
@@ -235,6 +239,12 @@ class RunDirectory:
     def reference_mesh(self) -> TriangleMesh:
         """The mesh that is computed with, at the reference shape."""
         return TriangleMesh.from_mapping(self.reference.read())
+
+    def own_shapes(self) -> FloatArray:
+        """(n, V, 3) the shapes of the collection, without mirror images."""
+        shapes = self.shapes.read()
+        found: FloatArray = shapes["vertices"][: shapes["original"].max() + 1]
+        return found
 
     def mean_mesh(self) -> TriangleMesh:
         """The mesh that is computed with, at the mean shape."""

@@ -53,6 +53,27 @@ class Shapes:
     derivatives: FloatArray | None = None
 
 
+@dataclass(frozen=True)
+class Places:
+    """Where the coordinates of a collection are on its surface: a code moves a feature to the edges whose place it is.
+
+    Attributes:
+        surface: (E, d) angles that tell edges apart.
+        multiples: (m, d) of these, whose sum is the place of a coordinate, in radians of its period.
+        constants: (E, c) what else an edge is, the same for all edges that symmetries which move places as they move
+            codes take to each other.
+    """
+
+    surface: FloatArray
+    multiples: IntArray
+    constants: FloatArray
+
+    @property
+    def angles(self) -> FloatArray:
+        """(E, m) the place of each coordinate at each edge."""
+        return self.surface @ self.multiples.T
+
+
 class Collection(Protocol):
     """A shape manifold with a parametrisation by codes: what the stages from `factors` on need to know.
 
@@ -65,6 +86,7 @@ class Collection(Protocol):
         codes: (n, m) of the shapes that the collection was made from, none where it is by design.
         symmetries: involutions of the edges, (E,) each, that take shapes of the collection to shapes of the collection
             and the reference to itself; the combiner sees each training sample's images too.
+        places: where features are that codes move over the surface; None where none move.
         finer: the same by exponentials of twice as many steps; None where shapes are not made by steps.
         differentiated: the same, whose shapes come with their derivatives; None where these are not known.
     """
@@ -83,6 +105,8 @@ class Collection(Protocol):
     def codes(self) -> FloatArray: ...  # noqa: D102
     @property
     def symmetries(self) -> list[IntArray]: ...  # noqa: D102
+    @property
+    def places(self) -> Places | None: ...  # noqa: D102
     @property
     def finer(self) -> Collection | None: ...  # noqa: D102
     @property

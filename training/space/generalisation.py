@@ -91,17 +91,24 @@ class HeldOut:
         counts: numbers of modes.
         by_modes: (k, V, 3) for each, the nearest exponentials.
         by_components: (k, V, 3) for each, what as many principal components make of them.
+        by_mirrored: likewise, components of the shapes and their mirror images; empty where there are none.
     """
 
     index: IntArray
     counts: Sequence[float]
     by_modes: list[FloatArray]
     by_components: list[FloatArray]
+    by_mirrored: list[FloatArray]
 
     def distances(self, shapes: FloatArray, diagonal: float) -> dict[str, list[FloatArray]]:
-        """``modes`` and ``components``, for each number (k, V), from shapes (n, V, 3) of the collection; see above."""
+        """``modes`` and ``components``, for each number (k, V), from shapes (n, V, 3) of the collection; see above.
+
+        And ``mirrored_components``, where there are mirror images.
+        """
         given = shapes[self.index]
         near = {"modes": self.by_modes, "components": self.by_components}
+        if self.by_mirrored:
+            near["mirrored_components"] = self.by_mirrored
         return {name: [vertex_distances(each, given, diagonal) for each in found] for name, found in near.items()}
 
 
@@ -112,7 +119,7 @@ def joined(parts: Sequence[HeldOut]) -> HeldOut:
         np.mean([part.counts for part in parts], axis=0).tolist(),
         *(
             [np.concatenate(shapes) for shapes in zip(*by_count, strict=True)]
-            for by_count in ([part.by_modes for part in parts], [part.by_components for part in parts])
+            for by_count in zip(*((part.by_modes, part.by_components, part.by_mirrored) for part in parts), strict=True)
         ),
     )
 
@@ -125,40 +132,49 @@ def held_out(
     settings: ModeSettings,
     material: Material,
     steps: int,
+    original: IntArray | None = None,
 ) -> HeldOut:
     """Mean, logarithms and modes without some shapes, and what they make of these.
 
     Args:
         reference: gives connectivity.
         shapes: (n, V, 3), all of them.
-        index: (k,) those that are held out.
+        index: (k,) those that are held out, and their mirror images with them.
         counts: numbers of modes, as far as there are shapes; by default what the settings give, and half of it.
         settings: of the modes.
         material: of the shell.
         steps: K of logarithms and exponentials.
+        original: (n,) which shape each is the mirror image of, itself where it is none; by default all are none.
 
     Raises:
         ModeError: the shapes that are left have no mean, or no modes.
     """
-    kept, unseen = np.delete(shapes, index, axis=0), shapes[index]
+    original = np.arange(len(shapes)) if original is None else original
+    known = np.flatnonzero(~np.isin(original, index))
+    kept, unseen = shapes[known], shapes[index]
+    whose = np.unique(original[known], return_inverse=True)[1]
     found = centred_mean(reference, kept, material, steps)
     if found.status is not Status.CONVERGED:
         raise ModeError(f"without some shapes the others have no mean: {found.reason}")
     mean = found.vertices
     space = ShellSpace(reference.with_vertices(mean), material)
     fields = logarithms(space, mean, kept, steps).fields
-    components = PrincipalComponents.of(kept, reference.vertices)
+    own = original[known] == known
+    components = PrincipalComponents.of(kept[own], reference.vertices)
+    mirrored = None if own.all() else PrincipalComponents.of(kept, reference.vertices)
     if counts is None:
-        count = mode_count(settings, space, mean, fields)
+        count = mode_count(settings, space, mean, fields, whose)
         counts = [-(-count // 2), count]
     counts = [min(count, len(kept) - 1) for count in counts]
     # The search for codes starts from projected logarithms: on the straight line to a far shape faces collapse.
     towards = logarithms(space, mean, unseen, steps).fields
-    reached, by_modes, by_components = [], [], []
+    reached, by_modes, by_components, by_mirrored = [], [], [], []
     for count in counts:
-        modes = find_modes(settings, space, mean, fields, count)
+        modes = find_modes(settings, space, mean, fields, count, whose)
         start, _ = coefficients(space, mean, towards, modes.vertices, settings.norm)
         by_modes.append(nearest_codes(space, mean, modes.vertices, unseen, start, steps).vertices)
         by_components.append(components.nearest(unseen, len(modes)))
+        if mirrored:
+            by_mirrored.append(mirrored.nearest(unseen, len(modes)))
         reached.append(len(modes))
-    return HeldOut(index, reached, by_modes, by_components)
+    return HeldOut(index, reached, by_modes, by_components, by_mirrored)

@@ -72,7 +72,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-from shapespace.arrays import FloatArray
+from shapespace.arrays import FloatArray, IntArray
 from shapespace.coordinates.normal_matrix import NormalMatrix, QuadraticForm
 from shapespace.coordinates.nric import WeightedNorm
 from shapespace.mesh.rigid_motion import rigid_motions, without_rigid_motion
@@ -169,6 +169,7 @@ def spga(
     sparsity: float | None,
     norm: Norm = "mixed",
     *,
+    whose: IntArray | None = None,
     max_iterations: int = ITERATIONS,
     tolerance: float = 1e-3,
 ) -> Modes:
@@ -186,6 +187,7 @@ def spga(
             share of ``max_j 2 |w_j|² ‖u_j‖² / ‖u_j‖_1`` over the modes of the plain analysis, the price at which the
             last of them, scaled down to nothing, is worth no more; 0 gives the span of the plain analysis.
         norm: of the misfit.
+        whose: see `worthwhile`.
         max_iterations: rounds through all modes.
         tolerance: ends when the objective fell by less than this part of itself in ten rounds.
 
@@ -197,7 +199,7 @@ def spga(
     problem = _Problem(space, mean, fields, count, norm)
     D, W = problem.principal(count)
     highest = problem.highest_price(D, W)
-    enough = _Enough(space, mean, fields, D, norm) if sparsity is None else None
+    enough = _Enough(space, mean, fields, D, norm, whose) if sparsity is None else None
     rotation = _varimax(problem.scaled(D))
     D, W = _normalised(rotation.T @ D, rotation.T @ W)
     for share in SPARSITIES if sparsity is None else [sparsity]:
@@ -207,14 +209,23 @@ def spga(
     return replace(problem.modes(D, converged, history), sparsity=share)
 
 
-def mode_count(settings: ModeSettings, space: ShellSpace, mean: FloatArray, fields: FloatArray) -> int:
-    """How many modes settings give for logarithms (n, V, 3) at a mean (V, 3), less than n."""
-    asked = worthwhile(space, mean, fields, settings.norm) if settings.count == "auto" else settings.count
+def mode_count(
+    settings: ModeSettings, space: ShellSpace, mean: FloatArray, fields: FloatArray, whose: IntArray | None = None
+) -> int:
+    """How many modes settings give for logarithms (n, V, 3) of shapes (n,) at a mean (V, 3), less than n."""
+    asked = worthwhile(space, mean, fields, settings.norm, whose) if settings.count == "auto" else settings.count
     return max(1, min(asked, len(fields) - 1))
 
 
-def find_modes(settings: ModeSettings, space: ShellSpace, mean: FloatArray, fields: FloatArray, count: int) -> Modes:
-    """So many modes of logarithms (n, V, 3) at a mean (V, 3), as settings say; raises ModeError."""
+def find_modes(
+    settings: ModeSettings,
+    space: ShellSpace,
+    mean: FloatArray,
+    fields: FloatArray,
+    count: int,
+    whose: IntArray | None = None,
+) -> Modes:
+    """So many modes of logarithms (n, V, 3) of shapes (n,) at a mean (V, 3), as settings say; raises ModeError."""
     if settings.sparsity == 0:
         return pga(space, mean, fields, count, settings.norm)
     return spga(
@@ -224,12 +235,15 @@ def find_modes(settings: ModeSettings, space: ShellSpace, mean: FloatArray, fiel
         count,
         None if settings.sparsity == "auto" else settings.sparsity,
         settings.norm,
+        whose=whose,
         max_iterations=settings.max_iterations,
         tolerance=TOLERANCE[settings.norm],
     )
 
 
-def worthwhile(space: ShellSpace, mean: FloatArray, fields: FloatArray, norm: Norm = "vertices") -> int:
+def worthwhile(
+    space: ShellSpace, mean: FloatArray, fields: FloatArray, norm: Norm = "vertices", whose: IntArray | None = None
+) -> int:
     """How many modes pay.
 
     The m that minimises ``error(m) + WORTH · m``, with the error of what m principal modes of the other shapes leave of
@@ -241,11 +255,12 @@ def worthwhile(space: ShellSpace, mean: FloatArray, fields: FloatArray, norm: No
         mean: X̄ (V, 3).
         fields: (n, V, 3) logarithms.
         norm: in which.
+        whose: (n,) shapes that they are of, from 0 on: those of a shape and of its mirror image are held out together.
 
     Raises:
         ModeError: fields that can't be used.
     """
-    left = np.sqrt(_Problem(space, mean, fields, 1, _judged(norm)).left_of_held_out())
+    left = np.sqrt(_Problem(space, mean, fields, 1, _judged(norm)).left_of_held_out(whose))
     errors = left.mean(axis=0) / left[:, 0].mean()
     return max(1, int(np.argmin(errors + WORTH * np.arange(len(fields)))))
 
@@ -389,12 +404,13 @@ class _Problem:
         W = np.linalg.lstsq(D @ (self.M @ D.T), B, rcond=NEGLIGIBLE)[0]
         return W, float(np.vdot(W, B)) / self.total
 
-    def left_of_held_out(self) -> FloatArray:
+    def left_of_held_out(self, whose: IntArray | None = None) -> FloatArray:
         """(n, n) squares of what 0, 1, 2 … principal modes of the other logarithms leave of those that are held out."""
         gram, n = self.D @ self.MD, len(self.D)
-        parts = min(INNER_FOLDS, n)
+        whose = np.arange(n) if whose is None else whose
+        parts = min(INNER_FOLDS, int(whose.max()) + 1)
         left = np.zeros((n, n))
-        for held in (np.arange(part, n, parts) for part in range(parts)):
+        for held in (np.flatnonzero(whose % parts == part) for part in range(parts)):
             kept = np.delete(np.arange(n), held)
             values, vectors = np.linalg.eigh(gram[np.ix_(kept, kept)])
             some = np.flatnonzero(values > NEGLIGIBLE * self.total)[::-1]
@@ -455,9 +471,17 @@ def _varimax(loadings: FloatArray) -> FloatArray:
 class _Enough:
     """Whether modes keep enough of the logarithms, beside as many principal modes (m, 3V): see SPENT."""
 
-    def __init__(self, space: ShellSpace, mean: FloatArray, fields: FloatArray, D: FloatArray, norm: Norm) -> None:
+    def __init__(
+        self,
+        space: ShellSpace,
+        mean: FloatArray,
+        fields: FloatArray,
+        D: FloatArray,
+        norm: Norm,
+        whose: IntArray | None,
+    ) -> None:
         self._seen = _Problem(space, mean, fields, 1, _judged(norm))
-        left = self._seen.left_of_held_out()[:, min(len(D), len(fields) - 1)].sum()
+        left = self._seen.left_of_held_out(whose)[:, min(len(D), len(fields) - 1)].sum()
         self._least = self._seen.project(D)[1] - SPENT * float(left) / self._seen.total
 
     def __call__(self, D: FloatArray) -> bool:

@@ -71,6 +71,11 @@ class ShellCollection:
         return Coordinates(self.lower, self.upper, np.full(len(self.modes), np.nan))
 
     @property
+    def places(self) -> None:
+        """Modes move nothing over the surface."""
+        return None
+
+    @property
     def symmetries(self) -> list[IntArray]:
         """None is known."""
         return []

@@ -32,8 +32,9 @@ from shapespace.solve.outcome import Status
 from shapespace.training.collection.appearance import kept, reference_surface, texture_bytes
 from shapespace.training.collection.generators import MESHES
 from shapespace.training.collection.ingest import MeshCollection, normalised, read_collection
-from shapespace.training.collection.large_arrays import some_vertices
-from shapespace.training.runs.config import Config, ConfigError
+from shapespace.training.collection.large_arrays import some_vertices, stacked
+from shapespace.training.collection.mirror import find_mirror, mirrored
+from shapespace.training.runs.config import CollectionSettings, Config, ConfigError
 from shapespace.training.runs.directory import RunDirectory
 from shapespace.training.runs.progress import progress, waiting
 from shapespace.training.space.codes import box_of, nearest_codes
@@ -90,13 +91,16 @@ def ingest(run: RunDirectory, config: Config, accepted: Sequence[str] = ()) -> d
     fine = TriangleMesh.from_arrays(vertices[chosen], meshes.faces)
     own = np.unique(meshes.shell_faces)
     shell = submesh(fine, own) if meshes.parts else fine
+    images, whose, notes = _images(settings, meshes, vertices, fine.edges)
     facts: dict[str, Any] = {"shapes": len(vertices), "vertices": vertices.shape[1], "reference": meshes.names[chosen]}
-    facts["notes"] = list(meshes.notes)
+    facts["images"] = len(images)
+    facts["notes"] = [*meshes.notes, *notes]
     facts["warnings"] = [warned.sentence for warned in meshes.warnings]
     reference, more, index = shell, {}, own
     if 0 < settings.coarse_vertices < len(own):
         with waiting("coarse mesh"):
-            coarsening = coarsen(shell, settings.coarse_vertices, some_vertices(vertices, own))
+            every = stacked(len(vertices) + len(images), (x[own] for x in itertools.chain(vertices, images)))
+            coarsening = coarsen(shell, settings.coarse_vertices, every)
         index = own[coarsening.fine_index]
         reference = TriangleMesh.from_arrays(fine.vertices[index], coarsening.faces)
         facts |= {
@@ -123,8 +127,15 @@ def ingest(run: RunDirectory, config: Config, accepted: Sequence[str] = ()) -> d
         more["file_vertices"] = meshes.file_vertices
     write_reference(run, reference, scale, **more)
     places = meshes.places or [(name, 0) for name in meshes.names]
-    files, first = map(np.array, zip(*places, strict=True))
-    run.shapes.write(names=np.array(meshes.names), vertices=vertices, files=files, first=first)
+    original = np.concatenate([np.arange(len(vertices)), whose])
+    files, first = (np.array(each)[original] for each in zip(*places, strict=True))
+    run.shapes.write(
+        names=np.array([*meshes.names, *(f"{meshes.names[k]} (mirrored)" for k in whose)]),
+        vertices=np.concatenate([vertices, images[:, index]]),
+        original=original,
+        files=files,
+        first=first,
+    )
     surface, left_out = reference_surface(settings.data, meshes, chosen)
     facts["warnings"] += left_out
     if surface:
@@ -133,6 +144,21 @@ def ingest(run: RunDirectory, config: Config, accepted: Sequence[str] = ()) -> d
         run.surface_names.write(surface_entry(surface).model_dump())
     run.ingest.write(facts)
     return facts
+
+
+def _images(
+    settings: CollectionSettings, meshes: MeshCollection, vertices: FloatArray, edges: IntArray
+) -> tuple[FloatArray, IntArray, list[str]]:
+    """Mirror images (k, V, 3) to learn from, of which shapes (k,), and what to say of them."""
+    found = find_mirror(vertices, edges) if settings.mirror else None
+    if found is None:
+        return np.empty((0, *vertices.shape[1:])), np.empty(0, dtype=int), []
+    images, whose = mirrored(vertices, found[0])
+    note = (
+        f"learns from {len(images)} mirror images too, since {meshes.names[found[1]]} is symmetric; "
+        "collection.mirror = false leaves them out"
+    )
+    return images, whose, [note] if len(images) else []
 
 
 def _prolong(
@@ -236,11 +262,12 @@ def modes(run: RunDirectory, config: Config) -> dict[str, Any]:
     settings, centre, shapes = config.modes, run.mean_mesh(), run.shapes.read()["vertices"]
     space = ShellSpace(centre, material(config))
     norm = WeightedNorm.of(centre, config.material.eta)
+    whose = run.shapes.read()["original"]
     found = logarithms(space, centre.vertices, shapes, settings.log_steps)
-    count = mode_count(settings, space, centre.vertices, found.fields)
+    count = mode_count(settings, space, centre.vertices, found.fields, whose)
     dense = pga(space, centre.vertices, found.fields, count, settings.norm)
     with waiting("sparse modes"):
-        sparse = find_modes(settings, space, centre.vertices, found.fields, count)
+        sparse = find_modes(settings, space, centre.vertices, found.fields, count, whose)
     codes = nearest_codes(space, centre.vertices, sparse.vertices, shapes, sparse.coefficients, settings.log_steps)
     lower, upper = box_of(codes.codes)
     arrays = {
@@ -280,14 +307,16 @@ def generalisation(run: RunDirectory, config: Config) -> dict[str, Any]:
     turn. Exponentials stand for networks, in LIGHT_STEPS steps. With half as many modes too. And
     ``least-general.npz``, the shape that is farthest.
     """
-    reference, shapes, settings = run.reference_mesh(), run.shapes.read()["vertices"], config.modes
+    reference, given, settings = run.reference_mesh(), run.shapes.read(), config.modes
+    shapes, original = given["vertices"], given["original"]
     steps = min(LIGHT_STEPS, settings.log_steps)
-    parts = folds(len(shapes))
+    count = len(run.own_shapes())
+    parts = folds(count)
     try:
         found = joined(
             [
-                held_out(reference, shapes, index, None, settings, material(config), steps)
-                for index in (parts if len(parts) == len(shapes) else parts[:1])
+                held_out(reference, shapes, index, None, settings, material(config), steps, original)
+                for index in (parts if len(parts) == count else parts[:1])
             ]
         )
     except (ModeError, NotPositiveDefiniteError) as error:  # no reason to do without a model
@@ -303,7 +332,7 @@ def generalisation(run: RunDirectory, config: Config) -> dict[str, Any]:
             "steps": steps,
             "counts": found.counts[different],
             **{name: [summary(each) for each in rows[different]] for name, rows in away.items()},
-            "worst": str(run.shapes.read()["names"][number]),
+            "worst": str(given["names"][number]),
         }
     run.generalisation.write(facts)
     return facts
@@ -339,8 +368,8 @@ def encoded(run: RunDirectory, bundle: Path) -> dict[str, Any]:
 
     By ``encode`` as it is served. And ``least-near.npz``, the farthest.
     """
-    model, reference, shapes = shapespace.load(bundle), run.reference_mesh(), run.shapes.read()
-    given, scale = shapes["vertices"], float(run.reference.read()["scale"])
+    model, reference, names = shapespace.load(bundle), run.reference_mesh(), run.shapes.read()["names"]
+    given, scale = run.own_shapes(), float(run.reference.read()["scale"])
     found = [model.encode(scale * shape) for shape in progress(given, "codes of the shapes", "shape", len(given))]
     near = np.stack([each.shape.vertices for each in found]) / scale
     linear = PrincipalComponents.of(given, reference.vertices).nearest(given, model.latents.dimension)
@@ -349,8 +378,8 @@ def encoded(run: RunDirectory, bundle: Path) -> dict[str, Any]:
     facts = summary(away) | {
         "components": summary(other),
         "shapes": len(given),
-        "outside": shapes["names"][[not each.inside_bounds for each in found]].tolist(),
-        "worst": str(shapes["names"][worst]),
+        "outside": [str(name) for name, each in zip(names, found, strict=False) if not each.inside_bounds],
+        "worst": str(names[worst]),
     }
     run.least_near.write(given=given[worst], found=near[worst])
     run.encoded.write(facts)

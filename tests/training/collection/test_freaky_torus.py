@@ -190,3 +190,26 @@ def test_its_symmetry_takes_the_shape_of_a_code_to_that_of_the_opposite_code(cod
     (edges,) = collection.symmetries
     assert sorted(edges) == list(range(connectivity.edge_count))
     np.testing.assert_allclose(z[:, np.concatenate([edges, len(edges) + edges])], opposite, atol=1e-10)
+
+
+@pytest.mark.parametrize("columns", [1, 24])
+def test_columns_move_shapes_and_places_as_they_move_codes(codes, columns):
+    """Places say where features are: there, a shape moved by some columns of the grid is that of the moved code."""
+    collection = freaky_torus.FreakyTorus()
+    connectivity, places = collection.reference.connectivity, collection.places
+    i, j = np.divmod(np.arange(N * M), M)
+    edges = freaky_torus.edge_permutation(connectivity, (i + columns) % N * M + j)
+    turn = 2 * np.pi * columns / N * np.array([2, 0, 1, 0])
+    np.testing.assert_allclose(np.exp(1j * places.angles[edges]), np.exp(1j * (places.angles + turn)), atol=1e-12)
+    np.testing.assert_allclose(places.constants[edges], places.constants, atol=1e-12)
+    z, moved = (nric(collection.shapes(c).vertices, connectivity) for c in (codes, codes + turn))
+    np.testing.assert_allclose(moved[:, np.concatenate([edges, len(edges) + edges])], z, atol=1e-10)
+
+
+def test_the_bump_is_where_its_code_is_the_place_of_edges():
+    collection = freaky_torus.FreakyTorus()
+    code = np.array([[0, 0, 2.0, 4.0]])
+    bump = np.linalg.norm(collection.shapes(code).vertices[0] - plain(0, 0).reshape(-1, 3) / collection.scale, axis=1)
+    at_edges = bump[collection.reference.connectivity.edges].mean(axis=1)
+    highest = collection.places.angles[at_edges.argmax(), 2:]
+    np.testing.assert_allclose(highest, code[0, 2:], atol=0.15)

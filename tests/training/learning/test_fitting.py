@@ -43,11 +43,13 @@ def fit(data: tuple[TriangleMesh, torch.Tensor, torch.Tensor], path: Path, setti
     return network
 
 
-@pytest.mark.parametrize("schedule", ["plateau", "cosine"])
+@pytest.mark.parametrize(("schedule", "optimiser"), [("plateau", "adam"), ("cosine", "adam"), ("cosine", "muon")])
 def test_a_killed_fit_continues_to_the_same_bits(
-    data: tuple, schedule: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    data: tuple, schedule: str, optimiser: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    settings = FitSettings(schedule=schedule, max_epochs=17, batch_size=16, patience=1, learning_rate=1e-2)
+    settings = FitSettings(
+        optimiser=optimiser, schedule=schedule, max_epochs=17, batch_size=16, patience=1, learning_rate=1e-2
+    )
     whole = fit(data, tmp_path / "whole.safetensors", settings).state_dict()
     written = fitting._checkpoint
 
@@ -73,8 +75,10 @@ def test_a_finished_fit_is_read_not_repeated(data: tuple, tmp_path: Path, monkey
     assert all(torch.equal(first[k], again[k]) for k in first)
 
 
-def test_a_fit_learns_and_keeps_its_best_epoch(data: tuple, tmp_path: Path) -> None:
-    network = fit(data, tmp_path / "n.safetensors", FitSettings(max_epochs=60, batch_size=16, learning_rate=1e-2))
+@pytest.mark.parametrize("optimiser", ["adam", "muon"])
+def test_a_fit_learns_and_keeps_its_best_epoch(data: tuple, optimiser: str, tmp_path: Path) -> None:
+    settings = FitSettings(optimiser=optimiser, max_epochs=60, batch_size=16, learning_rate=1e-2)
+    network = fit(data, tmp_path / "n.safetensors", settings)
     state = fitting.read_network(tmp_path / "n.safetensors").state
     errors = [validation for _, validation in state["history"]]
     assert state["best"] == min(errors)

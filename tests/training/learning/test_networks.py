@@ -34,6 +34,7 @@ from shapespace.training.learning.polynomials import PolynomialCorrection, learn
 from shapespace.training.runs.config import (
     AutoSettings,
     ConvolutionSettings,
+    FieldSettings,
     KernelSettings,
     LatentNetworkSettings,
     PaperSettings,
@@ -234,7 +235,7 @@ def test_every_correction_comes_back_from_its_file(ball: TriangleMesh, settings:
 
 
 def test_every_kind_has_a_class() -> None:
-    assert {settings.kind for settings, _, _ in KINDS} == set(CORRECTIONS)
+    assert {settings.kind for settings, _, _ in KINDS} | {FieldSettings().kind} == set(CORRECTIONS)
     paper = candidates(PaperSettings())[0]
     assert isinstance(paper, ConvolutionSettings)
     assert (paper.neighbourhood, paper.residual, paper.dropout, paper.edge_channels) == ("star", False, 0.1, 0)

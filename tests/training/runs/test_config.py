@@ -151,7 +151,7 @@ def test_what_is_kept_of_a_configuration_says_the_same() -> None:
 
 
 def test_a_configuration_of_version_0_1_is_refused_in_a_sentence_that_says_what_to_write() -> None:
-    path = Path(__file__).parents[3] / "runs" / "freaky-torus" / "config.toml"
+    path = Path(__file__).parents[1] / "whole_runs" / "run_of_0_1" / "config.toml"
     with pytest.raises(ConfigError) as caught:
         load(path)
     (line,) = str(caught.value).splitlines()[1:]

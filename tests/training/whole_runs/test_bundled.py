@@ -20,67 +20,21 @@ from shapespace.model.decoder import MeshChoice
 from shapespace.model.exact_shapes import exact_shape
 from shapespace.training.__main__ import main
 from shapespace.training.collection import freaky_torus
-from shapespace.training.collection.generators import PRODUCTS
 from shapespace.training.learning.evaluation import r_squared
-from shapespace.training.learning.networks import affine_sum, candidates
-from shapespace.training.runs.config import CombinerSettings, Config, LatentNetworkSettings, load
+from shapespace.training.learning.networks import affine_sum
+from shapespace.training.runs.config import Config
 
 ROOT = Path(__file__).parents[3]
 #: Versions of the bundled models.
 MODELS = {"freaky-torus": "1", "figure": "2"}
 
-
-#: Defaults of version 0.1 for the combiner.
-COMBINER_OF_0_1 = {
-    "layers": 0, "kernel": 12, "polynomial": 0, "monomials": 1800, "pairwise": 0, "symmetries": True,
-    "width": 24, "neighbourhood": "star", "crop": 0, "residual": True, "edge_channels": 4, "dropout": 0.0,
-    "fit": {"schedule": "cosine", "learning_rate": 2e-3, "batch_size": 16, "max_epochs": 12},
-}  # fmt: skip
-
-
-def combiner(written: dict[str, Any]) -> dict[str, Any]:
-    """Settings of a combiner of 0.1 in today's form."""
-    old = COMBINER_OF_0_1 | written
-    if not old["layers"]:
-        assert old["kernel"]
-        assert not old["polynomial"]
-        assert not old["pairwise"]
-        correction = {"kind": "kernel", "coefficients": old["kernel"]}
-    else:
-        assert not old["kernel"]
-        assert not old["polynomial"]
-        names = ("layers", "width", "neighbourhood", "crop", "residual", "edge_channels", "dropout", "fit")
-        correction = {"kind": "convolutions", "products": old["pairwise"], **{name: old[name] for name in names}}
-    return CombinerSettings.model_validate({"correction": correction, "symmetries": old["symmetries"]}).model_dump()
-
-
-def latent_network(written: dict[str, Any]) -> dict[str, Any]:
-    """Settings of a latent network of 0.1 in today's form; settings not given have the same default."""
-    no_layer = {"skip_orders": []} if written.get("skip_orders", ()) is None else {}
-    return LatentNetworkSettings.model_validate(written | no_layer).model_dump()
-
-
-def recipe(written: dict[str, Any]) -> dict[str, Any]:
-    factors = written.get("factors") or {}
-    some = [latent_network(each) for each in factors] if isinstance(factors, list) else latent_network(factors)
-    return {"factors": some, "combiner": combiner(written.get("combiner") or {})}
+#: What a run of version 0.1 left of the torus.
+RUN_OF_0_1 = Path(__file__).parent / "run_of_0_1"
 
 
 def today(config: dict[str, Any]) -> Config:
-    """A configuration in today's form; those of products are of version 0.1, whose variants were complete."""
-    if config["collection"]["generator"] not in PRODUCTS:
-        return Config.model_validate(config)
-    networks = config.get("networks", {})
-    values = config | {"networks": networks | recipe(networks)}
-    values.pop("modes", None)  # which a product doesn't read
-    if "monolithic" in config:
-        values["monolithic"] = latent_network(config["monolithic"])
-    main = {name: networks.get(name) for name in ("factors", "combiner")}
-    values["variants"] = {
-        name: {"title": v["title"]} | recipe(main | {key: value for key, value in v.items() if value is not None})
-        for name, v in config.get("variants", {}).items()
-    }
-    return Config.model_validate(values)
+    """A configuration; those of before mirror images had none."""
+    return Config.model_validate(config | {"collection": {"mirror": False} | config["collection"]})
 
 
 @pytest.mark.parametrize("name", MODELS)
@@ -93,17 +47,8 @@ def test_a_bundle_states_the_figures_and_the_configuration_of_the_committed_run(
 
 @pytest.mark.parametrize("name", MODELS)
 def test_an_example_is_the_recipe_of_the_committed_run(name: str) -> None:
-    example, _ = load(ROOT / "examples" / f"{name}.toml")
-    run = today(tomllib.loads((ROOT / "runs" / name / "config.toml").read_text()))
-    apart = {"networks": {"factors", "combiner"}, "variants": True}
-    assert example.model_dump(exclude=apart) == run.model_dump(exclude=apart)
-    assert [(key, variant.title) for key, variant in example.variants.items()] == [
-        (key, variant.title) for key, variant in run.variants.items()
-    ]
-    assert example.recipes == run.recipes
-    assert example.networks.factors == run.networks.factors
-    assert candidates(example.networks.combiner.correction) == candidates(run.networks.combiner.correction)
-    assert example.networks.combiner.symmetries == run.networks.combiner.symmetries
+    example = tomllib.loads((ROOT / "examples" / f"{name}.toml").read_text())
+    assert today(example) == today(tomllib.loads((ROOT / "runs" / name / "config.toml").read_text()))
 
 
 @pytest.mark.parametrize("name", MODELS)
@@ -112,16 +57,16 @@ def test_a_bundle_meets_what_it_promises(name: str) -> None:
     assert sum(path.stat().st_size for path in folder.iterdir()) <= 15 * 2**20
     figures = read_bundle(folder).manifest.figures
     r2 = {name: value["total"] for name, value in figures["r2"].items()}
-    assert r2["composite"] >= 0.99
+    assert r2["composite"] >= 0.998
     assert r2["composite"] > max(r2["monolithic"], r2["affine"], r2["grid"])
     assert figures["vertex_error"]["mean"] <= 0.01
 
 
-@pytest.mark.parametrize("name", MODELS)
-def test_a_run_of_version_0_1_can_be_looked_at(
-    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+@pytest.mark.parametrize("folder", [*(ROOT / "runs" / name for name in MODELS), RUN_OF_0_1], ids=lambda path: path.name)
+def test_committed_runs_can_be_looked_at(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    run = shutil.copytree(ROOT / "runs" / name, tmp_path / "run")
+    run = shutil.copytree(folder, tmp_path / "run")
     for command, says in (("status", "export       to do"), ("report", "report.html")):
         monkeypatch.setattr(sys, "argv", ["shapespace-train", command, str(run)])
         assert main() == 0
@@ -161,10 +106,10 @@ def test_the_torus_networks_know_shape_and_bump_at_fresh_codes(monkeypatch: pyte
         r2 = r_squared(nric, exact.nric, norm)
         away = np.linalg.norm(align(vertices, few) - few, axis=2) / size
         limits = {
-            "total": r2["total"] < 0.99,
-            "angles": r2["angles"] < 0.85,
-            "mean": away.mean() > 0.004,
-            "near the bump": away[near].mean() > 0.015,
+            "total": r2["total"] < 0.998,
+            "angles": r2["angles"] < 0.98,
+            "mean": away.mean() > 0.002,
+            "near the bump": away[near].mean() > 0.006,
         }
         return [name for name, over in limits.items() if over]
 

@@ -1,0 +1,75 @@
+"""The left–right symmetry of a collection, and mirror images of its shapes.
+
+Bodies and faces are often made from a template whose vertices mirror each other. A pose of the left arm then says how
+the right one moves. Faces need not mirror each other: a quad may be split the other way on the other side.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.spatial import KDTree
+
+from shapespace.arrays import FloatArray, IntArray
+from shapespace.mesh.rigid_motion import align
+from shapespace.mesh.triangle_mesh import diagonal
+from shapespace.training.collection.large_arrays import stacked
+
+#: A shape is symmetric if a reflection takes no vertex farther from another than this share of its diagonal.
+TOLERANCE = 1e-3
+#: Least share of the edges whose image is an edge.
+EDGES = 0.9
+#: Vertices that are tried before all are.
+FIRST = 200
+
+
+def find_mirror(shapes: Sequence[FloatArray] | FloatArray, edges: IntArray) -> tuple[IntArray, int] | None:
+    """Which vertex each is the mirror image of, by the first shape that a reflection takes to itself.
+
+    Args:
+        shapes: (n, V, 3).
+        edges: (E, 2) of all of them.
+
+    Returns:
+        (V,) vertices, each the image of its image, and the number of that shape; None where no shape is symmetric.
+    """
+    known = np.unique(np.sort(edges, axis=1) @ [len(shapes[0]), 1])
+    for number, shape in enumerate(shapes):
+        centred = shape - shape.mean(axis=0)
+        tree, size = KDTree(centred), TOLERANCE * diagonal(shape)
+        # The normal of a plane of symmetry is a principal axis, where these are distinct.
+        for normal in [*np.linalg.eigh(centred.T @ centred)[1].T, *np.eye(3)]:
+            reflection = np.eye(3) - 2 * np.outer(normal, normal)
+            some = centred[:: max(1, len(shape) // FIRST)]
+            if np.max(tree.query(some @ reflection)[0]) > size:
+                continue
+            away, image = map(np.asarray, tree.query(centred @ reflection))
+            images = np.unique(np.sort(image[edges], axis=1) @ [len(shape), 1])
+            if (
+                away.max() <= size
+                and np.array_equal(image[image], np.arange(len(image)))
+                and len(np.intersect1d(images, known)) >= EDGES * len(known)
+            ):
+                return image, number
+    return None
+
+
+def mirrored(shapes: FloatArray, image: IntArray) -> tuple[FloatArray, IntArray]:
+    """Mirror images of shapes, where these stand.
+
+    Args:
+        shapes: (n, V, 3).
+        image: (V,) of the vertices.
+
+    Returns:
+        (k, V, 3) without those of symmetric shapes, and (k,) which shapes the others are images of.
+    """
+    flipped = np.array([-1.0, 1, 1])
+
+    def of(shape: FloatArray) -> FloatArray:
+        return align(shape[image] * flipped, shape)
+
+    others = [k for k, shape in enumerate(shapes) if np.abs(of(shape) - shape).max() > TOLERANCE * diagonal(shape)]
+    found = stacked(len(others), (of(shapes[k]) for k in others)) if others else np.empty((0, *shapes.shape[1:]))
+    return found, np.array(others, dtype=int)
