@@ -107,7 +107,7 @@ def test_the_torus_networks_know_shape_and_bump_at_fresh_codes(monkeypatch: pyte
         away = np.linalg.norm(align(vertices, few) - few, axis=2) / size
         limits = {
             "total": r2["total"] < 0.998,
-            "angles": r2["angles"] < 0.98,
+            "angles": r2["angles"] < 0.9,
             "mean": away.mean() > 0.002,
             "near the bump": away[near].mean() > 0.006,
         }
