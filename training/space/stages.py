@@ -99,7 +99,9 @@ def ingest(run: RunDirectory, config: Config, accepted: Sequence[str] = ()) -> d
     reference, more, index = shell, {}, own
     if 0 < settings.coarse_vertices < len(own):
         with waiting("coarse mesh"):
-            every = stacked(len(vertices) + len(images), (x[own] for x in itertools.chain(vertices, images)))
+            every = some_vertices(vertices, own)
+            if len(images):
+                every = stacked(len(vertices) + len(images), (x[own] for x in itertools.chain(vertices, images)))
             coarsening = coarsen(shell, settings.coarse_vertices, every)
         index = own[coarsening.fine_index]
         reference = TriangleMesh.from_arrays(fine.vertices[index], coarsening.faces)

@@ -19,7 +19,17 @@ from shapespace.shell.geodesic import geodesic
 from shapespace.shell.space import ShellSpace
 from shapespace.solve.outcome import Status
 from shapespace.training.space.logarithms import logarithms
-from shapespace.training.space.modes import ModeError, Modes, Norm, _fit_in_box, coefficients, localisation, pga, spga
+from shapespace.training.space.modes import (
+    ModeError,
+    Modes,
+    Norm,
+    _fit_in_box,
+    coefficients,
+    localisation,
+    pga,
+    spga,
+    worthwhile,
+)
 from tests.shapespace.conftest import bent
 
 
@@ -362,3 +372,13 @@ def test_a_shape_that_is_not_finite_has_no_logarithm(bumps):
     shapes = np.stack([bumps.mean, np.where(np.arange(3) == 1, np.nan, bumps.mean)])
     with pytest.raises(ModeError, match="shape 1 has a coordinate that is not finite"):
         logarithms(bumps.space, bumps.mean, shapes, 4, workers=1)
+
+
+def test_a_shape_and_its_mirror_image_are_held_out_together(bumps: Bumps) -> None:
+    """The count of modes of each logarithm twice is that of each once; held out alone, each would be known already."""
+    rng = np.random.default_rng(5)
+    noisy = bumps.fields + 0.3 * np.abs(bumps.fields).max() * rng.normal(size=bumps.fields.shape)
+    twice, whose = np.concatenate([noisy, noisy]), np.tile(np.arange(len(noisy)), 2)
+    once = worthwhile(bumps.space, bumps.mean, noisy)
+    assert worthwhile(bumps.space, bumps.mean, twice, whose=whose) == once
+    assert worthwhile(bumps.space, bumps.mean, twice) > once
