@@ -25,7 +25,9 @@ FIRST = 200
 
 
 def find_mirror(shapes: Sequence[FloatArray] | FloatArray, edges: IntArray) -> tuple[IntArray, int] | None:
-    """Which vertex each is the mirror image of, by the first shape that a reflection takes to itself.
+    """Which vertex each is the mirror image of, by the first shape that exactly one reflection takes to itself.
+
+    Where several do, as a straight bar, none of them tells left from right: what bends forward need not bend backward.
 
     Args:
         shapes: (n, V, 3).
@@ -36,6 +38,7 @@ def find_mirror(shapes: Sequence[FloatArray] | FloatArray, edges: IntArray) -> t
     """
     known = np.unique(np.sort(edges, axis=1) @ [len(shapes[0]), 1])
     for number, shape in enumerate(shapes):
+        found: list[IntArray] = []
         centred = shape - shape.mean(axis=0)
         tree, size = KDTree(centred), TOLERANCE * diagonal(shape)
         # The normal of a plane of symmetry is a principal axis, where these are distinct.
@@ -50,8 +53,11 @@ def find_mirror(shapes: Sequence[FloatArray] | FloatArray, edges: IntArray) -> t
                 away.max() <= size
                 and np.array_equal(image[image], np.arange(len(image)))
                 and len(np.intersect1d(images, known)) >= EDGES * len(known)
+                and not any(np.array_equal(image, other) for other in found)
             ):
-                return image, number
+                found.append(image)
+        if len(found) == 1:
+            return found[0], number
     return None
 
 

@@ -57,8 +57,8 @@ class CollectionSettings(_Section):
     coarse_vertices: int = Field(1000, ge=0)
     """Vertices to compute with: meshes with more are simplified to about this number. 0 computes with all vertices."""
     mirror: bool = True
-    """Whether to learn from the shapes' mirror images too, if one of the shapes is symmetric: its vertices say which
-    vertex each is the mirror image of. So a pose of the left arm is one of the right arm as well."""
+    """Whether to learn from the shapes' mirror images too, if one of the shapes has a plane of symmetry, and only one:
+    its vertices say which vertex each is the mirror image of. So a pose of the left arm is one of the right arm too."""
 
     @model_validator(mode="after")
     def _one_source(self) -> CollectionSettings:

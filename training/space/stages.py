@@ -275,7 +275,8 @@ def modes(run: RunDirectory, config: Config) -> dict[str, Any]:
     arrays = {
         "nric": sparse.nric,
         "vertices": sparse.vertices,
-        "coefficients": codes.codes,
+        "coefficients": codes.codes[whose == np.arange(len(whose))],
+        "mirrored_coefficients": codes.codes[whose != np.arange(len(whose))],
         "lower": lower,
         "upper": upper,
         "localisation": localisation(sparse.nric, norm),
@@ -352,7 +353,8 @@ def factors(run: RunDirectory, config: Config) -> dict[str, Any]:
     groups = group(shared, config.factors.count)
     order = [j for members in groups for j in members]
     ordered = {name: found[name][order] for name in ("nric", "vertices", "lower", "upper", "localisation")}
-    ordered |= {"coefficients": found["coefficients"][:, order], "rank": np.array(order)}
+    ordered |= {name: found[name][:, order] for name in ("coefficients", "mirrored_coefficients")}
+    ordered["rank"] = np.array(order)
     run.modes.write(**found | ordered)
     starts = np.cumsum([0, *map(len, groups)])
     run.factors.write(
@@ -400,7 +402,7 @@ def collection(run: RunDirectory, config: Config) -> ShellCollection:
         steps=config.samples.steps,
         material=material(config),
         scale=float(run.reference.read()["scale"]),
-        codes=modes["coefficients"],
+        codes=np.concatenate([modes["coefficients"], modes["mirrored_coefficients"]]),
     )
 
 
@@ -415,7 +417,7 @@ def geometry(run: RunDirectory) -> Geometry:
         reference=mean,
         fine=fine,
         modes=modes["vertices"],
-        training_codes=modes["coefficients"],
+        training_codes=np.concatenate([modes["coefficients"], modes["mirrored_coefficients"]]),
         file_vertices=reference.get("file_vertices"),
         surface=_surface(run),
     )

@@ -60,6 +60,14 @@ def test_no_shape_is_taken_for_symmetric_that_is_not() -> None:
     assert find_mirror(np.stack([body() + 0.05 * TOLERANCE * noise]), EDGES) is not None
 
 
+def test_what_is_symmetric_in_several_ways_has_no_left_and_right() -> None:
+    box = np.asarray(ROUND.vertices) * [3.0, 2.0, 1.0]
+    assert find_mirror(np.stack([box]), EDGES) is None
+    found = find_mirror(np.stack([box, body()]), EDGES)
+    assert found is not None
+    assert found[1] == 1
+
+
 def test_vertices_that_mirror_each_other_by_chance_do_not_count() -> None:
     """The edges have to as well."""
     shuffled = np.random.default_rng(0).permutation(len(body()))
