@@ -112,7 +112,7 @@ class FieldCorrection(Correction):
 
     @property
     def descent(self) -> FitSettings:
-        """Adam trains the perceptron."""
+        """How the perceptron is trained; what reads codes is fitted."""
         return self.settings.fit
 
     def _fit_reader(

@@ -514,7 +514,12 @@ class Config(_Section):
 
     @model_validator(mode="after")
     def _usable_variants(self) -> Config:
-        _ = self.recipes
+        for name, recipe in {"networks": self.networks, **self.recipes}.items():
+            if recipe.combiner.correction.kind == "field" and self.collection.generator != "freaky-torus":
+                raise ValueError(
+                    f'{name}: kind = "field" is for features that move over the surface, which only the generator '
+                    "freaky-torus has"
+                )
         return self
 
 

@@ -158,3 +158,12 @@ def test_a_configuration_of_version_0_1_is_refused_in_a_sentence_that_says_what_
     assert "settings of version 0.1: write kernel as correction = { kind = " in line
     for name in ("pairwise", "layers", "crop", "fit"):
         assert name in line
+
+
+@pytest.mark.parametrize("where", ["networks.combiner.correction", "variants.a.combiner.correction"])
+def test_a_field_needs_features_that_move(where: str) -> None:
+    table = f'[{where}]\nkind = "field"\n' + ('[variants.a]\ntitle = ""\n' if "variants" in where else "")
+    rest = '[export]\nname = "a"\ntitle = ""\ndescription = ""\nlicence = ""\n'
+    assert parse(f'[collection]\ngenerator = "freaky-torus"\n{table}{rest}', "here")
+    with pytest.raises(ConfigError, match="features that move over the surface"):
+        parse(f'[collection]\ngenerator = "figure"\n{table}{rest}', "here")
