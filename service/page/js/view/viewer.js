@@ -1,7 +1,8 @@
 /**
  * The large view: draws the shape when something has changed, and only then.
  *
- * Its canvas fires `drawn` after each picture, in the same task, and `turned` when a hand has moved the view.
+ * Its canvas fires `drawn` after each picture, in the same task, and `turned` when a view that a hand has
+ * chosen has moved.
  */
 
 import * as THREE from "three";
@@ -193,7 +194,11 @@ export class Viewer {
     this.seen = positions ? joined(this.reference, positions) : this.reference;
     this.middle = sphereOf(this.seen).center;
     if (!this.turned) this.resetView();
-    else if (!given) this.#move(this.middle.clone().sub(middle), this.#distance / before);
+    else if (!given) {
+      this.#move(this.middle.clone().sub(middle), this.#distance / before);
+      // The address may have been written before the shape came.
+      this.canvas.dispatchEvent(new Event("turned"));
+    }
   }
 
   /** Move what one looks at, and be as many times as far from it. */
