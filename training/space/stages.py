@@ -261,10 +261,10 @@ def modes(run: RunDirectory, config: Config) -> dict[str, Any]:
 
     ``modes.npz`` holds the same until `factors` puts them in its order.
     """
-    settings, centre, shapes = config.modes, run.mean_mesh(), run.shapes.read()["vertices"]
+    settings, centre, given = config.modes, run.mean_mesh(), run.shapes.read()
+    shapes, whose = given["vertices"], given["original"]
     space = ShellSpace(centre, material(config))
     norm = WeightedNorm.of(centre, config.material.eta)
-    whose = run.shapes.read()["original"]
     found = logarithms(space, centre.vertices, shapes, settings.log_steps)
     count = mode_count(settings, space, centre.vertices, found.fields, whose)
     dense = pga(space, centre.vertices, found.fields, count, settings.norm)
@@ -275,8 +275,8 @@ def modes(run: RunDirectory, config: Config) -> dict[str, Any]:
     arrays = {
         "nric": sparse.nric,
         "vertices": sparse.vertices,
-        "coefficients": codes.codes[whose == np.arange(len(whose))],
-        "mirrored_coefficients": codes.codes[whose != np.arange(len(whose))],
+        "coefficients": codes.codes[: whose.max() + 1],
+        "mirrored_coefficients": codes.codes[whose.max() + 1 :],
         "lower": lower,
         "upper": upper,
         "localisation": localisation(sparse.nric, norm),
@@ -313,7 +313,7 @@ def generalisation(run: RunDirectory, config: Config) -> dict[str, Any]:
     reference, given, settings = run.reference_mesh(), run.shapes.read(), config.modes
     shapes, original = given["vertices"], given["original"]
     steps = min(LIGHT_STEPS, settings.log_steps)
-    count = len(run.own_shapes())
+    count = int(original.max()) + 1
     parts = folds(count)
     try:
         found = joined(
@@ -390,6 +390,11 @@ def encoded(run: RunDirectory, bundle: Path) -> dict[str, Any]:
     return facts
 
 
+def _known_codes(modes: dict[str, np.ndarray]) -> FloatArray:
+    """(n, m) of all shapes that were learned from, mirror images last."""
+    return np.concatenate([modes["coefficients"], modes["mirrored_coefficients"]])
+
+
 def collection(run: RunDirectory, config: Config) -> ShellCollection:
     """The collection that the stages found."""
     factors, modes = run.factors.read(), run.modes.read()
@@ -402,7 +407,7 @@ def collection(run: RunDirectory, config: Config) -> ShellCollection:
         steps=config.samples.steps,
         material=material(config),
         scale=float(run.reference.read()["scale"]),
-        codes=np.concatenate([modes["coefficients"], modes["mirrored_coefficients"]]),
+        codes=_known_codes(modes),
     )
 
 
@@ -417,7 +422,7 @@ def geometry(run: RunDirectory) -> Geometry:
         reference=mean,
         fine=fine,
         modes=modes["vertices"],
-        training_codes=np.concatenate([modes["coefficients"], modes["mirrored_coefficients"]]),
+        training_codes=_known_codes(modes),
         file_vertices=reference.get("file_vertices"),
         surface=_surface(run),
     )
