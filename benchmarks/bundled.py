@@ -1,6 +1,7 @@
 """docs/measurements/bundled.md: what the committed runs of the bundled models measured.
 
-``python -m benchmarks.bundled`` writes the page from ``runs/figure`` and ``runs/freaky-torus``; it trains nothing.
+``python -m benchmarks.bundled`` writes the page from ``runs/figure``, ``runs/freaky-torus`` and
+``runs/freaky-torus-1000``; it trains nothing.
 """
 
 from __future__ import annotations
@@ -60,7 +61,7 @@ def page() -> str:
         autoescape=False,  # noqa: S701 - Markdown of our own
     )
     environment.filters["percent"] = lambda share, digits=2: f"{100 * share:.{digits}f} %"
-    runs = {"figure": record("figure"), "torus": record("freaky-torus")}
+    runs = {"figure": record("figure"), "torus": record("freaky-torus"), "alone": record("freaky-torus-1000")}
     return environment.get_template("bundled.md.jinja").render(models=MODELS, bumpless=without_bump(), **runs)
 
 

@@ -15,11 +15,13 @@ from typing import Any
 import numpy as np
 import tomlkit
 
-from benchmarks.results import COLLECTIONS, ROOT, open_run
+from benchmarks.generalisation import ROWS
+from benchmarks.results import MIRRORED, ROOT, open_run
 from benchmarks.space import CODES, to_nearest
 from shapespace.arrays import FloatArray
-from shapespace.mesh.triangle_mesh import diagonal
+from shapespace.mesh.triangle_mesh import TriangleMesh, diagonal
 from shapespace.model.shape_model import ShapeModel, load
+from shapespace.training.collection.mirror import find_mirror, mirrored
 from shapespace.training.pipeline import Run, execute
 from shapespace.training.runs.config import parse
 from shapespace.training.space.generalisation import PrincipalComponents, folds, summary, vertex_distances
@@ -29,8 +31,16 @@ JOINT, OF_FACTORS = 1000, 300
 COLUMNS = ("unseen", "trained on")
 #: What the names of runs with half as many modes end in.
 HALF = "-half"
+#: Of the rows.
+NAMES = tuple(each + ending for each in ROWS for ending in ("", HALF))
 #: What was measured, a file for each collection; one that is there is not measured again.
 FIGURES = ROOT / "runs" / "collections"
+
+#: Columns of the table.
+HEAD = (
+    *("", "m", "unseen", "95 %", "components", "95 %", "ratio", "trained on", "components", "ratio"),
+    *("specificity", "components", "unseen: components with images", "ratio"),
+)
 
 PAGE = """# Served models and shapes that they have not seen
 
@@ -39,13 +49,14 @@ at most {joint} joint exponentials and {factors} of each factor, and exported; w
 model with half as many modes. Its `encode`, as it is served, was
 given each shape's fine mesh. **unseen**: mean and 95th percentile over all vertices of the other fifth of the shapes,
 of the distance to the shape of the code, in percent of the bounding box's diagonal; **components**: of as many
-principal components of the same four fifths' fine meshes. **trained on**: the same of the shapes that made the model.
+principal components of the same four fifths' fine meshes. Models *with mirror images* also learned from the images of
+these shapes; the components beside them did not, and in the last columns are components that did. **trained on**: the
+same of the shapes that made the model.
 **specificity**: mean distance of {codes} random shapes, uniform in the bounds of the codes or of the components'
 coefficients, to the nearest of the shapes that made the model: lower is better. `python -m benchmarks.served --data
 FOLDER` trains, measures and writes this page; what it measured is in `runs/collections/`.
 
-| | m | unseen | 95 % | components | 95 % | ratio | trained on | components | ratio | specificity | components |
-|---|---|---|---|---|---|---|---|---|---|---|---|
+{head}
 {rows}
 
 ## Networks and exponentials
@@ -69,13 +80,19 @@ the learned factors, on test codes. **steps**: 1 − R² of the exponentials to 
 """
 
 
+def title(name: str) -> str:
+    """Of a row: nothing where that above it is of the same collection and images."""
+    return "" if name.endswith(HALF) else name.replace(MIRRORED, ", with mirror images")
+
+
 def four_fifths(name: str, data: Path, out: Path) -> tuple[Run, FloatArray, FloatArray]:
     """The run of a collection without its first fold, the fine meshes (n, V, 3) that it knows, and the others.
 
-    With half as many modes where the name ends in ``HALF``.
+    With half as many modes where the name ends in ``HALF``, and mirror images where ``MIRRORED`` stands before.
     """
-    collection = name.removesuffix(HALF)
-    example = open_run(collection, data, out)
+    whole_space = name.removesuffix(HALF)
+    collection = whole_space.removesuffix(MIRRORED)
+    example = open_run(whole_space, data, out)
     with np.load(str(example.config.collection.data), allow_pickle=False) as arrays:
         whole = {key: arrays[key] for key in arrays.files}
     held = folds(len(whole["vertices"]))[0]
@@ -86,7 +103,7 @@ def four_fifths(name: str, data: Path, out: Path) -> tuple[Run, FloatArray, Floa
         np.savez(file, **known)
     document: Any = tomlkit.parse(example.source)
     document["collection"]["data"] = str(file.resolve())
-    if name != collection:
+    if name.endswith(HALF):
         document["modes"]["count"] = -(-document["modes"]["count"] // 2)
     joint, factors = example.config.samples.count, example.config.samples.factor_counts
     document["samples"]["count"] = min(joint, JOINT)
@@ -107,6 +124,18 @@ def encoded(model: ShapeModel, shapes: FloatArray) -> FloatArray:
     return np.stack([model.encode(shape).distances for shape in shapes]) / size
 
 
+def with_images(known: FloatArray, model: ShapeModel) -> PrincipalComponents:
+    """Components of shapes (n, V, 3) and their mirror images.
+
+    Raises:
+        ValueError: none of the shapes is symmetric.
+    """
+    symmetric = find_mirror(known, TriangleMesh.from_arrays(known[0], model.faces).edges)
+    if symmetric is None:
+        raise ValueError("none of the shapes is symmetric")
+    return PrincipalComponents.of(np.concatenate([known, mirrored(known, symmetric[0])[0]]), model.vertices)
+
+
 def measure(name: str, data: Path, out: Path) -> dict[str, Any]:
     """Train, and measure what is trained."""
     run, known, unseen = four_fifths(name, data, out)
@@ -123,19 +152,24 @@ def measure(name: str, data: Path, out: Path) -> dict[str, Any]:
         found[kind] = summary(encoded(model, shapes)) | {"components": summary(others)}
     drawn = np.stack([model.decode(code) for code in model.sample(CODES, 0)])
     others = linear.random(m, CODES, np.random.default_rng(0))
+    if name.removesuffix(HALF).endswith(MIRRORED):
+        linear_too = with_images(known, model)
+        found["mirrored_components"] = summary(vertex_distances(linear_too.nearest(unseen, m), unseen, size))
     found["specificity"] = [to_nearest(each, known, size) for each in (drawn, others)]
     return found
 
 
 def row(name: str, found: dict[str, Any]) -> str:
     """Of the table."""
-    cells = ["" if name.endswith(HALF) else name, str(found["modes"])]
+    cells = [title(name), str(found["modes"])]
     for kind in COLUMNS:
         own, other = found[kind], found[kind]["components"]
         both = [(own["mean"], own["p95"]), (other["mean"], other["p95"])]
         cells += [f"{100 * figure:.3f}" for pair in both for figure in (pair if kind == "unseen" else pair[:1])]
         cells.append(f"{own['mean'] / other['mean']:.2f}")
     cells += [f"{100 * figure:.2f}" for figure in found["specificity"]]
+    images = found.get("mirrored_components")
+    cells += [f"{100 * images['mean']:.3f}", f"{found['unseen']['mean'] / images['mean']:.2f}"] if images else ["", ""]
     return f"| {' | '.join(cells)} |"
 
 
@@ -145,7 +179,7 @@ def network_row(name: str, found: dict[str, Any]) -> str:
     fresh, sizes = figures["fresh"], figures["sizes"]
     r2 = [fresh["r2"][each]["total"] for each in ("composite", "monolithic", "kernel", "monolithic_paper")]
     cells = [
-        "" if name.endswith(HALF) else name,
+        title(name),
         str(found["modes"]),
         str(len(figures["r2_factors"])),
         str(figures["exponentials"]),
@@ -162,7 +196,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--data", type=Path, required=True, help="folder of the collections")
     parser.add_argument("--out", type=Path, default=ROOT / "build" / "served")
-    parser.add_argument("names", nargs="*", default=COLLECTIONS, help=f"collections, with {HALF} for half of the modes")
+    parser.add_argument("names", nargs="*", default=NAMES, help=f"of rows: {', '.join(NAMES)}")
     given = parser.parse_args()
     for name in given.names:
         file = FIGURES / f"{name}.json"
@@ -170,12 +204,12 @@ def main() -> None:
             found = measure(name, given.data, given.out)
             file.parent.mkdir(exist_ok=True)
             file.write_text(json.dumps(found, indent=1), encoding="utf-8")
-        names = [each + ending for each in COLLECTIONS for ending in ("", HALF)]
-        done = {each: json.loads(path.read_text()) for each in names if (path := FIGURES / f"{each}.json").exists()}
+        done = {each: json.loads(path.read_text()) for each in NAMES if (path := FIGURES / f"{each}.json").exists()}
         page = PAGE.format(
             joint=JOINT,
             factors=OF_FACTORS,
             codes=CODES,
+            head=f"| {' | '.join(HEAD)} |\n|{'---|' * len(HEAD)}",
             rows="\n".join(row(*each) for each in done.items()),
             networks="\n".join(network_row(*each) for each in done.items()),
         )

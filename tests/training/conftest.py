@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import fcntl
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -84,8 +86,13 @@ def command(config: Path, out: Path, *more: str) -> list[str]:
 
 @pytest.fixture(scope="session")
 def tiny_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("tiny")
-    config = folder / "tiny.toml"
-    config.write_text(TINY)
-    subprocess.run(command(config, folder / "run"), check=True, capture_output=True, text=True)
+    """Not to be written to: processes that run tests at once share it."""
+    base = tmp_path_factory.getbasetemp()
+    folder = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "tiny"
+    with folder.with_suffix(".lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not folder.exists():
+            folder.mkdir()
+            (folder / "tiny.toml").write_text(TINY)
+            subprocess.run(command(folder / "tiny.toml", folder / "run"), check=True, capture_output=True, text=True)
     return folder / "run"

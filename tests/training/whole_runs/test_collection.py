@@ -451,6 +451,9 @@ def test_init_writes_a_configuration_that_the_command_takes(folder: Path, tmp_pa
     out = tmp_path / "mine.toml"
     shapespace = [sys.executable, "-m", "shapespace.training"]
     subprocess.run([*shapespace, "init", str(folder / "meshes"), "--out", str(out)], check=True, capture_output=True)
+    text, default = out.read_text(), "# coarse_vertices = 1000"
+    assert default in text
+    out.write_text(text.replace(default, "coarse_vertices = 120"))
     run = command(out, tmp_path / "run", "--until", "mean")
     done = subprocess.run(run, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
