@@ -35,10 +35,10 @@ MODELS = {
 
 
 def record(name: str) -> dict[str, Any]:
-    """What a committed run holds, by the names of its files, and the example, whose recipe it has."""
+    """What a committed run holds, by the names of its files."""
     folder = ROOT / "runs" / name
     found: dict[str, Any] = {path.stem: json.loads(path.read_text()) for path in folder.glob("*.json")}
-    return found | {"config": load(ROOT / "examples" / f"{name}.toml")[0]}
+    return found | {"config": load(folder / "config.toml")[0]}
 
 
 def without_bump(count: int = 1000) -> float:

@@ -75,6 +75,16 @@ def measure(name: str, data: Path, out: Path) -> dict[str, Any]:
     }
 
 
+def title(name: str) -> str:
+    """Of a row of the table."""
+    return name.replace(MIRRORED, ", with mirror images")
+
+
+def beside_images(own: dict[str, float], images: dict[str, float] | None) -> list[str]:
+    """The last cells of a row: components with images, if there are any, and the share of their error."""
+    return [f"{100 * images['mean']:.3f}", f"{own['mean'] / images['mean']:.2f}"] if images else ["", ""]
+
+
 def rows(name: str, found: dict[str, Any]) -> list[str]:
     """Of the table."""
     result: list[str] = []
@@ -82,9 +92,14 @@ def rows(name: str, found: dict[str, Any]) -> list[str]:
     each = zip(found["counts"], found["modes"], found["components"], mirrored, strict=True)
     for count, own, other, images in each:
         figures = [f"{100 * figure:.3f}" for figure in (own["mean"], own["p95"], other["mean"], other["p95"])]
-        title = name.replace(MIRRORED, ", with mirror images") if not result else ""
-        cells = [title, str(found["shapes"]), str(count), *figures, f"{own['mean'] / other['mean']:.2f}"]
-        cells += [f"{100 * images['mean']:.3f}", f"{own['mean'] / images['mean']:.2f}"] if images else ["", ""]
+        cells = [
+            "" if result else title(name),
+            str(found["shapes"]),
+            str(count),
+            *figures,
+            f"{own['mean'] / other['mean']:.2f}",
+        ]
+        cells += beside_images(own, images)
         result.append(f"| {' | '.join(cells)} |")
     return result
 

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import tomlkit
 
-from benchmarks.generalisation import ROWS
+from benchmarks.generalisation import ROWS, beside_images, title
 from benchmarks.results import MIRRORED, ROOT, open_run
 from benchmarks.space import CODES, to_nearest
 from shapespace.arrays import FloatArray
@@ -31,7 +31,7 @@ JOINT, OF_FACTORS = 1000, 300
 COLUMNS = ("unseen", "trained on")
 #: What the names of runs with half as many modes end in.
 HALF = "-half"
-#: Of the rows.
+#: Models, in the order of the rows.
 NAMES = tuple(each + ending for each in ROWS for ending in ("", HALF))
 #: What was measured, a file for each collection; one that is there is not measured again.
 FIGURES = ROOT / "runs" / "collections"
@@ -80,19 +80,13 @@ the learned factors, on test codes. **steps**: 1 − R² of the exponentials to 
 """
 
 
-def title(name: str) -> str:
-    """Of a row: nothing where that above it is of the same collection and images."""
-    return "" if name.endswith(HALF) else name.replace(MIRRORED, ", with mirror images")
-
-
 def four_fifths(name: str, data: Path, out: Path) -> tuple[Run, FloatArray, FloatArray]:
     """The run of a collection without its first fold, the fine meshes (n, V, 3) that it knows, and the others.
 
     With half as many modes where the name ends in ``HALF``, and mirror images where ``MIRRORED`` stands before.
     """
-    whole_space = name.removesuffix(HALF)
-    collection = whole_space.removesuffix(MIRRORED)
-    example = open_run(whole_space, data, out)
+    example = open_run(name.removesuffix(HALF), data, out)
+    collection = name.removesuffix(HALF).removesuffix(MIRRORED)
     with np.load(str(example.config.collection.data), allow_pickle=False) as arrays:
         whole = {key: arrays[key] for key in arrays.files}
     held = folds(len(whole["vertices"]))[0]
@@ -150,26 +144,25 @@ def measure(name: str, data: Path, out: Path) -> dict[str, Any]:
     for kind, shapes in zip(COLUMNS, (unseen, known), strict=True):
         others = vertex_distances(linear.nearest(shapes, m), shapes, size)
         found[kind] = summary(encoded(model, shapes)) | {"components": summary(others)}
+    if name.removesuffix(HALF).endswith(MIRRORED):
+        others = vertex_distances(with_images(known, model).nearest(unseen, m), unseen, size)
+        found["mirrored_components"] = summary(others)
     drawn = np.stack([model.decode(code) for code in model.sample(CODES, 0)])
     others = linear.random(m, CODES, np.random.default_rng(0))
-    if name.removesuffix(HALF).endswith(MIRRORED):
-        linear_too = with_images(known, model)
-        found["mirrored_components"] = summary(vertex_distances(linear_too.nearest(unseen, m), unseen, size))
     found["specificity"] = [to_nearest(each, known, size) for each in (drawn, others)]
     return found
 
 
 def row(name: str, found: dict[str, Any]) -> str:
     """Of the table."""
-    cells = [title(name), str(found["modes"])]
+    cells = ["" if name.endswith(HALF) else title(name), str(found["modes"])]
     for kind in COLUMNS:
         own, other = found[kind], found[kind]["components"]
         both = [(own["mean"], own["p95"]), (other["mean"], other["p95"])]
         cells += [f"{100 * figure:.3f}" for pair in both for figure in (pair if kind == "unseen" else pair[:1])]
         cells.append(f"{own['mean'] / other['mean']:.2f}")
     cells += [f"{100 * figure:.2f}" for figure in found["specificity"]]
-    images = found.get("mirrored_components")
-    cells += [f"{100 * images['mean']:.3f}", f"{found['unseen']['mean'] / images['mean']:.2f}"] if images else ["", ""]
+    cells += beside_images(found["unseen"], found.get("mirrored_components"))
     return f"| {' | '.join(cells)} |"
 
 
@@ -179,7 +172,7 @@ def network_row(name: str, found: dict[str, Any]) -> str:
     fresh, sizes = figures["fresh"], figures["sizes"]
     r2 = [fresh["r2"][each]["total"] for each in ("composite", "monolithic", "kernel", "monolithic_paper")]
     cells = [
-        title(name),
+        "" if name.endswith(HALF) else title(name),
         str(found["modes"]),
         str(len(figures["r2_factors"])),
         str(figures["exponentials"]),

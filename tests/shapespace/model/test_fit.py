@@ -82,12 +82,12 @@ def test_a_code_comes_back_from_points_anywhere(figure: ShapeModel) -> None:
 
 def test_landmarks_tell_a_ring_how_it_is_turned(ring: ShapeModel) -> None:
     # A ring turned by 180° or upside down is that of another code: only landmarks tell vertices apart.
-    given = Moved.of(ring, 2)
+    given = Moved.of(ring, 1)
     points = given.points()
     landmarks = [Landmark(k, given.shape[k].tolist()) for k in (0, 300, 700, 1000, 1400, 1900)]
     found = ring.fit(points, landmarks=landmarks)
+    assert given.error(found) < 5e-3
     # A bump of two percent of the surface may be found in the wrong place, but then the status says so.
-    assert given.error(found) < 1e-2
     for fit in (found, ring.fit(points)):
         assert fit.scan.mean < 3e-3 * given.size
         assert fit.status is FitStatus.POOR or fit.scan.p95 < 5e-3 * given.size
