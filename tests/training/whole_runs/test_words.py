@@ -61,6 +61,31 @@ def said(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) ->
     return Said(monkeypatch, capsys)
 
 
+def test_faults_of_the_user_s_making_are_one_message(place: Path, said: Said) -> None:
+    (place / "bad.toml").write_text("[collection]\n")
+    for arguments, says in (
+        (("run", "bad.toml"), "export: Field required"),
+        (("run", "none.toml"), "can't be read"),
+        (("status", "nowhere"), "is no run directory"),
+    ):
+        assert says in said(*arguments, code=1)
+
+
+def test_status_tells_how_far_a_run_is(tiny_run: Path, said: Said) -> None:
+    lines = dict(line.split(maxsplit=1) for line in said("status", str(tiny_run)).splitlines())
+    assert list(lines) == list(STAGES)
+    assert all(state.startswith("done in") for state in lines.values())
+
+
+def test_status_of_a_stage_at_work_tells_its_samples(tiny_run: Path, tmp_path: Path, said: Said) -> None:
+    copy = shutil.copytree(tiny_run, tmp_path / "run")
+    (copy / "stages" / "samples.json").write_text('{"key": "", "basis": ""}')
+    log = (copy / "log.jsonl").read_text().splitlines()
+    at = max(k for k, line in enumerate(log) if '"samples of factor 1"' in line)
+    (copy / "log.jsonl").write_text("\n".join(log[: at + 1]))
+    assert "samples      begun: samples of factor 1: 60 of 60" in said("status", str(copy)).splitlines()
+
+
 def test_changed_data_are_read_again_and_it_is_said(place: Path, said: Said) -> None:
     run = "run", "bars.toml", "--until", "ingest"
     meshes = place / "meshes"
