@@ -2,7 +2,8 @@
 
 ``python -m benchmarks.served --data FOLDER`` trains a model on four fifths of each collection, exports it, and has its
 ``encode`` find the codes of the other fifth and of the shapes that it was trained on. What is done is kept under
-``--out``: a killed call goes on. ``python -m benchmarks.fit --data OUT/models`` fits scans of the unseen shapes.
+``--out``: a killed call goes on. With ``--folds`` each of the other fifths is held out too, of a model of its own
+without what is measured of networks. ``python -m benchmarks.fit --data OUT/models`` fits scans of the unseen shapes.
 """
 
 from __future__ import annotations
@@ -22,24 +23,36 @@ from shapespace.arrays import FloatArray
 from shapespace.mesh.triangle_mesh import TriangleMesh, diagonal
 from shapespace.model.shape_model import ShapeModel, load
 from shapespace.training.collection.mirror import find_mirror, mirrored
-from shapespace.training.pipeline import Run, execute
+from shapespace.training.pipeline import Run, execute, write_bundle_of
 from shapespace.training.runs.config import parse
-from shapespace.training.space.generalisation import PrincipalComponents, folds, summary, vertex_distances
+from shapespace.training.space.generalisation import FOLDS, PrincipalComponents, folds, summary, vertex_distances
 
 #: Most exponentials to learn from: joint, and of each factor.
 JOINT, OF_FACTORS = 1000, 300
 COLUMNS = ("unseen", "trained on")
 #: What the names of runs with half as many modes end in.
 HALF = "-half"
+#: Models beside which the paper's own system is trained, which takes hours.
+PAPER = ("hand",)
 #: Models, in the order of the rows.
 NAMES = tuple(each + ending for each in ROWS for ending in ("", HALF))
 #: What was measured, a file for each collection; one that is there is not measured again.
 FIGURES = ROOT / "runs" / "collections"
+#: The same of all five folds.
+FIVE = FIGURES / "folds"
 
-#: Columns of the table.
+#: Columns of the tables.
 HEAD = (
     *("", "m", "unseen", "95 %", "components", "95 %", "ratio", "trained on", "components", "ratio"),
     *("specificity", "components", "unseen: components with images", "ratio"),
+)
+FOLDS_HEAD = (
+    *("", "m", "unseen", "components", "ratio", "of folds"),
+    *("trained on", "components", "ratio", "of folds"),
+)
+NETWORKS_HEAD = (
+    *("", "m", "factors", "exponentials", "composite", "one factor", "kernel", "paper's one", "paper's own", "affine"),
+    *("steps", "failed", "learned by", "MB"),
 )
 
 PAGE = """# Served models and shapes that they have not seen
@@ -59,17 +72,26 @@ FOLDER` trains, measures and writes this page; what it measured is in `runs/coll
 {head}
 {rows}
 
+## Five folds
+
+Means over all shapes of a collection, each unseen by one of five models: the one above, and four more with another
+fifth held out of each. **of folds**: the least and the greatest ratio of one of these. `--folds` trains and measures
+them.
+
+{folds_head}
+{folds}
+
 ## Networks and exponentials
 
 R² of the same models in the weighted norm with η = 1e-2, on codes that follow from a digest of the finished networks,
 so that nothing can have been chosen on them. **exponentials** are all that the composite saw, joint ones and those of
 factors. The others see the joint ones: **one factor** is our recipe without a product, **kernel** is kernel ridge
-regression on the codes, **paper's** is the paper's monolithic network, trained to convergence. **affine** is the sum of
-the learned factors, on test codes. **steps**: 1 − R² of the exponentials to those of twice as many steps. Where
-1 − R² of the composite is less, it is nearer to these exponentials than these are to the limit.
+regression on the codes, **paper's one** is the paper's monolithic network. **paper's own** is the paper's whole system
+(factor networks, convolutions on stars, dropout), which sees what the composite saw. Both are trained to convergence.
+**affine** is the sum of the learned factors, on test codes. **steps**: 1 − R² of the exponentials to those of twice as
+many steps. Where 1 − R² of the composite is less, it is nearer to these exponentials than these are to the limit.
 
-| | m | factors | exponentials | composite | one factor | kernel | paper's | affine | steps | failed | learned by | MB |
-|---|---|---|---|---|---|---|---|---|---|---|---|---|
+{networks_head}
 {networks}
 
 ![Hands of four fresh codes: exact, and by each model with the distance of vertices in colours](hand-models.png)
@@ -80,8 +102,8 @@ the learned factors, on test codes. **steps**: 1 − R² of the exponentials to 
 """
 
 
-def four_fifths(name: str, data: Path, out: Path) -> tuple[Run, FloatArray, FloatArray]:
-    """The run of a collection without its first fold, the fine meshes (n, V, 3) that it knows, and the others.
+def four_fifths(name: str, data: Path, out: Path, fold: int = 0) -> tuple[Run, FloatArray, FloatArray]:
+    """The run of a collection without one of its folds, the fine meshes (n, V, 3) that it knows, and the others.
 
     With half as many modes where the name ends in ``HALF``, and mirror images where ``MIRRORED`` stands before.
     """
@@ -89,9 +111,10 @@ def four_fifths(name: str, data: Path, out: Path) -> tuple[Run, FloatArray, Floa
     collection = name.removesuffix(HALF).removesuffix(MIRRORED)
     with np.load(str(example.config.collection.data), allow_pickle=False) as arrays:
         whole = {key: arrays[key] for key in arrays.files}
-    held = folds(len(whole["vertices"]))[0]
+    held = folds(len(whole["vertices"]))[fold]
+    ending = f"-fold-{fold}" if fold else ""
     known = {key: array if key == "faces" else np.delete(array, held, axis=0) for key, array in whole.items()}
-    file = out / "data" / f"{collection}.npz"
+    file = out / "data" / f"{collection}{ending}.npz"
     if not file.exists():
         file.parent.mkdir(parents=True, exist_ok=True)
         np.savez(file, **known)
@@ -106,9 +129,11 @@ def four_fifths(name: str, data: Path, out: Path) -> tuple[Run, FloatArray, Floa
         document.pop(section, None)
     for studied in ("seeds", "fractions"):
         document.get("networks", {}).pop(studied, None)
-    document["export"]["name"] = name
+    if name in PAPER and not fold:
+        document["networks"]["paper"] = True
+    document["export"]["name"] = name + ending
     text = tomlkit.dumps(document)
-    run = Run(out / name, parse(text, name), text, out / "models")
+    run = Run(out / (name + ending), parse(text, name), text, out / "models")
     return run, known["vertices"].astype(np.float64), whole["vertices"][held].astype(np.float64)
 
 
@@ -130,6 +155,32 @@ def with_images(known: FloatArray, model: ShapeModel) -> PrincipalComponents:
     return PrincipalComponents.of(np.concatenate([known, mirrored(known, symmetric[0])[0]]), model.vertices)
 
 
+def distances(
+    model: ShapeModel, linear: PrincipalComponents, unseen: FloatArray, known: FloatArray
+) -> dict[str, dict[str, Any]]:
+    """Of shapes (n, V, 3) of both kinds, from those of codes and from those of as many components."""
+    found, size = {}, float(diagonal(model.vertices))
+    for kind, shapes in zip(COLUMNS, (unseen, known), strict=True):
+        others = vertex_distances(linear.nearest(shapes, model.dimension), shapes, size)
+        found[kind] = summary(encoded(model, shapes)) | {"components": summary(others), "shapes": len(shapes)}
+    return found
+
+
+def measure_fold(name: str, data: Path, out: Path, fold: int) -> dict[str, Any]:
+    """Distances alone, of a model that knows the other folds; of the first fold they are known."""
+    run, known, unseen = four_fifths(name, data, out, fold)
+    if not fold:
+        found = json.loads((FIGURES / f"{name}.json").read_text())
+        return {kind: found[kind] | {"shapes": len(some)} for kind, some in zip(COLUMNS, (unseen, known), strict=True)}
+    file = run.directory.study("served")
+    if not file.exists():
+        execute(run, "samples", keep_going=True)
+        model = load(write_bundle_of(run))
+        file.write(distances(model, PrincipalComponents.of(known, model.vertices), unseen, known))
+        print(name, fold, file.read(), flush=True)
+    return file.read()
+
+
 def measure(name: str, data: Path, out: Path) -> dict[str, Any]:
     """Train, and measure what is trained."""
     run, known, unseen = four_fifths(name, data, out)
@@ -140,10 +191,7 @@ def measure(name: str, data: Path, out: Path) -> dict[str, Any]:
     model = load(out / "models" / name)
     m, size = model.dimension, float(diagonal(model.vertices))
     linear = PrincipalComponents.of(known, model.vertices)
-    found: dict[str, Any] = {"modes": m, "evaluation": run.directory.evaluation.read()}
-    for kind, shapes in zip(COLUMNS, (unseen, known), strict=True):
-        others = vertex_distances(linear.nearest(shapes, m), shapes, size)
-        found[kind] = summary(encoded(model, shapes)) | {"components": summary(others)}
+    found = {"modes": m, "evaluation": run.directory.evaluation.read(), **distances(model, linear, unseen, known)}
     if name.removesuffix(HALF).endswith(MIRRORED):
         others = vertex_distances(with_images(known, model).nearest(unseen, m), unseen, size)
         found["mirrored_components"] = summary(others)
@@ -166,6 +214,19 @@ def row(name: str, found: dict[str, Any]) -> str:
     return f"| {' | '.join(cells)} |"
 
 
+def folds_row(name: str, modes: int, every: list[dict[str, Any]]) -> str:
+    """Of the table of folds: means over all shapes, and the least and the greatest ratio of a fold."""
+    cells = ["" if name.endswith(HALF) else title(name), str(modes)]
+    for kind in COLUMNS:
+        shapes = [fold[kind]["shapes"] for fold in every]
+        means = np.array([(fold[kind]["mean"], fold[kind]["components"]["mean"]) for fold in every])
+        own, other = np.average(means, axis=0, weights=shapes)
+        ratios = means[:, 0] / means[:, 1]
+        cells += [f"{100 * own:.3f}", f"{100 * other:.3f}", f"{own / other:.2f}"]
+        cells.append(f"{ratios.min():.2f} – {ratios.max():.2f}")
+    return f"| {' | '.join(cells)} |"
+
+
 def network_row(name: str, found: dict[str, Any]) -> str:
     """Of the other table."""
     figures = found["evaluation"]
@@ -178,6 +239,7 @@ def network_row(name: str, found: dict[str, Any]) -> str:
         str(figures["exponentials"]),
         *(f"{each:.4f}" for each in r2),
     ]
+    cells.append(f"{fresh['r2']['paper']['total']:.4f}" if "paper" in fresh["r2"] else "")
     cells += [f"{figures['r2']['affine of learned factors']['total']:.4f}", f"{1 - fresh['steps']['total']:.1e}"]
     cells += [f"{fresh['failed']} of {fresh['codes']}", figures["correction"]["kind"]]
     cells.append(f"{sizes['composite'] / 1e6:.1f}")
@@ -190,23 +252,48 @@ def main() -> None:
     parser.add_argument("--data", type=Path, required=True, help="folder of the collections")
     parser.add_argument("--out", type=Path, default=ROOT / "build" / "served")
     parser.add_argument("names", nargs="*", default=NAMES, help=f"of rows: {', '.join(NAMES)}")
+    parser.add_argument("--folds", action="store_true", help="hold out each fifth, not the first alone")
     given = parser.parse_args()
     for name in given.names:
-        file = FIGURES / f"{name}.json"
+        file, five = FIGURES / f"{name}.json", FIVE / f"{name}.json"
         if not file.exists():
-            found = measure(name, given.data, given.out)
-            file.parent.mkdir(exist_ok=True)
-            file.write_text(json.dumps(found, indent=1), encoding="utf-8")
-        done = {each: json.loads(path.read_text()) for each in NAMES if (path := FIGURES / f"{each}.json").exists()}
-        page = PAGE.format(
-            joint=JOINT,
-            factors=OF_FACTORS,
-            codes=CODES,
-            head=f"| {' | '.join(HEAD)} |\n|{'---|' * len(HEAD)}",
-            rows="\n".join(row(*each) for each in done.items()),
-            networks="\n".join(network_row(*each) for each in done.items()),
-        )
-        (ROOT / "docs" / "measurements" / "served.md").write_text(page, encoding="utf-8")
+            write(file, measure(name, given.data, given.out))
+        if given.folds and not five.exists():
+            write(five, [measure_fold(name, given.data, given.out, fold) for fold in range(FOLDS)])
+        write_page()
+
+
+def read(folder: Path) -> dict[str, Any]:
+    """What was measured and is there, by the names of rows."""
+    return {each: json.loads(path.read_text()) for each in NAMES if (path := folder / f"{each}.json").exists()}
+
+
+def write(file: Path, found: Any) -> None:
+    """What was measured."""
+    file.parent.mkdir(exist_ok=True)
+    file.write_text(json.dumps(found, indent=1), encoding="utf-8")
+
+
+def write_page() -> None:
+    """The page of all that was measured."""
+    done = read(FIGURES)
+    page = PAGE.format(
+        joint=JOINT,
+        factors=OF_FACTORS,
+        codes=CODES,
+        head=head(HEAD),
+        rows="\n".join(row(*each) for each in done.items()),
+        folds_head=head(FOLDS_HEAD),
+        folds="\n".join(folds_row(name, done[name]["modes"], every) for name, every in read(FIVE).items()),
+        networks_head=head(NETWORKS_HEAD),
+        networks="\n".join(network_row(*each) for each in done.items()),
+    )
+    (ROOT / "docs" / "measurements" / "served.md").write_text(page, encoding="utf-8")
+
+
+def head(columns: tuple[str, ...]) -> str:
+    """Of a table."""
+    return f"| {' | '.join(columns)} |\n|{'---|' * len(columns)}"
 
 
 if __name__ == "__main__":

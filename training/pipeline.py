@@ -261,8 +261,8 @@ def evaluation(run: Run) -> None:
     run.directory.evaluation.write(figures)
 
 
-def export_bundle(run: Run) -> None:
-    """The bundle, in the models directory."""
+def write_bundle_of(run: Run) -> Path:
+    """The bundle of a run whose samples are there, in the models directory, with what was measured so far."""
     directory = run.directory
     digest = hashlib.sha256()
     for path in sorted(directory.samples.rglob("*.npz")):
@@ -271,19 +271,24 @@ def export_bundle(run: Run) -> None:
     geometry = Geometry(reference=run.collection.reference) if run.by_design else space.geometry(directory)
     composite = learner.main()
     with waiting("bundle"):
-        folder = export(
+        return export(
             composite,
             run.collection,
             run.config,
-            directory.evaluation.read(),
+            directory.evaluation.read_if_written(),
             digest.hexdigest(),
             run.models,
             geometry,
             learner.start(),
         )
-    directory.log("exported", bundle=f"{folder.parent.name}/{folder.name}")
+
+
+def export_bundle(run: Run) -> None:
+    """The bundle, and how near its codes come to the collection's shapes."""
+    folder = write_bundle_of(run)
+    run.directory.log("exported", bundle=f"{folder.parent.name}/{folder.name}")
     if not run.by_design:
-        directory.log("encoded", **space.encoded(directory, folder))
+        run.directory.log("encoded", **space.encoded(run.directory, folder))
 
 
 #: The function of each stage. It continues from what an interrupted call has left.

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import time
 
 import numpy as np
 import pytest
@@ -120,15 +119,20 @@ def test_a_draft_turns_into_the_full_shape_pixel_by_pixel(studio: Studio) -> Non
 
 
 def test_shapes_that_take_their_time_are_asked_for_once(studio: Studio) -> None:
-    def late(route: Route) -> None:
-        time.sleep(0.5)
-        route.continue_()
+    waiting: list[Route] = []
 
-    studio.page.route("**/vertices*", late)
+    def keep(route: Route) -> None:
+        waiting.append(route)
+
+    studio.page.route("**/vertices*", keep)
     studio.asked.clear()
     studio.type(0, 0.11)
+    studio.eventually(lambda: bool(waiting))
     studio.type(0, 0.12)
-    studio.eventually(lambda: bool(studio.asked) and studio.asked[-1]["quality"] == "full")
+    for _ in range(3):
+        studio.eventually(lambda: bool(waiting))
+        studio.page.wait_for_timeout(500)
+        waiting.pop(0).continue_()
     studio.rest()
     studio.page.wait_for_timeout(1000)
     assert [asked["quality"] for asked in studio.asked] == ["draft", "draft", "full"]
