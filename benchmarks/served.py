@@ -33,7 +33,7 @@ COLUMNS = ("unseen", "trained on")
 #: What the names of runs with half as many modes end in.
 HALF = "-half"
 #: Models beside which the paper's own system is trained, which takes hours.
-PAPER = ("hand",)
+PAPER = ("hand", "faces-mirrored")
 #: Models, in the order of the rows.
 NAMES = tuple(each + ending for each in ROWS for ending in ("", HALF))
 #: What was measured, a file for each collection; one that is there is not measured again.

@@ -1,11 +1,11 @@
-"""Studies of `benchmarks.results`: measured once, and again only after their run has changed."""
+"""Studies of `benchmarks.results`: measured once, and again only after their run has changed; and rows of pages."""
 
 import json
 from pathlib import Path
 
 import pytest
 
-from benchmarks import results
+from benchmarks import results, served
 from benchmarks.results import have, measured
 from shapespace.training.runs.directory import RunDirectory
 
@@ -36,3 +36,19 @@ def test_the_page_of_results_says_what_was_measured(tmp_path: Path, monkeypatch:
     assert "yet: hand, faces, samba, makehuman, hippocampus." in page
     assert results.spread(row, "composite")[1] <= results.spread(row, "composite")[0]
     assert "| bodies" not in page, "aims of what was not measured"
+
+
+def test_a_row_of_folds_counts_each_shape_once() -> None:
+    def fold(own: float, components: float, shapes: int) -> dict[str, dict[str, object]]:
+        found = {"mean": own, "components": {"mean": components}, "shapes": shapes}
+        return dict.fromkeys(served.COLUMNS, found)
+
+    row = served.folds_row("hand-half", 6, [fold(0.01, 0.02, 1), fold(0.04, 0.02, 3)])
+    assert [cell.strip() for cell in row.strip("|").split("|")][:6] == [
+        "",
+        "6",
+        "3.250",
+        "2.000",
+        "1.62",
+        "0.50 – 2.00",
+    ]
