@@ -38,8 +38,8 @@ PAPER = ("hand",)
 NAMES = tuple(each + ending for each in ROWS for ending in ("", HALF))
 #: What was measured, a file for each collection; one that is there is not measured again.
 FIGURES = ROOT / "runs" / "collections"
-#: The same of all five folds.
-FIVE = FIGURES / "folds"
+#: Distances of the other folds, a list for each collection.
+OTHER_FOLDS = FIGURES / "folds"
 
 #: Columns of the tables.
 HEAD = (
@@ -167,15 +167,12 @@ def distances(
 
 
 def measure_fold(name: str, data: Path, out: Path, fold: int) -> dict[str, Any]:
-    """Distances alone, of a model that knows the other folds; of the first fold they are known."""
+    """Distances alone, of a model that knows the other folds."""
     run, known, unseen = four_fifths(name, data, out, fold)
-    if not fold:
-        found = json.loads((FIGURES / f"{name}.json").read_text())
-        return {kind: found[kind] | {"shapes": len(some)} for kind, some in zip(COLUMNS, (unseen, known), strict=True)}
     file = run.directory.study("served")
     if not file.exists():
         execute(run, "samples", keep_going=True)
-        model = load(write_bundle_of(run))
+        model = load(write_bundle_of(run, figures={}))
         file.write(distances(model, PrincipalComponents.of(known, model.vertices), unseen, known))
         print(name, fold, file.read(), flush=True)
     return file.read()
@@ -201,9 +198,14 @@ def measure(name: str, data: Path, out: Path) -> dict[str, Any]:
     return found
 
 
+def first_cells(name: str, found: dict[str, Any]) -> list[str]:
+    """Of a row of any table."""
+    return ["" if name.endswith(HALF) else title(name), str(found["modes"])]
+
+
 def row(name: str, found: dict[str, Any]) -> str:
     """Of the table."""
-    cells = ["" if name.endswith(HALF) else title(name), str(found["modes"])]
+    cells = first_cells(name, found)
     for kind in COLUMNS:
         own, other = found[kind], found[kind]["components"]
         both = [(own["mean"], own["p95"]), (other["mean"], other["p95"])]
@@ -214,9 +216,9 @@ def row(name: str, found: dict[str, Any]) -> str:
     return f"| {' | '.join(cells)} |"
 
 
-def folds_row(name: str, modes: int, every: list[dict[str, Any]]) -> str:
+def folds_row(name: str, first: dict[str, Any], others: list[dict[str, Any]]) -> str:
     """Of the table of folds: means over all shapes, and the least and the greatest ratio of a fold."""
-    cells = ["" if name.endswith(HALF) else title(name), str(modes)]
+    cells, every = first_cells(name, first), [first, *others]
     for kind in COLUMNS:
         shapes = [fold[kind]["shapes"] for fold in every]
         means = np.array([(fold[kind]["mean"], fold[kind]["components"]["mean"]) for fold in every])
@@ -231,15 +233,13 @@ def network_row(name: str, found: dict[str, Any]) -> str:
     """Of the other table."""
     figures = found["evaluation"]
     fresh, sizes = figures["fresh"], figures["sizes"]
-    r2 = [fresh["r2"][each]["total"] for each in ("composite", "monolithic", "kernel", "monolithic_paper")]
+    r2 = [fresh["r2"].get(each) for each in ("composite", "monolithic", "kernel", "monolithic_paper", "paper")]
     cells = [
-        "" if name.endswith(HALF) else title(name),
-        str(found["modes"]),
+        *first_cells(name, found),
         str(len(figures["r2_factors"])),
         str(figures["exponentials"]),
-        *(f"{each:.4f}" for each in r2),
+        *(f"{each['total']:.4f}" if each else "" for each in r2),
     ]
-    cells.append(f"{fresh['r2']['paper']['total']:.4f}" if "paper" in fresh["r2"] else "")
     cells += [f"{figures['r2']['affine of learned factors']['total']:.4f}", f"{1 - fresh['steps']['total']:.1e}"]
     cells += [f"{fresh['failed']} of {fresh['codes']}", figures["correction"]["kind"]]
     cells.append(f"{sizes['composite'] / 1e6:.1f}")
@@ -255,11 +255,11 @@ def main() -> None:
     parser.add_argument("--folds", action="store_true", help="hold out each fifth, not the first alone")
     given = parser.parse_args()
     for name in given.names:
-        file, five = FIGURES / f"{name}.json", FIVE / f"{name}.json"
+        file, others = FIGURES / f"{name}.json", OTHER_FOLDS / f"{name}.json"
         if not file.exists():
             write(file, measure(name, given.data, given.out))
-        if given.folds and not five.exists():
-            write(five, [measure_fold(name, given.data, given.out, fold) for fold in range(FOLDS)])
+        if given.folds and not others.exists():
+            write(others, [measure_fold(name, given.data, given.out, fold) for fold in range(1, FOLDS)])
         write_page()
 
 
@@ -284,7 +284,7 @@ def write_page() -> None:
         head=head(HEAD),
         rows="\n".join(row(*each) for each in done.items()),
         folds_head=head(FOLDS_HEAD),
-        folds="\n".join(folds_row(name, done[name]["modes"], every) for name, every in read(FIVE).items()),
+        folds="\n".join(folds_row(name, done[name], others) for name, others in read(OTHER_FOLDS).items()),
         networks_head=head(NETWORKS_HEAD),
         networks="\n".join(network_row(*each) for each in done.items()),
     )

@@ -261,8 +261,8 @@ def evaluation(run: Run) -> None:
     run.directory.evaluation.write(figures)
 
 
-def write_bundle_of(run: Run) -> Path:
-    """The bundle of a run whose samples are there, in the models directory, with what was measured so far."""
+def write_bundle_of(run: Run, figures: dict[str, Any]) -> Path:
+    """The bundle of a run whose samples are there, in the models directory, with what was measured."""
     directory = run.directory
     digest = hashlib.sha256()
     for path in sorted(directory.samples.rglob("*.npz")):
@@ -275,7 +275,7 @@ def write_bundle_of(run: Run) -> Path:
             composite,
             run.collection,
             run.config,
-            directory.evaluation.read_if_written(),
+            figures,
             digest.hexdigest(),
             run.models,
             geometry,
@@ -285,7 +285,7 @@ def write_bundle_of(run: Run) -> Path:
 
 def export_bundle(run: Run) -> None:
     """The bundle, and how near its codes come to the collection's shapes."""
-    folder = write_bundle_of(run)
+    folder = write_bundle_of(run, run.directory.evaluation.read())
     run.directory.log("exported", bundle=f"{folder.parent.name}/{folder.name}")
     if not run.by_design:
         run.directory.log("encoded", **space.encoded(run.directory, folder))

@@ -43,7 +43,7 @@ def test_a_row_of_folds_counts_each_shape_once() -> None:
         found = {"mean": own, "components": {"mean": components}, "shapes": shapes}
         return dict.fromkeys(served.COLUMNS, found)
 
-    row = served.folds_row("hand-half", 6, [fold(0.01, 0.02, 1), fold(0.04, 0.02, 3)])
+    row = served.folds_row("hand-half", {"modes": 6, **fold(0.01, 0.02, 1)}, [fold(0.04, 0.02, 3)])
     assert [cell.strip() for cell in row.strip("|").split("|")][:6] == [
         "",
         "6",

@@ -43,15 +43,20 @@ def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 class Said:
-    """Runs the command in this process, which saves importing torch again, and returns its output."""
+    """Runs the command in this process, which saves importing torch again, and returns its output.
+
+    Attributes:
+        errors: what the last one wrote to standard error.
+    """
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-        self._monkeypatch, self._capsys = monkeypatch, capsys
+        self._monkeypatch, self._capsys, self.errors = monkeypatch, capsys, ""
 
     def __call__(self, *arguments: str, code: int = 0) -> str:
         self._monkeypatch.setattr(sys, "argv", ["shapespace-train", *arguments])
         assert command.main() == code
         captured = self._capsys.readouterr()
+        self.errors = captured.err
         assert "Traceback" not in captured.err
         return captured.out + captured.err
 
@@ -68,7 +73,8 @@ def test_faults_of_the_user_s_making_are_one_message(place: Path, said: Said) ->
         (("run", "none.toml"), "can't be read"),
         (("status", "nowhere"), "is no run directory"),
     ):
-        assert says in said(*arguments, code=1)
+        said(*arguments, code=1)
+        assert says in said.errors
 
 
 def test_status_tells_how_far_a_run_is(tiny_run: Path, said: Said) -> None:
