@@ -8,14 +8,13 @@ collection whose folds are all done has its figures in ``runs/folds/``, and is n
 from __future__ import annotations
 
 import argparse
-import itertools
 import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from benchmarks.results import COLLECTIONS, MIRRORED, ROOT, SYMMETRIC, open_run
+from benchmarks.results import COLLECTIONS, MANNEQUIN, MIRRORED, ROOT, SYMMETRIC, open_run
 from shapespace.training.space import stages
 from shapespace.training.space.generalisation import folds, held_out, summary
 
@@ -28,16 +27,18 @@ Distance of a vertex from its place after rigid alignment, in percent of the bou
 percentile over all vertices of all shapes, each held out in one of five folds that found mean, logarithms and modes
 without it. **Modes**: the code whose exponential comes closest in vertices, in {steps} time steps; no networks.
 **Components**: principal components of the aligned vertices, as many. On coarse meshes of at most a thousand vertices.
-Rows *with mirror images* also learn from the images of the shapes that they know, which both collections' symmetric
-template gives; components are without and, in the last columns, with them too.
-Folds choose nothing: settings are those of `examples/collections`. `python -m benchmarks.generalisation --data FOLDER`
+Rows *with mirror images* also learn from the images of the shapes that they know, which a symmetric shape of the
+collection gives; components are without and, in the last columns, with them too.
+Folds choose nothing: settings are those of `examples`. `python -m benchmarks.generalisation --data FOLDER`
 measures and writes this page; a collection is in it once all its folds are measured, with figures in `runs/folds/`.
 
 | | shapes | m | modes: mean | 95 % | components: mean | 95 % | modes / components | with images: mean | modes / these |
 |---|---|---|---|---|---|---|---|---|---|
 """
 #: Rows of the table.
-ROWS = tuple(itertools.chain(*((name, name + MIRRORED) if name in SYMMETRIC else (name,) for name in COLLECTIONS)))
+ROWS = tuple(
+    name + ending for name in (*COLLECTIONS, MANNEQUIN) for ending in ("", MIRRORED) if name in SYMMETRIC or not ending
+)
 
 
 def measure(name: str, data: Path, out: Path) -> dict[str, Any]:

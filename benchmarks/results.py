@@ -29,9 +29,11 @@ ROOT = Path(__file__).resolve().parents[1]
 #: Collections of real meshes, in the order of the tables; then the hand without sparse modes, and with one factor.
 COLLECTIONS = ("hand", "faces", "samba", "makehuman", "horse", "hippocampus")
 CONTRASTS = ("hand-pga", "hand-one-factor")
+#: The bundled collection of shapes; its other figures are on the page of the bundled models.
+MANNEQUIN = "figure"
 #: What the names of runs with mirror images end in, and the collections that have a symmetric shape.
 MIRRORED = "-mirrored"
-SYMMETRIC = ("faces", "makehuman")
+SYMMETRIC = ("faces", "makehuman", MANNEQUIN)
 #: Runs whose extrapolation is measured: an easy and a difficult one.
 EXTRAPOLATED = ("hand", "samba")
 #: Studies, each with the last stage whose results it measures.
@@ -55,10 +57,11 @@ def have(run: RunDirectory, name: str, measure: Callable[[], dict[str, Any]]) ->
 
 
 def open_run(name: str, data: Path, out: Path) -> Run:
-    """The run of a collection; with mirror images of its shapes where the name ends in ``MIRRORED``."""
-    path = ROOT / "examples" / "collections" / f"{name.removesuffix(MIRRORED)}.toml"
-    meshes = load(path)[0].collection.data.relative_to(path.parent)
-    config, text = load(path, data / meshes)
+    """The run of a collection or the figure, with mirror images of its shapes where the name ends in ``MIRRORED``."""
+    plain = name.removesuffix(MIRRORED)
+    path = ROOT / "examples" / (f"{plain}.toml" if plain == MANNEQUIN else f"collections/{plain}.toml")
+    meshes = load(path)[0].collection.data
+    config, text = load(path, data / meshes.relative_to(path.parent) if meshes else None)
     if name.endswith(MIRRORED):
         document: Any = tomlkit.parse(text)
         document["collection"]["mirror"] = True
