@@ -304,7 +304,9 @@ class PaperSettings(_Section):
 
 
 class AutoSettings(_Section):
-    """The kind that suits the collection: ``kernel``, or ``polynomials`` where these are better on held-out codes."""
+    """The kind that suits the collection: ``kernel``, or, where this leaves more than a thousandth of the shapes' mean
+    square, ``polynomials`` if these are better on held-out codes.
+    """
 
     kind: Literal["auto"] = "auto"
 
