@@ -1,4 +1,4 @@
-"""Corrections of the affine sum of the factors' shapes: what they have in common, and two kinds in closed form."""
+"""Corrections of the affine sum of the factors' shapes: what they have in common, and products of two factors."""
 
 from __future__ import annotations
 
@@ -13,10 +13,13 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from shapespace.mesh.triangle_mesh import TriangleMesh
-from shapespace.training.learning.layers import Scaling, half_precision
-from shapespace.training.learning.linear import Ridge, kernel_ridge, principal_axes, regression
-from shapespace.training.runs.config import FitSettings, KernelSettings, ProductSettings
+from shapespace.training.learning.layers import Scaling
+from shapespace.training.learning.linear import principal_axes, regression
+from shapespace.training.runs.config import FitSettings, ProductSettings
 from shapespace.training.runs.sampling import Places
+
+#: Factor shapes (n, J, 2E), and the residual (n, 2E) of their affine sum to the joint shape, as scaled differences.
+Pairs = tuple[Tensor, Tensor]
 
 
 @dataclass(frozen=True)
@@ -87,6 +90,11 @@ class JointSamples:
         return self.scaling.down(self.factors)
 
     @property
+    def pairs(self) -> Pairs:
+        """`inputs` and `missed`."""
+        return self.inputs, self.missed
+
+    @property
     def missed(self) -> Tensor:
         """(n, 2E) scaled differences of the joint shapes from the affine sums, in NRIC of single precision."""
         # In parts, since all inputs together take J times the room of the result.
@@ -133,123 +141,6 @@ class Correction(nn.Module, ABC):
     def loss(self, y: Tensor, target: Tensor) -> Tensor:
         """Mean square error, or an estimate of it, to train with."""
         return nn.functional.mse_loss(self(y), target)
-
-
-class KernelCorrection(Correction):
-    """Kernel ridge regression on the factors' shapes, smooth and global.
-
-    The kernel of two samples is ``exp(−½ Σ_j ‖x_j − x_j'‖² / (ℓ σ_j)²)``, with the difference of the shapes of factor j
-    in a few principal coefficients, and σ_j the standard deviation of the first. Its values are principal coefficients
-    of what the affine sum misses. Products of two or three coefficients, which describe how factors act on each other,
-    are among the functions that such a kernel approximates.
-    """
-
-    centre: Tensor
-    axes: Tensor
-    anchors: Tensor
-    gamma: Tensor
-    weights: Tensor
-    mean: Tensor
-    basis: Tensor
-    #: Most samples to fit to: the time grows with their cube, the size of the network with their number.
-    ANCHORS = 4000
-    #: Candidates for the length ℓ and for the penalty, where the kernel's largest value is 1. With penalties below 1e-4
-    #: the weights are too large for single precision.
-    LENGTHS = (2.0, 4.0, 8.0, 16.0)
-    PENALTIES = tuple(10.0 ** (k / 2) for k in range(-8, -1))
-    #: Most samples that the principal axes of factors are computed from.
-    AXES = 500
-    #: Share of the variance that the correction's output basis keeps, and its largest rank.
-    ENERGY, RANK = 0.995, 512
-
-    def __init__(self, factor_count: int, coefficients: int, size: int, anchors: int, rank: int) -> None:
-        super().__init__()
-        self.register_buffer("centre", torch.zeros(factor_count, size))
-        self.register_buffer("axes", torch.zeros(factor_count, size, coefficients))
-        self.register_buffer("anchors", torch.zeros(anchors, factor_count * coefficients))
-        self.register_buffer("gamma", torch.ones(()))
-        self.register_buffer("weights", torch.zeros(anchors, rank))
-        self.register_buffer("mean", torch.zeros(size))
-        self.register_buffer("basis", torch.zeros(rank, size))
-
-    @classmethod
-    def load(cls, settings: KernelSettings, reference: TriangleMesh, tensors: Mapping[str, Tensor]) -> KernelCorrection:
-        """See `Correction`; sizes are those of the tensors."""
-        (factors, size, coefficients), anchors = tensors["axes"].shape, len(tensors["anchors"])
-        result = cls(factors, coefficients, size, anchors, len(tensors["basis"]))
-        result.load_state_dict(tensors)
-        return result
-
-    @classmethod
-    def fit(
-        cls, settings: KernelSettings, reference: TriangleMesh, own: JointSamples, held_out: JointSamples, seed: int
-    ) -> KernelCorrection:
-        """See `Correction`."""
-        y, residual = own.inputs[: cls.ANCHORS], own.missed[: cls.ANCHORS]
-        mean = residual.mean(dim=0)
-        s, axes = principal_axes((residual - mean)[: 3 * cls.RANK], by="rows")
-        energy = s.square().cumsum(0)
-        rank = min(int((energy < cls.ENERGY * energy[-1]).sum()) + 1, cls.RANK)
-        result = cls(y.shape[1], settings.coefficients, y.shape[2], len(y), rank)
-        result.mean.copy_(mean)
-        result.basis.copy_(half_precision(axes[:rank]))
-        result._fit_inputs(y)
-        result.anchors.copy_(result._inputs(y))
-        result._fit_weights(
-            result._values(residual),
-            (result._inputs(held_out.inputs), result._values(held_out.missed)),
-            own.slopes,
-        )
-        return result
-
-    def _fit_inputs(self, y: Tensor) -> None:
-        """Principal axes of the shapes of each factor, scaled so that the first coefficient has a variance of one."""
-        self.centre.copy_(y.mean(dim=0))
-        for j in range(y.shape[1]):
-            some = y[: self.AXES, j] - self.centre[j]
-            s, axes = principal_axes(some, by="rows")
-            count = min(self.axes.shape[2], len(s))
-            self.axes[j, :, :count] = half_precision(axes[:count].T * (len(some) ** 0.5 / s[0].clamp_min(1e-12)))
-
-    def _fit_weights(self, target: Tensor, held_out: tuple[Tensor, Tensor], slopes: Slopes | None) -> None:
-        """The length and the penalty that suit held-out inputs and values best, and the weights (anchors, rank)."""
-
-        def fitted(length: float) -> tuple[Ridge, Tensor]:
-            gamma = torch.tensor(0.5 / length**2)
-            kernel, other = self._kernel(self.anchors, gamma), self._kernel(held_out[0], gamma)
-            rows = self._slopes(slopes, gamma) if slopes else None
-            return kernel_ridge(kernel, target, rows, (other, held_out[1]), self.PENALTIES), gamma
-
-        best, gamma = min(map(fitted, self.LENGTHS), key=lambda fit: fit[0].error)
-        self.gamma.copy_(gamma)
-        self.weights.copy_(best.weights)
-
-    def _slopes(self, slopes: Slopes, gamma: Tensor) -> tuple[Tensor, Tensor]:
-        """Derivatives of the kernel (k m, anchors) and of the values (k m, rank)."""
-        x, along = slopes.repeated(self._inputs(slopes.inputs)).double(), slopes.coefficients(self.axes).double()
-        towards = along @ self.anchors.T.double() - (x * along).sum(dim=1, keepdim=True)
-        rows = 2 * gamma.double() * towards * self._kernel(x, gamma)
-        return rows, (slopes.missed.flatten(0, 1) @ self.basis.T).double()
-
-    def _values(self, residual: Tensor) -> Tensor:
-        """(n, rank) coefficients of residuals (n, 2E), in double precision."""
-        return ((residual - self.mean) @ self.basis.T).double()
-
-    def _inputs(self, y: Tensor) -> Tensor:
-        """(n, J d) coefficients of the factors' shapes (n, J, 2E)."""
-        # Not einsum, which, once exported, would transpose the axes in every call.
-        return torch.matmul((y - self.centre)[:, :, None], self.axes).flatten(1)
-
-    def _kernel(self, inputs: Tensor, gamma: Tensor) -> Tensor:
-        """(n, anchors), in double precision, to fit with."""
-        return torch.exp(-gamma.double() * torch.cdist(inputs.double(), self.anchors.double()).square())
-
-    def difference(self, y: Tensor) -> Tensor:
-        # Weights are large and of both signs: in single precision up to 3 % of the result would be rounding errors.
-        c, anchors = self._inputs(y).double(), self.anchors.double()
-        squares = c.square().sum(dim=1, keepdim=True) - 2 * c @ anchors.T + anchors.square().sum(dim=1)
-        coefficients = torch.exp(-self.gamma.double() * squares) @ self.weights.double()
-        return self.mean + coefficients.to(y.dtype) @ self.basis
 
 
 class ProductCorrection(Correction):

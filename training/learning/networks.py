@@ -19,8 +19,9 @@ from shapespace.arrays import FloatArray
 from shapespace.mesh.rigid_motion import align
 from shapespace.mesh.triangle_mesh import TriangleMesh
 from shapespace.training.learning.convolutions import ConvolutionCorrection
-from shapespace.training.learning.corrections import Correction, JointSamples, KernelCorrection, ProductCorrection
+from shapespace.training.learning.corrections import Correction, JointSamples, ProductCorrection
 from shapespace.training.learning.fields import FieldCorrection
+from shapespace.training.learning.kernels import KernelCorrection
 from shapespace.training.learning.layers import (
     FourierProducts,
     LatentFeatures,

@@ -193,11 +193,15 @@ class LatentNetworkSettings(_Section):
 
 
 class KernelSettings(_Section):
-    """Kernel ridge regression on principal coefficients of the factors' shapes."""
+    """Kernel ridge regression on principal coefficients of the factors' shapes, another one for each patch of edges, in
+    a metric that is learned.
+    """
 
     kind: Literal["kernel"] = "kernel"
     coefficients: int = Field(12, ge=1)
-    """Principal coefficients of each factor."""
+    """Principal coefficients of each factor in a patch."""
+    patches: int = Field(8, ge=1)
+    """Number of patches."""
 
 
 class PolynomialSettings(_Section):
