@@ -30,8 +30,9 @@ SWEEPS, PROMISING = 4, 1.2
 TOLERANCE, GAIN, SHAPES = 1e-4, 1e-4, 25
 #: Where codes outside the bounds are allowed: by how much, a fraction of the bounds' width.
 MARGIN = 0.5
-#: A code inside is preferred if so many more shapes find one whose mean distance is less than this many times as large.
-INSIDE, AS_NEAR = 5, 1.02
+#: A code inside is preferred if so many more shapes, and those that the search left over, find one whose distance is at
+#: most this many times as large.
+INSIDE, AS_NEAR = 3, 1.02
 #: A mesh this many times larger or smaller than the reference is taken to be in other units.
 UNITS = 3.0
 #: Least standard deviation of a vertex that the posterior assumes, as a fraction of the diagonal.
@@ -231,9 +232,27 @@ class Encoder:
         if np.array_equal(moved.x, fit.x) or fit.status is Status.DEADLINE:
             return fit
         box = Box(lower, upper, self.model.latents.width)
-        other = self._by_vertices(target, moved, box, fixed, deadline, most=INSIDE)
-        near = other is not moved and other.status is not Status.DEADLINE and other.cost <= AS_NEAR**2 * fit.cost
+        other = self._by_vertices(target, moved, box, fixed, deadline, most=SHAPES + INSIDE - fit.iterations)
+        near = (
+            other is not moved
+            and other.status is not Status.DEADLINE
+            and self._away(other.x, target, deadline) <= AS_NEAR * self._away(fit.x, target, deadline)
+        )
         return replace(other if near else fit, iterations=fit.iterations + other.iterations)
+
+    def _away(self, x: FloatArray, target: FloatArray, deadline: Deadline | None) -> float:
+        """Root mean square distance of vertices (V, 3) from those of a code (m,) as it is served.
+
+        A search goes from shape to shape, and far outside the bounds it may come to another one.
+        """
+        try:
+            shape = self.model.shape(self.model.latents.code(x.tolist())[0], mesh=MeshChoice.COARSE, deadline=deadline)
+        except NotFiniteError:
+            return np.inf
+        return (
+            float(np.linalg.norm(align(shape.vertices / self.model.manifest.scale, target) - target))
+            / len(target) ** 0.5
+        )
 
     def _by_nric(self, target: FloatArray, box: Box, fixed: Fixed, deadline: Deadline | None) -> Fit:
         """The fit to lengths and angles (2E,)."""

@@ -174,3 +174,16 @@ def test_a_code_outside_is_answered_only_where_none_inside_is_as_near(figure: Sh
     outside = figure.encode(figure.decode(beyond))
     assert not outside.inside_bounds
     assert outside.distances.mean() < 0.1 * away
+
+
+def test_a_code_outside_is_no_farther_than_one_inside(figure: ShapeModel) -> None:
+    """Of twisted shapes, which no code makes: what a search far outside comes to need not be the shape of its code."""
+    for k in (1, 2):
+        shape = figure.decode(figure.sample(1, k)[0])
+        turn = 4 * (shape[:, 1] - figure.vertices[:, 1].mean()) / np.linalg.norm(np.ptp(figure.vertices, axis=0))
+        x, y, z = shape.T
+        twisted = np.stack([x * np.cos(turn) - z * np.sin(turn), y, x * np.sin(turn) + z * np.cos(turn)], axis=1)
+        allowed, clamped = (
+            np.sqrt(np.square(figure.encode(twisted, bounds).distances).mean()) for bounds in ("allow", "clamp")
+        )
+        assert allowed < 1.03 * clamped, k
