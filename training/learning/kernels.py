@@ -50,6 +50,8 @@ class KernelCorrection(PatchCorrection):
     gammas: Tensor
     weights: Tensor
     basis: Tensor
+    #: Fewest edges of a patch, on average.
+    EDGES = 24
     #: Most samples to fit to: the time grows with their cube, the size of the network with their number.
     ANCHORS = 4000
     #: See `output_rank`, and the largest rank.
@@ -62,7 +64,8 @@ class KernelCorrection(PatchCorrection):
         """See `Correction`; the held-out samples choose metrics too, and the seed is that of the patches."""
         inputs, missed = own.pairs
         pairs, others = (inputs[: cls.ANCHORS], missed[: cls.ANCHORS]), held_out.pairs
-        patches = patches_of(_Patch, reference, settings.patches, settings.coefficients, pairs, others, seed)
+        count = max(1, min(settings.patches, len(reference.edges) // cls.EDGES))
+        patches = patches_of(_Patch, reference, count, settings.coefficients, pairs, others, seed)
         coordinates = max(patch.rank for patch in patches)
         for patch in progress(patches, "kernels", "patch"):
             patch.fit(pairs, others, own.slopes, coordinates)

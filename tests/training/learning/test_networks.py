@@ -22,6 +22,7 @@ from shapespace.training.learning.baselines import LatentKernel
 from shapespace.training.learning.convolutions import EdgeConvolution, Flaps, Star, flaps
 from shapespace.training.learning.corrections import JointSamples, Slopes
 from shapespace.training.learning.fitting import read_network, save_network
+from shapespace.training.learning.kernels import KernelCorrection
 from shapespace.training.learning.layers import (
     FourierProducts,
     LatentFeatures,
@@ -249,6 +250,18 @@ def test_every_kind_has_a_class() -> None:
     assert isinstance(paper, ConvolutionSettings)
     assert (paper.neighbourhood, paper.residual, paper.dropout, paper.edge_channels) == ("star", False, 0.1, 0)
     assert (paper.fit.schedule, paper.fit.learning_rate) == ("plateau", 1e-3)
+
+
+def test_the_kernel_of_a_small_mesh_has_one_patch() -> None:
+    box = trimesh.creation.box()
+    mesh = TriangleMesh.from_arrays(box.vertices, box.faces)
+    x, z = interplay(mesh, 60, bilinear)
+    network = fitted(mesh, KernelSettings(coefficients=3), x[:50], z[:50], 40)
+    assert isinstance(network.correction, KernelCorrection)
+    assert len(network.correction.anchors) == 1
+    with torch.no_grad():
+        missed = network.scaling.down(network(x[50:]) - z[50:] + network.scaling.mean)
+    assert missed.square().mean() < 1e-3
 
 
 @pytest.mark.parametrize(
