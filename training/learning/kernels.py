@@ -54,8 +54,8 @@ class KernelCorrection(PatchCorrection):
     EDGES = 24
     #: Most samples to fit to: the time grows with their cube, the size of the network with their number.
     ANCHORS = 4000
-    #: See `output_rank`, and the largest rank.
-    SLACK, RANK = 0.125, 128
+    #: Largest rank of the output.
+    RANK = 128
 
     @classmethod
     def fit(
@@ -69,7 +69,7 @@ class KernelCorrection(PatchCorrection):
         coordinates = max(patch.rank for patch in patches)
         for patch in progress(patches, "kernels", "patch"):
             patch.fit(pairs, others, own.slopes, coordinates)
-        bases = padded_bases(patches, min(output_rank(patches, cls.SLACK), cls.RANK))
+        bases = padded_bases(patches, min(output_rank(patches), cls.RANK))
         return cls(
             common_tensors(patches, coordinates, missed.shape[1])
             | {

@@ -16,6 +16,8 @@ from shapespace.training.learning.layers import half_precision, patch_entries
 from shapespace.training.learning.linear import SpectralRidge, principal_axes
 from shapespace.training.runs.progress import progress
 
+#: By which share the rank of the output may increase the squared error on held-out samples.
+SLACK = 0.125
 #: Most samples that the principal axes of factors are computed from.
 AXES = 500
 
@@ -159,14 +161,14 @@ def patches_of(
 def common_tensors(patches: Sequence[Patch], rank: int, size: int) -> dict[str, Tensor]:
     """The tensors of a `PatchCorrection` of 2E = ``size``."""
     # Shorter patches are padded with an entry of NRIC that does not exist, where shapes are zero.
-    entries = padded([torch.as_tensor(patch.columns) for patch in patches], size)
+    entries = _padded([torch.as_tensor(patch.columns) for patch in patches], size)
     mean = torch.zeros(size)
     for patch in patches:
         mean[patch.columns] = patch.mean.float()
     return {
         "entries": entries,
         "place": torch.argsort(entries.flatten())[:size],
-        "axes": padded([patch.axes.permute(2, 0, 1) for patch in patches]).permute(0, 2, 3, 1).contiguous(),
+        "axes": _padded([patch.axes.permute(2, 0, 1) for patch in patches]).permute(0, 2, 3, 1).contiguous(),
         "units": torch.stack([patch.units for patch in patches]).float(),
         "centre": torch.stack([patch.centre for patch in patches]).float(),
         "metric": torch.stack([patch.metric[:rank] for patch in patches]),
@@ -174,21 +176,21 @@ def common_tensors(patches: Sequence[Patch], rank: int, size: int) -> dict[str, 
     }
 
 
-def padded(parts: Sequence[Tensor], value: float = 0) -> Tensor:
+def _padded(parts: Sequence[Tensor], value: float = 0) -> Tensor:
     """(P, longest, …) of P tensors (·, …)."""
     return nn.utils.rnn.pad_sequence(list(parts), batch_first=True, padding_value=value)
 
 
-def output_rank(patches: Sequence[Patch], slack: float) -> int:
-    """The smallest rank of the output that adds no more than this share to the squared error of all patches."""
-    energy = padded([patch.energy for patch in patches]).sum(dim=0)
+def output_rank(patches: Sequence[Patch]) -> int:
+    """The smallest rank of the output that adds no more than SLACK to the squared error of all patches."""
+    energy = _padded([patch.energy for patch in patches]).sum(dim=0)
     lost = energy.sum() - energy.cumsum(0)
-    return min(int((lost > slack * sum(patch.error for patch in patches)).sum()) + 1, len(energy))
+    return min(int((lost > SLACK * sum(patch.error for patch in patches)).sum()) + 1, len(energy))
 
 
 def padded_bases(patches: Sequence[Patch], rank: int) -> Tensor:
     """(P, S, rank) of their first axes; zeros beyond the entries and the axes of a patch."""
-    return padded(
+    return _padded(
         [nn.functional.pad(each[:, :rank], (0, max(0, rank - each.shape[1]))) for each in (p.basis for p in patches)]
     )
 
@@ -212,12 +214,12 @@ OUTPUTS = 16
 SCALE = 1 / 8
 
 
-def kernel(s: Tensor) -> Tensor:
+def _kernel(s: Tensor) -> Tensor:
     """``κ(s)``, the exponential series to degree three."""
     return 1 + s * (1 + s * (1 / 2 + s / 6))
 
 
-def kernel_slope(s: Tensor) -> Tensor:
+def _kernel_slope(s: Tensor) -> Tensor:
     """``κ'(s)``."""
     return 1 + s * (1 + s / 2)
 
@@ -241,7 +243,7 @@ def learned_metric(x: Tensor, y: Tensor, held_out: Pairs) -> tuple[Tensor, float
     for step in range(STEPS + 1):
         z = x @ metric
         s = z @ z.T
-        found = SpectralRidge.fit(kernel(s), y, (kernel(held_out[0] @ metric @ z.T), held_out[1]), PENALTIES)
+        found = SpectralRidge.fit(_kernel(s), y, (_kernel(held_out[0] @ metric @ z.T), held_out[1]), PENALTIES)
         if found.error < best:
             best, chosen = found.error, (metric, found.penalty)
         if step < STEPS:
@@ -259,6 +261,6 @@ def _updated(metric: Tensor, z: Tensor, s: Tensor, weights: Tensor) -> Tensor:
         s: (m, n) inner products of the samples at which gradients are taken, with all.
         weights: (n, q) of the kernel regression.
     """
-    gradients = torch.einsum("pn,nq,nk->pqk", kernel_slope(s), weights, z).flatten(0, 1) @ metric.T
+    gradients = torch.einsum("pn,nq,nk->pqk", _kernel_slope(s), weights, z).flatten(0, 1) @ metric.T
     value, vector = torch.linalg.eigh(gradients.T @ gradients)
     return vector * (value / value[-1].clamp_min(1e-30)).clamp_min(1e-12) ** POWER

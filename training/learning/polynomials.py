@@ -53,8 +53,6 @@ class PolynomialCorrection(PatchCorrection):
     basis: Tensor
     #: Mean number of edges of a patch.
     EDGES = 24
-    #: The output's rank is the lowest that increases the squared error on held-out samples by at most this share.
-    SLACK = 0.125
 
     @classmethod
     def fit(
@@ -68,7 +66,7 @@ class PolynomialCorrection(PatchCorrection):
         monomials = _Monomials.strongest(spread.numpy(), settings.monomials)
         for patch in progress(patches, "polynomials", "patch"):
             patch.fit(pairs, others, monomials, own.slopes)
-        weights, gains, basis = _output_layers(patches, output_rank(patches, cls.SLACK))
+        weights, gains, basis = _output_layers(patches, output_rank(patches))
         return cls(
             common_tensors(patches, monomials.rank, pairs[1].shape[1])
             | {
