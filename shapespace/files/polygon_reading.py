@@ -12,7 +12,7 @@ from array import array
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import pairwise
+from itertools import islice, pairwise
 from typing import Any, Self
 
 import numpy as np
@@ -27,32 +27,42 @@ LONGEST_LINE, LONGEST_HEAD = 2**20, 2**16
 #: Most ends of lines for each vertex and face, and beside these: an ASCII STL file has seven lines for a face, an OBJ
 #: file up to seven with texture and normals, and each may end in two characters.
 _LINES_OF_EACH, _LINES_BESIDE = 16, 100_000
-_LINE = re.compile(rb"[^\r\n]++")
+_ENDS = "it ends before all that it says is there"
+
+
+def _lines_with(start: bytes) -> re.Pattern[bytes]:
+    """Lines that begin so after blanks: others cost no Python, as strangers may send tens of millions of them."""
+    return re.compile(rb"(?<![^\r\n])[^\S\r\n]*+(" + start + rb"[^\r\n]*+)")
+
+
+_LINE, _OBJ_LINE, _STL_LINE = map(_lines_with, (rb"[^\s#]", rb"[vf]\b", rb"(?i:vertex|endsolid)"))
 
 
 class Lines:
     """The lines of a text that are neither empty nor a remark; where one can't be understood, the error names it.
 
+    Args:
+        line: a pattern of the lines that count, each its first group.
+
     Raises:
         MeshError: more or longer lines than a mesh needs.
     """
 
-    def __init__(self, data: memoryview, limits: Limits) -> None:
+    def __init__(self, data: memoryview, limits: Limits, line: re.Pattern[bytes] = _LINE) -> None:
         most = _LINES_BESIDE + _LINES_OF_EACH * (limits.vertices + limits.faces)
         lines = count_bytes(data, b"\n", b"\r")
         if lines > most:
             raise MeshError(f"it has {lines} lines, where {most} are enough")
         self._data, self._place = data, 0
+        self._matches = line.finditer(data)
         self._lines = self._all()
 
     def _all(self) -> Iterator[bytes]:
-        for match in _LINE.finditer(self._data):
-            self._place, stop = match.span()
+        for match in self._matches:
+            self._place, stop = match.span(1)
             if stop - self._place > LONGEST_LINE:
                 raise MeshError(f"line {self._number} has more than {LONGEST_LINE} bytes")
-            line = match.group().strip()
-            if line and not line.startswith(b"#"):
-                yield line
+            yield match.group(1).rstrip()
 
     @property
     def _number(self) -> int:
@@ -65,7 +75,12 @@ class Lines:
         """The next line; raises EOFError behind the last one."""
         for line in self._lines:
             return line
-        raise EOFError("it ends before all that it says is there")
+        raise EOFError(_ENDS)
+
+    def skip(self, count: int) -> None:
+        """Go behind so many lines without a look at them; raises EOFError where there are fewer."""
+        if sum(1 for _ in islice(self._matches, count)) < count:
+            raise EOFError(_ENDS)
 
     def __enter__(self) -> Self:
         return self
@@ -73,7 +88,7 @@ class Lines:
     def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
         if isinstance(error, ValueError | LookupError | OverflowError) and not isinstance(error, MeshError):
             line = _LINE.match(self._data[self._place : self._place + 1000])
-            text = line.group().decode(errors="replace") if line else ""
+            text = line[1].decode(errors="replace") if line else ""
             raise ValueError(f"line {self._number} is {clipped(text)!r}") from None
 
 
@@ -100,7 +115,7 @@ class _Triangles:
 def read_obj(data: memoryview, limits: Limits) -> tuple[FloatArray, IntArray]:
     """Vertices (V, 3) and faces (F, 3) of an OBJ file; everything else in it is left out."""
     coordinates, triangles = array("d"), _Triangles(limits)
-    with Lines(data, limits) as lines:
+    with Lines(data, limits, _OBJ_LINE) as lines:
         for line in lines:
             keyword, *values = line.split(None, 1)
             if keyword == b"v":
@@ -176,7 +191,7 @@ def read_stl(data: memoryview, limits: Limits) -> tuple[FloatArray, IntArray]:
 
 def _ascii_stl(data: memoryview, limits: Limits) -> FloatArray:
     coordinates, solids = array("d"), 0
-    with Lines(data, limits) as lines:
+    with Lines(data, limits, _STL_LINE) as lines:
         for line in lines:
             keyword = line[:8].lower()
             if keyword.startswith(b"vertex"):
@@ -320,8 +335,7 @@ class TextTable:
     def skip(self, element: Element) -> None:
         """Go behind the rows of an element."""
         with self._lines:
-            for _ in range(element.rows):
-                self._lines.next()
+            self._lines.skip(element.rows)
 
     def columns(self, element: Element, which: Sequence[int]) -> FloatArray:
         """(rows, k) some properties of an element without lists."""

@@ -39,7 +39,7 @@ def models(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session")
 def server(models: Path) -> Iterator[Server]:
     with starting() as start:
-        yield start(models, workers=2)
+        yield start(models, workers=2, deadline=300)
 
 
 @pytest.fixture

@@ -61,8 +61,8 @@ def test_polygons_in_text(ends: str) -> None:
         + POINT_LINES
         + SIDE_LINES,
         "obj": "o pyramid\n"
-        + "".join(f"v  {line}\n" for line in POINT_LINES.splitlines())
-        + "vt 0 0\nvn 0 0 1\nusemtl a\n"
+        + "".join(f" \tv  {line}\n" for line in POINT_LINES.splitlines())
+        + "vt 0 0\nvn 0 0 1\nusemtl v 1 2 3\n\n  # v 1 2 3\n"
         + "".join("f " + " ".join(f"{c + 1}/1/1" for c in side) + " # a side\n" for side in SIDES),
     }
     for format, text in files.items():
