@@ -17,6 +17,7 @@ import jinja2
 import matplotlib.pyplot as plt
 import numpy as np
 import tomlkit
+from matplotlib.ticker import LogLocator, NullFormatter
 
 import shapespace
 from benchmarks import limits, space
@@ -130,23 +131,36 @@ def spread(row: dict[str, Any], model: str) -> tuple[float, float, float]:
     return sum(values) / len(values), min(values), max(values)
 
 
+def joint_exponentials(row: dict[str, Any]) -> list[int]:
+    """How many joint exponentials a model has seen: from all samples, then from each share of them."""
+    every = row["drawn"]["joint"] - row["drawn"]["failed"]["joint"] - row["evaluation"]["test_samples"]
+    # The composite from a share has each joint code's part in each factor too.
+    shares = [some["exponentials"]["composite"] for some in row["evaluation"]["fractions"]]
+    return [every, *(count // (1 + len(row["sizes"])) for count in shares)]
+
+
 def plot_samples(rows: dict[str, dict[str, Any]], path: Path) -> None:
-    """R² by the share of the samples, of the ways to learn from them."""
+    """R² by the number of exponentials that a model has seen, those of factors included."""
     figure, axes = plt.subplots(
         1, len(rows), figsize=(1.6 + 2.2 * len(rows), 2.9), sharey=True, layout="constrained", squeeze=False
     )
     styles = {"composite": "o-", "all of factors": "s--", "monolithic": "^:", "kernel": "v-."}
     labels = {"all of factors": "composite, all factor samples", "monolithic": "one factor"}
     for axis, (name, row) in zip(axes[0], rows.items(), strict=True):
-        r2 = row["evaluation"]["r2"]
-        whole = {"fraction": 1.0, "r2": r2 | {"all of factors": r2["composite"]}}
-        every = sorted([whole, *row["evaluation"]["fractions"]], key=lambda each: each["fraction"])
-        at = [100 * each["fraction"] for each in every]
+        found = row["evaluation"]
+        r2, seen = found["r2"], found["exponentials"]
+        whole = {
+            "r2": r2 | {"all of factors": r2["composite"]},
+            "exponentials": {"composite": seen, "all of factors": seen},
+        }
         for model, style in styles.items():
-            axis.plot(at, [1 - each["r2"][model]["total"] for each in every], style, label=labels.get(model, model))
-        axis.set(title=name, xscale="log", yscale="log", xlabel="joint samples (%)")
-        axis.set_xticks(at, [f"{a:g}" for a in at], minor=False)
-        axis.minorticks_off()
+            at = [
+                (each["exponentials"].get(model, joint), 1 - each["r2"][model]["total"])
+                for each, joint in zip([whole, *found["fractions"]], joint_exponentials(row), strict=True)
+            ]
+            axis.plot(*zip(*sorted(at), strict=True), style, label=labels.get(model, model))
+        axis.set(title=name, xscale="log", yscale="log", xlabel="exponentials seen")
+        axis.xaxis.set(major_locator=LogLocator(subs=(1, 3)), major_formatter="{x:g}", minor_formatter=NullFormatter())
     axes[0, 0].set_ylabel("1 − R²")
     figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=4, fontsize="x-small")
     figure.savefig(path, dpi=110)
@@ -170,7 +184,11 @@ def write_page() -> None:
         undefined=jinja2.StrictUndefined,
     )
     page = environment.get_template("results.md.jinja").render(
-        rows=rows, real=real, missing=[name for name in COLLECTIONS if name not in rows], spread=spread
+        rows=rows,
+        real=real,
+        missing=[name for name in COLLECTIONS if name not in rows],
+        spread=spread,
+        joint=joint_exponentials,
     )
     (DOCS / "results.md").write_text(page, encoding="utf-8")
 
