@@ -14,8 +14,9 @@ from scipy.interpolate import RegularGridInterpolator
 from torch import Tensor, nn
 
 from shapespace.arrays import FloatArray
+from shapespace.training.learning.gaussian import Centres
 from shapespace.training.learning.layers import LatentFeatures, Scaling
-from shapespace.training.learning.linear import Ridge, kernel_ridge, principal_axes
+from shapespace.training.learning.linear import Ridge, principal_axes
 from shapespace.training.runs.config import EvaluationSettings
 from shapespace.training.runs.latent_coordinates import Coordinates
 from shapespace.training.runs.sampling import Collection
@@ -38,7 +39,7 @@ class Exact(Protocol):
 
 
 class LatentKernel(nn.Module):
-    """``z = mean + Σ_i k(x, x_i) w_i`` with the Gaussian kernel ``exp(−½ |x − x_i|² / ℓ²)``, in double precision.
+    """Kernel ridge regression of NRIC on codes, by the functions of `Centres`, in double precision: γ = 1 / (2 ℓ²).
 
     The inputs x are bounded coordinates in [−1, 1], and cosine and sine of periodic ones. Length ℓ and penalty are
     those that suit held-out codes best.
@@ -52,6 +53,7 @@ class LatentKernel(nn.Module):
     """
 
     anchors: Tensor
+    nodes: Tensor
     weights: Tensor
     mean: Tensor
 
@@ -70,14 +72,18 @@ class LatentKernel(nn.Module):
         mean = y.mean(dim=0)
         axes = principal_axes(y - mean, by="rows")[1][:CHOSEN_BY]
 
+        nodes, known = x[:0], None
+        if slopes:
+            nodes = self.features(slopes[0]).double()
+            count, size = nodes.shape
+            directions = torch.eye(size, dtype=x.dtype).repeat(count, 1)
+            changes = (slopes[1] * (self.features.radius[:, None] * scaling.factor)).double().flatten(0, 1)
+            known = nodes.repeat_interleave(size, dim=0), directions, changes
+
         def solved(length: float, penalties: Sequence[float], project: Callable[[Tensor], Tensor]) -> Ridge:
-            rows = None
-            if slopes:
-                at = self.features(slopes[0]).double()
-                values = project((slopes[1] * (self.features.radius[:, None] * scaling.factor)).double())
-                rows = _kernel_slopes(at, x, length), values.flatten(0, 1)
-            held_out = _kernel(others, x, length), project(wanted - mean)
-            return kernel_ridge(_kernel(x, x, length), project(y - mean), rows, held_out, penalties)
+            rows = (*known[:2], project(known[2])) if known else None
+            held_out = others, project(wanted - mean)
+            return self._centres(x, nodes, length).fit((x, project(y - mean)), rows, held_out, penalties)
 
         lengths = [times * self.features.size**0.5 for times in LENGTHS]
         best, self.length = min(
@@ -85,24 +91,18 @@ class LatentKernel(nn.Module):
             key=lambda fit: fit[0].error,
         )
         self.register_buffer("anchors", x)
+        self.register_buffer("nodes", nodes)
         self.register_buffer("weights", solved(self.length, [best.penalty], lambda values: values).weights)
         self.register_buffer("mean", mean)
 
+    @staticmethod
+    def _centres(anchors: Tensor, nodes: Tensor, length: float) -> Centres:
+        return Centres(anchors, nodes, torch.tensor(0.5 / length**2, dtype=anchors.dtype))
+
     def forward(self, codes: Tensor) -> Tensor:
         """NRIC (n, 2E) of codes (n, m)."""
-        kernel = _kernel(self.features(codes).double(), self.anchors, self.length)
-        return self.scaling.up((self.mean + kernel @ self.weights).float())
-
-
-def _kernel(x: Tensor, anchors: Tensor, length: float) -> Tensor:
-    return torch.exp(-0.5 * torch.cdist(x, anchors).square() / length**2)
-
-
-def _kernel_slopes(x: Tensor, anchors: Tensor, length: float) -> Tensor:
-    """(k p, n) derivatives by the inputs x (k, p)."""
-    apart = anchors - x[:, None]
-    slopes = apart * (_kernel(x, anchors, length) / length**2)[:, :, None]
-    return slopes.transpose(1, 2).flatten(0, 1)
+        found = self._centres(self.anchors, self.nodes, self.length)(self.features(codes).double())
+        return self.scaling.up((self.mean + found @ self.weights).float())
 
 
 @dataclass(frozen=True)

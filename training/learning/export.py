@@ -40,7 +40,7 @@ class ExportError(RuntimeError):
     """The bundle would not compute what the networks compute, or could not be read."""
 
 
-def _to_onnx(network: nn.Module, example: Tensor, names: Network) -> bytes:
+def to_onnx(network: nn.Module, example: Tensor, names: Network) -> bytes:
     """An ONNX file of a network, with the names that bundles have for its input and output."""
     network.eval()
     # Without gradients networks compute by plain gathers and sums, which ONNX has.
@@ -101,11 +101,11 @@ def _networks(composite: Composite, start: StartNetwork | None, latents: Tensor)
     some = latents[:2]
     return Networks(
         factors=[
-            _to_onnx(network, some[:, index], factor_network(j))
+            to_onnx(network, some[:, index], factor_network(j))
             for j, (network, index) in enumerate(zip(composite.networks, composite.factors, strict=True))
         ],
-        combiner=_to_onnx(composite.combiner, predict(composite.factor_shapes, some), COMBINER),
-        start=_to_onnx(start, some, START) if start else None,
+        combiner=to_onnx(composite.combiner, predict(composite.factor_shapes, some), COMBINER),
+        start=to_onnx(start, some, START) if start else None,
     )
 
 

@@ -7,8 +7,9 @@ from torch import Tensor
 
 from shapespace.mesh.triangle_mesh import TriangleMesh
 from shapespace.training.learning.corrections import JointSamples, Pairs, Slopes
+from shapespace.training.learning.gaussian import Centres
 from shapespace.training.learning.layers import half_precision
-from shapespace.training.learning.linear import SpectralRidge, kernel_ridge
+from shapespace.training.learning.linear import Ridge
 from shapespace.training.learning.patches import (
     Patch,
     PatchCorrection,
@@ -23,8 +24,8 @@ from shapespace.training.runs.progress import progress
 #: Candidates for γ, and for the penalty, where the kernel's largest value is 1. With smaller penalties the weights are
 #: too large for single precision.
 GAMMAS = (0.5, 2.0, 8.0, 32.0)
-PENALTIES = tuple(10.0 ** (k / 2) for k in range(-11, 0))
-#: Most samples that γ is chosen with.
+PENALTIES = tuple(10.0**k for k in range(-6, 0))
+#: Most functions that γ is chosen with.
 SOME = 800
 #: Share of the coordinates' mean square that is left out.
 NEGLIGIBLE = 1e-6
@@ -35,25 +36,27 @@ class KernelCorrection(PatchCorrection):
 
     The kernel of two samples is ``exp(−γ |u − u'|²)``, u their coordinates in the metric of the patch. Products of two
     or three coefficients, which describe how factors act on each other, are among the functions that such a kernel
-    approximates.
+    approximates. Where there are derivatives its gradients are used too (`Centres`).
 
-    With n samples, and rank k of the output:
+    With n anchors and k nodes, and rank q of the output:
 
     Attributes:
-        anchors: (P, n, r) coordinates of the samples.
+        anchors: (P, n, r) coordinates of samples.
+        nodes: (P, k, r) of samples with derivatives.
         gammas: (P,).
-        weights: (P, k, n).
-        basis: (P, S, k).
+        weights: (P, q, n + k r).
+        basis: (P, S, q).
     """
 
     anchors: Tensor
+    nodes: Tensor
     gammas: Tensor
     weights: Tensor
     basis: Tensor
     #: Fewest edges of a patch, on average.
     EDGES = 24
-    #: Most samples to fit to: the time grows with their cube, the size of the network with their number.
-    ANCHORS = 4000
+    #: Most functions of a patch: the time grows with their cube, the size of the network with their number.
+    FUNCTIONS = 3000
     #: Largest rank of the output.
     RANK = 128
 
@@ -62,19 +65,19 @@ class KernelCorrection(PatchCorrection):
         cls, settings: KernelSettings, reference: TriangleMesh, own: JointSamples, held_out: JointSamples, seed: int
     ) -> KernelCorrection:
         """See `Correction`; the held-out samples choose metrics too, and the seed is that of the patches."""
-        inputs, missed = own.pairs
-        pairs, others = (inputs[: cls.ANCHORS], missed[: cls.ANCHORS]), held_out.pairs
+        pairs, others = own.pairs, held_out.pairs
         count = max(1, min(settings.patches, len(reference.edges) // cls.EDGES))
         patches = patches_of(_Patch, reference, count, settings.coefficients, pairs, others, seed)
         coordinates = max(patch.rank for patch in patches)
         for patch in progress(patches, "kernels", "patch"):
-            patch.fit(pairs, others, own.slopes, coordinates)
+            patch.fit(pairs, others, own.slopes, coordinates, cls.FUNCTIONS)
         bases = padded_bases(patches, min(output_rank(patches), cls.RANK))
         return cls(
-            common_tensors(patches, coordinates, missed.shape[1])
+            common_tensors(patches, coordinates, pairs[1].shape[1])
             | {
-                "anchors": torch.stack([patch.anchors for patch in patches]),
-                "gammas": torch.tensor([patch.gamma for patch in patches]),
+                "anchors": torch.stack([patch.centres.anchors for patch in patches]).float(),
+                "nodes": torch.stack([patch.centres.nodes for patch in patches]).float(),
+                "gammas": torch.stack([patch.centres.gamma for patch in patches]).float(),
                 "weights": torch.stack([patch.weights_in(basis) for patch, basis in zip(patches, bases, strict=True)]),
                 "basis": half_precision(bases),
             }
@@ -82,20 +85,21 @@ class KernelCorrection(PatchCorrection):
 
     def difference(self, y: Tensor) -> Tensor:
         # Weights are large and of both signs: sums of single precision would be rounding errors in part.
-        u, anchors = self.coordinates(y).double(), self.anchors.double()
-        squares = anchors.square().sum(dim=2, keepdim=True) - 2 * anchors @ u + u.square().sum(dim=1, keepdim=True)
-        found = torch.exp(-self.gammas.double()[:, None, None] * squares)
-        return self.whole(self.basis @ (self.weights.double() @ found).to(y.dtype))
+        gammas = self.gammas.double()[:, None, None]
+        found = Centres(self.anchors.double(), self.nodes.double(), gammas)(self.coordinates(y).double().mT)
+        return self.whole(self.basis @ (self.weights.double() @ found.mT).to(y.dtype))
 
 
 class _Patch(Patch):
     """One patch while it is fitted.
 
     Attributes:
-        anchors: (n, r) coordinates of the samples.
-        gamma: γ.
-        weights: (n, S), in double precision.
+        centres: the functions, in coordinates of 16 bits.
+        weights: (n + k r, S), in double precision.
     """
+
+    centres: Centres
+    weights: Tensor
 
     @property
     def rank(self) -> int:
@@ -103,32 +107,25 @@ class _Patch(Patch):
         left = self.spread.sum() - self.spread.cumsum(0)
         return 1 + int((left > NEGLIGIBLE * self.spread.sum()).sum())
 
-    def fit(self, own: Pairs, held_out: Pairs, slopes: Slopes | None, rank: int) -> None:
-        """Kernel ridge regression on so many coordinates, with γ and the penalty that suit held-out samples."""
-        self.anchors = self.coordinates(own[0], rank).float()
-        x, other = self.anchors.double(), self.coordinates(held_out[0], rank)
+    def fit(self, own: Pairs, held_out: Pairs, slopes: Slopes | None, rank: int, most: int) -> None:
+        """Ridge regression on so many coordinates by so many functions, γ and the penalty as held-out samples like."""
+        x, other = (self.coordinates(inputs, rank) for inputs, _ in (own, held_out))
         wanted, theirs = (residual[:, self.columns].double() - self.mean for _, residual in (own, held_out))
-
-        def error(gamma: float) -> float:
-            some = x[:SOME]
-            chosen_by = _kernel(other, some, gamma), theirs
-            return SpectralRidge.fit(_kernel(some, some, gamma), wanted[:SOME], chosen_by, PENALTIES).error
-
-        self.gamma = min(GAMMAS, key=error)
-        kernel, rows = _kernel(x, x, self.gamma), None
+        anchors, nodes = half_precision(x[:most]), x[:0]
         if slopes:
-            at, along, missed = self.slopes(slopes, rank)
-            towards = along @ x.T - (along * at).sum(dim=1, keepdim=True)
-            rows = 2 * self.gamma * towards * _kernel(at, x, self.gamma), missed
-        found = kernel_ridge(kernel, wanted, rows, (_kernel(other, x, self.gamma), theirs), PENALTIES)
+            nodes = half_precision(self.coordinates(slopes.inputs, rank)[: (most - len(anchors)) // rank])
+        known = self.slopes(slopes, rank) if slopes else None
+        share = min(1.0, SOME / (len(anchors) + nodes.numel()))
+        tried = [Centres(anchors, nodes, torch.tensor(gamma, dtype=x.dtype)) for gamma in GAMMAS]
+
+        def fitted(centres: Centres) -> Ridge:
+            return centres.fit((x, wanted), known, (other, theirs), PENALTIES)
+
+        self.centres = min(tried, key=lambda centres: fitted(centres.some(share)).error)
+        found = fitted(self.centres)
         self.weights, self.error = found.weights, found.error * theirs.shape[1]
-        self.keep_axes(kernel @ found.weights)
+        self.keep_axes(self.centres(x) @ found.weights)
 
     def weights_in(self, basis: Tensor) -> Tensor:
-        """(k, n) of the coefficients in a basis (at least S, k)."""
+        """(q, n + k r) of the coefficients in a basis (at least S, q)."""
         return (self.weights @ basis[: len(self.columns)].double()).T.float()
-
-
-def _kernel(x: Tensor, anchors: Tensor, gamma: float) -> Tensor:
-    """(m, n) of coordinates (m, r) and (n, r)."""
-    return torch.exp(-gamma * torch.cdist(x, anchors).square())

@@ -11,6 +11,8 @@ from torch import Tensor, nn
 
 #: Eigenvalues below this share of the largest are rounding errors.
 ROUNDING = 1e-12
+#: What is added to the diagonal of a Gram matrix, a share of its trace.
+JITTER = 1e-12
 
 
 @dataclass(frozen=True)
@@ -52,33 +54,25 @@ def ridge(gram: Tensor, right: Tensor, held_out: tuple[Tensor, Tensor], penaltie
 
 
 def kernel_ridge(
-    kernel: Tensor,
-    target: Tensor,
-    slopes: tuple[Tensor, Tensor] | None,
-    held_out: tuple[Tensor, Tensor],
-    penalties: Sequence[float],
+    gram: Tensor, features: Tensor, values: Tensor, held_out: tuple[Tensor, Tensor], penalties: Sequence[float]
 ) -> Ridge:
-    """Kernel ridge regression of values, and of derivatives where there are some; see `ridge` for the rest.
+    """Ridge regression with functions that are not orthonormal: the penalty is on the norm of what is found.
 
     Args:
-        kernel: (n, n) of samples.
-        target: (n, q) values.
-        slopes: derivatives at some samples, of the kernel (s, n) and of the values (s, q).
-        held_out: kernels (m, n) of held-out samples with the others, and values (m, q).
+        gram: (n, n) inner products of the functions.
+        features: (m, n) the functions at samples, or their derivatives.
+        values: (m, q).
+        held_out: features of held-out samples, and values.
         penalties: candidates.
 
     Returns:
-        Weights (n, q) of the samples.
+        Weights (n, q) of the functions.
     """
-    if slopes is None:
-        return ridge(kernel, target, held_out, penalties)
-    # Orthonormal functions in the kernel's space: in these the penalty is that of the dual form.
-    s, vectors = torch.linalg.eigh(kernel)
-    kept = s > ROUNDING * s[-1]
-    to = vectors[:, kept] * s[kept].rsqrt()
-    features, values = torch.cat([kernel, slopes[0]]) @ to, torch.cat([target, slopes[1]])
-    found = ridge(features.T @ features, features.T @ values, (held_out[0] @ to, held_out[1]), penalties)
-    return replace(found, weights=to @ found.weights)
+    # Functions that all but depend on each other are told apart by as little as rounding allows.
+    half = torch.linalg.cholesky(gram + JITTER * gram.trace() * torch.eye(len(gram)))
+    x, theirs = (torch.linalg.solve_triangular(half, rows.T, upper=False).T for rows in (features, held_out[0]))
+    found = ridge(x.T @ x, x.T @ values, (theirs, held_out[1]), penalties)
+    return replace(found, weights=torch.linalg.solve_triangular(half.T, found.weights, upper=True))
 
 
 @dataclass(frozen=True)

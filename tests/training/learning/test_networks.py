@@ -9,18 +9,21 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import onnxruntime
 import pytest
 import torch
 import trimesh
 from numpy.typing import NDArray
 from torch import nn
 
+from shapespace.bundle.schema import COMBINER
 from shapespace.coordinates.nric import WeightedNorm, nric
 from shapespace.mesh.triangle_mesh import Connectivity, TriangleMesh
 from shapespace.training.learning import networks
 from shapespace.training.learning.baselines import LatentKernel
 from shapespace.training.learning.convolutions import EdgeConvolution, Flaps, Star, flaps
 from shapespace.training.learning.corrections import JointSamples, Slopes
+from shapespace.training.learning.export import to_onnx
 from shapespace.training.learning.fitting import read_network, save_network
 from shapespace.training.learning.kernels import KernelCorrection
 from shapespace.training.learning.layers import (
@@ -217,14 +220,22 @@ def test_derivatives_teach_a_correction(ball: TriangleMesh, settings: Any) -> No
     missed = (joint - own) * scale.factor
     slopes = Slopes(scale.down(factors[:count]), [[0], [1]], own * scale.factor, missed)
 
-    def error(samples: int, slopes: Slopes | None) -> float:
+    def fit(samples: int, slopes: Slopes | None) -> CombinerNetwork:
         own = JointSamples(factors[:samples], z[:samples], scale, slopes)
+        return CombinerNetwork.fit(settings, ball, own, held_out, 0).eval()
+
+    def error(network: CombinerNetwork) -> float:
         with torch.no_grad():
-            network = CombinerNetwork.fit(settings, ball, own, held_out, 0).eval()
             return float((network.coefficients(factors[100:]) - scale.down(z[100:])).square().mean())
 
-    assert error(15, slopes) < 0.6 * error(15, None)
-    assert error(15, replace(slopes, missed=-missed)) > error(15, None)
+    network, without = fit(15, slopes), error(fit(15, None))
+    assert error(network) < 0.6 * without
+    assert error(fit(15, replace(slopes, missed=-missed))) > without
+    session = onnxruntime.InferenceSession(to_onnx(network, factors[:2], COMBINER))
+    (answer,) = session.run(None, {COMBINER.input: factors[100:].numpy()})
+    with torch.no_grad():
+        difference = torch.from_numpy(answer) - network(factors[100:])
+    assert difference.square().mean() < 1e-10 * (scale.up(scale.down(z[100:])) - middle).square().mean()
 
 
 @pytest.mark.parametrize(
