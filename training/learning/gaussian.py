@@ -1,7 +1,7 @@
 """Ridge regression by Gaussian kernels and their gradients, of values and of derivatives.
 
 Beside derivatives kernels alone are a poor space: what suits best, of all functions, is a sum of kernels at the samples
-and of the kernels' gradients where there are derivatives (Hermite–Birkhoff interpolation; Wendland 2004, chapter 16).
+and of the kernels' gradients where there are derivatives (Hermite–Birkhoff interpolation; Wendland 2005, chapter 16).
 """
 
 from __future__ import annotations
@@ -78,7 +78,7 @@ class Centres:
             Weights (n + k r, q) of the functions.
         """
         theirs = self(held_out[0]), held_out[1]
-        if own[0] is self.anchors and slopes is None:
+        if own[0] is self.anchors and slopes is None:  # the dual form needs no other basis
             return ridge(self.gram, own[1], theirs, penalties)
         features, values = self(own[0]), own[1]
         if slopes:
