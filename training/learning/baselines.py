@@ -14,7 +14,7 @@ from scipy.interpolate import RegularGridInterpolator
 from torch import Tensor, nn
 
 from shapespace.arrays import FloatArray
-from shapespace.training.learning.gaussian import Centres
+from shapespace.training.learning.gaussian import Centres, every_axis
 from shapespace.training.learning.layers import LatentFeatures, Scaling
 from shapespace.training.learning.linear import Ridge, principal_axes
 from shapespace.training.runs.config import EvaluationSettings
@@ -75,10 +75,8 @@ class LatentKernel(nn.Module):
         nodes, known = x[:0], None
         if slopes:
             nodes = self.features(slopes[0]).double()
-            count, size = nodes.shape
-            directions = torch.eye(size, dtype=x.dtype).repeat(count, 1)
             changes = (slopes[1] * (self.features.radius[:, None] * scaling.factor)).double().flatten(0, 1)
-            known = nodes.repeat_interleave(size, dim=0), directions, changes
+            known = *every_axis(nodes), changes
 
         def solved(length: float, penalties: Sequence[float], project: Callable[[Tensor], Tensor]) -> Ridge:
             rows = (*known[:2], project(known[2])) if known else None

@@ -55,9 +55,7 @@ class Centres:
     @property
     def gram(self) -> Tensor:
         """(n + k r, n + k r) inner products of the functions."""
-        k, r = self.nodes.shape
-        at, axes = self.nodes.repeat_interleave(r, dim=0), torch.eye(r, dtype=self.nodes.dtype).repeat(k, 1)
-        return torch.cat([self(self.anchors), self.along(at, axes) / (2 * self.gamma).sqrt()])
+        return torch.cat([self(self.anchors), self.along(*every_axis(self.nodes)) / (2 * self.gamma).sqrt()])
 
     def fit(
         self,
@@ -90,6 +88,12 @@ class Centres:
         """A share of the anchors and of the nodes, the first ones."""
         n, k = (math.ceil(share * len(centres)) for centres in (self.anchors, self.nodes))
         return Centres(self.anchors[:n], self.nodes[:k], self.gamma)
+
+
+def every_axis(u: Tensor) -> tuple[Tensor, Tensor]:
+    """Each of the points (k, r), r times, and a direction along each axis there: both (k r, r)."""
+    k, r = u.shape
+    return u.repeat_interleave(r, dim=0), torch.eye(r, dtype=u.dtype).repeat(k, 1)
 
 
 def _kernel(u: Tensor, centres: Tensor, gamma: Tensor) -> Tensor:
