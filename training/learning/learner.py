@@ -241,8 +241,9 @@ class Learner:
         self, settings: CombinerSettings, path: Path, indices: list[list[int]], networks: list[FactorNetwork]
     ) -> CombinerNetwork:
         """Ψ, read from ``path`` or fitted to what the networks of factors make of the joint samples."""
-        saved, reference = read_network(path) if path.exists() else None, self.collection.reference
-        if saved and saved.done:
+        reference = self.collection.reference
+        if path.exists():
+            saved = read_network(path)
             combiner = CombinerNetwork.load(saved.metadata, reference, saved.tensors)
             combiner.eval()
             self._record(path, saved.state)
@@ -251,21 +252,27 @@ class Learner:
         data = _Data(predict(partial(factor_shapes, networks, indices), latents), self.joint.nric, self.rows)
         if settings.symmetries:
             data = self._with_images(data)
+        scaling = self._scaling(self.joint.nric[self.rows["train"]])
+        slopes = self._slopes(indices, networks, data.inputs, scaling)
+        own = JointSamples(*data.part("train"), scaling, slopes, self._motion(indices, "train"))
+        held_out = JointSamples(*data.part("validation"), scaling, motion=self._motion(indices, "validation"))
+        states = {}
+
+        def unfinished(kind: str) -> Path:
+            return path.with_name(path.name.replace("combiner", f"combiner-{kind}"))
+
+        def train(network: CombinerNetwork) -> None:
+            if descent := network.correction.descent:
+                kind = network.settings.kind
+                states[kind] = self._fit(network, data, descent, unfinished(kind), self._fraction)
+
         torch.manual_seed(self.seed)
-        if saved:
-            combiner = CombinerNetwork.load(saved.metadata, reference, saved.tensors)
-        else:
-            scaling = self._scaling(self.joint.nric[self.rows["train"]])
-            slopes = self._slopes(indices, networks, data.inputs, scaling)
-            own = JointSamples(*data.part("train"), scaling, slopes, self._motion(indices, "train"))
-            held_out = JointSamples(*data.part("validation"), scaling, motion=self._motion(indices, "validation"))
-            combiner = CombinerNetwork.fit(settings.correction, reference, own, held_out, self.seed)
-        if descent := combiner.correction.descent:
-            state = self._fit(combiner, data, descent, path, self._fraction)
-        else:
-            state = {"done": True, "epoch": 0, "best": None, "history": []}
-            combiner.eval()
-            save_network(path, combiner, state)
+        combiner = CombinerNetwork.fit(settings.correction, reference, own, held_out, self.seed, train)
+        combiner.eval()
+        state = states.get(combiner.settings.kind, {"done": True, "epoch": 0, "best": None, "history": []})
+        save_network(path, combiner, state)
+        for kind in states:
+            unfinished(kind).unlink()
         self._record(path, state)
         return combiner
 

@@ -6,8 +6,10 @@ Paper, sections 3 and 4. All but the start network put out NRIC ``z`` (n, 2E).
 from __future__ import annotations
 
 import json
+import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -30,11 +32,14 @@ from shapespace.training.learning.layers import (
     Scaling,
     perceptron,
 )
-from shapespace.training.learning.linear import regression
+from shapespace.training.learning.linear import principal_axes, regression
 from shapespace.training.learning.polynomials import PolynomialCorrection
 from shapespace.training.runs.config import (
     AutoSettings,
+    ConvolutionSettings,
     CorrectionSettings,
+    FieldSettings,
+    FitSettings,
     KernelSettings,
     LatentNetworkSettings,
     PaperSettings,
@@ -133,27 +138,45 @@ CORRECTIONS: dict[str, type[Correction]] = {
 }
 
 
-#: Share of the kernel's squared error on held-out codes below which polynomials, which take longer, are chosen.
+#: Share of the squared error on held-out codes of what is chosen so far below which another kind, which takes longer,
+#: is chosen in its place.
 BETTER = 0.9
-#: Mean square error of the kernel, of scaled differences whose mean square is 1, below which they aren't even tried:
+#: Mean square error of the kernel, of scaled differences whose mean square is 1, below which no other kind is tried:
 #: of some fifteen models of real collections polynomials were better in none where the kernel left as little.
 ENOUGH = 1e-3
+#: Of how many shapes of a factor the principal components are counted that hold 99 % of their variance, and from how
+#: many components something wanders over the surface: it changes entries that no other code changes. Limbs need tens.
+LOOKED_AT, WANDERING = 500, 100
+#: Convolutions that follow a bump over a torus (docs/measurements/notes.md, Freaky Torus for three epochs).
+FOLLOWING = ConvolutionSettings(
+    layers=5,
+    width=40,
+    neighbourhood="flaps",
+    crop=900,
+    products=8,
+    fit=FitSettings(schedule="cosine", learning_rate=2e-3, batch_size=16, max_epochs=30),
+)
 
 
 def choices(settings: CorrectionSettings) -> list[ResolvedCorrection]:
-    """What ``auto`` chooses from, the first unless another is better; nothing for all other settings."""
-    return [KernelSettings(), PolynomialSettings()] if isinstance(settings, AutoSettings) else []
+    """All that ``auto`` may choose; nothing for other settings."""
+    every: list[ResolvedCorrection] = [KernelSettings(), PolynomialSettings(), FieldSettings(), FOLLOWING]
+    return every if isinstance(settings, AutoSettings) else []
 
 
-def candidates(settings: CorrectionSettings) -> list[ResolvedCorrection]:
-    """What is fitted for some settings, with all that ``paper`` stands for written out."""
-    match settings:
-        case AutoSettings():
-            return choices(settings)
-        case PaperSettings():
-            return [settings.convolutions]
-        case _:
-            return [settings]
+def _beside_the_kernel(own: JointSamples) -> ResolvedCorrection:
+    """What ``auto`` tries where the kernel leaves much, by a quick look at the samples."""
+    if own.motion:
+        return FieldSettings()
+    components = (_components(y) for y in own.inputs[:LOOKED_AT].unbind(dim=1))
+    return FOLLOWING if max(components) > WANDERING else PolynomialSettings()
+
+
+def _components(y: Tensor) -> int:
+    """How many principal components hold 99 % of the variance of y (n, p)."""
+    s, _ = principal_axes(y - y.mean(dim=0), by="rows")
+    share = s.square().cumsum(0) / s.square().sum().clamp_min(1e-30)
+    return 1 + int((share < 0.99).sum())
 
 
 class CombinerNetwork(ShapeNetwork):
@@ -180,24 +203,44 @@ class CombinerNetwork(ShapeNetwork):
         own: JointSamples,
         held_out: JointSamples,
         seed: int,
+        train: Callable[[CombinerNetwork], Any] = lambda network: None,
     ) -> CombinerNetwork:
-        """Fit all that has a closed form, see `Correction.fit`; held-out samples choose where there is a choice."""
+        """Fit all that has a closed form, see `Correction.fit`, and choose by held-out samples where there is a choice.
+
+        Args:
+            settings: of the correction.
+            reference: the mesh.
+            own: samples to fit to.
+            held_out: samples that choose.
+            seed: of whatever is random.
+            train: called with each network that was fitted, to train what has no closed form.
+        """
 
         def fit(each: ResolvedCorrection) -> CombinerNetwork:
-            return cls(own.scaling, each, CORRECTIONS[each.kind].fit(each, reference, own, held_out, seed), {})
+            network = cls(own.scaling, each, CORRECTIONS[each.kind].fit(each, reference, own, held_out, seed), {})
+            train(network)
+            return network
 
-        def error(each: CombinerNetwork) -> float:
-            return float((predict(each.coefficients, held_out.factors) - wanted).square().mean())
+        match settings:
+            case AutoSettings():
+                pass
+            case PaperSettings():
+                return fit(settings.convolutions)
+            case _:
+                return fit(settings)
 
-        first, *others = candidates(settings)
-        chosen = fit(first)
-        if not others:
-            return chosen
         wanted = own.scaling.down(held_out.joint)
-        tried: dict[str, float] = {first.kind: error(chosen)}
-        for other in map(fit, others if tried[first.kind] > ENOUGH else []):
+
+        def error(network: CombinerNetwork) -> float:
+            return float((predict(network.coefficients, held_out.factors) - wanted).square().mean())
+
+        start = time.monotonic()
+        chosen = fit(KernelSettings())
+        tried = {"kernel": error(chosen)}
+        if tried["kernel"] > ENOUGH and time.monotonic() - start < 60 * settings.minutes:
+            other = fit(_beside_the_kernel(own))
             tried[other.settings.kind] = error(other)
-            if tried[other.settings.kind] < BETTER * tried[chosen.settings.kind]:
+            if tried[other.settings.kind] < BETTER * tried["kernel"]:
                 chosen = other
         return cls(own.scaling, chosen.settings, chosen.correction, tried)
 

@@ -50,7 +50,15 @@ MODELS = {
 }
 #: Keys of evaluation.json with a section on the page; all others are listed in one table.
 PLACED = {"eta", "test_samples", "r2", "r2_factors", "variants", "vertex_error", "sizes", "times", "fractions"}
-PLACED |= {"prolongation", "generalisation", "fresh"}
+PLACED |= {"prolongation", "generalisation", "fresh", "correction"}
+#: What the kinds of corrections are called.
+CORRECTIONS = {
+    "kernel": "kernel ridge regression",
+    "polynomials": "polynomials in patches",
+    "products": "products of two factors' coefficients",
+    "convolutions": "graph convolutions",
+    "field": "a perceptron at every edge",
+}
 
 
 def shapes(record: Record, studio: Studio) -> Iterator[tuple[Markup, str]]:
@@ -251,6 +259,19 @@ def fraction_plot(record: Record) -> Markup | None:
     return lines("R² by the fraction of samples", "fraction of the samples", drawn)
 
 
+def joined(correction: dict[str, Any]) -> str:
+    """How factors are joined, and why so."""
+    kind, tried = correction["kind"], correction.get("tried", {})
+    sentence = f"Factors are joined by {CORRECTIONS.get(kind, kind)}"
+    if kind not in tried:
+        return f"{sentence}, as the configuration says."
+    sentence += f", which leaves {percent(tried[kind])} of the shapes' mean square on held-out codes"
+    others = [f"{CORRECTIONS.get(each, each)} {percent(left)}" for each, left in tried.items() if each != kind]
+    if others:
+        return f"{sentence}; {', '.join(others)}."
+    return f"{sentence}. Nothing else was tried: there was little to gain, or no time."
+
+
 def flatten(value: Any, name: str = "") -> Iterator[tuple[str, Any]]:
     """Figures without a section of their own, each with its path."""
     if isinstance(value, dict | list):
@@ -335,6 +356,7 @@ def page(record: Record) -> str:
         evaluation=figures,
         models=MODELS,
         fractions=fraction_plot(record),
+        joined=joined(figures["correction"]) if "correction" in figures else "",
         others=list(flatten({key: value for key, value in figures.items() if key not in PLACED})),
     )
 

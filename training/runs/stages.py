@@ -79,7 +79,7 @@ STAGES: dict[str, Stage] = {
     ),
     # Networks are in files named by what decides their contents, so that a change leaves alone those it doesn't touch.
     "networks": Stage(
-        version=3,
+        version=4,
         settings=lambda config: [
             config.networks,
             config.monolithic,

@@ -12,13 +12,14 @@ import torch
 
 from shapespace.coordinates.nric import WeightedNorm, nric
 from shapespace.training.collection.freaky_torus import U_COUNT, V_COUNT, FreakyTorus, edge_permutation
+from shapespace.training.learning import networks
 from shapespace.training.learning.corrections import JointSamples, Motion
 from shapespace.training.learning.evaluation import alone
 from shapespace.training.learning.fields import FieldCorrection
 from shapespace.training.learning.fitting import read_network, save_network
 from shapespace.training.learning.layers import Scaling
 from shapespace.training.learning.networks import CombinerNetwork
-from shapespace.training.runs.config import FieldSettings
+from shapespace.training.runs.config import AutoSettings, FieldSettings, KernelSettings
 
 TORUS = FreakyTorus()
 FACTORS = list(TORUS.factors.values())
@@ -107,19 +108,45 @@ def test_its_loss_is_the_mean_square_error_on_average(own: JointSamples, held_ou
     assert 0 < float(drawn.std()) < 0.2 * float(exact)
 
 
-def test_descent_brings_it_nearer_to_new_shapes_than_the_affine_sum(own: JointSamples, held_out: JointSamples) -> None:
-    combiner = network(own, held_out)
-    optimiser = torch.optim.Adam(combiner.parameters(), 1e-2)
+def descend(combiner: CombinerNetwork, own: JointSamples, steps: int, rate: float) -> None:
+    optimiser = torch.optim.Adam(combiner.parameters(), rate)
     y, target = own.inputs, combiner.target(own.joint)
-    for _ in range(200):
+    for _ in range(steps):
         batch = torch.randperm(len(y))[:32]
         optimiser.zero_grad()
         combiner.correction.loss(y[batch], target[batch]).backward()
         optimiser.step()
+
+
+def test_descent_brings_it_nearer_to_new_shapes_than_the_affine_sum(own: JointSamples, held_out: JointSamples) -> None:
+    combiner = network(own, held_out)
+    descend(combiner, own, 200, 1e-2)
     wanted = combiner.target(held_out.joint)
     with torch.no_grad():
         left = (combiner.coefficients(held_out.factors) - wanted).square().mean()
     assert left < 0.65 * (held_out.inputs.sum(dim=1) - wanted).square().mean()
+
+
+@pytest.mark.parametrize("known", [True, False], ids=["known where", "unknown"])
+def test_auto_tries_what_follows_a_bump(
+    own: JointSamples, held_out: JointSamples, known: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A field where the collection knows where codes move things, convolutions where shapes alone tell."""
+    monkeypatch.setattr(networks, "KernelSettings", lambda: KernelSettings(coefficients=3, patches=64))
+    trained: list[str] = []
+
+    def train(combiner: CombinerNetwork) -> None:
+        trained.append(combiner.settings.kind)
+        if combiner.settings.kind == "field":
+            descend(combiner, own, 60, 3e-3)
+
+    motion = Motion(own.motion.codes[:130], FACTORS, TORUS.places) if known else None
+    samples = replace(own, factors=own.factors[:130], joint=own.joint[:130], motion=motion)
+    found = CombinerNetwork.fit(AutoSettings(), TORUS.reference, samples, held_out, 0, train)
+    assert trained == list(found.tried) == ["kernel", "field" if known else "convolutions"]
+    if known:  # it was judged as it was after it had been trained
+        affine = (held_out.inputs.sum(dim=1) - found.target(held_out.joint)).square().mean()
+        assert found.tried["field"] < 0.9 * affine
 
 
 def test_it_comes_back_from_its_file(own: JointSamples, held_out: JointSamples, tmp_path: Path) -> None:

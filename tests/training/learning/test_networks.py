@@ -40,7 +40,7 @@ from shapespace.training.learning.networks import (
     CombinerNetwork,
     FactorNetwork,
     affine_sum,
-    candidates,
+    choices,
 )
 from shapespace.training.learning.patches import learned_metric
 from shapespace.training.learning.polynomials import PolynomialCorrection
@@ -257,8 +257,8 @@ def test_every_correction_comes_back_from_its_file(ball: TriangleMesh, settings:
 
 def test_every_kind_has_a_class() -> None:
     assert {settings.kind for settings, _, _ in KINDS} | {FieldSettings().kind} == set(CORRECTIONS)
-    paper = candidates(PaperSettings())[0]
-    assert isinstance(paper, ConvolutionSettings)
+    assert {settings.kind for settings in choices(AutoSettings())} <= set(CORRECTIONS)
+    paper = PaperSettings().convolutions
     assert (paper.neighbourhood, paper.residual, paper.dropout, paper.edge_channels) == ("star", False, 0.1, 0)
     assert (paper.fit.schedule, paper.fit.learning_rate) == ("plateau", 1e-3)
 
@@ -276,23 +276,30 @@ def test_the_kernel_of_a_small_mesh_has_one_patch() -> None:
 
 
 @pytest.mark.parametrize(
-    ("own", "better", "tried", "kind"),
+    ("own", "minutes", "better", "tried", "kind"),
     [
-        (8, BETTER, {"kernel", "polynomials"}, "kernel"),
-        (8, 1.5, {"kernel", "polynomials"}, "polynomials"),
-        (20, 1.5, {"kernel"}, "kernel"),
+        (8, 30, BETTER, {"kernel", "polynomials"}, "kernel"),
+        (8, 30, 1.5, {"kernel", "polynomials"}, "polynomials"),
+        (8, 0, 1.5, {"kernel"}, "kernel"),
+        (20, 30, 1.5, {"kernel"}, "kernel"),
     ],
 )
 def test_auto_takes_what_is_better_on_codes_that_it_has_not_seen(
-    ball: TriangleMesh, monkeypatch: pytest.MonkeyPatch, own: int, better: float, tried: set[str], kind: str
+    ball: TriangleMesh,
+    monkeypatch: pytest.MonkeyPatch,
+    own: int,
+    minutes: float,
+    better: float,
+    tried: set[str],
+    kind: str,
 ) -> None:
-    """By the share of the kernel's error that polynomials have to reach; none where it leaves next to nothing."""
+    """By the share of the kernel's error that another has to reach; none where it leaves next to nothing or is slow."""
     monkeypatch.setattr(networks, "BETTER", better)
     x, z = interplay(ball, 260, cubic)
-    network = fitted(ball, AutoSettings(), x[: own + 20], z[: own + 20], own)
+    network = fitted(ball, AutoSettings(minutes=minutes), x[: own + 20], z[: own + 20], own)
     assert network.settings.kind == kind
     assert set(network.tried) == tried
-    assert (network.tried["kernel"] < 1e-3) == (tried == {"kernel"})
+    assert (network.tried["kernel"] < 1e-3) == (own == 20)
     held_out = slice(own, own + 20)
     wanted = network.scaling.down(z[held_out])
     with torch.no_grad():
