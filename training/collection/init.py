@@ -48,7 +48,7 @@ data = {data}    # folder of meshes, or one NPZ; relative to this file
 # hidden = {factor.hidden}    # layers of each factor's network; wider where the report shows a low R² of factors
 
 [networks.combiner]
-# correction = {{ kind = "{combiner.correction.kind}" }}    # how the factors join; or "kernel", "polynomials", …
+# correction = {{ kind = "{combiner.correction.kind}" }}    # how the factors join; or "kernel", "convolutions", …
 
 [export]
 name = {name}    # in addresses and file names: small letters, digits and hyphens

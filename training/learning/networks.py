@@ -33,7 +33,6 @@ from shapespace.training.learning.layers import (
     perceptron,
 )
 from shapespace.training.learning.linear import principal_axes, regression
-from shapespace.training.learning.polynomials import PolynomialCorrection
 from shapespace.training.runs.config import (
     AutoSettings,
     ConvolutionSettings,
@@ -43,7 +42,6 @@ from shapespace.training.runs.config import (
     KernelSettings,
     LatentNetworkSettings,
     PaperSettings,
-    PolynomialSettings,
     ResolvedCorrection,
 )
 from shapespace.training.runs.latent_coordinates import Coordinates
@@ -131,21 +129,16 @@ class FactorNetwork(ShapeNetwork):
 #: The classes of corrections, by the kinds of their settings.
 CORRECTIONS: dict[str, type[Correction]] = {
     "kernel": KernelCorrection,
-    "polynomials": PolynomialCorrection,
     "products": ProductCorrection,
     "convolutions": ConvolutionCorrection,
     "field": FieldCorrection,
 }
 
 
-#: Share of the squared error on held-out codes of what is chosen so far below which another kind, which takes longer,
-#: is chosen in its place.
+#: Share of the kernel's squared error on held-out codes below which another kind, which takes longer, is chosen.
 BETTER = 0.9
-#: Mean square error of the kernel, of scaled differences whose mean square is 1, below which no other kind is tried:
-#: of some fifteen models of real collections polynomials were better in none where the kernel left as little.
-ENOUGH = 1e-3
-#: Of how many shapes of a factor the principal components are counted that hold 99 % of their variance, and from how
-#: many components something wanders over the surface: it changes entries that no other code changes. Limbs need tens.
+#: Of how many shapes of a factor principal components are counted until they hold 99 % of the variance, and from how
+#: many on something wanders over the surface: a bump on a torus needs hundreds, a body with forty modes about forty.
 LOOKED_AT, WANDERING = 500, 100
 #: Convolutions that follow a bump over a torus (docs/measurements/notes.md, Freaky Torus for three epochs).
 FOLLOWING = ConvolutionSettings(
@@ -160,16 +153,15 @@ FOLLOWING = ConvolutionSettings(
 
 def choices(settings: CorrectionSettings) -> list[ResolvedCorrection]:
     """All that ``auto`` may choose; nothing for other settings."""
-    every: list[ResolvedCorrection] = [KernelSettings(), PolynomialSettings(), FieldSettings(), FOLLOWING]
-    return every if isinstance(settings, AutoSettings) else []
+    return [KernelSettings(), FieldSettings(), FOLLOWING] if isinstance(settings, AutoSettings) else []
 
 
-def _beside_the_kernel(own: JointSamples) -> ResolvedCorrection:
-    """What ``auto`` tries where the kernel leaves much, by a quick look at the samples."""
+def _follower(own: JointSamples) -> ResolvedCorrection | None:
+    """What ``auto`` tries beside the kernel, by a quick look: nothing where nothing wanders over the surface."""
     if own.motion:
         return FieldSettings()
     components = (_components(y) for y in own.inputs[:LOOKED_AT].unbind(dim=1))
-    return FOLLOWING if max(components) > WANDERING else PolynomialSettings()
+    return FOLLOWING if max(components) > WANDERING else None
 
 
 def _components(y: Tensor) -> int:
@@ -237,10 +229,11 @@ class CombinerNetwork(ShapeNetwork):
         start = time.monotonic()
         chosen = fit(KernelSettings())
         tried = {"kernel": error(chosen)}
-        if tried["kernel"] > ENOUGH and time.monotonic() - start < 60 * settings.minutes:
-            other = fit(_beside_the_kernel(own))
-            tried[other.settings.kind] = error(other)
-            if tried[other.settings.kind] < BETTER * tried["kernel"]:
+        follower = _follower(own)
+        if follower and time.monotonic() - start < 60 * settings.minutes:
+            other = fit(follower)
+            tried[follower.kind] = error(other)
+            if tried[follower.kind] < BETTER * tried["kernel"]:
                 chosen = other
         return cls(own.scaling, chosen.settings, chosen.correction, tried)
 

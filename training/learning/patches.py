@@ -82,7 +82,6 @@ class Patch:
         centre: (J d,) coefficients of the mean shapes.
         metric: (J d, J d) rows A of the coordinates ``u = A c`` of coefficients c, those of the largest variance first.
         spread: (J d,) mean squares of the coordinates.
-        penalty: that suits the metric.
         mean: (S,) the constant.
         basis: (S, k) principal axes of what is put out.
         energy: (k,) mean squares along these.
@@ -115,7 +114,7 @@ class Patch:
         x, other = self.inputs(own[0]), self.inputs(held_out[0])
         wanted, theirs = (pairs[1][:, self.columns].double() for pairs in (own, held_out))
         self.mean = wanted.mean(dim=0)
-        metric, self.penalty = learned_metric(x, wanted - self.mean, (other, theirs - self.mean))
+        metric = learned_metric(x, wanted - self.mean, (other, theirs - self.mean))
         # The kernel is invariant under rotations: in the principal axes of the samples the fewest coordinates matter.
         z = x @ metric
         s, axes = principal_axes(z, by="columns")
@@ -224,28 +223,25 @@ def _kernel_slope(s: Tensor) -> Tensor:
     return 1 + s * (1 + s / 2)
 
 
-def learned_metric(x: Tensor, y: Tensor, held_out: Pairs) -> tuple[Tensor, float]:
+def learned_metric(x: Tensor, y: Tensor, held_out: Pairs) -> Tensor:
     """A linear map A (k, k) of inputs x (n, k), z = x A, for which kernel ridge regression of y (n, q) is accurate.
 
     The kernel is ``κ(z·z') = 1 + s + s²/2 + s³/6``, s = z·z'. A starts as a multiple of the identity and is then set,
     several times, to a power of the mean outer product of the gradients of the regression, which shrinks the directions
     in which y does not change (recursive feature machines: Radhakrishnan et al., Science 383, 2024). Held-out pairs
     choose the penalty and the step.
-
-    Returns:
-        The map and its penalty.
     """
     x, y = x[:SAMPLES], y[:SAMPLES]
     components = principal_axes(y, by="svd")[1][:OUTPUTS].T
     metric = SCALE * torch.eye(x.shape[1], dtype=x.dtype)
     size = (x @ metric).square().sum()
-    best, chosen = math.inf, (metric, PENALTIES[-1])
+    best, chosen = math.inf, metric
     for step in range(STEPS + 1):
         z = x @ metric
         s = z @ z.T
         found = SpectralRidge.fit(_kernel(s), y, (_kernel(held_out[0] @ metric @ z.T), held_out[1]), PENALTIES)
         if found.error < best:
-            best, chosen = found.error, (metric, found.penalty)
+            best, chosen = found.error, metric
         if step < STEPS:
             metric = _updated(metric, z, s[:GRADIENTS], found.weights @ components)
             metric = metric * (size / (x @ metric).square().sum().clamp_min(1e-30)).sqrt()

@@ -54,7 +54,6 @@ PLACED |= {"prolongation", "generalisation", "fresh", "correction"}
 #: What the kinds of corrections are called.
 CORRECTIONS = {
     "kernel": "kernel ridge regression",
-    "polynomials": "polynomials in patches",
     "products": "products of two factors' coefficients",
     "convolutions": "graph convolutions",
     "field": "a perceptron at every edge",
@@ -269,7 +268,7 @@ def joined(correction: dict[str, Any]) -> str:
     others = [f"{CORRECTIONS.get(each, each)} {percent(left)}" for each, left in tried.items() if each != kind]
     if others:
         return f"{sentence}; {', '.join(others)}."
-    return f"{sentence}. Nothing else was tried: there was little to gain, or no time."
+    return f"{sentence}. Nothing wanders over the surface, so that nothing else was tried."
 
 
 def flatten(value: Any, name: str = "") -> Iterator[tuple[str, Any]]:

@@ -204,19 +204,6 @@ class KernelSettings(_Section):
     """Number of patches."""
 
 
-class PolynomialSettings(_Section):
-    """Cubic polynomials in principal coefficients of the factors' shapes, separate ones for each patch of edges.
-
-    Suited to many factors that each influence the others a little and locally.
-    """
-
-    kind: Literal["polynomials"] = "polynomials"
-    coefficients: int = Field(12, ge=1)
-    """Principal coefficients of each factor in a patch."""
-    monomials: int = Field(1800, ge=1)
-    """Monomials of degree two and three in each patch."""
-
-
 class ProductSettings(_Section):
     """Ridge regression on products of the principal coefficients of every two factors."""
 
@@ -310,9 +297,8 @@ class PaperSettings(_Section):
 class AutoSettings(_Section):
     """The kind that suits the collection, by its error on held-out codes.
 
-    That is ``kernel``, or, where it leaves more than a thousandth of the shapes' mean square, one other kind if this
-    leaves a tenth less: ``polynomials``, or, where codes move something over the surface, ``field`` if the collection
-    knows where, and ``convolutions`` otherwise.
+    That is ``kernel``; where codes move something over the surface, another is tried and chosen if it leaves a tenth
+    less: ``field`` if the collection knows where, and ``convolutions`` otherwise.
     """
 
     kind: Literal["auto"] = "auto"
@@ -322,15 +308,14 @@ class AutoSettings(_Section):
 
 #: The kinds that a network can be of; ``auto`` and ``paper`` stand for one of them.
 ResolvedCorrection = Annotated[
-    KernelSettings | PolynomialSettings | ProductSettings | ConvolutionSettings | FieldSettings,
+    KernelSettings | ProductSettings | ConvolutionSettings | FieldSettings,
     Field(discriminator="kind"),
 ]
 CorrectionSettings = Annotated[ResolvedCorrection | PaperSettings | AutoSettings, Field(discriminator="kind")]
 
 #: Settings of a combiner in version 0.1, and how ``correction`` is written in their place.
 _COMBINER_OF_0_1 = {
-    '{ kind = "kernel", coefficients }': ["kernel"],
-    '{ kind = "polynomials", coefficients, monomials }': ["polynomial", "monomials"],
+    '{ kind = "kernel", coefficients }': ["kernel", "polynomial", "monomials"],
     '{ kind = "products", coefficients } or { kind = "convolutions", products, … }': ["pairwise"],
     '{ kind = "convolutions", … } with the same names': [
         "layers", "width", "neighbourhood", "crop", "residual", "edge_channels", "dropout", "fit",

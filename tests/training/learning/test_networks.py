@@ -19,7 +19,6 @@ from torch import nn
 from shapespace.bundle.schema import COMBINER
 from shapespace.coordinates.nric import WeightedNorm, nric
 from shapespace.mesh.triangle_mesh import Connectivity, TriangleMesh
-from shapespace.training.learning import networks
 from shapespace.training.learning.baselines import LatentKernel
 from shapespace.training.learning.convolutions import EdgeConvolution, Flaps, Star, flaps
 from shapespace.training.learning.corrections import JointSamples, Slopes
@@ -32,10 +31,8 @@ from shapespace.training.learning.layers import (
     PatchBasis,
     Polynomials,
     Scaling,
-    narrowest,
 )
 from shapespace.training.learning.networks import (
-    BETTER,
     CORRECTIONS,
     CombinerNetwork,
     FactorNetwork,
@@ -43,7 +40,6 @@ from shapespace.training.learning.networks import (
     choices,
 )
 from shapespace.training.learning.patches import learned_metric
-from shapespace.training.learning.polynomials import PolynomialCorrection
 from shapespace.training.runs.config import (
     AutoSettings,
     ConvolutionSettings,
@@ -51,7 +47,6 @@ from shapespace.training.runs.config import (
     KernelSettings,
     LatentNetworkSettings,
     PaperSettings,
-    PolynomialSettings,
     ProductSettings,
 )
 from shapespace.training.runs.latent_coordinates import Coordinates
@@ -179,7 +174,6 @@ KINDS = [
     (ProductSettings(coefficients=1), bilinear, 1e-6),
     (ConvolutionSettings(width=4, products=1), bilinear, 1e-6),
     (KernelSettings(coefficients=3), beyond_cubic, 1e-2),
-    (PolynomialSettings(coefficients=3, monomials=20), cubic, 1e-3),
 ]
 
 
@@ -197,10 +191,7 @@ def test_every_correction_finds_an_interplay_from_factors_alone(
     assert after < left * before
 
 
-@pytest.mark.parametrize(
-    "settings", [KernelSettings(coefficients=3), PolynomialSettings(coefficients=3, monomials=20)], ids=lambda s: s.kind
-)
-def test_derivatives_teach_a_correction(ball: TriangleMesh, settings: Any) -> None:
+def test_derivatives_teach_a_correction(ball: TriangleMesh) -> None:
     """With those at 12 of 15 samples it errs less than without, and with wrong ones more."""
     rng, count = np.random.default_rng(0), 12
     reference = nric(ball.vertices, ball.connectivity)
@@ -222,7 +213,7 @@ def test_derivatives_teach_a_correction(ball: TriangleMesh, settings: Any) -> No
 
     def fit(samples: int, slopes: Slopes | None) -> CombinerNetwork:
         own = JointSamples(factors[:samples], z[:samples], scale, slopes)
-        return CombinerNetwork.fit(settings, ball, own, held_out, 0).eval()
+        return CombinerNetwork.fit(KernelSettings(coefficients=3), ball, own, held_out, 0).eval()
 
     def error(network: CombinerNetwork) -> float:
         with torch.no_grad():
@@ -275,36 +266,14 @@ def test_the_kernel_of_a_small_mesh_has_one_patch() -> None:
     assert missed.square().mean() < 1e-3
 
 
-@pytest.mark.parametrize(
-    ("own", "minutes", "better", "tried", "kind"),
-    [
-        (8, 30, BETTER, {"kernel", "polynomials"}, "kernel"),
-        (8, 30, 1.5, {"kernel", "polynomials"}, "polynomials"),
-        (8, 0, 1.5, {"kernel"}, "kernel"),
-        (20, 30, 1.5, {"kernel"}, "kernel"),
-    ],
-)
-def test_auto_takes_what_is_better_on_codes_that_it_has_not_seen(
-    ball: TriangleMesh,
-    monkeypatch: pytest.MonkeyPatch,
-    own: int,
-    minutes: float,
-    better: float,
-    tried: set[str],
-    kind: str,
-) -> None:
-    """By the share of the kernel's error that another has to reach; none where it leaves next to nothing or is slow."""
-    monkeypatch.setattr(networks, "BETTER", better)
-    x, z = interplay(ball, 260, cubic)
-    network = fitted(ball, AutoSettings(minutes=minutes), x[: own + 20], z[: own + 20], own)
-    assert network.settings.kind == kind
-    assert set(network.tried) == tried
-    assert (network.tried["kernel"] < 1e-3) == (own == 20)
-    held_out = slice(own, own + 20)
-    wanted = network.scaling.down(z[held_out])
+def test_auto_is_the_kernel_where_nothing_wanders(ball: TriangleMesh) -> None:
+    x, z = interplay(ball, 60, cubic)
+    network = fitted(ball, AutoSettings(), x, z, 40)
+    assert network.settings.kind == "kernel"
+    wanted = network.scaling.down(z[40:])
     with torch.no_grad():
-        error = float((network.coefficients(x[held_out]) - wanted).square().mean())
-    assert network.tried[kind] == pytest.approx(error, rel=1e-3)
+        error = float((network.coefficients(x[40:]) - wanted).square().mean())
+    assert network.tried == {"kernel": pytest.approx(error, rel=1e-3)}
     assert CombinerNetwork.load(network.metadata, ball, network.state_dict()).tried == network.tried
 
 
@@ -354,16 +323,11 @@ def test_derivatives_teach_kernel_regression_on_codes(ball: TriangleMesh) -> Non
     assert error((some, -derivatives)) > error(None)
 
 
-def polynomials(mesh: TriangleMesh, coefficients: int, monomials: int) -> tuple[PolynomialCorrection, torch.Tensor]:
-    """A fitted polynomial correction, and scaled shapes of factors."""
-    x, z = interplay(mesh, 60, cubic)
-    network = fitted(mesh, PolynomialSettings(coefficients=coefficients, monomials=monomials), x, z, 40)
-    assert isinstance(network.correction, PolynomialCorrection)
-    return network.correction, network.scaling.down(x)
-
-
-def test_polynomials_look_at_no_other_patch(ball: TriangleMesh) -> None:
-    correction, y = polynomials(ball, 2, 10)
+def test_a_kernel_looks_at_no_other_patch(ball: TriangleMesh) -> None:
+    x, z = interplay(ball, 60, cubic)
+    network = fitted(ball, KernelSettings(coefficients=2), x, z, 40)
+    correction, y = network.correction, network.scaling.down(x)
+    assert isinstance(correction, KernelCorrection)
     size = y.shape[2]
     here = correction.entries[0][correction.entries[0] < size]
     other = torch.ones(size, dtype=torch.bool)
@@ -382,16 +346,10 @@ def test_a_learned_metric_finds_the_direction_that_matters() -> None:
     x, other = (torch.randn(n, 20, generator=rng, dtype=torch.float64) for n in (120, 200))
     direction = nn.functional.normalize(torch.randn(20, generator=rng, dtype=torch.float64), dim=0)
     y, wanted = ((v @ direction)[:, None] ** 2 for v in (x, other))
-    metric, _ = learned_metric(x, y, (other, wanted))
+    metric = learned_metric(x, y, (other, wanted))
     value, vector = torch.linalg.eigh(metric @ metric.T)
     assert (vector[:, -1] @ direction).abs() > 0.999
     assert value[-1] > 20 * value[-2]
-
-
-def test_weights_of_polynomials_take_a_byte_each(ball: TriangleMesh) -> None:
-    correction, _ = polynomials(ball, 3, 60)
-    assert narrowest(correction.weights) == torch.int8
-    assert narrowest(correction.axes) == narrowest(correction.basis) == torch.int8
 
 
 def test_scaled_differences_go_both_ways_and_have_unit_size(sheet: TriangleMesh) -> None:

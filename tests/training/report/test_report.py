@@ -128,7 +128,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
             "r2": {"composite": score(0.9876), "monolithic": score(0.8765)},
             "fresh": {"codes": 50, "failed": 1, "r2": {"composite": score(0.6789)}, "steps": score(0.7891)},
             "affine_samples": 80,
-            "correction": {"kind": "polynomials", "tried": {"kernel": 0.0123, "polynomials": 0.00456}},
+            "correction": {"kind": "field", "tried": {"kernel": 0.0123, "field": 0.00456}},
             "r2_factors": {"head": score(0.9), NASTY: score(0.8)},
             "variants": {"v": {"title": "without <i>this</i>", "r2": score(0.7)}},
             "vertex_error": {"mean": 0.0123, "max": 0.2, "iterations": 3.5, "status": {"converged": 3}},
@@ -233,7 +233,7 @@ def test_every_section_is_there_with_its_figures(page: Page) -> None:
                  "SPGA 0.7531, PGA 0.8531"):  # fmt: skip
         assert said in words
     assert "4,321" in words  # a figure that the page's code doesn't name
-    assert "joined by polynomials in patches, which leaves 0.46 % of" in words
+    assert "joined by a perceptron at every edge, which leaves 0.46 % of" in words
     assert "kernel ridge regression 1.2 %" in words
     assert "seeds · 0 · r2 · composite · total" in words
     assert "0.5432" in words

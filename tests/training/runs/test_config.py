@@ -12,7 +12,7 @@ from shapespace.training.runs.config import (
     CollectionSettings,
     Config,
     ConfigError,
-    PolynomialSettings,
+    ProductSettings,
     load,
     parse,
 )
@@ -118,8 +118,8 @@ def test_a_variant_is_what_differs_from_its_base() -> None:
 
 
 def test_a_correction_of_another_kind_starts_from_its_defaults() -> None:
-    config = variant('[variants.a]\ntitle = ""\ncombiner.correction = { kind = "polynomials", monomials = 7 }')
-    assert config.recipes["a"].combiner.correction == PolynomialSettings(monomials=7)
+    config = variant('[variants.a]\ntitle = ""\ncombiner.correction = { kind = "products", coefficients = 7 }')
+    assert config.recipes["a"].combiner.correction == ProductSettings(coefficients=7)
 
 
 def test_factors_of_a_variant_differ_all_alike_or_each_for_itself() -> None:

@@ -59,7 +59,7 @@ skip_degree = 2
 fit = { batch_size = 16, max_epochs = 8 }
 
 [networks.combiner]
-correction = { kind = "polynomials", coefficients = 4, monomials = 60 }
+correction = { kind = "kernel", coefficients = 4 }
 
 [monolithic]
 hidden = [16]
