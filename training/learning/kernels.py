@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from shapespace.mesh.triangle_mesh import TriangleMesh
 from shapespace.training.learning.corrections import JointSamples, Pairs, Slopes
 from shapespace.training.learning.gaussian import Centres
 from shapespace.training.learning.layers import half_precision
-from shapespace.training.learning.linear import Ridge
+from shapespace.training.learning.linear import Ridge, rounded
 from shapespace.training.learning.patches import (
     Patch,
     PatchCorrection,
     common_tensors,
+    in_bytes,
     output_rank,
     padded_bases,
     patches_of,
@@ -44,21 +45,25 @@ class KernelCorrection(PatchCorrection):
         anchors: (P, n, r) coordinates of samples.
         nodes: (P, k, r) of samples with derivatives.
         gammas: (P,).
-        weights: (P, q, n + k r).
-        basis: (P, S, q).
+        weights: (P, q, n + k r), integers of 16 bits.
+        steps: (P, n + k r) factors of the functions.
+        gains: (P, q) factors of the weights and of the basis.
+        basis: (P, S, q), integers of 8 bits.
     """
 
     anchors: Tensor
     nodes: Tensor
     gammas: Tensor
     weights: Tensor
+    steps: Tensor
+    gains: Tensor
     basis: Tensor
     #: Fewest edges of a patch, on average.
     EDGES = 24
     #: Most functions of a patch: the time grows with their cube, the size of the network with their number.
     FUNCTIONS = 3000
     #: Largest rank of the output.
-    RANK = 128
+    RANK = 176
 
     @classmethod
     def fit(
@@ -70,16 +75,20 @@ class KernelCorrection(PatchCorrection):
         patches = patches_of(_Patch, reference, count, settings.coefficients, pairs, others, seed)
         coordinates = max(patch.rank for patch in patches)
         for patch in progress(patches, "kernels", "patch"):
-            patch.fit(pairs, others, own.slopes, coordinates, cls.FUNCTIONS)
-        bases = padded_bases(patches, min(output_rank(patches), cls.RANK))
+            patch.fit(pairs, others, own.slopes, coordinates, cls.FUNCTIONS, cls.RANK)
+        rank = min(output_rank(patches), cls.RANK)
+        bases, outer = in_bytes(padded_bases(patches, rank), dim=1)
+        inner = torch.stack([_padded(patch.gains, rank) for patch in patches])
         return cls(
             common_tensors(patches, coordinates, pairs[1].shape[1])
             | {
                 "anchors": torch.stack([patch.centres.anchors for patch in patches]).float(),
                 "nodes": torch.stack([patch.centres.nodes for patch in patches]).float(),
                 "gammas": torch.stack([patch.centres.gamma for patch in patches]).float(),
-                "weights": torch.stack([patch.weights_in(basis) for patch, basis in zip(patches, bases, strict=True)]),
-                "basis": half_precision(bases),
+                "weights": torch.stack([_padded(patch.weights, rank) for patch in patches]).mT.float().contiguous(),
+                "steps": torch.stack([patch.steps for patch in patches]).float(),
+                "gains": (inner * outer.squeeze(1)).float(),
+                "basis": bases,
             }
         )
 
@@ -87,7 +96,13 @@ class KernelCorrection(PatchCorrection):
         # Weights are large and of both signs: sums of single precision would be rounding errors in part.
         gammas = self.gammas.double()[:, None, None]
         found = Centres(self.anchors.double(), self.nodes.double(), gammas)(self.coordinates(y).double().mT)
-        return self.whole(self.basis @ (self.weights.double() @ found.mT).to(y.dtype))
+        put_out = self.weights.double() @ (found * self.steps[:, None].double()).mT
+        return self.whole(self.basis @ (put_out * self.gains[:, :, None]).to(y.dtype))
+
+
+def _padded(values: Tensor, size: int) -> Tensor:
+    """The first ``size`` entries of the last dimension; zeros beyond."""
+    return nn.functional.pad(values[..., :size], (0, max(0, size - values.shape[-1])))
 
 
 class _Patch(Patch):
@@ -95,11 +110,15 @@ class _Patch(Patch):
 
     Attributes:
         centres: the functions, in coordinates of 16 bits.
-        weights: (n + k r, S), in double precision.
+        weights: (n + k r, q) of the coefficients along the axes, integers of 16 bits.
+        steps: (n + k r,) factors of the functions.
+        gains: (q,) of the coefficients.
     """
 
     centres: Centres
     weights: Tensor
+    steps: Tensor
+    gains: Tensor
 
     @property
     def rank(self) -> int:
@@ -107,8 +126,11 @@ class _Patch(Patch):
         left = self.spread.sum() - self.spread.cumsum(0)
         return 1 + int((left > NEGLIGIBLE * self.spread.sum()).sum())
 
-    def fit(self, own: Pairs, held_out: Pairs, slopes: Slopes | None, rank: int, most: int) -> None:
-        """Ridge regression on so many coordinates by so many functions, γ and the penalty as held-out samples like."""
+    def fit(self, own: Pairs, held_out: Pairs, slopes: Slopes | None, rank: int, most: int, outputs: int) -> None:
+        """Ridge regression on ``rank`` coordinates by at most so many functions, of so many outputs.
+
+        Held-out samples choose γ and the penalty.
+        """
         x, other = (self.coordinates(inputs, rank) for inputs, _ in (own, held_out))
         wanted, theirs = (residual[:, self.columns].double() - self.mean for _, residual in (own, held_out))
         anchors, nodes = half_precision(x[:most]), x[:0]
@@ -123,9 +145,10 @@ class _Patch(Patch):
 
         self.centres = min(tried, key=lambda centres: fitted(centres.some(share)).error)
         found = fitted(self.centres)
-        self.weights, self.error = found.weights, found.error * theirs.shape[1]
-        self.keep_axes(self.centres(x) @ found.weights)
-
-    def weights_in(self, basis: Tensor) -> Tensor:
-        """(q, n + k r) of the coefficients in a basis (at least S, q)."""
-        return (self.weights @ basis[: len(self.columns)].double()).T.float()
+        self.error = found.error * theirs.shape[1]
+        features = self.centres(x)
+        self.keep_axes(features @ found.weights)
+        if known:
+            features = torch.cat([features, self.centres.along(*known[:2])])
+        weights, steps, gains = rounded(found.weights @ self.basis[:, :outputs].double(), features)
+        self.weights, self.steps, self.gains = weights, steps.flatten(), gains.flatten()

@@ -32,7 +32,7 @@ def half_precision(x: Tensor) -> Tensor:
 def narrowest(x: Tensor) -> torch.dtype:
     """The type that a tensor has in a bundle: 8 or 16 bits where they hold all values of a large one exactly."""
     if x.dtype == torch.float32 and x.numel() >= NARROWED_SIZE:
-        for narrow in (torch.int8, torch.float16):
+        for narrow in (torch.int8, torch.int16, torch.float16):
             if torch.equal(x, x.to(narrow).to(x.dtype)):
                 return narrow
     return x.dtype

@@ -13,6 +13,10 @@ from torch import Tensor, nn
 ROUNDING = 1e-12
 #: What is added to the diagonal of a Gram matrix, a share of its trace.
 JITTER = 1e-12
+#: The same for `rounded`.
+SLIGHT = 1e-10
+#: Largest integer that a weight is rounded to, so many of which are left for what makes up for others; rows at once.
+MOST, LEVELS, BLOCK = 32767, 25000, 64
 
 
 @dataclass(frozen=True)
@@ -73,6 +77,41 @@ def kernel_ridge(
     x, theirs = (torch.linalg.solve_triangular(half, rows.T, upper=False).T for rows in (features, held_out[0]))
     found = ridge(x.T @ x, x.T @ values, (theirs, held_out[1]), penalties)
     return replace(found, weights=torch.linalg.solve_triangular(half.T, found.weights, upper=True))
+
+
+def rounded(weights: Tensor, features: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Integers of 16 bits, and factors of rows and columns, whose product is nearly as good as some weights.
+
+    Kernels that all but depend on each other have large weights of both signs, whose sums are lost if each is rounded
+    for itself. So they are rounded one after the other, and those that are left make up for each error as well as they
+    can at the samples (Frantar et al., GPTQ, ICLR 2023).
+
+    Args:
+        weights: (n, q) of functions.
+        features: (m, n) the functions at samples.
+
+    Returns:
+        (n, q), (n, 1) and (1, q).
+    """
+    gram = features.T @ features
+    order = gram.diagonal().argsort(descending=True)
+    gram = gram[order][:, order] + SLIGHT * gram.trace() * torch.eye(len(gram))
+    # Its rows say how the functions after one make up for it.
+    rows = torch.linalg.cholesky(torch.cholesky_inverse(torch.linalg.cholesky(gram)), upper=True)
+    columns = weights.square().mean(dim=0, keepdim=True).sqrt().clamp_min(1e-30)
+    left = (weights / columns)[order]
+    units = left.abs().amax(dim=1, keepdim=True).clamp_min(1e-30) / LEVELS
+    whole = torch.empty_like(left)
+    for start in range(0, len(left), BLOCK):
+        end = min(start + BLOCK, len(left))
+        errors = torch.empty_like(left[start:end])
+        for i, error in zip(range(start, end), errors, strict=True):
+            whole[i] = (left[i] / units[i]).round().clamp(-MOST, MOST)
+            error[:] = (left[i] - whole[i] * units[i]) / rows[i, i]
+            left[i:end] -= rows[i, i:end, None] * error
+        left[end:] -= rows[start:end, end:].T @ errors
+    back = order.argsort()
+    return whole[back], units[back], columns
 
 
 @dataclass(frozen=True)
