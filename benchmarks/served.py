@@ -33,8 +33,6 @@ JOINT, OF_FACTORS = 1000, 300
 COLUMNS = ("unseen", "trained on")
 #: What the names of runs with half as many modes end in.
 HALF = "-half"
-#: Models beside which the paper's own system is trained, which takes from ten minutes to hours.
-PAPER = ("hand",)
 #: Models, in the order of the rows.
 NAMES = tuple(each + ending for each in ROWS for ending in ("", HALF))
 #: What was measured, a file for each collection; one that is there is not measured again.
@@ -135,8 +133,6 @@ def four_fifths(name: str, data: Path, out: Path, fold: int = 0) -> tuple[Run, F
         document.pop(section, None)
     for studied in ("seeds", "fractions"):
         document.get("networks", {}).pop(studied, None)
-    if name in PAPER and not fold:
-        document["networks"]["paper"] = True
     document["export"].pop("names", None)
     document["export"]["name"] = name + ending
     text = tomlkit.dumps(document)
