@@ -94,8 +94,8 @@ class Reconstructions:
 
 
 @dataclass(frozen=True)
-class TestSplit:
-    """The test split of a learner, which is read here and nowhere before.
+class Split:
+    """Joint samples that nothing is fitted to: the validation codes, or the test codes, which are read only here.
 
     Attributes:
         rows: (n,) of the joint samples.
@@ -112,9 +112,9 @@ class TestSplit:
     norm: WeightedNorm
 
     @classmethod
-    def of(cls, learner: Learner) -> TestSplit:
-        """That of this seed."""
-        rows, joint = learner.split["test"], learner.joint
+    def of(cls, learner: Learner, name: str = "test") -> Split:
+        """That of this seed, by its name."""
+        rows, joint = learner.split[name], learner.joint
         norm = WeightedNorm.of(learner.collection.reference, learner.config.evaluation.eta)
         return cls(rows, joint.latents[rows], joint.nric[rows], joint.vertices[rows], norm)
 
@@ -148,7 +148,7 @@ def evaluate(
     settings, main = config.evaluation, learner()
     collection, reference = main.collection, main.collection.reference
     z_reference = nric(reference.vertices, reference.connectivity)
-    test, composite = TestSplit.of(main), main.main()
+    test, composite = Split.of(main), main.main()
     baselines: dict[str, Composite | nn.Module] = {
         "monolithic": main.monolithic(),
         "monolithic_paper": main.monolithic_paper(),
@@ -183,10 +183,7 @@ def evaluate(
         "r2_factors": {
             name: r_squared(learned[found, j], shapes[:, j], test.norm) for j, name in enumerate(collection.factors)
         },
-        "variants": {
-            name: {"title": config.variants[name].title, "r2": test.r2(variant)}
-            for name, variant in main.variants().items()
-        },
+        **variants(main, config),
         "exponentials": main.exponentials(),
         "derivatives": len(main.differentiated()[0]),
         "correction": {"kind": composite.combiner.settings.kind, "tried": composite.combiner.tried},
@@ -198,6 +195,27 @@ def evaluate(
     }
     gallery = extremes(reconstructed.vertices, test.vertices[first], reconstructed.errors, test.rows[first])
     return figures, gallery | strip(collection, composite, eta) | {"faces": reference.faces}
+
+
+def variants(learner: Learner, config: Config) -> dict[str, Any]:
+    """R² of the ablation's rows on the validation codes, so that recipes are not chosen by the test codes.
+
+    Returns:
+        ``variants``, each with its title, and ``validation`` with what they are compared with.
+    """
+    validation, composite = Split.of(learner, "validation"), learner.main()
+    reference = learner.collection.reference
+    affine = affine_sum(nric(reference.vertices, reference.connectivity), validation.predicted(composite.factor_shapes))
+    return {
+        "validation": {
+            "samples": len(validation.rows),
+            "r2": {"composite": validation.r2(composite), "affine of learned factors": validation.r2_of(affine)},
+        },
+        "variants": {
+            name: {"title": config.variants[name].title, "r2": validation.r2(variant)}
+            for name, variant in learner.variants().items()
+        },
+    }
 
 
 #: Share of the fresh codes whose exponentials are computed once more, with twice as many steps.
@@ -242,7 +260,7 @@ def on_fresh_codes(
     return result
 
 
-def _fraction(learner: Callable[..., Learner], fraction: float, test: TestSplit) -> dict[str, Any]:
+def _fraction(learner: Callable[..., Learner], fraction: float, test: Split) -> dict[str, Any]:
     """R² of networks that learn from a fraction of the training codes, and of one with all samples of the factors."""
     some, free = learner(fraction=fraction), learner(fraction=fraction, all_of_factors=True)
     return {
@@ -261,7 +279,7 @@ def _fraction(learner: Callable[..., Learner], fraction: float, test: TestSplit)
 
 def _other_seed(learner: Learner) -> dict[str, Any]:
     """R² of networks learned with another seed, on the test split of that seed."""
-    test = TestSplit.of(learner)
+    test = Split.of(learner)
     r2 = {"composite": test.r2(learner.main()), "monolithic": test.r2(learner.monolithic())}
     r2["kernel"] = test.r2(learner.kernel())
     return {"seed": learner.seed, "r2": r2}

@@ -50,7 +50,7 @@ MODELS = {
 }
 #: Keys of evaluation.json with a section on the page; all others are listed in one table.
 PLACED = {"eta", "test_samples", "r2", "r2_factors", "variants", "vertex_error", "sizes", "times", "fractions"}
-PLACED |= {"prolongation", "generalisation", "fresh", "correction"}
+PLACED |= {"prolongation", "generalisation", "fresh", "correction", "validation"}
 #: What the kinds of corrections are called.
 CORRECTIONS = {
     "kernel": "kernel ridge regression",

@@ -94,7 +94,7 @@ STAGES: dict[str, Stage] = {
         results=lambda run: [run.generalisation.path, run.least_general.path],
     ),
     "evaluation": Stage(
-        version=1,
+        version=2,
         settings=lambda config: [config.evaluation],
         results=lambda run: [run.evaluation.path, run.gallery.path, run.report.path, run.exact],
     ),
