@@ -25,6 +25,7 @@ from shapespace.training.collection.freaky_torus import FreakyTorus, vertices
 from shapespace.training.learning.evaluation import r_squared
 from shapespace.training.learning.export import ExportError, export
 from shapespace.training.learning.fitting import read_network
+from shapespace.training.learning.networks import predict
 from shapespace.training.pipeline import Run, learner_of
 from shapespace.training.runs.config import load, parse
 from shapespace.training.runs.directory import RunDirectory
@@ -67,6 +68,18 @@ def test_a_run_leaves_what_the_contract_promises(tiny_run: Path) -> None:
     events = [json.loads(line) for line in (tiny_run / "log.jsonl").read_text().splitlines()]
     assert [e["stage"] for e in events if e["event"] == "end"] == list(STAGES)
     assert all(e["time"] for e in events)
+
+
+def test_options_are_compared_on_validation_codes(tiny_run: Path) -> None:
+    run = Run(tiny_run, *load(tiny_run / "config.toml"), tiny_run / "models")
+    learner, figures = learner_of(run), json.loads((tiny_run / "evaluation.json").read_text())
+    rows, joint = learner.split["validation"], learner.joint
+    assert figures["validation"]["samples"] == len(rows)
+    norm = WeightedNorm.of(learner.collection.reference, run.config.evaluation.eta)
+    found = {"recipe": figures["validation"]["r2"]["composite"], "paper": figures["variants"]["paper"]["r2"]}
+    for model, r2 in zip((learner.main(), learner.variants()["paper"]), found.values(), strict=True):
+        z = predict(model, torch.as_tensor(joint.latents[rows], dtype=torch.float32)).numpy()
+        assert r2["total"] == pytest.approx(r_squared(z, joint.nric[rows], norm)["total"], abs=1e-6)
 
 
 def test_no_factor_learns_from_parts_of_test_codes(tiny_run: Path) -> None:
