@@ -167,8 +167,8 @@ def _follower(own: JointSamples) -> ResolvedCorrection | None:
 def _components(y: Tensor) -> int:
     """How many principal components hold 99 % of the variance of y (n, p)."""
     s, _ = principal_axes(y - y.mean(dim=0), by="rows")
-    share = s.square().cumsum(0) / s.square().sum().clamp_min(1e-30)
-    return 1 + int((share < 0.99).sum())
+    variance = s.square().cumsum(0)
+    return 1 + int((variance < 0.99 * variance[-1]).sum())
 
 
 class CombinerNetwork(ShapeNetwork):

@@ -268,7 +268,7 @@ def joined(correction: dict[str, Any]) -> str:
     others = [f"{CORRECTIONS.get(each, each)} {percent(left)}" for each, left in tried.items() if each != kind]
     if others:
         return f"{sentence}; {', '.join(others)}."
-    return f"{sentence}. Nothing wanders over the surface, so that nothing else was tried."
+    return f"{sentence}. Nothing else was tried, as nothing wanders over the surface or this took long."
 
 
 def flatten(value: Any, name: str = "") -> Iterator[tuple[str, Any]]:

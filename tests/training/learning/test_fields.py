@@ -183,3 +183,8 @@ def test_it_refuses_collections_that_know_no_places(own: JointSamples) -> None:
     unknown: Any = replace(own, motion=None)
     with pytest.raises(ValueError, match="where its coordinates are on the surface"):
         FieldCorrection.fit(SMALL, TORUS.reference, unknown, unknown, 0)
+
+
+@pytest.mark.parametrize(("y", "count"), [(torch.zeros(200, 50), 1), (torch.eye(200), 198), (torch.ones(9, 1), 1)])
+def test_a_quick_look_counts_principal_components(y: torch.Tensor, count: int) -> None:
+    assert networks._components(y) == count
