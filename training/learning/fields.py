@@ -1,7 +1,7 @@
 """Neural fields on the edges of the mesh, for features that move over the surface.
 
 The perceptron is the same at every edge and sees where each feature lies to it. Convolutions have to find that out from
-the factors' shapes around an edge, by way of many layers; polynomials have to learn it anew for every place.
+the factors' shapes around an edge, by way of many layers; kernels in patches have to learn it anew for every place.
 """
 
 from __future__ import annotations

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from shapespace.mesh.triangle_mesh import TriangleMesh
 from shapespace.training.learning.corrections import JointSamples, Pairs, Slopes
@@ -18,6 +18,7 @@ from shapespace.training.learning.patches import (
     output_rank,
     padded_bases,
     patches_of,
+    resized,
 )
 from shapespace.training.runs.config import KernelSettings
 from shapespace.training.runs.progress import progress
@@ -78,14 +79,14 @@ class KernelCorrection(PatchCorrection):
             patch.fit(pairs, others, own.slopes, coordinates, cls.FUNCTIONS, cls.RANK)
         rank = min(output_rank(patches), cls.RANK)
         bases, outer = in_bytes(padded_bases(patches, rank), dim=1)
-        inner = torch.stack([_padded(patch.gains, rank) for patch in patches])
+        inner = torch.stack([resized(patch.gains, rank) for patch in patches])
         return cls(
             common_tensors(patches, coordinates, pairs[1].shape[1])
             | {
                 "anchors": torch.stack([patch.centres.anchors for patch in patches]).float(),
                 "nodes": torch.stack([patch.centres.nodes for patch in patches]).float(),
                 "gammas": torch.stack([patch.centres.gamma for patch in patches]).float(),
-                "weights": torch.stack([_padded(patch.weights, rank) for patch in patches]).mT.float().contiguous(),
+                "weights": torch.stack([resized(patch.weights, rank) for patch in patches]).mT.float().contiguous(),
                 "steps": torch.stack([patch.steps for patch in patches]).float(),
                 "gains": (inner * outer.squeeze(1)).float(),
                 "basis": bases,
@@ -98,11 +99,6 @@ class KernelCorrection(PatchCorrection):
         found = Centres(self.anchors.double(), self.nodes.double(), gammas)(self.coordinates(y).double().mT)
         put_out = self.weights.double() @ (found * self.steps[:, None].double()).mT
         return self.whole(self.basis @ (put_out * self.gains[:, :, None]).to(y.dtype))
-
-
-def _padded(values: Tensor, size: int) -> Tensor:
-    """The first ``size`` entries of the last dimension; zeros beyond."""
-    return nn.functional.pad(values[..., :size], (0, max(0, size - values.shape[-1])))
 
 
 class _Patch(Patch):

@@ -213,13 +213,10 @@ class CombinerNetwork(ShapeNetwork):
             train(network)
             return network
 
-        match settings:
-            case AutoSettings():
-                pass
-            case PaperSettings():
-                return fit(settings.convolutions)
-            case _:
-                return fit(settings)
+        if isinstance(settings, PaperSettings):
+            settings = settings.convolutions
+        if not isinstance(settings, AutoSettings):
+            return fit(settings)
 
         wanted = own.scaling.down(held_out.joint)
 

@@ -189,9 +189,12 @@ def output_rank(patches: Sequence[Patch]) -> int:
 
 def padded_bases(patches: Sequence[Patch], rank: int) -> Tensor:
     """(P, S, rank) of their first axes; zeros beyond the entries and the axes of a patch."""
-    return _padded(
-        [nn.functional.pad(each[:, :rank], (0, max(0, rank - each.shape[1]))) for each in (p.basis for p in patches)]
-    )
+    return _padded([resized(patch.basis, rank) for patch in patches])
+
+
+def resized(values: Tensor, size: int) -> Tensor:
+    """The first ``size`` entries of the last dimension; zeros beyond."""
+    return nn.functional.pad(values[..., :size], (0, max(0, size - values.shape[-1])))
 
 
 def in_bytes(x: Tensor, dim: int) -> tuple[Tensor, Tensor]:
