@@ -2,47 +2,41 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+from typing import Any, Self
+
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from shapespace.mesh.triangle_mesh import TriangleMesh
-from shapespace.training.learning.corrections import JointSamples, Pairs, Slopes
+from shapespace.training.learning.corrections import Correction, JointSamples
 from shapespace.training.learning.gaussian import Centres
-from shapespace.training.learning.layers import half_precision
-from shapespace.training.learning.linear import Ridge, rounded
-from shapespace.training.learning.patches import (
-    Patch,
-    PatchCorrection,
-    common_tensors,
-    in_bytes,
-    output_rank,
-    padded_bases,
-    patches_of,
-    resized,
-)
+from shapespace.training.learning.layers import in_bytes, patch_entries, resized
+from shapespace.training.learning.patches import Patch
 from shapespace.training.runs.config import KernelSettings
 from shapespace.training.runs.progress import progress
 
-#: Candidates for γ, and for the penalty, where the kernel's largest value is 1. With smaller penalties the weights are
-#: too large for single precision.
-GAMMAS = (0.5, 2.0, 8.0, 32.0)
-PENALTIES = tuple(10.0**k for k in range(-6, 0))
-#: Most functions that γ is chosen with.
-SOME = 800
-#: Share of the coordinates' mean square that is left out.
-NEGLIGIBLE = 1e-6
+#: By which share the rank of the output may increase the squared error on held-out samples.
+SLACK = 0.125
 
 
-class KernelCorrection(PatchCorrection):
+class KernelCorrection(Correction):
     """Kernel ridge regression on the factors' shapes, patch by patch.
 
-    The kernel of two samples is ``exp(−γ |u − u'|²)``, u their coordinates in the metric of the patch. Products of two
-    or three coefficients, which describe how factors act on each other, are among the functions that such a kernel
+    The kernel of two samples is ``exp(−γ |u − u'|²)``, u their coordinates in the metric of the `Patch`. Products of
+    two or three coefficients, which describe how factors act on each other, are among the functions that such a kernel
     approximates. Where there are derivatives its gradients are used too (`Centres`).
 
-    With n anchors and k nodes, and rank q of the output:
+    With P patches of at most S entries of NRIC, rank r of the metric and q of the output, n anchors and k nodes:
 
     Attributes:
+        entries: (P, S) indices of the entries in each patch, 2E where there are fewer.
+        place: (2E,) index in the flat ``entries`` of each entry of NRIC.
+        axes: (P, J, d, S) principal axes of the factors' shapes, integers of 8 bits.
+        units: (P, J d) factors of the axes.
+        centre: (P, J d) coefficients of the mean shapes.
+        metric: (P, r, J d) coordinates u of coefficients c, ``u = A c``.
+        mean: (2E,) the constant.
         anchors: (P, n, r) coordinates of samples.
         nodes: (P, k, r) of samples with derivatives.
         gammas: (P,).
@@ -52,6 +46,13 @@ class KernelCorrection(PatchCorrection):
         basis: (P, S, q), integers of 8 bits.
     """
 
+    entries: Tensor
+    place: Tensor
+    axes: Tensor
+    units: Tensor
+    centre: Tensor
+    metric: Tensor
+    mean: Tensor
     anchors: Tensor
     nodes: Tensor
     gammas: Tensor
@@ -66,6 +67,16 @@ class KernelCorrection(PatchCorrection):
     #: Largest rank of the output.
     RANK = 176
 
+    def __init__(self, tensors: Mapping[str, Tensor]) -> None:
+        super().__init__()
+        for name, tensor in tensors.items():
+            self.register_buffer(name, tensor)
+
+    @classmethod
+    def load(cls, settings: Any, reference: TriangleMesh, tensors: Mapping[str, Tensor]) -> Self:
+        """See `Correction`."""
+        return cls(tensors)
+
     @classmethod
     def fit(
         cls, settings: KernelSettings, reference: TriangleMesh, own: JointSamples, held_out: JointSamples, seed: int
@@ -73,78 +84,67 @@ class KernelCorrection(PatchCorrection):
         """See `Correction`; the held-out samples choose metrics too, and the seed is that of the patches."""
         pairs, others = own.pairs, held_out.pairs
         count = max(1, min(settings.patches, len(reference.edges) // cls.EDGES))
-        patches = patches_of(_Patch, reference, count, settings.coefficients, pairs, others, seed)
+        entries = patch_entries(reference.edge_midpoints, count, seed)
+        patches = [Patch(columns, settings.coefficients, pairs[0]) for columns in entries]
+        for patch in progress(patches, "metrics", "patch"):
+            patch.learn_metric(pairs, others)
         coordinates = max(patch.rank for patch in patches)
         for patch in progress(patches, "kernels", "patch"):
             patch.fit(pairs, others, own.slopes, coordinates, cls.FUNCTIONS, cls.RANK)
-        rank = min(output_rank(patches), cls.RANK)
-        bases, outer = in_bytes(padded_bases(patches, rank), dim=1)
-        inner = torch.stack([resized(patch.gains, rank) for patch in patches])
-        return cls(
-            common_tensors(patches, coordinates, pairs[1].shape[1])
-            | {
-                "anchors": torch.stack([patch.centres.anchors for patch in patches]).float(),
-                "nodes": torch.stack([patch.centres.nodes for patch in patches]).float(),
-                "gammas": torch.stack([patch.centres.gamma for patch in patches]).float(),
-                "weights": torch.stack([resized(patch.weights, rank) for patch in patches]).mT.float().contiguous(),
-                "steps": torch.stack([patch.steps for patch in patches]).float(),
-                "gains": (inner * outer.squeeze(1)).float(),
-                "basis": bases,
-            }
-        )
+        return cls(_joined(patches, coordinates, min(_output_rank(patches), cls.RANK)))
+
+    def coordinates(self, y: Tensor) -> Tensor:
+        """(P, r, n) coordinates u of factor shapes (n, J, 2E)."""
+        # The dimension of samples comes last: so gathers copy rows, and products of small matrices are few operations.
+        rows = torch.cat([y, torch.zeros_like(y[:, :, :1])], dim=2).permute(2, 1, 0)
+        local = rows.index_select(0, self.entries.flatten()).unflatten(0, self.entries.shape).transpose(1, 2)
+        c = (self.axes @ local).flatten(1, 2) * self.units[:, :, None] - self.centre[:, :, None]
+        return self.metric @ c
 
     def difference(self, y: Tensor) -> Tensor:
         # Weights are large and of both signs: sums of single precision would be rounding errors in part.
         gammas = self.gammas.double()[:, None, None]
         found = Centres(self.anchors.double(), self.nodes.double(), gammas)(self.coordinates(y).double().mT)
         put_out = self.weights.double() @ (found * self.steps[:, None].double()).mT
-        return self.whole(self.basis @ (put_out * self.gains[:, :, None]).to(y.dtype))
+        parts = self.basis @ (put_out * self.gains[:, :, None]).to(y.dtype)
+        return parts.flatten(0, 1).index_select(0, self.place).T + self.mean
 
 
-class _Patch(Patch):
-    """One patch while it is fitted.
+def _joined(patches: Sequence[Patch], coordinates: int, rank: int) -> dict[str, Tensor]:
+    """The tensors of a `KernelCorrection`, with so many coordinates and outputs of each patch."""
+    # Shorter patches are padded with an entry of NRIC that does not exist, where shapes are zero.
+    size = sum(len(patch.columns) for patch in patches)
+    entries = _padded([torch.as_tensor(patch.columns) for patch in patches], size)
+    mean = torch.zeros(size)
+    for patch in patches:
+        mean[patch.columns] = patch.mean.float()
+    basis, outer = in_bytes(_padded([resized(patch.basis, rank) for patch in patches]), dim=1)
+    inner = torch.stack([resized(patch.gains, rank) for patch in patches])
+    return {
+        "entries": entries,
+        "place": torch.argsort(entries.flatten())[:size],
+        "axes": _padded([patch.axes.permute(2, 0, 1) for patch in patches]).permute(0, 2, 3, 1).contiguous(),
+        "units": torch.stack([patch.units for patch in patches]).float(),
+        "centre": torch.stack([patch.centre for patch in patches]).float(),
+        "metric": torch.stack([patch.metric[:coordinates] for patch in patches]),
+        "mean": mean,
+        "anchors": torch.stack([patch.centres.anchors for patch in patches]).float(),
+        "nodes": torch.stack([patch.centres.nodes for patch in patches]).float(),
+        "gammas": torch.stack([patch.centres.gamma for patch in patches]).float(),
+        "weights": torch.stack([resized(patch.weights, rank) for patch in patches]).mT.float().contiguous(),
+        "steps": torch.stack([patch.steps for patch in patches]).float(),
+        "gains": (inner * outer.squeeze(1)).float(),
+        "basis": basis,
+    }
 
-    Attributes:
-        centres: the functions, in coordinates of 16 bits.
-        weights: (n + k r, q) of the coefficients along the axes, integers of 16 bits.
-        steps: (n + k r,) factors of the functions.
-        gains: (q,) of the coefficients.
-    """
 
-    centres: Centres
-    weights: Tensor
-    steps: Tensor
-    gains: Tensor
+def _padded(parts: Sequence[Tensor], value: float = 0) -> Tensor:
+    """(P, longest, …) of P tensors (·, …)."""
+    return nn.utils.rnn.pad_sequence(list(parts), batch_first=True, padding_value=value)
 
-    @property
-    def rank(self) -> int:
-        """How many coordinates matter."""
-        left = self.spread.sum() - self.spread.cumsum(0)
-        return 1 + int((left > NEGLIGIBLE * self.spread.sum()).sum())
 
-    def fit(self, own: Pairs, held_out: Pairs, slopes: Slopes | None, rank: int, most: int, outputs: int) -> None:
-        """Ridge regression on ``rank`` coordinates by at most so many functions, of so many outputs.
-
-        Held-out samples choose γ and the penalty.
-        """
-        x, other = (self.coordinates(inputs, rank) for inputs, _ in (own, held_out))
-        wanted, theirs = (residual[:, self.columns].double() - self.mean for _, residual in (own, held_out))
-        anchors, nodes = half_precision(x[:most]), x[:0]
-        if slopes:
-            nodes = half_precision(self.coordinates(slopes.inputs, rank)[: (most - len(anchors)) // rank])
-        known = self.slopes(slopes, rank) if slopes else None
-        share = min(1.0, SOME / (len(anchors) + nodes.numel()))
-        tried = [Centres(anchors, nodes, torch.tensor(gamma, dtype=x.dtype)) for gamma in GAMMAS]
-
-        def fitted(centres: Centres) -> Ridge:
-            return centres.fit((x, wanted), known, (other, theirs), PENALTIES)
-
-        self.centres = min(tried, key=lambda centres: fitted(centres.some(share)).error)
-        found = fitted(self.centres)
-        self.error = found.error * theirs.shape[1]
-        features = self.centres(x)
-        self.keep_axes(features @ found.weights)
-        if known:
-            features = torch.cat([features, self.centres.along(*known[:2])])
-        weights, steps, gains = rounded(found.weights @ self.basis[:, :outputs].double(), features)
-        self.weights, self.steps, self.gains = weights, steps.flatten(), gains.flatten()
+def _output_rank(patches: Sequence[Patch]) -> int:
+    """The smallest rank of the output that adds no more than SLACK to the squared error of all patches."""
+    energy = _padded([patch.energy for patch in patches]).sum(dim=0)
+    lost = energy.sum() - energy.cumsum(0)
+    return min(int((lost > SLACK * sum(patch.error for patch in patches)).sum()) + 1, len(energy))

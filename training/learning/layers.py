@@ -29,6 +29,17 @@ def half_precision(x: Tensor) -> Tensor:
     return x.half().to(x.dtype)
 
 
+def in_bytes(x: Tensor, dim: int) -> tuple[Tensor, Tensor]:
+    """Integers from −127 to 127, as floating-point numbers, and the factors along ``dim`` that make x of them."""
+    unit = x.abs().amax(dim=dim, keepdim=True).clamp_min(1e-30) / 127
+    return (x / unit).round(), unit
+
+
+def resized(values: Tensor, size: int) -> Tensor:
+    """The first ``size`` entries of the last dimension; zeros beyond."""
+    return nn.functional.pad(values[..., :size], (0, max(0, size - values.shape[-1])))
+
+
 def narrowest(x: Tensor) -> torch.dtype:
     """The type that a tensor has in a bundle: 8 or 16 bits where they hold all values of a large one exactly."""
     if x.dtype == torch.float32 and x.numel() >= NARROWED_SIZE:

@@ -32,6 +32,7 @@ from shapespace.training.learning.layers import (
     Polynomials,
     Scaling,
 )
+from shapespace.training.learning.metric import learned_metric
 from shapespace.training.learning.networks import (
     CORRECTIONS,
     CombinerNetwork,
@@ -39,7 +40,6 @@ from shapespace.training.learning.networks import (
     affine_sum,
     choices,
 )
-from shapespace.training.learning.patches import learned_metric
 from shapespace.training.runs.config import (
     AutoSettings,
     ConvolutionSettings,
