@@ -38,7 +38,9 @@ def record(name: str) -> dict[str, Any]:
     """What a committed run holds, by the names of its files."""
     folder = ROOT / "runs" / name
     found: dict[str, Any] = {path.stem: json.loads(path.read_text()) for path in folder.glob("*.json")}
-    return found | {"config": load(folder / "config.toml")[0]}
+    config = load(folder / "config.toml")[0]
+    bundle = ROOT / "models" / config.export.name / str(config.export.version)
+    return found | {"config": config, "manifest": json.loads((bundle / "manifest.json").read_text())}
 
 
 def without_bump(count: int = 1000) -> float:

@@ -57,7 +57,7 @@ def measure(name: str, data: Path, out: Path) -> dict[str, Any]:
         file = run.study(f"fold-{k}")
         if not file.exists():
             material = stages.material(config)
-            found = held_out(reference, shapes, index, counts, config.modes, material, stages.LIGHT_STEPS, original)
+            found = held_out(reference, shapes, index, counts, config.modes, material, original=original)
             away = found.distances(shapes, reference.diagonal)
             file.write(
                 {"counts": found.counts} | {kind: [each.tolist() for each in rows] for kind, rows in away.items()}

@@ -88,6 +88,7 @@ def figures(name: str, run: Run) -> dict[str, Any]:
         "ingest": {key: ingest[key] for key in ("shapes", "vertices", "coarse_vertices", "prolongation")},
         "explained": {"sparse": decomposition["explained"], "principal": decomposition["pga_explained"]},
         "linearised": decomposition["linearised_logarithms"],
+        "steps": decomposition["log_steps"],
         "localisation": {
             "sparse": float(modes["localisation"].mean()),
             "principal": float(modes["pga_localisation"].mean()),

@@ -37,7 +37,7 @@ def measure(run: RunDirectory, config: Config) -> dict[str, Any]:
     others = linear.random(min(m, len(shapes) - 1), CODES, np.random.default_rng(0))
     energy = (linear.coefficients**2).sum(axis=0)
     space = ShellSpace(reference.with_vertices(mean), material(config))
-    fields = logarithms(space, mean, shapes, config.modes.log_steps).fields
+    fields = logarithms(space, mean, shapes, run.decomposition.read()["log_steps"]).fields
 
     def explained(span: FloatArray) -> list[float]:
         return [modes.coefficients(space, mean, fields, span[:k], config.modes.norm)[1] for k in counts]

@@ -117,8 +117,13 @@ class FreakyTorus:
         )
 
     @property
-    def finer(self) -> None:
+    def steps(self) -> None:
         """None: a formula has no steps."""
+        return None
+
+    @property
+    def finer(self) -> None:
+        """None, likewise."""
         return None
 
     @property

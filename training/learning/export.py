@@ -169,7 +169,7 @@ def export(
         period=coordinates.period,
         material=Material(material.mu, material.lambda_, material.eta),
         eta_reconstruction=settings.eta_reconstruction,
-        exponential_steps=None if geometry.modes is None else config.samples.steps,
+        exponential_steps=collection.steps,
         scale=collection.scale,
         tolerance=Tolerance(required=settings.tolerance, measured=measured),
         figures=figures,

@@ -93,9 +93,10 @@ class ModeSettings(_Section):
     """Weight λ of the sparsity term, as a share of the weight at which every principal mode would vanish. Larger
     values make each mode move a smaller part; 0 is plain principal geodesic analysis. ``auto`` takes the largest of
     some candidates that increases the squared error of held-out shapes by at most 3 %."""
-    log_steps: int = Field(16, ge=2)
-    """Time steps K of the discrete logarithms. Best equal to ``samples.steps``: only logarithms and exponentials with
-    the same K are inverse to each other."""
+    log_steps: Annotated[int, Field(ge=1)] | Literal["auto"] = "auto"
+    """Time steps K of the discrete logarithms. In one step a mode moves every vertex along a straight line, and modes
+    add up in vertices, as blend shapes do; in many they bend the surface. ``auto`` takes 16, or one where shapes that
+    are held out come nearer so by more than a twentieth."""
     max_iterations: int = Field(200, ge=1)
     """Most iterations of the sparse analysis, each over all modes."""
 
@@ -114,8 +115,9 @@ class SampleSettings(_Section):
 
     count: int = Field(4000, ge=10)
     """Number of joint samples: shapes of random codes. Computing them takes most of a run's time."""
-    steps: int = Field(16, ge=2)
-    """Time steps K of the discrete exponentials."""
+    steps: int | None = Field(None, ge=1)
+    """Time steps K of the discrete exponentials, by default those of the logarithms: only with the same K are they
+    inverse to each other."""
     factor_counts: list[int] | int | None = None
     """Samples of each factor alone, one number for all or one for each. They have the factor's part of the joint
     codes, and of further codes beyond ``count``. By default 1000, or ``count`` where that is less; the paper takes

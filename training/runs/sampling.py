@@ -87,7 +87,8 @@ class Collection(Protocol):
         symmetries: involutions of the edges, (E,) each, that take shapes of the collection to shapes of the collection
             and the reference to itself; the combiner sees each training sample's images too.
         places: where features are that codes move over the surface; None where none move.
-        finer: the same by exponentials of twice as many steps; None where shapes are not made by steps.
+        steps: K of the exponentials; None where shapes are not made by steps.
+        finer: the same by exponentials of twice as many steps; None where that would not be more exact.
         differentiated: the same, whose shapes come with their derivatives; None where these are not known.
     """
 
@@ -107,6 +108,8 @@ class Collection(Protocol):
     def symmetries(self) -> list[IntArray]: ...  # noqa: D102
     @property
     def places(self) -> Places | None: ...  # noqa: D102
+    @property
+    def steps(self) -> int | None: ...  # noqa: D102
     @property
     def finer(self) -> Collection | None: ...  # noqa: D102
     @property

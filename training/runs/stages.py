@@ -11,7 +11,7 @@ from typing import Any
 
 from pydantic import BaseModel
 
-from shapespace.training.runs.config import Config
+from shapespace.training.runs.config import Config, ModeSettings
 from shapespace.training.runs.directory import RunDirectory
 
 
@@ -58,7 +58,7 @@ STAGES: dict[str, Stage] = {
     ),
     "mean": Stage(
         version=2,
-        settings=lambda config: [config.material],
+        settings=lambda config: [config.material, ModeSettings(log_steps=config.modes.log_steps)],
         results=lambda run: [run.mean.path],
     ),
     "modes": Stage(

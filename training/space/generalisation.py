@@ -6,7 +6,7 @@ shares of the diagonal of the reference's bounding box.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,15 +16,22 @@ from shapespace.mesh.rigid_motion import align
 from shapespace.mesh.triangle_mesh import TriangleMesh
 from shapespace.shell.energy import Material
 from shapespace.shell.space import ShellSpace
+from shapespace.solve.cholesky import NotPositiveDefiniteError
 from shapespace.solve.outcome import Status
 from shapespace.training.runs.config import ModeSettings
 from shapespace.training.space.codes import nearest_codes
 from shapespace.training.space.logarithms import logarithms
 from shapespace.training.space.mean import centred_mean
-from shapespace.training.space.modes import ModeError, coefficients, find_modes, mode_count
+from shapespace.training.space.modes import ModeError, coefficients, find_modes, mode_count, pga
 
 #: Number of folds; of fewer than twice as many shapes each is held out by itself.
 FOLDS = 5
+#: Steps K of the logarithms and exponentials of a model, and of those by which spaces are compared.
+STEPS, LIGHT_STEPS = 16, 8
+#: One step is chosen if it leaves less than this share of what `LIGHT_STEPS` leave of shapes that are held out.
+NEARER = 0.95
+#: Most shapes and most modes by which steps are chosen.
+SOME, FEW = 100, 20
 #: Percentile of the vertices' distances that is reported beside their mean.
 SHARE = 95
 
@@ -82,6 +89,11 @@ def folds(count: int) -> list[IntArray]:
     return [np.arange(fold, count, parts) for fold in range(parts)]
 
 
+def some_folds(count: int) -> list[IntArray]:
+    """The first fold, or all where each shape is held out by itself."""
+    return folds(count)[: 1 if count >= 2 * FOLDS else None]
+
+
 @dataclass(frozen=True)
 class HeldOut:
     """Shapes and what a space makes of them that was found without them.
@@ -92,6 +104,7 @@ class HeldOut:
         by_modes: (k, V, 3) for each, the nearest exponentials.
         by_components: (k, V, 3) for each, what as many principal components make of them.
         by_mirrored: likewise, components of the shapes and their mirror images; empty where there are none.
+        steps: (k,) K of the exponentials.
     """
 
     index: IntArray
@@ -99,6 +112,7 @@ class HeldOut:
     by_modes: list[FloatArray]
     by_components: list[FloatArray]
     by_mirrored: list[FloatArray]
+    steps: IntArray
 
     def distances(self, shapes: FloatArray, diagonal: float) -> dict[str, list[FloatArray]]:
         """``modes`` and ``components``, for each number (k, V), from shapes (n, V, 3) of the collection; see above.
@@ -114,14 +128,70 @@ class HeldOut:
 
 def joined(parts: Sequence[HeldOut]) -> HeldOut:
     """The shapes of several folds together; the numbers of modes are means."""
+
+    def together(by_count: Iterable[list[FloatArray]]) -> list[FloatArray]:
+        return [np.concatenate(shapes) for shapes in zip(*by_count, strict=True)]
+
     return HeldOut(
-        np.concatenate([part.index for part in parts]),
-        np.mean([part.counts for part in parts], axis=0).tolist(),
-        *(
-            [np.concatenate(shapes) for shapes in zip(*by_count, strict=True)]
-            for by_count in zip(*((part.by_modes, part.by_components, part.by_mirrored) for part in parts), strict=True)
-        ),
+        index=np.concatenate([part.index for part in parts]),
+        counts=np.mean([part.counts for part in parts], axis=0).tolist(),
+        by_modes=together(part.by_modes for part in parts),
+        by_components=together(part.by_components for part in parts),
+        by_mirrored=together(part.by_mirrored for part in parts),
+        steps=np.concatenate([part.steps for part in parts]),
     )
+
+
+def time_steps(
+    settings: ModeSettings,
+    reference: TriangleMesh,
+    shapes: FloatArray,
+    material: Material,
+    original: IntArray | None = None,
+) -> int:
+    """K of logarithms and exponentials, as the settings say or as ``auto`` finds.
+
+    With K = 1 the exponential is ``X̄ + Σ_j w_j u_j``. Both are tried on every shape, by principal modes of the other
+    folds' logarithms at the mean of all.
+
+    Args:
+        settings: of the modes; only ``log_steps`` counts.
+        reference: gives connectivity.
+        shapes: (n, V, 3), of which at most `SOME`, spread evenly, are looked at.
+        material: of the shell.
+        original: see `held_out`.
+    """
+    if settings.log_steps != "auto":
+        return settings.log_steps
+    every = np.arange(len(shapes))
+    original = every if original is None else original
+    own = every[original == every]
+    if len(own) < FOLDS:  # too few to tell
+        return STEPS
+    used = np.isin(original, own[:: -(-len(own) // SOME)])
+    whose, shapes = np.unique(original[used], return_inverse=True)[1], shapes[used]
+    try:
+        straight, bent = (_missed(reference, shapes, whose, material, steps) for steps in (1, LIGHT_STEPS))
+    except (ModeError, NotPositiveDefiniteError):  # the stages that need mean and modes tell
+        return STEPS
+    return 1 if straight < NEARER * bent else STEPS
+
+
+def _missed(reference: TriangleMesh, shapes: FloatArray, whose: IntArray, material: Material, steps: int) -> float:
+    """Mean distance of vertices of shapes (n, V, 3), the first of them originals, from what K steps make of others."""
+    found = centred_mean(reference, shapes, material, steps)
+    if found.status is not Status.CONVERGED:
+        raise ModeError(f"the shapes have no mean: {found.reason}")
+    mean, count = found.vertices, int(whose.max()) + 1
+    space = ShellSpace(reference.with_vertices(mean), material)
+    fields = logarithms(space, mean, shapes, steps).fields
+    away = []
+    for index in folds(count):
+        modes = pga(space, mean, fields[~np.isin(whose, index)], max(1, min(FEW, count // 3)), "vertices").vertices
+        start, _ = coefficients(space, mean, fields[index], modes, "vertices")
+        near = nearest_codes(space, mean, modes, shapes[index], start, steps).vertices
+        away.append(vertex_distances(near, shapes[index], 1.0))
+    return float(np.concatenate(away).mean())
 
 
 def held_out(
@@ -131,7 +201,7 @@ def held_out(
     counts: Sequence[int] | None,
     settings: ModeSettings,
     material: Material,
-    steps: int,
+    steps: int | None = None,
     original: IntArray | None = None,
 ) -> HeldOut:
     """Mean, logarithms and modes without some shapes, and what they make of these.
@@ -143,7 +213,8 @@ def held_out(
         counts: numbers of modes, as far as there are shapes; by default what the settings give, and half of it.
         settings: of the modes.
         material: of the shell.
-        steps: K of logarithms and exponentials.
+        steps: K of logarithms and exponentials; by default what the settings give for the others, at most
+            `LIGHT_STEPS`.
         original: (n,) which shape each is the mirror image of, itself where it is none; by default all are none.
 
     Raises:
@@ -153,6 +224,9 @@ def held_out(
     known = np.flatnonzero(~np.isin(original, index))
     kept, unseen = shapes[known], shapes[index]
     whose = np.unique(original[known], return_inverse=True)[1]
+    if steps is None:
+        first = np.searchsorted(known, original[known])
+        steps = min(LIGHT_STEPS, time_steps(settings, reference, kept, material, first))
     found = centred_mean(reference, kept, material, steps)
     if found.status is not Status.CONVERGED:
         raise ModeError(f"without some shapes the others have no mean: {found.reason}")
@@ -177,4 +251,4 @@ def held_out(
         if mirrored:
             by_mirrored.append(mirrored.nearest(unseen, len(modes)))
         reached.append(len(modes))
-    return HeldOut(index, reached, by_modes, by_components, by_mirrored)
+    return HeldOut(index, reached, by_modes, by_components, by_mirrored, np.full(len(index), steps))

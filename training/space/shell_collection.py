@@ -81,9 +81,9 @@ class ShellCollection:
         return []
 
     @property
-    def finer(self) -> ShellCollection:
-        """The same by exponentials of twice as many steps."""
-        return replace(self, steps=2 * self.steps)
+    def finer(self) -> ShellCollection | None:
+        """The same by exponentials of twice as many steps; None for one step, which approximates no geodesic."""
+        return replace(self, steps=2 * self.steps) if self.steps > 1 else None
 
     @property
     def differentiated(self) -> ShellCollection:

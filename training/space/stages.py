@@ -41,20 +41,19 @@ from shapespace.training.space.codes import box_of, nearest_codes
 from shapespace.training.space.factors import between, group, names, overlap
 from shapespace.training.space.generalisation import (
     FOLDS,
+    LIGHT_STEPS,
     PrincipalComponents,
-    folds,
     held_out,
     joined,
+    some_folds,
     summary,
+    time_steps,
     vertex_distances,
 )
 from shapespace.training.space.logarithms import logarithms
 from shapespace.training.space.mean import centred_mean
 from shapespace.training.space.modes import ModeError, find_modes, localisation, mode_count, pga
 from shapespace.training.space.shell_collection import ShellCollection
-
-#: Steps K of the logarithms and exponentials by which a run measures how its space generalises.
-LIGHT_STEPS = 8
 
 
 def material(config: Config) -> Material:
@@ -218,16 +217,18 @@ class MeanError(ValueError):
 
 
 def mean(run: RunDirectory, config: Config) -> dict[str, Any]:
-    """``mean.npz``: the elastic mean of all shapes, centred: where the tangent space is attached.
+    """``mean.npz``: the elastic mean of all shapes, centred: where the tangent space is attached; and K.
 
     Raises:
         MeanError: it isn't found.
     """
-    reference, shapes = run.reference_mesh(), run.shapes.read()["vertices"]
-    found = centred_mean(reference, shapes, material(config), LIGHT_STEPS)
+    reference, given = run.reference_mesh(), run.shapes.read()
+    shapes = given["vertices"]
+    steps = time_steps(config.modes, reference, shapes, material(config), given["original"])
+    found = centred_mean(reference, shapes, material(config), min(LIGHT_STEPS, steps))
     if found.status is not Status.CONVERGED:
         raise MeanError(_where(run, found))
-    facts = {"status": str(found.status), "iterations": found.iterations, "residual": found.residual}
+    facts = {"status": str(found.status), "iterations": found.iterations, "residual": found.residual, "steps": steps}
     # Shapes are served where the mean stands, which has to be where the reference stands in its file.
     vertices = align(found.vertices, reference.vertices)
     run.mean.write(vertices=vertices, **{k: np.array(v) for k, v in facts.items()})
@@ -265,12 +266,13 @@ def modes(run: RunDirectory, config: Config) -> dict[str, Any]:
     shapes, whose = given["vertices"], given["original"]
     space = ShellSpace(centre, material(config))
     norm = WeightedNorm.of(centre, config.material.eta)
-    found = logarithms(space, centre.vertices, shapes, settings.log_steps)
+    steps = _steps(run)
+    found = logarithms(space, centre.vertices, shapes, steps)
     count = mode_count(settings, space, centre.vertices, found.fields, whose)
     dense = pga(space, centre.vertices, found.fields, count, settings.norm)
     with waiting("sparse modes"):
         sparse = find_modes(settings, space, centre.vertices, found.fields, count, whose)
-    codes = nearest_codes(space, centre.vertices, sparse.vertices, shapes, sparse.coefficients, settings.log_steps)
+    codes = nearest_codes(space, centre.vertices, sparse.vertices, shapes, sparse.coefficients, steps)
     lower, upper = box_of(codes.codes)
     arrays = {
         "nric": sparse.nric,
@@ -294,7 +296,7 @@ def modes(run: RunDirectory, config: Config) -> dict[str, Any]:
         "pga_explained": dense.explained,
         "linearised_logarithms": len(found.fallbacks),
         "asked": count if settings.count == "auto" else settings.count,
-        "log_steps": settings.log_steps,
+        "log_steps": steps,
         "steps": list(found.steps),
         "via": list(found.via),
         "codes": [str(status) for status in codes.status],
@@ -303,24 +305,24 @@ def modes(run: RunDirectory, config: Config) -> dict[str, Any]:
     return facts
 
 
+def _steps(run: RunDirectory) -> int:
+    """K that was chosen with the mean."""
+    return int(run.mean.read()["steps"])
+
+
 def generalisation(run: RunDirectory, config: Config) -> dict[str, Any]:
     """``generalisation.json``: how near modes of a part of the shapes come to the others, beside principal components.
 
     A fifth of the shapes is held out of everything: mean, logarithms, modes and their number; or below ten each in its
-    turn. Exponentials stand for networks, in LIGHT_STEPS steps. With half as many modes too. And
+    turn. Exponentials stand for networks, in at most LIGHT_STEPS steps. With half as many modes too. And
     ``least-general.npz``, the shape that is farthest.
     """
     reference, given, settings = run.reference_mesh(), run.shapes.read(), config.modes
     shapes, original = given["vertices"], given["original"]
-    steps = min(LIGHT_STEPS, settings.log_steps)
-    count = int(original.max()) + 1
-    parts = folds(count)
+    parts = some_folds(int(original.max()) + 1)
     try:
         found = joined(
-            [
-                held_out(reference, shapes, index, None, settings, material(config), steps, original)
-                for index in (parts if len(parts) == count else parts[:1])
-            ]
+            [held_out(reference, shapes, index, None, settings, material(config), original=original) for index in parts]
         )
     except (ModeError, NotPositiveDefiniteError) as error:  # no reason to do without a model
         facts: dict[str, Any] = {"failed": str(error)}
@@ -332,7 +334,7 @@ def generalisation(run: RunDirectory, config: Config) -> dict[str, Any]:
         different = slice(0 if found.counts[0] < found.counts[1] else 1, None)
         facts = {
             "held_out": len(found.index),
-            "steps": steps,
+            "steps": int(found.steps.max()),
             "counts": found.counts[different],
             **{name: [summary(each) for each in rows[different]] for name, rows in away.items()},
             "worst": str(given["names"][number]),
@@ -404,7 +406,7 @@ def collection(run: RunDirectory, config: Config) -> ShellCollection:
         lower=modes["lower"],
         upper=modes["upper"],
         factors=dict(zip(factors["names"], factors["factors"], strict=True)),
-        steps=config.samples.steps,
+        steps=config.samples.steps or _steps(run),
         material=material(config),
         scale=float(run.reference.read()["scale"]),
         codes=_known_codes(modes),

@@ -202,8 +202,8 @@ def test_exact_exponentials_stand_beside_the_networks_answer(client: httpx.Clien
     with np.load(folder / "geometry.npz") as file:
         mesh, modes = TriangleMesh.from_mapping(file), file["modes"].astype(float)
     material = Material(facts["mu"], facts["lambda"], facts["eta"])
-    steps = facts["origin"]["config"]["samples"]["steps"]
-    path = exponential(ShellSpace(mesh, material), mesh.vertices, np.tensordot(codes[0], modes, axes=1), steps)
+    velocity = np.tensordot(codes[0], modes, axes=1)
+    path = exponential(ShellSpace(mesh, material), mesh.vertices, velocity, facts["exponential_steps"])
     expected = facts["scale"] * align(path.vertices[-1], mesh.vertices)
     np.testing.assert_allclose(answer["exact"][0], expected, atol=1e-5)
     for found, exact, distance in zip(answer["vertices"], answer["exact"], answer["distance"], strict=True):

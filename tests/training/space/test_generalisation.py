@@ -16,6 +16,7 @@ from shapespace.training.space.generalisation import (
     folds,
     held_out,
     summary,
+    time_steps,
     vertex_distances,
 )
 
@@ -58,6 +59,19 @@ def test_nothing_is_known_of_what_is_held_out(reference, shapes):
     # The start of the search depends on both held-out shapes, its end hardly.
     assert found.by_modes[0][0] == pytest.approx(again.by_modes[0][0], abs=1e-4)
     assert found.by_components[0][0] == pytest.approx(again.by_components[0][0], abs=1e-12)
+
+
+def test_one_step_is_chosen_for_blend_shapes_and_many_for_bends(reference, shapes, blends):
+    mesh, linear = blends
+    assert time_steps(ModeSettings(), mesh, linear, Material()) == 1
+    assert time_steps(ModeSettings(), reference, shapes, Material()) == 16
+    assert time_steps(ModeSettings(log_steps=3), mesh, linear, Material()) == 3
+    assert time_steps(ModeSettings(), mesh, linear[:4], Material()) == 16, "too few to tell"
+    index, plain = np.array([0, 5]), ModeSettings(sparsity=0)
+    found, bent = (held_out(mesh, linear, index, [3], plain, Material(), steps) for steps in (None, 8))
+    assert found.steps.tolist() == [1, 1]
+    away, more = (vertex_distances(each.by_modes[0], linear[index], mesh.diagonal).mean() for each in (found, bent))
+    assert away < 0.4 * more
 
 
 @pytest.mark.parametrize(("count", "parts"), [(3, 3), (9, 9), (10, 5), (57, 5)])

@@ -1,4 +1,4 @@
-"""The stage mean: where a collection has none, the message names the place; otherwise it converges."""
+"""The stages: where a collection has no mean the message names the place, and steps are chosen with the mean."""
 
 from pathlib import Path
 
@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 import trimesh
 
+from shapespace.mesh.rigid_motion import align
 from shapespace.mesh.triangle_mesh import TriangleMesh
 from shapespace.training.runs.config import parse
 from shapespace.training.runs.directory import RunDirectory
-from shapespace.training.space.stages import MeanError, mean, write_reference
+from shapespace.training.space.stages import MeanError, collection, factors, mean, modes, write_reference
 
 CONFIG = """
 [collection]
@@ -36,7 +37,7 @@ def test_a_run_without_a_mean_ends_with_the_place(tmp_path: Path) -> None:
     write_reference(run, mesh, 10.0, fine_index=fine_index, file_vertices=file_vertices)
     names = np.array(["one", "two", "three"])
     files, first = np.array(["one.obj", "two.obj", "three.ply"]), np.array([1, 1, 0])
-    run.shapes.write(names=names, vertices=shapes, files=files, first=first)
+    run.shapes.write(names=names, vertices=shapes, files=files, first=first, original=np.arange(3))
     with pytest.raises(MeanError) as error:
         mean(run, parse(CONFIG, "balls.toml"))
     faces = mesh.faces[[{i, j} <= set(face) for face in mesh.faces]]
@@ -47,5 +48,25 @@ def test_a_run_without_a_mean_ends_with_the_place(tmp_path: Path) -> None:
     assert sum(place in str(error.value) for place in places) >= 1
     assert "coarse_vertices" in str(error.value)
     assert not run.mean.exists()
-    run.shapes.write(names=np.array(["one", "three"]), vertices=shapes[[0, 2]])
-    assert mean(run, parse(CONFIG, "balls.toml"))["status"] == "converged"
+    run.shapes.write(names=np.array(["one", "three"]), vertices=shapes[[0, 2]], original=np.arange(2))
+    found = mean(run, parse(CONFIG, "balls.toml"))
+    assert (found["status"], found["steps"]) == ("converged", 16)
+
+
+@pytest.mark.parametrize(("given", "steps"), [(None, 1), (3, 3)])
+def test_codes_of_a_run_stand_for_exponentials_of_the_steps_that_were_chosen(
+    blends: tuple[TriangleMesh, np.ndarray], tmp_path: Path, given: int | None, steps: int
+) -> None:
+    (mesh, shapes), run = blends, RunDirectory(tmp_path)
+    write_reference(run, mesh, 10.0)
+    run.shapes.write(names=np.arange(len(shapes)).astype(str), vertices=shapes, original=np.arange(len(shapes)))
+    config = parse(CONFIG + ("" if given is None else f"[samples]\nsteps = {given}\n"), "balls.toml")
+    for stage in (mean, modes, factors):
+        stage(run, config)
+    found = collection(run, config)
+    assert found.steps == steps
+    code = 0.7 * found.upper
+    straight = found.reference.vertices + np.tensordot(code, found.modes, axes=1)
+    away = np.abs(align(found.shapes(code[None]).vertices[0], straight) - straight).max()
+    assert away < 1e-12 if steps == 1 else away > 1e-4
+    assert (found.finer is None) == (steps == 1), "one step approximates no geodesic"
