@@ -102,7 +102,7 @@ def main() -> None:
     studio = Studio.of(Record(run.directory))
     if studio is None:
         raise SystemExit("Nothing to draw with: install embreex.")
-    folder, name = ROOT / "docs" / "measurements", run.config.export.name
+    folder, name = ROOT / "docs" / "measurements", given.config.stem
     models(run, studio, folder / f"{name}-models.png")
     modes(run, studio, folder / f"{name}-modes.png")
 
