@@ -33,9 +33,11 @@ RUN_OF_0_1 = Path(__file__).parent / "run_of_0_1"
 
 
 def today(name: str, config: dict[str, Any]) -> Config:
-    """A configuration; the figure's is of before mirror images."""
-    before = {"mirror": False} if name == "figure" else {}
-    return Config.model_validate(config | {"collection": before | config["collection"]})
+    """A configuration of before time steps were chosen; the figure's is of before mirror images."""
+    before: dict[str, dict[str, Any]] = {"modes": {"log_steps": 16}, "samples": {"steps": 16}}
+    if name == "figure":
+        before["collection"] = {"mirror": False}
+    return Config.model_validate(config | {section: each | config.get(section, {}) for section, each in before.items()})
 
 
 @pytest.mark.parametrize("name", MODELS)
