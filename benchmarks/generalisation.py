@@ -25,7 +25,8 @@ INTRODUCTION = """# Shapes that a space has not seen
 
 Distance of a vertex from its place after rigid alignment, in percent of the bounding box's diagonal: mean and 95th
 percentile over all vertices of all shapes, each held out in one of five folds that found mean, logarithms and modes
-without it. **Modes**: the code whose exponential comes closest in vertices, in {steps} time steps; no networks.
+without it. **Modes**: the code whose exponential comes closest in vertices, in {steps} time steps, or one
+where that is chosen; no networks.
 **Components**: principal components of the aligned vertices, as many. On coarse meshes of at most a thousand vertices.
 Rows *with mirror images* also learn from the images of the shapes that they know, which a symmetric shape of the
 collection gives; components are without and, in the last columns, with them too.

@@ -124,7 +124,7 @@ class RunDirectory:
 
     @property
     def mean(self) -> NpzFile:
-        """``vertices (V, 3)`` of the elastic mean, centred; and its ``status``, ``iterations``, ``residual``."""
+        """``vertices (V, 3)`` of the centred mean; its ``status``, ``iterations``, ``residual``; ``steps``, K."""
         return self._npz("mean")
 
     @property

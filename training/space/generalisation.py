@@ -147,7 +147,7 @@ def time_steps(
     reference: TriangleMesh,
     shapes: FloatArray,
     material: Material,
-    original: IntArray | None = None,
+    whose: IntArray | None = None,
 ) -> int:
     """K of logarithms and exponentials, as the settings say or as ``auto`` finds.
 
@@ -159,17 +159,16 @@ def time_steps(
         reference: gives connectivity.
         shapes: (n, V, 3), of which at most `SOME`, spread evenly, are looked at.
         material: of the shell.
-        original: see `held_out`.
+        whose: (n,) shapes that they are of, from 0 on, mirror images last; by default none is an image.
     """
     if settings.log_steps != "auto":
         return settings.log_steps
-    every = np.arange(len(shapes))
-    original = every if original is None else original
-    own = every[original == every]
-    if len(own) < FOLDS:  # too few to tell
+    whose = np.arange(len(shapes)) if whose is None else whose
+    count = int(whose.max()) + 1
+    if count < FOLDS:  # too few to tell
         return STEPS
-    used = np.isin(original, own[:: -(-len(own) // SOME)])
-    whose, shapes = np.unique(original[used], return_inverse=True)[1], shapes[used]
+    used = whose % -(-count // SOME) == 0
+    whose, shapes = np.unique(whose[used], return_inverse=True)[1], shapes[used]
     try:
         straight, bent = (_missed(reference, shapes, whose, material, steps) for steps in (1, LIGHT_STEPS))
     except (ModeError, NotPositiveDefiniteError):  # the stages that need mean and modes tell
@@ -225,8 +224,7 @@ def held_out(
     kept, unseen = shapes[known], shapes[index]
     whose = np.unique(original[known], return_inverse=True)[1]
     if steps is None:
-        first = np.searchsorted(known, original[known])
-        steps = min(LIGHT_STEPS, time_steps(settings, reference, kept, material, first))
+        steps = min(LIGHT_STEPS, time_steps(settings, reference, kept, material, whose))
     found = centred_mean(reference, kept, material, steps)
     if found.status is not Status.CONVERGED:
         raise ModeError(f"without some shapes the others have no mean: {found.reason}")
