@@ -57,6 +57,7 @@ def test_back_goes_to_the_shape_before_and_to_the_model_before(window: Open) -> 
 
     studio.page.go_back()
     studio.eventually(lambda: studio.hash.get("model") == "with-fine" and studio.code == [0.3, -0.2, 0.5])
+    studio.eventually(lambda: "Small torus" in studio.page.title())  # the address changes before the model is there
     studio.rest()
     assert studio["#wireframe"].get_attribute("aria-pressed") == "true", "shown as it was then"
     studio.page.go_back()
