@@ -131,7 +131,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--out", type=Path, default=ROOT / "build" / "served", help="what benchmarks.served has left")
     given = parser.parse_args()
-    found = [row for name in COLLECTIONS if (given.out / f"{name}.json").exists() for row in rows(name, given.out)]
+    there = [name for name in COLLECTIONS if (given.out / "models" / f"{name}.npz").exists()]
+    found = [row for name in there for row in rows(name, given.out)]
     cost = "\n".join(costs(load(ROOT / "models" / "figure")))
     page = PAGE.format(rows="\n".join(found), coarse=len(_ball(COARSE).vertices), costs=cost)
     (ROOT / "docs" / "measurements" / "detail.md").write_text(page, encoding="utf-8")
