@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from shapespace.arrays import FloatArray, IntArray
 from shapespace.bundle.schema import ARRAYS, ArrayType, Manifest
@@ -36,6 +38,13 @@ class FineMesh:
 
     reference: TriangleMesh
     prolong: Prolongation
+
+    @cached_property
+    def nearby(self) -> FloatArray:
+        """How many vertices of the reference lie nearest to each coarse one, itself among them, (V,)."""
+        own = self.prolong.coarse_vertices
+        nearest = cKDTree(self.reference.vertices[own]).query(self.reference.vertices)[1]
+        return np.maximum(np.bincount(nearest, minlength=len(own)), 1).astype(float)
 
 
 @dataclass(frozen=True, kw_only=True)

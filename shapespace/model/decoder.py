@@ -311,6 +311,11 @@ class Decoder:
         fine = self.finer(mesh)
         return vertices[fine.prolong.coarse_vertices] if fine else vertices
 
+    def nearby(self, mesh: MeshChoice) -> FloatArray:
+        """How many vertices of the mesh of choice lie nearest to each coarse one, (V,)."""
+        fine = self.finer(mesh)
+        return fine.nearby if fine else np.ones(len(self.reference.vertices))
+
     def _networks(self, codes: Codes) -> tuple[NDArray[np.float32], FloatArray]:
         """Factors (n, J, 2E) and combined NRIC (n, 2E), normalised."""
         with self._limited() as until:

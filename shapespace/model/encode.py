@@ -10,7 +10,7 @@ import numpy as np
 
 from shapespace.arrays import FloatArray, IntArray
 from shapespace.coordinates.nric import WeightedNorm, nric, wrap
-from shapespace.mesh.rigid_motion import align, aligned_change
+from shapespace.mesh.rigid_motion import Placement, align, aligned_change, weighted_change
 from shapespace.model.correspondence import InvalidMeshError, Matched
 from shapespace.model.decoder import Decoder, MeshChoice, Shape
 from shapespace.model.derivatives import FactorGrids, derivatives, factor_derivatives, nodes
@@ -77,6 +77,28 @@ class Encoded:
     samples: Codes
 
 
+@dataclass(frozen=True)
+class Aim:
+    """Vertices (V, 3) of the coarse mesh that a shape should come close to, and how much each counts (V,)."""
+
+    vertices: FloatArray
+    weights: FloatArray
+
+    def place(self, shape: FloatArray) -> Placement:
+        """What brings a shape (V, 3) closest."""
+        return Placement.between(shape, self.vertices, self.weights)
+
+    def misfit(self, shape: FloatArray) -> FloatArray:
+        """Of a shape (V, 3), there: weighted (V, 3), the sum of squares is the weighted mean of square distances."""
+        roots = np.sqrt(self.weights / self.weights.sum())
+        return roots[:, None] * (self.place(shape)(shape) - self.vertices)
+
+    def change(self, shape: FloatArray, fields: FloatArray) -> FloatArray:
+        """Of the misfit (n, V, 3) where the shape changes by fields (n, V, 3)."""
+        place = self.place(shape)
+        return weighted_change(fields @ place.rotation.T, place(shape), self.weights / self.weights.sum())
+
+
 class Encoder:
     """Finds codes of meshes; may be used by several threads at once.
 
@@ -85,9 +107,10 @@ class Encoder:
     where a factor has periodic coordinates it begins at the best of a grid. The second takes the whole composite, and
     rarely needs more than a handful of evaluations beside one Jacobian.
 
-    By vertices it goes on from there to the minimum of ``Σ_i ‖x_i(code) − x_i‖²`` over the vertices of the coarse mesh,
-    after rigid alignment: small angles add up along a limb, and what is smallest in lengths and angles may be twice as
-    far in space. The shapes' derivatives are those of ``shapespace.model.edit``.
+    By vertices it goes on from there to the minimum of ``Σ_i n_i ‖x_i(code) − x_i‖²`` over the vertices of the coarse
+    mesh, after rigid alignment, where n_i of the vertices that are given lie nearest to vertex i: small angles add up
+    along a limb, and what is smallest in lengths and angles may be twice as far in space. The shapes' derivatives are
+    those of ``shapespace.model.edit``.
     """
 
     def __init__(self, model: Decoder) -> None:
@@ -136,9 +159,10 @@ class Encoder:
         box = Box(lower, upper, latents.width)
         fit = self._by_nric(target, box, fixed, deadline)
         if objective is Objective.VERTICES and fit.status is not Status.DEADLINE:
-            fit = self._by_vertices(vertices, fit, box, fixed, deadline)
+            aim = Aim(vertices, model.nearby(given.mesh))
+            fit = self._by_vertices(aim, fit, box, fixed, deadline)
             if bounds is not Bounds.CLAMP:
-                fit = self._inside_if_as_near(vertices, fit, fixed, deadline)
+                fit = self._inside_if_as_near(aim, fit, fixed, deadline)
         code, inside = latents.found(fit.x, bounds, fixed)
         coarse = model.shape(code, inside, MeshChoice.COARSE, deadline)
         posterior = self._posterior(code, coarse.vertices / model.manifest.scale, vertices, fixed)
@@ -199,10 +223,10 @@ class Encoder:
         return patches_of(self.model.reference.vertices)
 
     def _by_vertices(
-        self, target: FloatArray, near: Fit, box: Box, fixed: Fixed, deadline: Deadline | None, most: int = SHAPES
+        self, aim: Aim, near: Fit, box: Box, fixed: Fixed, deadline: Deadline | None, most: int = SHAPES
     ) -> Fit:
-        """The fit to vertices (V, 3), from one nearby, which stands where its shape has all but collapsed."""
-        model, weight = self.model, 1 / (self.model.reference.diagonal * np.sqrt(len(target)))
+        """The fit to vertices, from one nearby, which stands where its shape has all but collapsed."""
+        model, size = self.model, self.model.reference.diagonal
         with model.solver() as reconstruct:
             if deadline is not None and deadline.passed:  # while waiting for the solver
                 return replace(near, status=Status.DEADLINE)
@@ -211,12 +235,12 @@ class Encoder:
             def residuals(x: FloatArray) -> FloatArray:
                 shape = shapes(x)
                 if not np.isfinite(shape).all():
-                    return np.full(target.size, np.nan)
-                return weight * (align(shape, target) - target).ravel()
+                    return np.full(shape.size, np.nan)
+                return aim.misfit(shape).ravel() / size
 
             def jacobian(x: FloatArray, _: FloatArray) -> FloatArray:
-                changes = aligned_change(shapes(x), shapes.derivatives(x, derivatives(model, x)), target)
-                return np.where(fixed.mask, 0.0, weight * changes.reshape(len(changes), -1).T)
+                changes = aim.change(shapes(x), shapes.derivatives(x, derivatives(model, x)))
+                return np.where(fixed.mask, 0.0, changes.reshape(len(changes), -1).T / size)
 
             stopping = Stopping(TOLERANCE, GAIN, max_evaluations=most, deadline=deadline)
             try:
@@ -225,23 +249,23 @@ class Encoder:
                 return near
             return near if fit.status is Status.NOT_FINITE else fit
 
-    def _inside_if_as_near(self, target: FloatArray, fit: Fit, fixed: Fixed, deadline: Deadline | None) -> Fit:
-        """The fit to vertices (V, 3), or one inside the bounds that is as near: networks know shapes best there."""
+    def _inside_if_as_near(self, aim: Aim, fit: Fit, fixed: Fixed, deadline: Deadline | None) -> Fit:
+        """The fit to vertices, or one inside the bounds that is as near: networks know shapes best there."""
         lower, upper = self.model.latents.box_around(fixed, 0.0)
         moved = replace(fit, x=np.clip(fit.x, lower, upper))
         if np.array_equal(moved.x, fit.x) or fit.status is Status.DEADLINE:
             return fit
         box = Box(lower, upper, self.model.latents.width)
-        other = self._by_vertices(target, moved, box, fixed, deadline, most=SHAPES + INSIDE - fit.iterations)
+        other = self._by_vertices(aim, moved, box, fixed, deadline, most=SHAPES + INSIDE - fit.iterations)
         near = (
             other is not moved
             and other.status is not Status.DEADLINE
-            and self._away(other.x, target, deadline) <= AS_NEAR * self._away(fit.x, target, deadline)
+            and self._away(other.x, aim, deadline) <= AS_NEAR * self._away(fit.x, aim, deadline)
         )
         return replace(other if near else fit, iterations=fit.iterations + other.iterations)
 
-    def _away(self, x: FloatArray, target: FloatArray, deadline: Deadline | None) -> float:
-        """Root mean square distance of vertices (V, 3) from those of a code (m,) as it is served.
+    def _away(self, x: FloatArray, aim: Aim, deadline: Deadline | None) -> float:
+        """Root mean square distance of the vertices from those of a code (m,) as it is served.
 
         A search goes from shape to shape, and far outside the bounds it may come to another one.
         """
@@ -249,10 +273,7 @@ class Encoder:
             shape = self.model.shape(self.model.latents.code(x.tolist())[0], mesh=MeshChoice.COARSE, deadline=deadline)
         except NotFiniteError:
             return np.inf
-        return (
-            float(np.linalg.norm(align(shape.vertices / self.model.manifest.scale, target) - target))
-            / len(target) ** 0.5
-        )
+        return float(np.linalg.norm(aim.misfit(shape.vertices / self.model.manifest.scale)))
 
     def _by_nric(self, target: FloatArray, box: Box, fixed: Fixed, deadline: Deadline | None) -> Fit:
         """The fit to lengths and angles (2E,)."""

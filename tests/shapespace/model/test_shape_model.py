@@ -3,21 +3,28 @@
 import os
 import shutil
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import httpx
 import numpy as np
 import pytest
+import trimesh
 
+from shapespace.bundle.geometry import FineMesh
 from shapespace.bundle.reader import BundleError
+from shapespace.bundle.writer import Networks
+from shapespace.bundle.writer import write_bundle as write_files
 from shapespace.files.formats import MESH_FORMATS
+from shapespace.mesh.prolongation import Prolongation
+from shapespace.mesh.rigid_motion import align
 from shapespace.mesh.triangle_mesh import MeshError, TriangleMesh
 from shapespace.model.correspondence import InvalidMeshError
 from shapespace.model.decoder import MeshChoice
 from shapespace.model.edit import InvalidTargetError
 from shapespace.model.latent_space import NotFiniteError, OutOfBoundsError, WrongLengthError
 from shapespace.model.shape_model import ShapeModel, load
-from tests.service.bundles import SCALE, fine_reference, reference, write_bundle
+from tests.service.bundles import SCALE, facts, fine_reference, geometry, networks, reference, write_bundle
 from tests.service.conftest import ROOT, starting
 
 CODES = np.array([[0.1, 0.7, 0.4], [0.0, -1.0, 0.2]])
@@ -103,6 +110,29 @@ def test_a_mesh_is_encoded_from_vertices_meshes_and_files(model: ShapeModel, tmp
             str(tmp_path / "shape.npz"),
         ):
             np.testing.assert_array_equal(model.encode(given).code, plain.code)
+
+
+def test_of_a_fine_mesh_all_vertices_count(tmp_path: Path) -> None:
+    """Shapes that no code makes, on a mesh that is fine on one side: there they are met."""
+    mesh = reference()
+    v, f = mesh.vertices, mesh.faces
+    for _ in range(3):
+        v, f = trimesh.remesh.subdivide(v, f, face_index=np.flatnonzero((v[f][:, :, 0] > 0).all(axis=1)))
+    finer = TriangleMesh.from_arrays(v, f)
+    *factors, combiner = (network.SerializeToString() for network in networks().values())
+    shapes = replace(geometry(fine=True), fine=FineMesh(finer, Prolongation.of(mesh, finer)))
+    write_files(tmp_path, facts("dense", "1"), Networks(factors=factors, combiner=combiner, start=None), shapes)
+    model = load(tmp_path / "dense")
+    coarse = [int(np.argmin(np.linalg.norm(model.vertices - corner, axis=1))) for corner in SCALE * mesh.vertices]
+    for code in CODES:
+        shape = model.decode(code)
+        x = shape[:, :1] / np.abs(shape).max()
+        target = shape * (1.02 + 0.02 * x)
+
+        def away(code: np.ndarray, target: np.ndarray = target) -> float:
+            return float(np.square(align(model.decode(code), target) - target).sum())
+
+        assert away(model.encode(target).code) < 0.5 * away(model.encode(target[coarse]).code)
 
 
 def test_a_folder_a_name_or_here(models: Path, monkeypatch: pytest.MonkeyPatch) -> None:
