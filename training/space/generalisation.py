@@ -28,6 +28,8 @@ from shapespace.training.space.modes import ModeError, coefficients, find_modes,
 FOLDS = 5
 #: Steps K of the logarithms and exponentials of a model, and of those by which spaces are compared.
 STEPS, LIGHT_STEPS = 16, 8
+#: One step is chosen if it leaves less than this share of what `LIGHT_STEPS` leave of shapes that are held out.
+NEARER = 0.95
 #: Most shapes and most modes by which steps are chosen.
 SOME, FEW = 100, 20
 #: Percentile of the vertices' distances that is reported beside their mean.
@@ -149,8 +151,8 @@ def time_steps(
 ) -> int:
     """K of logarithms and exponentials, as the settings say or as ``auto`` finds.
 
-    With K = 1 the exponential is ``X̄ + Σ_j w_j u_j``. One step and `LIGHT_STEPS` are tried on every shape, by principal
-    modes of the other folds' logarithms at the mean of all: the nearer counts.
+    With K = 1 the exponential is ``X̄ + Σ_j w_j u_j``. Both are tried on every shape, by principal modes of the other
+    folds' logarithms at the mean of all.
 
     Args:
         settings: of the modes; only ``log_steps`` counts.
@@ -171,7 +173,7 @@ def time_steps(
         straight, bent = (_missed(reference, shapes, whose, material, steps) for steps in (1, LIGHT_STEPS))
     except (ModeError, NotPositiveDefiniteError):  # the stages that need mean and modes tell
         return STEPS
-    return 1 if straight <= bent else STEPS
+    return 1 if straight < NEARER * bent else STEPS
 
 
 def _missed(reference: TriangleMesh, shapes: FloatArray, whose: IntArray, material: Material, steps: int) -> float:
