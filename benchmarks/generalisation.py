@@ -25,16 +25,16 @@ INTRODUCTION = """# Shapes that a space has not seen
 
 Distance of a vertex from its place after rigid alignment, in percent of the bounding box's diagonal: mean and 95th
 percentile over all vertices of all shapes, each held out in one of five folds that found mean, logarithms and modes
-without it. **Modes**: the code whose exponential comes closest in vertices, in {steps} time steps, or one
-where that is chosen; no networks.
+without it. **Modes**: the code whose exponential comes closest in vertices, in **K** time steps, {steps} or as the
+folds chose; no networks.
 **Components**: principal components of the aligned vertices, as many. On coarse meshes of at most a thousand vertices.
 Rows *with mirror images* also learn from the images of the shapes that they know, which a symmetric shape of the
 collection gives; components are without and, in the last columns, with them too.
 Folds choose nothing: settings are those of `examples`. `python -m benchmarks.generalisation --data FOLDER`
 measures and writes this page; a collection is in it once all its folds are measured, with figures in `runs/folds/`.
 
-| | shapes | m | modes: mean | 95 % | components: mean | 95 % | modes / components | with images: mean | modes / these |
-|---|---|---|---|---|---|---|---|---|---|
+| | shapes | m | K | modes: mean | 95 % | components: mean | 95 % | modes / components | with images: mean | modes / these |
+|---|---|---|---|---|---|---|---|---|---|---|
 """
 #: Rows of the table.
 ROWS = tuple(
@@ -61,7 +61,8 @@ def measure(name: str, data: Path, out: Path) -> dict[str, Any]:
             found = held_out(reference, shapes, index, counts, config.modes, material, original=original)
             away = found.distances(shapes, reference.diagonal)
             file.write(
-                {"counts": found.counts} | {kind: [each.tolist() for each in rows] for kind, rows in away.items()}
+                {"counts": found.counts, "steps": int(found.steps[0])}
+                | {kind: [each.tolist() for each in rows] for kind, rows in away.items()}
             )
             means = {kind: [round(100 * float(np.mean(each)), 4) for each in rows] for kind, rows in away.items()}
             print(name, k, means, flush=True)
@@ -69,10 +70,11 @@ def measure(name: str, data: Path, out: Path) -> dict[str, Any]:
     return {
         "shapes": len(own),
         "counts": every[0]["counts"],
+        "steps": sorted({fold["steps"] for fold in every}),
         **{
             kind: [summary(np.concatenate(some)) for some in zip(*(fold[kind] for fold in every), strict=True)]
             for kind in every[0]
-            if kind != "counts"
+            if kind not in ("counts", "steps")
         },
     }
 
@@ -98,6 +100,7 @@ def rows(name: str, found: dict[str, Any]) -> list[str]:
             "" if result else title(name),
             str(found["shapes"]),
             str(count),
+            ", ".join(map(str, found["steps"])),
             *figures,
             f"{own['mean'] / other['mean']:.2f}",
         ]
