@@ -33,7 +33,7 @@ collection gives; components are without and, in the last columns, with them too
 Folds choose nothing: settings are those of `examples`. `python -m benchmarks.generalisation --data FOLDER`
 measures and writes this page; a collection is in it once all its folds are measured, with figures in `runs/folds/`.
 
-| | shapes | m | K | modes: mean | 95 % | components: mean | 95 % | modes / components | with images: mean | modes / these |
+| | shapes | m | K | modes: mean | 95 % | components: mean | 95 % | ratio | components with images: mean | ratio |
 |---|---|---|---|---|---|---|---|---|---|---|
 """
 #: Rows of the table.

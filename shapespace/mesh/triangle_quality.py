@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from shapespace.arrays import FloatArray, IntArray
 from shapespace.mesh.triangle_mesh import Connectivity, cross
@@ -92,6 +93,18 @@ def folded_pairs(connectivity: Connectivity, normals: FloatArray) -> IntArray:
     normals = unit(normals)
     pairs = connectivity.edge_faces[connectivity.interior]
     folded: IntArray = pairs[(dots(normals[pairs[:, 0]], normals[pairs[:, 1]]) < FOLD_LIMIT).any(axis=1)]
+    return folded
+
+
+def folded_anew(angles: FloatArray, others: FloatArray) -> NDArray[np.bool_]:
+    """Whether shapes have two faces folded onto one another where no other shape has as much as a crease, (n,).
+
+    Args:
+        angles: (n, E) dihedral.
+        others: (k, E) of the others.
+    """
+    smooth = (np.abs(others) < np.pi / 2).all(axis=0)
+    folded: NDArray[np.bool_] = ((np.cos(angles) < FOLD_LIMIT) & smooth).any(axis=1)
     return folded
 
 

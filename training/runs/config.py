@@ -96,7 +96,7 @@ class ModeSettings(_Section):
     log_steps: Annotated[int, Field(ge=1)] | Literal["auto"] = "auto"
     """Time steps K of the discrete logarithms. In one step a mode moves every vertex along a straight line, and modes
     add up in vertices, as blend shapes do; in many they bend the surface. ``auto`` takes 16, or one where shapes that
-    are held out come nearer so by more than a twentieth."""
+    are held out come no less near so and at most a tenth of random shapes fold."""
     max_iterations: int = Field(200, ge=1)
     """Most iterations of the sparse analysis, each over all modes."""
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from shapespace.coordinates.nric import dihedral_angles
 from shapespace.mesh.triangle_mesh import TriangleMesh
-from shapespace.mesh.triangle_quality import FOLD_LIMIT
+from shapespace.mesh.triangle_quality import folded_anew
 from shapespace.training.runs.directory import RunDirectory
 from shapespace.training.runs.sampling import DONE, columns, parts
 
@@ -152,11 +152,10 @@ def _folded(run: RunDirectory) -> list[Shortfall]:
         return []
     connectivity = TriangleMesh.from_mapping(run.reference.read()).connectivity
     angles = dihedral_angles(run.shapes.read()["vertices"], connectivity)
-    smooth = (np.abs(angles) < np.pi / 2).all(axis=0)
     folded = count = 0
     for part in parts(run.samples):
-        sharp = np.cos(part["nric"][:, connectivity.edge_count :]) < FOLD_LIMIT
-        folded, count = folded + int((sharp & smooth).any(axis=1).sum()), count + len(sharp)
+        anew = folded_anew(part["nric"][:, connectivity.edge_count :], angles)
+        folded, count = folded + int(anew.sum()), count + len(anew)
     return [Shortfall(f"folded {folded} of {count} joint samples where no shape has a crease")] if folded else []
 
 

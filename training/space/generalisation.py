@@ -12,14 +12,16 @@ from dataclasses import dataclass
 import numpy as np
 
 from shapespace.arrays import FloatArray, IntArray
+from shapespace.coordinates.nric import dihedral_angles
 from shapespace.mesh.rigid_motion import align
 from shapespace.mesh.triangle_mesh import TriangleMesh
+from shapespace.mesh.triangle_quality import folded_anew
 from shapespace.shell.energy import Material
 from shapespace.shell.space import ShellSpace
 from shapespace.solve.cholesky import NotPositiveDefiniteError
 from shapespace.solve.outcome import Status
 from shapespace.training.runs.config import ModeSettings
-from shapespace.training.space.codes import nearest_codes
+from shapespace.training.space.codes import box_of, nearest_codes
 from shapespace.training.space.logarithms import logarithms
 from shapespace.training.space.mean import centred_mean
 from shapespace.training.space.modes import ModeError, coefficients, find_modes, mode_count, pga
@@ -28,10 +30,10 @@ from shapespace.training.space.modes import ModeError, coefficients, find_modes,
 FOLDS = 5
 #: Steps K of the logarithms and exponentials of a model, and of those by which spaces are compared.
 STEPS, LIGHT_STEPS = 16, 8
-#: One step is chosen if it leaves less than this share of what `LIGHT_STEPS` leave of shapes that are held out.
-NEARER = 0.95
 #: Most shapes and most modes by which steps are chosen.
 SOME, FEW = 100, 20
+#: One step is not chosen if a larger share of so many random shapes folds, with at most so many modes.
+FOLDED, DRAWN, DRAWN_MODES = 0.1, 500, 10
 #: Percentile of the vertices' distances that is reported beside their mean.
 SHARE = 95
 
@@ -151,13 +153,14 @@ def time_steps(
 ) -> int:
     """K of logarithms and exponentials, as the settings say or as ``auto`` finds.
 
-    With K = 1 the exponential is ``X̄ + Σ_j w_j u_j``. Both are tried on every shape, by principal modes of the other
-    folds' logarithms at the mean of all.
+    With K = 1 the exponential is ``X̄ + Σ_j w_j u_j``: shapes add up in vertices, which may come nearer to others of the
+    kind, but folds them where limbs bend. It is chosen where it comes as near as `LIGHT_STEPS` to every shape, by
+    principal modes of the other folds' logarithms at the mean of all, and hardly ever folds.
 
     Args:
         settings: of the modes; only ``log_steps`` counts.
         reference: gives connectivity.
-        shapes: (n, V, 3), of which at most `SOME`, spread evenly, are looked at.
+        shapes: (n, V, 3), of which at most `SOME`, spread evenly, are held out.
         material: of the shell.
         whose: (n,) shapes that they are of, from 0 on, mirror images last; by default none is an image.
     """
@@ -168,22 +171,42 @@ def time_steps(
     if count < FOLDS:  # too few to tell
         return STEPS
     used = whose % -(-count // SOME) == 0
-    whose, shapes = np.unique(whose[used], return_inverse=True)[1], shapes[used]
     try:
+        if _folded(reference, shapes, material) > FOLDED:
+            return STEPS
+        whose, shapes = np.unique(whose[used], return_inverse=True)[1], shapes[used]
         straight, bent = (_missed(reference, shapes, whose, material, steps) for steps in (1, LIGHT_STEPS))
     except (ModeError, NotPositiveDefiniteError):  # the stages that need mean and modes tell
         return STEPS
-    return 1 if straight < NEARER * bent else STEPS
+    return 1 if straight <= bent else STEPS
+
+
+def _folded(reference: TriangleMesh, shapes: FloatArray, material: Material) -> float:
+    """Share of random shapes of one step that fold where none of the shapes (n, V, 3) has as much as a crease."""
+    space, mean, fields = _space(reference, shapes, material, 1)
+    modes = pga(space, mean, fields, min(DRAWN_MODES, len(shapes) - 1), "vertices").vertices
+    lower, upper = box_of(coefficients(space, mean, fields, modes, "vertices")[0])
+    codes = np.random.default_rng(0).uniform(lower, upper, (DRAWN, len(modes)))
+    drawn = mean + np.tensordot(codes, modes, axes=1)
+    angles, others = (dihedral_angles(each, reference.connectivity) for each in (drawn, shapes))
+    return float(folded_anew(angles, others).mean())
+
+
+def _space(
+    reference: TriangleMesh, shapes: FloatArray, material: Material, steps: int
+) -> tuple[ShellSpace, FloatArray, FloatArray]:
+    """At the mean of shapes (n, V, 3), the mean (V, 3), and their logarithms there (n, V, 3); raises ModeError."""
+    found = centred_mean(reference, shapes, material, steps)
+    if found.status is not Status.CONVERGED:
+        raise ModeError(f"the shapes have no mean: {found.reason}")
+    space = ShellSpace(reference.with_vertices(found.vertices), material)
+    return space, found.vertices, logarithms(space, found.vertices, shapes, steps).fields
 
 
 def _missed(reference: TriangleMesh, shapes: FloatArray, whose: IntArray, material: Material, steps: int) -> float:
     """Mean distance of vertices of shapes (n, V, 3), the first of them originals, from what K steps make of others."""
-    found = centred_mean(reference, shapes, material, steps)
-    if found.status is not Status.CONVERGED:
-        raise ModeError(f"the shapes have no mean: {found.reason}")
-    mean, count = found.vertices, int(whose.max()) + 1
-    space = ShellSpace(reference.with_vertices(mean), material)
-    fields = logarithms(space, mean, shapes, steps).fields
+    space, mean, fields = _space(reference, shapes, material, steps)
+    count = int(whose.max()) + 1
     away = []
     for index in folds(count):
         modes = pga(space, mean, fields[~np.isin(whose, index)], max(1, min(FEW, count // 3)), "vertices").vertices
@@ -225,12 +248,7 @@ def held_out(
     whose = np.unique(original[known], return_inverse=True)[1]
     if steps is None:
         steps = min(LIGHT_STEPS, time_steps(settings, reference, kept, material, whose))
-    found = centred_mean(reference, kept, material, steps)
-    if found.status is not Status.CONVERGED:
-        raise ModeError(f"without some shapes the others have no mean: {found.reason}")
-    mean = found.vertices
-    space = ShellSpace(reference.with_vertices(mean), material)
-    fields = logarithms(space, mean, kept, steps).fields
+    space, mean, fields = _space(reference, kept, material, steps)
     own = original[known] == known
     components = PrincipalComponents.of(kept[own], reference.vertices)
     mirrored = None if own.all() else PrincipalComponents.of(kept, reference.vertices)

@@ -21,6 +21,6 @@ def blends(ellipsoid: TriangleMesh) -> tuple[TriangleMesh, np.ndarray]:
     x = ellipsoid.vertices / size
     centres = x[[3, 60, 120]]
     bumps = np.exp(-((np.linalg.norm(x - centres[:, None], axis=2) / 0.15) ** 2))[:, :, None]
-    fields = 0.2 * bumps * rng.normal(size=(3, 1, 3))
+    fields = 0.17 * bumps * rng.normal(size=(3, 1, 3))
     weights = rng.uniform(-1, 1, (12, 3))
     return ellipsoid.with_vertices(x), x + np.tensordot(weights, fields, axes=1)

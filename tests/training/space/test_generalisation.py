@@ -67,6 +67,8 @@ def test_one_step_is_chosen_for_blend_shapes_and_many_for_bends(reference, shape
     assert time_steps(ModeSettings(), reference, shapes, Material()) == 16
     assert time_steps(ModeSettings(log_steps=3), mesh, linear, Material()) == 3
     assert time_steps(ModeSettings(), mesh, linear[:4], Material()) == 16, "too few to tell"
+    wide = mesh.vertices + 3 * (linear - mesh.vertices)
+    assert time_steps(ModeSettings(), mesh, wide, Material()) == 16, "in one step they fold"
     index, plain = np.array([0, 5]), ModeSettings(sparsity=0)
     found, bent = (held_out(mesh, linear, index, [3], plain, Material(), steps) for steps in (None, 8))
     assert found.steps.tolist() == [1, 1]
