@@ -43,6 +43,13 @@ class Stage:
         return {"key": digest(settings), "basis": digest(rest)}
 
 
+def _of_mean(modes: ModeSettings) -> ModeSettings:
+    """K, and where that is chosen the number of modes by which it is."""
+    if modes.log_steps == "auto":
+        return ModeSettings(count=modes.count)
+    return ModeSettings(log_steps=modes.log_steps)
+
+
 STAGES: dict[str, Stage] = {
     "ingest": Stage(
         version=1,
@@ -57,8 +64,8 @@ STAGES: dict[str, Stage] = {
         ],
     ),
     "mean": Stage(
-        version=2,
-        settings=lambda config: [config.material, ModeSettings(log_steps=config.modes.log_steps)],
+        version=3,
+        settings=lambda config: [config.material, _of_mean(config.modes)],
         results=lambda run: [run.mean.path],
     ),
     "modes": Stage(

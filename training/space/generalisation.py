@@ -30,8 +30,8 @@ from shapespace.training.space.modes import ModeError, coefficients, find_modes,
 FOLDS = 5
 #: Steps K of the logarithms and exponentials of a model, and of those by which spaces are compared.
 STEPS, LIGHT_STEPS = 16, 8
-#: Most shapes and most modes by which steps are chosen.
-SOME, FEW = 100, 20
+#: Most shapes by which steps are chosen, and modes where the settings give no number.
+SOME, FEW = 100, 10
 #: One step is not chosen if a larger share of so many random shapes folds, with at most so many modes.
 FOLDED, DRAWN, DRAWN_MODES = 0.1, 500, 10
 #: Percentile of the vertices' distances that is reported beside their mean.
@@ -158,7 +158,7 @@ def time_steps(
     principal modes of the other folds' logarithms at the mean of all, and hardly ever folds.
 
     Args:
-        settings: of the modes; only ``log_steps`` counts.
+        settings: of the modes; only ``log_steps`` and ``count`` matter.
         reference: gives connectivity.
         shapes: (n, V, 3), of which at most `SOME`, spread evenly, are held out.
         material: of the shell.
@@ -175,7 +175,8 @@ def time_steps(
         if _folded(reference, shapes, material) > FOLDED:
             return STEPS
         whose, shapes = np.unique(whose[used], return_inverse=True)[1], shapes[used]
-        straight, bent = (_missed(reference, shapes, whose, material, steps) for steps in (1, LIGHT_STEPS))
+        few = max(1, min(FEW if settings.count == "auto" else settings.count, count // 3))
+        straight, bent = (_missed(reference, shapes, whose, material, few, steps) for steps in (1, LIGHT_STEPS))
     except (ModeError, NotPositiveDefiniteError):  # the stages that need mean and modes tell
         return STEPS
     return 1 if straight <= bent else STEPS
@@ -203,15 +204,17 @@ def _space(
     return space, found.vertices, logarithms(space, found.vertices, shapes, steps).fields
 
 
-def _missed(reference: TriangleMesh, shapes: FloatArray, whose: IntArray, material: Material, steps: int) -> float:
-    """Mean distance of vertices of shapes (n, V, 3), the first of them originals, from what K steps make of others."""
+def _missed(
+    reference: TriangleMesh, shapes: FloatArray, whose: IntArray, material: Material, modes: int, steps: int
+) -> float:
+    """Mean distance of vertices of shapes (n, V, 3), the first of them originals, from what modes of others make."""
     space, mean, fields = _space(reference, shapes, material, steps)
     count = int(whose.max()) + 1
     away = []
     for index in folds(count):
-        modes = pga(space, mean, fields[~np.isin(whose, index)], max(1, min(FEW, count // 3)), "vertices").vertices
-        start, _ = coefficients(space, mean, fields[index], modes, "vertices")
-        near = nearest_codes(space, mean, modes, shapes[index], start, steps).vertices
+        directions = pga(space, mean, fields[~np.isin(whose, index)], modes, "vertices").vertices
+        start, _ = coefficients(space, mean, fields[index], directions, "vertices")
+        near = nearest_codes(space, mean, directions, shapes[index], start, steps).vertices
         away.append(vertex_distances(near, shapes[index], 1.0))
     return float(np.concatenate(away).mean())
 
