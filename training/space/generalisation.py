@@ -175,7 +175,7 @@ def time_steps(
         if _folded(reference, shapes, material) > FOLDED:
             return STEPS
         whose, shapes = np.unique(whose[used], return_inverse=True)[1], shapes[used]
-        few = max(1, min(FEW if settings.count == "auto" else settings.count, count // 3))
+        few = max(1, min(FEW if settings.count == "auto" else settings.count, (int(whose.max()) + 1) // 3))
         straight, bent = (_missed(reference, shapes, whose, material, few, steps) for steps in (1, LIGHT_STEPS))
     except (ModeError, NotPositiveDefiniteError):  # the stages that need mean and modes tell
         return STEPS
