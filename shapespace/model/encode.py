@@ -79,24 +79,23 @@ class Encoded:
 
 @dataclass(frozen=True)
 class Aim:
-    """Vertices (V, 3) of the coarse mesh that a shape should come close to, and how much each counts (V,)."""
+    """Vertices (V, 3) of the coarse mesh that a shape should come close to, and how much each counts (V,), in all 1."""
 
     vertices: FloatArray
-    weights: FloatArray
+    shares: FloatArray
 
     def place(self, shape: FloatArray) -> Placement:
         """What brings a shape (V, 3) closest."""
-        return Placement.between(shape, self.vertices, self.weights)
+        return Placement.between(shape, self.vertices, self.shares)
 
     def misfit(self, shape: FloatArray) -> FloatArray:
         """Of a shape (V, 3), there: weighted (V, 3), the sum of squares is the weighted mean of square distances."""
-        roots = np.sqrt(self.weights / self.weights.sum())
-        return roots[:, None] * (self.place(shape)(shape) - self.vertices)
+        return np.sqrt(self.shares)[:, None] * (self.place(shape)(shape) - self.vertices)
 
     def change(self, shape: FloatArray, fields: FloatArray) -> FloatArray:
         """Of the misfit (n, V, 3) where the shape changes by fields (n, V, 3)."""
         place = self.place(shape)
-        return weighted_change(fields @ place.rotation.T, place(shape), self.weights / self.weights.sum())
+        return weighted_change(fields @ place.rotation.T, place(shape), self.shares)
 
 
 class Encoder:
@@ -159,7 +158,8 @@ class Encoder:
         box = Box(lower, upper, latents.width)
         fit = self._by_nric(target, box, fixed, deadline)
         if objective is Objective.VERTICES and fit.status is not Status.DEADLINE:
-            aim = Aim(vertices, model.nearby(given.mesh))
+            nearby = model.nearby(given.mesh)
+            aim = Aim(vertices, nearby / nearby.sum())
             fit = self._by_vertices(aim, fit, box, fixed, deadline)
             if bounds is not Bounds.CLAMP:
                 fit = self._inside_if_as_near(aim, fit, fixed, deadline)

@@ -189,12 +189,12 @@ def facts(name: str = "small", version: str = "1", *, idle: int = 0) -> Facts:
     )
 
 
-def geometry(*, fine: bool = False) -> Geometry:
-    """The reference; if ``fine``, also a fine mesh, modes and training codes."""
+def geometry(*, fine: bool | TriangleMesh = False) -> Geometry:
+    """The reference; if ``fine``, also a fine mesh, that one or another, modes and training codes."""
     mesh = reference()
-    if not fine:
+    if fine is False:
         return Geometry(reference=mesh)
-    finer = fine_reference()
+    finer = fine_reference() if fine is True else fine
     return Geometry(
         reference=mesh,
         fine=FineMesh(finer, Prolongation.of(mesh, finer)),
@@ -204,7 +204,13 @@ def geometry(*, fine: bool = False) -> Geometry:
 
 
 def write_bundle(
-    models: Path, name: str = "small", version: str = "1", *, start: bool = False, fine: bool = False, idle: int = 0
+    models: Path,
+    name: str = "small",
+    version: str = "1",
+    *,
+    start: bool = False,
+    fine: bool | TriangleMesh = False,
+    idle: int = 0,
 ) -> Path:
     """Write a complete bundle and return its folder; idle coordinates come last and have no effect."""
     *factors, combiner = (model.SerializeToString() for model in networks(idle).values())

@@ -199,7 +199,7 @@ def _space(
     """At the mean of shapes (n, V, 3), the mean (V, 3), and their logarithms there (n, V, 3); raises ModeError."""
     found = centred_mean(reference, shapes, material, steps)
     if found.status is not Status.CONVERGED:
-        raise ModeError(f"the shapes have no mean: {found.reason}")
+        raise ModeError(f"{len(shapes)} shapes that are not held out have no mean: {found.reason}")
     space = ShellSpace(reference.with_vertices(found.vertices), material)
     return space, found.vertices, logarithms(space, found.vertices, shapes, steps).fields
 

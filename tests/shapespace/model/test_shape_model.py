@@ -3,7 +3,6 @@
 import os
 import shutil
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 
 import httpx
@@ -11,12 +10,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from shapespace.bundle.geometry import FineMesh
 from shapespace.bundle.reader import BundleError
-from shapespace.bundle.writer import Networks
-from shapespace.bundle.writer import write_bundle as write_files
 from shapespace.files.formats import MESH_FORMATS
-from shapespace.mesh.prolongation import Prolongation
 from shapespace.mesh.rigid_motion import align
 from shapespace.mesh.triangle_mesh import MeshError, TriangleMesh
 from shapespace.model.correspondence import InvalidMeshError
@@ -24,7 +19,7 @@ from shapespace.model.decoder import MeshChoice
 from shapespace.model.edit import InvalidTargetError
 from shapespace.model.latent_space import NotFiniteError, OutOfBoundsError, WrongLengthError
 from shapespace.model.shape_model import ShapeModel, load
-from tests.service.bundles import SCALE, facts, fine_reference, geometry, networks, reference, write_bundle
+from tests.service.bundles import SCALE, fine_reference, reference, write_bundle
 from tests.service.conftest import ROOT, starting
 
 CODES = np.array([[0.1, 0.7, 0.4], [0.0, -1.0, 0.2]])
@@ -118,10 +113,7 @@ def test_of_a_fine_mesh_all_vertices_count(tmp_path: Path) -> None:
     v, f = mesh.vertices, mesh.faces
     for _ in range(3):
         v, f = trimesh.remesh.subdivide(v, f, face_index=np.flatnonzero((v[f][:, :, 0] > 0).all(axis=1)))
-    finer = TriangleMesh.from_arrays(v, f)
-    *factors, combiner = (network.SerializeToString() for network in networks().values())
-    shapes = replace(geometry(fine=True), fine=FineMesh(finer, Prolongation.of(mesh, finer)))
-    write_files(tmp_path, facts("dense", "1"), Networks(factors=factors, combiner=combiner, start=None), shapes)
+    write_bundle(tmp_path, "dense", fine=TriangleMesh.from_arrays(v, f))
     model = load(tmp_path / "dense")
     coarse = [int(np.argmin(np.linalg.norm(model.vertices - corner, axis=1))) for corner in SCALE * mesh.vertices]
     for code in CODES:
