@@ -28,13 +28,13 @@ class Stage:
     """
 
     version: int
-    settings: Callable[[Config], Sequence[BaseModel]]
+    settings: Callable[[Config], Sequence[BaseModel | dict[str, Any]]]
     results: Callable[[RunDirectory], Sequence[Path]] = lambda run: ()
     amounts: frozenset[str] = frozenset()
 
     def keys(self, name: str, config: Config, before: str) -> dict[str, str]:
         """See `stage_keys`; ``before`` is the key of the stage before, or of the data."""
-        settings = [s.model_dump(mode="json") for s in self.settings(config)]
+        settings = [s if isinstance(s, dict) else s.model_dump(mode="json") for s in self.settings(config)]
         rest = [{k: v for k, v in s.items() if k not in self.amounts} for s in settings]
 
         def digest(read: list[dict[str, Any]]) -> str:
@@ -102,7 +102,7 @@ STAGES: dict[str, Stage] = {
     ),
     "evaluation": Stage(
         version=2,
-        settings=lambda config: [config.evaluation],
+        settings=lambda config: [config.evaluation, config.export.model_dump(include={"eta_reconstruction"})],
         results=lambda run: [run.evaluation.path, run.gallery.path, run.report.path, run.exact],
     ),
     "export": Stage(
