@@ -27,9 +27,12 @@ from shapespace.training.runs.directory import RunDirectory
 from shapespace.training.runs.sampling import DONE, KNOWN, columns
 
 ROOT = Path(__file__).resolve().parents[1]
-#: Collections of real meshes, in the order of the tables; then the hand without sparse modes, and with one factor.
+#: What the names of runs with the paper's modes end in: in the shell's norm, as sparse for all.
+SHELL, SHELL_MODES = "-shell", {"norm": "shell", "sparsity": 0.1, "log_steps": 16}
+#: Collections of real meshes, in the order of the tables; then the hand without sparse modes and with one factor, the
+#: dancer from few samples, and all with the paper's modes.
 COLLECTIONS = ("hand", "faces", "samba", "makehuman", "horse", "hippocampus")
-CONTRASTS = ("hand-pga", "hand-one-factor")
+CONTRASTS = ("hand-pga", "hand-one-factor", "samba-few", *(name + SHELL for name in COLLECTIONS))
 #: The bundled collection of shapes; its other figures are on the page of the bundled models.
 MANNEQUIN = "figure"
 #: What the names of runs with mirror images end in, and the collections that have a symmetric shape.
@@ -58,14 +61,22 @@ def have(run: RunDirectory, name: str, measure: Callable[[], dict[str, Any]]) ->
 
 
 def open_run(name: str, data: Path, out: Path) -> Run:
-    """The run of a collection or the figure, with mirror images of its shapes where the name ends in ``MIRRORED``."""
-    plain = name.removesuffix(MIRRORED)
+    """The run of a collection or the figure, with mirror images of its shapes where the name ends in ``MIRRORED``.
+
+    Where it ends in ``SHELL``, with these modes, one seed, and none of the studies.
+    """
+    plain = name.removesuffix(MIRRORED).removesuffix(SHELL)
     path = ROOT / "examples" / (f"{plain}.toml" if plain == MANNEQUIN else f"collections/{plain}.toml")
     meshes = load(path)[0].collection.data
     config, text = load(path, data / meshes.relative_to(path.parent) if meshes else None)
-    if name.endswith(MIRRORED):
+    if name != plain:
         document: Any = tomlkit.parse(text)
-        document["collection"]["mirror"] = True
+        if name.endswith(MIRRORED):
+            document["collection"]["mirror"] = True
+        else:
+            document["modes"].update(SHELL_MODES)
+            for studied in ("networks", "variants", "evaluation"):
+                document.pop(studied, None)
         text = tomlkit.dumps(document)
         config = parse(text, name)
     return Run(out / name, config, text, out / "models")
@@ -140,6 +151,14 @@ def joint_exponentials(row: dict[str, Any]) -> list[int]:
     return [every, *(count // (1 + len(row["sizes"])) for count in shares)]
 
 
+def sampling(row: dict[str, Any]) -> float:
+    """What all samples of a run took, in exponentials: a code with its derivatives as many as take as long."""
+    times, drawn = row["evaluation"]["times"], row["drawn"]
+    worth: float = times["exact, with derivatives"] / times["exact"]
+    own: int = drawn["joint"] + drawn["of factors"]
+    return own + worth * row["evaluation"]["derivatives"]
+
+
 def plot_samples(rows: dict[str, dict[str, Any]], path: Path) -> None:
     """R² by the number of exponentials that a model has seen, those of factors included."""
     figure, axes = plt.subplots(
@@ -187,9 +206,11 @@ def write_page() -> None:
     page = environment.get_template("results.md.jinja").render(
         rows=rows,
         real=real,
+        shell={name: rows[name + SHELL] for name in COLLECTIONS if name + SHELL in rows},
         missing=[name for name in COLLECTIONS if name not in rows],
         spread=spread,
         joint=joint_exponentials,
+        sampling=sampling,
     )
     (DOCS / "results.md").write_text(page, encoding="utf-8")
 
