@@ -17,16 +17,16 @@ import numpy as np
 import tomlkit
 
 from benchmarks.generalisation import ROWS, beside_images, title
-from benchmarks.results import MANNEQUIN, MIRRORED, ROOT, open_run
+from benchmarks.results import MIRRORED, ROOT, open_run
 from benchmarks.space import CODES, to_nearest
 from shapespace.arrays import FloatArray
 from shapespace.mesh.triangle_mesh import TriangleMesh, diagonal
 from shapespace.model.shape_model import ShapeModel, load
-from shapespace.training.collection.generators import MESHES
 from shapespace.training.collection.mirror import find_mirror, mirrored
 from shapespace.training.pipeline import Run, execute, write_bundle_of
 from shapespace.training.runs.config import parse
 from shapespace.training.space.generalisation import FOLDS, PrincipalComponents, folds, summary, vertex_distances
+from shapespace.training.space.stages import read_meshes
 
 #: Most exponentials to learn from: joint, and of each factor.
 JOINT, OF_FACTORS = 1000, 300
@@ -75,20 +75,14 @@ def four_fifths(name: str, data: Path, out: Path, fold: int = 0) -> tuple[Run, F
     With half as many modes where the name ends in ``HALF``, and mirror images where ``MIRRORED`` stands before.
     """
     example = open_run(name.removesuffix(HALF), data, out)
-    collection = name.removesuffix(HALF).removesuffix(MIRRORED)
-    if collection == MANNEQUIN:
-        meshes = MESHES[MANNEQUIN]()
-        whole = {"vertices": meshes.vertices, "faces": meshes.faces}
-    else:
-        with np.load(str(example.config.collection.data), allow_pickle=False) as arrays:
-            whole = {key: arrays[key] for key in arrays.files}
-    held = folds(len(whole["vertices"]))[fold]
+    meshes = read_meshes(example.config)
+    held = folds(len(meshes.names))[fold]
+    known, names = (np.delete(array, held, axis=0) for array in (meshes.vertices, np.array(meshes.names)))
     ending = f"-fold-{fold}" if fold else ""
-    known = {key: array if key == "faces" else np.delete(array, held, axis=0) for key, array in whole.items()}
-    file = out / "data" / f"{collection}{ending}.npz"
+    file = out / "data" / f"{name.removesuffix(HALF).removesuffix(MIRRORED)}{ending}.npz"
     if not file.exists():
         file.parent.mkdir(parents=True, exist_ok=True)
-        np.savez(file, **known)
+        np.savez(file, vertices=known, faces=meshes.faces, names=names)
     document: Any = tomlkit.parse(example.source)
     document["collection"].pop("generator", None)
     document["collection"]["data"] = str(file.resolve())
@@ -105,7 +99,7 @@ def four_fifths(name: str, data: Path, out: Path, fold: int = 0) -> tuple[Run, F
     document["export"]["name"] = name + ending
     text = tomlkit.dumps(document)
     run = Run(out / (name + ending), parse(text, name), text, out / "models")
-    return run, known["vertices"].astype(np.float64), whole["vertices"][held].astype(np.float64)
+    return run, known, meshes.vertices[held]
 
 
 def encoded(model: ShapeModel, shapes: FloatArray) -> FloatArray:

@@ -62,7 +62,8 @@ def material(config: Config) -> Material:
     return Material(settings.mu, settings.lambda_, settings.eta)
 
 
-def _meshes(config: Config) -> MeshCollection:
+def read_meshes(config: Config) -> MeshCollection:
+    """The collection that a run is of; raises ConfigError where none is named, IngestError where it can't be used."""
     settings = config.collection
     if settings.generator is not None:
         return MESHES[settings.generator]()
@@ -83,7 +84,7 @@ def ingest(run: RunDirectory, config: Config, accepted: Sequence[str] = ()) -> d
         IngestError: the collection can't be used, or shapes of it have to be accepted first.
     """
     settings = config.collection
-    meshes = _meshes(config)
+    meshes = read_meshes(config)
     meshes.require_accepted(accepted)
     chosen = meshes.index(settings.reference)
     vertices, scale = normalised(meshes, chosen)
