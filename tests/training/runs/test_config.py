@@ -16,6 +16,7 @@ from shapespace.training.runs.config import (
     load,
     parse,
 )
+from shapespace.training.runs.stages import STAGES, stage_keys
 from tests.training.conftest import TINY
 
 EXAMPLES = sorted((Path(__file__).parents[3] / "examples").rglob("*.toml"))
@@ -140,6 +141,24 @@ def test_factors_of_a_variant_differ_all_alike_or_each_for_itself() -> None:
     assert (each[2].skip_orders, each[2].fourier) == ([], main[2].fourier)
     one = parse(TINY[: TINY.index("[[networks")] + TINY[TINY.index("[monolithic]") :], "here")
     assert one.recipes["paper"].factors == one.networks.factors
+
+
+@pytest.mark.parametrize(
+    ("section", "setting", "again"),
+    [
+        ("export", "eta_reconstruction = 0.001", "evaluation"),  # reconstructs vertices as the bundle will
+        ("export", "tolerance = 0.001", "export"),
+        ("samples", "seed = 5", "samples"),
+    ],
+)
+def test_a_setting_is_read_by_its_stage_and_none_before(section: str, setting: str, again: str) -> None:
+    header = f"[{section}]"
+    assert TINY.count(header) == 1
+    one, other = (
+        stage_keys(parse(text, "here"), "data") for text in (TINY, TINY.replace(header, f"{header}\n{setting}"))
+    )
+    stages = list(STAGES)
+    assert [name for name in stages if one[name] != other[name]] == stages[stages.index(again) :]
 
 
 def test_what_is_kept_of_a_configuration_says_the_same() -> None:
