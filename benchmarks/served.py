@@ -61,7 +61,7 @@ and in the last columns are components that did, beside the same fold of the mod
 
 How well networks follow exponentials is on [another page](results.md), and [a third](generalisation.md) has exact
 exponentials in place of networks. `python -m benchmarks.served --data FOLDER` trains, measures and writes this page;
-what it measured is in `runs/collections/`.
+what it measured is in `runs/collections/`. Some rows are of [older networks](notes.md#kernels-in-patches).
 
 | {head} |
 |{line}
