@@ -38,9 +38,7 @@ def record(name: str) -> dict[str, Any]:
     """What a committed run holds, by the names of its files."""
     folder = ROOT / "runs" / name
     found: dict[str, Any] = {path.stem: json.loads(path.read_text()) for path in folder.glob("*.json")}
-    config = load(folder / "config.toml")[0]
-    bundle = ROOT / "models" / config.export.name / str(config.export.version)
-    return found | {"config": config, "manifest": json.loads((bundle / "manifest.json").read_text())}
+    return found | {"config": load(folder / "config.toml")[0]}
 
 
 def without_bump(count: int = 1000) -> float:
@@ -64,7 +62,11 @@ def page() -> str:
     )
     environment.filters["percent"] = lambda share, digits=2: f"{100 * share:.{digits}f} %"
     runs = {"figure": record("figure"), "torus": record("freaky-torus"), "alone": record("freaky-torus-1000")}
-    return environment.get_template("bundled.md.jinja").render(models=MODELS, bumpless=without_bump(), **runs)
+    exported = runs["figure"]["config"].export
+    manifest = json.loads((ROOT / "models" / exported.name / str(exported.version) / "manifest.json").read_text())
+    return environment.get_template("bundled.md.jinja").render(
+        models=MODELS, bumpless=without_bump(), manifest=manifest, **runs
+    )
 
 
 if __name__ == "__main__":

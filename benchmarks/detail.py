@@ -27,7 +27,8 @@ from shapespace.training.runs.directory import RunDirectory
 
 PAGE = """# Fine detail
 
-The models of [served.md](served.md): how near fine answers come to the files' fine meshes, and how rough they are.
+Models of the first folds of [served.md](served.md), before some of them were trained anew there: how near fine answers
+come to the files' fine meshes, and how rough they are.
 **fine**, **coarse**: vertices. **carried**: the shape's own coarse vertices, taken from the file, with the weights
 that carry the fine mesh along; **answered**: the fine mesh of the code that `encode` finds for the file. **unseen**
 shapes had no part in mean, modes, networks and weights. **distance**: mean of all vertices after rigid alignment, in

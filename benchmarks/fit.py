@@ -43,8 +43,9 @@ anew, turned at random and moved. **whole**: alternately {points} points all ove
 vertices. **noisy**: {points} points with noise of {noise:.1%} of the bounding box's diagonal and {outliers:.0%}
 outliers. **camera**: at most so many points, those that one camera sees, with the same noise, and `partial=true`.
 **unseen** shapes of the figure are poses from its generator that no training knows, those of the collections the fifth
-that was left out of their training ([served.md](served.md)); **training** ones those that made the model, **drawn**
-ones shapes of the population's codes. `python -m benchmarks.fit` measures and writes this page.
+that was left out of their training ([served.md](served.md)), all of models that have been trained anew since;
+**training** ones those that made the model, **drawn** ones shapes of the population's codes.
+`python -m benchmarks.fit` measures and writes this page.
 
 **error**: median over tries of the mean distance of vertices from the truth, in percent of the diagonal; of the torus
 the distance of its surface, which four codes share in as many places, each with other vertices. **encode**: the same
