@@ -146,7 +146,7 @@ class Decoder:
         self.reference, self.fine = bundle.reference, bundle.fine
         self.modes, self.file_vertices = bundle.modes, bundle.file_vertices
         self._surface = bundle.surface
-        codes = bundle.training_codes
+        codes = self.training_codes = bundle.training_codes
         self._training = None if codes is None else TrainingCodes(self.latents, codes)
         #: What codes are like: those of the training shapes, or where there are none any inside the bounds.
         self.population = (
@@ -273,6 +273,13 @@ class Decoder:
         with self._limited() as until:
             return self._factors[j](parts.astype(np.float32), until).astype(np.float64)
 
+    def guesses(self, codes: Codes) -> FloatArray:
+        """What the start network makes of codes (n, m): shapes (n, V, 3), normalised; ValueError if there is none."""
+        if self._start is None:
+            raise ValueError("the bundle has no start network")
+        with self._limited() as until:
+            return self._start(codes, until).astype(np.float64)
+
     def rehearse(self) -> None:
         """Run every network once, at the ends of the bounds and between them, and reconstruct one shape.
 
@@ -327,13 +334,8 @@ class Decoder:
             return factors, self._combiner(factors, until).astype(np.float64)
 
     def _learned_start(self, code: Codes) -> Iterator[Callable[[], FloatArray]]:
-        if network := self._start:
-
-            def start() -> FloatArray:
-                with self._limited() as until:
-                    return network(code[None], until)[0].astype(np.float64)
-
-            yield start
+        if self._start:
+            yield lambda: self.guesses(code[None])[0]
 
     @contextmanager
     def _limited(self) -> Iterator[float]:

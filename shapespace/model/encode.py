@@ -28,6 +28,9 @@ SWEEPS, PROMISING = 4, 1.2
 #: The search by vertices ends when no coordinate would move by more than this fraction of the bounds' width, when the
 #: sum of squares would fall by less than this share, or after so many shapes.
 TOLERANCE, GAIN, SHAPES = 1e-4, 1e-4, 25
+#: A search that took so many shapes is begun once more from a training shape, one of at most so many, if at least so
+#: many shapes are left, and the code there differs by more than this fraction of the bounds' width.
+LONG, KNOWN, FEWEST, DIFFERENT = 10, 200, 5, 0.01
 #: Where codes outside the bounds are allowed: by how much, a fraction of the bounds' width.
 MARGIN = 0.5
 #: A code inside is preferred if so many more shapes, and those that the search left over, find one whose distance is at
@@ -160,9 +163,10 @@ class Encoder:
         if objective is Objective.VERTICES and fit.status is not Status.DEADLINE:
             nearby = model.nearby(given.mesh)
             aim = Aim(vertices, nearby / nearby.sum())
-            fit = self._by_vertices(aim, fit, box, fixed, deadline)
+            near, fit = fit, self._by_vertices(aim, fit, box, fixed, deadline)
             if bounds is not Bounds.CLAMP:
                 fit = self._inside_if_as_near(aim, fit, fixed, deadline)
+            fit = self._from_training_shape_if_nearer(aim, target, near, fit, fixed, deadline)
         code, inside = latents.found(fit.x, bounds, fixed)
         coarse = model.shape(code, inside, MeshChoice.COARSE, deadline)
         posterior = self._posterior(code, coarse.vertices / model.manifest.scale, vertices, fixed)
@@ -221,6 +225,37 @@ class Encoder:
     def _patches(self) -> list[IntArray]:
         """Of the coarse mesh; made once, as they take as long as a shape."""
         return patches_of(self.model.reference.vertices)
+
+    def _from_training_shape_if_nearer(
+        self, aim: Aim, target: FloatArray, near: Fit, fit: Fit, fixed: Fixed, deadline: Deadline | None
+    ) -> Fit:
+        """The fit to vertices, or one from the training shape that is nearest, with the shapes that are left.
+
+        Where faces have all but collapsed, the fit to lengths and angles that the search began with may be far away. A
+        search takes long there; elsewhere it ends at once.
+        """
+        left = SHAPES + INSIDE - fit.iterations
+        if fit.iterations < LONG or left < FEWEST or fit.status is Status.DEADLINE or self._known is None:
+            return fit
+        box = Box(*self.model.latents.box_around(fixed, 0.0), self.model.latents.width)
+        codes, shapes = self._known
+        away = ((align(shapes, aim.vertices) - aim.vertices) ** 2).sum(axis=2) @ aim.shares
+        start = np.clip(fixed.into(codes[away.argmin()]), box.lower, box.upper)
+        other = self._from(start, target, box, fixed, deadline)
+        if np.abs(self.model.latents.shorter(other.x - near.x) / box.scale).max() < DIFFERENT:
+            return fit
+        other = self._by_vertices(aim, other, box, fixed, deadline, most=left)
+        nearer = min((fit, other), key=lambda each: self._away(each.x, aim, deadline))
+        return replace(nearer, iterations=fit.iterations + other.iterations)
+
+    @cached_property
+    def _known(self) -> tuple[FloatArray, FloatArray] | None:
+        """Codes (n, m) of training shapes and guesses (n, V, 3) of these, which take a thousandth of the time."""
+        codes = self.model.training_codes
+        if codes is None or self.model.manifest.start is None:
+            return None
+        codes = codes[:: -(-len(codes) // KNOWN)]
+        return codes, self.model.guesses(codes.astype(np.float32))
 
     def _by_vertices(
         self, aim: Aim, near: Fit, box: Box, fixed: Fixed, deadline: Deadline | None, most: int = SHAPES
@@ -282,18 +317,6 @@ class Encoder:
         def affine(x: FloatArray) -> FloatArray:
             return root * self._difference(self._affine(x), target)
 
-        def composite(x: FloatArray) -> FloatArray:
-            return root * self._difference(self.model.nric(x), target)
-
-        def from_composite(start: FloatArray) -> Fit:
-            return least_squares(
-                composite,
-                lambda x, _: np.where(fixed.mask, 0.0, root[:, None] * derivatives(self.model, x)),
-                start,
-                box,
-                Stopping(deadline=deadline),
-            )
-
         x = fixed.into((latents.lower + latents.upper) / 2)
         for _ in range(SWEEPS * len(self.grids.images)):
             moved = self._another_start(x, affine(x), fixed)
@@ -308,16 +331,26 @@ class Encoder:
             Stopping(tolerance=1e-3, deadline=deadline),
             secant=False,
         )
-        best = from_composite(rough.x)
+        best = self._from(rough.x, target, box, fixed, deadline)
         for _ in range(SWEEPS):
             moved = self._another_start(best.x, best.residuals, fixed)
             if moved is None or best.status is Status.DEADLINE:
                 break
-            other = from_composite(moved)
+            other = self._from(moved, target, box, fixed, deadline)
             if other.cost >= best.cost:
                 break
             best = other
         return best
+
+    def _from(self, start: FloatArray, target: FloatArray, box: Box, fixed: Fixed, deadline: Deadline | None) -> Fit:
+        """The composite's fit to lengths and angles (2E,), from a code (m,)."""
+        return least_squares(
+            lambda x: self._root * self._difference(self.model.nric(x), target),
+            lambda x, _: np.where(fixed.mask, 0.0, self._root[:, None] * derivatives(self.model, x)),
+            start,
+            box,
+            Stopping(deadline=deadline),
+        )
 
     def _another_start(self, x: FloatArray, residuals: FloatArray, fixed: Fixed) -> FloatArray | None:
         """A code with one factor moved to the node that fits best, where that promises to be better than x.

@@ -3,22 +3,27 @@
 import os
 import shutil
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import httpx
 import numpy as np
 import pytest
 import trimesh
 
-from shapespace.bundle.reader import BundleError
+from shapespace.bundle.reader import BundleError, read_bundle
 from shapespace.files.formats import MESH_FORMATS
 from shapespace.mesh.rigid_motion import align
 from shapespace.mesh.triangle_mesh import MeshError, TriangleMesh
 from shapespace.model.correspondence import InvalidMeshError
 from shapespace.model.decoder import MeshChoice
 from shapespace.model.edit import InvalidTargetError
+from shapespace.model.encode import LONG, Aim, Encoder
 from shapespace.model.latent_space import NotFiniteError, OutOfBoundsError, WrongLengthError
 from shapespace.model.shape_model import ShapeModel, load
+from shapespace.solve.least_squares import Fit
+from shapespace.solve.outcome import Status
 from tests.service.bundles import SCALE, fine_reference, reference, write_bundle
 from tests.service.conftest import ROOT, starting
 
@@ -209,3 +214,30 @@ def test_a_code_outside_is_no_farther_than_one_inside(figure: ShapeModel) -> Non
             np.sqrt(np.square(figure.encode(twisted, bounds).distances).mean()) for bounds in ("allow", "clamp")
         )
         assert allowed < 1.03 * clamped, k
+
+
+def test_a_search_that_went_astray_begins_once_more_from_the_nearest_training_shape(
+    models: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model = load(models / "figure")
+    codes = read_bundle(models / "figure" / "2").training_codes
+    assert codes is not None
+    given = model.decode(codes[20])
+    size = np.linalg.norm(np.ptp(given, axis=0))
+    by_nric, by_vertices = Encoder._by_nric, Encoder._by_vertices
+    searches = iter(range(9))
+
+    def astray(self: Encoder, *given: Any) -> Fit:
+        return replace(by_nric(self, *given), x=model.upper)
+
+    def stuck(self: Encoder, aim: Aim, near: Fit, *given: Any, **more: Any) -> Fit:
+        if next(searches) == 0:
+            return replace(near, iterations=LONG)
+        return by_vertices(self, aim, near, *given, **more)
+
+    monkeypatch.setattr(Encoder, "_by_nric", astray)
+    monkeypatch.setattr(Encoder, "_by_vertices", stuck)
+    found = model.encode(given, bounds="clamp")
+    assert found.distances.mean() < 1e-5 * size
+    assert LONG < found.iterations <= 30
+    assert found.status is Status.CONVERGED
