@@ -112,7 +112,7 @@ class Encoder:
     By vertices it goes on from there to the minimum of ``Σ_i n_i ‖x_i(code) − x_i‖²`` over the vertices of the coarse
     mesh, after rigid alignment, where n_i of the vertices that are given lie nearest to vertex i: small angles add up
     along a limb, and what is smallest in lengths and angles may be twice as far in space. The shapes' derivatives are
-    those of ``shapespace.model.edit``.
+    those of ``shapespace.model.edit``. A search that takes long begins once more from the nearest training shape.
     """
 
     def __init__(self, model: Decoder) -> None:
