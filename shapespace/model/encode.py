@@ -239,8 +239,8 @@ class Encoder:
             return fit
         box = Box(*self.model.latents.box_around(fixed, 0.0), self.model.latents.width)
         codes, shapes = self._known
-        away = ((align(shapes, aim.vertices) - aim.vertices) ** 2).sum(axis=2) @ aim.shares
-        start = np.clip(fixed.into(codes[away.argmin()]), box.lower, box.upper)
+        nearest = int(np.argmin([np.linalg.norm(aim.misfit(shape)) for shape in shapes]))
+        start = np.clip(fixed.into(codes[nearest]), box.lower, box.upper)
         other = self._from(start, target, box, fixed, deadline)
         if np.abs(self.model.latents.shorter(other.x - near.x) / box.scale).max() < DIFFERENT:
             return fit
