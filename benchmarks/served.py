@@ -31,6 +31,8 @@ from shapespace.training.space.stages import read_meshes
 #: Most exponentials to learn from: joint, and of each factor.
 JOINT, OF_FACTORS = 1000, 300
 COLUMNS = ("unseen", "trained on")
+#: Of the shapes that a model was trained on: by one that remembers nothing of them.
+ALONE = "nothing remembered"
 #: What the names of runs with half as many modes end in.
 HALF = "-half"
 #: Models, in the order of the rows.
@@ -40,7 +42,8 @@ FIGURES = ROOT / "runs" / "collections"
 
 HEAD = (
     *("", "m", "folds", "unseen", "95 %", "components", "95 %", "ratio", "of folds"),
-    *("trained on", "components", "ratio", "of folds", "specificity", "components"),
+    *("trained on", "components", "ratio", "of folds", "nothing remembered", "ratio", "of folds"),
+    *("specificity", "components"),
     *("unseen: components with images", "ratio"),
 )
 
@@ -51,8 +54,12 @@ For each collection models were trained on four fifths of the shapes, with the s
 half as many modes. The `encode` of each, as it is served, was given the fine meshes of the other fifth, so that over
 five **folds** each shape is unseen once. **unseen**: mean distance of all vertices of these shapes to the shape of the
 code, in percent of the bounding box's diagonal, and the mean of the folds' 95th percentiles; **components**: of as many
-principal components of the same four fifths' fine meshes. **trained on**: the same of the shapes that made a model.
-**of folds**: the least and the greatest ratio of a fold.
+principal components of the same four fifths' fine meshes. **trained on**: the same of the shapes that made a model,
+which a bundle [remembers](../explanation/mathematics.md#networks): it adds what modes and networks miss of them.
+Components remember nothing, so this says that users get their own shapes back, not that the modes are better;
+**nothing remembered** is a model without it (`export.examples = false`) beside the same components. Rows without
+figures of *trained on* were measured before models remembered, unseen shapes too. **of folds**: the least and the
+greatest ratio of a fold.
 
 Of the first fold alone: **specificity**, the mean distance of {codes} random shapes, uniform in the bounds of the codes
 or of the components' coefficients, to the nearest of the shapes that made the model (lower is better); and the last
@@ -108,6 +115,14 @@ def encoded(model: ShapeModel, shapes: FloatArray) -> FloatArray:
     return np.stack([model.encode(shape).distances for shape in shapes]) / size
 
 
+def forgetful(run: Run) -> ShapeModel:
+    """The model of a run without what its bundle remembers of the training shapes."""
+    settings = run.config.export.model_copy(update={"examples": False})
+    config = run.config.model_copy(update={"export": settings})
+    other = Run(run.directory.folder, config, run.source, run.models / ALONE)
+    return load(other.bundle if other.bundle.exists() else write_bundle_of(other, figures={}))
+
+
 def with_images(known: FloatArray, model: ShapeModel) -> PrincipalComponents:
     """Components of shapes (n, V, 3) and their mirror images.
 
@@ -131,6 +146,7 @@ def measure(name: str, data: Path, out: Path, fold: int) -> dict[str, Any]:
     for kind, shapes in zip(COLUMNS, (unseen, known), strict=True):
         others = vertex_distances(linear.nearest(shapes, m), shapes, size)
         found[kind] = summary(encoded(model, shapes)) | {"components": summary(others), "shapes": len(shapes)}
+    found[ALONE] = found[COLUMNS[1]] | summary(encoded(forgetful(run), known))
     if fold:
         return found
     np.savez(out / "models" / f"{name}.npz", vertices=unseen)
@@ -144,16 +160,20 @@ def measure(name: str, data: Path, out: Path, fold: int) -> dict[str, Any]:
 
 def row(name: str, folds: list[dict[str, Any]]) -> str:
     """Of the table: means over all shapes, and the least and the greatest ratio of a fold."""
-    first = folds[0]
-    cells = ["" if name.endswith(HALF) else title(name), str(first["modes"]), str(len(folds))]
-    for kind in COLUMNS:
-        found = [fold[kind] for fold in folds]
+    first, remembering = folds[0], sum("trained on" in fold for fold in folds)
+    count = f"{len(folds)}, {remembering} remembering" if 0 < remembering < len(folds) else str(len(folds))
+    cells = ["" if name.endswith(HALF) else title(name), str(first["modes"]), count]
+    for kind in (*COLUMNS, ALONE):
+        found = [fold[kind] for fold in folds if kind in fold]
+        if not found:
+            cells += [""] * 4
+            continue
         figures = np.array([[(each[key], each["components"][key]) for key in ("mean", "p95")] for each in found])
         means = np.average(figures, axis=0, weights=[each["shapes"] for each in found])
-        shown = means if kind == "unseen" else means[:1]
-        cells += [f"{100 * figure:.3f}" for figure in shown.T.ravel()]
+        shown = {"unseen": means.T.ravel(), ALONE: means[0, :1]}.get(kind, means[0])
+        cells += [f"{100 * figure:.3f}" for figure in shown]
         ratios = figures[:, 0, 0] / figures[:, 0, 1]
-        cells += [f"{means[0, 0] / means[0, 1]:.2f}", f"{ratios.min():.2f} – {ratios.max():.2f}" if folds[1:] else ""]
+        cells += [f"{means[0, 0] / means[0, 1]:.2f}", f"{ratios.min():.2f} – {ratios.max():.2f}" if found[1:] else ""]
     cells += [f"{100 * figure:.2f}" for figure in first["specificity"]]
     cells += beside_images(first["unseen"], first.get("mirrored_components"))
     return f"| {' | '.join(cells)} |"
@@ -170,8 +190,10 @@ def main() -> None:
     for name in given.names:
         file = FIGURES / f"{name}.json"
         found = json.loads(file.read_text()) if file.exists() else []
-        for fold in range(len(found), given.folds):
-            found.append(measure(name, given.data, given.out, fold))
+        for fold in range(given.folds):
+            if fold < len(found) and COLUMNS[1] in found[fold]:
+                continue
+            found[fold : fold + 1] = [measure(name, given.data, given.out, fold)]
             file.parent.mkdir(exist_ok=True)
             file.write_text(json.dumps(found, indent=1), encoding="utf-8")
             write_page()

@@ -7,6 +7,7 @@ import json
 import shutil
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,7 @@ from shapespace.bundle.geometry import Geometry
 from shapespace.training.collection.generators import PRODUCTS
 from shapespace.training.collection.ingest import data_files
 from shapespace.training.learning.evaluation import alone, evaluate
+from shapespace.training.learning.examples import RememberingCombiner
 from shapespace.training.learning.export import export
 from shapespace.training.learning.learner import Learner
 from shapespace.training.report.page import write_report
@@ -270,6 +272,8 @@ def write_bundle_of(run: Run, figures: dict[str, Any]) -> Path:
     learner = learner_of(run)
     geometry = Geometry(reference=run.collection.reference) if run.by_design else space.geometry(directory)
     composite = learner.main()
+    if run.config.export.examples and not run.by_design:
+        composite = replace(composite, combiner=RememberingCombiner.of(composite, *space.examples(directory)))
     with waiting("bundle"):
         return export(
             composite,
@@ -288,7 +292,7 @@ def export_bundle(run: Run) -> None:
     folder = write_bundle_of(run, run.directory.evaluation.read())
     run.directory.log("exported", bundle=f"{folder.parent.name}/{folder.name}")
     if not run.by_design:
-        run.directory.log("encoded", **space.encoded(run.directory, folder))
+        run.directory.log("encoded", **space.encoded(run.directory, run.config, folder))
 
 
 #: The function of each stage. It continues from what an interrupted call has left.

@@ -34,6 +34,8 @@ from shapespace.training.runs.config import Config
 from shapespace.training.runs.sampling import Collection
 
 OPSET = 18
+#: Random codes, and codes of training shapes, at which ONNX and PyTorch are compared.
+CHECKED = 64
 
 
 class ExportError(RuntimeError):
@@ -132,7 +134,7 @@ def export(
         start: for start.onnx, where there is one.
 
     Raises:
-        ExportError: ONNX and PyTorch differ by more than the tolerance on 64 random codes, or the bundle contradicts
+        ExportError: ONNX and PyTorch differ by more than the tolerance at a code, or the bundle contradicts
             itself, or has no shape at a code inside its bounds.
     """
     settings, reference = config.export, collection.reference
@@ -141,7 +143,8 @@ def export(
     except NamingError as error:
         raise ExportError(str(error)) from None
     rng = np.random.default_rng(0)
-    latents = torch.as_tensor(collection.coordinates.uniform(64, rng), dtype=torch.float32)
+    codes = np.concatenate([collection.coordinates.uniform(CHECKED, rng), collection.codes[:CHECKED]])
+    latents = torch.as_tensor(codes, dtype=torch.float32)
     networks = _networks(composite, start, latents)
 
     measured = difference(composite, networks, latents, WeightedNorm.of(reference, config.evaluation.eta))

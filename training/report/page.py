@@ -209,10 +209,15 @@ def nearness(record: Record, studio: Studio | None) -> list[dict[str, Any]]:
             "pictures": _pair(record.run.least_general, facts["worst"], studio),
         })  # fmt: skip
     if facts := record.encoded:
+        modes = facts.get("modes")
         kinds.append({
             "title": "Shapes it has learned from",
-            "how": f"all {facts['shapes']}, through encode as it is served",
-            "figures": [("all coordinates", facts, facts["components"])],
+            "how": f"all {facts['shapes']}, through encode as it is served"
+            + (", where what it missed of them is remembered" if facts.get("remembered") else ""),
+            "figures": [
+                ("as served", facts, facts["components"]),
+                *([("modes alone, no networks", modes, facts["components"])] if modes else []),
+            ],
             "worst": facts["worst"],
             "pictures": _pair(record.run.least_near, facts["worst"], studio),
         })  # fmt: skip

@@ -454,6 +454,9 @@ class ExportSettings(_Section):
     """Licence of the meshes, and so of the model."""
     eta_reconstruction: float = Field(DEFAULT_ETA, gt=0)
     """Weight η of angles against lengths when vertices are found from them (Gauss–Newton)."""
+    examples: bool = True
+    """Whether the model remembers what modes and networks miss of the training shapes, and adds it where a code is
+    theirs. Other codes hardly notice."""
     tolerance: float = Field(1e-4, gt=0)
     """Largest relative difference of ONNX and PyTorch, in the weighted norm."""
     faces: Axis | None = None

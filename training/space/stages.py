@@ -17,7 +17,7 @@ from shapespace.arrays import FloatArray, IntArray
 from shapespace.bundle.geometry import FineMesh, Geometry
 from shapespace.bundle.schema import SurfaceEntry
 from shapespace.bundle.surface import from_entry, surface_arrays, surface_entry
-from shapespace.coordinates.nric import WeightedNorm
+from shapespace.coordinates.nric import WeightedNorm, nric
 from shapespace.mesh.coarsening import coarsen
 from shapespace.mesh.prolongation import Prolongation, submesh
 from shapespace.mesh.riders import find_rider
@@ -301,6 +301,7 @@ def modes(run: RunDirectory, config: Config) -> dict[str, Any]:
         "steps": list(found.steps),
         "via": list(found.via),
         "codes": [str(status) for status in codes.status],
+        "left": summary(vertex_distances(codes.vertices, shapes, run.reference_mesh().diagonal)[: whose.max() + 1]),
     }
     run.decomposition.write(facts | {"reasons": list(found.reasons), "history": sparse.history})
     return facts
@@ -370,10 +371,11 @@ def factors(run: RunDirectory, config: Config) -> dict[str, Any]:
     return {"factors": len(groups), "largest": max(map(len, groups))}
 
 
-def encoded(run: RunDirectory, bundle: Path) -> dict[str, Any]:
+def encoded(run: RunDirectory, config: Config, bundle: Path) -> dict[str, Any]:
     """``encoded.json``: how near a bundle's codes come to the shapes of the collection, and which are out of bounds.
 
-    By ``encode`` as it is served. And ``least-near.npz``, the farthest.
+    By ``encode`` as it is served, beside what modes leave without networks and without what a bundle remembers. And
+    ``least-near.npz``, the farthest.
     """
     model, reference, names = shapespace.load(bundle), run.reference_mesh(), run.shapes.read()["names"]
     given, scale = run.own_shapes(), float(run.reference.read()["scale"])
@@ -384,6 +386,8 @@ def encoded(run: RunDirectory, bundle: Path) -> dict[str, Any]:
     worst = int(away.mean(axis=1).argmax())
     facts = summary(away) | {
         "components": summary(other),
+        "modes": run.decomposition.read().get("left"),
+        "remembered": config.export.examples,
         "shapes": len(given),
         "outside": [str(name) for name, each in zip(names, found, strict=False) if not each.inside_bounds],
         "worst": str(names[worst]),
@@ -412,6 +416,12 @@ def collection(run: RunDirectory, config: Config) -> ShellCollection:
         scale=float(run.reference.read()["scale"]),
         codes=_known_codes(modes),
     )
+
+
+def examples(run: RunDirectory) -> tuple[FloatArray, FloatArray]:
+    """Codes (n, m) of the collection's own shapes, and their lengths and angles (n, 2E)."""
+    shapes, connectivity = run.own_shapes(), run.reference_mesh().connectivity
+    return run.modes.read()["coefficients"], np.stack([nric(shape, connectivity) for shape in shapes])
 
 
 def geometry(run: RunDirectory) -> Geometry:

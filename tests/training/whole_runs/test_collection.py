@@ -185,6 +185,9 @@ def test_a_run_leaves_what_the_contract_promises(run: Path) -> None:
         assert 0 < more < fewer < 0.1
     assert (encoded["shapes"], encoded["outside"]) == (8, [])
     assert 0 < encoded["mean"] < encoded["p95"] < 0.02
+    # What modes and these hasty networks miss is remembered; the fine mesh is still carried along.
+    assert encoded["remembered"]
+    assert encoded["mean"] < 0.5 * encoded["modes"]["mean"]
     assert report.index("Shapes it has not seen") < report.index("Shapes it has learned from") < report.index("R²")
     events = [json.loads(line) for line in (run / "log.jsonl").read_text().splitlines()]
     assert [e["stage"] for e in events if e["event"] == "end"] == list(STAGES)
