@@ -29,10 +29,12 @@ from shapespace.training.runs.sampling import DONE, KNOWN, columns
 ROOT = Path(__file__).resolve().parents[1]
 #: What the names of runs with the paper's modes end in: in the shell's norm, as sparse for all.
 SHELL, SHELL_MODES = "-shell", {"norm": "shell", "sparsity": 0.1, "log_steps": 16}
+#: The largest that 110 shapes give: as many modes and factors as the paper's bodies have.
+LARGEST = "hippocampus-80"
 #: Collections of real meshes, in the order of the tables; then the hand without sparse modes and with one factor, the
-#: dancer from few samples, and all with the paper's modes.
+#: dancer from few samples, the largest, and all with the paper's modes.
 COLLECTIONS = ("hand", "faces", "samba", "makehuman", "horse", "hippocampus")
-CONTRASTS = ("hand-pga", "hand-one-factor", "samba-few", *(name + SHELL for name in COLLECTIONS))
+CONTRASTS = ("hand-pga", "hand-one-factor", "samba-few", LARGEST, *(name + SHELL for name in COLLECTIONS))
 #: The bundled collection of shapes; its other figures are on the page of the bundled models.
 MANNEQUIN = "figure"
 #: What the names of runs with mirror images end in, and the collections that have a symmetric shape.
@@ -207,6 +209,7 @@ def write_page() -> None:
         rows=rows,
         real=real,
         shell={name: rows[name + SHELL] for name in COLLECTIONS if name + SHELL in rows},
+        largest=rows.get(LARGEST),
         missing=[name for name in COLLECTIONS if name not in rows],
         spread=spread,
         joint=joint_exponentials,
