@@ -8,6 +8,7 @@ entries is the loss with both halves normalised.
 from __future__ import annotations
 
 import itertools
+import math
 
 import numpy as np
 import torch
@@ -22,6 +23,8 @@ from shapespace.training.runs.latent_coordinates import Coordinates
 
 #: Smallest number of entries of a tensor that is stored in 8 or 16 bits, if these hold its values exactly.
 NARROWED_SIZE = 1024
+#: Most polynomials of a layer: cubics of 47 coordinates. Of 80 there would be 91,881.
+MOST_MONOMIALS = 20_000
 
 
 def half_precision(x: Tensor) -> Tensor:
@@ -199,6 +202,11 @@ class Polynomials(nn.Module):
         values = (x[:, :, None] ** self.power @ self.legendre).flatten(1)
         # One gather and one product for all coordinates: the time of a small network is its number of operations.
         return values.index_select(1, self.columns).unflatten(1, self.exponents.shape).prod(dim=1) * self.sizes
+
+
+def affordable_degree(degree: int, coordinates: int) -> int:
+    """The largest total degree, at most the one given and at least one, with no more than `MOST_MONOMIALS`."""
+    return next((d for d in range(degree, 1, -1) if math.comb(coordinates + d, d) <= MOST_MONOMIALS), 1)
 
 
 def patch_entries(midpoints: FloatArray, count: int, seed: int) -> list[IntArray]:

@@ -30,6 +30,7 @@ from shapespace.training.learning.layers import (
     PatchBasis,
     Polynomials,
     Scaling,
+    affordable_degree,
     perceptron,
 )
 from shapespace.training.learning.linear import principal_axes, regression
@@ -96,7 +97,7 @@ class FactorNetwork(ShapeNetwork):
         if settings.skip_orders:
             self.skip_features = FourierProducts(coordinates, settings.skip_orders)
         elif settings.skip_degree and not np.isfinite(coordinates.period).any():
-            self.skip_features = Polynomials(coordinates, settings.skip_degree)
+            self.skip_features = Polynomials(coordinates, affordable_degree(settings.skip_degree, len(coordinates)))
         if self.skip_features is not None:
             self.register_buffer("skip", torch.zeros(self.skip_features.size, size))
             # Training starts from the fitted layer alone.
@@ -118,8 +119,8 @@ class FactorNetwork(ShapeNetwork):
     def fit_skip(self, latent: Tensor, target: Tensor, held_out: tuple[Tensor, Tensor]) -> None:
         """Fit the linear layer to coefficients by ridge regression; pairs held out choose its penalty."""
         if self.skip_features is not None:
-            chosen = self.skip_features(held_out[0]), held_out[1]
-            self.skip.copy_(regression(self.skip_features(latent), target, chosen).weights)
+            features, chosen = (predict(self.skip_features, x) for x in (latent, held_out[0]))
+            self.skip.copy_(regression(features, target, (chosen, held_out[1])).weights)
 
     def forward(self, latent: Tensor) -> Tensor:
         y = self.coefficients(latent)

@@ -185,7 +185,8 @@ class LatentNetworkSettings(_Section):
     """Largest frequency of each coordinate in a linear layer of Fourier products beside the hidden ones, fitted by
     ridge regression; an empty list leaves it out. All coordinates must be periodic."""
     skip_degree: int = Field(3, ge=0)
-    """Total degree of the polynomials in such a layer, for factors without a periodic coordinate; 0 leaves it out."""
+    """Total degree of the polynomials in such a layer, for factors without a periodic coordinate; 0 leaves it out.
+    Less for factors of so many coordinates that there would be more than 20,000 polynomials."""
     patches: int = Field(1, ge=1)
     """Groups of neighbouring edges, each with a principal basis of its own, in the last layer."""
     energy: float = Field(0.9999, gt=0, le=1)

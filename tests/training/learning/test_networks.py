@@ -31,6 +31,7 @@ from shapespace.training.learning.layers import (
     PatchBasis,
     Polynomials,
     Scaling,
+    affordable_degree,
 )
 from shapespace.training.learning.metric import learned_metric
 from shapespace.training.learning.networks import (
@@ -88,6 +89,14 @@ def test_flaps_are_the_other_edges_of_the_two_faces_in_order(mesh: str, request:
             apex = connectivity.edge_opposite[e, side]
             expected = [len(index)] * 2 if apex < 0 else [index[tuple(sorted((end, apex)))] for end in (i, j)]
             assert table[e, 2 * side : 2 * side + 2].tolist() == expected
+
+
+def test_a_factor_of_many_coordinates_takes_polynomials_of_a_lower_degree() -> None:
+    degrees = [affordable_degree(3, m) for m in (12, 40, 47, 48, 80, 500)]
+    assert degrees == [3, 3, 3, 2, 2, 1]
+    coordinates = Coordinates(-np.ones(80), np.ones(80), np.full(80, np.nan))
+    network = FactorNetwork(LatentNetworkSettings(hidden=[4]), coordinates, Scaling.blank(6), None)
+    assert network.skip.shape == (1 + 80 + 80 * 81 // 2, 6)
 
 
 def star(connectivity: Connectivity) -> np.ndarray:
