@@ -58,8 +58,8 @@ principal components of the same four fifths' fine meshes. **trained on**: the s
 which a bundle [remembers](../explanation/mathematics.md#networks): it adds what modes and networks miss of them.
 Components remember nothing, so this says that users get their own shapes back, not that the modes are better;
 **nothing remembered** is a model without it (`export.examples = false`) beside the same components. Rows without
-figures of *trained on* were measured before models remembered, unseen shapes too. **of folds**: the least and the
-greatest ratio of a fold.
+figures of *trained on*, and of others the folds that are not said to be remembering, were measured before models
+remembered, unseen shapes too. **of folds**: the least and the greatest ratio of a fold.
 
 Of the first fold alone: **specificity**, the mean distance of {codes} random shapes, uniform in the bounds of the codes
 or of the components' coefficients, to the nearest of the shapes that made the model (lower is better); and the last
