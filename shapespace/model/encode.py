@@ -30,7 +30,9 @@ SWEEPS, PROMISING = 4, 1.2
 TOLERANCE, GAIN, SHAPES = 1e-4, 1e-4, 25
 #: A search that took so many shapes is begun once more from a training shape, one of at most so many, if at least so
 #: many shapes are left, and the code there differs by more than this fraction of the bounds' width.
-LONG, KNOWN, FEWEST, DIFFERENT = 10, 200, 5, 0.01
+LONG, KNOWN, FEWEST, DIFFERENT = 10, 512, 5, 0.01
+#: Of so many training shapes, the nearest by guesses, lengths and angles are compared.
+CANDIDATES = 5
 #: Where codes outside the bounds are allowed: by how much, a fraction of the bounds' width.
 MARGIN = 0.5
 #: A code inside is preferred if so many more shapes, and those that the search left over, find one whose distance is at
@@ -107,7 +109,8 @@ class Encoder:
     By lengths and angles it minimises ``‖z(code) − z‖_{2,z̄}``, angles compared modulo 2π, in two rounds, whatever the
     pose. The first takes the factors alone, ``z̄ + Σ_j (ψ_j − z̄)``, which come within a few percent and cost little;
     where a factor has periodic coordinates it begins at the best of a grid. The second takes the whole composite, and
-    rarely needs more than a handful of evaluations beside one Jacobian.
+    rarely needs more than a handful of evaluations beside one Jacobian; it begins once more from a training shape that is
+    nearer.
 
     By vertices it goes on from there to the minimum of ``Σ_i n_i ‖x_i(code) − x_i‖²`` over the vertices of the coarse
     mesh, after rigid alignment, where n_i of the vertices that are given lie nearest to vertex i: small angles add up
@@ -159,10 +162,11 @@ class Encoder:
         fixed = latents.fixed() if fixed is None else fixed
         lower, upper = latents.box_around(fixed, MARGIN if bounds is not Bounds.CLAMP else 0.0)
         box = Box(lower, upper, latents.width)
+        nearby = model.nearby(given.mesh)
+        aim = Aim(vertices, nearby / nearby.sum())
         fit = self._by_nric(target, box, fixed, deadline)
+        fit = self._at_training_shape_if_nearer(aim, target, fit, box, fixed, deadline)
         if objective is Objective.VERTICES and fit.status is not Status.DEADLINE:
-            nearby = model.nearby(given.mesh)
-            aim = Aim(vertices, nearby / nearby.sum())
             near, fit = fit, self._by_vertices(aim, fit, box, fixed, deadline)
             if bounds is not Bounds.CLAMP:
                 fit = self._inside_if_as_near(aim, fit, fixed, deadline)
@@ -226,6 +230,30 @@ class Encoder:
         """Of the coarse mesh; made once, as they take as long as a shape."""
         return patches_of(self.model.reference.vertices)
 
+    def _at_training_shape_if_nearer(
+        self, aim: Aim, target: FloatArray, fit: Fit, box: Box, fixed: Fixed, deadline: Deadline | None
+    ) -> Fit:
+        """The fit to lengths and angles, or one that begins at a training shape where it is nearer there.
+
+        What a bundle remembers of a training shape reaches only so far around its code, and a search may pass it by.
+        """
+        if fit.status is Status.DEADLINE:
+            return fit
+        nearest, least = fit.x, np.sqrt(fit.cost)
+        for code in self._training_codes(aim)[:CANDIDATES]:
+            x = np.clip(fixed.into(code), box.lower, box.upper)
+            misfit = np.linalg.norm(self._root * self._difference(self.model.nric(x), target))
+            if misfit < least:
+                nearest, least = x, misfit
+        return fit if nearest is fit.x else self._from(nearest, target, box, fixed, deadline)
+
+    def _training_codes(self, aim: Aim) -> FloatArray:
+        """Codes (n, m) of training shapes, by guesses the nearest first; none where guesses can't be made."""
+        if self._known is None:
+            return np.zeros((0, self.model.latents.dimension))
+        codes, shapes = self._known
+        return codes[np.argsort([np.linalg.norm(aim.misfit(shape)) for shape in shapes])]
+
     def _from_training_shape_if_nearer(
         self, aim: Aim, target: FloatArray, near: Fit, fit: Fit, fixed: Fixed, deadline: Deadline | None
     ) -> Fit:
@@ -238,9 +266,7 @@ class Encoder:
         if fit.iterations < LONG or left < FEWEST or fit.status is Status.DEADLINE or self._known is None:
             return fit
         box = Box(*self.model.latents.box_around(fixed, 0.0), self.model.latents.width)
-        codes, shapes = self._known
-        nearest = int(np.argmin([np.linalg.norm(aim.misfit(shape)) for shape in shapes]))
-        start = np.clip(fixed.into(codes[nearest]), box.lower, box.upper)
+        start = np.clip(fixed.into(self._training_codes(aim)[0]), box.lower, box.upper)
         other = self._from(start, target, box, fixed, deadline)
         if np.abs(self.model.latents.shorter(other.x - near.x) / box.scale).max() < DIFFERENT:
             return fit

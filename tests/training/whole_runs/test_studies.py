@@ -41,7 +41,7 @@ def test_the_page_of_results_says_what_was_measured(tmp_path: Path, monkeypatch:
 def test_a_row_of_folds_counts_each_shape_once() -> None:
     def fold(own: float, components: float, shapes: int) -> dict[str, object]:
         found = {"mean": own, "p95": 0.1, "components": {"mean": components, "p95": 0.1}, "shapes": shapes}
-        return {"modes": 6, "specificity": [0.1, 0.2], **dict.fromkeys(served.COLUMNS, found)}
+        return {"modes": 6, "specificity": [0.1, 0.2], **dict.fromkeys((*served.COLUMNS, served.ALONE), found)}
 
     row = served.row("hand-half", [fold(0.01, 0.02, 1), fold(0.04, 0.02, 3)])
     cells = [cell.strip() for cell in row.strip("|").split("|")]
