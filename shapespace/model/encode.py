@@ -109,8 +109,8 @@ class Encoder:
     By lengths and angles it minimises ``‖z(code) − z‖_{2,z̄}``, angles compared modulo 2π, in two rounds, whatever the
     pose. The first takes the factors alone, ``z̄ + Σ_j (ψ_j − z̄)``, which come within a few percent and cost little;
     where a factor has periodic coordinates it begins at the best of a grid. The second takes the whole composite, and
-    rarely needs more than a handful of evaluations beside one Jacobian; it begins once more from a training shape that is
-    nearer.
+    rarely needs more than a handful of evaluations beside one Jacobian; it begins once more from a training
+    shape that is nearer.
 
     By vertices it goes on from there to the minimum of ``Σ_i n_i ‖x_i(code) − x_i‖²`` over the vertices of the coarse
     mesh, after rigid alignment, where n_i of the vertices that are given lie nearest to vertex i: small angles add up

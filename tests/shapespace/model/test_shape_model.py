@@ -5,7 +5,7 @@ import shutil
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import httpx
 import numpy as np
@@ -228,7 +228,8 @@ def test_a_search_that_went_astray_begins_once_more_from_the_nearest_training_sh
     searches = iter(range(9))
 
     def astray(self: Encoder, *given: Any) -> Fit:
-        return replace(by_nric(self, *given), x=model.upper)
+        found = by_nric(self, *given)
+        return replace(found, x=model.upper, residuals=0 * found.residuals)
 
     def stuck(self: Encoder, aim: Aim, near: Fit, *given: Any, **more: Any) -> Fit:
         if next(searches) == 0:
@@ -241,3 +242,23 @@ def test_a_search_that_went_astray_begins_once_more_from_the_nearest_training_sh
     assert found.distances.mean() < 1e-5 * size
     assert LONG < found.iterations <= 30
     assert found.status is Status.CONVERGED
+
+
+def test_a_search_begins_at_a_training_shape_that_is_nearer(models: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A search by lengths and angles that ends elsewhere, as where a bundle remembers more than reaches that far."""
+    model = load(models / "figure")
+    codes = read_bundle(models / "figure" / "2").training_codes
+    assert codes is not None
+    given = model.decode(codes[20])
+    by_nric = Encoder._by_nric
+
+    def elsewhere(self: Encoder, *given: Any) -> Fit:
+        found = by_nric(self, *given)
+        return replace(found, x=model.upper, residuals=1 + found.residuals)
+
+    monkeypatch.setattr(Encoder, "_by_nric", elsewhere)
+    objectives: tuple[Literal["vertices", "nric"], ...] = ("vertices", "nric")
+    for objective in objectives:
+        found = model.encode(given, objective=objective)
+        assert found.distances.mean() < 1e-4 * np.linalg.norm(np.ptp(given, axis=0))
+        assert found.iterations <= 3
