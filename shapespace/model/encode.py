@@ -165,12 +165,13 @@ class Encoder:
         nearby = model.nearby(given.mesh)
         aim = Aim(vertices, nearby / nearby.sum())
         fit = self._by_nric(target, box, fixed, deadline)
-        fit = self._at_training_shape_if_nearer(aim, target, fit, box, fixed, deadline)
+        known = self._training_codes(aim)
+        fit = self._at_training_shape_if_nearer(known, target, fit, box, fixed, deadline)
         if objective is Objective.VERTICES and fit.status is not Status.DEADLINE:
             near, fit = fit, self._by_vertices(aim, fit, box, fixed, deadline)
             if bounds is not Bounds.CLAMP:
                 fit = self._inside_if_as_near(aim, fit, fixed, deadline)
-            fit = self._from_training_shape_if_nearer(aim, target, near, fit, fixed, deadline)
+            fit = self._from_training_shape_if_nearer(known, aim, target, near, fit, fixed, deadline)
         code, inside = latents.found(fit.x, bounds, fixed)
         coarse = model.shape(code, inside, MeshChoice.COARSE, deadline)
         posterior = self._posterior(code, coarse.vertices / model.manifest.scale, vertices, fixed)
@@ -231,7 +232,7 @@ class Encoder:
         return patches_of(self.model.reference.vertices)
 
     def _at_training_shape_if_nearer(
-        self, aim: Aim, target: FloatArray, fit: Fit, box: Box, fixed: Fixed, deadline: Deadline | None
+        self, known: FloatArray, target: FloatArray, fit: Fit, box: Box, fixed: Fixed, deadline: Deadline | None
     ) -> Fit:
         """The fit to lengths and angles, or one that begins at a training shape where it is nearer there.
 
@@ -240,7 +241,7 @@ class Encoder:
         if fit.status is Status.DEADLINE:
             return fit
         nearest, least = fit.x, np.sqrt(fit.cost)
-        for code in self._training_codes(aim)[:CANDIDATES]:
+        for code in known[:CANDIDATES]:
             x = np.clip(fixed.into(code), box.lower, box.upper)
             misfit = np.linalg.norm(self._root * self._difference(self.model.nric(x), target))
             if misfit < least:
@@ -255,7 +256,14 @@ class Encoder:
         return codes[np.argsort([np.linalg.norm(aim.misfit(shape)) for shape in shapes])]
 
     def _from_training_shape_if_nearer(
-        self, aim: Aim, target: FloatArray, near: Fit, fit: Fit, fixed: Fixed, deadline: Deadline | None
+        self,
+        known: FloatArray,
+        aim: Aim,
+        target: FloatArray,
+        near: Fit,
+        fit: Fit,
+        fixed: Fixed,
+        deadline: Deadline | None,
     ) -> Fit:
         """The fit to vertices, or one from the training shape that is nearest, with the shapes that are left.
 
@@ -263,10 +271,10 @@ class Encoder:
         search takes long there; elsewhere it ends at once.
         """
         left = SHAPES + INSIDE - fit.iterations
-        if fit.iterations < LONG or left < FEWEST or fit.status is Status.DEADLINE or self._known is None:
+        if fit.iterations < LONG or left < FEWEST or fit.status is Status.DEADLINE or not len(known):
             return fit
         box = Box(*self.model.latents.box_around(fixed, 0.0), self.model.latents.width)
-        start = np.clip(fixed.into(self._training_codes(aim)[0]), box.lower, box.upper)
+        start = np.clip(fixed.into(known[0]), box.lower, box.upper)
         other = self._from(start, target, box, fixed, deadline)
         if np.abs(self.model.latents.shorter(other.x - near.x) / box.scale).max() < DIFFERENT:
             return fit

@@ -420,8 +420,7 @@ def collection(run: RunDirectory, config: Config) -> ShellCollection:
 
 def examples(run: RunDirectory) -> tuple[FloatArray, FloatArray]:
     """Codes (n, m) of all shapes that were learned from, mirror images last, and their lengths and angles (n, 2E)."""
-    shapes, connectivity = run.shapes.read()["vertices"], run.reference_mesh().connectivity
-    return _known_codes(run.modes.read()), np.stack([nric(shape, connectivity) for shape in shapes])
+    return _known_codes(run.modes.read()), nric(run.shapes.read()["vertices"], run.reference_mesh().connectivity)
 
 
 def geometry(run: RunDirectory) -> Geometry:
