@@ -139,8 +139,9 @@ CORRECTIONS: dict[str, type[Correction]] = {
 #: Share of the kernel's squared error on held-out codes below which another kind, which takes longer, is chosen.
 BETTER = 0.9
 #: Of how many shapes of a factor principal components are counted until they hold 99 % of the variance, and from how
-#: many on something wanders over the surface: a bump on a torus needs hundreds, a body with forty modes about forty.
-LOOKED_AT, WANDERING = 500, 100
+#: many on, in all and for each latent, something wanders over the surface. A bump on a torus needs hundreds for its two
+#: latents; factors of bodies, faces and hippocampi with up to 80 latents at most 3.4 for each.
+LOOKED_AT, WANDERING, FOR_EACH_LATENT = 500, 100, 5
 #: Convolutions that follow a bump over a torus (docs/measurements/notes.md, Freaky Torus for three epochs).
 FOLLOWING = ConvolutionSettings(
     layers=5,
@@ -161,8 +162,10 @@ def _follower(own: JointSamples) -> ResolvedCorrection | None:
     """What ``auto`` tries beside the kernel, by a quick look: nothing where nothing wanders over the surface."""
     if own.motion:
         return FieldSettings()
-    components = (_components(y) for y in own.inputs[:LOOKED_AT].unbind(dim=1))
-    return FOLLOWING if max(components) > WANDERING else None
+    latents = own.slopes.latents if own.slopes else [[]] * own.factors.shape[1]
+    usual = (max(WANDERING, FOR_EACH_LATENT * len(index)) for index in latents)
+    shapes = own.inputs[:LOOKED_AT].unbind(dim=1)
+    return FOLLOWING if any(_components(y) > most for y, most in zip(shapes, usual, strict=True)) else None
 
 
 def _components(y: Tensor) -> int:

@@ -200,6 +200,24 @@ def test_every_correction_finds_an_interplay_from_factors_alone(
     assert after < left * before
 
 
+@pytest.mark.parametrize(("latents", "tried"), [(120, ["kernel"]), (12, ["kernel", "convolutions"])])
+def test_auto_tries_nothing_else_where_shapes_vary_as_much_as_latents_do(
+    ball: TriangleMesh, latents: int, tried: list[str]
+) -> None:
+    """120 directions are many for twelve latents, for 120 they are what is to be expected."""
+    rng = np.random.default_rng(0)
+    reference = torch.from_numpy(nric(ball.vertices, ball.connectivity)).float()
+    varied = rng.normal(size=(240, 120)) @ rng.normal(size=(120, len(reference)))
+    z = reference + 0.01 * torch.from_numpy(varied).float()
+    scale = scaling(ball, z.numpy())
+    derivatives = torch.zeros(1, latents, len(reference))
+    slopes = Slopes(scale.down(z[:1, None]), [list(range(latents))], derivatives, derivatives)
+    own, held_out = (JointSamples(z[part, None], z[part], scale) for part in (slice(200), slice(200, None)))
+    with torch.no_grad():
+        network = CombinerNetwork.fit(AutoSettings(), ball, replace(own, slopes=slopes), held_out, 0)
+    assert list(network.tried) == tried
+
+
 def test_derivatives_teach_a_correction(ball: TriangleMesh) -> None:
     """With those at 12 of 15 samples it errs less than without, and with wrong ones more."""
     rng, count = np.random.default_rng(0), 12
