@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -29,7 +30,8 @@ class SavedNetwork:
     """What a network's file holds.
 
     Attributes:
-        state: of training: ``done``, ``epoch``, ``best`` validation loss, ``history`` of (train, validation) losses.
+        state: of training: ``done``, ``epoch``, ``seconds``, ``best`` validation loss, ``history`` of (train,
+            validation) losses.
         metadata: of the network, see `ShapeNetwork.metadata`.
         tensors: its ``state_dict()``.
         extra: of an unfinished one, the rest that is needed to continue.
@@ -114,11 +116,12 @@ def fit(
         # What was fitted in closed form may be better than any epoch.
         network.eval()
         error = _error(network, inputs[validation], target[validation], settings.batch_size)
-        state = {"done": False, "epoch": 0, "best": error, "history": []}
+        state = {"done": False, "epoch": 0, "seconds": 0.0, "best": error, "history": []}
         best = _copied(network)
 
     epochs = bar(title, "epoch", settings.max_epochs, initial=state["epoch"])
     while not state["done"]:
+        start = time.monotonic()
         total = _epoch(network, optimisers, inputs, target, train, settings.batch_size)
         network.eval()
         error = _error(network, inputs[validation], target[validation], settings.batch_size)
@@ -135,7 +138,9 @@ def fit(
         rate = optimisers[0].param_groups[0]["lr"]
         epochs.set_postfix(train=f"{total:.2e}", validation=f"{error:.2e}", rate=f"{rate:.0e}")
         epochs.update()
-        state["done"] = state["epoch"] >= settings.max_epochs or rate < settings.final_rate
+        state["seconds"] += time.monotonic() - start
+        late = settings.minutes is not None and state["seconds"] > 60 * settings.minutes
+        state["done"] = state["epoch"] >= settings.max_epochs or rate < settings.final_rate or late
         if not state["done"] and state["epoch"] % CHECKPOINT_EPOCHS == 0:
             _checkpoint(path, network, optimisers, schedules, state, best)
     epochs.close()

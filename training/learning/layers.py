@@ -217,12 +217,22 @@ def patch_entries(midpoints: FloatArray, count: int, seed: int) -> list[IntArray
     return [np.concatenate([own, edges + own]) for own in members]
 
 
+def supporting(y: NDArray, share: float) -> NDArray[np.bool_]:
+    """(2E,) entries of the fewest edges that hold this share of the variance of scaled differences y (n, 2E)."""
+    variance = y.var(axis=0, dtype=np.float64).reshape(2, -1).sum(axis=0)
+    strongest = np.argsort(-variance, kind="stable")
+    held = np.cumsum(variance[strongest])
+    few = np.zeros(len(variance), dtype=bool)
+    few[strongest[: 1 + np.searchsorted(held[:-1], share * held[-1])]] = True
+    return np.tile(few | (share == 1), 2)
+
+
 class PatchBasis(nn.Module):
     """A linear last layer of low rank: an orthonormal principal basis for each patch of neighbouring edges.
 
     A variation that wanders over the surface has no small basis on all of it, but has one within a patch.
     The basis is orthonormal up to one common factor, so the mean square of what is missed is the same, up to that
-    factor, in coefficients as in scaled differences.
+    factor, in coefficients as in scaled differences. Entries in no patch keep their mean.
     """
 
     mean: Tensor
@@ -236,8 +246,10 @@ class PatchBasis(nn.Module):
         for i, basis in enumerate(bases):
             self.register_buffer(f"basis{i}", half_precision(torch.as_tensor(basis.T.copy(), dtype=torch.float32)))
         order = np.concatenate(entries)
+        place = np.full(len(mean), len(order))
+        place[order] = np.arange(len(order))
         self.register_buffer("order", torch.as_tensor(order))
-        self.register_buffer("place", torch.as_tensor(np.argsort(order)))
+        self.register_buffer("place", torch.as_tensor(place))
 
     @classmethod
     def blank(cls, tensors: dict[str, Tensor]) -> PatchBasis:
@@ -245,16 +257,20 @@ class PatchBasis(nn.Module):
         sizes = [tensors[f"basis{i}"].shape for i in range(sum(name.startswith("basis") for name in tensors))]
         stops = np.cumsum([size for _, size in sizes])
         entries = [np.arange(stop - size, stop) for stop, (_, size) in zip(stops, sizes, strict=True)]
-        return cls(entries, [np.zeros((size, rank)) for rank, size in sizes], np.zeros(stops[-1]))
+        return cls(entries, [np.zeros((size, rank)) for rank, size in sizes], np.zeros(len(tensors["mean"])))
 
     @classmethod
-    def fit(cls, y: NDArray, midpoints: FloatArray, patches: int, energy: float, seed: int) -> PatchBasis:
+    def fit(
+        cls, y: NDArray, midpoints: FloatArray, patches: int, energy: float, seed: int, support: float = 1
+    ) -> PatchBasis:
         """Principal bases of scaled differences y (n, 2E).
 
         Of all axes of all patches those of the largest variance are kept, until they hold the share ``energy`` of it.
+        Before that only so many edges are, those that vary most, as hold the share ``support`` of all variance.
         """
-        mean = y.mean(axis=0)
-        entries, values, vectors = patch_entries(midpoints, patches, seed), [], []
+        mean, vary = y.mean(axis=0), supporting(y, support)
+        entries = [own[vary[own]] for own in patch_entries(midpoints, patches, seed)]
+        entries, values, vectors = [own for own in entries if len(own)], [], []
         for columns in entries:
             d = torch.as_tensor((y[:, columns] - mean[columns]).astype(np.float64))
             s, axes = principal_axes(d, by="svd" if len(d) < len(columns) else "columns")
@@ -284,10 +300,13 @@ class PatchBasis(nn.Module):
 
     def forward(self, coefficients: Tensor) -> Tensor:
         """Scaled differences (n, 2E) of coefficients (n, rank)."""
-        if len(self.ranks) == 1:
+        everywhere = len(self.order) == len(self.mean)
+        if len(self.ranks) == 1 and everywhere:
             return coefficients @ self._bases()[0] + self.mean
         parts = coefficients.split(self.ranks, dim=1)
         y = torch.cat([part @ basis for part, basis in zip(parts, self._bases(), strict=True)], dim=1)
+        if not everywhere:
+            y = nn.functional.pad(y, (0, 1))
         return y.index_select(1, self.place) + self.mean
 
 

@@ -14,9 +14,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from pydantic import BaseModel
+from scipy import sparse
 from torch import Tensor
 
 from shapespace.arrays import FloatArray, IntArray
+from shapespace.coordinates.integrability import Integrability
 from shapespace.coordinates.nric import WeightedNorm, nric
 from shapespace.training.learning.baselines import LatentKernel
 from shapespace.training.learning.corrections import JointSamples, Motion, Slopes
@@ -119,6 +121,12 @@ class Learner:
         reference = self.collection.reference
         return nric(reference.vertices, reference.connectivity)
 
+    @property
+    def _closing(self) -> sparse.csr_array:
+        """(q, 2E) derivatives of the closing conditions around vertices at the reference."""
+        conditions = Integrability(self.collection.reference.connectivity)
+        return conditions.jacobian(self._reference)[: 3 * len(conditions.vertices)]
+
     def _path(self, kind: str, fractions: Sequence[float], *settings: BaseModel) -> Path:
         decides = [self._data_key, fractions, self.seed]
         text = json.dumps([*decides, [s.model_dump(mode="json") for s in settings]])
@@ -182,6 +190,8 @@ class Learner:
         z = drawn.nric[rows["train"]]
         scaling = self._scaling(z)
         network = FactorNetwork(settings, coordinates, scaling, self._basis(settings, scaling, z))
+        if settings.integrability:
+            network.penalise(self._closing, settings.integrability)
         if not saved:
             own_pair, held_out = (
                 (latents, network.target(exact)) for latents, exact in map(data.part, ("train", "validation"))
@@ -195,7 +205,7 @@ class Learner:
         if settings.energy == 1:
             return None
         y, midpoints = scaling.down(torch.from_numpy(z)).numpy(), self.collection.reference.edge_midpoints
-        return PatchBasis.fit(y, midpoints, settings.patches, settings.energy, self.seed)
+        return PatchBasis.fit(y, midpoints, settings.patches, settings.energy, self.seed, settings.support)
 
     def factor_samples(self, j: int) -> Samples:
         """The samples of a factor alone."""

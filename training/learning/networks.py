@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from pydantic import TypeAdapter
+from scipy import sparse
 from torch import Tensor, nn
 
 from shapespace.arrays import FloatArray
@@ -81,6 +82,9 @@ class FactorNetwork(ShapeNetwork):
     A perceptron, and a last layer that maps its coefficients to scaled differences; without ``basis`` the perceptron's
     own last layer does so. ``skip`` is a linear map from latents to the coefficients beside the perceptron: of Fourier
     products, for detail too fine for a perceptron, or of polynomials, since an exponential is smooth in its velocity.
+
+    Attributes:
+        metric: (rank, rank) that errors of coefficients are multiplied with in the loss; None for the mean square.
     """
 
     skip: Tensor
@@ -90,6 +94,7 @@ class FactorNetwork(ShapeNetwork):
     ) -> None:
         super().__init__()
         self.scaling, self.basis = scaling, basis
+        self.metric: Tensor | None = None
         size = basis.rank if basis is not None else len(scaling.mean)
         self.features = LatentFeatures(coordinates, settings.fourier)
         self.hidden = perceptron([self.features.size, *settings.hidden, size])
@@ -115,6 +120,26 @@ class FactorNetwork(ShapeNetwork):
         if self.skip_features is not None:
             result = result + self.skip_features(inputs) @ self.skip
         return result
+
+    def penalise(self, closing: sparse.csr_array, weight: float) -> None:
+        """Let errors that no change of a surface makes count more in the loss.
+
+        Args:
+            closing: (q, 2E) derivatives of the closing conditions by NRIC, see `Integrability`.
+            weight: of their squares, scaled to the mean square of errors that are alike in all directions.
+        """
+        each = torch.eye(len(self.scaling.mean))
+        if self.basis is not None:
+            each = self.basis(torch.eye(self.basis.rank)) - self.basis.mean
+        change = closing @ (each * self.scaling.inverse).double().numpy().T
+        gram = torch.from_numpy(change.T @ change)
+        gram *= weight * len(gram) / gram.trace()
+        self.metric = torch.linalg.cholesky(torch.eye(len(gram)) + gram).float()
+
+    def loss(self, inputs: Tensor, target: Tensor) -> Tensor:
+        """Mean square error of coefficients, in the metric if there is one."""
+        missed = self.coefficients(inputs) - target
+        return (missed if self.metric is None else missed @ self.metric).square().mean()
 
     def fit_skip(self, latent: Tensor, target: Tensor, held_out: tuple[Tensor, Tensor]) -> None:
         """Fit the linear layer to coefficients by ridge regression; pairs held out choose its penalty."""
@@ -158,7 +183,7 @@ def choices(settings: CorrectionSettings) -> list[ResolvedCorrection]:
     return [KernelSettings(), FieldSettings(), FOLLOWING] if isinstance(settings, AutoSettings) else []
 
 
-def _follower(own: JointSamples) -> ResolvedCorrection | None:
+def _follower(own: JointSamples) -> FieldSettings | ConvolutionSettings | None:
     """What ``auto`` tries beside the kernel, by a quick look: nothing where nothing wanders over the surface."""
     if own.motion:
         return FieldSettings()
@@ -232,7 +257,8 @@ class CombinerNetwork(ShapeNetwork):
         tried = {"kernel": error(chosen)}
         follower = _follower(own)
         if follower and time.monotonic() - start < 60 * settings.minutes:
-            other = fit(follower)
+            within = follower.fit.model_copy(update={"minutes": settings.minutes})
+            other = fit(follower.model_copy(update={"fit": within}))
             tried[follower.kind] = error(other)
             if tried[follower.kind] < BETTER * tried["kernel"]:
                 chosen = other

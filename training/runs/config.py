@@ -169,6 +169,8 @@ class FitSettings(_Section):
     """Most passes over the training samples."""
     batch_size: int = Field(64, ge=2)
     """Number of samples per step."""
+    minutes: float | None = Field(None, gt=0)
+    """Training ends with the epoch in which it has taken so long; what was best by then is kept."""
 
 
 class LatentNetworkSettings(_Section):
@@ -191,6 +193,12 @@ class LatentNetworkSettings(_Section):
     """Groups of neighbouring edges, each with a principal basis of its own, in the last layer."""
     energy: float = Field(0.9999, gt=0, le=1)
     """Share of the variance that this basis keeps; 1 makes the last layer dense, as in the paper."""
+    support: float = Field(1, gt=0, le=1)
+    """Share of the variance on the edges that this basis has entries for. With less than 1 the network is sparse, the
+    file smaller: edges that hardly vary keep their mean. A dense last layer has all."""
+    integrability: float = Field(0, ge=0)
+    """Weight, in gradient descent, of errors that change lengths and angles as no surface can: how far faces around a
+    vertex are from closing (to first order at the mean), scaled to the mean square error of errors in any direction."""
     fit: FitSettings = FitSettings(schedule="cosine", learning_rate=2e-3, max_epochs=60)
     """How the network is trained."""
 
@@ -305,8 +313,8 @@ class AutoSettings(_Section):
     """
 
     kind: Literal["auto"] = "auto"
-    minutes: float = Field(30, ge=0)
-    """No other kind is tried where the kernel alone took longer."""
+    minutes: float = Field(30, gt=0)
+    """The other kind is trained for so long at most, and not tried where the kernel alone took longer."""
 
 
 #: The kinds that a network can be of; ``auto`` and ``paper`` stand for one of them.

@@ -96,3 +96,10 @@ def test_the_rate_falls_on_a_plateau_and_ends_the_fit(data: tuple, tmp_path: Pat
     fit(data, tmp_path / "n.safetensors", settings)
     state = fitting.read_network(tmp_path / "n.safetensors").state
     assert state["epoch"] < 500
+
+
+def test_a_fit_ends_when_its_time_is_up(data: tuple, tmp_path: Path) -> None:
+    fit(data, tmp_path / "n.safetensors", FitSettings(max_epochs=500, batch_size=16, minutes=1e-9))
+    saved = fitting.read_network(tmp_path / "n.safetensors")
+    assert saved.done
+    assert saved.state["epoch"] == 1

@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 from torch import nn
 
 from shapespace.bundle.schema import COMBINER
-from shapespace.coordinates.nric import WeightedNorm, nric
+from shapespace.coordinates.integrability import Integrability
+from shapespace.coordinates.nric import NRICJacobian, WeightedNorm, nric
 from shapespace.mesh.triangle_mesh import Connectivity, TriangleMesh
 from shapespace.training.learning.baselines import LatentKernel
 from shapespace.training.learning.convolutions import EdgeConvolution, Flaps, Star, flaps
@@ -403,6 +404,43 @@ def test_a_patch_basis_keeps_the_variance_it_promises(ball: TriangleMesh, patche
         assert 0 < lost <= 1 - energy + 1e-5
     # Orthonormal up to rounding to 16 bits.
     torch.testing.assert_close(basis.encode(kept), basis.encode(x), atol=1e-3, rtol=1e-3)
+
+
+def test_a_sparse_basis_has_entries_for_the_edges_that_vary(ball: TriangleMesh) -> None:
+    """A hundred edges have nearly all of the variance; the others keep their mean, in patches where none varies too."""
+    moving = np.argsort(ball.edge_midpoints[:, 0])[-100:]
+    spread = np.full(len(ball.edge_midpoints), 1e-3)
+    spread[moving] = 1
+    y = (1 + np.tile(spread, 2) * np.random.default_rng(0).normal(size=(400, 2 * len(spread)))).astype(np.float32)
+    for patches in (1, 5):
+        basis = PatchBasis.fit(y, ball.edge_midpoints, patches, 0.9999, seed=0, support=0.999)
+        x, edges = torch.from_numpy(y), len(spread)
+        kept = basis(basis.encode(x))
+        constant = (kept == basis.mean).all(dim=0)
+        assert set(np.flatnonzero(~constant)) == {*moving, *(edges + moving)}
+        assert (x - kept).square().sum() < 0.003 * (x - x.mean(dim=0)).square().sum()
+        again = PatchBasis.blank(basis.state_dict())
+        again.load_state_dict(basis.state_dict())
+        assert torch.equal(again(basis.encode(x)), kept)
+        assert torch.equal(torch.export.export(basis, (basis.encode(x),)).module()(basis.encode(x)), kept)
+
+
+@pytest.mark.parametrize("energy", [1, 0.999999])
+def test_what_no_surface_does_counts_more(ball: TriangleMesh, energy: float) -> None:
+    """Errors along changes of lengths and angles of surfaces count as before, others with the weight."""
+    connectivity, rng = ball.connectivity, np.random.default_rng(0)
+    rest = nric(ball.vertices, connectivity)
+    tangents = NRICJacobian(connectivity)(ball.vertices) @ rng.normal(size=(3 * len(ball.vertices), 20))
+    change = 0.01 * np.concatenate([tangents.T, rng.normal(size=(60, len(rest)))])
+    scale = scaling(ball, rest + change)
+    y = scale.down(torch.from_numpy(rest + change).float())
+    basis = None if energy == 1 else PatchBasis.fit(torch.cat([y, -y]).numpy(), ball.edge_midpoints, 1, energy, 0)
+    network = FactorNetwork(LatentNetworkSettings(hidden=[4]), TORUS, scale, basis)
+    missed = y if basis is None else basis.encode(y)
+    network.penalise(Integrability(connectivity).jacobian(rest), 5)
+    counts = ((missed @ network.metric).square().mean(dim=1) / missed.square().mean(dim=1)).detach()
+    torch.testing.assert_close(counts[:20], torch.ones(20), atol=0.01, rtol=0)
+    assert (counts[20:] > 2).all()
 
 
 def test_periodic_features_close_up_and_bounded_ones_fill_the_unit_interval() -> None:
