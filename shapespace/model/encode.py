@@ -28,9 +28,10 @@ SWEEPS, PROMISING = 4, 1.2
 #: The search by vertices ends when no coordinate would move by more than this fraction of the bounds' width, when the
 #: sum of squares would fall by less than this share, or after so many shapes.
 TOLERANCE, GAIN, SHAPES = 1e-4, 1e-4, 25
-#: A search that took so many shapes is begun once more from a training shape, one of at most so many, if at least so
-#: many shapes are left, and the code there differs by more than this fraction of the bounds' width.
-LONG, KNOWN, FEWEST, DIFFERENT = 10, 512, 5, 0.01
+#: A search that took so many shapes, or met one that had all but collapsed, is begun once more from a training shape,
+#: one of at most so many, if at least so many shapes are left, and the code there differs by more than this fraction of
+#: the bounds' width.
+LONG, KNOWN, FEWEST, DIFFERENT = 10, 512, 3, 0.01
 #: Of so many training shapes, the nearest by guesses, lengths and angles are compared.
 CANDIDATES = 5
 #: Where codes outside the bounds are allowed: by how much, a fraction of the bounds' width.
@@ -59,8 +60,8 @@ class Encoded:
         code: (m,), float32, as the networks take it.
         inside_bounds: whether it lies inside the bounds.
         status: how the iteration ended.
-        iterations: shapes that the search by vertices looked at, or evaluations of the networks where it was by
-            lengths and angles.
+        iterations: shapes that the search by vertices went through, 0 where the first had all but collapsed; or
+            evaluations of the networks where it was by lengths and angles.
         residual: relative misfit of lengths and angles, in the weighted norm of the reconstruction.
         shape: of the code, on the mesh that was given.
         distances: (V,) from the given vertices to those of that shape, after rigid alignment.
@@ -165,7 +166,7 @@ class Encoder:
         nearby = model.nearby(given.mesh)
         aim = Aim(vertices, nearby / nearby.sum())
         fit = self._by_nric(target, box, fixed, deadline)
-        known = self._training_codes(aim)
+        known = self._training_codes(aim, deadline)
         fit = self._at_training_shape_if_nearer(known, target, fit, box, fixed, deadline)
         if objective is Objective.VERTICES and fit.status is not Status.DEADLINE:
             near, fit = fit, self._by_vertices(aim, fit, box, fixed, deadline)
@@ -248,9 +249,9 @@ class Encoder:
                 nearest, least = x, misfit
         return fit if nearest is fit.x else self._from(nearest, target, box, fixed, deadline)
 
-    def _training_codes(self, aim: Aim) -> FloatArray:
-        """Codes (n, m) of training shapes, by guesses the nearest first; none where guesses can't be made."""
-        if self._known is None:
+    def _training_codes(self, aim: Aim, deadline: Deadline | None) -> FloatArray:
+        """Codes (n, m) of training shapes, by guesses the nearest first; none where guesses or time are missing."""
+        if self._known is None or (deadline is not None and deadline.passed):
             return np.zeros((0, self.model.latents.dimension))
         codes, shapes = self._known
         return codes[np.argsort([np.linalg.norm(aim.misfit(shape)) for shape in shapes])]
@@ -271,7 +272,7 @@ class Encoder:
         search takes long there; elsewhere it ends at once.
         """
         left = SHAPES + INSIDE - fit.iterations
-        if fit.iterations < LONG or left < FEWEST or fit.status is Status.DEADLINE or not len(known):
+        if 0 < fit.iterations < LONG or left < FEWEST or fit.status is Status.DEADLINE or not len(known):
             return fit
         box = Box(*self.model.latents.box_around(fixed, 0.0), self.model.latents.width)
         start = np.clip(fixed.into(known[0]), box.lower, box.upper)
@@ -288,13 +289,13 @@ class Encoder:
         codes = self.model.training_codes
         if codes is None or self.model.manifest.start is None:
             return None
-        codes = codes[:: -(-len(codes) // KNOWN)]
+        codes = codes[np.linspace(0, len(codes) - 1, min(len(codes), KNOWN)).round().astype(int)]
         return codes, self.model.guesses(codes.astype(np.float32))
 
     def _by_vertices(
         self, aim: Aim, near: Fit, box: Box, fixed: Fixed, deadline: Deadline | None, most: int = SHAPES
     ) -> Fit:
-        """The fit to vertices, from one nearby, which stands where its shape has all but collapsed."""
+        """The fit to vertices, from one nearby, which stands after 0 iterations where its shape has all but collapsed."""
         model, size = self.model, self.model.reference.diagonal
         with model.solver() as reconstruct:
             if deadline is not None and deadline.passed:  # while waiting for the solver
@@ -312,11 +313,12 @@ class Encoder:
                 return np.where(fixed.mask, 0.0, changes.reshape(len(changes), -1).T / size)
 
             stopping = Stopping(TOLERANCE, GAIN, max_evaluations=most, deadline=deadline)
+            stuck = replace(near, status=Status.STALLED, iterations=0)
             try:
                 fit = least_squares(residuals, jacobian, near.x, box, stopping)
             except NotPositiveDefiniteError:
-                return near
-            return near if fit.status is Status.NOT_FINITE else fit
+                return stuck
+            return stuck if fit.status is Status.NOT_FINITE else fit
 
     def _inside_if_as_near(self, aim: Aim, fit: Fit, fixed: Fixed, deadline: Deadline | None) -> Fit:
         """The fit to vertices, or one inside the bounds that is as near: networks know shapes best there."""
@@ -326,10 +328,8 @@ class Encoder:
             return fit
         box = Box(lower, upper, self.model.latents.width)
         other = self._by_vertices(aim, moved, box, fixed, deadline, most=SHAPES + INSIDE - fit.iterations)
-        near = (
-            other is not moved
-            and other.status is not Status.DEADLINE
-            and self._away(other.x, aim, deadline) <= AS_NEAR * self._away(fit.x, aim, deadline)
+        near = other.status is not Status.DEADLINE and (
+            self._away(other.x, aim, deadline) <= AS_NEAR * self._away(fit.x, aim, deadline)
         )
         return replace(other if near else fit, iterations=fit.iterations + other.iterations)
 

@@ -28,7 +28,7 @@ class Slopes:
 
     Attributes:
         inputs: (k, J, 2E) the factors' shapes of these samples.
-        latents: of each factor; no other factor's shape depends on them.
+        latents: of each factor, see `JointSamples`.
         own: (k, m, 2E) derivatives of that factor's shape.
         missed: (k, m, 2E) derivatives of the difference between the joint shape and the affine sum.
     """
@@ -57,12 +57,10 @@ class Motion:
 
     Attributes:
         codes: (n, m) of the joint samples, as angles; images under symmetries have none and come after.
-        factors: latents of each factor.
-        places: of these latents at the edges.
+        places: of the latents at the edges.
     """
 
     codes: Tensor
-    factors: list[list[int]]
     places: Places
 
 
@@ -74,6 +72,7 @@ class JointSamples:
         factors: (n, J, 2E) NRIC of the factors' shapes.
         joint: (n, 2E) NRIC of the joint shapes.
         scaling: to scaled differences.
+        latents: of each factor; no other factor's shape depends on them.
         slopes: derivatives to fit to as well, where there are some.
         motion: of features, where codes move them.
     """
@@ -81,6 +80,7 @@ class JointSamples:
     factors: Tensor
     joint: Tensor
     scaling: Scaling
+    latents: list[list[int]]
     slopes: Slopes | None = None
     motion: Motion | None = None
 

@@ -211,10 +211,10 @@ def variants(learner: Learner, config: Config) -> dict[str, Any]:
 
     def figures(model: Composite) -> dict[str, Any]:
         predicted = validation.predicted(model)
-        closing = np.stack([conditions.at_vertices(z) for z in predicted.astype(np.float64)])
+        open_by = [np.square(conditions.at_vertices(z)).sum() for z in predicted.astype(np.float64)]
         return {
             "bytes": size_bytes(model),
-            "closing": float(np.sqrt(np.mean(np.sum(closing**2, axis=2)))),
+            "closing": float(np.sqrt(np.mean(open_by) / max(1, len(conditions.vertices)))),
             "r2": validation.r2_of(predicted),
         }
 
@@ -325,10 +325,11 @@ def _exact_factor(learner: Learner, rows: IntArray, j: int, exact: Exact) -> NDA
 
 
 def size_bytes(model: Composite | nn.Module) -> int:
-    """Bytes of the floating-point parameters and buffers, in the types that they have in a bundle."""
+    """Bytes of what is large in a bundle, in the types that it has there: numbers, and the places of entries."""
     networks = model.parts if isinstance(model, Composite) else [model]
-    tensors = (t for n in networks for t in n.state_dict().values() if t.is_floating_point())
-    return sum(t.numel() * narrowest(t).itemsize for t in tensors)
+    every = (item for network in networks for item in network.state_dict().items())
+    large = (tensor for name, tensor in every if tensor.is_floating_point() or name == "basis.place")
+    return sum(tensor.numel() * narrowest(tensor).itemsize for tensor in large)
 
 
 def median_seconds(function: Callable[[], Any], repeat: int = 20) -> float:

@@ -21,8 +21,9 @@ MOST, COORDINATES = 512, 64
 #: Standard deviation of an example's Gaussian, as a share of the distance to the nearest other one: there it has fallen
 #: to 0.4 %. Where it is larger, random codes differ from exponentials more (docs/measurements/notes.md, Examples).
 WIDTH = 0.3
-#: Examples that are nearer to each other than this share of the largest distance are not told apart.
-SAME = 1e-3
+#: Examples that are nearer to each other than this share of the largest distance are not told apart; and combinations
+#: of examples that their Gaussians tell apart less than this, where one is for a single example.
+SAME, TOLD_APART = 1e-3, 0.3
 
 
 class RememberingCombiner(CombinerNetwork):
@@ -68,10 +69,10 @@ class RememberingCombiner(CombinerNetwork):
         widest = float(apart.max())
         apart = torch.where(apart > SAME * widest, apart, widest).amin(dim=1)
         self.register_buffer("places", places)
-        self.register_buffer("sharpness", 0.5 / (WIDTH * apart.clamp_min(1e-30)).square())
+        self.register_buffer("sharpness", 0.5 / (WIDTH * apart.clamp_min(1e-15)).square())
         gaussians = self._gaussians(places).double()
-        # Shapes that are there twice make this singular.
-        solved = torch.linalg.pinv(gaussians, rtol=SAME) @ missed.double()
+        # Of shapes that are hardly apart the mean is remembered: their difference would take large weights.
+        solved = torch.linalg.pinv(gaussians, atol=TOLD_APART, rtol=0) @ missed.double()
         weights, units = in_bytes(solved.float(), dim=1)
         self.register_buffer("weights", weights)
         self.register_buffer("units", units)

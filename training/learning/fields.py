@@ -94,7 +94,7 @@ class FieldCorrection(Correction):
             torch.as_tensor(constants, dtype=torch.float32),
         )
         waves = _waves(torch.as_tensor(places.surface, dtype=torch.float32))
-        for j, index in enumerate(own.motion.factors):
+        for j, index in enumerate(own.latents):
             result.owner[index] = j
             pairs = (_reading(s, m, j, index, waves) for s, m in ((own, own.motion), (held_out, held_out.motion)))
             result._fit_reader(index, waves, *pairs)

@@ -30,7 +30,7 @@ class SavedNetwork:
     """What a network's file holds.
 
     Attributes:
-        state: of training: ``done``, ``epoch``, ``seconds``, ``best`` validation loss, ``history`` of (train,
+        state: of training: ``done``, ``epoch`` of ``epochs`` at most, ``best`` validation loss, ``history`` of (train,
             validation) losses.
         metadata: of the network, see `ShapeNetwork.metadata`.
         tensors: its ``state_dict()``.
@@ -81,9 +81,9 @@ def fit(
 ) -> dict[str, Any]:
     """Fit a network to NRIC samples, and save it as it was after the epoch with the least validation loss.
 
-    The loss is the mean square difference of `coefficients` and `target`. With a last layer of low rank and orthonormal
-    basis it differs by a constant from the loss on z. An unfinished file at ``path`` is continued: it holds parameters,
-    moments, schedule, random state and history.
+    Epochs are compared by the network's `error`, usually the mean square difference of `coefficients` and `target`.
+    With a last layer of low rank and orthonormal basis that differs by a constant from the loss on z. An unfinished
+    file at ``path`` is continued: it holds parameters, moments, schedule, random state and history.
 
     Args:
         network: with its initial parameters.
@@ -116,7 +116,7 @@ def fit(
         # What was fitted in closed form may be better than any epoch.
         network.eval()
         error = _error(network, inputs[validation], target[validation], settings.batch_size)
-        state = {"done": False, "epoch": 0, "seconds": 0.0, "best": error, "history": []}
+        state = {"done": False, "epoch": 0, "epochs": settings.max_epochs, "best": error, "history": []}
         best = _copied(network)
 
     epochs = bar(title, "epoch", settings.max_epochs, initial=state["epoch"])
@@ -125,6 +125,8 @@ def fit(
         total = _epoch(network, optimisers, inputs, target, train, settings.batch_size)
         network.eval()
         error = _error(network, inputs[validation], target[validation], settings.batch_size)
+        if settings.minutes and not state["epoch"]:
+            _shorten(state, schedules, 60 * settings.minutes / (time.monotonic() - start))
         for schedule in schedules:
             if isinstance(schedule, ReduceLROnPlateau):
                 schedule.step(error)
@@ -138,9 +140,7 @@ def fit(
         rate = optimisers[0].param_groups[0]["lr"]
         epochs.set_postfix(train=f"{total:.2e}", validation=f"{error:.2e}", rate=f"{rate:.0e}")
         epochs.update()
-        state["seconds"] += time.monotonic() - start
-        late = settings.minutes is not None and state["seconds"] > 60 * settings.minutes
-        state["done"] = state["epoch"] >= settings.max_epochs or rate < settings.final_rate or late
+        state["done"] = state["epoch"] >= state["epochs"] or rate < settings.final_rate
         if not state["done"] and state["epoch"] % CHECKPOINT_EPOCHS == 0:
             _checkpoint(path, network, optimisers, schedules, state, best)
     epochs.close()
@@ -200,8 +200,16 @@ def _copied(network: ShapeNetwork) -> dict[str, Tensor]:
     return {k: v.clone() for k, v in network.state_dict().items()}
 
 
+def _shorten(state: dict[str, Any], schedules: Sequence[Schedule], affordable: float) -> None:
+    """End after so many epochs, and let the rate fall sooner."""
+    state["epochs"] = max(1, min(state["epochs"], int(affordable)))
+    for schedule in schedules:
+        if isinstance(schedule, CosineAnnealingLR):
+            schedule.T_max = state["epochs"]
+
+
 def _error(network: ShapeNetwork, inputs: Tensor, target: Tensor, batch_size: int) -> float:
-    return nn.functional.mse_loss(predict(network.coefficients, inputs, batch_size), target).item()
+    return network.error(predict(network.coefficients, inputs, batch_size), target).item()
 
 
 def _checkpoint(

@@ -237,7 +237,6 @@ class PatchBasis(nn.Module):
 
     mean: Tensor
     order: Tensor
-    place: Tensor
 
     def __init__(self, entries: list[NDArray], bases: list[NDArray], mean: NDArray) -> None:
         super().__init__()
@@ -246,10 +245,12 @@ class PatchBasis(nn.Module):
         for i, basis in enumerate(bases):
             self.register_buffer(f"basis{i}", half_precision(torch.as_tensor(basis.T.copy(), dtype=torch.float32)))
         order = np.concatenate(entries)
-        place = np.full(len(mean), len(order))
+        place = np.full(len(mean), len(order), dtype=np.int32)
         place[order] = np.arange(len(order))
         self.register_buffer("order", torch.as_tensor(order))
-        self.register_buffer("place", torch.as_tensor(place))
+        #: Where each entry is among those of all patches, with a zero after them.
+        self.place: Tensor | None
+        self.register_buffer("place", torch.as_tensor(place) if bases[1:] or len(order) < len(mean) else None)
 
     @classmethod
     def blank(cls, tensors: dict[str, Tensor]) -> PatchBasis:
@@ -300,12 +301,11 @@ class PatchBasis(nn.Module):
 
     def forward(self, coefficients: Tensor) -> Tensor:
         """Scaled differences (n, 2E) of coefficients (n, rank)."""
-        everywhere = len(self.order) == len(self.mean)
-        if len(self.ranks) == 1 and everywhere:
+        if self.place is None:
             return coefficients @ self._bases()[0] + self.mean
         parts = coefficients.split(self.ranks, dim=1)
         y = torch.cat([part @ basis for part, basis in zip(parts, self._bases(), strict=True)], dim=1)
-        if not everywhere:
+        if len(self.order) < len(self.mean):
             y = nn.functional.pad(y, (0, 1))
         return y.index_select(1, self.place) + self.mean
 

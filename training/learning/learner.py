@@ -121,7 +121,7 @@ class Learner:
         reference = self.collection.reference
         return nric(reference.vertices, reference.connectivity)
 
-    @property
+    @cached_property
     def _closing(self) -> sparse.csr_array:
         """(q, 2E) derivatives of the closing conditions around vertices at the reference."""
         conditions = Integrability(self.collection.reference.connectivity)
@@ -190,8 +190,8 @@ class Learner:
         z = drawn.nric[rows["train"]]
         scaling = self._scaling(z)
         network = FactorNetwork(settings, coordinates, scaling, self._basis(settings, scaling, z))
-        if settings.integrability:
-            network.penalise(self._closing, settings.integrability)
+        if network.basis is not None and settings.integrability:
+            network.penalise(network.basis, self._closing, settings.integrability)
         if not saved:
             own_pair, held_out = (
                 (latents, network.target(exact)) for latents, exact in map(data.part, ("train", "validation"))
@@ -264,8 +264,8 @@ class Learner:
             data = self._with_images(data)
         scaling = self._scaling(self.joint.nric[self.rows["train"]])
         slopes = self._slopes(indices, networks, data.inputs, scaling)
-        own = JointSamples(*data.part("train"), scaling, slopes, self._motion(indices, "train"))
-        held_out = JointSamples(*data.part("validation"), scaling, motion=self._motion(indices, "validation"))
+        own = JointSamples(*data.part("train"), scaling, indices, slopes, self._motion("train"))
+        held_out = JointSamples(*data.part("validation"), scaling, indices, motion=self._motion("validation"))
         states = {}
 
         def unfinished(kind: str) -> Path:
@@ -286,13 +286,13 @@ class Learner:
         self._record(path, state)
         return combiner
 
-    def _motion(self, indices: list[list[int]], part: str) -> Motion | None:
+    def _motion(self, part: str) -> Motion | None:
         """Of a part of the joint samples."""
         places = self.collection.places
         if places is None:
             return None
         angles = self.joint.latents[self.rows[part]] * (2 * np.pi / self.collection.coordinates.period)
-        return Motion(torch.as_tensor(angles, dtype=torch.float32), indices, places)
+        return Motion(torch.as_tensor(angles, dtype=torch.float32), places)
 
     def differentiated(self) -> tuple[IntArray, NDArray[np.float32]]:
         """Rows (k,) of the joint samples to learn from that have derivatives, and these (k, m, 2E)."""

@@ -71,9 +71,13 @@ class ShapeNetwork(nn.Module):
         """The exact `coefficients` of NRIC (n, 2E)."""
         raise NotImplementedError
 
+    def error(self, found: Tensor, target: Tensor) -> Tensor:
+        """Mean square error in these coordinates, by which epochs are compared."""
+        return nn.functional.mse_loss(found, target)
+
     def loss(self, inputs: Tensor, target: Tensor) -> Tensor:
-        """Mean square error in these coordinates, or an estimate of it, to train with."""
-        return nn.functional.mse_loss(self.coefficients(inputs), target)
+        """This error, or an estimate of it, to train with."""
+        return self.error(self.coefficients(inputs), target)
 
 
 class FactorNetwork(ShapeNetwork):
@@ -84,7 +88,7 @@ class FactorNetwork(ShapeNetwork):
     products, for detail too fine for a perceptron, or of polynomials, since an exponential is smooth in its velocity.
 
     Attributes:
-        metric: (rank, rank) that errors of coefficients are multiplied with in the loss; None for the mean square.
+        metric: (rank, rank) that errors of coefficients are multiplied with; None for the mean square error.
     """
 
     skip: Tensor
@@ -121,24 +125,23 @@ class FactorNetwork(ShapeNetwork):
             result = result + self.skip_features(inputs) @ self.skip
         return result
 
-    def penalise(self, closing: sparse.csr_array, weight: float) -> None:
-        """Let errors that no change of a surface makes count more in the loss.
+    def penalise(self, basis: PatchBasis, closing: sparse.csr_array, weight: float) -> None:
+        """Let errors that no change of a surface makes count more.
 
         Args:
+            basis: the last layer.
             closing: (q, 2E) derivatives of the closing conditions by NRIC, see `Integrability`.
             weight: of their squares, scaled to the mean square of errors that are alike in all directions.
         """
-        each = torch.eye(len(self.scaling.mean))
-        if self.basis is not None:
-            each = self.basis(torch.eye(self.basis.rank)) - self.basis.mean
-        change = closing @ (each * self.scaling.inverse).double().numpy().T
+        each = (basis(torch.eye(basis.rank)) - basis.mean) * self.scaling.inverse
+        change = closing @ each.double().numpy().T
         gram = torch.from_numpy(change.T @ change)
-        gram *= weight * len(gram) / gram.trace()
-        self.metric = torch.linalg.cholesky(torch.eye(len(gram)) + gram).float()
+        scale = float(gram.trace()) / len(gram) or 1.0  # a strip has no vertex that faces close around
+        self.metric = torch.linalg.cholesky(torch.eye(len(gram)) + weight / scale * gram).float()
 
-    def loss(self, inputs: Tensor, target: Tensor) -> Tensor:
+    def error(self, found: Tensor, target: Tensor) -> Tensor:
         """Mean square error of coefficients, in the metric if there is one."""
-        missed = self.coefficients(inputs) - target
+        missed = found - target
         return (missed if self.metric is None else missed @ self.metric).square().mean()
 
     def fit_skip(self, latent: Tensor, target: Tensor, held_out: tuple[Tensor, Tensor]) -> None:
@@ -187,9 +190,8 @@ def _follower(own: JointSamples) -> FieldSettings | ConvolutionSettings | None:
     """What ``auto`` tries beside the kernel, by a quick look: nothing where nothing wanders over the surface."""
     if own.motion:
         return FieldSettings()
-    latents = own.slopes.latents if own.slopes else [[]] * own.factors.shape[1]
-    usual = (max(WANDERING, FOR_EACH_LATENT * len(index)) for index in latents)
-    shapes = own.inputs[:LOOKED_AT].unbind(dim=1)
+    usual = (max(WANDERING, FOR_EACH_LATENT * len(index)) for index in own.latents)
+    shapes = own.scaling.down(own.factors[:LOOKED_AT]).unbind(dim=1)
     return FOLLOWING if any(_components(y) > most for y, most in zip(shapes, usual, strict=True)) else None
 
 

@@ -170,7 +170,7 @@ class FitSettings(_Section):
     batch_size: int = Field(64, ge=2)
     """Number of samples per step."""
     minutes: float | None = Field(None, gt=0)
-    """Training ends with the epoch in which it has taken so long; what was best by then is kept."""
+    """Only as many epochs as take so long, by the time of the first."""
 
 
 class LatentNetworkSettings(_Section):
@@ -194,13 +194,19 @@ class LatentNetworkSettings(_Section):
     energy: float = Field(0.9999, gt=0, le=1)
     """Share of the variance that this basis keeps; 1 makes the last layer dense, as in the paper."""
     support: float = Field(1, gt=0, le=1)
-    """Share of the variance on the edges that this basis has entries for. With less than 1 the network is sparse, the
-    file smaller: edges that hardly vary keep their mean. A dense last layer has all."""
+    """Share of the variance on the edges that this basis has entries for. With less than 1 the network is sparse: edges
+    that hardly vary keep their mean. Files are smaller where the basis has a large rank."""
     integrability: float = Field(0, ge=0)
     """Weight, in gradient descent, of errors that change lengths and angles as no surface can: how far faces around a
     vertex are from closing (to first order at the mean), scaled to the mean square error of errors in any direction."""
     fit: FitSettings = FitSettings(schedule="cosine", learning_rate=2e-3, max_epochs=60)
     """How the network is trained."""
+
+    @model_validator(mode="after")
+    def _of_low_rank(self) -> LatentNetworkSettings:
+        if self.energy == 1 and (self.support < 1 or self.integrability):
+            raise ValueError("support and integrability need energy < 1")
+        return self
 
 
 class KernelSettings(_Section):
@@ -314,7 +320,7 @@ class AutoSettings(_Section):
 
     kind: Literal["auto"] = "auto"
     minutes: float = Field(30, gt=0)
-    """The other kind is trained for so long at most, and not tried where the kernel alone took longer."""
+    """The other kind has only as many epochs as take so long, and is not tried where the kernel alone took longer."""
 
 
 #: The kinds that a network can be of; ``auto`` and ``paper`` stand for one of them.

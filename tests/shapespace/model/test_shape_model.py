@@ -21,7 +21,9 @@ from shapespace.model.decoder import MeshChoice
 from shapespace.model.edit import InvalidTargetError
 from shapespace.model.encode import LONG, Aim, Encoder
 from shapespace.model.latent_space import NotFiniteError, OutOfBoundsError, WrongLengthError
+from shapespace.model.searched_shapes import SearchedShapes
 from shapespace.model.shape_model import ShapeModel, load
+from shapespace.solve.cholesky import NotPositiveDefiniteError
 from shapespace.solve.least_squares import Fit
 from shapespace.solve.outcome import Status
 from tests.service.bundles import SCALE, fine_reference, reference, write_bundle
@@ -242,6 +244,30 @@ def test_a_search_that_went_astray_begins_once_more_from_the_nearest_training_sh
     assert found.distances.mean() < 1e-5 * size
     assert LONG < found.iterations <= 30
     assert found.status is Status.CONVERGED
+
+
+def test_a_search_that_met_a_collapsed_shape_begins_once_more(models: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    model = load(models / "figure")
+    codes = read_bundle(models / "figure" / "2").training_codes
+    assert codes is not None
+    given = model.decode(codes[20])
+    by_nric, moved = Encoder._by_nric, SearchedShapes.derivatives
+    searches = iter(range(99))
+
+    def astray(self: Encoder, *given: Any) -> Fit:
+        found = by_nric(self, *given)
+        return replace(found, x=model.upper, residuals=0 * found.residuals)
+
+    def collapsed(self: SearchedShapes, *given: Any) -> Any:
+        if next(searches) == 0:
+            raise NotPositiveDefiniteError("a face without area")
+        return moved(self, *given)
+
+    monkeypatch.setattr(Encoder, "_by_nric", astray)
+    monkeypatch.setattr(SearchedShapes, "derivatives", collapsed)
+    found = model.encode(given, bounds="clamp")
+    assert found.distances.mean() < 1e-5 * np.linalg.norm(np.ptp(given, axis=0))
+    assert (found.status, found.iterations <= 30) == (Status.CONVERGED, True)
 
 
 def test_a_search_begins_at_a_training_shape_that_is_nearer(models: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -38,7 +38,7 @@ def combiner(mesh: TriangleMesh) -> tuple[CombinerNetwork, torch.Tensor, torch.T
     settings = ConvolutionSettings(width=6, layers=LAYERS, neighbourhood="flaps")
     scaling = Scaling.of(nric(mesh.vertices, mesh.connectivity), WeightedNorm.of(mesh, 1.0).squared, z)
     inputs, joint = torch.from_numpy(z[:8].reshape(4, 2, -1)), torch.from_numpy(z[8:])
-    samples = JointSamples(inputs, joint, scaling)
+    samples = JointSamples(inputs, joint, scaling, [[0], [1]])
     network = CombinerNetwork.fit(settings, mesh, samples, samples, 0).eval()
     torch.nn.init.normal_(network.correction.readout.weight)
     return network, inputs, network.target(joint)

@@ -49,11 +49,11 @@ def test_examples_come_back_and_shapes_between_them_stay(combiner: CombinerNetwo
     remembering = RememberingCombiner(combiner, factors, missed)
     added = at(remembering, factors) - at(combiner, factors)
     assert (added - missed).abs().max() < 0.01 * missed.abs().max()  # weights have 8 bits
-    # Halfway to the nearest other example next to nothing is left.
+    # Halfway to the nearest other example a quarter of each is left.
     apart = torch.cdist(factors.sum(dim=1), factors.sum(dim=1)).fill_diagonal_(torch.inf)
     halfway = (factors + factors[apart.argmin(dim=1)]) / 2
     left = (at(remembering, halfway) - at(combiner, halfway)).norm(dim=1)
-    assert left.max() < missed.norm(dim=1).max()
+    assert left.max() < 0.45 * missed.norm(dim=1).max()
     away = 20 * factors
     torch.testing.assert_close(at(remembering, away), at(combiner, away))
 
@@ -63,6 +63,16 @@ def test_a_shape_that_is_there_twice_is_remembered_once(combiner: CombinerNetwor
     remembering = RememberingCombiner(combiner, factors, missed)
     added = at(remembering, factors) - at(combiner, factors)
     assert (added - missed).abs().max() < 0.01 * missed.abs().max()
+
+
+def test_many_examples_of_few_coordinates_add_no_more_than_was_missed(combiner: CombinerNetwork) -> None:
+    """Two hundred along a line, of which each misses something else, many of them hardly apart."""
+    generator = torch.Generator().manual_seed(4)
+    codes, mode = torch.rand(1200, 1, 1, generator=generator), torch.randn(1, 2, SIZE, generator=generator)
+    missed = 0.1 * torch.randn(200, SIZE, generator=generator)
+    remembering = RememberingCombiner(combiner, codes[:200] * mode, missed)
+    added = at(remembering, codes[200:] * mode) - at(combiner, codes[200:] * mode)
+    assert added.norm(dim=1).max() < 3 * missed.norm(dim=1).max()
 
 
 def test_angles_are_missed_by_the_shorter_way(combiner: CombinerNetwork) -> None:

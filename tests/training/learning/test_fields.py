@@ -37,8 +37,9 @@ def samples(latents: np.ndarray) -> JointSamples:
     joint, reference = TORUS.shapes(latents).nric, TORUS.reference
     rest = nric(reference.vertices, reference.connectivity)
     scaling = Scaling.of(rest, WeightedNorm.of(reference, 1.0).squared, joint)
-    motion = Motion(torch.as_tensor(latents, dtype=torch.float32), FACTORS, TORUS.places)
-    return JointSamples(torch.as_tensor(factors).float(), torch.as_tensor(joint).float(), scaling, motion=motion)
+    motion = Motion(torch.as_tensor(latents, dtype=torch.float32), TORUS.places)
+    exact = (torch.as_tensor(each).float() for each in (factors, joint))
+    return JointSamples(*exact, scaling, FACTORS, motion=motion)
 
 
 @pytest.fixture(scope="module")
@@ -160,7 +161,7 @@ def test_auto_tries_what_follows_a_bump(
         if combiner.settings.kind == "field":
             descend(combiner, own, 60, 3e-3)
 
-    motion = Motion(own.motion.codes[:130], FACTORS, TORUS.places) if known else None
+    motion = Motion(own.motion.codes[:130], TORUS.places) if known else None
     samples = replace(own, factors=own.factors[:130], joint=own.joint[:130], motion=motion)
     found = CombinerNetwork.fit(AutoSettings(minutes=minutes), TORUS.reference, samples, held_out, 0, train)
     assert trained == list(found.tried) == tried

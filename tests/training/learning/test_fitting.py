@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -98,8 +100,14 @@ def test_the_rate_falls_on_a_plateau_and_ends_the_fit(data: tuple, tmp_path: Pat
     assert state["epoch"] < 500
 
 
-def test_a_fit_ends_when_its_time_is_up(data: tuple, tmp_path: Path) -> None:
-    fit(data, tmp_path / "n.safetensors", FitSettings(max_epochs=500, batch_size=16, minutes=1e-9))
-    saved = fitting.read_network(tmp_path / "n.safetensors")
-    assert saved.done
-    assert saved.state["epoch"] == 1
+def test_a_fit_has_as_many_epochs_as_fit_into_its_time(
+    data: tuple, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The rate falls as if they were all that had been asked for."""
+    monkeypatch.setattr(fitting, "time", SimpleNamespace(monotonic=itertools.count(step=6).__next__))
+    settings = FitSettings(max_epochs=500, batch_size=16, schedule="cosine", minutes=1)
+    short = fit(data, tmp_path / "short.safetensors", settings).state_dict()
+    assert fitting.read_network(tmp_path / "short.safetensors").state["epoch"] == 10
+    asked = FitSettings(max_epochs=10, batch_size=16, schedule="cosine")
+    for key, value in fit(data, tmp_path / "asked.safetensors", asked).state_dict().items():
+        assert torch.equal(value, short[key]), key
