@@ -43,8 +43,8 @@ anew, turned at random and moved. **whole**: alternately {points} points all ove
 vertices. **noisy**: {points} points with noise of {noise:.1%} of the bounding box's diagonal and {outliers:.0%}
 outliers. **camera**: at most so many points, those that one camera sees, with the same noise, and `partial=true`.
 **unseen** shapes of the figure are poses from its generator that no training knows, those of the collections the fifth
-that was left out of their training ([served.md](served.md)), all of models that have been trained anew since;
-**training** ones those that made the model, **drawn** ones shapes of the population's codes.
+that was left out of their training ([served.md](served.md)); **training** ones those that made the model, **drawn**
+ones shapes of the population's codes. Which models these are is in the [notes](notes.md#fits-of-scans).
 `python -m benchmarks.fit` measures and writes this page.
 
 **error**: median over tries of the mean distance of vertices from the truth, in percent of the diagonal; of the torus
@@ -52,8 +52,9 @@ the distance of its surface, which four codes share in as many places, each with
 of `encode`, which is given the vertices in their order. **failed**: tries further off than {failed:g} times the median
 of their row. **told**: those of them whose status is not `converged`. **false alarms**: others whose status is not.
 **shapes**: solved ones at the median, three rough ones counted as one; **time**: in solved shapes. **components**:
-the usual alternative, an iterated closest-point fit with as many principal components of 60 drawn shapes; it begins
-with the mean shape, placed as `fit` has found it, which helps it.
+the usual alternative, an iterated closest-point fit with as many principal components, here of 60 shapes drawn from the
+model, with settings that were not tuned; components of the training shapes come much nearer where the correspondence is
+known ([served.md](served.md)). It begins with the mean shape, placed as `fit` has found it, which helps it.
 
 | model | shapes | scan | tries | error | encode | ratio | failed | told | false alarms | shapes | time | components |
 |---|---|---|---|---|---|---|---|---|---|---|---|---|
@@ -65,7 +66,8 @@ How often the code's 90 % intervals hold the truth's coordinates, over all coord
 the intervals' median width as a share of the population's. Of shapes drawn from the model the truth is their code; of
 training shapes it is `encode`'s code. Four codes of the torus have the same surface up to the networks' errors: after
 half a turn about its axis gamma is another by π, and upside down all signs are. A fit finds one of them or another
-nearby, and its covariance does not know of the others: there the intervals do not hold.
+nearby, and its covariance does not know of the others: there the intervals do not hold. Of scans without noise they
+are too narrow elsewhere too, on the hand above all.
 
 | model | shapes | scan | fits | held | width |
 |---|---|---|---|---|---|

@@ -148,6 +148,12 @@ def spread(row: dict[str, Any], model: str) -> tuple[float, float, float]:
     return sum(values) / len(values), min(values), max(values)
 
 
+def leading(found: dict[str, Any]) -> str:
+    """Cells of composite, one factor and kernel, the largest R² bold."""
+    cells = [f"{found['r2'][model]['total']:.4f}" for model in ("composite", "monolithic", "kernel")]
+    return " | ".join(f"**{cell}**" if cell == max(cells) else cell for cell in cells)
+
+
 def joint_exponentials(row: dict[str, Any]) -> list[int]:
     """How many joint exponentials a model has seen: from all samples, then from each share of them."""
     every = row["drawn"]["joint"] - row["drawn"]["failed"]["joint"] - row["evaluation"]["test_samples"]
@@ -158,21 +164,24 @@ def joint_exponentials(row: dict[str, Any]) -> list[int]:
 
 def sampling(row: dict[str, Any]) -> float:
     """What all samples of a run took, in exponentials: a code with its derivatives as many as take as long."""
-    times, drawn = row["evaluation"]["times"], row["drawn"]
-    worth: float = times["exact, with derivatives"] / times["exact"]
-    own: int = drawn["joint"] + drawn["of factors"]
-    return own + worth * row["evaluation"]["derivatives"]
+    return float(row["drawn"]["joint"] + row["drawn"]["of factors"] + worth(row))
+
+
+def worth(row: dict[str, Any]) -> float:
+    """How many exponentials take as long as the derivatives of a run."""
+    times = row["evaluation"]["times"]
+    return float(times["exact, with derivatives"] / times["exact"] * row["evaluation"]["derivatives"])
 
 
 def plot_samples(rows: dict[str, dict[str, Any]], path: Path) -> None:
-    """R² by the number of exponentials that a model has seen, those of factors included."""
+    """R² by the exponentials that a model has seen, those of factors and the worth of derivatives included."""
     figure, axes = plt.subplots(
         1, len(rows), figsize=(1.6 + 2.2 * len(rows), 2.9), sharey=True, layout="constrained", squeeze=False
     )
     styles = {"composite": "o-", "all of factors": "s--", "monolithic": "^:", "kernel": "v-."}
     labels = {"all of factors": "composite, all factor samples", "monolithic": "one factor"}
     for axis, (name, row) in zip(axes[0], rows.items(), strict=True):
-        found = row["evaluation"]
+        found, derivatives = row["evaluation"], worth(row)
         r2, seen = found["r2"], found["exponentials"]
         whole = {
             "r2": r2 | {"all of factors": r2["composite"]},
@@ -180,7 +189,7 @@ def plot_samples(rows: dict[str, dict[str, Any]], path: Path) -> None:
         }
         for model, style in styles.items():
             at = [
-                (each["exponentials"].get(model, joint), 1 - each["r2"][model]["total"])
+                (each["exponentials"].get(model, joint) + derivatives, 1 - each["r2"][model]["total"])
                 for each, joint in zip([whole, *found["fractions"]], joint_exponentials(row), strict=True)
             ]
             axis.plot(*zip(*sorted(at), strict=True), style, label=labels.get(model, model))
@@ -215,6 +224,7 @@ def write_page() -> None:
         largest=rows.get(LARGEST),
         missing=[name for name in COLLECTIONS if name not in rows],
         spread=spread,
+        leading=leading,
         joint=joint_exponentials,
         sampling=sampling,
     )

@@ -18,14 +18,21 @@ import tomlkit
 
 from benchmarks.generalisation import ROWS, beside_images, title
 from benchmarks.results import MIRRORED, ROOT, open_run
-from benchmarks.space import CODES, to_nearest
 from shapespace.arrays import FloatArray
 from shapespace.mesh.triangle_mesh import TriangleMesh, diagonal
 from shapespace.model.shape_model import ShapeModel, load
 from shapespace.training.collection.mirror import find_mirror, mirrored
 from shapespace.training.pipeline import Run, execute, write_bundle_of
 from shapespace.training.runs.config import parse
-from shapespace.training.space.generalisation import FOLDS, PrincipalComponents, folds, summary, vertex_distances
+from shapespace.training.space.generalisation import (
+    FOLDS,
+    RANDOM,
+    PrincipalComponents,
+    folds,
+    summary,
+    to_nearest,
+    vertex_distances,
+)
 from shapespace.training.space.stages import read_meshes
 
 #: Most exponentials to learn from: joint, and of each factor.
@@ -57,9 +64,12 @@ code, in percent of the bounding box's diagonal, and the mean of the folds' 95th
 principal components of the same four fifths' fine meshes. **trained on**: the same of the shapes that made a model,
 which a bundle [remembers](../explanation/mathematics.md#networks): it adds what modes and networks miss of them.
 Components remember nothing, so this says that users get their own shapes back, not that the modes are better;
-**nothing remembered** is a model without it (`export.examples = false`) beside the same components. Rows without
-figures of *trained on*, and of others the folds that are not said to be remembering, were measured before models
-remembered, unseen shapes too. **of folds**: the least and the greatest ratio of a fold.
+**nothing remembered** is a model without it (`export.examples = false`) beside the same components.
+
+**folds**: with all five each shape is unseen once; rows with fewer know only some shapes. Where only some are
+*remembering*, the others are of older models, trained and encoded before models remembered: *trained on* is of the
+remembering ones, all else of all. Rows without *trained on* are of older models altogether. **of folds**: the least and
+the greatest ratio of a fold. **m**: of the first fold, others may differ by one.
 
 Of the first fold alone: **specificity**, the mean distance of {codes} random shapes, uniform in the bounds of the codes
 or of the components' coefficients, to the nearest of the shapes that made the model (lower is better); and the last
@@ -67,8 +77,9 @@ columns. Models *with mirror images* also learned from the images of these shape
 and in the last columns are components that did, beside the same fold of the model.
 
 How well networks follow exponentials is on [another page](results.md), and [a third](generalisation.md) has exact
-exponentials in place of networks. `python -m benchmarks.served --data FOLDER` trains, measures and writes this page;
-what it measured is in `runs/collections/`. Some rows are of [older networks](notes.md#kernels-in-patches).
+exponentials in place of networks; on makehuman networks come nearer, as they go on where exponentials end.
+`python -m benchmarks.served --data FOLDER` trains, measures and writes this page; what it measured is in
+`runs/collections/`. Some rows are of [older networks](notes.md#kernels-in-patches).
 
 | {head} |
 |{line}
@@ -153,8 +164,8 @@ def measure(name: str, data: Path, out: Path, fold: int) -> dict[str, Any]:
     if name.removesuffix(HALF).endswith(MIRRORED):
         others = vertex_distances(with_images(known, model).nearest(unseen, m), unseen, size)
         found["mirrored_components"] = summary(others)
-    drawn = np.stack([model.decode(code) for code in model.sample(CODES, 0)])
-    others = linear.random(m, CODES, np.random.default_rng(0))
+    drawn = np.stack([model.decode(code) for code in model.sample(RANDOM, 0)])
+    others = linear.random(m, RANDOM, np.random.default_rng(0))
     return found | {"specificity": [to_nearest(each, known, size) for each in (drawn, others)]}
 
 
@@ -206,7 +217,7 @@ def write_page() -> None:
     page = PAGE.format(
         joint=JOINT,
         factors=OF_FACTORS,
-        codes=CODES,
+        codes=RANDOM,
         head=" | ".join(HEAD),
         line="---|" * len(HEAD),
         rows="\n".join(rows),

@@ -259,6 +259,8 @@ def evaluation(run: Run) -> None:
     unseen = run.directory.generalisation.read_if_written()
     if unseen and "failed" not in unseen:
         figures["generalisation"] = unseen
+    if not run.by_design:
+        figures |= space.compactness_and_specificity(run.directory)
     run.directory.gallery.write(**gallery)
     run.directory.evaluation.write(figures)
 

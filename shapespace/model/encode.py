@@ -295,7 +295,7 @@ class Encoder:
     def _by_vertices(
         self, aim: Aim, near: Fit, box: Box, fixed: Fixed, deadline: Deadline | None, most: int = SHAPES
     ) -> Fit:
-        """The fit to vertices, from one nearby, which stands after 0 iterations where its shape has all but collapsed."""
+        """The fit to vertices, from one nearby, which stands, after 0 steps, where its shape has all but collapsed."""
         model, size = self.model, self.model.reference.diagonal
         with model.solver() as reconstruct:
             if deadline is not None and deadline.passed:  # while waiting for the solver

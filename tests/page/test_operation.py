@@ -32,6 +32,8 @@ def test_the_models_and_their_cards(studio: Studio) -> None:
         "3 %",
         "5 %",
         "a linear model with as many numbers",
+        "random shapes, to the nearest trained on",
+        "how far they stray",
     ):
         assert fact in card
     studio.page.keyboard.press("Escape")

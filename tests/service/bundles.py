@@ -184,6 +184,8 @@ def facts(name: str = "small", version: str = "1", *, idle: int = 0) -> Facts:
                 "components": [{"mean": 0.08, "p95": 0.12}, {"mean": 0.05, "p95": 0.07}],
                 "worst": "a",
             },
+            "compactness": {"modes": 0.9, "components": 0.8},
+            "specificity": {"modes": 0.02, "components": 0.03},
         },
         origin=Origin(config={}, data_digest="0" * 64, code_version="test"),
     )

@@ -50,7 +50,7 @@ MODELS = {
 }
 #: Keys of evaluation.json with a section on the page; all others are listed in one table.
 PLACED = {"eta", "test_samples", "r2", "r2_factors", "variants", "vertex_error", "sizes", "times", "fractions"}
-PLACED |= {"prolongation", "generalisation", "fresh", "correction", "validation"}
+PLACED |= {"compactness", "specificity", "prolongation", "generalisation", "fresh", "correction", "validation"}
 #: What the kinds of corrections are called.
 CORRECTIONS = {
     "kernel": "kernel ridge regression",
@@ -200,7 +200,8 @@ def nearness(record: Record, studio: Studio | None) -> list[dict[str, Any]]:
     if (facts := record.generalisation) and "failed" not in facts:
         kinds.append({
             "title": "Shapes it has not seen",
-            "how": f"{facts['held_out']} shapes, held out while mean and modes were found; exponentials, no networks",
+            "how": f"{facts['held_out']} shapes, held out while mean and modes were found; exponentials, no networks"
+            + stuck(facts),
             "figures": [
                 (f"{count:.3g} coordinates", of, components)
                 for count, of, components in zip(facts["counts"], facts["modes"], facts["components"], strict=True)
@@ -222,6 +223,24 @@ def nearness(record: Record, studio: Studio | None) -> list[dict[str, Any]]:
             "pictures": _pair(record.run.least_near, facts["worst"], studio),
         })  # fmt: skip
     return kinds
+
+
+def stuck(facts: dict[str, Any]) -> str:
+    """How many searches for held-out shapes did not end, if some did not."""
+    count = facts.get("stuck", [0])[-1]
+    if not count:
+        return ""
+    return f". Of {count} no end was found, as faces collapse on the way: networks may come nearer"
+
+
+def qualities(record: Record) -> list[tuple[str, dict[str, float]]]:
+    """Compactness and specificity, in words, where they are known."""
+    found = record.evaluation
+    words = {
+        "compactness": "variance of your shapes that is explained (compactness)",
+        "specificity": "from random shapes to the nearest of yours (specificity)",
+    }
+    return [(words[name], found[name]) for name in words if name in found]
 
 
 def _pair(file: NpzFile, title: str, studio: Studio | None) -> list[tuple[Markup, str]]:
@@ -339,6 +358,7 @@ def page(record: Record) -> str:
         description=export.get("description", ""),
         record=record,
         nearness=nearness(record, close or None),
+        qualities=qualities(record),
         stages=list(STAGES),
         pictures=studio is not None,
         shapes=list(shapes(record, close)) if close else [],

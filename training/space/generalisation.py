@@ -34,6 +34,8 @@ STEPS, LIGHT_STEPS = 16, 8
 SOME, FEW = 100, 10
 #: One step is not chosen if a larger share of so many random shapes folds, with at most so many modes.
 FOLDED, DRAWN, DRAWN_MODES = 0.1, 500, 10
+#: Random shapes, whose distance from the collection is its specificity.
+RANDOM = 200
 #: Percentile of the vertices' distances that is reported beside their mean.
 SHARE = 95
 
@@ -51,6 +53,11 @@ class PrincipalComponents:
     mean: FloatArray
     axes: FloatArray
     coefficients: FloatArray
+
+    def explained(self, count: int) -> float:
+        """Share of the shapes' variance that the first components explain."""
+        energy = (self.coefficients**2).sum(axis=0)
+        return float(energy[:count].sum() / energy.sum())
 
     @classmethod
     def of(cls, shapes: FloatArray, reference: FloatArray) -> PrincipalComponents:
@@ -80,6 +87,12 @@ def vertex_distances(shapes: FloatArray, others: FloatArray, diagonal: float) ->
     return result
 
 
+def to_nearest(shapes: FloatArray, collection: FloatArray, diagonal: float) -> float:
+    """Mean distance of shapes (k, V, 3) from the nearest of a collection (n, V, 3)."""
+    distances = [vertex_distances(shapes, other, diagonal).mean(axis=1) for other in collection]
+    return float(np.min(distances, axis=0).mean())
+
+
 def summary(distances: FloatArray) -> dict[str, float]:
     """Mean and 95th percentile of distances of vertices."""
     return {"mean": float(distances.mean()), f"p{SHARE}": float(np.percentile(distances, SHARE))}
@@ -107,6 +120,7 @@ class HeldOut:
         by_components: (k, V, 3) for each, what as many principal components make of them.
         by_mirrored: likewise, components of the shapes and their mirror images; empty where there are none.
         steps: (k,) K of the exponentials.
+        stuck: for each, how many searches did not end, as exponentials run into collapsing faces on the way.
     """
 
     index: IntArray
@@ -115,6 +129,7 @@ class HeldOut:
     by_components: list[FloatArray]
     by_mirrored: list[FloatArray]
     steps: IntArray
+    stuck: list[int]
 
     def distances(self, shapes: FloatArray, diagonal: float) -> dict[str, list[FloatArray]]:
         """``modes`` and ``components``, for each number (k, V), from shapes (n, V, 3) of the collection; see above.
@@ -141,6 +156,7 @@ def joined(parts: Sequence[HeldOut]) -> HeldOut:
         by_components=together(part.by_components for part in parts),
         by_mirrored=together(part.by_mirrored for part in parts),
         steps=np.concatenate([part.steps for part in parts]),
+        stuck=np.sum([part.stuck for part in parts], axis=0).tolist(),
     )
 
 
@@ -261,13 +277,15 @@ def held_out(
     counts = [min(count, len(kept) - 1) for count in counts]
     # The search for codes starts from projected logarithms: on the straight line to a far shape faces collapse.
     towards = logarithms(space, mean, unseen, steps).fields
-    reached, by_modes, by_components, by_mirrored = [], [], [], []
+    reached, by_modes, by_components, by_mirrored, stuck = [], [], [], [], []
     for count in counts:
         modes = find_modes(settings, space, mean, fields, count, whose)
         start, _ = coefficients(space, mean, towards, modes.vertices, settings.norm)
-        by_modes.append(nearest_codes(space, mean, modes.vertices, unseen, start, steps).vertices)
+        near = nearest_codes(space, mean, modes.vertices, unseen, start, steps)
+        by_modes.append(near.vertices)
+        stuck.append(sum(status is not Status.CONVERGED for status in near.status))
         by_components.append(components.nearest(unseen, len(modes)))
         if mirrored:
             by_mirrored.append(mirrored.nearest(unseen, len(modes)))
         reached.append(len(modes))
-    return HeldOut(index, reached, by_modes, by_components, by_mirrored, np.full(len(index), steps))
+    return HeldOut(index, reached, by_modes, by_components, by_mirrored, np.full(len(index), steps), stuck)

@@ -37,17 +37,20 @@ from shapespace.training.collection.mirror import find_mirror, mirrored
 from shapespace.training.runs.config import CollectionSettings, Config, ConfigError
 from shapespace.training.runs.directory import RunDirectory
 from shapespace.training.runs.progress import progress, waiting
+from shapespace.training.runs.sampling import read
 from shapespace.training.space.codes import box_of, nearest_codes
 from shapespace.training.space.factors import between, group, names, overlap
 from shapespace.training.space.generalisation import (
     FOLDS,
     LIGHT_STEPS,
+    RANDOM,
     PrincipalComponents,
     held_out,
     joined,
     some_folds,
     summary,
     time_steps,
+    to_nearest,
     vertex_distances,
 )
 from shapespace.training.space.logarithms import logarithms
@@ -339,10 +342,30 @@ def generalisation(run: RunDirectory, config: Config) -> dict[str, Any]:
             "steps": int(found.steps.max()),
             "counts": found.counts[different],
             **{name: [summary(each) for each in rows[different]] for name, rows in away.items()},
+            "stuck": found.stuck[different],
             "worst": str(given["names"][number]),
         }
     run.generalisation.write(facts)
     return facts
+
+
+def compactness_and_specificity(run: RunDirectory) -> dict[str, dict[str, float]]:
+    """Of the space, ``modes``, beside as many principal ``components`` of the aligned vertices (Davies et al. 2002).
+
+    Compactness is the share of the variance that they explain, of logarithms or of vertices. Specificity is the mean
+    distance of random shapes, in the bounds of codes or of coefficients, from the nearest of the collection, as a share
+    of the diagonal: the first joint samples, which are learned from.
+    """
+    shapes, reference, samples = run.own_shapes(), run.reference_mesh(), read(run.samples)
+    m = samples.latents.shape[1]
+    drawn = samples.vertices[samples.index >= 0][:RANDOM].astype(np.float64)
+    linear = PrincipalComponents.of(shapes, reference.vertices)
+    others = linear.random(m, len(drawn), np.random.default_rng(0))
+    away = [to_nearest(each, shapes, reference.diagonal) for each in (drawn, others)]
+    return {
+        "compactness": {"modes": run.decomposition.read()["explained"], "components": linear.explained(m)},
+        "specificity": dict(zip(("modes", "components"), away, strict=True)),
+    }
 
 
 def factors(run: RunDirectory, config: Config) -> dict[str, Any]:

@@ -327,6 +327,13 @@ class GeneralisationAnswer(DistanceAnswer):
     modes: float = Field(description="How many modes; a mean where several folds differ.")
 
 
+class BesideComponents(BaseModel):
+    """A figure of a space, and the same of as many principal components of aligned vertices."""
+
+    modes: float
+    components: float
+
+
 class ModelCard(ModelSummary):
     """What a model is, how good it is, and where it comes from."""
 
@@ -343,6 +350,13 @@ class ModelCard(ModelSummary):
     figures: dict[str, Any] = Field(description="Evaluation figures on the test split.")
     generalisation: GeneralisationAnswer | None = Field(
         description="How near the modes come to shapes that they were found without; null where that is not known."
+    )
+    compactness: BesideComponents | None = Field(
+        description="Share of the variance of the training shapes that is explained; null where that is not known."
+    )
+    specificity: BesideComponents | None = Field(
+        description="Mean distance of random shapes from the nearest training shape, as a share of the bounding box's "
+        "diagonal; null where that is not known."
     )
     draft_error: DistanceAnswer | None = Field(
         description="How far drafts are from full shapes over codes inside the bounds; null where that is not known."

@@ -12,6 +12,7 @@ from shapespace.model.shape_model import ShapeModel
 from shapespace.service.http.dependencies import Model, ServiceDependency
 from shapespace.service.http.description import problems
 from shapespace.service.http.messages.schemas import (
+    BesideComponents,
     GeneralisationAnswer,
     ModelCard,
     ModelList,
@@ -35,6 +36,8 @@ async def model_card(service: ServiceDependency, model: Model) -> ModelCard:
         digest=model.digest,
         versions=service.repository.versions(model.manifest.name),
         generalisation=_generalisation(model.manifest.figures),
+        compactness=_beside_components(model.manifest.figures, "compactness"),
+        specificity=_beside_components(model.manifest.figures, "specificity"),
     )
 
 
@@ -46,6 +49,14 @@ def _generalisation(figures: Mapping[str, Any]) -> GeneralisationAnswer | None:
         content |= {"shapes": found["held_out"], "modes": found["counts"][-1]}
         return GeneralisationAnswer.model_validate(content)
     except (KeyError, IndexError, TypeError, ValidationError):
+        return None
+
+
+def _beside_components(figures: Mapping[str, Any], name: str) -> BesideComponents | None:
+    """Of that name, where a run has measured it; what other tools write there is left alone."""
+    try:
+        return BesideComponents.model_validate(figures.get(name))
+    except ValidationError:
         return None
 
 

@@ -157,6 +157,14 @@ def test_the_card_tells_how_near_it_comes_to_shapes_that_it_has_not_seen(client:
     assert torus["generalisation"] is None, "a product by design has no shapes to hold out"
 
 
+def test_the_card_tells_what_the_space_spans(tmp_path: Path, start: Start) -> None:
+    write_bundle(tmp_path, "small")
+    card = httpx.get(f"{start(tmp_path).url}/v1/models/small").raise_for_status().json()
+    for name in ("compactness", "specificity"):
+        assert card[name] == card["figures"][name]
+        assert card[name]["modes"] > 0
+
+
 def test_cards_of_bundles_that_do_not_tell_how_near_they_come(tmp_path: Path, start: Start) -> None:
     figures = [
         None,
@@ -167,10 +175,11 @@ def test_cards_of_bundles_that_do_not_tell_how_near_they_come(tmp_path: Path, st
     ]
     for k, unseen in enumerate(figures):
         manifest = write_bundle(tmp_path, f"older-{k}") / MANIFEST
-        facts = json.loads(manifest.read_text()) | {"figures": {"generalisation": unseen}}
+        facts = json.loads(manifest.read_text()) | {"figures": {"generalisation": unseen, "specificity": unseen}}
         facts.pop("draft_error")
         manifest.write_text(json.dumps(facts))
     server = start(tmp_path)
     for k in range(len(figures)):
         card = httpx.get(f"{server.url}/v1/models/older-{k}").raise_for_status().json()
-        assert (card["draft_error"], card["generalisation"]) == (None, None)
+        names = "draft_error", "generalisation", "compactness", "specificity"
+        assert [card[name] for name in names] == [None] * 4

@@ -113,6 +113,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
             "worst": NASTY,
             "modes": [{"mean": 0.023, "p95": 0.031}, {"mean": 0.0047, "p95": 0.0061}],
             "components": [{"mean": 0.021, "p95": 0.032}, {"mean": 0.0053, "p95": 0.0071}],
+            "stuck": [0, 2],
         },
         "encoded.json": {
             "shapes": 9,
@@ -132,6 +133,8 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
             "affine_samples": 80,
             "correction": {"kind": "field", "tried": {"kernel": 0.0123, "field": 0.00456}},
             "r2_factors": {"head": score(0.9), NASTY: score(0.8)},
+            "compactness": {"modes": 0.9123, "components": 0.9234},
+            "specificity": {"modes": 0.0345, "components": 0.0456},
             "variants": {"v": {"title": "without <i>this</i>", "r2": score(0.7)}},
             "vertex_error": {"mean": 0.0123, "max": 0.2, "iterations": 3.5, "status": {"converged": 3}},
             "sizes": {"composite": 12_300_000},
@@ -252,8 +255,9 @@ def test_every_section_is_there_with_its_figures(page: Page) -> None:
 def test_the_page_opens_with_how_near_the_space_comes_to_the_shapes_of_the_user(page: Page) -> None:
     assert page.source.index('id="nearness"') < page.source.index("R² of the composite network")
     words = page.words.replace("\N{NO-BREAK SPACE}", " ")
-    said = ["3 shapes, held out", "2 coordinates", "0.47 %", "0.61 %", "0.53 %", "pose7"]
+    said = ["3 shapes, held out", "Of 2 no end was found", "2 coordinates", "0.47 %", "0.61 %", "0.53 %", "pose7"]
     said += ["all 9, through encode", "remembered", "modes alone", "0.37 %"]
+    said += ["explained (compactness)", "91 %", "92 %", "nearest of yours (specificity)", "3.5 %", "4.6 %"]
     assert not [each for each in said if each not in words]
     best = re.findall(r'<td class="best">(.*?)</td>', page.source)[:4]
     assert [cell.replace("\N{NO-BREAK SPACE}", " ") for cell in best] == ["2.1 %", "0.47 %", "0.18 %", "0.18 %"]

@@ -17,6 +17,7 @@ from shapespace.training.space.generalisation import (
     held_out,
     summary,
     time_steps,
+    to_nearest,
     vertex_distances,
 )
 
@@ -88,9 +89,17 @@ def test_components_reproduce_what_they_were_found_from_and_come_nearer_with_mor
     assert vertex_distances(linear.nearest(shapes, 5), shapes, 1.0).max() < 1e-9
     errors = [np.square(vertex_distances(linear.nearest(shapes, k), shapes, 1.0)).sum() for k in range(6)]
     assert (np.diff(errors) < 0).all()
+    left = [1 - linear.explained(k) for k in range(6)]
+    assert left == pytest.approx(np.array(errors) / errors[0], abs=1e-9)
     drawn = linear.random(1, 50, rng)
     along = (drawn - linear.mean).reshape(50, -1) @ linear.axes[0]
     assert linear.coefficients[:, 0].min() <= along.min() <= along.max() <= linear.coefficients[:, 0].max()
+
+
+def test_shapes_are_as_far_from_a_collection_as_from_the_nearest_of_it(shapes):
+    assert to_nearest(shapes[:2], shapes, 1.0) < 1e-9
+    expected = vertex_distances(shapes[:1], shapes[1], 2.0).mean()
+    assert to_nearest(shapes[:1], shapes[1:], 2.0) == pytest.approx(expected), "the next of a family"
 
 
 def test_distances_know_no_pose_and_no_unit(shapes, rng):

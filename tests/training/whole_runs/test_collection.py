@@ -183,6 +183,16 @@ def test_a_run_leaves_what_the_contract_promises(run: Path) -> None:
     for kind in ("modes", "components"):
         fewer, more = (each["mean"] for each in unseen[kind])
         assert 0 < more < fewer < 0.1
+    assert unseen["stuck"] == [0, 0]
+    parts = [np.load(path) for path in sorted((run / "samples").glob("part-*.npz"))]
+    random = np.concatenate([part["vertices"][part["status"] == "done"] for part in parts])[:200]
+    given = np.load(run / "shapes.npz")["vertices"]
+    size = np.linalg.norm(np.ptp(np.load(run / "reference.npz")["vertices"], axis=0))
+    away = [min(np.linalg.norm(align(x, y) - y, axis=1).mean() for y in given) for x in random]
+    assert figures["specificity"]["modes"] == pytest.approx(np.mean(away) / size, rel=1e-4)
+    assert 0 < figures["specificity"]["components"] < 0.2
+    assert 0.5 < figures["compactness"]["modes"] <= 1
+    assert 0.5 < figures["compactness"]["components"] <= 1
     assert (encoded["shapes"], encoded["outside"]) == (8, [])
     assert 0 < encoded["mean"] < encoded["p95"] < 0.02
     # What modes and these hasty networks miss is remembered; the fine mesh is still carried along.

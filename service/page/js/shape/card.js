@@ -20,6 +20,7 @@ const MEANINGS = {
   r2: "How much of the change of lengths and angles the networks get right: 1 is all of it.",
   unseen: "From shapes that training has not seen, in shares of the diagonal.",
   components: "The same by a linear model with as many numbers.",
+  random: "From random shapes to the nearest that training has seen, in shares of the diagonal: how far they stray.",
   draft: "From what is shown while something moves to the full shape.",
   error: "From the networks’ shapes to exact ones, in shares of the diagonal.",
 };
@@ -34,7 +35,7 @@ function flatten(value, path = []) {
 export async function openCard(dialog, model) {
   const card = await api.modelCard(model);
   const { r2, vertex_error: error } = card.figures;
-  const { generalisation: unseen, draft_error: draft } = card;
+  const { generalisation: unseen, specificity: random, draft_error: draft } = card;
   find("h2", dialog).textContent = card.title;
   find(".kind", dialog).textContent = `${card.name} · version ${card.version} · ${card.licence}`;
   find(".description", dialog).textContent = card.description;
@@ -49,6 +50,12 @@ export async function openCard(dialog, model) {
         ? [
             ["unseen shapes, mean distance", percent(unseen.mean), MEANINGS.unseen],
             ["as many principal components", percent(unseen.components.mean), MEANINGS.components],
+          ]
+        : []),
+      ...(random
+        ? [
+            ["random shapes, to the nearest trained on", percent(random.modes), MEANINGS.random],
+            ["of as many principal components", percent(random.components), MEANINGS.components],
           ]
         : []),
       ...(draft ? [["drafts, mean distance", percent(draft.mean), MEANINGS.draft]] : []),
