@@ -471,7 +471,7 @@ class ExportSettings(_Section):
     """Weight η of angles against lengths when vertices are found from them (Gauss–Newton)."""
     examples: bool = True
     """Whether the model remembers what modes and networks miss of the training shapes, and adds it where a code is
-    theirs. Other codes hardly notice. Takes a byte of the bundle for each length and angle of each shape, 512 at most."""
+    theirs. Other codes hardly notice. The bundle is larger by a byte for each length and angle of each shape."""
     tolerance: float = Field(1e-4, gt=0)
     """Largest relative difference of ONNX and PyTorch, in the weighted norm."""
     faces: Axis | None = None
