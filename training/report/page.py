@@ -201,11 +201,12 @@ def nearness(record: Record, studio: Studio | None) -> list[dict[str, Any]]:
         kinds.append({
             "title": "Shapes it has not seen",
             "how": f"{facts['held_out']} shapes, held out while mean and modes were found; exponentials, no networks"
-            + stuck(facts),
+            + (f"; for {facts['stuck']} the search did not end: faces collapse" if facts.get("stuck") else ""),
             "figures": [
                 (f"{count:.3g} coordinates", of, components)
                 for count, of, components in zip(facts["counts"], facts["modes"], facts["components"], strict=True)
-            ],
+            ]
+            + others(facts),
             "worst": facts["worst"],
             "pictures": _pair(record.run.least_general, facts["worst"], studio),
         })  # fmt: skip
@@ -225,12 +226,12 @@ def nearness(record: Record, studio: Studio | None) -> list[dict[str, Any]]:
     return kinds
 
 
-def stuck(facts: dict[str, Any]) -> str:
-    """How many searches for held-out shapes did not end, if some did not."""
-    count = facts.get("stuck", [0])[-1]
-    if not count:
-        return ""
-    return f". Of {count} no end was found, as faces collapse on the way: networks may come nearer"
+def others(facts: dict[str, Any]) -> list[tuple[str, dict[str, float], dict[str, float]]]:
+    """Of held-out shapes those whose search ended, where it did not for some: networks go on where it stops."""
+    if not facts.get("stuck") or not facts["not_stuck"]:
+        return []
+    some, count = facts["not_stuck"], facts["held_out"] - facts["stuck"]
+    return [(f"where it ended ({count})", some["modes"], some["components"])]
 
 
 def qualities(record: Record) -> list[tuple[str, dict[str, float]]]:

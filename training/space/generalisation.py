@@ -10,6 +10,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from shapespace.arrays import FloatArray, IntArray
 from shapespace.coordinates.nric import dihedral_angles
@@ -120,7 +121,7 @@ class HeldOut:
         by_components: (k, V, 3) for each, what as many principal components make of them.
         by_mirrored: likewise, components of the shapes and their mirror images; empty where there are none.
         steps: (k,) K of the exponentials.
-        stuck: for each, how many searches did not end, as exponentials run into collapsing faces on the way.
+        stuck: (k,) for each, whether the search did not end, as exponentials run into collapsing faces on the way.
     """
 
     index: IntArray
@@ -129,7 +130,7 @@ class HeldOut:
     by_components: list[FloatArray]
     by_mirrored: list[FloatArray]
     steps: IntArray
-    stuck: list[int]
+    stuck: list[NDArray[np.bool_]]
 
     def distances(self, shapes: FloatArray, diagonal: float) -> dict[str, list[FloatArray]]:
         """``modes`` and ``components``, for each number (k, V), from shapes (n, V, 3) of the collection; see above.
@@ -146,8 +147,8 @@ class HeldOut:
 def joined(parts: Sequence[HeldOut]) -> HeldOut:
     """The shapes of several folds together; the numbers of modes are means."""
 
-    def together(by_count: Iterable[list[FloatArray]]) -> list[FloatArray]:
-        return [np.concatenate(shapes) for shapes in zip(*by_count, strict=True)]
+    def together(by_count: Iterable[list[NDArray]]) -> list[NDArray]:
+        return [np.concatenate(each) for each in zip(*by_count, strict=True)]
 
     return HeldOut(
         index=np.concatenate([part.index for part in parts]),
@@ -156,7 +157,7 @@ def joined(parts: Sequence[HeldOut]) -> HeldOut:
         by_components=together(part.by_components for part in parts),
         by_mirrored=together(part.by_mirrored for part in parts),
         steps=np.concatenate([part.steps for part in parts]),
-        stuck=np.sum([part.stuck for part in parts], axis=0).tolist(),
+        stuck=together(part.stuck for part in parts),
     )
 
 
@@ -283,7 +284,7 @@ def held_out(
         start, _ = coefficients(space, mean, towards, modes.vertices, settings.norm)
         near = nearest_codes(space, mean, modes.vertices, unseen, start, steps)
         by_modes.append(near.vertices)
-        stuck.append(sum(status is not Status.CONVERGED for status in near.status))
+        stuck.append(np.array([status is not Status.CONVERGED for status in near.status]))
         by_components.append(components.nearest(unseen, len(modes)))
         if mirrored:
             by_mirrored.append(mirrored.nearest(unseen, len(modes)))

@@ -337,12 +337,14 @@ def generalisation(run: RunDirectory, config: Config) -> dict[str, Any]:
         number = found.index[worst]
         run.least_general.write(given=shapes[number], found=found.by_modes[-1][worst])
         different = slice(0 if found.counts[0] < found.counts[1] else 1, None)
+        ended = ~found.stuck[-1]
         facts = {
             "held_out": len(found.index),
             "steps": int(found.steps.max()),
             "counts": found.counts[different],
             **{name: [summary(each) for each in rows[different]] for name, rows in away.items()},
-            "stuck": found.stuck[different],
+            "stuck": int((~ended).sum()),
+            "not_stuck": {name: summary(rows[-1][ended]) for name, rows in away.items() if ended.any()},
             "worst": str(given["names"][number]),
         }
     run.generalisation.write(facts)
