@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import argparse
+from dataclasses import replace
 from pathlib import Path
 
 import matplotlib.pyplot as plt
@@ -27,6 +28,8 @@ from shapespace.training.runs.sampling import read
 ROOT = Path(__file__).resolve().parents[1]
 #: How many codes are shown (the first fresh ones), how many modes (the strongest), and pixels of a picture's side.
 CODES, MODES, SIZE = 4, 6, 260
+#: Room around the shapes, a share of the picture's longer side.
+MARGIN = 0.02
 #: Errors between which colours change, as shares of the diagonal, on a logarithmic scale.
 LEAST, MOST = 1e-4, 3e-2
 
@@ -45,9 +48,14 @@ def models(run: Run, studio: Studio, path: Path) -> None:
         "affine sum of factors": affine_sum(rest, predict(composite.factor_shapes, latents).numpy()),
     }
     reconstruct = Reconstructor(reference, eta)
+    made = {
+        name: align(np.stack([reconstruct(row, tolerance=1e-6).vertices for row in z]), exact)
+        for name, z in found.items()
+    }
+    points = np.concatenate([exact, *made.values()]).reshape(-1, 3)
+    studio = replace(studio, camera=studio.camera.framing(points, MARGIN))
     columns: list[tuple[str, list[NDArray[np.uint8]]]] = [("exact", [studio.pixels(x, SIZE, CLAY) for x in exact])]
-    for name, z in found.items():
-        shapes = align(np.stack([reconstruct(row, tolerance=1e-6).vertices for row in z]), exact)
+    for name, shapes in made.items():
         away = np.linalg.norm(shapes - exact, axis=2) / reference.diagonal
         level = np.log(np.maximum(away, LEAST) / LEAST) / np.log(MOST / LEAST)
         pictures = [studio.pixels(x, SIZE, tint(ERROR, row)) for x, row in zip(shapes, level, strict=True)]
