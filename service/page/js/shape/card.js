@@ -20,8 +20,7 @@ const MEANINGS = {
   r2: "How much of the change of lengths and angles the networks get right: 1 is all of it.",
   unseen: "From shapes that training has not seen, in shares of the diagonal.",
   components: "The same by a linear model with as many numbers.",
-  random:
-    "From random shapes to the nearest that training has seen, in shares of the diagonal: how far they stray.",
+  random: "From random shapes to the nearest of training, in shares of the diagonal: how far they stray.",
   draft: "From what is shown while something moves to the full shape.",
   error: "From the networks’ shapes to exact ones, in shares of the diagonal.",
 };
