@@ -234,14 +234,18 @@ def others(facts: dict[str, Any]) -> list[tuple[str, dict[str, float], dict[str,
     return [(f"where it ended ({count})", some["modes"], some["components"])]
 
 
-def qualities(record: Record) -> list[tuple[str, dict[str, float]]]:
-    """Compactness and specificity, in words, where they are known."""
+def qualities(record: Record) -> list[tuple[str, str, str]]:
+    """Compactness and specificity, of modes and of components, where they are known."""
+    rows = [
+        ("compactness", 4, "variance of your shapes that is explained (compactness)"),
+        ("specificity", 2, "from random shapes to the nearest of yours (specificity)"),
+    ]
     found = record.evaluation
-    words = {
-        "compactness": "variance of your shapes that is explained (compactness)",
-        "specificity": "from random shapes to the nearest of yours (specificity)",
-    }
-    return [(words[name], found[name]) for name in words if name in found]
+    return [
+        (title, percent(found[name]["modes"], digits), percent(found[name]["components"], digits))
+        for name, digits, title in rows
+        if name in found
+    ]
 
 
 def _pair(file: NpzFile, title: str, studio: Studio | None) -> list[tuple[Markup, str]]:
@@ -317,9 +321,9 @@ def r2(value: float | None) -> str:
     return "–" if value is None or not math.isfinite(value) else f"{value:.4f}"
 
 
-def percent(value: float) -> str:
-    """Two digits of a percentage."""
-    return f"{100 * value:.2g}\N{NO-BREAK SPACE}%"
+def percent(value: float, digits: int = 2) -> str:
+    """So many digits of a percentage."""
+    return f"{100 * value:.{digits}g}\N{NO-BREAK SPACE}%"
 
 
 def duration(seconds: float | None) -> str:

@@ -259,7 +259,7 @@ def test_the_page_opens_with_how_near_the_space_comes_to_the_shapes_of_the_user(
     said = ["3 shapes, held out", "2 coordinates", "0.47 %", "0.61 %", "0.53 %", "pose7"]
     said += ["for 2 the search did not end", "where it ended (1)", "0.31 %"]
     said += ["all 9, through encode", "remembered", "modes alone", "0.37 %"]
-    said += ["explained (compactness)", "91 %", "92 %", "nearest of yours (specificity)", "3.5 %", "4.6 %"]
+    said += ["explained (compactness)", "91.23 %", "92.34 %", "nearest of yours (specificity)", "3.5 %", "4.6 %"]
     assert not [each for each in said if each not in words]
     best = re.findall(r'<td class="best">(.*?)</td>', page.source)[:5]
     best = [cell.replace("\N{NO-BREAK SPACE}", " ") for cell in best]
