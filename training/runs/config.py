@@ -319,7 +319,7 @@ class AutoSettings(_Section):
     """
 
     kind: Literal["auto"] = "auto"
-    minutes: float = Field(30, gt=0)
+    minutes: float = Field(30, ge=0)
     """The other kind has only as many epochs as take so long, and is not tried where the kernel alone took longer."""
 
 

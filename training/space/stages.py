@@ -37,7 +37,7 @@ from shapespace.training.collection.mirror import find_mirror, mirrored
 from shapespace.training.runs.config import CollectionSettings, Config, ConfigError
 from shapespace.training.runs.directory import RunDirectory
 from shapespace.training.runs.progress import progress, waiting
-from shapespace.training.runs.sampling import read
+from shapespace.training.runs.sampling import DONE, parts
 from shapespace.training.space.codes import box_of, nearest_codes
 from shapespace.training.space.factors import between, group, names, overlap
 from shapespace.training.space.generalisation import (
@@ -358,14 +358,15 @@ def compactness_and_specificity(run: RunDirectory) -> dict[str, dict[str, float]
     distance of random shapes, in the bounds of codes or of coefficients, from the nearest of the collection, as a share
     of the diagonal: the first joint samples, which are learned from.
     """
-    shapes, reference, samples = run.own_shapes(), run.reference_mesh(), read(run.samples)
-    m = samples.latents.shape[1]
-    drawn = samples.vertices[samples.index >= 0][:RANDOM].astype(np.float64)
+    shapes, reference, found = run.own_shapes(), run.reference_mesh(), run.decomposition.read()
+    # Only as many files as are needed: all samples may be gigabytes.
+    random = itertools.chain.from_iterable(part["vertices"][part["status"] == DONE] for part in parts(run.samples))
+    drawn = np.array(list(itertools.islice(random, RANDOM)), dtype=np.float64)
     linear = PrincipalComponents.of(shapes, reference.vertices)
-    others = linear.random(m, len(drawn), np.random.default_rng(0))
+    others = linear.random(found["modes"], len(drawn), np.random.default_rng(0))
     away = [to_nearest(each, shapes, reference.diagonal) for each in (drawn, others)]
     return {
-        "compactness": {"modes": run.decomposition.read()["explained"], "components": linear.explained(m)},
+        "compactness": {"modes": found["explained"], "components": linear.explained(found["modes"])},
         "specificity": dict(zip(("modes", "components"), away, strict=True)),
     }
 

@@ -2,7 +2,7 @@
 
 import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
@@ -11,6 +11,7 @@ import httpx
 import numpy as np
 import pytest
 import trimesh
+from numpy.typing import NDArray
 
 from shapespace.bundle.reader import BundleError, read_bundle
 from shapespace.files.formats import MESH_FORMATS
@@ -218,27 +219,35 @@ def test_a_code_outside_is_no_farther_than_one_inside(figure: ShapeModel) -> Non
         assert allowed < 1.03 * clamped, k
 
 
-def test_a_search_that_went_astray_begins_once_more_from_the_nearest_training_shape(
-    models: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    model = load(models / "figure")
+def ending_elsewhere(
+    models: Path, monkeypatch: pytest.MonkeyPatch, residuals: Callable[[NDArray], NDArray]
+) -> tuple[ShapeModel, NDArray]:
+    """The figure, whose search by lengths and angles ends at the upper bounds, with residuals; and a training shape."""
+    model, by_nric = load(models / "figure"), Encoder._by_nric
     codes = read_bundle(models / "figure" / "2").training_codes
     assert codes is not None
     given = model.decode(codes[20])
-    size = np.linalg.norm(np.ptp(given, axis=0))
-    by_nric, by_vertices = Encoder._by_nric, Encoder._by_vertices
-    searches = iter(range(9))
 
-    def astray(self: Encoder, *given: Any) -> Fit:
+    def elsewhere(self: Encoder, *given: Any) -> Fit:
         found = by_nric(self, *given)
-        return replace(found, x=model.upper, residuals=0 * found.residuals)
+        return replace(found, x=model.upper, residuals=residuals(found.residuals))
+
+    monkeypatch.setattr(Encoder, "_by_nric", elsewhere)
+    return model, given
+
+
+def test_a_search_that_went_astray_begins_once_more_from_the_nearest_training_shape(
+    models: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model, given = ending_elsewhere(models, monkeypatch, np.zeros_like)
+    size = np.linalg.norm(np.ptp(given, axis=0))
+    by_vertices, searches = Encoder._by_vertices, iter(range(9))
 
     def stuck(self: Encoder, aim: Aim, near: Fit, *given: Any, **more: Any) -> Fit:
         if next(searches) == 0:
             return replace(near, iterations=LONG)
         return by_vertices(self, aim, near, *given, **more)
 
-    monkeypatch.setattr(Encoder, "_by_nric", astray)
     monkeypatch.setattr(Encoder, "_by_vertices", stuck)
     found = model.encode(given, bounds="clamp")
     assert found.distances.mean() < 1e-5 * size
@@ -247,23 +256,14 @@ def test_a_search_that_went_astray_begins_once_more_from_the_nearest_training_sh
 
 
 def test_a_search_that_met_a_collapsed_shape_begins_once_more(models: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    model = load(models / "figure")
-    codes = read_bundle(models / "figure" / "2").training_codes
-    assert codes is not None
-    given = model.decode(codes[20])
-    by_nric, moved = Encoder._by_nric, SearchedShapes.derivatives
-    searches = iter(range(99))
-
-    def astray(self: Encoder, *given: Any) -> Fit:
-        found = by_nric(self, *given)
-        return replace(found, x=model.upper, residuals=0 * found.residuals)
+    model, given = ending_elsewhere(models, monkeypatch, np.zeros_like)
+    moved, searches = SearchedShapes.derivatives, iter(range(99))
 
     def collapsed(self: SearchedShapes, *given: Any) -> Any:
         if next(searches) == 0:
             raise NotPositiveDefiniteError("a face without area")
         return moved(self, *given)
 
-    monkeypatch.setattr(Encoder, "_by_nric", astray)
     monkeypatch.setattr(SearchedShapes, "derivatives", collapsed)
     found = model.encode(given, bounds="clamp")
     assert found.distances.mean() < 1e-5 * np.linalg.norm(np.ptp(given, axis=0))
@@ -272,17 +272,7 @@ def test_a_search_that_met_a_collapsed_shape_begins_once_more(models: Path, monk
 
 def test_a_search_begins_at_a_training_shape_that_is_nearer(models: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A search by lengths and angles that ends elsewhere, as where a bundle remembers more than reaches that far."""
-    model = load(models / "figure")
-    codes = read_bundle(models / "figure" / "2").training_codes
-    assert codes is not None
-    given = model.decode(codes[20])
-    by_nric = Encoder._by_nric
-
-    def elsewhere(self: Encoder, *given: Any) -> Fit:
-        found = by_nric(self, *given)
-        return replace(found, x=model.upper, residuals=1 + found.residuals)
-
-    monkeypatch.setattr(Encoder, "_by_nric", elsewhere)
+    model, given = ending_elsewhere(models, monkeypatch, lambda residuals: 1 + residuals)
     objectives: tuple[Literal["vertices", "nric"], ...] = ("vertices", "nric")
     for objective in objectives:
         found = model.encode(given, objective=objective)

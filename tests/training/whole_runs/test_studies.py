@@ -32,7 +32,8 @@ def test_the_page_of_results_says_what_was_measured(tmp_path: Path, monkeypatch:
     results.write_page()
     page = (tmp_path / "results.md").read_text()
     assert "| horse | 35 | 20 | 5 |" in page
-    assert " 0.8765 |" in page
+    kernel = row["evaluation"]["fresh"]["r2"]["kernel"]["total"]
+    assert f"| 0.8765 | 0.9981 | **{kernel:.4f}** |" in page, "the best is bold"
     assert "yet: hand, faces, samba, makehuman, hippocampus." in page
     assert results.spread(row, "composite")[1] <= results.spread(row, "composite")[0]
     assert "| bodies" not in page, "aims of what was not measured"
