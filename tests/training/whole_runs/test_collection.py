@@ -462,9 +462,13 @@ def test_a_run_killed_in_every_stage_ends_as_one_that_nobody_disturbed(run: Path
 
 
 def test_init_writes_a_configuration_that_the_command_takes(folder: Path, tmp_path: Path) -> None:
-    out = tmp_path / "mine.toml"
+    few, out = tmp_path / "few", tmp_path / "mine.toml"
+    few.mkdir()
+    for file in sorted((folder / "meshes").iterdir()):
+        if file.stem not in ("bar5", "bar6", "bar7"):
+            (few / file.name).symlink_to(file)
     shapespace = [sys.executable, "-m", "shapespace.training"]
-    subprocess.run([*shapespace, "init", str(folder / "meshes"), "--out", str(out)], check=True, capture_output=True)
+    subprocess.run([*shapespace, "init", str(few), "--out", str(out)], check=True, capture_output=True)
     text, default = out.read_text(), "# coarse_vertices = 1000"
     assert default in text
     out.write_text(text.replace(default, "coarse_vertices = 120"))
