@@ -101,7 +101,7 @@ def save(columns: list[tuple[str, list[NDArray[np.uint8]]]], path: Path, words: 
 
 
 def main() -> None:
-    """Draw both."""
+    """Draw both; of a collection that is a product by design, no modes."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("config", type=Path)
     parser.add_argument("run", type=Path)
@@ -112,7 +112,8 @@ def main() -> None:
         raise SystemExit("Nothing to draw with: install embreex.")
     folder, name = ROOT / "docs" / "measurements", given.config.stem
     models(run, studio, folder / f"{name}-models.png")
-    modes(run, studio, folder / f"{name}-modes.png")
+    if not run.by_design:
+        modes(run, studio, folder / f"{name}-modes.png")
 
 
 if __name__ == "__main__":
