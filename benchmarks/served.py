@@ -66,10 +66,9 @@ which a bundle [remembers](../explanation/mathematics.md#networks): it adds what
 Components remember nothing, so this says that users get their own shapes back, not that the modes are better;
 **nothing remembered** is a model without it (`export.examples = false`) beside the same components.
 
-**folds**: with all five each shape is unseen once; rows with fewer know only some shapes. Where only some are
-*remembering*, the others are of older models, trained and encoded before models remembered: *trained on* is of the
-remembering ones, all else of all. Rows without *trained on* are of older models altogether. **of folds**: the least and
-the greatest ratio of a fold. **m**: of the first fold, others may differ by one.
+**folds**: with all five each shape is unseen once; rows with fewer know only some shapes. Rows without *trained on* are
+of older models, trained and encoded before models remembered. **of folds**: the least and the greatest ratio of a fold.
+**m**: of the first fold, others may differ by one.
 
 Of the first fold alone: **specificity**, the mean distance of {codes} random shapes, uniform in the bounds of the codes
 or of the components' coefficients, to the nearest of the shapes that made the model (lower is better); and the last
@@ -171,9 +170,8 @@ def measure(name: str, data: Path, out: Path, fold: int) -> dict[str, Any]:
 
 def row(name: str, folds: list[dict[str, Any]]) -> str:
     """Of the table: means over all shapes, and the least and the greatest ratio of a fold."""
-    first, remembering = folds[0], sum("trained on" in fold for fold in folds)
-    count = f"{len(folds)}, {remembering} remembering" if 0 < remembering < len(folds) else str(len(folds))
-    cells = ["" if name.endswith(HALF) else title(name), str(first["modes"]), count]
+    first = folds[0]
+    cells = ["" if name.endswith(HALF) else title(name), str(first["modes"]), str(len(folds))]
     for kind in (*COLUMNS, ALONE):
         found = [fold[kind] for fold in folds if kind in fold]
         if not found:
