@@ -16,7 +16,7 @@ import numpy as np
 
 from benchmarks.results import COLLECTIONS, MANNEQUIN, MIRRORED, ROOT, SYMMETRIC, open_run
 from shapespace.training.space import stages
-from shapespace.training.space.generalisation import folds, held_out, summary
+from shapespace.training.space.generalisation import LIGHT_STEPS, folds, held_out, summary
 
 #: What was measured, a file for each collection.
 FIGURES = ROOT / "runs" / "folds"
@@ -133,7 +133,7 @@ def main() -> None:
             file.write_text(json.dumps(found, indent=1), encoding="utf-8")
         done = {each: json.loads(path.read_text()) for each in ROWS if (path := FIGURES / f"{each}.json").exists()}
         table = "\n".join(row for each in done.items() for row in rows(*each))
-        page = INTRODUCTION.format(steps=stages.LIGHT_STEPS) + table + "\n"
+        page = INTRODUCTION.format(steps=LIGHT_STEPS) + table + "\n"
         (ROOT / "docs" / "measurements" / "generalisation.md").write_text(page, encoding="utf-8")
 
 
