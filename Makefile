@@ -64,7 +64,7 @@ QUICK = tests/shapespace tests/service/use_cases/test_use_cases.py tests/trainin
 
 # What the libraries of serving take part in, and training doesn't; processes, signals, slow strangers and fits are the same
 # with all.
-NOT_SERVING = blocks bundled_files clients deployment proxy replicas draining operation reloading strangers networks fit
+NOT_SERVING = blocks bundled_files clients deployment proxy replicas draining operation reloading strangers fit
 SERVING = $(filter-out $(foreach name,$(NOT_SERVING),%/test_$(name).py), \
 	$(wildcard tests/service/*/test_*.py)) $(foreach name,files/test_formats files/test_polygon_reading files/test_gltf_reading \
 	coordinates/test_reconstruction solve/test_cholesky,tests/shapespace/$(name).py)
