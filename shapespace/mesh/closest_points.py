@@ -70,17 +70,16 @@ class Surface:
     @cached_property
     def face_normals(self) -> FloatArray:
         """(F, 3), zero for a face without area."""
-        n = face_normals(self.vertices, self.fans.faces, normalised=False)
-        return n / np.maximum(np.linalg.norm(n, axis=1, keepdims=True), np.finfo(float).tiny)
+        return unit(face_normals(self.vertices, self.fans.faces, normalised=False))
 
     @cached_property
     def vertex_normals(self) -> FloatArray:
         """(V, 3) sums of the normals around, weighted by area, of unit length."""
         faces, n = self.fans.faces, face_normals(self.vertices, self.fans.faces, normalised=False)
-        sums = np.stack(
+        sums: FloatArray = np.stack(
             [np.bincount(faces.ravel(), np.repeat(n[:, k], 3), minlength=len(self.vertices)) for k in range(3)], axis=1
         )
-        return sums / np.maximum(np.linalg.norm(sums, axis=1, keepdims=True), np.finfo(float).tiny)
+        return unit(sums)
 
     def closest(self, points: FloatArray) -> Closest:
         """Of points (n, 3)."""
@@ -123,3 +122,9 @@ def nearest_shares(points: FloatArray, corners: FloatArray) -> FloatArray:
         best_v, best_w = np.where(better, v_side, best_v), np.where(better, w_side, best_w)
     v, w = np.where(inside, v, best_v), np.where(inside, w, best_w)
     return np.stack([1 - v - w, v, w], axis=-1)
+
+
+def unit(vectors: FloatArray) -> FloatArray:
+    """(n, 3) of length one; zero where they were."""
+    found: FloatArray = vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), np.finfo(float).tiny)
+    return found

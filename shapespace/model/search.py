@@ -19,6 +19,7 @@ from shapespace.mesh.rigid_motion import Placement, align
 from shapespace.mesh.triangle_mesh import vertex_areas
 from shapespace.model.decoder import Decoder, MeshChoice
 from shapespace.model.derivatives import carried, derivatives, factor_derivatives
+from shapespace.model.pairing import Pairing, Pairs
 from shapespace.model.population import Population
 from shapespace.model.scan import Scan, near
 from shapespace.model.searched_shapes import SearchedShapes
@@ -28,8 +29,6 @@ from shapespace.solve.deadline import Deadline
 #: The robust weight of a pair is one half at this distance, in standard deviations of the present distances. The first
 #: such distance is the quantile FARTHEST of all; it shrinks by a factor in each iteration.
 WIDTH, FARTHEST, SHRINKING = 3.0, 0.95, 0.7
-#: Cosine of the angle between the normals of a pair: below the first its weight is 0, above the second it is 1.
-APART, ALIKE = 0.2, 0.6
 #: Weight of the point-to-point distance beside the point-to-plane distance, at first and later. It keeps a shape from
 #: sliding along its own surface.
 SLIDING, SLIDING_AT_LAST = 0.3, 0.01
@@ -128,38 +127,6 @@ class State:
     moved: float = np.inf
 
 
-@dataclass(frozen=True, eq=False)
-class _Pairs:
-    """Points of the scan and of the model that stand for each other, in the model's frame.
-
-    Attributes:
-        gaps: (n, 3) from the model's points to the scan's.
-        normals: (n, 3) of the model.
-        distances: (n,).
-        rows: (n, V) sparse, the model's points as means of its vertices.
-        places: (n, 3) the model's points.
-        agree: (n,) from 0 to 1, whether normals do.
-        mass: (n,) what each pair stands for; those of the scan sum to 1.
-        of_scan: how many of them begin at points of the scan; they come first.
-        drawn: (n,) whether the pair is one of what was left over on both sides, drawn to each other from afar.
-    """
-
-    gaps: FloatArray
-    normals: FloatArray
-    distances: FloatArray
-    rows: sparse.csr_array
-    places: FloatArray
-    agree: FloatArray
-    mass: FloatArray
-    of_scan: int
-    drawn: NDArray[np.bool_]
-
-    @property
-    def heights(self) -> FloatArray:
-        """(n,) of the scan's points over the model's planes."""
-        return (self.gaps * self.normals).sum(axis=1)
-
-
 class Search:
     """Looks for the code and the place of a shape near a start; the derivatives are those of ``encode`` and ``edit``.
 
@@ -186,7 +153,8 @@ class Search:
         deadline: Deadline | None,
     ) -> None:
         self._model, self.options, self._level, self._deadline = model, options, level, deadline
-        self.scan, self._some, self._fans, self._vertices = scan, scan.some(level.points), fans, vertices
+        self.scan, self._fans = scan, fans
+        self._pairing = Pairing(scan, level.points, vertices, both=not options.partial, blended=not level.rough)
         self._diagonal = model.reference.diagonal
         self._whiten: FloatArray = np.asarray(np.linalg.inv(options.prior.root), np.float64)
         self.shapes = SearchedShapes(model, reconstruct, deadline, rough=level.rough)
@@ -217,7 +185,7 @@ class Search:
                 width = float(np.quantile(pairs.distances, FARTHEST))
             sigma = self._sigma(pairs, state)
             if k < drawn:
-                pairs = self._drawn(replace(state, sigma=sigma), pairs)
+                pairs = self._pairing.drawn(pairs, self.surface(state.shape), state.placement, self.tolerance(sigma))
             moved = self._step(state, pairs, max(WIDTH * sigma, width), sigma, SLIDING if first else SLIDING_AT_LAST)
             width *= SHRINKING
             if moved is None:
@@ -236,7 +204,7 @@ class Search:
         pairs = self._pairs(state)
         sigma, n = self._sigma(pairs, state), pairs.of_scan
         weights = _robust(pairs.distances[:n], WIDTH * sigma) * pairs.agree[:n]
-        share = independent(self._some.points, pairs.heights[:n], weights)
+        share = independent(self._pairing.some.points, pairs.heights[:n], weights)
         A = self._motions(pairs, state)
         normal = np.einsum("nxp,nx->np", A[:n], pairs.normals[:n])
         H = share / sigma**2 * normal.T @ (weights[:, None] * normal)
@@ -264,42 +232,8 @@ class Search:
         shape = self.shapes(code)
         return shape if np.isfinite(shape).all() else None
 
-    def _pairs(self, state: State) -> _Pairs:
-        surface, place, some = self.surface(state.shape), state.placement, self._some
-        points, normals = place.back(some.points), some.normals @ place.rotation
-        found = surface.closest(points)
-        corners = self._fans.faces[found.faces]
-        own = np.einsum("nk,nkx->nx", found.shares, surface.vertex_normals[corners])
-        own /= np.maximum(np.linalg.norm(own, axis=1, keepdims=True), np.finfo(float).tiny)
-        n = len(points)
-        rows = [(found.shares.ravel(), np.repeat(np.arange(n), 3), corners.ravel())]
-        parts = [
-            (
-                points - found.places,
-                own,
-                found.distances,
-                found.places,
-                self._alike(normals, own, some.trust),
-                np.full(n, 1 / n),
-            )
-        ]
-        if not self.options.partial:
-            places, across = surface.vertices[self._vertices], surface.vertex_normals[self._vertices]
-            _, nearest = near(self.scan.tree, place(places))
-            gaps = place.back(self.scan.points[nearest]) - places
-            # Points of a scan are some way apart, which says nothing of how far the surface is.
-            distances = self.scan.distances(place(places)) / place.scale
-            k = len(places)
-            there, trust = self.scan.normals[nearest] @ place.rotation, self.scan.trust[nearest]
-            agree = self._alike(there, across, trust)
-            if not self._level.rough:
-                across = _blended(across, there, trust)
-            rows.append((np.ones(k), n + np.arange(k), self._vertices))
-            parts.append((gaps, across, distances, places, agree, np.full(k, 1 / k)))
-        gaps, across, distances, places, agree, mass = (np.concatenate([part[i] for part in parts]) for i in range(6))
-        values, row, column = (np.concatenate([each[i] for each in rows]) for i in range(3))
-        matrix = sparse.csr_array((values, (row, column)), shape=(len(gaps), len(surface.vertices)))
-        return _Pairs(gaps, across, distances, matrix, places, agree, mass, n, np.zeros(len(gaps), bool))
+    def _pairs(self, state: State) -> Pairs:
+        return self._pairing.closest(self.surface(state.shape), state.placement)
 
     def tolerance(self, sigma: float) -> float:
         """How far a point may be from the surface and still count as explained, given what is left of the others."""
@@ -314,47 +248,7 @@ class Search:
         areas = vertex_areas(surface.vertices, surface.fans.faces)
         return float(explained.mean()), float(areas @ (away <= most) / areas.sum())
 
-    def _drawn(self, state: State, pairs: _Pairs) -> _Pairs:
-        """The same pairs, but what the model doesn't explain is paired with what of the model nothing shows.
-
-        A limb that is folded the wrong way has both, and its own nearest points are those of other limbs.
-        """
-        surface, place, most = self.surface(state.shape), state.placement, self.tolerance(state.sigma)
-        points, vertices = place.back(self._some.points), surface.vertices[self._vertices]
-        far = np.flatnonzero(pairs.distances[: pairs.of_scan] > most)
-        unseen = np.flatnonzero(self.scan.distances(place(vertices)) / place.scale > most)
-        if not len(far) or not len(unseen):
-            return pairs
-        _, there = near(cKDTree(vertices[unseen]), points[far])
-        replaced = [(far, self._vertices[unseen[there]], points[far])]
-        if not self.options.partial:
-            _, back = near(cKDTree(points[far]), vertices[unseen])
-            replaced.append((pairs.of_scan + unseen, self._vertices[unseen], points[far[back]]))
-        index, own, goal = (np.concatenate([each[i] for each in replaced]) for i in range(3))
-        normals, distances, agree, drawn = (
-            pairs.normals.copy(),
-            pairs.distances.copy(),
-            pairs.agree.copy(),
-            pairs.drawn.copy(),
-        )
-        places, gaps, rows = pairs.places.copy(), pairs.gaps.copy(), pairs.rows.tolil()
-        places[index] = surface.vertices[own]
-        gaps[index], normals[index] = goal - places[index], surface.vertex_normals[own]
-        distances[index], agree[index], drawn[index] = 0, 1, True
-        rows[index] = 0
-        rows[index, own] = 1
-        return _Pairs(gaps, normals, distances, rows.tocsr(), places, agree, pairs.mass, pairs.of_scan, drawn)
-
-    def _alike(self, normals: FloatArray, others: FloatArray, trust: FloatArray) -> FloatArray:
-        cosines = (normals * others).sum(axis=1)
-        if not self.scan.oriented:
-            cosines = np.abs(cosines)
-        elif cosines.sum() < 0:  # the scan's faces are turned inside out
-            cosines = -cosines
-        agree: FloatArray = 1 - trust * (1 - np.clip((cosines - APART) / (ALIKE - APART), 0, 1))
-        return agree
-
-    def _sigma(self, pairs: _Pairs, state: State) -> float:
+    def _sigma(self, pairs: Pairs, state: State) -> float:
         """Standard deviation of the heights, from their median: what doesn't belong has no say."""
         floor = self._level.floor * self._diagonal
         if self.options.noise is not None:
@@ -363,7 +257,7 @@ class Search:
         alike = pairs.agree[: pairs.of_scan] > 0.5
         return max(floor, 1.4826 * float(np.median(heights[alike] if alike.any() else pairs.distances)))
 
-    def _cost(self, state: State, pairs: _Pairs) -> float:
+    def _cost(self, state: State, pairs: Pairs) -> float:
         squares = pairs.distances**2
         missed = squares / (squares + (COMPARED * self._diagonal) ** 2)
         away = self._away(state.code)
@@ -391,7 +285,7 @@ class Search:
         self._fields = state.code, found
         return found
 
-    def _motions(self, pairs: _Pairs, state: State) -> FloatArray:
+    def _motions(self, pairs: Pairs, state: State) -> FloatArray:
         """(n, 3, f + 6 or 7) how the model's points move with the code, a turn, a shift and the size."""
         fields = self._derivatives(state)
         by_code = (pairs.rows @ fields.reshape(len(fields), -1)).reshape(len(pairs.gaps), 3, -1)
@@ -430,7 +324,7 @@ class Search:
         own = np.arange(len(vertices))
         return sparse.csr_array((np.ones(len(vertices)), (own, vertices)), shape=(len(vertices), count))
 
-    def _step(self, state: State, pairs: _Pairs, width: float, sigma: float, sliding: float) -> State | None:
+    def _step(self, state: State, pairs: Pairs, width: float, sigma: float, sliding: float) -> State | None:
         """A Gauss–Newton step; None where there is none that can be taken."""
         try:
             fields = self._derivatives(state)
@@ -499,19 +393,6 @@ class Search:
             step[: len(low)] = clipped
             free[: len(low)] &= ~out
         return step
-
-
-def _blended(normals: FloatArray, others: FloatArray, trust: FloatArray) -> FloatArray:
-    """(n, 3) normals of pairs that begin at vertices: those of the scan (n, 3) as far as these are trusted (n,).
-
-    A vertex of a convex surface lies outside of its neighbourhood. Over the plane at the vertex its nearest scan point,
-    which lies beside it, would have a negative height, and the model would shrink; over the plane at the scan point the
-    vertex has none.
-    """
-    sides = np.sign((normals * others).sum(axis=1))
-    both = (1 - trust)[:, None] * normals + (sides * trust)[:, None] * others
-    found: FloatArray = both / np.maximum(np.linalg.norm(both, axis=1, keepdims=True), np.finfo(float).tiny)
-    return found
 
 
 def _robust(distances: FloatArray, width: float) -> FloatArray:
