@@ -66,25 +66,22 @@ def have(run: RunDirectory, name: str, measure: Callable[[], dict[str, Any]]) ->
 
 
 def open_run(name: str, data: Path, out: Path) -> Run:
-    """The run of a collection or the figure, with mirror images of its shapes where the name ends in ``MIRRORED``.
+    """The run of a collection or the figure, without mirror images of its shapes unless the name ends in ``MIRRORED``.
 
     Where it ends in ``SHELL``, with these modes, one seed, and none of the studies.
     """
     plain = name.removesuffix(MIRRORED).removesuffix(SHELL)
     path = ROOT / "examples" / (f"{plain}.toml" if plain == MANNEQUIN else f"collections/{plain}.toml")
     meshes = load(path)[0].collection.data
-    config, text = load(path, data / meshes.relative_to(path.parent) if meshes else None)
-    if name != plain:
-        document: Any = tomlkit.parse(text)
-        if name.endswith(MIRRORED):
-            document["collection"]["mirror"] = True
-        else:
-            document["modes"].update(SHELL_MODES)
-            for studied in ("networks", "variants", "evaluation"):
-                document.pop(studied, None)
-        text = tomlkit.dumps(document)
-        config = parse(text, name)
-    return Run(out / name, config, text, out / "models")
+    _, text = load(path, data / meshes.relative_to(path.parent) if meshes else None)
+    document: Any = tomlkit.parse(text)
+    document["collection"]["mirror"] = name.endswith(MIRRORED)
+    if name.endswith(SHELL):
+        document["modes"].update(SHELL_MODES)
+        for studied in ("networks", "variants", "evaluation"):
+            document.pop(studied, None)
+    text = tomlkit.dumps(document)
+    return Run(out / name, parse(text, name), text, out / "models")
 
 
 def figures(name: str, run: Run) -> dict[str, Any]:
