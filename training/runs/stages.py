@@ -86,7 +86,7 @@ STAGES: dict[str, Stage] = {
     ),
     # Networks are in files named by what decides their contents, so that a change leaves alone those it doesn't touch.
     "networks": Stage(
-        version=4,
+        version=5,
         settings=lambda config: [
             config.networks,
             config.monolithic,

@@ -20,6 +20,7 @@ from shapespace.bundle.schema import COMBINER
 from shapespace.coordinates.integrability import Integrability
 from shapespace.coordinates.nric import NRICJacobian, WeightedNorm, nric
 from shapespace.mesh.triangle_mesh import Connectivity, TriangleMesh
+from shapespace.training.learning import kernels
 from shapespace.training.learning.baselines import LatentKernel
 from shapespace.training.learning.convolutions import EdgeConvolution, Flaps, Star, flaps
 from shapespace.training.learning.corrections import JointSamples, Slopes
@@ -294,6 +295,25 @@ def test_the_kernel_of_a_small_mesh_has_one_patch() -> None:
     with torch.no_grad():
         missed = network.scaling.down(network(x[50:]) - z[50:] + network.scaling.mean)
     assert missed.square().mean() < 1e-3
+
+
+def test_outputs_that_change_shapes_by_next_to_nothing_are_left_out(
+    ball: TriangleMesh, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    x, z = interplay(ball, 60, lambda a, b, f, g: a * b * f + 0.01 * a**2 * b * g)
+
+    def learned() -> tuple[int, float]:
+        network = fitted(ball, KernelSettings(coefficients=2), x, z, 40)
+        assert isinstance(network.correction, KernelCorrection)
+        with torch.no_grad():
+            missed = network.coefficients(x[40:]) - network.scaling.down(z[40:])
+        return network.correction.basis.shape[2], float(missed.square().mean())
+
+    rank, error = learned()
+    monkeypatch.setattr(kernels, "UNSEEN", 0)
+    full_rank, least = learned()
+    assert (rank, full_rank) == (1, 2)
+    assert error < least + 2e-5
 
 
 def test_auto_is_the_kernel_where_nothing_wanders(ball: TriangleMesh) -> None:
