@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from copy import copy
 from typing import Any, Self
 
 import torch
@@ -16,9 +17,11 @@ from shapespace.training.learning.patches import Patch
 from shapespace.training.runs.config import KernelSettings
 from shapespace.training.runs.progress import progress
 
-#: By how much the rank of the output may increase the squared error on held-out samples: by this share, or by this much
-#: of the shapes' mean square, which no one sees. Each row that is put out costs time at every shape.
-SLACK, UNSEEN = 0.125, 2e-5
+#: By which share the rank of the output may increase the squared error on held-out samples.
+SLACK = 0.125
+#: A mean squared error that nobody sees, as a share of the shapes' mean square. What gains less is left out, since it
+#: costs time at every shape.
+UNSEEN = 2e-5
 
 
 class KernelCorrection(Correction):
@@ -63,8 +66,9 @@ class KernelCorrection(Correction):
     basis: Tensor
     #: Fewest edges of a patch, on average.
     EDGES = 24
-    #: Most functions of a patch: the time grows with their cube, the size of the network with their number.
-    FUNCTIONS = 3000
+    #: How many functions of a patch are tried, in turn, as long as more of them gain what can be seen: learning takes a
+    #: time that grows with their cube, and what a shape costs grows with their number.
+    FUNCTIONS = (750, 1500, 3000)
     #: Largest rank of the output.
     RANK = 176
 
@@ -90,9 +94,16 @@ class KernelCorrection(Correction):
         for patch in progress(patches, "metrics", "patch"):
             patch.learn_metric(pairs, others)
         coordinates = max(patch.rank for patch in patches)
-        for patch in progress(patches, "kernels", "patch"):
-            patch.fit(pairs, others, own.slopes, coordinates, cls.FUNCTIONS, cls.RANK)
-        return cls(_joined(patches, coordinates, min(_output_rank(patches), cls.RANK)))
+        known = len(pairs[0]) + (coordinates * len(own.slopes.inputs) if own.slopes else 0)
+        best: list[Patch] = []
+        for most in sorted({min(most, known) for most in cls.FUNCTIONS}):
+            fitted = [copy(patch) for patch in patches]
+            for patch in progress(fitted, f"kernels, {most} functions", "patch"):
+                patch.fit(pairs, others, own.slopes, coordinates, most, cls.RANK)
+            if best and _error(best) - _error(fitted) < UNSEEN:
+                break
+            best = fitted
+        return cls(_joined(best, coordinates, min(_output_rank(best), cls.RANK)))
 
     def coordinates(self, y: Tensor) -> Tensor:
         """(P, n, r) coordinates u of factor shapes (n, J, 2E)."""
@@ -145,10 +156,14 @@ def _padded(parts: Sequence[Tensor], value: float = 0) -> Tensor:
     return nn.utils.rnn.pad_sequence(list(parts), batch_first=True, padding_value=value)
 
 
+def _error(patches: Sequence[Patch]) -> float:
+    """Mean squared error on held-out samples, as a share of the shapes' mean square."""
+    # Scaled differences have a mean square of one over all entries.
+    return sum(patch.error for patch in patches) / sum(len(patch.columns) for patch in patches)
+
+
 def _output_rank(patches: Sequence[Patch]) -> int:
     """The smallest rank of the output that adds no more to the squared error than SLACK and UNSEEN say."""
-    energy = _padded([patch.energy for patch in patches]).sum(dim=0)
+    energy = _padded([patch.energy for patch in patches]).sum(dim=0) / sum(len(patch.columns) for patch in patches)
     lost = energy.sum() - energy.cumsum(0)
-    # Scaled differences have a mean square of one over all entries.
-    most = max(SLACK * sum(patch.error for patch in patches), UNSEEN * sum(len(patch.columns) for patch in patches))
-    return min(int((lost > most).sum()) + 1, len(energy))
+    return min(int((lost > max(SLACK * _error(patches), UNSEEN)).sum()) + 1, len(energy))

@@ -152,7 +152,7 @@ def test_auto_tries_what_follows_a_bump(
     It is chosen by the share of the kernel's error that it has to reach, and not tried where the kernel is slow.
     """
     monkeypatch.setattr(networks, "KernelSettings", lambda: KernelSettings(coefficients=3, patches=64))
-    monkeypatch.setattr(KernelCorrection, "FUNCTIONS", 40)
+    monkeypatch.setattr(KernelCorrection, "FUNCTIONS", (40,))
     monkeypatch.setattr(networks, "BETTER", better)
     trained: list[str] = []
 

@@ -316,6 +316,19 @@ def test_outputs_that_change_shapes_by_next_to_nothing_are_left_out(
     assert error < least + 2e-5
 
 
+@pytest.mark.parametrize(("unseen", "functions"), [(1, 5), (-1, 40)])
+def test_there_are_more_functions_as_long_as_they_gain_what_can_be_seen(
+    ball: TriangleMesh, monkeypatch: pytest.MonkeyPatch, unseen: float, functions: int
+) -> None:
+    """Of 40 samples, whose number is the most that there can be."""
+    monkeypatch.setattr(KernelCorrection, "FUNCTIONS", (5, 20, 80))
+    monkeypatch.setattr(kernels, "UNSEEN", unseen)
+    x, z = interplay(ball, 60, cubic)
+    correction = fitted(ball, KernelSettings(coefficients=2), x, z, 40).correction
+    assert isinstance(correction, KernelCorrection)
+    assert correction.anchors.shape[1] == functions
+
+
 def test_auto_is_the_kernel_where_nothing_wanders(ball: TriangleMesh) -> None:
     x, z = interplay(ball, 60, cubic)
     network = fitted(ball, AutoSettings(), x, z, 40)
