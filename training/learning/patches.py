@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
@@ -20,6 +22,8 @@ PENALTIES = tuple(10.0**k for k in range(-6, 0))
 SOME = 800
 #: Share of the coordinates' mean square that is left out.
 NEGLIGIBLE = 1e-6
+#: By which factor rounding the weights may increase the squared error.
+ROUGHLY = 1.5
 #: Most samples that the principal axes of factors are computed from.
 AXES = 500
 
@@ -40,7 +44,7 @@ class Patch:
         spread: (J d,) mean squares of the coordinates.
         mean: (S,) the constant.
         centres: the n + k r functions, in r coordinates of 16 bits.
-        error: squared error on held-out samples, their mean summed over the entries.
+        error: squared error on held-out samples with these weights, their mean summed over the entries.
         basis: (S, S) principal axes of what is put out.
         energy: (S,) mean squares along these.
         weights: (n + k r, q) of the coefficients along the first axes, integers of 16 bits.
@@ -120,16 +124,23 @@ class Patch:
         share = min(1.0, SOME / (len(anchors) + nodes.numel()))
         tried = [Centres(anchors, nodes, torch.tensor(gamma, dtype=x.dtype)) for gamma in GAMMAS]
 
-        def fitted(centres: Centres) -> Ridge:
-            return centres.fit((x, wanted), known, (other, theirs), PENALTIES)
+        def fitted(centres: Centres, penalties: Sequence[float] = PENALTIES) -> Ridge:
+            return centres.fit((x, wanted), known, (other, theirs), penalties)
 
         self.centres = min(tried, key=lambda centres: fitted(centres.some(share)).error)
-        found = fitted(self.centres)
-        self.error = found.error * theirs.shape[1]
-        features = self.centres(x)
-        s, axes = principal_axes(features @ found.weights, by="columns")
-        self.energy, self.basis = s.square() / len(x), axes.T.float()
-        if known:
-            features = torch.cat([features, self.centres.along(*known[:2])])
-        weights, steps, gains = rounded(found.weights @ self.basis[:, :outputs].double(), features)
-        self.weights, self.steps, self.gains = weights, steps.flatten(), gains.flatten()
+        features, others = self.centres(x), self.centres(other)
+        slope = self.centres.along(*known[:2]) if known else features[:0]
+        penalties: Sequence[float] = PENALTIES
+        while penalties:
+            found = fitted(self.centres, penalties)
+            s, axes = principal_axes(features @ found.weights, by="columns")
+            self.energy, self.basis = s.square() / len(x), axes.T.float()
+            basis = self.basis[:, :outputs].double()
+            weights, steps, gains = rounded(found.weights @ basis, torch.cat([features, slope]))
+            self.weights, self.steps, self.gains = weights, steps.flatten(), gains.flatten()
+            missed = (others * self.steps) @ weights @ (basis * gains).T - theirs
+            self.error = float(missed.square().sum(dim=1).mean())
+            # Where few functions have weights so large that rounding them spoils the sums, a larger penalty helps.
+            if self.error <= ROUGHLY * found.error * len(self.columns):
+                break
+            penalties = [penalty for penalty in penalties if penalty > found.penalty]

@@ -300,20 +300,18 @@ def test_the_kernel_of_a_small_mesh_has_one_patch() -> None:
 def test_outputs_that_change_shapes_by_next_to_nothing_are_left_out(
     ball: TriangleMesh, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    x, z = interplay(ball, 60, lambda a, b, f, g: a * b * f + 0.01 * a**2 * b * g)
-
-    def learned() -> tuple[int, float]:
+    x, z = interplay(ball, 60, lambda a, b, f, g: a * b * f + 0.05 * a**2 * b * g)
+    found = {}
+    for unseen in (1e-3, 0):
+        monkeypatch.setattr(kernels, "UNSEEN", unseen)
         network = fitted(ball, KernelSettings(coefficients=2), x, z, 40)
         assert isinstance(network.correction, KernelCorrection)
         with torch.no_grad():
             missed = network.coefficients(x[40:]) - network.scaling.down(z[40:])
-        return network.correction.basis.shape[2], float(missed.square().mean())
-
-    rank, error = learned()
-    monkeypatch.setattr(kernels, "UNSEEN", 0)
-    full_rank, least = learned()
+        found[unseen] = network.correction.basis.shape[2], float(missed.square().mean())
+    (rank, error), (full_rank, least) = found.values()
     assert (rank, full_rank) == (1, 2)
-    assert error < least + 2e-5
+    assert error < least + 1e-3
 
 
 @pytest.mark.parametrize(("unseen", "functions"), [(1, 5), (-1, 40)])
@@ -327,6 +325,16 @@ def test_there_are_more_functions_as_long_as_they_gain_what_can_be_seen(
     correction = fitted(ball, KernelSettings(coefficients=2), x, z, 40).correction
     assert isinstance(correction, KernelCorrection)
     assert correction.anchors.shape[1] == functions
+
+
+def test_few_functions_have_weights_that_can_be_rounded(ball: TriangleMesh, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The penalty that suits held-out samples best before rounding leaves a third of the mean square after it."""
+    monkeypatch.setattr(KernelCorrection, "FUNCTIONS", (40,))
+    x, z = interplay(ball, 400, beyond_cubic)
+    network = fitted(ball, KernelSettings(coefficients=3), x, z, 300)
+    with torch.no_grad():
+        missed = network.coefficients(x[300:]) - network.scaling.down(z[300:])
+    assert missed.square().mean() < 2e-3
 
 
 def test_auto_is_the_kernel_where_nothing_wanders(ball: TriangleMesh) -> None:
