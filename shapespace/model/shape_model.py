@@ -52,7 +52,7 @@ def load(folder: str | os.PathLike[str], threads: int = 1) -> ShapeModel:
 
     >>> import shapespace
     >>> shapespace.load("models/figure")
-    <ShapeModel figure/2: 20 coordinates, 10 factors, 4601 vertices>
+    <ShapeModel figure/3: 20 coordinates, 10 factors, 4601 vertices>
     """
     path = Path(os.path.abspath(folder))  # the names of the last two folders count, also of "."
     if not (path / MANIFEST).exists():

@@ -224,7 +224,7 @@ def ending_elsewhere(
 ) -> tuple[ShapeModel, NDArray]:
     """The figure, whose search by lengths and angles ends at the upper bounds, with residuals; and a training shape."""
     model, by_nric = load(models / "figure"), Encoder._by_nric
-    codes = read_bundle(models / "figure" / "2").training_codes
+    codes = read_bundle(models / "figure" / "3").training_codes
     assert codes is not None
     given = model.decode(codes[20])
 
