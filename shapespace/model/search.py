@@ -1,4 +1,4 @@
-"""The search of a fit: closest points, robust weights, and Gauss–Newton steps of code, motion and size together."""
+"""The search of a fit: robust weights, and Gauss–Newton steps of code, motion and size together."""
 
 from __future__ import annotations
 

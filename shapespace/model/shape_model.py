@@ -75,11 +75,11 @@ class ShapeModel(Decoder):
     >>> import shapespace
     >>> model = shapespace.load("models/figure")
     >>> model.dimension, model.names[0], model.period[0]
-    (20, 'right hip, 1', None)
+    (20, 'left hip, 1', None)
     >>> model.vertices.shape, model.faces.shape
     ((4601, 3), (9198, 3))
     >>> model.manifest.factors[0].name
-    'right hip'
+    'left hip'
     """
 
     def __repr__(self) -> str:
@@ -185,7 +185,7 @@ class ShapeModel(Decoder):
         >>> model = shapespace.load("models/figure")
         >>> blend = model.blend_shapes("coarse")
         >>> blend.names[:2], blend.ends.shape, 0.001 < blend.error["mean"] < 0.05
-        (['right hip, 1 +', 'right hip, 1 -'], (40, 1000, 3), True)
+        (['left hip, 1 +', 'left hip, 1 -'], (40, 1000, 3), True)
         >>> blend.glb()[:4]
         b'glTF'
         """

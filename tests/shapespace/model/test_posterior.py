@@ -80,13 +80,14 @@ def bumps(figure: ShapeModel, size: float, width: float, rng: np.random.Generato
 def test_the_truth_lies_in_the_intervals_of_a_noisy_mesh(figure: ShapeModel, width: float | None) -> None:
     rng = np.random.default_rng(0)
     scores = []
-    for code in 0.3 * figure.sample(12, 2).astype(np.float64):
+    for code in 0.3 * figure.sample(24, 2).astype(np.float64):
         shape = figure.decode(code)
         noise = 0.005 * rng.standard_normal(shape.shape) if width is None else bumps(figure, 0.005, width, rng)
         found = figure.encode(shape + noise)
         scores.append((found.code - code) / np.sqrt(np.diag(found.covariance)))
     held = np.mean(np.abs(scores) < 1.645)
-    assert 0.75 < held < 0.99
+    # The intervals are those of 0.9; how far noise of neighbours is alike they can only estimate.
+    assert 0.7 < held < 0.97
 
 
 def test_encode_keeps_what_is_fixed_and_draws_around_the_code(model: ShapeModel) -> None:
