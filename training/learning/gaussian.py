@@ -99,4 +99,5 @@ def every_axis(u: Tensor) -> tuple[Tensor, Tensor]:
 def _kernel(u: Tensor, centres: Tensor, gamma: Tensor) -> Tensor:
     """(…, m, n) of coordinates (…, m, r) and (…, n, r)."""
     squares = u.square().sum(dim=-1, keepdim=True) + centres.square().sum(dim=-1)[..., None, :]
-    return torch.exp(-gamma * (squares - 2 * u @ centres.mT))
+    # A sum, as onnxruntime fuses products with numbers into an operation that old ones don't have for doubles.
+    return torch.exp(-gamma * (squares - (u + u) @ centres.mT))

@@ -117,7 +117,8 @@ class KernelCorrection(Correction):
         # Weights are large and of both signs: sums of single precision would be rounding errors in part.
         gammas = self.gammas.double()[:, None, None]
         found = Centres(self.anchors.double(), self.nodes.double(), gammas)(self.coordinates(y).double())
-        put_out = self.weights.double() @ (found * self.steps[:, None].double()).mT
+        # Scaled once transposed, so that onnxruntime fuses nothing here: old ones can't run that for doubles.
+        put_out = self.weights.double() @ (found.mT * self.steps[:, :, None].double())
         # From here on a code is a row: for one alone that takes a fraction of the time that a column does.
         parts = (put_out.mT * self.gains[:, None]).to(y.dtype) @ self.basis.mT
         return parts.transpose(0, 1).flatten(1).index_select(1, self.place) + self.mean
