@@ -57,14 +57,15 @@ HEAD = (
 PAGE = """# Served models and shapes that they have not seen
 
 For each collection models were trained on four fifths of the shapes, with the settings of `examples` but at most
-{joint} joint exponentials and {factors} of each factor, and exported; where there is a second row, other models with
-half as many modes. The `encode` of each, as it is served, was given the fine meshes of the other fifth, so that over
-five **folds** each shape is unseen once. **unseen**: mean distance of all vertices of these shapes to the shape of the
-code, in percent of the bounding box's diagonal, and the mean of the folds' 95th percentiles; **components**: of as many
-principal components of the same four fifths' fine meshes. **trained on**: the same of the shapes that made a model,
-which a bundle [remembers](../explanation/mathematics.md#networks): it adds what modes and networks miss of them.
-Components remember nothing, so this says that users get their own shapes back, not that the modes are better;
-**nothing remembered** is a model without it (`export.examples = false`) beside the same components.
+{joint} joint exponentials and {factors} of each factor, without mirror images where a row doesn't say so, and
+exported; where there is a second row, other models with half as many modes. The `encode` of each, as it is served,
+was given the fine meshes of the other fifth, so that over five **folds** each shape is unseen once. **unseen**: mean
+distance of all vertices of these shapes to the shape of the code, in percent of the bounding box's diagonal, and the
+mean of the folds' 95th percentiles; **components**: of as many principal components of the same four fifths' fine
+meshes. **trained on**: the same of the shapes that made a model, which a bundle
+[remembers](../explanation/mathematics.md#networks): it adds what modes and networks miss of them. Components remember
+nothing, so this says that users get their own shapes back, not that the modes are better; **nothing remembered** is a
+model without it (`export.examples = false`) beside the same components.
 
 **folds**: with all five each shape is unseen once; rows with fewer know only some shapes. Rows without *trained on* are
 of older models, trained and encoded before models remembered. **of folds**: the least and the greatest ratio of a fold.
