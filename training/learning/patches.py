@@ -129,14 +129,14 @@ class Patch:
 
         self.centres = min(tried, key=lambda centres: fitted(centres.some(share)).error)
         features, others = self.centres(x), self.centres(other)
-        slope = self.centres.along(*known[:2]) if known else features[:0]
+        rows = torch.cat([features, self.centres.along(*known[:2])]) if known else features
         penalties: Sequence[float] = PENALTIES
         while penalties:
             found = fitted(self.centres, penalties)
             s, axes = principal_axes(features @ found.weights, by="columns")
             self.energy, self.basis = s.square() / len(x), axes.T.float()
             basis = self.basis[:, :outputs].double()
-            weights, steps, gains = rounded(found.weights @ basis, torch.cat([features, slope]))
+            weights, steps, gains = rounded(found.weights @ basis, rows)
             self.weights, self.steps, self.gains = weights, steps.flatten(), gains.flatten()
             missed = (others * self.steps) @ weights @ (basis * gains).T - theirs
             self.error = float(missed.square().sum(dim=1).mean())
