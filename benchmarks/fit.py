@@ -11,6 +11,7 @@ import json
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -33,8 +34,9 @@ POINTS, NOISE, OUTLIERS = 4000, 0.005, 0.02
 #: A try has failed if its error exceeds this many medians; half the width of a 90 % interval, in standard deviations.
 FAILED, NINETY = 2.0, 1.645
 VARIANTS = ("whole", "noisy", "camera")
-#: Steps of the closest-point fit with principal components, and how strongly it holds on to the mean.
-COMPONENT_STEPS, HOLD = 40, 1e-3
+#: Steps of the closest-point fit with principal components, how strongly it may hold on to the mean, and by how many
+#: training shapes this is chosen.
+COMPONENT_STEPS, HOLDS, CHOOSING = 40, (1e-5, 1e-4, 1e-3, 1e-2, 1e-1), 4
 
 PAGE = """# Fits of scans
 
@@ -52,9 +54,10 @@ the distance of its surface, which four codes share in as many places, each with
 of `encode`, which is given the vertices in their order. **failed**: tries further off than {failed:g} times the median
 of their row. **told**: those of them whose status is not `converged`. **false alarms**: others whose status is not.
 **shapes**: solved ones at the median, three rough ones counted as one; **time**: in solved shapes. **components**:
-the usual alternative, an iterated closest-point fit with as many principal components, here of 60 shapes drawn from the
-model, with settings that were not tuned; components of the training shapes come much nearer where the correspondence is
-known ([served.md](served.md)). It begins with the mean shape, placed as `fit` has found it, which helps it.
+the usual alternative, an iterated closest-point fit with as many principal components of the training shapes, as the
+model remembers them. It begins with the mean shape, placed as `fit` has found it, which helps it; how strongly it
+holds on to the mean is chosen for each kind of scan by scans of {choosing} training shapes, each with components of the
+others.
 
 | model | shapes | scan | tries | error | encode | ratio | failed | told | false alarms | shapes | time | components |
 |---|---|---|---|---|---|---|---|---|---|---|---|---|
@@ -140,7 +143,7 @@ def scan(
 
 
 def by_components(
-    training: FloatArray, count: int, points: FloatArray, start: Placement, *, partial: bool
+    training: FloatArray, count: int, points: FloatArray, start: Placement, hold: float, *, partial: bool
 ) -> FloatArray:
     """Vertices (V, 3) of the closest-point fit with principal components of training shapes (n, V, 3).
 
@@ -161,8 +164,8 @@ def by_components(
         near = far <= np.quantile(far, 0.95)
         index, goal = index[near], goal[near]
         A = modes[:, index].reshape(len(modes), -1)
-        hold = HOLD * np.trace(A @ A.T) / len(modes) * np.eye(len(modes))
-        weights = np.linalg.solve(A @ A.T + hold, A @ (goal - mean[index]).ravel())
+        penalty = hold * np.trace(A @ A.T) / len(modes) * np.eye(len(modes))
+        weights = np.linalg.solve(A @ A.T + penalty, A @ (goal - mean[index]).ravel())
         shape = mean + np.tensordot(weights, modes, 1)
         place = Placement.between(shape[index], place(goal))
     return place(shape)
@@ -186,8 +189,7 @@ class Bench:
             model.shape(code)
             times.append(time.process_time() - began)
         self.solved = float(np.median(times))
-        # The components are of the same shapes as the codes.
-        codes = model.population.sample(60, 3)
+        codes = model.population.sample(60, 3) if model.training_codes is None else model.training_codes
         self.training = np.stack([model.shape(code).vertices for code in codes.astype(np.float32)])
 
     def distance(self, found: FloatArray, truth: FloatArray) -> float:
@@ -222,10 +224,33 @@ class Bench:
             encoded = model.encode(shape)
             row.encoded.append(self.distance(align(encoded.shape.vertices, shape), shape))
             begun = Placement.between(self.training.mean(axis=0), found.placement(found.shape.vertices))
-            fitted = by_components(self.training, model.dimension, points, begun, partial=variant == "camera")
+            fitted = self.fitted_by_components(self.training, points, begun, variant, self.holds[variant])
             row.components.append(self.distance(fitted, there))
         elif row.converged[-1]:
             self.interval(row, found, truth)
+
+    def fitted_by_components(
+        self, training: FloatArray, points: FloatArray, start: Placement, variant: str, hold: float
+    ) -> FloatArray:
+        """Vertices (V, 3)."""
+        count = min(self.model.dimension, len(training) - 1)
+        return by_components(training, count, points, start, hold, partial=variant == "camera")
+
+    @cached_property
+    def holds(self) -> dict[str, float]:
+        """How strongly components hold on to the mean, for each variant of scans."""
+        chosen = {}
+        for variant in VARIANTS:
+            away: dict[float, list[float]] = {hold: [] for hold in HOLDS}
+            for number, k in enumerate(np.linspace(0, len(self.training) - 1, CHOOSING).round().astype(int)):
+                shape, others = self.training[k], np.delete(self.training, k, axis=0)
+                points, _ = scan(shape, self.model.faces, variant, number, np.random.default_rng(number))
+                start = Placement.between(others.mean(axis=0), shape)
+                for hold, errors in away.items():
+                    found = self.fitted_by_components(others, points, start, variant, hold)
+                    errors.append(self.distance(found, shape))
+            chosen[variant] = min(away, key=lambda hold: float(np.median(away[hold])))
+        return chosen
 
     def interval(self, row: Row, found: Fitted, truth: FloatArray) -> None:
         """Whether intervals hold a code (m,), and how wide they are."""
@@ -322,6 +347,7 @@ def main() -> None:
         noise=NOISE,
         outliers=OUTLIERS,
         failed=FAILED,
+        choosing=CHOOSING,
         rows="\n".join(row for each in every for row in each["rows"]),
         intervals="\n".join(row for each in every for row in each["intervals"]),
     )
