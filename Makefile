@@ -15,8 +15,8 @@ BPY_PYTHON ?= python3.11
 # The first interpreter that is new enough; `make PYTHON=…` names another.
 PYTHON ?= $(shell for p in python3 python3.14 python3.13 python3.12 python3.11 python; do \
 	$$p -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && echo $$p && break; done)
-# Files of tests that run at once: twice two cores, since many tests wait.
-JOBS ?= 4
+# Files of tests that run at once: one more than two cores, since many tests wait.
+JOBS ?= 3
 # Each computes on one thread: more threads than cores wait for one another, for a quarter of the processors' time.
 test check lowest compiled: export OMP_NUM_THREADS ?= 1
 # Node comes from PyPI where the machine has none.
@@ -46,7 +46,7 @@ train: $(VENV)/.train ## train the bundled models from their generators
 	$(BIN)/shapespace-train run examples/freaky-torus.toml
 	$(BIN)/shapespace-train run examples/figure.toml
 
-test: $(VENV)/.all $(MODULES) $(VENV)/.browser ## run the whole suite (ARGS="-k glb" for a part of it, JOBS=4 at once)
+test: $(VENV)/.all $(MODULES) $(VENV)/.browser ## run the whole suite (ARGS="-k glb" for a part of it, JOBS=3 at once)
 	PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/python -m pytest --numprocesses $(JOBS) --dist loadfile --no-loadscope-reorder $(ARGS)
 
 check: lint ## what is quick: style, types and doors, then the library, use cases and pages; no torch, Node or browser

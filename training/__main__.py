@@ -13,9 +13,8 @@ from pathlib import Path
 
 from shapespace.training.collection import init
 from shapespace.training.collection.ingest import IngestError
-from shapespace.training.learning.export import ExportError
+from shapespace.training.learning import ExportError
 from shapespace.training.pipeline import OldRunError, Run, execute, refuse_old
-from shapespace.training.report.page import write_report
 from shapespace.training.report.record import Record, ReportError
 from shapespace.training.runs.config import ConfigError, load
 from shapespace.training.runs.directory import RunDirectory
@@ -120,6 +119,8 @@ def _status(arguments: argparse.Namespace) -> None:
 
 
 def _report(arguments: argparse.Namespace) -> None:
+    from shapespace.training.report.page import write_report
+
     print(write_report(RunDirectory(arguments.run)))
 
 

@@ -9,8 +9,9 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cached_property, partial
+from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,13 +20,9 @@ from shapespace.arrays import FloatArray
 from shapespace.bundle.geometry import Geometry
 from shapespace.training.collection.generators import PRODUCTS
 from shapespace.training.collection.ingest import data_files
-from shapespace.training.learning.evaluation import alone, evaluate
-from shapespace.training.learning.examples import RememberingCombiner
-from shapespace.training.learning.export import export
-from shapespace.training.learning.learner import Learner
-from shapespace.training.report.page import write_report
 from shapespace.training.runs.config import Config
 from shapespace.training.runs.directory import RunDirectory
+from shapespace.training.runs.latent_coordinates import alone
 from shapespace.training.runs.progress import waiting
 from shapespace.training.runs.sampling import (
     DERIVATIVES,
@@ -42,6 +39,10 @@ from shapespace.training.runs.sampling import (
 from shapespace.training.runs.shortfalls import refuse, shortfalls
 from shapespace.training.runs.stages import STAGES, stage_keys
 from shapespace.training.space import stages as space
+
+# PyTorch and Matplotlib, which take most of a second to load, are loaded where a stage needs them.
+if TYPE_CHECKING:
+    from shapespace.training.learning.learner import Learner
 
 
 class OldRunError(ValueError):
@@ -193,6 +194,8 @@ def samples(run: Run) -> None:
 
 def learner_of(run: Run, **how: Any) -> Learner:
     """The networks of a run whose samples are there, learned from a share of them, or with another seed."""
+    from shapespace.training.learning.learner import Learner
+
     samples = run.directory.stamp("samples").read()["key"]
     return Learner(run.collection, run.config, run.directory, f"{samples}, {STAGES['networks'].version}", **how)
 
@@ -244,6 +247,7 @@ def generalisation(run: Run) -> None:
 
 def evaluation(run: Run) -> None:
     """evaluation.json and gallery.npz."""
+    from shapespace.training.learning.evaluation import evaluate
 
     def exact(name: str, latents: FloatArray, collection: Collection | None = None) -> NDArray[np.float32]:
         folder = run.directory.exact / name
@@ -267,6 +271,9 @@ def evaluation(run: Run) -> None:
 
 def write_bundle_of(run: Run, figures: dict[str, Any]) -> Path:
     """The bundle of a run whose samples are there, in the models directory, with what was measured."""
+    from shapespace.training.learning.examples import RememberingCombiner
+    from shapespace.training.learning.export import export
+
     directory = run.directory
     digest = hashlib.sha256()
     for path in sorted(directory.samples.rglob("*.npz")):
@@ -373,6 +380,10 @@ def execute(
     keys = stage_keys(run.config, json.dumps({name: facts["sha256"] for name, facts in data.items()}) if data else "")
     _forget(directory, keys, show)
     directory.config.write(run.source)
+    order = list(STAGES)
+    if until is None or order.index(until) >= order.index("networks"):
+        # Before other stages load what solves their equations: beside that, PyTorch computes other last bits.
+        import_module("torch")
     news = False
     for name, stage in STAGES.items():
         stamp = directory.stamp(name).read_if_written()
@@ -403,4 +414,6 @@ def execute(
         if name == until:
             break
     if directory.evaluation.exists() and (news or not directory.report.exists()):
+        from shapespace.training.report.page import write_report
+
         show(f"report: {write_report(directory)}")

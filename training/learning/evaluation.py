@@ -26,6 +26,7 @@ from shapespace.training.learning.layers import narrowest
 from shapespace.training.learning.learner import Learner
 from shapespace.training.learning.networks import Composite, affine_sum, predict
 from shapespace.training.runs.config import Config
+from shapespace.training.runs.latent_coordinates import alone
 from shapespace.training.runs.progress import progress
 from shapespace.training.runs.sampling import Collection
 
@@ -45,13 +46,6 @@ def r_squared(predicted: NDArray, exact: NDArray, norm: WeightedNorm) -> dict[st
         "lengths": ratio(slice(0, half)),
         "angles": ratio(slice(half, None)),
     }
-
-
-def alone(latents: FloatArray, factor: list[int]) -> FloatArray:
-    """Codes (n, m) with the latents of one factor only, the others zero."""
-    result = np.zeros_like(latents)
-    result[:, factor] = latents[:, factor]
-    return result
 
 
 #: A map from codes (n, m) to NRIC (n, 2E), or to those of the factors (n, J, 2E).

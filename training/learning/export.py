@@ -27,6 +27,7 @@ from shapespace.model.decoder import ModelFailedError
 from shapespace.model.latent_space import NotFiniteError
 from shapespace.model.shape_model import load
 from shapespace.shell.energy import Material
+from shapespace.training.learning import ExportError
 from shapespace.training.learning.layers import narrowest
 from shapespace.training.learning.naming import NamingError, called
 from shapespace.training.learning.networks import Composite, StartNetwork, predict
@@ -36,10 +37,6 @@ from shapespace.training.runs.sampling import Collection
 OPSET = 18
 #: Random codes, and codes of training shapes, at which ONNX and PyTorch are compared.
 CHECKED = 64
-
-
-class ExportError(RuntimeError):
-    """The bundle would not compute what the networks compute, or could not be read."""
 
 
 def to_onnx(network: nn.Module, example: Tensor, names: Network) -> bytes:

@@ -1,4 +1,4 @@
-"""Latent coordinates: their bounds and periods."""
+"""Latent coordinates: their bounds and periods, and codes of one factor."""
 
 from __future__ import annotations
 
@@ -31,3 +31,10 @@ class Coordinates:
     def uniform(self, count: int, rng: np.random.Generator) -> FloatArray:
         """Codes (count, m) uniform in the hypercube."""
         return rng.uniform(self.lower, self.upper, (count, len(self)))
+
+
+def alone(latents: FloatArray, factor: list[int]) -> FloatArray:
+    """Codes (n, m) with the latents of one factor only, the others zero."""
+    result = np.zeros_like(latents)
+    result[:, factor] = latents[:, factor]
+    return result

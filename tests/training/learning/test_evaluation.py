@@ -8,8 +8,9 @@ import pytest
 from shapespace.coordinates.nric import WeightedNorm
 from shapespace.training.collection.freaky_torus import FreakyTorus
 from shapespace.training.learning.baselines import MultilinearGrid, grid_nodes
-from shapespace.training.learning.evaluation import Reconstructions, alone, r_squared
+from shapespace.training.learning.evaluation import Reconstructions, r_squared
 from shapespace.training.runs.config import EvaluationSettings
+from shapespace.training.runs.latent_coordinates import alone
 
 
 @pytest.fixture(scope="module")

@@ -14,13 +14,13 @@ from shapespace.coordinates.nric import WeightedNorm, nric
 from shapespace.training.collection.freaky_torus import U_COUNT, V_COUNT, FreakyTorus, edge_permutation
 from shapespace.training.learning import networks
 from shapespace.training.learning.corrections import JointSamples, Motion
-from shapespace.training.learning.evaluation import alone
 from shapespace.training.learning.fields import FieldCorrection
 from shapespace.training.learning.fitting import read_network, save_network
 from shapespace.training.learning.kernels import KernelCorrection
 from shapespace.training.learning.layers import Scaling
 from shapespace.training.learning.networks import CombinerNetwork
 from shapespace.training.runs.config import AutoSettings, FieldSettings, KernelSettings
+from shapespace.training.runs.latent_coordinates import alone
 
 TORUS = FreakyTorus()
 FACTORS = list(TORUS.factors.values())

@@ -22,8 +22,9 @@ from shapespace.bundle.reader import read_bundle
 from shapespace.coordinates.nric import WeightedNorm, nric
 from shapespace.model.shape_model import ShapeModel
 from shapespace.training.collection.freaky_torus import FreakyTorus, vertices
+from shapespace.training.learning import ExportError
 from shapespace.training.learning.evaluation import r_squared
-from shapespace.training.learning.export import ExportError, export
+from shapespace.training.learning.export import export
 from shapespace.training.learning.fitting import read_network
 from shapespace.training.learning.networks import predict
 from shapespace.training.pipeline import Run, learner_of
@@ -164,20 +165,11 @@ def test_export_refuses_where_onnx_and_torch_disagree(tiny_run: Path, tmp_path: 
     assert not (tmp_path / "tiny-torus" / "1").exists()
 
 
-def test_a_bundle_calls_things_as_the_configuration_does(tiny_run: Path, tmp_path: Path) -> None:
+def test_export_refuses_a_name_for_nothing(tiny_run: Path, tmp_path: Path) -> None:
     run = Run(tiny_run, *load(tiny_run / "config.toml"), tmp_path)
-    figures = read_bundle(tiny_run / "models" / "tiny-torus" / "1").manifest.figures
-    composite, geometry = learner_of(run).main(), Geometry(reference=FreakyTorus().reference)
-
-    def write(names: str) -> Path:
-        return export(composite, run.collection, parse(TINY + names, "named"), figures, "", tmp_path, geometry)
-
-    manifest = read_bundle(write('names = { bump = "hill", gamma = "along" }\n')).manifest
-    own = list(run.collection.factors)
-    assert [factor.name for factor in manifest.factors] == ["hill" if name == "bump" else name for name in own]
-    assert manifest.latent_names == ["alpha", "beta", "along", "zeta"]
+    config, geometry = parse(TINY + 'names = { nose = "a" }\n', "named"), Geometry(reference=FreakyTorus().reference)
     with pytest.raises(ExportError, match="'nose', which is neither"):
-        write('names = { nose = "a" }\n')
+        export(learner_of(run).main(), run.collection, config, {}, "", tmp_path, geometry)
 
 
 def test_the_same_command_again_does_nothing_and_a_changed_setting_only_its_stages(
@@ -190,12 +182,16 @@ def test_the_same_command_again_does_nothing_and_a_changed_setting_only_its_stag
     before = seconds(copy)
     subprocess.run(command(config, copy), check=True, capture_output=True)
     assert seconds(copy) == before
-    config.write_text(TINY.replace("A run for the tests.", "Another description."))
+    names = 'names = { bump = "hill", gamma = "along" }\n'
+    config.write_text(TINY.replace("A run for the tests.", "Another description.") + names)
     subprocess.run(command(config, copy), check=True, capture_output=True)
     after = seconds(copy)
     assert {name for name in STAGES if before[name] != after[name]} == {"export"}
-    manifest = json.loads((copy / "models" / "tiny-torus" / "1" / "manifest.json").read_text())
-    assert manifest["description"] == "Another description."
+    manifest = read_bundle(copy / "models" / "tiny-torus" / "1").manifest
+    assert manifest.description == "Another description."
+    own = list(FreakyTorus().factors)
+    assert [factor.name for factor in manifest.factors] == ["hill" if name == "bump" else name for name in own]
+    assert manifest.latent_names == ["alpha", "beta", "along", "zeta"]
 
 
 def test_more_samples_are_drawn_beside_those_that_are_there(tiny_run: Path, tmp_path: Path) -> None:
