@@ -31,9 +31,8 @@ folds chose; no networks.
 Rows *with mirror images* also learn from the images of the shapes that they know, which a symmetric shape of the
 collection gives, on another coarse mesh; components are without and, in the last columns, with them too.
 Held-out shapes choose nothing: settings are those of `examples`, and each fold chooses its sparsity by the shapes that
-it knows. So it does K of faces; the other rows were measured with K = 8 before K could be chosen, and hippocampi take
-one step now. The rule for K was changed twice after folds had been seen
-([notes](notes.md#why-faces-are-no-nearer-than-components)).
+it knows, and K. Rows of samba and of makehuman were measured with K = 8 before K could be chosen. The rule for K was
+changed twice after folds had been seen ([notes](notes.md#why-faces-are-no-nearer-than-components)).
 
 Makehuman is further away here than [served networks](served.md) are: some of its poses lie where exponentials end, as
 faces collapse on the way, and networks go on there ([notes](notes.md#where-exponentials-end)). The ratios of its rows
