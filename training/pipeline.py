@@ -382,7 +382,7 @@ def execute(
     directory.config.write(run.source)
     order = list(STAGES)
     if until is None or order.index(until) >= order.index("networks"):
-        # Before other stages load what solves their equations: beside that, PyTorch computes other last bits.
+        # First: loaded after the libraries that solve other stages' equations, its results differ in the last bits.
         import_module("torch")
     news = False
     for name, stage in STAGES.items():
