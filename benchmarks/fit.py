@@ -189,8 +189,14 @@ class Bench:
             model.shape(code)
             times.append(time.process_time() - began)
         self.solved = float(np.median(times))
-        codes = model.population.sample(60, 3) if model.training_codes is None else model.training_codes
-        self.training = np.stack([model.shape(code).vertices for code in codes.astype(np.float32)])
+
+    @cached_property
+    def training(self) -> FloatArray:
+        """The training shapes (n, V, 3), as the model remembers them."""
+        codes = self.model.training_codes
+        if codes is None:
+            raise ValueError(f"{self.model.name} has no codes of training shapes, which components would be of")
+        return np.stack([self.model.shape(code).vertices for code in codes.astype(np.float32)])
 
     def distance(self, found: FloatArray, truth: FloatArray) -> float:
         """Mean distance of shapes (V, 3) in the same place, as a fraction of the diagonal."""
@@ -224,17 +230,11 @@ class Bench:
             encoded = model.encode(shape)
             row.encoded.append(self.distance(align(encoded.shape.vertices, shape), shape))
             begun = Placement.between(self.training.mean(axis=0), found.placement(found.shape.vertices))
-            fitted = self.fitted_by_components(self.training, points, begun, variant, self.holds[variant])
+            hold, partial = self.holds[variant], variant == "camera"
+            fitted = by_components(self.training, model.dimension, points, begun, hold, partial=partial)
             row.components.append(self.distance(fitted, there))
         elif row.converged[-1]:
             self.interval(row, found, truth)
-
-    def fitted_by_components(
-        self, training: FloatArray, points: FloatArray, start: Placement, variant: str, hold: float
-    ) -> FloatArray:
-        """Vertices (V, 3)."""
-        count = min(self.model.dimension, len(training) - 1)
-        return by_components(training, count, points, start, hold, partial=variant == "camera")
 
     @cached_property
     def holds(self) -> dict[str, float]:
@@ -247,7 +247,8 @@ class Bench:
                 points, _ = scan(shape, self.model.faces, variant, number, np.random.default_rng(number))
                 start = Placement.between(others.mean(axis=0), shape)
                 for hold, errors in away.items():
-                    found = self.fitted_by_components(others, points, start, variant, hold)
+                    count, partial = self.model.dimension, variant == "camera"
+                    found = by_components(others, count, points, start, hold, partial=partial)
                     errors.append(self.distance(found, shape))
             chosen[variant] = min(away, key=lambda hold: float(np.median(away[hold])))
         return chosen

@@ -40,7 +40,7 @@ from shapespace.training.runs.shortfalls import refuse, shortfalls
 from shapespace.training.runs.stages import STAGES, stage_keys
 from shapespace.training.space import stages as space
 
-# PyTorch and Matplotlib, which take most of a second to load, are loaded where a stage needs them.
+# PyTorch and Matplotlib, which take more than a second to load, are loaded where a stage needs them.
 if TYPE_CHECKING:
     from shapespace.training.learning.learner import Learner
 
