@@ -195,7 +195,7 @@ class Bench:
         """The training shapes (n, V, 3), as the model remembers them."""
         codes = self.model.training_codes
         if codes is None:
-            raise ValueError(f"{self.model.manifest.name} has no codes of training shapes, which components would be of")
+            raise ValueError(f"{self.model.manifest.name} has no codes of the training shapes, as components need")
         return np.stack([self.model.shape(code).vertices for code in codes.astype(np.float32)])
 
     def distance(self, found: FloatArray, truth: FloatArray) -> float:
