@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import TypeVar
 
@@ -43,12 +44,14 @@ def codes(model: ShapeModel, count: int, seed: int) -> Codes:
 
 def encode(model: ShapeModel, count: int) -> str:
     """Errors of coordinates as fractions of their range."""
-    rng, shape_times, times, errors = np.random.default_rng(0), [], [], []
+    shape_times: list[float] = []
+    times: list[float] = []
+    rng, errors = np.random.default_rng(0), []
     for code in codes(model, count, 0):
-        shape = timed(shape_times, lambda code=code: model.shape(code))
+        shape = timed(shape_times, partial(model.shape, code))
         turn = Rotation.random(rng=rng).as_matrix()
         moved = (shape.vertices @ turn + rng.normal(size=3)).astype(np.float32).astype(np.float64)
-        found = timed(times, lambda moved=moved: model.encode(Matched(moved, MeshChoice.FINE)))
+        found = timed(times, partial(model.encode, Matched(moved, MeshChoice.FINE)))
         errors.append(np.abs(model.latents.shorter(found.code.astype(np.float64) - code)) / model.latents.width)
     worst = np.median(errors, axis=0).max()
     return (
@@ -59,13 +62,15 @@ def encode(model: ShapeModel, count: int) -> str:
 
 def edit(model: ShapeModel, count: int) -> str:
     """Largest distance from a target as a fraction of the diagonal."""
-    rng, shape_times, times, errors = np.random.default_rng(0), [], [], []
+    shape_times: list[float] = []
+    times: list[float] = []
+    rng, errors = np.random.default_rng(0), []
     diagonal = model.manifest.scale * model.mesh(MeshChoice.FINE).diagonal
     for k, (start, goal) in enumerate(zip(codes(model, count, 1), codes(model, count, 2), strict=True)):
-        vertices = timed(shape_times, lambda goal=goal: model.shape(goal)).vertices
+        vertices = timed(shape_times, partial(model.shape, goal)).vertices
         chosen = rng.choice(len(vertices), (1, 3, 5, 10)[k % 4], replace=False)
         targets = [Target(int(v), vertices[v].tolist()) for v in chosen]
-        found = timed(times, lambda start=start, targets=targets: edited(model, start, targets))
+        found = timed(times, partial(edited, model, start, targets))
         errors.append(found.distances.max() / diagonal)
     return (
         f"median {np.median(errors):.3%}, largest {np.max(errors):.3%}; over 1 % in "

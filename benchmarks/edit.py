@@ -113,7 +113,8 @@ def own_factors(model: ShapeModel, rng: np.random.Generator) -> dict[str, list[i
 
 def pulls(model: ShapeModel, count: int, seed: int) -> list[Pull]:
     """Random pulls, as many of each handle as can be."""
-    rng, found, parts, several = np.random.default_rng(seed), [], limbs(), handles()
+    rng, parts, several = np.random.default_rng(seed), limbs(), handles()
+    found: list[Pull] = []
     own = own_factors(model, rng)
     starts = iter(model.latents.sample(8 * count, seed, Distribution.GAUSSIAN))
     while len(found) < count:
@@ -169,7 +170,7 @@ def row(model: ShapeModel, some: list[Pull], kind: PriorKind, edit: Callable[...
         rest_of_it = np.logical_or.reduce([limb for name, limb in parts.items() if name != pull.limb])
         others.append(np.linalg.norm(now - pull.before, axis=1)[rest_of_it].mean())
         away.append(found.distances[0] / PULL)
-        change = np.abs(model.latents.shorter(found.code - pull.start.astype(np.float64))) / model.latents.width
+        change = np.abs(model.latents.shorter(found.code.astype(np.float64) - pull.start)) / model.latents.width
         factors.append(sum(change[f.start : f.stop].max() > 0.01 for f in model.manifest.factors))
         shapes.append(found.iterations)
     return (

@@ -23,12 +23,13 @@ import time
 import unittest.mock
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, redirect_stdout
+from functools import partial
 from pathlib import Path
 
 import httpx
 import numpy as np
 from scipy import sparse
-from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
+from threadpoolctl import threadpool_limits
 
 from benchmarks import synthetic
 from benchmarks.yardstick import superlu
@@ -40,6 +41,7 @@ from shapespace.coordinates.reconstruction import Reconstruction, Reconstructor
 from shapespace.files.formats import MESH_FORMATS
 from shapespace.mesh.rigid_motion import align
 from shapespace.model.decoder import TOLERANCE, MeshChoice, Quality
+from shapespace.model.latent_space import Codes
 from shapespace.model.shape_model import ShapeModel
 from shapespace.shell.energy import Material
 from shapespace.shell.exponential import exponential
@@ -89,7 +91,7 @@ def normal_matrix(model: ShapeModel, vertices: FloatArray) -> sparse.csr_array:
     return sparse.csr_array(jacobian.T @ sparse.diags_array(weights) @ jacobian)
 
 
-def draw(model: ShapeModel, count: int, spread: float = 1.0) -> FloatArray:
+def draw(model: ShapeModel, count: int, spread: float = 1.0) -> Codes:
     """Random codes (count, m) in a box so many times as wide as the bounds."""
     centre = (model.latents.lower + model.latents.upper) / 2
     radius = spread * (model.latents.upper - model.latents.lower) / 2
@@ -118,7 +120,7 @@ def without_numba() -> Iterator[None]:
         yield
 
 
-def measure(path: Path, model: ShapeModel, codes: FloatArray) -> dict[str, list[float]]:
+def measure(path: Path, model: ShapeModel, codes: Codes) -> dict[str, list[float]]:
     """Times of code → GLB by stage, and of the yardsticks in turn with them; of the model of a bundle."""
     fine = model.mesh(MeshChoice.FINE)
     shape = model.shape(codes[0], mesh=MeshChoice.COARSE)
@@ -134,12 +136,12 @@ def measure(path: Path, model: ShapeModel, codes: FloatArray) -> dict[str, list[
         def blend(code: FloatArray = code) -> object:
             return GLB(fine.vertices + (code @ fields).reshape(-1, 3), fine.faces, None)
 
-        network = seconds(lambda code=code: model._networks(code[None]))
+        network = seconds(partial(model._networks, code[None]))
         began = time.thread_time()
         shape = model.shape(code)
         solved = time.thread_time() - began
-        draft = seconds(lambda code=code: model.shape(code, quality=Quality.DRAFT))
-        encode = seconds(lambda shape=shape: GLB(shape.vertices, fine.faces, None))
+        draft = seconds(partial(model.shape, code, quality=Quality.DRAFT))
+        encode = seconds(partial(GLB, shape.vertices, fine.faces, None))
         found = {
             "network": network,
             "reconstruct": solved - network,
@@ -149,10 +151,10 @@ def measure(path: Path, model: ShapeModel, codes: FloatArray) -> dict[str, list[
             "iterations": shape.diagnostics.iterations,
             "blend shapes": seconds(blend),
         }
-        found["NumPy"] = seconds(lambda code=code: numpy.shape(code)) + encode
+        found["NumPy"] = seconds(partial(numpy.shape, code)) + encode
         if plain:
             with without_mkl():
-                found["without MKL"] = seconds(lambda code=code: plain.shape(code)) + encode
+                found["without MKL"] = seconds(partial(plain.shape, code)) + encode
         if len(times.get("SuperLU", ())) < 5 or found["sum"] > times["SuperLU"][-1] / 10:
             found["SuperLU"] = seconds(yardstick)  # of large meshes five have to do
         for name, value in found.items():
@@ -160,7 +162,7 @@ def measure(path: Path, model: ShapeModel, codes: FloatArray) -> dict[str, list[
     return times
 
 
-def away(model: ShapeModel, codes: FloatArray) -> list[float]:
+def away(model: ShapeModel, codes: Codes) -> list[float]:
     """How far shapes end from a solution of tolerance 1e-10: the furthest vertex, in millionths of the diagonal."""
     found = []
     with model.solver() as reconstruct:
@@ -218,16 +220,14 @@ def stages(folders: list[Path], count: int) -> None:
         )
 
 
-def ceiling(model: ShapeModel, codes: FloatArray) -> float | str:
+def ceiling(model: ShapeModel, codes: Codes) -> float | str:
     """Time of the exact exponential, where the model has modes."""
     if model.modes is None:
         return "–"
     facts = model.manifest
     space = ShellSpace(model.reference, Material(facts.mu, facts.lambda_, facts.eta))
     velocities = [np.tensordot(code.astype(np.float64), model.modes, 1) for code in codes]
-    return statistics.median(
-        seconds(lambda v=v: exponential(space, model.reference.vertices, v, 16)) for v in velocities
-    )
+    return statistics.median(seconds(partial(exponential, space, model.reference.vertices, v, 16)) for v in velocities)
 
 
 def starts(models: Path, count: int) -> None:
@@ -241,7 +241,7 @@ def starts(models: Path, count: int) -> None:
             row(f"{model.manifest.name} × {spread:g}", *_starts(model, draw(model, count, spread)))
 
 
-def _starts(model: ShapeModel, codes: FloatArray) -> list[object]:
+def _starts(model: ShapeModel, codes: Codes) -> list[object]:
     reconstruct = Reconstructor(model.reference, model.manifest.eta_reconstruction)
     radius = 0.1 * (model.latents.upper - model.latents.lower) / 2
     rng = np.random.default_rng(1)
@@ -254,10 +254,10 @@ def _starts(model: ShapeModel, codes: FloatArray) -> list[object]:
         learned = list(model._learned_start(code))
         neighbour = reconstruct(beside, reconstruct.guess(beside), tolerance=TOLERANCE).vertices
         starts: dict[str, Callable[[], FloatArray]] = {
-            "frames": lambda target=target: reconstruct.integrate(target),
+            "frames": partial(reconstruct.integrate, target),
             "reference": lambda: model.reference.vertices,
             **dict(zip(["learned"], learned, strict=False)),
-            "neighbour": lambda neighbour=neighbour: neighbour,
+            "neighbour": neighbour.copy,
         }
         found: dict[str, Reconstruction] = {}
         for name in ("ours", *starts):

@@ -129,13 +129,13 @@ def main() -> None:
         print("|---|---|---|---|---|---|---|")
         cases = [Case(count) for count in options.sizes]
         for case in cases:
-            case.report("exponential, K = 16", lambda case=case: case.shoot(16), options.repeats)
+            case.report("exponential, K = 16", partial(case.shoot, 16), options.repeats)
         for case in cases:
-            case.report("geodesic, K = 8", lambda case=case: case.connect(8), options.repeats)
+            case.report("geodesic, K = 8", partial(case.connect, 8), options.repeats)
         middle = cases[len(cases) // 2]
-        middle.report("geodesic, K = 16", lambda: middle.connect(16), options.repeats)
+        middle.report("geodesic, K = 16", partial(middle.connect, 16), options.repeats)
         for steps in (8, 32, 64):
-            middle.report(f"exponential, K = {steps}", lambda steps=steps: middle.shoot(steps), options.repeats)
+            middle.report(f"exponential, K = {steps}", partial(middle.shoot, steps), options.repeats)
         for case in cases:
             reconstruct = Reconstructor(case.mesh)
             target = nric(case.end, case.mesh.connectivity)
@@ -150,7 +150,7 @@ def main() -> None:
                 case, repeats = Case(count), 3
                 shoot, connect = (
                     float(np.median([clock(task)[1] for _ in range(repeats)]))
-                    for task in (lambda case=case: case.shoot(16), lambda case=case: case.connect(8))
+                    for task in (partial(case.shoot, 16), partial(case.connect, 8))
                 )
                 rows.append((count, shoot, connect))
                 print(f"| {count} | {case.analysis:.3f} | {shoot:.3f} | {connect:.3f} |", flush=True)

@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 import trimesh
-from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
+from threadpoolctl import threadpool_limits
 
 from shapespace.arrays import FloatArray
 from shapespace.bundle.reader import read_bundle
@@ -111,8 +111,9 @@ def measure(size: Size, folder: Path) -> dict[str, tuple[float, float]]:
         where = ["--out", str(folder / "run"), "--models", str(folder), "--until", stage]
         command = [sys.executable, "-m", "shapespace.training", "run", str(file), *where]
         one_thread = os.environ | {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
-        silent = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
-        child = subprocess.Popen(command, env=one_thread, **silent)  # noqa: S603 - our own
+        child = subprocess.Popen(  # noqa: S603 - our own
+            command, env=one_thread, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+        )
         _, status, used = os.wait4(child.pid, 0)
         if status:
             raise RuntimeError(f"{stage} of {size} ended with {os.waitstatus_to_exitcode(status)}")
