@@ -10,9 +10,10 @@ import argparse
 import json
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import trimesh
@@ -37,6 +38,8 @@ VARIANTS = ("whole", "noisy", "camera")
 #: Steps of the closest-point fit with principal components, how strongly it may hold on to the mean, and by how many
 #: training shapes this is chosen.
 COMPONENT_STEPS, HOLDS, CHOOSING = 40, (1e-5, 1e-4, 1e-3, 1e-2, 1e-1), 4
+#: What was measured, a file for each model.
+FIGURES = ROOT / "runs" / "fit"
 
 PAGE = """# Fits of scans
 
@@ -45,9 +48,9 @@ anew, turned at random and moved. **whole**: alternately {points} points all ove
 vertices. **noisy**: {points} points with noise of {noise:.1%} of the bounding box's diagonal and {outliers:.0%}
 outliers. **camera**: at most so many points, those that one camera sees, with the same noise, and `partial=true`.
 **unseen** shapes of the figure are poses from its generator that no training knows, those of the collections the fifth
-that was left out of their training ([served.md](served.md)); **training** ones those that made the model, **drawn**
-ones shapes of the population's codes. Which models these are is in the [notes](notes.md#fits-of-scans).
-`python -m benchmarks.fit` measures and writes this page.
+that was left out of their training ([served.md](served.md), whose first folds these models are); **training** ones
+those that made the model, **drawn** ones shapes of the population's codes. `python -m benchmarks.fit` measures and
+writes this page; what it measured, every try of it, is in `runs/fit/`.
 
 **error**: median over tries of the mean distance of vertices from the truth, in percent of the diagonal; of the torus
 the distance of its surface, which four codes share in as many places, each with other vertices. **encode**: the same
@@ -69,8 +72,8 @@ How often the code's 90 % intervals hold the truth's coordinates, over all coord
 the intervals' median width as a share of the population's. Of shapes drawn from the model the truth is their code; of
 training shapes it is `encode`'s code. Four codes of the torus have the same surface up to the networks' errors: after
 half a turn about its axis gamma is another by π, and upside down all signs are. A fit finds one of them or another
-nearby, and its covariance does not know of the others: there the intervals do not hold. Of scans without noise they
-are too narrow elsewhere too, on the hand above all.
+nearby, and its covariance does not know of the others: there the intervals do not hold. Elsewhere they are too narrow
+where a row has much less than 90 %, as those of scans without noise.
 
 | model | shapes | scan | fits | held | width |
 |---|---|---|---|---|---|
@@ -80,8 +83,10 @@ are too narrow elsewhere too, on the hand above all.
 
 @dataclass
 class Row:
-    """Tries of one kind."""
+    """Tries of one kind of shapes and one variant of scans."""
 
+    kind: str
+    variant: str
     errors: list[float] = field(default_factory=list)
     encoded: list[float] = field(default_factory=list)
     components: list[float] = field(default_factory=list)
@@ -206,17 +211,17 @@ class Bench:
             away = np.linalg.norm(found - truth, axis=1)
         return float(away.mean() / diagonal(truth))
 
-    def tries(self, shapes: FloatArray, truths: FloatArray | None) -> Iterator[tuple[str, Row]]:
+    def tries(self, kind: str, shapes: FloatArray, truths: FloatArray | None) -> Iterator[Row]:
         """A row for each variant of scans of shapes (n, V, 3), given their codes (n, m) or not."""
         for variant in VARIANTS:
-            row = Row()
+            row = Row(kind, variant)
             for number, shape in enumerate(shapes):
-                self.one(row, variant, number, shape, None if truths is None else truths[number])
-            yield variant, row
+                self.one(row, number, shape, None if truths is None else truths[number])
+            yield row
 
-    def one(self, row: Row, variant: str, number: int, shape: FloatArray, truth: FloatArray | None) -> None:
+    def one(self, row: Row, number: int, shape: FloatArray, truth: FloatArray | None) -> None:
         """One scan of a shape (V, 3) of a code (m,), if that is known."""
-        rng, model = np.random.default_rng(number), self.model
+        rng, model, variant = np.random.default_rng(number), self.model, row.variant
         points, faces = scan(shape, model.faces, variant, number, rng)
         turn, shift = Rotation.random(random_state=rng).as_matrix(), diagonal(shape) * rng.standard_normal(3)
         points, there = points @ turn.T + shift, shape @ turn.T + shift
@@ -261,7 +266,7 @@ class Bench:
         row.widths.append(float(np.median(deviations / np.sqrt(self.model.population.covariance.diagonal()))))
 
 
-def line(name: str, kind: str, variant: str, row: Row) -> str:
+def line(name: str, row: Row) -> str:
     """Of the table of errors."""
     errors, converged = np.array(row.errors), np.array(row.converged)
     failed = errors > FAILED * np.median(errors)
@@ -269,8 +274,8 @@ def line(name: str, kind: str, variant: str, row: Row) -> str:
     middle = 100 * float(np.median(errors))
     cells = [
         name,
-        kind,
-        variant,
+        row.kind,
+        row.variant,
         str(len(errors)),
         f"{middle:.3f}",
         "–" if encoded is None else f"{encoded:.3f}",
@@ -285,10 +290,10 @@ def line(name: str, kind: str, variant: str, row: Row) -> str:
     return f"| {' | '.join(cells)} |"
 
 
-def held(name: str, kind: str, variant: str, row: Row) -> str:
+def held(name: str, row: Row) -> str:
     """Of the table of intervals."""
     figures = [f"{np.mean(row.held):.0%}", f"{np.median(row.widths):.3f}"] if row.held else ["–", "–"]
-    return f"| {' | '.join([name, kind, variant, str(len(row.held)), *figures])} |"
+    return f"| {' | '.join([name, row.kind, row.variant, str(len(row.held)), *figures])} |"
 
 
 def kinds(
@@ -301,21 +306,35 @@ def kinds(
     yield "drawn", np.stack([model.decode(code) for code in codes]), codes
 
 
-def measure(name: str, model: ShapeModel, unseen: FloatArray | None, count: int) -> dict[str, list[str]]:
-    """Rows of both tables for one model."""
-    found: dict[str, list[str]] = {"rows": [], "intervals": []}
+def measure(name: str, model: ShapeModel, unseen: FloatArray | None, count: int) -> list[Row]:
+    """All tries of one model."""
     bench = Bench(model, by_surface=name == "freaky-torus")
     every = list(kinds(model, unseen, count))
     if name == "figure":
         shapes = figure.poses(len(figure.NAMED) + count)[1][len(figure.NAMED) :]
         every.append(("training", shapes, np.stack([model.encode(shape).code for shape in shapes])))
+    found = []
     for kind, shapes, codes in every:
-        for variant, row in bench.tries(shapes, codes):
-            found["rows"].append(line(name, kind, variant, row))
-            if codes is not None:
-                found["intervals"].append(held(name, kind, variant, row))
-            print(found["rows"][-1], *found["intervals"][-1:], sep="\n", flush=True)
+        for row in bench.tries(kind, shapes, codes):
+            print(line(name, row), held(name, row), sep="\n", flush=True)
+            found.append(row)
     return found
+
+
+def write_page() -> None:
+    """Of all that was measured."""
+    files = {file.stem: json.loads(file.read_text(encoding="utf-8")) for file in sorted(FIGURES.glob("*.json"))}
+    rows = [(name, Row(**each)) for name, found in files.items() for each in found]
+    page = PAGE.format(
+        points=POINTS,
+        noise=NOISE,
+        outliers=OUTLIERS,
+        failed=FAILED,
+        choosing=CHOOSING,
+        rows="\n".join(line(name, row) for name, row in rows),
+        intervals="\n".join(held(name, row) for name, row in rows if row.kind != "unseen"),
+    )
+    (ROOT / "docs" / "measurements" / "fit.md").write_text(page, encoding="utf-8")
 
 
 def main() -> None:
@@ -323,13 +342,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--data", type=Path, help="folder of other bundles and of shapes that they have not seen")
     parser.add_argument("--count", type=int, default=10, help="shapes of each kind, twice as many unseen ones")
-    parser.add_argument("--out", type=Path, default=ROOT / "build" / "fit", help="folder of what is measured")
-    parser.add_argument("--page", action="store_true", help="measure nothing, and write the page of what is in --out")
-    parser.add_argument("names", nargs="*", help="models to measure; by default all. The page has every one in --out")
+    parser.add_argument("--page", action="store_true", help="measure nothing, and write the page of what is there")
+    parser.add_argument("names", nargs="*", help="models to measure; by default all")
     given = parser.parse_args()
     bundles = {name: ROOT / "models" / name for name in ("figure", "freaky-torus")}
     bundles |= {file.stem: given.data / file.stem for file in sorted(given.data.glob("*.npz"))} if given.data else {}
-    given.out.mkdir(parents=True, exist_ok=True)
+    FIGURES.mkdir(exist_ok=True)
     with threadpool_limits(1):
         for name in [] if given.page else given.names or bundles:
             unseen = None
@@ -341,18 +359,9 @@ def main() -> None:
                 with np.load(given.data / f"{name}.npz", allow_pickle=False) as arrays:
                     unseen = arrays["vertices"]
             found = measure(name, load(bundles[name]), unseen, given.count)
-            (given.out / f"{name}.json").write_text(json.dumps(found), encoding="utf-8")
-    every = [json.loads(file.read_text(encoding="utf-8")) for file in sorted(given.out.glob("*.json"))]
-    page = PAGE.format(
-        points=POINTS,
-        noise=NOISE,
-        outliers=OUTLIERS,
-        failed=FAILED,
-        choosing=CHOOSING,
-        rows="\n".join(row for each in every for row in each["rows"]),
-        intervals="\n".join(row for each in every for row in each["intervals"]),
-    )
-    (ROOT / "docs" / "measurements" / "fit.md").write_text(page, encoding="utf-8")
+            every: list[dict[str, Any]] = [asdict(row) for row in found]
+            (FIGURES / f"{name}.json").write_text(json.dumps(every, indent=1), encoding="utf-8")
+    write_page()
 
 
 if __name__ == "__main__":

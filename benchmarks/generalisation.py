@@ -30,9 +30,11 @@ folds chose; no networks.
 **Components**: principal components of the aligned vertices, as many. On coarse meshes of at most a thousand vertices.
 Rows *with mirror images* also learn from the images of the shapes that they know, which a symmetric shape of the
 collection gives, on another coarse mesh; components are without and, in the last columns, with them too.
-Held-out shapes choose nothing: settings are those of `examples`, and each fold chooses its sparsity by the shapes that
-it knows, and K. Rows of samba and of makehuman were measured with K = 8 before K could be chosen. The rule for K was
-changed twice after folds had been seen ([notes](notes.md#why-faces-are-no-nearer-than-components)).
+No fold chooses on its own held-out shapes: settings are those of `examples`, and each fold chooses K, and sparsity
+where the settings leave it open, by the shapes that it knows. But how modes are found was settled with such folds in
+view ([how we know](../explanation/how-we-know.md#which-choice-was-made-on-which-data)), and the rule for K was changed
+twice after ([notes](notes.md#why-faces-are-no-nearer-than-components)). Rows of samba and of makehuman were measured
+with K = 8 before K could be chosen.
 
 Makehuman is further away here than [served networks](served.md) are: some of its poses lie where exponentials end, as
 faces collapse on the way, and networks go on there ([notes](notes.md#where-exponentials-end)). The ratios of its rows

@@ -220,6 +220,7 @@ def write_page() -> None:
         shell={name: rows[name + SHELL] for name in COLLECTIONS if name + SHELL in rows},
         largest=rows.get(LARGEST),
         missing=[name for name in COLLECTIONS if name not in rows],
+        missing_shell=[name for name in COLLECTIONS if name + SHELL not in rows],
         spread=spread,
         leading=leading,
         joint=joint_exponentials,

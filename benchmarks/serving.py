@@ -23,6 +23,7 @@ import time
 import unittest.mock
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, redirect_stdout
+from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
 
@@ -58,7 +59,7 @@ PAGE = """# Serving
 that thread. *SuperLU* is one factorisation (symmetric mode) of the model's own normal matrix, run in turn. *Blend
 shapes* is a sum of m fields and the same file, the floor; the *exponential* is what networks stand for, the ceiling.
 [performance.md](performance.md) has the aims, and why it is as fast as it is. Everything but the column *without Numba*
-was measured {kernels} Numba.
+was measured {kernels} Numba, on {day:%Y-%m-%d}; models may have been trained anew since.
 """
 #: Two results of one code agree up to this fraction of the diagonal.
 AGREEMENT = 1e-4
@@ -222,12 +223,13 @@ def stages(folders: list[Path], count: int) -> None:
 
 def ceiling(model: ShapeModel, codes: Codes) -> float | str:
     """Time of the exact exponential, where the model has modes."""
-    if model.modes is None:
-        return "–"
     facts = model.manifest
+    if model.modes is None or facts.exponential_steps is None:
+        return "–"
     space = ShellSpace(model.reference, Material(facts.mu, facts.lambda_, facts.eta))
     velocities = [np.tensordot(code.astype(np.float64), model.modes, 1) for code in codes]
-    return statistics.median(seconds(partial(exponential, space, model.reference.vertices, v, 16)) for v in velocities)
+    start, steps = model.reference.vertices, facts.exponential_steps
+    return statistics.median(seconds(partial(exponential, space, start, v, steps)) for v in velocities)
 
 
 def starts(models: Path, count: int) -> None:
@@ -483,7 +485,7 @@ def main() -> None:
         return
     with redirect_stdout(io.StringIO()) as text:
         run(arguments)
-    page = PAGE.format(kernels="with" if compiled.AVAILABLE else "without")
+    page = PAGE.format(kernels="with" if compiled.AVAILABLE else "without", day=datetime.now(UTC))
     (ROOT / "docs" / "measurements" / "serving.md").write_text(page + text.getvalue(), encoding="utf-8")
 
 

@@ -13,6 +13,7 @@ import subprocess
 import sys
 import time
 from dataclasses import asdict, dataclass, replace
+from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
@@ -39,6 +40,7 @@ workers included and those of starting left out, of one run, with one BLAS threa
 grow with the number of exponentials, which is 1000 and more in a real run. Memory is the largest resident set of a
 process, of `ingest` and of whatever stage has most. The last two columns are of the model that comes out: processor
 milliseconds of a shape on the coarse mesh, and what carrying the fine mesh along adds, medians over {codes} codes.
+Measured on {day:%Y-%m-%d}; training may have changed since.
 
 """
 
@@ -163,7 +165,7 @@ def main() -> None:
         rows.append([*map(str, asdict(size).values()), *seconds, *(f"{mb:.0f}" for mb in memory)])
         rows[-1] += [f"{ms:.1f}" for ms in kept["serving"]]
     text = (
-        PAGE.format(joint=JOINT, factors=OF_FACTORS, codes=CODES)
+        PAGE.format(joint=JOINT, factors=OF_FACTORS, codes=CODES, day=datetime.now(UTC))
         + "\n".join(f"| {' | '.join(row)} |" for row in rows)
         + "\n"
     )
