@@ -47,43 +47,47 @@ NAMES = tuple(each + ending for each in ROWS for ending in ("", HALF))
 #: What was measured, a file for each row; a fold that is there is not measured again.
 FIGURES = ROOT / "runs" / "collections"
 
-HEAD = (
-    *("", "m", "folds", "unseen", "95 %", "components", "95 %", "ratio", "of folds"),
-    *("trained on", "components", "ratio", "of folds", "nothing remembered", "ratio", "of folds"),
-    *("specificity", "components"),
-    *("unseen: components with images", "ratio"),
-)
-
 PAGE = """# Served models and shapes that they have not seen
 
 For each collection models were trained on four fifths of the shapes, with the settings of `examples` but at most
 {joint} joint exponentials and {factors} of each factor, without mirror images where a row doesn't say so, and
 exported; where there is a second row, other models with half as many modes. The `encode` of each, as it is served,
-was given the fine meshes of the other fifth, so that over five **folds** each shape is unseen once. **unseen**: mean
-distance of all vertices of these shapes to the shape of the code, in percent of the bounding box's diagonal, and the
-mean of the folds' 95th percentiles; **components**: of as many principal components of the same four fifths' fine
-meshes. **trained on**: the same of the shapes that made a model, which a bundle
-[remembers](../explanation/mathematics.md#networks): it adds what modes and networks miss of them. Components remember
-nothing, so this says that users get their own shapes back, not that the modes are better; **nothing remembered** is a
-model without it (`export.examples = false`) beside the same components.
+was given the fine meshes of shapes, and this page has the mean distance of all their vertices to the shape of the code,
+in percent of the bounding box's diagonal, beside that to the nearest of as many principal **components** of the same
+four fifths' fine meshes. **95 %**: mean of the folds' 95th percentiles. **of folds**: the least and the greatest ratio
+of a fold. **m**: of all folds.
 
-**folds**: with all five each shape is unseen once; rows with fewer know only some shapes. Rows without *trained on* are
-of older models, trained and encoded before models remembered. **of folds**: the least and the greatest ratio of a fold.
-**m**: of the first fold, others may differ by one.
-
-Of the first fold alone: **specificity**, the mean distance of {codes} random shapes, uniform in the bounds of the codes
-or of the components' coefficients, to the nearest of the shapes that made the model (lower is better); and the last
-columns. Models *with mirror images* also learned from the images of these shapes; the components beside them did not,
-and in the last columns are components that did, beside the same fold of the model.
+A bundle also [remembers](../explanation/mathematics.md#networks) the shapes that made it: it adds what modes and
+networks miss of these, and less so at codes nearby. **Nothing remembered** is the same model without that
+(`export.examples = false`): what modes and networks do alone. Rows with gaps are of older models, which remembered
+nothing.
 
 How well networks follow exponentials is on [another page](results.md), and [a third](generalisation.md) has exact
 exponentials in place of networks; on makehuman networks come nearer, as they go on where exponentials end.
 `python -m benchmarks.served --data FOLDER` trains, measures and writes this page; what it measured is in
-`runs/collections/`. Some rows are of [older networks](notes.md#kernels-in-patches).
+`runs/collections/`. Some rows are of [older networks](notes.md#kernels-in-patches). No fold has chosen on its own
+unseen shapes, but the method has been changed with some of them in view: see [how we
+know](../explanation/how-we-know.md#which-choice-was-made-on-which-data).
 
-| {head} |
-|{line}
-{rows}
+## Unseen shapes
+
+Those of the other fifth. With five **folds** each shape is unseen once.
+
+{unseen}
+
+## Shapes that it was trained on
+
+Components remember nothing, so the first ratio says that users get their own shapes back, not that modes are better.
+
+{known}
+
+## Random shapes, and mirror images
+
+Of the first fold alone. **Specificity**: the mean distance of {codes} random shapes, uniform in the bounds of the codes
+or of the components' coefficients, to the nearest of the shapes that made the model (lower is better). Models *with
+mirror images* also learned from the images of these shapes; the components above did not, but those here did.
+
+{first}
 """
 
 
@@ -152,12 +156,15 @@ def measure(name: str, data: Path, out: Path, fold: int) -> dict[str, Any]:
     execute(run, "samples", keep_going=True)
     model = load(run.bundle if run.bundle.exists() else write_bundle_of(run, figures={}))
     m, size = model.dimension, float(diagonal(model.vertices))
-    linear = PrincipalComponents.of(known, model.vertices)
+    linear, without = PrincipalComponents.of(known, model.vertices), forgetful(run)
     found: dict[str, Any] = {"modes": m}
     for kind, shapes in zip(COLUMNS, (unseen, known), strict=True):
         others = vertex_distances(linear.nearest(shapes, m), shapes, size)
-        found[kind] = summary(encoded(model, shapes)) | {"components": summary(others), "shapes": len(shapes)}
-    found[ALONE] = found[COLUMNS[1]] | summary(encoded(forgetful(run), known))
+        found[kind] = summary(encoded(model, shapes)) | {
+            "components": summary(others),
+            ALONE: summary(encoded(without, shapes)),
+            "shapes": len(shapes),
+        }
     if fold:
         return found
     np.savez(out / "models" / f"{name}.npz", vertices=unseen)
@@ -169,24 +176,34 @@ def measure(name: str, data: Path, out: Path, fold: int) -> dict[str, Any]:
     return found | {"specificity": [to_nearest(each, known, size) for each in (drawn, others)]}
 
 
-def row(name: str, folds: list[dict[str, Any]]) -> str:
-    """Of the table: means over all shapes, and the least and the greatest ratio of a fold."""
-    first = folds[0]
-    cells = ["" if name.endswith(HALF) else title(name), str(first["modes"]), str(len(folds))]
-    for kind in (*COLUMNS, ALONE):
-        found = [fold[kind] for fold in folds if kind in fold]
-        if not found:
-            cells += [""] * 4
-            continue
-        figures = np.array([[(each[key], each["components"][key]) for key in ("mean", "p95")] for each in found])
-        means = np.average(figures, axis=0, weights=[each["shapes"] for each in found])
-        shown = {"unseen": means.T.ravel(), ALONE: means[0, :1]}.get(kind, means[0])
-        cells += [f"{100 * figure:.3f}" for figure in shown]
-        ratios = figures[:, 0, 0] / figures[:, 0, 1]
-        cells += [f"{means[0, 0] / means[0, 1]:.2f}", f"{ratios.min():.2f} – {ratios.max():.2f}" if found[1:] else ""]
-    cells += [f"{100 * figure:.2f}" for figure in first["specificity"]]
-    cells += beside_images(first["unseen"], first.get("mirrored_components"))
-    return f"| {' | '.join(cells)} |"
+def against(folds: list[dict[str, Any]], key: str | None = None) -> list[str]:
+    """Cells of the mean over all shapes, by the model or what ``key`` names, its ratio to components, and the range."""
+    ours = [fold if key is None else fold[key] for fold in folds]
+    if "mean" not in ours[0]:
+        return [""] * 3
+    found = np.array([(each["mean"], fold["components"]["mean"]) for each, fold in zip(ours, folds, strict=True)])
+    mean, components = np.average(found, axis=0, weights=[fold["shapes"] for fold in folds])
+    ratios = found[:, 0] / found[:, 1]
+    return [f"{100 * mean:.3f}", f"{mean / components:.2f}", f"{ratios.min():.2f} – {ratios.max():.2f}"]
+
+
+def percentile(folds: list[dict[str, Any]]) -> str:
+    """Mean of the folds' 95th percentiles; nothing where they have none."""
+    found = [fold["p95"] for fold in folds if "p95" in fold]
+    return f"{100 * np.average(found, weights=[fold['shapes'] for fold in folds]):.3f}" if found else ""
+
+
+def compared(folds: list[dict[str, Any]]) -> list[str]:
+    """Cells of a kind of shapes: model, components, and the model that remembers nothing."""
+    components = [fold["components"] | {"components": fold["components"], "shapes": fold["shapes"]} for fold in folds]
+    mean, *ratios = against(folds)
+    return [mean, percentile(folds), against(components)[0], percentile(components), *ratios, *against(folds, ALONE)]
+
+
+def table(head: tuple[str, ...], rows: list[list[str]]) -> str:
+    """In Markdown."""
+    lines = [head, ["---"] * len(head), *rows]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
 def main() -> None:
@@ -212,14 +229,25 @@ def main() -> None:
 def write_page() -> None:
     """The page of all that was measured."""
     files = {name: FIGURES / f"{name}.json" for name in NAMES}
-    rows = [row(name, json.loads(file.read_text())) for name, file in files.items() if file.exists()]
+    rows = {name: json.loads(file.read_text()) for name, file in files.items() if file.exists()}
+    tables: dict[str, list[list[str]]] = {"unseen": [], "known": [], "first": []}
+    for name, found in rows.items():
+        modes = sorted({fold["modes"] for fold in found})
+        start = ["" if name.endswith(HALF) else title(name), " – ".join(map(str, dict.fromkeys((modes[0], modes[-1]))))]
+        unseen, known = ([fold[kind] for fold in found if kind in fold] for kind in COLUMNS)
+        tables["unseen"].append([*start, str(len(found)), *compared(unseen)])
+        tables["known"].append([*start, *compared(known)])
+        specificity = [f"{100 * figure:.2f}" for figure in found[0]["specificity"]]
+        images = beside_images(unseen[0].get(ALONE), found[0].get("mirrored_components"))
+        tables["first"].append([*start, *specificity, *images])
+    columns = ("95 %", "components", "95 %", "ratio", "of folds", ALONE, "ratio", "of folds")
     page = PAGE.format(
         joint=JOINT,
         factors=OF_FACTORS,
         codes=RANDOM,
-        head=" | ".join(HEAD),
-        line="---|" * len(HEAD),
-        rows="\n".join(rows),
+        unseen=table(("", "m", "folds", "unseen", *columns), tables["unseen"]),
+        known=table(("", "m", "trained on", *columns), tables["known"]),
+        first=table(("", "m", "specificity", "components", "unseen: components with images", "ratio"), tables["first"]),
     )
     (ROOT / "docs" / "measurements" / "served.md").write_text(page, encoding="utf-8")
 
