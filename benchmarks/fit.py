@@ -32,8 +32,9 @@ from shapespace.training.collection import figure
 
 #: Points of a scan; its noise as a share of the diagonal, and the share of outliers.
 POINTS, NOISE, OUTLIERS = 4000, 0.005, 0.02
-#: A try has failed if its error exceeds this many medians; half the width of a 90 % interval, in standard deviations.
-FAILED, NINETY = 2.0, 1.645
+#: A try has failed if its error exceeds this many medians, and this share of the diagonal; half the width of a 90 %
+#: interval, in standard deviations.
+FAILED, FAR, NINETY = 2.0, 0.01, 1.645
 VARIANTS = ("whole", "noisy", "camera")
 #: Steps of the closest-point fit with principal components, how strongly it may hold on to the mean, and by how many
 #: training shapes this is chosen.
@@ -55,7 +56,8 @@ writes this page; what it measured, every try of it, is in `runs/fit/`.
 **error**: median over tries of the mean distance of vertices from the truth, in percent of the diagonal; of the torus
 the distance of its surface, which four codes share in as many places, each with other vertices. **encode**: the same
 of `encode`, which is given the vertices in their order. **failed**: tries further off than {failed:g} times the median
-of their row. **told**: those of them whose status is not `converged`. **false alarms**: others whose status is not.
+of their row and than {far:.0%} of the diagonal. **told**: those of them whose status is not `converged`. **false
+alarms**: others whose status is not.
 **shapes**: solved ones at the median, three rough ones counted as one; **time**: in solved shapes. **components**:
 the usual alternative, an iterated closest-point fit with as many principal components of the training shapes, as the
 model remembers them. It begins with the mean shape, placed as `fit` has found it, which helps it; how strongly it
@@ -269,7 +271,7 @@ class Bench:
 def line(name: str, row: Row) -> str:
     """Of the table of errors."""
     errors, converged = np.array(row.errors), np.array(row.converged)
-    failed = errors > FAILED * np.median(errors)
+    failed = errors > max(FAILED * np.median(errors), FAR)
     encoded = 100 * float(np.median(row.encoded)) if row.encoded else None
     middle = 100 * float(np.median(errors))
     cells = [
@@ -330,6 +332,7 @@ def write_page() -> None:
         noise=NOISE,
         outliers=OUTLIERS,
         failed=FAILED,
+        far=FAR,
         choosing=CHOOSING,
         rows="\n".join(line(name, row) for name, row in rows),
         intervals="\n".join(held(name, row) for name, row in rows if row.kind != "unseen"),
