@@ -50,7 +50,8 @@ test: $(VENV)/.all $(MODULES) $(VENV)/.browser ## run the whole suite (ARGS="-k 
 	PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/python -m pytest --numprocesses $(JOBS) --dist loadfile --no-loadscope-reorder $(ARGS)
 
 check: lint ## what is quick: style, types and doors, then the library, use cases and pages; no torch, Node or browser
-	PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/python -m pytest --numprocesses $(JOBS) --dist loadfile $(QUICK) $(ARGS)
+	PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/python -m pytest --numprocesses $(JOBS) --dist loadfile $(QUICK) $(ARGS) \
+		--deselect tests/shapespace/files/test_surfaces.py::test_the_khronos_validator_finds_nothing_in_a_textured_animation
 
 lint: $(VENV)/.all $(BIN)/hadolint ## check style, types, doors between packages and the Dockerfile
 	$(BIN)/ruff check .
