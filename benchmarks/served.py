@@ -218,7 +218,7 @@ def main() -> None:
         file = FIGURES / f"{name}.json"
         found = json.loads(file.read_text()) if file.exists() else []
         for fold in range(given.folds):
-            if fold < len(found) and COLUMNS[1] in found[fold]:
+            if fold < len(found) and "mean" in found[fold][COLUMNS[0]]:
                 continue
             found[fold : fold + 1] = [measure(name, given.data, given.out, fold)]
             file.parent.mkdir(exist_ok=True)
