@@ -13,7 +13,6 @@ from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import trimesh
@@ -224,11 +223,12 @@ class Bench:
     def one(self, row: Row, number: int, shape: FloatArray, truth: FloatArray | None) -> None:
         """One scan of a shape (V, 3) of a code (m,), if that is known."""
         rng, model, variant = np.random.default_rng(number), self.model, row.variant
+        partial = variant == "camera"
         points, faces = scan(shape, model.faces, variant, number, rng)
         turn, shift = Rotation.random(random_state=rng).as_matrix(), diagonal(shape) * rng.standard_normal(3)
         points, there = points @ turn.T + shift, shape @ turn.T + shift
         began = time.process_time()
-        found = model.fit((points, faces), partial=variant == "camera")
+        found = model.fit((points, faces), partial=partial)
         row.seconds.append((time.process_time() - began) / self.solved)
         row.errors.append(self.distance(found.placement(found.shape.vertices), there))
         row.converged.append(found.status is FitStatus.CONVERGED)
@@ -237,7 +237,7 @@ class Bench:
             encoded = model.encode(shape)
             row.encoded.append(self.distance(align(encoded.shape.vertices, shape), shape))
             begun = Placement.between(self.training.mean(axis=0), found.placement(found.shape.vertices))
-            hold, partial = self.holds[variant], variant == "camera"
+            hold = self.holds[variant]
             fitted = by_components(self.training, model.dimension, points, begun, hold, partial=partial)
             row.components.append(self.distance(fitted, there))
         elif row.converged[-1]:
@@ -362,8 +362,8 @@ def main() -> None:
                 with np.load(given.data / f"{name}.npz", allow_pickle=False) as arrays:
                     unseen = arrays["vertices"]
             found = measure(name, load(bundles[name]), unseen, given.count)
-            every: list[dict[str, Any]] = [asdict(row) for row in found]
-            (FIGURES / f"{name}.json").write_text(json.dumps(every, indent=1), encoding="utf-8")
+            every = json.dumps([asdict(row) for row in found], indent=1)
+            (FIGURES / f"{name}.json").write_text(every, encoding="utf-8")
     write_page()
 
 

@@ -17,6 +17,7 @@ import numpy as np
 import tomlkit
 
 from benchmarks.generalisation import ROWS, beside_images, title
+from benchmarks.markdown import table
 from benchmarks.results import MIRRORED, ROOT, open_run
 from shapespace.arrays import FloatArray
 from shapespace.mesh.triangle_mesh import TriangleMesh, diagonal
@@ -85,7 +86,8 @@ Components remember nothing, so the first ratio says that users get their own sh
 
 Of the first fold alone. **Specificity**: the mean distance of {codes} random shapes, uniform in the bounds of the codes
 or of the components' coefficients, to the nearest of the shapes that made the model (lower is better). Models *with
-mirror images* also learned from the images of these shapes; the components above did not, but those here did.
+mirror images* also learned from the images of these shapes; the components above did not, but those here did, beside
+the model that remembers nothing.
 
 {first}
 """
@@ -176,34 +178,28 @@ def measure(name: str, data: Path, out: Path, fold: int) -> dict[str, Any]:
     return found | {"specificity": [to_nearest(each, known, size) for each in (drawn, others)]}
 
 
-def against(folds: list[dict[str, Any]], key: str | None = None) -> list[str]:
-    """Cells of the mean over all shapes, by the model or what ``key`` names, its ratio to components, and the range."""
-    ours = [fold if key is None else fold[key] for fold in folds]
-    if "mean" not in ours[0]:
-        return [""] * 3
-    found = np.array([(each["mean"], fold["components"]["mean"]) for each, fold in zip(ours, folds, strict=True)])
+def average(folds: list[dict[str, Any]], some: list[dict[str, float]], key: str = "mean") -> str:
+    """Of summaries, one for each fold, over all shapes; nothing of a model that was not measured."""
+    if key not in some[0]:
+        return ""
+    return f"{100 * np.average([each[key] for each in some], weights=[fold['shapes'] for fold in folds]):.3f}"
+
+
+def ratios(folds: list[dict[str, Any]], some: list[dict[str, float]]) -> list[str]:
+    """Cells of the ratio of means to components', and of the folds' least and greatest."""
+    if "mean" not in some[0]:
+        return ["", ""]
+    found = np.array([(each["mean"], fold["components"]["mean"]) for each, fold in zip(some, folds, strict=True)])
     mean, components = np.average(found, axis=0, weights=[fold["shapes"] for fold in folds])
-    ratios = found[:, 0] / found[:, 1]
-    return [f"{100 * mean:.3f}", f"{mean / components:.2f}", f"{ratios.min():.2f} – {ratios.max():.2f}"]
-
-
-def percentile(folds: list[dict[str, Any]]) -> str:
-    """Mean of the folds' 95th percentiles; nothing where they have none."""
-    found = [fold["p95"] for fold in folds if "p95" in fold]
-    return f"{100 * np.average(found, weights=[fold['shapes'] for fold in folds]):.3f}" if found else ""
+    each = found[:, 0] / found[:, 1]
+    return [f"{mean / components:.2f}", f"{each.min():.2f} – {each.max():.2f}" if folds[1:] else ""]
 
 
 def compared(folds: list[dict[str, Any]]) -> list[str]:
     """Cells of a kind of shapes: model, components, and the model that remembers nothing."""
-    components = [fold["components"] | {"components": fold["components"], "shapes": fold["shapes"]} for fold in folds]
-    mean, *ratios = against(folds)
-    return [mean, percentile(folds), against(components)[0], percentile(components), *ratios, *against(folds, ALONE)]
-
-
-def table(head: tuple[str, ...], rows: list[list[str]]) -> str:
-    """In Markdown."""
-    lines = [head, ["---"] * len(head), *rows]
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+    components, alone = ([fold[key] for fold in folds] for key in ("components", ALONE))
+    means = [average(folds, some, key) for some in (folds, components) for key in ("mean", "p95")]
+    return [*means, *ratios(folds, folds), average(folds, alone), *ratios(folds, alone)]
 
 
 def main() -> None:
@@ -232,13 +228,13 @@ def write_page() -> None:
     rows = {name: json.loads(file.read_text()) for name, file in files.items() if file.exists()}
     tables: dict[str, list[list[str]]] = {"unseen": [], "known": [], "first": []}
     for name, found in rows.items():
-        modes = sorted({fold["modes"] for fold in found})
-        start = ["" if name.endswith(HALF) else title(name), " – ".join(map(str, dict.fromkeys((modes[0], modes[-1]))))]
-        unseen, known = ([fold[kind] for fold in found if kind in fold] for kind in COLUMNS)
+        modes = [fold["modes"] for fold in found]
+        start = ["" if name.endswith(HALF) else title(name), " – ".join(map(str, sorted({min(modes), max(modes)})))]
+        unseen, known = ([fold[kind] for fold in found] for kind in COLUMNS)
         tables["unseen"].append([*start, str(len(found)), *compared(unseen)])
         tables["known"].append([*start, *compared(known)])
         specificity = [f"{100 * figure:.2f}" for figure in found[0]["specificity"]]
-        images = beside_images(unseen[0].get(ALONE), found[0].get("mirrored_components"))
+        images = beside_images(unseen[0][ALONE], found[0].get("mirrored_components"))
         tables["first"].append([*start, *specificity, *images])
     columns = ("95 %", "components", "95 %", "ratio", "of folds", ALONE, "ratio", "of folds")
     page = PAGE.format(

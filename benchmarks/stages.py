@@ -20,6 +20,7 @@ import numpy as np
 import trimesh
 from threadpoolctl import threadpool_limits
 
+from benchmarks.markdown import table
 from shapespace.arrays import FloatArray
 from shapespace.bundle.reader import read_bundle
 from shapespace.model.decoder import MeshChoice
@@ -148,7 +149,7 @@ def main() -> None:
     given = parser.parse_args()
     shown = [stage for stage in STAGES if stage != "factors"]
     head = ["files' V", "n", "m", "coarse V", *shown, "ingest MB", "most MB", "shape ms", "fine mesh ms"]
-    rows = [head, ["---"] * len(head)]
+    rows: list[list[str]] = []
     for size in SIZES:
         name = "-".join(map(str, asdict(size).values()))
         path = given.out / f"{name}.json"
@@ -164,11 +165,7 @@ def main() -> None:
         memory = [found["ingest"][1], max(most for _, most in found.values())]
         rows.append([*map(str, asdict(size).values()), *seconds, *(f"{mb:.0f}" for mb in memory)])
         rows[-1] += [f"{ms:.1f}" for ms in kept["serving"]]
-    text = (
-        PAGE.format(joint=JOINT, factors=OF_FACTORS, codes=CODES, day=datetime.now(UTC))
-        + "\n".join(f"| {' | '.join(row)} |" for row in rows)
-        + "\n"
-    )
+    text = PAGE.format(joint=JOINT, factors=OF_FACTORS, codes=CODES, day=datetime.now(UTC)) + table(head, rows) + "\n"
     (ROOT / "docs" / "measurements" / "growth.md").write_text(text, encoding="utf-8")
 
 
