@@ -1,12 +1,16 @@
 """Studies of `benchmarks.results`: measured once, and again only after their run has changed; and rows of pages."""
 
 import json
+import shutil
 from pathlib import Path
 
 import pytest
 
-from benchmarks import results, served
+from benchmarks import bundled, paper, results, served
 from benchmarks.results import have, measured
+from shapespace.training.learning.learner import Learner
+from shapespace.training.pipeline import Run
+from shapespace.training.runs.config import load
 from shapespace.training.runs.directory import RunDirectory
 
 
@@ -47,3 +51,23 @@ def test_a_row_of_folds_counts_each_shape_once() -> None:
     cells = served.compared([fold(0.01, 0.02, 1), fold(0.04, 0.02, 3)])
     assert cells[:6] == ["3.250", "10.000", "2.000", "10.000", "1.62", "0.50 – 2.00"]
     assert cells[6:] == ["3.250", "1.62", "0.50 – 2.00"]
+
+
+def test_a_model_measured_later_meets_the_codes_of_the_others(
+    tiny_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The main networks, in the place of the paper's that take hours, reach again what they have reached."""
+    folder = shutil.copytree(tiny_run, tmp_path / "run")
+    run = Run(folder, *load(folder / "config.toml"), tmp_path / "models")
+    before = json.loads((folder / "evaluation.json").read_text())
+    monkeypatch.setattr(Learner, "paper", Learner.main)
+    after = json.loads(json.dumps(before))
+    paper.measure(run, after)
+    for old, new in ((before, after), (before["fresh"], after["fresh"])):
+        assert new["r2"]["paper"] == pytest.approx(old["r2"]["composite"], abs=1e-6)
+    bundled.add_paper(before, after)
+    assert before["fresh"]["r2"]["paper"] == after["fresh"]["r2"]["paper"]
+
+    before["fresh"]["seed"] += 1
+    with pytest.raises(paper.OtherSamplesError, match="the kernel has"):
+        paper.measure(run, before)

@@ -1,0 +1,81 @@
+"""The paper's own system (section 4) beside a committed run of a generator that was measured without it.
+
+``python -m benchmarks.paper NAME …`` draws the run's samples once more, which a generator gives equal to rounding,
+learns the paper's factor networks and convolutions from them, and writes what these reach on the run's own test codes
+and fresh codes to ``runs/NAME-paper/evaluation.json``, beside the figures of the run's other models.
+``benchmarks.bundled`` makes the page. It takes an hour on a processor; a call that was ended goes on where it was.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from benchmarks.bundled import ROOT
+from shapespace.training.learning.evaluation import Split, r_squared, size_bytes
+from shapespace.training.learning.networks import Composite, predict
+from shapespace.training.pipeline import Run, execute, learner_of
+from shapespace.training.runs.config import load
+from shapespace.training.runs.latent_coordinates import alone
+
+#: How far apart R² of the kernel on codes may be, anew and before: rounding differs from machine to machine.
+ROUNDING = 1e-6
+
+
+class OtherSamplesError(ValueError):
+    """Samples that are not those of the figures which the paper's system is to stand beside."""
+
+
+def measure(run: Run, evaluation: dict[str, Any]) -> None:
+    """Learn the paper's system of a run, and add its figures to an ``evaluation.json`` of the same run.
+
+    Args:
+        run: of a generator; anew, or with the samples and networks that an earlier call has left.
+        evaluation: of its other models; changed in place. ``paper_factors`` is R² of the paper's factor networks.
+
+    Raises:
+        OtherSamplesError: kernel ridge regression, which is in closed form, reaches something else than it did.
+    """
+    execute(run, "samples", keep_going=True)
+    learner, fresh, collection = learner_of(run), evaluation["fresh"], run.collection
+    test = Split.of(learner)
+    codes = collection.coordinates.uniform(fresh["codes"], np.random.default_rng(fresh["seed"]))
+    z, latents = collection.shapes(codes).nric, torch.as_tensor(codes, dtype=torch.float32)
+
+    def reached(model: Composite | torch.nn.Module) -> tuple[dict[str, float], dict[str, float]]:
+        return test.r2(model), r_squared(predict(model, latents).numpy(), z, test.norm)
+
+    for now, where in zip(reached(learner.kernel()), (evaluation, fresh), strict=True):
+        if abs(now["total"] - (before := where["r2"]["kernel"]["total"])) > ROUNDING:
+            raise OtherSamplesError(f"{run.directory.folder}: the kernel has {now['total']}, and had {before}")
+    model = learner.paper()
+    evaluation["r2"]["paper"], fresh["r2"]["paper"] = reached(model)
+    evaluation["sizes"]["paper"] = size_bytes(model)
+    own = predict(model.factor_shapes, latents).numpy()
+    evaluation["paper_factors"] = {
+        name: r_squared(own[:, j], collection.shapes(alone(codes, index)).nric, test.norm)
+        for j, (name, index) in enumerate(collection.factors.items())
+    }
+
+
+def main() -> None:
+    """Measure and write."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--out", type=Path, default=ROOT / "build" / "results", help="folder of the runs")
+    parser.add_argument("names", nargs="+", help="folders of runs/")
+    given = parser.parse_args()
+    for name in given.names:
+        record, file = ROOT / "runs" / name, ROOT / "runs" / f"{name}-paper" / "evaluation.json"
+        evaluation = json.loads((record / "evaluation.json").read_text())
+        measure(Run(given.out / name, *load(record / "config.toml"), given.out / "models"), evaluation)
+        file.parent.mkdir(exist_ok=True)
+        file.write_text(json.dumps(evaluation, indent=2) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
