@@ -17,8 +17,8 @@ import numpy as np
 import torch
 
 from benchmarks.bundled import ROOT
-from shapespace.training.learning.evaluation import Split, r_squared, size_bytes
-from shapespace.training.learning.networks import Composite, predict
+from shapespace.training.learning.evaluation import Model, Split, r_squared, size_bytes
+from shapespace.training.learning.networks import predict
 from shapespace.training.pipeline import Run, execute, learner_of
 from shapespace.training.runs.config import load
 from shapespace.training.runs.latent_coordinates import alone
@@ -47,7 +47,7 @@ def measure(run: Run, evaluation: dict[str, Any]) -> None:
     codes = collection.coordinates.uniform(fresh["codes"], np.random.default_rng(fresh["seed"]))
     z, latents = collection.shapes(codes).nric, torch.as_tensor(codes, dtype=torch.float32)
 
-    def reached(model: Composite | torch.nn.Module) -> tuple[dict[str, float], dict[str, float]]:
+    def reached(model: Model) -> tuple[dict[str, float], dict[str, float]]:
         return test.r2(model), r_squared(predict(model, latents).numpy(), z, test.norm)
 
     for now, where in zip(reached(learner.kernel()), (evaluation, fresh), strict=True):

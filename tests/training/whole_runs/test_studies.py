@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from copy import deepcopy
 from pathlib import Path
 
 import pytest
@@ -61,7 +62,7 @@ def test_a_model_measured_later_meets_the_codes_of_the_others(
     run = Run(folder, *load(folder / "config.toml"), tmp_path / "models")
     before = json.loads((folder / "evaluation.json").read_text())
     monkeypatch.setattr(Learner, "paper", Learner.main)
-    after = json.loads(json.dumps(before))
+    after = deepcopy(before)
     paper.measure(run, after)
     for old, new in ((before, after), (before["fresh"], after["fresh"])):
         assert new["r2"]["paper"] == pytest.approx(old["r2"]["composite"], abs=1e-6)
