@@ -61,7 +61,7 @@ lint: $(VENV)/.all $(BIN)/hadolint ## check style, types, doors between packages
 
 QUICK = tests/shapespace tests/service/use_cases/test_use_cases.py tests/training/runs/test_config.py \
 	$(wildcard tests/test_[cdm]*.py) \
-	--deselect tests/shapespace/files/test_surfaces.py::test_the_khronos_validator_finds_nothing_in_a_textured_animation
+	--deselect tests/shapespace/files/test_attributes.py::test_the_khronos_validator_finds_nothing_in_a_textured_animation
 
 # What the libraries of serving take part in, and training doesn't; processes, signals, slow strangers and fits are the same
 # with all.

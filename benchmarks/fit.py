@@ -22,7 +22,7 @@ from threadpoolctl import threadpool_limits
 
 from benchmarks.results import ROOT
 from shapespace.arrays import FloatArray, IntArray
-from shapespace.mesh.closest_points import Fans, Surface
+from shapespace.mesh.closest_points import MeshProximity, VertexFaces
 from shapespace.mesh.rigid_motion import Placement, align
 from shapespace.mesh.triangle_mesh import diagonal
 from shapespace.model.fit import FitStatus, Fitted
@@ -187,7 +187,7 @@ class Bench:
 
     def __init__(self, model: ShapeModel, *, by_surface: bool) -> None:
         self.model, self.by_surface = model, by_surface
-        self.fans = Fans(model.faces, len(model.vertices))
+        self.fans = VertexFaces(model.faces, len(model.vertices))
         model.fit(sampled(model.vertices, model.faces, POINTS, np.random.default_rng(0)))  # makes what is made once
         times = []
         for code in model.population.sample(12, 1).astype(np.float32):
@@ -207,7 +207,7 @@ class Bench:
     def distance(self, found: FloatArray, truth: FloatArray) -> float:
         """Mean distance of shapes (V, 3) in the same place, as a fraction of the diagonal."""
         if self.by_surface:
-            away = Surface(found, self.fans).closest(truth).distances
+            away = MeshProximity(found, self.fans).closest(truth).distances
         else:
             away = np.linalg.norm(found - truth, axis=1)
         return float(away.mean() / diagonal(truth))

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import trimesh
 
-from shapespace.mesh.surface import Labels, Material, Surface
+from shapespace.mesh.attributes import Labels, MeshAttributes, SurfaceMaterial
 
 
 def png(seed: int = 0, size: int = 4, color: tuple[int, int, int] | None = None) -> bytes:
@@ -26,7 +26,7 @@ def png(seed: int = 0, size: int = 4, color: tuple[int, int, int] | None = None)
     return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + chunk(b"IDAT", zlib.compress(rows)) + chunk(b"IEND", b"")
 
 
-def ball(subdivisions: int = 3) -> tuple[np.ndarray, Surface]:
+def ball(subdivisions: int = 3) -> tuple[np.ndarray, MeshAttributes]:
     """An icosphere of triangles and quads, with 20 charts that are separate in the texture.
 
     Returns:
@@ -47,7 +47,7 @@ def ball(subdivisions: int = 3) -> tuple[np.ndarray, Surface]:
     uv = np.stack([chart % 5 + 0.5 + places[:, 0] / 3, chart // 5 + 0.5 + places[:, 1] / 3], axis=1) / [5, 4]
     starts = np.concatenate([[0], np.cumsum(sizes)])
     left = np.minimum.reduceat(sphere.vertices[corners, 0], starts[:-1]) < 0
-    return sphere.vertices, Surface(
+    return sphere.vertices, MeshAttributes(
         starts=starts,
         corners=corners,
         uv=uv,
@@ -55,12 +55,15 @@ def ball(subdivisions: int = 3) -> tuple[np.ndarray, Surface]:
         objects=Labels(("Bar",), np.zeros(polygons, int)),
         groups=Labels(("left", "right"), np.where(left, 0, 1)),
         material_of=np.where(charts >= 15, 1, 0),
-        materials=(Material("skin", (0.9, 0.8, 0.7, 1.0), texture="skin.png"), Material("cap", (0.1, 0.2, 0.3, 1.0))),
+        materials=(
+            SurfaceMaterial("skin", (0.9, 0.8, 0.7, 1.0), texture="skin.png"),
+            SurfaceMaterial("cap", (0.1, 0.2, 0.3, 1.0)),
+        ),
         textures={"skin.png": png()},
     )
 
 
-def with_parts(body: tuple[np.ndarray, Surface]) -> tuple[np.ndarray, Surface]:
+def with_parts(body: tuple[np.ndarray, MeshAttributes]) -> tuple[np.ndarray, MeshAttributes]:
     """A ball with two separate parts, an eye before it and a nail after it in the file's order.
 
     Returns:
@@ -86,7 +89,7 @@ def with_parts(body: tuple[np.ndarray, Surface]) -> tuple[np.ndarray, Surface]:
         groups.append(surface.groups.of if surface else np.ones(len(sizes), int))
         materials.append(surface.material_of if k == 1 else np.full(len(sizes), k // 2))
         vertices, uvs, ends = vertices + len(places), uvs + len(own_uv), ends + int(sizes.sum())
-    whole = Surface(
+    whole = MeshAttributes(
         starts=np.concatenate(starts),
         corners=np.concatenate(corners),
         uv=np.concatenate(uv),
@@ -100,7 +103,7 @@ def with_parts(body: tuple[np.ndarray, Surface]) -> tuple[np.ndarray, Surface]:
     return np.concatenate([places for places, *_ in pieces]), whole
 
 
-def write_files(path: Path, vertices: np.ndarray, surface: Surface) -> None:
+def write_files(path: Path, vertices: np.ndarray, surface: MeshAttributes) -> None:
     """Write an OBJ file with its materials and textures in the same folder."""
     lines = [f"mtllib {path.parent.name}.mtl"]
     lines += ["v {!r} {!r} {!r}".format(*row) for row in vertices.tolist()]
@@ -149,7 +152,7 @@ def parse_obj(text: str) -> dict:
     return found
 
 
-def corner_uv(surface: Surface) -> dict[tuple[int, ...], tuple[str, np.ndarray]]:
+def corner_uv(surface: MeshAttributes) -> dict[tuple[int, ...], tuple[str, np.ndarray]]:
     """For the vertices of each triangle, the name of its material and texture coordinates (3, 2)."""
     uv = surface.uv[surface.uv_corners[surface.triangle_corners]]
     named = surface.material_of is not None

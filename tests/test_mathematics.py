@@ -23,7 +23,7 @@ ROOMS = {
 #: Modules in them that implement no formula: they store, name, choose, run or write.
 NO_MATHEMATICS = {
     "shapespace.solve.deadline",
-    "shapespace.mesh.surface",
+    "shapespace.mesh.attributes",
     "shapespace.model.correspondence",
     "shapespace.model.latent_space",
     "shapespace.model.networks",

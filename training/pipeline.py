@@ -271,7 +271,7 @@ def evaluation(run: Run) -> None:
 
 def write_bundle_of(run: Run, figures: dict[str, Any]) -> Path:
     """The bundle of a run whose samples are there, in the models directory, with what was measured."""
-    from shapespace.training.learning.examples import RememberingCombiner
+    from shapespace.training.learning.examples import ExampleCorrectedCombiner
     from shapespace.training.learning.export import export
 
     directory = run.directory
@@ -282,7 +282,7 @@ def write_bundle_of(run: Run, figures: dict[str, Any]) -> Path:
     geometry = Geometry(reference=run.collection.reference) if run.by_design else space.geometry(directory)
     composite = learner.main()
     if run.config.export.examples and not run.by_design:
-        composite = replace(composite, combiner=RememberingCombiner.of(composite, *space.examples(directory)))
+        composite = replace(composite, combiner=ExampleCorrectedCombiner.of(composite, *space.examples(directory)))
     with waiting("bundle"):
         return export(
             composite,

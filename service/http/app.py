@@ -18,7 +18,14 @@ from shapespace.service.http.caching import AnswerCache
 from shapespace.service.http.connections import Connections
 from shapespace.service.http.dependencies import Service, known_query
 from shapespace.service.http.description import describe
-from shapespace.service.http.middleware import AnswerHead, LimitBody, Observe, PaceAnswers, RequireHost, RequireKey
+from shapespace.service.http.middleware import (
+    AnswerHead,
+    LimitBody,
+    LimitUnreadAnswers,
+    Observe,
+    RequireHost,
+    RequireKey,
+)
 from shapespace.service.http.routes import (
     blend_shapes,
     codes,
@@ -112,7 +119,7 @@ def _middleware(settings: Settings) -> list[Middleware]:
     stack = [
         Middleware(AnswerHead),
         Middleware(Observe),
-        Middleware(PaceAnswers),
+        Middleware(LimitUnreadAnswers),
         Middleware(RequireHost, hosts=_hosts(settings)),
         *([Middleware(RequireKey, key=settings.api_key)] if settings.api_key else []),
         Middleware(LimitBody, limit=settings.max_body, upload=settings.max_upload),

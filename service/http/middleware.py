@@ -247,7 +247,7 @@ class LimitBody:
             self._held.give_back(client, received)
 
 
-class PaceAnswers:
+class LimitUnreadAnswers:
     """Sends large answers as fast as they are read, and holds so many bytes of them at most.
 
     Uvicorn takes the body of an answer as a whole, and keeps it until a client has read it.

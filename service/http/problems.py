@@ -21,7 +21,7 @@ from shapespace.model.edit import InvalidTargetError
 from shapespace.model.exact_shapes import NoTangentSpaceError
 from shapespace.model.latent_space import InvalidFixedError, NotFiniteError, OutOfBoundsError, WrongLengthError
 from shapespace.model.scan import InvalidScanError
-from shapespace.model.spread import InvalidCovarianceError
+from shapespace.model.vertex_uncertainty import InvalidCovarianceError
 from shapespace.service.limits.workers import BusyError, DeadlineError, DisconnectedError, EndingError
 from shapespace.service.repository.repository import UnknownModelError, UnknownVersionError
 from shapespace.service.use_cases.animation import PathTooLongError, UnknownInterpolationError

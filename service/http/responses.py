@@ -11,7 +11,7 @@ from fastapi import Request, Response
 from fastapi.responses import StreamingResponse
 from starlette.types import Receive, Scope, Send
 
-from shapespace.mesh.surface import Topology
+from shapespace.mesh.attributes import Topology
 from shapespace.model.decoder import Quality
 from shapespace.model.latent_space import CheckedCode
 from shapespace.model.shape_model import ShapeModel

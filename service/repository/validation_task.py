@@ -36,7 +36,7 @@ def validate_bundle(body: bytearray, folder: str) -> tuple[Facts, Arrays]:
     try:
         bundle = read_bundle(Path(folder))
         allow(min(OF_A_VERTEX * bundle.manifest.vertices, MOST_OF_VERTICES))
-        ShapeModel(bundle).rehearse()
+        ShapeModel(bundle).self_test()
     except (BundleError, OSError) as error:
         raise FailedError("refused", str(error)) from None
     return {"digest": bundle.digest}, {}

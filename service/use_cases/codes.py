@@ -70,7 +70,7 @@ class Upload:
 
 
 @dataclass(frozen=True)
-class Wishes:
+class SearchOptions:
     """What may be asked of any search for a code.
 
     Attributes:
@@ -99,7 +99,7 @@ async def encode(
     upload: Upload,
     bounds: Bounds,
     objective: Objective,
-    wishes: Wishes,
+    wishes: SearchOptions,
 ) -> Found:
     """The code whose shape comes closest to a mesh in correspondence, in any rigid pose; see ShapeModel.encode.
 
@@ -148,7 +148,7 @@ async def edit(
     prior: float,
     prior_kind: PriorKind,
     mesh: MeshChoice,
-    wishes: Wishes,
+    wishes: SearchOptions,
     anchored: bool = False,
 ) -> Found:
     """The code inside the bounds whose shape comes closest to having some vertices at some places.

@@ -36,7 +36,7 @@ VERTICES_TYPES = {"json": "application/json", "npz": OCTET_STREAM}
 
 
 @dataclass(frozen=True)
-class Shapes:
+class ShapeBatch:
     """Several shapes.
 
     Attributes:
@@ -143,7 +143,7 @@ async def infer(
         raise TooManyCodesError(f"{len(codes)} codes are too many for both outputs. Ask for each by itself, or fewer.")
     async with batch(workers, caller, size) as work:
         arrays: dict[str, NDArray[np.float32]] = {}
-        found: Shapes | None = None
+        found: ShapeBatch | None = None
         for name in outputs:
             if name == "vertices":
                 found = await shapes(work, model, codes, inside, mesh, quality)
@@ -167,7 +167,7 @@ def shapes_size(model: ShapeModel, count: int, mesh: MeshChoice) -> int:
 
 async def shapes(
     work: Batch, model: ShapeModel, codes: Codes, inside: NDArray[np.bool_], mesh: MeshChoice, quality: Quality
-) -> Shapes:
+) -> ShapeBatch:
     """Shapes of codes (n, m), side by side; raises as ``Batch.map``."""
     vertices = np.empty((len(codes), *model.mesh(mesh).vertices.shape), np.float32)
 
@@ -178,11 +178,13 @@ async def shapes(
         return shape.diagnostics, shape.seconds
 
     found = await work.map(find, enumerate(zip(codes, map(bool, inside), strict=True)))
-    return Shapes(vertices, [diagnostics for diagnostics, _ in found], total_seconds(seconds for _, seconds in found))
+    return ShapeBatch(
+        vertices, [diagnostics for diagnostics, _ in found], total_seconds(seconds for _, seconds in found)
+    )
 
 
 async def _exponentials(
-    work: Batch, model: ShapeModel, codes: Codes, found: Shapes, mesh: MeshChoice
+    work: Batch, model: ShapeModel, codes: Codes, found: ShapeBatch, mesh: MeshChoice
 ) -> list[ExactShape]:
     """Discrete exponentials of codes (n, m), side by side, and how far the networks' shapes are from them."""
 

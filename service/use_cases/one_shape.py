@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 
 from shapespace.arrays import FloatArray
 from shapespace.files.colouring import Colouring, Quantity
+from shapespace.mesh.attributes import Topology
 from shapespace.mesh.rigid_motion import Placement
-from shapespace.mesh.surface import Topology
 from shapespace.model.decoder import Diagnostics, MeshChoice, Quality, Shape
 from shapespace.model.latent_space import CheckedCode, NotFiniteError
 from shapespace.model.shape_model import ShapeModel
-from shapespace.model.spread import spread
+from shapespace.model.vertex_uncertainty import vertex_uncertainty
 from shapespace.service.limits.workers import Caller, Workers
 from shapespace.service.use_cases.batch import Timings, solve, total_seconds
 from shapespace.service.use_cases.shape_formats import SHAPE_FORMATS, shown, writing
@@ -109,7 +109,9 @@ async def shape_file(workers: Workers, caller: Caller, model: ShapeModel, wanted
     def make(deadline: Deadline) -> ShapeFile:
         found, colouring = [find(wanted.code, deadline)], None
         if colour_by and wanted.code and colour_by.covariance is not None:
-            colouring = Colouring.of_spread(spread(model, wanted.code[0], colour_by.covariance, mesh, deadline))
+            colouring = Colouring.of_spread(
+                vertex_uncertainty(model, wanted.code[0], colour_by.covariance, mesh, deadline)
+            )
         elif colour_by:
             found.append(find(colour_by.against, deadline))
         began = time.perf_counter()

@@ -13,7 +13,7 @@ import numpy as np
 from shapespace.files.animated_gltf import FRAMES_PER_SECOND
 from shapespace.files.archives import Buffer
 from shapespace.files.colouring import Colouring
-from shapespace.mesh.surface import Topology
+from shapespace.mesh.attributes import Topology
 from shapespace.model.decoder import Quality
 from shapespace.model.latent_space import CheckedCode, Codes
 from shapespace.model.shape_model import ShapeModel

@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 from shapespace.arrays import FloatArray, IntArray
 from shapespace.files.animated_gltf import FRAMES_PER_SECOND, animated_glb
 from shapespace.files.archives import Buffer, npz_pieces, zip_pieces
+from shapespace.files.attributes.obj import obj_faces, obj_files, obj_vertices
 from shapespace.files.colouring import Colouring
 from shapespace.files.formats import OCTET_STREAM
 from shapespace.files.point_cache import point_cache
-from shapespace.files.surfaces.obj import obj_faces, obj_files, obj_vertices
 from shapespace.files.usd import animated_usd
-from shapespace.mesh.surface import Surface
+from shapespace.mesh.attributes import MeshAttributes
 from shapespace.model.decoder import Diagnostics, Shape
 from shapespace.model.latent_space import Codes
 from shapespace.service.use_cases.shape_formats import diagnostics_arrays, dump_json, float32, writing
@@ -44,7 +44,7 @@ class Frames:
     faces: IntArray
     positions: FloatArray
     codes: Codes
-    surface: Surface | None = None
+    surface: MeshAttributes | None = None
     fps: float = FRAMES_PER_SECOND
     colourings: Sequence[Colouring] = ()
 
@@ -106,7 +106,7 @@ def _usd(frames: Frames, *, packed: bool = False) -> tuple[Iterator[Buffer], dic
 
 
 def _zip(frames: Frames) -> tuple[Iterator[Buffer], dict[str, Any]]:
-    surface = frames.surface or Surface.of_triangles(frames.faces)
+    surface = frames.surface or MeshAttributes.of_triangles(frames.faces)
     beside = obj_files(surface, "frames")
     head, faces = "mtllib frames.mtl\n" if beside else "", obj_faces(surface)
 

@@ -14,7 +14,7 @@ from shapespace.arrays import FloatArray, IntArray
 from shapespace.files.colouring import Colouring
 from shapespace.files.formats import MESH_FORMATS, OBJ_ZIP, USD_FORMATS, MeshFormat
 from shapespace.files.usd import usd_installed
-from shapespace.mesh.surface import Surface, Topology
+from shapespace.mesh.attributes import MeshAttributes, Topology
 from shapespace.model.decoder import Diagnostics, Quality
 from shapespace.model.exact_shapes import ExactShape
 
@@ -44,7 +44,7 @@ def float32(array: NDArray) -> NDArray[np.float32]:
 
 
 def _mesh_json(
-    vertices: FloatArray, faces: IntArray, colouring: Colouring | None = None, surface: Surface | None = None
+    vertices: FloatArray, faces: IntArray, colouring: Colouring | None = None, surface: MeshAttributes | None = None
 ) -> bytes:
     content: dict[str, Any] = {"vertices": float32(vertices), "faces": np.ascontiguousarray(faces)}
     if colouring:
@@ -81,7 +81,7 @@ def writable(media_types: Mapping[str, str]) -> dict[str, str]:
     return {name: kind for name, kind in media_types.items() if name not in UNAVAILABLE or usd_installed()}
 
 
-def shown(surface: Surface | None, topology: Topology) -> Surface | None:
+def shown(surface: MeshAttributes | None, topology: Topology) -> MeshAttributes | None:
     """A surface with the polygons that are wanted."""
     return surface.triangulated if surface and topology is Topology.TRIANGLES else surface
 

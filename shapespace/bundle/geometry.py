@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from shapespace.arrays import FloatArray, IntArray
+from shapespace.bundle.attributes import from_entry, surface_arrays
 from shapespace.bundle.schema import ARRAYS, ArrayType, Manifest
-from shapespace.bundle.surface import from_entry, surface_arrays
+from shapespace.mesh.attributes import MeshAttributes
 from shapespace.mesh.prolongation import PREFIX, Prolongation, ProlongationError
-from shapespace.mesh.surface import Surface
 from shapespace.mesh.triangle_mesh import MeshError, TriangleMesh
 
 #: Largest distance of a vertex of the fine mesh from the prolonged reference, as a fraction of the diagonal: the
@@ -66,7 +66,7 @@ class Geometry:
     modes: FloatArray | None = None
     training_codes: FloatArray | None = None
     file_vertices: IntArray | None = None
-    surface: Surface | None = None
+    surface: MeshAttributes | None = None
 
     def arrays(self) -> dict[str, NDArray]:
         """The arrays of the file, by name, in the types of `ARRAYS`."""

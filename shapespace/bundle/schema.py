@@ -44,7 +44,7 @@ class _Range(_Strict):
     stop: PositiveInt
 
 
-class Factor(Network, _Range):
+class FactorEntry(Network, _Range):
     """The network ψ_j of one factor, fed with latents from ``start`` to just before ``stop``."""
 
 
@@ -61,7 +61,7 @@ Share = Annotated[float, Field(ge=0, le=1)]
 
 
 class MaterialEntry(_Strict):
-    """A material; see mesh.surface."""
+    """A material; see mesh.attributes."""
 
     name: Label
     color: tuple[Share, Share, Share, Share]
@@ -70,8 +70,8 @@ class MaterialEntry(_Strict):
     texture: FileName | None
 
 
-class SurfaceEntry(_Strict):
-    """Names of parts and materials of the finest mesh, whose arrays begin with `SURFACE`; see mesh.surface."""
+class AttributesEntry(_Strict):
+    """Names of parts and materials of the finest mesh, whose arrays begin with `SURFACE`; see mesh.attributes."""
 
     objects: Labels
     groups: Labels
@@ -125,7 +125,7 @@ class Manifest(_Strict):
     description: str
     latent_dimension: PositiveInt
     latent_names: list[str]
-    factors: list[Factor] = Field(min_length=1)
+    factors: list[FactorEntry] = Field(min_length=1)
     lower: list[float]
     upper: list[float]
     period: list[PositiveFloat | None]
@@ -142,7 +142,7 @@ class Manifest(_Strict):
     combiner: Network
     start: Network | None
     geometry: GeometryFile
-    surface: SurfaceEntry | None = None
+    surface: AttributesEntry | None = None
     onnx_tolerance: Tolerance
     figures: dict[str, Any]
     draft_error: DraftError | None = None
@@ -203,7 +203,7 @@ ARRAYS = {
     # Where parts move rigidly: of each fine vertex the number of its part or -1, and places at rest of those with one.
     "prolongation_rigid": ArrayType(("W",), np.int32),
     "prolongation_rest": ArrayType(("R", 3), np.float64),
-    # What the user's file had on the finest mesh beside triangles: P polygons with C corners. See mesh.surface.
+    # What the user's file had on the finest mesh beside triangles: P polygons with C corners. See mesh.attributes.
     "surface_starts": ArrayType(("P + 1",), np.int32),
     "surface_corners": ArrayType(("C",), np.int32),
     "surface_uv": ArrayType(("U", 2), np.float32),

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shapespace.arrays import FloatArray
+from shapespace.bundle.attributes import surface_entry
 from shapespace.bundle.geometry import Geometry
 from shapespace.bundle.schema import (
     COMBINER,
@@ -29,7 +30,6 @@ from shapespace.bundle.schema import (
     Tolerance,
     factor_network,
 )
-from shapespace.bundle.surface import surface_entry
 from shapespace.shell.energy import Material
 
 

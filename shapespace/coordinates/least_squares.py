@@ -15,7 +15,7 @@ from shapespace.mesh.triangle_mesh import Connectivity
 
 
 @dataclass(frozen=True)
-class Point:
+class LeastSquaresPoint:
     """A shape, and how far it is from what is asked for.
 
     Attributes:
@@ -51,7 +51,7 @@ class LeastSquares:
         self.jacobian = NRICJacobian(connectivity)
 
     @np.errstate(divide="ignore", over="ignore", invalid="ignore")
-    def __call__(self, vertices: FloatArray, target: FloatArray) -> Point:
+    def __call__(self, vertices: FloatArray, target: FloatArray) -> LeastSquaresPoint:
         """A shape (V, 3) beside z* (2E,)."""
         geometry = HingeGeometry(vertices, self.connectivity)
         misfit = geometry.nric()
@@ -63,7 +63,7 @@ class LeastSquares:
 
 
 @dataclass(frozen=True)
-class _NumPyPoint(Point):
+class _NumPyPoint(LeastSquaresPoint):
     squares: LeastSquares
     geometry: HingeGeometry
 
@@ -73,18 +73,18 @@ class _NumPyPoint(Point):
         return self.geometry.gradients()
 
     def forces(self) -> FloatArray:
-        """See Point."""
+        """See LeastSquaresPoint."""
         return -self.squares.jacobian.pull_back(self.gradients, self.squares.norm.squared * self.misfit)
 
     def entries(self) -> FloatArray:
-        """See Point."""
+        """See LeastSquaresPoint."""
         return self.squares.matrix.entries(self.gradients, self.squares.norm)
 
 
 class CompiledLeastSquares(LeastSquares):
     """The same in compiled loops."""
 
-    def __call__(self, vertices: FloatArray, target: FloatArray) -> Point:
+    def __call__(self, vertices: FloatArray, target: FloatArray) -> LeastSquaresPoint:
         """See LeastSquares."""
         c, vertices = self.connectivity, np.ascontiguousarray(vertices, np.float64)
         target = np.ascontiguousarray(target, np.float64)
@@ -99,7 +99,7 @@ class CompiledLeastSquares(LeastSquares):
 
 
 @dataclass(frozen=True)
-class _CompiledPoint(Point):
+class _CompiledPoint(LeastSquaresPoint):
     squares: CompiledLeastSquares
 
     @cached_property
@@ -110,7 +110,7 @@ class _CompiledPoint(Point):
         return found
 
     def forces(self) -> FloatArray:
-        """See Point."""
+        """See LeastSquaresPoint."""
         c, weighted = self.squares.connectivity, -self.squares.norm.squared * self.misfit
         forces: FloatArray = compiled.pull_back(
             *self.gradients, c.edges, c.hinges, c.hinge_edges, c.vertex_count, weighted
@@ -118,7 +118,7 @@ class _CompiledPoint(Point):
         return forces
 
     def entries(self) -> FloatArray:
-        """See Point."""
+        """See LeastSquaresPoint."""
         squares = self.squares
         hinge_edges, size = squares.connectivity.hinge_edges, len(squares.matrix.pattern)
         return squares.matrix.regularised(

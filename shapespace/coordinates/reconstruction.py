@@ -14,13 +14,13 @@ from scipy import sparse
 from shapespace.arrays import FloatArray
 from shapespace.coordinates import compiled
 from shapespace.coordinates.frame_integration import CompiledFrameIntegration, FrameIntegration
-from shapespace.coordinates.least_squares import CompiledLeastSquares, LeastSquares, Point
+from shapespace.coordinates.least_squares import CompiledLeastSquares, LeastSquares, LeastSquaresPoint
 from shapespace.coordinates.normal_matrix import NormalMatrix
 from shapespace.coordinates.nric import NRICJacobian, WeightedNorm
 from shapespace.mesh.rigid_motion import rigid_motions
 from shapespace.mesh.triangle_mesh import TriangleMesh, face_areas
 from shapespace.solve.anderson import Anderson
-from shapespace.solve.cholesky import Backend, Cholesky, Factor, NotPositiveDefiniteError, analyse
+from shapespace.solve.cholesky import Backend, Cholesky, Factorisation, NotPositiveDefiniteError, analyse
 from shapespace.solve.deadline import Deadline
 from shapespace.solve.line_search import backtrack, sufficient_decrease
 from shapespace.solve.outcome import Outcome, Status
@@ -134,7 +134,7 @@ class Reconstructor:
         """
         return self._guess(target, others).vertices
 
-    def _guess(self, target: FloatArray, others: Iterable[Callable[[], FloatArray]]) -> Point:
+    def _guess(self, target: FloatArray, others: Iterable[Callable[[], FloatArray]]) -> LeastSquaresPoint:
         integrated = self._squares(self.integrate(target), target)
         if self._is_good(integrated, target):
             return integrated
@@ -157,7 +157,7 @@ class Reconstructor:
         """The one of some shapes (V, 3) whose misfit is smallest; the last one if no misfit is finite."""
         return self._nearest(target, self._squares(shapes[0], target), shapes[1:]).vertices
 
-    def _nearest(self, target: FloatArray, best: Point, shapes: Iterable[FloatArray]) -> Point:
+    def _nearest(self, target: FloatArray, best: LeastSquaresPoint, shapes: Iterable[FloatArray]) -> LeastSquaresPoint:
         for vertices in shapes:
             point = self._squares(vertices, target)
             if not best.energy <= point.energy < np.inf:
@@ -216,7 +216,12 @@ class Reconstructor:
 
     @np.errstate(divide="ignore", over="ignore", invalid="ignore")
     def _iterate(
-        self, target: FloatArray, start: Point, tolerance: float, max_iterations: int, deadline: Deadline | None
+        self,
+        target: FloatArray,
+        start: LeastSquaresPoint,
+        tolerance: float,
+        max_iterations: int,
+        deadline: Deadline | None,
     ) -> Reconstruction:
         if not (np.isfinite(start.energy) and target.any()):
             reason = "lengths and angles of the start are not finite, or those asked for are not, or all are zero"
@@ -234,7 +239,7 @@ class Reconstructor:
             flipped_faces=self._flipped(ended.point.misfit),
         )
 
-    def _gauss_newton(self, target: FloatArray, here: Point, limits: _Limits) -> _Found:
+    def _gauss_newton(self, target: FloatArray, here: LeastSquaresPoint, limits: _Limits) -> _Found:
         """Steps with a new factor use a line search; those with an old one are accelerated, until one doesn't help."""
         iterations = 0
         factor: _GaussNewtonFactor | None = None
@@ -270,8 +275,8 @@ class Reconstructor:
         return _Found(point=here, status=reached, iterations=iterations)
 
     def _line_search(
-        self, target: FloatArray, here: Point, forces: FloatArray, step: FloatArray, shortest: float
-    ) -> tuple[float, Point]:
+        self, target: FloatArray, here: LeastSquaresPoint, forces: FloatArray, step: FloatArray, shortest: float
+    ) -> tuple[float, LeastSquaresPoint]:
         """The share of a step that lowers the energy enough, or moves no vertex further than ``shortest``."""
         slope, size = 2 * float(np.vdot(forces, step)), np.abs(step).max()
         found = backtrack(
@@ -307,7 +312,7 @@ class Reconstructor:
                 return _stalled(here, iterations, "no damped step lowers the misfit")
         return _Found(point=here, status=reached, iterations=iterations)
 
-    def _factor(self, here: Point, target: FloatArray) -> Factor:
+    def _factor(self, here: LeastSquaresPoint, target: FloatArray) -> Factorisation:
         """A factor of the normal matrix, in single precision where possible; raises NotPositiveDefiniteError."""
         entries = here.entries()
         if self._is_good(here, target):
@@ -315,10 +320,10 @@ class Reconstructor:
                 return self._single.factorise(self._damped(entries, LIFT))
         return self._double.factorise(entries)
 
-    def _is_good(self, here: Point, target: FloatArray) -> bool:
+    def _is_good(self, here: LeastSquaresPoint, target: FloatArray) -> bool:
         return bool(here.energy <= GOOD_GUESS**2 * self.norm.square(target))
 
-    def _damped_factor(self, here: Point, damping: float) -> Factor:
+    def _damped_factor(self, here: LeastSquaresPoint, damping: float) -> Factorisation:
         """A factor of the normal matrix with its diagonal increased by a share; raises NotPositiveDefiniteError."""
         return self._double.factorise(self._damped(here.entries(), damping))
 
@@ -347,7 +352,7 @@ class Reconstructor:
         solved = factor.solve(fields.reshape(len(fields), -1))
         return (jacobian @ solved.T).T * self.norm.squared
 
-    def _linearised_at(self, vertices: FloatArray) -> tuple[sparse.csr_array, Factor]:
+    def _linearised_at(self, vertices: FloatArray) -> tuple[sparse.csr_array, Factorisation]:
         """J and the factor of JᵀWJ."""
         gradients = self.jacobian.gradients(vertices)
         factor = self._double.factorise(self.normal_matrix.entries(gradients, self.norm))
@@ -363,10 +368,10 @@ class Reconstructor:
 class _Found(Outcome):
     """The point at which one of the two iterations ended, and how."""
 
-    point: Point
+    point: LeastSquaresPoint
 
 
-def _stalled(point: Point, iterations: int, reason: str) -> _Found:
+def _stalled(point: LeastSquaresPoint, iterations: int, reason: str) -> _Found:
     return _Found(point=point, status=Status.STALLED, iterations=iterations, reason=reason)
 
 
@@ -396,7 +401,7 @@ class _Limits:
 class _GaussNewtonFactor:
     """The normal matrix of one shape, factorised, for steps from there and from its neighbours."""
 
-    def __init__(self, factor: Factor, at: FloatArray) -> None:
+    def __init__(self, factor: Factorisation, at: FloatArray) -> None:
         self._at, self._steps = at, 0
         self._inverse, self._mixing = Preconditioner(factor, rigid_motions(at)), Anderson()
 

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from shapespace.arrays import FloatArray, IntArray
 from shapespace.files.colouring import Colouring
-from shapespace.files.gltf_writing import Document
-from shapespace.mesh.surface import Surface
+from shapespace.files.gltf_writing import GltfBuilder
+from shapespace.mesh.attributes import MeshAttributes
 from shapespace.mesh.triangle_mesh import diagonal
 
 #: Up to this many frames each frame is a morph target of its own. Longer animations have a basis of at most this many
@@ -44,7 +44,7 @@ class AnimatedGLB:
 def animated_glb(
     frames: NDArray[np.floating],
     faces: IntArray,
-    surface: Surface | None = None,
+    surface: MeshAttributes | None = None,
     fps: float = FRAMES_PER_SECOND,
     colourings: Sequence[Colouring] = (),
 ) -> AnimatedGLB:
@@ -79,7 +79,7 @@ def animated_glb(
         shown = np.tensordot(keys[1:].astype(np.float64), targets[:, block], 1)
         error = max(error, float(np.linalg.norm(shown - displacements, axis=-1).max(initial=0)))
     first = colourings[0] if colourings else None
-    document = Document(rest, faces, "animation", first, surface)
+    document = GltfBuilder(rest, faces, "animation", first, surface)
     normal_targets = _normal_targets(frames, document.normals, fit)
     if len(targets):
         document.add_targets(targets, normal_targets, colors=_colour_targets(colourings, fit) if first else None)

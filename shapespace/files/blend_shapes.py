@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from shapespace.arrays import FloatArray, IntArray
-from shapespace.files.gltf_writing import Document
-from shapespace.mesh.surface import Surface
+from shapespace.files.gltf_writing import GltfBuilder
+from shapespace.mesh.attributes import MeshAttributes
 
 
 def blend_shapes_glb(
@@ -15,7 +15,7 @@ def blend_shapes_glb(
     ends: FloatArray,
     names: Sequence[str],
     faces: IntArray,
-    surface: Surface | None = None,
+    surface: MeshAttributes | None = None,
     extras: Mapping[str, Any] | None = None,
 ) -> bytes:
     """Encode a shape and others that weights of 1 lead to.
@@ -28,7 +28,7 @@ def blend_shapes_glb(
         surface: of the mesh, where its file had more than triangles.
         extras: of the ``asset``.
     """
-    document = Document(rest, faces, "shape", surface=surface, joined=True)
+    document = GltfBuilder(rest, faces, "shape", surface=surface, joined=True)
     normals = document.normals(rest)
     document.add_targets((end - rest for end in ends), (document.normals(end) - normals for end in ends), names)
     if extras:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from shapespace.arrays import FloatArray
 from shapespace.coordinates.nric import dihedral_angles, edge_lengths, wrap
-from shapespace.mesh.surface import linear
+from shapespace.mesh.attributes import linear
 from shapespace.mesh.triangle_mesh import Connectivity
 
 #: Moreland's "coolwarm", perceptually even away from its grey middle, at 33 equal steps in sRGB: "Diverging Color Maps

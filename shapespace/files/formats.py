@@ -14,7 +14,7 @@ from shapespace.files.gltf_reading import read_gltf
 from shapespace.files.limits import UNLIMITED, Limits, clipped
 from shapespace.files.npz_reading import load_npz
 from shapespace.files.polygon_reading import read_obj, read_off, read_ply, read_stl, read_xyz
-from shapespace.mesh.surface import Surface
+from shapespace.mesh.attributes import MeshAttributes
 from shapespace.mesh.triangle_mesh import MeshError
 
 if TYPE_CHECKING:
@@ -32,7 +32,7 @@ class Encode(Protocol):
         vertices: FloatArray,
         faces: IntArray,
         colouring: Colouring | None = None,
-        surface: Surface | None = None,
+        surface: MeshAttributes | None = None,
         /,
     ) -> bytes:
         """Encode vertices (V, 3) in any unit and faces (F, 3), with what the surface has; positions are float32."""
@@ -56,36 +56,36 @@ class MeshFormat:
 
 
 def _glb(
-    vertices: FloatArray, faces: IntArray, colouring: Colouring | None = None, surface: Surface | None = None
+    vertices: FloatArray, faces: IntArray, colouring: Colouring | None = None, surface: MeshAttributes | None = None
 ) -> bytes:
-    from shapespace.files.gltf_writing import Document
+    from shapespace.files.gltf_writing import GltfBuilder
 
-    return Document(vertices, faces, colouring=colouring, surface=surface).glb()
+    return GltfBuilder(vertices, faces, colouring=colouring, surface=surface).glb()
 
 
 def _gltf(
-    vertices: FloatArray, faces: IntArray, colouring: Colouring | None = None, surface: Surface | None = None
+    vertices: FloatArray, faces: IntArray, colouring: Colouring | None = None, surface: MeshAttributes | None = None
 ) -> bytes:
-    from shapespace.files.gltf_writing import Document
+    from shapespace.files.gltf_writing import GltfBuilder
 
-    return Document(vertices, faces, colouring=colouring, surface=surface).gltf()
+    return GltfBuilder(vertices, faces, colouring=colouring, surface=surface).gltf()
 
 
 def _obj(
-    vertices: FloatArray, faces: IntArray, colouring: Colouring | None = None, surface: Surface | None = None
+    vertices: FloatArray, faces: IntArray, colouring: Colouring | None = None, surface: MeshAttributes | None = None
 ) -> bytes:
-    from shapespace.files.surfaces.obj import write_obj
+    from shapespace.files.attributes.obj import write_obj
 
-    return write_obj(vertices, surface or Surface.of_triangles(faces), colouring).encode()
+    return write_obj(vertices, surface or MeshAttributes.of_triangles(faces), colouring).encode()
 
 
 def _obj_zip(
-    vertices: FloatArray, faces: IntArray, colouring: Colouring | None = None, surface: Surface | None = None
+    vertices: FloatArray, faces: IntArray, colouring: Colouring | None = None, surface: MeshAttributes | None = None
 ) -> bytes:
     from shapespace.files.archives import zip_pieces
-    from shapespace.files.surfaces.obj import obj_files, write_obj
+    from shapespace.files.attributes.obj import obj_files, write_obj
 
-    shown = surface or Surface.of_triangles(faces)
+    shown = surface or MeshAttributes.of_triangles(faces)
     files = obj_files(shown, "shape")
     text = write_obj(vertices, shown, colouring, "shape.mtl" if files else None)
     members = {"shape.obj": text.encode(), **files}
@@ -93,15 +93,15 @@ def _obj_zip(
 
 
 def _ply(
-    vertices: FloatArray, faces: IntArray, colouring: Colouring | None = None, surface: Surface | None = None
+    vertices: FloatArray, faces: IntArray, colouring: Colouring | None = None, surface: MeshAttributes | None = None
 ) -> bytes:
-    from shapespace.files.surfaces.ply import write_ply
+    from shapespace.files.attributes.ply import write_ply
 
-    return write_ply(vertices, surface or Surface.of_triangles(faces), colouring)
+    return write_ply(vertices, surface or MeshAttributes.of_triangles(faces), colouring)
 
 
 def _stl(
-    vertices: FloatArray, faces: IntArray, colouring: Colouring | None = None, surface: Surface | None = None
+    vertices: FloatArray, faces: IntArray, colouring: Colouring | None = None, surface: MeshAttributes | None = None
 ) -> bytes:
     import trimesh
 
@@ -110,7 +110,7 @@ def _stl(
 
 
 def _npz(
-    vertices: FloatArray, faces: IntArray, colouring: Colouring | None = None, surface: Surface | None = None
+    vertices: FloatArray, faces: IntArray, colouring: Colouring | None = None, surface: MeshAttributes | None = None
 ) -> bytes:
     colours = {}
     if colouring:
@@ -123,7 +123,7 @@ def _npz(
 
 
 def _usd(
-    vertices: FloatArray, faces: IntArray, colouring: Colouring | None = None, surface: Surface | None = None
+    vertices: FloatArray, faces: IntArray, colouring: Colouring | None = None, surface: MeshAttributes | None = None
 ) -> bytes:
     from shapespace.files.usd import still_usd
 
@@ -131,7 +131,7 @@ def _usd(
 
 
 def _usdz(
-    vertices: FloatArray, faces: IntArray, colouring: Colouring | None = None, surface: Surface | None = None
+    vertices: FloatArray, faces: IntArray, colouring: Colouring | None = None, surface: MeshAttributes | None = None
 ) -> bytes:
     from shapespace.files.usd import still_usd
 

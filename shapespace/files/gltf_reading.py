@@ -68,7 +68,7 @@ def open_scene(data: memoryview, limits: Limits, *, binary: bool, beside: Path |
     """
     text, chunk = _chunks(data) if binary else (data, None)
     tree, uris = _parse(text)
-    document = Document(tree)
+    document = GltfDocument(tree)
     buffers = Buffers(document.buffers, chunk, uris, beside)
     return Scene(document, buffers, limits)
 
@@ -115,7 +115,7 @@ def _parse(text: memoryview) -> tuple[dict[str, Any], list[memoryview]]:
     return tree, uris
 
 
-class Document:
+class GltfDocument:
     """The parts of the JSON that describe triangles, once they are known to be what they should be."""
 
     def __init__(self, tree: dict[str, Any]) -> None:
@@ -242,7 +242,7 @@ class Accessor:
     normalized: bool
 
     @classmethod
-    def of(cls, document: Document, index: object, kind: str, components: tuple[int, ...]) -> Accessor:
+    def of(cls, document: GltfDocument, index: object, kind: str, components: tuple[int, ...]) -> Accessor:
         """One of the accessors, which must be of that kind and have such components."""
         accessor = _entry(document.accessors, index)
         if "sparse" in accessor:
@@ -360,7 +360,7 @@ class Scene:
         first: (V,) the first of these that each vertex is.
     """
 
-    def __init__(self, document: Document, buffers: Buffers, limits: Limits) -> None:
+    def __init__(self, document: GltfDocument, buffers: Buffers, limits: Limits) -> None:
         self.document, self.buffers, self.parts = document, buffers, _parts(document)
         numbered = all(part.numbers for part in self.parts)
         # Our own files have a part for each material, on the same vertices.
@@ -394,7 +394,7 @@ class Scene:
 
 
 @dataclass(frozen=True)
-class Part:
+class PlacedPrimitive:
     """A primitive at one of its places (3.7.2).
 
     Attributes:
@@ -458,9 +458,9 @@ class Part:
         return faces[:, ::-1] if mirrored else faces
 
 
-def _parts(document: Document) -> list[Part]:
+def _parts(document: GltfDocument) -> list[PlacedPrimitive]:
     """Every primitive of the scene at each of its places."""
-    parts: list[Part] = []
+    parts: list[PlacedPrimitive] = []
     for number, place in document.places():
         primitives = _objects(_entry(document.meshes, number), "primitives")
         for primitive in primitives:
@@ -472,7 +472,9 @@ def _parts(document: Document) -> list[Part]:
     return parts
 
 
-def _part(document: Document, primitive: dict[str, Any], place: FloatArray | None, mesh: dict[str, Any]) -> Part:
+def _part(
+    document: GltfDocument, primitive: dict[str, Any], place: FloatArray | None, mesh: dict[str, Any]
+) -> PlacedPrimitive:
     mode = primitive.get("mode", _TRIANGLES)
     if mode not in (_TRIANGLES, _STRIP, _FAN):
         raise MeshError("has points or lines: export triangles only")
@@ -485,7 +487,7 @@ def _part(document: Document, primitive: dict[str, Any], place: FloatArray | Non
         numbers = Accessor.of(document, primitive["attributes"]["_VERTEX"], "SCALAR", _NUMBERS)
         if numbers.count != positions.count:
             raise ValueError(f"_VERTEX numbers {numbers.count} of {positions.count} vertices")
-    part = Part(positions, indices, numbers, mode, place, primitive, mesh)
+    part = PlacedPrimitive(positions, indices, numbers, mode, place, primitive, mesh)
     if part.corners < 3 or (mode == _TRIANGLES and part.corners % 3):
         raise ValueError(f"{part.corners} corners make no triangles")
     return part

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from shapespace.arrays import FloatArray, IntArray
 from shapespace.coordinates.nric import components, cross, dot
 from shapespace.files.colouring import Colouring
-from shapespace.mesh.surface import NONE, Material, Surface, linear
+from shapespace.mesh.attributes import NONE, MeshAttributes, SurfaceMaterial, linear
 
 FLOAT, UNSIGNED_INT = 5126, 5125
 ARRAY_BUFFER, ELEMENT_ARRAY_BUFFER = 34962, 34963
@@ -43,8 +43,8 @@ def vertex_normals(vertices: FloatArray, faces: IntArray) -> FloatArray:
     return _normals(vertices, faces, faces, len(vertices))
 
 
-def surface_normals(vertices: FloatArray, surface: Surface) -> FloatArray:
-    """Unit normals (N, 3) of a shape (V, 3) by the numbers of `Surface.normal_corners`."""
+def surface_normals(vertices: FloatArray, surface: MeshAttributes) -> FloatArray:
+    """Unit normals (N, 3) of a shape (V, 3) by the numbers of `MeshAttributes.normal_corners`."""
     count = int(max(surface.normal_corners.max() + 1, len(vertices) if surface.shading is None else 0))
     return _normals(vertices, surface.triangles, surface.normal_faces, count)
 
@@ -69,7 +69,7 @@ def picture_type(data: bytes) -> str:
     return "image/png" if data.startswith(b"\x89PNG") else "image/jpeg"
 
 
-def _material(material: Material, pictures: dict[str | None, int]) -> dict[str, Any]:
+def _material(material: SurfaceMaterial, pictures: dict[str | None, int]) -> dict[str, Any]:
     look: dict[str, Any] = {
         "baseColorFactor": [*material.color],
         "metallicFactor": material.metallic,
@@ -89,7 +89,7 @@ class _Piece(NamedTuple):
     triangles: IntArray
 
 
-def _pieces(surface: Surface, *, objects: bool, materials: bool) -> list[_Piece]:
+def _pieces(surface: MeshAttributes, *, objects: bool, materials: bool) -> list[_Piece]:
     """Of a surface, told apart by these or not."""
     count = len(surface.triangle_polygons)
     of_objects = surface.objects.of if objects and surface.objects else None
@@ -107,7 +107,7 @@ def _pieces(surface: Surface, *, objects: bool, materials: bool) -> list[_Piece]
     return found
 
 
-class Document:
+class GltfBuilder:
     """A glTF document with a mesh on a node for each object of the surface, filled from arrays that all share.
 
     Args:
@@ -130,7 +130,7 @@ class Document:
         faces: IntArray,
         name: str = "shape",
         colouring: Colouring | None = None,
-        surface: Surface | None = None,
+        surface: MeshAttributes | None = None,
         *,
         joined: bool = False,
     ) -> None:
@@ -201,7 +201,7 @@ class Document:
     def _indices(self, faces: IntArray) -> int:
         return self.add(faces.ravel(), target=ELEMENT_ARRAY_BUFFER)
 
-    def _pictures(self, surface: Surface, names: set[str | None]) -> dict[str | None, int]:
+    def _pictures(self, surface: MeshAttributes, names: set[str | None]) -> dict[str | None, int]:
         """Numbers of the textures by name."""
         found = sorted(name for name in names if name is not None)
         if found:

@@ -23,7 +23,7 @@ _DEFLATION, _LONGEST_NUMBER = 1032, 32
 _READ_HEAD = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
 
 
-class _File:
+class _MemoryFile:
     """Bytes as an open file, not copied. A request for a large piece is refused: it follows a forged directory."""
 
     def __init__(self, data: memoryview) -> None:
@@ -71,7 +71,7 @@ def load_npz(
             needed; with the reason.
     """
     try:
-        with zipfile.ZipFile(_File(data)) as archive:
+        with zipfile.ZipFile(_MemoryFile(data)) as archive:
             entries = {e.filename.removesuffix(".npy"): e for e in archive.infolist() if e.filename.endswith(".npy")}
             if len(entries) > _MOST_ARRAYS:
                 raise MeshError(f"holds {len(entries)} arrays, where {_MOST_ARRAYS} are the most")

@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 
 from shapespace.arrays import FloatArray, IntArray
 from shapespace.files.animated_gltf import FRAMES_PER_SECOND
+from shapespace.files.attributes.usd import add_surface
 from shapespace.files.colouring import Colouring
 from shapespace.files.gltf_writing import picture_type, surface_normals
-from shapespace.files.surfaces.usd import add_surface
-from shapespace.mesh.surface import Surface, srgb
+from shapespace.mesh.attributes import MeshAttributes, srgb
 
 _PIECE, _FRAMES_AT_ONCE = 2**20, 32
 #: Modification time of all files in a package: noon UTC on the second day that ZIP can represent, so that it is
@@ -36,7 +36,7 @@ def still_usd(
     vertices: FloatArray,
     faces: IntArray,
     colouring: Colouring | None = None,
-    surface: Surface | None = None,
+    surface: MeshAttributes | None = None,
     *,
     packed: bool = False,
 ) -> bytes:
@@ -56,7 +56,7 @@ def still_usd(
 def animated_usd(
     frames: NDArray[np.floating],
     faces: IntArray,
-    surface: Surface | None = None,
+    surface: MeshAttributes | None = None,
     fps: float = FRAMES_PER_SECOND,
     colourings: Sequence[Colouring] = (),
     *,
@@ -85,7 +85,7 @@ def animated_usd(
 def _pieces(
     frames: NDArray[np.floating],
     faces: IntArray,
-    surface: Surface | None,
+    surface: MeshAttributes | None,
     fps: float | None,
     colourings: Sequence[Colouring],
     *,
@@ -111,7 +111,7 @@ def _pieces(
             stage.SetEndTimeCode(len(frames) - 1)
         mesh = UsdGeom.Mesh.Define(stage, f"/{name}")
         stage.SetDefaultPrim(mesh.GetPrim())
-        shown = surface or Surface.of_triangles(faces)
+        shown = surface or MeshAttributes.of_triangles(faces)
         if colourings:
             shown = replace(shown, colors=srgb(colourings[0].linear), material_of=None, materials=(), textures={})
         mesh.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(shown.sizes.astype(np.int32)))

@@ -12,7 +12,7 @@ from shapespace.arrays import FloatArray, IntArray
 from shapespace.mesh.triangle_mesh import face_normals
 
 
-class Fans:
+class VertexFaces:
     """The faces around each vertex of a connectivity, in rows of equal length.
 
     Args:
@@ -51,7 +51,7 @@ class Closest:
     places: FloatArray
 
 
-class Surface:
+class MeshProximity:
     """Triangles in which closest points are looked for: among the faces around the closest vertex.
 
     Args:
@@ -59,7 +59,7 @@ class Surface:
         fans: of its connectivity.
     """
 
-    def __init__(self, vertices: FloatArray, fans: Fans) -> None:
+    def __init__(self, vertices: FloatArray, fans: VertexFaces) -> None:
         self.vertices, self.fans = vertices, fans
 
     @cached_property

@@ -30,7 +30,7 @@ class ProlongationError(ValueError):
     """Arrays that are no prolongation, with a sentence that says why."""
 
 
-class Rider(NamedTuple):
+class AttachedPart(NamedTuple):
     """A part of the fine mesh that no coarse face lies under, and what carries it as a whole.
 
     Attributes:
@@ -84,7 +84,7 @@ class Prolongation:
     rigid: tuple[RigidPart, ...] = ()
 
     @classmethod
-    def of(cls, coarse: TriangleMesh, fine: TriangleMesh, riders: Sequence[Rider] = ()) -> Prolongation:
+    def of(cls, coarse: TriangleMesh, fine: TriangleMesh, riders: Sequence[AttachedPart] = ()) -> Prolongation:
         """Bind a fine mesh to a coarse one at rest; both lie on the same surface, but for parts that ride along."""
         whole = np.arange(len(fine.vertices))
         bound = np.setdiff1d(whole, np.concatenate([rider.vertices for rider in riders])) if riders else whole
@@ -94,7 +94,7 @@ class Prolongation:
             rows.append(np.repeat(rider.vertices, len(rider.anchors)))
             columns.append(np.tile(rider.anchors, len(rider.vertices)))
             b.append(np.tile(rider.weights, len(rider.vertices)))
-        weights = hung(coarse, fine.vertices, *map(np.concatenate, (rows, columns, b)))
+        weights = bind_points(coarse, fine.vertices, *map(np.concatenate, (rows, columns, b)))
         rigid = (RigidPart(rider.vertices, fine.vertices[rider.vertices]) for rider in riders if rider.rigid)
         return cls(coarse.faces, weights, tuple(rigid))
 
@@ -253,7 +253,9 @@ def submesh(mesh: TriangleMesh, vertices: IntArray) -> TriangleMesh:
     return TriangleMesh.from_arrays(mesh.vertices[vertices], np.searchsorted(vertices, mesh.faces[inside]))
 
 
-def hung(coarse: TriangleMesh, points: FloatArray, rows: IntArray, columns: IntArray, b: FloatArray) -> sp.csr_array:
+def bind_points(
+    coarse: TriangleMesh, points: FloatArray, rows: IntArray, columns: IntArray, b: FloatArray
+) -> sp.csr_array:
     """Weights (k, 2V) that carry points (k, 3) with the vertices they hang on: B beside C of `Prolongation`.
 
     Args:

@@ -21,7 +21,7 @@ SMALLEST_SHARE = 0.1
 
 
 @dataclass(frozen=True)
-class Quality:
+class TriangleQuality:
     """Of a few faces: smallest sin² of an angle, cosine between neighbours and size, and how many are beyond limits."""
 
     sine: float
@@ -68,11 +68,11 @@ class Triangles:
         sizes = np.minimum(areas / least, angles / least_angles)
         return cls(sines, normals / np.maximum(doubled, 1e-300)[..., None], squares, areas, sizes)
 
-    def quality(self, faces: list[int], pairs: Pairs, sine: float) -> Quality:
+    def quality(self, faces: list[int], pairs: Pairs, sine: float) -> TriangleQuality:
         """Quality of some of the faces and of some neighbours among them, all by number."""
         angles, sizes = self.sines[faces], self.sizes[faces]
         folds = dots(self.normals[[i for i, _ in pairs]], self.normals[[j for _, j in pairs]])
-        return Quality(
+        return TriangleQuality(
             float(angles.min(initial=1)),
             float(folds.min(initial=1)),
             float(sizes.min(initial=1)),

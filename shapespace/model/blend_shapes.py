@@ -9,8 +9,8 @@ import numpy as np
 
 from shapespace.arrays import FloatArray, IntArray
 from shapespace.files.blend_shapes import blend_shapes_glb
+from shapespace.mesh.attributes import MeshAttributes
 from shapespace.mesh.rigid_motion import align
-from shapespace.mesh.surface import Surface
 from shapespace.model.decoder import Decoder, MeshChoice, Shape
 from shapespace.model.latent_space import Codes, Distribution
 
@@ -42,7 +42,7 @@ class BlendShapes:
     ends: FloatArray
     names: list[str]
     faces: IntArray
-    surface: Surface | None
+    surface: MeshAttributes | None
     error: dict[str, float]
     model: str
 

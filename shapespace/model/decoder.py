@@ -20,8 +20,8 @@ from shapespace.bundle.reader import Bundle, BundleError
 from shapespace.coordinates.integrability import Integrability
 from shapespace.coordinates.nric import nric
 from shapespace.coordinates.reconstruction import Reconstructor
+from shapespace.mesh.attributes import MeshAttributes
 from shapespace.mesh.rigid_motion import align
-from shapespace.mesh.surface import Surface
 from shapespace.mesh.triangle_mesh import TriangleMesh
 from shapespace.model.latent_space import Bounds, Codes, Distribution, LatentSpace, NotFiniteError, TrainingCodes
 from shapespace.model.networks import PATIENCE, NetworkError, Session, TerminatedError
@@ -177,7 +177,7 @@ class Decoder:
         fine = self.finer(choice)
         return fine.reference if fine else self.reference
 
-    def surface(self, choice: MeshChoice) -> Surface | None:
+    def surface(self, choice: MeshChoice) -> MeshAttributes | None:
         """What the user's file had on that mesh beside triangles; None for the coarse one of two."""
         return self._surface if self.fine is None or self.finer(choice) else None
 
@@ -280,7 +280,7 @@ class Decoder:
         with self._limited() as until:
             return self._start(codes, until).astype(np.float64)
 
-    def rehearse(self) -> None:
+    def self_test(self) -> None:
         """Run every network once, at the ends of the bounds and between them, and reconstruct one shape.
 
         Raises:

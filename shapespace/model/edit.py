@@ -183,7 +183,7 @@ def edited(
             _PulledVertices(model, reconstruct, vertices, mesh, deadline, rough=rough) for rough in (True, False)
         )
         here = pulled.placed(before.vertices / scale)
-        problem = _Problem(model, rough, pulled, begin, here, wanted, fixed, deadline)
+        problem = _EditProblem(model, rough, pulled, begin, here, wanted, fixed, deadline)
         try:
             best = _best(problem)
             code, inside = model.latents.found(best.x, Bounds.CLAMP, fixed)
@@ -256,7 +256,7 @@ class _Candidate:
     weights: _Weights
 
 
-def _best(problem: _Problem) -> _Candidate:
+def _best(problem: _EditProblem) -> _Candidate:
     """The best candidate from a few starts."""
     rough = problem.search(problem.start)
     best = problem.refine(rough.x)
@@ -278,7 +278,7 @@ def _worthwhile(cost: float) -> float:
     return cost - (1 - PROMISING) * shrinkable(cost, GOOD_ROUGHLY)
 
 
-class _Problem:
+class _EditProblem:
     """The problem of one edit.
 
     It is solved twice: with rough shapes, which cost at most a third of answered ones and lie about half a percent of

@@ -11,11 +11,11 @@ import numpy as np
 
 from shapespace.arrays import FloatArray, IntArray
 from shapespace.coordinates.reconstruction import Reconstructor
-from shapespace.mesh.closest_points import Fans, Surface
+from shapespace.mesh.closest_points import MeshProximity, VertexFaces
 from shapespace.mesh.rigid_motion import Placement
 from shapespace.model.decoder import Decoder, MeshChoice, Shape
 from shapespace.model.latent_space import Bounds, Codes
-from shapespace.model.placement import NARROW, WIDE, Breadth, Start, coarse, evenly
+from shapespace.model.placement import NARROW, WIDE, PlacementEffort, Start, coarse, evenly
 from shapespace.model.population import Population
 from shapespace.model.posterior import Posterior
 from shapespace.model.scan import InvalidScanError, Scan, scan_of
@@ -219,10 +219,10 @@ class Fitter:
         return _Fit(self, points, faces, options, deadline)()
 
     @cached_property
-    def reach(self) -> dict[MeshChoice, tuple[Fans, IntArray]]:
-        """Fans and vertices that look for points, of each mesh."""
+    def reach(self) -> dict[MeshChoice, tuple[VertexFaces, IntArray]]:
+        """VertexFaces and vertices that look for points, of each mesh."""
         return {
-            choice: (Fans(mesh.faces, len(mesh.vertices)), evenly(mesh.vertices, count))
+            choice: (VertexFaces(mesh.faces, len(mesh.vertices)), evenly(mesh.vertices, count))
             for choice, count in ((MeshChoice.COARSE, LOOKING_ROUGHLY), (MeshChoice.FINE, LOOKING))
             for mesh in (self.model.mesh(choice),)
         }
@@ -343,7 +343,7 @@ class _Fit:
         fans, looking = self.fitter.reach[level.mesh]
         return Search(self.model, reconstruct, scan, options, level, fans, looking, self.deadline)
 
-    def _placed(self, search: Search, breadth: Breadth) -> list[Start]:
+    def _placed(self, search: Search, breadth: PlacementEffort) -> list[Start]:
         """Where a search begins."""
         options = search.options
         if len(options.landmarks) < 3:
@@ -359,7 +359,7 @@ class _Fit:
             raise InvalidScanError("All landmarks lie at one place, which tells no size. Send others, or scale=fixed.")
         return sorted(starts, key=lambda start: start.score)[: breadth.count]
 
-    def _roughly(self, search: Search, *breadths: Breadth) -> tuple[State, list[State]]:
+    def _roughly(self, search: Search, *breadths: PlacementEffort) -> tuple[State, list[State]]:
         """The best fit of rough shapes, and others; from more places where those of the first breadth give none."""
         states: list[State] = []
         for breadth in breadths:
@@ -374,7 +374,7 @@ class _Fit:
                     states[0] = again
         return states[0], states[1:]
 
-    def _followed(self, search: Search, breadth: Breadth) -> list[State]:
+    def _followed(self, search: Search, breadth: PlacementEffort) -> list[State]:
         """Fits of rough shapes from so many places, the best first."""
         begun = [
             search.start(self.codes[start.shape], start.placement, self.shapes[start.shape])
@@ -442,7 +442,7 @@ class _Fit:
         scale = state.placement.scale
         placed = Placement.between(scale * shape.vertices, self.unit * there)
         placement = Placement(placed.rotation, placed.translation, scale)
-        surface = Surface(placement(shape.vertices), search.surface(state.shape).fans)
+        surface = MeshProximity(placement(shape.vertices), search.surface(state.shape).fans)
         to_model = surface.closest(self.unit * self.scan.points).distances
         to_scan = self.unit * self.scan.distances(surface.vertices / self.unit)
         parts = np.array_split(self.points, -(-len(self.points) // CHUNK)) if asked.points else []

@@ -11,7 +11,7 @@ from scipy import sparse
 from scipy.spatial import cKDTree
 
 from shapespace.arrays import FloatArray, IntArray
-from shapespace.mesh.closest_points import Surface, unit
+from shapespace.mesh.closest_points import MeshProximity, unit
 from shapespace.mesh.rigid_motion import Placement
 from shapespace.model.scan import Scan, near
 
@@ -66,7 +66,7 @@ class Pairing:
         self.scan, self.some = scan, scan.some(count)
         self._vertices, self._both, self._blended = vertices, both, blended
 
-    def closest(self, surface: Surface, placement: Placement) -> Pairs:
+    def closest(self, surface: MeshProximity, placement: Placement) -> Pairs:
         """Points of both sides and the closest ones of the other, where a placement takes the surface to the scan."""
         some = self.some
         points, normals = placement.back(some.points), some.normals @ placement.rotation
@@ -95,7 +95,7 @@ class Pairing:
         matrix = sparse.csr_array((values, (row, column)), shape=(n + k, len(surface.vertices)))
         return Pairs(gaps, across, distances, matrix, places, agree, mass, n, np.zeros(n + k, bool))
 
-    def drawn(self, pairs: Pairs, surface: Surface, placement: Placement, most: float) -> Pairs:
+    def drawn(self, pairs: Pairs, surface: MeshProximity, placement: Placement, most: float) -> Pairs:
         """The same pairs, but what is further away than ``most`` is paired with what of the model nothing shows.
 
         A limb that is folded the wrong way has both, and its own nearest points are those of other limbs.

@@ -21,7 +21,7 @@ DIFFERENT = 0.35
 
 
 @dataclass(frozen=True)
-class Breadth:
+class PlacementEffort:
     """How widely placements are looked for.
 
     Attributes:
@@ -41,8 +41,8 @@ class Breadth:
 
 
 #: What serves most scans; and what those of a part may need, since a flat shape looks alike from both sides.
-NARROW = Breadth(points=150, rotations=60, kept=8, polished=12, steps=6, count=5)
-WIDE = Breadth(points=300, rotations=240, kept=48, polished=48, steps=20, count=32)
+NARROW = PlacementEffort(points=150, rotations=60, kept=8, polished=12, steps=6, count=5)
+WIDE = PlacementEffort(points=300, rotations=240, kept=48, polished=48, steps=20, count=32)
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,7 +60,7 @@ class Start:
     score: float
 
 
-def coarse(scan: Scan, shapes: FloatArray, *, partial: bool, free: bool, breadth: Breadth) -> list[Start]:
+def coarse(scan: Scan, shapes: FloatArray, *, partial: bool, free: bool, breadth: PlacementEffort) -> list[Start]:
     """The best placements of some shapes in a scan, each clearly different from the ones before.
 
     Args:

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from shapespace.arrays import FloatArray, IntArray
 from shapespace.coordinates.reconstruction import Reconstructor
-from shapespace.mesh.closest_points import Fans, Surface
+from shapespace.mesh.closest_points import MeshProximity, VertexFaces
 from shapespace.mesh.rigid_motion import Placement, align
 from shapespace.mesh.triangle_mesh import vertex_areas
 from shapespace.model.decoder import Decoder, MeshChoice
@@ -148,7 +148,7 @@ class Search:
         scan: Scan,
         options: Options,
         level: Level,
-        fans: Fans,
+        fans: VertexFaces,
         vertices: IntArray,
         deadline: Deadline | None,
     ) -> None:
@@ -219,9 +219,9 @@ class Search:
         )
         return found
 
-    def surface(self, shape: FloatArray) -> Surface:
+    def surface(self, shape: FloatArray) -> MeshProximity:
         """Of a coarse shape (V, 3), on the mesh of this level."""
-        return Surface(self._fine(shape), self._fans)
+        return MeshProximity(self._fine(shape), self._fans)
 
     def _fine(self, shapes: FloatArray) -> FloatArray:
         fine = self._model.finer(self._level.mesh)

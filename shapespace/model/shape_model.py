@@ -25,7 +25,7 @@ from shapespace.model.edit import PRIOR, Edited, PriorKind, Target, edited
 from shapespace.model.encode import Encoded, Encoder, Objective
 from shapespace.model.fit import FitOptions, Fitted, Fitter, Landmark, Prior, ScaleChoice
 from shapespace.model.latent_space import Bounds, Codes, Distribution, NotFiniteError, WrongLengthError
-from shapespace.model.spread import require_covariance, spread
+from shapespace.model.vertex_uncertainty import require_covariance, vertex_uncertainty
 from shapespace.solve.deadline import Deadline
 from shapespace.solve.outcome import Status
 
@@ -387,7 +387,7 @@ class ShapeModel(Decoder):
             raise NotFiniteError(f"temperature is {temperature:g}. Give a finite number of at least 0.")
         return self.latents.codes(self.population.sample(count, seed, temperature))[0]
 
-    def spread(self, code: ArrayLike, covariance: ArrayLike, mesh: MeshName = "fine") -> FloatArray:
+    def vertex_uncertainty(self, code: ArrayLike, covariance: ArrayLike, mesh: MeshName = "fine") -> FloatArray:
         """Standard deviation (V,) of where the vertices of a code's shape are, as ``decode`` answers them.
 
         Args:
@@ -404,7 +404,7 @@ class ShapeModel(Decoder):
         (4601,)
         """
         checked, _ = self.latents.code(np.asarray(code, dtype=np.float64).tolist())
-        return spread(self, checked, require_covariance(self, covariance), MeshChoice(mesh))
+        return vertex_uncertainty(self, checked, require_covariance(self, covariance), MeshChoice(mesh))
 
     @cached_property
     def _encoder(self) -> Encoder:

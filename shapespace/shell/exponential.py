@@ -12,7 +12,7 @@ from scipy.sparse.linalg import splu
 from shapespace.arrays import FloatArray
 from shapespace.coordinates.normal_matrix import NormalMatrix
 from shapespace.mesh.rigid_motion import without_rigid_motion
-from shapespace.shell.space import TOLERANCE, ChordSolver, DiscretePath, Point, ShellSpace, fault_between
+from shapespace.shell.space import TOLERANCE, ChordSolver, DiscretePath, ShellPoint, ShellSpace, fault_between
 from shapespace.solve.anderson import Anderson
 from shapespace.solve.cholesky import NotPositiveDefiniteError
 from shapespace.solve.deadline import Deadline
@@ -200,7 +200,7 @@ class _Step:
     ``F(X) = J_kᵀ (∂₁W[z_k, z_{k+1}] + ∂₂W[z(X), z_k]) = 0``.
     """
 
-    def __init__(self, previous: Point, current: Point, forward: bool) -> None:
+    def __init__(self, previous: ShellPoint, current: ShellPoint, forward: bool) -> None:
         self.current = current
         self._forward = forward
         if forward:
@@ -208,7 +208,7 @@ class _Step:
         else:
             self._known = current.rest.gradient_rest(previous.z)
 
-    def forces(self, unknown: Point) -> FloatArray:
+    def forces(self, unknown: ShellPoint) -> FloatArray:
         """F (V, 3)."""
         if self._forward:
             covector = self.current.rest.gradient_rest(unknown.z)
@@ -216,7 +216,7 @@ class _Step:
             covector = unknown.rest.gradient_deformed(self.current.z)
         return self.current.pull_back(covector + self._known)
 
-    def derivative(self, unknown: Point) -> sparse.csc_array:
+    def derivative(self, unknown: ShellPoint) -> sparse.csc_array:
         """``DF(X)`` (3V, 3V), near −A and not symmetric; the rigid motions are lifted out of its null space."""
         matrix = self.current.space.jacobian.matrix
         here, there = matrix(self.current.gradients), matrix(unknown.gradients)
@@ -232,17 +232,17 @@ class _Step:
 class _Solution(Outcome):
     """Where an iteration on one step ended."""
 
-    point: Point
+    point: ShellPoint
 
 
-def _accepted(equation: _Step, point: Point, iterations: int, residual: float) -> _Solution:
+def _accepted(equation: _Step, point: ShellPoint, iterations: int, residual: float) -> _Solution:
     """A solution of the equation, which also has to be a deformation."""
     fault = fault_between(equation.current, point)
     status = Status.DEGENERATE if fault else Status.CONVERGED
     return _Solution(status=status, iterations=iterations, residual=residual, reason=fault or "", point=point)
 
 
-def _stalled(point: Point, iterations: int, residual: float, reason: str) -> _Solution:
+def _stalled(point: ShellPoint, iterations: int, residual: float, reason: str) -> _Solution:
     return _Solution(status=Status.STALLED, iterations=iterations, residual=residual, reason=reason, point=point)
 
 
@@ -295,18 +295,18 @@ def _newton(equation: _Step, chord: ChordSolver, tolerance: float) -> _Solution:
     return _stalled(point, NEWTON_ITERATIONS, residual, f"Newton is slow, residual {residual:.1e}")
 
 
-def _measured(equation: _Step, chord: ChordSolver, point: Point) -> tuple[FloatArray, float]:
+def _measured(equation: _Step, chord: ChordSolver, point: ShellPoint) -> tuple[FloatArray, float]:
     """F at a shape, and the residual."""
     forces = equation.forces(point)
     return forces, step_length(forces, chord.solve(forces))
 
 
 def _line_search(
-    equation: _Step, chord: ChordSolver, point: Point, step: FloatArray, residual: float
-) -> tuple[Point, FloatArray, float] | None:
+    equation: _Step, chord: ChordSolver, point: ShellPoint, step: FloatArray, residual: float
+) -> tuple[ShellPoint, FloatArray, float] | None:
     """The shape after a share t of a step that takes away t/4 of the residual or more, with F and residual there."""
 
-    def trial(t: float) -> tuple[Point, FloatArray, float]:
+    def trial(t: float) -> tuple[ShellPoint, FloatArray, float]:
         there = point.space.point(point.vertices + t * step)
         return there, *_measured(equation, chord, there)
 

@@ -11,7 +11,7 @@ from scipy.sparse.linalg import SuperLU, splu
 from shapespace.arrays import FloatArray
 from shapespace.coordinates.normal_matrix import NormalMatrix
 from shapespace.mesh.rigid_motion import without_rigid_motion
-from shapespace.shell.space import DiscretePath, Point
+from shapespace.shell.space import DiscretePath, ShellPoint
 
 
 class ExponentialDerivative:
@@ -97,14 +97,14 @@ def _apply(matrix: sparse.csc_array | sparse.csr_array, fields: FloatArray) -> F
     return product.T.reshape(fields.shape)
 
 
-def _coupling(current: Point, following: Point) -> sparse.csc_array:
+def _coupling(current: ShellPoint, following: ShellPoint) -> sparse.csc_array:
     """``D_k`` (3V, 3V)."""
     matrix = current.space.jacobian.matrix
     hessian = current.rest.mixed_hessian(following.z)
     return sparse.csc_array(matrix(current.gradients).T @ hessian @ matrix(following.gradients))
 
 
-def _stiffness(previous: Point, current: Point, following: Point) -> sparse.csc_array:
+def _stiffness(previous: ShellPoint, current: ShellPoint, following: ShellPoint) -> sparse.csc_array:
     """``C_k`` (3V, 3V), symmetric."""
     space = current.space
     jacobian = space.jacobian.matrix(current.gradients)

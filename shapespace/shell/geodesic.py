@@ -16,7 +16,7 @@ from shapespace.shell.space import (
     ChordSolver,
     DiscretePath,
     Factorise,
-    Point,
+    ShellPoint,
     ShellSpace,
     edge_length,
     fault_between,
@@ -213,15 +213,17 @@ def _nearest(chord: ChordSolver, target: FloatArray) -> FloatArray:
 
 
 #: A shape, by how much its lengths and angles miss a target (2E,), and the square of that in a metric.
-_Compared = tuple[Point, FloatArray, float]
+_Compared = tuple[ShellPoint, FloatArray, float]
 
 
-def _compared(metric: Point, point: Point, target: FloatArray) -> _Compared:
+def _compared(metric: ShellPoint, point: ShellPoint, target: FloatArray) -> _Compared:
     misfit = unwrap(target, point.z) - point.z
     return point, misfit, float(misfit @ metric.lower(misfit))
 
 
-def _line_search(metric: Point, target: FloatArray, point: Point, step: FloatArray, square: float) -> _Compared | None:
+def _line_search(
+    metric: ShellPoint, target: FloatArray, point: ShellPoint, step: FloatArray, square: float
+) -> _Compared | None:
     """The shape along a step that comes closer to a target without a face that collapses."""
     found = backtrack(
         lambda t: _compared(metric, point.space.point(point.vertices + t * step), target),
@@ -291,12 +293,12 @@ def _factorised(space: ShellSpace, shapes: FloatArray, factorise: list[Factorise
     return [f(space.point(x)) for f, x in zip(factorise, shapes[1:-1], strict=True)]
 
 
-def _forces(space: ShellSpace, shapes: FloatArray) -> tuple[list[Point], FloatArray]:
+def _forces(space: ShellSpace, shapes: FloatArray) -> tuple[list[ShellPoint], FloatArray]:
     """The inner shapes with forces ``−F``."""
     z = space.nric(shapes)
     rest = space.energy.rest(z[:-1])
     covectors = rest.gradient_deformed(z[1:])[:-1] + rest.gradient_rest(z[1:])[1:]
-    points = [Point(space, *xz) for xz in zip(shapes[1:-1], z[1:-1], strict=True)]
+    points = [ShellPoint(space, *xz) for xz in zip(shapes[1:-1], z[1:-1], strict=True)]
     forces = np.stack([-p.pull_back(c) for p, c in zip(points, covectors, strict=True)])
     return points, forces
 

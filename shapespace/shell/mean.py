@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from shapespace.arrays import FloatArray
 from shapespace.shell.geodesic import Logarithm, logarithm
-from shapespace.shell.space import TOLERANCE, Point, ShellSpace, edge_length, fault_between, keeps_faces
+from shapespace.shell.space import TOLERANCE, ShellPoint, ShellSpace, edge_length, fault_between, keeps_faces
 from shapespace.solve.anderson import Anderson
 from shapespace.solve.cholesky import NotPositiveDefiniteError
 from shapespace.solve.line_search import backtrack, sufficient_decrease
@@ -85,7 +85,7 @@ class _MeanEnergy:
         """Of lengths and angles (2E,)."""
         return float(self._weights @ self._rest.value(z))
 
-    def forces_at(self, point: Point) -> FloatArray:
+    def forces_at(self, point: ShellPoint) -> FloatArray:
         """(V, 3)."""
         return -point.pull_back(self._weights @ self._rest.gradient_deformed(point.z))
 
@@ -146,11 +146,11 @@ def _quasi_newton(mean: _MeanEnergy, start: FloatArray) -> Mean:
 
 
 def _line_search(
-    mean: _MeanEnergy, point: Point, energy: float, step: FloatArray, slope: float
-) -> tuple[Point, float] | None:
+    mean: _MeanEnergy, point: ShellPoint, energy: float, step: FloatArray, slope: float
+) -> tuple[ShellPoint, float] | None:
     """The shape along a step that lowers the energy enough, and its energy."""
 
-    def trial(t: float) -> tuple[Point, float]:
+    def trial(t: float) -> tuple[ShellPoint, float]:
         there = mean.space.point(point.vertices + t * step)
         return there, mean.value_of(there.z)
 

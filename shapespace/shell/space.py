@@ -42,7 +42,7 @@ LARGEST_LOSS = 0.8
 LARGEST_TURN = 0.75 * np.pi
 
 
-class Point:
+class ShellPoint:
     """A shape with what its tangent space and its energy are made of, each computed when first asked for.
 
     Attributes:
@@ -91,7 +91,7 @@ class Point:
         return np.concatenate([energy.sum_over_faces(sides), self.hessian.angles * angles])
 
 
-def fault_between(old: Point, new: Point) -> str | None:
+def fault_between(old: ShellPoint, new: ShellPoint) -> str | None:
     """Why the step from one shape to the next is no deformation of a surface; None if it is one."""
     if not np.isfinite(new.z).all():
         return "a vertex is not finite or an edge has no length"
@@ -134,11 +134,11 @@ class ChordSolver:
         rotations: (V, 3, 3) of its vertices to the shape that is served, if they are taken into account.
     """
 
-    at: Point
+    at: ShellPoint
     inverse: Preconditioner
     rotations: FloatArray | None = None
 
-    def rotated_to(self, point: Point) -> ChordSolver:
+    def rotated_to(self, point: ShellPoint) -> ChordSolver:
         """The same factor, serving another shape: ``R A⁻¹ Rᵀ`` and ``J Rᵀ`` with rotations of the vertices to it."""
         return replace(self, rotations=point.space.vertex_rotations(self.at.face_frames, point.face_frames))
 
@@ -162,7 +162,7 @@ class ChordSolver:
 
 
 #: Factorises A at a shape; raises NotPositiveDefiniteError. The factor that it returned before becomes unusable.
-Factorise = Callable[[Point], ChordSolver]
+Factorise = Callable[[ShellPoint], ChordSolver]
 
 
 class ShellSpace:
@@ -198,7 +198,7 @@ class ShellSpace:
             self._factorise = [partial(_factorised, self._matrix, cholesky, number) for number in range(count)]
         return self._factorise[:count]
 
-    def factorise(self, point: Point) -> ChordSolver:
+    def factorise(self, point: ShellPoint) -> ChordSolver:
         """A at a shape, by the first of the ``factorisations``."""
         return self.factorisations(1)[0](point)
 
@@ -206,9 +206,9 @@ class ShellSpace:
         """Lengths and angles (…, 2E) of shapes (…, V, 3)."""
         return nric(vertices, self.connectivity)
 
-    def point(self, vertices: FloatArray) -> Point:
+    def point(self, vertices: FloatArray) -> ShellPoint:
         """A shape (V, 3) as a point of the manifold."""
-        return Point(self, self.shape(vertices))
+        return ShellPoint(self, self.shape(vertices))
 
     def shape(self, vertices: ArrayLike) -> FloatArray:
         """Vertices as an array; raises ValueError if they can't be those of this mesh."""
@@ -217,7 +217,7 @@ class ShellSpace:
             raise ValueError(f"vertices must be {self.reference.vertices.shape} like the reference's, not {x.shape}")
         return x
 
-    def curvature(self, point: Point, covector: FloatArray) -> sparse.csc_array:
+    def curvature(self, point: ShellPoint, covector: FloatArray) -> sparse.csc_array:
         """``Σ_i p_i D²z_i(X)`` (3V, 3V) of a covector p (2E,): how ``Jᵀp`` changes with X."""
         second = HingeGeometry(point.vertices, self.connectivity).second_derivatives()
         return self._matrix.pattern.matrix(self._matrix.second_derivative(second, covector))
@@ -245,7 +245,7 @@ class ShellSpace:
         return without_rigid_motion(d, point.vertices)
 
 
-def _factorised(matrix: NormalMatrix, cholesky: Cholesky, number: int, point: Point) -> ChordSolver:
+def _factorised(matrix: NormalMatrix, cholesky: Cholesky, number: int, point: ShellPoint) -> ChordSolver:
     factor = cholesky.factorise(matrix.entries(point.gradients, point.hessian), number)
     return ChordSolver(point, Preconditioner(factor, rigid_motions(point.vertices)))
 

@@ -79,7 +79,7 @@ class SymmetricPattern:
         return sparse.csc_array(upper + sparse.triu(upper, 1).T)
 
 
-class Factor(Protocol):
+class Factorisation(Protocol):
     """A factorised matrix. Not for use by two threads at once."""
 
     def solve(self, right: ArrayLike) -> FloatArray:
@@ -93,7 +93,7 @@ class Cholesky(Protocol):
     which must not be used afterwards: a backend that has overwritten its memory raises RuntimeError.
     """
 
-    def factorise(self, entries: FloatArray, number: int = 0) -> Factor:
+    def factorise(self, entries: FloatArray, number: int = 0) -> Factorisation:
         """Factorise the matrix with these upper-triangle entries; raises NotPositiveDefiniteError."""
 
 
@@ -113,7 +113,7 @@ class BandedCholesky:
         self._slots = low * (self.bandwidth + 1) + (high - low)
         self._shape = (self.bandwidth + 1, n)
 
-    def factorise(self, entries: FloatArray, number: int = 0) -> Factor:
+    def factorise(self, entries: FloatArray, number: int = 0) -> Factorisation:
         """See Cholesky; every factor has its own memory here, so the number is ignored."""
         band = np.zeros(self._shape, self._precision, order="F")
         band.ravel(order="K")[self._slots] = entries
@@ -132,7 +132,7 @@ class _BandedFactor:
     order: IntArray
 
     def solve(self, right: ArrayLike) -> FloatArray:
-        """See Factor."""
+        """See Factorisation."""
         right = np.asarray(right, self.band.dtype)
         x = np.empty(right.shape)
         x[..., self.order] = linalg.cho_solve_banded(
@@ -221,7 +221,7 @@ class PardisoCholesky:
             raise NotPositiveDefiniteError(f"Pardiso's phase {phase} failed with error {error.value}")
         return x
 
-    def factorise(self, entries: FloatArray, number: int = 0) -> Factor:
+    def factorise(self, entries: FloatArray, number: int = 0) -> Factorisation:
         """See Cholesky."""
         kept = np.array(entries, self._precision)
         if not np.isfinite(kept).all():
@@ -253,7 +253,7 @@ class _PardisoFactor:
     version: int
 
     def solve(self, right: ArrayLike) -> FloatArray:
-        """See Factor."""
+        """See Factorisation."""
         return self.cholesky.solve(self, right)
 
 

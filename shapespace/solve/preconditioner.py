@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from shapespace.arrays import FloatArray
-from shapespace.solve.cholesky import Factor
+from shapespace.solve.cholesky import Factorisation
 
 
 class Preconditioner:
@@ -21,7 +21,7 @@ class Preconditioner:
         null_space: (n, 3V) orthonormal basis.
     """
 
-    def __init__(self, factor: Factor, null_space: FloatArray) -> None:
+    def __init__(self, factor: Factorisation, null_space: FloatArray) -> None:
         self._factor, self._null_space = factor, null_space
 
     def __call__(self, forces: FloatArray) -> FloatArray:

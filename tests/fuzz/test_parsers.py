@@ -359,7 +359,7 @@ def as_bundle(spoil: Callable[[Path], object]) -> None:
             (place / name).write_bytes(content)
         spoil(place)
         try:
-            ShapeModel(read_bundle(place)).rehearse()
+            ShapeModel(read_bundle(place)).self_test()
         except BundleError as error:
             one_line(ValueError(" ".join(str(error).split())))
 

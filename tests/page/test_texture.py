@@ -9,7 +9,7 @@ import numpy as np
 
 from shapespace.bundle import writer
 from shapespace.bundle.writer import Networks
-from shapespace.mesh.surface import Material, Surface
+from shapespace.mesh.attributes import MeshAttributes, SurfaceMaterial
 from tests.page.conftest import Open
 from tests.service.bundles import facts, fine_reference, geometry, networks
 from tests.service.conftest import Start
@@ -21,13 +21,13 @@ def dressed(folder: Path, picture: bytes) -> Path:
     mesh = fine_reference()
     faces = mesh.faces
     half = mesh.vertices[faces].mean(axis=1)[:, 0] > 0
-    surface = Surface(
+    surface = MeshAttributes(
         starts=np.arange(0, faces.size + 1, 3),
         corners=faces.ravel(),
         uv=np.array([[0.2, 0.2], [0.8, 0.8]]),
         uv_corners=np.repeat(half, 3).astype(int),
         material_of=np.where(half, 0, 1),
-        materials=(Material("red", texture="red.png"), Material("green", (0.0, 0.5, 0.0, 1.0))),
+        materials=(SurfaceMaterial("red", texture="red.png"), SurfaceMaterial("green", (0.0, 0.5, 0.0, 1.0))),
         textures={"red.png": picture},
     )
     *factors, combiner = (model.SerializeToString() for model in networks().values())

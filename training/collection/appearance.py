@@ -6,13 +6,15 @@ from pathlib import Path
 
 import numpy as np
 
-from shapespace.files.surfaces.reading import FORMATS, read_surface
-from shapespace.mesh.surface import Surface
+from shapespace.files.attributes.reading import FORMATS, read_attributes
+from shapespace.mesh.attributes import MeshAttributes
 from shapespace.mesh.triangle_mesh import MeshError
 from shapespace.training.collection.ingest import MeshCollection
 
 
-def reference_surface(data: Path | None, meshes: MeshCollection, chosen: int) -> tuple[Surface | None, list[str]]:
+def reference_surface(
+    data: Path | None, meshes: MeshCollection, chosen: int
+) -> tuple[MeshAttributes | None, list[str]]:
     """The surface of the reference's file; where its format has triangles only, of the first file that may have more.
 
     Args:
@@ -30,7 +32,7 @@ def reference_surface(data: Path | None, meshes: MeshCollection, chosen: int) ->
     if path is None:
         return None, []
     try:
-        found, faults = read_surface(path)
+        found, faults = read_attributes(path)
         if found:
             found = found.welded(meshes.file_vertices)
             found.check(meshes.vertices.shape[1], meshes.faces)
@@ -39,7 +41,7 @@ def reference_surface(data: Path | None, meshes: MeshCollection, chosen: int) ->
     return found, [f"{path}: {fault}" for fault in faults]
 
 
-def kept(surface: Surface) -> str:
+def kept(surface: MeshAttributes) -> str:
     """One sentence on what is kept of a file."""
     sizes = surface.sizes
     counts = {"triangles": (sizes == 3).sum(), "quads": (sizes == 4).sum(), "larger polygons": (sizes > 4).sum()}
@@ -61,6 +63,6 @@ def kept(surface: Surface) -> str:
     return sentence
 
 
-def texture_bytes(surface: Surface) -> dict[str, np.ndarray]:
+def texture_bytes(surface: MeshAttributes) -> dict[str, np.ndarray]:
     """Textures as arrays of bytes, by name."""
     return {name: np.frombuffer(data, np.uint8) for name, data in surface.textures.items()}

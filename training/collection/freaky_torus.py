@@ -8,7 +8,7 @@ from shapespace.arrays import FloatArray, IntArray
 from shapespace.coordinates.nric import nric, unwrap
 from shapespace.mesh.triangle_mesh import Connectivity, TriangleMesh
 from shapespace.training.runs.latent_coordinates import Coordinates
-from shapespace.training.runs.sampling import Places, Shapes
+from shapespace.training.runs.sampling import FeaturePositions, SampledShapes
 
 U_COUNT, V_COUNT = 64, 32
 MAJOR_RADIUS, MINOR_RADIUS = 0.375, 0.125
@@ -99,7 +99,7 @@ class FreakyTorus:
         return [edge_permutation(self.reference.connectivity, turned)]
 
     @property
-    def places(self) -> Places:
+    def places(self) -> FeaturePositions:
         """What each code moves: the ellipses, which turn by half its angle, and the bump.
 
         Where all shapes move by some columns of the grid, α by twice their angle and γ by this angle, edges have the
@@ -110,7 +110,7 @@ class FreakyTorus:
         step = (end - start + counts // 2) % counts - counts // 2
         surface = 2 * np.pi / counts * (start + step / 2)
         row = surface[:, 1, None] * [1, 2]
-        return Places(
+        return FeaturePositions(
             surface=surface,
             multiples=np.array([[2, 0], [0, 2], [1, 0], [0, 1]]),
             constants=np.concatenate([step == 0, np.cos(row), np.sin(row)], axis=1),
@@ -131,8 +131,8 @@ class FreakyTorus:
         """None: the convolutions that this collection needs do not learn from derivatives."""
         return None
 
-    def shapes(self, latents: FloatArray) -> Shapes:
+    def shapes(self, latents: FloatArray) -> SampledShapes:
         """Shapes of codes (n, 4), angles as near as they can be to the reference's; the formula never fails."""
         mesh, points = self.reference, vertices(latents) / self.scale
         z = unwrap(nric(points, mesh.connectivity), nric(mesh.vertices, mesh.connectivity))
-        return Shapes(points, z, [""] * len(latents))
+        return SampledShapes(points, z, [""] * len(latents))

@@ -18,15 +18,15 @@ from scipy import sparse
 from scipy.spatial import KDTree
 
 from shapespace.arrays import FloatArray, IntArray
+from shapespace.files.attributes.reading import FORMATS
 from shapespace.files.formats import READ_FORMATS, read_arrays
 from shapespace.files.npz_reading import load_npz
-from shapespace.files.surfaces.reading import FORMATS
 from shapespace.mesh.rigid_motion import align
 from shapespace.mesh.triangle_mesh import Connectivity, MeshError, PlaceError, TriangleMesh, diagonal, face_areas
 from shapespace.training.collection import parts as separate_parts
 from shapespace.training.collection.large_arrays import some_vertices, stacked
-from shapespace.training.collection.parts import Part
-from shapespace.training.collection.suspicions import Placements, suspicions
+from shapespace.training.collection.parts import MeshPart
+from shapespace.training.collection.warnings import Placements, suspicions
 from shapespace.training.runs.progress import progress
 
 MIN_SHAPES = 3
@@ -90,7 +90,7 @@ class MeshCollection:
     warnings: tuple[Warned, ...] = ()
     central: int = 0
     places: tuple[tuple[str, int], ...] = ()
-    parts: tuple[Part, ...] = ()
+    parts: tuple[MeshPart, ...] = ()
 
     @property
     def shell_faces(self) -> IntArray:
@@ -204,7 +204,7 @@ def read_collection(path: Path, wanted: Sequence[str] = ()) -> MeshCollection:
         remaining = np.unique(faces[chosen])
         vertices, faces = some_vertices(vertices, remaining), np.searchsorted(remaining, faces[chosen])
         connectivity, kept = Connectivity(faces, len(remaining)), kept[remaining]
-        parts = [Part(part.name, np.searchsorted(chosen, part.faces)) for part in parts]
+        parts = [MeshPart(part.name, np.searchsorted(chosen, part.faces)) for part in parts]
     if len(seams):
         notes.append(
             f"{len(seams)} pairs of border vertices almost coincide in every shape, to {SEAM_TOLERANCE:g} of the size, "
@@ -503,7 +503,7 @@ def _parts(
     connectivity: Connectivity,
     kept_pairs: FloatArray,
     seams: IntArray,
-) -> tuple[list[Part], list[Part]]:
+) -> tuple[list[MeshPart], list[MeshPart]]:
     """The shell and what rides along, and what is left out; nothing where there is one part."""
     apart = separate_parts.separate(connectivity)
     if len(apart) == 1 and not wanted:

@@ -11,9 +11,9 @@ import numpy as np
 from scipy import sparse
 
 from shapespace.arrays import FloatArray, IntArray
-from shapespace.files.surfaces.reading import FORMATS, read_surface
+from shapespace.files.attributes.reading import FORMATS, read_attributes
+from shapespace.mesh.attributes import Labels, MeshAttributes
 from shapespace.mesh.rigid_motion import align
-from shapespace.mesh.surface import Labels, Surface
 from shapespace.mesh.triangle_mesh import Connectivity, MeshError, diagonal, face_areas
 
 #: A part with more than this share of the shell's area may only be carried along if it moves rigidly.
@@ -25,7 +25,7 @@ RIGID = 0.005
 MOST = 100
 
 
-class Part(NamedTuple):
+class MeshPart(NamedTuple):
     """A part of a mesh.
 
     Attributes:
@@ -48,7 +48,7 @@ def separate(connectivity: Connectivity) -> list[IntArray]:
     return sorted(found, key=lambda faces: int(faces[0]))
 
 
-def named(parts: Sequence[IntArray], path: Path | None) -> list[Part]:
+def named(parts: Sequence[IntArray], path: Path | None) -> list[MeshPart]:
     """Parts with the names that a file has for them; those without are numbered from 1.
 
     Args:
@@ -61,8 +61,8 @@ def named(parts: Sequence[IntArray], path: Path | None) -> list[Part]:
         of = [int(labels.of[first]) for first in firsts] if firsts.max() < len(labels.of) else []
         if len(set(of)) > 1:
             names = [labels.names[k] if k >= 0 else name for k, name in zip(of, numbered, strict=True)]
-            return [Part(name, faces) for name, faces in zip(names, parts, strict=True)]
-    return [Part(name, faces) for name, faces in zip(numbered, parts, strict=True)]
+            return [MeshPart(name, faces) for name, faces in zip(names, parts, strict=True)]
+    return [MeshPart(name, faces) for name, faces in zip(numbered, parts, strict=True)]
 
 
 def _labels(path: Path | None) -> list[Labels]:
@@ -77,16 +77,16 @@ def _labels(path: Path | None) -> list[Labels]:
     return [labels for labels in (flat.objects, flat.groups, materials) if labels]
 
 
-def _surface(path: Path | None) -> Surface | None:
+def _surface(path: Path | None) -> MeshAttributes | None:
     if path is None or path.suffix.lstrip(".").lower() not in FORMATS:
         return None
     try:
-        return read_surface(path)[0]
+        return read_attributes(path)[0]
     except OSError:
         return None
 
 
-def choose(parts: Sequence[Part], wanted: Sequence[str], shapes: FloatArray, faces: IntArray) -> list[Part]:
+def choose(parts: Sequence[MeshPart], wanted: Sequence[str], shapes: FloatArray, faces: IntArray) -> list[MeshPart]:
     """The shell, and the parts that ride along.
 
     Args:
@@ -124,7 +124,7 @@ def choose(parts: Sequence[Part], wanted: Sequence[str], shapes: FloatArray, fac
     return [shell, *riders]
 
 
-def _one(part: Part) -> str:
+def _one(part: MeshPart) -> str:
     return f"{part.name!r} ({len(part.faces)} faces)"
 
 
@@ -140,7 +140,7 @@ def _keeps_its_form(shapes: FloatArray, vertices: IntArray) -> bool:
     )
 
 
-def kept(parts: Sequence[Part], left_out: Sequence[Part]) -> str:
+def kept(parts: Sequence[MeshPart], left_out: Sequence[MeshPart]) -> str:
     """One sentence on what becomes of the parts, the shell first."""
     shell, *riders = parts
     sentence = f"{len(parts) + len(left_out)} separate parts: the model computes with {_one(shell)}"

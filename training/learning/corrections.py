@@ -16,7 +16,7 @@ from shapespace.mesh.triangle_mesh import TriangleMesh
 from shapespace.training.learning.layers import Scaling
 from shapespace.training.learning.linear import principal_axes, regression
 from shapespace.training.runs.config import FitSettings, ProductSettings
-from shapespace.training.runs.sampling import Places
+from shapespace.training.runs.sampling import FeaturePositions
 
 #: Factor shapes (n, J, 2E), and the residual (n, 2E) of their affine sum to the joint shape, as scaled differences.
 Pairs = tuple[Tensor, Tensor]
@@ -61,7 +61,7 @@ class Motion:
     """
 
     codes: Tensor
-    places: Places
+    places: FeaturePositions
 
 
 @dataclass(frozen=True)

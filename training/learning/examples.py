@@ -26,7 +26,7 @@ WIDTH = 0.3
 SAME, TOLD_APART = 1e-3, 0.3
 
 
-class RememberingCombiner(CombinerNetwork):
+class ExampleCorrectedCombiner(CombinerNetwork):
     """A combiner Ψ that also knows what it misses of examples: ``Ψ(x) + Σ_i φ_i(x) r_i``.
 
     The φ_i are sums of Gaussians around the examples, with ``φ_i = δ_ik`` at example k. They depend, as Ψ does, on
@@ -78,7 +78,7 @@ class RememberingCombiner(CombinerNetwork):
         self.register_buffer("units", units)
 
     @classmethod
-    def of(cls, composite: Composite, codes: FloatArray, shapes: FloatArray) -> RememberingCombiner:
+    def of(cls, composite: Composite, codes: FloatArray, shapes: FloatArray) -> ExampleCorrectedCombiner:
         """The combiner of a composite, with what this misses of shapes with codes (n, m) and NRIC (n, 2E)."""
         factors = predict(composite.factor_shapes, torch.as_tensor(codes, dtype=torch.float32))
         found = predict(composite.combiner, factors)

@@ -32,7 +32,7 @@ class ReportError(ValueError):
 
 
 @dataclass(frozen=True)
-class Factor:
+class FactorRecord:
     """A group of modes, and the hue that stands for it throughout the page."""
 
     name: str
@@ -76,7 +76,7 @@ class Record:
         self.base = self.reference.get("vertices") if self.mean is None else self.mean
         groups = grouping.get("factors", [])
         self.factors = [
-            Factor(name, hue, group)
+            FactorRecord(name, hue, group)
             for name, hue, group in zip(grouping.get("names", []), cycle(HUES), groups, strict=False)
         ]
         self.overlap = np.array(grouping.get("overlap", []))

@@ -28,7 +28,7 @@ def whole(path: Path) -> Iterator[IO[bytes]]:
 
 
 @dataclass(frozen=True)
-class _File:
+class _AtomicFile:
     path: Path
 
     def exists(self) -> bool:
@@ -36,7 +36,7 @@ class _File:
         return self.path.exists()
 
 
-class TextFile(_File):
+class TextFile(_AtomicFile):
     """A text in UTF-8."""
 
     def read(self) -> str:
@@ -49,7 +49,7 @@ class TextFile(_File):
             file.write(text.encode())
 
 
-class JsonFile(_File):
+class JsonFile(_AtomicFile):
     """A JSON object."""
 
     def read(self) -> dict[str, Any]:
@@ -65,7 +65,7 @@ class JsonFile(_File):
         TextFile(self.path).write(json.dumps(value, indent=2) + "\n")
 
 
-class NpzFile(_File):
+class NpzFile(_AtomicFile):
     """Arrays by name."""
 
     def read(self) -> dict[str, NDArray]:

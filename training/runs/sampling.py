@@ -36,7 +36,7 @@ class SamplesError(RuntimeError):
 
 
 @dataclass(frozen=True)
-class Shapes:
+class SampledShapes:
     """Shapes of a collection.
 
     Attributes:
@@ -54,7 +54,7 @@ class Shapes:
 
 
 @dataclass(frozen=True)
-class Places:
+class FeaturePositions:
     """Where the coordinates of a collection are on its surface: a code moves a feature to the edges whose place it is.
 
     Attributes:
@@ -107,7 +107,7 @@ class Collection(Protocol):
     @property
     def symmetries(self) -> list[IntArray]: ...  # noqa: D102
     @property
-    def places(self) -> Places | None: ...  # noqa: D102
+    def places(self) -> FeaturePositions | None: ...  # noqa: D102
     @property
     def steps(self) -> int | None: ...  # noqa: D102
     @property
@@ -115,7 +115,7 @@ class Collection(Protocol):
     @property
     def differentiated(self) -> Collection | None: ...  # noqa: D102
 
-    def shapes(self, latents: FloatArray) -> Shapes:
+    def shapes(self, latents: FloatArray) -> SampledShapes:
         """The shapes of codes (n, m), each depending on nothing but its own code."""
         ...
 

@@ -34,7 +34,7 @@ class LostTooMuchError(RuntimeError):
 
 
 @dataclass(frozen=True)
-class Shortfall:
+class StageWarning:
     """One thing that a stage could not do.
 
     Attributes:
@@ -53,12 +53,12 @@ class Shortfall:
         return self.share > MOST_LOST
 
 
-def shortfalls(run: RunDirectory, stage: str) -> list[Shortfall]:
+def shortfalls(run: RunDirectory, stage: str) -> list[StageWarning]:
     """What a finished stage could not do."""
     return _STAGES[stage](run) if stage in _STAGES else []
 
 
-def refuse(stage: str, lost: list[Shortfall], command: str = "") -> None:
+def refuse(stage: str, lost: list[StageWarning], command: str = "") -> None:
     """Stop a run that has lost too much.
 
     Raises:
@@ -79,15 +79,15 @@ def _some(names: list[str]) -> str:
     return ", ".join(names[:NAMED]) + more
 
 
-def _ingest(run: RunDirectory) -> list[Shortfall]:
+def _ingest(run: RunDirectory) -> list[StageWarning]:
     facts = run.ingest.read_if_written()
     sentences = [*facts.get("notes", ()), *facts.get("warnings", ())]
     if facts.get("reason"):
         sentences.append(f"coarse mesh: {facts['reason']}")
-    return [Shortfall(sentence) for sentence in sentences]
+    return [StageWarning(sentence) for sentence in sentences]
 
 
-def _modes(run: RunDirectory) -> list[Shortfall]:
+def _modes(run: RunDirectory) -> list[StageWarning]:
     facts = run.decomposition.read_if_written()
     if "steps" not in facts:
         return []
@@ -97,27 +97,29 @@ def _modes(run: RunDirectory) -> list[Shortfall]:
     linearised = names[steps == 0].tolist()
     if linearised:
         sentence = f"linearised {len(linearised)} of {len(steps)} logarithms: {_some(linearised)}"
-        lost.append(Shortfall(sentence, len(linearised) / len(steps), COARSER))
+        lost.append(StageWarning(sentence, len(linearised) / len(steps), COARSER))
     finer = names[steps > facts["log_steps"]].tolist()
     if finer:
-        lost.append(Shortfall(f"took twice as many steps for {len(finer)} of {len(steps)} logarithms: {_some(finer)}"))
+        lost.append(
+            StageWarning(f"took twice as many steps for {len(finer)} of {len(steps)} logarithms: {_some(finer)}")
+        )
     if found < asked:
         why = (
             f"{len(steps)} shapes differ in {found} directions"
             if found == len(steps) - 1
             else "the others would be zero; a smaller modes.sparsity keeps more, where it isn't 0 already"
         )
-        lost.append(Shortfall(f"found {found} of {asked} modes, because {why}"))
+        lost.append(StageWarning(f"found {found} of {asked} modes, because {why}"))
     unfinished = names[np.array(facts.get("codes", ["converged"] * len(names))) != "converged"].tolist()
     if unfinished:
         sentence = f"the codes of {len(unfinished)} of {len(names)} shapes may not be the nearest: {_some(unfinished)}"
-        lost.append(Shortfall(sentence))
+        lost.append(StageWarning(sentence))
     if not facts.get("converged", True):
-        lost.append(Shortfall("sparse modes: the iteration ended at modes.max_iterations, before it had converged"))
+        lost.append(StageWarning("sparse modes: the iteration ended at modes.max_iterations, before it had converged"))
     return lost
 
 
-def _samples(run: RunDirectory) -> list[Shortfall]:
+def _samples(run: RunDirectory) -> list[StageWarning]:
     grouping = run.factors.read_if_written()
     advice = f"{COARSER}; or without the shapes farthest from the others, which make the box of codes large"
     lost = []
@@ -133,7 +135,7 @@ def _samples(run: RunDirectory) -> list[Shortfall]:
             whose = "joint samples" if kind == "joint" else f"samples of factor {kind}"
             where = _farthest(samples["asked"], shortened, grouping) if kind == "joint" else ""
             sentence = f"shortened {shortened.sum()} of {len(failed)} codes of {whose} until they had a shape{where}"
-            lost.append(Shortfall(sentence, float((shortened | failed).mean()), advice))
+            lost.append(StageWarning(sentence, float((shortened | failed).mean()), advice))
         if not failed.any():
             continue
         reason, _ = Counter(str(r).partition(":")[0] for r in samples["reason"][failed]).most_common(1)[0]
@@ -142,11 +144,11 @@ def _samples(run: RunDirectory) -> list[Shortfall]:
             sentence = f"failed {failed.sum()} of {len(failed)} joint samples ({reason}){where}"
         else:
             sentence = f"failed {failed.sum()} of {len(failed)} samples of factor {kind} ({reason})"
-        lost.append(Shortfall(sentence, float(failed.mean()), advice))
+        lost.append(StageWarning(sentence, float(failed.mean()), advice))
     return lost + _folded(run)
 
 
-def _folded(run: RunDirectory) -> list[Shortfall]:
+def _folded(run: RunDirectory) -> list[StageWarning]:
     """Joint samples with two faces folded onto one another where no shape of the collection has as much as a crease."""
     if not run.shapes.exists():
         return []
@@ -156,7 +158,7 @@ def _folded(run: RunDirectory) -> list[Shortfall]:
     for part in parts(run.samples):
         anew = folded_anew(part["nric"][:, connectivity.edge_count :], angles)
         folded, count = folded + int(anew.sum()), count + len(anew)
-    return [Shortfall(f"folded {folded} of {count} joint samples where no shape has a crease")] if folded else []
+    return [StageWarning(f"folded {folded} of {count} joint samples where no shape has a crease")] if folded else []
 
 
 def _farthest(latents: NDArray, failed: NDArray, grouping: dict[str, Any]) -> str:
@@ -170,35 +172,39 @@ def _farthest(latents: NDArray, failed: NDArray, grouping: dict[str, Any]) -> st
     return f", most in factor {names[int(excess.argmax())]!r}" if excess.max() > CLEARLY else ""
 
 
-def _evaluation(run: RunDirectory) -> list[Shortfall]:
+def _evaluation(run: RunDirectory) -> list[StageWarning]:
     figures = run.evaluation.read_if_written()
     lost = []
     statuses = figures.get("vertex_error", {}).get("status", {})
     stalled, count = sum(n for status, n in statuses.items() if status != "converged"), sum(statuses.values())
     if stalled:
-        lost.append(Shortfall(f"{stalled} of {count} test shapes were not quite found from their lengths and angles"))
+        lost.append(
+            StageWarning(f"{stalled} of {count} test shapes were not quite found from their lengths and angles")
+        )
     total = figures.get("r2", {}).get("composite", {}).get("total", 1.0)
     if not total > 1 - MOST_LOST:
-        lost.append(Shortfall(f"the networks miss much: R² {total:.2f}; a larger samples.count may help"))
+        lost.append(StageWarning(f"the networks miss much: R² {total:.2f}; a larger samples.count may help"))
     return lost
 
 
-def _export(run: RunDirectory) -> list[Shortfall]:
+def _export(run: RunDirectory) -> list[StageWarning]:
     facts = run.encoded.read_if_written()
     outside = facts.get("outside", [])
     if not outside:
         return []
     return [
-        Shortfall(f"the codes of {len(outside)} of {facts['shapes']} shapes lie outside the bounds: {_some(outside)}")
+        StageWarning(
+            f"the codes of {len(outside)} of {facts['shapes']} shapes lie outside the bounds: {_some(outside)}"
+        )
     ]
 
 
-def _generalisation(run: RunDirectory) -> list[Shortfall]:
+def _generalisation(run: RunDirectory) -> list[StageWarning]:
     why = run.generalisation.read_if_written().get("failed")
-    return [Shortfall(f"how near the space comes to unseen shapes was not measured: {why}")] if why else []
+    return [StageWarning(f"how near the space comes to unseen shapes was not measured: {why}")] if why else []
 
 
-_STAGES: dict[str, Callable[[RunDirectory], list[Shortfall]]] = {
+_STAGES: dict[str, Callable[[RunDirectory], list[StageWarning]]] = {
     "ingest": _ingest,
     "modes": _modes,
     "samples": _samples,

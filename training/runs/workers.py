@@ -59,16 +59,16 @@ def run(
             that kills them again and again.
     """
     if scheduler is not None and items:
-        return _on_cluster(_Travelling(function), items, scheduler)
+        return _on_cluster(PickledFunction(function), items, scheduler)
     if workers == 1 or len(items) < 2:
         return _here(function, items)
-    return _in_processes(_Travelling(function), items, workers)
+    return _in_processes(PickledFunction(function), items, workers)
 
 
 _kept = threading.local()
 
 
-class _Travelling(Generic[Item, Result]):
+class PickledFunction(Generic[Item, Result]):
     """A function that is sent as bytes, and unpickled by a thread that doesn't hold it yet."""
 
     def __init__(self, function: Callable[[Item], Result]) -> None:
@@ -78,6 +78,7 @@ class _Travelling(Generic[Item, Result]):
         self._pickled = np.frombuffer(pickled, np.uint8)
 
     def __call__(self, item: Item) -> Result:
+        """Call the function."""
         if getattr(_kept, "digest", None) != self._digest:
             _kept.function = pickle.loads(self._pickled.data)  # noqa: S301 - our own, from where the results go
             _kept.digest = self._digest
@@ -86,11 +87,11 @@ class _Travelling(Generic[Item, Result]):
         return _kept.function(item)
 
 
-def _numbered(function: _Travelling[Item, Result], k: int, item: Item) -> tuple[int, Result]:
+def _numbered(function: PickledFunction[Item, Result], k: int, item: Item) -> tuple[int, Result]:
     return k, function(item)
 
 
-def _itself(function: _Travelling[Item, Result]) -> _Travelling[Item, Result]:
+def _itself(function: PickledFunction[Item, Result]) -> PickledFunction[Item, Result]:
     return function
 
 
@@ -102,7 +103,7 @@ def _here(function: Callable[[Item], Result], items: Sequence[Item]) -> Iterator
 
 
 def _in_processes(
-    function: _Travelling[Item, Result], items: Sequence[Item], workers: int
+    function: PickledFunction[Item, Result], items: Sequence[Item], workers: int
 ) -> Iterator[tuple[int, Result]]:
     from joblib import Parallel, delayed, parallel_config
     from joblib.externals.loky.process_executor import TerminatedWorkerError
@@ -126,7 +127,7 @@ def _in_processes(
 
 
 def _on_cluster(
-    function: _Travelling[Item, Result], items: Sequence[Item], scheduler: str
+    function: PickledFunction[Item, Result], items: Sequence[Item], scheduler: str
 ) -> Iterator[tuple[int, Result]]:
     with _client(scheduler) as client:
         from distributed import CancelledError, Future, KilledWorker

@@ -166,7 +166,7 @@ def time_steps(
     reference: TriangleMesh,
     shapes: FloatArray,
     material: Material,
-    whose: IntArray | None = None,
+    original_index: IntArray | None = None,
 ) -> int:
     """K of logarithms and exponentials, as the settings say or as ``auto`` finds.
 
@@ -179,21 +179,23 @@ def time_steps(
         reference: gives connectivity.
         shapes: (n, V, 3), of which at most `SOME`, spread evenly, are held out.
         material: of the shell.
-        whose: (n,) shapes that they are of, from 0 on, mirror images last; by default none is an image.
+        original_index: (n,) shapes that they are of, from 0 on, mirror images last; by default none is an image.
     """
     if settings.log_steps != "auto":
         return settings.log_steps
-    whose = np.arange(len(shapes)) if whose is None else whose
-    count = int(whose.max()) + 1
+    original_index = np.arange(len(shapes)) if original_index is None else original_index
+    count = int(original_index.max()) + 1
     if count < FOLDS:  # too few to tell
         return STEPS
-    used = whose % -(-count // SOME) == 0
+    used = original_index % -(-count // SOME) == 0
     try:
         if _folded(reference, shapes, material) > FOLDED:
             return STEPS
-        whose, shapes = np.unique(whose[used], return_inverse=True)[1], shapes[used]
-        few = max(1, min(FEW if settings.count == "auto" else settings.count, (int(whose.max()) + 1) // 3))
-        straight, bent = (_missed(reference, shapes, whose, material, few, steps) for steps in (1, LIGHT_STEPS))
+        original_index, shapes = np.unique(original_index[used], return_inverse=True)[1], shapes[used]
+        few = max(1, min(FEW if settings.count == "auto" else settings.count, (int(original_index.max()) + 1) // 3))
+        straight, bent = (
+            _missed(reference, shapes, original_index, material, few, steps) for steps in (1, LIGHT_STEPS)
+        )
     except (ModeError, NotPositiveDefiniteError):  # the stages that need mean and modes tell
         return STEPS
     return 1 if straight <= bent else STEPS
@@ -222,14 +224,14 @@ def _space(
 
 
 def _missed(
-    reference: TriangleMesh, shapes: FloatArray, whose: IntArray, material: Material, modes: int, steps: int
+    reference: TriangleMesh, shapes: FloatArray, original_index: IntArray, material: Material, modes: int, steps: int
 ) -> float:
     """Mean distance of vertices of shapes (n, V, 3), the first of them originals, from what modes of others make."""
     space, mean, fields = _space(reference, shapes, material, steps)
-    count = int(whose.max()) + 1
+    count = int(original_index.max()) + 1
     away = []
     for index in folds(count):
-        directions = pga(space, mean, fields[~np.isin(whose, index)], modes, "vertices").vertices
+        directions = pga(space, mean, fields[~np.isin(original_index, index)], modes, "vertices").vertices
         start, _ = coefficients(space, mean, fields[index], directions, "vertices")
         near = nearest_codes(space, mean, directions, shapes[index], start, steps).vertices
         away.append(vertex_distances(near, shapes[index], 1.0))
@@ -265,22 +267,22 @@ def held_out(
     original = np.arange(len(shapes)) if original is None else original
     known = np.flatnonzero(~np.isin(original, index))
     kept, unseen = shapes[known], shapes[index]
-    whose = np.unique(original[known], return_inverse=True)[1]
+    original_index = np.unique(original[known], return_inverse=True)[1]
     if steps is None:
-        steps = min(LIGHT_STEPS, time_steps(settings, reference, kept, material, whose))
+        steps = min(LIGHT_STEPS, time_steps(settings, reference, kept, material, original_index))
     space, mean, fields = _space(reference, kept, material, steps)
     own = original[known] == known
     components = PrincipalComponents.of(kept[own], reference.vertices)
     mirrored = None if own.all() else PrincipalComponents.of(kept, reference.vertices)
     if counts is None:
-        count = mode_count(settings, space, mean, fields, whose)
+        count = mode_count(settings, space, mean, fields, original_index)
         counts = [-(-count // 2), count]
     counts = [min(count, len(kept) - 1) for count in counts]
     # The search for codes starts from projected logarithms: on the straight line to a far shape faces collapse.
     towards = logarithms(space, mean, unseen, steps).fields
     reached, by_modes, by_components, by_mirrored, stuck = [], [], [], [], []
     for count in counts:
-        modes = find_modes(settings, space, mean, fields, count, whose)
+        modes = find_modes(settings, space, mean, fields, count, original_index)
         start, _ = coefficients(space, mean, towards, modes.vertices, settings.norm)
         near = nearest_codes(space, mean, modes.vertices, unseen, start, steps)
         by_modes.append(near.vertices)

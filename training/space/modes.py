@@ -77,7 +77,7 @@ from shapespace.coordinates.normal_matrix import NormalMatrix, QuadraticForm
 from shapespace.coordinates.nric import WeightedNorm
 from shapespace.mesh.rigid_motion import rigid_motions, without_rigid_motion
 from shapespace.mesh.triangle_mesh import vertex_areas
-from shapespace.shell.space import Point, ShellSpace
+from shapespace.shell.space import ShellPoint, ShellSpace
 from shapespace.solve.cholesky import SymmetricPattern, analyse
 from shapespace.training.runs.config import ModeSettings
 
@@ -157,7 +157,7 @@ def pga(space: ShellSpace, mean: FloatArray, fields: FloatArray, count: int, nor
     Raises:
         ModeError: a count that is not possible, or fields without anything in them.
     """
-    problem = _Problem(space, mean, fields, count, norm)
+    problem = _ModeProblem(space, mean, fields, count, norm)
     return problem.modes(problem.principal(count)[0])
 
 
@@ -169,7 +169,7 @@ def spga(
     sparsity: float | None,
     norm: Norm = "mixed",
     *,
-    whose: IntArray | None = None,
+    original_index: IntArray | None = None,
     max_iterations: int = ITERATIONS,
     tolerance: float = 1e-3,
 ) -> Modes:
@@ -187,7 +187,7 @@ def spga(
             share of ``max_j 2 |w_j|² ‖u_j‖² / ‖u_j‖_1`` over the modes of the plain analysis, the price at which the
             last of them, scaled down to nothing, is worth no more; 0 gives the span of the plain analysis.
         norm: of the misfit.
-        whose: see `worthwhile`.
+        original_index: see `worthwhile`.
         max_iterations: rounds through all modes.
         tolerance: ends when the objective fell by less than this part of itself in ten rounds.
 
@@ -196,10 +196,10 @@ def spga(
     """
     if sparsity is not None and not 0 <= sparsity < np.inf:
         raise ModeError(f"sparsity must be a number from 0 up, not {sparsity}")
-    problem = _Problem(space, mean, fields, count, norm)
+    problem = _ModeProblem(space, mean, fields, count, norm)
     D, W = problem.principal(count)
     highest = problem.highest_price(D, W)
-    enough = _Enough(space, mean, fields, D, norm, whose) if sparsity is None else None
+    enough = _SparsityCriterion(space, mean, fields, D, norm, original_index) if sparsity is None else None
     rotation = _varimax(problem.scaled(D))
     D, W = _normalised(rotation.T @ D, rotation.T @ W)
     for share in SPARSITIES if sparsity is None else [sparsity]:
@@ -210,10 +210,16 @@ def spga(
 
 
 def mode_count(
-    settings: ModeSettings, space: ShellSpace, mean: FloatArray, fields: FloatArray, whose: IntArray | None = None
+    settings: ModeSettings,
+    space: ShellSpace,
+    mean: FloatArray,
+    fields: FloatArray,
+    original_index: IntArray | None = None,
 ) -> int:
     """How many modes settings give for logarithms (n, V, 3) of shapes (n,) at a mean (V, 3), less than n."""
-    asked = worthwhile(space, mean, fields, settings.norm, whose) if settings.count == "auto" else settings.count
+    asked = (
+        worthwhile(space, mean, fields, settings.norm, original_index) if settings.count == "auto" else settings.count
+    )
     return max(1, min(asked, len(fields) - 1))
 
 
@@ -223,7 +229,7 @@ def find_modes(
     mean: FloatArray,
     fields: FloatArray,
     count: int,
-    whose: IntArray | None = None,
+    original_index: IntArray | None = None,
 ) -> Modes:
     """So many modes of logarithms (n, V, 3) of shapes (n,) at a mean (V, 3), as settings say; raises ModeError."""
     if settings.sparsity == 0:
@@ -235,14 +241,18 @@ def find_modes(
         count,
         None if settings.sparsity == "auto" else settings.sparsity,
         settings.norm,
-        whose=whose,
+        original_index=original_index,
         max_iterations=settings.max_iterations,
         tolerance=TOLERANCE[settings.norm],
     )
 
 
 def worthwhile(
-    space: ShellSpace, mean: FloatArray, fields: FloatArray, norm: Norm = "vertices", whose: IntArray | None = None
+    space: ShellSpace,
+    mean: FloatArray,
+    fields: FloatArray,
+    norm: Norm = "vertices",
+    original_index: IntArray | None = None,
 ) -> int:
     """How many modes pay.
 
@@ -255,12 +265,12 @@ def worthwhile(
         mean: X̄ (V, 3).
         fields: (n, V, 3) logarithms.
         norm: in which.
-        whose: (n,) shapes that they are of, from 0 on: those of a shape and of its mirror image are held out together.
+        original_index: (n,) the shape that each is of, from 0; a shape and its mirror image are held out together.
 
     Raises:
         ModeError: fields that can't be used.
     """
-    left = np.sqrt(_Problem(space, mean, fields, 1, _judged(norm)).left_of_held_out(whose))
+    left = np.sqrt(_ModeProblem(space, mean, fields, 1, _judged(norm)).left_of_held_out(original_index))
     errors = left.mean(axis=0) / left[:, 0].mean()
     return max(1, int(np.argmin(errors + WORTH * np.arange(len(fields)))))
 
@@ -288,7 +298,7 @@ def coefficients(
     Raises:
         ModeError: logarithms that can't be used.
     """
-    problem = _Problem(space, mean, fields, 1, norm)
+    problem = _ModeProblem(space, mean, fields, 1, norm)
     W, explained = problem.project(problem.balanced(modes))
     return W.T, explained
 
@@ -313,7 +323,7 @@ def localisation(nric: FloatArray, norm: WeightedNorm) -> FloatArray:
     return ((squares < LOCAL * squares[:, -1:]).sum(axis=1) + 1) / squares.shape[1]
 
 
-class _Problem:
+class _ModeProblem:
     """The tangent space at a mean with the logarithms in it, all as matrices on flat vertex fields (3V,).
 
     Attributes:
@@ -329,7 +339,7 @@ class _Problem:
     """
 
     def __init__(self, space: ShellSpace, mean: FloatArray, fields: FloatArray, count: int, norm: Norm) -> None:
-        self.point: Point = space.point(mean)
+        self.point: ShellPoint = space.point(mean)
         fields = np.asarray(fields, dtype=np.float64)
         if fields.ndim != 3 or fields.shape[1:] != self.point.vertices.shape:
             raise ModeError(f"fields must be (n, {len(self.point.vertices)}, 3), not {fields.shape}")
@@ -404,13 +414,13 @@ class _Problem:
         W = np.linalg.lstsq(D @ (self.M @ D.T), B, rcond=NEGLIGIBLE)[0]
         return W, float(np.vdot(W, B)) / self.total
 
-    def left_of_held_out(self, whose: IntArray | None = None) -> FloatArray:
+    def left_of_held_out(self, original_index: IntArray | None = None) -> FloatArray:
         """(n, n) squares of what 0, 1, 2 … principal modes of the other logarithms leave of those that are held out."""
         gram, n = self.D @ self.MD, len(self.D)
-        whose = np.arange(n) if whose is None else whose
-        parts = min(INNER_FOLDS, int(whose.max()) + 1)
+        original_index = np.arange(n) if original_index is None else original_index
+        parts = min(INNER_FOLDS, int(original_index.max()) + 1)
         left = np.zeros((n, n))
-        for held in (np.flatnonzero(whose % parts == part) for part in range(parts)):
+        for held in (np.flatnonzero(original_index % parts == part) for part in range(parts)):
             kept = np.delete(np.arange(n), held)
             values, vectors = np.linalg.eigh(gram[np.ix_(kept, kept)])
             some = np.flatnonzero(values > NEGLIGIBLE * self.total)[::-1]
@@ -468,7 +478,7 @@ def _varimax(loadings: FloatArray) -> FloatArray:
     return rotation
 
 
-class _Enough:
+class _SparsityCriterion:
     """Whether modes keep enough of the logarithms, beside as many principal modes (m, 3V): see SPENT."""
 
     def __init__(
@@ -478,10 +488,10 @@ class _Enough:
         fields: FloatArray,
         D: FloatArray,
         norm: Norm,
-        whose: IntArray | None,
+        original_index: IntArray | None,
     ) -> None:
-        self._seen = _Problem(space, mean, fields, 1, _judged(norm))
-        left = self._seen.left_of_held_out(whose)[:, min(len(D), len(fields) - 1)].sum()
+        self._seen = _ModeProblem(space, mean, fields, 1, _judged(norm))
+        left = self._seen.left_of_held_out(original_index)[:, min(len(D), len(fields) - 1)].sum()
         self._least = self._seen.project(D)[1] - SPENT * float(left) / self._seen.total
 
     def __call__(self, D: FloatArray) -> bool:
@@ -492,7 +502,7 @@ class _Enough:
 class _Shrinkage:
     """ADMM for ``argmin_d ‖d − t‖_M² + p ‖J d‖_1``, with a state for each mode that is kept between calls."""
 
-    def __init__(self, problem: _Problem, space: ShellSpace, D: FloatArray) -> None:
+    def __init__(self, problem: _ModeProblem, space: ShellSpace, D: FloatArray) -> None:
         G = problem.G
         pattern, entries = problem.shrinkage_matrix()
         self._factor = analyse(pattern, space.backend).factorise(entries)
@@ -515,7 +525,7 @@ class _Shrinkage:
 
 
 def _alternate(
-    problem: _Problem, D: FloatArray, W: FloatArray, price: float, max_iterations: int, tolerance: float
+    problem: _ModeProblem, D: FloatArray, W: FloatArray, price: float, max_iterations: int, tolerance: float
 ) -> tuple[bool, list[dict[str, float]]]:
     """Minimise in place over modes D (m, 3V) and coefficients W (m, n), block by block; never uphill."""
     shrink = _Shrinkage(problem, problem.point.space, D)

@@ -16,7 +16,7 @@ from shapespace.shell.exponential import exponential
 from shapespace.shell.exponential_derivative import ExponentialDerivative
 from shapespace.shell.space import DiscretePath, ShellSpace
 from shapespace.training.runs.latent_coordinates import Coordinates
-from shapespace.training.runs.sampling import Shapes
+from shapespace.training.runs.sampling import SampledShapes
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,7 +90,7 @@ class ShellCollection:
         """The same, whose shapes come with their derivatives."""
         return replace(self, with_derivatives=True)
 
-    def shapes(self, latents: FloatArray) -> Shapes:
+    def shapes(self, latents: FloatArray) -> SampledShapes:
         """Exponentials of codes (n, m), with one BLAS thread; angles are unwrapped along each geodesic."""
         # One code at a time: a product with all of them would round differently with their number.
         velocities = np.stack([np.tensordot(code, self.modes, axes=1) for code in latents])
@@ -107,7 +107,7 @@ class ShellCollection:
                         except RuntimeError as error:
                             reasons[k] = f"no derivative: {error}"
         vertices, z = (np.stack(ends) for ends in zip(*((p.vertices[-1], p.nric[-1]) for p in paths), strict=True))
-        return Shapes(vertices, z, reasons, derivatives)
+        return SampledShapes(vertices, z, reasons, derivatives)
 
     def _derivative(self, path: DiscretePath) -> FloatArray:
         """(m, 2E) of the end of a path by the code; raises RuntimeError, see `ExponentialDerivative`."""

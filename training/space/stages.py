@@ -14,15 +14,15 @@ import numpy as np
 
 import shapespace
 from shapespace.arrays import FloatArray, IntArray
+from shapespace.bundle.attributes import from_entry, surface_arrays, surface_entry
 from shapespace.bundle.geometry import FineMesh, Geometry
-from shapespace.bundle.schema import SurfaceEntry
-from shapespace.bundle.surface import from_entry, surface_arrays, surface_entry
+from shapespace.bundle.schema import AttributesEntry
 from shapespace.coordinates.nric import WeightedNorm, nric
+from shapespace.mesh.attached_parts import attach_part
+from shapespace.mesh.attributes import MeshAttributes
 from shapespace.mesh.coarsening import coarsen
 from shapespace.mesh.prolongation import Prolongation, submesh
-from shapespace.mesh.riders import find_rider
 from shapespace.mesh.rigid_motion import align
-from shapespace.mesh.surface import Surface
 from shapespace.mesh.triangle_mesh import TriangleMesh, face_areas
 from shapespace.shell.energy import Material
 from shapespace.shell.mean import Mean
@@ -94,7 +94,7 @@ def ingest(run: RunDirectory, config: Config, accepted: Sequence[str] = ()) -> d
     fine = TriangleMesh.from_arrays(vertices[chosen], meshes.faces)
     own = np.unique(meshes.shell_faces)
     shell = submesh(fine, own) if meshes.parts else fine
-    images, whose, notes = _images(settings, meshes, vertices, fine.edges)
+    images, original_index, notes = _images(settings, meshes, vertices, fine.edges)
     facts: dict[str, Any] = {"shapes": len(vertices), "vertices": vertices.shape[1], "reference": meshes.names[chosen]}
     facts["images"] = len(images)
     facts["notes"] = [*meshes.notes, *notes]
@@ -132,10 +132,10 @@ def ingest(run: RunDirectory, config: Config, accepted: Sequence[str] = ()) -> d
         more["file_vertices"] = meshes.file_vertices
     write_reference(run, reference, scale, **more)
     places = meshes.places or [(name, 0) for name in meshes.names]
-    original = np.concatenate([np.arange(len(vertices)), whose])
+    original = np.concatenate([np.arange(len(vertices)), original_index])
     files, first = (np.array(each)[original] for each in zip(*places, strict=True))
     run.shapes.write(
-        names=np.array([*meshes.names, *(f"{meshes.names[k]} (mirrored)" for k in whose)]),
+        names=np.array([*meshes.names, *(f"{meshes.names[k]} (mirrored)" for k in original_index)]),
         vertices=np.concatenate([vertices, images[:, index]]),
         original=original,
         files=files,
@@ -158,12 +158,12 @@ def _images(
     found = find_mirror(vertices, edges) if settings.mirror else None
     if found is None:
         return np.empty((0, *vertices.shape[1:])), np.empty(0, dtype=int), []
-    images, whose = mirrored(vertices, found[0])
+    images, original_index = mirrored(vertices, found[0])
     note = (
         f"learns from {len(images)} mirror images too, since {meshes.names[found[1]]} is symmetric; "
         "collection.mirror = false leaves them out"
     )
-    return images, whose, [note] if len(images) else []
+    return images, original_index, [note] if len(images) else []
 
 
 def _prolong(
@@ -184,7 +184,7 @@ def _prolong(
     riders = []
     for part in meshes.parts[1:]:
         index = np.setdiff1d(meshes.faces[part.faces], own)
-        riders.append(find_rider(reference, fine.vertices[index], index, coarse, some_vertices(exact, index)))
+        riders.append(attach_part(reference, fine.vertices[index], index, coarse, some_vertices(exact, index)))
     prolong = trial = Prolongation.of(reference, fine, riders)
     every = np.arange(len(exact))
     fitted = prolong.fitted(coarse, exact, own, np.setdiff1d(every, held))
@@ -267,22 +267,22 @@ def modes(run: RunDirectory, config: Config) -> dict[str, Any]:
     ``modes.npz`` holds the same until `factors` puts them in its order.
     """
     settings, centre, given = config.modes, run.mean_mesh(), run.shapes.read()
-    shapes, whose = given["vertices"], given["original"]
+    shapes, original_index = given["vertices"], given["original"]
     space = ShellSpace(centre, material(config))
     norm = WeightedNorm.of(centre, config.material.eta)
     steps = _steps(run)
     found = logarithms(space, centre.vertices, shapes, steps)
-    count = mode_count(settings, space, centre.vertices, found.fields, whose)
+    count = mode_count(settings, space, centre.vertices, found.fields, original_index)
     dense = pga(space, centre.vertices, found.fields, count, settings.norm)
     with waiting("sparse modes"):
-        sparse = find_modes(settings, space, centre.vertices, found.fields, count, whose)
+        sparse = find_modes(settings, space, centre.vertices, found.fields, count, original_index)
     codes = nearest_codes(space, centre.vertices, sparse.vertices, shapes, sparse.coefficients, steps)
     lower, upper = box_of(codes.codes)
     arrays = {
         "nric": sparse.nric,
         "vertices": sparse.vertices,
-        "coefficients": codes.codes[: whose.max() + 1],
-        "mirrored_coefficients": codes.codes[whose.max() + 1 :],
+        "coefficients": codes.codes[: original_index.max() + 1],
+        "mirrored_coefficients": codes.codes[original_index.max() + 1 :],
         "lower": lower,
         "upper": upper,
         "localisation": localisation(sparse.nric, norm),
@@ -304,7 +304,9 @@ def modes(run: RunDirectory, config: Config) -> dict[str, Any]:
         "steps": list(found.steps),
         "via": list(found.via),
         "codes": [str(status) for status in codes.status],
-        "left": summary(vertex_distances(codes.vertices, shapes, run.reference_mesh().diagonal)[: whose.max() + 1]),
+        "left": summary(
+            vertex_distances(codes.vertices, shapes, run.reference_mesh().diagonal)[: original_index.max() + 1]
+        ),
     }
     run.decomposition.write(facts | {"reasons": list(found.reasons), "history": sparse.history})
     return facts
@@ -466,8 +468,8 @@ def geometry(run: RunDirectory) -> Geometry:
     )
 
 
-def _surface(run: RunDirectory) -> Surface | None:
+def _surface(run: RunDirectory) -> MeshAttributes | None:
     if not run.surface_names.exists():
         return None
-    entry, arrays = SurfaceEntry.model_validate(run.surface_names.read()), run.surface.read()
+    entry, arrays = AttributesEntry.model_validate(run.surface_names.read()), run.surface.read()
     return from_entry(entry, arrays, {name: arrays[name].tobytes() for name in entry.textures})

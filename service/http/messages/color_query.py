@@ -11,7 +11,7 @@ from fastapi import Depends, Query, Request
 from shapespace.files.colouring import Quantity
 from shapespace.model.latent_space import Bounds
 from shapespace.model.shape_model import ShapeModel
-from shapespace.model.spread import require_covariance
+from shapespace.model.vertex_uncertainty import require_covariance
 from shapespace.service.http.messages.latent_query import NUMBERS, numbers
 from shapespace.service.http.negotiation import choose
 from shapespace.service.http.problems import ProblemError

@@ -6,7 +6,7 @@ from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from shapespace.bundle.schema import SurfaceEntry
+from shapespace.bundle.schema import AttributesEntry
 from shapespace.files.colouring import Quantity
 from shapespace.model.decoder import MeshChoice, Quality
 from shapespace.model.edit import PRIOR, PriorKind
@@ -299,7 +299,7 @@ class ModelSummary(BaseModel):
     vertices: int
     edges: int
     faces: int
-    surface: SurfaceEntry | None = Field(
+    surface: AttributesEntry | None = Field(
         description="What answers of the fine mesh have from the training files beside triangles: names of parts, "
         "materials, textures, and whether these had normals; null where nothing."
     )

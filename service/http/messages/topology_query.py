@@ -6,7 +6,7 @@ from typing import Annotated
 
 from fastapi import Query
 
-from shapespace.mesh.surface import Topology
+from shapespace.mesh.attributes import Topology
 from shapespace.model.decoder import MeshChoice
 from shapespace.model.shape_model import ShapeModel
 from shapespace.service.http.problems import ProblemError

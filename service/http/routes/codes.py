@@ -69,7 +69,7 @@ async def encode(
     """
     file = codes.Upload(await gather(request), request.headers.get("content-type", ""), format)
     held = {} if fixed is None else read_query(fixed, "fixed", _FIXED)
-    wishes = codes.Wishes(held, samples, seed, service.settings.max_codes)
+    wishes = codes.SearchOptions(held, samples, seed, service.settings.max_codes)
     found = await codes.encode(service.workers, service.sandbox, caller, model, file, bounds, objective, wishes)
     return found_response(service, found)
 
@@ -92,7 +92,7 @@ async def edit(
     with; `placement` takes the mesh of the new code there.
     """
     targets = [Target(target.vertex, target.position, target.sigma) for target in body.targets]
-    wishes = codes.Wishes(body.fixed, body.samples, body.seed, service.settings.max_codes)
+    wishes = codes.SearchOptions(body.fixed, body.samples, body.seed, service.settings.max_codes)
     found = await codes.edit(
         service.workers,
         caller,

@@ -10,7 +10,7 @@ from fastapi import APIRouter, Depends, Path, Query, Request, Response
 from fastapi.responses import StreamingResponse
 
 from shapespace.files.animated_gltf import FRAMES_PER_SECOND
-from shapespace.mesh.surface import Topology
+from shapespace.mesh.attributes import Topology
 from shapespace.model.decoder import Quality
 from shapespace.service.http.caching import cache_headers, entity_tag, not_modified
 from shapespace.service.http.dependencies import (

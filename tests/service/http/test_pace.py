@@ -14,7 +14,7 @@ from starlette.types import Message, Receive, Scope, Send
 
 from shapespace.files.archives import npz_pieces, zip_pieces
 from shapespace.service.http import middleware
-from shapespace.service.http.middleware import PIECE, PaceAnswers
+from shapespace.service.http.middleware import PIECE, LimitUnreadAnswers
 from tests.service.conftest import Start
 
 MIB = 2**20
@@ -40,7 +40,7 @@ def test_a_large_answer_leaves_in_pieces_each_after_the_last_was_taken() -> None
         async def send(message: Message) -> None:
             sent.append(message)
 
-        await PaceAnswers(large)(scope("a"), nothing, send)
+        await LimitUnreadAnswers(large)(scope("a"), nothing, send)
         return sent
 
     start, *pieces = asyncio.run(ask())
@@ -54,7 +54,7 @@ def test_answers_that_nobody_reads_are_limited_together(monkeypatch: pytest.Monk
     monkeypatch.setattr(middleware, "ANSWERS", 8 * MIB)
 
     async def ask() -> list[int]:
-        pace, statuses, go_on = PaceAnswers(large), [], asyncio.Event()
+        pace, statuses, go_on = LimitUnreadAnswers(large), [], asyncio.Event()
 
         async def send(message: Message) -> None:
             if message["type"] == "http.response.start":

@@ -206,7 +206,7 @@ def test_frames_are_those_of_one_file_and_of_the_lines(model: ShapeModel) -> Non
         interpolation_id(model, animation, 2)
 
 
-NO_WISHES = codes.Wishes({}, 0, 0, 0)
+NO_WISHES = codes.SearchOptions({}, 0, 0, 0)
 
 
 def test_a_mesh_is_searched_for_its_code(model: ShapeModel, sandbox: Sandbox) -> None:

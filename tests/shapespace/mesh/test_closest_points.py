@@ -4,7 +4,7 @@ import numpy as np
 import trimesh
 from trimesh.triangles import closest_point
 
-from shapespace.mesh.closest_points import Fans, Surface, nearest_shares
+from shapespace.mesh.closest_points import MeshProximity, VertexFaces, nearest_shares
 
 
 def test_nearest_points_of_triangles_are_trimeshs(rng: np.random.Generator) -> None:
@@ -26,7 +26,7 @@ def test_a_triangle_without_area_has_nearest_points_too() -> None:
 
 def test_a_surface_is_found_from_points_around_it(rng: np.random.Generator) -> None:
     ball = trimesh.creation.icosphere(3)
-    surface = Surface(ball.vertices, Fans(ball.faces, len(ball.vertices)))
+    surface = MeshProximity(ball.vertices, VertexFaces(ball.faces, len(ball.vertices)))
     points = rng.standard_normal((200, 3)) + ball.vertices[:200]
     found = surface.closest(points)
     every = np.stack([closest_point(ball.triangles, np.tile(point, (len(ball.faces), 1))) for point in points])
@@ -40,6 +40,6 @@ def test_a_surface_is_found_from_points_around_it(rng: np.random.Generator) -> N
 
 def test_fans_hold_the_faces_around_each_vertex() -> None:
     box = trimesh.creation.box()
-    fans = Fans(box.faces, 8)
+    fans = VertexFaces(box.faces, 8)
     for vertex in range(8):
         assert set(fans.around[vertex]) == set(np.flatnonzero((box.faces == vertex).any(axis=1)))

@@ -10,7 +10,7 @@ from shapespace.model.latent_space import NotFiniteError
 from shapespace.model.population import Population
 from shapespace.model.posterior import Posterior, independent_share, patches_of
 from shapespace.model.shape_model import ShapeModel
-from shapespace.model.spread import InvalidCovarianceError
+from shapespace.model.vertex_uncertainty import InvalidCovarianceError
 from tests.service.bundles import SCALE
 
 CODE = np.array([0.1, 0.7, 0.4])

@@ -12,7 +12,7 @@ import pytest
 import trimesh
 
 from shapespace.files.formats import MESH_FORMATS
-from shapespace.mesh.surface import Surface
+from shapespace.mesh.attributes import MeshAttributes
 from shapespace.training.collection.appearance import kept, reference_surface
 from shapespace.training.collection.ingest import MeshCollection, read_collection
 from shapespace.training.pipeline import Run, execute
@@ -35,7 +35,7 @@ licence = "MIT"
 """
 
 
-def surface_of(folder: Path, name: str | None = None) -> tuple[MeshCollection, Surface | None, list[str]]:
+def surface_of(folder: Path, name: str | None = None) -> tuple[MeshCollection, MeshAttributes | None, list[str]]:
     meshes = read_collection(folder)
     return meshes, *reference_surface(folder, meshes, meshes.index(name))
 

@@ -194,7 +194,7 @@ def test_its_symmetry_takes_the_shape_of_a_code_to_that_of_the_opposite_code(cod
 
 @pytest.mark.parametrize("columns", [1, 24])
 def test_columns_move_shapes_and_places_as_they_move_codes(codes, columns):
-    """Places say where features are: there, a shape moved by some columns of the grid is that of the moved code."""
+    """They say where features are: there, a shape moved by some columns of the grid is that of the moved code."""
     collection = freaky_torus.FreakyTorus()
     connectivity, places = collection.reference.connectivity, collection.places
     i, j = np.divmod(np.arange(N * M), M)

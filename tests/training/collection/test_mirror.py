@@ -76,13 +76,13 @@ def test_vertices_that_mirror_each_other_by_chance_do_not_count() -> None:
 
 def test_a_mirror_image_is_what_a_mirror_shows() -> None:
     shapes = np.stack([placed(bent(0.4, 0.1)), placed(body()), bent(0, 0.3)])
-    images, whose = mirrored(shapes, pairs())
-    assert whose.tolist() == [0, 2], "a symmetric shape is its own image"
+    images, original_index = mirrored(shapes, pairs())
+    assert original_index.tolist() == [0, 2], "a symmetric shape is its own image"
     for image, expected in zip(images, (bent(0.1, 0.4), bent(0.3, 0)), strict=True):
         np.testing.assert_allclose(align(image, expected), expected, atol=1e-12)
     again, _ = mirrored(images, pairs())
-    np.testing.assert_allclose(align(again, shapes[whose]), shapes[whose], atol=1e-12)
-    for image, shape in zip(images, shapes[whose], strict=True):
+    np.testing.assert_allclose(align(again, shapes[original_index]), shapes[original_index], atol=1e-12)
+    for image, shape in zip(images, shapes[original_index], strict=True):
         np.testing.assert_allclose(align(image, shape), image, atol=1e-12, err_msg="it stands where the shape stands")
 
 

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 import trimesh
 
+from shapespace.mesh.attributes import Labels
 from shapespace.mesh.rigid_motion import align
-from shapespace.mesh.surface import Labels
 from shapespace.training.collection.appearance import reference_surface
 from shapespace.training.collection.ingest import IngestError, MeshCollection, normalised, read_collection
 from shapespace.training.collection.init import configuration

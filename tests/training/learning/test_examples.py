@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from shapespace.bundle.schema import COMBINER
-from shapespace.training.learning.examples import RememberingCombiner
+from shapespace.training.learning.examples import ExampleCorrectedCombiner
 from shapespace.training.learning.export import to_onnx
 from shapespace.training.learning.layers import Scaling
 from shapespace.training.learning.networks import CombinerNetwork, Composite
@@ -46,7 +46,7 @@ def at(combiner: nn.Module, factors: Tensor) -> Tensor:
 
 def test_examples_come_back_and_shapes_between_them_stay(combiner: CombinerNetwork) -> None:
     factors, missed = shapes(12, 1), 0.1 * torch.randn(12, SIZE, generator=torch.Generator().manual_seed(2))
-    remembering = RememberingCombiner(combiner, factors, missed)
+    remembering = ExampleCorrectedCombiner(combiner, factors, missed)
     added = at(remembering, factors) - at(combiner, factors)
     assert (added - missed).abs().max() < 0.01 * missed.abs().max()  # weights have 8 bits
     # Halfway to the nearest other example a quarter of each is left.
@@ -60,7 +60,7 @@ def test_examples_come_back_and_shapes_between_them_stay(combiner: CombinerNetwo
 
 def test_a_shape_that_is_there_twice_is_remembered_once(combiner: CombinerNetwork) -> None:
     factors, missed = shapes(6, 1).repeat(2, 1, 1), 0.1 * torch.ones(12, SIZE)
-    remembering = RememberingCombiner(combiner, factors, missed)
+    remembering = ExampleCorrectedCombiner(combiner, factors, missed)
     added = at(remembering, factors) - at(combiner, factors)
     assert (added - missed).abs().max() < 0.01 * missed.abs().max()
 
@@ -70,7 +70,7 @@ def test_many_examples_of_few_coordinates_add_no_more_than_was_missed(combiner: 
     generator = torch.Generator().manual_seed(4)
     codes, mode = torch.rand(1200, 1, 1, generator=generator), torch.randn(1, 2, SIZE, generator=generator)
     missed = 0.1 * torch.randn(200, SIZE, generator=generator)
-    remembering = RememberingCombiner(combiner, codes[:200] * mode, missed)
+    remembering = ExampleCorrectedCombiner(combiner, codes[:200] * mode, missed)
     added = at(remembering, codes[200:] * mode) - at(combiner, codes[200:] * mode)
     assert added.norm(dim=1).max() < 3 * missed.norm(dim=1).max()
 
@@ -85,14 +85,14 @@ def test_angles_are_missed_by_the_shorter_way(combiner: CombinerNetwork) -> None
     turned = wanted.copy()
     turned[:, SIZE // 2 :] += 2 * np.pi * np.arange(-2, 3)[:, None]
     with torch.no_grad():
-        remembering = RememberingCombiner.of(composite, codes, turned)
+        remembering = ExampleCorrectedCombiner.of(composite, codes, turned)
         again = remembering(composite.factor_shapes(torch.from_numpy(codes))).numpy()
     np.testing.assert_allclose(again, wanted, atol=1e-3)
 
 
 def test_the_exported_combiner_remembers_too(combiner: CombinerNetwork) -> None:
     factors, missed = shapes(12, 1), 0.1 * torch.randn(12, SIZE, generator=torch.Generator().manual_seed(2))
-    remembering = RememberingCombiner(combiner, factors, missed)
+    remembering = ExampleCorrectedCombiner(combiner, factors, missed)
     session = onnxruntime.InferenceSession(to_onnx(remembering, factors[:2], COMBINER))
     some = torch.cat([factors, shapes(5, 4)])
     (answer,) = session.run(None, {COMBINER.input: some.numpy()})

@@ -380,5 +380,5 @@ def test_a_shape_and_its_mirror_image_are_held_out_together(bumps: Bumps) -> Non
     noisy = bumps.fields + 0.3 * np.abs(bumps.fields).max() * rng.normal(size=bumps.fields.shape)
     twice, whose = np.concatenate([noisy, noisy]), np.tile(np.arange(len(noisy)), 2)
     once = worthwhile(bumps.space, bumps.mean, noisy)
-    assert worthwhile(bumps.space, bumps.mean, twice, whose=whose) == once
+    assert worthwhile(bumps.space, bumps.mean, twice, original_index=whose) == once
     assert worthwhile(bumps.space, bumps.mean, twice) > once

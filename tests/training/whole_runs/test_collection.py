@@ -21,7 +21,7 @@ import trimesh
 from pxr import Usd, UsdGeom
 from safetensors.numpy import load_file
 
-from shapespace.files.surfaces.reading import read_surface
+from shapespace.files.attributes.reading import read_attributes
 from shapespace.mesh.rigid_motion import align
 from shapespace.mesh.triangle_mesh import TriangleMesh
 from shapespace.training.pipeline import Run, learner_of
@@ -321,7 +321,7 @@ def test_what_the_files_had_comes_back(url: str, run: Path, folder: Path, tmp_pa
     assert (tmp_path / "skin.png").read_bytes() == given.textures["skin.png"]
     assert parse_obj(archive.read("shape.obj").decode())["polygons"] == answer["polygons"]
     (tmp_path / "shape.ply").write_bytes(ask(format="ply").content)
-    kept, _ = read_surface(tmp_path / "shape.ply")
+    kept, _ = read_attributes(tmp_path / "shape.ply")
     assert kept
     assert np.array_equal(kept.corners, given.corners)
     assert np.array_equal(kept.starts, given.starts)
@@ -370,7 +370,7 @@ def test_what_the_files_had_comes_back(url: str, run: Path, folder: Path, tmp_pa
         rows = scene.geometry[name].vertices[used[name]]
         np.testing.assert_allclose(np.unique(rows, axis=0), np.unique(positions[vertices].astype("f4"), axis=0))
     (tmp_path / "shape.glb").write_bytes(glb)
-    kept, _ = read_surface(tmp_path / "shape.glb")
+    kept, _ = read_attributes(tmp_path / "shape.glb")
     assert kept
     same_corners(corner_uv(kept), corner_uv(given))
     headers = {"Content-Type": "model/gltf-binary"}

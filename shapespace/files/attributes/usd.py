@@ -8,10 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from shapespace.mesh.surface import Labels, Material, Surface, linear
+from shapespace.mesh.attributes import Labels, MeshAttributes, SurfaceMaterial, linear
 
 
-def add_surface(stage: Any, mesh: Any, surface: Surface, pictures: Mapping[str, str] = MappingProxyType({})) -> None:
+def add_surface(
+    stage: Any, mesh: Any, surface: MeshAttributes, pictures: Mapping[str, str] = MappingProxyType({})
+) -> None:
     """Texture coordinates at corners, materials and names of parts for a mesh whose faces are those of the surface.
 
     Args:
@@ -45,7 +47,7 @@ def add_surface(stage: Any, mesh: Any, surface: Surface, pictures: Mapping[str, 
         numbered = (f"{word}_{k}" for k in range(2, len(taken) + 3))
         return folder.AppendChild(next(new for new in (word, *numbered) if new not in taken))
 
-    def shader(material: Material, place: Any) -> Any:
+    def shader(material: SurfaceMaterial, place: Any) -> Any:
         made = UsdShade.Material.Define(stage, place)
         made.GetPrim().SetDisplayName(material.name)
         look = UsdShade.Shader.Define(stage, place.AppendChild("surface"))

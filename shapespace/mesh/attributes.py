@@ -26,7 +26,7 @@ class Topology(StrEnum):
 
 
 @dataclass(frozen=True)
-class Material:
+class SurfaceMaterial:
     """How a part of a surface looks.
 
     Attributes:
@@ -61,7 +61,7 @@ class SplitVertices(NamedTuple):
     Attributes:
         vertex: (V',) which vertex each is of, increasing.
         uv: (V', 2), zeros for those without.
-        normal: (V',) which of the normals of `Surface.normal_faces` each has.
+        normal: (V',) which of the normals of `MeshAttributes.normal_faces` each has.
         faces: (F, 3) triangles.
     """
 
@@ -72,7 +72,7 @@ class SplitVertices(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Surface:
+class MeshAttributes:
     """Polygons on the vertices of a mesh, whose triangles are these cut at the first corner of each.
 
     P polygons have C corners together; corners of one polygon follow each other.
@@ -92,7 +92,7 @@ class Surface:
         textures: the files of the pictures, by name.
 
     >>> import numpy as np
-    >>> square = Surface(starts=np.array([0, 4]), corners=np.array([0, 1, 3, 2]))
+    >>> square = MeshAttributes(starts=np.array([0, 4]), corners=np.array([0, 1, 3, 2]))
     >>> square.triangles.tolist()
     [[0, 1, 3], [0, 3, 2]]
     """
@@ -107,11 +107,11 @@ class Surface:
     objects: Labels | None = None
     groups: Labels | None = None
     material_of: IntArray | None = None
-    materials: tuple[Material, ...] = ()
+    materials: tuple[SurfaceMaterial, ...] = ()
     textures: Mapping[str, bytes] = field(default_factory=dict)
 
     @classmethod
-    def of_triangles(cls, faces: IntArray) -> Surface:
+    def of_triangles(cls, faces: IntArray) -> MeshAttributes:
         """Triangles (F, 3) and nothing else."""
         return cls(starts=np.arange(0, faces.size + 1, 3), corners=faces.ravel())
 
@@ -145,7 +145,7 @@ class Surface:
         return bool((self.sizes == 3).all()) and not self.normals and all(part is None for part in parts)
 
     @cached_property
-    def triangulated(self) -> Surface:
+    def triangulated(self) -> MeshAttributes:
         """The same with its triangles as polygons."""
         corners, polygons = self.triangle_corners.ravel(), self.triangle_polygons
 
@@ -166,7 +166,7 @@ class Surface:
             material_of=taken(self.material_of, polygons),
         )
 
-    def only(self, polygons: NDArray[np.bool_]) -> Surface:
+    def only(self, polygons: NDArray[np.bool_]) -> MeshAttributes:
         """Some of its polygons (P,)."""
         corners = np.repeat(polygons, self.sizes)
 
@@ -192,7 +192,7 @@ class Surface:
             material_of=taken(self.material_of, polygons),
         )
 
-    def welded(self, vertices: IntArray) -> Surface:
+    def welded(self, vertices: IntArray) -> MeshAttributes:
         """On other vertices: ``vertices`` (N,) is what each has become, NONE for those whose polygons are left out."""
         there = np.logical_and.reduceat(vertices[self.corners] >= 0, self.starts[:-1])
         if not there.all():

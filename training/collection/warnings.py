@@ -42,7 +42,7 @@ SAMPLE = 2000
 
 
 @dataclass(frozen=True)
-class Suspicion:
+class CollectionWarning:
     """One oddity of one shape.
 
     Attributes:
@@ -132,7 +132,7 @@ def _exchanges() -> list[FloatArray]:
 
 def suspicions(
     vertices: FloatArray, connectivity: Connectivity, names: Sequence[str], placements: Placements
-) -> list[Suspicion]:
+) -> list[CollectionWarning]:
     """Everything odd about shapes (n, V, 3), by shape; names (n) are for sentences that name another one."""
     edges = _Edges(vertices, connectivity)
     found = edges.suspicions()
@@ -141,18 +141,18 @@ def suspicions(
     found += _sizes(vertices, connectivity, edges.out_of_place, scrambled)
     found += _duplicates(vertices, names)
     mirrored = [k for k in placements.mirrored() if k not in scrambled]
-    found += [Suspicion(k, "is a mirror image of what the others show; mirror it back") for k in mirrored]
+    found += [CollectionWarning(k, "is a mirror image of what the others show; mirror it back") for k in mirrored]
     for k, exchange in placements.turned().items():
         if k not in scrambled and k not in mirrored:
             axes = ", ".join(f"{'−' if row.min() < 0 else ''}{'xyz'[np.abs(row).argmax()]}" for row in exchange)
             sentence = f"is turned against the others: its x, y, z are their {axes}; is another axis up in that file?"
-            found.append(Suspicion(k, sentence))
+            found.append(CollectionWarning(k, sentence))
     return sorted(found, key=lambda s: (s.shape, not s.grave))
 
 
 def _sizes(
     vertices: FloatArray, connectivity: Connectivity, out_of_place: dict[int, IntArray], scrambled: set[int]
-) -> list[Suspicion]:
+) -> list[CollectionWarning]:
     """Shapes whose area, without the faces at vertices that are out of place, is far from the median."""
     wrong = np.zeros(connectivity.vertex_count, dtype=bool)
     for shape, those in out_of_place.items():
@@ -167,17 +167,17 @@ def _sizes(
         if not 1 / AREA_FACTOR < ratio < AREA_FACTOR:
             length = float(f"{ratio**0.5:.3g}")
             sentence = f"is of another size: its lengths are {length:,g} times the median's; is it in another unit?"
-            found.append(Suspicion(k, sentence, grave=True))
+            found.append(CollectionWarning(k, sentence, grave=True))
     return found
 
 
-def _duplicates(vertices: FloatArray, names: Sequence[str]) -> list[Suspicion]:
+def _duplicates(vertices: FloatArray, names: Sequence[str]) -> list[CollectionWarning]:
     first: dict[bytes, int] = {}
     found = []
     for k, shape in enumerate(vertices):
         same = first.setdefault(hashlib.sha256(shape.tobytes()).digest(), k)
         if same != k:
-            found.append(Suspicion(k, f"has every vertex where {names[same]} has it: the same shape twice"))
+            found.append(CollectionWarning(k, f"has every vertex where {names[same]} has it: the same shape twice"))
     return found
 
 
@@ -225,14 +225,14 @@ class _Edges:
         shape_of, vertex_of = np.concatenate(places).T
         self.out_of_place = {int(k): vertex_of[shape_of == k] for k in np.unique(shape_of)}
 
-    def suspicions(self) -> list[Suspicion]:
+    def suspicions(self) -> list[CollectionWarning]:
         """Vertices in another order, wholly or in part, and vertices far off."""
         found = []
         for k in self.scrambled.tolist():
             sentence = (
                 "has its vertices in another order than the others, with the same faces; export it again like them"
             )
-            found.append(Suspicion(k, sentence, grave=True))
+            found.append(CollectionWarning(k, sentence, grave=True))
         for k, those in self.out_of_place.items():
             if k in self.scrambled:
                 continue
@@ -242,9 +242,9 @@ class _Edges:
                     f"has some vertices in another order than the others, with the same faces: vertex {{vertex}}{more} "
                     "stand where others should; export it like the others"
                 )
-                found.append(Suspicion(k, sentence, grave=True, vertex=vertex))
+                found.append(CollectionWarning(k, sentence, grave=True, vertex=vertex))
             else:
-                found.append(Suspicion(k, f"has a vertex far off: {{vertex}}{more}", vertex=vertex))
+                found.append(CollectionWarning(k, f"has a vertex far off: {{vertex}}{more}", vertex=vertex))
         return found
 
     def _exchanged(self, k: int, those: IntArray) -> bool:

@@ -14,8 +14,8 @@ from shapespace.bundle import writer
 from shapespace.bundle.reader import BundleError, read_bundle
 from shapespace.bundle.schema import ARRAYS, SURFACE
 from shapespace.bundle.writer import Networks
-from shapespace.files.surfaces.textures import ALL, LARGEST
-from shapespace.mesh.surface import Labels, Material, Surface
+from shapespace.files.attributes.textures import ALL, LARGEST
+from shapespace.mesh.attributes import Labels, MeshAttributes, SurfaceMaterial
 from shapespace.model.decoder import MeshChoice
 from shapespace.model.shape_model import ShapeModel
 from tests.service.bundles import facts, fine_reference, geometry, networks, seal
@@ -25,11 +25,11 @@ MESH = fine_reference()
 RNG = np.random.default_rng(0)
 
 
-def surface() -> Surface:
+def surface() -> MeshAttributes:
     """Everything that a surface can have, on the finer torus, except polygons of more corners."""
     faces = MESH.faces
     count = len(faces)
-    return Surface(
+    return MeshAttributes(
         starts=np.arange(0, 3 * count + 1, 3),
         corners=faces.ravel(),
         uv=RNG.random((50, 2)),
@@ -40,7 +40,10 @@ def surface() -> Surface:
         objects=Labels(("torus",), np.zeros(count, int)),
         groups=Labels(("inside", "outside"), RNG.integers(-1, 2, count)),
         material_of=RNG.integers(-1, 2, count),
-        materials=(Material("skin", texture="skin.png"), Material("steel", (0.1, 0.2, 0.3, 0.5), 1.0, 0.2)),
+        materials=(
+            SurfaceMaterial("skin", texture="skin.png"),
+            SurfaceMaterial("steel", (0.1, 0.2, 0.3, 0.5), 1.0, 0.2),
+        ),
         textures={"skin.png": png()},
     )
 

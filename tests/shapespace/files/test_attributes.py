@@ -16,13 +16,13 @@ from pxr import Usd, UsdGeom, UsdShade
 from scipy.spatial import KDTree
 
 from shapespace.files.animated_gltf import animated_glb
+from shapespace.files.attributes.reading import read_attributes
+from shapespace.files.attributes.textures import LARGEST
 from shapespace.files.colouring import Colouring, Quantity
 from shapespace.files.formats import MESH_FORMATS, OBJ_ZIP, USD_FORMATS, read_arrays
 from shapespace.files.limits import Limits
-from shapespace.files.surfaces.reading import read_surface
-from shapespace.files.surfaces.textures import LARGEST
 from shapespace.files.usd import animated_usd
-from shapespace.mesh.surface import Labels, Material, Surface
+from shapespace.mesh.attributes import Labels, MeshAttributes, SurfaceMaterial
 from shapespace.mesh.triangle_mesh import MeshError
 from tests.service.glb import GLB, khronos_report
 from tests.surfaces import ball, corner_uv, parse_obj, png, same_corners, write_files
@@ -40,7 +40,7 @@ def file(tmp_path: Path) -> Path:
     return path
 
 
-def same(found: Surface | None, wanted: Surface) -> None:
+def same(found: MeshAttributes | None, wanted: MeshAttributes) -> None:
     """Assert that two surfaces agree in everything that OBJ and MTL can express."""
     assert found
     for name in ("starts", "corners", "uv_corners", "material_of"):
@@ -55,19 +55,19 @@ def same(found: Surface | None, wanted: Surface) -> None:
     assert pictures[0] == pictures[1]
 
 
-def cube(lines: list[str], faces: list[str], tmp_path: Path) -> tuple[Surface | None, list[str]]:
-    """Surface and notes read from a cube with further lines before its faces."""
+def cube(lines: list[str], faces: list[str], tmp_path: Path) -> tuple[MeshAttributes | None, list[str]]:
+    """Attributes and notes read from a cube with further lines before its faces."""
     points = [f"v {x} {y} {z}" for x, y, z in CUBE]
     path = tmp_path / "cube.obj"
     path.write_text("\n".join([*points, *lines, *faces]) + "\n")
-    return read_surface(path)
+    return read_attributes(path)
 
 
 PLAIN = ["f " + " ".join(str(v + 1) for v in side) for side in SIDES]
 
 
 def test_a_file_of_others_is_read_whole(file: Path) -> None:
-    found, faults = read_surface(file)
+    found, faults = read_attributes(file)
     assert not faults
     same(found, SURFACE)
     assert np.array_equal(SURFACE.triangles, read_arrays(file)[1]), (
@@ -81,7 +81,7 @@ def test_an_archive_of_obj_comes_back_whole(tmp_path: Path) -> None:
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
         archive.extractall(tmp_path)
         assert sorted(archive.namelist()) == ["shape.mtl", "shape.obj", "skin.png"]
-    found, faults = read_surface(tmp_path / "shape.obj")
+    found, faults = read_attributes(tmp_path / "shape.obj")
     assert not faults
     same(found, SURFACE)
     scene = trimesh.load_scene(tmp_path / "shape.obj", process=False)
@@ -159,11 +159,11 @@ def test_the_khronos_validator_finds_nothing_in_a_textured_animation(tmp_path: P
 def test_gltf_goes_round(tmp_path: Path) -> None:
     first, second = tmp_path / "first.glb", tmp_path / "second.gltf"
     first.write_bytes(MESH_FORMATS["glb"].encode(VERTICES, SURFACE.triangles, None, SURFACE))
-    found, faults = read_surface(first)
+    found, faults = read_attributes(first)
     assert not faults
     assert found
     second.write_bytes(MESH_FORMATS["gltf"].encode(*read_arrays(first), None, found))
-    again, _ = read_surface(second)
+    again, _ = read_attributes(second)
     assert again
     assert again.materials == found.materials == SURFACE.materials
     assert again.textures == SURFACE.textures
@@ -177,7 +177,7 @@ def test_ply_keeps_polygons_and_texture_coordinates(tmp_path: Path) -> None:
     path = tmp_path / "ball.ply"
     one_chart = replace(SURFACE, uv=VERTICES[:, :2], uv_corners=SURFACE.corners)
     path.write_bytes(MESH_FORMATS["ply"].encode(VERTICES, SURFACE.triangles, None, one_chart))
-    found, _ = read_surface(path)
+    found, _ = read_attributes(path)
     assert found
     np.testing.assert_array_equal(found.starts, SURFACE.starts)
     np.testing.assert_array_equal(found.corners, SURFACE.corners)
@@ -189,7 +189,7 @@ def test_ply_keeps_polygons_and_texture_coordinates(tmp_path: Path) -> None:
     # Seams: texture coordinates as lists of the faces, which others read if all faces have the same size.
     triangles = SURFACE.triangulated
     path.write_bytes(MESH_FORMATS["ply"].encode(VERTICES, SURFACE.triangles, None, triangles))
-    found, _ = read_surface(path)
+    found, _ = read_attributes(path)
     assert found
     unnamed = replace(SURFACE, material_of=None, materials=())
     same_corners(corner_uv(found), corner_uv(unnamed))
@@ -262,11 +262,11 @@ def test_smooth_files_stay_smooth_across_welded_seams(tmp_path: Path) -> None:
 
 def test_vertex_colours_come_back(tmp_path: Path) -> None:
     colours = np.random.default_rng(0).integers(0, 256, (len(VERTICES), 3)) / 255
-    surface = Surface(starts=SURFACE.starts, corners=SURFACE.corners, colors=colours)
+    surface = MeshAttributes(starts=SURFACE.starts, corners=SURFACE.corners, colors=colours)
     for format in ("obj", "ply", "glb", "gltf"):
         path = tmp_path / f"ball.{format}"
         path.write_bytes(MESH_FORMATS[format].encode(VERTICES, SURFACE.triangles, None, surface))
-        found, _ = read_surface(path)
+        found, _ = read_attributes(path)
         assert found
         np.testing.assert_allclose(found.colors, colours, atol=1e-3)
     other = trimesh.load_mesh(tmp_path / "ball.ply", process=False)
@@ -300,7 +300,7 @@ def test_corners_with_and_without_texture_coordinates_and_normals_go_round(tmp_p
     assert found
     path = tmp_path / "again.obj"
     path.write_bytes(MESH_FORMATS["obj"].encode(CUBE, found.triangles, None, found))
-    again, faults = read_surface(path)
+    again, faults = read_attributes(path)
     assert again
     assert not faults
     np.testing.assert_array_equal(again.uv_corners, found.uv_corners)
@@ -346,11 +346,11 @@ def test_pictures_are_taken_from_the_folder_only(name: str, file: Path) -> None:
     library.write_text(f"newmtl skin\nmap_Kd {name.format(outside=file.parents[1])}\n")
     (file.parents[1] / "skin.png").write_bytes(png(1))
     if "maps" not in name:
-        found, (fault,) = read_surface(file)
+        found, (fault,) = read_attributes(file)
         assert found
         assert "the texture skin.png of material skin is left out: No such file" in fault
         (file.parent / "skin.png").write_bytes(png())
-    found, faults = read_surface(file)
+    found, faults = read_attributes(file)
     assert not faults
     assert found
     assert found.textures == {"skin.png": png()}
@@ -361,7 +361,7 @@ def test_a_picture_of_gltf_that_is_not_there_is_left_out(tmp_path: Path) -> None
     tree = json.loads(MESH_FORMATS["gltf"].encode(VERTICES, SURFACE.triangles, None, SURFACE))
     tree["images"] = [{"uri": "none.png"}]
     path.write_text(json.dumps(tree))
-    found, (fault,) = read_surface(path)
+    found, (fault,) = read_attributes(path)
     assert found
     assert "the texture none.png of material skin is left out: No such file" in fault
     assert [material.texture for material in found.materials] == [None, None]
@@ -380,11 +380,13 @@ def test_a_picture_of_gltf_that_is_not_there_is_left_out(tmp_path: Path) -> None
         ({"shading": np.array([0, 0, 0, -1])}, "no shading label"),
         ({"colors": np.full((4, 3), 2.0)}, "numbers from 0 to 1"),
         ({"groups": Labels(("a",), np.array([1]))}, "a group is numbered 1 to 1, but there are 1"),
-        ({"materials": (Material("a", texture="none.png"),)}, "has no file none.png"),
+        ({"materials": (SurfaceMaterial("a", texture="none.png"),)}, "has no file none.png"),
     ],
 )
 def test_arrays_that_do_not_fit_are_refused(change: dict, says: str) -> None:
-    square = Surface(starts=np.array([0, 4]), corners=np.array([0, 1, 3, 2]), uv=np.eye(4, 2), uv_corners=np.arange(4))
+    square = MeshAttributes(
+        starts=np.array([0, 4]), corners=np.array([0, 1, 3, 2]), uv=np.eye(4, 2), uv_corners=np.arange(4)
+    )
     triangles = np.array([[0, 1, 3], [0, 3, 2]])
     square.check(4, triangles)
     with pytest.raises(MeshError, match=says):

@@ -7,13 +7,13 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from shapespace.bundle.schema import SURFACE, MaterialEntry, SurfaceEntry
-from shapespace.files.surfaces.textures import ALL, BEGINNINGS, LARGEST
-from shapespace.mesh.surface import Labels, Material, Surface
+from shapespace.bundle.schema import SURFACE, AttributesEntry, MaterialEntry
+from shapespace.files.attributes.textures import ALL, BEGINNINGS, LARGEST
+from shapespace.mesh.attributes import Labels, MeshAttributes, SurfaceMaterial
 from shapespace.mesh.triangle_mesh import MeshError
 
 
-def surface_arrays(surface: Surface) -> dict[str, NDArray]:
+def surface_arrays(surface: MeshAttributes) -> dict[str, NDArray]:
     """The arrays of a surface by the names that `from_entry` reads."""
     found = {
         "starts": surface.starts,
@@ -29,9 +29,9 @@ def surface_arrays(surface: Surface) -> dict[str, NDArray]:
     return {SURFACE + name: array for name, array in found.items() if array is not None}
 
 
-def surface_entry(surface: Surface) -> SurfaceEntry:
+def surface_entry(surface: MeshAttributes) -> AttributesEntry:
     """What a manifest says of a surface."""
-    return SurfaceEntry(
+    return AttributesEntry(
         objects=list(surface.objects.names) if surface.objects else [],
         groups=list(surface.groups.names) if surface.groups else [],
         materials=[MaterialEntry(**vars(material)) for material in surface.materials],
@@ -39,12 +39,12 @@ def surface_entry(surface: Surface) -> SurfaceEntry:
     )
 
 
-def from_entry(entry: SurfaceEntry, arrays: Mapping[str, NDArray], textures: Mapping[str, bytes]) -> Surface:
+def from_entry(entry: AttributesEntry, arrays: Mapping[str, NDArray], textures: Mapping[str, bytes]) -> MeshAttributes:
     """The surface of an entry.
 
     Raises:
         MeshError: an array that is missing, or a texture that is none or too large. Whether arrays fit each other and
-            the mesh says `Surface.check`.
+            the mesh says `MeshAttributes.check`.
     """
 
     def whole(name: str) -> NDArray | None:
@@ -71,7 +71,7 @@ def from_entry(entry: SurfaceEntry, arrays: Mapping[str, NDArray], textures: Map
             raise MeshError(f"{name} has more than {LARGEST >> 20} MiB")
     if sum(len(textures[name]) for name in entry.textures) > ALL:
         raise MeshError(f"textures have more than {ALL >> 20} MiB together")
-    return Surface(
+    return MeshAttributes(
         starts=starts,
         corners=corners,
         uv=real("uv"),
@@ -82,6 +82,6 @@ def from_entry(entry: SurfaceEntry, arrays: Mapping[str, NDArray], textures: Map
         objects=labels(entry.objects, whole("object_of"), "objects"),
         groups=labels(entry.groups, whole("group_of"), "groups"),
         material_of=whole("material_of"),
-        materials=tuple(Material(**vars(material)) for material in entry.materials),
+        materials=tuple(SurfaceMaterial(**vars(material)) for material in entry.materials),
         textures={name: textures[name] for name in entry.textures},
     )

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
+from shapespace.files.attributes import gltf, obj, ply
 from shapespace.files.limits import clipped
-from shapespace.files.surfaces import gltf, obj, ply
-from shapespace.mesh.surface import Surface
+from shapespace.mesh.attributes import MeshAttributes
 from shapespace.mesh.triangle_mesh import MeshError
 
 _READERS = {"glb": gltf.read, "gltf": gltf.read, "obj": obj.read, "ply": ply.read}
@@ -16,7 +16,7 @@ _READERS = {"glb": gltf.read, "gltf": gltf.read, "obj": obj.read, "ply": ply.rea
 FORMATS = tuple(_READERS)
 
 
-def read_surface(path: Path) -> tuple[Surface | None, list[str]]:
+def read_attributes(path: Path) -> tuple[MeshAttributes | None, list[str]]:
     """The surface of a mesh file, on the vertices that ``read_arrays`` gives; None where it has triangles only.
 
     Returns:

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from shapespace.arrays import FloatArray, IntArray
-from shapespace.mesh.prolongation import Prolongation, Rider, hung
+from shapespace.mesh.prolongation import AttachedPart, Prolongation, bind_points
 from shapespace.mesh.rigid_motion import align
 from shapespace.mesh.triangle_mesh import TriangleMesh, diagonal
 
@@ -19,9 +19,9 @@ NEAR, SAMPLE, ANCHORS = 64, 100, (1, 2, 4, 8, 16)
 CLOSER = 0.9
 
 
-def find_rider(
+def attach_part(
     coarse: TriangleMesh, rest: FloatArray, vertices: IntArray, shapes: FloatArray, parts: FloatArray
-) -> Rider:
+) -> AttachedPart:
     """The anchors that carry a part best, and whether it keeps its form on the way.
 
     Each coarse vertex near the part would take it along with its own affine map (`Prolongation`). Those whose maps come
@@ -38,7 +38,9 @@ def find_rider(
     away = [np.asarray(cKDTree(part).query(shape)[0]) for shape, part in zip(shapes, parts, strict=True)]
     near = np.argsort(np.mean(away, axis=0), kind="stable")[:NEAR]
     rows = np.arange(len(near) * len(some))
-    weights = hung(coarse, np.tile(rest[some], (len(near), 1)), rows, np.repeat(near, len(some)), np.ones(len(rows)))
+    weights = bind_points(
+        coarse, np.tile(rest[some], (len(near), 1)), rows, np.repeat(near, len(some)), np.ones(len(rows))
+    )
     alone = Prolongation(coarse.faces, weights)(shapes).reshape(len(shapes), len(near), len(some), 3)
     truth = parts[:, None, some]
     errors = np.linalg.norm(alone - truth, axis=-1).mean(axis=(0, 2))
@@ -53,5 +55,5 @@ def find_rider(
         if rigid:
             carried = align(np.broadcast_to(rest[some], carried.shape), carried)
         error = np.linalg.norm(carried - truth[:, 0], axis=-1).mean()
-        found.append((error if rigid else error / CLOSER, Rider(vertices, near[chosen], b, rigid)))
+        found.append((error if rigid else error / CLOSER, AttachedPart(vertices, near[chosen], b, rigid)))
     return min(found, key=lambda one: one[0])[1]

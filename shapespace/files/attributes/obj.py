@@ -11,12 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shapespace.arrays import FloatArray
+from shapespace.files.attributes.textures import Textures, beside
 from shapespace.files.colouring import Colouring
 from shapespace.files.gltf_writing import surface_normals
 from shapespace.files.limits import UNLIMITED, clipped, label
 from shapespace.files.polygon_reading import Lines
-from shapespace.files.surfaces.textures import Textures, beside
-from shapespace.mesh.surface import NONE, Labels, Material, Surface, labelled
+from shapespace.mesh.attributes import NONE, Labels, MeshAttributes, SurfaceMaterial, labelled
 from shapespace.mesh.triangle_mesh import MeshError
 
 #: Decimals to which normals of one vertex have to agree.
@@ -26,7 +26,7 @@ _MAP_OPTIONS = {b"-blendu": 1, b"-blendv": 1, b"-boost": 1, b"-mm": 2, b"-o": 3,
 _MAP_OPTIONS |= {b"-clamp": 1, b"-bm": 1, b"-imfchan": 1, b"-type": 1, b"-cc": 1, b"-colorspace": 1}
 
 
-def read(path: Path, faults: list[str]) -> Surface:
+def read(path: Path, faults: list[str]) -> MeshAttributes:
     """The surface of an OBJ file; sentences on what is left out are appended to ``faults``."""
     uv, normals, colors, starts, corners = array("d"), array("d"), array("d"), [0], array("q")
     uv_corners, shading, smoothing = array("q"), array("q"), array("q")
@@ -77,7 +77,7 @@ def read(path: Path, faults: list[str]) -> Surface:
     textures = Textures(faults)
     labels = labelled(materials)
     of_file = _read_libraries(path, libraries, textures, labels, faults) if labels else {}
-    return Surface(
+    return MeshAttributes(
         starts=np.array(starts),
         corners=np.array(corners),
         uv=coordinates,
@@ -88,7 +88,7 @@ def read(path: Path, faults: list[str]) -> Surface:
         objects=labelled(objects),
         groups=labelled(groups),
         material_of=labels.of if labels else None,
-        materials=tuple(of_file.get(name, Material(name)) for name in labels.names) if labels else (),
+        materials=tuple(of_file.get(name, SurfaceMaterial(name)) for name in labels.names) if labels else (),
         textures=textures.files,
     )
 
@@ -106,7 +106,7 @@ def _number(text: bytes, count: int) -> int:
 def _shading(
     sizes: np.ndarray, of_normal: np.ndarray, normals: array[float], smoothing: np.ndarray, *, told: bool
 ) -> np.ndarray | None:
-    """Labels of corners, see Surface.shading: by normals where there are some, otherwise by smoothing groups."""
+    """Labels of corners, see MeshAttributes.shading: by normals where there are some, otherwise by smoothing groups."""
     if (of_normal >= 0).all():
         values = np.array(normals).reshape(-1, 3).round(_NORMAL_DECIMALS)
         return np.unique(values, axis=0, return_inverse=True)[1].reshape(-1)[of_normal]
@@ -131,9 +131,9 @@ def _colors(values: array[float], points: int, faults: list[str]) -> FloatArray 
 
 def _read_libraries(
     path: Path, names: list[str], textures: Textures, wanted: Labels, faults: list[str]
-) -> dict[str, Material]:
+) -> dict[str, SurfaceMaterial]:
     """Materials of MTL files by name, as far as the surface uses them."""
-    found: dict[str, Material] = {}
+    found: dict[str, SurfaceMaterial] = {}
     for name in names:
         whole = [beside(path.parent, name)]
         for library in whole if whole[0].is_file() else [beside(path.parent, part) for part in name.split()]:
@@ -146,8 +146,8 @@ def _read_libraries(
     return found
 
 
-def _read_library(path: Path, textures: Textures, wanted: set[str]) -> dict[str, Material]:
-    found: dict[str, Material] = {}
+def _read_library(path: Path, textures: Textures, wanted: set[str]) -> dict[str, SurfaceMaterial]:
+    found: dict[str, SurfaceMaterial] = {}
     name, look = "", dict[str, float | tuple[float, ...] | str]()
 
     def end() -> None:
@@ -156,7 +156,7 @@ def _read_library(path: Path, textures: Textures, wanted: set[str]) -> dict[str,
             kept = None if texture is None else textures.add_file(path.parent, str(texture), name)
             color = look.pop("color", (1.0, 1.0, 1.0))
             opacity = look.pop("opacity", 1.0)
-            found[name] = Material(name, (*color, opacity), texture=kept, **look)  # type: ignore[arg-type, misc]
+            found[name] = SurfaceMaterial(name, (*color, opacity), texture=kept, **look)  # type: ignore[arg-type, misc]
 
     with Lines(memoryview(path.read_bytes()), UNLIMITED) as lines:
         for line in lines:
@@ -200,7 +200,9 @@ def _is_number(text: bytes) -> bool:
     return True
 
 
-def obj_vertices(vertices: FloatArray, colouring: Colouring | None = None, surface: Surface | None = None) -> str:
+def obj_vertices(
+    vertices: FloatArray, colouring: Colouring | None = None, surface: MeshAttributes | None = None
+) -> str:
     """The positions (V, 3) of an OBJ file, with colours behind them in the way that most readers understand.
 
     What of a surface changes with the shape, its normals, follows.
@@ -223,7 +225,7 @@ def _lines(line: str, rows: np.ndarray) -> str:
     return line * len(rows) % tuple(rows.ravel().tolist())
 
 
-def obj_faces(surface: Surface) -> str:
+def obj_faces(surface: MeshAttributes) -> str:
     """The faces of an OBJ file, with texture coordinates, and the names of what they belong to."""
     uv = "" if surface.uv is None else _lines("vt %.9g %.9g\n", surface.uv.astype(np.float32))
     lines = _face_lines(surface)
@@ -243,7 +245,7 @@ def obj_faces(surface: Surface) -> str:
     return uv + "".join(lines.tolist())
 
 
-def _face_lines(surface: Surface) -> NDArray:
+def _face_lines(surface: MeshAttributes) -> NDArray:
     """(P,) a line for each polygon."""
     corners, form = [surface.corners + 1], "%d"
     if surface.uv_corners is not None:
@@ -261,7 +263,7 @@ def _face_lines(surface: Surface) -> NDArray:
     return lines
 
 
-def polygon_lines(surface: Surface, numbers: NDArray, line: Callable[[int], str]) -> NDArray:
+def polygon_lines(surface: MeshAttributes, numbers: NDArray, line: Callable[[int], str]) -> NDArray:
     """(P,) a line for each polygon, filled with the numbers (C, k) of its corners.
 
     Args:
@@ -278,19 +280,19 @@ def polygon_lines(surface: Surface, numbers: NDArray, line: Callable[[int], str]
 
 
 def write_obj(
-    vertices: FloatArray, surface: Surface, colouring: Colouring | None = None, library: str | None = None
+    vertices: FloatArray, surface: MeshAttributes, colouring: Colouring | None = None, library: str | None = None
 ) -> str:
     """An OBJ file; it refers to a library of materials if that is named."""
     begin = f"mtllib {library}\n" if library else ""
     return begin + obj_vertices(vertices, colouring, surface) + obj_faces(surface)
 
 
-def write_mtl(surface: Surface) -> str:
+def write_mtl(surface: MeshAttributes) -> str:
     """The library of a surface's materials, which names its textures."""
     return "\n".join("".join(_material(material)) for material in surface.materials)
 
 
-def _material(material: Material) -> Iterator[str]:
+def _material(material: SurfaceMaterial) -> Iterator[str]:
     *color, opacity = material.color
     yield f"newmtl {material.name}\n"
     yield "Kd {:.6g} {:.6g} {:.6g}\n".format(*color)
@@ -299,7 +301,7 @@ def _material(material: Material) -> Iterator[str]:
         yield f"map_Kd {material.texture}\n"
 
 
-def obj_files(surface: Surface, stem: str) -> Mapping[str, bytes]:
+def obj_files(surface: MeshAttributes, stem: str) -> Mapping[str, bytes]:
     """What belongs beside OBJ files: the library of materials, and textures, by name; nothing without materials."""
     if not surface.materials:
         return {}

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from shapespace.mesh.prolongation import Prolongation, ProlongationError, Rider
-from shapespace.mesh.riders import find_rider
+from shapespace.mesh.attached_parts import attach_part
+from shapespace.mesh.prolongation import AttachedPart, Prolongation, ProlongationError
 from shapespace.mesh.rigid_motion import align
 from shapespace.mesh.triangle_mesh import TriangleMesh
 
@@ -35,9 +35,9 @@ def both(part: np.ndarray, faces: np.ndarray) -> tuple[TriangleMesh, np.ndarray]
     return fine, count + np.arange(len(part))
 
 
-def ridden(part: np.ndarray, moved: np.ndarray, faces: np.ndarray = BALL.faces) -> tuple[Rider, Prolongation]:
+def ridden(part: np.ndarray, moved: np.ndarray, faces: np.ndarray = BALL.faces) -> tuple[AttachedPart, Prolongation]:
     fine, index = both(part, faces)
-    rider = find_rider(BODY, part, index, SHAPES, moved)
+    rider = attach_part(BODY, part, index, SHAPES, moved)
     return rider, Prolongation.of(BODY, fine, [rider])
 
 
@@ -68,7 +68,7 @@ def test_a_part_that_changes_its_form_is_carried_affinely() -> None:
     shapes = np.stack([BODY.vertices * [1, 1, k] for k in stretches])
     moved = np.stack([EYE * [1, 1, k] for k in stretches])
     fine, index = both(EYE, BALL.faces)
-    rider = find_rider(BODY, EYE, index, shapes, moved)
+    rider = attach_part(BODY, EYE, index, shapes, moved)
     assert not rider.rigid
     prolong = Prolongation.of(BODY, fine, [rider])
     np.testing.assert_allclose(prolong(shapes[2])[index], moved[2], atol=0.08)
@@ -86,7 +86,7 @@ def test_a_part_is_carried_by_what_moves_with_it_not_by_what_is_nearest() -> Non
 @pytest.mark.parametrize("rigid", [True, False])
 def test_parts_move_with_the_shape(rigid: bool, rng: np.random.Generator) -> None:
     fine, index = both(EYE, BALL.faces)
-    prolong = Prolongation.of(BODY, fine, [Rider(index, np.array([3, 9]), np.array([0.25, 0.75]), rigid)])
+    prolong = Prolongation.of(BODY, fine, [AttachedPart(index, np.array([3, 9]), np.array([0.25, 0.75]), rigid)])
     np.testing.assert_allclose(prolong(BODY.vertices), fine.vertices, atol=1e-12)
     turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
     turn *= np.sign(np.linalg.det(turn))

@@ -38,7 +38,7 @@ def require_covariance(model: Decoder, covariance: ArrayLike) -> FloatArray:
     return matrix
 
 
-def spread(
+def vertex_uncertainty(
     model: Decoder,
     code: Codes,
     covariance: FloatArray,

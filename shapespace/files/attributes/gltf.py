@@ -12,16 +12,16 @@ from urllib.parse import unquote
 import numpy as np
 
 from shapespace.arrays import FloatArray
-from shapespace.files.gltf_reading import Accessor, Part, Scene, open_scene
+from shapespace.files.attributes.textures import Textures
+from shapespace.files.gltf_reading import Accessor, PlacedPrimitive, Scene, open_scene
 from shapespace.files.limits import UNLIMITED, label
-from shapespace.files.surfaces.textures import Textures
-from shapespace.mesh.surface import NONE, Material, Surface, labelled, srgb
+from shapespace.mesh.attributes import NONE, MeshAttributes, SurfaceMaterial, labelled, srgb
 
 _REAL = (5121, 5123, 5126)
 _NORMAL_DECIMALS = 3
 
 
-def read(path: Path, faults: list[str]) -> Surface:
+def read(path: Path, faults: list[str]) -> MeshAttributes:
     """The surface of a GLB or glTF file; sentences on what is left out are appended to ``faults``."""
     binary = path.suffix.lower() == ".glb"
     scene = open_scene(memoryview(path.read_bytes()), UNLIMITED, binary=binary, beside=path)
@@ -33,15 +33,15 @@ def read(path: Path, faults: list[str]) -> Surface:
     numbers = [part.primitive.get("material") for part in scene.parts]
     textures = Textures(faults)
     used = sorted({number for number in numbers if number is not None})
-    materials: list[Material] = []
+    materials: list[SurfaceMaterial] = []
     for number in used:
         material = _material(scene, number, path, textures)
         # Other formats know materials by their names alone.
         taken = material.name in {known.name for known in materials}
         materials.append(replace(material, name=f"{material.name[:80]} {number}") if taken else material)
     names = [label(part.mesh.get("name", "")) for part in scene.parts]
-    surface = Surface.of_triangles(scene.faces)
-    return Surface(
+    surface = MeshAttributes.of_triangles(scene.faces)
+    return MeshAttributes(
         starts=surface.starts,
         corners=surface.corners,
         uv=None if uv is None else uv * [1, -1] + [0, 1],
@@ -68,7 +68,7 @@ def _attribute(
     if not all(name in part.primitive["attributes"] for part in scene.read):
         return None
 
-    def values(part: Part) -> FloatArray:
+    def values(part: PlacedPrimitive) -> FloatArray:
         index = part.primitive["attributes"][name]
         given = scene.document.accessors[index].get("type")
         kind = given if given in kinds else kinds[0]
@@ -80,7 +80,7 @@ def _attribute(
     return np.concatenate([values(part) for part in scene.read])
 
 
-def _material(scene: Scene, number: int, path: Path, textures: Textures) -> Material:
+def _material(scene: Scene, number: int, path: Path, textures: Textures) -> SurfaceMaterial:
     tree = scene.document.tree
     given = tree["materials"][number]
     look: Mapping[str, Any] = given.get("pbrMetallicRoughness", {})
@@ -92,7 +92,7 @@ def _material(scene: Scene, number: int, path: Path, textures: Textures) -> Mate
             texture = _picture(scene, tree["images"][source], source, path, textures, name)
     r, g, b, a = (min(1.0, max(0.0, float(x))) for x in look.get("baseColorFactor", (1, 1, 1, 1)))
     metallic, roughness = (min(1.0, max(0.0, float(look.get(f"{of}Factor", 1)))) for of in ("metallic", "roughness"))
-    return Material(name, (r, g, b, a), metallic, roughness, texture)
+    return SurfaceMaterial(name, (r, g, b, a), metallic, roughness, texture)
 
 
 def _picture(

@@ -8,11 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shapespace.arrays import FloatArray
+from shapespace.files.attributes.obj import polygon_lines
 from shapespace.files.colouring import Colouring
 from shapespace.files.limits import UNLIMITED
 from shapespace.files.polygon_reading import BinaryTable, TextTable, ply_head
-from shapespace.files.surfaces.obj import polygon_lines
-from shapespace.mesh.surface import NONE, Surface
+from shapespace.mesh.attributes import NONE, MeshAttributes
 from shapespace.mesh.triangle_mesh import MeshError
 
 #: Names of texture coordinates, and of colours.
@@ -20,7 +20,7 @@ _UV = (("s", "t"), ("u", "v"), ("texture_u", "texture_v"), ("texture_s", "textur
 _RGB = ("red", "green", "blue")
 
 
-def read(path: Path, faults: list[str]) -> Surface:
+def read(path: Path, faults: list[str]) -> MeshAttributes:
     """The surface of a PLY file; sentences on what is left out are appended to ``faults``."""
     text, elements, body = ply_head(memoryview(path.read_bytes()))
     table = TextTable(body, UNLIMITED) if text else BinaryTable(body, UNLIMITED)
@@ -69,7 +69,7 @@ def _surface(
     colors: FloatArray | None,
     *,
     normals: bool,
-) -> Surface:
+) -> MeshAttributes:
     uv, of_uv = at_vertices, None if at_vertices is None else corners
     if at_corners:
         values = np.concatenate(at_corners)
@@ -79,10 +79,10 @@ def _surface(
         of_uv[there] = found.reshape(-1)
         if not there.any():
             uv, of_uv = None, None
-    return Surface(starts=starts, corners=corners, uv=uv, uv_corners=of_uv, colors=colors, normals=normals)
+    return MeshAttributes(starts=starts, corners=corners, uv=uv, uv_corners=of_uv, colors=colors, normals=normals)
 
 
-def write_ply(vertices: FloatArray, surface: Surface, colouring: Colouring | None = None) -> bytes:
+def write_ply(vertices: FloatArray, surface: MeshAttributes, colouring: Colouring | None = None) -> bytes:
     """A PLY file, as text where faces have different numbers of corners.
 
     Texture coordinates are at the vertices, or at corners where a vertex has several; not where corners of faces
@@ -126,7 +126,7 @@ def write_ply(vertices: FloatArray, surface: Surface, colouring: Colouring | Non
     return "\n".join([*head, "end_header\n"]).encode() + body
 
 
-def _of_vertices(surface: Surface) -> FloatArray | None:
+def _of_vertices(surface: MeshAttributes) -> FloatArray | None:
     """(V, 2) texture coordinates, where each vertex has exactly one."""
     if surface.uv is None or surface.uv_corners is None or (surface.uv_corners < 0).any():
         return None
@@ -136,7 +136,7 @@ def _of_vertices(surface: Surface) -> FloatArray | None:
     return found if np.array_equal(found[surface.corners], surface.uv[surface.uv_corners]) else None
 
 
-def _face_rows(surface: Surface, lists: list[tuple[str, str, NDArray]], length: str) -> bytes:
+def _face_rows(surface: MeshAttributes, lists: list[tuple[str, str, NDArray]], length: str) -> bytes:
     """Faces of as many corners each."""
     count = len(surface.sizes)
     pieces: list[NDArray] = []
