@@ -12,7 +12,7 @@ import traceback
 from pathlib import Path
 
 from shapespace.training.collection import init
-from shapespace.training.collection.ingest import IngestError
+from shapespace.training.collection.checks import IngestError
 from shapespace.training.learning import ExportError
 from shapespace.training.pipeline import OldRunError, Run, execute, refuse_old
 from shapespace.training.report.record import Record, ReportError
@@ -82,9 +82,9 @@ def _init(arguments: argparse.Namespace) -> None:
     out, collection = init.write(arguments.meshes, arguments.out, force=arguments.force)
     shapes, vertices = collection.vertices.shape[:2]
     print(f"{out}: for {shapes} shapes of {vertices} vertices and {len(collection.faces)} faces")
-    for note in (*collection.notes, *(warned.sentence for warned in collection.warnings)):
+    for note in (*collection.notes, *(warning.sentence for warning in collection.warnings)):
         print(f"  {note}")
-    accept = " ".join(shlex.quote(warned.name) for warned in collection.warnings if warned.grave)
+    accept = " ".join(shlex.quote(collection.names[warning.shape]) for warning in collection.warnings if warning.grave)
     if accept:
         print(f"A run would stop at {accept}: mend or remove these, or take them as they are with --accept {accept}")
     print(f"Next: {_program()} run {_here(out)}")

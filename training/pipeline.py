@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from shapespace.arrays import FloatArray
 from shapespace.bundle.geometry import Geometry
 from shapespace.training.collection.generators import PRODUCTS
-from shapespace.training.collection.ingest import data_files
+from shapespace.training.collection.reading import data_files
 from shapespace.training.runs.config import Config
 from shapespace.training.runs.directory import RunDirectory
 from shapespace.training.runs.latent_coordinates import alone

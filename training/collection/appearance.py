@@ -9,7 +9,7 @@ import numpy as np
 from shapespace.files.attributes.reading import FORMATS, read_attributes
 from shapespace.mesh.attributes import MeshAttributes
 from shapespace.mesh.triangle_mesh import MeshError
-from shapespace.training.collection.ingest import MeshCollection
+from shapespace.training.collection.mesh_collection import MeshCollection
 
 
 def reference_surface(

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 from shapespace.training.collection import figure
 from shapespace.training.collection.freaky_torus import FreakyTorus
-from shapespace.training.collection.ingest import MeshCollection
+from shapespace.training.collection.mesh_collection import MeshCollection
 from shapespace.training.runs.sampling import Collection
 
 

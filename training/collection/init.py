@@ -8,7 +8,8 @@ import re
 import unicodedata
 from pathlib import Path
 
-from shapespace.training.collection.ingest import MeshCollection, read_collection
+from shapespace.training.collection.ingest import read_collection
+from shapespace.training.collection.mesh_collection import MeshCollection
 from shapespace.training.runs.config import (
     CollectionSettings,
     CombinerSettings,
@@ -98,7 +99,7 @@ def _parts(collection: MeshCollection) -> str:
     if not collection.parts:
         return ""
     names = ", ".join(_string(name) for name in dict.fromkeys(part.name for part in collection.parts))
-    return f"\n# parts = [{names}]    # the first is what the model computes with, the others ride along"
+    return f"\n# parts = [{names}]    # the model computes with the first; the others are attached to it"
 
 
 def write(meshes: Path, out: Path | None = None, *, force: bool = False) -> tuple[Path, MeshCollection]:

@@ -1,7 +1,7 @@
-"""Shapes that differ suspiciously from the others of their collection: another unit, another order, a mirror image.
+"""Warnings about single shapes: another unit, another order of vertices, a mirror image, a vertex far off.
 
-Each such shape is a mesh that can be used, and that leads to a model nobody wants. All checks compare, none knows what
-the shapes are of, so each can be wrong: people are told, and decide.
+Each such shape is a valid mesh, but a model trained on it is rarely wanted. All checks compare shapes with each other
+and know nothing about the objects, so a warning can be wrong: the user reads it and decides.
 """
 
 from __future__ import annotations
@@ -20,36 +20,53 @@ from shapespace.arrays import FloatArray, IntArray
 from shapespace.mesh.triangle_mesh import Connectivity, face_areas
 from shapespace.training.collection.large_arrays import TOGETHER, columns, room
 
-#: Areas that differ from the median by more than this factor suggest another unit.
-AREA_FACTOR = 3.0
-#: A vertex is misplaced in a shape if its shortest edge there is longer than STRETCH times its longest in other shapes,
-STRETCH = 2.0
-#: and longer than LONG times the shape's mean edge.
-LONG = 3.0
-#: If half of all edges are longer than this many times those of other shapes, the vertices have another order.
-SCRAMBLED = 2.5
-#: "In other shapes" means this quantile over all shapes, so that faults are found even if only a quarter of the shapes
-#: are right.
-QUANTILE = 0.25
-#: A reflection, or a rotation, explains why a shape differs from the others if it reduces the squared distance to less
-#: than this share.
-MIRRORED, TURNED = 0.5, 0.1
-#: Largest angles, in degrees: between a rotation and one that exchanges coordinate axes, to count as it; and between
-#: shapes that count as having the same orientation.
-QUARTER_TURN, ALIKE = 25.0, 30.0
+
+@dataclass(frozen=True)
+class WarningThresholds:
+    """Differences between shapes that cause a warning.
+
+    Attributes:
+        area_factor: an area that differs from the median by more than this factor suggests another unit.
+        stretch: a vertex is misplaced in a shape if its shortest edge there is longer than ``stretch`` times its
+            longest edge in other shapes,
+        long: and longer than ``long`` times the shape's median edge.
+        scrambled: the vertices have another order if the median of all ratios of edges to the same edges in other
+            shapes is larger.
+        quantile: "in other shapes" means this quantile over all shapes, so that faults are found even if only a
+            quarter of the shapes are right.
+        mirrored: a reflection explains why a shape differs from another if it reduces the squared distance to less
+            than this share.
+        turned: the same for a rotation.
+        quarter_turn: largest angle, in degrees, between a rotation and one that exchanges coordinate axes, to count as
+            such an exchange.
+        alike: largest angle, in degrees, between shapes that count as having the same orientation.
+    """
+
+    area_factor: float = 3.0
+    stretch: float = 2.0
+    long: float = 3.0
+    scrambled: float = 2.5
+    quantile: float = 0.25
+    mirrored: float = 0.5
+    turned: float = 0.1
+    quarter_turn: float = 25.0
+    alike: float = 30.0
+
+
+THRESHOLDS = WarningThresholds()
 #: Number of vertices, spread evenly, that rigid motions between shapes are computed from.
 SAMPLE = 2000
 
 
 @dataclass(frozen=True)
 class CollectionWarning:
-    """One oddity of one shape.
+    """A warning about one shape of a collection.
 
     Attributes:
-        shape: its index.
-        sentence: what is odd, to follow the file's name; with ``{vertex}`` where it names one.
-        grave: whether a model of such a shape is worthless, so that somebody has to accept it by name.
-        vertex: that is named.
+        shape: index of the shape.
+        sentence: what seems wrong. From `find_warnings` it follows the file's name and may have a field ``{vertex}``.
+        grave: whether a model of such a shape is useless, so that the user must accept the shape by name.
+        vertex: index of the vertex that the sentence names.
     """
 
     shape: int
@@ -59,7 +76,7 @@ class CollectionWarning:
 
 
 class Placements:
-    """How the shapes of a collection stand to each other, from a sample of their vertices.
+    """Distances, reflections and rotations between the shapes of a collection, from a sample of their vertices.
 
     Args:
         vertices: (n, V, 3).
@@ -74,7 +91,7 @@ class Placements:
         self.squares = (self.points**2).sum(axis=(1, 2))
 
     def _distances(self, sign: int) -> FloatArray:
-        """(n, n) squared distances after the best rotation, or for −1 the best reflection (Kabsch 1976)."""
+        """Squared distances (n, n) after the best rotation, or for −1 the best reflection (Kabsch 1976)."""
         count = len(self.points)
         columns = np.moveaxis(self.points, 1, 0).reshape(-1, 3 * count)
         products = (columns.T @ columns).reshape(count, 3, count, 3).swapaxes(1, 2)
@@ -84,7 +101,7 @@ class Placements:
 
     @cached_property
     def distances(self) -> FloatArray:
-        """(n, n) squared distances after the best rigid motion."""
+        """Squared distances (n, n) after the best rigid motion."""
         return self._distances(1)
 
     @cached_property
@@ -93,53 +110,67 @@ class Placements:
         return int(self.distances.mean(axis=1).argmin())
 
     def mirrored(self) -> list[int]:
-        """Shapes that a reflection brings closer to most others than any motion does."""
+        """Find shapes that a reflection brings closer to most others than any rigid motion does."""
         with np.errstate(divide="ignore", invalid="ignore"):
             ratio = self._distances(-1) / self.distances
         np.fill_diagonal(ratio, np.inf)
-        return np.flatnonzero(np.quantile(ratio, 0.6, axis=1) < MIRRORED).tolist()
+        return np.flatnonzero(np.quantile(ratio, 0.6, axis=1) < THRESHOLDS.mirrored).tolist()
 
     def turned(self) -> dict[int, FloatArray]:
-        """Shapes that stand as if axes were exchanged, where most stand alike, with that exchange (3, 3)."""
+        """Find shapes whose axes are exchanged, if most shapes have the same orientation.
+
+        Returns:
+            For each such shape the exchange, a signed permutation matrix (3, 3).
+        """
         centre = self.points[self.central]
         products = np.swapaxes(self.points, 1, 2) @ centre
         u, _, vt = np.linalg.svd(products)
         u[..., -1] *= np.sign(np.linalg.det(u @ vt))[:, None]
         rotations = u @ vt  # x @ rotation is closest to the centre
-        if np.median(_angles(rotations, np.eye(3))) > ALIKE:
+        if np.median(_angles(rotations, np.eye(3))) > THRESHOLDS.alike:
             return {}
         exchanges = np.stack([m for m in _exchanges() if np.linalg.det(m) > 0 and not np.array_equal(m, np.eye(3))])
         found = {}
         standing = ((self.points - centre) ** 2).sum(axis=(1, 2))
-        for k in np.flatnonzero(self.distances[self.central] < TURNED * standing):
+        for k in np.flatnonzero(self.distances[self.central] < THRESHOLDS.turned * standing):
             angles = _angles(exchanges, rotations[k])
-            if angles.min() < QUARTER_TURN:
+            if angles.min() < THRESHOLDS.quarter_turn:
                 found[int(k)] = exchanges[angles.argmin()]
         return found
 
 
 def _angles(rotations: FloatArray, other: FloatArray) -> FloatArray:
-    """Degrees (n,) between rotations (n, 3, 3) and another."""
+    """Angles (n,) in degrees between rotations (n, 3, 3) and another rotation."""
     cosine = (np.einsum("nij,ij->n", rotations, other) - 1) / 2
     return np.rad2deg(np.arccos(cosine.clip(-1, 1)))
 
 
 def _exchanges() -> list[FloatArray]:
-    """All matrices that exchange axes and their directions."""
+    """Return all matrices that exchange axes and reverse their directions."""
     signs = itertools.product((1.0, -1.0), repeat=3)
     return [np.eye(3)[list(order)] * sign for sign in signs for order in itertools.permutations(range(3))]
 
 
-def suspicions(
+def find_warnings(
     vertices: FloatArray, connectivity: Connectivity, names: Sequence[str], placements: Placements
 ) -> list[CollectionWarning]:
-    """Everything odd about shapes (n, V, 3), by shape; names (n) are for sentences that name another one."""
-    edges = _Edges(vertices, connectivity)
-    found = edges.suspicions()
-    # Of a shape in another order the other checks say nothing.
-    scrambled = {s.shape for s in found if s.grave}
-    found += _sizes(vertices, connectivity, edges.out_of_place, scrambled)
-    found += _duplicates(vertices, names)
+    """Find shapes that look wrong beside the others.
+
+    Args:
+        vertices: (n, V, 3).
+        connectivity: the edges and faces of all shapes.
+        names: the n shapes' names, for sentences that refer to another shape.
+        placements: of the shapes.
+
+    Returns:
+        The warnings in the order of the shapes, grave ones first.
+    """
+    edges = _EdgeLengths(vertices, connectivity)
+    found = edges.warnings()
+    # The other checks say nothing about a shape in another order.
+    scrambled = {warning.shape for warning in found if warning.grave}
+    found += _size_warnings(vertices, connectivity, edges.misplaced, scrambled)
+    found += _duplicate_warnings(vertices, names)
     mirrored = [k for k in placements.mirrored() if k not in scrambled]
     found += [CollectionWarning(k, "is a mirror image of what the others show; mirror it back") for k in mirrored]
     for k, exchange in placements.turned().items():
@@ -147,31 +178,31 @@ def suspicions(
             axes = ", ".join(f"{'−' if row.min() < 0 else ''}{'xyz'[np.abs(row).argmax()]}" for row in exchange)
             sentence = f"is turned against the others: its x, y, z are their {axes}; is another axis up in that file?"
             found.append(CollectionWarning(k, sentence))
-    return sorted(found, key=lambda s: (s.shape, not s.grave))
+    return sorted(found, key=lambda warning: (warning.shape, not warning.grave))
 
 
-def _sizes(
-    vertices: FloatArray, connectivity: Connectivity, out_of_place: dict[int, IntArray], scrambled: set[int]
+def _size_warnings(
+    vertices: FloatArray, connectivity: Connectivity, misplaced: dict[int, IntArray], scrambled: set[int]
 ) -> list[CollectionWarning]:
-    """Shapes whose area, without the faces at vertices that are out of place, is far from the median."""
+    """Warn of shapes whose area is far from the median; faces at misplaced vertices don't count."""
     wrong = np.zeros(connectivity.vertex_count, dtype=bool)
-    for shape, those in out_of_place.items():
+    for shape, indices in misplaced.items():
         if shape not in scrambled:
-            wrong[those] = True
+            wrong[indices] = True
     faces = connectivity.faces[~wrong[connectivity.faces].any(axis=1)]
     areas = np.array([face_areas(shape, faces).sum() for shape in vertices])
-    there = [k for k in range(len(vertices)) if k not in scrambled]
+    ordered = [k for k in range(len(vertices)) if k not in scrambled]
     found = []
-    for k in there:
-        ratio = areas[k] / np.median(areas[there])
-        if not 1 / AREA_FACTOR < ratio < AREA_FACTOR:
+    for k in ordered:
+        ratio = areas[k] / np.median(areas[ordered])
+        if not 1 / THRESHOLDS.area_factor < ratio < THRESHOLDS.area_factor:
             length = float(f"{ratio**0.5:.3g}")
             sentence = f"is of another size: its lengths are {length:,g} times the median's; is it in another unit?"
             found.append(CollectionWarning(k, sentence, grave=True))
     return found
 
 
-def _duplicates(vertices: FloatArray, names: Sequence[str]) -> list[CollectionWarning]:
+def _duplicate_warnings(vertices: FloatArray, names: Sequence[str]) -> list[CollectionWarning]:
     first: dict[bytes, int] = {}
     found = []
     for k, shape in enumerate(vertices):
@@ -181,11 +212,15 @@ def _duplicates(vertices: FloatArray, names: Sequence[str]) -> list[CollectionWa
     return found
 
 
-class _Edges:
+class _EdgeLengths:
     """Lengths of the edges of all shapes, each compared with the same edge of the other shapes.
 
-    A shape may be in another unit, or rolled up: an edge counts as long only if it is so both in the units of the
-    file and as a share of the shape's extent.
+    A shape may be in another unit, or rolled up. An edge counts as long only if it is long in the units of the file
+    and also as a share of the shape's extent.
+
+    Attributes:
+        scrambled: indices of shapes whose vertices have another order.
+        misplaced: by the index of a shape, its vertices that are far from their neighbours.
     """
 
     def __init__(self, vertices: FloatArray, connectivity: Connectivity) -> None:
@@ -206,38 +241,36 @@ class _Edges:
             shortest[k] = np.minimum.reduceat(lengths, starts)
             longest[k] = np.maximum.reduceat(lengths, starts)
             self._middle[k] = np.median(lengths)
-            # Medians, since a vertex far off would hide itself in a mean.
+            # A median, since a vertex far off would hide itself in a mean.
             extent[k] = np.median(np.linalg.norm(shape - np.median(shape, axis=0), axis=1))
             sample[k] = np.linalg.norm(shape[i] - shape[j], axis=1)
         relative = extent[:, None]
 
-        def beside(values: NDArray, usual: NDArray) -> NDArray:
-            """Values (n, …) as multiples of the usual ones; the smaller of the two ways of counting."""
-            raw = values / np.quantile(usual, QUANTILE, axis=0)
-            return np.minimum(raw, (values / relative) / np.quantile(usual / relative, QUANTILE, axis=0))
+        def ratios(values: NDArray, usual: NDArray) -> NDArray:
+            """Divide values (n, …) by the usual ones, in file units and relative to the extent; take the smaller."""
+            raw = values / np.quantile(usual, THRESHOLDS.quantile, axis=0)
+            scaled = (values / relative) / np.quantile(usual / relative, THRESHOLDS.quantile, axis=0)
+            return np.minimum(raw, scaled)
 
-        self.scrambled = np.flatnonzero(np.median(beside(sample, sample), axis=1) > SCRAMBLED)
+        self.scrambled = np.flatnonzero(np.median(ratios(sample, sample), axis=1) > THRESHOLDS.scrambled)
         places = []
         for part in columns(*shortest.shape):
             short, long = shortest[:, part], longest[:, part]
-            stretched = (beside(short, long) > STRETCH) & (short > LONG * self._middle[:, None])
+            stretched = ratios(short, long) > THRESHOLDS.stretch
+            stretched &= short > THRESHOLDS.long * self._middle[:, None]
             places.append(np.argwhere(stretched) + np.array([0, part.start]))
         shape_of, vertex_of = np.concatenate(places).T
-        self.out_of_place = {int(k): vertex_of[shape_of == k] for k in np.unique(shape_of)}
+        self.misplaced = {int(k): vertex_of[shape_of == k] for k in np.unique(shape_of)}
 
-    def suspicions(self) -> list[CollectionWarning]:
-        """Vertices in another order, wholly or in part, and vertices far off."""
-        found = []
-        for k in self.scrambled.tolist():
-            sentence = (
-                "has its vertices in another order than the others, with the same faces; export it again like them"
-            )
-            found.append(CollectionWarning(k, sentence, grave=True))
-        for k, those in self.out_of_place.items():
+    def warnings(self) -> list[CollectionWarning]:
+        """Warn of vertices in another order, wholly or in part, and of vertices far off."""
+        sentence = "has its vertices in another order than the others, with the same faces; export it again like them"
+        found = [CollectionWarning(k, sentence, grave=True) for k in self.scrambled.tolist()]
+        for k, indices in self.misplaced.items():
             if k in self.scrambled:
                 continue
-            vertex, more = int(those[0]), f" and {len(those) - 1} more" if len(those) > 1 else ""
-            if self._exchanged(k, those):
+            vertex, more = int(indices[0]), f" and {len(indices) - 1} more" if len(indices) > 1 else ""
+            if self._exchanged(k, indices):
                 sentence = (
                     f"has some vertices in another order than the others, with the same faces: vertex {{vertex}}{more} "
                     "stand where others should; export it like the others"
@@ -247,7 +280,7 @@ class _Edges:
                 found.append(CollectionWarning(k, f"has a vertex far off: {{vertex}}{more}", vertex=vertex))
         return found
 
-    def _exchanged(self, k: int, those: IntArray) -> bool:
-        """Whether most vertices that are out of place lie on the surface: then they are exchanged, not moved away."""
-        near = np.asarray(KDTree(self.vertices[k]).query(self.vertices[k][those], 2)[0])[:, 1]
-        return len(those) > 1 and bool((near < LONG * self._middle[k]).mean() > 0.5)
+    def _exchanged(self, k: int, misplaced: IntArray) -> bool:
+        """Whether most misplaced vertices lie on the surface: then they are exchanged, not moved away."""
+        near = np.asarray(KDTree(self.vertices[k]).query(self.vertices[k][misplaced], 2)[0])[:, 1]
+        return len(misplaced) > 1 and bool((near < THRESHOLDS.long * self._middle[k]).mean() > 0.5)

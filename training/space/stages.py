@@ -31,8 +31,9 @@ from shapespace.solve.cholesky import NotPositiveDefiniteError
 from shapespace.solve.outcome import Status
 from shapespace.training.collection.appearance import kept, reference_surface, texture_bytes
 from shapespace.training.collection.generators import MESHES
-from shapespace.training.collection.ingest import MeshCollection, normalised, read_collection
+from shapespace.training.collection.ingest import read_collection
 from shapespace.training.collection.large_arrays import some_vertices, stacked
+from shapespace.training.collection.mesh_collection import MeshCollection, normalised
 from shapespace.training.collection.mirror import find_mirror, mirrored
 from shapespace.training.runs.config import CollectionSettings, Config, ConfigError
 from shapespace.training.runs.directory import RunDirectory

@@ -14,7 +14,8 @@ import trimesh
 from shapespace.files.formats import MESH_FORMATS
 from shapespace.mesh.attributes import MeshAttributes
 from shapespace.training.collection.appearance import kept, reference_surface
-from shapespace.training.collection.ingest import MeshCollection, read_collection
+from shapespace.training.collection.ingest import read_collection
+from shapespace.training.collection.mesh_collection import MeshCollection
 from shapespace.training.pipeline import Run, execute
 from shapespace.training.runs.config import load
 from tests.surfaces import ball, corner_uv, same_corners, write_files

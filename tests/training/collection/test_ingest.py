@@ -12,7 +12,9 @@ import trimesh
 
 from shapespace.files.formats import MESH_FORMATS, READ_FORMATS
 from shapespace.mesh.triangle_mesh import TriangleMesh, face_areas
-from shapespace.training.collection.ingest import IngestError, MeshCollection, normalised, read_collection
+from shapespace.training.collection.checks import IngestError
+from shapespace.training.collection.ingest import read_collection
+from shapespace.training.collection.mesh_collection import MeshCollection, normalised
 
 NAMES = ("pose1", "pose2", "pose10")
 BALL = trimesh.creation.icosphere(subdivisions=1)

@@ -1,4 +1,4 @@
-"""Collections of several parts: which is the shell, which parts follow it, and what is refused."""
+"""Collections of several parts: which is the shell, which parts are attached, and what is refused."""
 
 from __future__ import annotations
 
@@ -13,8 +13,10 @@ import trimesh
 from shapespace.mesh.attributes import Labels
 from shapespace.mesh.rigid_motion import align
 from shapespace.training.collection.appearance import reference_surface
-from shapespace.training.collection.ingest import IngestError, MeshCollection, normalised, read_collection
+from shapespace.training.collection.checks import IngestError
+from shapespace.training.collection.ingest import read_collection
 from shapespace.training.collection.init import configuration
+from shapespace.training.collection.mesh_collection import MeshCollection, normalised
 from shapespace.training.runs.config import parse
 from tests.surfaces import ball, with_parts, write_files
 
@@ -39,13 +41,13 @@ def collection(folder: Path, wanted: Sequence[str] = (), surface=SURFACE) -> Mes
     return read_collection(folder, wanted)
 
 
-def test_the_largest_is_the_shell_and_the_others_ride_along(tmp_path: Path) -> None:
+def test_the_largest_is_the_shell_and_the_others_are_attached(tmp_path: Path) -> None:
     meshes = collection(tmp_path)
     assert [part.name for part in meshes.parts] == ["Bar", "Eye", "Nail"]
     for part in meshes.parts:
         assert part.faces.tolist() == np.flatnonzero(np.array(NAMES)[OBJECT] == part.name).tolist()
     np.testing.assert_array_equal(meshes.faces, FACES)
-    assert any("3 separate parts" in note and "'Eye', 'Nail' ride along" in note for note in meshes.notes)
+    assert any("3 separate parts" in note and "attached to it: 'Eye', 'Nail'" in note for note in meshes.notes)
     # Normalisation gives the shell area 1.
     vertices, scale = normalised(meshes, 0)
     shell = trimesh.Trimesh(vertices[0], meshes.shell_faces, process=False)

@@ -1,4 +1,4 @@
-"""Suspicious shapes among good ones: each is named with what is wrong, and no good one is."""
+"""Warnings about wrong shapes among good ones: each is named with what is wrong, and no good shape is."""
 
 from __future__ import annotations
 
@@ -11,7 +11,9 @@ import pytest
 
 from shapespace.files.formats import MESH_FORMATS
 from shapespace.training.collection import figure, large_arrays
-from shapespace.training.collection.ingest import IngestError, MeshCollection, read_collection
+from shapespace.training.collection.checks import IngestError
+from shapespace.training.collection.ingest import read_collection
+from shapespace.training.collection.mesh_collection import MeshCollection
 from tests.training.whole_runs.test_collection import bars
 
 SHAPES, FACES = bars(12)
@@ -63,16 +65,16 @@ def test_an_odd_shape_is_named_and_no_other(oddity: str, tmp_path: Path) -> None
     shapes = SHAPES.copy()
     shapes[ODD] = change(SHAPES[ODD])
     found = write(tmp_path / "meshes", shapes)
-    (warned,) = found.warnings
-    assert (warned.name, warned.grave) == (f"bar{ODD}", grave)
-    assert warned.sentence.startswith(f"{tmp_path / 'meshes' / f'bar{ODD}.obj'}: ")
-    assert re.search(says, warned.sentence)
+    (warning,) = found.warnings
+    assert (found.names[warning.shape], warning.grave) == (f"bar{ODD}", grave)
+    assert warning.sentence.startswith(f"{tmp_path / 'meshes' / f'bar{ODD}.obj'}: ")
+    assert re.search(says, warning.sentence)
     if not grave:
         found.require_accepted([])
         return
     with pytest.raises(IngestError, match=f"--accept bar{ODD}$") as refusal:
         found.require_accepted(["bar1.obj"])
-    assert warned.sentence in str(refusal.value)
+    assert warning.sentence in str(refusal.value)
     for name in (f"bar{ODD}", f"bar{ODD}.obj", f"meshes/bar{ODD}.obj"):
         found.require_accepted([name])
     with pytest.raises(IngestError, match="no shape is called bar77"):
@@ -86,9 +88,9 @@ def test_a_mirrored_sheet_is_named(tmp_path: Path) -> None:
     shapes = np.stack([[x, y, 0.3 * x**2 + 0.4 * x * y + k * 0.02 * y**2] for k in range(5)]).swapaxes(1, 2)
     assert not write(tmp_path / "meshes", shapes, faces).warnings
     shapes[3] *= [-1, 1, 1]
-    (warned,) = write(tmp_path / "meshes", shapes, faces).warnings
-    assert (warned.name, warned.grave) == ("bar3", False)
-    assert "is a mirror image" in warned.sentence
+    (warning,) = write(tmp_path / "meshes", shapes, faces).warnings
+    assert (warning.shape, warning.grave) == (3, False)
+    assert "is a mirror image" in warning.sentence
 
 
 @pytest.mark.parametrize("format", ["obj", "ply"])
@@ -96,8 +98,8 @@ def test_vertices_are_numbered_as_in_the_file(format: str, tmp_path: Path) -> No
     # Two vertices that no face uses come first.
     shapes = np.concatenate([np.zeros((len(SHAPES), 2, 3)), SHAPES], axis=1)
     shapes[ODD, 2:] = far_off(SHAPES[ODD])
-    (warned,) = write(tmp_path / "meshes", shapes, FACES + 2, format).warnings
-    assert f": {79 + (format == 'obj')} (counted from {int(format == 'obj')})" in warned.sentence
+    (warning,) = write(tmp_path / "meshes", shapes, FACES + 2, format).warnings
+    assert f": {79 + (format == 'obj')} (counted from {int(format == 'obj')})" in warning.sentence
 
 
 def test_shapes_that_only_differ_are_not_odd(tmp_path: Path) -> None:

@@ -1,0 +1,189 @@
+"""Checks of single meshes and of shapes in correspondence; each refusal is one line with the file and the fault."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from shapespace.arrays import FloatArray, IntArray
+from shapespace.mesh.rigid_motion import align
+from shapespace.mesh.triangle_mesh import Connectivity, MeshError, PlaceError, TriangleMesh, diagonal, face_areas
+
+#: A volume below this share of area^(3/2) is too small to tell inside from outside; a ball has 0.094.
+CLEAR_VOLUME = 1e-3
+
+
+class IngestError(ValueError):
+    """A collection that can't be used: one line with the file, the fault and, where there is one, the remedy."""
+
+
+@dataclass(frozen=True)
+class Tolerances:
+    """Distances between vertices, as shares of the diagonal of the shape's bounding box.
+
+    Attributes:
+        weld: vertices that are closer coincide; storing a coordinate as float32 moves it by up to 6e-8.
+        seam: border vertices that are closer were probably meant to be one vertex.
+    """
+
+    weld: float = 1e-6
+    seam: float = 1e-4
+
+
+TOLERANCES = Tolerances()
+
+
+@dataclass(frozen=True)
+class ShapeSource:
+    """The place that a shape was read from.
+
+    Attributes:
+        label: the file's path, followed by the shape's name if the file holds several shapes.
+        name: the shape's name.
+        first: number that the file gives to its first vertex and its first face: 1 in OBJ, 0 in all other formats.
+    """
+
+    label: str
+    name: str
+    first: int = 0
+
+    @classmethod
+    def of_file(cls, path: Path) -> ShapeSource:
+        """Return the source of a shape that has a file of its own."""
+        return cls(str(path), path.stem, int(path.suffix.lower() == ".obj"))
+
+    @property
+    def file(self) -> str:
+        """The label without the folder."""
+        return Path(self.label).name
+
+    @property
+    def counted(self) -> str:
+        """The end of a sentence that names vertices or faces by number."""
+        return f" (counted from {self.first})"
+
+
+@contextmanager
+def refusing(source: ShapeSource, numbers: IntArray | None = None) -> Iterator[None]:
+    """Turn a MeshError into an IngestError about a file.
+
+    Args:
+        source: the shape that is checked.
+        numbers: (V,) index that the file gives each vertex; the same one if left out.
+    """
+    try:
+        yield
+    except PlaceError as error:
+        raise IngestError(f"{source.label}: {error.numbered(source.first, numbers)}{source.counted}") from error
+    except MeshError as error:
+        raise IngestError(f"{source.label}: {error}") from error
+
+
+def mesh_arrays(vertices: np.ndarray, faces: np.ndarray) -> tuple[FloatArray, IntArray]:
+    """Check the arrays of one mesh and return them as float64 and int64.
+
+    Raises:
+        MeshError: a wrong shape or type, no faces, a vertex number out of range, or a coordinate that isn't finite.
+    """
+    if vertices.ndim == 3:
+        raise MeshError(
+            f"vertices are of shape {vertices.shape}; where an NPZ holds the whole collection, name that file"
+        )
+    if vertices.ndim != 2 or vertices.shape[1] != 3 or vertices.dtype.kind not in "fiu":
+        raise MeshError(f"vertices must be a (V, 3) array of numbers, not {vertices.dtype} of shape {vertices.shape}")
+    if not len(faces):
+        raise MeshError("has no faces")
+    if faces.ndim != 2 or faces.shape[1] != 3 or faces.dtype.kind not in "iu":
+        raise MeshError(f"faces must be an (F, 3) array of vertex indices, not {faces.dtype} of shape {faces.shape}")
+    if faces.min() < 0 or faces.max() >= len(vertices):
+        sentence = f"faces name vertices {{lowest}} to {{highest}}, but there are {len(vertices)} vertices"
+        raise PlaceError(sentence, {"lowest": [int(faces.min())], "highest": [int(faces.max())]})
+    bad = np.flatnonzero(~np.isfinite(vertices).all(axis=1))
+    if len(bad):
+        raise PlaceError("vertex {vertex} has a coordinate that is not finite", {"vertex": [int(bad[0])]})
+    return vertices.astype(np.float64), faces.astype(np.int64)
+
+
+def same_connectivity(
+    vertices: FloatArray, faces: IntArray, other_vertices: FloatArray, other_faces: IntArray, other: str
+) -> None:
+    """Check that a mesh has the same number of vertices and the same faces as the mesh in the file ``other``.
+
+    Raises:
+        MeshError: the meshes differ.
+    """
+    if (len(vertices), len(faces)) != (len(other_vertices), len(other_faces)):
+        raise MeshError(
+            f"has {len(vertices)} vertices and {len(faces)} faces, but {other} has {len(other_vertices)} and "
+            f"{len(other_faces)}; all meshes need the same connectivity"
+        )
+    differing = np.flatnonzero((faces != other_faces).any(axis=1))
+    if len(differing):
+        k = int(differing[0])
+        raise PlaceError(
+            f"face {{face}} joins vertices {{here}}, but in {other} {{there}}; all meshes need the same connectivity, "
+            "in the same order",
+            {"face": [k], "here": faces[k].tolist(), "there": other_faces[k].tolist()},
+        )
+
+
+def check_meshes(sources: Sequence[ShapeSource], vertices: FloatArray, faces: IntArray, numbers: IntArray) -> None:
+    """Check that shapes (n, V, 3) with common faces (F, 3) are valid triangle meshes.
+
+    Args:
+        sources: the n shapes' files.
+        vertices: (n, V, 3), each vertex in a face.
+        faces: (F, 3).
+        numbers: (V,) index that the files give each vertex.
+
+    Raises:
+        IngestError: the faces form no oriented manifold, or a face of a shape has no area.
+    """
+    with refusing(sources[0], numbers):
+        connectivity = Connectivity(faces, vertices.shape[1])
+    for source, shape in zip(sources, vertices, strict=True):
+        with refusing(source, numbers):
+            TriangleMesh(shape, connectivity)
+
+
+def check_different(path: Path, vertices: FloatArray) -> None:
+    """Check that shapes (n, V, 3) are not all equal up to rigid motion.
+
+    Raises:
+        IngestError: all are equal.
+    """
+    tolerance = TOLERANCES.weld * diagonal(vertices[0])
+    if all(np.abs(align(shape, vertices[0]) - vertices[0]).max() <= tolerance for shape in vertices):
+        raise IngestError(
+            f"{path}: all {len(vertices)} shapes are equal up to where they stand and how they are turned; poses and "
+            "morph targets inside a file are not read, export each shape as a mesh of its own"
+        )
+
+
+def orientation_notes(sources: Sequence[ShapeSource], vertices: FloatArray, faces: IntArray) -> list[str]:
+    """Return a note if closed shapes (n, V, 3) are wound inside out, else nothing.
+
+    Raises:
+        IngestError: some shapes are wound inside out and others are not.
+    """
+    used, local = np.unique(faces, return_inverse=True)
+    if not Connectivity(local.reshape(-1, 3), len(used)).is_closed:
+        return []
+    sides = []
+    for shape in vertices:
+        shape = shape - shape.mean(axis=0)
+        a, b, c = (shape[faces[:, k]] for k in range(3))
+        volume = np.einsum("fi,fi->", a, np.cross(b, c)) / 6
+        sides.append(np.sign(volume) * (abs(volume) > CLEAR_VOLUME * face_areas(shape, faces).sum() ** 1.5))
+    outwards, inwards = ([k for k, side in enumerate(sides) if side == sign] for sign in (1, -1))
+    if outwards and inwards:
+        odd, most = sorted((outwards, inwards), key=len)
+        raise IngestError(
+            f"{sources[odd[0]].label}: is inside out, compared with {sources[most[0]].label} and most others, like a "
+            "mirror image; mirror it back"
+        )
+    return ["faces are wound inside out, normals point inwards; they stay so in all that is written"] if inwards else []

@@ -1,0 +1,87 @@
+"""The meshes of a collection in correspondence: the result of reading files, and of a generator."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from shapespace.arrays import FloatArray, IntArray
+from shapespace.mesh.triangle_mesh import face_areas
+from shapespace.training.collection.checks import IngestError
+from shapespace.training.collection.large_arrays import stacked
+from shapespace.training.collection.parts import MeshPart
+from shapespace.training.collection.warnings import CollectionWarning
+
+
+@dataclass(frozen=True, eq=False)
+class MeshCollection:
+    """Shapes in correspondence, each a valid TriangleMesh, in the user's units.
+
+    Attributes:
+        names: the n shapes' names: the names of their files in natural order (pose2 before pose10), or the NPZ's own.
+        vertices: (n, V, 3) positions as in the files. A large array lies on disk, so read it shape by shape.
+        faces: (F, 3) of every shape, in the order of the files.
+        file_vertices: (N,) index here of each vertex of a file, −1 for vertices that were left out. None if there are
+            no files.
+        notes: what was found in the files and handled, one sentence each.
+        warnings: single shapes that look wrong.
+        central: index of the shape with the least mean square distance from the others, after rigid alignment.
+        places: for each shape its file, and the number that the file gives its first vertex. Empty if there are no
+            files.
+        parts: if there are several, the shell and then the attached parts. Edges join the faces of one part.
+    """
+
+    names: tuple[str, ...]
+    vertices: FloatArray
+    faces: IntArray
+    file_vertices: IntArray | None = None
+    notes: tuple[str, ...] = ()
+    warnings: tuple[CollectionWarning, ...] = ()
+    central: int = 0
+    places: tuple[tuple[str, int], ...] = ()
+    parts: tuple[MeshPart, ...] = ()
+
+    @property
+    def shell_faces(self) -> IntArray:
+        """(G, 3) faces that the model computes with, as indices of all vertices."""
+        return self.faces[self.parts[0].faces] if self.parts else self.faces
+
+    def index(self, name: str | None) -> int:
+        """Return the index of a shape by its name, or of the most central shape for None; IngestError if unknown."""
+        if name is not None and name not in self.names:
+            raise IngestError(f"no shape is called {name!r}; there are {', '.join(self.names[:8])} …")
+        return self.central if name is None else self.names.index(name)
+
+    def require_accepted(self, accepted: Sequence[str]) -> None:
+        """Refuse shapes with a grave warning, unless the user accepts them.
+
+        Args:
+            accepted: names or files of shapes.
+
+        Raises:
+            IngestError: with each such shape, or with a name that no shape has.
+        """
+        names = {name if name in self.names else Path(name).stem for name in accepted}
+        if unknown := names - set(self.names):
+            raise IngestError(f"--accept: no shape is called {', '.join(sorted(unknown))}")
+        grave = [warning for warning in self.warnings if warning.grave and self.names[warning.shape] not in names]
+        if grave:
+            files = " ".join(shlex.quote(self.names[warning.shape]) for warning in grave)
+            raise IngestError(
+                "\n  ".join(["these shapes would spoil the model:", *(warning.sentence for warning in grave)])
+                + f"\nMend or remove them; or take them as they are, with --accept {files}"
+            )
+
+
+def normalised(collection: MeshCollection, reference: int) -> tuple[FloatArray, float]:
+    """Scale all shapes about the origin, so that the reference's shell has unit area; they are not centred.
+
+    Returns:
+        Vertices (n, V, 3) and the scale in the user's units: ``collection.vertices == scale * vertices``.
+    """
+    scale = float(np.sqrt(face_areas(collection.vertices[reference], collection.shell_faces).sum()))
+    return stacked(len(collection.vertices), (shape / scale for shape in collection.vertices)), scale
