@@ -1,1 +1,1 @@
-"""Collections: mesh files read and checked, and synthetic ones generated."""
+"""Collections of shapes: read and check mesh files, or generate shapes."""

@@ -1,4 +1,4 @@
-"""What the reference's file has beside positions and triangles, on the vertices of the collection."""
+"""Polygons, texture coordinates, colours and materials of the reference's file, for the vertices of the collection."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from shapespace.training.collection.mesh_collection import MeshCollection
 def reference_surface(
     data: Path | None, meshes: MeshCollection, chosen: int
 ) -> tuple[MeshAttributes | None, list[str]]:
-    """The surface of the reference's file; where its format has triangles only, of the first file that may have more.
+    """Read the mesh attributes of the reference's file, or of the first file whose format has more than triangles.
 
     Args:
-        data: the folder; None, or a file, where there are no mesh files.
-        meshes: read from it.
-        chosen: which of them is the reference.
+        data: the folder of mesh files. With None or a single file there are no attributes.
+        meshes: the collection read from the folder.
+        chosen: index of the reference.
 
     Returns:
-        The surface, if any, and sentences on what of it is left out.
+        The attributes, if any, and a sentence about each attribute that is left out.
     """
     if data is None or not data.is_dir() or meshes.file_vertices is None:
         return None, []
@@ -42,7 +42,7 @@ def reference_surface(
 
 
 def kept(surface: MeshAttributes) -> str:
-    """One sentence on what is kept of a file."""
+    """Return a sentence on the attributes that are kept from a file."""
     sizes = surface.sizes
     counts = {"triangles": (sizes == 3).sum(), "quads": (sizes == 4).sum(), "larger polygons": (sizes > 4).sum()}
     parts = [f"{count} {name}" for name, count in counts.items() if count]
@@ -64,5 +64,5 @@ def kept(surface: MeshAttributes) -> str:
 
 
 def texture_bytes(surface: MeshAttributes) -> dict[str, np.ndarray]:
-    """Textures as arrays of bytes, by name."""
+    """Return textures as arrays of bytes, by name."""
     return {name: np.frombuffer(data, np.uint8) for name, data in surface.textures.items()}

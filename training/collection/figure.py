@@ -1,4 +1,4 @@
-"""An articulated figure of our own: the mannequin, posed by its joints."""
+"""The articulated figure: poses of the mannequin, each given by the angles of its joints."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ from shapespace.training.collection.mannequin import (
 
 
 class FigureError(ValueError):
-    """Angles or a count that the figure can't take."""
+    """Angles or a number of poses that the figure can't have."""
 
 
 _SPINE = {"spine bend": (-0.35, 0.8), "spine lean": (-0.4, 0.4), "spine twist": (-0.6, 0.6)}
@@ -42,8 +42,8 @@ _HEAD = {"head nod": (-0.5, 0.6), "head tilt": (-0.4, 0.4), "head turn": (-0.9, 
 _ARM = {"arm swing": (-0.6, 1.2), "arm raise": (-0.4, 1.1), "arm twist": (-0.5, 1.2), "elbow": (0.0, 2.1)}
 _LEG = {"leg swing": (-0.5, 1.3), "leg spread": (-0.1, 0.6), "knee": (0.0, 1.9)}
 
-#: Least and greatest angle of each degree of freedom, in order. Forwards, outwards, upwards, inwards and to the
-#: figure's left are positive.
+#: Least and greatest angle in radians of each degree of freedom, in order. Forwards, outwards, upwards, inwards and
+#: to the figure's left are positive.
 ANGLES: dict[str, tuple[float, float]] = {
     **_SPINE,
     **_HEAD,
@@ -53,18 +53,19 @@ ANGLES: dict[str, tuple[float, float]] = {
 
 @dataclass(frozen=True)
 class Joint:
-    """A bend of the surface that grows smoothly from nothing at one plane to the whole at another.
+    """A joint of the figure: its rotation grows smoothly from zero at one plane to the full angle at another.
 
     Attributes:
-        name: of the joint.
-        centre: (3,) that stays where it is.
+        name: the joint's name.
+        centre: (3,) fixed point of the rotation.
         start: point and normal of the plane where the motion begins.
-        end: point and normal of the plane from which on it is rigid.
-        tip: (3,) near the end of the limb: what begins at the plane is the piece with the tip.
+        end: point and normal of the plane beyond which the motion is rigid.
+        tip: (3,) near the end of the limb. Beyond the first plane, the connected piece with the tip moves.
         axes: (3,) axis of rotation at each degree of freedom; they add as rotation vectors.
-        softness: 0 where points in between turn by part of the angle, which keeps them as far from the centre,
-            1 where they go part of the way, which rounds hips and armpits off.
-        carries: joints whose points all move along, also those outside the planes.
+        softness: with 0, points between the planes turn by a part of the angle, which keeps their distance from the
+            centre. With 1, they move a part of the way to their place after the full rotation, which rounds hips and
+            armpits off. Values in between mix both.
+        carries: joints whose moving points also move with this joint, even outside its planes.
     """
 
     name: str
@@ -77,7 +78,7 @@ class Joint:
     carries: Sequence[str] = field(default=())
 
     def shares(self, mesh: TriangleMesh) -> FloatArray:
-        """Part (V,) of the motion that each vertex takes."""
+        """Return the share (V,) of the joint's motion for each vertex, between 0 and 1."""
         v = mesh.vertices
         (p, n), (q, m) = self.start, self.end
         begun, missing = np.maximum((v - p) @ n, 0), np.maximum((q - v) @ m, 0)
@@ -88,7 +89,7 @@ class Joint:
         return t * t * (3 - 2 * t)
 
     def mirrored(self) -> Joint:
-        """The same on the right side."""
+        """Return the same joint on the right side of the figure."""
         (p, n), (q, m) = self.start, self.end
         return replace(
             self,
@@ -111,7 +112,10 @@ def _joint(
     axes: dict[str, FloatArray],
     softness: float = 0.0,
 ) -> Joint:
-    """Planes at distances from a point along normals, of any length; the centre shifted from that point."""
+    """Make a joint at a point, with its centre shifted from there.
+
+    Each plane is given by its distance from the point and a normal of any length.
+    """
     planes = [(point + distance * unit(normal), unit(normal)) for distance, normal in (start, end)]
     carries = ("left shoulder", "right shoulder") if axes.keys() == _SPINE.keys() else ()
     return Joint(name, point + shift, planes[0], planes[1], tip, axes, softness, carries)
@@ -143,12 +147,13 @@ def _joints() -> tuple[Joint, ...]:
     )
 
 
-#: Joints in order from the tips of the limbs to the root, the pelvis, which never moves.
+#: The joints, from the tips of the limbs to the root. The root is the pelvis, which never moves.
 JOINTS = _joints()
 
 
 @cache
 def _shares() -> dict[str, FloatArray]:
+    """Return the share (V,) of each joint's motion, by the joint's name."""
     shares: dict[str, FloatArray] = {}
     for joint in JOINTS:
         shares[joint.name] = np.max([joint.shares(rest()), *(shares[name] for name in joint.carries)], axis=0)
@@ -156,17 +161,17 @@ def _shares() -> dict[str, FloatArray]:
 
 
 def _turn(x: FloatArray, omega: FloatArray) -> FloatArray:
-    """Displacements of points (…, 3) rotated by rotation vectors (…, 3): Rodrigues' formula less the identity."""
+    """Return displacements of points (…, 3) by rotation vectors (…, 3): Rodrigues' formula less the identity."""
     t = np.linalg.norm(omega, axis=-1, keepdims=True)
     across = np.cross(omega, x)
     return np.sinc(t / np.pi) * across + 0.5 * np.sinc(t / (2 * np.pi)) ** 2 * np.cross(omega, across)
 
 
 def pose(angles: ArrayLike) -> FloatArray:
-    """Vertices (n, V, 3) at angles (n, D), in the order of `ANGLES`.
+    """Return vertices (n, V, 3) for angles (n, D) in radians, in the order of `ANGLES`.
 
     Raises:
-        FigureError: angles of another shape, or not finite.
+        FigureError: the angles have another shape or are not finite.
     """
     angles = np.asarray(angles, dtype=np.float64)
     if angles.ndim != 2 or angles.shape[1] != len(ANGLES):
@@ -185,7 +190,7 @@ def pose(angles: ArrayLike) -> FloatArray:
     return vertices
 
 
-#: Poses with a name, each given by its nonzero angles.
+#: Poses with a name, each given by its nonzero angles in radians.
 NAMED: dict[str, dict[str, float]] = {
     "rest": {},
     "walking": {
@@ -215,26 +220,26 @@ NAMED: dict[str, dict[str, float]] = {
 
 
 def _touches(vertices: FloatArray) -> bool:
-    """Whether parts of the body that are far apart at rest come closer to each other than their vertices are."""
+    """Whether vertices more than 0.25 m apart at rest are closer to each other than an edge is long."""
     i, j = cKDTree(vertices).query_pairs(EDGE, output_type="ndarray").T
     far = np.linalg.norm(rest().vertices[i] - rest().vertices[j], axis=1) > 0.25
     return bool(far.any())
 
 
 def poses(count: int = 60, seed: int = 0) -> tuple[list[str], FloatArray, IntArray]:
-    """The collection: the rest pose, those with a name, and random ones in which no limb touches another.
+    """Return the collection: the named poses, the rest pose first, and random poses in which no limb touches another.
 
-    Random angles are triangularly distributed between their bounds, likeliest at rest.
+    Random angles have a triangular distribution between their bounds with its mode at rest.
 
     Args:
-        count: number of poses, n.
-        seed: of the random angles.
+        count: number n of poses.
+        seed: seed of the random angles.
 
     Returns:
         Names (n), vertices (n, V, 3) and faces (F, 3).
 
     Raises:
-        FigureError: a count below 1.
+        FigureError: the count is below 1.
     """
     if count < 1:
         raise FigureError(f"count must be at least 1, not {count}")

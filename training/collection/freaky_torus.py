@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from shapespace.arrays import FloatArray, IntArray
@@ -10,42 +12,66 @@ from shapespace.mesh.triangle_mesh import Connectivity, TriangleMesh
 from shapespace.training.runs.latent_coordinates import Coordinates
 from shapespace.training.runs.sampling import FeaturePositions, SampledShapes
 
-U_COUNT, V_COUNT = 64, 32
-MAJOR_RADIUS, MINOR_RADIUS = 0.375, 0.125
-SEMI_AXES = (1.0, 0.5)
-BUMP_HEIGHT, BUMP_WIDTH = 0.075, 0.05
 
+@dataclass(frozen=True)
+class TorusForm:
+    """Grid and sizes of the torus; the defaults are from the paper's appendix A, lengths without a unit.
+
+    Attributes:
+        columns: number of vertices around the axis, along u.
+        rows: number of vertices around the ring, along v.
+        major_radius: size of the ellipse around the axis.
+        minor_radius: size of the ellipse around the ring.
+        semi_axes: of both ellipses, as multiples of their sizes.
+        bump_height: of the bump over the surface.
+        bump_width: distance at which the bump has fallen to 1/e.
+    """
+
+    columns: int = 64
+    rows: int = 32
+    major_radius: float = 0.375
+    minor_radius: float = 0.125
+    semi_axes: tuple[float, float] = (1.0, 0.5)
+    bump_height: float = 0.075
+    bump_width: float = 0.05
+
+
+PAPER = TorusForm()
+#: Latent indices of each factor.
 FACTORS = {"latitudinal ellipse": [0], "longitudinal ellipse": [1], "bump": [2, 3]}
 LATENTS = ("alpha", "beta", "gamma", "zeta")
+#: Period of every latent, in radians.
 PERIOD = 2 * np.pi
 
 
 def connectivity() -> Connectivity:
-    """The 64 × 32 grid on the torus: vertex (i, j) is 32 i + j, each quad split along (i, j) – (i+1, j+1)."""
-    i, j = np.meshgrid(np.arange(U_COUNT), np.arange(V_COUNT), indexing="ij")
+    """Return the 64 × 32 grid on the torus: vertex (i, j) is 32 i + j, each quad split along (i, j) – (i+1, j+1)."""
+    columns, rows = PAPER.columns, PAPER.rows
+    i, j = np.meshgrid(np.arange(columns), np.arange(rows), indexing="ij")
 
     def index(di: int, dj: int) -> np.ndarray:
-        return ((i + di) % U_COUNT * V_COUNT + (j + dj) % V_COUNT).ravel()
+        return ((i + di) % columns * rows + (j + dj) % rows).ravel()
 
     corner, right, up, across = index(0, 0), index(1, 0), index(0, 1), index(1, 1)
     return Connectivity(
-        np.concatenate([np.stack([corner, right, across], 1), np.stack([corner, across, up], 1)]),
-        U_COUNT * V_COUNT,
+        np.concatenate([np.stack([corner, right, across], 1), np.stack([corner, across, up], 1)]), columns * rows
     )
 
 
-def _ellipse(angle: FloatArray, t: FloatArray) -> tuple[FloatArray, ...]:
-    """The warped ellipse τ(t) turned by half the angle, and its derivative: τ₁, τ₂, τ₁', τ₂'."""
-    a, b = SEMI_AXES
+def _ellipse(angle: FloatArray, t: FloatArray, semi_axes: tuple[float, float]) -> tuple[FloatArray, ...]:
+    """Return the warped ellipse τ(t) turned by half the angle, and its derivative: τ₁, τ₂, τ₁', τ₂'."""
+    a, b = semi_axes
     c, s = np.cos(angle / 2), np.sin(angle / 2)
     ct, st = np.cos(t - angle / 2), np.sin(t - angle / 2)
     return a * c * ct - b * s * st, a * s * ct + b * c * st, -a * c * st - b * s * ct, -a * s * st + b * c * ct
 
 
-def _surface(alpha: FloatArray, beta: FloatArray, u: FloatArray, v: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Points f^{α,β}(u, v) and unit normals, each (…, 3)."""
-    p1, p2, dp1, dp2 = (MAJOR_RADIUS * x for x in _ellipse(alpha, u))
-    q1, q2, dq1, dq2 = (MINOR_RADIUS * x for x in _ellipse(beta, v))
+def _surface(
+    form: TorusForm, alpha: FloatArray, beta: FloatArray, u: FloatArray, v: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return points f^{α,β}(u, v) and unit normals, each (…, 3)."""
+    p1, p2, dp1, dp2 = (form.major_radius * x for x in _ellipse(alpha, u, form.semi_axes))
+    q1, q2, dq1, dq2 = (form.minor_radius * x for x in _ellipse(beta, v, form.semi_axes))
     c, s = np.cos(u), np.sin(u)
     point = np.stack(np.broadcast_arrays(p1 + c * q1, p2 + s * q1, q2), axis=-1)
     by_u = np.stack(np.broadcast_arrays(dp1 - s * q1, dp2 + c * q1, 0.0 * q2), axis=-1)
@@ -54,37 +80,38 @@ def _surface(alpha: FloatArray, beta: FloatArray, u: FloatArray, v: FloatArray) 
     return point, normal / np.linalg.norm(normal, axis=-1, keepdims=True)
 
 
-def vertices(latents: FloatArray) -> FloatArray:
-    """Shapes (n, V, 3) of codes (n, 4) = (α, β, γ, ζ) in radians: the map 𝓕 of the paper's appendix."""
+def vertices(latents: FloatArray, form: TorusForm = PAPER) -> FloatArray:
+    """Return shapes (n, V, 3) for codes (n, 4) = (α, β, γ, ζ) in radians: the map 𝓕 of the paper's appendix."""
     alpha, beta, gamma, zeta = np.moveaxis(np.asarray(latents, dtype=np.float64)[..., None], -2, 0)
-    u = np.repeat(2 * np.pi * np.arange(U_COUNT) / U_COUNT, V_COUNT)
-    v = np.tile(2 * np.pi * np.arange(V_COUNT) / V_COUNT, U_COUNT)
-    points, _ = _surface(alpha, beta, u, v)
-    centre, normal = _surface(alpha, beta, gamma, zeta)
+    u = np.repeat(2 * np.pi * np.arange(form.columns) / form.columns, form.rows)
+    v = np.tile(2 * np.pi * np.arange(form.rows) / form.rows, form.columns)
+    points, _ = _surface(form, alpha, beta, u, v)
+    centre, normal = _surface(form, alpha, beta, gamma, zeta)
     distance = np.linalg.norm(points - centre, axis=-1, keepdims=True)
-    return points + BUMP_HEIGHT * np.exp(-((distance / BUMP_WIDTH) ** 2)) * normal
+    return points + form.bump_height * np.exp(-((distance / form.bump_width) ** 2)) * normal
 
 
 def reference() -> TriangleMesh:
-    """The torus at α = β = γ = ζ = 0."""
+    """Return the torus at α = β = γ = ζ = 0."""
     return TriangleMesh(vertices(np.zeros((1, 4)))[0], connectivity())
 
 
 def edge_permutation(mesh: Connectivity, vertex_map: IntArray) -> IntArray:
-    """(E,) image of each edge under an automorphism of the connectivity given on its vertices."""
+    """Return the image (E,) of each edge under an automorphism of the connectivity, given on vertices (V,)."""
     image = np.sort(vertex_map[mesh.edges], axis=1)
     key = mesh.edges[:, 0] * mesh.vertex_count + mesh.edges[:, 1]
     return np.searchsorted(key, image[:, 0] * mesh.vertex_count + image[:, 1])
 
 
 class FreakyTorus:
-    """The collection of `vertices`, normalised to a reference of unit area; see sampling.Collection."""
+    """The collection of `vertices`, normalised to a reference of unit area; see `sampling.Collection`."""
 
     factors = FACTORS
     latent_names = LATENTS
     coordinates = Coordinates(np.zeros(4), np.full(4, PERIOD), np.full(4, PERIOD))
-
     codes = np.empty((0, 4))
+    #: Sizes of the shapes; the reference always has the paper's.
+    form = PAPER
 
     def __init__(self) -> None:
         mesh = reference()
@@ -93,20 +120,21 @@ class FreakyTorus:
 
     @property
     def symmetries(self) -> list[IntArray]:
-        """The half turn about the x-axis, which takes the shape of (α, β, γ, ζ) to that of (−α, −β, −γ, −ζ)."""
-        i, j = np.divmod(np.arange(U_COUNT * V_COUNT), V_COUNT)
-        turned = -i % U_COUNT * V_COUNT + -j % V_COUNT
+        """The half turn about the x-axis, which maps the shape with code (α, β, γ, ζ) to the one with code negated."""
+        columns, rows = PAPER.columns, PAPER.rows
+        i, j = np.divmod(np.arange(columns * rows), rows)
+        turned = -i % columns * rows + -j % rows
         return [edge_permutation(self.reference.connectivity, turned)]
 
     @property
     def places(self) -> FeaturePositions:
-        """What each code moves: the ellipses, which turn by half its angle, and the bump.
+        """The features that codes move over the surface: both ellipses, each by half its angle, and the bump.
 
-        Where all shapes move by some columns of the grid, α by twice their angle and γ by this angle, edges have the
-        constants that they had: their row, and their direction in the grid.
+        Shift a shape by some columns of the grid: α changes by twice the angle of the shift, γ by the angle itself.
+        The constants of an edge don't change. They are its row and its direction in the grid.
         """
-        counts = np.array([U_COUNT, V_COUNT])
-        start, end = np.moveaxis(np.stack(np.divmod(self.reference.connectivity.edges, V_COUNT), axis=-1), 1, 0)
+        counts = np.array([PAPER.columns, PAPER.rows])
+        start, end = np.moveaxis(np.stack(np.divmod(self.reference.connectivity.edges, PAPER.rows), axis=-1), 1, 0)
         step = (end - start + counts // 2) % counts - counts // 2
         surface = 2 * np.pi / counts * (start + step / 2)
         row = surface[:, 1, None] * [1, 2]
@@ -123,16 +151,16 @@ class FreakyTorus:
 
     @property
     def finer(self) -> None:
-        """None, likewise."""
+        """None: a formula is exact."""
         return None
 
     @property
     def differentiated(self) -> None:
-        """None: the convolutions that this collection needs do not learn from derivatives."""
+        """None: the convolutions for this collection don't learn from derivatives."""
         return None
 
     def shapes(self, latents: FloatArray) -> SampledShapes:
-        """Shapes of codes (n, 4), angles as near as they can be to the reference's; the formula never fails."""
-        mesh, points = self.reference, vertices(latents) / self.scale
+        """Return the shapes for codes (n, 4); each angle differs from the reference's by at most π. Never fails."""
+        mesh, points = self.reference, vertices(latents, self.form) / self.scale
         z = unwrap(nric(points, mesh.connectivity), nric(mesh.vertices, mesh.connectivity))
         return SampledShapes(points, z, [""] * len(latents))

@@ -1,4 +1,4 @@
-"""The collections that a configuration can name: CollectionSettings.generator."""
+"""Built-in generators of collections, by the names for `CollectionSettings.generator`."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from shapespace.training.runs.sampling import Collection
 
 
 def figure_meshes() -> MeshCollection:
-    """The figure in its poses; the first is the one at rest."""
+    """Return the figure in its poses, first the rest pose."""
     labels, vertices, faces = figure.poses()
     return MeshCollection(tuple(labels), vertices, faces)
 
 
-#: Products of shape spaces by design: they give factors and bounds themselves, and skip `mean` and `modes`.
+#: Products of shape spaces by design: they give factors and bounds themselves, so the run skips `mean` and `modes`.
 PRODUCTS: dict[str, Callable[[], Collection]] = {"freaky-torus": FreakyTorus}
-#: Meshes in correspondence, as a folder holds them.
+#: Generators of meshes in correspondence, as a folder holds them.
 MESHES: dict[str, Callable[[], MeshCollection]] = {"figure": figure_meshes}

@@ -1,4 +1,4 @@
-"""The command's ``init``: a configuration with comments for a folder of meshes, with values chosen from them."""
+"""The command ``init``: write a commented configuration for a folder of meshes, with values chosen from the meshes."""
 
 from __future__ import annotations
 
@@ -60,12 +60,12 @@ licence = "unspecified"    # of the meshes, and so of the model: say it before y
 
 
 def configuration(collection: MeshCollection, data: str, title: str) -> str:
-    """TOML text for a collection.
+    """Return the TOML text of a collection's configuration.
 
     Args:
-        collection: read from ``data``.
-        data: as the configuration names the meshes.
-        title: for people; the bundle's name is made from it.
+        collection: the meshes.
+        data: the meshes' path in the configuration.
+        title: the model's title; the bundle's name is made from it.
     """
     count, vertices = collection.vertices.shape[:2]
     target = CollectionSettings().coarse_vertices
@@ -103,11 +103,11 @@ def _parts(collection: MeshCollection) -> str:
 
 
 def write(meshes: Path, out: Path | None = None, *, force: bool = False) -> tuple[Path, MeshCollection]:
-    """Read a collection and write its configuration, by default under its name into the working directory.
+    """Read a collection and write its configuration, by default into the working directory under the collection's name.
 
     Raises:
         IngestError: the collection can't be used.
-        ConfigError: the file is there already, and no ``force``, or can't be written.
+        ConfigError: the file exists and ``force`` isn't set, or the file can't be written.
     """
     full = meshes.resolve()
     title = (full.stem if full.is_file() else full.name) or "shapes"
@@ -124,11 +124,11 @@ def write(meshes: Path, out: Path | None = None, *, force: bool = False) -> tupl
 
 
 def slug(title: str) -> str:
-    """A bundle's name from any text: small letters, digits and hyphens."""
+    """Make a bundle's name from any text: small letters, digits and hyphens."""
     plain = unicodedata.normalize("NFKD", title).encode("ascii", "ignore").decode().lower()
     return re.sub(r"[^a-z0-9]+", "-", plain).strip("-") or "shapes"
 
 
 def _string(text: str) -> str:
-    # JSON's strings are TOML's too, save for DEL.
+    # A JSON string is also a TOML string, except for DEL.
     return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")

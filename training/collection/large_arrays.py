@@ -1,4 +1,4 @@
-"""Arrays of whole collections, which need not fit into memory: large ones lie in a temporary file."""
+"""Arrays of whole collections, which need not fit into memory: large arrays lie in a temporary file."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from numpy.typing import DTypeLike, NDArray
 
 from shapespace.arrays import FloatArray, IntArray
 
-#: A larger array, in bytes, is kept in a temporary file.
+#: Bytes of the largest array that is kept in memory.
 IN_MEMORY = 2**27
-#: How many numbers are processed at a time.
+#: Number of values that are processed at a time.
 TOGETHER = 2**22
 
 
 def room(shape: tuple[int, ...], dtype: DTypeLike = np.float64) -> NDArray:
-    """An array to be filled, in memory or in a file that is gone with it.
+    """Return an array to be filled, in memory or in a temporary file that disappears with the array.
 
     Raises:
         OSError: the disk is full.
@@ -33,7 +33,7 @@ def room(shape: tuple[int, ...], dtype: DTypeLike = np.float64) -> NDArray:
 
 
 def stacked(count: int, shapes: Iterable[FloatArray]) -> FloatArray:
-    """Shapes (V, 3), each needed only until the next, as one array (count, V, 3)."""
+    """Stack shapes (V, 3) into one array (count, V, 3), so that only one shape at a time is needed in memory."""
     array: FloatArray = np.zeros(0)
     for k, shape in enumerate(shapes):
         if k == 0:
@@ -43,13 +43,13 @@ def stacked(count: int, shapes: Iterable[FloatArray]) -> FloatArray:
 
 
 def some_vertices(vertices: FloatArray, chosen: IntArray) -> FloatArray:
-    """Some vertices of all shapes (n, V, 3)."""
+    """Return the chosen vertices (k,) of all shapes (n, V, 3)."""
     if len(chosen) == vertices.shape[1]:
         return vertices
     return stacked(len(vertices), (shape[chosen] for shape in vertices))
 
 
 def columns(count: int, size: int) -> Iterator[slice]:
-    """Parts of an array (count, size), all rows of some columns each, that fit into memory."""
+    """Divide an array (count, size) into blocks of columns that fit into memory."""
     width = max(1, TOGETHER // count)
     return (slice(start, start + width) for start in range(0, size, width))

@@ -1,6 +1,6 @@
-"""The body of the figure: a solid given by formulas, meshed once, the same on the left and on the right.
+"""The body of the figure: a solid given by formulas and meshed once, with equal left and right halves.
 
-Everything is in metres and radians; the figure stands on y = 0, looks along z, and has its left side at x > 0.
+All lengths are in metres. The figure stands on y = 0 and looks along z; its left side is at x > 0.
 """
 
 from __future__ import annotations
@@ -20,11 +20,12 @@ def _vector(x: float, y: float, z: float) -> FloatArray:
 
 
 def unit(v: FloatArray) -> FloatArray:
-    """A vector (3,) of length 1."""
+    """Scale a vector (3,) to length 1."""
     return v / np.linalg.norm(v)
 
 
 X, Y, Z = np.eye(3)
+# Joints and directions of the left half at rest.
 MIRROR = _vector(-1, 1, 1)
 SHOULDER, ARM = _vector(0.168, 1.385, -0.014), unit(_vector(0.88, -1, 0))
 ELBOW, WRIST = SHOULDER + 0.285 * ARM, SHOULDER + 0.53 * ARM
@@ -35,14 +36,14 @@ TOES = unit(_vector(0.16, 0, 1))
 
 
 class _Tube:
-    """A rounded solid about a straight axis, its sections half ellipses in front and behind, interpolated by splines.
+    """A rounded solid about a straight axis. Splines interpolate its sections, each a half ellipse in front and behind.
 
     Args:
-        origin: (3,) where s = 0.
+        origin: (3,) point of the axis with s = 0.
         axis: (3,) direction in which s grows.
-        front: (3,) direction of depth; width is across both.
-        caps: lengths of the half ellipsoids before the first row and after the last.
-        rows: s, centre across, centre forward, half width, depth to the front, depth to the back.
+        front: (3,) direction of depth; the width is perpendicular to axis and depth.
+        caps: lengths of the half ellipsoids before the first section and after the last.
+        rows: a section each: s, centre across, centre forward, half width, depth to the front, depth to the back.
     """
 
     def __init__(
@@ -61,7 +62,7 @@ class _Tube:
         self.sections = CubicSpline(table[:, 0], table[:, 1:], bc_type="natural")
 
     def __call__(self, points: FloatArray) -> FloatArray:
-        """Distances (n,) to first order, negative inside."""
+        """Return distances (n,) from points (n, 3) to first order, negative inside."""
         s, u, v = self.frame @ (points - self.origin).T
         inner = np.clip(s, *self.ends)
         u0, v0, width, front, back = self.sections(inner).T
@@ -77,11 +78,11 @@ def _ball(centre: FloatArray, width: float, height: float, depth: float) -> _Tub
 
 
 def _join(f: FloatArray, g: FloatArray, blend: float) -> FloatArray:
-    """The union of two solids, rounded where they are closer than blend; twice differentiable."""
+    """Unite two solids given by distances; where these differ by less than ``blend``, the union is rounded (C²)."""
     return np.minimum(f, g) - np.maximum(blend - np.abs(f - g), 0) ** 3 / (6 * blend**2)
 
 
-#: Solids of the left half, each with the width over which it blends into those before it.
+#: Solids of the left half, each with the width over which it blends into the solids before it.
 SOLIDS: list[tuple[_Tube, float]] = [
     # Torso, by height.
     (_Tube(0 * Y, Y, Z, (0.05, 0.04),
@@ -163,9 +164,9 @@ SOLIDS: list[tuple[_Tube, float]] = [
 
 
 def _distance(points: FloatArray) -> FloatArray:
-    """Distances (n,) to the surface, to first order, negative inside; symmetric in x."""
+    """Return distances (n,) from points (n, 3) to the surface, to first order, negative inside; symmetric in x."""
     x, y, z = points.T
-    # Rounded where |x| has its kink, which joins the halves smoothly.
+    # A rounded |x|, which joins the halves smoothly.
     left = np.stack([np.hypot(x, 0.008), y, z], axis=1)
     f = np.full(len(points), np.inf)
     for solid, blend in SOLIDS:
@@ -174,7 +175,7 @@ def _distance(points: FloatArray) -> FloatArray:
 
 
 def _project(points: FloatArray, steps: int) -> FloatArray:
-    """Points moved onto the surface by Newton's steps."""
+    """Move points (n, 3) onto the surface by Newton steps."""
     h = 1e-5
     for _ in range(steps):
         f = _distance(np.concatenate([points, *(points + h * e for e in np.eye(3))])).reshape(4, -1)
@@ -183,8 +184,9 @@ def _project(points: FloatArray, steps: int) -> FloatArray:
     return points
 
 
-#: Length of the edges at the trunk.
+#: Length of edges on the trunk in metres, which gives the figure about 4600 vertices.
 EDGE = 0.0195
+#: Steps in which springs move the vertices.
 RELAXATIONS = 60
 
 
@@ -197,7 +199,11 @@ def _edge_length(points: FloatArray) -> FloatArray:
 
 
 def _scatter() -> tuple[FloatArray, int]:
-    """Points (n, 3) of the surface with x ≥ 0, nearly an edge apart; and how many, the first, lie at x = 0."""
+    """Scatter points (n, 3) over the surface with x ≥ 0, nearly an edge apart.
+
+    Returns:
+        The points, those at x = 0 first, and the number of points at x = 0.
+    """
     cell = 0.03
     axes = [np.arange(a, b, cell) for a, b in ((0, 0.7), (-0.02, 1.75), (-0.2, 0.25))]
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
@@ -217,18 +223,20 @@ def _scatter() -> tuple[FloatArray, int]:
 
 
 def _both(left: FloatArray, middle: int) -> FloatArray:
+    """Add the mirror images of all points but the first ``middle``, which lie in the plane x = 0."""
     return np.concatenate([left, left[middle:] * MIRROR])
 
 
 def _triangulate(points: FloatArray) -> IntArray:
-    """Faces (F, 3), outward: restricted Delaunay, those between tetrahedra whose circumcentres lie inside and outside.
+    """Return the faces (F, 3), seen from outside, of the restricted Delaunay triangulation of surface points (n, 3).
 
-    For points dense on a smooth surface that is a closed surface of the same topology (Amenta and Bern 1999).
+    A face separates a tetrahedron whose circumcentre is inside from one whose circumcentre is outside. If the points
+    are dense on a smooth surface, the faces form a closed surface of the same topology (Amenta and Bern 1999).
     """
     corners = np.stack(np.meshgrid([-4, 4], [-4, 4], [-4, 4]), axis=-1).reshape(-1, 3)
-    # Mirrored pairs of points lie on common circles; shaken, they have one triangulation and finite circumcentres.
-    shaken = points + np.random.default_rng(0).uniform(-1e-6, 1e-6, points.shape)
-    mesh = Delaunay(np.concatenate([shaken, corners]))
+    # Mirrored pairs of points lie on common circles. Noise gives them one triangulation and finite circumcentres.
+    noisy = points + np.random.default_rng(0).uniform(-1e-6, 1e-6, points.shape)
+    mesh = Delaunay(np.concatenate([noisy, corners]))
     tetrahedra = mesh.simplices
     p = mesh.points[tetrahedra]
     a, b, c = np.moveaxis(p[:, 1:] - p[:, :1], 1, 0)
@@ -248,9 +256,9 @@ def _triangulate(points: FloatArray) -> IntArray:
 
 @cache
 def rest() -> TriangleMesh:
-    """The figure with all angles zero, arms half lowered: closed, of genus 0, its vertices mirrored in x = 0.
+    """Mesh the figure at rest, arms half lowered: closed, of genus 0, vertices mirrored in the plane x = 0.
 
-    Springs between neighbours push points apart until their edges are as long as wanted (Persson and Strang 2004).
+    Springs push neighbouring points apart until edges have the wanted lengths (Persson and Strang 2004).
     """
     left, middle = _scatter()
     triangulated = np.full((2 * len(left) - middle, 3), np.inf)

@@ -1,7 +1,7 @@
 """The left–right symmetry of a collection, and mirror images of its shapes.
 
 Bodies and faces are often made from a template whose vertices mirror each other. A pose of the left arm then says how
-the right one moves. Faces need not mirror each other: a quad may be split the other way on the other side.
+the right arm moves. The mesh's faces need not mirror each other: a quad may be split along the other diagonal.
 """
 
 from __future__ import annotations
@@ -16,32 +16,34 @@ from shapespace.mesh.rigid_motion import align
 from shapespace.mesh.triangle_mesh import diagonal
 from shapespace.training.collection.large_arrays import stacked
 
-#: A shape is symmetric if a reflection takes no vertex farther from another than this share of its diagonal.
+#: A shape is symmetric if a reflection maps every vertex to within this distance of a vertex, a share of the diagonal.
 TOLERANCE = 1e-3
-#: Least share of the edges whose image is an edge.
+#: Least share of edges that the reflection maps to an edge.
 EDGES = 0.9
-#: Vertices that are tried before all are.
+#: Number of vertices to test first, as most reflections fail already there.
 FIRST = 200
 
 
 def find_mirror(shapes: Sequence[FloatArray] | FloatArray, edges: IntArray) -> tuple[IntArray, int] | None:
-    """Which vertex each is the mirror image of, by the first shape that exactly one reflection takes to itself.
+    """Find the first shape with exactly one reflection symmetry, and the mirror image of each vertex.
 
-    Where several do, as a straight bar, none of them tells left from right: what bends forward need not bend backward.
+    A shape with several reflections, such as a straight bar, doesn't tell left from right: if the bar can bend forward,
+    it need not be able to bend backward.
 
     Args:
         shapes: (n, V, 3).
-        edges: (E, 2) of all of them.
+        edges: (E, 2) of all shapes.
 
     Returns:
-        (V,) vertices, each the image of its image, and the number of that shape; None where no shape is symmetric.
+        The index (V,) of each vertex's mirror image, and the index of the symmetric shape. None if no shape is
+        symmetric.
     """
     known = np.unique(np.sort(edges, axis=1) @ [len(shapes[0]), 1])
     for number, shape in enumerate(shapes):
         found: list[IntArray] = []
         centred = shape - shape.mean(axis=0)
         tree, size = KDTree(centred), TOLERANCE * diagonal(shape)
-        # The normal of a plane of symmetry is a principal axis, where these are distinct.
+        # If the principal axes are distinct, the normal of a plane of symmetry is one of them.
         for normal in [*np.linalg.eigh(centred.T @ centred)[1].T, *np.eye(3)]:
             reflection = np.eye(3) - 2 * np.outer(normal, normal)
             some = centred[:: max(1, len(shape) // FIRST)]
@@ -62,14 +64,14 @@ def find_mirror(shapes: Sequence[FloatArray] | FloatArray, edges: IntArray) -> t
 
 
 def mirrored(shapes: FloatArray, image: IntArray) -> tuple[FloatArray, IntArray]:
-    """Mirror images of shapes, where these stand.
+    """Return mirror images of shapes, each aligned to its shape. Symmetric shapes get no image.
 
     Args:
         shapes: (n, V, 3).
-        image: (V,) of the vertices.
+        image: (V,) index of each vertex's mirror image.
 
     Returns:
-        (k, V, 3) without those of symmetric shapes, and (k,) which shapes the others are images of.
+        The images (k, V, 3), and the indices (k,) of the shapes that they mirror.
     """
     flipped = np.array([-1.0, 1, 1])
 

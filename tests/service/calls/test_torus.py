@@ -35,7 +35,7 @@ def test_one_call_gives_a_valid_glb_with_the_bump_where_it_was_asked_for(client:
     i, j = np.unravel_index(moved[here].argmax(), moved[here].shape)
     assert abs(19 + i - 3 * 64 / (2 * np.pi)) < 1.5
     assert abs(j - 4 * 32 / (2 * np.pi)) < 1.5
-    assert moved[here].max() > 0.5 * freaky_torus.BUMP_HEIGHT
+    assert moved[here].max() > 0.5 * freaky_torus.PAPER.bump_height
 
 
 def test_fresh_codes_come_within_a_hundredth_of_the_formula(client: httpx.Client) -> None:

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from shapespace.coordinates.nric import WeightedNorm, nric
-from shapespace.training.collection.freaky_torus import U_COUNT, V_COUNT, FreakyTorus, edge_permutation
+from shapespace.training.collection.freaky_torus import PAPER, FreakyTorus, edge_permutation
 from shapespace.training.learning import networks
 from shapespace.training.learning.corrections import JointSamples, Motion
 from shapespace.training.learning.fields import FieldCorrection
@@ -87,11 +87,11 @@ def test_symmetric_shapes_look_alike_at_symmetric_edges(
 ) -> None:
     """Moved by eight columns; what is not relative, and the factors' shapes, which have other bumps, don't count."""
     field = network(own, held_out, SMALL.model_copy(update={"relative": relative})).correction
-    turn = 2 * np.pi * 8 / U_COUNT
+    turn = 2 * np.pi * 8 / PAPER.columns
     before, after = held_out.motion.codes[:4], held_out.motion.codes[:4] + turn * torch.tensor([2.0, 0, 1, 0])
     circle = [torch.stack([torch.cos(c), torch.sin(c)], dim=2) for c in (before, after)]
-    i, j = np.divmod(np.arange(U_COUNT * V_COUNT), V_COUNT)
-    image = edge_permutation(TORUS.reference.connectivity, (i + 8) % U_COUNT * V_COUNT + j)
+    i, j = np.divmod(np.arange(PAPER.columns * PAPER.rows), PAPER.rows)
+    image = edge_permutation(TORUS.reference.connectivity, (i + 8) % PAPER.columns * PAPER.rows + j)
     seen = []
     for known, at in zip(circle, (torch.arange(len(image)), torch.as_tensor(image)), strict=True):
         field.codes = lambda y, known=known: known
