@@ -1,4 +1,4 @@
-"""Pictures of a run's shapes as elements of its report, and the colours of the whole report."""
+"""Pictures of a run's shapes as HTML elements, and the colours of the report."""
 
 from __future__ import annotations
 
@@ -19,20 +19,20 @@ from shapespace.mesh.rigid_motion import align
 from shapespace.training.report.record import Record
 from shapespace.training.report.rendering import Camera
 
-#: Largest displacement in the picture of a mode, as a fraction of the diagonal.
+#: Largest displacement in the picture of a mode, as a share of the diagonal.
 MODE_REACH = 0.1
-#: Colours of shapes: exact ones, those from networks (yellow in the paper too), and modes without a factor.
+#: Colours of exact shapes, of shapes from networks (yellow as in the paper), and of modes without a factor.
 CLAY, COMPOSITE, NEUTRAL = "#d3ccc1", "#e3b23c", "#4b5a6b"
 ERROR = LinearSegmentedColormap.from_list("error", [CLAY, "#f2c14e", "#e4572e", "#8f1440"])
 
 
 @dataclass(frozen=True)
 class Studio:
-    """Draws the shapes of one run, all with one camera.
+    """A camera and colours for all shapes of one run.
 
     Attributes:
-        camera: sees every shape of the run.
-        base: (V, 3) shape that the others are aligned to.
+        camera: a view that holds every shape of the run.
+        base: (V, 3) shape that all other shapes are aligned to.
         faces: (F, 3).
     """
 
@@ -42,7 +42,7 @@ class Studio:
 
     @classmethod
     def of(cls, record: Record) -> Studio | None:
-        """Set up the camera; None where there is no shape to draw, or nothing to draw with."""
+        """Set up the camera; return None without a shape to draw, or without the package ``embreex``."""
         if record.base is None or importlib.util.find_spec("embreex") is None:
             return None
         base, faces = record.base.astype(np.float64), record.reference["faces"]
@@ -51,14 +51,25 @@ class Studio:
         return cls(Camera.facing(base, faces, np.concatenate([base[None], *shapes])), base, faces)
 
     def closer(self, reference: FloatArray) -> Studio:
-        """The same view without the room that far-reaching shapes need: for the base, the reference and modes."""
+        """Return the same view, cut to the base, the reference and modes, which need less room than other shapes."""
         points = np.concatenate([self.base, align(reference, self.base)])
         return replace(self, camera=self.camera.framing(points, 1.2 * MODE_REACH))
 
     def pixels(
         self, shape: FloatArray, size: int, colours: Any = CLAY, faces: IntArray | None = None, *, smooth: bool = True
     ) -> NDArray[np.uint8]:
-        """A picture (h, w, 4) of a shape (V, 3), or several (T, V, 3) side by side; colours are a name or (…, V, 3)."""
+        """Draw a shape (V, 3), or several shapes (T, V, 3) side by side.
+
+        Args:
+            shape: the vertices.
+            size: pixels of the longer side of one shape's picture.
+            colours: a name, or sRGB (…, V, 3) between 0 and 1.
+            faces: (F, 3); the run's if left out.
+            smooth: see `Camera.render`.
+
+        Returns:
+            (height, width, 4) sRGB and coverage.
+        """
         faces = self.faces if faces is None else faces
         shapes = shape.reshape(-1, *shape.shape[-2:])
         tints = np.broadcast_to(to_rgb(colours) if isinstance(colours, str) else colours, shapes.shape)
@@ -66,7 +77,7 @@ class Studio:
         return np.concatenate(pictures, axis=1)
 
     def draw(self, shape: FloatArray, alt: str, size: int, *how: Any, **more: Any) -> Markup:
-        """The same as an image element."""
+        """Return the picture from `pixels` as an HTML element with alternative text."""
         pixels = self.pixels(shape, size, *how, **more)
         file = io.BytesIO()
         Image.fromarray(pixels).save(file, format="WEBP", quality=84)
@@ -77,17 +88,20 @@ class Studio:
 
 
 def ramp(hue: str) -> Colormap:
-    """Colours from clay to a hue; in the middle more of it than on a straight line, where it would look muddy."""
+    """Return colours from clay to a hue.
+
+    The middle has more of the hue than linear interpolation gives, which would look muddy.
+    """
     middle = 0.35 * np.array(to_rgb(CLAY)) + 0.65 * np.array(to_rgb(hue))
     return LinearSegmentedColormap.from_list(hue, [to_rgb(CLAY), tuple(middle), to_rgb(hue)])
 
 
 def tint(colours: Colormap, values: FloatArray) -> FloatArray:
-    """Colours (…, 3) of values between 0 and 1."""
+    """Return colours (…, 3) for values between 0 and 1."""
     return np.asarray(colours(np.nan_to_num(values).clip(0, 1)))[..., :3]
 
 
 def colour_bar(colours: Colormap, *labels: str) -> dict[str, Any]:
-    """A legend: a CSS gradient, and labels evenly along it."""
+    """Return a legend: a CSS gradient, and evenly spaced labels."""
     stops = ", ".join(to_hex(colours(x)) for x in np.linspace(0, 1, 9))
     return {"gradient": f"linear-gradient(90deg, {stops})", "labels": labels}

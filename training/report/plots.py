@@ -1,4 +1,4 @@
-"""Plots as SVG elements that take the font and the colours of the page around them."""
+"""Plots as SVG elements that inherit the page's font and colours."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, MaxNLocator, NullFormatter
 from numpy.typing import ArrayLike
 
-#: A placeholder for the page's text colour, light or dark, which replaces it in the written SVG.
+#: Placeholder for the page's text colour, light or dark; the SVG has ``currentColor`` instead.
 INK = "#010203"
 STYLE: dict[Any, Any] = {
     "axes.edgecolor": INK, "axes.labelcolor": INK, "axes.linewidth": 0.6, "axes.spines.right": False,
@@ -27,7 +27,13 @@ STYLE: dict[Any, Any] = {
 
 
 def plot(alt: str, draw: Callable[[Axes], Any], size: tuple[float, float] = (3.5, 2.2)) -> Markup:
-    """An SVG element of what ``draw`` puts into the axes; ``alt`` is what it says to those who don't see it."""
+    """Return an SVG element.
+
+    Args:
+        alt: alternative text for screen readers.
+        draw: draws into the axes.
+        size: width and height in inches, which fixes the size of text relative to the plot.
+    """
     file = io.StringIO()
     with mpl.rc_context({**STYLE, "svg.hashsalt": alt}):
         figure = Figure(figsize=size, layout="constrained")
@@ -35,8 +41,8 @@ def plot(alt: str, draw: Callable[[Axes], Any], size: tuple[float, float] = (3.5
         nothing = dict.fromkeys(("Creator", "Date", "Format", "Type"))
         figure.savefig(file, format="svg", transparent=True, metadata=nothing)
     svg = file.getvalue()
-    # Left out: the XML prologue, the fixed size, addresses of namespaces, and ids, which repeat from plot to plot.
-    # The ids that are referred to differ between plots: they are hashes, with ``alt`` as their salt.
+    # Remove the XML prologue, the fixed size, addresses of namespaces, and ids that repeat from plot to plot. Ids with
+    # references stay. They are hashes with ``alt`` as salt, so they differ between plots.
     svg = re.sub(r'^.*?<svg .*?(viewBox="[^"]*").*?>', r" \1>", svg, count=1, flags=re.DOTALL)
     svg = re.sub(r' id="[a-zA-Z0-9.]+_\d+"', "", svg).replace(INK, "currentColor")
     rest = Markup(svg.rstrip())  # noqa: S704 - matplotlib has escaped the texts in it
@@ -45,7 +51,7 @@ def plot(alt: str, draw: Callable[[Axes], Any], size: tuple[float, float] = (3.5
 
 @dataclass(frozen=True)
 class Line:
-    """A line of a plot; one without a name stays out of the legend."""
+    """A line of a plot; without a name it isn't in the legend."""
 
     x: ArrayLike
     y: ArrayLike
@@ -56,7 +62,7 @@ class Line:
 
 
 def lines(alt: str, label: str, rows: Sequence[Line], *, log: bool = False, **axis: Any) -> Markup:
-    """Plot lines over an axis with a label; ``axis`` goes to matplotlib's ``Axes.set``."""
+    """Plot lines over an axis with a label; ``axis`` holds arguments for matplotlib's ``Axes.set``."""
 
     def draw(axes: Axes) -> None:
         for line in rows:

@@ -1,4 +1,4 @@
-"""What a run has left in its directory, as its report needs it."""
+"""The files of a run's directory, as the report needs them."""
 
 from __future__ import annotations
 
@@ -10,30 +10,31 @@ from dataclasses import dataclass
 from functools import cached_property, partial
 from itertools import cycle
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
 from shapespace.arrays import FloatArray
 from shapespace.coordinates.nric import WeightedNorm
 from shapespace.mesh.triangle_mesh import TriangleMesh
+from shapespace.training.runs.atomic_files import JsonFile, NpzFile
 from shapespace.training.runs.directory import RunDirectory
 from shapespace.training.runs.shortfalls import shortfalls
 from shapespace.training.runs.stages import STAGES
 from shapespace.training.space.modes import edge_magnitudes
 
 Value = TypeVar("Value")
-#: Colours of the factors in their order, in plots too.
+#: Colours of the factors in their order; charts take their colours from here too.
 HUES = ("#d1495b", "#2a7fba", "#3a9d5d", "#8e5bb5", "#e08a1e", "#1a9aa0", "#b5651d", "#d45fa0", "#7b9a24", "#5560c9")
 
 
 class ReportError(ValueError):
-    """A folder that no report can be made of, with the reason in one line."""
+    """A folder without a readable run, with the reason in one line."""
 
 
 @dataclass(frozen=True)
 class FactorRecord:
-    """A group of modes, and the hue that stands for it throughout the page."""
+    """A group of modes, and its colour throughout the page."""
 
     name: str
     hue: str
@@ -47,11 +48,15 @@ def _readable(path: Path, read: Callable[[], Value]) -> Value:
         raise ReportError(f"{path} can't be read: {str(error).splitlines()[0]}") from error
 
 
+def _read(file: JsonFile | NpzFile) -> dict[str, Any]:
+    return _readable(file.path, file.read_if_written)
+
+
 class Record:
-    """What a run has left so far; what isn't there is empty or None.
+    """The results that a run has written so far; missing results are empty or None.
 
     Raises:
-        ReportError: the folder is no run directory; or, on reading, a file of it is broken.
+        ReportError: the folder is no run directory, or a file in it can't be read.
     """
 
     def __init__(self, run: RunDirectory) -> None:
@@ -60,19 +65,13 @@ class Record:
             raise ReportError(f"{run.folder} is no run directory: it holds no config.toml")
         self.text = _readable(run.config.path, run.config.read)
         self.config = _readable(run.config.path, lambda: tomllib.loads(self.text))
-        self.reference, self.gallery, mean = (
-            _readable(file.path, file.read_if_written) for file in (run.reference, run.gallery, run.mean)
+        self.reference, self.gallery, self.modes, mean = map(_read, (run.reference, run.gallery, run.modes, run.mean))
+        self.decomposition, self.evaluation, self.histories = map(
+            _read, (run.decomposition, run.evaluation, run.histories)
         )
-        self.modes = _readable(run.modes.path, run.modes.read_if_written)
-        self.decomposition, self.evaluation, self.histories, grouping = (
-            _readable(file.path, file.read_if_written)
-            for file in (run.decomposition, run.evaluation, run.histories, run.factors)
-        )
-        self.generalisation, self.encoded = (
-            _readable(file.path, file.read_if_written) for file in (run.generalisation, run.encoded)
-        )
+        self.generalisation, self.encoded, grouping = map(_read, (run.generalisation, run.encoded, run.factors))
         self.mean: FloatArray | None = mean.get("vertices")
-        #: (V, 3) the base point of tangent vectors: the mean, or the reference where there is none.
+        #: (V, 3) base point of tangent vectors: the mean, or the reference if there is no mean.
         self.base = self.reference.get("vertices") if self.mean is None else self.mean
         groups = grouping.get("factors", [])
         self.factors = [
@@ -80,13 +79,13 @@ class Record:
             for name, hue, group in zip(grouping.get("names", []), cycle(HUES), groups, strict=False)
         ]
         self.overlap = np.array(grouping.get("overlap", []))
-        #: Seconds of the stages that are done, None for one that is running.
-        stamps = {name: _readable(run.stamp(name).path, run.stamp(name).read_if_written) for name in STAGES}
+        stamps = {name: _read(run.stamp(name)) for name in STAGES}
+        #: Wall time in seconds of each stage that has begun; None if it hasn't ended.
         self.seconds = {name: stamp.get("seconds") for name, stamp in stamps.items() if "key" in stamp}
 
     @cached_property
     def given_up(self) -> list[tuple[str, str]]:
-        """What the finished stages could not do: pairs of a stage and a sentence."""
+        """Warnings of the finished stages: pairs of a stage and a sentence."""
         found = []
         for stage in (name for name in STAGES if self.seconds.get(name) is not None):
             lost = _readable(self.run.folder, partial(shortfalls, self.run, stage))
@@ -95,17 +94,18 @@ class Record:
 
     @cached_property
     def at_work(self) -> str:
-        """Progress of the stage at work, from the last line of the log; empty where it reports none."""
+        """Progress of the running stage, from the last line of the log; empty if it reports none."""
         last = deque(self.run.events(), maxlen=1)
         if last and last[0].get("event") == "progress":
             return "{what}: {done} of {total}".format(**last[0])
         return ""
 
     def supports(self, tangents: FloatArray) -> FloatArray:
-        """Where tangent vectors (m, 2E) act: (m, V) between 0 and 1.
+        """Return the supports (m, V) of tangent vectors (m, 2E): where they change the shape, between 0 and 1.
 
-        The root of the mean of the weighted norm's terms over the edges at a vertex. Displacements would tell less: a
-        bent knee moves the whole lower leg, but lengths and angles change at the knee (paper, figure of SPGA modes).
+        The value at a vertex is the root mean square, over its edges, of the terms of the weighted norm. Displacements
+        would tell less: a bent knee moves the whole lower leg, but lengths and angles change at the knee (paper, figure
+        of SPGA modes).
         """
         mesh = TriangleMesh.from_arrays(self.base, self.reference["faces"])  # type: ignore[arg-type]
         norm = WeightedNorm.of(mesh, self.evaluation.get("eta", 1e-2))
@@ -113,5 +113,5 @@ class Record:
         ends, count = mesh.edges.T.ravel(), len(mesh.vertices)
         degree = np.bincount(ends, minlength=count).clip(1)
         result = np.sqrt([np.bincount(ends, np.tile(row, 2), count) / degree for row in density])
-        # The very largest value may sit on a single sliver.
+        # Percentile instead of maximum: the largest value may belong to a single sliver.
         return (result / np.percentile(result, 99, axis=1, keepdims=True).clip(1e-300)).clip(0, 1)

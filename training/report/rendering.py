@@ -1,4 +1,4 @@
-"""Pictures of shapes, drawn with rays on the CPU: no display, no OpenGL, only the embreex wheel."""
+"""Pictures of shapes by ray casting on the CPU: without a display or OpenGL, only with the package embreex."""
 
 from __future__ import annotations
 
@@ -13,31 +13,48 @@ from shapespace.arrays import FloatArray, IntArray
 from shapespace.files.gltf_writing import vertex_normals
 from shapespace.mesh.triangle_mesh import diagonal, face_normals
 
-#: Degrees from which a shape is seen, to the right of its front and above it.
-AZIMUTH, ELEVATION = 25.0, 18.0
-#: Distance of the camera, in diagonals of all that is shown: from far away perspective distorts little.
-DISTANCE = 2.5
-#: Directions of lights in (right, up, towards the viewer), and their brightness.
-LIGHTS = (((-0.55, 0.75, 0.65), 0.78), ((0.85, 0.10, 0.50), 0.20))
-#: Ambient light on surfaces that face down, and on those that face up.
-AMBIENT = (0.20, 0.46)
-#: Wrap of diffuse light beyond the line where a surface turns away from it; 0 is plain Lambertian shading.
-WRAP = 0.3
-#: Rays from each vertex that test what occludes its ambient light.
-OCCLUSION_RAYS = 96
-#: Rays per pixel along each side, which smooths outlines.
-SUPERSAMPLING = 2
-GAMMA = 2.2
-#: Margin around the shapes, a fraction of the picture's longer side.
-MARGIN = 0.03
+
+@dataclass(frozen=True)
+class RenderingSettings:
+    """View, light and quality of all pictures.
+
+    Attributes:
+        azimuth: degrees to the right of the shape's front.
+        elevation: degrees above the shape's front.
+        distance: distance of the camera, in diagonals of all shapes: from far away, perspective distorts little.
+        margin: space around the shapes, a share of the picture's longer side.
+        lights: for each light its direction (right, up, towards the viewer) and its brightness.
+        ambient: ambient light on surfaces that face down, and on surfaces that face up.
+        wrap: how far diffuse light reaches around a surface that turns away from it; 0 is Lambertian shading.
+        occlusion_rays: number of rays from each vertex that test which directions are occluded.
+        supersampling: rays per pixel along each side, which smooths outlines.
+        gamma: exponent between light and its encoding as sRGB.
+    """
+
+    azimuth: float = 25.0
+    elevation: float = 18.0
+    distance: float = 2.5
+    margin: float = 0.03
+    lights: tuple[tuple[tuple[float, float, float], float], ...] = (
+        ((-0.55, 0.75, 0.65), 0.78),
+        ((0.85, 0.10, 0.50), 0.20),
+    )
+    ambient: tuple[float, float] = (0.20, 0.46)
+    wrap: float = 0.3
+    occlusion_rays: int = 96
+    supersampling: int = 2
+    gamma: float = 2.2
+
+
+SETTINGS = RenderingSettings()
 
 
 @dataclass(frozen=True)
 class Camera:
-    """A perspective camera; one serves all shapes of a run, so that their pictures compare.
+    """A perspective camera. All shapes of a run have the same camera, so that their pictures can be compared.
 
     Attributes:
-        axes: (3, 3) rows are the directions right, up and towards the viewer.
+        axes: (3, 3) directions right, up and towards the viewer, as rows.
         eye: (3,) position.
         window: left, right, bottom and top of the picture, at one unit of length before the eye.
     """
@@ -48,18 +65,18 @@ class Camera:
 
     @classmethod
     def facing(cls, reference: FloatArray, faces: IntArray, shapes: ArrayLike = ()) -> Camera:
-        """Choose a view of a reference shape (V, 3) whose picture holds all points of ``shapes`` (…, 3) as well.
+        """Choose a view of a reference shape (V, 3) whose picture also holds all points of ``shapes`` (…, 3).
 
-        Collections come with any axis up. A shape is looked at along the coordinate axis in which it is thinnest,
-        from its open side or, where it is closed, from where modelling tools have their front view; up is y, or z
-        where y is the line of sight.
+        Any axis of a collection may point up. The camera looks along the axis in which the shape is thinnest. It looks
+        at the shape's open side, or at the front as modelling tools define it if the shape is closed. In the picture y
+        points up, or z if the camera looks along y.
         """
         thin = int(np.argmin(reference.std(axis=0)))
         normals = face_normals(reference, faces, normalised=False)
         openness = normals.sum(axis=0)[thin] / np.linalg.norm(normals, axis=1).sum()
         side = np.sign(openness) if abs(openness) > 0.05 else -1.0 if thin == 1 else 1.0
         towards, up = side * np.eye(3)[thin], np.eye(3)[2 if thin == 1 else 1]
-        azimuth, elevation = math.radians(AZIMUTH), math.radians(ELEVATION)
+        azimuth, elevation = math.radians(SETTINGS.azimuth), math.radians(SETTINGS.elevation)
         level = math.cos(azimuth) * towards + math.sin(azimuth) * np.cross(up, towards)
         back = math.cos(elevation) * level + math.sin(elevation) * up
         right = np.cross(up, back) / np.linalg.norm(np.cross(up, back))
@@ -67,11 +84,11 @@ class Camera:
 
         points = np.concatenate([reference, np.reshape(shapes, (-1, 3))])
         low, high = points.min(axis=0), points.max(axis=0)
-        eye = (low + high) / 2 + DISTANCE * np.linalg.norm(high - low) * back
-        return cls(axes, eye, (-1.0, 1.0, -1.0, 1.0)).framing(points, MARGIN)
+        eye = (low + high) / 2 + SETTINGS.distance * np.linalg.norm(high - low) * back
+        return cls(axes, eye, (-1.0, 1.0, -1.0, 1.0)).framing(points, SETTINGS.margin)
 
     def framing(self, points: FloatArray, margin: float) -> Camera:
-        """The same view, cut to points (n, 3) and a margin around them, a fraction of the picture's longer side."""
+        """Return the same view, cut to points (n, 3) and a margin, a share of the picture's longer side."""
         local = (points - self.eye) @ self.axes.T
         screen = local[:, :2] / -local[:, 2:]
         low, high = screen.min(axis=0), screen.max(axis=0)
@@ -82,19 +99,19 @@ class Camera:
     def render(
         self, vertices: FloatArray, faces: IntArray, colours: ArrayLike, size: int, *, smooth: bool = True
     ) -> NDArray[np.uint8]:
-        """Draw a shape before a transparent background.
+        """Draw a shape on a transparent background.
 
         Args:
             vertices: (V, 3) positions.
             faces: (F, 3) vertex indices.
             colours: (V, 3) or (3,) sRGB between 0 and 1.
             size: pixels of the picture's longer side.
-            smooth: shade by normals of vertices; by those of faces otherwise, which shows the triangles.
+            smooth: shade by normals of vertices instead of normals of faces, which show the triangles.
 
         Returns:
             (height, width, 4) sRGB and coverage.
         """
-        # Imported here: there are platforms without this wheel, and everything but pictures works there.
+        # Imported here, because everything but pictures also works on platforms without this package.
         from embreex.mesh_construction import TriangleMesh
         from embreex.rtcore_scene import EmbreeScene
 
@@ -107,37 +124,38 @@ class Camera:
         left, right, bottom, top = self.window
         pixel = max(right - left, top - bottom) / size
         height, width = round((top - bottom) / pixel), round((right - left) / pixel)
-        rays = _rays(self.window, SUPERSAMPLING * height, SUPERSAMPLING * width)
+        fine = SETTINGS.supersampling
+        rays = _rays(self.window, fine * height, fine * width)
         hit = scene.run(np.zeros_like(rays), rays, output=True)
         seen = hit["primID"] >= 0
         rays, face, u, v = rays[seen], hit["primID"][seen], hit["u"][seen, None], hit["v"][seen, None]
 
-        albedo = np.broadcast_to(np.asarray(colours) ** GAMMA, vertices.shape)
+        albedo = np.broadcast_to(np.asarray(colours) ** SETTINGS.gamma, vertices.shape)
         corners = np.hstack([normals, albedo, light[:, None]]).astype(np.float32)[faces]
         a, b, c = (corners[face, corner] for corner in range(3))
         normal, albedo, light = np.split((1 - u - v) * a + u * b + v * c, [3, 6], axis=1)
         front = np.einsum("ij,ij->i", hit["Ng"][seen], rays) < 0
         if not smooth:
             normal = hit["Ng"][seen]
-        # Surfaces have two equal sides. The face tells which is seen: at a sharp edge the smooth normal may look away.
+        # Both sides of a surface look the same. The face tells which side is visible: at a sharp edge the smooth normal
+        # may point away from the viewer.
         normal = np.where(front[:, None], normal, -normal)
 
-        picture = np.zeros((SUPERSAMPLING**2 * height * width, 4), dtype=np.float32)
+        picture = np.zeros((fine**2 * height * width, 4), dtype=np.float32)
         picture[seen, :3], picture[seen, 3] = _shade(normal, -rays, albedo, light), 1
-        # Averages are taken of light, not of its encoding, and weighted by coverage: no dark seam at outlines.
+        # Average the light instead of its encoding, weighted by coverage, so that outlines have no dark seam.
         picture = np.mean(
-            [picture.reshape(height, SUPERSAMPLING, width, SUPERSAMPLING, 4)[:, i, :, j]
-             for i in range(SUPERSAMPLING) for j in range(SUPERSAMPLING)],
+            [picture.reshape(height, fine, width, fine, 4)[:, i, :, j] for i in range(fine) for j in range(fine)],
             axis=0,
-        )  # fmt: skip
+        )
         coverage = picture[..., 3:]
-        picture[..., :3] = (picture[..., :3] / np.where(coverage > 0, coverage, 1)).clip(0, 1) ** (1 / GAMMA)
+        picture[..., :3] = (picture[..., :3] / np.where(coverage > 0, coverage, 1)).clip(0, 1) ** (1 / SETTINGS.gamma)
         return (255 * picture + 0.5).astype(np.uint8)
 
 
 @lru_cache(maxsize=4)
 def _rays(window: tuple[float, float, float, float], height: int, width: int) -> NDArray[np.float32]:
-    """Directions (height·width, 3) through the pixels of a picture, row by row from the top."""
+    """Return directions (height·width, 3) through the pixels of a picture, row by row from the top."""
     left, right, bottom, top = window
     x = left + (right - left) * (np.arange(width) + 0.5) / width
     y = top - (top - bottom) * (np.arange(height) + 0.5) / height
@@ -146,9 +164,10 @@ def _rays(window: tuple[float, float, float, float], height: int, width: int) ->
 
 
 def _ambient(scene: object, vertices: FloatArray, normals: FloatArray) -> FloatArray:
-    """Part (V,) of the light from all sides that reaches each vertex: creases and armpits are darker."""
-    k = np.arange(OCCLUSION_RAYS) + 0.5
-    z, turn = 1 - 2 * k / OCCLUSION_RAYS, math.pi * (1 + math.sqrt(5)) * k  # evenly over the sphere (Fibonacci)
+    """Return the share (V,) of ambient light that reaches each vertex: creases and armpits are darker."""
+    rays = SETTINGS.occlusion_rays
+    k = np.arange(rays) + 0.5
+    z, turn = 1 - 2 * k / rays, math.pi * (1 + math.sqrt(5)) * k  # evenly over the sphere (Fibonacci)
     ring = np.sqrt(1 - z**2)
     directions = np.stack([ring * np.cos(turn), ring * np.sin(turn), z], axis=1)
     weight = normals @ directions.T
@@ -163,14 +182,15 @@ def _ambient(scene: object, vertices: FloatArray, normals: FloatArray) -> FloatA
 
 
 def _shade(normal: NDArray, view: NDArray, albedo: NDArray, ambient: NDArray) -> NDArray:
-    """Linear light (n, 3) that leaves n points towards the viewer; float32 throughout, for speed."""
+    """Return the linear light (n, 3) that leaves n points towards the viewer, in float32 for speed."""
     normal = normal / np.linalg.norm(normal, axis=1, keepdims=True).clip(1e-12)
-    low, high = AMBIENT
+    low, high = SETTINGS.ambient
     light = ambient * (low + (high - low) * (0.5 + 0.5 * normal[:, 1:2]))
     gloss = 0.06 * (1 - np.einsum("ij,ij->i", normal, view)).clip(0, 1)[:, None] ** 3
-    for direction, brightness in LIGHTS:
+    for direction, brightness in SETTINGS.lights:
         towards = (np.array(direction) / np.linalg.norm(direction)).astype(np.float32)
-        light += brightness * ((normal @ towards + WRAP) / (1 + WRAP)).clip(0)[:, None] * (0.4 + 0.6 * ambient)
+        diffuse = ((normal @ towards + SETTINGS.wrap) / (1 + SETTINGS.wrap)).clip(0)[:, None]
+        light += brightness * diffuse * (0.4 + 0.6 * ambient)
         halfway = view + towards
         cosine = np.einsum("ij,ij->i", normal, halfway) / np.linalg.norm(halfway, axis=1)
         gloss += 0.08 * brightness * cosine.clip(0)[:, None] ** 40

@@ -21,7 +21,8 @@ from PIL import Image
 from shapespace.files.gltf_writing import vertex_normals
 from shapespace.mesh.triangle_mesh import TriangleMesh
 from shapespace.training.__main__ import main
-from shapespace.training.report.page import duration, write_report
+from shapespace.training.report.number_format import duration
+from shapespace.training.report.page import write_report
 from shapespace.training.report.record import Record, ReportError
 from shapespace.training.report.rendering import Camera
 from shapespace.training.runs.directory import RunDirectory
@@ -213,8 +214,8 @@ class Page(HTMLParser):
 @pytest.fixture(scope="module", autouse=True)
 def small_pictures() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("shapespace.training.report.page.LARGE", 100)
-        patch.setattr("shapespace.training.report.page.SMALL", 100)
+        patch.setattr("shapespace.training.report.cards.LARGE", 100)
+        patch.setattr("shapespace.training.report.cards.SMALL", 100)
         yield
 
 

@@ -1,0 +1,50 @@
+"""Numbers in the words of a report: digits, percent, durations and sizes."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from typing import Any
+
+
+def flatten(value: Any, name: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield the values in nested dictionaries and lists, each with its path."""
+    if isinstance(value, dict | list):
+        for key, inner in value.items() if isinstance(value, dict) else enumerate(value):
+            yield from flatten(inner, f"{name} · {key}" if name else str(key))
+    else:
+        yield name, value
+
+
+def figure(value: Any) -> str:
+    """Format a number with four digits; return anything else as it stands."""
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return str(value)
+    return "–" if not math.isfinite(value) else f"{value:,}" if isinstance(value, int) else f"{value:.4g}"
+
+
+def r2(value: float | None) -> str:
+    """Format a coefficient of determination with four decimals."""
+    return "–" if value is None or not math.isfinite(value) else f"{value:.4f}"
+
+
+def percent(value: float, digits: int = 2) -> str:
+    """Format a share as a percentage with some significant digits."""
+    return f"{100 * value:.{digits}g}\N{NO-BREAK SPACE}%"
+
+
+def duration(seconds: float | None) -> str:
+    """Format seconds in the unit that suits them."""
+    if seconds is None or not math.isfinite(seconds):
+        return "–"
+    if seconds < 0.9995:
+        return f"{1000 * seconds:.3g}\N{NO-BREAK SPACE}ms"
+    for unit, length in (("h", 3600), ("min", 60)):
+        if seconds >= 2 * length:
+            return f"{seconds / length:.3g}\N{NO-BREAK SPACE}{unit}"
+    return f"{seconds:.3g}\N{NO-BREAK SPACE}s"
+
+
+def size(value: float) -> str:
+    """Format bytes as megabytes."""
+    return f"{value / 1e6:.3g}\N{NO-BREAK SPACE}MB"
