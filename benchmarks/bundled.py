@@ -17,7 +17,7 @@ import jinja2
 import numpy as np
 
 from shapespace.coordinates.nric import WeightedNorm
-from shapespace.training.collection import freaky_torus
+from shapespace.training.collection.generators import freaky_torus
 from shapespace.training.learning.evaluation import r_squared
 from shapespace.training.runs.config import load
 

@@ -19,7 +19,7 @@ from shapespace.mesh.rigid_motion import align
 from shapespace.model.edit import PRIOR, Edited, PriorKind, Target, edited
 from shapespace.model.latent_space import Codes, Distribution
 from shapespace.model.shape_model import ShapeModel, load
-from shapespace.training.collection.mannequin import ARM, ELBOW, HIP, KNEE, LEG, SHOULDER, rest
+from shapespace.training.collection.generators.mannequin import ARM, ELBOW, HIP, KNEE, LEG, SHOULDER, rest
 
 ROOT = Path(__file__).resolve().parents[1]
 #: How far each vertex is pulled, in metres, the figure's unit; and how many pulls there are.

@@ -27,7 +27,7 @@ from shapespace.mesh.rigid_motion import Placement, align
 from shapespace.mesh.triangle_mesh import diagonal
 from shapespace.model.fit import FitStatus, Fitted
 from shapespace.model.shape_model import ShapeModel, load
-from shapespace.training.collection import figure
+from shapespace.training.collection.generators import figure
 
 #: Points of a scan; its noise as a share of the diagonal, and the share of outliers.
 POINTS, NOISE, OUTLIERS = 4000, 0.005, 0.02

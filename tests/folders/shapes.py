@@ -11,7 +11,7 @@ import numpy as np
 from shapespace.files.formats import MESH_FORMATS
 from shapespace.mesh.thinning import thin
 from shapespace.mesh.triangle_mesh import Connectivity
-from shapespace.training.collection import figure
+from shapespace.training.collection.generators import figure
 
 #: The joints that move; few, so that a few modes describe all shapes.
 BENDS = {"left elbow": 1.2, "right arm raise": 0.8, "head turn": 0.6, "left leg swing": 0.7}

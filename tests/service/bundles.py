@@ -18,7 +18,7 @@ from shapespace.coordinates.nric import nric
 from shapespace.mesh.prolongation import Prolongation
 from shapespace.mesh.triangle_mesh import TriangleMesh
 from shapespace.shell.energy import Material
-from shapespace.training.collection import freaky_torus
+from shapespace.training.collection.generators import freaky_torus
 
 SCALE = 3.0
 LATENTS = ("size", "turn", "twist")

@@ -1,4 +1,4 @@
-"""Vertices of shapes in correspondence: leave out unused ones, merge those that coincide, find seams left open.
+"""Vertices of shapes in correspondence: drop unused vertices, merge coinciding vertices, find open seams.
 
 Exporters split a vertex along seams of texture or shading, and STL has no shared vertices at all. Vertices become one
 if they coincide in every shape. Vertices that coincide in some shapes only stay apart: they touch by chance.

@@ -43,7 +43,7 @@ class CollectionSettings(_Section):
     """Where the shapes come from: a built-in generator, or meshes in correspondence."""
 
     generator: Literal["freaky-torus", "figure"] | None = None
-    """A built-in generator of a collection; see training/collection/generators.py."""
+    """A built-in generator of a collection; see training/collection/generators."""
     data: Path | None = None
     """Folder of OBJ, PLY, STL, OFF or glTF files, or one NPZ file with ``vertices`` (n, V, 3) and ``faces``; relative
     to the configuration's own folder. The command's ``--data`` takes precedence."""

@@ -7,7 +7,7 @@ import httpx
 import numpy as np
 
 from shapespace.mesh.rigid_motion import align
-from shapespace.training.collection import freaky_torus
+from shapespace.training.collection.generators import freaky_torus
 from tests.service.glb import GLB, khronos_report
 
 MODEL = "/v1/models/freaky-torus"

@@ -15,7 +15,7 @@ from shapespace.mesh.triangle_mesh import TriangleMesh
 from shapespace.solve.cholesky import NotPositiveDefiniteError
 from shapespace.solve.deadline import Deadline
 from shapespace.solve.outcome import Status
-from shapespace.training.collection.freaky_torus import FreakyTorus
+from shapespace.training.collection.generators.freaky_torus import FreakyTorus
 from tests.shapespace.conftest import KERNELS, MESHES, bent
 
 ETAS = [DEFAULT_ETA, 1.0]

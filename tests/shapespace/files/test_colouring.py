@@ -7,7 +7,7 @@ from matplotlib.colors import to_rgb
 
 from shapespace.files.colouring import Colouring, Quantity
 from shapespace.mesh.triangle_mesh import Connectivity
-from shapespace.training.collection import freaky_torus
+from shapespace.training.collection.generators import freaky_torus
 from tests.shapespace.conftest import hinge
 
 ROTATION = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))[0]

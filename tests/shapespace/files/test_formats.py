@@ -18,7 +18,7 @@ from shapespace.files.gltf_writing import vertex_normals
 from shapespace.files.point_cache import point_cache
 from shapespace.files.usd import animated_usd
 from shapespace.mesh.triangle_mesh import MeshError, TriangleMesh
-from shapespace.training.collection import freaky_torus
+from shapespace.training.collection.generators import freaky_torus
 from tests.meshes import read_mesh
 from tests.sequences import read_point_cache, read_usd
 from tests.service.glb import GLB

@@ -17,7 +17,7 @@ from shapespace.files.animated_gltf import animated_glb
 from shapespace.files.formats import MESH_FORMATS, read_arrays
 from shapespace.files.limits import Limits
 from shapespace.mesh.triangle_mesh import MeshError
-from shapespace.training.collection import freaky_torus
+from shapespace.training.collection.generators import freaky_torus
 from tests.hostile import BINARY, FACES, MATRIX, VERTICES, chain, document, doubling, glb, graph, ring
 
 POINTS = VERTICES.astype(np.float64)

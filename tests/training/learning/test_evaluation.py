@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from shapespace.coordinates.nric import WeightedNorm
-from shapespace.training.collection.freaky_torus import FreakyTorus
+from shapespace.training.collection.generators.freaky_torus import FreakyTorus
 from shapespace.training.learning.baselines import MultilinearGrid, grid_nodes
 from shapespace.training.learning.evaluation import Reconstructions, r_squared
 from shapespace.training.runs.config import EvaluationSettings

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from shapespace.coordinates.nric import WeightedNorm, nric
-from shapespace.training.collection.freaky_torus import PAPER, FreakyTorus, edge_permutation
+from shapespace.training.collection.generators.freaky_torus import PAPER, FreakyTorus, edge_permutation
 from shapespace.training.learning import networks
 from shapespace.training.learning.corrections import JointSamples, Motion
 from shapespace.training.learning.fields import FieldCorrection

@@ -21,7 +21,7 @@ from shapespace.bundle.geometry import Geometry
 from shapespace.bundle.reader import read_bundle
 from shapespace.coordinates.nric import WeightedNorm, nric
 from shapespace.model.shape_model import ShapeModel
-from shapespace.training.collection.freaky_torus import FreakyTorus, vertices
+from shapespace.training.collection.generators.freaky_torus import FreakyTorus, vertices
 from shapespace.training.learning import ExportError
 from shapespace.training.learning.evaluation import r_squared
 from shapespace.training.learning.export import export

@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 
 from shapespace.arrays import FloatArray, IntArray
 from shapespace.mesh.triangle_mesh import TriangleMesh
-from shapespace.training.collection.mannequin import (
+from shapespace.training.collection.generators.mannequin import (
     ANKLE,
     ARM,
     EDGE,

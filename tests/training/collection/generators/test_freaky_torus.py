@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from shapespace.coordinates.nric import dihedral_angles, nric
-from shapespace.training.collection import freaky_torus
+from shapespace.training.collection.generators import freaky_torus
 
 # The paper's parameters and resolution.
 A_R = A_r = 1.0

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from shapespace.training.collection import figure
-from shapespace.training.collection.freaky_torus import FreakyTorus
+from shapespace.training.collection.generators import figure
+from shapespace.training.collection.generators.freaky_torus import FreakyTorus
 from shapespace.training.collection.mesh_collection import MeshCollection
 from shapespace.training.runs.sampling import Collection
 

@@ -5,7 +5,7 @@ import pytest
 
 from shapespace.arrays import FloatArray
 from shapespace.mesh.triangle_mesh import TriangleMesh
-from shapespace.training.collection import figure, mannequin
+from shapespace.training.collection.generators import figure, mannequin
 
 
 def smallest_angles(vertices: FloatArray, faces: np.ndarray) -> FloatArray:
