@@ -35,7 +35,7 @@ data = {data}    # folder of meshes, or one NPZ; relative to this file
 # eta = {material.eta:g}    # bending against stretching; larger makes stiffer shells, whose triangles may collapse
 
 [modes]
-# count = "{mode.count}"    # how many numbers describe a shape: "auto" stops where more hardly help; {most} at most
+# count = "{mode.count}"    # how many numbers describe a shape: "auto" stops when more gain little; {most} at most
 # norm = "{mode.norm}"    # measures how near modes come to the shapes; "shell", the paper's, is less accurate
 
 [factors]

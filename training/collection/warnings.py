@@ -160,7 +160,7 @@ def find_warnings(
         vertices: (n, V, 3).
         connectivity: the edges and faces of all shapes.
         names: the n shapes' names, for sentences that refer to another shape.
-        placements: of the shapes.
+        placements: distances and rotations between the shapes.
 
     Returns:
         The warnings in the order of the shapes, grave ones first.

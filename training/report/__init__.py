@@ -1,1 +1,1 @@
-"""What a run shows people: pictures, plots and the page of a run."""
+"""The report of a run: pictures, charts and one HTML page."""

@@ -1,4 +1,4 @@
-"""What the reference's file has beside triangles is kept in reading, welding and choosing the reference."""
+"""Attributes of the reference's file survive reading, welding and choosing the reference."""
 
 from __future__ import annotations
 

@@ -216,7 +216,7 @@ def written(*arguments: object, **named: object) -> Callable[[Path], Path]:
 
 
 def with_other(name: str, vertices: np.ndarray, faces: np.ndarray) -> Callable[[Path], Path]:
-    """A folder of three OBJ files (or STL files, if ``name`` is one) of which one is replaced."""
+    """A folder of three OBJ files, or STL files if ``name`` is one, with one file replaced."""
     format = name.rpartition(".")[2]
 
     def build(folder: Path) -> Path:

@@ -22,8 +22,8 @@ class TorusForm:
         rows: number of vertices around the ring, along v.
         major_radius: size of the ellipse around the axis.
         minor_radius: size of the ellipse around the ring.
-        semi_axes: of both ellipses, as multiples of their sizes.
-        bump_height: of the bump over the surface.
+        semi_axes: semi-axes of both ellipses, as multiples of their sizes.
+        bump_height: height of the bump over the surface.
         bump_width: distance at which the bump has fallen to 1/e.
     """
 
