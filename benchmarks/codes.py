@@ -22,8 +22,8 @@ from benchmarks.serving import bundles
 from shapespace.bundle.reader import read_bundle
 from shapespace.model.correspondence import Matched
 from shapespace.model.decoder import MeshChoice
-from shapespace.model.edit import Target, edited
 from shapespace.model.latent_space import Codes, Distribution
+from shapespace.model.options import Target
 from shapespace.model.shape_model import ShapeModel
 
 T = TypeVar("T")
@@ -70,7 +70,7 @@ def edit(model: ShapeModel, count: int) -> str:
         vertices = timed(shape_times, partial(model.shape, goal)).vertices
         chosen = rng.choice(len(vertices), (1, 3, 5, 10)[k % 4], replace=False)
         targets = [Target(int(v), vertices[v].tolist()) for v in chosen]
-        found = timed(times, partial(edited, model, start, targets))
+        found = timed(times, partial(model.edit, start, targets))
         errors.append(found.distances.max() / diagonal)
     return (
         f"median {np.median(errors):.3%}, largest {np.max(errors):.3%}; over 1 % in "

@@ -7,7 +7,6 @@ factor alone differs, one that moves hardly anything but that limb, and measures
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,8 +15,8 @@ from numpy.typing import NDArray
 
 from shapespace.arrays import FloatArray
 from shapespace.mesh.rigid_motion import align
-from shapespace.model.edit import PRIOR, Edited, PriorKind, Target, edited
 from shapespace.model.latent_space import Codes, Distribution
+from shapespace.model.options import PriorKind, Target
 from shapespace.model.shape_model import ShapeModel, load
 from shapespace.training.collection.generators.mannequin import ARM, ELBOW, HIP, KNEE, LEG, SHOULDER, rest
 
@@ -160,12 +159,12 @@ def _place(
     return place(high)
 
 
-def row(model: ShapeModel, some: list[Pull], kind: PriorKind, edit: Callable[..., Edited] = edited) -> str:
+def row(model: ShapeModel, some: list[Pull], kind: PriorKind) -> str:
     """Edit by every pull, and summarise."""
     others, away, factors, shapes = [], [], [], []
     parts = limbs()
     for pull in some:
-        found = edit(model, pull.start, [pull.target], PRIOR, kind=kind)
+        found = model.edit(pull.start, [pull.target], prior_kind=kind)
         now = found.placement(found.shape.vertices)
         rest_of_it = np.logical_or.reduce([limb for name, limb in parts.items() if name != pull.limb])
         others.append(np.linalg.norm(now - pull.before, axis=1)[rest_of_it].mean())

@@ -25,7 +25,7 @@ from shapespace.arrays import FloatArray, IntArray
 from shapespace.mesh.closest_points import MeshProximity, VertexFaces
 from shapespace.mesh.rigid_motion import Placement, align
 from shapespace.mesh.triangle_mesh import diagonal
-from shapespace.model.fit import FitStatus, Fitted
+from shapespace.model.fit_result import FitStatus, Fitted
 from shapespace.model.shape_model import ShapeModel, load
 from shapespace.training.collection.generators import figure
 
@@ -188,7 +188,9 @@ class Bench:
     def __init__(self, model: ShapeModel, *, by_surface: bool) -> None:
         self.model, self.by_surface = model, by_surface
         self.fans = VertexFaces(model.faces, len(model.vertices))
-        model.fit(sampled(model.vertices, model.faces, POINTS, np.random.default_rng(0)))  # makes what is made once
+        model.fit_scan(
+            sampled(model.vertices, model.faces, POINTS, np.random.default_rng(0))
+        )  # makes what is made once
         times = []
         for code in model.population.sample(12, 1).astype(np.float32):
             began = time.process_time()
@@ -199,7 +201,7 @@ class Bench:
     @cached_property
     def training(self) -> FloatArray:
         """The training shapes (n, V, 3), as the model remembers them."""
-        codes = self.model.training_codes
+        codes = self.model.decoder.training_codes
         if codes is None:
             raise ValueError(f"{self.model.manifest.name} has no codes of the training shapes, as components need")
         return np.stack([self.model.shape(code).vertices for code in codes.astype(np.float32)])
@@ -228,7 +230,7 @@ class Bench:
         turn, shift = Rotation.random(random_state=rng).as_matrix(), diagonal(shape) * rng.standard_normal(3)
         points, there = points @ turn.T + shift, shape @ turn.T + shift
         began = time.process_time()
-        found = model.fit((points, faces), partial=partial)
+        found = model.fit_scan((points, faces), partial=partial)
         row.seconds.append((time.process_time() - began) / self.solved)
         row.errors.append(self.distance(found.placement(found.shape.vertices), there))
         row.converged.append(found.status is FitStatus.CONVERGED)

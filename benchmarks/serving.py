@@ -137,7 +137,7 @@ def measure(path: Path, model: ShapeModel, codes: Codes) -> dict[str, list[float
         def blend(code: FloatArray = code) -> object:
             return GLB(fine.vertices + (code @ fields).reshape(-1, 3), fine.faces, None)
 
-        network = seconds(partial(model._networks, code[None]))
+        network = seconds(partial(model.decoder._networks, code[None]))
         began = time.thread_time()
         shape = model.shape(code)
         solved = time.thread_time() - began
@@ -166,9 +166,9 @@ def measure(path: Path, model: ShapeModel, codes: Codes) -> dict[str, list[float
 def away(model: ShapeModel, codes: Codes) -> list[float]:
     """How far shapes end from a solution of tolerance 1e-10: the furthest vertex, in millionths of the diagonal."""
     found = []
-    with model.solver() as reconstruct:
+    with model.decoder.solver() as reconstruct:
         for code in codes:
-            target, others = model._networks(code[None])[1][0], list(model._learned_start(code))
+            target, others = model.decoder._networks(code[None])[1][0], list(model.decoder._learned_start(code))
             ours, exact = (reconstruct.from_guess(target, *others, tolerance=t).vertices for t in (TOLERANCE, 1e-10))
             found.append(
                 1e6 * float(np.linalg.norm(align(ours, exact) - exact, axis=1).max()) / model.reference.diagonal
@@ -224,10 +224,10 @@ def stages(folders: list[Path], count: int) -> None:
 def ceiling(model: ShapeModel, codes: Codes) -> float | str:
     """Time of the exact exponential, where the model has modes."""
     facts = model.manifest
-    if model.modes is None or facts.exponential_steps is None:
+    if model.decoder.modes is None or facts.exponential_steps is None:
         return "–"
     space = ShellSpace(model.reference, Material(facts.mu, facts.lambda_, facts.eta))
-    velocities = [np.tensordot(code.astype(np.float64), model.modes, 1) for code in codes]
+    velocities = [np.tensordot(code.astype(np.float64), model.decoder.modes, 1) for code in codes]
     start, steps = model.reference.vertices, facts.exponential_steps
     return statistics.median(seconds(partial(exponential, space, start, v, steps)) for v in velocities)
 
@@ -250,10 +250,10 @@ def _starts(model: ShapeModel, codes: Codes) -> list[object]:
     spent: dict[str, list[tuple[int, float]]] = {}
     apart, statuses = 0, dict.fromkeys(Status, 0)
     for code in codes:
-        target = model._networks(code[None])[1][0]
+        target = model.decoder._networks(code[None])[1][0]
         near = (code + radius * rng.uniform(-1, 1, len(code))).astype(np.float32)
-        beside = model._networks(near[None])[1][0]
-        learned = list(model._learned_start(code))
+        beside = model.decoder._networks(near[None])[1][0]
+        learned = list(model.decoder._learned_start(code))
         neighbour = reconstruct(beside, reconstruct.guess(beside), tolerance=TOLERANCE).vertices
         starts: dict[str, Callable[[], FloatArray]] = {
             "frames": partial(reconstruct.integrate, target),
@@ -337,7 +337,7 @@ def growth(count: int) -> None:
 def factor(model: ShapeModel) -> float:
     """Time of one factor of Gauss–Newton, of the reference."""
     target = nric(model.reference.vertices, model.reference.connectivity)
-    with model.solver() as reconstruct:
+    with model.decoder.solver() as reconstruct:
         point = reconstruct._squares(model.reference.vertices, target)
         return statistics.median(seconds(lambda: reconstruct._factor(point, target)) for _ in range(5))
 

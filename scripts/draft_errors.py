@@ -14,7 +14,7 @@ from shapespace.model.shape_model import load
 
 if __name__ == "__main__":
     for folder in map(Path, sys.argv[1:]):
-        found = load(folder).draft_error()
+        found = load(folder).decoder.draft_error()
         path = folder / MANIFEST
         facts = json.loads(path.read_text(encoding="utf-8"))
         origin, files = facts.pop("origin"), facts.pop("files")

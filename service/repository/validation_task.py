@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from shapespace.bundle.reader import BundleError, read_bundle
-from shapespace.model.shape_model import ShapeModel
+from shapespace.model.decoder import Decoder
 from shapespace.service.limits.sandbox_child import allow
 from shapespace.service.limits.sandbox_errors import FailedError
 from shapespace.service.limits.sandbox_wire import Arrays, Facts
@@ -36,7 +36,7 @@ def validate_bundle(body: bytearray, folder: str) -> tuple[Facts, Arrays]:
     try:
         bundle = read_bundle(Path(folder))
         allow(min(OF_A_VERTEX * bundle.manifest.vertices, MOST_OF_VERTICES))
-        ShapeModel(bundle).self_test()
+        Decoder(bundle).self_test()
     except (BundleError, OSError) as error:
         raise FailedError("refused", str(error)) from None
     return {"digest": bundle.digest}, {}

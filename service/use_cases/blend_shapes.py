@@ -26,7 +26,7 @@ async def blend_shapes_file(
         NotFiniteError, ModelFailedError: the model has no shape for one of its ends.
         BusyError, DeadlineError, DisconnectedError, EndingError: no place, or the call ended before.
     """
-    require_ends(model)
+    require_ends(model.decoder)
     size = shapes_size(model, 2 * model.latents.dimension + 1, mesh)
 
     def shape(deadline: Deadline, code: Codes) -> Shape:
@@ -34,7 +34,7 @@ async def blend_shapes_file(
 
     def make(deadline: Deadline) -> tuple[bytes, Timings]:
         began = time.perf_counter()
-        found = blend_shapes(model, mesh, partial(shape, deadline))
+        found = blend_shapes(model.decoder, mesh, partial(shape, deadline))
         solved = time.perf_counter()
         content = found.glb()
         return content, {"reconstruct": solved - began, "encode": time.perf_counter() - solved}

@@ -1,10 +1,10 @@
-"""Finding latent codes: of mesh files, of vertices pulled elsewhere, at random."""
+"""Find latent codes: of mesh files, of edited vertices, and random ones."""
 
 from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -14,10 +14,9 @@ from shapespace.arrays import FloatArray, IntArray
 from shapespace.files.limits import Limits
 from shapespace.mesh.rigid_motion import Placement
 from shapespace.model.correspondence import limits, match
-from shapespace.model.decoder import MeshChoice
-from shapespace.model.edit import PriorKind, Target, edited, require_targets
-from shapespace.model.encode import Objective
+from shapespace.model.edit import require_targets
 from shapespace.model.latent_space import Bounds, Codes, Distribution
+from shapespace.model.options import EditOptions, EncodeOptions, SearchOptions, Target
 from shapespace.model.shape_model import ShapeModel
 from shapespace.service.limits.sandbox import Pieces, Sandbox
 from shapespace.service.limits.sandbox_errors import (
@@ -36,17 +35,18 @@ from shapespace.solve.deadline import Deadline
 from shapespace.solve.outcome import Status
 
 logger = logging.getLogger(__name__)
-#: Bytes that reading a file may take beside the file.
+#: Memory in bytes that reading a file may take in addition to the file.
 MEMORY = 64 * 2**20
-_LEAST = 2**16
+#: Bytes of a reading process's answer beside the arrays.
+_ANSWER = 2**16
 
 
 @dataclass(frozen=True)
 class Found:
-    """What a search found.
+    """Result of a search.
 
     Attributes:
-        content: as JSON.
+        content: answer as JSON.
         seconds: time by stage.
     """
 
@@ -56,39 +56,17 @@ class Found:
 
 @dataclass(frozen=True)
 class Upload:
-    """A mesh file that somebody has sent.
+    """An uploaded mesh file.
 
     Attributes:
-        pieces: of the file, or of the form that holds it; emptied while it is read.
-        content_type: as it was declared, or nothing.
-        format: as it was asked for, which wins.
+        pieces: pieces of the file, or of the form that holds it; reading empties them.
+        content_type: declared media type, or an empty string.
+        format: format from the query, which has priority.
     """
 
     pieces: Pieces
     content_type: str
     format: str | None
-
-
-@dataclass(frozen=True)
-class SearchOptions:
-    """What may be asked of any search for a code.
-
-    Attributes:
-        fixed: value by coordinate that the code keeps.
-        samples: codes to draw from the posterior.
-        seed: of these.
-        most: samples that are answered at once.
-    """
-
-    fixed: Mapping[int, float]
-    samples: int
-    seed: int
-    most: int
-
-    def require_few(self) -> None:
-        """Raise TooManyCodesError where there are to be more samples than that."""
-        if self.samples:
-            require_count(self.samples, self.most, "samples")
 
 
 async def encode(
@@ -97,26 +75,35 @@ async def encode(
     caller: Caller,
     model: ShapeModel,
     upload: Upload,
-    bounds: Bounds,
-    objective: Objective,
-    wishes: SearchOptions,
+    options: EncodeOptions,
+    most: int,
 ) -> Found:
-    """The code whose shape comes closest to a mesh in correspondence, in any rigid pose; see ShapeModel.encode.
+    """Find the code whose shape comes closest to a mesh in correspondence; see ShapeModel.encode.
+
+    Args:
+        workers: workers that compute.
+        sandbox: sandbox that reads the file.
+        caller: caller who waits.
+        model: model of the code.
+        upload: mesh file.
+        options: options of the search.
+        most: maximum number of samples.
 
     Raises:
-        UploadError, InvalidMeshError: no mesh that can be used.
-        LatentError: numbers that overflow, a code outside the bounds where that is refused, or no such coordinate.
-        TooManyCodesError: more samples than codes are answered at once.
-        BusyError, DeadlineError, DisconnectedError, EndingError: no place, or the call ended before.
+        UploadError, InvalidMeshError: the mesh can't be used.
+        LatentError: numbers overflow, the code lies outside the bounds where that is refused, or a fixed coordinate
+            does not exist.
+        TooManyCodesError: more than ``most`` samples.
+        BusyError, DeadlineError, DisconnectedError, EndingError: the server is busy, or the call ended early.
     """
-    wishes.require_few()
-    model.latents.fixed(wishes.fixed)  # refused before the file is read
+    _require_few_samples(options, most)
+    model.latents.fixed(options.fixed)  # refused before the file is read
 
     def make(deadline: Deadline) -> Found:
         began = time.perf_counter()
-        given = match(model, *read_mesh(sandbox, upload, limits(model), deadline))
+        given = match(model.decoder, *read_mesh(sandbox, upload, limits(model.decoder), deadline))
         read = time.perf_counter()
-        found = model.encode(given, bounds, deadline, objective, wishes.fixed, wishes.samples, wishes.seed)
+        found = model.encode(given, options, deadline=deadline)
         if found.status is Status.DEADLINE:
             raise workers.late()
         seconds = {"read": read - began, "search": time.perf_counter() - read}
@@ -145,42 +132,35 @@ async def edit(
     model: ShapeModel,
     latent: Sequence[float],
     targets: Sequence[Target],
-    prior: float,
-    prior_kind: PriorKind,
-    mesh: MeshChoice,
-    wishes: SearchOptions,
-    anchored: bool = False,
+    options: EditOptions,
+    most: int,
 ) -> Found:
-    """The code inside the bounds whose shape comes closest to having some vertices at some places.
+    """Find the code whose shape comes closest to having some vertices at given positions; see ShapeModel.edit.
 
     Args:
-        workers: that compute.
-        caller: who waits.
-        model: whose code it is.
-        latent: (m,) to start from, clamped to the bounds.
-        targets: vertices of the mesh, and where they should be.
-        prior: weight of the change of the code.
-        prior_kind: what of the change costs.
-        mesh: that the targets' vertices belong to.
-        wishes: of the code and around it.
-        anchored: whether the whole stays where it is.
+        workers: workers that compute.
+        caller: caller who waits.
+        model: model of the code.
+        latent: (m,) code to start from, clamped to the bounds.
+        targets: vertices and their positions.
+        options: options of the edit.
+        most: maximum number of samples.
 
     Raises:
         InvalidTargetError: no such vertex, or too many targets.
         LatentError: a start that can't be used, or no such coordinate.
-        TooManyCodesError: more samples than codes are answered at once.
-        BusyError, DeadlineError, DisconnectedError, EndingError: no place, or the call ended before.
+        TooManyCodesError: more than ``most`` samples.
+        BusyError, DeadlineError, DisconnectedError, EndingError: the server is busy, or the call ended early.
     """
-    require_targets(model, targets, mesh)
-    wishes.require_few()
-    start, _ = model.latents.code(latent, Bounds.CLAMP)
-    fixed = model.latents.fixed(wishes.fixed)
+    # Refused before the call waits for a worker.
+    require_targets(model.decoder, targets, options.mesh)
+    _require_few_samples(options, most)
+    model.latents.code(latent, Bounds.CLAMP)
+    model.latents.fixed(options.fixed)
 
     def make(deadline: Deadline) -> Found:
         began = time.perf_counter()
-        found = edited(
-            model, start, targets, prior, mesh, deadline, prior_kind, fixed, wishes.samples, wishes.seed, anchored
-        )
+        found = model.edit(latent, targets, options, deadline=deadline)
         if found.status is Status.DEADLINE:
             raise workers.late()
         seconds = {"search": time.perf_counter() - began}
@@ -204,24 +184,29 @@ async def edit(
 def sample(
     model: ShapeModel, count: int, seed: int, distribution: Distribution, temperature: float, most: int
 ) -> Codes:
-    """Random codes (count, m), at most so many; see ShapeModel.sample.
+    """Return random codes (count, m); see ShapeModel.sample.
 
     Raises:
-        NoCodesError, TooManyCodesError: not between 1 and so many.
-        LatentError: a temperature at which the numbers overflow.
+        NoCodesError, TooManyCodesError: ``count`` is not between 1 and ``most``.
+        LatentError: a temperature at which numbers overflow.
     """
     require_count(count, most, "count")
     return model.sample(count, seed, distribution, temperature)
 
 
+def _require_few_samples(options: SearchOptions, most: int) -> None:
+    if options.samples:
+        require_count(options.samples, most, "samples")
+
+
 def placement(found: Placement) -> dict[str, Any]:
-    """A placement as it is answered."""
-    rotation = np.ascontiguousarray(found.rotation)  # as JSON takes it
+    """Return a placement as answers hold it."""
+    rotation = np.ascontiguousarray(found.rotation)  # the JSON writer needs contiguous arrays
     return {"rotation": rotation, "translation": found.translation, "scale": found.scale}
 
 
 def read_mesh(sandbox: Sandbox, upload: Upload, limits: Limits, deadline: Deadline) -> tuple[FloatArray, IntArray]:
-    """Vertices (V, 3) and faces (F, 3) of an uploaded file; raises as ``read_upload``."""
+    """Return vertices (V, 3) and faces (F, 3) of an uploaded file; raises as ``read_upload``."""
     vertices, faces, _ = read_upload(sandbox, upload, limits, deadline)
     return vertices, faces
 
@@ -235,25 +220,25 @@ def read_upload(
     points: bool = False,
     memory: int = MEMORY,
 ) -> tuple[FloatArray, IntArray, str]:
-    """Vertices (V, 3), faces (F, 3) and the form's ``options`` of an uploaded file, read in a process of its own.
+    """Read vertices (V, 3), faces (F, 3) and the form's ``options`` of an uploaded file in a process of its own.
 
     Args:
-        sandbox: whose children know the task ``read``.
-        upload: which is emptied.
-        limits: of the mesh.
-        deadline: after which the child is ended.
-        points: whether points without faces will do.
-        memory: bytes that reading may take beside the file.
+        sandbox: sandbox whose child processes know the task ``read``.
+        upload: file; reading empties it.
+        limits: limits of the mesh.
+        deadline: time limit of the child process.
+        points: whether the file may hold points without faces.
+        memory: bytes that reading may take in addition to the file.
 
     Raises:
-        UploadError: no mesh that can be used.
+        UploadError: the mesh can't be used.
         DeadlineError: the file was not read in time.
-        BusyError: no process can be had.
+        BusyError: no process is available.
         EndingError: the server ends.
     """
     facts = {"content_type": upload.content_type, "format": upload.format, "points": points}
     bounds = {"vertices": limits.vertices, "faces": limits.faces}
-    most = 24 * (limits.vertices + limits.faces) + _LEAST
+    most = 24 * (limits.vertices + limits.faces) + _ANSWER
     try:
         said, arrays = sandbox.call("read", facts | bounds, upload.pieces, deadline=deadline, memory=memory, most=most)
     except FailedError as error:

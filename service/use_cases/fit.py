@@ -1,4 +1,4 @@
-"""Fitting a model to a scan that somebody has sent."""
+"""Fit a model to an uploaded scan."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ from dataclasses import asdict
 from typing import Any
 
 from shapespace.files.limits import Limits
-from shapespace.model.fit import Distances, FitOptions, FitStatus
+from shapespace.model.fit_result import Distances, FitStatus
+from shapespace.model.options import FitOptions
 from shapespace.model.shape_model import ShapeModel
 from shapespace.service.limits.sandbox import Sandbox
 from shapespace.service.limits.workers import Caller, Workers
@@ -16,7 +17,7 @@ from shapespace.service.use_cases.codes import Found, Upload, placement, read_up
 from shapespace.service.use_cases.shape_formats import dump_json, float32
 from shapespace.solve.deadline import Deadline
 
-#: Largest numbers of vertices and faces of a scan; and memory, in bytes, that reading it may take besides the file.
+#: Maximum numbers of vertices and faces of a scan; memory in bytes that reading may take in addition to the file.
 LIMITS, MEMORY = Limits(2**21, 2**21), 256 * 2**20
 
 
@@ -28,19 +29,19 @@ async def fit(
     upload: Upload,
     options: Callable[[str], FitOptions],
 ) -> Found:
-    """The code, place and size that explain a scan; see ShapeModel.fit.
+    """Find the code, placement and size that explain a scan; see ShapeModel.fit_scan.
 
     Args:
-        workers: that compute.
-        sandbox: that reads the file.
-        caller: who waits.
-        model: that is fitted.
-        upload: the scan.
-        options: what is asked for, given the form's field ``options``, which may be empty.
+        workers: workers that compute.
+        sandbox: sandbox that reads the file.
+        caller: caller who waits.
+        model: model to fit.
+        upload: scan file.
+        options: returns the options, given the form's field ``options``, which may be empty.
 
     Raises:
-        UploadError, InvalidScanError: no scan that can be used.
-        BusyError, DeadlineError, DisconnectedError, EndingError: no place, or the call ended before.
+        UploadError, InvalidScanError: the scan can't be used.
+        BusyError, DeadlineError, DisconnectedError, EndingError: the server is busy, or the call ended early.
     """
 
     def make(deadline: Deadline) -> Found:
@@ -48,7 +49,7 @@ async def fit(
         points, faces, said = read_upload(sandbox, upload, LIMITS, deadline, points=True, memory=MEMORY)
         asked = options(said)
         read = time.perf_counter()
-        found = model.fitter(points, faces, asked, deadline)
+        found = model.fit_scan((points, faces), asked, deadline=deadline)
         if found.status is FitStatus.DEADLINE:
             raise workers.late()
         content = {

@@ -86,7 +86,7 @@ async def vertices_file(
         DeadlineError, DisconnectedError, EndingError: the call ended before the file was ready.
     """
     if exponentials:
-        require_tangent_space(model)
+        require_tangent_space(model.decoder)
     codes, inside = model.latents.codes(latents, bounds)
     async with batch(workers, caller, shapes_size(model, (2 if exponentials else 1) * len(codes), mesh)) as work:
         found = await shapes(work, model, codes, inside, mesh, quality)
@@ -189,6 +189,6 @@ async def _exponentials(
     """Discrete exponentials of codes (n, m), side by side, and how far the networks' shapes are from them."""
 
     def one(item: tuple[Codes, NDArray[np.float32]], call: Call) -> ExactShape:
-        return exact_shape(model, *item, mesh, call)
+        return exact_shape(model.decoder, *item, mesh, call)
 
     return await work.map(one, zip(codes, found.vertices, strict=True))

@@ -82,7 +82,7 @@ async def predictions(work: Batch, model: ShapeModel, codes: Codes, *, factors: 
 
     def predict(item: tuple[int, Codes], _: Call) -> None:
         k, code = item
-        z = model.lengths_and_angles(code)
+        z = model.decoder.lengths_and_angles(code)
         found[k] = np.concatenate([z.lengths, z.angles])
         if parts is not None:
             parts[k] = z.factors

@@ -103,14 +103,16 @@ async def shape_file(workers: Workers, caller: Caller, model: ShapeModel, wanted
 
     def find(code: CheckedCode | None, deadline: Deadline) -> Shape:
         return (
-            model.reference_shape(mesh) if code is None else solve(workers, model, mesh, wanted.quality, code, deadline)
+            model.decoder.reference_shape(mesh)
+            if code is None
+            else solve(workers, model, mesh, wanted.quality, code, deadline)
         )
 
     def make(deadline: Deadline) -> ShapeFile:
         found, colouring = [find(wanted.code, deadline)], None
         if colour_by and wanted.code and colour_by.covariance is not None:
             colouring = Colouring.of_spread(
-                vertex_uncertainty(model, wanted.code[0], colour_by.covariance, mesh, deadline)
+                vertex_uncertainty(model.decoder, wanted.code[0], colour_by.covariance, mesh, deadline)
             )
         elif colour_by:
             found.append(find(colour_by.against, deadline))
@@ -119,7 +121,7 @@ async def shape_file(workers: Workers, caller: Caller, model: ShapeModel, wanted
             vertices, against = (shape.vertices for shape in found)
             colouring = Colouring.between(colour_by.quantity, vertices, against, model.mesh(mesh).connectivity)
         vertices = placed(found[0].vertices, wanted.place)
-        surface = shown(model.surface(mesh), wanted.topology)
+        surface = shown(model.decoder.surface(mesh), wanted.topology)
         with writing():
             content = SHAPE_FORMATS[wanted.format].encode(vertices, model.mesh(mesh).faces, colouring, surface)
         seconds = {**total_seconds(shape.seconds for shape in found), "encode": time.perf_counter() - began}

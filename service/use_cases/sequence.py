@@ -101,13 +101,15 @@ async def sequence_file(
     # Colours take as much as positions.
     async with batch(workers, caller, shapes_size(model, len(codes) * (2 if colour_by else 1), mesh)) as work:
         found = await shapes(work, model, codes, inside, mesh, quality)
-        whole, surface = model.mesh(mesh), shown(model.surface(mesh), topology)
+        whole, surface = model.mesh(mesh), shown(model.decoder.surface(mesh), topology)
 
         def encode() -> tuple[Iterator[Buffer], dict[str, Any]]:
             colourings: list[Colouring] = []
             if colour_by:
                 reference = colour_by.against is None
-                against = model.reference_shape(mesh).vertices if reference else found.vertices[-1].astype(np.float64)
+                against = (
+                    model.decoder.reference_shape(mesh).vertices if reference else found.vertices[-1].astype(np.float64)
+                )
                 colourings = Colouring.of_frames(
                     colour_by.quantity, found.vertices[:number], against, whole.connectivity
                 )

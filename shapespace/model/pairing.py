@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 from shapespace.arrays import FloatArray, IntArray
 from shapespace.mesh.closest_points import MeshProximity, unit
 from shapespace.mesh.rigid_motion import Placement
-from shapespace.model.scan import Scan, near
+from shapespace.model.scan import Scan, nearest_points
 
 #: Cosine of the angle between the normals of a pair: below the first its weight is 0, above the second it is 1.
 APART, ALIKE = 0.2, 0.6
@@ -79,7 +79,7 @@ class Pairing:
         parts = [(points - found.places, own, found.distances, found.places, agree, np.full(n, 1 / n))]
         if k:
             places, across = surface.vertices[self._vertices], surface.vertex_normals[self._vertices]
-            _, nearest = near(self.scan.tree, placement(places))
+            _, nearest = nearest_points(self.scan.tree, placement(places))
             gaps = placement.back(self.scan.points[nearest]) - places
             # Points of a scan are some way apart, which says nothing of how far the surface is.
             distances = self.scan.distances(placement(places)) / placement.scale
@@ -105,10 +105,10 @@ class Pairing:
         unseen = np.flatnonzero(self.scan.distances(placement(vertices)) / placement.scale > most)
         if not len(far) or not len(unseen):
             return pairs
-        _, there = near(cKDTree(vertices[unseen]), points[far])
+        _, there = nearest_points(cKDTree(vertices[unseen]), points[far])
         replaced = [(far, self._vertices[unseen[there]], points[far])]
         if self._both:
-            _, back = near(cKDTree(points[far]), vertices[unseen])
+            _, back = nearest_points(cKDTree(points[far]), vertices[unseen])
             replaced.append((pairs.of_scan + unseen, self._vertices[unseen], points[far[back]]))
         index, own, goal = (np.concatenate(each) for each in zip(*replaced, strict=True))
         rows, found = pairs.rows.tolil(), deepcopy(pairs)

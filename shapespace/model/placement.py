@@ -1,4 +1,4 @@
-"""Placements of a model in a scan's frame, and the coarse ones from which a fit begins."""
+"""Start placements of a model's shapes in a scan's frame, from which a fit begins."""
 
 from __future__ import annotations
 
@@ -10,26 +10,27 @@ from scipy.spatial.transform import Rotation
 
 from shapespace.arrays import FloatArray, IntArray
 from shapespace.mesh.rigid_motion import Placement
-from shapespace.model.scan import Scan, near
+from shapespace.model.scan import Scan, nearest_points
 
-#: Share of the distances that count: the farthest may belong to a limb bent otherwise, or to something else.
+#: Share of the distances that count. The farthest points may belong to a limb in another pose, or to something else.
 TRIMMED = 0.8
-#: Shapes that rotations are tried on. The others are tried at the best of them.
+#: Number of shapes that are tried in all rotations. The other shapes are tried in the best of these rotations.
 FIRST = 4
-#: How far apart placements have to be to count as different, in radians.
+#: Smallest angle between different placements, in radians.
 DIFFERENT = 0.35
 
 
 @dataclass(frozen=True)
 class PlacementEffort:
-    """How widely placements are looked for.
+    """Effort of the search for placements.
 
     Attributes:
-        points: of the scan, that they are scored by.
-        rotations: tried beside principal axes.
-        kept, polished: placements, and more with other shapes, that go on to the next stage.
-        steps: of closest points there.
-        count: starts, at most.
+        points: number of the scan's points by which placements are scored.
+        rotations: number of rotations beside principal axes.
+        kept: number of placements that go on to closest-point steps.
+        polished: additional number of these placements, with other shapes.
+        steps: number of closest-point steps.
+        count: maximum number of start placements.
     """
 
     points: int
@@ -40,18 +41,18 @@ class PlacementEffort:
     count: int
 
 
-#: What serves most scans; and what those of a part may need, since a flat shape looks alike from both sides.
-NARROW = PlacementEffort(points=150, rotations=60, kept=8, polished=12, steps=6, count=5)
-WIDE = PlacementEffort(points=300, rotations=240, kept=48, polished=48, steps=20, count=32)
+#: Effort for most scans, and for scans of a part: a flat shape looks alike from both sides.
+QUICK = PlacementEffort(points=150, rotations=60, kept=8, polished=12, steps=6, count=5)
+THOROUGH = PlacementEffort(points=300, rotations=240, kept=48, polished=48, steps=20, count=32)
 
 
 @dataclass(frozen=True, eq=False)
-class Start:
-    """Where a fit may begin.
+class StartPlacement:
+    """Placement at which a fit may begin.
 
     Attributes:
         shape: index of the shape.
-        placement: of it.
+        placement: placement of the shape in the scan's frame.
         score: mean of the distances that count, in the model's units.
     """
 
@@ -60,39 +61,41 @@ class Start:
     score: float
 
 
-def coarse(scan: Scan, shapes: FloatArray, *, partial: bool, free: bool, breadth: PlacementEffort) -> list[Start]:
-    """The best placements of some shapes in a scan, each clearly different from the ones before.
+def start_placements(
+    scan: Scan, shapes: FloatArray, *, partial: bool, free: bool, effort: PlacementEffort
+) -> list[StartPlacement]:
+    """Find the best placements of shapes in a scan, each clearly different from the better ones.
 
     Args:
-        scan: in the model's units.
-        shapes: (k, n, 3) points evenly spread on shapes of a model.
-        partial: whether the scan shows a part of the shape only: then nothing has to be near each of its points.
+        scan: scan in the model's units.
+        shapes: (k, n, 3) evenly spread points of k shapes.
+        partial: whether the scan shows only a part of the shape. Points of the shape may then be far from the scan.
         free: whether the size may change too.
-        breadth: how widely they are looked for.
+        effort: effort of the search.
     """
-    some = scan.some(breadth.points).points
-    turns = np.concatenate([_grid(breadth.rotations), *(_principal(shape, some) for shape in shapes[:1])])
-    tried: list[Start] = []
+    some = scan.some(effort.points).points
+    turns = np.concatenate([_grid(effort.rotations), *(_principal(shape, some) for shape in shapes[:1])])
+    tried: list[StartPlacement] = []
     for k, shape in enumerate(shapes[:FIRST]):
         tried += _scored(k, shape, some, turns, partial=partial, free=free)
-    kept = _different(tried, breadth.kept, DIFFERENT)
+    kept = _different(tried, effort.kept, DIFFERENT)
     again = np.stack([start.placement.rotation for start in kept])
     for k, shape in enumerate(shapes[FIRST:], FIRST):
         tried += _scored(k, shape, some, again, partial=partial, free=free)
     tree = cKDTree(some)
-    # One of each rotation at least, so that a wrong one with the right code doesn't take all places.
-    chosen = [*kept, *sorted(tried, key=lambda start: start.score)[: 2 * breadth.polished]]
+    # At least one placement of each rotation, so that a wrong rotation with the right code doesn't take all places.
+    chosen = [*kept, *sorted(tried, key=lambda start: start.score)[: 2 * effort.polished]]
     unique = list({(start.shape, id(start.placement)): start for start in chosen}.values())
     polished = [
-        _polished(start, shapes[start.shape], some, tree, breadth.steps, partial=partial, free=free)
-        for start in unique[: breadth.kept + breadth.polished]
+        _polished(start, shapes[start.shape], some, tree, effort.steps, partial=partial, free=free)
+        for start in unique[: effort.kept + effort.polished]
     ]
-    return _different(polished, breadth.count, DIFFERENT / 2)
+    return _different(polished, effort.count, DIFFERENT / 2)
 
 
-def _different(starts: list[Start], count: int, apart: float) -> list[Start]:
-    """The best of the starts, none of them the same shape in nearly the same rotation as a better one."""
-    found: list[Start] = []
+def _different(starts: list[StartPlacement], count: int, apart: float) -> list[StartPlacement]:
+    """Return the best placements, without those whose rotation is within an angle of a better placement."""
+    found: list[StartPlacement] = []
     for start in sorted(starts, key=lambda start: start.score):
         if all(start.placement.angle_to(other.placement) > apart for other in found):
             found.append(start)
@@ -103,54 +106,54 @@ def _different(starts: list[Start], count: int, apart: float) -> list[Start]:
 
 def _scored(
     k: int, shape: FloatArray, some: FloatArray, turns: FloatArray, *, partial: bool, free: bool
-) -> list[Start]:
-    """A shape in many rotations, its middle on that of the scan."""
+) -> list[StartPlacement]:
+    """Score a shape in many rotations, with its centroid at the centre of the scan."""
     middle, centre = shape.mean(axis=0), np.median(some, axis=0) if not partial else some.mean(axis=0)
     ratio = float(np.sqrt(some.var(axis=0).sum() / shape.var(axis=0).sum())) if free else 1.0
-    # Turning the scan instead lets one tree serve all rotations; the other way round likewise.
+    # The scan is rotated instead of the shape, so one tree serves all rotations; and vice versa below.
     there = (some - centre) @ turns / ratio + middle
-    to_shape = near(cKDTree(shape), there.reshape(-1, 3))[0].reshape(len(turns), -1)
+    to_shape = nearest_points(cKDTree(shape), there.reshape(-1, 3))[0].reshape(len(turns), -1)
     scores = _trimmed(to_shape)
     if not partial:
         back = ratio * (shape - middle) @ np.swapaxes(turns, 1, 2) + centre
-        to_scan = near(cKDTree(some), back.reshape(-1, 3))[0].reshape(len(turns), -1) / ratio
+        to_scan = nearest_points(cKDTree(some), back.reshape(-1, 3))[0].reshape(len(turns), -1) / ratio
         scores = scores + _trimmed(to_scan)
     return [
-        Start(k, Placement(turn, centre - ratio * turn @ middle, ratio), float(score))
+        StartPlacement(k, Placement(turn, centre - ratio * turn @ middle, ratio), float(score))
         for turn, score in zip(turns, scores, strict=True)
     ]
 
 
 def _polished(
-    start: Start, shape: FloatArray, some: FloatArray, tree: cKDTree, steps: int, *, partial: bool, free: bool
-) -> Start:
-    """A few steps of closest points, for the motion alone."""
+    start: StartPlacement, shape: FloatArray, some: FloatArray, tree: cKDTree, steps: int, *, partial: bool, free: bool
+) -> StartPlacement:
+    """Improve a placement by closest-point steps of the rigid motion."""
     placement, own = start.placement, cKDTree(shape)
     for _ in range(steps):
-        to_shape, nearest = near(own, placement.back(some))
+        to_shape, nearest = nearest_points(own, placement.back(some))
         pairs = [(shape[nearest], some, to_shape)]
         if not partial:
-            to_scan, nearest = near(tree, placement(shape))
+            to_scan, nearest = nearest_points(tree, placement(shape))
             pairs.append((shape, some[nearest], to_scan / placement.scale))
         here, there, away = (np.concatenate([pair[i] for pair in pairs]) for i in range(3))
         close = away <= np.quantile(away, TRIMMED)
         placement = Placement.between(here[close], there[close], scaled=free)
         if not 0 < placement.scale < np.inf:
             return start
-    score = _trimmed(near(own, placement.back(some))[0])
+    score = _trimmed(nearest_points(own, placement.back(some))[0])
     if not partial:
-        score = score + _trimmed(near(tree, placement(shape))[0] / placement.scale)
-    return Start(start.shape, placement, float(score))
+        score = score + _trimmed(nearest_points(tree, placement(shape))[0] / placement.scale)
+    return StartPlacement(start.shape, placement, float(score))
 
 
 def _trimmed(distances: FloatArray) -> FloatArray:
-    """(…) mean of the smaller ones of (…, n)."""
+    """Return the mean (…) of the smallest distances (…, n), a share TRIMMED of them."""
     count = max(1, int(TRIMMED * distances.shape[-1]))
     return np.partition(distances, count - 1, axis=-1)[..., :count].mean(axis=-1)
 
 
 def _grid(count: int) -> FloatArray:
-    """(count, 3, 3) rotations all over, the same ones always (super-Fibonacci spirals: Alexa 2022)."""
+    """Return evenly spread rotations (count, 3, 3), always the same (super-Fibonacci spirals: Alexa 2022)."""
     s = np.arange(count) + 0.5
     r, outer = np.sqrt(s / count), np.sqrt(1 - s / count)
     phi, psi = 2 * np.pi * s / np.sqrt(2), 2 * np.pi * s / 1.533751168755204288118041
@@ -160,7 +163,7 @@ def _grid(count: int) -> FloatArray:
 
 
 def _principal(shape: FloatArray, some: FloatArray) -> FloatArray:
-    """(4, 3, 3) rotations that bring principal axes of a shape onto those of points, with every flip."""
+    """Return the rotations (4, 3, 3) that map the shape's principal axes to the points' principal axes."""
     own, there = (np.linalg.svd(x - x.mean(axis=0), full_matrices=False)[2] for x in (shape, some))
     own[2] *= np.linalg.det(own)
     there[2] *= np.linalg.det(there)
@@ -169,7 +172,7 @@ def _principal(shape: FloatArray, some: FloatArray) -> FloatArray:
 
 
 def evenly(points: FloatArray, count: int, first: int = 0) -> IntArray:
-    """Indices of points (n, 3) or codes (n, m), each the farthest from those before it."""
+    """Return indices of points (n, 3) or codes (n, m), each the farthest from all points chosen before."""
     chosen = [first]
     away = np.full(len(points), np.inf)
     while len(chosen) < min(count, len(points)):

@@ -65,7 +65,7 @@ class Scan:
     @cached_property
     def gaps(self) -> FloatArray:
         """(n,) how far apart points are around each: as far as its sixth neighbour."""
-        away, _ = near(self.tree, self.points, min(7, len(self.points)))
+        away, _ = nearest_points(self.tree, self.points, min(7, len(self.points)))
         return away[:, -1]
 
     def distances(self, places: FloatArray) -> FloatArray:
@@ -73,16 +73,36 @@ class Scan:
 
         Over a point it is the distance from the plane there; where no point is near, that from the point.
         """
-        away, nearest = near(self.tree, places)
+        away, nearest = nearest_points(self.tree, places)
         above = np.abs(((places - self.points[nearest]) * self.normals[nearest]).sum(axis=1))
         beside = np.sqrt(np.maximum(away**2 - above**2, 0))
         return np.where(beside <= self.gaps[nearest], above, away)
 
 
-def near(tree: cKDTree, places: FloatArray, count: int = 1) -> tuple[FloatArray, IntArray]:
+def nearest_points(tree: cKDTree, places: FloatArray, count: int = 1) -> tuple[FloatArray, IntArray]:
     """Distances and indices, (…) of the nearest point of a tree to places (…, 3), or (…, count) of several."""
     away, index = tree.query(places, k=count)
     return np.asarray(away), np.asarray(index)
+
+
+def independent_points(points: FloatArray, residuals: FloatArray, weights: FloatArray) -> float:
+    """Return the share of residuals (n,) at points (n, 3) that count as independent observations.
+
+    The share is ``1 / (1 + Σ ρ_k)``, with ρ_k the correlation of residuals of k-th neighbours, up to the k where it
+    falls below 5 %.
+    """
+    used = weights > 0.25
+    points, residuals = points[used], residuals[used]
+    if len(points) < 50:
+        return 1.0
+    residuals = np.clip(residuals, *(np.quantile(residuals, [0.01, 0.99])))
+    _, beside = nearest_points(cKDTree(points), points, min(len(points) // 4, 200))
+    products = (residuals[:, None] * residuals[beside[:, 1:]]).mean(axis=0) / (residuals**2).mean()
+    # Averages over shells, as single neighbours are noisy.
+    smooth = np.convolve(products, np.ones(5) / 5, mode="valid")
+    below = np.flatnonzero(smooth < 0.05)
+    end = int(below[0]) if len(below) else len(smooth)
+    return float(1 / (1 + max(0.0, smooth[:end].sum())))
 
 
 def scan_of(points: FloatArray, faces: IntArray, rng: np.random.Generator) -> Scan:
@@ -143,7 +163,7 @@ def _of_points(points: FloatArray, rng: np.random.Generator) -> Scan:
     """The points themselves, or some of them, with normals of the planes through their neighbours."""
     some = _thinned(points, rng)
     kept = rng.permutation(_evenly(some, MOST))
-    _, beside = near(cKDTree(some), some[kept], min(NEIGHBOURS, len(some)))
+    _, beside = nearest_points(cKDTree(some), some[kept], min(NEIGHBOURS, len(some)))
     around = some[beside] - some[beside].mean(axis=1, keepdims=True)
     moments, axes = np.linalg.eigh(np.swapaxes(around, 1, 2) @ around)
     trust = np.clip(1 - CLOUDY * moments[:, 0] / np.maximum(moments[:, 1], np.finfo(float).tiny), 0, 1)

@@ -1,4 +1,7 @@
-"""A model as a library: codes to vertices, meshes and pulled vertices back to codes, random codes."""
+"""The model that library users load, with all its operations.
+
+The module is one class. Most of its lines are documentation and tested examples.
+"""
 
 from __future__ import annotations
 
@@ -8,53 +11,52 @@ import warnings
 from collections.abc import Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from shapespace.arrays import FloatArray, IntArray
-from shapespace.bundle.reader import BundleError, read_bundle
-from shapespace.bundle.schema import MANIFEST, VERSION_PATTERN
-from shapespace.files.formats import read_arrays
+from shapespace.bundle.reader import Bundle, BundleError, read_bundle
+from shapespace.bundle.schema import MANIFEST, VERSION_PATTERN, Manifest
 from shapespace.mesh.triangle_mesh import TriangleMesh
 from shapespace.model.blend_shapes import BlendShapes, blend_shapes
-from shapespace.model.correspondence import InvalidMeshError, Matched, match
-from shapespace.model.decoder import Decoder, MeshChoice, Quality
-from shapespace.model.edit import PRIOR, Edited, PriorKind, Target, edited
-from shapespace.model.encode import Encoded, Encoder, Objective
-from shapespace.model.fit import FitOptions, Fitted, Fitter, Landmark, Prior, ScaleChoice
-from shapespace.model.latent_space import Bounds, Codes, Distribution, NotFiniteError, WrongLengthError
+from shapespace.model.correspondence import Matched
+from shapespace.model.decoder import Decoder, MeshChoice, Quality, Shape
+from shapespace.model.edit import Edited, edited
+from shapespace.model.encode import Encoded, Encoder
+from shapespace.model.fit import Fitter
+from shapespace.model.fit_result import Fitted
+from shapespace.model.inputs import MeshLike, ScanLike, listed_targets, matched, points_and_faces
+from shapespace.model.latent_space import Bounds, Codes, Distribution, LatentSpace, NotFiniteError, WrongLengthError
+from shapespace.model.options import EditOptions, EncodeOptions, FitOptions, Target
+from shapespace.model.population import Population
 from shapespace.model.vertex_uncertainty import require_covariance, vertex_uncertainty
 from shapespace.solve.deadline import Deadline
 from shapespace.solve.outcome import Status
 
-#: The values of the enumerations, so that callers may write plain strings.
+# Enumerations with their values, so that callers may write plain strings.
 MeshName = MeshChoice | Literal["fine", "coarse"]
 BoundsName = Bounds | Literal["allow", "clamp", "reject"]
 QualityName = Quality | Literal["full", "draft"]
-ObjectiveName = Objective | Literal["vertices", "nric"]
 DistributionName = Distribution | Literal["uniform", "gaussian", "population"]
-PriorName = PriorKind | Literal["groups", "ridge"]
-ScaleName = ScaleChoice | Literal["fixed", "free"]
-ExpectedName = Prior | Literal["population", "box"]
 
 
 def load(folder: str | os.PathLike[str], threads: int = 1) -> ShapeModel:
     """Read a bundle, check every file against its manifest, and make a model of it.
 
     Args:
-        folder: NAME/VERSION, or NAME for the highest version there.
-        threads: shapes that may be computed at once, see Decoder.
+        folder: folder NAME/VERSION, or NAME for the highest version in it.
+        threads: number of shapes that may be computed at once, see Decoder.
 
     Raises:
-        BundleError: no bundle, or one that is not exactly as its manifest says.
+        BundleError: there is no bundle, or it differs from its manifest.
 
     >>> import shapespace
     >>> shapespace.load("models/figure")
     <ShapeModel figure/3: 20 coordinates, 10 factors, 4601 vertices>
     """
-    path = Path(os.path.abspath(folder))  # the names of the last two folders count, also of "."
+    path = Path(os.path.abspath(folder))  # makes "." absolute: the names of the last two folders matter
     if not (path / MANIFEST).exists():
         try:
             versions = [int(entry.name) for entry in path.iterdir() if re.fullmatch(VERSION_PATTERN, entry.name)]
@@ -66,11 +68,18 @@ def load(folder: str | os.PathLike[str], threads: int = 1) -> ShapeModel:
     return ShapeModel(read_bundle(path), threads)
 
 
-class ShapeModel(Decoder):
-    """A bundle at work, with the calls that the HTTP interface has.
+class ShapeModel:
+    """A trained model, with the same operations as the HTTP interface.
 
-    Codes are (m,) numbers, one for each coordinate; positions are in the units of the training meshes, aligned to the
-    reference. Every method may be called from several threads at once.
+    Codes are (m,) numbers, one for each coordinate. Positions are in the units of the training meshes, aligned to
+    the reference. Several threads may call every method at once.
+
+    Args:
+        bundle: verified bundle.
+        threads: number of shapes that may be computed at once, see Decoder.
+
+    Attributes:
+        decoder: networks and solver of the model.
 
     >>> import shapespace
     >>> model = shapespace.load("models/figure")
@@ -82,12 +91,40 @@ class ShapeModel(Decoder):
     'left hip'
     """
 
+    def __init__(self, bundle: Bundle, threads: int = 1) -> None:
+        self.decoder = Decoder(bundle, threads)
+
     def __repr__(self) -> str:
         facts = self.manifest
         return (
             f"<ShapeModel {facts.name}/{facts.version}: {self.dimension} coordinates, {len(facts.factors)} factors, "
             f"{len(self.vertices)} vertices>"
         )
+
+    @property
+    def manifest(self) -> Manifest:
+        """Manifest of the bundle."""
+        return self.decoder.manifest
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 of the manifest."""
+        return self.decoder.digest
+
+    @property
+    def latents(self) -> LatentSpace:
+        """Latent coordinates with their names, bounds and periods."""
+        return self.decoder.latents
+
+    @property
+    def population(self) -> Population:
+        """Gaussian of the training codes, or of uniform codes where the model has no training codes."""
+        return self.decoder.population
+
+    @property
+    def reference(self) -> TriangleMesh:
+        """Reference mesh, coarse and normalised."""
+        return self.decoder.reference
 
     @property
     def dimension(self) -> int:
@@ -101,47 +138,87 @@ class ShapeModel(Decoder):
 
     @property
     def lower(self) -> FloatArray:
-        """(m,) lower bound of each coordinate, the smallest that was trained."""
+        """Lower bounds (m,) of the coordinates: the smallest values in training."""
         return self.latents.lower
 
     @property
     def upper(self) -> FloatArray:
-        """(m,) upper bound of each coordinate."""
+        """Upper bounds (m,) of the coordinates."""
         return self.latents.upper
 
     @property
     def period(self) -> list[float | None]:
-        """Period of each coordinate; None for those that are no angles."""
+        """Period of each coordinate; None for a coordinate that is no angle."""
         return self.manifest.period
 
     @property
     def faces(self) -> IntArray:
-        """(F, 3) faces of the fine mesh; ``model.mesh(MeshChoice.COARSE)`` has those of the coarse one."""
-        return self.mesh(MeshChoice.FINE).faces
+        """Faces (F, 3) of the fine mesh; ``model.mesh("coarse").faces`` are the faces of the coarse mesh."""
+        return self.mesh().faces
 
     @property
     def vertices(self) -> FloatArray:
-        """(V, 3) the reference shape on the fine mesh, in the units of the training meshes."""
-        return self.reference_shape().vertices
+        """Vertices (V, 3) of the reference on the fine mesh, in the units of the training meshes."""
+        return self.decoder.reference_shape().vertices
+
+    def mesh(self, mesh: MeshName = "fine") -> TriangleMesh:
+        """Return the normalised reference on the fine or the coarse mesh; every shape has its faces.
+
+        >>> import shapespace
+        >>> model = shapespace.load("models/figure")
+        >>> model.mesh("coarse").vertices.shape
+        (1000, 3)
+        """
+        return self.decoder.mesh(MeshChoice(mesh))
+
+    def shape(
+        self,
+        code: ArrayLike,
+        inside_bounds: bool = True,
+        mesh: MeshName = "fine",
+        deadline: Deadline | None = None,
+        quality: QualityName = "full",
+    ) -> Shape:
+        """Return the shape of one checked code (m,) with its diagnostics, even if Gauss–Newton did not converge.
+
+        Args:
+            code: code from ``model.latents.codes`` or ``model.sample``.
+            inside_bounds: whether the code lies inside the bounds, for the diagnostics.
+            mesh: "fine" or "coarse".
+            deadline: time limit after which Gauss–Newton stops with Status.DEADLINE.
+            quality: "full", or "draft", which leaves Gauss–Newton out where the first guess is near enough.
+
+        Raises:
+            LatentError: the code is so far outside the bounds that numbers overflow.
+            ModelFailedError: the networks failed at this code, or took too long.
+
+        >>> import shapespace
+        >>> model = shapespace.load("models/figure")
+        >>> shape = model.shape(model.sample(1)[0])
+        >>> shape.vertices.shape, shape.diagnostics.status
+        ((4601, 3), <Status.CONVERGED: 'converged'>)
+        """
+        given = np.asarray(code, dtype=np.float32)
+        return self.decoder.shape(given, inside_bounds, MeshChoice(mesh), deadline, Quality(quality))
 
     def decode(
         self, codes: ArrayLike, mesh: MeshName = "fine", bounds: BoundsName = "allow", quality: QualityName = "full"
     ) -> FloatArray:
-        """The shapes of codes.
+        """Return the shapes of codes.
 
-        Warns with RuntimeWarning where Gauss–Newton did not converge; ``shape`` gives the diagnostics of one code.
+        Warns with RuntimeWarning if Gauss–Newton did not converge; ``shape`` gives the diagnostics of one code.
 
         Args:
-            codes: (n, m), or one code (m,).
-            mesh: "fine" or "coarse"; a model without a finer mesh answers both with the one it has.
+            codes: codes (n, m), or one code (m,).
+            mesh: "fine" or "coarse"; a model without a finer mesh returns its only mesh for both.
             bounds: "allow" extrapolates outside the bounds, "clamp" moves to the nearest bound, "reject" refuses.
             quality: "full", or "draft", which leaves Gauss–Newton out where the first guess is near enough.
 
         Returns:
-            Positions (n, V, 3), or (V, 3) of one code.
+            Positions (n, V, 3), or (V, 3) for one code.
 
         Raises:
-            LatentError: a code of the wrong length, not finite, or out of bounds where that is refused.
+            LatentError: a code has the wrong length, is not finite, or lies outside the bounds with "reject".
             ModelFailedError: the networks failed at a code, or took too long.
 
         >>> import numpy as np, shapespace
@@ -172,13 +249,14 @@ class ShapeModel(Decoder):
         return positions if values.ndim == 2 else positions[0]
 
     def blend_shapes(self, mesh: MeshName = "fine") -> BlendShapes:
-        """The model as linear blend shapes: code 0, and both ends of each coordinate; with how far that is from it.
+        """Return linear blend shapes: code 0, both ends of each coordinate, and the error against the model.
 
         Args:
             mesh: "fine" or "coarse".
 
         Raises:
-            PeriodicError: there are angles among the coordinates, which have no ends.
+            PeriodicError: some coordinates are angles, which have no ends.
+            LatentError: the model has no finite shape at an end.
             ModelFailedError: the networks failed, or took too long.
 
         >>> import shapespace
@@ -190,37 +268,32 @@ class ShapeModel(Decoder):
         b'glTF'
         """
         choice = MeshChoice(mesh)
-        return blend_shapes(self, choice, lambda code: self.shape(code, mesh=choice))
+        return blend_shapes(self.decoder, choice, lambda code: self.shape(code, mesh=choice))
 
     def encode(
         self,
-        mesh: ArrayLike | TriangleMesh | Matched | str | os.PathLike[str],
-        bounds: BoundsName = "allow",
+        mesh: MeshLike | Matched,
+        options: EncodeOptions | None = None,
+        *,
         deadline: Deadline | None = None,
-        objective: ObjectiveName = "vertices",
-        fixed: Mapping[int, float] | None = None,
-        samples: int = 0,
-        seed: int = 0,
+        **changes: Any,
     ) -> Encoded:
-        """The code whose shape comes closest to a mesh in correspondence, in any rigid pose.
+        """Find the code whose shape comes closest to a mesh in correspondence, in any rigid pose.
 
         Args:
-            mesh: the fine or the coarse mesh of the model, as vertices (V, 3) in its order, as a mesh, or as the path
-                of an OBJ, PLY, STL, OFF, glTF or NPZ file; in the units of the training meshes.
-            bounds: "allow" lets the code lie up to half the bounds' width outside, "clamp" searches inside only,
-                "reject" refuses a code outside.
-            deadline: after which the status is Status.DEADLINE.
-            objective: what comes closest, "vertices" after rigid alignment, or "nric", lengths and angles, in their
-                weighted norm.
-            fixed: value by coordinate that the code keeps, in the bounds or not.
-            samples: codes to draw from the posterior.
-            seed: of these.
+            mesh: the fine or the coarse mesh of the model in the units of the training meshes: vertices (V, 3) in the
+                model's order, a mesh, or the path of an OBJ, PLY, STL, OFF, glTF or NPZ file.
+            options: options of the search.
+            deadline: time limit after which the status is Status.DEADLINE.
+            changes: single options by name, for example ``objective="nric"``; see EncodeOptions.
 
         Raises:
-            MeshError: a file that can't be read.
-            InvalidMeshError: none of the model's meshes, or not in their units: less than a third or more than three
-                times as large.
-            LatentError: numbers that overflow, a code out of bounds where that is refused, or no such coordinate.
+            MeshError: the file can't be read.
+            InvalidMeshError: the mesh is none of the model's meshes, or its size suggests other units: less than a
+                third or more than three times the size of the training meshes.
+            LatentError: numbers overflow, the code lies outside the bounds with "reject", or a fixed coordinate does
+                not exist.
+            ModelFailedError: the networks failed, or took too long.
 
         >>> import numpy as np, shapespace
         >>> model = shapespace.load("models/figure")
@@ -229,49 +302,35 @@ class ShapeModel(Decoder):
         >>> bool(np.abs(found.code - code).max() < 1e-2), found.mesh, found.shape.vertices.shape
         (True, <MeshChoice.FINE: 'fine'>, (4601, 3))
         """
-        given = mesh if isinstance(mesh, Matched) else self._matched(mesh)
-        return self._encoder(
-            given, Bounds(bounds), deadline, Objective(objective), self.latents.fixed(fixed), samples, seed
-        )
+        given = mesh if isinstance(mesh, Matched) else matched(self.decoder, mesh)
+        return self._encoder(given, EncodeOptions.of(options, changes), deadline)
 
     def edit(
         self,
         code: ArrayLike,
-        targets: Mapping[int, ArrayLike],
-        prior: float = PRIOR,
-        mesh: MeshName = "fine",
+        targets: Mapping[int, ArrayLike] | Sequence[Target],
+        options: EditOptions | None = None,
+        *,
         deadline: Deadline | None = None,
-        prior_kind: PriorName = "groups",
-        sigma: float | Mapping[int, float] | None = None,
-        fixed: Mapping[int, float] | None = None,
-        samples: int = 0,
-        seed: int = 0,
-        anchored: bool = False,
+        **changes: Any,
     ) -> Edited:
-        """The code inside the bounds whose shape comes closest to having some vertices at some places.
+        """Find the code inside the bounds whose shape comes closest to having some vertices at given positions.
 
-        What is not asked to move stays where it is, as far as it can: ``placement`` takes what ``decode`` answers for
-        the new code into the frame of the start's shape, in which ``distances`` and ``residual`` are measured.
+        Vertices without a target stay in place as far as possible. ``placement`` moves the new code's shape, as
+        ``decode`` returns it, into the frame of the start's shape. ``distances`` and ``residual`` are measured there.
 
         Args:
-            code: (m,) to start from; moved to the nearest bounds first.
-            targets: position (3,) by vertex, at least one, in the frame of what ``decode`` answers for ``code``.
-            prior: weight of the mean square change of the code, in widths of the bounds, against the mean square
-                distance from the targets, in diagonals of the bounding box.
-            mesh: whose vertices are meant, "fine" or "coarse".
-            deadline: after which the status is Status.DEADLINE.
-            prior_kind: "groups" changes few factors, "ridge" all of them a little.
-            sigma: standard deviation of targets, of all or by vertex; half a percent of the diagonal where there is
-                none.
-            fixed: value by coordinate that the code keeps, in the bounds or not.
-            samples: codes to draw from the posterior.
-            seed: of these.
-            anchored: whether the place of the whole is by what is not pulled alone, so that targets out of reach do not
-                carry it along.
+            code: code (m,) to start from; it is first moved to the nearest bounds.
+            targets: at least one target: positions (3,) by vertex, or Targets; in the frame of the shape that
+                ``decode`` returns for ``code``.
+            options: options of the edit.
+            deadline: time limit after which the status is Status.DEADLINE.
+            changes: single options by name, for example ``prior=1e-3``; see EditOptions.
 
         Raises:
-            LatentError: a code of the wrong length, numbers that are not finite, or no such coordinate.
-            InvalidTargetError: no targets, a vertex that the mesh does not have, or a sigma that is not above 0.
+            LatentError: the code has the wrong length, numbers are not finite, or a fixed coordinate does not exist.
+            InvalidTargetError: there is no target, the mesh does not have a vertex, or a sigma is not above 0.
+            ModelFailedError: the networks failed, or took too long.
 
         >>> import numpy as np, shapespace
         >>> model = shapespace.load("models/figure")
@@ -281,99 +340,84 @@ class ShapeModel(Decoder):
         >>> found.code.shape, bool(found.residual < 0.01 * size)
         ((20,), True)
         """
+        chosen = EditOptions.of(options, changes)
         start, _ = self.latents.code(np.asarray(code, dtype=np.float64).tolist(), Bounds.CLAMP)
-        sigmas = sigma if isinstance(sigma, Mapping) else dict.fromkeys(targets, sigma)
-        pulled = [
-            Target(int(v), np.asarray(place, dtype=np.float64).tolist(), sigmas.get(v)) for v, place in targets.items()
-        ]
-        held = self.latents.fixed(fixed)
-        return edited(
-            self, start, pulled, prior, MeshChoice(mesh), deadline, PriorKind(prior_kind), held, samples, seed, anchored
-        )
+        return edited(self.decoder, start, listed_targets(targets, chosen.sigma), chosen, deadline)
 
-    def fit(
+    def fit_scan(
         self,
-        scan: ArrayLike | TriangleMesh | tuple[ArrayLike, ArrayLike] | str | os.PathLike[str],
+        scan: ScanLike,
+        options: FitOptions | None = None,
         *,
-        scale: ScaleName = "fixed",
-        partial: bool = False,
-        noise: float | None = None,
-        landmarks: Sequence[Landmark] = (),
-        fixed: Mapping[int, float] | None = None,
-        distribution: ExpectedName = "population",
-        samples: int = 0,
-        points: bool = False,
-        used: bool = False,
-        seed: int = 0,
         deadline: Deadline | None = None,
+        **changes: Any,
     ) -> Fitted:
-        """The code of a scan: points or a mesh of any connectivity, whole or in part, in any pose, with noise.
+        """Find the code of a scan: points or a mesh without correspondence, whole or in part, in any pose, with noise.
 
         Args:
-            scan: points (N, 3); or these and faces (F, 3); or a mesh; or the path of an OBJ, PLY, STL, OFF, glTF, NPZ
-                or XYZ file. In the units of the training meshes unless the scale is free.
-            scale: "fixed", or "free": the scan's size is found too.
-            partial: whether the scan shows a part of the shape only, as from one camera.
-            noise: standard deviation of the scan's points, in its units; by default it is estimated.
-            landmarks: vertices of the fine mesh whose places are known; three or more decide where the search begins.
-            fixed: values of coordinates that keep them, by index.
-            distribution: what codes are held to be like: "population", the Gaussian of the training codes, or "box",
-                any inside the bounds.
-            samples: codes to draw from the posterior.
-            points: whether the distance of each point and of each vertex is wanted.
-            used: whether the points that stood for the scan are wanted.
-            seed: of all random numbers; one seed gives the same answer.
-            deadline: after which the status is "deadline".
+            scan: points (N, 3); points and faces (F, 3); a mesh; or the path of an OBJ, PLY, STL, OFF, glTF, NPZ or XYZ
+                file. In the units of the training meshes unless the scale is free.
+            options: options of the fit.
+            deadline: time limit after which the status is "deadline".
+            changes: single options by name, for example ``partial=True``; see FitOptions.
 
         Returns:
-            Code, covariance, placement, distances and how the fit ended: look at ``status`` and ``reason``.
+            Code, covariance, placement and distances. ``status`` and ``reason`` say how the fit ended.
 
         Raises:
-            MeshError: a file that can't be read.
-            InvalidScanError: a scan or an option that can't be used.
-            LatentError: fixed coordinates that the model doesn't have, or with which its numbers overflow.
+            MeshError: the file can't be read.
+            InvalidScanError: the scan or an option can't be used.
+            LatentError: a fixed coordinate does not exist, or numbers overflow.
             ModelFailedError: the networks failed, or took too long.
 
         >>> import numpy as np, shapespace
         >>> model = shapespace.load("models/figure")
         >>> code = np.linspace(-0.5, 0.5, 20)
         >>> points = np.random.default_rng(0).permutation(model.decode(code))[:3000] + [3, 0, 1]
-        >>> found = model.fit(points)
+        >>> found = model.fit_scan(points)
         >>> found.status, found.covariance.shape
         (<FitStatus.CONVERGED: 'converged'>, (20, 20))
         >>> there = found.placement(found.shape.vertices)
         >>> bool(np.abs(there - model.decode(code) - [3, 0, 1]).max() < 0.01)
         True
         """
-        options = FitOptions(
-            scale=ScaleChoice(scale),
-            partial=partial,
-            noise=noise,
-            landmarks=landmarks,
-            fixed=fixed,
-            prior=Prior(distribution),
-            samples=samples,
-            points=points,
-            used=used,
-            seed=seed,
-        )
-        return self.fitter(*_points_and_faces(scan), options, deadline)
+        return self._fitter(*points_and_faces(scan), FitOptions.of(options, changes), deadline)
+
+    def fit(
+        self,
+        scan: ScanLike,
+        options: FitOptions | None = None,
+        *,
+        deadline: Deadline | None = None,
+        **changes: Any,
+    ) -> Fitted:
+        """Call ``fit_scan``. This old name remains for one release.
+
+        Raises:
+            MeshError, InvalidScanError, LatentError, ModelFailedError: as ``fit_scan``.
+
+        >>> import shapespace
+        >>> model = shapespace.load("models/figure")
+        >>> model.fit(model.vertices).status
+        <FitStatus.CONVERGED: 'converged'>
+        """
+        return self.fit_scan(scan, options, deadline=deadline, **changes)
 
     def sample(
         self, count: int, seed: int = 0, distribution: DistributionName = "uniform", temperature: float = 1.0
     ) -> Codes:
-        """Random codes (count, m); one seed gives the same on every machine.
+        """Return random codes (count, m); one seed gives the same codes on every machine.
 
         Args:
-            count: how many.
-            seed: of the random numbers.
-            distribution: "uniform" in the bounds, or "gaussian": around their middle with a standard deviation of a
-                quarter of their width, cut off at them. Or "population": the Gaussian with shrinkage fitted to the
-                codes of the training shapes (without any: with mean and variances of uniform ones), not cut off.
-            temperature: factor of the differences from the mean of the population; the others have none.
+            count: number of codes.
+            seed: seed of the random numbers.
+            distribution: "uniform" in the bounds. "gaussian": around the middle of the bounds with a standard deviation
+                of a quarter of their width, cut off at the bounds. "population": the Gaussian with shrinkage of the
+                training codes, not cut off; without training codes, mean and variances of uniform codes.
+            temperature: factor of the differences from the mean of the population; only for "population".
 
         Raises:
-            LatentError: a temperature that is negative, not finite, or so large that the numbers overflow.
+            LatentError: the temperature is negative, not finite, or so large that the numbers overflow.
 
         >>> import shapespace
         >>> model = shapespace.load("models/figure")
@@ -388,54 +432,42 @@ class ShapeModel(Decoder):
         return self.latents.codes(self.population.sample(count, seed, temperature))[0]
 
     def vertex_uncertainty(self, code: ArrayLike, covariance: ArrayLike, mesh: MeshName = "fine") -> FloatArray:
-        """Standard deviation (V,) of where the vertices of a code's shape are, as ``decode`` answers them.
+        """Return the standard deviation (V,) of the vertices of a code's shape, as ``decode`` returns them.
 
         Args:
-            code: (m,).
-            covariance: (m, m) of codes around it, as ``edit`` and ``encode`` find it.
+            code: code (m,).
+            covariance: covariance (m, m) of codes around it, from ``edit``, ``encode`` or ``fit_scan``.
             mesh: "fine" or "coarse".
 
         Raises:
-            LatentError: a code of the wrong length, or numbers that are not finite, or no covariance.
+            LatentError: the code has the wrong length, numbers are not finite, or the matrix is no covariance.
+            ModelFailedError: the networks failed, or took too long.
+
+        >>> import numpy as np, shapespace
+        >>> model = shapespace.load("models/figure")
+        >>> model.vertex_uncertainty(np.zeros(20), model.population.covariance).shape
+        (4601,)
+        """
+        checked, _ = self.latents.code(np.asarray(code, dtype=np.float64).tolist())
+        return vertex_uncertainty(self.decoder, checked, require_covariance(self.decoder, covariance), MeshChoice(mesh))
+
+    def spread(self, code: ArrayLike, covariance: ArrayLike, mesh: MeshName = "fine") -> FloatArray:
+        """Call ``vertex_uncertainty``. This old name remains for one release.
+
+        Raises:
+            LatentError, ModelFailedError: as ``vertex_uncertainty``.
 
         >>> import numpy as np, shapespace
         >>> model = shapespace.load("models/figure")
         >>> model.spread(np.zeros(20), model.population.covariance).shape
         (4601,)
         """
-        checked, _ = self.latents.code(np.asarray(code, dtype=np.float64).tolist())
-        return vertex_uncertainty(self, checked, require_covariance(self, covariance), MeshChoice(mesh))
+        return self.vertex_uncertainty(code, covariance, mesh)
 
     @cached_property
     def _encoder(self) -> Encoder:
-        return Encoder(self)
+        return Encoder(self.decoder)
 
     @cached_property
-    def fitter(self) -> Fitter:
-        """What fits scans, with all options in one; made at the first scan."""
-        return Fitter(self)
-
-    def _matched(self, mesh: ArrayLike | TriangleMesh | str | os.PathLike[str]) -> Matched:
-        if isinstance(mesh, TriangleMesh):
-            return match(self, mesh.vertices, mesh.faces)
-        if isinstance(mesh, str | os.PathLike):
-            return match(self, *read_arrays(Path(mesh)))
-        vertices = np.asarray(mesh, dtype=np.float64)
-        if vertices.ndim != 2 or vertices.shape[1] != 3:
-            raise InvalidMeshError(f"vertices must be (V, 3), not {vertices.shape}")
-        return match(self, vertices, np.empty((0, 3), np.int64))
-
-
-def _points_and_faces(
-    scan: ArrayLike | TriangleMesh | tuple[ArrayLike, ArrayLike] | str | os.PathLike[str],
-) -> tuple[FloatArray, IntArray]:
-    """Of what ``fit`` takes; no faces where there are none."""
-    if isinstance(scan, TriangleMesh):
-        return scan.vertices, scan.faces
-    if isinstance(scan, str | os.PathLike):
-        points, faces = read_arrays(Path(scan), points=True)
-    elif isinstance(scan, tuple):
-        points, faces = (np.asarray(part) for part in scan)
-    else:
-        points, faces = np.asarray(scan), np.empty((0, 3))
-    return points.astype(np.float64), faces.reshape(-1, 3).astype(np.int64)
+    def _fitter(self) -> Fitter:
+        return Fitter(self.decoder)

@@ -144,6 +144,6 @@ def sound(folder: Folder, place: Path, data: Path, *, may_fold: bool) -> str:
             errors.append(found.distances.mean() / diagonal(shape))
     assert np.mean(errors) <= folder.back, f"training shapes come back to {np.mean(errors):.3f} of the diagonal"
     centre = collection.vertices[collection.central]
-    away = np.linalg.norm((model.reference_shape().vertices - centre).mean(axis=0)) / diagonal(centre)
+    away = np.linalg.norm((model.decoder.reference_shape().vertices - centre).mean(axis=0)) / diagonal(centre)
     assert away < 0.02, f"the reference is served {away:.3f} of the diagonal from where its file has it"
     return f"bundle: {CODES} codes without a fold, shapes to {100 * np.mean(errors):.2f} %"

@@ -236,8 +236,8 @@ def test_uploads(format: str) -> None:
 
 
 def matched(data: bytes, format: str | None, content_type: str = "") -> Matched:
-    vertices, faces, *_ = read_mesh_file(data, content_type, format, limits(model()))
-    return match(model(), vertices, faces)
+    vertices, faces, *_ = read_mesh_file(data, content_type, format, limits(model().decoder))
+    return match(model().decoder, vertices, faces)
 
 
 FORM = b"\r\n".join(
@@ -360,7 +360,7 @@ def as_bundle(spoil: Callable[[Path], object]) -> None:
             (place / name).write_bytes(content)
         spoil(place)
         try:
-            ShapeModel(read_bundle(place)).self_test()
+            ShapeModel(read_bundle(place)).decoder.self_test()
         except BundleError as error:
             one_line(ValueError(" ".join(str(error).split())))
 

@@ -179,7 +179,7 @@ def export(
         # Drafts are measured as they are served, so that a bundle comes first, where no server watches.
         with TemporaryDirectory() as folder:
             facts = replace(
-                facts, draft_error=load(write_bundle(Path(folder), facts, networks, geometry)).draft_error()
+                facts, draft_error=load(write_bundle(Path(folder), facts, networks, geometry)).decoder.draft_error()
             )
         return write_bundle(models, facts, networks, geometry)
     except ValidationError as error:

@@ -40,7 +40,7 @@ class ColourParameters:
                 raise ProblemError(
                     "invalid-request", "color=spread shows how sure a code is. POST it with its covariance in the body."
                 )
-            return ColourBy(self.quantity, None, require_covariance(model, covariance))
+            return ColourBy(self.quantity, None, require_covariance(model.decoder, covariance))
         if covariance is not None:
             raise ProblemError("invalid-request", "covariance is what color=spread shows. Add ?color=spread.")
         if self.quantity is None:

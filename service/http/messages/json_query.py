@@ -1,4 +1,4 @@
-"""JSON in the address: ``?fixed=`` and ``?place=``."""
+"""JSON in query parameters: ``?fixed=``, ``?landmarks=`` and ``?place=``."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ T = TypeVar("T")
 
 
 def read_query(text: str, name: str, model: TypeAdapter[T]) -> T:
-    """A parameter of that name; raises RequestValidationError, or ProblemError where it is no JSON."""
+    """Return the value of a parameter; raises RequestValidationError, or ProblemError if the text is not JSON."""
     try:
         return model.validate_python(parse(text.encode()))
     except ValidationError as error:

@@ -9,9 +9,10 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from shapespace.bundle.schema import AttributesEntry
 from shapespace.files.colouring import Quantity
 from shapespace.model.decoder import MeshChoice, Quality
-from shapespace.model.edit import PRIOR, PriorKind
 from shapespace.model.latent_space import Bounds, Distribution
-from shapespace.service.use_cases.fields import Body, Number, NumbersByIndex, Whole
+from shapespace.model.options import EditOptions, EncodeOptions, Target
+from shapespace.service.http.messages.options import body_of, query_of
+from shapespace.service.use_cases.fields import Body, Number, Whole
 
 #: Each list fails at its first fault: there may be as many as elements.
 Latent = Annotated[
@@ -72,55 +73,25 @@ class VerticesRequest(Body):
     faces: bool = Field(True, strict=True, description="Whether NPZ has the mesh's faces too; JSON never has.")
 
 
+@body_of(Target)
 class TargetRequest(Body):
-    """Where a vertex should be."""
-
-    vertex: Whole = Field(description="Index in the mesh that `mesh` names, from 0.")
-    position: Annotated[list[Number], Field(fail_fast=True)] = Field(
-        min_length=3,
-        max_length=3,
-        description="In the frame of the mesh that `latent` is answered with, and its units.",
-    )
-    sigma: Number | None = Field(
-        None,
-        gt=0,
-        description="Standard deviation of each coordinate, in the same units; by default half a percent of the "
-        "bounding box's diagonal. A target of twice that counts a quarter.",
-    )
+    """A vertex and the position that it should have."""
 
 
-FIXED = "Coordinates that keep their value, inside the bounds or not: numbers by index, from 0."
-SAMPLES = "Codes to draw from the posterior, the Gaussian around `latent` of the `covariance` that is answered."
-SEED = "Of the random codes: the same for the same seed."
-
-
+@body_of(EditOptions, without=["sigma"])
 class EditRequest(Body):
-    """A code to start from, and vertices that should be elsewhere."""
+    """A code to start from, vertices that should be elsewhere, and the options of an edit."""
 
     latent: Latent
-    targets: Annotated[list[TargetRequest], Field(fail_fast=True)] = Field(
-        min_length=1, description="At least one.", examples=[[{"vertex": 0, "position": [0.3, 0.1, 0]}]]
-    )
-    prior: Number = Field(
-        PRIOR,
-        ge=0,
-        description="Weight of the mean square change of the code, as a fraction of the bounds' width, against the "
-        "mean square distance from the targets, as a fraction of the bounding box's diagonal.",
-    )
-    prior_kind: PriorKind = Field(
-        PriorKind.GROUPS,
-        description="What of the change costs: `groups` the square of the sum of the factors' norms, so that few "
-        "factors change; `ridge` the sum of their squares.",
-    )
-    anchored: bool = Field(
-        False,
-        description="Whether the place of the whole is by what is not pulled alone, so that targets out of reach do "
-        "not carry it along.",
-    )
-    fixed: NumbersByIndex = Field({}, description=FIXED, examples=[{"0": 0.5}])
-    samples: Whole = Field(0, ge=0, description=SAMPLES)
-    seed: Whole = Field(0, ge=0, lt=2**63, description=SEED)
-    mesh: MeshChoice = Field(MeshChoice.FINE, description="Which mesh the targets' vertices belong to.")
+    targets: Annotated[
+        list[TargetRequest],
+        Field(fail_fast=True, min_length=1, examples=[[{"vertex": 0, "position": [0.3, 0.1, 0]}]]),
+    ] = Field(description="At least one target, in the frame of the mesh that `latent` is answered with.")
+
+
+@query_of(EncodeOptions)
+class EncodeQuery(BaseModel):
+    """Options of ``encode`` in the query."""
 
 
 class SampleRequest(Body):

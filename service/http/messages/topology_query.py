@@ -34,7 +34,7 @@ def choose_topology(
                 "invalid-request",
                 f"{format.upper()} answers have triangles only. For topology=original ask for obj, zip, ply or usd.",
             )
-        if model.fine and not model.finer(mesh):
+        if model.decoder.fine and not model.decoder.finer(mesh):
             raise ProblemError(
                 "invalid-request", "The coarse mesh has triangles only. For topology=original ask for mesh=fine."
             )

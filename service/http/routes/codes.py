@@ -1,38 +1,31 @@
-"""Finding latent codes: of meshes, of vertices pulled elsewhere, at random."""
+"""Calls that answer latent codes: of meshes, of edited vertices, and random ones."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Annotated
 
 from fastapi import APIRouter, Depends, Query, Request, Response
-from pydantic import TypeAdapter
 
-from shapespace.model.edit import Target
-from shapespace.model.encode import Objective
-from shapespace.model.latent_space import Bounds
+from shapespace.model.options import EditOptions, EncodeOptions, Target
 from shapespace.service.http.dependencies import CallerDependency, MeshQuery, Model, ServiceDependency, one_of
 from shapespace.service.http.description import problems, upload
 from shapespace.service.http.messages.bodies import JSONBody, gather
-from shapespace.service.http.messages.json_query import read_query
+from shapespace.service.http.messages.options import options_of
 from shapespace.service.http.messages.schemas import (
-    FIXED,
-    SAMPLES,
-    SEED,
     EditAnswer,
     EditRequest,
     EncodeAnswer,
+    EncodeQuery,
     SampleAnswer,
     SampleRequest,
 )
 from shapespace.service.http.responses import found_response
 from shapespace.service.use_cases import codes
-from shapespace.service.use_cases.fields import NumbersByIndex
 from shapespace.service.use_cases.shape_formats import dump_json
 from shapespace.service.use_cases.uploads import FORMATS
 
 router = APIRouter(prefix="/v1/models/{name}", tags=["codes"])
-
-_FIXED: TypeAdapter[dict[int, float]] = TypeAdapter(NumbersByIndex)
 
 
 @router.post(
@@ -46,31 +39,21 @@ async def encode(
     request: Request,
     caller: CallerDependency,
     model: Model,
+    options: Annotated[EncodeQuery, Query()],
     format: Annotated[
         str | None,
         one_of(FORMATS),
         Query(description="Format of the file, which wins over `Content-Type`."),
     ] = None,
-    bounds: Annotated[
-        Bounds, Query(description="Whether the code may lie outside the bounds, is looked for inside, or is refused.")
-    ] = Bounds.ALLOW,
-    objective: Annotated[
-        Objective,
-        Query(description="What comes closest: vertices after rigid alignment, or lengths and angles (`nric`)."),
-    ] = Objective.VERTICES,
-    fixed: Annotated[str | None, Query(description=f"{FIXED} A JSON object.", examples=['{"0": 0.5}'])] = None,
-    samples: Annotated[int, Query(ge=0, description=SAMPLES)] = 0,
-    seed: Annotated[int, Query(ge=0, lt=2**63, description=SEED)] = 0,
 ) -> Response:
-    """The code whose shape comes closest to a mesh in correspondence, in any rigid pose.
+    """Find the code whose shape comes closest to a mesh in correspondence, in any rigid pose.
 
     The file holds the fine or the coarse mesh of the model in its vertex order (STL: in its order of faces), in the
-    units of the training meshes: one of less than a third or more than three times their size is refused.
+    units of the training meshes. A mesh with less than a third or more than three times their size is refused.
     """
     file = codes.Upload(await gather(request), request.headers.get("content-type", ""), format)
-    held = {} if fixed is None else read_query(fixed, "fixed", _FIXED)
-    wishes = codes.SearchOptions(held, samples, seed, service.settings.max_codes)
-    found = await codes.encode(service.workers, service.sandbox, caller, model, file, bounds, objective, wishes)
+    asked, most = options_of(EncodeOptions, options), service.settings.max_codes
+    found = await codes.encode(service.workers, service.sandbox, caller, model, file, asked, most)
     return found_response(service, found)
 
 
@@ -86,25 +69,15 @@ async def edit(
     body: Annotated[EditRequest, Depends(JSONBody(EditRequest))],
     mesh: MeshQuery = None,
 ) -> Response:
-    """The code inside the bounds whose shape comes closest to having some vertices at some places.
+    """Find the code inside the bounds whose shape comes closest to having some vertices at given positions.
 
-    What is not asked to move stays where it is, as far as it can, in the frame of the mesh that `latent` is answered
-    with; `placement` takes the mesh of the new code there.
+    Vertices without a target stay in place as far as possible, in the frame of the mesh that `latent` is answered with.
+    `placement` takes the mesh of the new code there.
     """
-    targets = [Target(target.vertex, target.position, target.sigma) for target in body.targets]
-    wishes = codes.SearchOptions(body.fixed, body.samples, body.seed, service.settings.max_codes)
-    found = await codes.edit(
-        service.workers,
-        caller,
-        model,
-        body.latent,
-        targets,
-        body.prior,
-        body.prior_kind,
-        mesh or body.mesh,
-        wishes,
-        body.anchored,
-    )
+    targets = [options_of(Target, target) for target in body.targets]
+    asked, most = options_of(EditOptions, body), service.settings.max_codes
+    asked = asked if mesh is None else replace(asked, mesh=mesh)
+    found = await codes.edit(service.workers, caller, model, body.latent, targets, asked, most)
     return found_response(service, found)
 
 
@@ -116,7 +89,7 @@ async def edit(
 async def sample(
     service: ServiceDependency, model: Model, body: Annotated[SampleRequest, Depends(JSONBody(SampleRequest))]
 ) -> Response:
-    """Random codes, inside the bounds or as those of the training shapes; one seed gives the same everywhere."""
+    """Draw random codes, inside the bounds or from the population; one seed gives the same codes everywhere."""
     most = service.settings.max_codes
     latents = codes.sample(model, body.count, body.seed, body.distribution, body.temperature, most)
     return Response(dump_json({"latents": latents}), media_type="application/json")

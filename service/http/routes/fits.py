@@ -1,17 +1,16 @@
-"""Finding the code of a scan."""
+"""The call that fits a model to a scan."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from functools import partial
 from typing import Annotated
 
-from fastapi import APIRouter, Depends, Query, Request, Response
+from fastapi import APIRouter, Query, Request, Response
 
-from shapespace.model.fit import FitOptions
 from shapespace.service.http.dependencies import CallerDependency, Model, ServiceDependency, one_of
 from shapespace.service.http.description import problems, upload
 from shapespace.service.http.messages.bodies import gather
-from shapespace.service.http.messages.fit import FitAnswer, fit_options
+from shapespace.service.http.messages.fit import FitAnswer, FitQuery, fit_options
 from shapespace.service.http.responses import found_response
 from shapespace.service.use_cases import fit as fits
 from shapespace.service.use_cases.codes import Upload
@@ -22,7 +21,7 @@ router = APIRouter(prefix="/v1/models/{name}", tags=["codes"])
 _OPTIONS = {
     "type": "string",
     "contentMediaType": "application/json",
-    "description": "The parameters of the query as one JSON object, over which it wins.",
+    "description": "The parameters of the query as one JSON object, which has priority.",
 }
 
 
@@ -37,17 +36,17 @@ async def fit(
     request: Request,
     caller: CallerDependency,
     model: Model,
-    options: Annotated[Callable[[str], FitOptions], Depends(fit_options)],
+    options: Annotated[FitQuery, Query()],
     format: Annotated[
         str | None,
         one_of(POINT_FORMATS),
         Query(description="Format of the file, which wins over `Content-Type`."),
     ] = None,
 ) -> Response:
-    """The code, the place and the size that explain a scan, without correspondence, and how sure that is.
+    """Find the code, the placement and the size that explain a scan without correspondence, with their covariance.
 
     The file holds a mesh of any connectivity or points without faces, in any rigid pose, whole or in part.
     """
     file = Upload(await gather(request), request.headers.get("content-type", ""), format)
-    found = await fits.fit(service.workers, service.sandbox, caller, model, file, options)
+    found = await fits.fit(service.workers, service.sandbox, caller, model, file, partial(fit_options, options))
     return found_response(service, found)

@@ -275,8 +275,8 @@ def of_files(tmp_path: Path) -> ShapeModel:
 
 
 def matched(model: ShapeModel, data: bytes, format: str) -> Matched:
-    vertices, faces, *_ = read_mesh_file(data, "", format, limits(model))
-    return match(model, vertices, faces)
+    vertices, faces, *_ = read_mesh_file(data, "", format, limits(model.decoder))
+    return match(model.decoder, vertices, faces)
 
 
 def test_files_like_those_that_the_model_was_made_of(of_files: ShapeModel) -> None:

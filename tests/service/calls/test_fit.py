@@ -61,7 +61,7 @@ POINTS = {"xyz": as_xyz, "json": as_json, "ply": as_ply, "obj": as_obj, "off": a
 def test_points_in_every_format_give_what_the_library_gives(
     client: httpx.Client, figure: ShapeModel, points: np.ndarray
 ) -> None:
-    expected = figure.fit(points)
+    expected = figure.fit_scan(points)
     for format, write in POINTS.items():
         found = client.post(FIT, content=write(points), params={"format": format}).raise_for_status().json()
         np.testing.assert_allclose(found["latent"], expected.code, atol=1e-6)

@@ -70,8 +70,8 @@ def test_a_surface_is_read_as_it_was_written(folder: Path) -> None:
     assert found.groups
     assert (found.objects.names, found.groups.names) == (("torus",), ("inside", "outside"))
     model = ShapeModel(read_bundle(folder))
-    assert model.surface(MeshChoice.FINE)
-    assert model.surface(MeshChoice.COARSE) is None
+    assert model.decoder.surface(MeshChoice.FINE)
+    assert model.decoder.surface(MeshChoice.COARSE) is None
 
 
 def entry(**changes: object) -> Callable[[Path], None]:

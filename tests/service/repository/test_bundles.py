@@ -458,8 +458,8 @@ def test_a_fine_mesh_of_a_hundred_and_sixty_thousand_vertices_is_no_bomb(tmp_pat
         repository = ModelRepository(tmp_path)
         assert repository.refused == []
         model = next(iter(repository))
-        assert model.fine
-        assert len(model.fine.reference.vertices) > 150_000
+        assert model.decoder.fine
+        assert len(model.decoder.fine.reference.vertices) > 150_000
 
 
 def name_with_a_line_break(models: Path) -> None:

@@ -148,14 +148,14 @@ def test_a_model_that_has_hung_gets_less_time(tmp_path: Path, caplog: pytest.Log
         times.append(time.monotonic() - began)
     # Only lower limits are tested; how much longer each takes depends on the machine.
     assert all(took >= least for took, least in zip(times, (5, 2.5, 1.25, 0.625, 0.5, 0.5), strict=True)), times
-    assert loops._patience == LEAST_PATIENCE
+    assert loops.decoder._patience == LEAST_PATIENCE
     assert loops.shape(loops.latents.code(GOOD)[0]).diagnostics.status == "converged"
 
 
 def test_what_went_wrong_is_in_the_log_and_not_in_the_answer(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     fails = model(tmp_path, hostile.fails)
     with caplog.at_level(logging.ERROR), pytest.raises(ModelFailedError) as found:
-        fails.nric(fails.latents.code(HARMFUL)[0])
+        fails.decoder.nric(fails.latents.code(HARMFUL)[0])
     assert "Gather" not in str(found.value)
     assert "Gather" in caplog.text
 
@@ -163,13 +163,13 @@ def test_what_went_wrong_is_in_the_log_and_not_in_the_answer(tmp_path: Path, cap
 def test_solvers_are_made_when_they_are_needed(tmp_path: Path) -> None:
     bundle = read_bundle(write_bundle(tmp_path))
     many, one = ShapeModel(bundle, 200), ShapeModel(bundle, 1)
-    assert many._solvers.qsize() == 1
+    assert many.decoder._solvers.qsize() == 1
     codes = many.latents.sample(4, 0, "uniform")
     expected = [one.shape(code) for code in codes]
-    with many.solver() as first, many.solver() as second, many.solver() as third:
+    with many.decoder.solver() as first, many.decoder.solver() as second, many.decoder.solver() as third:
         assert len({id(first), id(second), id(third)}) == 3
         found = [many.shape(code) for code in codes]  # by a fourth solver
-    assert many._solvers.qsize() == 4
+    assert many.decoder._solvers.qsize() == 4
     for a, b in zip(expected, found, strict=True):
         assert np.array_equal(a.vertices, b.vertices)
         assert a.diagnostics == b.diagnostics
@@ -180,8 +180,8 @@ def test_no_more_solvers_than_shapes_at_once(tmp_path: Path) -> None:
     code = two.latents.sample(1, 0, "uniform")[0]
     shapes = []
     waiting = threading.Thread(target=lambda: shapes.append(two.shape(code)))
-    with two.solver():
-        with two.solver():
+    with two.decoder.solver():
+        with two.decoder.solver():
             waiting.start()
             waiting.join(0.5)
             assert shapes == []

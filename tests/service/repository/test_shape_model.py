@@ -40,7 +40,7 @@ def steep(tmp_path: Path) -> ShapeModel:
 
 def test_codes_at_which_the_networks_overflow_are_refused(steep: ShapeModel) -> None:
     codes, _ = steep.latents.codes([[1e30, 0, 0]])
-    for ask in (lambda: steep.shape(codes[0]), lambda: steep.lengths_and_angles(codes[0])):
+    for ask in (lambda: steep.shape(codes[0]), lambda: steep.decoder.lengths_and_angles(codes[0])):
         with pytest.raises(NotFiniteError, match="nearer to the bounds"):
             ask()
 
@@ -65,7 +65,7 @@ def test_a_deadline_ends_gauss_newton(tmp_path: Path) -> None:
 
 def test_the_summary_of_several_shapes_is_their_worst(tmp_path: Path) -> None:
     model = ShapeModel(read_bundle(write_bundle(tmp_path)))
-    good = model.reference_shape().diagnostics
+    good = model.decoder.reference_shape().diagnostics
     bad = dataclasses.replace(good, status=Status.STALLED, iterations=9, residual=0.5, inside_bounds=False)
     folded = dataclasses.replace(good, flipped_faces=4, integrability=0.2, plausibility=1.5)
     assert worst([good, bad, folded]) == {
@@ -104,7 +104,7 @@ def test_every_start_ends_in_one_shape(bundled: ShapeModel) -> None:
     for code in codes[:-1]:
         shape = bundled.shape(code, mesh=MeshChoice.COARSE)
         assert shape.diagnostics.status is Status.CONVERGED
-        target = bundled._networks(code[None])[1][0]
+        target = bundled.decoder._networks(code[None])[1][0]
         for start in (reference.vertices, other):
             found = solver(target, start, tolerance=TOLERANCE)
             assert found.status is Status.CONVERGED

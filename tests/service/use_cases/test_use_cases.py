@@ -17,10 +17,10 @@ from shapespace.coordinates.nric import nric
 from shapespace.files.colouring import Quantity
 from shapespace.files.formats import MESH_FORMATS
 from shapespace.model.decoder import MeshChoice, Quality
-from shapespace.model.edit import InvalidTargetError, PriorKind, Target
-from shapespace.model.encode import Objective
+from shapespace.model.edit import InvalidTargetError
 from shapespace.model.exact_shapes import NoTangentSpaceError
 from shapespace.model.latent_space import Bounds, Distribution
+from shapespace.model.options import EditOptions, EncodeOptions, Target
 from shapespace.model.shape_model import ShapeModel
 from shapespace.service.limits.sandbox import Sandbox
 from shapespace.service.limits.workers import BusyError, Caller, DeadlineError, DisconnectedError, Workers
@@ -206,9 +206,6 @@ def test_frames_are_those_of_one_file_and_of_the_lines(model: ShapeModel) -> Non
         interpolation_id(model, animation, 2)
 
 
-NO_WISHES = codes.SearchOptions({}, 0, 0, 0)
-
-
 def test_a_mesh_is_searched_for_its_code(model: ShapeModel, sandbox: Sandbox) -> None:
     code = model.latents.codes([CODES[0]])[0][0]
     file = MESH_FORMATS["obj"].encode(model.shape(code).vertices, model.reference.faces, None)
@@ -217,8 +214,7 @@ def test_a_mesh_is_searched_for_its_code(model: ShapeModel, sandbox: Sandbox) ->
         return codes.Upload(deque([memoryview(data)]), "model/obj", format)
 
     def encode(given: codes.Upload) -> codes.Found:
-        how = (Bounds.ALLOW, Objective.VERTICES)
-        return run(lambda workers: codes.encode(workers, sandbox, CALLER, model, given, *how, NO_WISHES))
+        return run(lambda workers: codes.encode(workers, sandbox, CALLER, model, given, EncodeOptions(), 0))
 
     found = encode(upload(file))
     assert np.allclose(json.loads(found.content)["latent"], code, atol=1e-3)
@@ -234,8 +230,8 @@ def test_a_vertex_is_pulled_to_where_another_code_has_it(model: ShapeModel) -> N
     targets = [Target(k, goal[k].tolist()) for k in (0, 20, 40)]
 
     def edit(targets: list[Target]) -> codes.Found:
-        how = (0.0, PriorKind.GROUPS, MeshChoice.FINE, NO_WISHES)
-        return run(lambda workers: codes.edit(workers, CALLER, model, [0.0, 0.0, 0.0], targets, *how))
+        options = EditOptions(prior=0.0)
+        return run(lambda workers: codes.edit(workers, CALLER, model, [0.0, 0.0, 0.0], targets, options, 0))
 
     found = edit(targets)
     assert max(json.loads(found.content)["distances"]) < 1e-2

@@ -9,8 +9,10 @@ from benchmarks.edit import PULL, limbs, pulls
 from shapespace.arrays import FloatArray
 from shapespace.mesh.rigid_motion import Placement, weighted_change
 from shapespace.model.decoder import MeshChoice
-from shapespace.model.edit import PRIOR, SIGMA, SMALL, STILL, UNMOVED, InvalidTargetError, PriorKind, Target, edited
+from shapespace.model.edit import InvalidTargetError
+from shapespace.model.edit_search import SETTINGS
 from shapespace.model.latent_space import InvalidFixedError, NotFiniteError
+from shapespace.model.options import EditOptions, PriorKind, Target
 from shapespace.model.shape_model import ShapeModel
 
 CODE = np.array([0.1, 0.7, 0.4])
@@ -20,7 +22,7 @@ CODE = np.array([0.1, 0.7, 0.4])
 def test_a_limb_follows_and_the_others_stay(figure: ShapeModel, kind: PriorKind) -> None:
     parts, moved, changed = limbs(), [], []
     for pull in pulls(figure, 6, 1):
-        found = edited(figure, pull.start, [pull.target], kind=kind)
+        found = figure.edit(pull.start, [pull.target], prior_kind=kind)
         now = found.placement(figure.decode(found.code))
         others = np.logical_or.reduce([limb for name, limb in parts.items() if name != pull.limb])
         moved.append(np.linalg.norm(now - pull.before, axis=1)[others].mean())
@@ -57,14 +59,17 @@ def objective(
     """What an edit from CODE minimises, term by term, with a general minimiser over rigid motions."""
     diagonal = model.manifest.scale * model.reference.diagonal
     vertices, choice = list(pulled), MeshChoice(mesh)
-    coarse = model.fine.prolong.coarse_vertices if model.fine and mesh == "fine" else slice(None)
+    coarse = model.decoder.fine.prolong.coarse_vertices if model.decoder.fine and mesh == "fine" else slice(None)
     before, shape = (model.decode(x, choice) for x in (CODE, code))
 
     def misfit(motion: FloatArray) -> float:
         moved = Rotation.from_rotvec(motion[:3]).apply(shape) + motion[3:]
         away = ((moved[vertices] - list(pulled.values())) ** 2).sum(axis=1) / diagonal**2
         square = ((moved - before)[coarse] ** 2).sum(axis=1) / diagonal**2
-        return float(away.mean() + STILL * (2 * SMALL * (np.sqrt(square + SMALL**2) - SMALL)).mean())
+        return float(
+            away.mean()
+            + SETTINGS.still * (2 * SETTINGS.small * (np.sqrt(square + SETTINGS.small**2) - SETTINGS.small)).mean()
+        )
 
     change = (code - CODE) / model.latents.width
     norms = [np.linalg.norm(change[f.start : f.stop]) for f in model.manifest.factors]
@@ -79,7 +84,7 @@ def test_an_edit_is_the_best_compromise(model: ShapeModel, mesh: str, kind: Prio
     shape = model.decode([-0.1, 0.2, 0.8], mesh)
     noise = np.random.default_rng(1).normal(0, 0.03, (3, 3))
     pulled = {v: shape[v] + by for v, by in zip((3, 20, 45), noise, strict=True)}
-    found = model.edit(CODE, pulled, 1e-3, mesh, prior_kind=kind)
+    found = model.edit(CODE, pulled, prior=1e-3, mesh=mesh, prior_kind=kind)
     best = found.code.astype(np.float64)
     cost = objective(model, best, pulled, 1e-3, kind, mesh)
     assert cost < 0.9 * objective(model, CODE, pulled, 1e-3, kind, mesh)
@@ -122,10 +127,10 @@ def test_targets_count_by_their_sigma(model: ShapeModel) -> None:
     apart = np.array([0.02, 0, 0])
     pulled = [Target(3, (shape[3] - apart).tolist(), 0.001), Target(3, (shape[3] + apart).tolist(), 0.002)]
     start = CODE.astype(np.float32)
-    found = edited(model, start, pulled)
+    found = model.edit(start, pulled)
     # Half the sigma has four times the weight: a fifth of the way from that target.
     np.testing.assert_allclose(found.distances, [0.008, 0.032], atol=1e-3)
-    everywhere = model.edit(CODE, {3: shape[3] + apart, 20: shape[20]}, sigma=SIGMA * shape_diagonal(model))
+    everywhere = model.edit(CODE, {3: shape[3] + apart, 20: shape[20]}, sigma=SETTINGS.sigma * shape_diagonal(model))
     plain = model.edit(CODE, {3: shape[3] + apart, 20: shape[20]})
     np.testing.assert_allclose(everywhere.code, plain.code, atol=1e-6)
     for sigma in (0, -1, np.nan, np.inf):
@@ -177,11 +182,11 @@ def test_the_prior_holds_a_code_back_as_much_as_it_weighs(model: ShapeModel) -> 
     shape = model.decode([-0.1, 0.2, 0.8])
     targets = {v: shape[v] for v in (0, 100, 300)}
     for kind in PriorKind:
-        residuals = [model.edit(CODE, targets, prior, prior_kind=kind).residual for prior in (0, 1e-2, 1)]
+        residuals = [model.edit(CODE, targets, prior=prior, prior_kind=kind).residual for prior in (0, 1e-2, 1)]
         assert residuals == sorted(residuals)
-        held = model.edit(CODE, targets, 1e6, prior_kind=kind)
-        np.testing.assert_allclose(held.code, CODE, atol=UNMOVED)
-    assert PRIOR < 1e-2
+        held = model.edit(CODE, targets, prior=1e6, prior_kind=kind)
+        np.testing.assert_allclose(held.code, CODE, atol=SETTINGS.unmoved)
+    assert EditOptions().prior < 1e-2
 
 
 def test_anchored_the_whole_stays_though_a_target_is_out_of_reach(figure: ShapeModel) -> None:

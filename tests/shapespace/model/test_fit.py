@@ -9,8 +9,9 @@ from scipy.spatial.transform import Rotation
 
 from shapespace.arrays import FloatArray, IntArray
 from shapespace.mesh.triangle_mesh import diagonal
-from shapespace.model.fit import FitStatus, Fitted, Landmark
+from shapespace.model.fit_result import FitStatus, Fitted
 from shapespace.model.latent_space import InvalidFixedError, NotFiniteError
+from shapespace.model.options import Landmark
 from shapespace.model.scan import InvalidScanError
 from shapespace.model.shape_model import ShapeModel, load
 from shapespace.solve.deadline import Deadline
@@ -66,7 +67,7 @@ class Moved:
 def test_a_code_comes_back_from_points_anywhere(figure: ShapeModel) -> None:
     for seed in (1, 3):
         given = Moved.of(figure, seed)
-        found = figure.fit(given.points())
+        found = figure.fit_scan(given.points())
         assert found.status is FitStatus.CONVERGED, found.reason
         assert given.error(found) < 1e-3
         assert found.explained > 0.99
@@ -85,10 +86,10 @@ def test_landmarks_tell_a_ring_how_it_is_turned(ring: ShapeModel) -> None:
     given = Moved.of(ring, 1)
     points = given.points()
     landmarks = [Landmark(k, given.shape[k].tolist()) for k in (0, 300, 700, 1000, 1400, 1900)]
-    found = ring.fit(points, landmarks=landmarks)
+    found = ring.fit_scan(points, landmarks=landmarks)
     assert given.error(found) < 5e-3
     # A bump of two percent of the surface may be found in the wrong place, but then the status says so.
-    for fit in (found, ring.fit(points)):
+    for fit in (found, ring.fit_scan(points)):
         assert fit.scan.mean < 3e-3 * given.size
         assert fit.status is FitStatus.POOR or fit.scan.p95 < 5e-3 * given.size
 
@@ -100,8 +101,8 @@ def test_another_mesh_is_fit_whichever_way_its_faces_are_turned(figure: ShapeMod
     order = rng.permutation(len(other.vertices))
     vertices, faces = np.empty_like(other.vertices), order[other.faces]
     vertices[order] = other.vertices
-    found = figure.fit((vertices, faces))
-    turned = figure.fit((vertices, faces[:, ::-1]))
+    found = figure.fit_scan((vertices, faces))
+    turned = figure.fit_scan((vertices, faces[:, ::-1]))
     assert given.error(found) < 1e-3
     assert given.error(turned) < 1e-3
     assert found.sampled
@@ -111,8 +112,8 @@ def test_another_mesh_is_fit_whichever_way_its_faces_are_turned(figure: ShapeMod
 def test_a_size_is_found_where_it_is_free(figure: ShapeModel) -> None:
     given = Moved.of(figure, 2, scale=40.0)
     with pytest.raises(InvalidScanError, match="scale=free"):
-        figure.fit(given.points())
-    found = figure.fit(given.points(), scale="free")
+        figure.fit_scan(given.points())
+    found = figure.fit_scan(given.points(), scale="free")
     assert found.placement.scale == pytest.approx(40, rel=1e-3)
     assert given.error(found) < 1e-3
 
@@ -123,19 +124,19 @@ def test_noise_and_outliers_are_told_from_the_shape(figure: ShapeModel) -> None:
     points = given.points() + 0.005 * given.size * rng.standard_normal((4000, 3))
     low, high = points.min(axis=0), points.max(axis=0)
     points[:80] = low + (high - low) * rng.random((80, 3))
-    found = figure.fit(points)
+    found = figure.fit_scan(points)
     assert found.status is FitStatus.CONVERGED, found.reason
     assert given.error(found) < 4e-3
     assert found.noise == pytest.approx(0.005 * given.size, rel=0.2)
     assert 0.96 < found.explained < 0.99
-    told = figure.fit(points, noise=0.005 * given.size)
+    told = figure.fit_scan(points, noise=0.005 * given.size)
     assert given.error(told) < 4e-3
     assert told.noise == pytest.approx(0.005 * given.size)
 
 
 def test_more_places_are_tried_where_the_first_explain_too_little_of_a_part(figure: ShapeModel) -> None:
     moved = Moved.of(figure, 51)
-    found = figure.fit(moved.seen_from(0), partial=True)
+    found = figure.fit_scan(moved.seen_from(0), partial=True)
     assert found.status is FitStatus.CONVERGED
     assert moved.error(found) < 0.005
 
@@ -143,11 +144,11 @@ def test_more_places_are_tried_where_the_first_explain_too_little_of_a_part(figu
 def test_what_one_camera_sees_is_enough_and_the_rest_is_less_certain(figure: ShapeModel) -> None:
     given = Moved.of(figure, 3)
     points = given.seen_from(2)
-    found = figure.fit(points, partial=True)
+    found = figure.fit_scan(points, partial=True)
     assert found.status is FitStatus.CONVERGED, found.reason
     assert given.error(found) < 0.01
     assert found.seen < 0.9 < found.explained
-    whole = figure.fit(given.points())
+    whole = figure.fit_scan(given.points())
     assert np.trace(found.covariance) > np.trace(whole.covariance)
 
 
@@ -155,7 +156,7 @@ def test_a_piece_that_does_not_belong_is_left_out(figure: ShapeModel) -> None:
     given = Moved.of(figure, 2)
     rng = np.random.default_rng(0)
     wall = given.shape.mean(axis=0) + given.size * (rng.random((800, 3)) - 0.5) * [1, 0, 1] + [0, given.size, 0]
-    found = figure.fit(np.concatenate([given.points(3200), wall]))
+    found = figure.fit_scan(np.concatenate([given.points(3200), wall]))
     assert found.status is FitStatus.CONVERGED, found.reason
     assert given.error(found) < 5e-3
     assert found.seen > 0.99
@@ -166,11 +167,11 @@ def test_landmarks_decide_where_a_fit_begins_and_what_it_holds_on_to(figure: Sha
     given = Moved.of(figure, 5)
     chosen = [0, 700, 1500, 2600, 4000]
     landmarks = [Landmark(k, given.shape[k].tolist(), 0.01) for k in chosen]
-    found = figure.fit(given.points(), landmarks=landmarks)
+    found = figure.fit_scan(given.points(), landmarks=landmarks)
     assert given.error(found) < 1e-3
     # A landmark moved elsewhere, with a small sigma, pulls the shape there.
     away = given.shape[chosen[0]] + 0.03 * given.size
-    moved = figure.fit(given.points(), landmarks=[Landmark(chosen[0], away.tolist(), 1e-4)])
+    moved = figure.fit_scan(given.points(), landmarks=[Landmark(chosen[0], away.tolist(), 1e-4)])
     there = [f.placement(f.shape.vertices)[chosen[0]] for f in (found, moved)]
     assert np.linalg.norm(there[1] - away) < 0.5 * np.linalg.norm(there[0] - away)
 
@@ -178,20 +179,20 @@ def test_landmarks_decide_where_a_fit_begins_and_what_it_holds_on_to(figure: Sha
 def test_fixed_coordinates_keep_their_values(figure: ShapeModel) -> None:
     given = Moved.of(figure, 1)
     fixed = {0: float(given.code[0]) + 0.2, 7: float(given.code[7])}
-    found = figure.fit(given.points(), fixed=fixed, samples=3)
+    found = figure.fit_scan(given.points(), fixed=fixed, samples=3)
     for k, value in fixed.items():
         assert found.code[k] == np.float32(value)
         assert (found.samples[:, k] == np.float32(value)).all()
         assert not found.covariance[k].any()
         assert not found.covariance[:, k].any()
     assert (found.covariance.diagonal() > 0).sum() == figure.dimension - 2
-    assert given.error(found) > 10 * given.error(figure.fit(given.points()))
+    assert given.error(found) > 10 * given.error(figure.fit_scan(given.points()))
 
 
 def test_the_covariance_is_that_of_the_samples_and_holds_the_truth(figure: ShapeModel) -> None:
     given = Moved.of(figure, 2)
     points = given.points() + 0.005 * given.size * np.random.default_rng(2).standard_normal((4000, 3))
-    found = figure.fit(points, samples=4000)
+    found = figure.fit_scan(points, samples=4000)
     assert (np.linalg.eigvalsh(found.covariance) > 0).all()
     np.testing.assert_array_equal(found.covariance, found.covariance.T)
     deviations = np.sqrt(found.covariance.diagonal())
@@ -208,7 +209,7 @@ def test_the_covariance_is_that_of_the_samples_and_holds_the_truth(figure: Shape
 
 def test_one_seed_gives_one_answer(figure: ShapeModel) -> None:
     points = Moved.of(figure, 1).points()
-    one, again, other = (figure.fit(points, samples=2, seed=seed) for seed in (5, 5, 6))
+    one, again, other = (figure.fit_scan(points, samples=2, seed=seed) for seed in (5, 5, 6))
     np.testing.assert_array_equal(one.code, again.code)
     np.testing.assert_array_equal(one.samples, again.samples)
     np.testing.assert_array_equal(one.covariance, again.covariance)
@@ -219,7 +220,7 @@ def test_one_seed_gives_one_answer(figure: ShapeModel) -> None:
 @pytest.mark.parametrize("name", ["ball", "box"])
 def test_what_is_no_such_shape_is_told_so(figure: ShapeModel, name: str) -> None:
     solids = {"ball": trimesh.creation.icosphere(4, 0.6), "box": trimesh.creation.box((1, 0.5, 1.5)).subdivide_loop(5)}
-    found = figure.fit((solids[name].vertices, solids[name].faces))
+    found = figure.fit_scan((solids[name].vertices, solids[name].faces))
     assert found.status is FitStatus.POOR
     assert found.explained < 0.9
     assert "no such shape" in found.reason
@@ -229,18 +230,18 @@ def test_a_mirrored_scan_is_told_so(figure: ShapeModel) -> None:
     # Fixed coordinates of arms and legs distinguish left from right, in a pose that is far from its own mirror image.
     given = Moved.of(figure, 3)
     fixed = {k: float(value) for k, value in enumerate(given.code) if k < 18}
-    found = figure.fit(given.points() * [-1, 1, 1], fixed=fixed)
+    found = figure.fit_scan(given.points() * [-1, 1, 1], fixed=fixed)
     assert found.status is FitStatus.POOR
     assert found.mirrored < 0.6
     assert "mirror image" in found.reason
-    assert figure.fit(given.points(), fixed=fixed).mirrored is None
+    assert figure.fit_scan(given.points(), fixed=fixed).mirrored is None
 
 
 def test_a_mirrored_scan_with_landmarks_is_told_so(figure: ShapeModel) -> None:
     given = Moved.of(figure, 2)
     some = np.linspace(0, len(given.shape) - 1, 6).astype(int)
     landmarks = [Landmark(int(vertex), (given.shape[vertex] * [-1, 1, 1]).tolist()) for vertex in some]
-    found = figure.fit(given.points() * [-1, 1, 1], landmarks=landmarks)
+    found = figure.fit_scan(given.points() * [-1, 1, 1], landmarks=landmarks)
     assert found.status is FitStatus.POOR
     assert found.mirrored < 0.6
 
@@ -249,18 +250,18 @@ def test_distances_of_each_point_come_in_its_order(figure: ShapeModel) -> None:
     given = Moved.of(figure, 1)
     points = given.points(3500)
     points[17] += given.size
-    found = figure.fit(points, points=True)
+    found = figure.fit_scan(points, points=True)
     assert found.scan.points.shape == (3500,)
     assert found.model.points.shape == (len(figure.vertices),)
     assert found.scan.points.argmax() == 17
-    assert figure.fit(points).scan.points is None
+    assert figure.fit_scan(points).scan.points is None
 
 
 def test_the_box_keeps_codes_inside_the_bounds(figure: ShapeModel) -> None:
     code = figure.population.mean.copy()
     code[0] = figure.upper[0] + 0.2 * (figure.upper[0] - figure.lower[0])
     given = Moved.of(figure, 1, code=code)
-    free, boxed = (figure.fit(given.points(), distribution=name) for name in ("population", "box"))
+    free, boxed = (figure.fit_scan(given.points(), distribution=name) for name in ("population", "box"))
     assert free.code[0] > figure.upper[0] + 0.1
     assert (boxed.code <= figure.upper.astype(np.float32)).all()
     assert (boxed.code >= figure.lower.astype(np.float32)).all()
@@ -268,7 +269,7 @@ def test_the_box_keeps_codes_inside_the_bounds(figure: ShapeModel) -> None:
 
 def test_a_million_points_are_sampled_and_it_is_said(figure: ShapeModel) -> None:
     given = Moved.of(figure, 1)
-    found = figure.fit(given.points(1_000_000))
+    found = figure.fit_scan(given.points(1_000_000))
     assert given.error(found) < 2e-3
     assert found.sampled
     assert "1000000 points" in found.reason
@@ -277,7 +278,7 @@ def test_a_million_points_are_sampled_and_it_is_said(figure: ShapeModel) -> None
 def test_a_deadline_ends_a_fit_with_what_there_is(figure: ShapeModel) -> None:
     late = Deadline(60)
     late.call_off()
-    found = figure.fit(Moved.of(figure, 1).points(), deadline=late)
+    found = figure.fit_scan(Moved.of(figure, 1).points(), deadline=late)
     assert found.status is FitStatus.DEADLINE
     assert found.rough < 12
     assert np.isfinite(found.covariance).all()
@@ -289,20 +290,20 @@ CLOUD = np.random.default_rng(0).standard_normal((50, 3))
 
 def test_one_stray_however_far_changes_nothing(figure: ShapeModel) -> None:
     points = figure.decode(np.full(20, 0.1))[::2]
-    plain = figure.fit(points)
-    strayed = figure.fit(np.concatenate([points, [[1e8, 0, 0]]]))
+    plain = figure.fit_scan(points)
+    strayed = figure.fit_scan(np.concatenate([points, [[1e8, 0, 0]]]))
     assert plain.status is strayed.status is FitStatus.CONVERGED
     away = strayed.placement(strayed.shape.vertices) - plain.placement(plain.shape.vertices)
     assert np.linalg.norm(away, axis=1).mean() < 1e-3
 
 
 def test_points_with_a_few_faces_among_them_are_points(figure: ShapeModel) -> None:
-    assert figure.fit((figure.decode(np.full(20, 0.1)), [[0, 1, 2]])).status is FitStatus.CONVERGED
+    assert figure.fit_scan((figure.decode(np.full(20, 0.1)), [[0, 1, 2]])).status is FitStatus.CONVERGED
 
 
 def test_fixed_values_for_which_numbers_overflow_are_refused(figure: ShapeModel) -> None:
     with pytest.raises(NotFiniteError, match="outside the bounds"):
-        figure.fit(CLOUD, fixed={0: 1e30}, scale="free")
+        figure.fit_scan(CLOUD, fixed={0: 1e30}, scale="free")
 
 
 @pytest.mark.parametrize(
@@ -335,5 +336,5 @@ def test_fixed_values_for_which_numbers_overflow_are_refused(figure: ShapeModel)
 )
 def test_bad_input_is_refused_with_what_to_do(figure: ShapeModel, points: object, options: dict, says: str) -> None:
     with pytest.raises((InvalidScanError, InvalidFixedError)) as caught:
-        figure.fit(points, **options)
+        figure.fit_scan(points, **options)
     assert says in str(caught.value)

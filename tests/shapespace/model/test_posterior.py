@@ -105,7 +105,7 @@ def test_encode_keeps_what_is_fixed_and_draws_around_the_code(model: ShapeModel)
     moved = model.encode(shape, fixed={2: 0.7})
     halfway = np.linalg.norm(model.decode([-0.1, 0.9, 0.7]) - shape, axis=1)
     assert (moved.distances**2).sum() <= (halfway**2).sum()
-    clamped = model.encode(shape, "clamp", fixed={0: 0.3})
+    clamped = model.encode(shape, bounds="clamp", fixed={0: 0.3})
     assert clamped.code[0] == np.float32(0.3)
     assert not clamped.inside_bounds
 
@@ -144,11 +144,11 @@ def test_the_spread_of_a_pulled_vertex_is_its_sigma(figure: ShapeModel) -> None:
     start = np.zeros(20)
     shape, vertex, sigma = figure.decode(start), 100, 0.01
     found = figure.edit(start, {vertex: shape[vertex]}, sigma=sigma)
-    spread = figure.spread(found.code, found.covariance)
-    prior = figure.spread(found.code, figure.population.covariance)
+    spread = figure.vertex_uncertainty(found.code, found.covariance)
+    prior = figure.vertex_uncertainty(found.code, figure.population.covariance)
     assert spread[vertex] <= 1.01 * np.sqrt(3) * sigma
     assert prior[vertex] > 3 * spread[vertex]
     far = np.linalg.norm(shape - shape[vertex], axis=1).argmax()
     assert spread[far] > 0.5 * prior[far]
     with pytest.raises(InvalidCovarianceError, match="20 rows of 20"):
-        figure.spread(start, np.eye(3))
+        figure.vertex_uncertainty(start, np.eye(3))

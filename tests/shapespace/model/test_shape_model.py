@@ -20,7 +20,7 @@ from shapespace.mesh.triangle_mesh import MeshError, TriangleMesh
 from shapespace.model.correspondence import InvalidMeshError
 from shapespace.model.decoder import MeshChoice
 from shapespace.model.edit import InvalidTargetError
-from shapespace.model.encode import LONG, Aim, Encoder
+from shapespace.model.encode_search import SETTINGS, EncodeSearch
 from shapespace.model.latent_space import NotFiniteError, OutOfBoundsError, WrongLengthError
 from shapespace.model.searched_shapes import SearchedShapes
 from shapespace.model.shape_model import ShapeModel, load
@@ -214,7 +214,7 @@ def test_a_code_outside_is_no_farther_than_one_inside(figure: ShapeModel) -> Non
         x, y, z = shape.T
         twisted = np.stack([x * np.cos(turn) - z * np.sin(turn), y, x * np.sin(turn) + z * np.cos(turn)], axis=1)
         allowed, clamped = (
-            np.sqrt(np.square(figure.encode(twisted, bounds).distances).mean()) for bounds in ("allow", "clamp")
+            np.sqrt(np.square(figure.encode(twisted, bounds=bounds).distances).mean()) for bounds in ("allow", "clamp")
         )
         assert allowed < 1.03 * clamped, k
 
@@ -223,16 +223,16 @@ def ending_elsewhere(
     models: Path, monkeypatch: pytest.MonkeyPatch, residuals: Callable[[NDArray], NDArray]
 ) -> tuple[ShapeModel, NDArray]:
     """The figure, whose search by lengths and angles ends at the upper bounds, with residuals; and a training shape."""
-    model, by_nric = load(models / "figure"), Encoder._by_nric
+    model, by_nric = load(models / "figure"), EncodeSearch._by_nric
     codes = read_bundle(models / "figure" / "3").training_codes
     assert codes is not None
     given = model.decode(codes[20])
 
-    def elsewhere(self: Encoder, *given: Any) -> Fit:
+    def elsewhere(self: EncodeSearch, *given: Any) -> Fit:
         found = by_nric(self, *given)
         return replace(found, x=model.upper, residuals=residuals(found.residuals))
 
-    monkeypatch.setattr(Encoder, "_by_nric", elsewhere)
+    monkeypatch.setattr(EncodeSearch, "_by_nric", elsewhere)
     return model, given
 
 
@@ -241,17 +241,17 @@ def test_a_search_that_went_astray_begins_once_more_from_the_nearest_training_sh
 ) -> None:
     model, given = ending_elsewhere(models, monkeypatch, np.zeros_like)
     size = np.linalg.norm(np.ptp(given, axis=0))
-    by_vertices, searches = Encoder._by_vertices, iter(range(9))
+    by_vertices, searches = EncodeSearch._by_vertices, iter(range(9))
 
-    def stuck(self: Encoder, aim: Aim, near: Fit, *given: Any, **more: Any) -> Fit:
+    def stuck(self: EncodeSearch, near: Fit, *given: Any, **more: Any) -> Fit:
         if next(searches) == 0:
-            return replace(near, iterations=LONG)
-        return by_vertices(self, aim, near, *given, **more)
+            return replace(near, iterations=SETTINGS.long)
+        return by_vertices(self, near, *given, **more)
 
-    monkeypatch.setattr(Encoder, "_by_vertices", stuck)
+    monkeypatch.setattr(EncodeSearch, "_by_vertices", stuck)
     found = model.encode(given, bounds="clamp")
     assert found.distances.mean() < 1e-5 * size
-    assert LONG < found.iterations <= 30
+    assert SETTINGS.long < found.iterations <= 30
     assert found.status is Status.CONVERGED
 
 

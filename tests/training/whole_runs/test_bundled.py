@@ -81,11 +81,13 @@ def test_the_figures_networks_follow_exponentials_that_nobody_drew_before() -> N
     model = shapespace.load(ROOT / "models" / "figure")
     codes, reference = model.sample(16, seed=20261123), model.reference
     answers = model.decode(codes, mesh="coarse").astype(np.float32)
-    found = [exact_shape(model, code, answer, MeshChoice.COARSE) for code, answer in zip(codes, answers, strict=True)]
+    found = [
+        exact_shape(model.decoder, code, answer, MeshChoice.COARSE) for code, answer in zip(codes, answers, strict=True)
+    ]
     exact = np.stack([nric(e.vertices.astype(float) / model.manifest.scale, reference.connectivity) for e in found])
-    factors = np.stack([model._networks(code[None])[0][0] for code in codes])
+    factors = np.stack([model.decoder._networks(code[None])[0][0] for code in codes])
     predicted, affine = (
-        np.stack([model.nric(code) for code in codes]),
+        np.stack([model.decoder.nric(code) for code in codes]),
         affine_sum(nric(reference.vertices, reference.connectivity), factors),
     )
     norm = WeightedNorm.of(reference, 1e-2)
@@ -117,7 +119,7 @@ def test_the_torus_networks_know_shape_and_bump_at_fresh_codes() -> None:
         return [name for name, over in limits.items() if over]
 
     decoded = model.decode(codes[:8], mesh="coarse") / model.manifest.scale
-    assert fails(np.stack([model.nric(code) for code in codes]), decoded) == []
+    assert fails(np.stack([model.decoder.nric(code) for code in codes]), decoded) == []
     assert {"total", "angles", "near the bump"} <= set(fails(smooth.nric, smooth.vertices[:8]))
     turned = torus.shapes(codes + np.array([0.1, 0, 0, 0]))
     assert "mean" in fails(turned.nric, turned.vertices[:8])

@@ -116,7 +116,7 @@ def test_the_bundle_is_one_the_server_takes_and_computes_the_same(tiny_run: Path
     assert bundle.manifest.figures == json.loads((tiny_run / "evaluation.json").read_text())
     assert bundle.manifest.onnx_tolerance.measured <= 1e-4
     assert bundle.manifest.draft_error
-    assert bundle.manifest.draft_error.model_dump() == pytest.approx(ShapeModel(bundle).draft_error(), rel=1e-6)
+    assert bundle.manifest.draft_error.model_dump() == pytest.approx(ShapeModel(bundle).decoder.draft_error(), rel=1e-6)
     text = b"".join(path.read_bytes() for path in folder.iterdir())
     assert str(Path(__file__).parents[3]).encode() not in text, "a bundle has no paths of its machine"
 
@@ -143,7 +143,7 @@ def test_fresh_codes_follow_from_the_networks_and_their_figure_is_that_of_the_bu
     assert hashlib.sha256(codes.tobytes()).hexdigest() == fresh["sha256"]
     assert not set(map(tuple, codes)) & set(map(tuple, read(tiny_run / "samples").latents))
     norm = WeightedNorm.of(torus.reference, 1e-2)
-    found = r_squared(np.stack([model.nric(code) for code in codes]), torus.shapes(codes).nric, norm)
+    found = r_squared(np.stack([model.decoder.nric(code) for code in codes]), torus.shapes(codes).nric, norm)
     assert found == pytest.approx(fresh["r2"]["composite"], abs=1e-4)
     assert set(fresh["r2"]) == {"composite", "monolithic", "monolithic_paper", "kernel"}
     assert "steps" not in fresh, "shapes of a formula have no steps"

@@ -1,0 +1,385 @@
+"""The search of a fit: robust weights, and joint Gauss–Newton steps of code, motion and size."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy import sparse
+from scipy.linalg import cho_factor, cho_solve
+from scipy.spatial.transform import Rotation
+
+from shapespace.arrays import FloatArray, IntArray
+from shapespace.coordinates.reconstruction import Reconstructor
+from shapespace.mesh.closest_points import MeshProximity, VertexFaces
+from shapespace.mesh.rigid_motion import Placement, align
+from shapespace.mesh.triangle_mesh import vertex_areas
+from shapespace.model.decoder import Decoder, MeshChoice
+from shapespace.model.derivatives import carried, derivatives, factor_derivatives
+from shapespace.model.fit_constraints import FitConstraints
+from shapespace.model.fit_result import FitState
+from shapespace.model.pairing import Pairing, Pairs
+from shapespace.model.scan import Scan, independent_points
+from shapespace.model.searched_shapes import SearchedShapes
+from shapespace.solve.cholesky import NotPositiveDefiniteError
+from shapespace.solve.deadline import Deadline
+
+
+@dataclass(frozen=True)
+class SearchSettings:
+    """Weights and limits of the search. Lengths are fractions of the reference's diagonal.
+
+    Attributes:
+        width: the robust weight of a pair is one half at this distance, in standard deviations of the distances.
+        farthest: quantile of all distances that is the first such distance.
+        shrinking: factor by which this distance shrinks in each iteration.
+        sliding, last_sliding: weight of the point-to-point distance against the point-to-plane distance, at first and
+            later. It keeps a shape from sliding along its own surface.
+        longest: longest step, in standard deviations of the population.
+        turn: largest rotation in a step, in radians.
+        shortest: a shorter step ends the search, in standard deviations of the population,
+        still: and so does a movement of the shape by less than this length.
+        kept: derivatives are used again until the code has moved this far, in standard deviations of the population.
+        landmark: default standard deviation of a landmark.
+        near: points within this distance of the model count as explained; at most twice this distance with noise.
+        compared: where fits are compared, a point at this distance counts as half explained.
+        plausible: weight of the code's plausibility in that comparison. Four standard deviations cost as much as
+            leaving 16 times this share of the scan unexplained.
+    """
+
+    width: float = 3.0
+    farthest: float = 0.95
+    shrinking: float = 0.7
+    sliding: float = 0.3
+    last_sliding: float = 0.01
+    longest: float = 1.5
+    turn: float = 0.5
+    shortest: float = 0.01
+    still: float = 2e-4
+    kept: float = 0.3
+    landmark: float = 0.01
+    near: float = 0.01
+    compared: float = 0.02
+    plausible: float = 0.001
+
+
+SETTINGS = SearchSettings()
+
+
+@dataclass(frozen=True)
+class SearchAccuracy:
+    """How accurately a search computes shapes.
+
+    Attributes:
+        rough: shapes from face frames on the coarse mesh with the factors' derivatives, instead of solved shapes on the
+            fine mesh with derivatives of the composite.
+        points: number of points of the scan, and of vertices of the model, that count.
+        floor: smallest standard deviation of points, as a fraction of the diagonal: the error of such shapes.
+        independent: share of the points that count as independent observations.
+    """
+
+    rough: bool
+    points: int
+    floor: float
+    independent: float
+
+    @property
+    def mesh(self) -> MeshChoice:
+        """Mesh that the search looks at."""
+        return MeshChoice.COARSE if self.rough else MeshChoice.FINE
+
+
+ROUGH = SearchAccuracy(True, 500, 5e-3, 0.1)
+SOLVED = SearchAccuracy(False, 4000, 3e-4, 0.5)
+
+
+class FitSearch:
+    """Search for the code and the placement of a shape near a start, with the derivatives of ``encode`` and ``edit``.
+
+    Args:
+        decoder: decoder of the model.
+        reconstruct: solver that the decoder has lent.
+        scan: scan in the model's normalised units.
+        constraints: what the fit knows beside the scan.
+        accuracy: how accurately shapes are computed.
+        vertex_faces: faces around the vertices of the mesh of this accuracy.
+        vertices: evenly spread vertices of the mesh that look for points of the scan.
+        deadline: no step begins after this time limit.
+
+    Attributes:
+        count: number of shapes computed so far.
+    """
+
+    def __init__(
+        self,
+        decoder: Decoder,
+        reconstruct: Reconstructor,
+        scan: Scan,
+        constraints: FitConstraints,
+        accuracy: SearchAccuracy,
+        vertex_faces: VertexFaces,
+        vertices: IntArray,
+        deadline: Deadline | None,
+    ) -> None:
+        self._decoder, self.constraints, self._accuracy, self._deadline = decoder, constraints, accuracy, deadline
+        self.scan, self._vertex_faces = scan, vertex_faces
+        self._pairing = Pairing(
+            scan, accuracy.points, vertices, both=not constraints.partial, blended=not accuracy.rough
+        )
+        self._diagonal = decoder.reference.diagonal
+        self._whiten: FloatArray = np.asarray(np.linalg.inv(constraints.prior.root), np.float64)
+        self.shapes = SearchedShapes(decoder, reconstruct, deadline, rough=accuracy.rough)
+        self._changes: Callable[[Decoder, FloatArray], FloatArray] = (
+            factor_derivatives if accuracy.rough else derivatives
+        )
+        self.count = 0
+        self._fields: tuple[FloatArray, FloatArray] | None = None
+
+    def start(self, code: FloatArray, placement: Placement, like: FloatArray) -> FitState | None:
+        """Return the state of a code that is placed like a shape (V, 3), or None where the networks overflow."""
+        shape = self._shape(code)
+        return None if shape is None else FitState(code, align(shape, like), placement)
+
+    def run(self, state: FitState, steps: int, *, first: bool, drawn: int = 0) -> FitState:
+        """Take steps from a state.
+
+        Args:
+            state: state to begin at.
+            steps: maximum number of steps.
+            first: whether the first steps also consider distant points.
+            drawn: number of first steps in which unmatched parts of both sides attract each other.
+        """
+        width, self._fields = np.inf if first else 0.0, None
+        for k in range(steps):
+            if self._deadline is not None and self._deadline.passed:
+                break
+            pairs = self._pairs(state)
+            if k == 0 and first:
+                width = float(np.quantile(pairs.distances, SETTINGS.farthest))
+            sigma = self._sigma(pairs, state)
+            if k < drawn:
+                pairs = self._pairing.drawn(pairs, self.surface(state.shape), state.placement, self.tolerance(sigma))
+            moved = self._step(
+                state,
+                pairs,
+                max(SETTINGS.width * sigma, width),
+                sigma,
+                SETTINGS.sliding if first else SETTINGS.last_sliding,
+            )
+            width *= SETTINGS.shrinking
+            if moved is None:
+                break
+            state = moved
+            if state.settled and k >= drawn and width <= SETTINGS.width * sigma:
+                break
+        pairs = self._pairs(state)
+        return replace(state, sigma=self._sigma(pairs, state), cost=self._cost(state, pairs))
+
+    def normal(self, state: FitState) -> FloatArray:
+        """Return the information matrix (m, m) of scan and landmarks about the code, half a Hessian; 0 where fixed.
+
+        Residuals of neighbouring points are correlated, so only the independent share of them counts.
+        """
+        pairs = self._pairs(state)
+        sigma, n = self._sigma(pairs, state), pairs.of_scan
+        weights = _robust(pairs.distances[:n], SETTINGS.width * sigma) * pairs.agree[:n]
+        share = independent_points(self._pairing.some.points, pairs.heights[:n], weights)
+        A = self._motions(pairs, state)
+        normal = np.einsum("nxp,nx->np", A[:n], pairs.normals[:n])
+        H = share / sigma**2 * normal.T @ (weights[:, None] * normal)
+        H += self._landmarks(state, self._derivatives(state))[0]
+        count = int(self.constraints.movable.sum())
+        # Eliminate motion and size, which are optimal for each code.
+        rest = H[count:, count:] + 1e-9 * np.eye(len(H) - count) * H.diagonal().max()
+        movable = self.constraints.movable
+        found = np.zeros((len(movable), len(movable)))
+        found[np.ix_(movable, movable)] = H[:count, :count] - H[:count, count:] @ np.linalg.solve(
+            rest, H[count:, :count]
+        )
+        return found
+
+    def surface(self, shape: FloatArray) -> MeshProximity:
+        """Return the surface of a coarse shape (V, 3), on the mesh of this accuracy."""
+        return MeshProximity(self._fine(shape), self._vertex_faces)
+
+    def _fine(self, shapes: FloatArray) -> FloatArray:
+        fine = self._decoder.finer(self._accuracy.mesh)
+        return fine.prolong(shapes) if fine else shapes
+
+    def _shape(self, code: FloatArray) -> FloatArray | None:
+        self.count += 1
+        shape = self.shapes(code)
+        return shape if np.isfinite(shape).all() else None
+
+    def _pairs(self, state: FitState) -> Pairs:
+        return self._pairing.closest(self.surface(state.shape), state.placement)
+
+    def tolerance(self, sigma: float) -> float:
+        """Return the largest distance from the surface at which a point counts as explained."""
+        least = SETTINGS.near * self._diagonal
+        return least + (min(3 * sigma, least) if self.constraints.noise is None else 3 * sigma)
+
+    def shares(self, state: FitState) -> tuple[float, float]:
+        """Return the share of the scan that is explained and the share of the model's area that is seen."""
+        most, surface = self.tolerance(state.sigma), self.surface(state.shape)
+        explained = surface.closest(state.placement.back(self.scan.points)).distances <= most
+        away = self.scan.distances(state.placement(surface.vertices)) / state.placement.scale
+        areas = vertex_areas(surface.vertices, surface.fans.faces)
+        return float(explained.mean()), float(areas @ (away <= most) / areas.sum())
+
+    def _sigma(self, pairs: Pairs, state: FitState) -> float:
+        """Return the standard deviation of the heights, from their median, which outliers do not affect."""
+        floor = self._accuracy.floor * self._diagonal
+        if self.constraints.noise is not None:
+            return max(floor, self.constraints.noise / state.placement.scale)
+        heights = np.abs(pairs.heights[: pairs.of_scan])
+        alike = pairs.agree[: pairs.of_scan] > 0.5
+        return max(floor, 1.4826 * float(np.median(heights[alike] if alike.any() else pairs.distances)))
+
+    def _cost(self, state: FitState, pairs: Pairs) -> float:
+        squares = pairs.distances**2
+        missed = squares / (squares + (SETTINGS.compared * self._diagonal) ** 2)
+        away = self._away(state.code)
+        return float((pairs.mass * missed).sum() / pairs.mass.sum() + SETTINGS.plausible * away @ away)
+
+    def _away(self, code: FloatArray) -> FloatArray:
+        """Return the scores (m,) of a code in the prior, angles the shorter way round."""
+        scores: FloatArray = self._whiten @ self._decoder.latents.shorter(code - self.constraints.prior.mean)
+        return scores
+
+    def _prior(self) -> FloatArray:
+        """Return the derivative (m, f) of the scores by the movable coordinates."""
+        return self._whiten[:, self.constraints.movable]
+
+    def _derivatives(self, state: FitState) -> FloatArray:
+        """Return derivatives (V, 3, f) of vertices by movable coordinates; cached while the code changes little."""
+        if self._fields is not None and np.abs(self._whiten @ (state.code - self._fields[0])).max() <= SETTINGS.kept:
+            return self._fields[1]
+        changes = self._changes(self._decoder, state.code)[:, self.constraints.movable]
+        raw = self.shapes(state.code)
+        fields = self.shapes.derivatives(state.code, changes)
+        turned = align(raw, state.shape, carried=raw + fields) - state.shape
+        moves = carried(self._decoder, self._fine, state.shape, turned)
+        found = np.ascontiguousarray(np.moveaxis(moves, 0, -1))
+        self._fields = state.code, found
+        return found
+
+    def _motions(self, pairs: Pairs, state: FitState) -> FloatArray:
+        """Return derivatives (n, 3, f + 6 or 7) of the model's points by code, rotation, translation and size."""
+        fields = self._derivatives(state)
+        by_code = (pairs.rows @ fields.reshape(len(fields), -1)).reshape(len(pairs.gaps), 3, -1)
+        return np.concatenate([by_code, self._rigid(pairs.places)], axis=2)
+
+    def _rigid(self, places: FloatArray) -> FloatArray:
+        """Return derivatives (n, 3, 6 or 7) of points (n, 3) by rotation, translation and size."""
+        x, y, z = places.T
+        o = np.zeros_like(x)
+        turns = np.array([[o, z, -y], [-z, o, x], [y, -x, o]]).transpose(2, 0, 1)
+        shifts = np.broadcast_to(np.eye(3), (len(places), 3, 3))
+        return np.concatenate([turns, shifts, *([places[:, :, None]] if self.constraints.free else [])], axis=2)
+
+    def _landmarks(self, state: FitState, fields: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the normal matrix and the right-hand side of the landmarks."""
+        constraints = self.constraints
+        size = fields.shape[-1] + (7 if constraints.free else 6)
+        if not len(constraints.landmarks):
+            return np.zeros((size, size)), np.zeros(size)
+        rows = self.landmark_rows()
+        places = rows @ self._fine(state.shape)
+        by_code = (rows @ fields.reshape(len(fields), -1)).reshape(len(places), 3, -1)
+        A = np.concatenate([by_code, self._rigid(places)], axis=2).reshape(-1, size)
+        gaps = (state.placement.back(constraints.places) - places).ravel()
+        usual = SETTINGS.landmark * self._diagonal
+        sigmas = np.where(np.isfinite(constraints.sigmas), constraints.sigmas / state.placement.scale, usual)
+        weights = np.repeat(sigmas**-2.0, 3)
+        return A.T @ (weights[:, None] * A), A.T @ (weights * gaps)
+
+    def landmark_rows(self) -> sparse.csr_array:
+        """Return the matrix (l, V) that computes landmarks as means of the mesh's vertices."""
+        fine, vertices = self._decoder.finer(MeshChoice.FINE), self.constraints.landmarks
+        count = len(self._vertex_faces.around)
+        if fine and self._accuracy.rough:
+            return sparse.csr_array(fine.prolong.weights[vertices][:, :count])
+        own = np.arange(len(vertices))
+        return sparse.csr_array((np.ones(len(vertices)), (own, vertices)), shape=(len(vertices), count))
+
+    def _step(self, state: FitState, pairs: Pairs, width: float, sigma: float, sliding: float) -> FitState | None:
+        """Take a Gauss–Newton step, or return None if there is none."""
+        try:
+            fields = self._derivatives(state)
+        except NotPositiveDefiniteError:
+            return None
+        weights = _robust(pairs.distances, width) * pairs.agree * pairs.mass
+        weights *= self._accuracy.independent * pairs.of_scan / sigma**2
+        A = self._motions(pairs, state)
+        size = A.shape[2]
+        normal, flat = np.einsum("nxp,nx->np", A, pairs.normals), A.reshape(-1, size)
+        share = np.where(pairs.drawn, 1.0, sliding)
+        above, beside = (1 - share) * weights, share * weights
+        H = normal.T @ (above[:, None] * normal) + flat.T @ (np.repeat(beside, 3)[:, None] * flat)
+        g = normal.T @ (above * pairs.heights) + flat.T @ (beside[:, None] * pairs.gaps).ravel()
+        for own, part in zip((H, g), self._landmarks(state, fields), strict=True):
+            own += part
+        prior, count = self._prior(), fields.shape[-1]
+        H[:count, :count] += prior.T @ prior
+        g[:count] -= prior.T @ self._away(state.code)
+        if not (np.isfinite(H).all() and np.isfinite(g).all()):  # networks overflow far outside the bounds
+            return None
+        try:
+            step = self._inside(H, g, state.code)
+        except np.linalg.LinAlgError:
+            return None
+        if not np.isfinite(step).all():
+            return None
+        change = np.zeros(len(state.code))
+        change[self.constraints.movable] = step[:count]
+        score = self._whiten @ change
+        longest = max(
+            np.abs(score).max() / SETTINGS.longest, np.linalg.norm(step[count : count + 3]) / SETTINGS.turn, 1.0
+        )
+        step, change = step / longest, change / longest
+        code = state.code + change
+        shape = self._shape(code)
+        if shape is None:
+            return None
+        # The new shape is moved to where the derivatives have led: it was solved in another frame.
+        led = align(shape, state.shape + self._coarse_move(state, change))
+        turn, shift = Rotation.from_rotvec(step[count : count + 3]).as_matrix(), step[count + 3 : count + 6]
+        motion = Placement(turn, shift, float(np.exp(step[count + 6])) if self.constraints.free else 1.0)
+        moved = float(np.abs(np.einsum("nxp,p->nx", A, step)).max()) / self._diagonal
+        settled = bool(np.abs(score).max() <= SETTINGS.shortest or moved <= SETTINGS.still)
+        return FitState(code, led, state.placement.after(motion), settled=settled, moved=moved)
+
+    def _coarse_move(self, state: FitState, change: FloatArray) -> FloatArray:
+        moves = self._derivatives(state) @ change[self.constraints.movable]
+        fine = self._decoder.finer(self._accuracy.mesh)
+        if fine is None:
+            return moves
+        known = fine.prolong.coarse_vertices
+        return moves[known] if (known >= 0).all() else np.zeros_like(state.shape)
+
+    def _inside(self, H: FloatArray, g: FloatArray, code: FloatArray) -> FloatArray:
+        """Return the step ``H⁻¹ g``, with coordinates that would leave the box held at its sides."""
+        constraints = self.constraints
+        low, high = (
+            side[constraints.movable] - code[constraints.movable] for side in (constraints.lower, constraints.upper)
+        )
+        free, step = np.ones(len(g), bool), np.zeros(len(g))
+        for _ in range(3):
+            rest = g[free] - H[np.ix_(free, ~free)] @ step[~free]
+            damped = H[np.ix_(free, free)] + 1e-9 * H.diagonal().max() * np.eye(int(free.sum()))
+            step[free] = cho_solve(cho_factor(damped), rest)
+            clipped = np.clip(step[: len(low)], np.minimum(low, 0), np.maximum(high, 0))
+            out = clipped != step[: len(low)]
+            if not out.any():
+                break
+            step[: len(low)] = clipped
+            free[: len(low)] &= ~out
+        return step
+
+
+def _robust(distances: FloatArray, width: float) -> FloatArray:
+    """Return robust weights (n,) of distances (Geman and McClure 1987)."""
+    weights: FloatArray = 1 / (1 + (distances / width) ** 2) ** 2
+    return weights
