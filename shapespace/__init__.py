@@ -1,6 +1,6 @@
-"""Learned product shape manifolds of triangle meshes: a handful of numbers in, a shape out.
+"""Learned product shape manifolds of triangle meshes: a model turns a few numbers into a 3D shape.
 
-A trained model, from its folder:
+Load a trained model from its folder, and decode codes:
 
 >>> import numpy as np, shapespace
 >>> model = shapespace.load("models/figure")
@@ -8,7 +8,15 @@ A trained model, from its folder:
 >>> positions.shape
 (2, 4601, 3)
 
-The Riemannian space of discrete shells that models are trained on, for any triangle mesh:
+Find codes of meshes with ``encode``, of edited vertices with ``edit``, and of scans with ``fit_scan``. Pass options by
+name or as one object. A deadline ends a search early, and ``status`` says how the search ended:
+
+>>> options = shapespace.EncodeOptions(objective="nric", samples=2)
+>>> found = model.encode(positions[0], options, deadline=shapespace.Deadline(seconds=600))
+>>> found.status is shapespace.Status.CONVERGED, found.samples.shape
+(True, (2, 20))
+
+The Riemannian space of discrete shells, in which models are trained, works with any triangle mesh:
 
 >>> ring = np.arange(8) * np.pi / 4
 >>> tube = [[np.cos(t), np.sin(t), z] for z in (0.0, 0.6, 1.2) for t in ring]
@@ -18,14 +26,15 @@ The Riemannian space of discrete shells that models are trained on, for any tria
 >>> space = shapespace.ShellSpace(mesh, shapespace.Material(eta=1e-3))
 >>> wider = mesh.vertices * [1.1, 1.0, 1.0]
 
-What joins two shapes, a vertex field (V, 3), and a geodesic shot with it; discrete paths have K steps:
+The logarithm of a shape is a vertex field (V, 3), and the exponential shoots a geodesic with it. Discrete paths have K
+steps:
 
 >>> found = shapespace.logarithm(space, mesh.vertices, wider, 4)
 >>> path = shapespace.exponential(space, mesh.vertices, found.velocity, 4)
 >>> path.converged, path.vertices.shape, bool(np.abs(space.nric(path.vertices[-1]) - space.nric(wider)).max() < 1e-6)
 (True, (5, 24, 3), True)
 
-The geodesic between them, and their elastic mean:
+Compute the geodesic between two shapes, and their elastic mean:
 
 >>> shapespace.geodesic(space, mesh.vertices, wider, 4).status
 <Status.CONVERGED: 'converged'>
@@ -33,13 +42,13 @@ The geodesic between them, and their elastic mean:
 >>> 2.0 < float(np.ptp(mean.vertices[:, 0])) < 2.2
 True
 
-The Riemannian centre of mass, which costs a geodesic to each shape in every iteration, and those geodesics' logarithms:
+The Riemannian centre of mass costs a geodesic to each shape in every iteration, and also returns their logarithms:
 
 >>> centre = shapespace.centre_of_mass(space, [mesh.vertices, wider])
 >>> centre.converged, len(centre.logarithms)
 (True, 2)
 
-A vector carried along a path, and how the last shape of a path changes with the velocity that it was shot with:
+Transport a vector along a path, and differentiate the end of a path by its initial velocity:
 
 >>> carried = shapespace.parallel_transport(space, path, found.velocity)
 >>> carried.converged, carried.velocities.shape
@@ -48,15 +57,34 @@ A vector carried along a path, and how the last shape of a path changes with the
 >>> changes.shape
 (1, 24, 3)
 
-An iteration that fails is a value: look at ``status`` and ``reason`` of what comes back. ``shapespace.client`` has the
-calls of a model over HTTP.
+An iteration that fails returns a value: look at ``status`` and ``reason`` of the result. ``shapespace.client`` has the
+operations of a model over HTTP.
 """
 
 from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from shapespace.mesh.triangle_mesh import TriangleMesh
+    from shapespace.bundle.reader import BundleError
+    from shapespace.mesh.triangle_mesh import MeshError, TriangleMesh
+    from shapespace.model.blend_shapes import PeriodicError
+    from shapespace.model.correspondence import InvalidMeshError
+    from shapespace.model.decoder import MeshChoice, ModelFailedError, Quality
+    from shapespace.model.edit import InvalidTargetError
+    from shapespace.model.fit_result import FitStatus
+    from shapespace.model.latent_space import Bounds, Distribution, LatentError
+    from shapespace.model.options import (
+        EditOptions,
+        EncodeOptions,
+        FitOptions,
+        Landmark,
+        Objective,
+        Prior,
+        PriorKind,
+        ScaleChoice,
+        Target,
+    )
+    from shapespace.model.scan import InvalidScanError
     from shapespace.model.shape_model import ShapeModel, load
     from shapespace.shell.energy import Material
     from shapespace.shell.exponential import exponential
@@ -65,13 +93,39 @@ if TYPE_CHECKING:
     from shapespace.shell.mean import centre_of_mass, elastic_mean
     from shapespace.shell.space import ShellSpace
     from shapespace.shell.transport import parallel_transport
+    from shapespace.solve.deadline import Deadline
+    from shapespace.solve.outcome import Status
 
 __version__ = "0.2.0"
 __all__ = [
+    "Bounds",
+    "BundleError",
+    "Deadline",
+    "Distribution",
+    "EditOptions",
+    "EncodeOptions",
     "ExponentialDerivative",
+    "FitOptions",
+    "FitStatus",
+    "InvalidMeshError",
+    "InvalidScanError",
+    "InvalidTargetError",
+    "Landmark",
+    "LatentError",
     "Material",
+    "MeshChoice",
+    "MeshError",
+    "ModelFailedError",
+    "Objective",
+    "PeriodicError",
+    "Prior",
+    "PriorKind",
+    "Quality",
+    "ScaleChoice",
     "ShapeModel",
     "ShellSpace",
+    "Status",
+    "Target",
     "TriangleMesh",
     "centre_of_mass",
     "elastic_mean",
@@ -83,10 +137,34 @@ __all__ = [
 ]
 
 _MODULES = {
+    "Bounds": "model.latent_space",
+    "BundleError": "bundle.reader",
+    "Deadline": "solve.deadline",
+    "Distribution": "model.latent_space",
+    "EditOptions": "model.options",
+    "EncodeOptions": "model.options",
     "ExponentialDerivative": "shell.exponential_derivative",
+    "FitOptions": "model.options",
+    "FitStatus": "model.fit_result",
+    "InvalidMeshError": "model.correspondence",
+    "InvalidScanError": "model.scan",
+    "InvalidTargetError": "model.edit",
+    "Landmark": "model.options",
+    "LatentError": "model.latent_space",
     "Material": "shell.energy",
+    "MeshChoice": "model.decoder",
+    "MeshError": "mesh.triangle_mesh",
+    "ModelFailedError": "model.decoder",
+    "Objective": "model.options",
+    "PeriodicError": "model.blend_shapes",
+    "Prior": "model.options",
+    "PriorKind": "model.options",
+    "Quality": "model.decoder",
+    "ScaleChoice": "model.options",
     "ShapeModel": "model.shape_model",
     "ShellSpace": "shell.space",
+    "Status": "solve.outcome",
+    "Target": "model.options",
     "TriangleMesh": "mesh.triangle_mesh",
     "centre_of_mass": "shell.mean",
     "elastic_mean": "shell.mean",
@@ -98,10 +176,10 @@ _MODULES = {
 }
 
 
-if not TYPE_CHECKING:  # a type checker would take any name for one of these
+if not TYPE_CHECKING:  # a type checker would accept any name
 
     def __getattr__(name: str) -> object:
-        # Imported when first asked for: the client and the workers of a cluster have few of the libraries installed.
+        # Imported on first use: the client and the workers of a cluster have few of the libraries installed.
         if name not in _MODULES:
             raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
         try:

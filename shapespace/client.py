@@ -1,4 +1,4 @@
-"""A client in one module, which needs httpx and NumPy and nothing else of this project.
+"""Client of a shapespace server. It can be copied as one file, and needs only httpx and NumPy.
 
 >>> from shapespace.client import Client
 >>> with Client("http://localhost:8000") as client:
@@ -15,31 +15,102 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import Any
+from typing import Any, TypedDict, Unpack
 
 import httpx
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-Options = str | int | float | bool | None
-#: ``rotation`` (3, 3), ``translation`` (3,) and ``scale``, each of which may be left out.
+#: A query parameter, or a member of a JSON body.
+Parameter = str | int | float | bool | None
+#: ``rotation`` (3, 3), ``translation`` (3,) and ``scale``; each may be left out.
 Placement = Mapping[str, Any]
 
 
-class ClientError(Exception):
-    """A problem that the server answers with.
+class EncodeParameters(TypedDict, total=False):
+    """Parameters of ``encode``, as the server describes them.
 
     Attributes:
-        status: of the answer.
+        version: version of the model; by default the newest.
+        fixed: values of coordinates that the code keeps, by index.
+        samples: number of codes to draw from the posterior.
+        seed: seed of the random numbers.
+        bounds: "allow", "clamp" or "reject".
+        objective: "vertices" or "nric".
+    """
+
+    version: str | None
+    fixed: Mapping[int, float] | None
+    samples: int
+    seed: int
+    bounds: str
+    objective: str
+
+
+class EditParameters(TypedDict, total=False):
+    """Parameters of ``edit``, as the server describes them.
+
+    Attributes:
+        version, fixed, samples, seed: as for ``encode``.
+        prior: weight of changes of the code.
+        prior_kind: "groups" changes few factors, "ridge" all factors a little.
+        mesh: mesh that the vertices belong to, "fine" or "coarse".
+        sigma: standard deviation of targets that have none.
+        anchored: whether only vertices without a target decide where the whole shape lies.
+    """
+
+    version: str | None
+    fixed: Mapping[int, float] | None
+    samples: int
+    seed: int
+    prior: float
+    prior_kind: str
+    mesh: str
+    sigma: float | None
+    anchored: bool
+
+
+class FitParameters(TypedDict, total=False):
+    """Parameters of ``fit``, as the server describes them.
+
+    Attributes:
+        version, fixed, samples, seed: as for ``encode``.
+        scale: "fixed", or "free" if the fit estimates the scan's size.
+        partial: whether the scan shows only a part of the shape.
+        noise: standard deviation of the scan's points.
+        landmarks: vertices with known positions: ``{"vertex", "position", "sigma"}`` each.
+        distribution: "population" or "box".
+        points: whether to return the distance of each point.
+        used: whether to return the points that represented the scan.
+    """
+
+    version: str | None
+    fixed: Mapping[int, float] | None
+    samples: int
+    seed: int
+    scale: str
+    partial: bool
+    noise: float | None
+    landmarks: Sequence[Mapping[str, Any]]
+    distribution: str
+    points: bool
+    used: bool
+
+
+class ClientError(Exception):
+    """Error that the server answers with.
+
+    Attributes:
+        status: HTTP status.
         type: stable name of the kind of problem.
-        detail: what to do.
-        request_id: by which the server's log names the request.
+        detail: sentence that says what to do.
+        request_id: name of the request in the server's log.
     """
 
     def __init__(self, answer: httpx.Response, problem: Mapping[str, Any] | None = None) -> None:
         try:
             problem = problem or answer.json()
-        except ValueError:  # it comes from a proxy
+        except ValueError:  # an answer of a proxy
             problem = {}
         self.status, self.type = problem.get("status", answer.status_code), problem.get("type", "about:blank")
         self.detail = problem.get("detail", answer.reason_phrase)
@@ -52,8 +123,8 @@ class Mesh:
     """A triangle mesh in the units of the training meshes.
 
     Attributes:
-        vertices: (V, 3) float32.
-        faces: (F, 3), from 0.
+        vertices: (V, 3) positions, float32.
+        faces: (F, 3) vertex indices, from 0.
     """
 
     vertices: NDArray[np.float32]
@@ -61,15 +132,15 @@ class Mesh:
 
 
 class Client:
-    """Calls of a shapespace server, as functions.
+    """Calls of a shapespace server, as methods.
 
-    Every call raises ClientError where the server answers with a problem, and httpx.HTTPError where it doesn't answer.
+    Every method raises ClientError if the server answers with a problem, and httpx.HTTPError if it doesn't answer.
 
     Args:
-        url: of the server.
-        api_key: for servers that want one.
+        url: address of the server.
+        api_key: key, if the server requires one.
         timeout: seconds to wait for each answer.
-        retries: how often a busy server is asked again, each time after the wait that it names.
+        retries: how often the client repeats a request to a busy server, after the wait that the server names.
     """
 
     def __init__(self, url: str, *, api_key: str | None = None, timeout: float = 120, retries: int = 3) -> None:
@@ -88,12 +159,12 @@ class Client:
         self._http.close()
 
     def models(self) -> list[dict[str, Any]]:
-        """The newest version of every model."""
+        """Return the newest version of every model."""
         found: list[dict[str, Any]] = self._send("GET", "/v1/models").json()["models"]
         return found
 
     def model(self, name: str, version: str | None = None) -> dict[str, Any]:
-        """A model's card."""
+        """Return a model's card."""
         card: dict[str, Any] = self._send("GET", f"/v1/models/{name}", params={"version": version}).json()
         return card
 
@@ -105,16 +176,16 @@ class Client:
         *,
         place: Placement | None = None,
         covariance: ArrayLike | None = None,
-        **options: Options,
+        **options: Parameter,
     ) -> bytes:
-        """The file of one shape, or of the reference.
+        """Return the file of one shape, or of the reference.
 
         Args:
-            name: of the model.
-            latent: (m,).
+            name: name of the model.
+            latent: (m,) code; None for the reference.
             format: glb, gltf, obj, ply, stl, npz, zip (OBJ with materials and textures) or json.
-            place: where to answer it, as ``edit`` answers a ``placement``.
-            covariance: (m, m) of codes around ``latent``, to colour the shape by how far its vertices may be.
+            place: placement of the shape, for example the ``placement`` that ``edit`` returns.
+            covariance: (m, m) covariance of codes around ``latent``, to colour vertices by their standard deviation.
             options: version, mesh ("fine" or "coarse"), bounds ("allow", "clamp" or "reject"), quality ("full" or
                 "draft"), color, topology ("original" or "triangles").
         """
@@ -128,17 +199,17 @@ class Client:
         return self._send("GET", path, params={"latent": code} | params).content
 
     def shape(
-        self, name: str, latent: ArrayLike | None = None, *, place: Placement | None = None, **options: Options
+        self, name: str, latent: ArrayLike | None = None, *, place: Placement | None = None, **options: Parameter
     ) -> Mesh:
-        """One shape, or the reference, as arrays; options as for ``mesh``."""
+        """Return one shape, or the reference, as arrays; options as for ``mesh``."""
         arrays = _arrays(self.mesh(name, latent, "npz", place=place, **options))
         return Mesh(arrays["vertices"].astype(np.float32), arrays["faces"].astype(np.int64))
 
-    def blend_shapes(self, name: str, **options: Options) -> bytes:
-        """A GLB with a morph target for each end of each coordinate.
+    def blend_shapes(self, name: str, **options: Parameter) -> bytes:
+        """Return a GLB with a morph target for each end of each coordinate.
 
         Args:
-            name: of a model without angles among its coordinates.
+            name: name of a model without angles among its coordinates.
             options: version, mesh ("fine" or "coarse").
         """
         content: bytes = self._send("GET", f"/v1/models/{name}/blendshapes", params=options).content
@@ -151,15 +222,15 @@ class Client:
         *,
         version: str | None = None,
         place: Placement | None = None,
-        **options: Options,
+        **options: Parameter,
     ) -> NDArray[np.float32]:
-        """Positions (n, V, 3) of codes (n, m).
+        """Return positions (n, V, 3) of codes (n, m).
 
         Args:
-            name: of the model.
-            latents: (n, m).
-            version: of the model.
-            place: where to answer them, see ``mesh``.
+            name: name of the model.
+            latents: (n, m) codes.
+            version: version of the model; by default the newest.
+            place: placement of the shapes, see ``mesh``.
             options: mesh ("fine" or "coarse"), bounds ("allow", "clamp" or "reject"), quality ("full" or "draft").
         """
         answer = self._send(
@@ -171,9 +242,9 @@ class Client:
         return _arrays(answer.content)["vertices"].astype(np.float32)
 
     def nric(
-        self, name: str, latents: ArrayLike, *, version: str | None = None, **options: Options
+        self, name: str, latents: ArrayLike, *, version: str | None = None, **options: Parameter
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Edge lengths and dihedral angles, (n, E) each, of codes (n, m); options: bounds."""
+        """Return edge lengths and dihedral angles, (n, E) each, of codes (n, m); options: bounds."""
         answer = self._send(
             "POST",
             f"/v1/models/{name}/nric",
@@ -185,13 +256,13 @@ class Client:
     def interpolate(
         self, name: str, keyframes: ArrayLike, *, version: str | None = None, quality: str = "full", **options: Any
     ) -> Interpolation:
-        """An animation along a path of codes.
+        """Make an animation along a path of codes.
 
         Args:
-            name: of the model.
-            keyframes: (k, m), at least two.
-            version: of the model.
-            quality: of the frames, "full" or "draft".
+            name: name of the model.
+            keyframes: (k, m) codes, at least two.
+            version: version of the model; by default the newest.
+            quality: quality of the frames, "full" or "draft".
             options: frames, times, start, stop, loop, mesh.
         """
         answer = self._send(
@@ -207,26 +278,22 @@ class Client:
         name: str,
         mesh: Mesh | bytes | Path,
         format: str | None = None,
-        *,
-        fixed: Mapping[int, float] | None = None,
-        **options: Options,
+        **options: Unpack[EncodeParameters],
     ) -> dict[str, Any]:
-        """The code whose shape is closest to a mesh in correspondence, whatever its rotation and position.
+        """Find the code whose shape comes closest to a mesh in correspondence, in any rigid pose.
 
         Args:
-            name: of the model.
-            mesh: arrays, a file or its content.
-            format: of the content; by default the file's suffix.
-            fixed: value by coordinate that the code keeps.
-            options: version, bounds ("allow", "clamp" or "reject"), objective ("vertices" or "nric"); samples, how many
-                codes to draw from the posterior; seed.
+            name: name of the model.
+            mesh: arrays, the path of a file, or its content.
+            format: format of the content; by default the file's suffix.
+            options: see EncodeParameters.
 
         Returns:
             ``latent``, ``residual``, ``vertex_error``, ``covariance``, ``samples`` and more.
         """
         content, format = _file(mesh, format)
         headers = {"Content-Type": "application/octet-stream"}
-        params = {"format": format, "fixed": _json(_by_index(fixed)), **options}
+        params: dict[str, Any] = {"format": format, **options, "fixed": _json(_by_index(options.get("fixed")))}
         found: dict[str, Any] = self._send(
             "POST", f"/v1/models/{name}/encode", params=params, content=content, headers=headers
         ).json()
@@ -237,19 +304,15 @@ class Client:
         name: str,
         scan: Mesh | ArrayLike | bytes | Path,
         format: str | None = None,
-        *,
-        version: str | None = None,
-        **options: Any,
+        **options: Unpack[FitParameters],
     ) -> dict[str, Any]:
-        """The code, place and size that explain a scan, without correspondence.
+        """Find the code, placement and size that explain a scan without correspondence.
 
         Args:
-            name: of the model.
-            scan: points (N, 3), a mesh, a file or its content.
-            format: of the content; by default the file's suffix.
-            version: of the model.
-            options: scale ("fixed" or "free"), partial, noise, landmarks, fixed (value by coordinate), distribution
-                ("population" or "box"), samples, points, used, seed.
+            name: name of the model.
+            scan: points (N, 3), a mesh, the path of a file, or its content.
+            format: format of the content; by default the file's suffix.
+            options: see FitParameters.
 
         Returns:
             ``latent``, ``covariance``, ``placement``, ``status``, ``reason`` and more.
@@ -260,14 +323,16 @@ class Client:
             buffer = io.BytesIO()
             np.savez(buffer, vertices=np.asarray(scan, dtype=np.float64))
             content, format = buffer.getvalue(), "npz"
-        if "fixed" in options:
-            options["fixed"] = _by_index(options["fixed"]) or {}
+        sent: dict[str, Any] = {**options}
+        version = sent.pop("version", None)
+        if "fixed" in sent:
+            sent["fixed"] = _by_index(sent["fixed"]) or {}
         found: dict[str, Any] = self._send(
             "POST",
             f"/v1/models/{name}/fit",
             params={"version": version, "format": format},
             files={"file": ("scan", content)},
-            data={"options": _json(options)},
+            data={"options": _json(sent)},
         ).json()
         return found
 
@@ -276,29 +341,21 @@ class Client:
         name: str,
         latent: ArrayLike,
         targets: Mapping[int, Sequence[float] | Mapping[str, Any]],
-        *,
-        version: str | None = None,
-        sigma: float | None = None,
-        fixed: Mapping[int, float] | None = None,
-        **options: Options,
+        **options: Unpack[EditParameters],
     ) -> dict[str, Any]:
-        """The code inside the hypercube whose shape comes closest to having some vertices at some places.
+        """Find the code inside the bounds whose shape comes closest to having some vertices at given positions.
 
         Args:
-            name: of the model.
-            latent: (m,) to start from.
-            targets: position (3,) by vertex, in the frame in which the shape of ``latent`` is answered, or
-                ``{"position", "sigma"}``.
-            version: of the model.
-            sigma: standard deviation of the targets that have none.
-            fixed: value by coordinate that the code keeps.
-            options: prior, the weight that holds the code back; prior_kind, "groups" or "ridge"; anchored, whether the
-                whole stays in its place; mesh, the one whose vertices are meant; samples, how many codes to draw from
-                the posterior; seed.
+            name: name of the model.
+            latent: (m,) code to start from.
+            targets: position (3,) or ``{"position", "sigma"}`` by vertex, in the frame of the shape of ``latent``.
+            options: see EditParameters.
 
         Returns:
             ``latent``, ``placement``, ``residual``, ``covariance``, ``samples`` and more.
         """
+        sent: dict[str, Any] = {**options}
+        version, sigma, fixed = (sent.pop(name, None) for name in ("version", "sigma", "fixed"))
         places = []
         for vertex, target in targets.items():
             given = target if isinstance(target, Mapping) else {"position": _numbers(target)}
@@ -308,33 +365,33 @@ class Client:
             "POST",
             f"/v1/models/{name}/edit",
             params={"version": version},
-            json={"latent": _numbers(latent), "targets": places, **held, **options},
+            json={"latent": _numbers(latent), "targets": places, **held, **sent},
         ).json()
         return found
 
-    def sample(self, name: str, count: int, *, version: str | None = None, **options: Options) -> NDArray[np.float64]:
-        """Random codes (count, m).
+    def sample(self, name: str, count: int, *, version: str | None = None, **options: Parameter) -> NDArray[np.float64]:
+        """Return random codes (count, m).
 
         Args:
-            name: of the model.
-            count: how many.
-            version: of the model.
-            options: seed; distribution, "uniform" or "gaussian" inside the bounds, or "population", as the codes of the
-                training shapes; temperature, the factor of the population's differences from its mean.
+            name: name of the model.
+            count: number of codes.
+            version: version of the model; by default the newest.
+            options: seed; distribution, "uniform" or "gaussian" inside the bounds, or "population", the Gaussian of the
+                training codes; temperature, the factor of the population's differences from its mean.
         """
         answer = self._send(
             "POST", f"/v1/models/{name}/sample", params={"version": version}, json={"count": count, **options}
         ).json()
         return np.array(answer["latents"])
 
-    def _send(self, method: str, path: str, *, params: Mapping[str, Options] | None = None, **sent: Any) -> Any:
+    def _send(self, method: str, path: str, *, params: Mapping[str, Parameter] | None = None, **sent: Any) -> Any:
         given = {key: value for key, value in (params or {}).items() if value is not None}
         for attempt in range(self._retries + 1):
             answer = self._http.request(method, path, params=given, **sent)
             if answer.status_code != httpx.codes.SERVICE_UNAVAILABLE or attempt == self._retries:
                 break
             wait = answer.headers.get("Retry-After", "")
-            time.sleep(int(wait) if wait.isdecimal() else 1)  # a proxy may send a date
+            time.sleep(int(wait) if wait.isdecimal() else 1)  # a proxy may send a date instead
         if answer.is_error:
             raise ClientError(answer)
         return answer
@@ -342,13 +399,13 @@ class Client:
 
 @dataclass(frozen=True)
 class Interpolation:
-    """An animation; iterating over it gives each frame's vertices (V, 3) as soon as it is ready.
+    """An animation. Iterating over it yields the vertices (V, 3) of each frame as soon as the frame is ready.
 
     Attributes:
-        client: the one that asked for it.
-        id: holds the whole request, so that any replica can answer it, at any time.
-        frames: how many there are.
-        quality: "full", or "draft": quicker, and nearly the same.
+        client: client that asked for the animation.
+        id: the whole request, so that any replica can answer it at any time.
+        frames: number of frames.
+        quality: "full", or "draft", which is quicker and nearly the same.
     """
 
     client: Client
@@ -369,35 +426,35 @@ class Interpolation:
                 yield np.array(frame["vertices"], dtype=np.float32)
 
     def file(self, format: str = "glb", fps: float | None = None) -> bytes:
-        """The whole animation; GLB, USD and USDZ with so many frames in a second."""
+        """Return the whole animation; ``fps`` is the number of frames per second in GLB, USD and USDZ."""
         return self._get("", format, fps=fps)
 
     def frame(self, k: int, format: str = "glb") -> bytes:
-        """One frame, from 0."""
+        """Return frame k, counted from 0."""
         return self._get(f"/frames/{k}", format)
 
     def vertices(self) -> NDArray[np.float32]:
-        """Positions (frames, V, 3)."""
+        """Return positions (frames, V, 3)."""
         return _arrays(self.file("npz"))["vertices"].astype(np.float32)
 
-    def _get(self, path: str, format: str, **more: Options) -> bytes:
+    def _get(self, path: str, format: str, **more: Parameter) -> bytes:
         params = {"format": format, "quality": self.quality, **more}
         content: bytes = self.client._send("GET", f"/v1/interpolations/{self.id}{path}", params=params).content
         return content
 
 
 def _by_index(fixed: Mapping[int, float] | None) -> dict[str, float] | None:
-    """As JSON has it, whose members have names."""
+    """Return values by index as JSON has them: its members have strings as names."""
     return None if fixed is None else {str(int(index)): float(value) for index, value in fixed.items()}
 
 
 def _json(value: Mapping[Any, Any] | None) -> str | None:
-    """As it stands in an address."""
+    """Return a value as JSON text for a query."""
     return None if value is None else json.dumps(value, default=lambda array: array.tolist())
 
 
 def _file(mesh: Mesh | bytes | Path, format: str | None) -> tuple[bytes, str | None]:
-    """The content of a mesh file, and its format where that is known."""
+    """Return the content of a mesh file, and its format if that is known."""
     if isinstance(mesh, Mesh):
         buffer = io.BytesIO()
         np.savez(buffer, vertices=mesh.vertices, faces=mesh.faces)
@@ -408,7 +465,7 @@ def _file(mesh: Mesh | bytes | Path, format: str | None) -> tuple[bytes, str | N
 
 
 def _numbers(values: ArrayLike) -> Any:
-    """Nested lists, as JSON takes them."""
+    """Return nested lists, as JSON takes them."""
     return np.asarray(values, dtype=np.float64).tolist()
 
 

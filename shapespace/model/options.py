@@ -55,6 +55,10 @@ class Target:
         position: x, y and z in the frame and the units of the shape that ``decode`` returns for the start.
         sigma: standard deviation of each coordinate, in the same units. The default is half a percent of the bounding
             box's diagonal. A target with twice the standard deviation has a quarter of the weight.
+
+    >>> import shapespace
+    >>> shapespace.Target(vertex=100, position=(0.1, 0.5, 0.2), sigma=0.01).vertex
+    100
     """
 
     vertex: int
@@ -71,6 +75,11 @@ class Landmark:
         position: x, y and z in the scan's units and frame.
         sigma: standard deviation of the position, in the scan's units. The default is a hundredth of the model's
             diagonal.
+
+    >>> import shapespace
+    >>> nose = shapespace.Landmark(vertex=5, position=(0, 1, 0), sigma=0.01)
+    >>> shapespace.FitOptions(landmarks=[nose]).landmarks[0].position
+    (0, 1, 0)
     """
 
     vertex: int
@@ -122,6 +131,10 @@ class EncodeOptions(SearchOptions):
             bounds only, ``reject`` refuses a code outside.
         objective: what is smallest: ``vertices``, distances after rigid alignment, or ``nric``, differences of lengths
             and angles in their weighted norm.
+
+    >>> import shapespace
+    >>> shapespace.EncodeOptions(objective="nric", fixed={0: 0.5}).objective
+    <Objective.NRIC: 'nric'>
     """
 
     bounds: Bounds = Bounds.ALLOW
@@ -142,6 +155,10 @@ class EditOptions(SearchOptions):
         sigma: standard deviation of targets that have none, of all or by vertex.
         anchored: whether only vertices without a target decide where the whole shape lies. Targets out of reach then do
             not carry the shape along.
+
+    >>> import shapespace
+    >>> shapespace.EditOptions(prior=1e-3, prior_kind="ridge").mesh
+    <MeshChoice.FINE: 'fine'>
     """
 
     prior: float = field(default=1e-4, metadata={"ge": 0})
@@ -164,6 +181,10 @@ class FitOptions(SearchOptions):
             uniform inside the bounds.
         points: whether to return the distance of each point and of each vertex.
         used: whether to return the points that represented the scan, for display beside the shape.
+
+    >>> import shapespace
+    >>> shapespace.FitOptions(partial=True, scale="free").scale
+    <ScaleChoice.FREE: 'free'>
     """
 
     scale: ScaleChoice = ScaleChoice.FIXED

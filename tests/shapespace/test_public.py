@@ -1,11 +1,13 @@
 """``import shapespace``: public names, each with an example that runs, and lazy imports."""
 
+import builtins
 import doctest
 import importlib
 import inspect
 import re
 import subprocess
 import sys
+from enum import StrEnum
 from pathlib import Path
 
 import pytest
@@ -41,12 +43,48 @@ def test_every_public_name_is_there_and_has_an_example() -> None:
     for name in shapespace.__all__:
         value = getattr(shapespace, name)
         assert value.__name__ == name
-        assert examples(value) or re.search(rf"shapespace\.{name}\b", tour), name
+        if inspect.isclass(value) and issubclass(value, Exception | StrEnum):
+            assert inspect.getdoc(value)
+        else:
+            assert examples(value) or re.search(rf"shapespace\.{name}\b", tour), name
     for name, method in vars(shapespace.ShapeModel).items():
         if inspect.isfunction(method) and not name.startswith("_"):
             assert f"model.{name}(" in examples(method)
     with pytest.raises(AttributeError, match="has no attribute 'unknown'"):
         shapespace.unknown  # noqa: B018
+
+
+def raised(documented: object) -> set[str]:
+    """Names of the errors in the section ``Raises`` of a docstring."""
+    _, _, section = (inspect.getdoc(documented) or "").partition("Raises:\n")
+    names = re.findall(r"^    (\w+(?:, \w+)*): ", section.partition("\n\n")[0], re.MULTILINE)
+    return {name for several in names for name in several.split(", ")}
+
+
+def test_every_error_that_a_public_docstring_names_is_public() -> None:
+    found: dict[str, set[str]] = {}
+    for name in shapespace.__all__:
+        value = getattr(shapespace, name)
+        if not inspect.isclass(value):
+            found[name] = raised(value)
+        elif not issubclass(value, Exception):
+            methods = {key: getattr(value, key) for key in vars(value) if not key.startswith("_")}
+            found |= {f"{name}.{key}": raised(method) for key, method in methods.items()} | {name: raised(value)}
+    assert found["ShapeModel.encode"] == {"InvalidMeshError", "LatentError", "MeshError", "ModelFailedError"}
+    known = {*shapespace.__all__, *vars(builtins)}
+    assert {name: errors - known for name, errors in found.items() if errors - known} == {}
+
+
+def test_options_go_by_name_or_as_one_object() -> None:
+    options = shapespace.EncodeOptions.of(shapespace.EncodeOptions(samples=3), {"objective": "nric"})
+    assert (options.samples, options.objective) == (3, shapespace.Objective.NRIC)
+    assert shapespace.EncodeOptions.of(None, {}) == shapespace.EncodeOptions()
+    with pytest.raises(TypeError, match="must be EncodeOptions, not 'clamp'\\. Pass single options by name"):
+        shapespace.EncodeOptions.of("clamp", {})  # type: ignore[arg-type]
+    with pytest.raises(TypeError, match="prior"):
+        shapespace.EncodeOptions.of(None, {"prior": 1})
+    with pytest.raises(ValueError, match="'neither' is not a valid Bounds"):
+        shapespace.EncodeOptions.of(None, {"bounds": "neither"})
 
 
 def test_nothing_is_imported_before_it_is_used() -> None:
@@ -63,7 +101,7 @@ import shapespace
 assert [name for name in sys.modules if name.startswith("shapespace")] == ["shapespace"]
 ALLOWED |= {"numpy", "scipy"}
 for name in shapespace.__all__:
-    if name not in {"load", "ShapeModel"}:
+    if not shapespace._MODULES[name].startswith(("bundle.", "model.")):
         getattr(shapespace, name)
 try:
     shapespace.load

@@ -1,18 +1,27 @@
 """The Python client, with a server and without the rest of the project."""
 
 import json
+import re
 import subprocess
 import sys
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 
 import httpx
 import numpy as np
 import pytest
 
-from shapespace.client import Client, ClientError, Interpolation
+from shapespace.client import (
+    Client,
+    ClientError,
+    EditParameters,
+    EncodeParameters,
+    FitParameters,
+    Interpolation,
+)
+from shapespace.model.options import EditOptions, EncodeOptions, FitOptions
 from tests.service.bundles import SCALE, expected_nric, reference
 from tests.service.conftest import ROOT, Server, Start
 from tests.service.glb import GLB
@@ -111,6 +120,16 @@ def test_codes_are_drawn_found_and_changed(shapes: Client, tmp_path: Path) -> No
     moved = {"translation": [1, 0, 0]}
     positions = [shapes.vertices("small", codes[:1], **options)[0] for options in ({}, {"place": moved})]
     np.testing.assert_allclose(positions[1] - positions[0], [[1, 0, 0]] * len(positions[0]), atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("parameters", "options"),
+    [(EncodeParameters, EncodeOptions), (EditParameters, EditOptions), (FitParameters, FitOptions)],
+)
+def test_parameters_are_the_options_of_the_library(parameters: type, options: type) -> None:
+    assert set(parameters.__annotations__) == {"version", *(field.name for field in fields(options))}
+    for name in parameters.__annotations__:
+        assert re.search(rf"^ +(\w+, )*{name}(, \w+)*: ", parameters.__doc__ or "", re.MULTILINE), name
 
 
 def test_problems_are_exceptions_that_say_what_to_do(shapes: Client) -> None:
