@@ -1,4 +1,4 @@
-"""Numbers and objects as JSON holds them, checked strictly."""
+"""Types of numbers and objects in JSON, checked strictly."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ Whole = Annotated[
 
 
 def _by_index(given: object) -> object:
-    # Stops at the first fault, because there may be as many faults as members.
+    # Stops at the first fault: every member may have a fault.
     if isinstance(given, dict):
         for index, value in given.items():
             if not re.fullmatch("[0-9]{1,6}", str(index)):
@@ -28,18 +28,18 @@ def _by_index(given: object) -> object:
     return given
 
 
-#: Numbers by index. Members of a JSON object have strings as names, so an index is written in digits.
+#: Numbers by index. JSON objects have strings as names, so an index is written in digits.
 NumbersByIndex = Annotated[
     dict[int, float],
     BeforeValidator(_by_index),
     Field(json_schema_extra={"propertyNames": {"pattern": "^[0-9]{1,6}$"}}),
 ]
-#: Most members of an object, because each unknown one is reported.
+#: Maximum number of members of an object, because each unknown member is reported.
 _MEMBERS = 32
 
 
 class Body(BaseModel):
-    """A body of a request, or an object in it."""
+    """Body of a request, or an object in a body."""
 
     model_config = ConfigDict(extra="forbid")
 

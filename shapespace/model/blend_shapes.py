@@ -1,4 +1,4 @@
-"""A model as linear blend shapes, for programs that know sliders and no networks; and how far that is from it."""
+"""Linear blend shapes of a model, for programs without networks, and their error against the model."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from shapespace.mesh.rigid_motion import align
 from shapespace.model.decoder import Decoder, MeshChoice, Shape
 from shapespace.model.latent_space import Codes, Distribution
 
-#: Random codes by which blend shapes are measured.
+#: Number of random codes by which the error is measured.
 MEASURED = 40
 
 
@@ -24,18 +24,18 @@ class PeriodicError(ValueError):
 
 @dataclass(frozen=True)
 class BlendShapes:
-    """A shape, and for each coordinate those at both of its bounds.
+    """The shape of code 0, and the shapes at both bounds of each coordinate.
 
     Attributes:
-        rest: (V, 3) of code 0, aligned to the reference, in the units of the training meshes.
-        ends: (2m, V, 3) of the codes in which one coordinate is at its upper or at its lower bound and all others 0,
-            aligned to the shape at rest.
-        names: (2m,), the coordinates' with + or -.
-        faces: (F, 3).
-        surface: of the mesh, where its file had more than triangles.
-        error: ``mean`` and ``p95`` over vertices and random codes inside the bounds, of the distance of the linear
-            blend to the model's shape, as shares of the diagonal of the reference.
-        model: name and version.
+        rest: (V, 3) shape of code 0, aligned to the reference, in the units of the training meshes.
+        ends: (2m, V, 3) shapes with one coordinate at its upper or lower bound and all other coordinates 0, aligned to
+            ``rest``.
+        names: (2m,) names of the coordinates with + or -.
+        faces: (F, 3) faces.
+        surface: attributes of the training file's mesh, if it had more than triangles.
+        error: ``mean`` and ``p95`` of the distance between linear blend and model, over vertices and random codes
+            inside the bounds, as shares of the reference's diagonal.
+        model: name and version of the model.
     """
 
     rest: FloatArray
@@ -47,13 +47,13 @@ class BlendShapes:
     model: str
 
     def glb(self) -> bytes:
-        """A GLB with a morph target for each end, and the error in ``asset.extras``."""
+        """Return a GLB with a morph target for each end, and with the error in ``asset.extras``."""
         extras = {"model": self.model, "error": self.error}
         return blend_shapes_glb(self.rest, self.ends, self.names, self.faces, self.surface, extras)
 
 
 def require_ends(model: Decoder) -> None:
-    """Raise PeriodicError for a model with angles among its coordinates."""
+    """Raise PeriodicError if the model has angles among its coordinates."""
     angles = [name for name, period in zip(model.latents.names, model.manifest.period, strict=True) if period]
     if angles:
         raise PeriodicError(
@@ -63,15 +63,15 @@ def require_ends(model: Decoder) -> None:
 
 
 def blend_shapes(model: Decoder, mesh: MeshChoice, shape: Callable[[Codes], Shape]) -> BlendShapes:
-    """The blend shapes of a model.
+    """Compute the blend shapes of a model.
 
     Args:
-        model: without angles.
-        mesh: fine or coarse.
-        shape: of a code (m,), on that mesh.
+        model: decoder of a model without angles.
+        mesh: fine or coarse mesh.
+        shape: function from a code (m,) to its shape on this mesh.
 
     Raises:
-        PeriodicError: a model with angles.
+        PeriodicError: the model has angles.
         NotFiniteError, ModelFailedError: the model has no shape for a code.
     """
     require_ends(model)
@@ -82,7 +82,7 @@ def blend_shapes(model: Decoder, mesh: MeshChoice, shape: Callable[[Codes], Shap
     ends = align(np.stack([shape(code).vertices for code in codes]), rest)
     size, away = model.manifest.scale * model.mesh(mesh).diagonal, []
     for code in latents.sample(MEASURED, 0, Distribution.UNIFORM):
-        # How far along a coordinate is, of the way to the bound on its side.
+        # Position of each coordinate between 0 and the bound on its side.
         along = np.repeat(code.astype(np.float64), 2) / np.where(sides == 0, 1, sides)
         weights = np.where((sides == 0) | (along < 0), 0, along)
         blend = rest + np.tensordot(weights, ends - rest, 1)

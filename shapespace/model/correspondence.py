@@ -1,4 +1,4 @@
-"""Uploaded meshes: which of a model's meshes one is, and its vertices in the model's order."""
+"""Match a given mesh with a model's meshes, and bring its vertices into the model's order."""
 
 from __future__ import annotations
 
@@ -11,21 +11,21 @@ from shapespace.files.limits import Limits
 from shapespace.mesh.triangle_mesh import diagonal
 from shapespace.model.decoder import Decoder, MeshChoice
 
-#: Larger meshes than the model's are read up to these, so that their sizes can be told.
+#: Larger meshes than the model's are read up to these limits, so that the error message can name their size.
 _VERTICES_READ, _FACES_READ = 2**15, 2**16
 
 
 class InvalidMeshError(ValueError):
-    """An uploaded mesh that can't be used, with a sentence that says what to do."""
+    """A mesh that can't be used; the message says what to do."""
 
 
 @dataclass(frozen=True)
 class Matched:
-    """An uploaded mesh in the model's order.
+    """A mesh in the model's vertex order.
 
     Attributes:
-        vertices: (V, 3) of the mesh of choice.
-        mesh: which one it is.
+        vertices: (V, 3) vertices.
+        mesh: whether they belong to the fine or the coarse mesh.
     """
 
     vertices: FloatArray
@@ -33,7 +33,7 @@ class Matched:
 
 
 def limits(model: Decoder) -> Limits:
-    """How large a file has to be read to tell whether it holds one of the model's meshes."""
+    """Return the limits up to which files are read: large enough for each of the model's meshes."""
     layouts = _layouts(model)
     vertices, faces = max(layout.count for layout in layouts), max(len(layout.faces) for layout in layouts)
     return Limits(max(vertices, 3 * faces, _VERTICES_READ), max(faces, _FACES_READ))
@@ -42,16 +42,16 @@ def limits(model: Decoder) -> Limits:
 def match(model: Decoder, vertices: FloatArray, faces: IntArray) -> Matched:
     """Find which of the model's meshes a file holds.
 
-    Vertices count in their order and faces in any; JSON may leave these out. STL, which shares no vertices, counts by
-    the order of its faces. A file like those that the model was trained on may have the vertices that were welded then.
+    Vertices must be in the model's order, faces may be in any order. JSON may leave faces out. STL shares no vertices
+    and must have the model's order of faces. Vertices that training has welded may be separate, as in its files.
 
     Args:
-        model: whose meshes come into question.
-        vertices: (V, 3) as they stand in the file.
-        faces: (F, 3) there, or none.
+        model: decoder with the meshes.
+        vertices: (V, 3) vertices in the file's order.
+        faces: (F, 3) faces; F may be 0.
 
     Raises:
-        InvalidMeshError: not finite, or none of the model's meshes.
+        InvalidMeshError: a vertex is not finite, or the mesh is none of the model's meshes.
     """
     layouts = _layouts(model)
     bad = np.flatnonzero(~(np.abs(vertices) < np.finfo(np.float32).max).all(axis=1))
@@ -78,13 +78,13 @@ def match(model: Decoder, vertices: FloatArray, faces: IntArray) -> Matched:
 
 @dataclass(frozen=True)
 class _Layout:
-    """One way in which a mesh of the model lies in a file.
+    """One order in which files may hold a mesh of the model.
 
     Attributes:
-        mesh: which mesh.
-        faces: (F, 3) of it.
-        of_file: (N,) vertex of the mesh that each vertex of the file is, −1 for none.
-        places: (V,) vertex of the file that each vertex of the mesh is.
+        mesh: fine or coarse mesh.
+        faces: (F, 3) faces of the mesh.
+        of_file: (N,) mesh vertex for each vertex of the file, −1 for none.
+        places: (V,) file vertex for each vertex of the mesh.
     """
 
     mesh: MeshChoice
@@ -94,16 +94,16 @@ class _Layout:
 
     @property
     def count(self) -> int:
-        """N."""
+        """Number N of vertices in the file."""
         return len(self.of_file)
 
     def fault(self, faces: IntArray) -> str | None:
-        """What distinguishes the faces of a file (F, 3) from those of the mesh, if there are any."""
+        """Return how a file's faces (F, 3) differ from the mesh's faces, or None."""
         if not len(faces):
             return None
         if faces.min() < 0 or faces.max() >= self.count:
             return f"The faces name vertices {faces.min()} to {faces.max()}, but there are {self.count}."
-        # Faces of parts that the model was told to leave out.
+        # Leave out faces of parts that training left out.
         faces = faces[(self.of_file[faces] >= 0).any(axis=1)]
         if len(faces) != len(self.faces):
             return f"The mesh has {len(faces)} faces, but the model's has {len(self.faces)}."
@@ -117,7 +117,7 @@ class _Layout:
 
 
 def _canonical(faces: IntArray) -> IntArray:
-    """Faces in an order that doesn't depend on the file's: each begins with its smallest vertex."""
+    """Return faces in an order that doesn't depend on the file; each begins with its smallest vertex."""
     first = faces.argmin(axis=1)[:, None]
     turned = np.take_along_axis(faces, (first + np.arange(3)) % 3, axis=1)
     return turned[np.lexsort(turned.T[::-1])]
@@ -127,7 +127,7 @@ def _layouts(model: Decoder) -> list[_Layout]:
     layouts = []
     choices = [MeshChoice.FINE, MeshChoice.COARSE] if model.fine else [MeshChoice.FINE]
     if model.fine and (model.fine.prolong.coarse_vertices < 0).any():
-        choices = [MeshChoice.COARSE]  # nothing tells where the coarse vertices are on a fine mesh
+        choices = [MeshChoice.COARSE]  # the positions of coarse vertices on the fine mesh are unknown
     for choice in choices:
         mesh = model.mesh(choice)
         own = np.arange(len(mesh.vertices))
@@ -135,7 +135,7 @@ def _layouts(model: Decoder) -> list[_Layout]:
     if model.file_vertices is not None and choices[0] is MeshChoice.FINE:
         of_file = model.file_vertices
         places = np.zeros(len(layouts[0].of_file), np.int64)
-        # Backwards, so that the first of welded vertices stays.
+        # In reverse order, so that the first of several welded vertices remains.
         there = np.flatnonzero(of_file >= 0)[::-1]
         places[of_file[there]] = there
         layouts.append(_Layout(choices[0], layouts[0].faces, of_file, places))
@@ -143,7 +143,7 @@ def _layouts(model: Decoder) -> list[_Layout]:
 
 
 def _of_soup(layout: _Layout, corners: FloatArray) -> Matched:
-    """Vertices of triangles (F, 3, 3) in the order of the mesh's faces."""
+    """Return the mesh of separate triangles (F, 3, 3) in the order of its faces."""
     vertices = np.zeros((layout.faces.max() + 1, 3))
     vertices[layout.faces] = corners
     apart = np.linalg.norm(vertices[layout.faces] - corners, axis=-1).max(axis=1)

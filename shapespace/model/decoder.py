@@ -1,4 +1,4 @@
-"""Decoding: latent codes to lengths and angles by the networks of a bundle, and those to vertices by Gauss–Newton."""
+"""Decoding: networks turn latent codes into lengths and angles, and Gauss–Newton turns these into vertices."""
 
 from __future__ import annotations
 
@@ -31,35 +31,35 @@ from shapespace.solve.deadline import Deadline
 from shapespace.solve.outcome import Status
 
 logger = logging.getLogger(__name__)
-#: Gauss–Newton stops once no vertex moves further than this fraction of the diagonal: a fiftieth of a pixel where a
-#: shape fills a screen.
+#: Gauss–Newton stops when no vertex moves by more than this fraction of the diagonal: a fiftieth of a pixel if a shape
+#: fills a screen.
 TOLERANCE = 2e-5
-#: When networks have taken too long, their limit of time is halved, down to so many seconds, and grows by that factor
-#: with each answer in time. Otherwise repeated requests for such codes would keep the workers from other models.
+#: After a timeout, the networks' time limit is halved, down to LEAST_PATIENCE seconds. Each answer in time multiplies
+#: the limit by RECOVERY. Otherwise repeated requests for slow codes would occupy all workers.
 LEAST_PATIENCE, RECOVERY = 0.5, 1.1
-#: Random codes at which a model is rehearsed.
-REHEARSED = 2
-#: Random codes by which drafts are measured.
-DRAFTED = 50
+#: Number of random codes in the self-test.
+TESTED_CODES = 2
+#: Number of random codes by which the error of drafts is measured.
+DRAFT_CODES = 50
 
 
 class ModelFailedError(RuntimeError):
-    """Networks that fail at a code, with a sentence that says what to do; its cause names the network and the fault."""
+    """Networks failed at a code. The message says what to do, and the cause names the network and the fault."""
 
 
 class NetworkTimeError(ModelFailedError):
-    """Networks that take too long at a code."""
+    """Networks exceeded their time limit at a code."""
 
 
 class MeshChoice(StrEnum):
-    """Which mesh an answer holds; a model without a finer one answers both with the one it has."""
+    """Mesh of a shape; a model without a finer mesh returns its only mesh for both."""
 
     FINE = "fine"
     COARSE = "coarse"
 
 
 class Quality(StrEnum):
-    """How exactly a shape is found: by Gauss–Newton, or from face frames alone, in a fraction of the time."""
+    """Accuracy of a shape: by Gauss–Newton, or from face frames alone in a fraction of the time."""
 
     FULL = "full"
     DRAFT = "draft"
@@ -67,21 +67,21 @@ class Quality(StrEnum):
 
 @dataclass(frozen=True)
 class Diagnostics:
-    """How well a shape was found.
+    """Diagnostics of a decoded shape.
 
     Attributes:
-        status: how Gauss–Newton ended, see shapespace.solve.outcome.Status; of a draft, which needs none, converged.
-        iterations: its steps.
-        residual: distance between the lengths and angles asked for and those of the shape, relative,
-            weighted norm.
-        flipped_faces: faces at an edge whose dihedral angle is more than π/2 from the one asked for.
-        integrability: how far the lengths and angles asked for are from those of any surface: root mean square over
+        status: how Gauss–Newton ended; ``converged`` for a draft, which needs no Gauss–Newton.
+        iterations: number of Gauss–Newton steps.
+        residual: relative difference of the shape's lengths and angles from the networks' prediction, in the weighted
+            norm.
+        flipped_faces: number of faces at an edge whose dihedral angle differs by more than π/2 from the prediction.
+        integrability: distance of the prediction from the lengths and angles of any surface: root mean square over
             vertices of ``|Q(z)|``, the sine of half the angle by which faces around a vertex fail to close.
-        plausibility: distance to the nearest code of a training shape, in multiples of the distance that these
-            typically have from each other; None where the model has no such codes.
+        plausibility: distance from the nearest training code, in multiples of the typical distance between training
+            codes; None if the model has no training codes.
         inside_bounds: whether the code lies inside the model's bounds.
         model: digest of the model's manifest.
-        quality: whether it is a draft.
+        quality: whether the shape is a draft.
     """
 
     status: Status
@@ -97,12 +97,12 @@ class Diagnostics:
 
 @dataclass(frozen=True)
 class Shape:
-    """A shape as it is answered: aligned to the reference, in the units of the training meshes.
+    """Decoded shape, aligned to the reference, in the units of the training meshes.
 
     Attributes:
-        vertices: (V, 3), of the mesh that was asked for.
-        diagnostics: how well it was found; they concern the coarse mesh.
-        seconds: time spent by stage, ``network`` and ``reconstruct``.
+        vertices: (V, 3) vertices of the requested mesh.
+        diagnostics: diagnostics, which concern the coarse mesh.
+        seconds: time in seconds by stage, ``network`` and ``reconstruct``.
     """
 
     vertices: FloatArray
@@ -115,8 +115,8 @@ class LengthsAndAngles:
     """NRIC in the units of the training meshes.
 
     Attributes:
-        lengths, angles: (E,) each, angles in radians.
-        factors: (J, 2E), the factors' own lengths and angles.
+        lengths, angles: (E,) edge lengths and dihedral angles in radians.
+        factors: (J, 2E) lengths and angles of each factor.
     """
 
     lengths: FloatArray
@@ -125,18 +125,18 @@ class LengthsAndAngles:
 
 
 class Decoder:
-    """The networks and the Gauss–Newton solver of a bundle, ready for any number of threads.
+    """Networks and Gauss–Newton solvers of a bundle; any number of threads may use it.
 
-    Each code is decoded by itself, and Gauss–Newton starts from the same places, so that a shape does not depend on
-    other codes.
+    Each code is decoded separately, and Gauss–Newton begins at fixed starts, so a shape does not depend on other
+    codes.
 
     Args:
-        bundle: verified.
-        threads: shapes that may be reconstructed at once; each has a solver of its own. The first is made here, the
-            others when they are needed, which takes about as long as a shape.
+        bundle: verified bundle.
+        threads: number of shapes that may be reconstructed at once, each with its own solver. The first solver is made
+            here, other solvers when they are needed, which takes about as long as a shape.
 
     Raises:
-        BundleError: a network that doesn't load, or has other inputs or outputs than the manifest says.
+        BundleError: a network doesn't load, or its inputs or outputs differ from the manifest.
     """
 
     def __init__(self, bundle: Bundle, threads: int = 1) -> None:
@@ -148,7 +148,7 @@ class Decoder:
         self._surface = bundle.surface
         codes = self.training_codes = bundle.training_codes
         self._training = None if codes is None else TrainingCodes(self.latents, codes)
-        #: What codes are like: those of the training shapes, or where there are none any inside the bounds.
+        #: Distribution of codes: of the training codes, or of uniform codes if there are no training codes.
         self.population = (
             Population.in_box(self.latents.lower, self.latents.upper)
             if codes is None
@@ -161,32 +161,32 @@ class Decoder:
         if manifest.start:
             self._start = Session(bundle, manifest.start, [manifest.latent_dimension], [manifest.vertices, 3])
         self._integrability = Integrability(self.reference.connectivity)
-        #: Spaces for exact exponentials, one for each thread that computes some; made when none is free.
+        #: Spaces for exact exponentials, one for each thread that computes them; made when no space is free.
         self.spaces: queue.SimpleQueue[ShellSpace] = queue.SimpleQueue()
         self._solvers: queue.SimpleQueue[Reconstructor] = queue.SimpleQueue()
         self._first_solver = Reconstructor(self.reference, manifest.eta_reconstruction)
-        # What it prepares at its first shape is done here, so that no request waits for it.
+        # The preparation at the first shape is done here, so that no request waits for it.
         self._first_solver.guess(nric(self.reference.vertices, self.reference.connectivity))
         self._solvers.put(self._first_solver)
-        #: Solvers that may still be made: a server of many threads rarely needs them all.
+        #: Number of solvers that may still be made. A server with many threads rarely needs all of them.
         self._solvers_left, self._lock = threads - 1, threading.Lock()
         self._patience = PATIENCE
 
     def mesh(self, choice: MeshChoice) -> TriangleMesh:
-        """The reference, normalised, as the fine or the coarse mesh; every shape has its faces."""
+        """Return the normalised reference as the fine or the coarse mesh; every shape has its faces."""
         fine = self.finer(choice)
         return fine.reference if fine else self.reference
 
     def surface(self, choice: MeshChoice) -> MeshAttributes | None:
-        """What the user's file had on that mesh beside triangles; None for the coarse one of two."""
+        """Return the training file's attributes of a mesh beside triangles; None for the coarse one of two meshes."""
         return self._surface if self.fine is None or self.finer(choice) else None
 
     def finer(self, choice: MeshChoice) -> FineMesh | None:
-        """The finer mesh, where the model has one and it is the choice; otherwise None."""
+        """Return the finer mesh if the model has one and the choice is fine; otherwise None."""
         return self.fine if choice is MeshChoice.FINE else None
 
     def reference_shape(self, mesh: MeshChoice = MeshChoice.FINE) -> Shape:
-        """The reference itself: what is answered without a code."""
+        """Return the reference as a shape, for requests without a code."""
         diagnostics = Diagnostics(Status.CONVERGED, 0, 0.0, 0, 0.0, None, True, self.digest)
         vertices = self.manifest.scale * self.mesh(mesh).vertices
         return Shape(vertices, diagnostics, {"network": 0.0, "reconstruct": 0.0})
@@ -199,17 +199,17 @@ class Decoder:
         deadline: Deadline | None = None,
         quality: Quality = Quality.FULL,
     ) -> Shape:
-        """The shape of one code (m,), also where Gauss–Newton did not converge: the diagnostics say so.
+        """Decode one code (m,), even if Gauss–Newton does not converge: the diagnostics say so.
 
         Args:
-            code: checked by ``latents.codes``.
-            inside_bounds: what the diagnostics say of it.
-            mesh: fine or coarse.
-            deadline: after which Gauss–Newton gives up with Status.DEADLINE.
-            quality: a draft is from face frames; where they go astray the shape is solved after all.
+            code: code from ``latents.codes``.
+            inside_bounds: whether the code lies inside the bounds, for the diagnostics.
+            mesh: fine or coarse mesh.
+            deadline: time limit after which Gauss–Newton stops with Status.DEADLINE.
+            quality: a draft comes from face frames. Where these are inconsistent, the shape is solved nevertheless.
 
         Raises:
-            NotFiniteError: the code is so far outside the bounds that the numbers overflow.
+            NotFiniteError: the code is so far outside the bounds that numbers overflow.
             ModelFailedError: the networks failed at this code, or took too long.
         """
         began = time.perf_counter()
@@ -223,7 +223,7 @@ class Decoder:
         with np.errstate(over="ignore", invalid="ignore"):
             try:
                 vertices = self.finish(found.vertices, mesh)
-            except np.linalg.LinAlgError:  # of the alignment, where vertices are not finite
+            except np.linalg.LinAlgError:  # an alignment of vertices that are not finite
                 raise NotFiniteError(self._overflow) from None
             if found.status is Status.NOT_FINITE or not np.isfinite(vertices.astype(np.float32)).all():
                 raise NotFiniteError(self._overflow)
@@ -242,19 +242,19 @@ class Decoder:
         return Shape(vertices, diagnostics, seconds)
 
     def draft_error(self) -> dict[str, float]:
-        """How far drafts are from full shapes: ``mean`` and ``p95`` over vertices of random codes' fine shapes.
+        """Return ``mean`` and ``p95`` of the distance between drafts and full shapes, over vertices and random codes.
 
-        Shares of the diagonal of the reference; codes are uniform inside the bounds. Where frames go astray, a draft is
-        the shape itself. Raises NotFiniteError or ModelFailedError.
+        Distances are shares of the reference's diagonal; codes are uniform inside the bounds. Where frames are
+        inconsistent, a draft is the full shape. Raises NotFiniteError or ModelFailedError.
         """
         size, away = self.manifest.scale * self.mesh(MeshChoice.FINE).diagonal, []
-        for code in self.latents.sample(DRAFTED, 0, Distribution.UNIFORM):
+        for code in self.latents.sample(DRAFT_CODES, 0, Distribution.UNIFORM):
             draft, full = (self.shape(code, quality=quality).vertices for quality in (Quality.DRAFT, Quality.FULL))
             away.append(np.linalg.norm(draft - full, axis=1) / size)
         return {"mean": float(np.mean(away)), "p95": float(np.percentile(away, 95))}
 
     def lengths_and_angles(self, code: Codes) -> LengthsAndAngles:
-        """What the networks predict for a code (m,), before any reconstruction; raises NotFiniteError."""
+        """Return the networks' prediction for a code (m,) in the user's units; raises NotFiniteError."""
         factors, z = (array[0].astype(np.float64) for array in self._networks(code[None]))
         half = self.manifest.edges
         for array in (factors, z):
@@ -265,32 +265,32 @@ class Decoder:
         return LengthsAndAngles(z[:half], z[half:], factors)
 
     def nric(self, code: FloatArray) -> FloatArray:
-        """What the networks predict for a code (m,): NRIC (2E,), normalised, not finite where they overflow."""
+        """Return the predicted NRIC (2E,) of a code (m,), normalised; not finite where the networks overflow."""
         return self._networks(code[None].astype(np.float32))[1][0]
 
     def factor(self, j: int, parts: FloatArray) -> FloatArray:
-        """What the network of factor j predicts for its parts (n, m_j) of codes: NRIC (n, 2E), normalised."""
+        """Return the NRIC (n, 2E) of factor j for its parts (n, m_j) of codes, normalised."""
         with self._limited() as until:
             return self._factors[j](parts.astype(np.float32), until).astype(np.float64)
 
     def guesses(self, codes: Codes) -> FloatArray:
-        """What the start network makes of codes (n, m): shapes (n, V, 3), normalised; ValueError if there is none."""
+        """Return the start network's normalised shapes (n, V, 3) of codes (n, m); ValueError if there is none."""
         if self._start is None:
             raise ValueError("the bundle has no start network")
         with self._limited() as until:
             return self._start(codes, until).astype(np.float64)
 
     def self_test(self) -> None:
-        """Run every network once, at the ends of the bounds and between them, and reconstruct one shape.
+        """Run every network at the ends of the bounds and between them, and reconstruct one shape.
 
         Raises:
-            BundleError: something fails, so that the bundle must not be served.
+            BundleError: something fails, so the bundle must not be served.
         """
         for network in (*self._factors, self._combiner, *([self._start] if self._start else [])):
             network.check()
         try:
             middle, *others = self._middle_and_ends()
-            for code in (*others, *self.latents.sample(REHEARSED, 0, Distribution.UNIFORM)):
+            for code in (*others, *self.latents.sample(TESTED_CODES, 0, Distribution.UNIFORM)):
                 self._networks(code[None])
             for start in self._learned_start(middle):
                 start()
@@ -305,26 +305,26 @@ class Decoder:
         return self.latents.codes([x.tolist() for x in (lower + (upper - lower) / 2, lower, upper)], Bounds.CLAMP)[0]
 
     def finish(self, shape: FloatArray, mesh: MeshChoice) -> FloatArray:
-        """A shape (V, 3) in any pose as it is answered: on the mesh of choice, aligned, in the user's units."""
+        """Bring a shape (V, 3) in any pose to the mesh of choice, aligned, in the user's units."""
         return self.manifest.scale * self.placed(shape, mesh)
 
     def placed(self, shapes: FloatArray, mesh: MeshChoice, carried: FloatArray | None = None) -> FloatArray:
-        """Shapes (…, V, 3) on the mesh of choice, aligned to its reference; or what is ``carried`` by that motion."""
+        """Return shapes (…, V, 3) on the mesh of choice, aligned to the reference; or ``carried`` points so moved."""
         fine = self.finer(mesh)
         return align(fine.prolong(shapes) if fine else shapes, self.mesh(mesh).vertices, carried)
 
     def coarse(self, vertices: FloatArray, mesh: MeshChoice) -> FloatArray:
-        """The coarse mesh's vertices, given those (V, 3) of the mesh of choice."""
+        """Return the coarse vertices among the vertices (V, 3) of the mesh of choice."""
         fine = self.finer(mesh)
         return vertices[fine.prolong.coarse_vertices] if fine else vertices
 
     def nearby(self, mesh: MeshChoice) -> FloatArray:
-        """How many vertices of the mesh of choice lie nearest to each coarse one, (V,)."""
+        """Return for each coarse vertex the number (V,) of vertices of the mesh of choice that lie nearest to it."""
         fine = self.finer(mesh)
         return fine.nearby if fine else np.ones(len(self.reference.vertices))
 
     def _networks(self, codes: Codes) -> tuple[NDArray[np.float32], FloatArray]:
-        """Factors (n, J, 2E) and combined NRIC (n, 2E), normalised."""
+        """Return factors (n, J, 2E) and combined NRIC (n, 2E), normalised."""
         with self._limited() as until:
             parts = [
                 session(codes[:, factor.start : factor.stop], until)
@@ -339,7 +339,7 @@ class Decoder:
 
     @contextmanager
     def _limited(self) -> Iterator[float]:
-        """Yields the moment by which networks must have answered; turns their errors into ModelFailedError."""
+        """Yield the time at which networks must have answered; turn their errors into ModelFailedError."""
         patience = self._patience
         try:
             yield time.monotonic() + patience
@@ -356,7 +356,7 @@ class Decoder:
 
     @contextmanager
     def solver(self) -> Iterator[Reconstructor]:
-        """Lends a solver; waits while all are in use."""
+        """Lend a solver; wait while all solvers are in use."""
         solver = self._spare_solver()
         try:
             yield solver

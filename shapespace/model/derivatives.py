@@ -1,4 +1,4 @@
-"""How the networks answer to changes of the code: difference quotients, and factors on grids."""
+"""Derivatives of the networks by difference quotients, and factors on grids."""
 
 from __future__ import annotations
 
@@ -11,21 +11,21 @@ from scipy import sparse
 from shapespace.arrays import FloatArray
 from shapespace.model.decoder import Decoder
 
-#: Step of a difference quotient, as a fraction of the coordinate's range. An angle may move something as small as a
-#: bump around the shape; for other coordinates smaller steps drown in the rounding of the networks' float32.
+#: Step of a difference quotient, as a fraction of the coordinate's range. An angle may move a feature as small as a
+#: bump around the shape. For other coordinates, smaller steps are dominated by rounding in the networks' float32.
 PERIODIC_DIFFERENCE, DIFFERENCE = 1e-3, 1e-2
 #: Step of a difference quotient through alignment and prolongation, as a fraction of the diagonal.
 SMALL_MOVE = 1e-4
-#: Nodes along each periodic coordinate of a factor, and most nodes of a factor's grid.
+#: Number of nodes along each periodic coordinate of a factor, and maximum number of nodes of a factor's grid.
 NODES, MOST_NODES = 32, 1024
-#: Random sums of lengths and angles that stand for all of them on the grids.
+#: Number of random sums of lengths and angles in a sketch.
 SKETCH = 1024
 
 
 def derivatives(model: Decoder, x: FloatArray) -> FloatArray:
-    """(2E, m) of the networks at a code (m,), by differences.
+    """Return derivatives (2E, m) of the networks at a code (m,), by differences.
 
-    One code at a time, which is faster than a batch: the combiner's arrays of many codes do not fit into the cache.
+    One code at a time is faster than a batch: the combiner's arrays for many codes do not fit into the cache.
     """
     z = model.nric(x)
     steps = np.diag(_steps(model))
@@ -33,7 +33,7 @@ def derivatives(model: Decoder, x: FloatArray) -> FloatArray:
 
 
 def factor_derivatives(model: Decoder, x: FloatArray) -> FloatArray:
-    """(2E, m) of the sum of the factors at a code (m,), by central differences."""
+    """Return derivatives (2E, m) of the sum of the factors at a code (m,), by central differences."""
     columns = []
     for j, factor in enumerate(model.manifest.factors):
         own = x[factor.start : factor.stop]
@@ -46,12 +46,12 @@ def factor_derivatives(model: Decoder, x: FloatArray) -> FloatArray:
 def carried(
     model: Decoder, place: Callable[[FloatArray], FloatArray], shape: FloatArray, fields: FloatArray
 ) -> FloatArray:
-    """How what is made of a shape, as by alignment and prolongation, changes with it; by differences.
+    """Differentiate a function of a shape, for example alignment and prolongation, by differences.
 
     Args:
-        model: of the shape.
-        place: takes shapes (…, V, 3) to what is made of them, (…, k, 3).
-        shape: (V, 3), normalised.
+        model: decoder of the shape.
+        place: function from shapes (…, V, 3) to points (…, k, 3).
+        shape: (V, 3) normalised shape.
         fields: (m, V, 3) changes of the shape.
 
     Returns:
@@ -69,7 +69,7 @@ def _steps(model: Decoder) -> FloatArray:
 
 
 def nodes(model: Decoder, j: int) -> FloatArray:
-    """Nodes (n, m_j) of a grid over the coordinates of a factor if all of them are periodic, otherwise none.
+    """Return grid nodes (n, m_j) over the coordinates of a factor if all are periodic, otherwise none.
 
     Along a period the misfit may have to grow before it falls, so that descent alone does not find the minimum.
     """
@@ -83,19 +83,19 @@ def nodes(model: Decoder, j: int) -> FloatArray:
 
 
 def batches(nodes: FloatArray) -> list[FloatArray]:
-    """Nodes in batches whose shapes fit into the cache."""
+    """Split nodes into batches whose shapes fit into the cache."""
     return np.array_split(nodes, -(-len(nodes) // 16)) if len(nodes) else []
 
 
 @dataclass(frozen=True, eq=False)
 class FactorGrids:
-    """The shapes of a model's periodic factors on grids, in a form that keeps scalar products to a few percent.
+    """Sketches of a model's periodic factors on grids, which keep scalar products to a few percent.
 
     Each length or angle, weighted by its norm, is added with a random sign to one of SKETCH sums (a count sketch:
     Charikar, Chen and Farach-Colton 2002), which takes a tenth of the memory.
 
     Attributes:
-        images: by factor, (n, SKETCH) sketches of ``ψ_j − z̄`` at its nodes.
+        images: for each factor, sketches (n, SKETCH) of ``ψ_j − z̄`` at its nodes.
     """
 
     images: dict[int, FloatArray]
@@ -106,9 +106,9 @@ class FactorGrids:
         """Run the factors of a model on their grids.
 
         Args:
-            model: whose factors.
+            model: decoder of the factors.
             centre: z̄ (2E,).
-            root: (2E,) roots of the weights of the norm.
+            root: (2E,) square roots of the norm's weights.
         """
         rng = np.random.default_rng(0)
         signs, sums = rng.choice([-1.0, 1.0], len(root)), rng.integers(SKETCH, size=len(root))
@@ -121,6 +121,6 @@ class FactorGrids:
         return cls(images, matrix)
 
     def sketch(self, weighted: FloatArray) -> FloatArray:
-        """(SKETCH,) of a difference of NRIC (2E,), weighted."""
+        """Return the sketch (SKETCH,) of a weighted difference (2E,) of NRIC."""
         sums: FloatArray = self._matrix @ weighted
         return sums

@@ -68,8 +68,8 @@ class Encoder:
 
     By vertices it continues to the minimum of ``Σ_i n_i ‖x_i(code) − x_i‖²`` over the vertices of the coarse mesh,
     after rigid alignment, where n_i given vertices lie nearest to vertex i. Small angles add up along a limb: the
-    minimum by lengths and angles may be twice as far away in space. The shapes' derivatives are those of
-    ``shapespace.model.edit``. A long search restarts from the nearest training shape.
+    minimum by lengths and angles may be twice as far away in space. The derivatives of shapes are the same
+    as in ``shapespace.model.edit``. A long search restarts from the nearest training shape.
     """
 
     def __init__(self, decoder: Decoder) -> None:

@@ -216,8 +216,8 @@ class EncodeSearch:
     def _another_start(self, x: FloatArray, residuals: FloatArray) -> FloatArray | None:
         """Move one factor of a code to the grid node that fits best, or return None if no move promises enough.
 
-        The criterion is the direction of a factor's shape from z̄ and not its size, because factors add up well in
-        direction but only roughly in size: a bump on the inner side of a torus is smaller than on the outer side.
+        The criterion is the direction of a factor's shape from z̄, not its size. The sum of the factors has the right
+        direction but only roughly the right size: a bump is smaller on the inner side of a torus than on the outer.
         Factors with a fixed coordinate stay.
         """
         decoder, grids = self._decoder, self._prepared.grids
@@ -290,7 +290,7 @@ class EncodeSearch:
             return stuck if fit.status is Status.NOT_FINITE else fit
 
     def _inside_if_as_near(self, fit: Fit) -> Fit:
-        """Return the fit to vertices, or a fit inside the bounds that is as near: networks are most accurate there."""
+        """Return the fit to vertices, or an equally near fit inside the bounds, where networks are most accurate."""
         box = self._box_with(0.0)
         moved = replace(fit, x=np.clip(fit.x, box.lower, box.upper))
         if np.array_equal(moved.x, fit.x) or fit.status is Status.DEADLINE:

@@ -1,4 +1,4 @@
-"""Exact shapes: the discrete exponentials that the networks approximate, computed."""
+"""Exact shapes: the discrete exponentials that the networks approximate."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ from shapespace.solve.outcome import Status
 
 
 class NoTangentSpaceError(ValueError):
-    """A model whose codes are no tangent vectors."""
+    """A model whose codes are not tangent vectors."""
 
 
 @dataclass(frozen=True)
 class ExactShape:
-    """The discrete exponential of one code.
+    """Discrete exponential of one code.
 
     Attributes:
-        status: of its solver, see shapespace.solve.outcome.Status.
-        vertices: (V, 3) float32, aligned to the reference, in the units of the training meshes; None where it failed.
-        mean, max: distance of the networks' answer from it, over vertices; None where it failed.
+        status: how the solver ended.
+        vertices: (V, 3) float32, aligned to the reference, in the units of the training meshes; None if it failed.
+        mean, max: distance of the networks' shape from ``vertices``; None if it failed.
     """
 
     status: Status
@@ -38,7 +38,7 @@ class ExactShape:
 
 
 def require_tangent_space(model: Decoder) -> None:
-    """Raise NoTangentSpaceError for models that have none."""
+    """Raise NoTangentSpaceError if the model has no tangent space."""
     if model.modes is None or model.manifest.exponential_steps is None:
         raise NoTangentSpaceError(
             f"The codes of {model.manifest.name} are no tangent vectors: it is a product by design, without exact "
@@ -49,17 +49,17 @@ def require_tangent_space(model: Decoder) -> None:
 def exact_shape(
     model: Decoder, code: Codes, answer: NDArray[np.float32], mesh: MeshChoice, deadline: Deadline | None = None
 ) -> ExactShape:
-    """The exponential ``exp_z̄(Σ_j code_j u_j)`` in K steps, with the material and K of the model's manifest.
+    """Compute the exponential ``exp_z̄(Σ_j code_j u_j)`` in K steps, with the material and K of the model's manifest.
 
     Args:
-        model: with a tangent space.
-        code: (m,).
-        answer: (V, 3) what the networks say to it, on the mesh of choice.
-        mesh: fine or coarse.
-        deadline: after which the status is Status.DEADLINE.
+        model: decoder of a model with a tangent space.
+        code: (m,) code.
+        answer: (V, 3) shape that the networks give for the code, on the mesh of choice.
+        mesh: fine or coarse mesh.
+        deadline: time limit after which the status is Status.DEADLINE.
     """
     require_tangent_space(model)
-    assert model.modes is not None  # noqa: S101 - has just been required
+    assert model.modes is not None  # noqa: S101 - required above
     assert model.manifest.exponential_steps is not None  # noqa: S101 - as above
     velocity = np.tensordot(code.astype(np.float64), model.modes, axes=1)
     try:

@@ -28,15 +28,15 @@ class WrongLengthError(LatentError):
 
 
 class NotFiniteError(LatentError):
-    """A code with a coordinate that isn't a finite number, or for which the networks give numbers that aren't."""
+    """A code with a coordinate that is not a finite number, or at which the networks' numbers overflow."""
 
 
 class OutOfBoundsError(LatentError):
-    """A code outside the bounds where the caller asked to refuse those."""
+    """A code outside the bounds, which the caller asked to refuse."""
 
 
 class InvalidFixedError(LatentError):
-    """Coordinates that can't be kept: there are none of that index, or the value is not finite."""
+    """Fixed coordinates that do not exist, or whose values are not finite."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,15 +44,15 @@ class Fixed:
     """Coordinates of a code that keep their value.
 
     Attributes:
-        mask: (m,) which.
-        values: (m,) theirs, as the networks take them; 0 where a coordinate is free.
+        mask: (m,) whether a coordinate is fixed.
+        values: (m,) values of fixed coordinates, as the networks take them; 0 for other coordinates.
     """
 
     mask: NDArray[np.bool_]
     values: Codes
 
     def into(self, x: FloatArray) -> FloatArray:
-        """A code (m,) with these values."""
+        """Return a code (m,) with the fixed values inserted."""
         return np.where(self.mask, self.values, x)
 
 
@@ -65,7 +65,7 @@ class Bounds(StrEnum):
 
 
 class Distribution(StrEnum):
-    """How random codes are distributed: in the bounds, or as those of the training shapes are."""
+    """Distribution of random codes: two inside the bounds, and the Gaussian of the training codes."""
 
     UNIFORM = "uniform"
     GAUSSIAN = "gaussian"
@@ -73,7 +73,7 @@ class Distribution(StrEnum):
 
 
 class LatentSpace:
-    """The coordinates of a model's codes.
+    """Coordinates of a model's codes, with their bounds and periods.
 
     A coordinate with a period is an angle: only its remainder counts, and it can be out of bounds only where the bounds
     are narrower than the period.
@@ -85,14 +85,14 @@ class LatentSpace:
         self.lower, self.upper = np.array(manifest.lower), np.array(manifest.upper)
         self.periodic = np.array([period is not None for period in manifest.period])
         self._period = np.array([period or 1.0 for period in manifest.period])
-        # Rounded as codes are when they are compared, so that a bound itself is always inside.
+        # Rounded like codes, so that a bound itself always counts as inside.
         self._low, self._high = self.lower.astype(np.float32), self.upper.astype(np.float32)
-        #: (m,) what counts as equally far in each coordinate.
+        #: (m,) unit of distance in each coordinate.
         self.width = self.upper - self.lower
 
     @property
     def dimension(self) -> int:
-        """M."""
+        """Number m of coordinates."""
         return len(self.names)
 
     def codes(
@@ -101,14 +101,14 @@ class LatentSpace:
         """Check codes and bring them into the one form that identifies a shape.
 
         Args:
-            values: n lists of m numbers, or an array of them.
-            bounds: what to do outside the bounds.
+            values: n lists of m numbers, or an array (n, m).
+            bounds: what to do with codes outside the bounds.
 
         Returns:
             (n, m) codes, angles within one period from ``lower``; and (n,) whether each is inside the bounds.
 
         Raises:
-            WrongLengthError, NotFiniteError, OutOfBoundsError: with the place of the first fault.
+            WrongLengthError, NotFiniteError, OutOfBoundsError: the message names the first fault.
         """
         for i, value in enumerate(values):
             if len(value) != self.dimension:
@@ -131,17 +131,17 @@ class LatentSpace:
                 f"Coordinate {k} ({self.names[k]}) of code {i} is {x[i, k]:g}, outside "
                 f'[{self._low[k]:g}, {self._high[k]:g}]. Move it inside, or send "bounds": "clamp" or "allow".'
             )
-        # Adding zero turns −0 into 0: the same shape must not have two names.
+        # Adding zero turns −0 into 0, so that a shape has only one code.
         inside = np.logical_not(outside.any(axis=1))
         return x + np.float32(0), inside
 
     def code(self, value: Sequence[float], bounds: Bounds = Bounds.ALLOW) -> CheckedCode:
-        """One code (m,) and whether it is inside the bounds; as ``codes``."""
+        """Check one code; return it as (m,) with whether it is inside the bounds. See ``codes``."""
         codes, inside = self.codes([value], bounds)
         return codes[0], bool(inside[0])
 
     def fixed(self, values: Mapping[int, float] | None = None) -> Fixed:
-        """Coordinates that keep a value, by index, inside the bounds or not; raises InvalidFixedError."""
+        """Check fixed coordinates, given as values by index, inside the bounds or not; raises InvalidFixedError."""
         values = values or {}
         unknown = [index for index in values if not 0 <= index < self.dimension]
         if unknown:
@@ -157,7 +157,7 @@ class LatentSpace:
         return Fixed(mask, np.where(mask, self.code(code.tolist())[0], np.float32(0)))
 
     def found(self, x: FloatArray, bounds: Bounds, fixed: Fixed) -> CheckedCode:
-        """A code (m,) that a search ended at, and whether it is inside the bounds; as ``code``, but for what is fixed.
+        """Check the code (m,) at which a search ended, like ``code``, with fixed values inserted.
 
         Clamping leaves fixed coordinates alone.
         """
@@ -167,7 +167,7 @@ class LatentSpace:
         return self.code(fixed.into(x).tolist(), bounds)
 
     def box_around(self, fixed: Fixed, margin: float = 0.0) -> tuple[FloatArray, FloatArray]:
-        """As ``box``, of no width where a coordinate is fixed."""
+        """Return lower and upper bounds (m,) like ``box``, equal where a coordinate is fixed."""
         lower, upper = self.box(margin)
         return fixed.into(lower), fixed.into(upper)
 
@@ -177,24 +177,24 @@ class LatentSpace:
         return np.concatenate([keyframes[:1], keyframes[:1] + np.cumsum(steps, axis=0)])
 
     def shorter(self, steps: FloatArray) -> FloatArray:
-        """Differences (…, m) of codes, angles taken the shorter way round."""
+        """Return differences (…, m) of codes with angles the shorter way round."""
         half = self._period / 2
         return np.where(self.periodic, half - np.mod(half - steps, self._period), steps)
 
     def box(self, margin: float = 0.0) -> tuple[FloatArray, FloatArray]:
-        """Lower and upper bounds (m,), wider by a fraction of the width on each side; an angle has none.
+        """Return lower and upper bounds (m,), wider by a fraction of the width on each side.
 
-        Angles that bounds restrict to less than a period keep to them.
+        Angles have infinite bounds, unless their bounds span less than a period.
         """
         free = self.periodic & (self.width >= self._period * (1 - 1e-9))
         extra = margin * self.width
         return np.where(free, -np.inf, self.lower - extra), np.where(free, np.inf, self.upper + extra)
 
     def sample(self, count: int, seed: int, distribution: Distribution) -> Codes:
-        """Random codes (count, m) inside the bounds, the same on every machine.
+        """Return random codes (count, m) inside the bounds, the same on every machine.
 
         Gaussian codes have their mean in the middle of the bounds and a standard deviation of a quarter of the width,
-        before they are cut off at the bounds. Those of the population are not the space's, but the model's.
+        before they are cut off at the bounds. Raises ValueError for the population, which belongs to the model.
         """
         if distribution is Distribution.POPULATION:
             raise ValueError("the bounds know no population")
@@ -221,24 +221,24 @@ class LatentSpace:
 
 
 class TrainingCodes:
-    """Codes of the shapes that a model was made from, as a measure of what is plausible.
+    """Training codes of a model, which measure how plausible other codes are.
 
     Args:
-        latents: the space they lie in.
-        codes: (n, m), n ≥ 1.
+        latents: coordinates of the codes.
+        codes: (n, m) training codes, n ≥ 1.
     """
 
     def __init__(self, latents: LatentSpace, codes: FloatArray) -> None:
         self._latents, self._codes = latents, codes
         others = np.array([np.sort(self._distances(code))[1:2] for code in codes])
-        #: How far a training code typically is from its nearest neighbour; without neighbours the bounds' width.
+        #: Median distance of a training code from its nearest neighbour; without neighbours the bounds' width.
         self.spacing = float(np.median(others)) if others.any() else 1.0
 
     def plausibility(self, code: Codes) -> float:
-        """Distance of a code (m,) to the nearest of these, in multiples of their own spacing."""
+        """Return the distance of a code (m,) from the nearest training code, in multiples of their spacing."""
         return float(self._distances(code).min() / self.spacing)
 
     def _distances(self, code: NDArray) -> FloatArray:
-        """(n,) root mean square over coordinates, as fractions of the bounds' width."""
+        """Return distances (n,) from the training codes: root mean square in fractions of the bounds' width."""
         steps = self._latents.shorter(self._codes - code) / self._latents.width
         return np.sqrt((steps**2).mean(axis=1))

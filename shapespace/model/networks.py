@@ -1,4 +1,4 @@
-"""ONNX networks, each run with a limit of time."""
+"""ONNX networks with a time limit for each run."""
 
 from __future__ import annotations
 
@@ -13,28 +13,28 @@ from numpy.typing import NDArray
 from shapespace.bundle.reader import LONGEST_REASON, Bundle, BundleError
 from shapespace.bundle.schema import Network
 
-#: Seconds that the networks may take for one code, hundreds of times what they need.
+#: Time limit of the networks for one code, in seconds: hundreds of times what they need.
 PATIENCE = 5.0
-#: Only what ends the process is logged: ONNX Runtime's messages quote names from the file, which a stranger chose.
+#: Log only fatal errors: ONNX Runtime's messages quote names from the file, which may come from an untrusted source.
 _FATAL = 4
 onnxruntime.set_default_logger_severity(_FATAL)
 
 
 class NetworkError(RuntimeError):
-    """A network that gives no answer at a code, with the reason."""
+    """A network failed at a code; the message has the reason."""
 
 
 class TerminatedError(NetworkError):
-    """A network that was stopped because its time was over."""
+    """A network was stopped at its time limit."""
 
 
 class _Watch:
-    """Ends runs that take too long: one thread for all of them, which looks at the clock while there are any.
+    """Ends runs at their time limit. One thread watches all runs.
 
-    ONNX Runtime looks at a run's flag between two nodes, in the bodies of loops too.
+    ONNX Runtime checks a run's flag between two nodes, also in the bodies of loops.
     """
 
-    #: Seconds from one look to the next.
+    #: Interval between checks, in seconds.
     STEP = 0.1
 
     def __init__(self) -> None:
@@ -44,13 +44,13 @@ class _Watch:
         self._thread: threading.Thread | None = None
 
     def begin(self, options: onnxruntime.RunOptions, until: float) -> None:
-        """Watch over a run, which must end by this moment of ``time.monotonic``."""
+        """Watch a run, which must end at the time ``until`` of ``time.monotonic``."""
         self._runs[id(options)] = until, options
         if not self._some.is_set():
             self._wake()
 
     def end(self, options: onnxruntime.RunOptions) -> None:
-        """Stop watching over a run that has ended."""
+        """Stop watching a run that has ended."""
         del self._runs[id(options)]
 
     def _wake(self) -> None:
@@ -69,7 +69,7 @@ class _Watch:
                     options.terminate = True
             if not self._runs:
                 self._some.clear()
-                if self._runs:  # a run that has begun since then found the flag still set
+                if self._runs:  # a run that began in the meantime found the flag still set
                     self._some.set()
 
 
@@ -77,21 +77,21 @@ _watch = _Watch()
 
 
 class Session:
-    """One ONNX network whose input and output are those of the manifest.
+    """One ONNX network, whose input and output match the manifest.
 
     Args:
-        bundle: holds its bytes.
+        bundle: bundle that holds the network's bytes.
         network: names of file, input and output.
-        inputs, outputs: expected shape of one row.
+        inputs, outputs: expected shapes of one row.
 
     Raises:
-        BundleError: it doesn't load, or has other inputs or outputs.
+        BundleError: the network doesn't load, or has other inputs or outputs.
     """
 
     def __init__(self, bundle: Bundle, network: Network, inputs: list[int], outputs: list[int]) -> None:
         options = onnxruntime.SessionOptions()
-        # Callers decode in several threads already, and more threads inside each would compete with them. The arena
-        # would keep the memory of the largest run for ever.
+        # Callers already decode in several threads, which more threads would slow down. The arena would never release
+        # the memory of the largest run.
         options.intra_op_num_threads = options.inter_op_num_threads = 1
         options.add_session_config_entry("session.intra_op.allow_spinning", "0")
         options.enable_cpu_mem_arena = False
@@ -102,7 +102,7 @@ class Session:
             )
         except Exception as error:  # ONNX Runtime's exceptions have no common public class
             raise BundleError(f"{network.file} does not load: {_first_line(error)}") from None
-        self._session.disable_fallback()  # there is none, and it prints
+        self._session.disable_fallback()  # there is no fallback, and it prints
         for role, nodes, name, row in (
             ("input", self._session.get_inputs(), network.input, inputs),
             ("output", self._session.get_outputs(), network.output, outputs),
@@ -110,13 +110,13 @@ class Session:
             if [node.name for node in nodes] != [name] or not _fits(nodes[0], row):
                 have = ", ".join(f"{node.name} {node.type} {node.shape}" for node in nodes)
                 raise BundleError(f"{network.file} must have one {role}, {name} float32 [n, {row}], but has {have}")
-        # ONNX Runtime keeps the file in case its providers change, which they don't: 20 MB with both bundled models.
+        # ONNX Runtime keeps the file in case its providers change. This frees 20 MB with both bundled models.
         self._session._model_bytes = None
         self._file, self._input, self._output = network.file, network.input, network.output
         self._row, self._shape = tuple(inputs), tuple(outputs)
 
     def check(self) -> None:
-        """Run the network once, for two rows of zeros; raises BundleError unless it answers finite numbers."""
+        """Run the network on two rows of zeros; raises BundleError unless the output is finite."""
         try:
             result = self(np.zeros((2, *self._row), np.float32), time.monotonic() + PATIENCE)
         except NetworkError as error:
@@ -125,11 +125,11 @@ class Session:
             raise BundleError(f"{self._file} does not give finite numbers for zeros")
 
     def __call__(self, rows: NDArray[np.float32], until: float) -> NDArray[np.float32]:
-        """Outputs for rows (n, …), by that moment of ``time.monotonic``.
+        """Return outputs for rows (n, …) before the time ``until`` of ``time.monotonic``.
 
         Raises:
-            TerminatedError: the moment came first.
-            NetworkError: it failed, or gave something else than it should.
+            TerminatedError: the time was over.
+            NetworkError: the network failed, or its output has another shape.
         """
         options = onnxruntime.RunOptions()
         options.log_severity_level = _FATAL
@@ -152,7 +152,7 @@ def _first_line(error: Exception) -> str:
 
 
 def _fits(node: Any, row: list[int]) -> bool:
-    """Whether a value is float32 with a free first dimension, and the known others as wanted."""
+    """Return whether a value is float32 with a free first dimension, and whether known dimensions match a row."""
     shape = node.shape
     return (
         node.type == "tensor(float)"

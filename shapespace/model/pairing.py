@@ -1,4 +1,4 @@
-"""Pairs of points that a scan and a model's surface have in common while a fit looks for its code."""
+"""Pairs of corresponding points of a scan and a model's surface, for the steps of a fit."""
 
 from __future__ import annotations
 
@@ -15,24 +15,24 @@ from shapespace.mesh.closest_points import MeshProximity, unit
 from shapespace.mesh.rigid_motion import Placement
 from shapespace.model.scan import Scan, nearest_points
 
-#: Cosine of the angle between the normals of a pair: below the first its weight is 0, above the second it is 1.
+#: Cosines of the angle between the normals of a pair: its weight is 0 below the first value and 1 above the second.
 APART, ALIKE = 0.2, 0.6
 
 
 @dataclass(frozen=True, eq=False)
 class Pairs:
-    """Points of the scan and of the model that stand for each other, in the model's frame.
+    """Pairs of points of the scan and of the model, in the model's frame.
 
     Attributes:
-        gaps: (n, 3) from the model's points to the scan's.
-        normals: (n, 3) of the model.
-        distances: (n,).
-        rows: (n, V) sparse, the model's points as means of its vertices.
-        places: (n, 3) the model's points.
-        agree: (n,) from 0 to 1, whether normals do.
-        mass: (n,) what each pair stands for; those of the scan sum to 1.
-        of_scan: how many of them begin at points of the scan; they come first.
-        drawn: (n,) whether the pair is one of what was left over on both sides, drawn to each other from afar.
+        gaps: (n, 3) vectors from the model's points to the scan's points.
+        normals: (n, 3) normals of the model.
+        distances: (n,) distances of the points.
+        rows: (n, V) sparse matrix that computes the model's points as means of its vertices.
+        places: (n, 3) points of the model.
+        agree: (n,) agreement of the normals, from 0 to 1.
+        mass: (n,) share of the surface that each pair represents; pairs from the scan sum to 1.
+        of_scan: number of pairs that begin at points of the scan; they come first.
+        drawn: (n,) whether a pair joins unmatched parts of both sides.
     """
 
     gaps: FloatArray
@@ -47,19 +47,19 @@ class Pairs:
 
     @property
     def heights(self) -> FloatArray:
-        """(n,) of the scan's points over the model's planes."""
+        """Signed distance (n,) of the scan's points from the model's tangent planes."""
         return (self.gaps * self.normals).sum(axis=1)
 
 
 class Pairing:
-    """Looks for pairs of a scan and a surface.
+    """Finds pairs of a scan and a surface.
 
     Args:
-        scan: in the model's normalised units.
-        count: of its points that look for the surface.
-        vertices: those of the surface that look for the scan.
-        both: whether they do; a scan that shows a part only says nothing of the rest.
-        blended: whether the planes of pairs that begin at a vertex are the scan's, as far as it has any.
+        scan: scan in the model's normalised units.
+        count: number of the scan's points that look for the surface.
+        vertices: vertices of the surface that look for the scan.
+        both: whether vertices look for the scan. If the scan shows only a part, the other vertices have no partner.
+        blended: whether pairs that begin at a vertex use the scan's planes where the scan has planes.
     """
 
     def __init__(self, scan: Scan, count: int, vertices: IntArray, *, both: bool, blended: bool) -> None:
@@ -67,7 +67,7 @@ class Pairing:
         self._vertices, self._both, self._blended = vertices, both, blended
 
     def closest(self, surface: MeshProximity, placement: Placement) -> Pairs:
-        """Points of both sides and the closest ones of the other, where a placement takes the surface to the scan."""
+        """Pair the points of each side with the closest points of the other side, at a placement of the surface."""
         some = self.some
         points, normals = placement.back(some.points), some.normals @ placement.rotation
         found = surface.closest(points)
@@ -81,7 +81,7 @@ class Pairing:
             places, across = surface.vertices[self._vertices], surface.vertex_normals[self._vertices]
             _, nearest = nearest_points(self.scan.tree, placement(places))
             gaps = placement.back(self.scan.points[nearest]) - places
-            # Points of a scan are some way apart, which says nothing of how far the surface is.
+            # Gaps to the nearest scan point include the points' spacing, so distances are measured from the planes.
             distances = self.scan.distances(placement(places)) / placement.scale
             there, trust = self.scan.normals[nearest] @ placement.rotation, self.scan.trust[nearest]
             agree = self._alike(there, across, trust)
@@ -96,9 +96,9 @@ class Pairing:
         return Pairs(gaps, across, distances, matrix, places, agree, mass, n, np.zeros(n + k, bool))
 
     def drawn(self, pairs: Pairs, surface: MeshProximity, placement: Placement, most: float) -> Pairs:
-        """The same pairs, but what is further away than ``most`` is paired with what of the model nothing shows.
+        """Pair scan points farther away than ``most`` with parts of the model that the scan does not show.
 
-        A limb that is folded the wrong way has both, and its own nearest points are those of other limbs.
+        A limb in the wrong pose causes both, and its nearest points belong to other limbs.
         """
         points, vertices = placement.back(self.some.points), surface.vertices[self._vertices]
         far = np.flatnonzero(pairs.distances[: pairs.of_scan] > most)
@@ -120,22 +120,21 @@ class Pairing:
         return replace(found, rows=rows.tocsr())
 
     def _alike(self, normals: FloatArray, others: FloatArray, trust: FloatArray) -> FloatArray:
-        """(n,) from 0 to 1, whether normals (n, 3) agree with those of the scan, as far as these are trusted (n,)."""
+        """Return the agreement (n,) of model and scan normals (n, 3), from 0 to 1, weighted by the scan's ``trust``."""
         cosines = (normals * others).sum(axis=1)
         if not self.scan.oriented:
             cosines = np.abs(cosines)
-        elif cosines.sum() < 0:  # the scan's faces are turned inside out
+        elif cosines.sum() < 0:  # the scan's faces point inwards
             cosines = -cosines
         agree: FloatArray = 1 - trust * (1 - np.clip((cosines - APART) / (ALIKE - APART), 0, 1))
         return agree
 
 
 def _blended(normals: FloatArray, others: FloatArray, trust: FloatArray) -> FloatArray:
-    """(n, 3) normals of pairs that begin at vertices: those of the scan (n, 3) as far as these are trusted (n,).
+    """Return normals (n, 3) of pairs that begin at vertices: the scan's normals, weighted by ``trust`` (n,).
 
-    A vertex of a convex surface lies outside of its neighbourhood. Over the plane at the vertex its nearest scan point,
-    which lies beside it, would have a negative height, and the model would shrink; over the plane at the scan point the
-    vertex has none.
+    On a convex surface, the nearest scan point lies beside the vertex and below its tangent plane. The negative height
+    would shrink the model. Above the plane at the scan point, the vertex has no height.
     """
     sides = np.sign((normals * others).sum(axis=1))
     return unit((1 - trust)[:, None] * normals + (sides * trust)[:, None] * others)

@@ -94,7 +94,7 @@ def start_placements(
 
 
 def _different(starts: list[StartPlacement], count: int, apart: float) -> list[StartPlacement]:
-    """Return the best placements, without those whose rotation is within an angle of a better placement."""
+    """Return the best placements, without placements whose rotation is close to a better placement's."""
     found: list[StartPlacement] = []
     for start in sorted(starts, key=lambda start: start.score):
         if all(start.placement.angle_to(other.placement) > apart for other in found):

@@ -1,4 +1,4 @@
-"""Scans: points or triangles from anywhere, brought to a few thousand points with normals."""
+"""Scans: points or triangles, reduced to a few thousand points with normals."""
 
 from __future__ import annotations
 
@@ -11,33 +11,33 @@ from scipy.spatial import cKDTree
 from shapespace.arrays import FloatArray, IntArray
 from shapespace.mesh.triangle_mesh import face_normals
 
-#: Points that a scan is brought to, and the most of which local planes are looked for.
+#: Maximum number of points that represent a scan, and of points from which local planes are computed.
 MOST, PLANES = 3000, 10_000
-#: Fewest points of a scan, and neighbours of a point that tell its local plane.
+#: Least number of points of a scan, and number of neighbours that determine a point's local plane.
 FEWEST, NEIGHBOURS = 10, 16
-#: Neighbours whose thickness is half their width, a ratio of moments of the inverse of this, have no plane.
+#: Neighbours have no plane if the ratio of their smallest to their middle moment exceeds the inverse of this number.
 CLOUDY = 4
 #: A scan whose thickness is less than this share of its extent lies in a plane.
 FLAT = 1e-6
-#: Points further from the median than so many times the median distance are strays.
+#: Points farther from the median than this multiple of the median distance are strays.
 FAR = 50
 
 
 class InvalidScanError(ValueError):
-    """A scan, or options for it, that can't be used: with a sentence that says what to do."""
+    """A scan or an option that can't be used; the message says what to do."""
 
 
 @dataclass(frozen=True, eq=False)
 class Scan:
-    """What a model is fitted to.
+    """Points and normals that represent a scan.
 
     Attributes:
-        points: (n, 3) in the scan's units, spread evenly, at most MOST.
-        normals: (n, 3) of unit length.
-        trust: (n,) from 0 to 1, whether the normals say anything: points strewn like a cloud have none.
-        oriented: whether normals tell inside from outside; those of local planes don't.
-        given: number of points or vertices that the scan came with.
-        sampled: whether ``points`` are not just those.
+        points: (n, 3) evenly spread points in the scan's units, at most MOST.
+        normals: (n, 3) unit normals.
+        trust: (n,) weight of each normal, from 0 to 1; 0 where the neighbours form no plane.
+        oriented: whether normals point outwards; normals of local planes may point either way.
+        given: number of points or vertices of the original scan.
+        sampled: whether ``points`` differ from the original points.
     """
 
     points: FloatArray
@@ -49,29 +49,29 @@ class Scan:
 
     @property
     def size(self) -> float:
-        """Root mean square distance of the points from their median, which a few strays hardly move."""
+        """Root mean square distance of the points from their median, without the farthest tenth."""
         away = np.linalg.norm(self.points - np.median(self.points, axis=0), axis=1)
         return float(np.sqrt((np.sort(away)[: max(1, int(0.9 * len(away)))] ** 2).mean()))
 
     def some(self, count: int) -> Scan:
-        """At most so many of the points; their order is random already."""
+        """Return the first ``count`` points; their order is random."""
         return replace(self, points=self.points[:count], normals=self.normals[:count], trust=self.trust[:count])
 
     @cached_property
     def tree(self) -> cKDTree:
-        """Of the points."""
+        """Tree of the points."""
         return cKDTree(self.points)
 
     @cached_property
     def gaps(self) -> FloatArray:
-        """(n,) how far apart points are around each: as far as its sixth neighbour."""
+        """Distance (n,) of each point from its sixth neighbour."""
         away, _ = nearest_points(self.tree, self.points, min(7, len(self.points)))
         return away[:, -1]
 
     def distances(self, places: FloatArray) -> FloatArray:
-        """(n,) of places (n, 3) from the surface that the points stand for.
+        """Return distances (n,) of places (n, 3) from the surface that the points represent.
 
-        Over a point it is the distance from the plane there; where no point is near, that from the point.
+        Near a point this is the distance from the point's plane, elsewhere the distance from the point.
         """
         away, nearest = nearest_points(self.tree, places)
         above = np.abs(((places - self.points[nearest]) * self.normals[nearest]).sum(axis=1))
@@ -80,7 +80,7 @@ class Scan:
 
 
 def nearest_points(tree: cKDTree, places: FloatArray, count: int = 1) -> tuple[FloatArray, IntArray]:
-    """Distances and indices, (…) of the nearest point of a tree to places (…, 3), or (…, count) of several."""
+    """Return distances and indices of a tree's nearest points to places (…, 3): (…), or (…, count) for several."""
     away, index = tree.query(places, k=count)
     return np.asarray(away), np.asarray(index)
 
@@ -98,7 +98,7 @@ def independent_points(points: FloatArray, residuals: FloatArray, weights: Float
     residuals = np.clip(residuals, *(np.quantile(residuals, [0.01, 0.99])))
     _, beside = nearest_points(cKDTree(points), points, min(len(points) // 4, 200))
     products = (residuals[:, None] * residuals[beside[:, 1:]]).mean(axis=0) / (residuals**2).mean()
-    # Averages over shells, as single neighbours are noisy.
+    # Moving averages, because single neighbours are noisy.
     smooth = np.convolve(products, np.ones(5) / 5, mode="valid")
     below = np.flatnonzero(smooth < 0.05)
     end = int(below[0]) if len(below) else len(smooth)
@@ -109,13 +109,13 @@ def scan_of(points: FloatArray, faces: IntArray, rng: np.random.Generator) -> Sc
     """Check a scan and sample it.
 
     Args:
-        points: (N, 3).
-        faces: (F, 3) indices of them, or none. Faces without area are left out.
-        rng: of the samples.
+        points: (N, 3) points.
+        faces: (F, 3) faces; F may be 0. Faces without area are left out.
+        rng: random numbers for the samples.
 
     Raises:
-        InvalidScanError: fewer than ten points, one that is not finite, all in a plane or at one place, or faces that
-            name points that aren't there.
+        InvalidScanError: fewer than ten points, a point that is not finite, all points in a plane or at one place, or
+            faces with indices out of range.
     """
     if points.ndim != 2 or points.shape[1] != 3:
         raise InvalidScanError(f"A scan must be points (N, 3), not {points.shape}. Send x, y and z of each.")
@@ -130,7 +130,7 @@ def scan_of(points: FloatArray, faces: IntArray, rng: np.random.Generator) -> Sc
         )
     if not np.ptp(points, axis=0).max() > np.finfo(np.float32).tiny:
         raise InvalidScanError("The scan is so small that the numbers vanish. Send it in units of its own size.")
-    # Strays may lie anywhere: neither flatness nor the spacing of samples may depend on them.
+    # Strays may lie anywhere. Neither flatness nor the spacing of samples may depend on strays.
     away = np.linalg.norm(points - np.median(points, axis=0), axis=1)
     if not np.median(away) > 0:
         raise InvalidScanError("More than half of the points lie at one place. Send each point once.")
@@ -142,15 +142,15 @@ def scan_of(points: FloatArray, faces: IntArray, rng: np.random.Generator) -> Sc
             "All points of the scan lie in a plane, which shows nothing of a shape. Send points from all over it."
         )
     twice_areas = np.linalg.norm(face_normals(points, faces, normalised=False), axis=1)
-    # Points with a few faces among them are points.
+    # A scan with faces at few of its points counts as a point cloud.
     if twice_areas.sum() > 0 and 2 * len(np.unique(faces)) >= kept.sum():
         return _of_surface(points, faces, twice_areas, rng)
     return _of_points(points[kept], rng)
 
 
 def _of_surface(points: FloatArray, faces: IntArray, weights: FloatArray, rng: np.random.Generator) -> Scan:
-    """Points at random all over the faces, each with the normal of its own."""
-    # More than are wanted, of which thinning leaves evenly spread ones.
+    """Return random points on the faces, each with the normal of its face."""
+    # Three times too many points, which are then thinned to evenly spread points.
     chosen = rng.choice(len(faces), 3 * MOST, p=weights / weights.sum())
     shares = rng.dirichlet(np.ones(3), len(chosen))
     there = np.einsum("nk,nkx->nx", shares, points[faces[chosen]])
@@ -160,7 +160,7 @@ def _of_surface(points: FloatArray, faces: IntArray, weights: FloatArray, rng: n
 
 
 def _of_points(points: FloatArray, rng: np.random.Generator) -> Scan:
-    """The points themselves, or some of them, with normals of the planes through their neighbours."""
+    """Return the points, or some of them, with normals of the planes through their neighbours."""
     some = _thinned(points, rng)
     kept = rng.permutation(_evenly(some, MOST))
     _, beside = nearest_points(cKDTree(some), some[kept], min(NEIGHBOURS, len(some)))
@@ -175,12 +175,12 @@ def _thinned(points: FloatArray, rng: np.random.Generator) -> FloatArray:
 
 
 def _evenly(points: FloatArray, most: int) -> IntArray:
-    """Indices of at most so many of points (n, 3): one from each cell of a grid that is as fine as that allows."""
+    """Return at most ``most`` indices of points (n, 3), one from each cell of the finest such grid."""
     if len(points) <= most:
         return np.arange(len(points))
     low, extent = points.min(axis=0), float(np.ptp(points, axis=0).max())
     coarse, fine, found = 1.0, 4096.0, np.arange(1)
-    # Halving the interval of cells along an edge.
+    # Bisection of the number of cells along an edge.
     while fine - coarse > 0.02 * coarse:
         cells = np.sqrt(coarse * fine)
         index = ((points - low) * (cells / extent)).astype(np.int64)

@@ -1,4 +1,4 @@
-"""Shapes of the codes that a search looks at, and how they move with the code."""
+"""Shapes of successive codes in a search, with derivatives by the code."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ from shapespace.solve.deadline import Deadline
 
 
 class SearchedShapes:
-    """Shapes of one code after the other, normalised and in any pose; the last one is kept.
+    """Shapes of successive codes, normalised and in any pose; the last shape is cached.
 
-    Each is reconstructed from the one before, or from integrated frames where these are nearer.
+    Each shape is reconstructed from the last shape, or from integrated frames if the frames are nearer.
 
     Args:
-        model: whose codes they are.
-        reconstruct: a solver that the model has lent.
-        deadline: after which shapes stay as they are.
-        rough: that of the frames (shapespace.coordinates.frame_integration) without Gauss–Newton, which costs at most
-            a third and lies about half a percent of the diagonal away.
+        model: decoder of the codes.
+        reconstruct: solver that the decoder has lent.
+        deadline: time limit; later shapes are not iterated further.
+        rough: use the shape of the frames (shapespace.coordinates.frame_integration) without Gauss–Newton. It takes at
+            most a third of the time and differs by about half a percent of the diagonal.
 
     Attributes:
-        count: shapes that were reconstructed.
+        count: number of reconstructed shapes.
     """
 
     def __init__(
@@ -34,13 +34,13 @@ class SearchedShapes:
         self.count = 0
 
     def __call__(self, x: FloatArray) -> FloatArray:
-        """(V, 3) at a code (m,); not finite where the networks overflow."""
+        """Return the shape (V, 3) of a code (m,); not finite where the networks overflow."""
         if not np.array_equal(x, self._code):
             self._code, self._shape = x.copy(), self._solve(self._model.nric(x))
         return self._shape
 
     def derivatives(self, x: FloatArray, changes: FloatArray) -> FloatArray:
-        """(m, V, 3) at a code (m,), without rigid motion, given those of lengths and angles (2E, m)."""
+        """Return derivatives (m, V, 3) at a code (m,), without rigid motion, from derivatives (2E, m) of NRIC."""
         return self._reconstruct.differential(self(x), changes.T)
 
     def _solve(self, target: FloatArray) -> FloatArray:

@@ -1,4 +1,4 @@
-"""How far the vertices of a shape may be from where they are, by how sure its code is."""
+"""Standard deviation of a shape's vertices, from the covariance of its code."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from shapespace.model.latent_space import Codes, LatentError
 from shapespace.solve.cholesky import NotPositiveDefiniteError
 from shapespace.solve.deadline import Deadline
 
-#: Differences between opposite entries, and eigenvalues below zero, that rounding may cause, as shares of the largest.
+#: Largest asymmetry and most negative eigenvalue that rounding may cause, as shares of the largest entry.
 ROUNDING = 1e-5
 
 
 class InvalidCovarianceError(LatentError):
-    """A matrix that is no covariance of codes, with a sentence that says what to do."""
+    """A matrix that is not a covariance of codes; the message says what to do."""
 
 
 def require_covariance(model: Decoder, covariance: ArrayLike) -> FloatArray:
-    """(m, m) as numbers; raises InvalidCovarianceError."""
+    """Return a covariance (m, m) as an array; raises InvalidCovarianceError."""
     m = model.latents.dimension
     try:
         matrix = np.asarray(covariance, dtype=np.float64)
@@ -45,18 +45,18 @@ def vertex_uncertainty(
     mesh: MeshChoice = MeshChoice.FINE,
     deadline: Deadline | None = None,
 ) -> FloatArray:
-    """Standard deviation (V,) of vertices, ``√tr(J C Jᵀ)`` with J the derivative of a vertex by the code.
+    """Return the standard deviation (V,) of vertices, ``√tr(J C Jᵀ)`` with J the derivative of a vertex by the code.
 
     Args:
-        model: whose code it is.
-        code: (m,).
-        covariance: (m, m) C, see ``require_covariance``.
-        mesh: whose vertices, aligned to the reference as they are answered.
-        deadline: after which the shape is taken as it is.
+        model: decoder of the code.
+        code: (m,) code.
+        covariance: (m, m) covariance C, see ``require_covariance``.
+        mesh: mesh of the vertices, which are aligned to the reference.
+        deadline: time limit; the shape is not iterated further after it.
 
     Raises:
         NotFiniteError: the numbers overflow at this code.
-        InvalidCovarianceError: the shape has all but collapsed there, so that it has no derivative.
+        InvalidCovarianceError: the shape has nearly collapsed, so it has no derivative.
     """
     scale, x = model.manifest.scale, code.astype(np.float64)
     values, vectors = np.linalg.eigh(covariance)

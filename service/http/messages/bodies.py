@@ -1,6 +1,7 @@
-"""Bodies of requests: JSON, counted before it is parsed, checked away from the event loop, refused with a few faults.
+"""Bodies of requests.
 
-Files are gathered in pieces, for whoever reads them.
+JSON is counted before it is parsed, and a few faults suffice to refuse it. Large bodies are checked in a thread. Files
+are gathered in pieces.
 """
 
 from __future__ import annotations
@@ -21,35 +22,35 @@ from shapespace.service.http.problems import ProblemError
 from shapespace.service.use_cases.shape_formats import holds_more_values
 
 M = TypeVar("M", bound=BaseModel)
-#: Most values in a body, counted by their separators; parsed, they take at most 20 MB.
+#: Maximum number of values in a body, counted by separators; after parsing they take at most 20 MB.
 MOST_VALUES = 2**18
-#: Bodies up to this many bytes are parsed on the event loop, which is faster than handing them to a thread.
+#: Bodies up to this size in bytes are parsed on the event loop, which is faster than in a thread.
 SMALL = 2**12
-#: NaN is accepted in bodies up to this many bytes: the parser that knows it holds the interpreter's lock, up to 40 ms
-#: for a MiB.
+#: NaN is accepted in bodies up to this size in bytes: the parser that knows NaN holds the interpreter's lock, up to
+#: 40 ms for a MiB.
 LENIENT = 2**20
-#: Size of the pieces, in bytes, in which a body is received and passed on.
+#: Size in bytes of the pieces in which a body is received and passed on.
 _PIECE = 4 * 2**20
 
 
 class JSONBody(Generic[M]):
-    """A dependency of a route: its request's body as a model.
+    """Dependency of a route that reads the request's body as a model.
 
-    FastAPI's own would parse any number of values on the event loop, and describe each fault of millions.
+    FastAPI's own body parameter would parse any number of values on the event loop, and describe millions of faults.
 
     Args:
-        model: whose lists fail at their first fault.
+        model: model whose lists fail at their first fault.
     """
 
     def __init__(self, model: type[M]) -> None:
         self.model = model
 
     async def __call__(self, request: Request) -> M:
-        """Read it.
+        """Read the body.
 
         Raises:
-            ProblemError: not declared as JSON, or too many values.
-            RequestValidationError: not JSON, or not of the model.
+            ProblemError: the body is not declared as JSON, or has too many values.
+            RequestValidationError: the body is not JSON, or does not match the model.
         """
         declared = declared_type(request.headers)
         if declared != "application/json" and not (declared.startswith("application/") and declared.endswith("+json")):
@@ -63,7 +64,7 @@ class JSONBody(Generic[M]):
 
 
 def read(text: bytes, model: type[M]) -> M:
-    """JSON as a model; raises as ``JSONBody`` does."""
+    """Read JSON as a model; raises as ``JSONBody`` does."""
     message = parse(text) if text.strip() else None
     try:
         return model.model_validate(message)
@@ -73,7 +74,7 @@ def read(text: bytes, model: type[M]) -> M:
 
 
 def parse(text: bytes) -> object:
-    """JSON with a bounded number of values; NaN and infinities are for the model to refuse. Raises as ``JSONBody``."""
+    """Parse JSON with a bounded number of values; the model must refuse NaN and infinities. Raises as ``JSONBody``."""
     if holds_more_values(text, MOST_VALUES):
         raise ProblemError(
             "body-too-large", f"The body holds more than {MOST_VALUES} values. Send fewer in each request."
@@ -84,7 +85,7 @@ def parse(text: bytes) -> object:
         where, why = error.pos, error.msg
     try:
         if len(text) <= LENIENT:
-            return json.loads(text)  # which knows NaN
+            return json.loads(text)  # accepts NaN
     except json.JSONDecodeError as error:
         where, why = error.pos, error.msg
     except UnicodeDecodeError as error:
@@ -97,10 +98,10 @@ def parse(text: bytes) -> object:
 
 
 async def gather(request: Request) -> deque[memoryview]:
-    """A request's body in pieces, however small those were in which it came.
+    """Return a request's body in large pieces.
 
-    Each has pages of its own: a piece that has been given on takes no memory any more, as on the heap it would until
-    everything after it is gone.
+    Each piece has its own pages, so its memory is free once it is passed on. On the heap it would be free only after
+    all later pieces.
     """
     pages: list[mmap.mmap] = []
     async for part in request.stream():

@@ -1,4 +1,4 @@
-"""``?color=`` and ``?against=``: colouring a mesh by how it differs from another shape of its model."""
+"""``?color=`` and ``?against=``: colours of a mesh by its difference from another shape of the model."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from shapespace.service.http.problems import ProblemError
 from shapespace.service.use_cases.one_shape import ColourBy
 from shapespace.service.use_cases.shape_formats import SHAPE_FORMATS, UNAVAILABLE, writable
 
-#: Why a format isn't among those of a coloured mesh.
+#: Reasons why formats can't hold a coloured mesh.
 _UNCOLOURED = {
     name: f"{name.upper()} files can't carry colours" for name, format in SHAPE_FORMATS.items() if not format.coloured
 }
@@ -26,7 +26,7 @@ _UNCOLOURED = {
 
 @dataclass(frozen=True)
 class ColourParameters:
-    """``?color=`` and ``?against=`` as they stand in the address."""
+    """Values of ``?color=`` and ``?against=``."""
 
     quantity: Quantity | None
     against: list[float] | None
@@ -34,7 +34,7 @@ class ColourParameters:
     def on(
         self, model: ShapeModel, bounds: Bounds = Bounds.ALLOW, covariance: Sequence[Sequence[float]] | None = None
     ) -> ColourBy | None:
-        """What they ask for, with the other code checked as the first one is; raises LatentError or ProblemError."""
+        """Return the colouring, with the other code checked like the first; raises LatentError or ProblemError."""
         if self.quantity is Quantity.SPREAD:
             if covariance is None:
                 raise ProblemError(
@@ -78,6 +78,6 @@ NO_COLOR = ColourParameters(None, None)
 
 
 def choose_mesh(format: str | None, request: Request, color: ColourParameters) -> str:
-    """The format of a mesh answer, which carries colours where some are asked for; raises ProblemError."""
+    """Return the format of a mesh answer, with colours if requested; raises ProblemError."""
     formats = {name: f.media_type for name, f in SHAPE_FORMATS.items() if f.coloured or color.quantity is None}
     return choose(writable(formats), format, request.headers.get("accept"), _UNCOLOURED | UNAVAILABLE)

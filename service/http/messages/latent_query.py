@@ -5,14 +5,14 @@ from __future__ import annotations
 from shapespace.service.http.problems import ProblemError
 
 _NUMBER = r"[-+]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][-+]?[0-9]+)?"
-#: What the description says of numbers in a query.
+#: Pattern of comma-separated numbers in a query, for the description of the interface.
 NUMBERS = f"^{_NUMBER}(,{_NUMBER})*$"
 
 
 def numbers(text: str, name: str) -> list[float]:
-    """A code in a query; raises ProblemError, invalid-request."""
+    """Read a code from a query; raises ProblemError, invalid-request."""
     try:
-        if "_" in text or not text.isascii():  # Python reads more as a number than others
+        if "_" in text or not text.isascii():  # Python accepts more spellings of numbers than other languages
             raise ValueError
         return [float(part) for part in text.split(",")] if text else []
     except ValueError:

@@ -1,4 +1,4 @@
-"""``?place=``: where a mesh is answered."""
+"""``?place=``: placement of an answered mesh."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from shapespace.mesh.rigid_motion import Placement
 from shapespace.service.http.messages.json_query import read_query
 from shapespace.service.use_cases.fields import Body, Number
 
-#: How far products of the rotation's rows may be from those of unit vectors at right angles.
+#: Tolerance of the products of a rotation's rows, which should be 0 or 1.
 _ROUNDING = 1e-3
 _EXAMPLE = '{"rotation": [[0, -1, 0], [1, 0, 0], [0, 0, 1]], "translation": [0, 0, 2], "scale": 1}'
 _Three = Annotated[list[Number], Field(min_length=3, max_length=3, fail_fast=True)]
 
 
 class _PlacementRequest(Body):
-    """A placement as ``edit`` and ``fit`` answer it."""
+    """Placement in the form that ``edit`` and ``fit`` answer."""
 
     rotation: Annotated[list[_Three], Field(min_length=3, max_length=3, fail_fast=True)] = Field(
         [[1, 0, 0], [0, 1, 0], [0, 0, 1]]

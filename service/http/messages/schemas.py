@@ -14,7 +14,7 @@ from shapespace.model.options import EditOptions, EncodeOptions, Target
 from shapespace.service.http.messages.options import body_of, query_of
 from shapespace.service.use_cases.fields import Body, Number, Whole
 
-#: Each list fails at its first fault: there may be as many as elements.
+#: Each list fails at its first fault, because every element may have a fault.
 Latent = Annotated[
     list[Number],
     Field(

@@ -1,4 +1,4 @@
-"""``?topology=``: whether a mesh is answered with the polygons of the files that a model is of, or with triangles."""
+"""``?topology=``: whether a mesh is answered with the polygons of the training files, or with triangles."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ TopologyQuery = Annotated[
 def choose_topology(
     asked: Topology | None, format: str, model: ShapeModel, mesh: MeshChoice, *, polygons: bool
 ) -> Topology:
-    """What to answer in a format that can hold polygons, or not.
+    """Return the topology of an answer, given whether its format can hold polygons.
 
     Raises:
-        ProblemError: invalid-request, where polygons are asked for and can't be had.
+        ProblemError: invalid-request, if the query asks for polygons that are not available.
     """
     if asked is Topology.ORIGINAL:
         if not polygons:
