@@ -63,6 +63,6 @@ class Population:
         return result.reshape(codes.shape)
 
     def sample(self, count: int, seed: int, temperature: float = 1.0) -> FloatArray:
-        """Return random codes (count, m), the same on every machine; the temperature scales differences from the mean."""
+        """Return random codes (count, m), the same on every machine; temperature scales their differences."""
         normal = np.random.Generator(np.random.PCG64(seed)).standard_normal((count, len(self.mean)))
         return self.mean + temperature * normal @ self.root.T
