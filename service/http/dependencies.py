@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Annotated
 
 from fastapi import Depends, Path, Query, Request
-from pydantic import WithJsonSchema
+from pydantic import Field, WithJsonSchema
 from starlette.exceptions import HTTPException
 
 from shapespace.model.decoder import MeshChoice, Quality
@@ -76,7 +76,12 @@ QualityQuery = Annotated[
 QualityOfBody = Annotated[
     Quality | None, Query(alias="quality", description="As in the body, over which it wins: `full` or `draft`.")
 ]
-Version = Annotated[str | None, Query(description="Version of the model; by default the newest.")]
+#: In the path of a route that names it there, as the Open Inference Protocol does, and otherwise in the query.
+Version = Annotated[
+    str | None,
+    Field(description="Version of the model; by default the newest."),
+    WithJsonSchema({"type": "string", "examples": ["1"]}),
+]
 Format = Annotated[
     str | None, Query(description="Format of the answer, which wins over `Accept`; 406 lists the choices.")
 ]

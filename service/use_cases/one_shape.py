@@ -40,7 +40,7 @@ class ColourBy:
 
 
 @dataclass(frozen=True)
-class WantedShape:
+class ShapeRequest:
     """A shape as somebody wants it.
 
     Attributes:
@@ -91,7 +91,7 @@ def placed(vertices: NDArray[np.floating], place: Placement | None) -> FloatArra
     return moved
 
 
-async def shape_file(workers: Workers, caller: Caller, model: ShapeModel, wanted: WantedShape) -> ShapeFile:
+async def shape_file(workers: Workers, caller: Caller, model: ShapeModel, wanted: ShapeRequest) -> ShapeFile:
     """One shape as a file.
 
     Raises:

@@ -7,10 +7,11 @@ from typing import Annotated
 from fastapi import APIRouter, Query, Request, Response
 
 from shapespace.model.decoder import MeshChoice
-from shapespace.service.http.caching import CachedAnswer, cache_headers, entity_tag, not_modified
+from shapespace.service.http.caching import CachedAnswer, entity_tag
 from shapespace.service.http.dependencies import CallerDependency, Model, ServiceDependency
 from shapespace.service.http.description import binary, problems
-from shapespace.service.http.responses import timing
+from shapespace.service.http.responses import cached_response
+from shapespace.service.use_cases.batch import Timings
 from shapespace.service.use_cases.blend_shapes import blend_shapes_file
 from shapespace.service.use_cases.shape_formats import SHAPE_FORMATS
 
@@ -34,14 +35,11 @@ async def get_blend_shapes(
 
     `asset.extras.error` of the file says how far the linear blend is from the model's shapes.
     """
-    tag = entity_tag("blend shapes", model.digest, mesh)
-    if unchanged := not_modified(request, tag):
-        return unchanged
-    answer, headers = service.answers.get(tag), cache_headers(tag)
-    if answer is None:
+
+    async def compute() -> tuple[CachedAnswer, Timings]:
         content, seconds = await blend_shapes_file(service.workers, caller, model, mesh)
         name = f"{model.manifest.name}-blendshapes.glb"
-        answer = CachedAnswer(content, {"Content-Disposition": f'inline; filename="{name}"'})
-        service.answers.keep(tag, answer)
-        headers |= timing(service, seconds)
-    return Response(answer.content, headers={**headers, **answer.headers}, media_type=_GLB["glb"])
+        return CachedAnswer(content, {"Content-Disposition": f'inline; filename="{name}"'}), seconds
+
+    tag = entity_tag("blend shapes", model.digest, mesh)
+    return await cached_response(service, request, tag, _GLB["glb"], compute)

@@ -20,8 +20,8 @@ from shapespace.service.http.dependencies import (
 )
 from shapespace.service.http.description import binary, mesh_answers, problems
 from shapespace.service.http.messages.bodies import JSONBody
-from shapespace.service.http.messages.color_query import NO_COLOR, ColorQuery, choose_mesh
 from shapespace.service.http.messages.latent_query import NUMBERS, numbers
+from shapespace.service.http.messages.mesh_query import SingleMeshQuery
 from shapespace.service.http.messages.place_query import PlaceQuery
 from shapespace.service.http.messages.schemas import (
     MeshRequest,
@@ -30,14 +30,11 @@ from shapespace.service.http.messages.schemas import (
     VerticesAnswer,
     VerticesRequest,
 )
-from shapespace.service.http.messages.topology_query import TopologyQuery, choose_topology
 from shapespace.service.http.negotiation import choose
 from shapespace.service.http.responses import file_headers, shape_response, written_response
 from shapespace.service.use_cases.batch import require_count
 from shapespace.service.use_cases.many_shapes import VERTICES_TYPES, vertices_file
 from shapespace.service.use_cases.nric import nric_file
-from shapespace.service.use_cases.one_shape import WantedShape
-from shapespace.service.use_cases.shape_formats import SHAPE_FORMATS
 
 router = APIRouter(prefix="/v1/models/{name}", tags=["shapes"])
 
@@ -50,6 +47,7 @@ async def get_mesh(
     request: Request,
     caller: CallerDependency,
     model: Model,
+    options: SingleMeshQuery,
     latent: Annotated[
         str | None,
         Query(
@@ -61,17 +59,10 @@ async def get_mesh(
     mesh: Annotated[MeshChoice, Query(description="Which mesh, where the model has a finer one.")] = MeshChoice.FINE,
     bounds: Annotated[Bounds, Query(description="What to do with a code outside the bounds.")] = Bounds.ALLOW,
     quality: QualityQuery = Quality.FULL,
-    color: ColorQuery = NO_COLOR,
-    place: PlaceQuery = None,
-    topology: TopologyQuery = None,
-    format: Annotated[Format, one_of(SHAPE_FORMATS)] = None,
 ) -> Response:
     """The shape of a code as a mesh file, for a link or a browser."""
-    chosen = choose_mesh(format, request, color)
     code = None if latent is None else model.latents.code(numbers(latent, "latent"), bounds)
-    faces = choose_topology(topology, chosen, model, mesh, polygons=SHAPE_FORMATS[chosen].polygons)
-    wanted = WantedShape(code, mesh, chosen, quality, color.on(model, bounds), place, faces)
-    return await shape_response(service, request, caller, model, wanted)
+    return await shape_response(service, request, caller, model, options.shape(model, code, mesh, quality, bounds))
 
 
 @router.post(
@@ -85,20 +76,13 @@ async def post_mesh(
     caller: CallerDependency,
     model: Model,
     body: Annotated[MeshRequest, Depends(JSONBody(MeshRequest))],
+    options: SingleMeshQuery,
     mesh: MeshQuery = None,
     quality: QualityOfBody = None,
-    color: ColorQuery = NO_COLOR,
-    place: PlaceQuery = None,
-    topology: TopologyQuery = None,
-    format: Annotated[Format, one_of(SHAPE_FORMATS)] = None,
 ) -> Response:
     """The shape of a code as a mesh file."""
-    chosen = choose_mesh(format, request, color)
     code = model.latents.code(body.latent, body.bounds)
-    colours = color.on(model, body.bounds, body.covariance)
-    which = mesh or body.mesh
-    faces = choose_topology(topology, chosen, model, which, polygons=SHAPE_FORMATS[chosen].polygons)
-    wanted = WantedShape(code, which, chosen, quality or body.quality, colours, place, faces)
+    wanted = options.shape(model, code, mesh or body.mesh, quality or body.quality, body.bounds, body.covariance)
     return await shape_response(service, request, caller, model, wanted)
 
 

@@ -35,7 +35,7 @@ from shapespace.service.use_cases.batch import (
 )
 from shapespace.service.use_cases.many_shapes import infer, vertices_file
 from shapespace.service.use_cases.nric import nric_file
-from shapespace.service.use_cases.one_shape import ColourBy, WantedShape, shape_file
+from shapespace.service.use_cases.one_shape import ColourBy, ShapeRequest, shape_file
 from shapespace.service.use_cases.sequence import (
     TooManyFramesError,
     UnknownFrameError,
@@ -96,7 +96,7 @@ def content(written: Written) -> bytes:
 
 def test_a_shape_is_a_file_with_diagnostics_and_timings(model: ShapeModel) -> None:
     code = model.latents.code(CODES[0])
-    found = run(lambda workers: shape_file(workers, CALLER, model, WantedShape(code, MeshChoice.FINE, "json")))
+    found = run(lambda workers: shape_file(workers, CALLER, model, ShapeRequest(code, MeshChoice.FINE, "json")))
     assert found.diagnostics.status == "converged"
     assert found.diagnostics.model == model.digest
     assert set(found.seconds) == {"network", "reconstruct", "encode"}
@@ -108,7 +108,7 @@ def test_a_shape_is_a_file_with_diagnostics_and_timings(model: ShapeModel) -> No
 
 def test_without_a_code_it_is_the_reference_and_colours_come_with_a_legend(model: ShapeModel) -> None:
     colour_by = ColourBy(Quantity.STRETCH, model.latents.code(CODES[1]))
-    wanted = WantedShape(None, MeshChoice.FINE, "json", colour_by=colour_by)
+    wanted = ShapeRequest(None, MeshChoice.FINE, "json", colour_by=colour_by)
     found = run(lambda workers: shape_file(workers, CALLER, model, wanted))
     answer = json.loads(found.content)
     assert np.allclose(answer["vertices"], SCALE * model.reference.vertices, atol=1e-5)
@@ -290,7 +290,7 @@ def test_work_ends_by_its_deadline_and_when_its_caller_leaves(model: ShapeModel)
     code = model.latents.code(CODES[0])
 
     def ask(caller: Caller) -> Callable[[Workers], Awaitable[object]]:
-        return lambda workers: shape_file(workers, caller, model, WantedShape(code, MeshChoice.FINE, "json"))
+        return lambda workers: shape_file(workers, caller, model, ShapeRequest(code, MeshChoice.FINE, "json"))
 
     with pytest.raises(DeadlineError, match="within 1e-06 s"):
         run(ask(CALLER), deadline=1e-6)
@@ -320,9 +320,9 @@ def test_one_caller_leaves_places_for_others(model: ShapeModel) -> None:
                 group.create_task(hold())
             await asyncio.sleep(0)
             with pytest.raises(BusyError, match="for this client"):
-                await shape_file(workers, CALLER, model, WantedShape(None, MeshChoice.FINE, "json"))
+                await shape_file(workers, CALLER, model, ShapeRequest(None, MeshChoice.FINE, "json"))
             other = Caller("somebody else", _stays)
-            assert (await shape_file(workers, other, model, WantedShape(None, MeshChoice.FINE, "json"))).content
+            assert (await shape_file(workers, other, model, ShapeRequest(None, MeshChoice.FINE, "json"))).content
             held.set()
 
     run(fill)
