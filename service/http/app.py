@@ -13,19 +13,14 @@ from starlette.middleware.cors import CORSMiddleware
 from threadpoolctl import threadpool_limits
 
 from shapespace import __version__
-from shapespace.service.http import problems
+from shapespace.service.http import error_handlers
 from shapespace.service.http.caching import AnswerCache
 from shapespace.service.http.connections import Connections
 from shapespace.service.http.dependencies import Service, known_query
 from shapespace.service.http.description import describe
-from shapespace.service.http.middleware import (
-    AnswerHead,
-    LimitBody,
-    LimitUnreadAnswers,
-    Observe,
-    RequireHost,
-    RequireKey,
-)
+from shapespace.service.http.middleware.access import RequireHost, RequireKey
+from shapespace.service.http.middleware.memory import LimitBody, LimitUnreadAnswers
+from shapespace.service.http.middleware.observe import HeadAsGet, Observe
 from shapespace.service.http.routes import (
     blend_shapes,
     codes,
@@ -73,7 +68,7 @@ def create_app(settings: Settings | None = None, validator: BundleValidator | No
             connections = Connections(settings.max_connections, settings.deadline, settings.trusted_proxies)
             repository = ModelRepository(settings.models_dir, settings.workers, validator)
             metrics = Metrics(repository, workers, connections.quota)
-            connections.refused = metrics.refused
+            connections.on_refusal = metrics.refused
             reloader = Reloader(repository, metrics)
             answers = AnswerCache(settings.cache)
             sandbox = Sandbox(min(settings.workers, UPLOADS))
@@ -81,7 +76,7 @@ def create_app(settings: Settings | None = None, validator: BundleValidator | No
             app.state.service = Service(settings, repository, workers, connections, metrics, reloader, answers, sandbox)
             # For what reads bodies and folders, beside the threads that compute.
             asyncio.get_running_loop().set_default_executor(ThreadPoolExecutor(2, thread_name_prefix="reading"))
-            chores = [asyncio.create_task(connections.sweep())]
+            chores = [asyncio.create_task(connections.check_timeouts())]
             if settings.watch:
                 chores.append(asyncio.create_task(reloader.watch(settings.watch)))
             yield
@@ -104,7 +99,7 @@ def create_app(settings: Settings | None = None, validator: BundleValidator | No
         redoc_url=None,
         openapi_url=None,
     )
-    problems.install(app)
+    error_handlers.install(app)
     calls = (models, shapes, blend_shapes, codes, fits, interpolations, open_inference, health, operation, page)
     routers = [module.router for module in calls]
     for router in routers:
@@ -117,7 +112,7 @@ def create_app(settings: Settings | None = None, validator: BundleValidator | No
 def _middleware(settings: Settings) -> list[Middleware]:
     """From the outside in."""
     stack = [
-        Middleware(AnswerHead),
+        Middleware(HeadAsGet),
         Middleware(Observe),
         Middleware(LimitUnreadAnswers),
         Middleware(RequireHost, hosts=_hosts(settings)),

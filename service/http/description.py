@@ -14,7 +14,7 @@ from pydantic.json_schema import models_json_schema
 from shapespace.service.http.messages.bodies import JSONBody
 from shapespace.service.http.messages.open_inference import InferenceRequest
 from shapespace.service.http.messages.schemas import MeshAnswer, Problem
-from shapespace.service.http.middleware import OPEN
+from shapespace.service.http.middleware.access import OPEN
 from shapespace.service.http.problems import KINDS, MEDIA_TYPE
 from shapespace.service.use_cases.shape_formats import SHAPE_FORMATS
 from shapespace.service.use_cases.uploads import MEDIA_TYPES

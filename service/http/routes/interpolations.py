@@ -22,13 +22,14 @@ from shapespace.service.http.dependencies import (
     one_of,
 )
 from shapespace.service.http.description import binary, mesh_answers, problems
+from shapespace.service.http.error_handlers import DOMAIN_ERRORS, domain_problem
 from shapespace.service.http.messages.bodies import JSONBody
 from shapespace.service.http.messages.color_query import NO_COLOR, ColorQuery, ColourParameters
 from shapespace.service.http.messages.mesh_query import FrameQuery
 from shapespace.service.http.messages.schemas import InterpolationAnswer
 from shapespace.service.http.messages.topology_query import TopologyQuery, choose_topology
 from shapespace.service.http.negotiation import choose
-from shapespace.service.http.problems import DOMAIN_ERRORS, ProblemError, domain_problem
+from shapespace.service.http.problems import ProblemError
 from shapespace.service.http.responses import file_headers, shape_response, tag_options, written_response
 from shapespace.service.use_cases.animation import Animation
 from shapespace.service.use_cases.sequence import (
