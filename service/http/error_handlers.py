@@ -96,7 +96,7 @@ async def _http(request: Request, error: Exception) -> Response:
 
 
 def _allowed(request: Request) -> list[str]:
-    # The router names the methods of the first route only; a path may have several.
+    # The router names the methods of the first route only, but a path may have several routes.
     routes = request.app.router.routes
     scopes = {
         method: {**request.scope, "method": method} for method in ("GET", "HEAD", "POST", "PUT", "PATCH", "DELETE")

@@ -1,4 +1,4 @@
-"""What use cases return, as HTTP: files with diagnostics and timings in their headers, answered again from a cache."""
+"""HTTP answers from the results of use cases: files with diagnostics and timings in their headers, and a cache."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from shapespace.model.shape_model import ShapeModel
 from shapespace.service.http.caching import CachedAnswer, cache_headers, entity_tag, not_modified
 from shapespace.service.http.dependencies import Service
 from shapespace.service.limits.workers import Caller
-from shapespace.service.use_cases.batch import PiecewiseFile, Timings, Written
+from shapespace.service.use_cases.batch import EncodedFile, PiecewiseFile, Timings
 from shapespace.service.use_cases.codes import Found
-from shapespace.service.use_cases.one_shape import ColourBy, ShapeRequest, shape_file
+from shapespace.service.use_cases.one_shape import ColourOptions, ShapeRequest, shape_file
 from shapespace.service.use_cases.shape_formats import SHAPE_FORMATS, dump_json
 
 #: Seconds by stage of an answer from the cache.
@@ -28,23 +28,23 @@ _CACHED = {"network": 0.0, "reconstruct": 0.0, "encode": 0.0}
 
 
 def timing(service: Service, seconds: Timings) -> dict[str, str]:
-    """The header ``Server-Timing``, in milliseconds; the metrics count the same."""
+    """Return the header ``Server-Timing``, in milliseconds, and count the same times in the metrics."""
     service.metrics.timed(seconds)
     return {"Server-Timing": ", ".join(f"{stage};dur={1e3 * duration:.3f}" for stage, duration in seconds.items())}
 
 
 def file_headers(diagnostics: Mapping[str, Any], filename: str) -> dict[str, str]:
-    """Headers of an answer that is a file."""
+    """Return the headers of an answer that is a file."""
     return {**diagnostics_header(diagnostics), "Content-Disposition": f'inline; filename="{filename}"'}
 
 
 def diagnostics_header(diagnostics: Mapping[str, Any]) -> dict[str, str]:
-    """The header ``Shape-Diagnostics``."""
+    """Return the header ``Shape-Diagnostics``."""
     return {"Shape-Diagnostics": dump_json(diagnostics).decode()}
 
 
 def found_response(service: Service, found: Found) -> Response:
-    """What a search found, with the time that it took."""
+    """Return the result of a search, with its time."""
     return Response(found.content, headers=timing(service, found.seconds), media_type="application/json")
 
 
@@ -93,7 +93,7 @@ async def shape_response(
     return await cached_response(service, request, tag, SHAPE_FORMATS[wanted.format].media_type, compute)
 
 
-def tag_options(quality: Quality, colour_by: ColourBy | None, topology: Topology) -> list[str | bytes]:
+def tag_options(quality: Quality, colour_by: ColourOptions | None, topology: Topology) -> list[str | bytes]:
     """Return the parts of an entity tag that distinguish options of the same shapes; none for the defaults."""
     options: list[str | bytes] = [] if quality is Quality.FULL else [quality]
     if colour_by:
@@ -107,8 +107,8 @@ def _code_bytes(code: CheckedCode | None) -> bytes:
     return b"" if code is None else code[0].tobytes()
 
 
-def written_response(service: Service, written: Written, headers: Mapping[str, str], media_type: str) -> Response:
-    """A file made from many codes: whole where it is small, otherwise as fast as it is read."""
+def encoded_response(service: Service, written: EncodedFile, headers: Mapping[str, str], media_type: str) -> Response:
+    """Return a file made from many codes. A large file is sent as fast as the client reads it."""
     headers = {**headers, **timing(service, written.seconds)}
     if isinstance(written.content, bytes):
         return Response(written.content, headers=headers, media_type=media_type)
@@ -116,7 +116,7 @@ def written_response(service: Service, written: Written, headers: Mapping[str, s
 
 
 class _PiecewiseResponse(StreamingResponse):
-    """A file that is written as fast as it is read, and holds its memory until then."""
+    """An answer written piece by piece, which keeps its reservation of memory until its end."""
 
     def __init__(self, file: PiecewiseFile, headers: Mapping[str, str], media_type: str) -> None:
         super().__init__(file, headers=headers, media_type=media_type)

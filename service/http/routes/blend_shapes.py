@@ -1,4 +1,4 @@
-"""A model as linear blend shapes."""
+"""The call that answers a model as linear blend shapes."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ async def get_blend_shapes(
     request: Request,
     caller: CallerDependency,
     model: Model,
-    mesh: Annotated[MeshChoice, Query(description="Which mesh, where the model has a finer one.")] = MeshChoice.FINE,
+    mesh: Annotated[MeshChoice, Query(description="The mesh, if the model has a fine one.")] = MeshChoice.FINE,
 ) -> Response:
-    """Code 0, and a morph target for each end of each coordinate: sliders for programs without this server.
+    """The shape of code 0 with a morph target for each bound of each coordinate: sliders without this server.
 
-    `asset.extras.error` of the file says how far the linear blend is from the model's shapes.
+    `asset.extras.error` of the file is the distance of the linear blend from the model's shapes.
     """
 
     async def compute() -> tuple[CachedAnswer, Timings]:

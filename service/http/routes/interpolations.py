@@ -30,7 +30,7 @@ from shapespace.service.http.messages.schemas import InterpolationAnswer
 from shapespace.service.http.messages.topology_query import TopologyQuery, choose_topology
 from shapespace.service.http.negotiation import choose
 from shapespace.service.http.problems import ProblemError
-from shapespace.service.http.responses import file_headers, shape_response, tag_options, written_response
+from shapespace.service.http.responses import encoded_response, file_headers, shape_response, tag_options
 from shapespace.service.use_cases.animation import Animation
 from shapespace.service.use_cases.sequence import (
     find_interpolation,
@@ -48,15 +48,15 @@ from shapespace.service.use_cases.shape_formats import UNAVAILABLE, writable
 
 router = APIRouter(prefix="/v1", tags=["interpolations"])
 
-#: Why a format isn't among those of a coloured animation.
+#: Reason why a format cannot hold a coloured animation.
 _UNCOLOURED = {
     name: f"Whole animations in {name.upper()} carry no colours; single frames do"
     for name in MEDIA_TYPES
     if name not in SEQUENCE_FORMATS or not SEQUENCE_FORMATS[name].timed
 }
-#: Most frames in a second: more than any screen shows.
+#: Most frames per second, more than any screen shows.
 MOST_FPS = 240
-Id = Annotated[str, Path(description="An interpolation's id.")]
+Id = Annotated[str, Path(description="Id of an interpolation.")]
 
 
 @router.post(
@@ -71,7 +71,7 @@ async def create_interpolation(
     response: Response,
     mesh: MeshQuery = None,
 ) -> InterpolationAnswer:
-    """An address for the animation along a path of codes. Nothing is stored: the id holds it all."""
+    """Address of the animation along a path of codes. Nothing is stored: the id holds the whole animation."""
     body = body.model_copy(update={"mesh": mesh or body.mesh})
     id = interpolation_id(model, body, service.settings.max_frames)
     path = f"/v1/interpolations/{id}"
@@ -95,11 +95,11 @@ async def get_interpolation(
     topology: TopologyQuery = None,
     fps: Annotated[
         float | None,
-        Query(ge=1, le=MOST_FPS, description="Frames in a second, of GLB, USD and USDZ; by default 30."),
+        Query(ge=1, le=MOST_FPS, description="Frames per second of GLB, USD and USDZ; by default 30."),
     ] = None,
     format: Annotated[Format, one_of([*MEDIA_TYPES, "obj"])] = None,
 ) -> Response:
-    """The animation: GLB, arrays, a zip of OBJ files, a point cache, USD, or JSON lines as they get ready."""
+    """The animation: GLB, arrays, a zip of OBJ files, a point cache, USD, or a stream of JSON lines."""
     chosen = _choose_format(request, format, color)
     animation, model = find_interpolation(service.repository, id, service.settings.max_frames)
     written_as = SEQUENCE_FORMATS.get(chosen)
@@ -117,14 +117,14 @@ async def get_interpolation(
         return answer
     if chosen == "jsonl":
         lines = sequence_lines(service.workers, caller, model, animation, quality)
-        first = await anext(lines)  # what goes wrong up to here still has a status of its own
+        first = await anext(lines)  # an error up to here still has its own status
         return StreamingResponse(_resume(request, first, lines), headers=cache_headers(tag), media_type=JSON_LINES)
     written = await sequence_file(
         service.workers, caller, model, animation, quality, chosen, faces, fps or FRAMES_PER_SECOND, colour_by
     )
     diagnostics = {**(written.diagnostics or {}), **written.facts}
     headers = cache_headers(tag) | file_headers(diagnostics, f"{model.manifest.name}-animation.{chosen}")
-    return written_response(service, written, headers, MEDIA_TYPES[chosen])
+    return encoded_response(service, written, headers, MEDIA_TYPES[chosen])
 
 
 @router.get(
@@ -137,7 +137,7 @@ async def get_frame(
     request: Request,
     caller: CallerDependency,
     id: Id,
-    k: Annotated[int, Path(description="Number of the frame, from 0.", json_schema_extra={"minimum": 0})],
+    k: Annotated[int, Path(description="Index of the frame, from 0.", json_schema_extra={"minimum": 0})],
     options: FrameQuery,
     quality: QualityQuery = Quality.FULL,
 ) -> Response:
@@ -161,5 +161,5 @@ async def _resume(request: Request, first: bytes, rest: AsyncGenerator[bytes, No
         try:
             async for line in rest:
                 yield line
-        except DOMAIN_ERRORS as error:  # too late for a status
+        except DOMAIN_ERRORS as error:  # the status has been sent already
             yield b'{"problem":%b}\n' % bytes((await domain_problem(request, error)).body)

@@ -21,7 +21,7 @@ from shapespace.service.http.messages.open_inference import (
     ServerMetadata,
     model_metadata,
 )
-from shapespace.service.http.responses import diagnostics_header, written_response
+from shapespace.service.http.responses import diagnostics_header, encoded_response
 from shapespace.service.use_cases.batch import require_count
 from shapespace.service.use_cases.many_shapes import infer as infer_file
 
@@ -101,5 +101,5 @@ async def infer(service: ServiceDependency, request: Request, caller: CallerDepe
     )
     headers = diagnostics_header(written.diagnostics) if written.diagnostics else {}
     if HEADER not in written.facts:
-        return written_response(service, written, headers, "application/json")
-    return written_response(service, written, headers | {HEADER: str(written.facts[HEADER])}, OCTET_STREAM)
+        return encoded_response(service, written, headers, "application/json")
+    return encoded_response(service, written, headers | {HEADER: str(written.facts[HEADER])}, OCTET_STREAM)

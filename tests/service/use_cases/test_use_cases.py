@@ -27,15 +27,15 @@ from shapespace.service.limits.workers import BusyError, Caller, DeadlineError, 
 from shapespace.service.use_cases import batch, codes, many_shapes
 from shapespace.service.use_cases.animation import Animation
 from shapespace.service.use_cases.batch import (
+    EncodedFile,
     NoCodesError,
     PiecewiseFile,
     TooManyCodesError,
-    Written,
     require_count,
 )
 from shapespace.service.use_cases.many_shapes import infer, vertices_file
 from shapespace.service.use_cases.nric import nric_file
-from shapespace.service.use_cases.one_shape import ColourBy, ShapeRequest, shape_file
+from shapespace.service.use_cases.one_shape import ColourOptions, ShapeRequest, shape_file
 from shapespace.service.use_cases.sequence import (
     TooManyFramesError,
     UnknownFrameError,
@@ -89,7 +89,7 @@ def run(use_case: Callable[[Workers], Awaitable[T]], deadline: float = 60) -> T:
     return asyncio.run(main())
 
 
-def content(written: Written) -> bytes:
+def content(written: EncodedFile) -> bytes:
     assert isinstance(written.content, bytes)
     return written.content
 
@@ -107,7 +107,7 @@ def test_a_shape_is_a_file_with_diagnostics_and_timings(model: ShapeModel) -> No
 
 
 def test_without_a_code_it_is_the_reference_and_colours_come_with_a_legend(model: ShapeModel) -> None:
-    colour_by = ColourBy(Quantity.STRETCH, model.latents.code(CODES[1]))
+    colour_by = ColourOptions(Quantity.STRETCH, model.latents.code(CODES[1]))
     wanted = ShapeRequest(None, MeshChoice.FINE, "json", colour_by=colour_by)
     found = run(lambda workers: shape_file(workers, CALLER, model, wanted))
     answer = json.loads(found.content)
@@ -187,7 +187,7 @@ def test_inference_computes_the_outputs_that_are_wanted(model: ShapeModel, outpu
 def test_frames_are_those_of_one_file_and_of_the_lines(model: ShapeModel) -> None:
     animation = Animation(keyframes=CODES, frames=3)
 
-    async def both(workers: Workers) -> tuple[Written, list[bytes]]:
+    async def both(workers: Workers) -> tuple[EncodedFile, list[bytes]]:
         written = await sequence_file(workers, CALLER, model, animation, Quality.FULL, "npz")
         return written, [line async for line in sequence_lines(workers, CALLER, model, animation, Quality.FULL)]
 
@@ -270,7 +270,7 @@ def test_both_outputs_together_may_be_more_than_an_answer_holds(
 ) -> None:
     monkeypatch.setattr(many_shapes, "MOST_VERTICES", len(CODES) * len(model.reference.vertices))
 
-    def ask(outputs: list[str]) -> Written:
+    def ask(outputs: list[str]) -> EncodedFile:
         latents, write = np.array(CODES), lambda arrays: (iter([b"x"]), {})
         return run(
             lambda workers: infer(
