@@ -136,7 +136,7 @@ def test_a_large_file_comes_in_pieces_and_holds_its_memory_until_it_is_read(
     async def both(workers: Workers) -> tuple[bytes, bytes]:
         ask = (workers, CALLER, model, CODES, Bounds.ALLOW, MeshChoice.FINE, "json")
         whole = content(await vertices_file(*ask))
-        monkeypatch.setattr(batch, "WHOLE", 100)
+        monkeypatch.setattr(batch, "WHOLE_FILE_BYTES", 100)
         file = (await vertices_file(*ask)).content
         assert isinstance(file, PiecewiseFile)
         assert workers.memory.used > 0
