@@ -63,9 +63,9 @@ QUICK = tests/shapespace tests/service/use_cases/test_use_cases.py tests/trainin
 	$(wildcard tests/test_[cdm]*.py) \
 	--deselect tests/shapespace/files/test_attributes.py::test_the_khronos_validator_finds_nothing_in_a_textured_animation
 
-# What the libraries of serving take part in, and training doesn't; processes, signals, slow strangers and fits are the same
+# What the libraries of serving take part in, and training doesn't; processes, signals, slow clients and fits are the same
 # with all.
-NOT_SERVING = blocks bundled_files clients deployment proxy replicas draining operation reloading strangers fit
+NOT_SERVING = blocks bundled_files clients deployment proxy replicas draining operation reloading untrusted_clients fit
 SERVING = $(filter-out $(foreach name,$(NOT_SERVING),%/test_$(name).py), \
 	$(wildcard tests/service/*/test_*.py)) $(foreach name,files/test_formats files/test_polygon_reading files/test_gltf_reading \
 	coordinates/test_reconstruction solve/test_cholesky,tests/shapespace/$(name).py)

@@ -26,14 +26,14 @@ NAMES = {int: "whole number", float: "number", str: "text", bool: "`true` or `fa
 
 
 def models_in(annotation: Any) -> list[type[BaseModel]]:
-    """The models somewhere in a type."""
+    """Return the models that a type contains."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return [annotation]
     return list(dict.fromkeys(model for part in get_args(annotation) for model in models_in(part)))
 
 
 def limits(metadata: list[Any]) -> Iterator[str]:
-    """What a value must be beside its type."""
+    """Yield the limits of a value, in words."""
     signs = {"gt": ">", "ge": "≥", "lt": "<", "le": "≤"}
     for constraint in [other for each in metadata for other in getattr(each, "metadata", [each])]:
         for name, sign in signs.items():
@@ -46,7 +46,7 @@ def limits(metadata: list[Any]) -> Iterator[str]:
 
 
 def words(annotation: Any) -> str:
-    """A type in words."""
+    """Return a type in words."""
     origin, parts = get_origin(annotation), get_args(annotation)
     if origin is Literal:
         return " or ".join(f"`{json.dumps(value)}`" for value in parts)
@@ -65,22 +65,22 @@ def words(annotation: Any) -> str:
 
 
 def value(default: Any) -> str:
-    """A default as TOML has it."""
+    """Return a default as TOML."""
     if default is None:
         return "left out"
     return "" if isinstance(default, BaseModel) or default == {} else f"`{json.dumps(default)}`"
 
 
 def shown(default: BaseModel | None, name: str, field: FieldInfo) -> Any:
-    """What a setting is in a table that holds this by default; PydanticUndefined where it has to be given."""
+    """Return the default of a setting in a table; PydanticUndefined if the setting is required."""
     return getattr(default, name) if default else field.get_default(call_default_factory=True, validated_data={})
 
 
 class Page:
-    """Collects each model once, with all places at which it stands."""
+    """The reference page: each model once, with all tables that it describes."""
 
     def __init__(self) -> None:
-        #: The tables of a model, each with the kind that it belongs to, if any, and what it holds by default.
+        #: The tables of each model: path, kind (or empty), and default.
         self.places: dict[type[BaseModel], list[tuple[str, str, BaseModel | None]]] = {}
         self._visit(Config, "", "", None)
 
@@ -137,7 +137,7 @@ class Page:
         yield ""
 
     def text(self) -> str:
-        """The whole page."""
+        """Return the text of the page."""
         lines = [line for model in self.places for line in self._section(model)]
         return "\n".join([HEAD, *lines]).rstrip() + "\n"
 

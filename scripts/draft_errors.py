@@ -1,6 +1,6 @@
-"""Measure the drafts of bundles that were exported before that was done, and write it into their manifests.
+"""Measure the error of drafts of old bundles, and write it into their manifests. An export measures it by itself.
 
-``python -m scripts.draft_errors models/NAME/VERSION …``; an export measures its own.
+Usage: ``python -m scripts.draft_errors models/NAME/VERSION …``.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Write the pictures of the page in docs/: ``python -m scripts.screenshots``. Bundled models only."""
+"""Write the screenshots of the page in docs/, of bundled models: ``python -m scripts.screenshots``."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ TORUS = "#model=freaky-torus&z=1,2,0.4,1"
 
 
 def drawn(page: Page, pictures: str) -> None:
-    """Wait until the shape rests and small pictures are there."""
+    """Wait until the shape is drawn and the small pictures are there."""
     page.wait_for_selector(".stage[data-shown]")
     page.wait_for_selector(f"{pictures} canvas.drawn")
     while page.locator(f"{pictures} canvas:not(.drawn)").count():
@@ -26,7 +26,7 @@ def drawn(page: Page, pictures: str) -> None:
 
 
 def main() -> None:
-    """Take them."""
+    """Take the screenshots."""
     desktop, phone = {"width": 1280, "height": 800}, {"width": 390, "height": 844}
     with server(Path("models")) as (client, *_), sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=CHROMIUM, args=FLAGS)

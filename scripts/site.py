@@ -1,4 +1,4 @@
-"""What MkDocs asks: links out of docs/ become their text, as the site holds only that folder."""
+"""Hook of MkDocs: replaces links out of docs/ by their text, because the site holds only this folder."""
 
 import posixpath
 import re
@@ -8,7 +8,7 @@ LINK = re.compile(r"(?<!!)\[([^\]]+)\]\(([^)\s]+)\)")
 
 
 def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
-    """The page without links that lead out of the folder."""
+    """Return the page without links that lead out of the folder."""
     folder = posixpath.dirname(page.file.src_uri)
 
     def kept(link: re.Match[str]) -> str:

@@ -1,1 +1,1 @@
-"""Shapes over HTTP: bundles in ``models/`` at work behind the calls of ``openapi/openapi.json``."""
+"""The server: shapes of the bundles in ``models/`` over HTTP, with the calls of ``openapi/openapi.json``."""

@@ -1,4 +1,4 @@
-"""``shapespace-serve``: the server as a command, set up by environment variables ``SHAPESPACE_*``."""
+"""``shapespace-serve``: the server as a command, with settings from environment variables ``SHAPESPACE_*``."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ from contextlib import suppress
 from shapespace.service.limits.process_memory import tune_malloc
 from shapespace.service.repository.validation import BundleValidator, bundle_folders
 
-#: Characters that a key should have.
+#: Length in characters below which a key is reported as short.
 SHORT_KEY = 16
 
 
 def main() -> None:
-    """Serve until SIGTERM or SIGINT; running requests are finished."""
+    """Serve until SIGTERM or SIGINT, and finish running requests."""
     tune_malloc()
     validator = BundleValidator()
     try:
-        validator.prepare()  # another process imports what validation needs while this one imports
+        validator.prepare()  # imports in a second process while this one imports
         _serve(validator)
     finally:
         validator.close()
@@ -36,7 +36,7 @@ def _serve(validator: BundleValidator) -> None:
         for fault in error.errors():
             print(f"{PREFIX}{str(fault['loc'][0]).upper()}: {fault['msg']}", file=sys.stderr)
         raise SystemExit(2) from None
-    with suppress(OSError):  # the first look will say what is the matter
+    with suppress(OSError):  # loading the models reports the reason
         validator.begin(bundle_folders(settings.models_dir)[0])
 
     from shapespace.service import logs
@@ -46,12 +46,12 @@ def _serve(validator: BundleValidator) -> None:
     logs.configure(settings.log_format)
     log = logging.getLogger(__name__)
     for name in unknown_variables():
-        log.warning("%s is no setting: docs/reference/settings.md lists those there are", name)
+        log.warning("%s is no setting: docs/reference/settings.md lists all settings", name)
     if settings.models_dir == BUNDLED:
         log.info("serving what is installed with the package; a folder models or SHAPESPACE_MODELS_DIR gives others")
     if hasattr(signal, "SIGHUP"):
         signal.signal(signal.SIGHUP, signal.SIG_IGN)  # until the server can reload
-    # Uvicorn raises the signal once more when everything is finished: that is a success.
+    # Uvicorn raises the signal again after the shutdown, which is a success.
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: sys.exit(0))
     if settings.api_key is None and not is_loopback(settings.host):

@@ -1,4 +1,4 @@
-"""The log: one line for each event, for people or as JSON, with the id of the request that it belongs to."""
+"""The log: one line for each event, as text or as JSON, with the id of its request."""
 
 from __future__ import annotations
 
@@ -11,25 +11,49 @@ from pythonjsonlogger.orjson import OrjsonFormatter
 
 from shapespace.service.settings import LogFormat
 
-#: The id of the request at work, for every line that is logged on its behalf.
+#: Least number of seconds between two log lines of one RateLimitedLog.
+LOG_INTERVAL = 1.0
+#: Id of the current request, for the log lines that belong to it.
 request_id: ContextVar[str | None] = ContextVar("request_id", default=None)
 
 
 def printable(text: str) -> str:
-    """Text in one line: what isn't for reading, line breaks and codes of terminals among it, as escapes."""
+    """Return text as one line: characters that cannot be printed, as line breaks and terminal codes, are escaped."""
     if text.isprintable():
         return text
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
 
 
-class _RequestId(logging.Filter):
+class RateLimitedLog:
+    """One log line for many equal events, at most once in LOG_INTERVAL, with their number.
+
+    Args:
+        logger: takes the lines.
+        level: of the lines.
+        text: of each line.
+    """
+
+    def __init__(self, logger: logging.Logger, level: int, text: str) -> None:
+        self._logger, self._level, self._text = logger, level, text
+        self._events, self._next = 0, 0.0
+
+    def event(self) -> None:
+        """Count an event, and log a line if the last one is old enough."""
+        self._events += 1
+        now = time.monotonic()
+        if now >= self._next:
+            self._logger.log(self._level, "%s (%d × since the last such line)", self._text, self._events)
+            self._events, self._next = 0, now + LOG_INTERVAL
+
+
+class _RequestIdFilter(logging.Filter):
     def filter(self, record: logging.LogRecord) -> bool:
         record.request_id = request_id.get()
         return True
 
 
-class _Text(logging.Formatter):
-    """An event is one line, whatever it quotes; lines of tracebacks are indented, so that none looks like an event."""
+class _TextFormatter(logging.Formatter):
+    """Formats each event as one line. Lines of a traceback are indented, so that none looks like an event."""
 
     def format(self, record: logging.LogRecord) -> str:
         text = super().format(record)
@@ -43,13 +67,13 @@ class _Text(logging.Formatter):
         return "\n".join(f"    {printable(line)}" for line in super().formatException(ei).splitlines())
 
 
-class _JSON(OrjsonFormatter):
+class _JSONFormatter(OrjsonFormatter):
     converter = staticmethod(time.gmtime)
     default_time_format = "%Y-%m-%dT%H:%M:%S"
     default_msec_format = "%s.%03dZ"
 
     def process_log_record(self, log_data: dict[str, Any]) -> dict[str, Any]:
-        # Names of files that are no UTF-8 hold half characters, which JSON has no place for.
+        # File names that are not UTF-8 hold surrogates, which JSON cannot express.
         for name, value in log_data.items():
             if isinstance(value, str):
                 log_data[name] = value.encode(errors="backslashreplace").decode()
@@ -57,16 +81,16 @@ class _JSON(OrjsonFormatter):
 
 
 def configure(format: LogFormat) -> None:
-    """Send everything from INFO on to standard error."""
+    """Send everything from level INFO to standard error."""
     formatter: logging.Formatter
     if format is LogFormat.JSON:
-        formatter = _JSON(
+        formatter = _JSONFormatter(
             ["asctime", "levelname", "name", "message"],
             rename_fields={"asctime": "time", "levelname": "level", "name": "logger"},
         )
     else:
-        formatter = _Text("%(levelname)s %(name)s: %(message)s")
+        formatter = _TextFormatter("%(levelname)s %(name)s: %(message)s")
     handler = logging.StreamHandler()
     handler.setFormatter(formatter)
-    handler.addFilter(_RequestId())
+    handler.addFilter(_RequestIdFilter())
     logging.basicConfig(level=logging.INFO, handlers=[handler], force=True)

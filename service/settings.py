@@ -1,4 +1,4 @@
-"""What can be set from outside, as environment variables ``SHAPESPACE_*``."""
+"""Settings of the server, from environment variables ``SHAPESPACE_*``."""
 
 from __future__ import annotations
 
@@ -15,25 +15,25 @@ from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict
 import shapespace
 
 PREFIX = "SHAPESPACE_"
-#: Models that are installed with the package.
+#: Folder of the models that are installed with the package.
 BUNDLED = Path(shapespace.__file__).parent / "models"
 
 
 class LogFormat(StrEnum):
-    """How a line of the log looks: for people, or one JSON object."""
+    """Format of a log line: text, or one JSON object."""
 
     TEXT = "text"
     JSON = "json"
 
 
 def cpu_quota(cgroup: Path = Path("/sys/fs/cgroup")) -> int:
-    """Processors this process may use, at least 1: its affinity within the quota of its control group."""
+    """Return the number of processors that this process may use, by its affinity and its control group; at least 1."""
     count = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     try:
         quota, period = (cgroup / "cpu.max").read_text().split()
-        share = float(quota) / float(period)  # "max" is no number: no quota
+        share = float(quota) / float(period)  # "max" is no number, and means no quota
     except (OSError, ValueError):
-        try:  # control groups of version 1; −1 stands for no quota
+        try:  # control groups of version 1; −1 means no quota
             quota, period = ((cgroup / "cpu" / f"cpu.cfs_{x}_us").read_text() for x in ("quota", "period"))
             share = float(quota) / float(period)
         except (OSError, ValueError):
@@ -42,7 +42,7 @@ def cpu_quota(cgroup: Path = Path("/sys/fs/cgroup")) -> int:
 
 
 def default_models_dir() -> Path:
-    """``models`` in the working directory; where there is none, the models that were installed with the package."""
+    """Return ``models`` in the working directory, or the models that are installed with the package."""
     return Path("models") if Path("models").exists() else BUNDLED
 
 
@@ -50,7 +50,7 @@ def _split(value: object) -> object:
     return tuple(filter(None, map(str.strip, value.split(",")))) if isinstance(value, str) else value
 
 
-#: Several values, separated by commas.
+#: Values separated by commas.
 Names = Annotated[tuple[str, ...], NoDecode, BeforeValidator(_split)]
 
 
@@ -61,24 +61,24 @@ class Settings(BaseSettings):
 
     models_dir: Path = Field(
         default_factory=default_models_dir,
-        description="folder of bundles, NAME/VERSION/; by default `models` here, or the one installed with the package",
+        description="folder of bundles, NAME/VERSION/; by default `models` here, or the installed models",
     )
     host: str = Field(default="127.0.0.1", description="address to listen on")
     port: int = Field(default=8000, ge=0, le=65535, description="port to listen on; 0 takes a free one")
     workers: PositiveInt = Field(
         default_factory=cpu_quota, description="shapes computed at once; by default the processors allowed"
     )
-    queue: int = Field(default=32, ge=0, description="requests that may wait for a worker before others get 503")
+    queue: int = Field(default=32, ge=0, description="requests that may wait for a worker; further ones get 503")
     deadline: PositiveFloat = Field(default=60.0, description="seconds a request may take before it gets 504")
     max_body: PositiveInt = Field(default=8 * 2**20, description="largest request body, in bytes")
     max_upload: PositiveInt = Field(default=64 * 2**20, description="largest mesh file sent to be encoded, in bytes")
     max_codes: PositiveInt = Field(default=256, description="most latent codes in one request")
     max_frames: PositiveInt = Field(default=600, description="most frames of an interpolation")
     cache: int = Field(
-        default=32 * 2**20, ge=0, description="bytes of recent answers kept for who asks again; 0 keeps none"
+        default=32 * 2**20, ge=0, description="bytes of recent answers that are kept to answer them again; 0 keeps none"
     )
     watch: NonNegativeFloat = Field(
-        default=2.0, description="seconds between looks at the models folder for changes; 0 never looks"
+        default=2.0, description="seconds between checks of the models folder for changes; 0 never checks"
     )
     drain: NonNegativeFloat = Field(
         default=2.0, description="seconds after SIGTERM in which new requests are still answered, and readiness is 503"
@@ -86,13 +86,13 @@ class Settings(BaseSettings):
     max_connections: PositiveInt = Field(default=512, description="most connections at once")
     hosts: Names = Field(
         default=(),
-        description="names that requests may call it by, separated by commas, or *; by default any, and without a key "
-        "on loopback that machine's own",
+        description="host names that requests may use, separated by commas, or *; by default any, and without a key "
+        "on loopback only names of this machine",
     )
     trusted_proxies: Names = Field(
-        default=(), description="addresses or networks of proxies whose X-Forwarded-For is believed"
+        default=(), description="addresses or networks of proxies whose X-Forwarded-For is trusted"
     )
-    api_key: SecretStr | None = Field(default=None, description="key that requests must bring; by default none")
+    api_key: SecretStr | None = Field(default=None, description="key that requests must have; by default none")
     cors_origins: Names = Field(default=(), description="origins whose pages may call, separated by commas, or *")
     embed_origins: Names = Field(
         default=(), description="origins whose pages may show the page's viewer in a frame, separated by commas, or *"
@@ -101,7 +101,7 @@ class Settings(BaseSettings):
 
     @field_validator("api_key")
     @classmethod
-    def _as_a_header_can_say_it(cls, key: SecretStr | None) -> SecretStr | None:
+    def _printable_key(cls, key: SecretStr | None) -> SecretStr | None:
         if key is not None and not re.fullmatch(r"[!-~]([ -~]*[!-~])?", key.get_secret_value()):
             raise ValueError("a key has printable ASCII characters only, without line breaks or spaces around it")
         return key
@@ -109,12 +109,12 @@ class Settings(BaseSettings):
     @field_validator("trusted_proxies")
     @classmethod
     def _networks(cls, proxies: tuple[str, ...]) -> tuple[str, ...]:
-        # With host bits set a network would be taken for a name.
+        # Uvicorn takes a network with host bits for a name.
         return tuple(str(ipaddress.ip_network(proxy, strict=False)) for proxy in proxies)
 
     @field_validator("cors_origins", "embed_origins")
     @classmethod
-    def _as_browsers_say_them(cls, origins: tuple[str, ...]) -> tuple[str, ...]:
+    def _origins(cls, origins: tuple[str, ...]) -> tuple[str, ...]:
         for origin in origins:
             if origin != "*" and not re.fullmatch(r"https?://[^/\s]+", origin):
                 raise ValueError(f"an origin is like https://a.example, without a path, or *, not {origin}")
@@ -122,7 +122,7 @@ class Settings(BaseSettings):
 
 
 def is_loopback(host: str) -> bool:
-    """Whether only this machine reaches what listens on an address or name."""
+    """Return whether only this machine can reach an address or name."""
     try:
         return ipaddress.ip_address(host).is_loopback
     except ValueError:
@@ -130,6 +130,6 @@ def is_loopback(host: str) -> bool:
 
 
 def unknown_variables() -> list[str]:
-    """Variables of the environment that look like settings but are none."""
+    """Return environment variables with the prefix of settings that are no settings."""
     known = {(PREFIX + name).upper() for name in Settings.model_fields}
     return sorted(name for name in os.environ if name.upper().startswith(PREFIX) and name.upper() not in known)

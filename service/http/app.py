@@ -1,4 +1,4 @@
-"""The application: wiring and lifespan, nothing else."""
+"""The application: its parts, their start and their end."""
 
 from __future__ import annotations
 
@@ -13,19 +13,14 @@ from starlette.middleware.cors import CORSMiddleware
 from threadpoolctl import threadpool_limits
 
 from shapespace import __version__
-from shapespace.service.http import problems
+from shapespace.service.http import error_handlers
 from shapespace.service.http.caching import AnswerCache
 from shapespace.service.http.connections import Connections
 from shapespace.service.http.dependencies import Service, known_query
 from shapespace.service.http.description import describe
-from shapespace.service.http.middleware import (
-    AnswerHead,
-    LimitBody,
-    LimitUnreadAnswers,
-    Observe,
-    RequireHost,
-    RequireKey,
-)
+from shapespace.service.http.middleware.access import RequireHost, RequireKey
+from shapespace.service.http.middleware.memory import LimitBody, LimitUnreadAnswers
+from shapespace.service.http.middleware.observe import HeadAsGet, Observe
 from shapespace.service.http.routes import (
     blend_shapes,
     codes,
@@ -47,41 +42,41 @@ from shapespace.service.repository.repository import ModelRepository
 from shapespace.service.repository.validation import BundleValidator
 from shapespace.service.settings import Settings, is_loopback
 
-#: Headers that pages of other origins may send, and those of answers that they may read.
+#: Headers that pages of other origins may send, and headers of answers that they may read.
 CORS_REQUEST = ["Authorization", "Content-Type", "If-None-Match", "Inference-Header-Content-Length"]
 CORS_REQUEST += ["X-API-Key", "X-Request-ID"]
 CORS_ANSWER = ["Content-Disposition", "ETag", "Inference-Header-Content-Length", "Location", "Retry-After"]
 CORS_ANSWER += ["Server-Timing", "Shape-Color", "Shape-Diagnostics", "X-Request-ID"]
-#: Names of the loopback interface.
+#: Host names of the loopback interface.
 LOOPBACK = ("localhost", "127.0.0.1", "[::1]")
 
 
 def create_app(settings: Settings | None = None, validator: BundleValidator | None = None) -> FastAPI:
-    """The service as an ASGI application; bundles are loaded when it starts.
+    """Return the service as an ASGI application; it loads the bundles when it starts.
 
     Args:
-        settings: by default from the environment.
-        validator: of these bundles, where it has begun already.
+        settings: settings of the server; by default from the environment.
+        validator: validation of the bundles that has begun already.
     """
     settings = settings or Settings()
 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
-        # The workers are the only threads: those of BLAS would multiply with them.
+        # BLAS computes in the thread that calls it: its own threads would multiply with the workers.
         with threadpool_limits(1):
             workers = Workers(settings.workers, settings.queue, settings.deadline)
             connections = Connections(settings.max_connections, settings.deadline, settings.trusted_proxies)
             repository = ModelRepository(settings.models_dir, settings.workers, validator)
             metrics = Metrics(repository, workers, connections.quota)
-            connections.refused = metrics.refused
+            connections.on_refusal = metrics.refused
             reloader = Reloader(repository, metrics)
             answers = AnswerCache(settings.cache)
             sandbox = Sandbox(min(settings.workers, UPLOADS))
             sandbox.prepare("read")
             app.state.service = Service(settings, repository, workers, connections, metrics, reloader, answers, sandbox)
-            # For what reads bodies and folders, beside the threads that compute.
+            # Threads that read bodies and folders, apart from the workers.
             asyncio.get_running_loop().set_default_executor(ThreadPoolExecutor(2, thread_name_prefix="reading"))
-            chores = [asyncio.create_task(connections.sweep())]
+            chores = [asyncio.create_task(connections.check_timeouts())]
             if settings.watch:
                 chores.append(asyncio.create_task(reloader.watch(settings.watch)))
             yield
@@ -99,12 +94,12 @@ def create_app(settings: Settings | None = None, validator: BundleValidator | No
         middleware=_middleware(settings),
         dependencies=[Depends(known_query)],
         generate_unique_id_function=lambda route: route.name,
-        # Their pages load scripts from elsewhere.
+        # FastAPI's pages load scripts from other servers.
         docs_url=None,
         redoc_url=None,
         openapi_url=None,
     )
-    problems.install(app)
+    error_handlers.install(app)
     calls = (models, shapes, blend_shapes, codes, fits, interpolations, open_inference, health, operation, page)
     routers = [module.router for module in calls]
     for router in routers:
@@ -115,9 +110,9 @@ def create_app(settings: Settings | None = None, validator: BundleValidator | No
 
 
 def _middleware(settings: Settings) -> list[Middleware]:
-    """From the outside in."""
+    """Return the middleware, from the outermost to the innermost."""
     stack = [
-        Middleware(AnswerHead),
+        Middleware(HeadAsGet),
         Middleware(Observe),
         Middleware(LimitUnreadAnswers),
         Middleware(RequireHost, hosts=_hosts(settings)),
@@ -125,7 +120,7 @@ def _middleware(settings: Settings) -> list[Middleware]:
         Middleware(LimitBody, limit=settings.max_body, upload=settings.max_upload),
     ]
     if settings.cors_origins:
-        # Outermost, so that pages can read every refusal; a preflight brings no key.
+        # Outermost, so that pages can read every refusal, and because a preflight has no key.
         cors = Middleware(
             CORSMiddleware,
             allow_origins=settings.cors_origins,
@@ -138,10 +133,10 @@ def _middleware(settings: Settings) -> list[Middleware]:
 
 
 def _hosts(settings: Settings) -> tuple[str, ...]:
-    """Names that requests may be for; none stands for any."""
+    """Return the accepted host names; none accepts all."""
     given = tuple(host.lower() for host in settings.hosts)
     if "*" in given:
         return ()
-    # With a key no stranger's page gets an answer, and a server for others has names that it can't know.
+    # With a key, pages of other sites get no answer. A server for other machines cannot know its names.
     open_to_all = settings.api_key is not None or not is_loopback(settings.host)
     return given or (() if open_to_all else (*LOOPBACK, settings.host.lower()))

@@ -1,4 +1,4 @@
-"""Entity tags, and the answers given last, so that asking for one again costs nothing."""
+"""Entity tags, and a cache of recent answers."""
 
 from __future__ import annotations
 
@@ -27,24 +27,24 @@ def entity_tag(*parts: str | bytes) -> str:
 
 
 def cache_headers(tag: str) -> dict[str, str]:
-    """Headers that let a client keep an answer and ask whether it still holds."""
+    """Return headers that let a client keep an answer and ask whether it is still valid."""
     return {"ETag": tag, "Vary": "Accept", "Cache-Control": "no-cache"}
 
 
 def not_modified(request: Request, tag: str) -> Response | None:
-    """304 where the client has the answer already."""
-    # Not where it is "*": whether there is a shape at all is known only once it has been found.
+    """Return 304 if the client has the answer already."""
+    # "*" matches nothing: whether a code has a shape is known only once the shape has been computed.
     known = {part.strip().removeprefix("W/") for part in request.headers.get("if-none-match", "").split(",")}
     return Response(status_code=304, headers=cache_headers(tag)) if tag in known else None
 
 
 @dataclass(frozen=True)
 class CachedAnswer:
-    """A file as it was answered.
+    """A file in the cache.
 
     Attributes:
-        content: its bytes.
-        headers: those that belong to it, whoever asks.
+        content: bytes of the file.
+        headers: headers of every answer with this file.
     """
 
     content: bytes
@@ -52,23 +52,21 @@ class CachedAnswer:
 
     @property
     def size(self) -> int:
-        """Bytes that keeping it takes, nearly."""
+        """Approximate number of bytes in memory."""
         return len(self.content) + sum(len(name) + len(value) for name, value in self.headers.items()) + 1024
 
 
 class AnswerCache(LRUCache[str, CachedAnswer]):
-    """Answers by entity tag, which names all that their bytes depend on, as many of the last ones as fit.
-
-    Touched from the event loop only.
+    """The most recently used answers by entity tag, for the event loop only.
 
     Args:
-        limit: most bytes of all of them together.
+        limit: most bytes of all answers together.
     """
 
     def __init__(self, limit: int) -> None:
         super().__init__(limit, getsizeof=lambda answer: answer.size)
 
     def keep(self, tag: str, answer: CachedAnswer) -> None:
-        """Keep an answer instead of those that nobody has asked for the longest, unless it alone is too large."""
+        """Keep an answer in place of the least recently used ones, unless it is over the limit by itself."""
         with suppress(ValueError):
             self[tag] = answer

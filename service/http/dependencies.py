@@ -1,4 +1,4 @@
-"""What routes share: the parts of the running service, and the parameters they have in common."""
+"""Dependencies that routes share: the parts of the running service, and common parameters."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Annotated
 
 from fastapi import Depends, Path, Query, Request
-from pydantic import WithJsonSchema
+from pydantic import Field, WithJsonSchema
 from starlette.exceptions import HTTPException
 
 from shapespace.model.decoder import MeshChoice, Quality
@@ -29,7 +29,7 @@ class Service:
     """The parts of a running service.
 
     Attributes:
-        draining: whether it is about to end, so that nobody should send anything more.
+        draining: whether the server is shutting down, so that clients should use another one.
     """
 
     settings: Settings
@@ -43,7 +43,7 @@ class Service:
     draining: bool = False
 
 
-# All dependencies are coroutines: FastAPI runs plain functions in a pool of threads, which takes longer.
+# All dependencies are coroutines, because FastAPI runs plain functions in threads, which takes longer.
 async def _service(request: Request) -> Service:
     service: Service = request.app.state.service
     return service
@@ -57,7 +57,7 @@ async def _caller(request: Request) -> Caller:
         try:
             while (await request.receive())["type"] != "http.disconnect":
                 pass
-        except HTTPException as error:  # what still comes is too much
+        except HTTPException as error:  # the rest of the body is over the limit
             return error
         return DisconnectedError("The client closed the connection before its answer was ready.")
 
@@ -68,21 +68,24 @@ CallerDependency = Annotated[Caller, Depends(_caller)]
 
 ModelName = Annotated[str, Path(description="Name of a model.", examples=["freaky-torus"])]
 MeshQuery = Annotated[
-    MeshChoice | None, Query(alias="mesh", description="As in the body, over which it wins: `fine` or `coarse`.")
+    MeshChoice | None, Query(alias="mesh", description="Overrides `mesh` in the body: `fine` or `coarse`.")
 ]
 QualityQuery = Annotated[
-    Quality, Query(alias="quality", description="`draft` leaves Gauss–Newton out where the first guess is near enough.")
+    Quality, Query(alias="quality", description="`draft` omits Gauss–Newton if the first guess is accurate enough.")
 ]
 QualityOfBody = Annotated[
-    Quality | None, Query(alias="quality", description="As in the body, over which it wins: `full` or `draft`.")
+    Quality | None, Query(alias="quality", description="Overrides `quality` in the body: `full` or `draft`.")
 ]
-Version = Annotated[str | None, Query(description="Version of the model; by default the newest.")]
-Format = Annotated[
-    str | None, Query(description="Format of the answer, which wins over `Accept`; 406 lists the choices.")
+#: In the path of routes that name it there, as in the Open Inference Protocol; otherwise in the query.
+Version = Annotated[
+    str | None,
+    Field(description="Version of the model; by default the newest."),
+    WithJsonSchema({"type": "string", "examples": ["1"]}),
 ]
+Format = Annotated[str | None, Query(description="Format of the answer; overrides `Accept`. 406 lists the choices.")]
 
 
-# Calls _service itself: FastAPI would resolve nested dependencies again for every parameter, even cached ones.
+# Calls _service directly, because FastAPI would resolve a nested dependency again for every parameter.
 async def _model(request: Request, name: ModelName, version: Version = None) -> ShapeModel:
     return (await _service(request)).repository.get(name, version)
 
@@ -91,12 +94,12 @@ Model = Annotated[ShapeModel, Depends(_model)]
 
 
 def one_of(names: Iterable[str]) -> WithJsonSchema:
-    """Names that a parameter takes, for the description only: any other gets an answer that lists them."""
+    """Return the schema of a parameter with these values. Routes refuse other values with a list of choices."""
     return WithJsonSchema({"type": "string", "enum": [*names]})
 
 
 async def known_query(request: Request) -> None:
-    """Refuse parameters that the description of a call doesn't list; raises ProblemError, invalid-request."""
+    """Raise ProblemError for query parameters that the description of a call does not list."""
     known: dict[tuple[str, str], list[str]] = request.app.state.query_parameters
     listed = known.get((request.scope["route"].path, request.method))
     unknown = [] if listed is None else [name for name in request.query_params if name not in listed]

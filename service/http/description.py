@@ -1,4 +1,4 @@
-"""The contract as OpenAPI 3.1: what FastAPI gathers from the routes, and what it can't know."""
+"""OpenAPI 3.1: the description that FastAPI generates from the routes, completed."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from pydantic.json_schema import models_json_schema
 from shapespace.service.http.messages.bodies import JSONBody
 from shapespace.service.http.messages.open_inference import InferenceRequest
 from shapespace.service.http.messages.schemas import MeshAnswer, Problem
-from shapespace.service.http.middleware import OPEN
+from shapespace.service.http.middleware.access import OPEN
 from shapespace.service.http.problems import KINDS, MEDIA_TYPE
 from shapespace.service.use_cases.shape_formats import SHAPE_FORMATS
 from shapespace.service.use_cases.uploads import MEDIA_TYPES
 
 DESCRIPTION = """\
-Learned product shape manifolds of triangle meshes. A latent code goes through small networks to edge lengths
-and dihedral angles, and from those by Gauss–Newton to a mesh.
+Learned product shape manifolds of triangle meshes. Small networks map a latent code to edge lengths and
+dihedral angles. Gauss–Newton finds the mesh with these lengths and angles.
 
 Coordinates are in the units of the training meshes, indices start at 0, every mesh is rigidly aligned to the
 model's reference. Every error is a problem (RFC 9457) whose `detail` says what to do.
@@ -30,7 +30,7 @@ model's reference. Every error is a problem (RFC 9457) whose `detail` says what 
 _HEADERS = {
     name: {"description": description, "schema": {"type": "string"}}
     for name, description in {
-        "ETag": "Strong; the same from every replica. Sent back as `If-None-Match` it saves the work.",
+        "ETag": "Strong; the same from every replica. Send it back as `If-None-Match` to get 304.",
         "Shape-Diagnostics": (
             "JSON: `status`, `iterations`, `residual`, `flipped_faces`, `integrability`, `plausibility`, "
             "`inside_bounds`, `model`, `quality`."
@@ -38,7 +38,7 @@ _HEADERS = {
         "Server-Timing": "Milliseconds by stage: `network`, `reconstruct`, `encode`.",
     }.items()
 }
-#: Bodies that routes read by themselves or only answer with, beside those of JSONBody.
+#: Models of bodies that FastAPI does not see, in addition to the models of JSONBody.
 _MODELS: tuple[type[BaseModel], ...] = (InferenceRequest, Problem)
 _KEYS = {
     "bearer": {"type": "http", "scheme": "bearer"},
@@ -47,7 +47,7 @@ _KEYS = {
 
 
 def describe(app: FastAPI, routers: Iterable[APIRouter]) -> None:
-    """Have an application of some routers generate its description, and know each call's query parameters by it."""
+    """Let an application describe its routers, and store the query parameters of each call in its state."""
     bodies = dict(_bodies(routers))
 
     def generate() -> dict[str, Any]:
@@ -68,11 +68,11 @@ def describe(app: FastAPI, routers: Iterable[APIRouter]) -> None:
                 components["schemas"].pop(superfluous, None)
             components["schemas"] = dict(sorted((components["schemas"] | definitions["$defs"]).items()))
             components["securitySchemes"] = _KEYS
-            # The empty one: a server without a key, which is the default.
+            # The empty requirement stands for a server without a key, the default.
             schema["security"] = [{}, *({name: []} for name in _KEYS)]
             for path, calls in schema["paths"].items():
                 for method, call in calls.items():
-                    _correct(path, call)
+                    _correct_responses(path, call)
                     if model := bodies.get((path, method)):
                         schema_of = {"schema": {"$ref": f"#/components/schemas/{model.__name__}"}}
                         call["requestBody"] = {"required": True, "content": {"application/json": schema_of}}
@@ -88,7 +88,7 @@ def describe(app: FastAPI, routers: Iterable[APIRouter]) -> None:
 
 
 def binary(media_types: Mapping[str, str], description: str, *, cached: bool = True) -> dict[int | str, dict[str, Any]]:
-    """OpenAPI's description of an answer in one of several binary formats, with an entity tag where ``cached``."""
+    """Describe an answer in one of several binary formats, with an entity tag if ``cached``."""
     schema = {"schema": {"type": "string", "format": "binary"}}
     others = {media_type: schema for media_type in media_types.values() if media_type != "application/json"}
     headers = {name: header for name, header in _HEADERS.items() if cached or name != "ETag"}
@@ -96,12 +96,12 @@ def binary(media_types: Mapping[str, str], description: str, *, cached: bool = T
         200: {"description": description, "content": others, "headers": headers}
     }
     if cached:
-        answers[304] = {"description": "The client has this answer already, by `If-None-Match`."}
+        answers[304] = {"description": "The client has this answer already, as `If-None-Match` says."}
     return answers
 
 
 def mesh_answers(description: str) -> dict[int | str, dict[str, Any]]:
-    """OpenAPI's description of a mesh in one of its formats."""
+    """Describe a mesh in one of the formats of a shape."""
     answers = binary({name: format.media_type for name, format in SHAPE_FORMATS.items()}, description)
     answers[200]["model"] = MeshAnswer
     answers[200]["headers"] |= {
@@ -114,7 +114,7 @@ def mesh_answers(description: str) -> dict[int | str, dict[str, Any]]:
 
 
 def upload(description: str, fields: Mapping[str, Any] | None = None) -> dict[str, Any]:
-    """OpenAPI's description of a body that is a file, JSON of a mesh, or a form with a file and further fields."""
+    """Describe a body that is a file, JSON of a mesh, or a form with a file and further fields."""
     file = {"type": "string", "format": "binary", "description": description}
     form = {"type": "object", "properties": {"file": file, **(fields or {})}, "required": ["file"]}
     content = {
@@ -126,7 +126,7 @@ def upload(description: str, fields: Mapping[str, Any] | None = None) -> dict[st
 
 
 def problems(*statuses: int) -> dict[int | str, dict[str, Any]]:
-    """OpenAPI's description of the problems that a call may answer."""
+    """Describe the problems that a call may answer."""
     reference = {MEDIA_TYPE: {"schema": {"$ref": "#/components/schemas/Problem"}}}
     return {
         status: {
@@ -140,16 +140,16 @@ def problems(*statuses: int) -> dict[int | str, dict[str, Any]]:
 
 
 def _bodies(routers: Iterable[APIRouter]) -> Iterator[tuple[tuple[str, str], type[BaseModel]]]:
-    """The model of each call's body, by path and method."""
+    """Yield the model of each call's body, by path and method."""
     for route in (route for router in routers for route in router.routes if isinstance(route, APIRoute)):
         for dependency in route.dependant.dependencies:
             if isinstance(dependency.call, JSONBody):
                 yield from (((route.path, method.lower()), dependency.call.model) for method in route.methods or ())
 
 
-def _correct(path: str, call: dict[str, Any]) -> None:
+def _correct_responses(path: str, call: dict[str, Any]) -> None:
     responses = call["responses"]
-    # FastAPI supposes its own answer to bad parameters; every call that has any says which problems it answers.
+    # FastAPI adds its own answer to bad parameters; the routes declare the problems that they answer instead.
     if "application/json" in responses.get("422", {}).get("content", {}):
         del responses["422"]
     if OPEN.fullmatch(path):

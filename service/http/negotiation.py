@@ -1,4 +1,4 @@
-"""Formats: that of a body, and choosing one to answer in: ``?format=``, ``Accept`` with its weights, the default."""
+"""The media type of a body, and the choice of a format by ``?format=``, ``Accept``, or the default."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ from types import MappingProxyType
 
 from shapespace.service.http.problems import ProblemError
 
-#: Ranges of an ``Accept`` that are looked at, the first ones; browsers send less than ten.
+#: Number of media ranges of an ``Accept`` that are read, the first ones; browsers send less than ten.
 MOST_RANGES = 100
 
 
 def declared_type(headers: Mapping[str, str]) -> str:
-    """What a body is declared to be, without parameters; empty where nothing is said."""
+    """Return the media type that a body declares, without parameters; empty if it declares none."""
     return headers.get("content-type", "").split(";")[0].strip().lower()
 
 
@@ -22,14 +22,14 @@ def choose(
     accept: str | None,
     unavailable: Mapping[str, str] = MappingProxyType({}),
 ) -> str:
-    """Name of the format to answer in.
+    """Return the name of the format to answer in.
 
     Args:
-        formats: media type of each format by name; the first is the default, and of two formats with one
-            media type ``Accept`` gets the first.
-        format: the query parameter.
-        accept: the header.
-        unavailable: why a format that one may expect is not among them, by name.
+        formats: media type of each format by name. The first is the default. ``Accept`` gets the first of two
+            formats with one media type.
+        format: the query parameter ``format``.
+        accept: the header ``Accept``.
+        unavailable: reason why a format is missing that a client may expect, by name.
 
     Raises:
         ProblemError: not-acceptable, with the choices.
@@ -61,7 +61,7 @@ def _parse(part: str) -> tuple[str, float]:
 
 
 def _weight(media_type: str, ranges: list[tuple[str, float]]) -> float:
-    """Weight of the most specific range that covers a media type; 0 where none does (RFC 9110, 12.5.1)."""
+    """Return the weight of the most specific range that covers a media type; 0 if none does (RFC 9110, 12.5.1)."""
     for pattern in (media_type, media_type.split("/", maxsplit=1)[0] + "/*", "*/*"):
         weights = [weight for media_range, weight in ranges if media_range == pattern]
         if weights:

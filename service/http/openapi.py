@@ -1,4 +1,4 @@
-"""``python -m shapespace.service.http.openapi`` writes the contract, ``openapi/openapi.json``."""
+"""``python -m shapespace.service.http.openapi`` writes ``openapi/openapi.json``."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ TARGET = Path(__file__).parents[3] / "openapi" / "openapi.json"
 
 
 def document() -> str:
-    """The text of ``openapi/openapi.json``."""
+    """Return the text of ``openapi/openapi.json``."""
     return json.dumps(create_app(Settings()).openapi(), indent=2, ensure_ascii=False) + "\n"
 
 

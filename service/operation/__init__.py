@@ -1,1 +1,1 @@
-"""For whoever runs the server: its metrics, and loading bundles that changed on disk."""
+"""Metrics of the server, and reloading of bundles that changed on disk."""

@@ -1,4 +1,4 @@
-"""Figures for Prometheus. Every label takes its values from a list that requests can't lengthen."""
+"""Metrics for Prometheus. Requests cannot add values of labels."""
 
 from __future__ import annotations
 
@@ -13,24 +13,24 @@ from shapespace.service.limits.quota import Quota
 from shapespace.service.limits.workers import Workers
 from shapespace.service.repository.repository import Changes, ModelRepository
 
-#: From a cached answer to the default deadline, in seconds.
+#: Upper ends of histogram buckets in seconds, from a cached answer to the default deadline.
 BUCKETS = (0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1, 2.5, 5, 10, 30, 60)
 METHODS = frozenset({"GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS"})
 
 
 class Metrics:
-    """What a server counts and measures, with a registry of its own.
+    """Metrics of one server, in a registry of their own.
 
     Args:
-        repository: the models that are served.
-        workers: the threads that compute.
-        connections: how many are open, and may be.
+        repository: served models.
+        workers: threads that compute.
+        connections: number of open connections, and its limit.
     """
 
     def __init__(self, repository: ModelRepository, workers: Workers, connections: Quota) -> None:
         self.registry = registry = CollectorRegistry()
         ProcessCollector(registry=registry)
-        registry.register(_Models(repository))
+        registry.register(_ModelInfo(repository))
         self._requests = Counter(
             "shapespace_requests", "Requests answered.", ["route", "method", "status"], registry=registry
         )
@@ -75,10 +75,10 @@ class Metrics:
         """Count an answer.
 
         Args:
-            route: template of the path, never the path itself.
-            method: of the request; unknown ones share a label.
-            status: of the answer.
-            seconds: from the request's head to the answer's end.
+            route: template of the path, not the path.
+            method: method of the request; unknown methods share a label.
+            status: status of the answer.
+            seconds: time from the head of the request to the end of the answer.
         """
         method = method if method in METHODS else "other"
         self._requests.labels(route, method, str(status)).inc()
@@ -90,18 +90,18 @@ class Metrics:
             self._stages.labels(stage).observe(duration)
 
     def refused(self, kind: str) -> None:
-        """Count a connection that was refused without a whole request."""
+        """Count a connection refused before a whole request arrived."""
         self._refusals.labels(kind).inc()
 
     def reloaded(self, changes: Changes) -> None:
-        """Count a look at the models folder."""
+        """Count the results of a reload."""
         for result in ("loaded", "removed", "refused"):
             self._reloads.labels(result).inc(len(getattr(changes, result)))
         self._reloads.labels("failed").inc(changes.failed)
 
 
-class _Models(Collector):
-    """The models that are served when somebody asks."""
+class _ModelInfo(Collector):
+    """Names, versions and digests of the served models."""
 
     def __init__(self, repository: ModelRepository) -> None:
         self._repository = repository

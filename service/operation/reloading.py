@@ -1,4 +1,4 @@
-"""Taking up changed bundles while the server runs."""
+"""Loading changed bundles while the server runs."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ logger = logging.getLogger(__name__)
 
 
 class Reloader:
-    """Reloads the models when told to, or when their folder changes; one reload at a time."""
+    """Reloads the models on request, or when their folder changes; one reload at a time."""
 
     def __init__(self, repository: ModelRepository, metrics: Metrics) -> None:
         self._repository, self._metrics = repository, metrics
         self._lock = asyncio.Lock()
 
     async def reload(self) -> None:
-        """Take up the folder as it is; requests go on in the meantime."""
+        """Load the folder as it is now, while requests go on."""
         async with self._lock:
             try:
                 changes = await asyncio.to_thread(self._repository.reload)
@@ -35,9 +35,9 @@ class Reloader:
             )
 
     async def watch(self, seconds: float) -> None:
-        """Look at the folder again and again, and reload once a change has come to rest.
+        """Check the folder regularly, and reload once a change is complete: when two checks find the same.
 
-        By looking and not by notifications, which network and container file systems don't deliver.
+        Checks replace notifications, which network and container file systems do not deliver.
         """
         before = self._repository.seen
         while True:

@@ -1,1 +1,1 @@
-"""The bundles being served: found, validated in a process of their own, swapped while requests run."""
+"""The served bundles: their validation in a separate process, and their replacement while requests run."""

@@ -1,4 +1,4 @@
-"""The bundles that are served, by name and version, and how they change while requests run."""
+"""The served bundles by name and version, which can be reloaded while requests run."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ from shapespace.service.repository.validation import BundleValidator, bundle_fol
 
 logger = logging.getLogger(__name__)
 
-#: Changes when anything in a folder of bundles does: (path, size, time of change, inode) of each file.
+#: State of a folder of bundles: (path, size, time of change, inode) of each file.
 Signature = tuple[tuple[str, int, int, int], ...]
 
 
 class UnknownModelError(LookupError):
-    """No model of that name."""
+    """No model has this name."""
 
 
 class UnknownVersionError(LookupError):
@@ -40,13 +40,13 @@ class UnknownVersionError(LookupError):
 
 @dataclass(frozen=True)
 class Changes:
-    """What a look at the folder found, as NAME/VERSION.
+    """Result of a reload; bundles are given as NAME/VERSION.
 
     Attributes:
-        loaded: bundles that are new, or other than before.
-        removed: bundles that are no longer there.
-        refused: bundles that can't be trusted.
-        failed: whether the folder could not be looked at, so that nothing changed.
+        loaded: new or changed bundles.
+        removed: bundles that are gone.
+        refused: invalid bundles.
+        failed: whether the folder could not be read, so that nothing changed.
     """
 
     loaded: list[str] = field(default_factory=list)
@@ -56,21 +56,21 @@ class Changes:
 
 
 class ModelRepository:
-    """Every bundle of a folder that can be trusted.
+    """All valid bundles of a folder.
 
-    A bundle is read only when it has been loaded and run once in a process of its own, and if it is still the same
-    then. One that can't be trusted is left out with one line in the log, and the others are served. A model in use is
-    never altered: a reload builds what is new beside it and then puts another list of models in the place of the whole
-    list, so that a request which holds a model keeps it, and none sees one half of a change.
+    The server reads a bundle only after a separate process has loaded and run it once, and only if it is unchanged
+    since. An invalid bundle is refused with one line in the log; the others are served. A reload never alters a model
+    in use. It builds new models and then replaces the whole list at once. A request keeps the model that it holds, and
+    no request sees half of a change.
 
     Args:
-        folder: holds NAME/VERSION/; hidden entries and plain files beside the names are passed over.
-        threads: shapes that a model may work on at once.
-        validator: for the first look, where it has begun already.
+        folder: holds NAME/VERSION/; hidden entries and plain files are ignored.
+        threads: number of shapes that a model may compute at once.
+        validator: validation that has begun already, for the first load.
 
     Attributes:
-        refused: bundles that the latest look refused.
-        seen: the folder's signature before that look.
+        refused: bundles that the latest reload refused.
+        seen: signature of the folder before the latest reload.
     """
 
     def __init__(self, folder: Path, threads: int = 1, validator: BundleValidator | None = None) -> None:
@@ -82,21 +82,21 @@ class ModelRepository:
         self.reload()
 
     def reload(self) -> Changes:
-        """Take up the folder as it is; not to be called twice at once, and never raises for a bundle's sake.
+        """Load the folder as it is now. Do not call it twice at once; it never raises because of a bundle.
 
-        A model whose bundle is the same byte for byte stays as it is. Where a bundle can't be trusted any more, or
-        the whole folder is out of reach, what was loaded before stays.
+        A model whose bundle is identical byte for byte stays. If a bundle has become invalid, its old model stays. If
+        the folder cannot be read, every model stays.
         """
         try:
             return self._reload(self._validator)
         finally:
             self._validator.close()
-            self._validator = BundleValidator()  # which has no process before there is something to validate
+            self._validator = BundleValidator()  # it starts no process before there is a bundle to validate
             if self._closed:
                 self._validator.close()
 
     def _reload(self, validator: BundleValidator) -> Changes:
-        self.seen = self.signature()  # first, so that what changes from now on makes a difference
+        self.seen = self.signature()  # first, so that changes from now on are noticed
         try:
             folders, unreadable = bundle_folders(self._folder)
         except OSError as error:
@@ -114,7 +114,7 @@ class ModelRepository:
             place = printable(f"{folder.parent.name}/{folder.name}")
             model = before.pop((folder.parent.name, folder.name), None)
             try:
-                new = self._take_up(folder, model, validator)
+                new = self._load(folder, model, validator)
                 if new is not model:
                     changes.loaded.append(place)
                     logger.info("bundle %s is served", place)
@@ -142,12 +142,12 @@ class ModelRepository:
         return changes
 
     def close(self) -> None:
-        """End validations that still run; the bundles that they were for stay as they are."""
+        """End running validations; their bundles stay as they are."""
         self._closed = True
         self._validator.close()
 
-    def _take_up(self, folder: Path, model: ShapeModel | None, validator: BundleValidator) -> ShapeModel:
-        """The model of a bundle: the one there is, or a new one where the bundle has changed."""
+    def _load(self, folder: Path, model: ShapeModel | None, validator: BundleValidator) -> ShapeModel:
+        """Return the model of a bundle: the present one, or a new one if the bundle has changed."""
         check_place(folder)
         if model is not None and manifest_digest(folder) == model.digest:
             read_files(folder, model.manifest)
@@ -155,9 +155,9 @@ class ModelRepository:
         return ShapeModel(read_bundle(folder, validator.digest(folder)), self._threads)
 
     def signature(self) -> Signature:
-        """Something that differs once any bundle does, without reading one."""
+        """Return the state of the folder, which changes with any bundle, without reading bundles."""
         found = []
-        with suppress(OSError):  # being changed at this moment: the next look will tell
+        with suppress(OSError):  # the folder is changing; the next check compares again
             for version in bundle_folders(self._folder)[0]:
                 found.append((str(version), 0, 0, 0))
                 with suppress(OSError), os.scandir(version) as entries:
@@ -167,22 +167,22 @@ class ModelRepository:
         return tuple(sorted(found))
 
     def __iter__(self) -> Iterator[ShapeModel]:
-        """The newest version of every model, by name."""
+        """Iterate over the newest version of every model, by name."""
         return (versions[max(versions)] for _, versions in sorted(self._models.items()))
 
     def __len__(self) -> int:
         return len(self._models)
 
     def all(self) -> Iterator[ShapeModel]:
-        """Every version of every model."""
+        """Return every version of every model."""
         return (model for versions in self._models.values() for model in versions.values())
 
     def versions(self, name: str) -> list[str]:
-        """Versions of a model, oldest first, by number; raises UnknownModelError."""
+        """Return the versions of a model, oldest first; raises UnknownModelError."""
         return [str(version) for version in sorted(self._named(name))]
 
     def get(self, name: str, version: str | None = None) -> ShapeModel:
-        """A model, the newest version by default; raises UnknownModelError or UnknownVersionError."""
+        """Return a model, by default its newest version; raises UnknownModelError or UnknownVersionError."""
         versions = self._named(name)
         for number, model in versions.items():
             if str(number) == version:
@@ -195,7 +195,7 @@ class ModelRepository:
         return versions[max(versions)]
 
     def by_digest(self, prefix: str) -> ShapeModel | None:
-        """The model whose digest begins with ``prefix``."""
+        """Return the model whose digest begins with ``prefix``."""
         return next((model for model in self.all() if model.digest.startswith(prefix)), None)
 
     def _named(self, name: str) -> Mapping[int, ShapeModel]:
@@ -207,16 +207,16 @@ class ModelRepository:
 
 
 def _is_new(folder: Path, model: ShapeModel | None) -> bool:
-    """Whether there is a bundle to validate, other than the one that is served."""
+    """Return whether a folder holds a bundle that differs from the served model."""
     try:
         check_place(folder)
         return model is None or manifest_digest(folder) != model.digest
     except (BundleError, OSError):
-        return False  # whoever takes it up says why
+        return False  # loading the bundle reports the reason
 
 
 def _reason(error: Exception) -> str:
-    """What is wrong with a bundle, in one line."""
+    """Return the fault of a bundle in one line."""
     match error:
         case FailedError(kind=FailedError.UNEXPECTED) | DiedError() | LateError() | OutOfMemoryError():
             text = f"tried in a process of its own, {error}"

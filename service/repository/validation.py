@@ -1,4 +1,4 @@
-"""Bundles of a folder, and their validation in a process of its own before the server reads them itself."""
+"""The bundles of a folder, and their validation in a separate process before the server reads them."""
 
 from __future__ import annotations
 
@@ -6,25 +6,40 @@ import os
 import threading
 from collections.abc import Iterable
 from concurrent.futures import CancelledError, Future, ThreadPoolExecutor
+from dataclasses import dataclass
 from pathlib import Path
 
 from shapespace.service.limits.sandbox import Sandbox
 from shapespace.service.limits.sandbox_errors import ClosedError
 from shapespace.solve.deadline import Deadline
 
-#: Limits of validating one bundle: seconds, and memory in bytes, to which this many times the size of its files is
-#: added: a network is in memory as read, as parsed, as checked, and three times in ONNX Runtime while that loads it.
-#: The memory of the solver is added once the size of the mesh is known.
-SECONDS, MEMORY, MEMORY_PER_BYTE = 60.0, 512 * 2**20, 6
-#: Largest size of the files that counts towards that, which is also the largest that a bundle may have.
-_MOST = 2**30
+
+@dataclass(frozen=True)
+class ValidationLimits:
+    """Limits on the validation of one bundle. Memory for the solver is added once the size of the mesh is known.
+
+    Attributes:
+        seconds: time.
+        memory: bytes, in addition to the bytes for the files.
+        copies: factor of the size of the files. While ONNX Runtime loads a network, memory holds it as read, as parsed,
+            as checked, and three times in ONNX Runtime.
+        files: largest size in bytes of all files of a bundle.
+    """
+
+    seconds: float = 60.0
+    memory: int = 512 * 2**20
+    copies: int = 6
+    files: int = 2**30
+
+
+LIMITS = ValidationLimits()
 
 
 def bundle_folders(folder: Path) -> tuple[list[Path], dict[Path, OSError]]:
-    """Folders NAME/VERSION, and those of names that can't be read; hidden entries and plain files are passed over.
+    """Return folders NAME/VERSION, and folders NAME that cannot be read; hidden entries and plain files are ignored.
 
     Raises:
-        OSError: the folder itself can't be read.
+        OSError: the folder cannot be read.
     """
     found: list[Path] = []
     unreadable = {}
@@ -38,7 +53,7 @@ def bundle_folders(folder: Path) -> tuple[list[Path], dict[Path, OSError]]:
 
 
 class BundleValidator:
-    """Validates bundles one after the other, ahead of whoever asks for the outcome."""
+    """Validates bundles one after the other in the background."""
 
     def __init__(self) -> None:
         self._sandbox = Sandbox(1)
@@ -47,22 +62,22 @@ class BundleValidator:
         self._lock, self._closed = threading.Lock(), False
 
     def prepare(self) -> None:
-        """Have a process import what validation needs; doesn't wait for it."""
+        """Start a process that imports the modules of validation; does not wait for it."""
         self._sandbox.prepare("validate")
 
     def begin(self, folders: Iterable[Path]) -> None:
-        """Validate bundles that haven't been, in this order; doesn't wait for them."""
+        """Start to validate bundles that are not validated yet, in this order; does not wait for them."""
         for folder in folders:
             with self._lock:
                 if folder not in self._digests and not self._closed:
                     self._digests[folder] = self._thread.submit(self._validate, folder)
 
     def digest(self, folder: Path) -> str:
-        """The digest of a bundle that has passed.
+        """Return the digest of a valid bundle, and wait for its validation.
 
         Raises:
-            SandboxError: what is wrong with it.
-            ClosedError: it has not been validated.
+            SandboxError: the bundle is invalid.
+            ClosedError: the validator was closed before.
         """
         self.begin([folder])
         try:
@@ -71,15 +86,17 @@ class BundleValidator:
             raise ClosedError("nothing is validated any more") from None
 
     def close(self) -> None:
-        """End what still runs."""
+        """End running validations."""
         with self._lock:
             self._closed = True
         self._sandbox.close()
         self._thread.shutdown(cancel_futures=True)
 
     def _validate(self, folder: Path) -> str:
-        memory = MEMORY + MEMORY_PER_BYTE * min(_bytes(folder), _MOST)
-        facts, _ = self._sandbox.call("validate", {"folder": str(folder)}, deadline=Deadline(SECONDS), memory=memory)
+        memory = LIMITS.memory + LIMITS.copies * min(_bytes(folder), LIMITS.files)
+        facts, _ = self._sandbox.call(
+            "validate", {"folder": str(folder)}, deadline=Deadline(LIMITS.seconds), memory=memory
+        )
         return str(facts["digest"])
 
 
@@ -88,4 +105,4 @@ def _bytes(folder: Path) -> int:
         with os.scandir(folder) as entries:
             return sum(entry.stat(follow_symlinks=False).st_size for entry in entries)
     except OSError:
-        return 0  # validation will say
+        return 0  # validation reports the reason

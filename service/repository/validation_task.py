@@ -1,4 +1,4 @@
-"""Validating a bundle before it is served; runs in a sandbox's child."""
+"""Validation of a bundle before it is served, as a task of a sandbox."""
 
 from __future__ import annotations
 
@@ -13,29 +13,30 @@ from shapespace.service.limits.sandbox_errors import FailedError
 from shapespace.service.limits.sandbox_wire import Arrays, Facts
 from shapespace.solve.cholesky import SymmetricPattern, analyse
 
-#: Memory, in bytes, that the solver may take for each vertex of the coarse mesh (about twice what it needs), and in
-#: all.
-OF_A_VERTEX, MOST_OF_VERTICES = 64 * 2**10, 4 * 2**30
-# Loads the library for factorisations now: its time and memory must not count against the first bundle.
+#: Bytes that the solver may take for each vertex of the coarse mesh, about twice its need.
+MEMORY_PER_VERTEX = 64 * 2**10
+#: Most bytes that the solver may take.
+SOLVER_MEMORY = 4 * 2**30
+# Loads the library of factorisations now, because its time and memory must not count for the first bundle.
 analyse(SymmetricPattern(1, np.array([0]), np.array([0])))
 
 
 def validate_bundle(body: bytearray, folder: str) -> tuple[Facts, Arrays]:
-    """Load a bundle, and do once what serving does with it.
+    """Load a bundle, and compute with it once as the server does.
 
     Args:
         body: empty.
-        folder: of the bundle.
+        folder: folder of the bundle.
 
     Returns:
-        Its ``digest``.
+        The ``digest`` of the bundle.
 
     Raises:
-        FailedError: it must not be served, and why.
+        FailedError: the bundle must not be served; the message says why.
     """
     try:
         bundle = read_bundle(Path(folder))
-        allow(min(OF_A_VERTEX * bundle.manifest.vertices, MOST_OF_VERTICES))
+        allow(min(MEMORY_PER_VERTEX * bundle.manifest.vertices, SOLVER_MEMORY))
         Decoder(bundle).self_test()
     except (BundleError, OSError) as error:
         raise FailedError("refused", str(error)) from None

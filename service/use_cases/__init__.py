@@ -1,1 +1,1 @@
-"""What the service does, without HTTP: values in; answer, diagnostics and timings out."""
+"""The calls of the service without HTTP: from values to an answer with diagnostics and timings."""

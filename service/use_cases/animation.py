@@ -1,4 +1,4 @@
-"""Paths through latent space, frame by frame, and the ids that hold them."""
+"""Paths through latent space, their frames, and the ids that hold a whole animation."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import base64
 import binascii
 import hashlib
 import zlib
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import Annotated
 
@@ -19,27 +20,44 @@ from shapespace.model.latent_space import LatentSpace
 from shapespace.service.use_cases.fields import Body, Number, Whole
 from shapespace.service.use_cases.shape_formats import holds_more_values
 
-#: Longest id: behind most proxies a whole URL may take 16 KiB at most.
-ID_LIMIT = 15_000
-#: Bytes that an id may unpack to, and values in them: reading one takes a few milliseconds at most.
-_PAYLOAD_LIMIT, _VALUES_LIMIT = 2**16, 2**13
-_CHECKSUM_BYTES = 9
-_DIGEST_DIGITS = 32
+
+@dataclass(frozen=True)
+class IdFormat:
+    """Format and limits of an animation's id: base64 of a checksum and compressed JSON.
+
+    With these limits, reading an id takes a few milliseconds at most.
+
+    Attributes:
+        length: most characters of an id; most proxies allow a URL of at most 16 KiB.
+        payload_bytes: most bytes that an id may unpack to.
+        values: most JSON values in these bytes.
+        checksum_bytes: length of the checksum, the first bytes of SHA-256 of the JSON.
+        digest_digits: number of hexadecimal digits of the model's digest that an id holds.
+    """
+
+    length: int = 15_000
+    payload_bytes: int = 2**16
+    values: int = 2**13
+    checksum_bytes: int = 9
+    digest_digits: int = 32
+
+
+ID = IdFormat()
 
 
 class UnknownInterpolationError(LookupError):
-    """An id that this server can't answer."""
+    """No animation has this id on this server."""
 
 
 class PathTooLongError(ValueError):
-    """Keyframes that don't fit into an id."""
+    """The keyframes do not fit into an id."""
 
 
 class Animation(Body):
     """A piecewise linear path through latent codes, sampled at equal steps.
 
-    Frame k of n lies at ``t = start + k (stop − start) / (n − 1)``, where 0 is the first keyframe and 1 the
-    last. Outside [0, 1] the first or the last segment goes on in a straight line. Angles take the shorter
+    Frame k of n lies at ``t = start + k (stop − start) / (n − 1)``; t is 0 at the first keyframe and 1 at the last.
+    Outside [0, 1], the first or the last segment continues in a straight line. Periodic coordinates take the shorter
     arc.
     """
 
@@ -54,23 +72,22 @@ class Animation(Body):
     ] = Field(min_length=2, description="At least two latent codes.")
     times: Annotated[list[Number], Field(fail_fast=True)] | None = Field(
         None,
-        description="Increasing times of the keyframes, in any unit; by default equally far apart. With "
-        "`loop` the way back to the first keyframe takes the average of the other segments.",
+        description="Increasing times of the keyframes in any unit; equal distances by default. With `loop`, the "
+        "last segment, back to the first keyframe, takes the mean time of the others.",
     )
     frames: Whole = Field(
         30,
         ge=2,
-        description="n, the number of frames, both ends included; `loop` leaves the last one out.",
+        description="Number n of frames, including both ends; `loop` leaves out the last frame.",
     )
     start: Number = Field(0.0, description="t of the first frame; below 0 extrapolates.")
     stop: Number = Field(1.0, description="t of the last frame; above 1 extrapolates.")
     loop: bool = Field(
         False,
         strict=True,
-        description="Append the first keyframe, and drop the last of the n frames, so that the "
-        "animation repeats without a jump.",
+        description="Append the first keyframe and drop the last frame, so that the animation repeats without a jump.",
     )
-    mesh: MeshChoice = Field(MeshChoice.FINE, description="Which mesh the frames have.")
+    mesh: MeshChoice = Field(MeshChoice.FINE, description="The mesh of the frames, fine or coarse.")
 
     @field_validator("times")
     @classmethod
@@ -89,16 +106,16 @@ class Animation(Body):
 
     @property
     def frame_count(self) -> int:
-        """Frames that are answered: ``frames``, or one less with ``loop``."""
+        """Number of answered frames: ``frames``, or one less with ``loop``."""
         return self.frames - self.loop
 
     @property
     def positions(self) -> FloatArray:
-        """T of each answered frame."""
+        """Position t of each answered frame, (n,)."""
         return (self.start + np.arange(self.frames) * (self.stop - self.start) / (self.frames - 1))[: self.frame_count]
 
     def codes(self, latents: LatentSpace, which: slice = slice(None)) -> list[list[float]]:
-        """Code of each frame, or of some, (n, m), angles not yet reduced; raises LatentError."""
+        """Return the codes (n, m) of all or some frames, periodic coordinates not reduced; raises LatentError."""
         keyframes = latents.codes(self.keyframes)[0].astype(np.float64)
         knots = np.arange(len(keyframes), dtype=np.float64) if self.times is None else np.array(self.times)
         if self.loop:
@@ -108,58 +125,58 @@ class Animation(Body):
         t = knots[0] + self.positions[which] * (knots[-1] - knots[0])
         segment = np.clip(np.searchsorted(knots, t, side="right") - 1, 0, len(knots) - 2)
         share = ((t - knots[segment]) / (knots[segment + 1] - knots[segment]))[:, None]
-        # This form gives both keyframes exactly, at 0 and at 1.
+        # This form gives both keyframes exactly, at share 0 and 1.
         codes: list[list[float]] = ((1 - share) * keyframes[segment] + share * keyframes[segment + 1]).tolist()
         return codes
 
     def to_id(self, model_digest: str, latents: LatentSpace) -> str:
-        """A name that holds the whole animation, so that any replica can answer it at any time.
+        """Return an id that holds the whole animation, so that any replica can answer it at any time.
 
-        The content is brought to its canonical form first: equal animations of a model have equal ids.
+        The id is of the animation's canonical form: equal animations of a model have equal ids.
 
         Raises:
-            LatentError: a keyframe that is no code of the model.
-            PathTooLongError: too many keyframes for a URL.
+            LatentError: a keyframe is no code of the model.
+            PathTooLongError: there are too many keyframes for a URL.
         """
         too_long = PathTooLongError(
             f"{len(self.keyframes)} keyframes of {latents.dimension} numbers don't fit into an "
             "interpolation's address. Send fewer keyframes, or the parts of the path one by one."
         )
-        if len(self.keyframes) + sum(map(len, self.keyframes)) > _VALUES_LIMIT:
-            raise too_long  # before anything is worked out from them
+        if len(self.keyframes) + sum(map(len, self.keyframes)) > ID.values:
+            raise too_long  # before computing anything from them
         content = self.model_dump(mode="json", exclude_none=True)
         content["keyframes"] = latents.codes(self.keyframes)[0]
-        content["model"] = model_digest[:_DIGEST_DIGITS]
+        content["model"] = model_digest[: ID.digest_digits]
         payload = orjson.dumps(content, option=orjson.OPT_SERIALIZE_NUMPY | orjson.OPT_SORT_KEYS)
         packed = _checksum(payload) + zlib.compress(payload, 9)
         name = base64.urlsafe_b64encode(packed).rstrip(b"=").decode()
-        if len(name) > ID_LIMIT or len(payload) > _PAYLOAD_LIMIT or holds_more_values(payload, _VALUES_LIMIT):
+        if len(name) > ID.length or len(payload) > ID.payload_bytes or holds_more_values(payload, ID.values):
             raise too_long
         return name
 
     @classmethod
     def from_id(cls, name: str) -> tuple[Animation, str]:
-        """The animation of an id, and the digits that its model's digest begins with.
+        """Return the animation of an id, and the first digits of its model's digest.
 
         Raises:
-            UnknownInterpolationError: damaged, made up, or from another version of this software.
+            UnknownInterpolationError: the id is damaged, invented, or from another version of this software.
         """
         try:
-            if len(name) > ID_LIMIT:
+            if len(name) > ID.length:
                 raise ValueError
             packed = base64.b64decode(name + "=" * (-len(name) % 4), altchars=b"-_", validate=True)
             inflate = zlib.decompressobj()
-            # Bounded: a short id could otherwise unpack to gigabytes.
-            payload = inflate.decompress(packed[_CHECKSUM_BYTES:], _PAYLOAD_LIMIT)
-            if not inflate.eof or inflate.unused_data or packed[:_CHECKSUM_BYTES] != _checksum(payload):
+            # With a limit, because a short id could unpack to gigabytes.
+            payload = inflate.decompress(packed[ID.checksum_bytes :], ID.payload_bytes)
+            if not inflate.eof or inflate.unused_data or packed[: ID.checksum_bytes] != _checksum(payload):
                 raise ValueError
             if base64.urlsafe_b64encode(packed).rstrip(b"=").decode() != name:
                 raise ValueError
-            if holds_more_values(payload, _VALUES_LIMIT):
+            if holds_more_values(payload, ID.values):
                 raise ValueError
             content = orjson.loads(payload)
             digest = content.pop("model")
-            if not isinstance(digest, str) or len(digest) != _DIGEST_DIGITS:
+            if not isinstance(digest, str) or len(digest) != ID.digest_digits:
                 raise ValueError
             return cls.model_validate(content), digest
         except (ValueError, KeyError, AttributeError, TypeError, binascii.Error, zlib.error, ValidationError):
@@ -170,4 +187,4 @@ class Animation(Body):
 
 
 def _checksum(payload: bytes) -> bytes:
-    return hashlib.sha256(payload).digest()[:_CHECKSUM_BYTES]
+    return hashlib.sha256(payload).digest()[: ID.checksum_bytes]

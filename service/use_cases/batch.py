@@ -1,4 +1,4 @@
-"""Work on many codes for one answer: side by side, within the memory it may hold, and written piece by piece."""
+"""Work on many codes for one answer: in parallel, within a limit of memory, and written piece by piece."""
 
 from __future__ import annotations
 
@@ -19,31 +19,31 @@ from shapespace.solve.deadline import Deadline
 from shapespace.solve.outcome import Status
 
 #: Seconds by stage. ``network``: inference; ``reconstruct``: Gauss–Newton; ``encode``: writing the file;
-#: ``read``: reading an uploaded file; ``search``: looking for a code.
+#: ``read``: reading an uploaded file; ``search``: searching for a code.
 Timings = dict[str, float]
-#: An answer whose arrays take at most this many bytes is made in one piece.
-WHOLE = 2**22
+#: Largest size in bytes of the arrays of an answer that is written in one piece.
+WHOLE_FILE_BYTES = 2**22
 S = TypeVar("S")
 T = TypeVar("T")
 
 
 class NoCodesError(ValueError):
-    """A request for no code at all."""
+    """A request asks for no code."""
 
 
 class TooManyCodesError(ValueError):
-    """A request for more codes than one answer may hold."""
+    """A request asks for more codes than one answer may hold."""
 
 
 class PiecewiseFile:
-    """A file that is written piece by piece, in a worker's thread, as fast as it is read.
+    """A file that a worker thread writes piece by piece, as fast as the client reads it.
 
-    It is a context manager, and holds the memory that it is made from until the context ends.
+    It is a context manager; its reservation of memory lasts until the context ends.
 
     Args:
-        pieces: of the file.
-        workers: whose threads make them.
-        held: released at the end.
+        pieces: computes the pieces of the file.
+        workers: threads that compute the pieces.
+        held: reservation of memory.
     """
 
     def __init__(self, pieces: Iterator[Buffer], workers: Workers, held: ExitStack) -> None:
@@ -63,14 +63,14 @@ class PiecewiseFile:
 
 
 @dataclass(frozen=True)
-class Written:
+class EncodedFile:
     """A file made from many codes.
 
     Attributes:
-        content: all of it, or its pieces where it is large.
+        content: the bytes of a small file, the pieces of a large one.
         seconds: time by stage; ``encode`` ends with the first piece.
-        diagnostics: one summary of all shapes, or nothing where none was reconstructed.
-        facts: what the format says about the file.
+        diagnostics: summary over all shapes; None if no shape was reconstructed.
+        facts: what the writer of the format reports about the file.
     """
 
     content: bytes | PiecewiseFile
@@ -83,57 +83,54 @@ class Batch:
     """An admitted request for many codes.
 
     Args:
-        workers: that compute.
-        call: the request's deadline.
-        size: bytes of what the answer is made from.
-        held: that memory.
+        workers: threads that compute.
+        call: deadline of the request.
+        size: bytes of the arrays of the answer.
+        held: reservation of this memory.
+
+    Attributes:
+        workers: the same as the argument.
     """
 
     def __init__(self, workers: Workers, call: Call, size: int, held: ExitStack) -> None:
-        self._workers, self._call, self._size, self._held = workers, call, size, held
+        self.workers, self._call, self._size, self._held = workers, call, size, held
 
     async def map(self, work: Callable[[S, Call], T], items: Iterable[S]) -> list[T]:
-        """Results of work on every item, side by side; raises as ``Workers.run``."""
-        async with aclosing(self._workers.map(work, items, self._call)) as results:
+        """Return the results of work on every item, computed in parallel; raises as ``Workers.run``."""
+        async with aclosing(self.workers.map(work, items, self._call)) as results:
             return [result async for result in results]
-
-    def solve(
-        self, model: ShapeModel, mesh: MeshChoice, quality: Quality, code: CheckedCode, deadline: Deadline
-    ) -> Shape:
-        """A code to its shape, in a worker's thread; raises DeadlineError."""
-        return solve(self._workers, model, mesh, quality, code, deadline)
 
     async def write(
         self,
         encode: Callable[[], tuple[Iterator[Buffer], Mapping[str, Any]]],
         seconds: Timings,
         diagnostics: Mapping[str, Any] | None = None,
-    ) -> Written:
-        """Write the file, or begin to where it is large.
+    ) -> EncodedFile:
+        """Write the file; of a large one only the first piece.
 
         Args:
-            encode: gives the pieces of the file, and facts about it.
-            seconds: time so far.
-            diagnostics: of all shapes.
+            encode: returns the pieces of the file, and facts about it.
+            seconds: time by stage so far.
+            diagnostics: summary over all shapes.
         """
         began = time.perf_counter()
 
         def start(_: Call) -> tuple[bytes | Buffer, Iterator[Buffer], Mapping[str, Any]]:
             pieces, facts = encode()
-            return (next(pieces) if self._size > WHOLE else b"".join(pieces)), pieces, facts
+            return (next(pieces) if self._size > WHOLE_FILE_BYTES else b"".join(pieces)), pieces, facts
 
-        first, rest, facts = await self._workers.run(start, self._call)
+        first, rest, facts = await self.workers.run(start, self._call)
         seconds = {**seconds, "encode": time.perf_counter() - began}
-        if isinstance(first, bytes) and self._size <= WHOLE:
-            return Written(first, seconds, diagnostics, facts)
-        return Written(
-            PiecewiseFile(chain([first], rest), self._workers, self._held.pop_all()), seconds, diagnostics, facts
+        if isinstance(first, bytes) and self._size <= WHOLE_FILE_BYTES:
+            return EncodedFile(first, seconds, diagnostics, facts)
+        return EncodedFile(
+            PiecewiseFile(chain([first], rest), self.workers, self._held.pop_all()), seconds, diagnostics, facts
         )
 
 
 @asynccontextmanager
 async def batch(workers: Workers, caller: Caller, size: int) -> AsyncIterator[Batch]:
-    """Count a request for many codes in, with the bytes that its answer is made from; raises BusyError."""
+    """Admit a request for many codes, and reserve bytes for the arrays of its answer; raises BusyError."""
     with workers.holding(caller, size) as held:
         async with workers.admit(caller) as call:
             yield Batch(workers, call, size, held)
@@ -142,7 +139,7 @@ async def batch(workers: Workers, caller: Caller, size: int) -> AsyncIterator[Ba
 def solve(
     workers: Workers, model: ShapeModel, mesh: MeshChoice, quality: Quality, code: CheckedCode, deadline: Deadline
 ) -> Shape:
-    """A code to its shape; raises DeadlineError."""
+    """Return the shape of a code; raises DeadlineError."""
     shape = model.shape(*code, mesh, deadline, quality)
     if shape.diagnostics.status is Status.DEADLINE:
         raise workers.late()
@@ -150,13 +147,13 @@ def solve(
 
 
 def total_seconds(seconds: Iterable[Timings]) -> Timings:
-    """Time of several shapes by stage."""
+    """Return the total time of several shapes by stage."""
     each = list(seconds)
     return {stage: sum(one[stage] for one in each) for stage in ("network", "reconstruct")}
 
 
 def require_count(count: int, most: int, field: str = "latents") -> None:
-    """Refuse requests for no code or more than allowed; raises NoCodesError or TooManyCodesError."""
+    """Raise NoCodesError for a request for no code, TooManyCodesError for one over the limit."""
     if count > most:
         raise TooManyCodesError(f"{field} asks for {count} codes; the limit is {most}. Send several requests.")
     if count == 0:

@@ -1,4 +1,4 @@
-"""A model as a GLB with a slider for each end of each coordinate."""
+"""A model as a GLB with a morph target for each bound of each coordinate."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from shapespace.solve.deadline import Deadline
 async def blend_shapes_file(
     workers: Workers, caller: Caller, model: ShapeModel, mesh: MeshChoice
 ) -> tuple[bytes, Timings]:
-    """The file, and the time that it took by stage.
+    """Return the GLB, and its time by stage.
 
     Raises:
-        PeriodicError: there are angles among the coordinates.
-        TooManyCodesError: more vertices, of all ends together, than one answer may hold.
-        NotFiniteError, ModelFailedError: the model has no shape for one of its ends.
-        BusyError, DeadlineError, DisconnectedError, EndingError: no place, or the call ended before.
+        PeriodicError: a coordinate is periodic, so that it has no bounds.
+        TooManyCodesError: all targets together have more vertices than one answer may hold.
+        NotFiniteError, ModelFailedError: the model has no shape at a bound.
+        BusyError, DeadlineError, DisconnectedError, EndingError: the queue is full, or the call ended early.
     """
     require_ends(model.decoder)
     size = shapes_size(model, 2 * model.latents.dimension + 1, mesh)

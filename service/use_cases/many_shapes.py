@@ -1,4 +1,4 @@
-"""Many codes to the positions of their vertices, with the true discrete exponentials on request."""
+"""Positions of the vertices of many shapes, with the true discrete exponentials on request."""
 
 from __future__ import annotations
 
@@ -17,21 +17,30 @@ from shapespace.model.exact_shapes import ExactShape, exact_shape, require_tange
 from shapespace.model.latent_space import Bounds, CheckedCode, Codes
 from shapespace.model.shape_model import ShapeModel
 from shapespace.service.limits.workers import Call, Caller, Workers
-from shapespace.service.use_cases.batch import Batch, Timings, TooManyCodesError, Written, batch, total_seconds
+from shapespace.service.use_cases.batch import (
+    Batch,
+    EncodedFile,
+    Timings,
+    TooManyCodesError,
+    batch,
+    solve,
+    total_seconds,
+)
 from shapespace.service.use_cases.nric import nric_size, predictions
-from shapespace.service.use_cases.one_shape import placed
+from shapespace.service.use_cases.one_shape import place_vertices
 from shapespace.service.use_cases.shape_formats import (
     diagnostics_arrays,
     exponential_arrays,
     exponential_lists,
     json_pieces,
-    worst,
+    summarise,
 )
 
-#: Vertices of all shapes of one answer together: 48 MiB of positions.
+#: Most vertices of all shapes of one answer together: 48 MiB of positions.
 MOST_VERTICES = 2**22
-BYTES_OF_A_VERTEX = 12
-#: Media types of the formats of many shapes by name; the first is the default.
+#: Three coordinates in float32.
+BYTES_PER_VERTEX = 12
+#: Media types of the formats of many shapes, by name; the first is the default.
 VERTICES_TYPES = {"json": "application/json", "npz": OCTET_STREAM}
 
 
@@ -41,8 +50,8 @@ class ShapeBatch:
 
     Attributes:
         vertices: (n, V, 3) float32, in the units of the training meshes.
-        diagnostics: how well each was found.
-        seconds: time of all of them by stage.
+        diagnostics: diagnostics of each shape.
+        seconds: total time by stage.
     """
 
     vertices: NDArray[np.float32]
@@ -63,26 +72,26 @@ async def vertices_file(
     exponentials: bool = False,
     place: Placement | None = None,
     faces: bool = True,
-) -> Written:
-    """Positions and diagnostics of the shapes of codes, in one of VERTICES_TYPES.
+) -> EncodedFile:
+    """Return positions and diagnostics of shapes, in a format of VERTICES_TYPES.
 
     Args:
-        workers: that compute.
-        caller: who waits.
-        model: whose codes they are.
-        latents: n lists of m numbers.
-        bounds: what to do outside the bounds.
+        workers: threads that compute.
+        caller: client that waits.
+        model: decodes the codes.
+        latents: n codes of m numbers.
+        bounds: what to do with codes outside the bounds.
         mesh: fine or coarse.
         format: name of the format.
-        quality: of the shapes.
-        exponentials: whether to compute the true discrete exponentials as well.
-        place: takes positions from where they are aligned to the reference to where they are wanted.
-        faces: whether NPZ has the mesh's faces, too.
+        quality: draft or full.
+        exponentials: whether to add the true discrete exponentials.
+        place: rigid motion and scale of the answer, relative to the reference.
+        faces: whether NPZ holds the faces of the mesh.
 
     Raises:
-        NoTangentSpaceError: exponentials of a model that has none.
-        LatentError: a code that can't be used.
-        TooManyCodesError, BusyError: more than one answer, or all together, may hold.
+        NoTangentSpaceError: the model has no exponentials.
+        LatentError: a code is invalid.
+        TooManyCodesError, BusyError: the shapes exceed the limit of one answer, or of all together.
         DeadlineError, DisconnectedError, EndingError: the call ended before the file was ready.
     """
     if exponentials:
@@ -92,8 +101,8 @@ async def vertices_file(
         found = await shapes(work, model, codes, inside, mesh, quality)
         true = await _exponentials(work, model, codes, found, mesh) if exponentials else None
         if place:
-            found = replace(found, vertices=placed(found.vertices, place).astype(np.float32))
-            true = [_placed(shape, place) for shape in true] if true else None
+            found = replace(found, vertices=place_vertices(found.vertices, place).astype(np.float32))
+            true = [_place_exact(shape, place) for shape in true] if true else None
 
         def encode() -> tuple[Iterator[Buffer], dict[str, Any]]:
             if format == "json":
@@ -105,17 +114,17 @@ async def vertices_file(
             arrays |= {"faces": model.mesh(mesh).faces} if faces else {}
             return npz_pieces(vertices=found.vertices, latents=codes, **arrays), {}
 
-        return await work.write(encode, found.seconds, worst(found.diagnostics))
+        return await work.write(encode, found.seconds, summarise(found.diagnostics))
 
 
-def _placed(exact: ExactShape, place: Placement) -> ExactShape:
+def _place_exact(exact: ExactShape, place: Placement) -> ExactShape:
     if exact.vertices is None or exact.mean is None or exact.max is None:
         return exact
-    vertices = placed(exact.vertices, place).astype(np.float32)
+    vertices = place_vertices(exact.vertices, place).astype(np.float32)
     return replace(exact, vertices=vertices, mean=place.scale * exact.mean, max=place.scale * exact.max)
 
 
-#: Writes the outputs of ``infer``, by name, to the pieces of a file and facts about it.
+#: Encodes the outputs of ``infer``, by name, as the pieces of a file and facts about it.
 WriteOutputs = Callable[[Mapping[str, NDArray[np.float32]]], tuple[Iterator[Buffer], Mapping[str, Any]]]
 
 
@@ -129,8 +138,8 @@ async def infer(
     quality: Quality,
     outputs: Sequence[str],
     write: WriteOutputs,
-) -> Written:
-    """The outputs of codes (n, m) that are wanted: ``nric`` (n, 2E), ``vertices`` (n, V, 3), or both.
+) -> EncodedFile:
+    """Return the requested outputs for codes (n, m): ``nric`` (n, 2E), ``vertices`` (n, V, 3), or both.
 
     Raises:
         LatentError, TooManyCodesError, BusyError, DeadlineError, DisconnectedError, EndingError: as ``vertices_file``.
@@ -139,7 +148,7 @@ async def infer(
     size = sum(
         shapes_size(model, len(codes), mesh) if name == "vertices" else nric_size(model, len(codes)) for name in outputs
     )
-    if size > BYTES_OF_A_VERTEX * MOST_VERTICES:
+    if size > BYTES_PER_VERTEX * MOST_VERTICES:
         raise TooManyCodesError(f"{len(codes)} codes are too many for both outputs. Ask for each by itself, or fewer.")
     async with batch(workers, caller, size) as work:
         arrays: dict[str, NDArray[np.float32]] = {}
@@ -150,30 +159,30 @@ async def infer(
                 arrays[name] = found.vertices
             else:
                 arrays[name] = (await predictions(work, model, codes)).nric
-        seconds, diagnostics = (found.seconds, worst(found.diagnostics)) if found else ({}, None)
+        seconds, diagnostics = (found.seconds, summarise(found.diagnostics)) if found else ({}, None)
         return await work.write(lambda: write(arrays), seconds, diagnostics)
 
 
 def shapes_size(model: ShapeModel, count: int, mesh: MeshChoice) -> int:
-    """Bytes of that many shapes; raises TooManyCodesError where they are more than one answer may hold."""
+    """Return the size of several shapes in bytes; raises TooManyCodesError above the limit of one answer."""
     vertices = len(model.mesh(mesh).vertices)
     if count * vertices > MOST_VERTICES:
         raise TooManyCodesError(
             f"{count} shapes of {vertices} vertices are too many for one answer. Ask for {MOST_VERTICES // vertices} "
             "at most, for the coarse mesh, or for an animation's frames as JSON lines or one by one."
         )
-    return BYTES_OF_A_VERTEX * count * vertices
+    return BYTES_PER_VERTEX * count * vertices
 
 
 async def shapes(
     work: Batch, model: ShapeModel, codes: Codes, inside: NDArray[np.bool_], mesh: MeshChoice, quality: Quality
 ) -> ShapeBatch:
-    """Shapes of codes (n, m), side by side; raises as ``Batch.map``."""
+    """Return the shapes of codes (n, m), computed in parallel; raises as ``Batch.map``."""
     vertices = np.empty((len(codes), *model.mesh(mesh).vertices.shape), np.float32)
 
     def find(item: tuple[int, CheckedCode], call: Call) -> tuple[Diagnostics, Timings]:
         k, code = item
-        shape = work.solve(model, mesh, quality, code, call)
+        shape = solve(work.workers, model, mesh, quality, code, call)
         vertices[k] = shape.vertices
         return shape.diagnostics, shape.seconds
 
@@ -186,7 +195,7 @@ async def shapes(
 async def _exponentials(
     work: Batch, model: ShapeModel, codes: Codes, found: ShapeBatch, mesh: MeshChoice
 ) -> list[ExactShape]:
-    """Discrete exponentials of codes (n, m), side by side, and how far the networks' shapes are from them."""
+    """Return the discrete exponentials of codes (n, m), and the distances of the networks' shapes from them."""
 
     def one(item: tuple[Codes, NDArray[np.float32]], call: Call) -> ExactShape:
         return exact_shape(model.decoder, *item, mesh, call)

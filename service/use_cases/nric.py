@@ -1,4 +1,4 @@
-"""Codes to lengths and angles (NRIC) as the networks predict them, before any reconstruction."""
+"""Lengths and angles (NRIC) as the networks predict them, before any reconstruction."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from shapespace.files.archives import Buffer
 from shapespace.model.latent_space import Bounds, Codes
 from shapespace.model.shape_model import ShapeModel
 from shapespace.service.limits.workers import Call, Caller, Workers
-from shapespace.service.use_cases.batch import Batch, TooManyCodesError, Written, batch
+from shapespace.service.use_cases.batch import Batch, EncodedFile, TooManyCodesError, batch
 from shapespace.service.use_cases.shape_formats import float32, json_pieces
 
-#: Most bytes of the predictions in one answer; networks with convolutions need memory besides their outputs.
+#: Most bytes of the predictions in one answer. Networks with convolutions need more memory than their outputs.
 MOST_BYTES = 2**25
 
 
@@ -27,7 +27,7 @@ class Predictions:
 
     Attributes:
         nric: (n, 2E) float32.
-        factors: (n, J, 2E) float32, where they are wanted.
+        factors: (n, J, 2E) float32, if requested.
     """
 
     nric: NDArray[np.float32]
@@ -42,12 +42,12 @@ async def nric_file(
     bounds: Bounds,
     *,
     factors: bool,
-) -> Written:
-    """Lengths and angles of codes as JSON, with those of each factor on request.
+) -> EncodedFile:
+    """Return lengths and angles of codes as JSON, on request also the lengths and angles of each factor.
 
     Raises:
-        LatentError: a code that can't be used.
-        TooManyCodesError, BusyError: more than one answer, or all together, may hold.
+        LatentError: a code is invalid.
+        TooManyCodesError, BusyError: the predictions exceed the limit of one answer, or of all together.
         DeadlineError, DisconnectedError, EndingError: the call ended before the file was ready.
     """
     codes, _ = model.latents.codes(latents, bounds)
@@ -67,7 +67,7 @@ async def nric_file(
 
 
 def nric_size(model: ShapeModel, count: int, *, factors: bool = False) -> int:
-    """Bytes of predictions for that many codes; raises TooManyCodesError where one answer may not hold them."""
+    """Return the size of predictions in bytes; raises TooManyCodesError above the limit of one answer."""
     size = 8 * model.manifest.edges * (1 + (len(model.manifest.factors) if factors else 0))
     if count * size > MOST_BYTES:
         raise TooManyCodesError(f"{count} codes are too many for one answer. Ask for {MOST_BYTES // size} at most.")
@@ -75,7 +75,7 @@ def nric_size(model: ShapeModel, count: int, *, factors: bool = False) -> int:
 
 
 async def predictions(work: Batch, model: ShapeModel, codes: Codes, *, factors: bool = False) -> Predictions:
-    """What the networks say to codes (n, m), side by side; raises as ``Batch.map``."""
+    """Return the predictions of the networks for codes (n, m); raises as ``Batch.map``."""
     n, wide = len(codes), 2 * model.manifest.edges
     found = np.empty((n, wide), np.float32)
     parts = np.empty((n, len(model.manifest.factors), wide), np.float32) if factors else None

@@ -1,4 +1,4 @@
-"""One code to one mesh file, coloured on request by how it differs from another shape."""
+"""One shape as a mesh file, on request coloured by its difference from another shape."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ from shapespace.model.shape_model import ShapeModel
 from shapespace.model.vertex_uncertainty import vertex_uncertainty
 from shapespace.service.limits.workers import Caller, Workers
 from shapespace.service.use_cases.batch import Timings, solve, total_seconds
-from shapespace.service.use_cases.shape_formats import SHAPE_FORMATS, shown, writing
+from shapespace.service.use_cases.shape_formats import SHAPE_FORMATS, catch_write_errors, with_topology
 from shapespace.solve.deadline import Deadline
 
 
 @dataclass(frozen=True)
-class ColourBy:
-    """What to colour a mesh by.
+class ColourOptions:
+    """Options of a coloured mesh.
 
     Attributes:
         quantity: stretch, bending or spread.
         against: code of the shape to compare with; None is the reference.
-        covariance: (m, m) of codes around this one, of a spread only.
+        covariance: (m, m), of codes around this one; for spread only.
     """
 
     quantity: Quantity
@@ -40,24 +40,24 @@ class ColourBy:
 
 
 @dataclass(frozen=True)
-class WantedShape:
-    """A shape as somebody wants it.
+class ShapeRequest:
+    """A request for one shape.
 
     Attributes:
-        code: of the shape; None is the reference.
+        code: checked latent code; None is the reference.
         mesh: fine or coarse.
-        format: one of SHAPE_FORMATS.
-        quality: of this shape, and of the one that colours compare with.
-        colour_by: what to colour it by, if anything.
-        place: takes it from where it is aligned to the reference to where it is wanted.
-        topology: of formats that can hold polygons.
+        format: a key of SHAPE_FORMATS.
+        quality: draft or full, also for the shape that colours compare with.
+        colour_by: options of colours; None for no colours.
+        place: rigid motion and scale of the answer, relative to the reference.
+        topology: polygons or triangles, in formats that can hold polygons.
     """
 
     code: CheckedCode | None
     mesh: MeshChoice
     format: str
     quality: Quality = Quality.FULL
-    colour_by: ColourBy | None = None
+    colour_by: ColourOptions | None = None
     place: Placement | None = None
     topology: Topology = Topology.ORIGINAL
 
@@ -67,9 +67,9 @@ class ShapeFile:
     """A shape as a file.
 
     Attributes:
-        content: of the file.
-        diagnostics: how well the shape was found.
-        legend: of the colours, where there are some.
+        content: bytes of the file.
+        diagnostics: diagnostics of the shape.
+        legend: legend of the colours, if there are any.
         seconds: time by stage.
     """
 
@@ -79,8 +79,8 @@ class ShapeFile:
     seconds: Timings
 
 
-def placed(vertices: NDArray[np.floating], place: Placement | None) -> FloatArray:
-    """Positions (…, V, 3) where they are wanted; raises NotFiniteError."""
+def place_vertices(vertices: NDArray[np.floating], place: Placement | None) -> FloatArray:
+    """Return positions (…, V, 3) after a placement; raises NotFiniteError if they overflow."""
     there = vertices.astype(np.float64, copy=False)
     if place is None:
         return there
@@ -91,11 +91,11 @@ def placed(vertices: NDArray[np.floating], place: Placement | None) -> FloatArra
     return moved
 
 
-async def shape_file(workers: Workers, caller: Caller, model: ShapeModel, wanted: WantedShape) -> ShapeFile:
-    """One shape as a file.
+async def shape_file(workers: Workers, caller: Caller, model: ShapeModel, wanted: ShapeRequest) -> ShapeFile:
+    """Return one shape as a file.
 
     Raises:
-        BusyError: no place for the request.
+        BusyError: the queue is full.
         DeadlineError, DisconnectedError, EndingError: the call ended before the file was ready.
         NotFiniteError, ModelFailedError: the model has no shape for the code.
     """
@@ -120,9 +120,9 @@ async def shape_file(workers: Workers, caller: Caller, model: ShapeModel, wanted
         if colour_by and colouring is None:
             vertices, against = (shape.vertices for shape in found)
             colouring = Colouring.between(colour_by.quantity, vertices, against, model.mesh(mesh).connectivity)
-        vertices = placed(found[0].vertices, wanted.place)
-        surface = shown(model.decoder.surface(mesh), wanted.topology)
-        with writing():
+        vertices = place_vertices(found[0].vertices, wanted.place)
+        surface = with_topology(model.decoder.surface(mesh), wanted.topology)
+        with catch_write_errors():
             content = SHAPE_FORMATS[wanted.format].encode(vertices, model.mesh(mesh).faces, colouring, surface)
         seconds = {**total_seconds(shape.seconds for shape in found), "encode": time.perf_counter() - began}
         return ShapeFile(content, found[0].diagnostics, colouring.legend if colouring else None, seconds)

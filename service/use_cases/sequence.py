@@ -1,4 +1,4 @@
-"""Interpolations: an id for an animation, and its frames as one file, as a stream of lines, or one by one."""
+"""Animations: their ids, and their frames as one file, as a stream of lines, or one by one."""
 
 from __future__ import annotations
 
@@ -20,29 +20,29 @@ from shapespace.model.shape_model import ShapeModel
 from shapespace.service.limits.workers import Caller, Workers
 from shapespace.service.repository.repository import ModelRepository
 from shapespace.service.use_cases.animation import Animation, UnknownInterpolationError
-from shapespace.service.use_cases.batch import Written, batch, solve
+from shapespace.service.use_cases.batch import EncodedFile, batch, solve
 from shapespace.service.use_cases.many_shapes import shapes, shapes_size
-from shapespace.service.use_cases.one_shape import ColourBy
+from shapespace.service.use_cases.one_shape import ColourOptions
 from shapespace.service.use_cases.sequence_formats import SEQUENCE_FORMATS, Frames, json_line
-from shapespace.service.use_cases.shape_formats import shown, worst
+from shapespace.service.use_cases.shape_formats import summarise, with_topology
 from shapespace.solve.deadline import Deadline
 
 
 class TooManyFramesError(ValueError):
-    """An animation of more frames than the server answers."""
+    """An animation has more frames than the server answers."""
 
 
 class UnknownFrameError(LookupError):
-    """A frame that the animation doesn't have."""
+    """An animation does not have this frame."""
 
 
 def interpolation_id(model: ShapeModel, animation: Animation, most_frames: int) -> str:
-    """An id that holds an animation; nothing is stored.
+    """Return an id that holds an animation; nothing is stored.
 
     Raises:
-        TooManyFramesError: more frames than that.
-        LatentError: a keyframe or a frame that is no code of the model.
-        PathTooLongError: keyframes that don't fit into an id.
+        TooManyFramesError: the animation has more than ``most_frames``.
+        LatentError: a keyframe or a frame is no code of the model.
+        PathTooLongError: the keyframes do not fit into an id.
     """
     _require_frames(animation, most_frames)
     id = animation.to_id(model.digest, model.latents)
@@ -51,11 +51,11 @@ def interpolation_id(model: ShapeModel, animation: Animation, most_frames: int) 
 
 
 def find_interpolation(repository: ModelRepository, id: str, most_frames: int) -> tuple[Animation, ShapeModel]:
-    """The animation of an id, and its model.
+    """Return the animation of an id, and its model.
 
     Raises:
-        UnknownInterpolationError: a damaged id, or one whose model is not served.
-        TooManyFramesError: more frames than that.
+        UnknownInterpolationError: the id is damaged, or its model is not served.
+        TooManyFramesError: the animation has more than ``most_frames``.
     """
     animation, digest = Animation.from_id(id)
     _require_frames(animation, most_frames)
@@ -69,7 +69,7 @@ def find_interpolation(repository: ModelRepository, id: str, most_frames: int) -
 
 
 def frame_code(model: ShapeModel, animation: Animation, k: int) -> CheckedCode:
-    """The code of one frame; raises UnknownFrameError."""
+    """Return the code of one frame; raises UnknownFrameError."""
     if not 0 <= k < animation.frame_count:
         raise UnknownFrameError(f"There is no frame {k}. Choose one from 0 to {animation.frame_count - 1}.")
     return model.latents.code(animation.codes(model.latents, slice(k, k + 1))[0])
@@ -84,24 +84,24 @@ async def sequence_file(
     format: str,
     topology: Topology = Topology.ORIGINAL,
     fps: float = FRAMES_PER_SECOND,
-    colour_by: ColourBy | None = None,
-) -> Written:
-    """All frames as one file in one of SEQUENCE_FORMATS, with polygons or triangles, coloured or not.
+    colour_by: ColourOptions | None = None,
+) -> EncodedFile:
+    """Return all frames as one file in a format of SEQUENCE_FORMATS.
 
     Raises:
-        TooManyCodesError, BusyError: more than one answer, or all together, may hold.
+        TooManyCodesError, BusyError: the frames exceed the limit of one answer, or of all together.
         DeadlineError, DisconnectedError, EndingError: the call ended before the file was ready.
-        NoRoomError: no room for a temporary file.
+        NoRoomError: there is no room for a temporary file.
     """
     codes, inside = model.latents.codes(animation.codes(model.latents))
     number, mesh = len(codes), animation.mesh
-    if colour_by and colour_by.against is not None:  # the last of the shapes, then
+    if colour_by and colour_by.against is not None:  # computed as one more shape, the last
         code, within = colour_by.against
         codes, inside = np.concatenate([codes, code[None]]), np.append(inside, within)
-    # Colours take as much as positions.
+    # Colours take as much memory as positions.
     async with batch(workers, caller, shapes_size(model, len(codes) * (2 if colour_by else 1), mesh)) as work:
         found = await shapes(work, model, codes, inside, mesh, quality)
-        whole, surface = model.mesh(mesh), shown(model.decoder.surface(mesh), topology)
+        whole, surface = model.mesh(mesh), with_topology(model.decoder.surface(mesh), topology)
 
         def encode() -> tuple[Iterator[Buffer], dict[str, Any]]:
             colourings: list[Colouring] = []
@@ -126,13 +126,13 @@ async def sequence_file(
                 )
             )
 
-        return await work.write(encode, found.seconds, worst(found.diagnostics[:number]))
+        return await work.write(encode, found.seconds, summarise(found.diagnostics[:number]))
 
 
 async def sequence_lines(
     workers: Workers, caller: Caller, model: ShapeModel, animation: Animation, quality: Quality
 ) -> AsyncGenerator[bytes, None]:
-    """All frames as lines of JSON, each as soon as it is ready; raises BusyError and as ``Workers.run``."""
+    """Yield each frame as a line of JSON as soon as it is ready; raises BusyError and as ``Workers.run``."""
     codes, inside = model.latents.codes(animation.codes(model.latents))
     faces = model.mesh(animation.mesh).faces
 
@@ -142,7 +142,7 @@ async def sequence_lines(
         return json_line(k, t, shape, None if k else faces)
 
     frames = zip(count(), animation.positions.tolist(), codes, map(bool, inside))
-    # The deadline holds for each frame: a stream may take as long as its reader does.
+    # Each frame has its own deadline, because a stream may take as long as its reader takes.
     with workers.stream(caller):
         # The first frame is computed alone: in parallel with the second it would take half as long again.
         yield await workers.piece(partial(line, next(frames)), None)

@@ -1,4 +1,4 @@
-"""Sequences of shapes as bytes: every format of an animation."""
+"""The file formats of an animation."""
 
 from __future__ import annotations
 
@@ -21,22 +21,22 @@ from shapespace.files.usd import animated_usd
 from shapespace.mesh.attributes import MeshAttributes
 from shapespace.model.decoder import Diagnostics, Shape
 from shapespace.model.latent_space import Codes
-from shapespace.service.use_cases.shape_formats import diagnostics_arrays, dump_json, float32, writing
+from shapespace.service.use_cases.shape_formats import catch_write_errors, diagnostics_arrays, dump_json, float32
 
 
 @dataclass(frozen=True)
 class Frames:
-    """The frames of an animation, ready to be encoded.
+    """The frames of an animation, ready to be written.
 
     Attributes:
-        vertices: (n, V, 3) float32.
-        diagnostics: one a frame.
-        faces: (F, 3).
-        positions: (n,) where on the path each frame lies.
+        vertices: (n, V, 3) float32, in the units of the training meshes.
+        diagnostics: diagnostics of each frame.
+        faces: (F, 3) vertex indices.
+        positions: (n,) position t of each frame on the path.
         codes: (n, m).
-        surface: of the mesh, where its file had more than triangles.
-        fps: frames in a second.
-        colourings: of each frame, or of none.
+        surface: attributes of the mesh, if its training file had more than triangles.
+        fps: frames per second.
+        colourings: colours of each frame; empty for none.
     """
 
     vertices: NDArray[np.float32]
@@ -54,10 +54,10 @@ class SequenceFormat:
     """A file format for a whole animation.
 
     Attributes:
-        media_type: as IANA has it.
-        encode: a sequence to the pieces of the file, and facts for the diagnostics.
-        polygons: whether faces are those of the surface, where there is one; otherwise they are triangles.
-        timed: whether files say how long a frame is shown, and can carry colours that change.
+        media_type: as registered with IANA.
+        encode: returns the pieces of the file, and facts for the diagnostics.
+        polygons: whether files hold polygons; otherwise they hold triangles.
+        timed: whether files hold the time of a frame; then they can hold colours that change, too.
     """
 
     media_type: str
@@ -67,7 +67,7 @@ class SequenceFormat:
 
 
 def json_line(k: int, t: float, shape: Shape, faces: IntArray | None) -> bytes:
-    """One frame as a line of JSON; the first also carries the faces."""
+    """Return one frame as a line of JSON, with the faces if they are given."""
     line: dict[str, Any] = {"frame": k, "t": t}
     if faces is not None:
         line["faces"] = np.ascontiguousarray(faces)
@@ -97,7 +97,7 @@ def _point_cache(frames: Frames) -> tuple[Iterator[Buffer], dict[str, Any]]:
 
 def _usd(frames: Frames, *, packed: bool = False) -> tuple[Iterator[Buffer], dict[str, Any]]:
     def pieces() -> Iterator[Buffer]:
-        with writing():
+        with catch_write_errors():
             yield from animated_usd(
                 frames.vertices, frames.faces, frames.surface, frames.fps, frames.colourings, packed=packed
             )
@@ -121,7 +121,7 @@ def _zip(frames: Frames) -> tuple[Iterator[Buffer], dict[str, Any]]:
 
 
 JSON_LINES = "application/jsonl"
-#: Formats of a whole animation but for JSON lines, which are streamed; the first is the default.
+#: Formats of a whole animation except JSON lines, which are streamed; the first is the default.
 SEQUENCE_FORMATS = {
     "glb": SequenceFormat("model/gltf-binary", _glb, timed=True),
     "npz": SequenceFormat(OCTET_STREAM, _npz),
@@ -130,5 +130,5 @@ SEQUENCE_FORMATS = {
     "usd": SequenceFormat(OCTET_STREAM, _usd, polygons=True, timed=True),
     "usdz": SequenceFormat("model/vnd.usdz+zip", partial(_usd, packed=True), polygons=True, timed=True),
 }
-#: Media types of all formats of a whole animation by name.
+#: Media types of all formats of a whole animation, by name.
 MEDIA_TYPES = {name: format.media_type for name, format in SEQUENCE_FORMATS.items()} | {"jsonl": JSON_LINES}

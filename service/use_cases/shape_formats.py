@@ -1,4 +1,4 @@
-"""Shapes as bytes: the project's mesh formats, and JSON."""
+"""The file formats of one shape, and JSON."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ from shapespace.mesh.attributes import MeshAttributes, Topology
 from shapespace.model.decoder import Diagnostics, Quality
 from shapespace.model.exact_shapes import ExactShape
 
-#: Size of the pieces, in bytes, in which values are counted; counting ends as soon as there are too many.
+#: Bytes in which values are counted at once; counting ends after the piece in which they exceed the limit.
 _PIECE = 2**16
 
 
 def dump_json(content: Any) -> bytes:
-    """JSON, with NumPy arrays as nested lists; what isn't finite becomes null."""
+    """Return JSON, with NumPy arrays as nested lists and null for numbers that are not finite."""
     return orjson.dumps(content, option=orjson.OPT_SERIALIZE_NUMPY)
 
 
 def holds_more_values(text: bytes, most: int) -> bool:
-    """Whether JSON holds more values than that, going by what separates them, before any of it is parsed."""
+    """Return whether JSON holds more values than ``most``, by counting separators, without parsing."""
     count = 0
     for start in range(0, len(text), _PIECE):
         piece = text[start : start + _PIECE]
@@ -39,7 +39,7 @@ def holds_more_values(text: bytes, most: int) -> bool:
 
 
 def float32(array: NDArray) -> NDArray[np.float32]:
-    """Contiguous float32: the precision of everything that leaves."""
+    """Return an array as contiguous float32, the precision of all answers."""
     return np.ascontiguousarray(array, dtype=np.float32)
 
 
@@ -54,19 +54,19 @@ def _mesh_json(
 
 #: Formats of one shape; the first is the default.
 SHAPE_FORMATS = {**MESH_FORMATS, "zip": OBJ_ZIP, "json": MeshFormat("application/json", _mesh_json), **USD_FORMATS}
-#: Why a format may be missing.
+#: Reason why a format may be missing on a server.
 UNAVAILABLE = dict.fromkeys(
     USD_FORMATS, "This server can't write USD, for which it needs the package usd-core: pip install usd-core"
 )
 
 
 class NoRoomError(OSError):
-    """No room for a temporary file."""
+    """There is no room for a temporary file."""
 
 
 @contextmanager
-def writing() -> Iterator[None]:
-    """Turn what the writer of USD says where its temporary file can't be written into NoRoomError."""
+def catch_write_errors() -> Iterator[None]:
+    """Raise NoRoomError if USD cannot write its temporary file."""
     try:
         yield
     except OSError:
@@ -77,17 +77,17 @@ def writing() -> Iterator[None]:
 
 
 def writable(media_types: Mapping[str, str]) -> dict[str, str]:
-    """Those of the formats, with their media types, that this server can write."""
+    """Return the formats that this server can write, with their media types."""
     return {name: kind for name, kind in media_types.items() if name not in UNAVAILABLE or usd_installed()}
 
 
-def shown(surface: MeshAttributes | None, topology: Topology) -> MeshAttributes | None:
-    """A surface with the polygons that are wanted."""
+def with_topology(surface: MeshAttributes | None, topology: Topology) -> MeshAttributes | None:
+    """Return the attributes of a mesh with polygons or cut into triangles."""
     return surface.triangulated if surface and topology is Topology.TRIANGLES else surface
 
 
 def diagnostics_arrays(diagnostics: Sequence[Diagnostics]) -> dict[str, NDArray]:
-    """Diagnostics of n shapes as arrays (n,), for NPZ files."""
+    """Return the diagnostics of n shapes as arrays (n,), for NPZ files."""
     return {
         "status": np.array([str(d.status) for d in diagnostics]),
         "iterations": np.array([d.iterations for d in diagnostics]),
@@ -101,7 +101,7 @@ def diagnostics_arrays(diagnostics: Sequence[Diagnostics]) -> dict[str, NDArray]
 
 
 def json_pieces(members: Mapping[str, Iterable[Any]]) -> Iterator[bytes]:
-    """An object of lists as JSON, an element at a time: together they may be large."""
+    """Yield an object of lists as JSON, one element at a time, because all together may be large."""
     opening = b"{"
     for name, elements in members.items():
         yield opening + dump_json(name) + b":["
@@ -112,7 +112,7 @@ def json_pieces(members: Mapping[str, Iterable[Any]]) -> Iterator[bytes]:
 
 
 def exponential_lists(exponentials: Sequence[ExactShape]) -> dict[str, list[Any]]:
-    """Exponentials of n codes as lists (n,), for JSON."""
+    """Return the exponentials of n codes as lists (n,), for JSON."""
     return {
         "exact": [e.vertices for e in exponentials],
         "distance": [None if e.vertices is None else {"mean": e.mean, "max": e.max} for e in exponentials],
@@ -121,7 +121,7 @@ def exponential_lists(exponentials: Sequence[ExactShape]) -> dict[str, list[Any]
 
 
 def exponential_arrays(exponentials: Sequence[ExactShape], vertex_count: int) -> dict[str, NDArray]:
-    """Exponentials of n codes as arrays, for NPZ files; NaN where one failed."""
+    """Return the exponentials of n codes as arrays, for NPZ files; NaN for codes without one."""
     missing = np.full((vertex_count, 3), np.nan, np.float32)
     return {
         "exact": np.stack([missing if e.vertices is None else e.vertices for e in exponentials]),
@@ -131,8 +131,8 @@ def exponential_arrays(exponentials: Sequence[ExactShape], vertex_count: int) ->
     }
 
 
-def worst(diagnostics: Sequence[Diagnostics]) -> dict[str, Any]:
-    """One summary of several diagnostics: the largest numbers, the first status that isn't good, a draft if any is."""
+def summarise(diagnostics: Sequence[Diagnostics]) -> dict[str, Any]:
+    """Summarise diagnostics: the largest numbers, the first bad status, and draft if any shape is one."""
     bad = [d.status for d in diagnostics if d.status != "converged"]
     return {
         "status": bad[0] if bad else diagnostics[0].status,

@@ -1,1 +1,1 @@
-"""Bodies of requests and answers: schemas, JSON, tensors; and what stands in queries."""
+"""Bodies of requests and answers, and parameters of queries."""

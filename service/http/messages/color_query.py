@@ -15,7 +15,7 @@ from shapespace.model.vertex_uncertainty import require_covariance
 from shapespace.service.http.messages.latent_query import NUMBERS, numbers
 from shapespace.service.http.negotiation import choose
 from shapespace.service.http.problems import ProblemError
-from shapespace.service.use_cases.one_shape import ColourBy
+from shapespace.service.use_cases.one_shape import ColourOptions
 from shapespace.service.use_cases.shape_formats import SHAPE_FORMATS, UNAVAILABLE, writable
 
 #: Reasons why formats can't hold a coloured mesh.
@@ -33,19 +33,19 @@ class ColourParameters:
 
     def on(
         self, model: ShapeModel, bounds: Bounds = Bounds.ALLOW, covariance: Sequence[Sequence[float]] | None = None
-    ) -> ColourBy | None:
+    ) -> ColourOptions | None:
         """Return the colouring, with the other code checked like the first; raises LatentError or ProblemError."""
         if self.quantity is Quantity.SPREAD:
             if covariance is None:
                 raise ProblemError(
                     "invalid-request", "color=spread shows how sure a code is. POST it with its covariance in the body."
                 )
-            return ColourBy(self.quantity, None, require_covariance(model.decoder, covariance))
+            return ColourOptions(self.quantity, None, require_covariance(model.decoder, covariance))
         if covariance is not None:
             raise ProblemError("invalid-request", "covariance is what color=spread shows. Add ?color=spread.")
         if self.quantity is None:
             return None
-        return ColourBy(self.quantity, None if self.against is None else model.latents.code(self.against, bounds))
+        return ColourOptions(self.quantity, None if self.against is None else model.latents.code(self.against, bounds))
 
 
 async def _query(

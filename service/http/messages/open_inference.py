@@ -1,63 +1,54 @@
-"""The Open Inference Protocol's messages: JSON, and the extension that lets tensors follow it as bytes.
+"""JSON messages of the Open Inference Protocol.
 
-One input, ``latent`` [n, m]; two outputs, ``nric`` [n, 2E] and ``vertices`` [n, V, 3], V being the fine mesh's where
-there is one. All are FP32, row-major, little-endian where binary.
-https://github.com/open-inference/open-inference-protocol and, for the bytes,
-https://github.com/triton-inference-server/server/blob/main/docs/protocol/extension_binary_data.md
+The input is ``latent`` [n, m]. The outputs are ``nric`` [n, 2E] and ``vertices`` [n, V, 3], with the V vertices of the
+fine mesh if the model has one. All are FP32 in row-major order.
+https://github.com/open-inference/open-inference-protocol
 """
 
 from __future__ import annotations
 
-import re
-from collections.abc import Iterator, Mapping, Sequence
-from itertools import chain
+from collections.abc import Sequence
 from typing import Annotated, Any, Literal
 
-import numpy as np
-from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, NonNegativeInt, field_validator
 from pydantic.json_schema import SkipJsonSchema
 
-from shapespace.files.archives import Buffer
 from shapespace.model.decoder import MeshChoice, Quality
 from shapespace.model.latent_space import Bounds
 from shapespace.model.shape_model import ShapeModel
-from shapespace.service.http.messages import bodies
 from shapespace.service.http.messages.schemas import BoundsField, QualityField
 from shapespace.service.http.problems import ProblemError
 from shapespace.service.use_cases.fields import Number
-from shapespace.service.use_cases.shape_formats import dump_json
 
-#: How long the JSON part of a body is, where bytes follow it.
-HEADER = "Inference-Header-Content-Length"
 INPUT = "latent"
 OutputName = Literal["nric", "vertices"]
 OUTPUTS: tuple[OutputName, ...] = ("nric", "vertices")
-_FLOAT = np.dtype("<f4")
 
 
 class _Message(BaseModel):
-    # Clients send parameters and members of other servers: the protocol has them ignored.
+    # Clients may send members that are meant for other servers; the protocol says to ignore them.
     model_config = ConfigDict(extra="ignore")
 
 
 class InputParameters(_Message):
-    """What may go with the input."""
+    """Parameters of the input."""
 
-    binary_data_size: SkipJsonSchema[NonNegativeInt | None] = Field(None, description="Its bytes after the JSON.")
+    binary_data_size: SkipJsonSchema[NonNegativeInt | None] = Field(
+        None, description="Number of its bytes after the JSON."
+    )
 
 
 _Numbers = Annotated[list[Number], Field(fail_fast=True)]
 
 
 def _as_json(schema: dict[str, Any]) -> None:
-    """Numbers are required in JSON: where bytes follow it, the body has another media type and no schema."""
+    """Require ``data``: this schema is for bodies without bytes after the JSON."""
     schema["required"].append("data")
     del schema["properties"]["data"]["default"]
 
 
 class InputTensor(_Message):
-    """The codes."""
+    """The latent codes."""
 
     model_config = ConfigDict(json_schema_extra=_as_json)
 
@@ -69,34 +60,38 @@ class InputTensor(_Message):
     datatype: Literal["FP32"]
     parameters: InputParameters = InputParameters(binary_data_size=None)
     data: _Numbers | Annotated[list[_Numbers], Field(fail_fast=True)] | SkipJsonSchema[None] = Field(
-        None, description="The numbers, row by row or flat; absent where bytes follow."
+        None, description="The numbers, flat or one list for each row; absent if bytes follow."
     )
 
 
 class OutputParameters(_Message):
-    """How an output is to come."""
+    """Parameters of an output."""
 
-    binary_data: bool | None = Field(None, strict=True, description="As bytes after the JSON.")
+    binary_data: bool | None = Field(None, strict=True, description="Send it as bytes after the JSON.")
 
 
 class RequestedOutput(_Message):
-    """An output that is wanted."""
+    """An output that the client asks for."""
 
     name: OutputName
     parameters: OutputParameters = OutputParameters(binary_data=None)
 
 
 class InferenceParameters(_Message):
-    """What holds for the whole request."""
+    """Parameters of the whole request."""
 
-    binary_data_output: bool = Field(False, strict=True, description="All outputs as bytes, unless one says otherwise.")
-    mesh: MeshChoice = Field(MeshChoice.FINE, description="Which mesh's vertices, where the model has a finer one.")
+    binary_data_output: bool = Field(
+        False, strict=True, description="Send all outputs as bytes, unless one says otherwise."
+    )
+    mesh: MeshChoice = Field(
+        MeshChoice.FINE, description="The mesh whose vertices are answered, if the model has a fine one."
+    )
     bounds: BoundsField = Bounds.ALLOW
     quality: QualityField = Quality.FULL
 
 
 class InferenceRequest(_Message):
-    """A request to infer."""
+    """Codes, and the outputs that the client asks for."""
 
     model_config = ConfigDict(
         json_schema_extra={
@@ -109,15 +104,17 @@ class InferenceRequest(_Message):
         }
     )
 
-    id: str | None = Field(None, description="Comes back in the answer.")
+    id: str | None = Field(None, description="Repeated in the answer.")
     inputs: Annotated[list[InputTensor], Field(min_length=1, max_length=1)]
-    outputs: Annotated[list[RequestedOutput], Field(fail_fast=True, description="By default both; each once.")] = []
+    outputs: Annotated[
+        list[RequestedOutput], Field(fail_fast=True, description="Both by default; each at most once.")
+    ] = []
     parameters: InferenceParameters = InferenceParameters()
 
     @field_validator("outputs", mode="before")
     @classmethod
     def _each_once(cls, given: object) -> object:
-        # Before they are looked at: there may be any number, and each would be computed.
+        # Before validation, because a list may have any number of outputs, and each would be computed.
         if isinstance(given, list):
             names = [output.get("name") for output in given[: len(OUTPUTS) + 1] if isinstance(output, dict)]
             for name in OUTPUTS:
@@ -128,28 +125,28 @@ class InferenceRequest(_Message):
         return given
 
     @property
-    def wanted(self) -> list[OutputName]:
-        """Names of the outputs to give."""
+    def output_names(self) -> list[OutputName]:
+        """Names of the outputs to answer."""
         return [output.name for output in self.outputs] or list(OUTPUTS)
 
     def binary(self, name: str) -> bool:
-        """Whether an output is to follow the JSON as bytes."""
+        """Return whether an output follows the JSON as bytes."""
         asked = [output.parameters.binary_data for output in self.outputs if output.name == name]
         return self.parameters.binary_data_output if not asked or asked[0] is None else asked[0]
 
 
 class OutputTensor(BaseModel):
-    """An output."""
+    """An output tensor."""
 
     name: OutputName
     shape: list[int]
     datatype: Literal["FP32"]
-    data: list[float] | None = Field(None, description="Flat, row by row; absent where bytes follow.")
-    parameters: dict[str, int] | None = Field(None, description="`binary_data_size`, where bytes follow.")
+    data: list[float] | None = Field(None, description="Flat, row by row; absent if bytes follow.")
+    parameters: dict[str, int] | None = Field(None, description="`binary_data_size`, if bytes follow.")
 
 
 class InferenceAnswer(BaseModel):
-    """What was inferred."""
+    """The outputs of a model."""
 
     model_name: str
     model_version: str
@@ -158,7 +155,7 @@ class InferenceAnswer(BaseModel):
 
 
 class TensorMetadata(BaseModel):
-    """A tensor that goes in or comes out; −1 stands for any number."""
+    """An input or output tensor; −1 stands for any size."""
 
     name: str
     datatype: str
@@ -166,7 +163,7 @@ class TensorMetadata(BaseModel):
 
 
 class ModelMetadata(BaseModel):
-    """A model as the protocol describes it."""
+    """Description of a model."""
 
     name: str
     versions: list[str]
@@ -176,7 +173,7 @@ class ModelMetadata(BaseModel):
 
 
 class ServerMetadata(BaseModel):
-    """The server as the protocol describes it."""
+    """Description of the server."""
 
     name: str
     version: str
@@ -184,14 +181,14 @@ class ServerMetadata(BaseModel):
 
 
 class ModelReadiness(BaseModel):
-    """Whether a model answers."""
+    """Whether a model is served."""
 
     name: str
     ready: bool
 
 
 def model_metadata(model: ShapeModel, versions: Sequence[str]) -> ModelMetadata:
-    """A model's tensors."""
+    """Return the description of a model with its tensors."""
     facts = model.manifest
     fine = len(model.mesh(MeshChoice.FINE).vertices)
     return ModelMetadata(
@@ -204,89 +201,3 @@ def model_metadata(model: ShapeModel, versions: Sequence[str]) -> ModelMetadata:
             TensorMetadata(name="vertices", datatype="FP32", shape=[-1, fine, 3]),
         ],
     )
-
-
-def parse(body: bytes, header: str | None) -> tuple[InferenceRequest, bytes]:
-    """A body to the request, and the bytes that follow its JSON.
-
-    Args:
-        body: JSON, and after it the input's bytes if they aren't in it.
-        header: value of HEADER, by default the length of the body.
-
-    Raises:
-        ProblemError: lengths that don't fit together.
-        RequestValidationError: JSON that isn't a request.
-    """
-    length = len(body)
-    if header is not None:
-        if not re.fullmatch("[0-9]{1,12}", header) or int(header) > length:
-            raise ProblemError(
-                "malformed-request",
-                f"{HEADER} is {header!r}, but the body has {length} bytes. Send the length of its JSON part.",
-            )
-        length = int(header)
-    request = bodies.read(body[:length], InferenceRequest)
-    tensor = request.inputs[0]
-    size = tensor.parameters.binary_data_size
-    if (size is None) == (tensor.data is None):
-        raise _invalid(f"Send {INPUT} either as data, or with binary_data_size and its bytes after the JSON part")
-    if len(body) - length != (size or 0):
-        raise _invalid(
-            f"{len(body) - length} bytes follow the JSON part, not {size or 0} as binary_data_size says. "
-            f"Send {HEADER}, the length of the JSON part, and then the bytes of {INPUT}"
-        )
-    return request, body[length:]
-
-
-def codes(request: InferenceRequest, tail: bytes) -> NDArray[np.floating]:
-    """The codes (n, m) of a request, given the bytes that followed it; raises ProblemError."""
-    tensor = request.inputs[0]
-    n, m = tensor.shape
-    if tensor.data is not None:
-        rows = (row if isinstance(row, list) else [row] for row in tensor.data)
-        values = np.array(list(chain.from_iterable(rows)), dtype=np.float64)
-    elif len(tail) % _FLOAT.itemsize:
-        raise _invalid(f"The bytes of {INPUT} are no whole number of FP32 values. Send {_FLOAT.itemsize} for each")
-    else:
-        values = np.frombuffer(tail, _FLOAT)
-    if m == 0 or values.size != n * m:  # any number of codes without coordinates would fit
-        raise _invalid(f"{INPUT} has {values.size} numbers, but its shape is {tensor.shape}. Send {n * m}")
-    return values.reshape(n, m)
-
-
-def _invalid(detail: str) -> ProblemError:
-    return ProblemError("invalid-request", detail + ".")
-
-
-def answer(
-    request: InferenceRequest, model: ShapeModel, outputs: Mapping[str, NDArray[np.float32]]
-) -> tuple[Iterator[Buffer], Mapping[str, int]]:
-    """The body of an answer in pieces, and HEADER, the length of its JSON part, where bytes follow.
-
-    Args:
-        request: says how each output is to come.
-        model: that inferred.
-        outputs: those that are wanted.
-    """
-    text = _text(request, model, outputs)
-    tail = [array.astype(_FLOAT, copy=False).data for name, array in outputs.items() if request.binary(name)]
-    if not tail:
-        return text, {}
-    whole = b"".join(text)  # whose length comes first
-    return chain([whole], (flat.cast("B") for flat in tail)), {HEADER: len(whole)}
-
-
-def _text(request: InferenceRequest, model: ShapeModel, outputs: Mapping[str, NDArray[np.float32]]) -> Iterator[bytes]:
-    facts = {"model_name": model.manifest.name, "model_version": model.manifest.version}
-    yield dump_json(facts)[:-1] + b',"outputs":['
-    for k, (name, array) in enumerate(outputs.items()):
-        tensor: dict[str, object] = {"name": name, "shape": list(array.shape), "datatype": "FP32"}
-        if request.binary(name):
-            tensor["parameters"] = {"binary_data_size": _FLOAT.itemsize * array.size}
-        yield (b"," if k else b"") + dump_json(tensor)[:-1]
-        if not request.binary(name):
-            for i, row in enumerate(array):  # a code at a time: all together may be large
-                yield (b"," if i else b',"data":[') + dump_json(row.ravel())[1:-1]
-            yield b"]"
-        yield b"}"
-    yield b"]" + (b',"id":' + dump_json(request.id) if request.id is not None else b"") + b"}"

@@ -1,1 +1,1 @@
-"""The calls, one module a group; each only translates between HTTP and the service's parts."""
+"""Routes, one module for each group of calls; they translate between HTTP and the use cases."""

@@ -1,4 +1,4 @@
-"""A model as linear blend shapes."""
+"""The call that answers a model as linear blend shapes."""
 
 from __future__ import annotations
 
@@ -7,10 +7,11 @@ from typing import Annotated
 from fastapi import APIRouter, Query, Request, Response
 
 from shapespace.model.decoder import MeshChoice
-from shapespace.service.http.caching import CachedAnswer, cache_headers, entity_tag, not_modified
+from shapespace.service.http.caching import CachedAnswer, entity_tag
 from shapespace.service.http.dependencies import CallerDependency, Model, ServiceDependency
 from shapespace.service.http.description import binary, problems
-from shapespace.service.http.responses import timing
+from shapespace.service.http.responses import cached_response
+from shapespace.service.use_cases.batch import Timings
 from shapespace.service.use_cases.blend_shapes import blend_shapes_file
 from shapespace.service.use_cases.shape_formats import SHAPE_FORMATS
 
@@ -28,20 +29,17 @@ async def get_blend_shapes(
     request: Request,
     caller: CallerDependency,
     model: Model,
-    mesh: Annotated[MeshChoice, Query(description="Which mesh, where the model has a finer one.")] = MeshChoice.FINE,
+    mesh: Annotated[MeshChoice, Query(description="The mesh, if the model has a fine one.")] = MeshChoice.FINE,
 ) -> Response:
-    """Code 0, and a morph target for each end of each coordinate: sliders for programs without this server.
+    """The shape of code 0 with a morph target for each bound of each coordinate: sliders without this server.
 
-    `asset.extras.error` of the file says how far the linear blend is from the model's shapes.
+    `asset.extras.error` of the file is the distance of the linear blend from the model's shapes.
     """
-    tag = entity_tag("blend shapes", model.digest, mesh)
-    if unchanged := not_modified(request, tag):
-        return unchanged
-    answer, headers = service.answers.get(tag), cache_headers(tag)
-    if answer is None:
+
+    async def compute() -> tuple[CachedAnswer, Timings]:
         content, seconds = await blend_shapes_file(service.workers, caller, model, mesh)
         name = f"{model.manifest.name}-blendshapes.glb"
-        answer = CachedAnswer(content, {"Content-Disposition": f'inline; filename="{name}"'})
-        service.answers.keep(tag, answer)
-        headers |= timing(service, seconds)
-    return Response(answer.content, headers={**headers, **answer.headers}, media_type=_GLB["glb"])
+        return CachedAnswer(content, {"Content-Disposition": f'inline; filename="{name}"'}), seconds
+
+    tag = entity_tag("blend shapes", model.digest, mesh)
+    return await cached_response(service, request, tag, _GLB["glb"], compute)

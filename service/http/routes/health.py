@@ -1,4 +1,4 @@
-"""Whether the server lives and can answer, by the Open Inference Protocol's paths."""
+"""Health of the server, at the paths of the Open Inference Protocol."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ router = APIRouter(prefix="/v2/health", tags=["health"])
 
 @router.get("/live")
 async def live() -> Health:
-    """Whether the process answers at all."""
+    """Whether the process answers."""
     return Health(live=True)
 
 
 @router.get("/ready", responses=problems(503))
 async def ready(service: ServiceDependency) -> Readiness:
-    """Whether there is a model to serve, and the server isn't about to end."""
+    """Whether the server has a model and is not shutting down."""
     if service.draining:
         raise ProblemError("not-ready", "The server is about to end. Send requests to another one.", ready=False)
     if len(service.repository) == 0:

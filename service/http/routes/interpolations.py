@@ -10,7 +10,6 @@ from fastapi import APIRouter, Depends, Path, Query, Request, Response
 from fastapi.responses import StreamingResponse
 
 from shapespace.files.animated_gltf import FRAMES_PER_SECOND
-from shapespace.mesh.attributes import Topology
 from shapespace.model.decoder import Quality
 from shapespace.service.http.caching import cache_headers, entity_tag, not_modified
 from shapespace.service.http.dependencies import (
@@ -23,15 +22,16 @@ from shapespace.service.http.dependencies import (
     one_of,
 )
 from shapespace.service.http.description import binary, mesh_answers, problems
+from shapespace.service.http.error_handlers import DOMAIN_ERRORS, domain_problem
 from shapespace.service.http.messages.bodies import JSONBody
-from shapespace.service.http.messages.color_query import NO_COLOR, ColorQuery, choose_mesh
+from shapespace.service.http.messages.color_query import NO_COLOR, ColorQuery, ColourParameters
+from shapespace.service.http.messages.mesh_query import FrameQuery
 from shapespace.service.http.messages.schemas import InterpolationAnswer
 from shapespace.service.http.messages.topology_query import TopologyQuery, choose_topology
 from shapespace.service.http.negotiation import choose
-from shapespace.service.http.problems import DOMAIN_ERRORS, ProblemError, domain_problem
-from shapespace.service.http.responses import draft_option, file_headers, shape_response, written_response
+from shapespace.service.http.problems import ProblemError
+from shapespace.service.http.responses import encoded_response, file_headers, shape_response, tag_options
 from shapespace.service.use_cases.animation import Animation
-from shapespace.service.use_cases.one_shape import WantedShape
 from shapespace.service.use_cases.sequence import (
     find_interpolation,
     frame_code,
@@ -44,19 +44,19 @@ from shapespace.service.use_cases.sequence_formats import (
     MEDIA_TYPES,
     SEQUENCE_FORMATS,
 )
-from shapespace.service.use_cases.shape_formats import SHAPE_FORMATS, UNAVAILABLE, writable
+from shapespace.service.use_cases.shape_formats import UNAVAILABLE, writable
 
 router = APIRouter(prefix="/v1", tags=["interpolations"])
 
-#: Why a format isn't among those of a coloured animation.
+#: Reason why a format cannot hold a coloured animation.
 _UNCOLOURED = {
     name: f"Whole animations in {name.upper()} carry no colours; single frames do"
     for name in MEDIA_TYPES
     if name not in SEQUENCE_FORMATS or not SEQUENCE_FORMATS[name].timed
 }
-#: Most frames in a second: more than any screen shows.
+#: Most frames per second, more than any screen shows.
 MOST_FPS = 240
-Id = Annotated[str, Path(description="An interpolation's id.")]
+Id = Annotated[str, Path(description="Id of an interpolation.")]
 
 
 @router.post(
@@ -71,7 +71,7 @@ async def create_interpolation(
     response: Response,
     mesh: MeshQuery = None,
 ) -> InterpolationAnswer:
-    """An address for the animation along a path of codes. Nothing is stored: the id holds it all."""
+    """Address of the animation along a path of codes. Nothing is stored: the id holds the whole animation."""
     body = body.model_copy(update={"mesh": mesh or body.mesh})
     id = interpolation_id(model, body, service.settings.max_frames)
     path = f"/v1/interpolations/{id}"
@@ -95,16 +95,12 @@ async def get_interpolation(
     topology: TopologyQuery = None,
     fps: Annotated[
         float | None,
-        Query(ge=1, le=MOST_FPS, description="Frames in a second, of GLB, USD and USDZ; by default 30."),
+        Query(ge=1, le=MOST_FPS, description="Frames per second of GLB, USD and USDZ; by default 30."),
     ] = None,
     format: Annotated[Format, one_of([*MEDIA_TYPES, "obj"])] = None,
 ) -> Response:
-    """The animation: GLB, arrays, a zip of OBJ files, a point cache, USD, or JSON lines as they get ready."""
-    # Who asks for OBJ gets one a frame, in a zip.
-    accept = request.headers.get("accept")
-    types = {name: kind for name, kind in MEDIA_TYPES.items() if color.quantity is None or name not in _UNCOLOURED}
-    why = UNAVAILABLE if color.quantity is None else _UNCOLOURED | UNAVAILABLE
-    chosen = choose(writable(types), "zip" if format == "obj" else format, accept, why)
+    """The animation: GLB, arrays, a zip of OBJ files, a point cache, USD, or a stream of JSON lines."""
+    chosen = _choose_format(request, format, color)
     animation, model = find_interpolation(service.repository, id, service.settings.max_frames)
     written_as = SEQUENCE_FORMATS.get(chosen)
     if fps is not None and not (written_as and written_as.timed):
@@ -113,24 +109,22 @@ async def get_interpolation(
         raise ProblemError("invalid-request", f"{said} For fps ask for one of {timed}.")
     polygons = bool(written_as and written_as.polygons)
     faces = choose_topology(topology, chosen, model, animation.mesh, polygons=polygons)
-    options: list[str | bytes] = [*draft_option(quality), *([faces] if faces is Topology.TRIANGLES else [])]
-    options += [] if fps is None else [f"{fps} frames a second"]
     colour_by = color.on(model)
-    if colour_by:
-        options += [colour_by.quantity, "reference" if colour_by.against is None else colour_by.against[0].tobytes()]
+    options = tag_options(quality, colour_by, faces)
+    options += [] if fps is None else [f"{fps} frames a second"]
     tag = entity_tag("animation", id, chosen, *options)
     if answer := not_modified(request, tag):
         return answer
     if chosen == "jsonl":
         lines = sequence_lines(service.workers, caller, model, animation, quality)
-        first = await anext(lines)  # what goes wrong up to here still has a status of its own
+        first = await anext(lines)  # an error up to here still has its own status
         return StreamingResponse(_resume(request, first, lines), headers=cache_headers(tag), media_type=JSON_LINES)
     written = await sequence_file(
         service.workers, caller, model, animation, quality, chosen, faces, fps or FRAMES_PER_SECOND, colour_by
     )
     diagnostics = {**(written.diagnostics or {}), **written.facts}
     headers = cache_headers(tag) | file_headers(diagnostics, f"{model.manifest.name}-animation.{chosen}")
-    return written_response(service, written, headers, MEDIA_TYPES[chosen])
+    return encoded_response(service, written, headers, MEDIA_TYPES[chosen])
 
 
 @router.get(
@@ -143,20 +137,22 @@ async def get_frame(
     request: Request,
     caller: CallerDependency,
     id: Id,
-    k: Annotated[int, Path(description="Number of the frame, from 0.", json_schema_extra={"minimum": 0})],
+    k: Annotated[int, Path(description="Index of the frame, from 0.", json_schema_extra={"minimum": 0})],
+    options: FrameQuery,
     quality: QualityQuery = Quality.FULL,
-    color: ColorQuery = NO_COLOR,
-    topology: TopologyQuery = None,
-    format: Annotated[Format, one_of(SHAPE_FORMATS)] = None,
 ) -> Response:
     """One frame of an animation in any mesh format."""
-    chosen = choose_mesh(format, request, color)
     animation, model = find_interpolation(service.repository, id, service.settings.max_frames)
-    faces = choose_topology(topology, chosen, model, animation.mesh, polygons=SHAPE_FORMATS[chosen].polygons)
-    wanted = WantedShape(
-        frame_code(model, animation, k), animation.mesh, chosen, quality, color.on(model), topology=faces
-    )
+    wanted = options.shape(model, frame_code(model, animation, k), animation.mesh, quality)
     return await shape_response(service, request, caller, model, wanted)
+
+
+def _choose_format(request: Request, format: str | None, color: ColourParameters) -> str:
+    """Return the format of an animation, one that carries colours where the query asks for some."""
+    types = {name: kind for name, kind in MEDIA_TYPES.items() if color.quantity is None or name not in _UNCOLOURED}
+    why = UNAVAILABLE if color.quantity is None else _UNCOLOURED | UNAVAILABLE
+    # OBJ holds one frame, so an animation is a zip of OBJ files.
+    return choose(writable(types), "zip" if format == "obj" else format, request.headers.get("accept"), why)
 
 
 async def _resume(request: Request, first: bytes, rest: AsyncGenerator[bytes, None]) -> AsyncGenerator[bytes, None]:
@@ -165,5 +161,5 @@ async def _resume(request: Request, first: bytes, rest: AsyncGenerator[bytes, No
         try:
             async for line in rest:
                 yield line
-        except DOMAIN_ERRORS as error:  # too late for a status
+        except DOMAIN_ERRORS as error:  # the status has been sent already
             yield b'{"problem":%b}\n' % bytes((await domain_problem(request, error)).body)

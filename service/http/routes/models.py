@@ -1,4 +1,4 @@
-"""The models that are served, and the card of each."""
+"""The list of models, and the card of each model."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ async def list_models(service: ServiceDependency) -> ModelList:
 
 @router.get("/{name}", responses=problems(404, 422))
 async def model_card(service: ServiceDependency, model: Model) -> ModelCard:
-    """What a model is, its bounds and figures, and where it comes from."""
+    """Description of a model: its bounds, measured figures, and origin."""
     return ModelCard(
         **_facts(model),
         digest=model.digest,
@@ -42,7 +42,7 @@ async def model_card(service: ServiceDependency, model: Model) -> ModelCard:
 
 
 def _generalisation(figures: Mapping[str, Any]) -> GeneralisationAnswer | None:
-    """Of the largest number of modes that a run has measured; what other tools write there is left alone."""
+    """Return figures for the largest number of modes; None if they are missing or have another form."""
     try:
         found = figures["generalisation"]
         content = {**found["modes"][-1], "components": found["components"][-1]}
@@ -53,7 +53,7 @@ def _generalisation(figures: Mapping[str, Any]) -> GeneralisationAnswer | None:
 
 
 def _beside_components(figures: Mapping[str, Any], name: str) -> BesideComponents | None:
-    """Of that name, where a run has measured it; what other tools write there is left alone."""
+    """Return a figure by its name; None if it is missing or has another form."""
     try:
         return BesideComponents.model_validate(figures.get(name))
     except ValidationError:

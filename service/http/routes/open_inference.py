@@ -1,54 +1,34 @@
-"""The Open Inference Protocol: metadata, readiness and inference."""
+"""Calls of the Open Inference Protocol: metadata, readiness and inference."""
 
 from __future__ import annotations
 
 import asyncio
 from functools import partial
-from typing import Annotated, Any
+from typing import Any
 
-from fastapi import APIRouter, Depends, Path, Request, Response
+from fastapi import APIRouter, Request, Response
 
 from shapespace import __version__
 from shapespace.files.formats import OCTET_STREAM
-from shapespace.model.shape_model import ShapeModel
-from shapespace.service.http.dependencies import CallerDependency, ModelName, Service, ServiceDependency
+from shapespace.service.http.dependencies import CallerDependency, Model, ServiceDependency
 from shapespace.service.http.description import problems
+from shapespace.service.http.messages.binary_tensors import HEADER, read_codes, read_request, write_answer
 from shapespace.service.http.messages.open_inference import (
-    HEADER,
     InferenceAnswer,
     InferenceRequest,
     ModelMetadata,
     ModelReadiness,
     ServerMetadata,
-    answer,
     model_metadata,
-    parse,
 )
-from shapespace.service.http.messages.open_inference import codes as codes_of
-from shapespace.service.http.responses import diagnostics_header, written_response
-from shapespace.service.limits.workers import Caller
+from shapespace.service.http.responses import diagnostics_header, encoded_response
 from shapespace.service.use_cases.batch import require_count
-from shapespace.service.use_cases.many_shapes import infer
+from shapespace.service.use_cases.many_shapes import infer as infer_file
 
 router = APIRouter(prefix="/v2", tags=["inference"])
 
 
-async def _newest(service: ServiceDependency, name: ModelName) -> ShapeModel:
-    return service.repository.get(name)
-
-
-async def _versioned(
-    service: ServiceDependency,
-    name: ModelName,
-    version: Annotated[str, Path(description="Version of the model.", examples=["1"])],
-) -> ShapeModel:
-    return service.repository.get(name, version)
-
-
-Newest = Annotated[ShapeModel, Depends(_newest)]
-Versioned = Annotated[ShapeModel, Depends(_versioned)]
-
-_NEWEST, _VERSIONED = "/models/{name}", "/models/{name}/versions/{version}"
+_NEWEST, _VERSION = "/models/{name}", "/models/{name}/versions/{version}"
 _BYTES = {OCTET_STREAM: {"schema": {"type": "string", "format": "binary"}}}
 _REQUEST = {"$ref": f"#/components/schemas/{InferenceRequest.__name__}"}
 _INFER: dict[str, Any] = {
@@ -56,10 +36,10 @@ _INFER: dict[str, Any] = {
     "response_model_exclude_none": True,
     "responses": {
         200: {
-            "description": "The outputs, as JSON or as JSON with bytes after it.",
+            "description": "The outputs, as JSON or as JSON followed by bytes.",
             "content": _BYTES,
             "headers": {
-                HEADER: {"description": "Length of the JSON part, where bytes follow.", "schema": {"type": "integer"}}
+                HEADER: {"description": "Length of the JSON part, if bytes follow.", "schema": {"type": "integer"}}
             },
         }
     }
@@ -73,7 +53,7 @@ _INFER: dict[str, Any] = {
             {
                 "name": HEADER,
                 "in": "header",
-                "description": "Length of the JSON part of the body, where the input's bytes follow it.",
+                "description": "Length of the JSON part of the body, if the bytes of the input follow it.",
                 "schema": {"type": "integer", "minimum": 0},
             }
         ],
@@ -83,66 +63,43 @@ _INFER: dict[str, Any] = {
 
 @router.get("")
 async def server_metadata() -> ServerMetadata:
-    """What this server is."""
+    """Name, version and extensions of the server."""
     return ServerMetadata(name="shapespace", version=__version__, extensions=["binary_tensor_data"])
 
 
-@router.get(_NEWEST, responses=problems(404), name="model_metadata")
-async def newest_metadata(service: ServiceDependency, model: Newest) -> ModelMetadata:
-    """The tensors of a model's newest version."""
+@router.get(_VERSION, responses=problems(404, 422), name="version_metadata")
+@router.get(_NEWEST, responses=problems(404, 422), name="model_metadata")
+async def metadata(service: ServiceDependency, model: Model) -> ModelMetadata:
+    """Description of a model with its input and output tensors."""
     return model_metadata(model, service.repository.versions(model.manifest.name))
 
 
-@router.get(_VERSIONED, responses=problems(404), name="version_metadata")
-async def versioned_metadata(service: ServiceDependency, model: Versioned) -> ModelMetadata:
-    """The tensors of one version of a model."""
-    return model_metadata(model, service.repository.versions(model.manifest.name))
-
-
-@router.get(f"{_NEWEST}/ready", responses=problems(404), name="model_ready")
-async def newest_ready(model: Newest) -> ModelReadiness:
-    """Whether a model answers; 404 where it isn't served."""
+@router.get(f"{_VERSION}/ready", responses=problems(404, 422), name="version_ready")
+@router.get(f"{_NEWEST}/ready", responses=problems(404, 422), name="model_ready")
+async def model_ready(model: Model) -> ModelReadiness:
+    """Whether a model is served; 404 if it is not."""
     return ModelReadiness(name=model.manifest.name, ready=True)
 
 
-@router.get(f"{_VERSIONED}/ready", responses=problems(404), name="version_ready")
-async def versioned_ready(model: Versioned) -> ModelReadiness:
-    """Whether a version of a model answers; 404 where it isn't served."""
-    return ModelReadiness(name=model.manifest.name, ready=True)
-
-
+@router.post(f"{_VERSION}/infer", name="infer_version", **_INFER)
 @router.post(f"{_NEWEST}/infer", name="infer", **_INFER)
-async def newest_infer(
-    service: ServiceDependency, request: Request, caller: CallerDependency, model: Newest
-) -> Response:
-    """Lengths and angles, and vertices, of codes, by a model's newest version."""
-    return await _infer(service, request, caller, model)
-
-
-@router.post(f"{_VERSIONED}/infer", name="infer_version", **_INFER)
-async def versioned_infer(
-    service: ServiceDependency, request: Request, caller: CallerDependency, model: Versioned
-) -> Response:
-    """Lengths and angles, and vertices, of codes, by one version of a model."""
-    return await _infer(service, request, caller, model)
-
-
-async def _infer(service: Service, request: Request, caller: Caller, model: ShapeModel) -> Response:
-    message, tail = await asyncio.to_thread(parse, await request.body(), request.headers.get(HEADER))
+async def infer(service: ServiceDependency, request: Request, caller: CallerDependency, model: Model) -> Response:
+    """Lengths and angles, vertices, or both, for latent codes."""
+    message, tail = await asyncio.to_thread(read_request, await request.body(), request.headers.get(HEADER))
     require_count(message.inputs[0].shape[0], service.settings.max_codes)
-    options, write = message.parameters, partial(answer, message, model)
-    written = await infer(
+    options, write = message.parameters, partial(write_answer, message, model)
+    written = await infer_file(
         service.workers,
         caller,
         model,
-        codes_of(message, tail),
+        read_codes(message, tail),
         options.bounds,
         options.mesh,
         options.quality,
-        message.wanted,
+        message.output_names,
         write,
     )
     headers = diagnostics_header(written.diagnostics) if written.diagnostics else {}
     if HEADER not in written.facts:
-        return written_response(service, written, headers, "application/json")
-    return written_response(service, written, headers | {HEADER: str(written.facts[HEADER])}, OCTET_STREAM)
+        return encoded_response(service, written, headers, "application/json")
+    return encoded_response(service, written, headers | {HEADER: str(written.facts[HEADER])}, OCTET_STREAM)

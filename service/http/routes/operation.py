@@ -1,4 +1,4 @@
-"""For those who run the server: figures, and the description of every call."""
+"""Calls for operators: metrics, and the description of every call."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ router = APIRouter(tags=["operation"])
     },
 )
 async def metrics(service: ServiceDependency) -> Response:
-    """What the server has counted and measured since its start."""
+    """Metrics of the server since its start."""
     return Response(generate_latest(service.metrics.registry), media_type=CONTENT_TYPE_PLAIN_0_0_4)
 
 
 @router.get("/openapi.json", include_in_schema=False)
 async def openapi(request: Request) -> dict[str, object]:
-    """This interface as OpenAPI 3.1."""
+    """Description of this interface as OpenAPI 3.1."""
     described: dict[str, object] = request.app.openapi()
     return described

@@ -1,4 +1,4 @@
-"""The page for people."""
+"""The web page."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ router = APIRouter(include_in_schema=False)
 
 
 class TaggedFiles(StaticFiles):
-    """Files with entity tags of their content, which replicas have in common whenever their files were written."""
+    """Static files whose entity tags are digests of their content, so that replicas agree."""
 
     def file_response(
         self, full_path: str | os.PathLike[str], stat_result: os.stat_result, scope: Scope, status_code: int = 200
     ) -> Response:
-        """A file, or 304 where the client has it."""
-        # By entity tag: modules of two versions must not meet.
+        """Return a file, or 304 if the client has it already."""
+        # no-cache, so that a page never loads modules of two versions.
         headers = {"ETag": _tag(os.fspath(full_path), stat_result.st_mtime_ns), "Cache-Control": "no-cache"}
         response = FileResponse(full_path, status_code, headers, stat_result=stat_result)
         if self.is_not_modified(response.headers, Headers(scope=scope)):
@@ -50,7 +50,7 @@ _FILES = TaggedFiles(directory=FOLDER)
 
 @router.api_route("/", methods=["GET", "HEAD"])
 async def page(request: Request, service: ServiceDependency) -> Response:
-    """Shapes to move by hand; with ``?embed`` their viewer alone, for pages that may show it in a frame."""
+    """The page; with ``?embed`` only its viewer, which the pages of some origins may show in a frame."""
     response = await _FILES.get_response("index.html", request.scope)
     framing = service.settings.embed_origins if "embed" in request.query_params else ()
     ancestors = " ".join(framing) or "'none'"
@@ -59,13 +59,13 @@ async def page(request: Request, service: ServiceDependency) -> Response:
 
 
 def assets() -> BaseRoute:
-    """Styles and scripts of the page, compressed."""
+    """Return the route of the page's styles and scripts, with compression."""
     return Mount("/page", GZipMiddleware(_FILES), name="page")
 
 
 @cache
 def _policy() -> str:
-    """Everything the page needs comes from this server; the import map, an inline script, goes by its digest."""
+    """Return the content security policy: files of this server only, and the inline import map by its digest."""
     maps = re.findall(r'<script type="importmap">(.*?)</script>', (FOLDER / "index.html").read_text("utf-8"), re.DOTALL)
     digests = (base64.b64encode(hashlib.sha256(text.encode()).digest()).decode() for text in maps)
     scripts = " ".join(["'self'", *(f"'sha256-{digest}'" for digest in digests)])

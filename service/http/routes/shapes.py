@@ -1,4 +1,4 @@
-"""Latent codes to meshes, positions, lengths and angles."""
+"""Calls that answer meshes, positions, and lengths and angles of latent codes."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ from shapespace.service.http.dependencies import (
 )
 from shapespace.service.http.description import binary, mesh_answers, problems
 from shapespace.service.http.messages.bodies import JSONBody
-from shapespace.service.http.messages.color_query import NO_COLOR, ColorQuery, choose_mesh
 from shapespace.service.http.messages.latent_query import NUMBERS, numbers
+from shapespace.service.http.messages.mesh_query import SingleMeshQuery
 from shapespace.service.http.messages.place_query import PlaceQuery
 from shapespace.service.http.messages.schemas import (
     MeshRequest,
@@ -30,18 +30,15 @@ from shapespace.service.http.messages.schemas import (
     VerticesAnswer,
     VerticesRequest,
 )
-from shapespace.service.http.messages.topology_query import TopologyQuery, choose_topology
 from shapespace.service.http.negotiation import choose
-from shapespace.service.http.responses import file_headers, shape_response, written_response
+from shapespace.service.http.responses import encoded_response, file_headers, shape_response
 from shapespace.service.use_cases.batch import require_count
 from shapespace.service.use_cases.many_shapes import VERTICES_TYPES, vertices_file
 from shapespace.service.use_cases.nric import nric_file
-from shapespace.service.use_cases.one_shape import WantedShape
-from shapespace.service.use_cases.shape_formats import SHAPE_FORMATS
 
 router = APIRouter(prefix="/v1/models/{name}", tags=["shapes"])
 
-_MESH_RESPONSES = mesh_answers("The mesh. `Shape-Diagnostics` says how well it was found.")
+_MESH_RESPONSES = mesh_answers("The mesh, with its diagnostics in `Shape-Diagnostics`.")
 
 
 @router.get("/mesh", responses=_MESH_RESPONSES | problems(404, 406, 422, 503, 504), response_class=Response)
@@ -50,28 +47,22 @@ async def get_mesh(
     request: Request,
     caller: CallerDependency,
     model: Model,
+    options: SingleMeshQuery,
     latent: Annotated[
         str | None,
         Query(
-            description="Coordinates separated by commas; without them the reference shape.",
+            description="Coordinates separated by commas; by default the reference shape.",
             openapi_examples={"a code": {"value": "1,2,3,4"}},
             json_schema_extra={"pattern": NUMBERS},
         ),
     ] = None,
-    mesh: Annotated[MeshChoice, Query(description="Which mesh, where the model has a finer one.")] = MeshChoice.FINE,
+    mesh: Annotated[MeshChoice, Query(description="The mesh, if the model has a fine one.")] = MeshChoice.FINE,
     bounds: Annotated[Bounds, Query(description="What to do with a code outside the bounds.")] = Bounds.ALLOW,
     quality: QualityQuery = Quality.FULL,
-    color: ColorQuery = NO_COLOR,
-    place: PlaceQuery = None,
-    topology: TopologyQuery = None,
-    format: Annotated[Format, one_of(SHAPE_FORMATS)] = None,
 ) -> Response:
-    """The shape of a code as a mesh file, for a link or a browser."""
-    chosen = choose_mesh(format, request, color)
+    """The shape of a code as a mesh file, by an address for links and browsers."""
     code = None if latent is None else model.latents.code(numbers(latent, "latent"), bounds)
-    faces = choose_topology(topology, chosen, model, mesh, polygons=SHAPE_FORMATS[chosen].polygons)
-    wanted = WantedShape(code, mesh, chosen, quality, color.on(model, bounds), place, faces)
-    return await shape_response(service, request, caller, model, wanted)
+    return await shape_response(service, request, caller, model, options.shape(model, code, mesh, quality, bounds))
 
 
 @router.post(
@@ -85,20 +76,13 @@ async def post_mesh(
     caller: CallerDependency,
     model: Model,
     body: Annotated[MeshRequest, Depends(JSONBody(MeshRequest))],
+    options: SingleMeshQuery,
     mesh: MeshQuery = None,
     quality: QualityOfBody = None,
-    color: ColorQuery = NO_COLOR,
-    place: PlaceQuery = None,
-    topology: TopologyQuery = None,
-    format: Annotated[Format, one_of(SHAPE_FORMATS)] = None,
 ) -> Response:
     """The shape of a code as a mesh file."""
-    chosen = choose_mesh(format, request, color)
     code = model.latents.code(body.latent, body.bounds)
-    colours = color.on(model, body.bounds, body.covariance)
-    which = mesh or body.mesh
-    faces = choose_topology(topology, chosen, model, which, polygons=SHAPE_FORMATS[chosen].polygons)
-    wanted = WantedShape(code, which, chosen, quality or body.quality, colours, place, faces)
+    wanted = options.shape(model, code, mesh or body.mesh, quality or body.quality, body.bounds, body.covariance)
     return await shape_response(service, request, caller, model, wanted)
 
 
@@ -116,11 +100,11 @@ async def post_vertices(
     body: Annotated[VerticesRequest, Depends(JSONBody(VerticesRequest))],
     mesh: MeshQuery = None,
     quality: QualityOfBody = None,
-    exact: Annotated[bool, Query(description="As in the body: also the true discrete exponentials.")] = False,
+    exact: Annotated[bool, Query(description="As in the body: add the true discrete exponentials.")] = False,
     place: PlaceQuery = None,
     format: Annotated[Format, one_of(VERTICES_TYPES)] = None,
 ) -> Response:
-    """The positions of many shapes at once."""
+    """Positions of many shapes."""
     chosen = choose(VERTICES_TYPES, format, request.headers.get("accept"))
     require_count(len(body.latents), service.settings.max_codes)
     written = await vertices_file(
@@ -137,7 +121,7 @@ async def post_vertices(
         faces=body.faces,
     )
     headers = {"Vary": "Accept", **file_headers(written.diagnostics or {}, f"{model.manifest.name}.{chosen}")}
-    return written_response(service, written, headers, VERTICES_TYPES[chosen])
+    return encoded_response(service, written, headers, VERTICES_TYPES[chosen])
 
 
 @router.post(
@@ -152,7 +136,7 @@ async def post_nric(
     model: Model,
     body: Annotated[NRICRequest, Depends(JSONBody(NRICRequest))],
 ) -> Response:
-    """Lengths and angles as the networks predict them, before any reconstruction."""
+    """Lengths and angles as the networks predict them, before reconstruction."""
     require_count(len(body.latents), service.settings.max_codes)
     written = await nric_file(service.workers, caller, model, body.latents, body.bounds, factors=body.factors)
-    return written_response(service, written, {}, "application/json")
+    return encoded_response(service, written, {}, "application/json")

@@ -1,4 +1,4 @@
-/** The state of the page as the part of its address after the #, and back. */
+/** Reads and writes the state of the page in the part of its address after the #. */
 
 import { Matrix4, Quaternion, Vector3 } from "three";
 import { OTHER } from "./view/colouring.js";
@@ -9,7 +9,7 @@ const number = (value) => String(Number(value.toFixed(5)));
 const list = (numbers) => numbers.map(number).join(",");
 const unlist = (text) => text.split(",").map(Number);
 
-/** What of the store goes into the address. */
+/** Return the part of the address for the store. */
 export function toHash(store, view) {
   const parts = new URLSearchParams({ model: store.model.name, z: list(store.code) });
   const flags = FLAGS.filter((flag) => store[flag]);
@@ -32,7 +32,7 @@ export function toHash(store, view) {
 
 const fromPin = ({ mesh, vertex, position }) => [mesh, vertex, list(position.toArray())].join(",");
 
-/** A pin; whether the mesh has its vertex is known when the mesh is there. */
+/** Read a pin. Whether the mesh has its vertex is checked once the mesh is loaded. */
 function toPin(text) {
   const [mesh, ...rest] = text.split(",");
   const [vertex, ...position] = rest.map(Number);
@@ -42,7 +42,7 @@ function toPin(text) {
     : [];
 }
 
-/** A motion as where it takes the origin, and a quaternion. */
+/** Return a motion as the image of the origin and a quaternion. */
 function fromPlacement(placement) {
   const [position, rotation] = [new Vector3(), new Quaternion()];
   placement.decompose(position, rotation, new Vector3());
@@ -56,7 +56,7 @@ function toPlacement(numbers) {
 }
 
 /**
- * What an address asks for; parts that make no sense for the model are left out.
+ * Read an address, without the parts that are invalid for the model.
  * @returns {{model?: any, missing?: string, code?: number[], keyframes?: number[][], locked?: boolean[],
  *   view?: number[], pins?: import("./shape/pull.js").Pin[], state?: Partial<import("./store.js").State>}}
  */

@@ -1,4 +1,4 @@
-/** Small helpers for building the page. Text only ever goes in as text. */
+/** Helpers to build the page. Text is inserted as text, never as HTML. */
 
 /** @type {(selector: string, root?: ParentNode) => any} */
 export const find = (selector, root = document) => root.querySelector(selector);
@@ -9,13 +9,13 @@ export const element = (name, properties = {}, ...children) => {
   return made;
 };
 
-/** A number for people: as many digits as say something. */
+/** Format a number with its meaningful digits. */
 export const readable = (value, digits = 3) => Number(value.toPrecision(digits)).toString();
 
-/** The value (of an array of numbers) below which a share of them lies. */
+/** Return the value below which a share of some numbers lies. */
 export const percentile = (values, share) => values.toSorted()[Math.floor(share * (values.length - 1))];
 
-/** A button that is on or off, tied to a value of the store. */
+/** Tie a toggle button to a value of the store. */
 export function toggle(button, store, key) {
   const show = () => button.setAttribute("aria-pressed", String(store[key]));
   button.addEventListener("click", () => store.set({ [key]: !store[key] }));
@@ -23,7 +23,7 @@ export function toggle(button, store, key) {
   show();
 }
 
-/** Width and height in device pixels, so that small pictures are sharp. */
+/** Set width and height in device pixels, so that small pictures are sharp. */
 export function sharp(canvas, size) {
   canvas.width = canvas.height = size * Math.min(devicePixelRatio, 2);
   return canvas;

@@ -1,15 +1,15 @@
-/** What a hand does to a slider in one go is one step: a drag, or keys one after the other. */
+/** Groups the events of one movement of a slider into one step: a drag, or several keys in a row. */
 
-const REST = 700; // ms without a key until a movement by keys has ended
+const REST = 700; // ms without a key until a movement by keys ends
 
 export class Hand {
   #held = false;
   #timer = 0;
 
-  /** @param {import("./store.js").Page} store whose `moving` says that a hand is at it */
+  /** @param {import("./store.js").Page} store whose `moving` is true during a movement */
   constructor(store) {
     this.store = store;
-    // The end of a drag, wherever it ends.
+    // A drag may end anywhere in the window.
     for (const end of ["pointerup", "pointercancel", "blur"]) addEventListener(end, () => this.#let());
   }
 

@@ -1,4 +1,4 @@
-/** Undo and redo of codes, of where pulls left their shapes, and of pins: each rest of the hand is a step. */
+/** Undo and redo of codes, placements of pulled shapes, and pins. Each finished movement is a step. */
 
 import { sameCode } from "./server/space.js";
 
@@ -24,7 +24,7 @@ export class History {
     addEventListener("keydown", (event) => {
       if (!(event.ctrlKey || event.metaKey) || event.altKey) return;
       const { target } = /** @type {{target: any}} */ (event);
-      if (target.matches?.(TYPED)) return; // which undoes what was typed
+      if (target.matches?.(TYPED)) return; // the browser undoes the typing
       const key = event.key.toLowerCase();
       if (key !== "z" && key !== "y") return;
       event.preventDefault();
@@ -38,7 +38,7 @@ export class History {
     if (this.#at < 0 || !sameCode(code, this.#steps[this.#at].code)) {
       this.#steps = [...this.#steps.slice(0, this.#at + 1), { code, placement, pins }].slice(-LONGEST);
       this.#at = this.#steps.length - 1;
-    } else this.#steps[this.#at].pins = pins; // which came or went without a change of shape
+    } else this.#steps[this.#at].pins = pins; // pins were added or removed without a change of shape
     this.#show();
   }
 

@@ -1,4 +1,4 @@
-/** Puts the page together: one store, and everything that shows or changes what is in it. */
+/** Puts the page together: one store, and the parts that show or change its values. */
 
 import { fromHash, toHash } from "./address.js";
 import { element, find, toggle } from "./dom.js";
@@ -128,7 +128,7 @@ store.on(["colour", "against", "highlight", "regions", "repaint", "moving"], () 
 });
 store.on(["wireframe", "normals"], () => viewer.style(store));
 
-// What is said about it.
+// Diagnostics of the shape.
 let timed = null;
 let told = {}; // diagnostics of the last full shape
 viewer.canvas.addEventListener("drawn", () => {
@@ -185,7 +185,7 @@ find("#theme").addEventListener("click", () => {
   viewer.recolour();
 });
 
-// Codes from elsewhere than the sliders.
+// Codes that do not come from the sliders.
 const take = (code) => {
   const { locked, space } = store;
   store.set({ code: space.wrapAll(code).map((value, k) => (locked[k] ? store.code[k] : value)) });
@@ -227,17 +227,17 @@ picker.addEventListener(
     try {
       await openModel({ model: models.find(({ name }) => name === picker.value) });
     } catch (error) {
-      picker.value = store.model.name; // which is still shown
+      picker.value = store.model.name; // the model that is still shown
       throw error;
     }
   }),
 );
 
-/** Whether a pin's mesh has its vertex. */
+/** Return whether a pin's mesh has its vertex. */
 const isThere = ({ mesh, vertex }) => 3 * vertex < store.references[mesh]?.vertices.length;
 
 /**
- * Show what an address asks for of the model that is shown.
+ * Apply an address to the model that is shown.
  * @param {ReturnType<typeof fromHash>} asked
  */
 function goTo({ code, keyframes, locked, view, pins, state }) {
@@ -248,7 +248,7 @@ function goTo({ code, keyframes, locked, view, pins, state }) {
 }
 
 /**
- * Take on a model, at its home, or as an address asks for it.
+ * Switch to a model, at its home code or as an address says.
  * @param {ReturnType<typeof fromHash>} asked
  */
 async function openModel({ model, code, keyframes = [], locked, view, pins = [], state = {} }) {
@@ -300,7 +300,7 @@ async function openModel({ model, code, keyframes = [], locked, view, pins = [],
       if (store.model !== model) skin.dispose();
       else viewer.dress(store.hasFine ? "fine" : "coarse", skin);
     } catch (error) {
-      // all but the look is there without it
+      // only the appearance is missing without it
       report(error);
     }
     if (store.model !== model) return;
@@ -310,7 +310,7 @@ async function openModel({ model, code, keyframes = [], locked, view, pins = [],
   await modes.draw();
 }
 
-// The address. Each rest of the hand at another shape is an entry of the browser's history.
+// The address. Each finished movement to another shape is an entry of the browser's history.
 let soon = 0;
 let remembered = null;
 function remember() {

@@ -1,4 +1,4 @@
-/** What the browser keeps of the page; `keep` answers whether it does, as some let pages keep nothing. */
+/** Storage of the browser. `keep` returns whether a value was stored, because a browser may refuse. */
 
 const memory = (storage) => ({
   keep(name, value) {
@@ -6,7 +6,7 @@ const memory = (storage) => ({
       storage().setItem(name, value);
       return true;
     } catch {
-      return false; // reading the storage throws already where it is blocked
+      return false; // even reading throws if storage is blocked
     }
   },
   kept(name) {
@@ -18,7 +18,7 @@ const memory = (storage) => ({
   },
 });
 
-/** From one visit to the next. */
+/** Kept from one visit to the next. */
 export const always = memory(() => localStorage);
-/** As long as the tab is open. */
+/** Kept while the tab is open. */
 export const here = memory(() => sessionStorage);

@@ -1,9 +1,9 @@
-/** What the page has to say to people: in the page, read out by screen readers, never only in the console. */
+/** Messages to the user: visible in the page and announced by screen readers, never only in the console. */
 
 const box = document.querySelector("#messages");
 
 /**
- * Say something; a message with a `key` replaces the one before, and stays until it is taken back.
+ * Show a message. One with a `key` replaces the last message with this key, and stays until it is removed.
  * @param {string} text
  * @param {{kind?: "note" | "error", key?: string}} [how]
  */
@@ -20,7 +20,7 @@ export function say(text, { kind = "note", key } = {}) {
   /** @type {NodeListOf<HTMLElement>} */
   const shown = box.querySelectorAll(":scope > :not([hidden])");
   for (const old of [...shown].slice(0, -3)) old.hidden = true;
-  // A log keeps what it has said, out of sight.
+  // A log keeps past messages invisibly.
   if (kind === "note")
     setTimeout(() => {
       line.hidden = true;
@@ -32,7 +32,7 @@ export function takeBack(key) {
   if (key) box.querySelectorAll(`[data-key="${key}"]`).forEach((line) => line.remove());
 }
 
-/** Tell of an error; what was merely superseded is none. */
+/** Show an error, unless the request was only superseded. */
 export function report(error) {
   if (error.name === "AbortError") return;
   if (error.offline)
@@ -40,7 +40,7 @@ export function report(error) {
   else say(error.message, { kind: "error" });
 }
 
-/** A handler that reports what goes wrong in it. */
+/** Return a handler that reports its errors. */
 export const reporting =
   (work) =>
   async (...parameters) => {

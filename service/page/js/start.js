@@ -1,6 +1,6 @@
-/** Starts the page where the browser can draw it; otherwise what works without stays in its place. */
+/** Starts the page if the browser can draw it; otherwise the parts that work without drawing stay. */
 
-// The viewer alone, for a frame in another page.
+// Only the viewer, for a frame in another page.
 if (new URLSearchParams(location.search).has("embed")) document.documentElement.classList.add("embed");
 
 if (document.createElement("canvas").getContext("webgl2")) {

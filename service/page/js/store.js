@@ -1,16 +1,16 @@
 /**
- * The page's state and who wants to know when it changes.
+ * The state of the page, with listeners for its changes.
  *
- * @typedef {object} Shape what is shown
+ * @typedef {object} Shape the shown shape
  * @property {object} model
  * @property {"coarse" | "fine"} mesh
  * @property {number[]} code
  * @property {Float32Array} positions 3V numbers
- * @property {import("three").Matrix4 | null} placement where a pull has left it
- * @property {import("three").Matrix4} motion from where the server has it to where it is shown
+ * @property {import("three").Matrix4 | null} placement motion by a pull
+ * @property {import("three").Matrix4} motion from the server's position to the shown one
  * @property {object | null} diagnostics of full shapes
  * @property {"draft" | "full"} [quality]
- * @property {number} began when it was asked for
+ * @property {number} began time of the request
  *
  * @typedef {object} State
  * @property {any} model as the server lists it
@@ -18,25 +18,25 @@
  * @property {{factors: string[], labels: string[], coordinates: string[]} | null} names
  * @property {{coarse?: Reference, fine?: Reference}} references
  * @property {boolean} hasFine
- * @property {import("./view/pose.js").Pose | null} pose where there is a fine mesh
+ * @property {import("./view/pose.js").Pose | null} pose if there is a fine mesh
  * @property {number[] | null} code
  * @property {boolean[]} locked by coordinate
  * @property {import("three").Matrix4 | null} placement
- * @property {boolean} moving whether a hand is at it: what comes meanwhile is one step
+ * @property {boolean} moving whether the user moves something; all changes meanwhile are one step
  * @property {boolean} playing
  * @property {Shape | null} shape
  * @property {number[][]} keyframes
  * @property {boolean} loop
- * @property {number} beyond share of the path that is played before its start, and after its end
- * @property {number | null} seconds that the path takes, where somebody has said so
+ * @property {number} beyond share of the path that is played before its start and after its end
+ * @property {number | null} seconds length of the path, if the user has set it
  * @property {"even" | "soft"} easing
  * @property {number | null} usual residual of the model's own shapes
  * @property {string} colour "none", "stretch", "bending", "distance" or "spread"
  * @property {number} against index of the keyframe that colours compare with; −1 the mean, −2 `other`
- * @property {number[] | null} other code of the shape beside, which is compared with
- * @property {number | null} highlight index of the factor that is pointed at
+ * @property {number[] | null} other code of the shape beside, to compare with
+ * @property {number | null} highlight index of the factor under the pointer
  * @property {Float32Array[] | null} regions weights of each factor at coarse vertices
- * @property {object | null} repaint new where colours have to be made again
+ * @property {object | null} repaint a new object when colours must be computed again
  * @property {boolean} wireframe
  * @property {boolean} normals
  * @property {boolean} fine
@@ -47,7 +47,7 @@
  * @property {boolean} ghost
  *
  * @typedef {{vertices: Float32Array, faces: Int32Array}} Reference
- * @typedef {Store & State} Page what the parts of the page are given
+ * @typedef {Store & State} Page the store that all parts of the page use
  */
 export class Store {
   #listeners = [];
@@ -67,7 +67,7 @@ export class Store {
   }
 
   /**
-   * Change some values at once; who listens to several of them is called once.
+   * Change some values at once. A listener for several of them is called once.
    * @param {Partial<State>} patch
    */
   set(patch) {

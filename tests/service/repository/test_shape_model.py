@@ -15,7 +15,7 @@ from shapespace.model.latent_space import NotFiniteError
 from shapespace.model.shape_model import ShapeModel
 from shapespace.service.limits.workers import DeadlineError, Workers
 from shapespace.service.use_cases.batch import solve
-from shapespace.service.use_cases.shape_formats import worst
+from shapespace.service.use_cases.shape_formats import summarise
 from shapespace.solve.deadline import Deadline
 from shapespace.solve.outcome import Status
 from tests.service.bundles import networks, seal, start_network, write_bundle
@@ -68,7 +68,7 @@ def test_the_summary_of_several_shapes_is_their_worst(tmp_path: Path) -> None:
     good = model.decoder.reference_shape().diagnostics
     bad = dataclasses.replace(good, status=Status.STALLED, iterations=9, residual=0.5, inside_bounds=False)
     folded = dataclasses.replace(good, flipped_faces=4, integrability=0.2, plausibility=1.5)
-    assert worst([good, bad, folded]) == {
+    assert summarise([good, bad, folded]) == {
         "status": "stalled",
         "iterations": 9,
         "residual": 0.5,
@@ -80,8 +80,8 @@ def test_the_summary_of_several_shapes_is_their_worst(tmp_path: Path) -> None:
         "quality": "full",
     }
     draft = dataclasses.replace(good, quality=Quality.DRAFT)
-    assert worst([good, draft])["quality"] == "draft"
-    assert worst([good, good])["status"] == "converged"
+    assert summarise([good, draft])["quality"] == "draft"
+    assert summarise([good, good])["status"] == "converged"
 
 
 @pytest.fixture(scope="module", params=["figure/3", "freaky-torus/1"])

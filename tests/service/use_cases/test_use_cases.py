@@ -27,15 +27,15 @@ from shapespace.service.limits.workers import BusyError, Caller, DeadlineError, 
 from shapespace.service.use_cases import batch, codes, many_shapes
 from shapespace.service.use_cases.animation import Animation
 from shapespace.service.use_cases.batch import (
+    EncodedFile,
     NoCodesError,
     PiecewiseFile,
     TooManyCodesError,
-    Written,
     require_count,
 )
 from shapespace.service.use_cases.many_shapes import infer, vertices_file
 from shapespace.service.use_cases.nric import nric_file
-from shapespace.service.use_cases.one_shape import ColourBy, WantedShape, shape_file
+from shapespace.service.use_cases.one_shape import ColourOptions, ShapeRequest, shape_file
 from shapespace.service.use_cases.sequence import (
     TooManyFramesError,
     UnknownFrameError,
@@ -89,14 +89,14 @@ def run(use_case: Callable[[Workers], Awaitable[T]], deadline: float = 60) -> T:
     return asyncio.run(main())
 
 
-def content(written: Written) -> bytes:
+def content(written: EncodedFile) -> bytes:
     assert isinstance(written.content, bytes)
     return written.content
 
 
 def test_a_shape_is_a_file_with_diagnostics_and_timings(model: ShapeModel) -> None:
     code = model.latents.code(CODES[0])
-    found = run(lambda workers: shape_file(workers, CALLER, model, WantedShape(code, MeshChoice.FINE, "json")))
+    found = run(lambda workers: shape_file(workers, CALLER, model, ShapeRequest(code, MeshChoice.FINE, "json")))
     assert found.diagnostics.status == "converged"
     assert found.diagnostics.model == model.digest
     assert set(found.seconds) == {"network", "reconstruct", "encode"}
@@ -107,8 +107,8 @@ def test_a_shape_is_a_file_with_diagnostics_and_timings(model: ShapeModel) -> No
 
 
 def test_without_a_code_it_is_the_reference_and_colours_come_with_a_legend(model: ShapeModel) -> None:
-    colour_by = ColourBy(Quantity.STRETCH, model.latents.code(CODES[1]))
-    wanted = WantedShape(None, MeshChoice.FINE, "json", colour_by=colour_by)
+    colour_by = ColourOptions(Quantity.STRETCH, model.latents.code(CODES[1]))
+    wanted = ShapeRequest(None, MeshChoice.FINE, "json", colour_by=colour_by)
     found = run(lambda workers: shape_file(workers, CALLER, model, wanted))
     answer = json.loads(found.content)
     assert np.allclose(answer["vertices"], SCALE * model.reference.vertices, atol=1e-5)
@@ -136,7 +136,7 @@ def test_a_large_file_comes_in_pieces_and_holds_its_memory_until_it_is_read(
     async def both(workers: Workers) -> tuple[bytes, bytes]:
         ask = (workers, CALLER, model, CODES, Bounds.ALLOW, MeshChoice.FINE, "json")
         whole = content(await vertices_file(*ask))
-        monkeypatch.setattr(batch, "WHOLE", 100)
+        monkeypatch.setattr(batch, "WHOLE_FILE_BYTES", 100)
         file = (await vertices_file(*ask)).content
         assert isinstance(file, PiecewiseFile)
         assert workers.memory.used > 0
@@ -187,7 +187,7 @@ def test_inference_computes_the_outputs_that_are_wanted(model: ShapeModel, outpu
 def test_frames_are_those_of_one_file_and_of_the_lines(model: ShapeModel) -> None:
     animation = Animation(keyframes=CODES, frames=3)
 
-    async def both(workers: Workers) -> tuple[Written, list[bytes]]:
+    async def both(workers: Workers) -> tuple[EncodedFile, list[bytes]]:
         written = await sequence_file(workers, CALLER, model, animation, Quality.FULL, "npz")
         return written, [line async for line in sequence_lines(workers, CALLER, model, animation, Quality.FULL)]
 
@@ -266,7 +266,7 @@ def test_both_outputs_together_may_be_more_than_an_answer_holds(
 ) -> None:
     monkeypatch.setattr(many_shapes, "MOST_VERTICES", len(CODES) * len(model.reference.vertices))
 
-    def ask(outputs: list[str]) -> Written:
+    def ask(outputs: list[str]) -> EncodedFile:
         latents, write = np.array(CODES), lambda arrays: (iter([b"x"]), {})
         return run(
             lambda workers: infer(
@@ -286,7 +286,7 @@ def test_work_ends_by_its_deadline_and_when_its_caller_leaves(model: ShapeModel)
     code = model.latents.code(CODES[0])
 
     def ask(caller: Caller) -> Callable[[Workers], Awaitable[object]]:
-        return lambda workers: shape_file(workers, caller, model, WantedShape(code, MeshChoice.FINE, "json"))
+        return lambda workers: shape_file(workers, caller, model, ShapeRequest(code, MeshChoice.FINE, "json"))
 
     with pytest.raises(DeadlineError, match="within 1e-06 s"):
         run(ask(CALLER), deadline=1e-6)
@@ -316,9 +316,9 @@ def test_one_caller_leaves_places_for_others(model: ShapeModel) -> None:
                 group.create_task(hold())
             await asyncio.sleep(0)
             with pytest.raises(BusyError, match="for this client"):
-                await shape_file(workers, CALLER, model, WantedShape(None, MeshChoice.FINE, "json"))
+                await shape_file(workers, CALLER, model, ShapeRequest(None, MeshChoice.FINE, "json"))
             other = Caller("somebody else", _stays)
-            assert (await shape_file(workers, other, model, WantedShape(None, MeshChoice.FINE, "json"))).content
+            assert (await shape_file(workers, other, model, ShapeRequest(None, MeshChoice.FINE, "json"))).content
             held.set()
 
     run(fill)

@@ -7,11 +7,11 @@ import { eased, Reel } from "./reel.js";
 import { meshOf } from "../server/shape-loop.js";
 
 const PICTURE = 64;
-const SEGMENT = 24; // frames
-const LONGEST = 120; // frames
-const MOST_VERTICES = 2 ** 21; // of all frames: where they would be more, the coarse mesh plays
-const MOST_NUMBERS = 2400; // of keyframes in an address
-const PACE = 1.8; // seconds for a segment, where nobody says how long the path takes
+const SEGMENT = 24; // frames between two keyframes
+const LONGEST = 120; // most frames of a path
+const MOST_VERTICES = 2 ** 21; // of all frames together; above, the player shows the coarse mesh
+const MOST_NUMBERS = 2400; // of all keyframes in an address
+const PACE = 1.8; // seconds for a segment, unless the user sets the length of the path
 
 export class Path {
   /** @type {Reel | null} frames of the path as it is now */
@@ -64,8 +64,8 @@ export class Path {
   }
 
   /**
-   * What the server is asked for a file that moves as the player does. The server goes evenly from keyframe
-   * to keyframe: where the player does not, each frame is one, or as many as an address holds.
+   * Return the request for a file that moves as the player does. The server moves evenly between keyframes. If
+   * the player does not, each frame becomes a keyframe, up to the limit of an address.
    */
   get request() {
     const { easing, keyframes, loop, model } = this.store;
@@ -79,19 +79,19 @@ export class Path {
     return { keyframes: codes, frames, loop };
   }
 
-  /** How many frames it has. */
+  /** Number of frames. */
   get #frames() {
     const [start, stop] = this.#ends;
     return Math.min(Math.ceil(SEGMENT * this.#segments * (stop - start)) + 1, LONGEST);
   }
 
-  /** How long it takes from its start to its end. */
+  /** Seconds from start to end. */
   get seconds() {
     const [start, stop] = this.#ends;
     return this.store.seconds ?? PACE * this.#segments * (stop - start);
   }
 
-  /** How many of its frames the player shows in a second. */
+  /** Frames per second of the player. */
   get fps() {
     return (this.#frames - 1) / this.seconds;
   }
@@ -157,12 +157,12 @@ export class Path {
       .catch(report);
   }
 
-  /** Have an item of the list go to another place, by hand and by keys. */
+  /** Let the user move an item of the list, by dragging and by keys. */
   #carry(item, i) {
     item.draggable = true;
     item.addEventListener("dragstart", ({ dataTransfer }) => {
       this.#carried = i;
-      dataTransfer.setData("text/plain", `keyframe ${i + 1}`); // or some browsers drag nothing
+      dataTransfer.setData("text/plain", `keyframe ${i + 1}`); // some browsers drag nothing without data
     });
     item.addEventListener("dragend", () => {
       this.#carried = null;
@@ -176,7 +176,7 @@ export class Path {
     item.addEventListener("keydown", (event) => {
       const by = { ArrowLeft: -1, ArrowRight: 1 }[event.key];
       if (!event.altKey || !by) return;
-      event.preventDefault(); // which would leave the page
+      event.preventDefault(); // the browser would leave the page
       this.#move(i, i + by);
     });
   }
@@ -192,14 +192,14 @@ export class Path {
     find(`li:nth-child(${to + 1}) [data-do=go]`, this.list).focus();
   }
 
-  /** Times of frames from start to end, in segments; a loop leaves its end, which is its start, out. */
+  /** Return the times of all frames, in segments. A loop omits its end, which equals its start. */
   #times(frames) {
     const [start, stop] = this.#ends;
     const length = frames - Number(this.store.loop);
     return Array.from({ length }, (_, k) => start + (k * (stop - start)) / (frames - 1));
   }
 
-  /** Codes at times of the path. */
+  /** Return the codes at times of the path. */
   #codes(times) {
     const { keyframes, loop, space } = this.store;
     const closed = loop ? [...keyframes, keyframes[0]] : keyframes;
@@ -224,7 +224,7 @@ export class Path {
     return new Reel(store, codes, mesh, { loop: store.loop, tell });
   }
 
-  /** The path's frames, as soon as those up to a share of it are there. */
+  /** Return the frames of the path, once all frames up to a share of it are loaded. */
   async #load(share) {
     this.#reel ??= this.#ask();
     const reel = this.#reel;
@@ -244,8 +244,8 @@ export class Path {
   }
 
   /**
-   * The path for a video: how long it takes, and what shows the shape at a share of it until somebody else
-   * plays.
+   * Return the path for a video: its length, and a function that shows the shape at a share of it until the
+   * user plays again.
    */
   async film() {
     this.pause();
@@ -260,11 +260,11 @@ export class Path {
     return { seconds: this.seconds, show };
   }
 
-  /** Play as far as frames are there, and on as they come. */
+  /** Play the loaded frames, and further frames as they arrive. */
   async #play() {
     const [start, stop] = this.#ends;
     const reel = await this.#load(0);
-    if (this.store.playing) return; // another click waited for the same frames
+    if (this.store.playing) return; // an earlier click waited for the same frames
     this.store.set({ playing: true });
     let before = performance.now();
     const step = (now) => {
@@ -287,7 +287,7 @@ export class Path {
     }
   }
 
-  /** Rest at the nearest frame: the sliders take its code. */
+  /** Stop at the nearest frame, and give its code to the sliders. */
   pause() {
     cancelAnimationFrame(this.#clock);
     if (!this.store.playing) return;
@@ -299,7 +299,7 @@ export class Path {
     this.#t = t;
     this.#tell();
     await this.#load(this.#share(t));
-    if (this.#t !== t) return; // it has been moved on
+    if (this.#t !== t) return; // the path has moved on
     this.store.set({ playing: true });
     this.#show(t);
     if (document.activeElement !== this.timeline || !this.timeline.matches(":active")) this.pause();
@@ -313,13 +313,13 @@ export class Path {
     this.#tell();
   }
 
-  /** How far along its frames the path is at a time. */
+  /** Return the share of the frames at a time. */
   #share(t) {
     const [start, stop] = this.#ends;
     return ((this.store.easing === "soft" ? this.#slowed(t) : t) - start) / (stop - start);
   }
 
-  /** Where a path is that is slow at its keyframes and ends, when an even one is at t. */
+  /** Map time t of an even path to a path that is slow at its keyframes and ends. */
   #slowed(t) {
     const [start, stop] = this.#ends;
     const before = Math.floor(t * this.#segments) / this.#segments;

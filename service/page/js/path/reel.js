@@ -1,25 +1,25 @@
-/** The frames of a path: they come from the server a few at a time, and are shown at any time between two. */
+/** The frames of a path, loaded in batches, with interpolation between two frames. */
 
 import * as api from "../server/api.js";
 import { motionOf } from "../server/shape-loop.js";
 
-const AT_ONCE = 12; // frames of a call: the first are there soon, and calls are few
+const AT_ONCE = 12; // frames in a call: few enough for a quick start, and many enough for few calls
 
-/** From 0 to 1, slow at both ends. */
+/** Map 0 … 1 to itself, slow at both ends (smoothstep). */
 export const eased = (share) => share * share * (3 - 2 * share);
 
 export class Reel {
   #abort = new AbortController();
-  #shapes = []; // positions (3V numbers) of the frames that are there, the first ones
-  #parts = []; // promises of what each call brings
+  #shapes = []; // positions (3V numbers) of the loaded frames, from the first
+  #parts = []; // promises of the frames of each call
 
   /**
-   * Ask for the frames, as drafts.
+   * Request the frames, as drafts.
    * @param {import("../store.js").Page} store
    * @param {number[][]} codes of all frames
    * @param {"coarse" | "fine"} mesh
-   * @param {{loop?: boolean, tell?: (there: number) => void}} [how] whether the first frame follows on the
-   *   last, and who is told how many have come
+   * @param {{loop?: boolean, tell?: (there: number) => void}} [how] whether the first frame follows the
+   *   last, and a callback with the number of loaded frames
    */
   constructor(store, codes, mesh, { loop = false, tell = () => {} } = {}) {
     this.store = store;
@@ -30,7 +30,7 @@ export class Reel {
     let last = Promise.resolve();
     for (let k = 0; k < codes.length; k += AT_ONCE) {
       last = last.then(() => this.#fetch(store.model, codes.slice(k, k + AT_ONCE)));
-      last.catch(() => {}); // those who wait for it are told
+      last.catch(() => {}); // callers that wait for it get the error
       this.#parts.push(last);
     }
   }
@@ -43,27 +43,27 @@ export class Reel {
     this.tell(this.#shapes.length);
   }
 
-  /** Ask for no more; who waits gets an AbortError. */
+  /** Stop loading; callers that wait get an AbortError. */
   stop() {
     this.#abort.abort();
   }
 
-  /** The later one of the frames that are seen at a share of the path. */
+  /** Return the later of the two frames around a share of the path. */
   #after(share) {
     return Math.min(Math.ceil(share * this.steps), this.codes.length - 1);
   }
 
-  /** Wait for what is seen at a share (0 … 1) of the path, and all before it. */
+  /** Wait for all frames up to a share (0 … 1) of the path. */
   async reach(share) {
     await this.#parts[Math.floor(this.#after(share) / AT_ONCE)];
   }
 
-  /** Whether that is there. */
+  /** Return whether these frames are loaded. */
   has(share) {
     return this.#after(share) < this.#shapes.length;
   }
 
-  /** Show the shape at a share of the path: between two frames a mixture of both. */
+  /** Show the shape at a share of the path, interpolated between two frames. */
   show(share) {
     const { codes, mesh, steps, store } = this;
     const at = share * steps;

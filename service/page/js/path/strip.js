@@ -1,4 +1,4 @@
-/** The elements of a path's factors: the whole shape along the path, and below it each factor alone. */
+/** Pictures along a path: rows for the whole shape and for each factor alone. */
 
 import * as api from "../server/api.js";
 import { element, find, sharp } from "../dom.js";

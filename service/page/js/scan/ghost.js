@@ -1,15 +1,15 @@
-/** A scan as points over the shape, at the place where the fit has found it. */
+/** A scan as points over the shape, placed by its fit. */
 
 import * as THREE from "three";
 import { distant } from "../view/colours.js";
 import { matrixOf } from "../view/pose.js";
 import { sameCode } from "../server/space.js";
 
-// Of a point, as three.js has it, in the model's radius: about a hundredth of it in the picture
+// Size of a point for three.js, in radii of the model: about a hundredth of the radius in the picture
 const SIZE = 0.04;
 
 /**
- * Shows `store.scan` while `store.ghost` is on; its colours are distances as long as its own shape is shown.
+ * Shows `store.scan` while `store.ghost` is on. Colours are distances while the fitted shape is shown.
  */
 export class Ghost {
   #scan = null;

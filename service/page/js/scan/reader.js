@@ -1,7 +1,6 @@
 /**
- * Files that become shapes. One with the model's vertices in their order has its code at once; any other is a
- * scan, which is fitted. A shape that doesn't fit never replaces that of the user, and to that there is a way
- * back.
+ * Reads files as shapes. A file with the model's vertices in their order is encoded. Any other is a scan, and is
+ * fitted. A poor fit never replaces the user's shape, and the user can always return to that shape.
  */
 
 import * as api from "../server/api.js";
@@ -13,11 +12,11 @@ import { encodeInWords, fitInWords } from "./words.js";
 import { Verdict } from "./verdict.js";
 
 const POINTS_ONLY = ["xyz"];
-const UNITS = "scale=free"; // what the server says to send where a scan is in other units
+const UNITS = "scale=free"; // the server suggests this for a scan in other units
 
 export class Reader {
   #abort = new AbortController();
-  #found = null; // what the file was found to be, and the shape before
+  #found = null; // the shape of the file, and the shape before
 
   /** @param {import("../store.js").Page} store */
   constructor(store, { box, input, readAs, ownScale, stage }) {
@@ -54,7 +53,7 @@ export class Reader {
     });
   }
 
-  /** Find out what a file is, and show it. */
+  /** Encode or fit a file, and show its shape. */
   async read(file) {
     const { model, locked } = this.store;
     const refuse = (why) => say(why, { kind: "error", key: "scan" });
@@ -90,7 +89,7 @@ export class Reader {
       const answer = await api.encode(model, file, formatOf(file), fixedBy(locked, code), signal);
       this.#tell(file, answer, encodeInWords(answer, { file: file.name, ...this.#about }), {});
     } catch (error) {
-      // Other vertices than the model's, or in other units: then it is a scan, if it is anything.
+      // Other vertices than the model's, or other units: try it as a scan.
       if (error.type?.endsWith("invalid-mesh")) await this.#fit(file, this.#asked);
       else this.#fail(file, error);
     }
@@ -126,7 +125,7 @@ export class Reader {
     return this.#abort.signal;
   }
 
-  /** Give up what is under way, and take the scan away. */
+  /** Cancel the current request, and remove the scan. */
   #leave() {
     this.#abort.abort();
     this.#abort = new AbortController();
@@ -179,7 +178,7 @@ export class Reader {
   #show() {
     const { code, covariance, scan } = this.#found;
     const { hasFine, fine } = this.store;
-    // The scan is placed by the fine mesh's frame.
+    // The placement of the scan is in the frame of the fine mesh.
     const finer = fine || (hasFine && Boolean(scan));
     this.store.set({
       playing: false,
@@ -197,7 +196,7 @@ export class Reader {
     this.store.set({ ...this.#found.before, ghost: false });
   }
 
-  /** What can be done from the shape that is shown now. */
+  /** Return the actions for the shape that is shown. */
   #offer() {
     if (!this.#found || !this.store.code) return;
     const { code, before, scan, tries } = this.#found;

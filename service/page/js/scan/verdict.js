@@ -1,5 +1,5 @@
 /**
- * The box that says what came of a file, with what can be done about it; also while the answer is awaited.
+ * The box with the result for a file and the possible actions; it also shows progress.
  */
 
 import { gradient } from "../view/colours.js";
@@ -23,7 +23,7 @@ export class Verdict {
     this.box.hidden = true;
   }
 
-  /** Say what is going on; it can be given up. */
+  /** Show the progress, with a button to cancel. */
   await(title, cancel) {
     this.say({ how: "busy", title, words: [], more: [] }, [["Cancel", cancel]]);
     const began = performance.now();
@@ -34,7 +34,7 @@ export class Verdict {
     this.#timer = setInterval(tell, 1000);
   }
 
-  /** Say a verdict, with actions as pairs of a label and what to do. */
+  /** Show a verdict, with actions as pairs of a label and a function. */
   say({ how, title, words, more }, actions) {
     clearInterval(this.#timer);
     this.box.hidden = false;
@@ -57,7 +57,7 @@ export class Verdict {
     find(".actions", this.box).replaceChildren(...buttons);
   }
 
-  /** What the colours of the scan mean; null where there is none. */
+  /** Show the meaning of the scan's colours; null hides it. */
   scale(end) {
     find(".distances", this.box).hidden = end === null;
     find(".distances .high", this.box).textContent = end ?? "";

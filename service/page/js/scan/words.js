@@ -1,10 +1,10 @@
-/** What `encode` and `fit` answer about a file, in words for people. */
+/** Describes the answers of `encode` and `fit` in words. */
 
 import { readable } from "../dom.js";
 
 const percent = (share) => `${readable(100 * share, 2)} %`;
 
-/** Mean distances, as shares of the diagonal, up to which a mesh in correspondence is such a shape. */
+/** Largest mean distances, as shares of the diagonal, for each verdict on a mesh in correspondence. */
 const GOOD = 0.01;
 const FAIR = 0.03;
 
@@ -12,15 +12,15 @@ const FAIR = 0.03;
  * @typedef {object} Verdict
  * @property {"good" | "fair" | "poor"} how
  * @property {string} title
- * @property {string[]} words what everybody should read
- * @property {string[]} more what some want to know
+ * @property {string[]} words the main sentences
+ * @property {string[]} more details
  */
 
 /**
- * Of a mesh in correspondence.
+ * Describe a mesh in correspondence.
  * @param {{residual: number, vertex_error: {mean: number, max: number}}} answer of `encode`
- * @param {{file: string, model: string, diagonal: number}} about the file's and the model's names, the
- *   model's diagonal
+ * @param {{file: string, model: string, diagonal: number}} about names of the file and the model, and
+ *   the model's diagonal
  * @returns {Verdict}
  */
 export function encodeInWords({ residual, vertex_error: error }, { file, model, diagonal }) {
@@ -46,10 +46,10 @@ export function encodeInWords({ residual, vertex_error: error }, { file, model, 
 }
 
 /**
- * Of a scan without correspondence.
+ * Describe a scan without correspondence.
  * @param {object} answer of `fit`
- * @param {{file: string, model: string, diagonal: number}} about the file's and the model's names, the
- *   model's diagonal
+ * @param {{file: string, model: string, diagonal: number}} about names of the file and the model, and
+ *   the model's diagonal
  * @returns {Verdict}
  */
 export function fitInWords(answer, { file, model, diagonal }) {
@@ -62,7 +62,7 @@ export function fitInWords(answer, { file, model, diagonal }) {
     mirrored,
     noise,
   } = answer;
-  const size = diagonal * placement.scale; // in the scan's units, as distances are
+  const size = diagonal * placement.scale; // in the scan's units, like the distances
   const titles = {
     converged: ["good", `${model} explains ${file}`],
     ambiguous: ["fair", `${file} fits, but another shape fits nearly as well`],
@@ -88,7 +88,7 @@ const rest = (back, size, noise) => [
   `The scan's noise is about ${readable(noise, 2)} units.`,
 ];
 
-/** The first sentence of a reason; the others speak to programs. */
+/** Return the first sentence of a reason; the others are for programs. */
 const sentence = (reason) => `${reason.split(/\.\s/)[0].replace(/\.$/, "")}.`;
 
 function place({ rotation: [[a], [, b], [, , c]], translation, scale }) {

@@ -1,5 +1,5 @@
 /**
- * The calls of the server that the page makes. Every failure becomes a Problem with a sentence for people.
+ * The page's calls of the server. Every failure becomes a Problem with a sentence for the user.
  */
 
 import { here } from "../memory.js";
@@ -9,7 +9,7 @@ export const origin = new URL(".", document.baseURI).href.replace(/\/$/, "");
 const PATIENCE = 3;
 const KEY = "shapespace-key";
 
-/** What the server said went wrong, by RFC 9457; status 0 stands for no answer at all. */
+/** A problem by RFC 9457; status 0 means that the server did not answer. */
 export class Problem extends Error {
   constructor(message, status, type) {
     super(message);
@@ -27,7 +27,7 @@ const wait = (seconds) =>
     setTimeout(resolve, 1000 * seconds);
   });
 
-/** Send a key with every call from now on, as long as the tab is open. */
+/** Send a key with every further call, while the tab is open. */
 export const useKey = (key) => here.keep(KEY, key);
 
 async function call(path, options = {}) {
@@ -75,18 +75,18 @@ export const ready = () =>
 
 const diagnosticsOf = (response) => JSON.parse(response.headers.get("Shape-Diagnostics") ?? "{}");
 
-/** The reference's positions and faces. */
+/** Return positions and faces of the reference. */
 export async function reference(model, mesh) {
   const response = await call(`${model.links.mesh}?mesh=${mesh}&format=npz`);
   const { vertices, faces } = await readNpz(await response.arrayBuffer(), ["vertices", "faces"]);
   return { vertices: vertices.data, faces: faces.data };
 }
 
-/** The reference as GLB, with the materials and textures of the model's files. */
+/** Return the reference as GLB, with the materials and textures of the training files. */
 export const textured = async (model) => (await call(`${model.links.mesh}?format=glb`)).arrayBuffer();
 
 /**
- * Positions (3V numbers each) of some codes, and the worst of their diagnostics.
+ * Return the positions (3V numbers each) of some codes, and a summary of their diagnostics.
  * @param {object} model as the server lists it
  * @param {number[][]} latents
  * @param {"coarse" | "fine"} mesh
@@ -99,10 +99,10 @@ export async function shapes(model, latents, mesh, { quality = "full", signal } 
   return { shapes: split(vertices), diagnostics: diagnosticsOf(response) };
 }
 
-/** The id and links of an animation. */
+/** Return the id and links of an animation. */
 export const interpolation = (model, path) => json(post(model.links.interpolations, path));
 
-/** A random code of a seed. */
+/** Return the random code of a seed. */
 export async function sample(model, seed) {
   const { latents } = await json(
     post(`${model.links.self}/sample`, { count: 1, seed, distribution: "uniform" }),
@@ -110,16 +110,16 @@ export async function sample(model, seed) {
   return latents[0];
 }
 
-/** The code whose shape comes closest to some vertices' targets. */
+/** Return the code whose shape is closest to the targets of some vertices. */
 export const edit = (model, body, signal) => json(post(`${model.links.self}/edit`, body, signal));
 
-/** The code of a mesh file, with values by coordinate that it keeps. */
+/** Return the code of a mesh file, with some fixed coordinates. */
 export const encode = (model, file, format, fixed, signal) => {
   const query = new URLSearchParams({ format, fixed: JSON.stringify(fixed) });
   return json(call(`${model.links.self}/encode?${query}`, { method: "POST", body: file, signal }));
 };
 
-/** How far each vertex may be off (V) by the covariance of a code, in the model's units. */
+/** Return the standard deviation of each vertex (V) for the covariance of a code, in the model's units. */
 export async function spread(model, { code, covariance }, mesh) {
   const response = await post(`${model.links.mesh}?color=spread&format=npz`, {
     latent: code,
@@ -129,16 +129,16 @@ export async function spread(model, { code, covariance }, mesh) {
   return (await readNpz(await response.arrayBuffer(), ["color_values"])).color_values.data;
 }
 
-/** The code, the place and the size that explain a scan. */
+/** Fit a scan: return its code and placement. */
 export const fit = (model, file, format, options, signal) => {
   const query = new URLSearchParams({ format, ...options });
   return json(call(`${model.links.self}/fit?${query}`, { method: "POST", body: file, signal }));
 };
 
-/** A file to keep, as a blob. */
+/** Return a file to save, as a blob. */
 export const file = async (path, body) => (await (body ? post(path, body) : call(path))).blob();
 
-/** Rows of an array of two or more dimensions. */
+/** Return the rows of an array of two or more dimensions. */
 function split({ shape, data }) {
   const size = data.length / shape[0];
   return Array.from({ length: shape[0] }, (_, i) => data.subarray(i * size, (i + 1) * size));

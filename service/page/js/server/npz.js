@@ -1,4 +1,4 @@
-/** Reads NumPy's NPZ files, which are ZIP archives of arrays, with what the browser has. */
+/** Reads NPZ files, which are ZIP archives of NumPy arrays, by means of the browser alone. */
 
 const READERS = {
   "<f4": (buffer) => new Float32Array(buffer),
@@ -7,14 +7,14 @@ const READERS = {
   "<i8": (buffer) => Int32Array.from(new BigInt64Array(buffer), Number),
 };
 
-/** The arrays `names` of an archive, as `{name: {shape, data}}`; names it doesn't have are left out. */
+/** Return the arrays `names` of an archive as `{name: {shape, data}}`, without missing ones. */
 export async function readNpz(buffer, names) {
   const entries = directory(new DataView(buffer)).filter(({ name }) => names.includes(name));
   const arrays = entries.map(async (entry) => [entry.name, readNpy(await content(buffer, entry))]);
   return Object.fromEntries(await Promise.all(arrays));
 }
 
-/** Name, place, size and compression of each file, from the directory at the archive's end. */
+/** Return name, offset, size and compression of each file, from the directory at the end of the archive. */
 function directory(view) {
   let end = view.byteLength - 22;
   while (end >= 0 && view.getUint32(end, true) !== 0x06054b50) end -= 1;

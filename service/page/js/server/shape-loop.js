@@ -1,34 +1,34 @@
 /**
- * Keeps the shape shown abreast of the code: a draft as it moves, the full shape when it rests, both on one
- * mesh.
+ * Keeps the shown shape up to date with the code: a draft while the code moves, the full shape when it rests,
+ * both on one mesh.
  *
- * One request is under way at a time; what is asked for meanwhile supersedes what waited, so nothing queues.
- * A full shape on its way is dropped as soon as the code moves on, and so is a draft that takes too long. A
- * draft that is quick is let finish: dropping it for each pixel of a drag would show nothing until the hand
- * rests. Where the server has answered a draft by the full shape, nothing more is asked for. From a draft to
- * its full shape vertices move in steps of a pixel, so that nothing jumps.
+ * One request runs at a time. A newer request replaces a waiting one, so there is no queue. When the code moves
+ * on, the loop cancels a request for a full shape, and a draft that takes too long. It lets a quick draft finish:
+ * cancelling it for each pixel of a drag would show nothing until the end of the drag. If the server answers a
+ * draft with the full shape, the loop requests no more. From a draft to its full shape, vertices move in steps of
+ * a pixel, so that nothing jumps.
  */
 
 import { Matrix4 } from "three";
 import * as api from "./api.js";
 import { report, say, takeBack } from "../messages.js";
 
-const REST = 160; // ms without movement until the full shape is asked for
-const TOO_LONG = 400; // ms after which a draft is given up for a newer one
+const REST = 160; // ms without movement until the full shape is requested
+const TOO_LONG = 400; // ms after which a newer draft cancels a draft
 
-const LINES = 1080; // of a screen that a shape fills: a step is as large as one
+const LINES = 1080; // pixels of a screen that the shape fills; a step is one pixel
 const MOST = 24; // steps
 
 /**
- * The mesh that the switch and the model give.
+ * Return the mesh, by the switch and the model.
  * @returns {"coarse" | "fine"}
  */
 export const meshOf = ({ fine, hasFine }) => (fine && hasFine ? "fine" : "coarse");
 
 /**
- * The motion (Matrix4) from where the server has a shape to where it is shown. Each mesh is aligned over its
- * own vertices, so that the fine and the coarse shape of one code lie a few degrees apart: fine ones are
- * shown where they are, and coarse ones in their place, as far as that was known when the mesh was changed.
+ * Return the motion (Matrix4) from the server's position of a shape to its shown position. The server aligns
+ * each mesh over its own vertices, so the fine and the coarse shape of one code lie a few degrees apart. Fine
+ * shapes are shown as they are. Coarse ones are moved to them, as far as known when the mesh was changed.
  */
 export function motionOf({ shape, pose }, mesh, code, positions) {
   if (mesh === "fine" || !shape?.motion || !pose) return new Matrix4();
@@ -36,7 +36,7 @@ export function motionOf({ shape, pose }, mesh, code, positions) {
   return shape.code === code ? pose.motion(shape.positions, positions).invert() : new Matrix4();
 }
 
-/** Positions on the way from a draft to the full shape, both ends left out. */
+/** Return positions between a draft and the full shape, without both ends. */
 export function* between(draft, full) {
   let [farthest, low, high] = [0, Infinity, -Infinity];
   full.forEach((x, i) => {
@@ -76,7 +76,7 @@ export class ShapeLoop {
     this.#want("draft");
   }
 
-  /** Ask for the full shape once a draft has been there for a while. */
+  /** Request the full shape once a draft has been shown for a while. */
   #rest() {
     clearTimeout(this.#timer);
     if (this.store.playing || !this.store.model) return;
@@ -130,7 +130,7 @@ export class ShapeLoop {
           return;
       }
     }
-    // How long it takes to settle is no part of how long it took to come.
+    // The time of an answer does not include the transition.
     this.store.set({ shape: { ...shape, began: shape.began + performance.now() - arrived } });
   }
 

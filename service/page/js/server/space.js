@@ -1,6 +1,5 @@
 /**
- * The coordinates of a model's codes: bounds, periods, and the code at home. Mirrors what the server does
- * with them.
+ * The coordinates of a model's codes: bounds, periods, and the home code. Computes as the server does.
  */
 
 const mod = (a, n) => ((a % n) + n) % n;
@@ -11,11 +10,11 @@ export class LatentSpace {
     this.upper = upper;
     this.period = period;
     this.factors = factors;
-    /** Zero, the mean, where it lies inside the bounds, else the middle. */
+    /** Zero, which is the mean, if it lies inside the bounds; otherwise the middle. */
     this.home = lower.map((low, k) => (low <= 0 && upper[k] >= 0 ? 0 : (low + upper[k]) / 2));
   }
 
-  /** A coordinate in its one form: an angle within one period from its lower bound. */
+  /** Return a coordinate in canonical form: an angle within one period from its lower bound. */
   wrap(k, value) {
     if (!this.period[k] || (value >= this.lower[k] && value < this.lower[k] + this.period[k])) return value;
     return this.lower[k] + mod(value - this.lower[k], this.period[k]);
@@ -25,14 +24,14 @@ export class LatentSpace {
     return code.map((value, k) => this.wrap(k, value));
   }
 
-  /** Ends of a slider: the bounds and some way beyond, or one period. */
+  /** Return the ends of a slider: somewhat beyond the bounds, or one period. */
   range(k) {
     if (this.period[k]) return [this.lower[k], this.lower[k] + this.period[k]];
     const beyond = 0.3 * (this.upper[k] - this.lower[k]);
     return [this.lower[k] - beyond, this.upper[k] + beyond];
   }
 
-  /** The values of a coordinate's three pictures: towards the lower bound, at home, towards the upper one. */
+  /** Return the values of a coordinate's three pictures: near the lower bound, home, near the upper bound. */
   stations(k) {
     if (!this.period[k]) return [this.lower[k], this.home[k], this.upper[k]];
     return [-0.25, 0, 0.25].map((turn) => this.wrap(k, this.home[k] + turn * this.period[k]));
@@ -44,8 +43,8 @@ export class LatentSpace {
   }
 
   /**
-   * The codes at some times of a path through keyframes: 0 is the first of these, 1 the next, and so on;
-   * before the first and past the last it goes straight on, and angles take the shorter way round.
+   * Return the codes at some times of a path through keyframes; time 0 is the first keyframe, 1 the second.
+   * Outside, the path continues in a straight line. Angles take the shorter way round.
    * @param {number[][]} keyframes
    * @param {number[]} times
    */
@@ -57,7 +56,7 @@ export class LatentSpace {
     });
   }
 
-  /** Keyframes with angles moved by whole periods, so that no step is longer than half of one. */
+  /** Return keyframes with angles moved by whole periods, so that no step exceeds half a period. */
   #unroll(keyframes) {
     const way = [keyframes[0]];
     for (const code of keyframes.slice(1)) {
@@ -72,12 +71,12 @@ export class LatentSpace {
     return period ? period / 2 - mod(period / 2 - step, period) : step;
   }
 
-  /** Home but for some coordinates. */
+  /** Return the home code with some coordinates replaced. */
   homeBut(changes) {
     return this.home.map((value, k) => changes[k] ?? value);
   }
 
-  /** Home but for one factor's coordinates, which are those of `code`. */
+  /** Return the home code with one factor's coordinates from `code`. */
   alone(factor, code) {
     return this.home.map((value, k) => (k >= factor.start && k < factor.stop ? code[k] : value));
   }
@@ -86,6 +85,6 @@ export class LatentSpace {
 export const sameCode = (a, b) =>
   a.length === b.length && a.every((value, k) => Math.abs(value - b[k]) < 1e-7);
 
-/** The locked coordinates of a code, as the server takes what is fixed. */
+/** Return the locked coordinates of a code as the server's `fixed`. */
 export const fixedBy = (locked, code) =>
   Object.fromEntries(code.map((value, k) => [k, value]).filter(([k]) => locked[k]));

@@ -1,4 +1,4 @@
-/** The card of a model: what it is, how good it is, and how to call it. */
+/** The card of a model: its description, its measured figures, and example calls. */
 
 import * as api from "../server/api.js";
 import { element, find, readable } from "../dom.js";
@@ -15,7 +15,7 @@ const rows = (facts) =>
   );
 const percent = (share) => `${readable(100 * share)} %`;
 
-/** What figures mean, for those who have not read the paper. */
+/** Explanations of the figures. */
 const MEANINGS = {
   r2: "How much of the change of lengths and angles the networks get right: 1 is all of it.",
   unseen: "From shapes that training has not seen, in shares of the diagonal.",
@@ -25,7 +25,7 @@ const MEANINGS = {
   error: "From the networks’ shapes to exact ones, in shares of the diagonal.",
 };
 
-/** Numbers of a nested object with the path to each, such as ["r2 composite total", 0.99]. */
+/** Return the numbers of a nested object with their paths, such as ["r2 composite total", 0.99]. */
 function flatten(value, path = []) {
   if (typeof value === "number") return [[path.join(" ").replaceAll("_", " "), value]];
   if (value === null || typeof value !== "object") return [];

@@ -1,19 +1,19 @@
-/** How well a shape was found, in words. */
+/** Describes the diagnostics of a shape in words. */
 
 import { readable } from "../dom.js";
 
-const FITS = 0.01; // residual up to which nobody need know more
+const FITS = 0.01; // residual below which no detail is shown
 const HARDLY = 0.05;
-const MUCH = 2; // times as much as is usual for the model
+const MUCH = 2; // factor of the model's usual residual
 const TOO_MUCH = 5;
 
 /** @typedef {["good" | "fair" | "poor", string, string]} News */
 
 /**
- * What the server says of a shape: how good the news is, a word for it, and a sentence.
+ * Describe diagnostics: for each a level, a word, and a sentence.
  * @param {object} diagnostics
- * @param {number | null} usual the model's own residual, at codes of the training range; null while it isn't
- *   known
+ * @param {number | null} usual the model's median residual at codes inside the bounds; null while it is
+ *   unknown
  * @returns {News[]}
  */
 export function inWords(diagnostics, usual) {
@@ -34,7 +34,7 @@ export function inWords(diagnostics, usual) {
   return words;
 }
 
-/** The worst of them, and a line for all: what is wrong, or else what is right. */
+/** Return the worst level, and one line for all: the faults, or what is good. */
 export function inShort(words) {
   const how = ["poor", "fair"].find((each) => words.some(([is]) => is === each)) ?? "good";
   const line = words
@@ -45,7 +45,7 @@ export function inShort(words) {
 }
 
 /**
- * A model is as good as it is: what is usual for it is no fault of a shape.
+ * Describe the residual. A residual that is usual for the model is no fault of the shape.
  * @returns {News}
  */
 function fits(residual, usual) {
@@ -59,7 +59,7 @@ function fits(residual, usual) {
 }
 
 /**
- * By the distance to the nearest training shape, in multiples of what these have from each other.
+ * Describe the distance to the nearest training shape, in multiples of the training shapes' typical distance.
  * @returns {News}
  */
 function plausible(distance) {

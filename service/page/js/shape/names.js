@@ -1,6 +1,5 @@
 /**
- * What factors and coordinates are called: as the model says, or as people call them for themselves in this
- * browser.
+ * Names of factors and coordinates: from the model, or from the user, who can rename them in this browser.
  */
 
 import { element, find } from "../dom.js";
@@ -9,7 +8,7 @@ import { always } from "../memory.js";
 const LONGEST = 60;
 const place = (model) => `names:${model.name}`;
 
-/** Names of people by what the model calls it; those of other versions of a model do no harm. */
+/** Return the user's names by the model's names; names for other versions of a model are ignored. */
 function own(model) {
   try {
     const kept = JSON.parse(always.kept(place(model)) ?? "{}");
@@ -20,11 +19,11 @@ function own(model) {
 }
 
 /**
- * The names to show.
+ * Return the names to show.
  * @param {object} model as the server lists it
- * @param {Record<string, string>} said what people call its factors and coordinates
- * @returns {{factors: string[], labels: string[], coordinates: string[]}} labels stand below the factor's
- *   name
+ * @param {Record<string, string>} said the user's names of factors and coordinates
+ * @returns {{factors: string[], labels: string[], coordinates: string[]}} labels stand below the
+ *   factor's name
  */
 export function namesOf(model, said = own(model)) {
   const factors = model.factors.map(({ name }) => said[`factor ${name}`] ?? name);
@@ -38,7 +37,7 @@ export function namesOf(model, said = own(model)) {
   return { factors, labels: all, coordinates };
 }
 
-/** Names of coordinates without that of their factor, which stands above. */
+/** Return the names of coordinates without the name of their factor, which stands above. */
 function labels({ factors, latent_names: names }) {
   return factors.flatMap((factor) =>
     names
@@ -49,7 +48,7 @@ function labels({ factors, latent_names: names }) {
   );
 }
 
-/** The dialog in which people name things; `store.names` is what comes of it. */
+/** The dialog in which the user renames factors and coordinates; its result is `store.names`. */
 export class Names {
   /** @param {import("../store.js").Page} store */
   constructor(store, { dialog, button }) {
@@ -84,7 +83,7 @@ export class Names {
         const ks = model.latent_names
           .slice(factor.start, factor.stop)
           .map((name, i) => [name, short[factor.start + i]]);
-        // A factor of one coordinate, which has its name, is named once.
+        // A factor with one coordinate shares its name, and has one field.
         const parts = ks
           .filter(([, label]) => label)
           .map(([name, label]) => line(`coordinate ${name}`, name, label));

@@ -1,8 +1,8 @@
-/** The pins of pulls as buttons over the shape: dragged they pull on, pressed they go. */
+/** The pins of pulls as buttons over the shape: dragging one pulls further, pressing one removes it. */
 
 import { element, find } from "../dom.js";
 
-const STILL = 4; // pixels that a press may move
+const STILL = 4; // pixels that the pointer may move during a press
 
 export class Pins {
   #buttons = [];
@@ -45,7 +45,7 @@ export class Pins {
       this.pull.take(this.store.pins[i], event);
     });
     button.addEventListener("click", (event) => {
-      const { detail, clientX, clientY } = event; // no detail: by a key
+      const { detail, clientX, clientY } = event; // without detail, a key caused the click
       const moved = detail > 0 && from && Math.hypot(clientX - from.clientX, clientY - from.clientY) > STILL;
       if (!moved) this.#remove(i);
     });

@@ -1,5 +1,5 @@
 /**
- * Edits the shape by pulling at vertices: each stays pinned, and the server finds the code that follows best.
+ * Edits the shape by pulling vertices. Pulled vertices stay pinned, and the server finds the closest code.
  */
 
 import { Matrix4, Vector3 } from "three";
@@ -11,19 +11,19 @@ import { matrixOf } from "../view/pose.js";
 import { diagonalOf } from "../view/scene.js";
 import { fixedBy } from "../server/space.js";
 
-const MET = 0.01; // distance from a pin, as a share of the diagonal, at which it is met
-const NEARER = 0.9; // a code that leaves more of the distance than this isn't worth a change of shape
+const MET = 0.01; // distance from a pin, as a share of the diagonal, at which it counts as reached
+const NEARER = 0.9; // a code that leaves more than this share of the distance does not change the shape
 
 /**
  * @typedef {object} Pin
- * @property {string} mesh whose vertex it holds
+ * @property {string} mesh the mesh of its vertex
  * @property {number} vertex
- * @property {Vector3} position where that should be, in the scene
+ * @property {Vector3} position target of the vertex, in the scene
  */
 
 export class Pull {
-  #held = null; // the pull under way: its pin, and the shape where it began
-  #last = null; // the same, also once it is over
+  #held = null; // the current pull: its pin, and the shape at its start
+  #last = null; // the last pull, also after its end
   #wanted = false;
   #busy = false;
   #answer = null;
@@ -34,7 +34,7 @@ export class Pull {
     this.viewer = viewer;
     const { canvas } = viewer;
     store.on(["pull"], () => canvas.classList.toggle("pulling", store.pull));
-    // Before the controls see it, which would turn the view.
+    // Before the controls get the event and turn the view.
     canvas.addEventListener("pointerdown", (event) => this.#pick(event), { capture: true });
     addEventListener("pointermove", (event) => this.#drag(event));
     for (const end of ["pointerup", "pointercancel"]) addEventListener(end, (event) => this.#let(event));
@@ -47,16 +47,16 @@ export class Pull {
     event.stopImmediatePropagation();
     this.viewer.canvas.setPointerCapture(event.pointerId);
     const pin = { mesh: this.store.shape.mesh, ...hit };
-    this.take(pin, event); // first, as what comes while something moves is part of its step in the history
+    this.take(pin, event); // first, so that changes during the pull belong to its step in the history
     this.store.set({ pins: [...this.store.pins, pin] });
   }
 
-  /** Take a pin into the hand that this event is of. */
+  /** Begin to drag a pin with the pointer of this event. */
   take(pin, event) {
     const { shape, code, playing } = this.store;
     if (playing || !shape) return;
     const { mesh, motion, placement, positions } = shape;
-    // From where the server has the shape
+    // From the server's position of the shape
     const there = (placement ?? new Matrix4()).clone().multiply(motion);
     const before = { code, placement: this.store.placement };
     this.#held = { pin, mesh, motion, there, positions, pointer: event.pointerId, before };
@@ -74,7 +74,7 @@ export class Pull {
     if (!this.#busy) this.#solve();
   }
 
-  /** Only the newest targets count; they wait until those before are answered. */
+  /** Send the newest targets, once the last request is answered. */
   async #solve() {
     this.#busy = true;
     while (this.#wanted) {
@@ -89,7 +89,7 @@ export class Pull {
         const { latent, placement: place, residual, distances } = await api.edit(model, body);
         if (this.store.model !== model) break;
         const follows = residual < NEARER * rootMeanSquare(began);
-        // What isn't pulled stays where it is; the coarse shape lies beside the fine one as before.
+        // The rest of the shape stays, and the coarse shape keeps its position relative to the fine one.
         const placement = there.clone().multiply(matrixOf(place)).multiply(motion.clone().invert());
         const kept = latent.map((value, k) => (locked[k] ? code[k] : value));
         if (follows) this.store.set({ code: kept, placement });
@@ -104,7 +104,7 @@ export class Pull {
     if (!this.#held) this.#done();
   }
 
-  /** The pins as the server takes them, in the frame of the shape where the pull began. */
+  /** Return the pins as targets for the server, in the frame of the shape at the start of the pull. */
   #targets(pins, mesh, there) {
     const back = there.clone().invert();
     const { references } = this.store;
@@ -155,7 +155,7 @@ export class Pull {
   }
 }
 
-/** How far each target is from its vertex among positions (3V numbers). */
+/** Return the distance of each target from its vertex, given positions (3V numbers). */
 const awayFrom = (targets, positions) =>
   targets.map(({ vertex, position }) =>
     new Vector3().fromArray(positions, 3 * vertex).distanceTo(new Vector3(...position)),

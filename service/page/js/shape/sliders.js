@@ -3,7 +3,7 @@
 import { clone, find, readable, sharp } from "../dom.js";
 
 const PICTURE = 44;
-const FEW = 8; // coordinates up to which all factors stand open
+const FEW = 8; // most coordinates for which all factors are open at first
 
 export class Sliders {
   #rows = [];
@@ -18,12 +18,12 @@ export class Sliders {
     store.on(["code", "locked"], () => this.#show());
   }
 
-  /** The canvases of coordinate k for shapes at its three stations. */
+  /** Return the canvases of coordinate k for its three pictures. */
   pictures(k) {
     return [...this.#rows[k].root.querySelectorAll("canvas")];
   }
 
-  /** The canvas of factor j, for what it moves. */
+  /** Return the canvas of factor j, for its region. */
   picture(j) {
     return find("summary canvas", this.list.children[j]);
   }
@@ -55,7 +55,7 @@ export class Sliders {
     this.#show();
   }
 
-  /** Say what everything is called. */
+  /** Show all names. */
   #label() {
     const {
       names: { factors, labels, coordinates },
@@ -124,12 +124,12 @@ export class Sliders {
     this.#change(this.store.code.map((old, i) => (i === k ? this.store.space.wrap(k, value) : old)));
   }
 
-  /** Take on a code, but for the coordinates that are locked. */
+  /** Set a code, except locked coordinates. */
   #change(code) {
     this.store.set({ code: code.map((value, k) => (this.store.locked[k] ? this.store.code[k] : value)) });
   }
 
-  /** An angle that is moved past its end by a key goes on at the other. */
+  /** Let an angle that a key moves past one end continue at the other. */
   #wrapAtTheEnd(event, k, slider) {
     const up = ["ArrowRight", "ArrowUp"].includes(event.key);
     const down = ["ArrowLeft", "ArrowDown"].includes(event.key);

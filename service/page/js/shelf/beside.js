@@ -1,4 +1,4 @@
-/** Another shape beside the one of the sliders, to compare them. */
+/** A second shape beside the shape of the sliders, to compare them. */
 
 import * as THREE from "three";
 import * as api from "../server/api.js";
@@ -6,13 +6,13 @@ import { report } from "../messages.js";
 import { VIEW, face, geometryOf, move, paint, surfaceMaterial } from "../view/scene.js";
 import { meshOf } from "../server/shape-loop.js";
 
-const APART = 1.1; // of the reference's width, from middle to middle
-/** Across the view that shapes are seen from first, so that both are as near. */
+const APART = 1.1; // distance between the middles, in widths of the reference
+/** Direction across the initial view, so that both shapes are at one distance. */
 const SIDEWAYS = new THREE.Vector3(VIEW.z, 0, -VIEW.x).normalize();
 
 export class Beside {
   #asked = { model: null, other: null, mesh: null };
-  #given = false; // whether the view comes with the shape, both from an address
+  #given = false; // whether the view comes from the same address as the shape
 
   /** @param {import("../store.js").Page} store */
   constructor(store, viewer) {
@@ -37,7 +37,7 @@ export class Beside {
     this.#asked = asked;
     if (before.model !== model) {
       this.#given = Boolean(other);
-      this.#appear(false); // the viewer has begun anew
+      this.#appear(false); // the viewer has a new model
     } else if (before.other !== other) this.#given = false;
     if (!other) {
       if (this.mesh.visible) this.viewer.makeRoom(null);
@@ -48,7 +48,7 @@ export class Beside {
     api
       .shapes(model, [other], asked.mesh)
       .then(({ shapes }) => {
-        // Answers may come in another order: a coarse shape after the fine one.
+        // Answers may come out of order, as a coarse shape after the fine one.
         if (this.#asked === asked) this.#show(references[asked.mesh], shapes[0]);
       })
       .catch(report);
@@ -72,13 +72,13 @@ export class Beside {
   }
 }
 
-/** Positions (3V numbers) elsewhere. */
+/** Return shifted positions (3V numbers). */
 function moved(positions, by) {
   const axes = by.toArray();
   return positions.map((x, i) => x + axes[i % 3]);
 }
 
-/** How far positions (3V numbers) reach along a direction. */
+/** Return the extent of positions (3V numbers) along a direction. */
 function extent(positions, direction) {
   let [least, most] = [Infinity, -Infinity];
   const point = new THREE.Vector3();

@@ -1,10 +1,10 @@
-/** A slider from the shape as it was to the one beside it. */
+/** A slider from the present shape to the shape beside it. */
 
 import { find } from "../dom.js";
 
 export class Blend {
-  #from = null; // the code at its one end
-  #own = null; // the code that it has made
+  #from = null; // the code at its start
+  #own = null; // its last code
 
   /** @param {import("../store.js").Page} store */
   constructor(store, hand, box) {
@@ -21,7 +21,7 @@ export class Blend {
     });
   }
 
-  /** Begin anew, at the shape as it is. */
+  /** Start again, at the present shape. */
   #start() {
     this.#from = this.#own = null;
     this.slider.value = 0;

@@ -1,4 +1,4 @@
-/** Shapes that people keep by name in this browser, for each model. */
+/** Shapes that the user keeps by name in this browser, for each model. */
 
 import * as api from "../server/api.js";
 import { OTHER } from "../view/colouring.js";
@@ -9,10 +9,10 @@ import { sameCode } from "../server/space.js";
 
 const PICTURE = 64;
 const MOST = 50;
-const LONGEST = 60; // characters of a name
+const LONGEST = 60; // most characters of a name
 const place = (model) => `shelf:${model.name}`;
 
-/** What is on a model's shelf; codes of versions with other coordinates are left out. */
+/** Return the shapes on a model's shelf, without codes of versions with other coordinates. */
 function kept(model) {
   const isCode = (code) => code?.length === model.latent_dimension && code.every(Number.isFinite);
   try {
@@ -37,7 +37,7 @@ export class Shelf {
       const numbers = this.#shapes.map(({ name }) => Number(/^Shape (\d+)$/.exec(name)?.[1] ?? 0));
       this.#put([...this.#shapes, { name: `Shape ${Math.max(0, ...numbers) + 1}`, code: store.code }]);
       const input = find("li:last-child input", list);
-      input.focus(); // which selecting need not do
+      input.focus(); // a selection does not have to focus
       input.select();
     });
     store.on(["model"], () => {
@@ -45,7 +45,7 @@ export class Shelf {
       this.#list();
     });
     store.on(["other"], () => this.#mark());
-    // Another window has changed it: what is kept here from now on must not undo that.
+    // Another window has changed the shelf, and later changes here must not undo this.
     addEventListener("storage", ({ key }) => {
       if (!store.model || key !== place(store.model)) return;
       this.#shapes = kept(store.model);
@@ -105,7 +105,7 @@ export class Shelf {
     input.addEventListener("change", () => {
       const said = input.value.trim();
       if (said) this.#keep(this.#shapes.with(i, { name: said, code }));
-      label(item, this.#shapes[i].name); // in its place: the focus is here, or next to it
+      label(item, this.#shapes[i].name); // in its place, because the focus is on it or next to it
     });
     label(item, name);
     sharp(find("canvas", item), PICTURE);
@@ -120,7 +120,7 @@ export class Shelf {
   }
 }
 
-/** Say what a shape is called. */
+/** Name a shape. */
 function label(item, name) {
   const says = { go: "Go to", compare: "Compare with", remove: "Remove", rename: "Name of" };
   for (const [what, words] of Object.entries(says)) {

@@ -1,17 +1,17 @@
-/** One call of the server as text to take along: for the shell, for programs, and for other pages. */
+/** One call of the server as text to copy: for the shell, for programs, and for other pages. */
 
 const json = (body) => JSON.stringify(body);
 
 /**
  * @typedef {object} Call
  * @property {string} url
- * @property {object} body numbers and strings, which Python writes as JSON does
- * @property {string} file to keep the answer in
+ * @property {object} body numbers and strings, which Python and JSON write alike
+ * @property {string} file name for the answer
  * @property {string} embed address of the viewer alone
  * @property {string} title of the model
  */
 
-/** What each kind of text is, by its name for people. @type {Record<string, (call: Call) => string>} */
+/** Writers of the texts, by their names in the page. @type {Record<string, (call: Call) => string>} */
 export const CODE = {
   curl: ({ url, body, file }) =>
     `curl '${url}' -H 'content-type: application/json' -d '${json(body)}' -o ${file}`,

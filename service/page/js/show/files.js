@@ -1,4 +1,4 @@
-/** Files to keep, pictures and videos among them, and calls to copy. */
+/** Files, pictures and videos to save, and calls to copy. */
 
 import { toHash } from "../address.js";
 import * as api from "../server/api.js";
@@ -8,10 +8,10 @@ import { reporting, say } from "../messages.js";
 import { CODE } from "./code.js";
 import { picture, record, turntable } from "./video.js";
 
-/** What the server offers for one shape. */
+/** Formats of one shape. */
 export const SHAPE_FORMATS = ["glb", "gltf", "obj", "ply", "stl", "npz", "zip", "json"];
 
-/** Animations that say how long a frame is shown; the server takes one frame a second or more. */
+/** Animation formats with the time of a frame; the server accepts one frame per second or more. */
 const TIMED = ["glb", "usd", "usdz"];
 
 const rounded = (code) => code.map((value) => Number(value.toFixed(6)));
@@ -76,12 +76,12 @@ export class Files {
     );
   }
 
-  /** Path and body of the call that answers the shape as a file. */
+  /** Return path and body of the call that answers the shape as a file. */
   get #call() {
     const { model, code, fine, colour } = this.store;
     const base = baseOf(this.store);
     const query = new URLSearchParams({ format: this.format.value });
-    // STL has no place for colours, and the server none for distances.
+    // STL holds no colours, and the server writes no distances.
     if (["stretch", "bending"].includes(colour) && this.format.value !== "stl") {
       query.set("color", colour);
       if (base) query.set("against", rounded(base));
@@ -133,7 +133,7 @@ export class Files {
     });
   }
 
-  /** Keep what is recorded, which takes as long as it lasts. */
+  /** Record a video, in real time, and save it. */
   async #video(what, make) {
     if (this.recording) return;
     this.recording = true;
@@ -149,7 +149,7 @@ export class Files {
     }
   }
 
-  /** Offer what the server has for a path: that depends on what is installed with it. */
+  /** Offer the formats of a path, which depend on the packages of the server. */
   async #animationFormats() {
     const { keyframes, model } = this.store;
     for (const button of ["#download-animation", "#film"]) find(button).disabled = keyframes.length < 2;
@@ -163,7 +163,7 @@ export class Files {
     const { model, fine } = this.store;
     say("The server makes the animation …", { key: "animation" });
     try {
-      await this.#animationFormats(); // they are not there yet where the server was away
+      await this.#animationFormats(); // they are missing if the server did not answer
       const format = this.animation.value;
       const { links } = await api.interpolation(model, {
         ...this.path.request,

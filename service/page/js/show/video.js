@@ -1,12 +1,12 @@
-/** Pictures and videos of the stage, as it is seen. */
+/** Pictures and videos of the stage, as shown. */
 
 const TYPES = ["video/webm;codecs=vp9", "video/webm;codecs=vp8", "video/webm", "video/mp4"];
 const FPS = 30;
-const BITS = 8e6; // a second
-const REST = 200; // ms at the end, as the last pictures come late
-const PATIENCE = 10_000; // ms until the first picture must have come
+const BITS = 8e6; // frames per second
+const REST = 200; // ms at the end, because the last pictures come late
+const PATIENCE = 10_000; // ms to wait for the first picture
 
-/** The stage as PNG. */
+/** Return a picture of the stage as PNG. */
 export function picture(viewer) {
   return viewer.opaquely(() => {
     viewer.render();
@@ -17,8 +17,7 @@ export function picture(viewer) {
 }
 
 /**
- * A video of the stage, while `show` is called with shares (0 … 1) of its time; where that answers false it
- * ends.
+ * Record a video of the stage, and call `show` with shares (0 … 1) of its time, until it returns false.
  * @returns {Promise<{blob: Blob, extension: string}>}
  */
 export function record(viewer, seconds, show) {
@@ -39,9 +38,9 @@ export function record(viewer, seconds, show) {
     const stopped = new Promise((resolve) => {
       recorder.addEventListener("stop", resolve);
     });
-    recorder.start(1); // parts as short as can be: the first tells that there is a picture
+    recorder.start(1); // shortest parts, because the first one shows that there is a picture
     try {
-      // On a busy machine the recorder can take longer to begin than the whole video lasts.
+      // On a busy machine, the recorder may need longer to start than the video lasts.
       await drawnUntil(viewer, first);
       await through(seconds, show);
       await new Promise((resolve) => {
@@ -56,7 +55,7 @@ export function record(viewer, seconds, show) {
   });
 }
 
-/** Once around the shape, back to where one looked from. */
+/** Turn the view once around the shape. */
 export async function turntable(viewer, seconds) {
   const { view } = viewer;
   try {
@@ -66,7 +65,7 @@ export async function turntable(viewer, seconds) {
   }
 }
 
-/** Draw anew for every picture of the screen, as only what is drawn is recorded, until a promise is kept. */
+/** Draw for every picture of the screen until a promise resolves, because only drawn pictures are recorded. */
 async function drawnUntil(viewer, promise) {
   let waiting = true;
   const step = () => {

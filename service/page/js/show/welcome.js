@@ -1,6 +1,5 @@
 /**
- * The first seconds: what this is, in a line, and moves of the shape along single coordinates until a hand
- * comes.
+ * The welcome: one line about the page, and movements along single coordinates until the user does something.
  */
 
 import { find } from "../dom.js";
@@ -8,14 +7,14 @@ import { always } from "../memory.js";
 import { eased, Reel } from "../path/reel.js";
 import { meshOf } from "../server/shape-loop.js";
 
-const MOVES = 3; // one in each of the first factors, which are the strongest
-const REACH = 0.8; // of the way to the bound
-const FRAMES = 8; // of the way there, and as many back
-const PACE = 1.2; // seconds of the same
+const MOVES = 3; // movements, one in each of the first factors, which are the strongest
+const REACH = 0.8; // share of the way to the bound
+const FRAMES = 8; // frames of the way there, and the same number back
+const PACE = 1.2; // seconds of one way
 const TOUCHES = ["pointerdown", "click", "keydown", "wheel", "focusin", "drop", "hashchange"];
 
 export class Welcome {
-  #touched = null; // its signal says when anything has been
+  #touched = null; // aborted by any action of the user
   #begun = false;
 
   /** @param {import("../store.js").Page} store */
@@ -28,7 +27,7 @@ export class Welcome {
     });
   }
 
-  /** Say what this is; the moves wait for the model. */
+  /** Show the line; the movements wait for the model. */
   open() {
     if (always.kept("welcomed")) return;
     this.box.hidden = false;
@@ -44,12 +43,12 @@ export class Welcome {
     }
   }
 
-  /** Whether the moves play, or are to: nothing of that is anybody's doing. */
+  /** Return whether movements play or will play, which are no actions of the user. */
   get alone() {
     return this.#touched?.signal.aborted === false;
   }
 
-  /** Play the moves, as often as they are let, and come back to the shape before. */
+  /** Play the movements until the user acts, and return to the shape before. */
   async play() {
     if (!this.alone || this.#begun) return;
     this.#begun = true;
@@ -75,11 +74,11 @@ export class Welcome {
       };
       requestAnimationFrame(step);
     } catch {
-      // Nobody has asked for it, and what is asked for next says what is wrong.
+      // The user did not ask for it, and the next request reports the fault.
     }
   }
 
-  /** From home along one coordinate and back, then along the next. */
+  /** Return codes from home along one coordinate and back, then along the next. */
   #keyframes() {
     const { code: home, model, space } = this.store;
     const ends = model.factors.slice(0, MOVES).map(({ start: k }) => {

@@ -1,4 +1,4 @@
-/** What colours the shape: the region of a factor, a change, how sure it is, or nothing. */
+/** Colours of the shape: the region of a factor, a difference, the uncertainty, or none. */
 
 import * as api from "../server/api.js";
 import { distant, diverging, gradient, tint } from "./colours.js";
@@ -9,8 +9,8 @@ import { diagonalOf } from "./scene.js";
 import { Surface } from "./surface.js";
 
 /**
- * The measures and the legend are those of the server's coloured files; here they are told in units for
- * people. `least`: the smallest end of a legend; distances, shares of the diagonal, have no sign.
+ * Quantities and legends as in the server's coloured files, in readable units. `least`: smallest end of a
+ * legend. Distances are shares of the diagonal and have no sign.
  */
 const KINDS = {
   stretch: {
@@ -51,16 +51,16 @@ const KINDS = {
   },
 };
 
-/** What stands for the shape beside among the shapes that colours compare with. */
+/** Index of the shape beside among the shapes that colours compare with. */
 export const OTHER = -2;
-/** The code that colours compare with; undefined for the mean. */
+/** Return the code that colours compare with; undefined for the mean. */
 export const baseOf = ({ against, keyframes, other }) => (against === OTHER ? other : keyframes[against]);
 
-const SMOOTHED = 4; // times, about as far as coarse vertices lie apart
+const SMOOTHED = 4; // smoothing steps, about the distance between coarse vertices
 
 export class Colouring {
   #surfaces = new Map();
-  #answers = new Map(); // of the server; null while they are on their way
+  #answers = new Map(); // answers of the server; null until they arrive
   #nearest = null;
   #limit = 0;
 
@@ -85,7 +85,7 @@ export class Colouring {
     against.addEventListener("change", () => store.set({ against: Number(against.value) }));
   }
 
-  /** Colours (3V) for the shape shown, or null; fills the legend. */
+  /** Return colours (3V) for the shown shape, or null, and fill the legend. */
   of({ mesh, positions }) {
     const { colour, highlight, regions, moving } = this.store;
     const region = highlight !== null && !(moving && colour !== "none") && regions?.[highlight];
@@ -102,13 +102,13 @@ export class Colouring {
       (colour === "spread" ? this.#spread(mesh) : this.#change(mesh, positions)) ?? [];
     if (!values) return null;
     const most = nice(Math.max(kind.least, percentile(values.map(Math.abs), 0.98)));
-    // While something moves the scale only grows: colours that change their meaning can't be read.
+    // During a movement the scale only grows, because colours with a changing scale cannot be read.
     this.#limit = moving || playing ? Math.max(this.#limit, most) : most;
     this.#tell(kind, measured);
     return values;
   }
 
-  /** What has changed, where it is measured and at vertices. */
+  /** Return the difference, at edges or vertices where it is measured, and at vertices. */
   #change(mesh, positions) {
     const { colour, references } = this.store;
     const surface = this.#surface(mesh);
@@ -122,7 +122,7 @@ export class Colouring {
     return [measured, surface.atVertices(measured, base, colour === "bending")];
   }
 
-  /** How far the vertices of a file's shape may be off. */
+  /** Return the uncertainty of the vertices of a file's shape. */
   #spread(mesh) {
     const { model, found, references } = this.store;
     const diagonal = diagonalOf(references[mesh].vertices);
@@ -140,7 +140,7 @@ export class Colouring {
     return this.#surfaces.get(mesh);
   }
 
-  /** Lengths and angles to compare with; null until they have come from the server. */
+  /** Return lengths and angles to compare with; null until the server has answered. */
   #base(mesh, surface) {
     const { model, references } = this.store;
     const code = baseOf(this.store);
@@ -150,9 +150,9 @@ export class Colouring {
     });
   }
 
-  /** An answer of the server by a name; null until it has come. */
+  /** Return an answer of the server by name; null until it arrives. */
   #asked(name, ask) {
-    const answers = this.#answers; // an answer that comes too late goes into a map that is no longer used
+    const answers = this.#answers; // a late answer goes into a map that is no longer used
     if (!answers.has(name)) {
       answers.set(name, null);
       ask()
@@ -168,7 +168,7 @@ export class Colouring {
     return answers.get(name);
   }
 
-  /** A region's weights at fine vertices: those of the nearest coarse ones, with its rim smoothed. */
+  /** Return a region's weights at fine vertices: weights of the nearest coarse vertices, smoothed. */
   #onFine(region) {
     const { coarse, fine } = this.store.references;
     this.#nearest ??= nearest(fine.vertices, coarse.vertices);
@@ -178,7 +178,7 @@ export class Colouring {
     return weights;
   }
 
-  /** Fill the legend, from values at edges or vertices. */
+  /** Fill the legend by values at edges or vertices. */
   #tell({ shown, unit, ends, title, signed }, values) {
     const mean = values.reduce((sum, value) => sum + Math.abs(value), 0) / values.length;
     const [low, high] = [Math.min, Math.max].map((end) => values.reduce((a, b) => end(a, b)));
@@ -206,14 +206,14 @@ export class Colouring {
   }
 }
 
-/** How far vertices are between two shapes, as shares of a diagonal. */
+/** Return the distances of vertices between two shapes, as shares of a diagonal. */
 const apart = (from, to, diagonal) =>
   Float32Array.from({ length: to.length / 3 }, (_, v) => {
     const [x, y, z] = [3 * v, 3 * v + 1, 3 * v + 2].map((i) => to[i] - from[i]);
     return Math.hypot(x, y, z) / diagonal;
   });
 
-/** The next of 1, 2, 5, 10, … times a power of ten. */
+/** Round up to 1, 2 or 5 times a power of ten. */
 function nice(value) {
   const power = 10 ** Math.floor(Math.log10(value));
   return power * [1, 2, 5, 10].find((step) => step * power >= value * 0.999);

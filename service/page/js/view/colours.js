@@ -3,7 +3,7 @@
 import * as THREE from "three";
 import { BASE } from "./scene.js";
 
-/** Moreland's "coolwarm", as in the server's coloured files. */
+/** Moreland's colour map "coolwarm", as in the server's coloured files. */
 const DIVERGING = [
   "#3b4cc0",
   "#6282ea",
@@ -19,7 +19,7 @@ const stops = DIVERGING.map((colour) => new THREE.Color(colour));
 const accent = new THREE.Color("#1f7fc4");
 export const gradient = `linear-gradient(to right, ${DIVERGING.join(", ")})`;
 
-/** Colours (3V) of values (V) between −limit, blue, and limit, red. */
+/** Return colours (3V) of values (V), from blue at −limit to red at limit. */
 export function diverging(values, limit) {
   const colours = new Float32Array(3 * values.length);
   const colour = new THREE.Color();
@@ -31,14 +31,14 @@ export function diverging(values, limit) {
   return colours;
 }
 
-/** Colours (3V) of distances (V) between 0, blue, and limit, red. */
+/** Return colours (3V) of distances (V), from blue at 0 to red at limit. */
 export const distant = (distances, limit) =>
   diverging(
     distances.map((distance) => 2 * distance - limit),
     limit,
   );
 
-/** Colours (3V) of weights (V) between 0, the surface's own colour, and 1. */
+/** Return colours (3V) of weights (V), from the surface's own colour at 0 to the accent at 1. */
 export function tint(weights) {
   const colours = new Float32Array(3 * weights.length);
   const colour = new THREE.Color();

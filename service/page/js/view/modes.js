@@ -1,6 +1,6 @@
 /**
- * Pictures of each coordinate and factor, where each factor changes lengths and angles, and how well shapes
- * of the model fit as a rule: all from the same few shapes.
+ * Pictures of coordinates and factors, regions of factors, and the usual residual of the model, all computed
+ * from the same few shapes.
  */
 
 import * as api from "../server/api.js";
@@ -10,7 +10,7 @@ import { report } from "../messages.js";
 import { sphereOf } from "./scene.js";
 import { Surface } from "./surface.js";
 
-/** Fetches the shapes of a model factor by factor, while nothing else is wanted of the server. */
+/** Fetches the shapes of a model factor by factor, while there are no other requests. */
 export class Modes {
   #abort = new AbortController();
   #regions = [];
@@ -26,7 +26,7 @@ export class Modes {
     });
   }
 
-  /** Draw every coordinate's pictures; the home shape is in all of them. */
+  /** Draw the pictures of every coordinate; each has the home shape in the middle. */
   async draw() {
     const {
       model,
@@ -74,7 +74,7 @@ export class Modes {
     this.sliders.pictures(k).forEach((canvas, i) => this.pictures.draw(canvas, shapes[i]));
   }
 
-  /** Take how much lengths and angles change at each vertex into a factor's region. */
+  /** Add the changes of lengths and angles at each vertex to a factor's region. */
   #grow(j, surface, rest, shapes) {
     const region = (this.#regions[j] ??= new Float32Array(surface.vertexCount));
     for (const shape of shapes) {
@@ -88,23 +88,23 @@ export class Modes {
   }
 }
 
-/** Changes to weights between 0 and 1. Everything changes a little: that doesn't count. */
+/** Return weights between 0 and 1 from changes; small changes, which occur everywhere, give 0. */
 function smooth(region) {
-  const most = Math.max(percentile(region, 0.99), 1e-9); // an edge that all but vanishes would dim all others
+  const most = Math.max(percentile(region, 0.99), 1e-9); // one nearly vanishing edge would dim all others
   return region.map((change) => {
     const share = Math.min(Math.max((change / most - 0.15) / 0.35, 0), 1);
     return share * share * (3 - 2 * share);
   });
 }
 
-/** The sphere around where a region is, in positions (3V numbers). */
+/** Return the sphere around a region in positions (3V numbers). */
 function around(positions, region) {
   const inside = [...region.keys()].filter((vertex) => region[vertex] > 0.5);
   const corners = inside.flatMap((vertex) => [...positions.subarray(3 * vertex, 3 * vertex + 3)]);
   return sphereOf(Float32Array.from(corners));
 }
 
-/** For each vertex of `fine` the nearest one of `coarse` (positions of one shape). */
+/** Return the nearest vertex of `coarse` for each vertex of `fine` (positions of one shape). */
 export function nearest(fine, coarse) {
   const found = new Uint32Array(fine.length / 3);
   for (let v = 0; v < found.length; v += 1) {

@@ -13,7 +13,7 @@ import {
   surfaceMaterial,
 } from "./scene.js";
 
-const LEAST = 0.36; // of the whole shape's radius, so that one sees where a part is
+const LEAST = 0.36; // least share of the shape's radius in a picture, so that a part has surroundings
 
 export class Pictures {
   constructor() {
@@ -33,7 +33,7 @@ export class Pictures {
     this.sphere = { center, radius: 0.95 * radius };
   }
 
-  /** Draw a shape into a canvas of the page, which keeps its size: whole, or what is around a sphere. */
+  /** Draw a shape, or its part inside a sphere, into a canvas of the page. */
   draw(canvas, positions, colours, part) {
     const { width, height } = canvas;
     this.renderer.setSize(width, height, false);

@@ -1,4 +1,4 @@
-/** How a fine shape lies to the coarse one of the same code. */
+/** The position of a fine shape relative to the coarse shape of the same code. */
 
 import { Matrix4, Vector3 } from "three";
 import { nearest } from "./modes.js";
@@ -6,14 +6,14 @@ import { nearest } from "./modes.js";
 const at = (positions, vertex) => new Vector3().fromArray(positions, 3 * vertex);
 
 /**
- * Every mesh that the server answers is aligned to its own reference, over its own vertices, which are denser
- * here than there. Shown one after the other, the coarse and the fine shape of one code would jump.
+ * The server aligns every mesh to its own reference over its own vertices, whose density differs. Without a
+ * correction, the shape would jump between the coarse and the fine mesh of one code.
  */
 export class Pose {
   #coarse;
   #fine;
 
-  /** From the positions of both references: three vertices far apart tell where a shape is. */
+  /** Choose three distant vertices from the positions of both references; they determine the pose. */
   constructor(coarse, fine) {
     const farthest = (distance) => {
       let best = 0;
@@ -30,7 +30,7 @@ export class Pose {
     this.#fine = nearest(corners, fine);
   }
 
-  /** The motion (Matrix4) from a fine shape to the coarse one of its code. */
+  /** Return the motion (Matrix4) from a fine shape to the coarse shape of its code. */
   motion(fine, coarse) {
     return frame(coarse, this.#coarse).multiply(frame(fine, this.#fine).invert());
   }
@@ -44,7 +44,7 @@ function frame(positions, corners) {
 }
 
 /**
- * A placement as the server answers it, as a Matrix4.
+ * Return a placement of the server as a Matrix4.
  * @typedef {[number, number, number]} Row
  * @param {{rotation: [Row, Row, Row], translation: Row, scale: number}} placement
  */

@@ -1,18 +1,18 @@
-/** What the large view and the small pictures have in common: surface, light, and where one looks from. */
+/** Parts of the large view and the small pictures: surface, light, and camera. */
 
 import * as THREE from "three";
 
-/** Towards the viewer, from which models are seen first. */
+/** Direction from the model to the initial camera. */
 export const VIEW = new THREE.Vector3(0.45, 0.28, 1).normalize();
-const FIELD = 28; // degrees
-/** Clay. */
+const FIELD = 28; // degrees of the camera's height
+/** Colour of clay. */
 export const BASE = new THREE.Color(0xdac6b4);
 
 export function surfaceMaterial() {
   return new THREE.MeshStandardMaterial({ vertexColors: true, roughness: 0.8, metalness: 0 });
 }
 
-/** A camera that carries its lights along, so that what one looks at is lit. */
+/** A camera with lights that move with it, so that the visible side is lit. */
 export function litCamera() {
   const camera = new THREE.PerspectiveCamera(FIELD, 1, 0.01, 100);
   const light = (colour, strength, x, y, z) => {
@@ -27,15 +27,15 @@ export function litCamera() {
   return camera;
 }
 
-/** Tangent of half the angle of a camera's height. */
+/** Return the tangent of half the angle of a camera's height. */
 const slope = (camera) => Math.tan((camera.fov * Math.PI) / 360);
 
-/** How far a camera must be from a sphere to have it in view. */
+/** Return the distance of a camera from a sphere that fills its view. */
 const distanceOf = (camera, { radius }) =>
   radius / Math.sin(Math.atan(slope(camera) * Math.min(camera.aspect, 1)));
 
 /**
- * How far it must be to have positions (3V numbers) in the width of its view and in a share of its height.
+ * Return the distance at which positions (3V numbers) fit the width and a share of the height of the view.
  */
 export function distanceTo(camera, positions, center, share) {
   const back = new THREE.Quaternion()
@@ -52,7 +52,7 @@ export function distanceTo(camera, positions, center, share) {
   return distance;
 }
 
-/** Put a camera so far from the middle of a sphere; where nothing is said, so that this fills its view. */
+/** Put a camera at a distance from the centre of a sphere; by default the sphere fills the view. */
 export function frame(camera, { center, radius }, distance = distanceOf(camera, { radius })) {
   camera.near = distance / 100;
   camera.far = distance * 20;
@@ -74,12 +74,12 @@ export function sphereOf(positions) {
   return new THREE.Sphere(center, Math.sqrt(squared));
 }
 
-/** Of the box around positions (3V numbers). */
+/** Return the sphere around the bounding box of positions (3V numbers). */
 export const diagonalOf = (positions) =>
   new THREE.Box3().setFromArray(positions).getSize(new THREE.Vector3()).length();
 
 /**
- * The side of faces to draw: of closed surfaces the outer one, as the inner would shine through along
+ * Return the side of faces to draw: the outer side of closed surfaces, whose inner side would show along
  * silhouettes.
  * @param {ArrayLike<number>} faces
  * @param {number} vertexCount
@@ -94,10 +94,10 @@ export function sideOf(faces, vertexCount) {
   return THREE.FrontSide;
 }
 
-/** Have a material draw a side. */
+/** Set the drawn side of a material. */
 export const face = (material, side) => Object.assign(material, { side, needsUpdate: true });
 
-/** A geometry for shapes with these faces; positions and colours come later. */
+/** Return a geometry for shapes with some faces; positions and colours come later. */
 export function geometryOf(faces, vertexCount) {
   const geometry = new THREE.BufferGeometry();
   const Index = vertexCount < 65536 ? Uint16Array : Uint32Array;
@@ -116,7 +116,7 @@ export function move(geometry, positions) {
   geometry.boundingSphere = geometry.boundingBox = null;
 }
 
-/** Colour each vertex; without `colours` (3V numbers in linear sRGB) the whole surface in its own. */
+/** Colour each vertex by `colours` (3V numbers in linear sRGB); without them, use the surface's colour. */
 export function paint(geometry, colours) {
   const { array } = geometry.attributes.color;
   if (colours) array.set(colours);

@@ -1,5 +1,5 @@
 /**
- * The surface as the model's files have it: materials and textures, on vertices that are split along seams.
+ * The surface of the training files: materials and textures, on vertices that are split along seams.
  */
 
 import * as THREE from "three";
@@ -7,7 +7,7 @@ import * as THREE from "three";
 const WIDTH = { SCALAR: 1, VEC2: 2 };
 
 export class Skin {
-  /** From the server's GLB of the reference. */
+  /** Read the server's GLB of the reference. */
   static async of(buffer) {
     const size = new DataView(buffer).getUint32(12, true);
     const tree = JSON.parse(new TextDecoder().decode(new Uint8Array(buffer, 20, size)));
@@ -78,7 +78,7 @@ export class Skin {
     });
   }
 
-  /** Go where a geometry of the same vertices, not split, is. */
+  /** Take the positions of a geometry with the same vertices, not split. */
   follow(geometry) {
     for (const name of ["position", "normal"]) {
       const [from, to] = [geometry.attributes[name].array, this.geometry.attributes[name].array];

@@ -1,12 +1,12 @@
-/** What the shape stands on: a disc that fades into the paper, and the soft shadow that it casts there. */
+/** The ground below the shape: a disc that fades into the page, and a soft shadow. */
 
 import * as THREE from "three";
 
-const WIDTH = 1.5; // of the disc, and of what can cast shadow, in the model's radius
-const CELLS = 96; // of a side of the shadow
-const BLUR = 2; // cells to each side of one, that it is averaged with
-// Darkness under what lies on the ground and under what is above it, the heights where each ends, and how
-// many times it is blurred: where feet touch the ground their shadow is sharper.
+const WIDTH = 1.5; // of the disc and of the shadow, in radii of the model
+const CELLS = 96; // along each side of the shadow
+const BLUR = 2; // cells on each side that a blur averages
+// Shadows of parts on the ground and of parts above it: darkness, height at which it ends, and number of blurs.
+// Where feet touch the ground, their shadow is sharper.
 const CONTACT = { dark: 0.62, end: 0.08, blurred: 1 };
 const BODY = { dark: 0.26, end: 1.6, blurred: 5 };
 
@@ -14,7 +14,7 @@ export class Stage extends THREE.Group {
   #disc;
   #shadow;
   #radius = 1;
-  #alpha = new Uint8Array(4 * CELLS * CELLS); // of black pixels
+  #alpha = new Uint8Array(4 * CELLS * CELLS); // alpha of black pixels
   #seen = new Float32Array(CELLS * CELLS);
   #touched = new Float32Array(CELLS * CELLS);
   #spare = new Float32Array(CELLS * CELLS);
@@ -42,22 +42,22 @@ export class Stage extends THREE.Group {
     this.#disc.renderOrder = -2;
     this.#shadow.renderOrder = -1;
     this.add(this.#disc, this.#shadow);
-    this.rotation.x = -Math.PI / 2; // both lie, seen from above only
+    this.rotation.x = -Math.PI / 2; // both lie flat, visible from above only
   }
 
-  /** Stand in the middle below a model. */
+  /** Move below the middle of a model. */
   open({ center, radius }) {
     this.position.copy(center);
     this.#radius = WIDTH * radius;
     this.scale.setScalar(this.#radius);
   }
 
-  /** The disc's colour, as the theme has it. */
+  /** Set the disc's colour by the theme. */
   set colour(colour) {
     this.#disc.material.color.set(colour);
   }
 
-  /** Go below positions (3V numbers) that a motion (Matrix4) shows, and take their shadow. */
+  /** Move below positions (3V numbers) after a motion (Matrix4), and draw their shadow. */
   under(positions, faces, motion) {
     const points = new Float32Array(positions.length);
     const point = new THREE.Vector3();
@@ -70,7 +70,7 @@ export class Stage extends THREE.Group {
     this.#seen.fill(0);
     this.#touched.fill(0);
     for (let i = 0; i < points.length; i += 3) this.#cast(points[i], points[i + 1], points[i + 2]);
-    // Corners alone would leave holes where faces are large.
+    // Corners alone would leave holes in large faces.
     for (let f = 0; f < faces.length; f += 3) {
       const [a, b, c] = [3 * faces[f], 3 * faces[f + 1], 3 * faces[f + 2]];
       const middle = (axis) => (points[a + axis] + points[b + axis] + points[c + axis]) / 3;
@@ -84,7 +84,7 @@ export class Stage extends THREE.Group {
     this.#shadow.material.map.needsUpdate = true;
   }
 
-  /** Darken the cell under a point; of several above each other the lowest counts. */
+  /** Darken the cell under a point; the lowest of several points counts. */
   #cast(x, y, z) {
     const cell = (offset) => Math.floor((offset / this.#radius + 1) * (CELLS / 2));
     const [column, row] = [cell(x - this.position.x), cell(this.position.z - z)];
@@ -98,7 +98,7 @@ export class Stage extends THREE.Group {
     darken(this.#touched, CONTACT);
   }
 
-  /** The mean of the cells around each, along one axis; turned over in between, along both. */
+  /** Average neighbouring cells along one axis and transpose; two calls blur along both axes. */
   #blur() {
     for (let turn = 0; turn < 2; turn += 1) {
       const [from, to] = [this.#seen, this.#spare];

@@ -1,7 +1,7 @@
-/** Lengths and angles of a mesh's edges, and how much they differ between two shapes. */
+/** Lengths and angles of a mesh's edges, and their differences between two shapes. */
 
 /**
- * What a mesh's faces say once for all: its edges, the faces beside them, and the edges around each vertex.
+ * The connectivity of a mesh: its edges, the faces beside them, and the edges around each vertex.
  */
 export class Surface {
   constructor(faces, vertexCount) {
@@ -12,7 +12,7 @@ export class Surface {
         const [a, b, opposite] = [faces[f + c], faces[f + ((c + 1) % 3)], faces[f + ((c + 2) % 3)]];
         const key = Math.min(a, b) * vertexCount + Math.max(a, b);
         const edge = known.get(key);
-        // Seen from the second face the edge runs the other way: its opposite corner lies to the right.
+        // In the second face the edge has the opposite direction, so the opposite corner lies to the right.
         if (edge === undefined) {
           known.set(key, edges.length);
           edges.push([a, b, opposite, -1]);
@@ -23,7 +23,7 @@ export class Surface {
     this.vertexCount = vertexCount;
   }
 
-  /** Lengths and signed dihedral angles (positive where convex, 0 at a boundary) of every edge. */
+  /** Return lengths and signed dihedral angles of all edges; positive where convex, 0 at a boundary. */
   measure(x) {
     const lengths = new Float32Array(this.edges.length);
     const angles = new Float32Array(this.edges.length);
@@ -38,12 +38,12 @@ export class Surface {
     return { lengths, angles };
   }
 
-  /** Logarithm of each edge's length by what it was. */
+  /** Return the logarithm of the ratio of each edge's lengths. */
   stretch(from, to) {
     return to.lengths.map((length, i) => Math.log(length / from.lengths[i]));
   }
 
-  /** Change of angle of each edge, in radians. */
+  /** Return the change of each edge's angle, in radians. */
   bending(from, to) {
     return to.angles.map((angle, i) => {
       const change = angle - from.angles[i];
@@ -51,7 +51,7 @@ export class Surface {
     });
   }
 
-  /** The mean of values at vertices over each and its neighbours. */
+  /** Average values at vertices over each vertex and its neighbours. */
   smooth(values) {
     const sums = Float32Array.from(values);
     const counts = new Float32Array(this.vertexCount).fill(1);
@@ -64,7 +64,7 @@ export class Surface {
     return sums.map((sum, vertex) => sum / counts[vertex]);
   }
 
-  /** The mean of the values at each vertex's edges, weighted by what their lengths were. */
+  /** Return the mean of values at the edges of each vertex, weighted by their lengths before. */
   atVertices(values, { lengths }, interiorOnly) {
     const sums = new Float32Array(this.vertexCount);
     const weights = new Float32Array(this.vertexCount);

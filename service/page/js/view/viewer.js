@@ -1,8 +1,7 @@
 /**
- * The large view: draws the shape when something has changed, and only then.
+ * The large view, which draws only after a change.
  *
- * Its canvas fires `drawn` after each picture, in the same task, and `turned` when a view that a hand has
- * chosen has moved.
+ * Its canvas fires `drawn` after each picture, in the same task, and `turned` when the user has turned it.
  */
 
 import * as THREE from "three";
@@ -22,14 +21,14 @@ import {
 import { Stage } from "./stage.js";
 
 const TURN = Math.PI / 24;
-const ROOM = 1.08; // for shapes that are larger than the reference
+const ROOM = 1.08; // factor of the distance, for shapes that are larger than the reference
 
 export class Viewer {
   #scheduled = false;
-  #share = 1; // of the height that is free for the shape
+  #share = 1; // share of the height that is free for the shape
   #grounds = [];
 
-  /** `margin`: pixels of the canvas's height that buttons and words take. */
+  /** `margin`: pixels of the canvas's height below buttons and text. */
   constructor(canvas, margin) {
     this.canvas = canvas;
     this.margin = margin;
@@ -41,7 +40,7 @@ export class Viewer {
     this.controls = new OrbitControls(this.camera, canvas);
     this.controls.addEventListener("change", () => this.draw());
     this.controls.addEventListener("end", () => this.#turned());
-    /** Whether the view is another than the one that shapes are seen from first. */
+    /** Whether the view differs from the initial one. */
     this.turned = false;
 
     this.materials = { surface: surfaceMaterial(), normals: new THREE.MeshNormalMaterial() };
@@ -54,7 +53,7 @@ export class Viewer {
       opacity: 0.55,
     });
     this.wires = new THREE.Mesh(this.mesh.geometry, wires);
-    // Lines lie on the surface: a little nearer to the eye they don't flicker.
+    // Lines lie on the surface; slightly nearer to the camera, they don't flicker.
     Object.assign(this.materials.surface, {
       polygonOffset: true,
       polygonOffsetFactor: 1,
@@ -66,10 +65,9 @@ export class Viewer {
       polygonOffsetUnits: 1,
     });
     this.mesh.frustumCulled = this.wires.frustumCulled = false;
-    // Not drawn while empty: three.js would take the lack of normals for flat shading, and keep to it.
+    // Not drawn while empty, because three.js would choose flat shading without normals, and keep it.
     this.mesh.visible = this.wires.visible = false;
-    // Instead of the mesh where there are textures and no colours; what the mesh is, is still what one points
-    // at.
+    // Shown instead of the mesh if there are textures and no colours; the pointer still picks the mesh.
     this.skinned = new THREE.Mesh();
     this.skinned.frustumCulled = this.skinned.visible = false;
     this.stage = this.ground();
@@ -83,7 +81,7 @@ export class Viewer {
     canvas.addEventListener("webglcontextrestored", () => this.draw());
   }
 
-  /** Take on a model, by its coarse reference; returns when nothing of the one before is left. */
+  /** Switch to a model, given its coarse reference; returns when the old model is removed. */
   open(reference) {
     for (const geometry of Object.values(this.geometries)) geometry.dispose();
     this.geometries = {};
@@ -104,7 +102,7 @@ export class Viewer {
     this.geometries[name] = geometryOf(faces, vertices.length / 3);
   }
 
-  /** Materials and textures for one of the model's meshes. */
+  /** Set materials and textures of one of the model's meshes. */
   dress(name, skin) {
     for (const material of skin.materials) face(material, this.side);
     this.skin = skin;
@@ -116,14 +114,14 @@ export class Viewer {
 
   #wear() {
     const { skin, mesh } = this;
-    if (!mesh.geometry.index) return; // nothing has been shown yet
+    if (!mesh.geometry.index) return; // no shape is shown yet
     const wears = Boolean(skin) && mesh.geometry === this.geometries[this.skinOf];
     this.skinned.visible = wears && !this.coloured && mesh.material === this.materials.surface;
     mesh.visible = !this.skinned.visible;
     if (wears) skin.follow(mesh.geometry);
   }
 
-  /** Show positions on one of the model's meshes, there or where a motion (Matrix4) takes them. */
+  /** Show positions on one of the model's meshes, after a motion (Matrix4) if it is given. */
   show(name, positions, colours, placement) {
     const geometry = this.geometries[name];
     move(geometry, positions);
@@ -147,7 +145,7 @@ export class Viewer {
     this.draw();
   }
 
-  /** Whether lines show, and whether colours stand for normals. */
+  /** Set whether lines are shown, and whether colours show normals. */
   style({ wireframe, normals }) {
     this.wires.visible = wireframe;
     this.mesh.material = normals ? this.materials.normals : this.materials.surface;
@@ -155,7 +153,7 @@ export class Viewer {
     this.draw();
   }
 
-  /** A ground for a shape to stand on. */
+  /** Add a ground below a shape. */
   ground() {
     const made = new Stage();
     this.#grounds.push(made);
@@ -163,7 +161,7 @@ export class Viewer {
     return made;
   }
 
-  /** Take the colours of the theme. */
+  /** Set the colours of the theme. */
   recolour() {
     for (const ground of this.#grounds) ground.colour = getComputedStyle(this.canvas).color;
     this.draw();
@@ -185,8 +183,8 @@ export class Viewer {
   }
 
   /**
-   * Have positions (3V numbers) in view beside the reference; null leaves it alone again. One goes on looking
-   * from where one has turned the view to, and where it is `given` from the very point.
+   * Show positions (3V numbers) beside the reference in the view; null shows the reference alone. The direction
+   * of the view stays; the camera's position stays, too, if it is `given`.
    */
   makeRoom(positions, given = false) {
     const { middle } = this;
@@ -196,12 +194,12 @@ export class Viewer {
     if (!this.turned) this.resetView();
     else if (!given) {
       this.#move(this.middle.clone().sub(middle), this.#distance / before);
-      // The address may have been written before the shape came.
+      // The address may be older than the shape.
       this.canvas.dispatchEvent(new Event("turned"));
     }
   }
 
-  /** Move what one looks at, and be as many times as far from it. */
+  /** Move the target of the camera, and scale its distance. */
   #move(by, times) {
     const { target } = this.controls;
     const offset = this.camera.position.clone().sub(target).multiplyScalar(times);
@@ -210,12 +208,12 @@ export class Viewer {
     this.controls.update();
   }
 
-  /** From which what is to be seen fills what is free of the picture. */
+  /** Return the distance at which the shapes fill the free part of the picture. */
   get #distance() {
     return ROOM * distanceTo(this.camera, this.seen, this.middle, this.#share);
   }
 
-  /** Where the camera is and looks, as six numbers. */
+  /** Position and target of the camera, as six numbers. */
   get view() {
     return [...this.camera.position.toArray(), ...this.controls.target.toArray()];
   }
@@ -227,14 +225,14 @@ export class Viewer {
     this.draw();
   }
 
-  /** Look from where a view does, but for an angle (radians) about the axis that is up. */
+  /** Set a view, turned by an angle (radians) about the vertical axis. */
   turn(view, angle) {
     const [position, target] = [new THREE.Vector3().fromArray(view), new THREE.Vector3().fromArray(view, 3)];
     const there = position.sub(target).applyAxisAngle(this.camera.up, angle).add(target);
     this.view = [...there.toArray(), ...target.toArray()];
   }
 
-  /** Draw before the next picture of the screen. */
+  /** Draw with the next frame of the screen. */
   draw() {
     if (this.#scheduled) return;
     this.#scheduled = true;
@@ -250,7 +248,7 @@ export class Viewer {
     this.canvas.dispatchEvent(new Event("drawn"));
   }
 
-  /** Do something while the canvas isn't transparent: files know nothing of the paper behind it. */
+  /** Call a function while the canvas is opaque, because files lack the page behind it. */
   async opaquely(work) {
     this.scene.background = new THREE.Color(getComputedStyle(this.canvas.parentElement).backgroundColor);
     try {
@@ -261,7 +259,7 @@ export class Viewer {
     }
   }
 
-  /** The vertex nearest to where a ray through a point of the window meets the surface, or null. */
+  /** Return the vertex nearest to the surface under a point of the window, or null. */
   pick({ clientX, clientY }) {
     const box = this.canvas.getBoundingClientRect();
     const point = new THREE.Vector2(
@@ -282,13 +280,13 @@ export class Viewer {
     return { vertex, position: at(vertex) };
   }
 
-  /** Where a point is in the picture, in pixels from its upper left. */
+  /** Return the position of a point in the picture, in pixels from the upper left. */
   project(position) {
     const { x, y } = position.clone().project(this.camera);
     return { x: ((x + 1) / 2) * this.canvas.clientWidth, y: ((1 - y) / 2) * this.canvas.clientHeight };
   }
 
-  /** The point at a place of the window, as far away as `depth` is. */
+  /** Return the point at a place of the window, at the depth of `depth`. */
   unproject({ clientX, clientY }, depth) {
     const box = this.canvas.getBoundingClientRect();
     const { z } = depth.clone().project(this.camera);
@@ -306,7 +304,7 @@ export class Viewer {
     this.camera.aspect = width / height;
     this.#share = Math.max(1 - this.margin / height, 0.4);
     this.renderer.setSize(width, height, false);
-    // A smaller window must show as much: the distance follows.
+    // The distance follows the size of the window, so that it shows the same.
     if (before) this.#move(new THREE.Vector3(), this.#distance / before);
     this.camera.updateProjectionMatrix();
     this.draw();

@@ -13,8 +13,8 @@ from starlette.responses import Response
 from starlette.types import Message, Receive, Scope, Send
 
 from shapespace.files.archives import npz_pieces, zip_pieces
-from shapespace.service.http import middleware
-from shapespace.service.http.middleware import PIECE, LimitUnreadAnswers
+from shapespace.service.http.middleware import memory
+from shapespace.service.http.middleware.memory import PIECE_BYTES, LimitUnreadAnswers
 from tests.service.conftest import Start
 
 MIB = 2**20
@@ -45,13 +45,13 @@ def test_a_large_answer_leaves_in_pieces_each_after_the_last_was_taken() -> None
 
     start, *pieces = asyncio.run(ask())
     assert dict(start["headers"])[b"content-length"] == str(MIB).encode()
-    assert max(len(piece["body"]) for piece in pieces) == PIECE
+    assert max(len(piece["body"]) for piece in pieces) == PIECE_BYTES
     assert b"".join(piece["body"] for piece in pieces) == bytes(range(256)) * (MIB // 256)
     assert [piece["more_body"] for piece in pieces] == [True] * (len(pieces) - 1) + [False]
 
 
 def test_answers_that_nobody_reads_are_limited_together(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(middleware, "ANSWERS", 8 * MIB)
+    monkeypatch.setattr(memory, "UNREAD_BYTES", 8 * MIB)
 
     async def ask() -> list[int]:
         pace, statuses, go_on = LimitUnreadAnswers(large), [], asyncio.Event()
@@ -59,7 +59,7 @@ def test_answers_that_nobody_reads_are_limited_together(monkeypatch: pytest.Monk
         async def send(message: Message) -> None:
             if message["type"] == "http.response.start":
                 statuses.append(message["status"])
-            elif len(message["body"]) == PIECE:
+            elif len(message["body"]) == PIECE_BYTES:
                 await go_on.wait()  # a client that doesn't read
 
         waiting = [asyncio.create_task(pace(scope(client), nothing, send)) for client in ["a"] * 8 + ["b"] * 2]

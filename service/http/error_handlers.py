@@ -1,0 +1,163 @@
+"""Exceptions of the models, the use cases and the framework as problems."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from http import HTTPStatus
+from typing import Any
+
+from fastapi import FastAPI, Request, Response
+from fastapi.exceptions import RequestValidationError
+from starlette.exceptions import HTTPException as StarletteHTTPException
+from starlette.requests import ClientDisconnect
+from starlette.routing import Match
+
+from shapespace.model.blend_shapes import PeriodicError
+from shapespace.model.correspondence import InvalidMeshError
+from shapespace.model.decoder import ModelFailedError, NetworkTimeError
+from shapespace.model.edit import InvalidTargetError
+from shapespace.model.exact_shapes import NoTangentSpaceError
+from shapespace.model.latent_space import InvalidFixedError, NotFiniteError, OutOfBoundsError, WrongLengthError
+from shapespace.model.scan import InvalidScanError
+from shapespace.model.vertex_uncertainty import InvalidCovarianceError
+from shapespace.service.http.problems import ProblemError, problem, shortened
+from shapespace.service.limits.workers import BusyError, DeadlineError, DisconnectedError, EndingError
+from shapespace.service.repository.repository import UnknownModelError, UnknownVersionError
+from shapespace.service.use_cases.animation import PathTooLongError, UnknownInterpolationError
+from shapespace.service.use_cases.batch import NoCodesError, TooManyCodesError
+from shapespace.service.use_cases.sequence import TooManyFramesError, UnknownFrameError
+from shapespace.service.use_cases.shape_formats import NoRoomError
+from shapespace.service.use_cases.uploads import UnknownFormatError, UnreadableFormError, UnusableMeshError
+
+#: Kind of problem of each exception of the model and the use cases; the message becomes the detail.
+_KINDS: dict[type[Exception], str] = {
+    UnknownModelError: "unknown-model",
+    UnknownVersionError: "unknown-version",
+    UnknownInterpolationError: "unknown-interpolation",
+    UnknownFrameError: "unknown-frame",
+    WrongLengthError: "wrong-length",
+    NotFiniteError: "not-finite",
+    OutOfBoundsError: "out-of-bounds",
+    InvalidFixedError: "invalid-request",
+    InvalidCovarianceError: "invalid-request",
+    NoCodesError: "invalid-request",
+    TooManyCodesError: "too-many-codes",
+    TooManyFramesError: "too-many-frames",
+    PathTooLongError: "path-too-long",
+    InvalidTargetError: "invalid-request",
+    UnreadableFormError: "malformed-request",
+    UnknownFormatError: "unsupported-media-type",
+    UnusableMeshError: "invalid-mesh",
+    InvalidMeshError: "invalid-mesh",
+    InvalidScanError: "invalid-scan",
+    NoTangentSpaceError: "no-tangent-space",
+    PeriodicError: "periodic",
+    BusyError: "busy",
+    DeadlineError: "deadline-passed",
+    NoRoomError: "no-room",
+    ModelFailedError: "model-failed",
+    NetworkTimeError: "model-failed",
+    DisconnectedError: "client-closed",
+    ClientDisconnect: "client-closed",
+    EndingError: "not-ready",
+}
+DOMAIN_ERRORS = tuple(_KINDS)
+
+
+def install(app: FastAPI) -> None:
+    """Let an application answer every error as a problem."""
+    for exception in _KINDS:
+        app.add_exception_handler(exception, domain_problem)
+    app.add_exception_handler(StarletteHTTPException, _http)
+    app.add_exception_handler(RequestValidationError, _validation)
+
+
+async def domain_problem(request: Request, error: Exception) -> Response:
+    """Return one of the DOMAIN_ERRORS as a problem."""
+    return problem(request.scope, _KINDS[type(error)], str(error))
+
+
+async def _http(request: Request, error: Exception) -> Response:
+    assert isinstance(error, StarletteHTTPException)  # noqa: S101 - narrows the type that the handler is registered for
+    if isinstance(error, ProblemError):
+        return problem(request.scope, error.kind, error.detail, error.headers, **error.extensions)
+    path, method = request.url.path, request.method
+    if error.status_code == HTTPStatus.NOT_FOUND:
+        return problem(request.scope, "not-found", f"Nothing answers at {path}. /openapi.json lists every call.")
+    if error.status_code == HTTPStatus.METHOD_NOT_ALLOWED:
+        allowed = ", ".join(_allowed(request)) or (error.headers or {}).get("Allow", "")
+        detail = f"{path} does not take {method}. Use {allowed}."
+        return problem(request.scope, "method-not-allowed", detail, {"Allow": allowed})
+    return problem(
+        request.scope,
+        "malformed-request",
+        "The body can't be read. Send one JSON object in UTF-8, as /openapi.json describes it.",
+    )
+
+
+def _allowed(request: Request) -> list[str]:
+    # The router names the methods of the first route only, but a path may have several routes.
+    routes = request.app.router.routes
+    scopes = {
+        method: {**request.scope, "method": method} for method in ("GET", "HEAD", "POST", "PUT", "PATCH", "DELETE")
+    }
+    return [m for m, scope in scopes.items() if any(route.matches(scope)[0] is Match.FULL for route in routes)]
+
+
+async def _validation(request: Request, error: Exception) -> Response:
+    assert isinstance(error, RequestValidationError)  # noqa: S101 - as above
+    faults = error.errors()
+    if any(fault["type"] == "json_invalid" for fault in faults):
+        where = faults[0]["loc"][-1]
+        reason = faults[0].get("ctx", {}).get("error", "")
+        return problem(
+            request.scope,
+            "malformed-request",
+            f"The body is not JSON (character {where}: {reason}). Send one valid JSON object.",
+        )
+    kind = "not-finite" if all(fault["type"] == "finite_number" for fault in faults) else "invalid-request"
+    errors = [
+        {"pointer": shortened(_pointer(fault["loc"])), "detail": shortened(_advice(fault))} for fault in faults[:10]
+    ]
+    more = f" ({len(faults) - 1} more under errors.)" if len(faults) > 1 else ""
+    return problem(request.scope, kind, errors[0]["detail"] + more, errors=errors)
+
+
+def _pointer(loc: tuple[Any, ...]) -> str:
+    place = loc[1:] if loc and loc[0] == "body" else loc
+    return "#/" + "/".join(map(str, place))
+
+
+def _advice(fault: Mapping[str, Any]) -> str:
+    """Return a sentence that says how to correct one fault that pydantic found."""
+    where, *place = fault["loc"]
+    name = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in place).lstrip(".")
+    name = name or f"the {where}"
+    limits = fault.get("ctx", {})
+    match fault["type"]:
+        case "missing":
+            return f"Add {name!r}: it is required." if place else "Send a JSON object as the body."
+        case "extra_forbidden":
+            return f"Remove {name!r}: there is no such field. /openapi.json lists those there are."
+        case "finite_number":
+            return f"Send finite numbers only: {name} is NaN or infinite."
+        case "float_type" | "float_parsing":
+            return f"Send a number for {name}."
+        case "int_type" | "int_from_float" | "int_parsing":
+            return f"Send a whole number for {name}."
+        case "bool_type" | "bool_parsing":
+            return f"Send true or false for {name}."
+        case "list_type":
+            return f"Send a list for {name}."
+        case "model_attributes_type" | "model_type" | "dict_type":
+            return f"Send a JSON object for {name}."
+        case "enum" | "literal_error":
+            return f"Send {limits['expected']} for {name}."
+        case "too_short":
+            return f"Send at least {limits['min_length']} entries for {name}, not {limits['actual_length']}."
+        case "greater_than_equal":
+            return f"Send a number of at least {limits['ge']} for {name}."
+        case "value_error":
+            return f"Correct {name}: {limits['error']}."
+        case _:
+            return f"Correct {name}: {fault['msg']}."

@@ -1,0 +1,34 @@
+"""Parts that all middleware shares."""
+
+from __future__ import annotations
+
+from starlette.types import ASGIApp, Receive, Scope, Send
+
+from shapespace.service.limits.quota import client_name
+
+
+class HTTPMiddleware:
+    """Middleware for HTTP requests, as plain ASGI, which leaves contexts and streams untouched.
+
+    Args:
+        app: the next application.
+    """
+
+    def __init__(self, app: ASGIApp) -> None:
+        self.app = app
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Handle a request; pass on everything else, as the start and the end of the server."""
+        if scope["type"] == "http":
+            await self.handle(scope, receive, send)
+        else:
+            await self.app(scope, receive, send)
+
+    async def handle(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Handle one request."""
+        raise NotImplementedError
+
+
+def client_of(scope: Scope) -> str:
+    """Return the client whose quotas a request counts for; empty where the address is unknown."""
+    return client_name((scope.get("client") or [""])[0])

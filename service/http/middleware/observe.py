@@ -1,0 +1,91 @@
+"""Ids, metrics and log lines of requests, and ``HEAD``."""
+
+from __future__ import annotations
+
+import logging
+import re
+import time
+from uuid import uuid4
+
+from starlette.datastructures import Headers, MutableHeaders
+from starlette.types import Message, Receive, Scope, Send
+
+from shapespace.service import logs
+from shapespace.service.http.middleware.access import HEALTH
+from shapespace.service.http.middleware.base import HTTPMiddleware
+from shapespace.service.http.problems import internal_error
+
+#: Named in docs/how-to/operate.md, so that operators can filter by it.
+logger = logging.getLogger("shapespace.service.http.middleware")
+#: Ids that a client may choose; others are replaced.
+REQUEST_ID = re.compile(r"[A-Za-z0-9._-]{1,64}")
+#: Most characters of a path in the log.
+LONGEST_PATH = 1000
+#: Paths whose requests are logged at level DEBUG only, because they come every few seconds.
+QUIET = HEALTH | {"/metrics"}
+
+
+class HeadAsGet(HTTPMiddleware):
+    """Answers ``HEAD`` as ``GET``; uvicorn leaves out the body."""
+
+    async def handle(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Pass a request on, HEAD as GET."""
+        if scope["method"] == "HEAD":
+            scope = {**scope, "method": "GET", "original_method": "HEAD"}
+        await self.app(scope, receive, send)
+
+
+class Observe(HTTPMiddleware):
+    """Gives each request an id, counts and times it, and logs one line about it.
+
+    An unexpected exception is answered as an internal error. Every answer tells browsers not to guess its type.
+    """
+
+    async def handle(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Pass a request on and watch its answer."""
+        given = Headers(scope=scope).get("x-request-id", "")
+        id = given if REQUEST_ID.fullmatch(given) else uuid4().hex
+        context = logs.request_id.set(id)
+        service, method = scope["app"].state.service, scope.get("original_method", scope["method"])
+        status = 499  # the status of nginx for a client that closed the connection
+        answered = False
+        began = time.perf_counter()
+
+        async def observed(message: Message) -> None:
+            nonlocal status, answered
+            if message["type"] == "http.response.start":
+                answered = True
+                headers = MutableHeaders(scope=message)
+                status = message["status"]
+                headers["X-Request-ID"] = id
+                headers["X-Content-Type-Options"] = "nosniff"
+                if service.draining:  # the client should send its next request to another server
+                    headers["Connection"] = "close"
+            await send(message)
+
+        try:
+            await self.app(scope, receive, observed)
+        except Exception:
+            logger.exception("a mistake of the server")
+            if answered:
+                raise  # breaks the connection, the only way left to tell the client
+            await internal_error(scope)(scope, receive, observed)
+        finally:
+            seconds = time.perf_counter() - began
+            route = _template(scope)
+            service.metrics.answered(route, method, status, seconds)
+            # As received, percent-encoded, so that a path cannot break a line.
+            path = scope.get("raw_path", b"")[:LONGEST_PATH].decode("ascii", "replace")
+            facts = {"method": method, "path": path, "route": route, "status": status}
+            facts |= {"seconds": round(seconds, 6), "client": (scope.get("client") or ["-"])[0]}
+            level = logging.DEBUG if route in QUIET else logging.INFO
+            logger.log(level, "%s %s %d in %.3f s", method, path, status, seconds, extra=facts)
+            logs.request_id.reset(context)
+
+
+def _template(scope: Scope) -> str:
+    """Return the route's path with its parameters unfilled; one word for all paths without a route."""
+    if "route" in scope:
+        template: str = scope["route"].path
+        return template
+    return f"{scope['root_path']}/*" if scope.get("root_path") else "unmatched"
