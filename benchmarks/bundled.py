@@ -16,6 +16,7 @@ from typing import Any
 import jinja2
 import numpy as np
 
+from benchmarks import studies
 from shapespace.coordinates.nric import WeightedNorm
 from shapespace.training.collection.generators import freaky_torus
 from shapespace.training.learning.evaluation import r_squared
@@ -40,6 +41,7 @@ def record(name: str) -> dict[str, Any]:
     """What a committed run holds, by the names of its files."""
     folder = ROOT / "runs" / name
     found: dict[str, Any] = {path.stem: json.loads(path.read_text()) for path in folder.glob("*.json")}
+    found["evaluation"] = studies.EMPTY | found["evaluation"]
     return found | {"config": load(folder / "config.toml")[0]}
 
 

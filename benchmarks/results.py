@@ -20,7 +20,7 @@ import tomlkit
 from matplotlib.ticker import LogLocator, NullFormatter
 
 import shapespace
-from benchmarks import limits, space
+from benchmarks import limits, space, studies
 from shapespace.training.pipeline import Run, execute, learner_of
 from shapespace.training.runs.config import load, parse
 from shapespace.training.runs.directory import RunDirectory
@@ -68,7 +68,7 @@ def have(run: RunDirectory, name: str, measure: Callable[[], dict[str, Any]]) ->
 def open_run(name: str, data: Path, out: Path) -> Run:
     """The run of a collection or the figure, without mirror images of its shapes unless the name ends in ``MIRRORED``.
 
-    Where it ends in ``SHELL``, with these modes, one seed, and none of the studies.
+    Where it ends in ``SHELL``, with these modes, and without the paper's system and the grid.
     """
     plain = name.removesuffix(MIRRORED).removesuffix(SHELL)
     path = ROOT / "examples" / (f"{plain}.toml" if plain == MANNEQUIN else f"collections/{plain}.toml")
@@ -78,8 +78,8 @@ def open_run(name: str, data: Path, out: Path) -> Run:
     document["collection"]["mirror"] = name.endswith(MIRRORED)
     if name.endswith(SHELL):
         document["modes"].update(SHELL_MODES)
-        for studied in ("networks", "variants", "evaluation"):
-            document.pop(studied, None)
+        for baselines in ("networks", "evaluation"):
+            document.pop(baselines, None)
     text = tomlkit.dumps(document)
     return Run(out / name, parse(text, name), text, out / "models")
 
@@ -87,6 +87,7 @@ def open_run(name: str, data: Path, out: Path) -> Run:
 def figures(name: str, run: Run) -> dict[str, Any]:
     """Do what is missing of a run, and return everything that was measured on it."""
     execute(run, "evaluation" if name in CONTRASTS else None, keep_going=True)
+    studies.add(run, studies.Studies.listed(name))
     directory = run.directory
     if name in COLLECTIONS:
         have(directory, "space", lambda: space.measure(directory, run.config))
@@ -205,6 +206,8 @@ def write_page() -> None:
         for name in (*COLLECTIONS, *CONTRASTS)
         if (file := FIGURES / f"{name}.json").exists()
     }
+    for row in rows.values():
+        row["evaluation"] = studies.EMPTY | row["evaluation"]
     real = {name: rows[name] for name in COLLECTIONS if name in rows}
     if some := {name: row for name, row in real.items() if row["evaluation"]["fractions"]}:
         plot_samples(some, DOCS / "results-samples.png")

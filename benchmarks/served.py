@@ -115,10 +115,8 @@ def four_fifths(name: str, data: Path, out: Path, fold: int = 0) -> tuple[Run, F
     joint, factors = example.config.samples.count, example.config.samples.factor_counts
     document["samples"]["count"] = min(joint, JOINT)
     document["samples"]["factor_counts"] = min(factors, OF_FACTORS) if isinstance(factors, int) else OF_FACTORS
-    for section in ("variants", "evaluation"):
-        document.pop(section, None)
-    for studied in ("seeds", "fractions", "paper"):
-        document.get("networks", {}).pop(studied, None)
+    document.pop("evaluation", None)
+    document.get("networks", {}).pop("paper", None)
     document["export"].pop("names", None)
     document["export"]["name"] = name + ending
     text = tomlkit.dumps(document)

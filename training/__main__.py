@@ -91,7 +91,7 @@ def _init(arguments: argparse.Namespace) -> None:
 
 
 def _run(arguments: argparse.Namespace) -> None:
-    config, source = load(arguments.config, arguments.data, arguments.fractions)
+    config, source = load(arguments.config, arguments.data)
     folder = _folder(arguments)
     run = Run(folder, config, source, arguments.models, arguments.scheduler, arguments.accept)
     again = " ".join([_program(), *map(shlex.quote, sys.argv[1:])])
@@ -144,14 +144,6 @@ def parser() -> argparse.ArgumentParser:
     run = commands.add_parser("run", help="do the stages of a configuration that are not done yet")
     run.add_argument("config", type=Path, metavar="CONFIG.toml")
     run.add_argument("--data", type=Path, metavar="DIR", help="folder of meshes or NPZ file, instead of the config's")
-    run.add_argument(
-        "--fractions",
-        type=float,
-        nargs="+",
-        default=(),
-        metavar="F",
-        help="also learn from these shares of the samples",
-    )
     run.add_argument("--out", type=Path, metavar="DIR", help="run directory (default: runs/ and the config's name)")
     run.add_argument("--until", choices=list(STAGES), metavar="STAGE", help=f"last stage to do: {', '.join(STAGES)}")
     run.add_argument("--scheduler", metavar="ADDRESS", help="Dask scheduler whose workers draw the samples")

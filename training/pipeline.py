@@ -8,7 +8,7 @@ import shutil
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import cached_property, partial
+from functools import cached_property
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -192,12 +192,12 @@ def samples(run: Run) -> None:
         shutil.rmtree(folder / DERIVATIVES, ignore_errors=True)
 
 
-def learner_of(run: Run, **how: Any) -> Learner:
-    """The networks of a run whose samples are there, learned from a share of them, or with another seed."""
+def learner_of(run: Run) -> Learner:
+    """The networks of a run whose samples are there."""
     from shapespace.training.learning.learner import Learner
 
     samples = run.directory.stamp("samples").read()["key"]
-    return Learner(run.collection, run.config, run.directory, f"{samples}, {STAGES['networks'].version}", **how)
+    return Learner(run.collection, run.config, run.directory, f"{samples}, {STAGES['networks'].version}")
 
 
 def networks(run: Run) -> None:
@@ -218,25 +218,11 @@ def networks(run: Run) -> None:
     learner.main()
     learner.monolithic()
     learner.monolithic_paper()
-    learner.variants()
     if run.config.networks.paper:
         learner.paper()
-    histories = learner.histories
-    for fraction in run.config.networks.fractions:
-        learner = learner_of(run, fraction=fraction)
-        learner.main()
-        learner.monolithic()
-        free = learner_of(run, fraction=fraction, all_of_factors=True)
-        free.main()
-        histories |= learner.histories | free.histories
-    for seed in run.config.networks.seeds:
-        learner = learner_of(run, seed=seed)
-        learner.main()
-        learner.monolithic()
-        histories |= learner.histories
-    directory.histories.write(histories)
+    directory.histories.write(learner.histories)
     for path in directory.networks():
-        if path.stem not in histories:
+        if path.stem not in learner.histories:
             path.unlink()
 
 
@@ -257,7 +243,7 @@ def evaluation(run: Run) -> None:
         result[samples.index] = samples.nric
         return result
 
-    figures, gallery = evaluate(partial(learner_of, run), run.config, exact)
+    figures, gallery = evaluate(learner_of(run), exact)
     if run.directory.ingest.exists():
         figures["prolongation"] = run.directory.ingest.read().get("prolongation")
     unseen = run.directory.generalisation.read_if_written()

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from torch import nn
 
 from shapespace.arrays import FloatArray, IntArray
-from shapespace.coordinates.integrability import Integrability
 from shapespace.coordinates.nric import WeightedNorm, nric
 from shapespace.coordinates.reconstruction import Reconstructor
 from shapespace.mesh.rigid_motion import align
@@ -25,7 +24,6 @@ from shapespace.training.learning.gallery import extremes, strip
 from shapespace.training.learning.layers import narrowest
 from shapespace.training.learning.learner import Learner
 from shapespace.training.learning.networks import Composite, affine_sum, predict
-from shapespace.training.runs.config import Config
 from shapespace.training.runs.latent_coordinates import alone
 from shapespace.training.runs.progress import progress
 from shapespace.training.runs.sampling import Collection
@@ -127,31 +125,28 @@ class Split:
         return result
 
 
-def evaluate(
-    learner: Callable[..., Learner], config: Config, exact: Exact
-) -> tuple[dict[str, Any], dict[str, NDArray]]:
+def evaluate(learner: Learner, exact: Exact) -> tuple[dict[str, Any], dict[str, NDArray]]:
     """Compare every model with the test split.
 
     Args:
-        learner: by the ``fraction`` of the training samples that it learns from, or another ``seed``.
-        config: of the run.
+        learner: networks of the run.
         exact: exact shapes.
 
     Returns:
         The contents of evaluation.json and of gallery.npz.
     """
-    settings, main = config.evaluation, learner()
-    collection, reference = main.collection, main.collection.reference
+    config, collection = learner.config, learner.collection
+    settings, reference = config.evaluation, collection.reference
     z_reference = nric(reference.vertices, reference.connectivity)
-    test, composite = Split.of(main), main.main()
+    test, composite = Split.of(learner), learner.main()
     baselines: dict[str, Composite | nn.Module] = {
-        "monolithic": main.monolithic(),
-        "monolithic_paper": main.monolithic_paper(),
-        "kernel": main.kernel(),
+        "monolithic": learner.monolithic(),
+        "monolithic_paper": learner.monolithic_paper(),
+        "kernel": learner.kernel(),
     }
     if config.networks.paper:
-        baselines["paper"] = main.paper()
-    shapes, found = exact_factors(main, test.rows[: settings.exact_factors], exact)
+        baselines["paper"] = learner.paper()
+    shapes, found = exact_factors(learner, test.rows[: settings.exact_factors], exact)
     learned, predicted = test.predicted(composite.factor_shapes), test.predicted(composite)
     models: dict[str, Composite | nn.Module] = {"composite": composite, **baselines}
     r2 = {
@@ -173,55 +168,20 @@ def evaluate(
         "eta": settings.eta,
         "test_samples": len(test.rows),
         "r2": r2,
-        "fresh": on_fresh_codes(models, main, min(settings.fresh, len(test.rows)), exact),
+        "fresh": on_fresh_codes(models, learner, min(settings.fresh, len(test.rows)), exact),
         "affine_samples": len(found),
         "r2_factors": {
             name: r_squared(learned[found, j], shapes[:, j], test.norm) for j, name in enumerate(collection.factors)
         },
-        **variants(main, config),
-        "exponentials": main.exponentials(),
-        "derivatives": len(main.differentiated()[0]),
+        "exponentials": learner.exponentials(),
+        "derivatives": len(learner.differentiated()[0]),
         "correction": {"kind": composite.combiner.settings.kind, "tried": composite.combiner.tried},
-        "fractions": [_fraction(learner, fraction, test) for fraction in config.networks.fractions],
-        "seeds": [_other_seed(learner(seed=seed)) for seed in config.networks.seeds],
         "vertex_error": reconstructed.figures(),
         "sizes": sizes,
         "times": model_times(collection, composite, eta),
     }
     gallery = extremes(reconstructed.vertices, test.vertices[first], reconstructed.errors, test.rows[first])
     return figures, gallery | strip(collection, composite, eta) | {"faces": reference.faces}
-
-
-def variants(learner: Learner, config: Config) -> dict[str, Any]:
-    """The ablation's rows on the validation codes, so that recipes are not chosen by the test codes.
-
-    Returns:
-        ``variants``, each with its title, R², bytes, and ``closing``, by how much faces around a vertex fail to close
-        (root mean square of the closing conditions); and ``validation`` with what they are compared with.
-    """
-    validation, composite = Split.of(learner, "validation"), learner.main()
-    reference = learner.collection.reference
-    conditions = Integrability(reference.connectivity)
-
-    def figures(model: Composite) -> dict[str, Any]:
-        predicted = validation.predicted(model)
-        open_by = [np.square(conditions.at_vertices(z)).sum() for z in predicted.astype(np.float64)]
-        return {
-            "bytes": size_bytes(model),
-            "closing": float(np.sqrt(np.mean(open_by) / max(1, len(conditions.vertices)))),
-            "r2": validation.r2_of(predicted),
-        }
-
-    own = figures(composite)
-    affine = affine_sum(nric(reference.vertices, reference.connectivity), validation.predicted(composite.factor_shapes))
-    r2 = {"composite": own.pop("r2"), "affine of learned factors": validation.r2_of(affine)}
-    return {
-        "validation": {"samples": len(validation.rows), **own, "r2": r2},
-        "variants": {
-            name: {"title": config.variants[name].title, **figures(variant)}
-            for name, variant in learner.variants().items()
-        },
-    }
 
 
 #: Share of the fresh codes whose exponentials are computed once more, with twice as many steps.
@@ -264,31 +224,6 @@ def on_fresh_codes(
         both = np.flatnonzero(np.isfinite(finer).all(axis=1))
         result["steps"] = r_squared(z[some][both], finer[both], norm) if len(both) > 1 else None
     return result
-
-
-def _fraction(learner: Callable[..., Learner], fraction: float, test: Split) -> dict[str, Any]:
-    """R² of networks that learn from a fraction of the training codes, and of one with all samples of the factors."""
-    some, free = learner(fraction=fraction), learner(fraction=fraction, all_of_factors=True)
-    return {
-        "fraction": fraction,
-        "training_samples": len(some.rows["train"]),
-        "derivatives": len(some.differentiated()[0]),
-        "exponentials": {"composite": some.exponentials(), "all of factors": free.exponentials()},
-        "r2": {
-            "composite": test.r2(some.main()),
-            "all of factors": test.r2(free.main()),
-            "monolithic": test.r2(some.monolithic()),
-            "kernel": test.r2(some.kernel()),
-        },
-    }
-
-
-def _other_seed(learner: Learner) -> dict[str, Any]:
-    """R² of networks learned with another seed, on the test split of that seed."""
-    test = Split.of(learner)
-    r2 = {"composite": test.r2(learner.main()), "monolithic": test.r2(learner.monolithic())}
-    r2["kernel"] = test.r2(learner.kernel())
-    return {"seed": learner.seed, "r2": r2}
 
 
 def exact_factors(learner: Learner, rows: IntArray, exact: Exact) -> tuple[NDArray[np.float32], IntArray]:

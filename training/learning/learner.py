@@ -43,7 +43,7 @@ from shapespace.training.runs.config import (
     Recipe,
 )
 from shapespace.training.runs.directory import RunDirectory
-from shapespace.training.runs.sampling import DERIVATIVES, DONE, Collection, Samples, columns, read, split
+from shapespace.training.runs.sampling import DERIVATIVES, DONE, Collection, Samples, columns, read
 
 #: Settings that make factor networks those of the paper.
 PAPER_FACTORS = LatentNetworkSettings(fourier=0, skip_degree=0, energy=1, fit=FitSettings())
@@ -73,33 +73,23 @@ class Learner:
     """Fits networks to the samples of a run; each is saved in a file whose name is a digest of all that it depends on.
 
     So recipes that have a network in common share its file. An unfinished file is continued; a finished one is read,
-    and the samples are not.
+    and the samples are not. Studies of fewer samples or other seeds are subclasses (``benchmarks.studies``).
 
     Args:
-        collection: what the samples are of.
-        config: of the run.
-        run: holds the samples, and gets the networks.
-        data_key: identifies the samples and the version of what is learned from them.
-        fraction: share of the training codes to learn from. The number of epochs is divided by it, so that the number
-            of steps stays the same.
-        all_of_factors: whether the factor networks learn from all samples of the factors nevertheless.
-        seed: of the networks, by default the configuration's. Another one also means another split of the samples.
+        collection: the parametrised collection of the samples.
+        config: configuration of the run.
+        run: directory that holds the samples and receives the networks.
+        data_key: identifies the samples and the version of the training code.
     """
 
-    def __init__(
-        self,
-        collection: Collection,
-        config: Config,
-        run: RunDirectory,
-        data_key: str,
-        fraction: float = 1.0,
-        all_of_factors: bool = False,
-        seed: int | None = None,
-    ) -> None:
-        self.collection, self.config, self.run = collection, config, run
-        self.seed = config.networks.seed if seed is None else seed
-        self._data_key, self._fraction = data_key, fraction
-        self._factor_fraction = 1.0 if all_of_factors else fraction
+    #: Shares of the training codes that joint networks and factor networks learn from. The number of epochs is divided
+    #: by the share, so that the number of steps stays the same. Part of the names of the networks' files.
+    share = 1.0
+    factor_share = 1.0
+
+    def __init__(self, collection: Collection, config: Config, run: RunDirectory, data_key: str) -> None:
+        self.collection, self.config, self.run, self.data_key = collection, config, run, data_key
+        self.seed = config.networks.seed
         self.histories: dict[str, Any] = {}
 
     @cached_property
@@ -109,11 +99,7 @@ class Learner:
 
     @cached_property
     def split(self) -> dict[str, IntArray]:
-        """Rows of the joint samples that were drawn: train, validation, test."""
-        if self.seed != self.config.networks.seed:
-            settings, rng = self.config.samples, np.random.default_rng(self.seed)
-            drawn = np.flatnonzero(self.joint.index >= 0)
-            return split(drawn, settings.test_fraction, settings.validation_fraction, rng)
+        """Rows of the randomly drawn joint samples: train, validation, test."""
         return {name: np.searchsorted(self.joint.index, index) for name, index in self.run.split.read().items()}
 
     @cached_property
@@ -127,8 +113,8 @@ class Learner:
         conditions = Integrability(self.collection.reference.connectivity)
         return conditions.jacobian(self._reference)[: 3 * len(conditions.vertices)]
 
-    def _path(self, kind: str, fractions: Sequence[float], *settings: BaseModel) -> Path:
-        decides = [self._data_key, fractions, self.seed]
+    def _path(self, kind: str, shares: Sequence[float], *settings: BaseModel) -> Path:
+        decides = [self.data_key, shares, self.seed]
         text = json.dumps([*decides, [s.model_dump(mode="json") for s in settings]])
         return self.run.network(f"{kind}-{hashlib.sha256(text.encode()).hexdigest()[:12]}")
 
@@ -137,18 +123,11 @@ class Learner:
 
     @property
     def rows(self) -> dict[str, IntArray]:
-        """The split, with the collection's shapes to learn from as well; or only the share of it to learn from, the
-        first rows, since codes are independent.
-        """
-        if self._fraction == 1:
-            return self.split | {"train": np.concatenate([np.flatnonzero(self.joint.index < 0), self.split["train"]])}
-        return {
-            name: index if name == "test" else index[: max(4, round(self._fraction * len(index)))]
-            for name, index in self.split.items()
-        }
+        """The split, with the collection's own shapes added to its training rows."""
+        return self.split | {"train": np.concatenate([np.flatnonzero(self.joint.index < 0), self.split["train"]])}
 
     def _fit(
-        self, network: ShapeNetwork, data: _Data, fitting: FitSettings, path: Path, fraction: float
+        self, network: ShapeNetwork, data: _Data, fitting: FitSettings, path: Path, share: float
     ) -> dict[str, Any]:
         return fit(
             network,
@@ -156,7 +135,7 @@ class Learner:
             torch.from_numpy(data.z),
             torch.from_numpy(data.rows["train"]),
             torch.from_numpy(data.rows["validation"]),
-            fitting.model_copy(update={"max_epochs": round(fitting.max_epochs / fraction)}),
+            fitting.model_copy(update={"max_epochs": round(fitting.max_epochs / share)}),
             path,
             title=path.stem.rpartition("-")[0],
             seed=self.seed,
@@ -170,7 +149,7 @@ class Learner:
         settings: LatentNetworkSettings,
         index: list[int],
         path: Path,
-        fraction: float,
+        share: float,
         samples: Callable[[], tuple[Samples, dict[str, IntArray]]],
     ) -> FactorNetwork:
         """A network from the latents ``index`` to shapes, read from ``path`` or fitted to samples and rows of these."""
@@ -197,7 +176,7 @@ class Learner:
                 (latents, network.target(exact)) for latents, exact in map(data.part, ("train", "validation"))
             )
             network.fit_skip(*own_pair, held_out)
-        self._record(path, self._fit(network, data, settings.fit, path, fraction))
+        self._record(path, self._fit(network, data, settings.fit, path, share))
         return network
 
     def _basis(self, settings: LatentNetworkSettings, scaling: Scaling, z: NDArray) -> PatchBasis | None:
@@ -219,19 +198,17 @@ class Learner:
             own = self.factor_samples(j)
             return own, self.factor_rows(own.index)
 
-        path = self._path(f"factor-{j}", [self._factor_fraction], settings)
-        return self._latent_network(settings, index, path, self._factor_fraction, samples)
+        path = self._path(f"factor-{j}", [self.factor_share], settings)
+        return self._latent_network(settings, index, path, self.factor_share, samples)
 
     def factor_rows(self, index: IntArray) -> dict[str, IntArray]:
-        """Rows of a factor's samples, which have these indices of codes: train and validation."""
-        rows = self.rows if self._factor_fraction < 1 else self.split
-        held_out = np.isin(index, self.joint.index[rows["validation"]])
-        if self._factor_fraction < 1:
-            train = np.isin(index, self.joint.index[rows["train"]])
-        else:
-            # Codes beyond the joint ones, and those whose joint shape failed, are training codes of the factor.
-            train = ~np.isin(index, self.joint.index[np.concatenate([rows["test"], rows["validation"]])])
-        return {"train": np.flatnonzero(train), "validation": np.flatnonzero(held_out)}
+        """Training and validation rows of a factor's samples with these indices of codes.
+
+        Training codes of the factor include codes beyond the joint samples, and codes whose joint shape failed.
+        """
+        held_out = {name: np.isin(index, self.joint.index[self.split[name]]) for name in ("validation", "test")}
+        train = ~(held_out["validation"] | held_out["test"])
+        return {"train": np.flatnonzero(train), "validation": np.flatnonzero(held_out["validation"])}
 
     def exponentials(self) -> int:
         """Number of samples behind the composite: joint ones and those of factors, held-out ones included."""
@@ -244,7 +221,7 @@ class Learner:
         factors = recipe.factors if isinstance(recipe.factors, list) else [recipe.factors] * len(indices)
         networks = [self.factor(j, settings) for j, settings in enumerate(factors)]
         decides = [*factors, *choices(recipe.combiner.correction)]
-        path = self._path("combiner", [self._fraction, self._factor_fraction], recipe.combiner, *decides)
+        path = self._path("combiner", [self.share, self.factor_share], recipe.combiner, *decides)
         return Composite(indices, networks, self._combiner(recipe.combiner, path, indices, networks))
 
     def _combiner(
@@ -274,7 +251,7 @@ class Learner:
         def train(network: CombinerNetwork) -> None:
             if descent := network.correction.descent:
                 kind = network.settings.kind
-                states[kind] = self._fit(network, data, descent, unfinished(kind), self._fraction)
+                states[kind] = self._fit(network, data, descent, unfinished(kind), self.share)
 
         torch.manual_seed(self.seed)
         combiner = CombinerNetwork.fit(settings.correction, reference, own, held_out, self.seed, train)
@@ -337,10 +314,6 @@ class Learner:
         """By the main recipe, which is exported."""
         return self.composite(self.config.networks)
 
-    def variants(self) -> dict[str, Composite]:
-        """One for each row of the ablation."""
-        return {name: self.composite(recipe) for name, recipe in self.config.recipes.items()}
-
     def paper(self) -> Composite:
         """The paper's own system (section 4): perceptrons of bare angles with dense last layers, and its combiner."""
         combiner = CombinerSettings(correction=PaperSettings(), symmetries=False)
@@ -351,7 +324,7 @@ class Learner:
         network = self._whole("monolithic", self.config.monolithic)
         index, combiner = list(range(len(self.collection.coordinates))), self.config.networks.combiner
         decides = [self.config.monolithic, *choices(combiner.correction)]
-        path = self._path("monolithic-combiner", [self._fraction], combiner, *decides)
+        path = self._path("monolithic-combiner", [self.share], combiner, *decides)
         return Composite([index], [network], self._combiner(combiner, path, [index], [network]))
 
     def monolithic_paper(self) -> FactorNetwork:
@@ -361,8 +334,8 @@ class Learner:
     def _whole(self, kind: str, settings: LatentNetworkSettings) -> FactorNetwork:
         """A network from all latents, on the joint samples."""
         index = list(range(len(self.collection.coordinates)))
-        path = self._path(kind, [self._fraction], settings)
-        return self._latent_network(settings, index, path, self._fraction, lambda: (self.joint, self.rows))
+        path = self._path(kind, [self.share], settings)
+        return self._latent_network(settings, index, path, self.share, lambda: (self.joint, self.rows))
 
     def kernel(self) -> LatentKernel:
         """Kernel ridge regression on the joint samples' latents: in closed form, in seconds, and not saved."""

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 import shapespace
+from benchmarks.studies import Studies
 from shapespace.bundle.reader import read_bundle
 from shapespace.coordinates.nric import WeightedNorm, nric
 from shapespace.mesh.rigid_motion import align
@@ -50,8 +51,14 @@ def test_a_bundle_states_the_figures_and_the_configuration_of_the_committed_run(
 
 @pytest.mark.parametrize("name", MODELS)
 def test_an_example_is_the_recipe_of_the_committed_run(name: str) -> None:
-    example = tomllib.loads((ROOT / "examples" / f"{name}.toml").read_text())
-    assert today(name, example) == today(name, tomllib.loads((ROOT / "runs" / name / "config.toml").read_text()))
+    example, committed = (
+        tomllib.loads(path.read_text())
+        for path in (ROOT / "examples" / f"{name}.toml", ROOT / "runs" / name / "config.toml")
+    )
+    listed = Studies.listed(name)
+    assert committed["networks"].pop("seeds") == listed.seeds
+    assert committed.pop("variants", {}) == {k: v.model_dump(exclude_unset=True) for k, v in listed.variants.items()}
+    assert today(name, example) == today(name, committed)
 
 
 @pytest.mark.parametrize("name", MODELS)

@@ -21,6 +21,7 @@ import trimesh
 from pxr import Usd, UsdGeom
 from safetensors.numpy import load_file
 
+from benchmarks.studies import SeedLearner, ShareLearner
 from shapespace.files.attributes.reading import read_attributes
 from shapespace.mesh.rigid_motion import align
 from shapespace.mesh.triangle_mesh import TriangleMesh
@@ -49,10 +50,6 @@ count = 2
 count = 60
 steps = 4
 part_size = 10
-
-[networks]
-fractions = [0.5]
-seeds = [1]
 
 [networks.factors]
 hidden = [16]
@@ -171,10 +168,6 @@ def test_a_run_leaves_what_the_contract_promises(run: Path) -> None:
         "Nail": "affinely",
     }
     assert all(1e-6 < part["mean"] < part["max"] < 0.02 for part in parts.values())
-    assert [row["fraction"] for row in figures["fractions"]] == [0.5]
-    (other,) = figures["seeds"]
-    assert other["seed"] == 1
-    assert 0 < abs(other["r2"]["composite"]["total"] - figures["r2"]["composite"]["total"]) < 0.02
     report = (run / "report.html").read_text()
     assert "<html" in report
     assert "Eye, carried rigidly" in report
@@ -225,18 +218,20 @@ def test_the_collection_s_shapes_are_learned_from_but_not_measured_on(run: Path)
         np.testing.assert_array_equal(samples.latents[known], np.concatenate([modes["coefficients"], images]))
     expected = opened.collection.shapes(samples.latents[known]).nric
     np.testing.assert_allclose(samples.nric[known], expected, atol=1e-6)
-    rows = learner_of(opened).rows
+    learner = learner_of(opened)
+    rows = learner.rows
     assert set(known) < set(rows["train"])
     assert not set(known) & {*rows["validation"], *rows["test"]}
-    assert not set(known) & set(learner_of(opened, fraction=0.5).rows["train"]), "shares have random codes only"
-    other = learner_of(opened, seed=1).rows
+    assert not set(known) & set(ShareLearner(learner, 0.5).rows["train"]), "shares have random codes only"
+    other = SeedLearner(learner, 1).rows
     assert set(known) < set(other["train"])
     assert not set(known) & {*other["validation"], *other["test"]}
 
 
 def test_derivatives_are_learned_from_at_training_codes_only(run: Path) -> None:
     opened = Run(run, *load(run / "config.toml"), run / "models")
-    learner, half, other = (learner_of(opened, **how) for how in ({}, {"fraction": 0.5}, {"seed": 1}))
+    learner = learner_of(opened)
+    half, other = ShareLearner(learner, 0.5), SeedLearner(learner, 1)
     rows, derivatives = learner.differentiated()
     assert rows.tolist() == learner.split["train"][:6].tolist(), "a tenth of the joint samples"
     expected = opened.collection.differentiated.shapes(learner.joint.latents[rows[:1]]).derivatives
@@ -245,7 +240,7 @@ def test_derivatives_are_learned_from_at_training_codes_only(run: Path) -> None:
     some = other.differentiated()[0]
     assert set(some) == set(rows) & set(other.split["train"])
     figures = json.loads((run / "evaluation.json").read_text())
-    assert figures["derivatives"] == figures["fractions"][0]["derivatives"] == 6
+    assert figures["derivatives"] == 6
     assert figures["times"]["exact, with derivatives"] > figures["times"]["exact"] > 0
 
 

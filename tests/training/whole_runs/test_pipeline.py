@@ -17,6 +17,7 @@ import pytest
 import torch
 
 import shapespace
+from benchmarks.studies import ShareLearner
 from shapespace.bundle.geometry import Geometry
 from shapespace.bundle.reader import read_bundle
 from shapespace.coordinates.nric import WeightedNorm, nric
@@ -26,7 +27,6 @@ from shapespace.training.learning import ExportError
 from shapespace.training.learning.evaluation import r_squared
 from shapespace.training.learning.export import export
 from shapespace.training.learning.fitting import read_network
-from shapespace.training.learning.networks import predict
 from shapespace.training.pipeline import Run, learner_of
 from shapespace.training.runs.config import load, parse
 from shapespace.training.runs.directory import RunDirectory
@@ -64,30 +64,17 @@ def test_a_run_leaves_what_the_contract_promises(tiny_run: Path) -> None:
         assert set(figures["r2"][model]) == {"total", "lengths", "angles"}
     assert 0.9 < figures["r2"]["affine"]["total"] < 0.99
     assert figures["r2"]["composite"]["total"] > 0.5
-    assert figures["variants"]["paper"]["title"]
+    assert not figures.keys() & {"variants", "validation", "fractions", "seeds"}, "figures of studies"
     assert figures["vertex_error"]["max"] > figures["vertex_error"]["mean"] > 0
     events = [json.loads(line) for line in (tiny_run / "log.jsonl").read_text().splitlines()]
     assert [e["stage"] for e in events if e["event"] == "end"] == list(STAGES)
     assert all(e["time"] for e in events)
 
 
-def test_options_are_compared_on_validation_codes(tiny_run: Path) -> None:
-    run = Run(tiny_run, *load(tiny_run / "config.toml"), tiny_run / "models")
-    learner, figures = learner_of(run), json.loads((tiny_run / "evaluation.json").read_text())
-    rows, joint = learner.split["validation"], learner.joint
-    assert figures["validation"]["samples"] == len(rows)
-    norm = WeightedNorm.of(learner.collection.reference, run.config.evaluation.eta)
-    found = {"recipe": figures["validation"]["r2"]["composite"], "paper": figures["variants"]["paper"]["r2"]}
-    for model, r2 in zip((learner.main(), learner.variants()["paper"]), found.values(), strict=True):
-        z = predict(model, torch.as_tensor(joint.latents[rows], dtype=torch.float32)).numpy()
-        assert r2["total"] == pytest.approx(r_squared(z, joint.nric[rows], norm)["total"], abs=1e-6)
-
-
 def test_no_factor_learns_from_parts_of_test_codes(tiny_run: Path) -> None:
     run = Run(tiny_run, *load(tiny_run / "config.toml"), tiny_run / "models")
-    learner, half, free = (
-        learner_of(run, **how) for how in ({}, {"fraction": 0.5}, {"fraction": 0.5, "all_of_factors": True})
-    )
+    learner = learner_of(run)
+    half, free = (ShareLearner(learner, 0.5, all_of_factors=every) for every in (False, True))
     joint = {name: learner.joint.index[rows] for name, rows in learner.split.items()}
     with (
         np.load(tiny_run / "samples" / "factor-2" / "part-00001.npz") as part,

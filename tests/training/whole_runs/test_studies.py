@@ -1,18 +1,26 @@
-"""Studies of `benchmarks.results`: measured once, and again only after their run has changed; and rows of pages."""
+"""Studies on finished runs, recipes of variants, and rows of the measurement pages."""
 
 import json
 import shutil
 from copy import deepcopy
 from pathlib import Path
+from typing import Any
 
 import pytest
+import torch
 
-from benchmarks import bundled, paper, results, served
+from benchmarks import bundled, paper, results, served, studies
 from benchmarks.results import have, measured
+from benchmarks.studies import SeedLearner, ShareLearner, Studies
+from benchmarks.variants import VariantSettings, recipes
+from shapespace.coordinates.nric import WeightedNorm
+from shapespace.training.learning.evaluation import Model, r_squared
 from shapespace.training.learning.learner import Learner
-from shapespace.training.pipeline import Run
-from shapespace.training.runs.config import load
+from shapespace.training.learning.networks import predict
+from shapespace.training.pipeline import Run, learner_of
+from shapespace.training.runs.config import ProductSettings, Recipe, load, parse
 from shapespace.training.runs.directory import RunDirectory
+from tests.training.conftest import TINY
 
 
 def test_a_study_is_measured_again_when_what_it_measured_has_changed(tmp_path: Path) -> None:
@@ -72,3 +80,117 @@ def test_a_model_measured_later_meets_the_codes_of_the_others(
     before["fresh"]["seed"] += 1
     with pytest.raises(paper.OtherSamplesError, match="the kernel has"):
         paper.measure(run, before)
+
+
+@pytest.fixture
+def finished(tiny_run: Path, tmp_path: Path) -> Run:
+    """A copy of the small run that studies may write to."""
+    folder = shutil.copytree(tiny_run, tmp_path / "run")
+    return Run(folder, *load(folder / "config.toml"), tmp_path / "models")
+
+
+def r2(learner: Learner, model: Model, part: str) -> float:
+    rows, joint = learner.split[part], learner.joint
+    norm = WeightedNorm.of(learner.collection.reference, learner.config.evaluation.eta)
+    z = predict(model, torch.as_tensor(joint.latents[rows], dtype=torch.float32)).numpy()
+    return r_squared(z, joint.nric[rows], norm)["total"]
+
+
+def test_studies_add_their_figures_and_networks_to_a_finished_run(finished: Run) -> None:
+    directory, variant = finished.directory, VariantSettings(title="other", combiner={"symmetries": False})
+    before = directory.evaluation.read()
+    main = {path.stem: path.read_bytes() for path in directory.networks()}
+    studies.add(finished, Studies(variants={"a": variant}, fractions=[0.5], seeds=[1]))
+    figures = directory.evaluation.read()
+    assert {name: figures[name] for name in before} == before
+    networks = {path.stem: path.read_bytes() for path in directory.networks()}
+    assert {name: networks[name] for name in main} == main
+    assert directory.histories.read().keys() == networks.keys()
+    assert "other" in directory.report.read()
+
+    learner = learner_of(finished)
+    half, free = ShareLearner(learner, 0.5), ShareLearner(learner, 0.5, all_of_factors=True)
+    recipe = recipes(finished.config.networks, {"a": variant})["a"]
+    assert figures["validation"]["samples"] == len(learner.split["validation"])
+    (share,), (seed,) = figures["fractions"], figures["seeds"]
+    assert share["training_samples"] == len(half.rows["train"]) == 22
+    assert share["exponentials"] == {"composite": half.exponentials(), "all of factors": free.exponentials()}
+    other = SeedLearner(learner, 1)
+    for said, found in (
+        (figures["validation"]["r2"]["composite"], r2(learner, learner.main(), "validation")),
+        (figures["variants"]["a"]["r2"], r2(learner, learner.composite(recipe), "validation")),
+        (share["r2"]["composite"], r2(half, half.main(), "test")),
+        (share["r2"]["all of factors"], r2(free, free.main(), "test")),
+        (seed["r2"]["composite"], r2(other, other.main(), "test")),
+    ):
+        assert said["total"] == pytest.approx(found, abs=1e-6)
+    assert other.split["test"].tolist() != learner.split["test"].tolist()
+    assert {path.stem: path.read_bytes() for path in directory.networks()} == networks, "learned again"
+
+
+def test_every_run_of_the_pages_has_valid_studies() -> None:
+    for name in (*results.COLLECTIONS, *results.CONTRASTS, results.MANNEQUIN, "freaky-torus"):
+        listed = Studies.listed(name)
+        path = next((results.ROOT / "examples").rglob(f"{name}.toml"), None)
+        if path is None:
+            assert listed == Studies(), "a run with the modes of another example"
+        else:
+            assert recipes(load(path)[0].networks, listed.variants).keys() == listed.variants.keys()
+    assert Studies.listed("hand").fractions == [0.2, 0.05]
+
+
+def changed(base: Recipe, **variants: dict[str, Any]) -> dict[str, Recipe]:
+    """Recipes of variants, which need no title here."""
+    return recipes(base, {name: VariantSettings(title="", **values) for name, values in variants.items()})
+
+
+TINY_RECIPE = parse(TINY, "tiny").networks
+
+
+def test_a_variant_is_what_differs_from_the_main_recipe() -> None:
+    correction = {"width": 3, "fit": {"max_epochs": 2}}
+    (found,) = changed(TINY_RECIPE, a={"combiner": {"correction": correction}}).values()
+    own = TINY_RECIPE.combiner.correction
+    fit = own.fit.model_copy(update={"max_epochs": 2})
+    assert found.factors == TINY_RECIPE.factors
+    assert found.combiner.correction == own.model_copy(update={"width": 3, "fit": fit})
+
+
+def test_a_variant_is_what_differs_from_its_base() -> None:
+    first, second = changed(
+        TINY_RECIPE,
+        a={"combiner": {"symmetries": False, "correction": {"width": 3}}},
+        b={"base": "a", "combiner": {"correction": {"layers": 1}}},
+    ).values()
+    assert second.combiner.correction == first.combiner.correction.model_copy(update={"layers": 1})
+    assert not second.combiner.symmetries
+
+
+def test_a_correction_of_another_kind_starts_from_its_defaults() -> None:
+    (found,) = changed(TINY_RECIPE, a={"combiner": {"correction": {"kind": "products", "coefficients": 7}}}).values()
+    assert found.combiner.correction == ProductSettings(coefficients=7)
+
+
+def test_factors_of_a_variant_differ_all_alike_or_each_for_itself() -> None:
+    tables = [{}, {"hidden": [5]}, {"skip_orders": []}]
+    alike, each = changed(TINY_RECIPE, a={"factors": {"energy": 1.0}}, b={"factors": tables}).values()
+    main = TINY_RECIPE.factors
+    assert alike.factors == [factor.model_copy(update={"energy": 1.0}) for factor in main]
+    assert each.factors[0] == main[0]
+    assert (each.factors[1].hidden, each.factors[1].energy) == ([5], main[1].energy)
+    assert (each.factors[2].skip_orders, each.factors[2].fourier) == ([], main[2].fourier)
+    (one,) = changed(Recipe(), a={}).values()
+    assert one == Recipe()
+
+
+@pytest.mark.parametrize(
+    ("values", "says"),
+    [
+        ({"base": "b"}, r"variants\.a\.base: no variant 'b' stands before it"),
+        ({"factors": [{}, {}]}, r"variants\.a: factors: 2 tables over 3"),
+        ({"combiner": {"correction": {"widht": 3}}}, r"variants\.a: (.|\n)*widht"),
+    ],
+)
+def test_a_faulty_variant_is_named(values: dict[str, Any], says: str) -> None:
+    with pytest.raises(ValueError, match=says):
+        changed(TINY_RECIPE, a=values)
