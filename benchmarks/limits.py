@@ -8,9 +8,10 @@ import numpy as np
 import torch
 
 from shapespace.coordinates.nric import WeightedNorm, nric
+from shapespace.training.learning.composite import affine_sum
 from shapespace.training.learning.evaluation import r_squared
 from shapespace.training.learning.learner import Learner
-from shapespace.training.learning.networks import affine_sum, predict
+from shapespace.training.learning.networks import predict
 from shapespace.training.runs.latent_coordinates import alone
 from shapespace.training.runs.workers import run
 

@@ -18,7 +18,8 @@ from shapespace.arrays import FloatArray
 from shapespace.coordinates.nric import nric
 from shapespace.coordinates.reconstruction import Reconstructor
 from shapespace.mesh.rigid_motion import align
-from shapespace.training.learning.networks import affine_sum, predict
+from shapespace.training.learning.composite import affine_sum
+from shapespace.training.learning.networks import predict
 from shapespace.training.pipeline import Run, learner_of
 from shapespace.training.report.pictures import CLAY, ERROR, MODE_REACH, Studio, ramp, tint
 from shapespace.training.report.record import Record

@@ -18,13 +18,13 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from benchmarks.variants import VariantSettings, recipes
+from benchmarks.variants import Variant, recipes
 from shapespace.arrays import IntArray
 from shapespace.coordinates.integrability import Integrability
 from shapespace.coordinates.nric import nric
+from shapespace.training.learning.composite import Composite, affine_sum
 from shapespace.training.learning.evaluation import Split, size_bytes
 from shapespace.training.learning.learner import Learner
-from shapespace.training.learning.networks import Composite, affine_sum
 from shapespace.training.pipeline import Run, learner_of
 from shapespace.training.report.page import write_report
 from shapespace.training.runs.config import load
@@ -41,7 +41,7 @@ class Studies(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    variants: dict[str, VariantSettings] = {}
+    variants: dict[str, Variant] = {}
     """Rows of the ablation, measured on the validation codes."""
     fractions: list[Annotated[float, Field(gt=0, lt=1)]] = []
     """Shares of the training codes to learn from. Factor networks learn once from the factors' parts of these codes
@@ -104,7 +104,7 @@ class SeedLearner(Learner):
         return split(drawn, settings.test_fraction, settings.validation_fraction, np.random.default_rng(self.seed))
 
 
-def variants(learner: Learner, some: dict[str, VariantSettings]) -> dict[str, Any]:
+def variants(learner: Learner, some: dict[str, Variant]) -> dict[str, Any]:
     """Measure an ablation on the validation codes, so that recipes are not chosen by the test codes.
 
     Returns:

@@ -10,7 +10,7 @@ from pydantic import BaseModel, ConfigDict
 from shapespace.training.runs.config import Recipe
 
 
-class VariantSettings(BaseModel):
+class Variant(BaseModel):
     """One row of an ablation: the settings that differ from the main recipe, or from another variant."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -44,7 +44,7 @@ class VariantSettings(BaseModel):
         return Recipe.model_validate({"factors": factors, "combiner": _merged(below["combiner"], self.combiner)})
 
 
-def recipes(main: Recipe, variants: Mapping[str, VariantSettings]) -> dict[str, Recipe]:
+def recipes(main: Recipe, variants: Mapping[str, Variant]) -> dict[str, Recipe]:
     """Return the full recipe of each variant.
 
     Raises:

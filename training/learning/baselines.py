@@ -15,7 +15,8 @@ from torch import Tensor, nn
 
 from shapespace.arrays import FloatArray
 from shapespace.training.learning.gaussian import Centres, every_axis
-from shapespace.training.learning.layers import LatentFeatures, Scaling
+from shapespace.training.learning.latent_features import LatentFeatures
+from shapespace.training.learning.layers import Scaling
 from shapespace.training.learning.linear import Ridge, principal_axes
 from shapespace.training.runs.config import EvaluationSettings
 from shapespace.training.runs.latent_coordinates import Coordinates

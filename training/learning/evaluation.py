@@ -20,10 +20,11 @@ from shapespace.coordinates.reconstruction import Reconstructor
 from shapespace.mesh.rigid_motion import align
 from shapespace.mesh.triangle_mesh import TriangleMesh
 from shapespace.training.learning.baselines import Exact, factor_grids
+from shapespace.training.learning.composite import Composite, affine_sum
 from shapespace.training.learning.gallery import extremes, strip
 from shapespace.training.learning.layers import narrowest
 from shapespace.training.learning.learner import Learner
-from shapespace.training.learning.networks import Composite, affine_sum, predict
+from shapespace.training.learning.networks import predict
 from shapespace.training.runs.latent_coordinates import alone
 from shapespace.training.runs.progress import progress
 from shapespace.training.runs.sampling import Collection

@@ -12,9 +12,11 @@ from torch import Tensor
 
 from shapespace.arrays import FloatArray
 from shapespace.coordinates.nric import unwrap
+from shapespace.training.learning.combiners.combiner import CombinerNetwork
+from shapespace.training.learning.composite import Composite
 from shapespace.training.learning.layers import in_bytes
 from shapespace.training.learning.linear import principal_axes
-from shapespace.training.learning.networks import CombinerNetwork, Composite, predict
+from shapespace.training.learning.networks import predict
 
 #: Most examples, those of which most is missed, and most coordinates in which shapes are told apart.
 MOST, COORDINATES = 512, 64

@@ -28,9 +28,10 @@ from shapespace.model.latent_space import NotFiniteError
 from shapespace.model.shape_model import load
 from shapespace.shell.energy import Material
 from shapespace.training.learning import ExportError
+from shapespace.training.learning.composite import Composite
 from shapespace.training.learning.layers import narrowest
 from shapespace.training.learning.naming import NamingError, called
-from shapespace.training.learning.networks import Composite, StartNetwork, predict
+from shapespace.training.learning.networks import StartNetwork, predict
 from shapespace.training.runs.config import Config
 from shapespace.training.runs.sampling import Collection
 

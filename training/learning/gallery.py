@@ -12,7 +12,7 @@ from shapespace.arrays import FloatArray
 from shapespace.coordinates.nric import nric
 from shapespace.coordinates.reconstruction import Reconstructor
 from shapespace.mesh.rigid_motion import align
-from shapespace.training.learning.networks import Composite
+from shapespace.training.learning.composite import Composite
 from shapespace.training.runs.sampling import Collection
 
 STRIP_FRAMES = 7

@@ -21,19 +21,12 @@ from shapespace.arrays import FloatArray, IntArray
 from shapespace.coordinates.integrability import Integrability
 from shapespace.coordinates.nric import WeightedNorm, nric
 from shapespace.training.learning.baselines import LatentKernel
-from shapespace.training.learning.corrections import JointSamples, Motion, Slopes
+from shapespace.training.learning.combiners.combiner import CombinerNetwork, choices
+from shapespace.training.learning.combiners.correction import JointSamples, Motion, Slopes
+from shapespace.training.learning.composite import Composite, factor_shapes
 from shapespace.training.learning.fitting import fit, read_network, save_network
 from shapespace.training.learning.layers import PatchBasis, Scaling
-from shapespace.training.learning.networks import (
-    CombinerNetwork,
-    Composite,
-    FactorNetwork,
-    ShapeNetwork,
-    StartNetwork,
-    choices,
-    factor_shapes,
-    predict,
-)
+from shapespace.training.learning.networks import FactorNetwork, ShapeNetwork, StartNetwork, predict
 from shapespace.training.runs.config import (
     CombinerSettings,
     Config,

@@ -9,10 +9,11 @@ import trimesh
 
 from shapespace.coordinates.nric import WeightedNorm, nric
 from shapespace.mesh.triangle_mesh import TriangleMesh
-from shapespace.training.learning.convolutions import UNIFORM, Crops, flaps
-from shapespace.training.learning.corrections import JointSamples
+from shapespace.training.learning.combiners.combiner import CombinerNetwork
+from shapespace.training.learning.combiners.convolutions import flaps
+from shapespace.training.learning.combiners.correction import JointSamples
+from shapespace.training.learning.combiners.crops import UNIFORM, Crops
 from shapespace.training.learning.layers import Scaling
-from shapespace.training.learning.networks import CombinerNetwork
 from shapespace.training.runs.config import ConvolutionSettings
 
 LAYERS = 3

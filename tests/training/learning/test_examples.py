@@ -9,10 +9,11 @@ import torch
 from torch import Tensor, nn
 
 from shapespace.bundle.schema import COMBINER
+from shapespace.training.learning.combiners.combiner import CombinerNetwork
+from shapespace.training.learning.composite import Composite
 from shapespace.training.learning.examples import ExampleCorrectedCombiner
 from shapespace.training.learning.export import to_onnx
 from shapespace.training.learning.layers import Scaling
-from shapespace.training.learning.networks import CombinerNetwork, Composite
 from shapespace.training.runs.config import KernelSettings
 
 SIZE = 60

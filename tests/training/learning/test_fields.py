@@ -12,13 +12,13 @@ import torch
 
 from shapespace.coordinates.nric import WeightedNorm, nric
 from shapespace.training.collection.generators.freaky_torus import PAPER, FreakyTorus, edge_permutation
-from shapespace.training.learning import networks
-from shapespace.training.learning.corrections import JointSamples, Motion
-from shapespace.training.learning.fields import FieldCorrection
+from shapespace.training.learning.combiners import combiner
+from shapespace.training.learning.combiners.combiner import CombinerNetwork
+from shapespace.training.learning.combiners.correction import JointSamples, Motion
+from shapespace.training.learning.combiners.fields import FieldCorrection
+from shapespace.training.learning.combiners.kernels import KernelCorrection
 from shapespace.training.learning.fitting import read_network, save_network
-from shapespace.training.learning.kernels import KernelCorrection
 from shapespace.training.learning.layers import Scaling
-from shapespace.training.learning.networks import CombinerNetwork
 from shapespace.training.runs.config import AutoSettings, FieldSettings, KernelSettings
 from shapespace.training.runs.latent_coordinates import alone
 
@@ -151,9 +151,9 @@ def test_auto_tries_what_follows_a_bump(
 
     It is chosen by the share of the kernel's error that it has to reach, and not tried where the kernel is slow.
     """
-    monkeypatch.setattr(networks, "KernelSettings", lambda: KernelSettings(coefficients=3, patches=64))
+    monkeypatch.setattr(combiner, "KernelSettings", lambda: KernelSettings(coefficients=3, patches=64))
     monkeypatch.setattr(KernelCorrection, "FUNCTIONS", (40,))
-    monkeypatch.setattr(networks, "BETTER", better)
+    monkeypatch.setattr(combiner, "BETTER", better)
     trained: list[str] = []
 
     def train(combiner: CombinerNetwork) -> None:
@@ -188,4 +188,4 @@ def test_it_refuses_collections_that_know_no_places(own: JointSamples) -> None:
 
 @pytest.mark.parametrize(("y", "count"), [(torch.zeros(200, 50), 1), (torch.eye(200), 198), (torch.ones(9, 1), 1)])
 def test_a_quick_look_counts_principal_components(y: torch.Tensor, count: int) -> None:
-    assert networks._components(y) == count
+    assert combiner._components(y) == count

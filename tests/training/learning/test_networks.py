@@ -20,29 +20,19 @@ from shapespace.bundle.schema import COMBINER
 from shapespace.coordinates.integrability import Integrability
 from shapespace.coordinates.nric import NRICJacobian, WeightedNorm, nric
 from shapespace.mesh.triangle_mesh import Connectivity, TriangleMesh
-from shapespace.training.learning import kernels
 from shapespace.training.learning.baselines import LatentKernel
-from shapespace.training.learning.convolutions import EdgeConvolution, Flaps, Star, flaps
-from shapespace.training.learning.corrections import JointSamples, Slopes
+from shapespace.training.learning.combiners import kernels
+from shapespace.training.learning.combiners.combiner import CORRECTIONS, CombinerNetwork, choices
+from shapespace.training.learning.combiners.convolutions import EdgeConvolution, Flaps, Star, flaps
+from shapespace.training.learning.combiners.correction import JointSamples, Slopes
+from shapespace.training.learning.combiners.kernels import KernelCorrection
+from shapespace.training.learning.combiners.metric import learned_metric
+from shapespace.training.learning.composite import affine_sum
 from shapespace.training.learning.export import to_onnx
 from shapespace.training.learning.fitting import read_network, save_network
-from shapespace.training.learning.kernels import KernelCorrection
-from shapespace.training.learning.layers import (
-    FourierProducts,
-    LatentFeatures,
-    PatchBasis,
-    Polynomials,
-    Scaling,
-    affordable_degree,
-)
-from shapespace.training.learning.metric import learned_metric
-from shapespace.training.learning.networks import (
-    CORRECTIONS,
-    CombinerNetwork,
-    FactorNetwork,
-    affine_sum,
-    choices,
-)
+from shapespace.training.learning.latent_features import FourierProducts, LatentFeatures, Polynomials, affordable_degree
+from shapespace.training.learning.layers import PatchBasis, Scaling
+from shapespace.training.learning.networks import FactorNetwork
 from shapespace.training.runs.config import (
     AutoSettings,
     ConvolutionSettings,

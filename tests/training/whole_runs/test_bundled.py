@@ -22,8 +22,8 @@ from shapespace.model.decoder import MeshChoice
 from shapespace.model.exact_shapes import exact_shape
 from shapespace.training.__main__ import main
 from shapespace.training.collection.generators import freaky_torus
+from shapespace.training.learning.composite import affine_sum
 from shapespace.training.learning.evaluation import r_squared
-from shapespace.training.learning.networks import affine_sum
 from shapespace.training.runs.config import Config
 
 ROOT = Path(__file__).parents[3]

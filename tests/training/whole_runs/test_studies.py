@@ -12,7 +12,7 @@ import torch
 from benchmarks import bundled, paper, results, served, studies
 from benchmarks.results import have, measured
 from benchmarks.studies import SeedLearner, ShareLearner, Studies
-from benchmarks.variants import VariantSettings, recipes
+from benchmarks.variants import Variant, recipes
 from shapespace.coordinates.nric import WeightedNorm
 from shapespace.training.learning.evaluation import Model, r_squared
 from shapespace.training.learning.learner import Learner
@@ -97,7 +97,7 @@ def r2(learner: Learner, model: Model, part: str) -> float:
 
 
 def test_studies_add_their_figures_and_networks_to_a_finished_run(finished: Run) -> None:
-    directory, variant = finished.directory, VariantSettings(title="other", combiner={"symmetries": False})
+    directory, variant = finished.directory, Variant(title="other", combiner={"symmetries": False})
     before = directory.evaluation.read()
     main = {path.stem: path.read_bytes() for path in directory.networks()}
     studies.add(finished, Studies(variants={"a": variant}, fractions=[0.5], seeds=[1]))
@@ -141,7 +141,7 @@ def test_every_run_of_the_pages_has_valid_studies() -> None:
 
 def changed(base: Recipe, **variants: dict[str, Any]) -> dict[str, Recipe]:
     """Recipes of variants, which need no title here."""
-    return recipes(base, {name: VariantSettings(title="", **values) for name, values in variants.items()})
+    return recipes(base, {name: Variant(title="", **values) for name, values in variants.items()})
 
 
 TINY_RECIPE = parse(TINY, "tiny").networks

@@ -10,10 +10,10 @@ import torch
 from torch import Tensor, nn
 
 from shapespace.mesh.triangle_mesh import TriangleMesh
-from shapespace.training.learning.corrections import Correction, JointSamples
+from shapespace.training.learning.combiners.correction import Correction, JointSamples
+from shapespace.training.learning.combiners.patches import Patch
 from shapespace.training.learning.gaussian import Centres
 from shapespace.training.learning.layers import in_bytes, patch_entries, resized
-from shapespace.training.learning.patches import Patch
 from shapespace.training.runs.config import KernelSettings
 from shapespace.training.runs.progress import progress
 

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from shapespace.mesh.triangle_mesh import TriangleMesh
-from shapespace.training.learning.corrections import Correction, JointSamples, Motion
+from shapespace.training.learning.combiners.correction import Correction, JointSamples, Motion
 from shapespace.training.learning.linear import regression
 from shapespace.training.runs.config import FieldSettings, FitSettings
 

@@ -8,11 +8,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from shapespace.training.learning.corrections import Pairs, Slopes
+from shapespace.training.learning.combiners.correction import Pairs, Slopes
+from shapespace.training.learning.combiners.metric import learned_metric
 from shapespace.training.learning.gaussian import Centres
 from shapespace.training.learning.layers import half_precision, in_bytes, resized
 from shapespace.training.learning.linear import Ridge, principal_axes, rounded
-from shapespace.training.learning.metric import learned_metric
 
 #: Candidates for γ, and for the penalty, where the kernel's largest value is 1. With smaller penalties the weights are
 #: too large for single precision.

@@ -7,7 +7,7 @@ import math
 import torch
 from torch import Tensor
 
-from shapespace.training.learning.corrections import Pairs
+from shapespace.training.learning.combiners.correction import Pairs
 from shapespace.training.learning.linear import SpectralRidge, principal_axes
 
 #: Candidates for the penalty, where the kernel is 1 at the centre.

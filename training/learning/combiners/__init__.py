@@ -1,0 +1,1 @@
+"""Combiners: the corrections of the affine sum of factor shapes, a module for each kind."""

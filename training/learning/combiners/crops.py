@@ -1,0 +1,101 @@
+"""Crops of a mesh: connected groups of edges on which convolutions are trained."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from scipy import sparse
+from scipy.sparse.csgraph import dijkstra
+from torch import Tensor
+
+from shapespace.arrays import FloatArray, IntArray
+
+#: Share of the crops whose centres are drawn uniformly from all edges.
+UNIFORM = 0.25
+
+
+@dataclass(frozen=True)
+class Crop:
+    """The K edges nearest to one edge, for each of n shapes another, as one graph of n K edges.
+
+    Attributes:
+        edges: (n, K) their indices in the mesh.
+        neighbours: (n K, k) indices in the graph of the neighbours of each; n K where there is none.
+        inner: (n, K) whether all layers have all their inputs in the crop, so that the output is that on the whole
+            mesh.
+    """
+
+    edges: Tensor
+    neighbours: Tensor
+    inner: Tensor
+
+
+class Crops:
+    """Draws crops of a mesh.
+
+    Args:
+        midpoints: (E, 3) of the edges; their distances are those of neighbours.
+        neighbours: (E, k) neighbours of each edge in a convolution, E where there is none.
+        size: K, at most.
+        layers: number of convolutions, one after the other.
+
+    Raises:
+        ValueError: crops so small that none of their edges is an inner one.
+    """
+
+    def __init__(self, midpoints: FloatArray, neighbours: IntArray, size: int, layers: int) -> None:
+        self._neighbours, self._layers = torch.as_tensor(neighbours), layers
+        self._nearest = torch.as_tensor(_nearest(midpoints, neighbours, min(size, len(midpoints))))
+        if not self.about(torch.zeros(1, dtype=torch.long)).inner.any():
+            raise ValueError(f"a crop of {size} edges is too small for {layers} convolutions")
+
+    def draw(self, missed: Tensor) -> Crop:
+        """A crop of each shape, about an edge drawn in proportion to the squared error (n, E) or uniformly."""
+        count = missed.shape[1]
+        share = missed / missed.sum(dim=1, keepdim=True).clamp_min(1e-30)
+        return self.about(torch.multinomial((1 - UNIFORM) * share + UNIFORM / count, 1)[:, 0])
+
+    def about(self, centres: Tensor) -> Crop:
+        """The crops about edges (n,)."""
+        edges = self._nearest[centres]
+        local, outside = self._local(edges)
+        n, size = edges.shape
+        graph = torch.where(local < 0, n * size, local + size * torch.arange(n)[:, None, None]).flatten(0, 1)
+        return Crop(edges, graph, self._inner(graph, outside))
+
+    def _local(self, edges: Tensor) -> tuple[Tensor, Tensor]:
+        """Places (n, K, k) of neighbours in crops (n, K), −1 outside of them; and whether they are edges outside."""
+        n, size = edges.shape
+        place = torch.full((n, len(self._neighbours) + 1), -1)
+        place.scatter_(1, edges, torch.arange(size).expand(n, -1))
+        neighbours = self._neighbours[edges]
+        local = place.gather(1, neighbours.flatten(1)).view_as(neighbours)
+        return local, (local < 0) & (neighbours < len(self._neighbours))
+
+    def _inner(self, graph: Tensor, outside: Tensor) -> Tensor:
+        """(n, K) whether no path of as many steps as there are layers leads outside.
+
+        Args:
+            graph: (n K, k) neighbours in the graph.
+            outside: (n, K, k) whether a neighbour lies outside of the crop.
+        """
+        inner = ~outside.any(dim=2)
+        for _ in range(self._layers - 1):
+            known = torch.cat([inner.flatten(), torch.ones(1, dtype=torch.bool)])
+            inner = inner & known[graph].all(dim=1).view_as(inner)
+        return inner
+
+
+def _nearest(midpoints: FloatArray, neighbours: IntArray, size: int) -> IntArray:
+    """(E, size) nearest edges of each edge, by the shortest paths over midpoints (E, 3) of neighbours (E, k)."""
+    count = len(midpoints)
+    edge, column = np.nonzero(neighbours < count)
+    other = neighbours[edge, column]
+    lengths = np.linalg.norm(midpoints[edge] - midpoints[other], axis=1)
+    graph = sparse.csr_array((lengths, (edge, other)), shape=(count, count))
+    # In parts, since all distances together would take E² numbers.
+    parts = np.array_split(np.arange(count), count // 256 + 1)
+    distances = (dijkstra(graph, indices=part) for part in parts)
+    return np.concatenate([np.argpartition(d, size - 1, axis=1)[:, :size] for d in distances])

@@ -1,0 +1,51 @@
+"""The composite network ``Φ = Ψ ∘ (ψ_1, …, ψ_J)`` (paper, section 3), and the affine sum that it corrects."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from shapespace.training.learning.combiners.combiner import CombinerNetwork
+from shapespace.training.learning.networks import FactorNetwork, ShapeNetwork
+
+
+@dataclass(frozen=True)
+class Composite:
+    """``Φ = Ψ ∘ (ψ_1, …, ψ_J)``.
+
+    Attributes:
+        factors: latent indices of each factor.
+        networks: the ψ_j.
+        combiner: Ψ.
+    """
+
+    factors: list[list[int]]
+    networks: list[FactorNetwork]
+    combiner: CombinerNetwork
+
+    @property
+    def parts(self) -> list[ShapeNetwork]:
+        """All its networks."""
+        return [*self.networks, self.combiner]
+
+    def __call__(self, latents: Tensor) -> Tensor:
+        """NRIC (n, 2E) of codes (n, m)."""
+        result: Tensor = self.combiner(self.factor_shapes(latents))
+        return result
+
+    def factor_shapes(self, latents: Tensor) -> Tensor:
+        """(n, J, 2E) outputs of the ψ_j."""
+        return factor_shapes(self.networks, self.factors, latents)
+
+
+def factor_shapes(networks: list[FactorNetwork], factors: list[list[int]], latents: Tensor) -> Tensor:
+    """(n, J, 2E) NRIC of each factor's network, of its part of codes (n, m)."""
+    return torch.stack([network(latents[:, index]) for network, index in zip(networks, factors, strict=True)], dim=1)
+
+
+def affine_sum(reference: NDArray, factors: NDArray) -> NDArray:
+    """``z̄ + Σ_j (x_j − z̄)`` for factor shapes (n, J, 2E): the direct sum of the paper's condition (2)."""
+    return reference + (factors - reference).sum(axis=1)
