@@ -1,29 +1,26 @@
-"""docs/measurements/bundled.md: what the committed runs of the bundled models measured.
+"""docs/measurements/bundled.md: figures of the committed runs of the bundled models.
 
 ``python -m benchmarks.bundled`` writes the page from ``runs/figure``, ``runs/freaky-torus`` and
-``runs/freaky-torus-1000``, and what the paper's own system reaches from the folders beside these that end in
-``-paper``: the figure's is that run with ``networks.paper``, and ``benchmarks.paper`` measured the torus. It trains
-nothing.
+``runs/freaky-torus-1000``. The figures of the paper's own system come from the folders next to these whose names end
+in ``-paper``. The figure's folder is that run with ``networks.paper``; ``benchmarks.paper`` measured the torus. The
+command trains nothing.
 """
 
 from __future__ import annotations
 
 import json
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
-import jinja2
 import numpy as np
 
-from benchmarks import studies
+from benchmarks import pages, studies
+from benchmarks.pages import ROOT
 from shapespace.coordinates.nric import WeightedNorm
 from shapespace.training.collection.generators import freaky_torus
 from shapespace.training.learning.evaluation import r_squared
 from shapespace.training.runs.config import load
 
-ROOT = Path(__file__).resolve().parents[1]
-PAGE = ROOT / "docs" / "measurements" / "bundled.md"
 #: Models of `evaluation.json` in the order of the tables, in words.
 MODELS = {
     "composite": "**composite**",
@@ -38,7 +35,7 @@ MODELS = {
 
 
 def record(name: str) -> dict[str, Any]:
-    """What a committed run holds, by the names of its files."""
+    """Return the contents of a committed run, by the names of its files."""
     folder = ROOT / "runs" / name
     found: dict[str, Any] = {path.stem: json.loads(path.read_text()) for path in folder.glob("*.json")}
     found["evaluation"] = studies.EMPTY | found["evaluation"]
@@ -46,10 +43,10 @@ def record(name: str) -> dict[str, Any]:
 
 
 def add_paper(found: dict[str, Any], again: dict[str, Any]) -> None:
-    """Add the paper's own system to an evaluation, from another one of the same networks and codes.
+    """Add the paper's own system to an evaluation, from another evaluation of the same networks and codes.
 
     Raises:
-        ValueError: it is of other networks.
+        ValueError: the other evaluation is of other networks.
     """
     if found["fresh"]["sha256"] != again["fresh"]["sha256"] or found["r2"]["composite"] != again["r2"]["composite"]:
         raise ValueError("the paper's own system was measured beside other networks")
@@ -59,7 +56,7 @@ def add_paper(found: dict[str, Any], again: dict[str, Any]) -> None:
 
 
 def without_bump(count: int = 1000) -> float:
-    """R² of the torus without its bump, at random codes."""
+    """Return R² of the torus without its bump, at random codes."""
     torus = freaky_torus.FreakyTorus()
     codes = torus.coordinates.uniform(count, np.random.default_rng(0))
     exact, norm = torus.shapes(codes).nric, WeightedNorm.of(torus.reference, 1e-2)
@@ -68,16 +65,7 @@ def without_bump(count: int = 1000) -> float:
 
 
 def page() -> str:
-    """The text of the page."""
-    environment = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(ROOT / "benchmarks"),
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-        keep_trailing_newline=True,
-        autoescape=False,  # noqa: S701 - Markdown of our own
-    )
-    environment.filters["percent"] = lambda share, digits=2: f"{100 * share:.{digits}f} %"
+    """Return the text of the page."""
     names = {"figure": "figure", "torus": "freaky-torus", "alone": "freaky-torus-1000"}
     runs = {key: record(name) for key, name in names.items()}
     for key, name in names.items():
@@ -85,10 +73,8 @@ def page() -> str:
             add_paper(runs[key]["evaluation"], json.loads(again.read_text()))
     exported = runs["figure"]["config"].export
     manifest = json.loads((ROOT / "models" / exported.name / str(exported.version) / "manifest.json").read_text())
-    return environment.get_template("bundled.md.jinja").render(
-        models=MODELS, bumpless=without_bump(), manifest=manifest, **runs
-    )
+    return pages.render("bundled", models=MODELS, bumpless=without_bump(), manifest=manifest, **runs)
 
 
 if __name__ == "__main__":
-    PAGE.write_text(page(), encoding="utf-8")
+    pages.write("bundled", page())

@@ -1,8 +1,8 @@
-"""How well and how fast codes are found: ``python -m benchmarks.codes``.
+"""Accuracy and time of finding codes: ``python -m benchmarks.codes``.
 
-Prints a Markdown row for each bundled model and task, in process and on one thread, of processor time. ``encode``:
-random codes to shapes, moved rigidly, and back. ``edit``: from a random code to another one's shape, by one to ten of
-its vertices.
+Prints a Markdown row for each bundled model and task, measured in this process, on one thread, in processor time.
+``encode`` takes shapes of random codes, moved rigidly, back to codes. ``edit`` goes from a random code to the shape of
+another code, by one to ten of its vertices.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from threadpoolctl import threadpool_limits
 
-from benchmarks.serving import bundles
+from benchmarks.bundles import bundles
 from shapespace.bundle.reader import read_bundle
 from shapespace.model.correspondence import Matched
 from shapespace.model.decoder import MeshChoice
@@ -30,7 +30,7 @@ T = TypeVar("T")
 
 
 def timed(times: list[float], work: Callable[[], T]) -> T:
-    """Do something and note its processor time."""
+    """Call a function and append its processor time in seconds."""
     began = time.process_time()
     result = work()
     times.append(time.process_time() - began)
@@ -38,12 +38,12 @@ def timed(times: list[float], work: Callable[[], T]) -> T:
 
 
 def codes(model: ShapeModel, count: int, seed: int) -> Codes:
-    """Random codes (count, m) inside the bounds."""
+    """Return random codes (count, m) inside the bounds."""
     return model.latents.sample(count, seed, Distribution.UNIFORM)
 
 
 def encode(model: ShapeModel, count: int) -> str:
-    """Errors of coordinates as fractions of their range."""
+    """Return cells: errors of coordinates as fractions of their range, and the relative time."""
     shape_times: list[float] = []
     times: list[float] = []
     rng, errors = np.random.default_rng(0), []
@@ -61,7 +61,7 @@ def encode(model: ShapeModel, count: int) -> str:
 
 
 def edit(model: ShapeModel, count: int) -> str:
-    """Largest distance from a target as a fraction of the diagonal."""
+    """Return cells: largest distance from a target as a fraction of the diagonal, and the relative time."""
     shape_times: list[float] = []
     times: list[float] = []
     rng, errors = np.random.default_rng(0), []
@@ -88,7 +88,7 @@ def main() -> None:
     with threadpool_limits(1):
         for path in bundles(given.models):
             model = ShapeModel(read_bundle(path))
-            model.encode(model.vertices)  # what encoding prepares once a model
+            model.encode(model.vertices)  # prepares what a model needs once
             print(f"| {path.parent.name} | encode | {encode(model, given.count)} |", flush=True)
             print(f"| {path.parent.name} | edit | {edit(model, max(1, given.count // 5))} |", flush=True)
 

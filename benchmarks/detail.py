@@ -1,14 +1,13 @@
-"""docs/measurements/detail.md: how much of the files' fine detail answers have, and what carrying it costs.
+"""docs/measurements/detail.md: fine detail of the files in the answers, and the time to add it.
 
-``python -m benchmarks.detail`` measures the models that ``python -m benchmarks.served`` has left in its ``--out``, on
-the shapes that these were trained on and those that they have not seen.
+``python -m benchmarks.detail`` measures the models that ``python -m benchmarks.served`` left in its ``--out``, on
+their training shapes and on unseen shapes.
 """
 
 from __future__ import annotations
 
 import argparse
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
@@ -17,12 +16,15 @@ import numpy as np
 import trimesh
 from threadpoolctl import threadpool_limits
 
-from benchmarks.results import COLLECTIONS, ROOT
+from benchmarks import pages
+from benchmarks.pages import ROOT
+from benchmarks.results import COLLECTIONS
 from shapespace.arrays import FloatArray
 from shapespace.mesh.prolongation import Prolongation
 from shapespace.mesh.rigid_motion import align
 from shapespace.mesh.triangle_mesh import Connectivity, TriangleMesh, diagonal, face_normals
 from shapespace.model.shape_model import ShapeModel, load
+from shapespace.training.learning.evaluation import median_seconds
 from shapespace.training.runs.directory import RunDirectory
 
 PAGE = """# Fine detail
@@ -49,13 +51,13 @@ fine mesh, in one call on one thread. `python -m benchmarks.detail` measures and
 |---|---|---|
 {costs}
 """
-#: Subdivisions of an icosahedron: of the coarse ball and of the fine ones.
+#: Subdivisions of an icosahedron for the coarse ball and for the fine balls.
 COARSE, FINE = 3, (4, 5, 6, 7)
 REPEATS = 21
 
 
 class Detail(NamedTuple):
-    """Distance as a share of the diagonal, angle of normals in degrees, and roughness beside the file's."""
+    """Distance as a share of the diagonal, angle between normals in degrees, and roughness relative to the file's."""
 
     distance: float
     normals: float
@@ -63,7 +65,7 @@ class Detail(NamedTuple):
 
     @classmethod
     def of(cls, found: FloatArray, file: FloatArray, mesh: Connectivity) -> Detail:
-        """Of an answer (V, 3) beside a file (V, 3)."""
+        """Compare an answer (V, 3) with a file (V, 3)."""
         found = align(found, file)
         own, others = (face_normals(shape, mesh.faces) for shape in (found, file))
         away = np.linalg.norm(found - file, axis=1).mean() / diagonal(file)
@@ -78,7 +80,7 @@ def _angles(a: FloatArray, b: FloatArray) -> FloatArray:
 
 
 def rows(name: str, out: Path) -> Iterator[str]:
-    """Of a collection, trained on and unseen."""
+    """Return rows of a collection: training shapes and unseen shapes."""
     run, model = RunDirectory(out / name), load(out / "models" / name)
     reference, weights = run.reference.read(), Prolongation.from_arrays(run.prolongation.read())
     mesh = Connectivity(reference["fine_faces"], len(reference["fine_vertices"]))
@@ -93,11 +95,11 @@ def rows(name: str, out: Path) -> Iterator[str]:
         for each in (carried, answered):
             distance, normals, roughness = np.mean(each, axis=0)
             cells += [f"{100 * distance:.3f}", f"{normals:.2f}", f"{roughness:.3f}"]
-        yield f"| {' | '.join(cells)} |"
+        yield pages.row(cells)
 
 
 def costs(model: ShapeModel) -> Iterator[str]:
-    """Of carrying balls, beside a shape of a model."""
+    """Return rows of the time to carry balls, relative to a shape of a model."""
     code = model.sample(1, 0)[0]
     coarse = _ball(COARSE)
 
@@ -105,11 +107,11 @@ def costs(model: ShapeModel) -> Iterator[str]:
         return model.decode(code, mesh="coarse")
 
     with threadpool_limits(1):
-        shape = _median(full)
+        shape = median_seconds(full, REPEATS)
         for subdivisions in FINE:
             fine = _ball(subdivisions)
             weights = Prolongation.of(coarse, fine)
-            seconds = _median(partial(weights, coarse.vertices))
+            seconds = median_seconds(partial(weights, coarse.vertices), REPEATS)
             yield f"| {len(fine.vertices):,} | {1e3 * seconds:.2f} | {seconds / shape:.2f} |"
 
 
@@ -118,17 +120,8 @@ def _ball(subdivisions: int) -> TriangleMesh:
     return TriangleMesh.from_arrays(ball.vertices, ball.faces)
 
 
-def _median(call: Callable[[], object]) -> float:
-    times = []
-    for _ in range(REPEATS):
-        start = time.perf_counter()
-        call()
-        times.append(time.perf_counter() - start)
-    return float(np.median(times))
-
-
 def main() -> None:
-    """Measure and write."""
+    """Measure and write the page."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--out", type=Path, default=ROOT / "build" / "served", help="what benchmarks.served has left")
     given = parser.parse_args()
@@ -136,7 +129,7 @@ def main() -> None:
     found = [row for name in there for row in rows(name, given.out)]
     cost = "\n".join(costs(load(ROOT / "models" / "figure")))
     page = PAGE.format(rows="\n".join(found), coarse=len(_ball(COARSE).vertices), costs=cost)
-    (ROOT / "docs" / "measurements" / "detail.md").write_text(page, encoding="utf-8")
+    pages.write("detail", page)
 
 
 if __name__ == "__main__":

@@ -1,18 +1,18 @@
-"""docs/measurements/editing.md: whether an edit moves what is meant. ``python -m benchmarks.edit``.
+"""docs/measurements/editing.md: side effects of an edit. ``python -m benchmarks.edit``.
 
-Pulls a fingertip, an elbow or a knee of the bundled figure, each to where it is on the shape of a code of which one
-factor alone differs, one that moves hardly anything but that limb, and measures what else moves.
+Pulls a fingertip, an elbow or a knee of the bundled figure to its position on the shape of another code, and measures
+what else moves. The two codes differ in one factor, which moves almost only this limb.
 """
 
 from __future__ import annotations
 
 import argparse
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks import pages
 from shapespace.arrays import FloatArray
 from shapespace.mesh.rigid_motion import align
 from shapespace.model.latent_space import Codes, Distribution
@@ -20,12 +20,11 @@ from shapespace.model.options import PriorKind, Target
 from shapespace.model.shape_model import ShapeModel, load
 from shapespace.training.collection.generators.mannequin import ARM, ELBOW, HIP, KNEE, LEG, SHOULDER, rest
 
-ROOT = Path(__file__).resolve().parents[1]
-#: How far each vertex is pulled, in metres, the figure's unit; and how many pulls there are.
+#: Distance of each pull in metres, the figure's unit; number of pulls.
 PULL, PULLS = 0.25, 40
 #: A factor belongs to a limb if it moves that limb at least this many times as far as any other.
 OWN = 5.0
-#: At how many codes that is measured, and how many directions are tried for one pull.
+#: Number of codes where this is measured; number of directions that are tried for one pull.
 LOOKED_AT, TRIED = 4, 20
 
 PAGE = """# What an edit moves
@@ -45,13 +44,13 @@ changed by more than 1 % of the bounds' width, and the shapes that the search ha
 
 @dataclass(frozen=True)
 class Pull:
-    """A vertex that should be elsewhere.
+    """A vertex and its target.
 
     Attributes:
         start: (m,) code to start from.
-        before: (V, 3) its shape.
+        before: (V, 3) shape of the code.
         limb: name of the limb.
-        target: where its vertex should be, ``PULL`` from where it is.
+        target: target of the vertex, at the distance ``PULL``.
     """
 
     start: Codes
@@ -61,7 +60,7 @@ class Pull:
 
 
 def limbs() -> dict[str, NDArray[np.bool_]]:
-    """(V,) which vertices belong to each limb, and to the head."""
+    """Mark the vertices (V,) of each limb, and of the head."""
     found = {}
     for side, sign in (("left", 1), ("right", -1)):
         y = rest().vertices * [sign, 1, 1]
@@ -72,7 +71,7 @@ def limbs() -> dict[str, NDArray[np.bool_]]:
 
 
 def handles() -> list[tuple[str, int]]:
-    """Limbs, and vertices of theirs that are pulled: fingertips, elbows and knees."""
+    """Return pairs of a limb and a vertex that is pulled: fingertips, elbows and knees."""
     found = []
     for side, sign in (("left", 1), ("right", -1)):
         y = rest().vertices * [sign, 1, 1]
@@ -84,12 +83,12 @@ def handles() -> list[tuple[str, int]]:
 
 
 def still(shape: FloatArray, before: FloatArray, limb: NDArray[np.bool_]) -> FloatArray:
-    """A shape (V, 3) moved to where all but one limb of it stays, as near as can be."""
+    """Align a shape (V, 3) by least squares over all vertices outside one limb."""
     return align(shape[~limb], before[~limb], carried=shape)
 
 
 def own_factors(model: ShapeModel, rng: np.random.Generator) -> dict[str, list[int]]:
-    """By limb, the factors that move hardly anything else."""
+    """Return by limb the factors that move almost only this limb."""
     parts, before = limbs(), model.decode((model.lower + model.upper) / 2)
     found: dict[str, list[int]] = {name: [] for name in parts}
     for j, factor in enumerate(model.manifest.factors):
@@ -99,7 +98,7 @@ def own_factors(model: ShapeModel, rng: np.random.Generator) -> dict[str, list[i
             code = (model.lower + model.upper) / 2
             code[own] = rng.uniform(model.lower[own], model.upper[own])
             shape = model.decode(code)
-            # Whichever limb it is, the shape is best aligned without it.
+            # The moving limb is unknown, so align without each limb in turn.
             fits = [still(shape, before, limb) for limb in parts.values()]
             away = min((np.linalg.norm(fit - before, axis=1) for fit in fits), key=np.median)
             for name, limb in parts.items():
@@ -111,7 +110,7 @@ def own_factors(model: ShapeModel, rng: np.random.Generator) -> dict[str, list[i
 
 
 def pulls(model: ShapeModel, count: int, seed: int) -> list[Pull]:
-    """Random pulls, as many of each handle as can be."""
+    """Draw random pulls, equally many of each handle where possible."""
     rng, parts, several = np.random.default_rng(seed), limbs(), handles()
     found: list[Pull] = []
     own = own_factors(model, rng)
@@ -138,7 +137,7 @@ def _place(
     own: slice,
     rng: np.random.Generator,
 ) -> FloatArray | None:
-    """Where a vertex is once it has moved by PULL towards a random value of a factor; None if it can't."""
+    """Return the position of a vertex after it moved by PULL towards a random value of a factor; None if it can't."""
     goal = rng.uniform(model.lower[own], model.upper[own])
 
     def place(share: float) -> FloatArray:
@@ -160,7 +159,7 @@ def _place(
 
 
 def row(model: ShapeModel, some: list[Pull], kind: PriorKind) -> str:
-    """Edit by every pull, and summarise."""
+    """Edit by every pull, and return a row with the summary."""
     others, away, factors, shapes = [], [], [], []
     parts = limbs()
     for pull in some:
@@ -180,15 +179,15 @@ def row(model: ShapeModel, some: list[Pull], kind: PriorKind) -> str:
 
 
 def main() -> None:
-    """Measure, and write the page."""
+    """Measure and write the page."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--count", type=int, default=PULLS, help="pulls")
     given = parser.parse_args()
-    model = load(ROOT / "models" / "figure")
+    model = load(pages.ROOT / "models" / "figure")
     some = pulls(model, given.count, 0)
     rows = "\n".join(row(model, some, kind) for kind in PriorKind)
     page = PAGE.format(count=given.count, pull=PULL, rows=rows)
-    (ROOT / "docs" / "measurements" / "editing.md").write_text(page, encoding="utf-8")
+    pages.write("editing", page)
 
 
 if __name__ == "__main__":

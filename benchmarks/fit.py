@@ -1,7 +1,7 @@
-"""docs/measurements/fit.md: how near fits of scans come to the truth, how sure they rightly are, and what they cost.
+"""docs/measurements/fit.md: accuracy, uncertainty and cost of fitting scans.
 
-``python -m benchmarks.fit`` measures the bundled models. With ``--data FOLDER`` also each bundle FOLDER/NAME that has
-shapes it has not seen beside it, FOLDER/NAME.npz with ``vertices`` (n, V, 3) in its order.
+``python -m benchmarks.fit`` measures the bundled models. ``--data FOLDER`` adds each bundle FOLDER/NAME with unseen
+shapes in FOLDER/NAME.npz, as ``vertices`` (n, V, 3) in the order of the bundle.
 """
 
 from __future__ import annotations
@@ -20,7 +20,8 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 from threadpoolctl import threadpool_limits
 
-from benchmarks.results import ROOT
+from benchmarks import pages
+from benchmarks.pages import ROOT
 from shapespace.arrays import FloatArray, IntArray
 from shapespace.mesh.closest_points import MeshProximity, VertexFaces
 from shapespace.mesh.rigid_motion import Placement, align
@@ -29,16 +30,16 @@ from shapespace.model.fit_result import FitStatus, Fitted
 from shapespace.model.shape_model import ShapeModel, load
 from shapespace.training.collection.generators import figure
 
-#: Points of a scan; its noise as a share of the diagonal, and the share of outliers.
+#: Number of points of a scan; noise as a share of the diagonal; share of outliers.
 POINTS, NOISE, OUTLIERS = 4000, 0.005, 0.02
-#: A try has failed if its error exceeds this many medians, and this share of the diagonal; half the width of a 90 %
-#: interval, in standard deviations.
+#: A fit has failed if its error exceeds this multiple of the median, and this share of the diagonal. NINETY is half the
+#: width of a 90 % interval, in standard deviations.
 FAILED, FAR, NINETY = 2.0, 0.01, 1.645
 VARIANTS = ("whole", "noisy", "camera")
-#: Steps of the closest-point fit with principal components, how strongly it may hold on to the mean, and by how many
-#: training shapes this is chosen.
+#: Steps of the closest-point fit with principal components; candidates for the weight of the mean; number of training
+#: shapes that choose the weight.
 COMPONENT_STEPS, HOLDS, CHOOSING = 40, (1e-5, 1e-4, 1e-3, 1e-2, 1e-1), 4
-#: What was measured, a file for each model.
+#: Stored figures, one file for each model.
 FIGURES = ROOT / "runs" / "fit"
 
 PAGE = """# Fits of scans
@@ -84,7 +85,7 @@ where a row has much less than 90 %, as those of scans without noise.
 
 @dataclass
 class Row:
-    """Tries of one kind of shapes and one variant of scans."""
+    """Results for one kind of shapes and one variant of scans."""
 
     kind: str
     variant: str
@@ -99,13 +100,13 @@ class Row:
 
 
 def sampled(vertices: FloatArray, faces: IntArray, count: int, rng: np.random.Generator) -> FloatArray:
-    """Points (count, 3) at random all over a surface."""
+    """Draw points (count, 3) at random on a surface."""
     points, _ = trimesh.sample.sample_surface(trimesh.Trimesh(vertices, faces, process=False), count, seed=rng)
     return np.asarray(points)
 
 
 def remeshed(vertices: FloatArray, faces: IntArray, rng: np.random.Generator) -> tuple[FloatArray, IntArray]:
-    """Another mesh of a surface: a vertex of it chosen at random in each cell of a grid."""
+    """Return another mesh of a surface, with one random vertex in each cell of a grid."""
     fine = trimesh.Trimesh(vertices, faces, process=False).subdivide()
     order = rng.permutation(len(fine.vertices))
     cells = np.floor(fine.vertices[order] / (0.015 * diagonal(vertices))).astype(np.int64)
@@ -118,7 +119,7 @@ def remeshed(vertices: FloatArray, faces: IntArray, rng: np.random.Generator) ->
 
 
 def seen(vertices: FloatArray, faces: IntArray, rng: np.random.Generator) -> FloatArray:
-    """Points (n, 3) that one camera sees, far away in a random direction."""
+    """Return points (n, 3) that are visible to one camera, far away in a random direction."""
     size = float(diagonal(vertices))
     points = sampled(vertices, faces, 10 * POINTS, rng)
     turned = points @ Rotation.random(random_state=rng).as_matrix().T
@@ -133,7 +134,7 @@ def seen(vertices: FloatArray, faces: IntArray, rng: np.random.Generator) -> Flo
 def scan(
     vertices: FloatArray, faces: IntArray, variant: str, number: int, rng: np.random.Generator
 ) -> tuple[FloatArray, IntArray]:
-    """A scan of a shape (V, 3), in the same place: points, and faces or none."""
+    """Return a scan of a shape (V, 3), in the same place: points, and faces or none."""
     none, size = np.zeros((0, 3), np.int64), float(diagonal(vertices))
     if variant == "whole":
         if number % 2:
@@ -151,9 +152,10 @@ def scan(
 def by_components(
     training: FloatArray, count: int, points: FloatArray, start: Placement, hold: float, *, partial: bool
 ) -> FloatArray:
-    """Vertices (V, 3) of the closest-point fit with principal components of training shapes (n, V, 3).
+    """Fit principal components of training shapes (n, V, 3) to points by closest points; return vertices (V, 3).
 
-    The iterated fit of Scalismo's tutorial on fitting without correspondence, of a Gaussian of aligned vertices.
+    This is the iterated fit of Scalismo's tutorial on fitting without correspondence, with a Gaussian of aligned
+    vertices.
     """
     mean = training.mean(axis=0)
     _, spread, axes = np.linalg.svd((training - mean).reshape(len(training), -1), full_matrices=False)
@@ -178,19 +180,18 @@ def by_components(
 
 
 class Bench:
-    """One model, and what is measured on it.
+    """Measurements of one model.
 
     Args:
-        model: with a name.
-        by_surface: whether the distance of the surface counts in place of that of vertices.
+        model: a model with a name.
+        by_surface: whether to measure the distance of the surface, not of vertices.
     """
 
     def __init__(self, model: ShapeModel, *, by_surface: bool) -> None:
         self.model, self.by_surface = model, by_surface
         self.fans = VertexFaces(model.faces, len(model.vertices))
-        model.fit_scan(
-            sampled(model.vertices, model.faces, POINTS, np.random.default_rng(0))
-        )  # makes what is made once
+        # The first fit also prepares what a model needs once.
+        model.fit_scan(sampled(model.vertices, model.faces, POINTS, np.random.default_rng(0)))
         times = []
         for code in model.population.sample(12, 1).astype(np.float32):
             began = time.process_time()
@@ -200,14 +201,14 @@ class Bench:
 
     @cached_property
     def training(self) -> FloatArray:
-        """The training shapes (n, V, 3), as the model remembers them."""
+        """The training shapes (n, V, 3), as stored in the model."""
         codes = self.model.decoder.training_codes
         if codes is None:
             raise ValueError(f"{self.model.manifest.name} has no codes of the training shapes, as components need")
         return np.stack([self.model.shape(code).vertices for code in codes.astype(np.float32)])
 
     def distance(self, found: FloatArray, truth: FloatArray) -> float:
-        """Mean distance of shapes (V, 3) in the same place, as a fraction of the diagonal."""
+        """Return the mean distance of shapes (V, 3) in the same place, as a fraction of the diagonal."""
         if self.by_surface:
             away = MeshProximity(found, self.fans).closest(truth).distances
         else:
@@ -215,7 +216,7 @@ class Bench:
         return float(away.mean() / diagonal(truth))
 
     def tries(self, kind: str, shapes: FloatArray, truths: FloatArray | None) -> Iterator[Row]:
-        """A row for each variant of scans of shapes (n, V, 3), given their codes (n, m) or not."""
+        """Yield a row for each variant of scans of shapes (n, V, 3), with their codes (n, m) if known."""
         for variant in VARIANTS:
             row = Row(kind, variant)
             for number, shape in enumerate(shapes):
@@ -223,7 +224,7 @@ class Bench:
             yield row
 
     def one(self, row: Row, number: int, shape: FloatArray, truth: FloatArray | None) -> None:
-        """One scan of a shape (V, 3) of a code (m,), if that is known."""
+        """Measure one scan of a shape (V, 3), with its code (m,) if known."""
         rng, model, variant = np.random.default_rng(number), self.model, row.variant
         partial = variant == "camera"
         points, faces = scan(shape, model.faces, variant, number, rng)
@@ -247,7 +248,7 @@ class Bench:
 
     @cached_property
     def holds(self) -> dict[str, float]:
-        """How strongly components hold on to the mean, for each variant of scans."""
+        """Strength with which components hold on to the mean, for each variant of scans."""
         chosen = {}
         for variant in VARIANTS:
             away: dict[float, list[float]] = {hold: [] for hold in HOLDS}
@@ -263,7 +264,7 @@ class Bench:
         return chosen
 
     def interval(self, row: Row, found: Fitted, truth: FloatArray) -> None:
-        """Whether intervals hold a code (m,), and how wide they are."""
+        """Record whether intervals contain a code (m,), and their width."""
         deviations = np.sqrt(found.covariance.diagonal())
         off = np.abs(self.model.latents.shorter(found.code - truth))
         row.held.append(float((off <= NINETY * deviations).mean()))
@@ -271,7 +272,7 @@ class Bench:
 
 
 def line(name: str, row: Row) -> str:
-    """Of the table of errors."""
+    """Return a row of the table of errors."""
     errors, converged = np.array(row.errors), np.array(row.converged)
     failed = errors > max(FAILED * np.median(errors), FAR)
     encoded = 100 * float(np.median(row.encoded)) if row.encoded else None
@@ -291,19 +292,19 @@ def line(name: str, row: Row) -> str:
         f"{np.median(row.seconds):.0f}",
         f"{100 * float(np.median(row.components)):.3f}" if row.components else "–",
     ]
-    return f"| {' | '.join(cells)} |"
+    return pages.row(cells)
 
 
 def held(name: str, row: Row) -> str:
-    """Of the table of intervals."""
+    """Return a row of the table of intervals."""
     figures = [f"{np.mean(row.held):.0%}", f"{np.median(row.widths):.3f}"] if row.held else ["–", "–"]
-    return f"| {' | '.join([name, row.kind, row.variant, str(len(row.held)), *figures])} |"
+    return pages.row([name, row.kind, row.variant, str(len(row.held)), *figures])
 
 
 def kinds(
     model: ShapeModel, unseen: FloatArray | None, count: int
 ) -> Iterator[tuple[str, FloatArray, FloatArray | None]]:
-    """Kinds of shapes (n, V, 3), and their codes (n, m) or None where only the shapes are known."""
+    """Yield kinds of shapes (n, V, 3), with their codes (n, m), or None where only the shapes are known."""
     if unseen is not None:
         yield "unseen", unseen[: 2 * count], None
     codes = np.clip(model.population.sample(count, 123), model.lower, model.upper)
@@ -311,7 +312,7 @@ def kinds(
 
 
 def measure(name: str, model: ShapeModel, unseen: FloatArray | None, count: int) -> list[Row]:
-    """All tries of one model."""
+    """Measure one model on all kinds of shapes."""
     bench = Bench(model, by_surface=name == "freaky-torus")
     every = list(kinds(model, unseen, count))
     if name == "figure":
@@ -326,7 +327,7 @@ def measure(name: str, model: ShapeModel, unseen: FloatArray | None, count: int)
 
 
 def write_page() -> None:
-    """Of all that was measured."""
+    """Write the page from all stored figures."""
     files = {file.stem: json.loads(file.read_text(encoding="utf-8")) for file in sorted(FIGURES.glob("*.json"))}
     rows = [(name, Row(**each)) for name, found in files.items() for each in found]
     page = PAGE.format(
@@ -339,11 +340,11 @@ def write_page() -> None:
         rows="\n".join(line(name, row) for name, row in rows),
         intervals="\n".join(held(name, row) for name, row in rows if row.kind != "unseen"),
     )
-    (ROOT / "docs" / "measurements" / "fit.md").write_text(page, encoding="utf-8")
+    pages.write("fit", page)
 
 
 def main() -> None:
-    """Measure and write."""
+    """Measure and write the page."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--data", type=Path, help="folder of other bundles and of shapes that they have not seen")
     parser.add_argument("--count", type=int, default=10, help="shapes of each kind, twice as many unseen ones")
@@ -357,7 +358,7 @@ def main() -> None:
         for name in [] if given.page else given.names or bundles:
             unseen = None
             if name == "figure":
-                # Its generator makes poses that no training knows; those with a name come first, and are known.
+                # The generator makes unseen poses, after the named poses, which are training shapes.
                 known = len(figure.NAMED)
                 unseen = figure.poses(known + 2 * given.count, seed=77)[1][known:]
             elif name != "freaky-torus":

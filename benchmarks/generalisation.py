@@ -1,8 +1,8 @@
-"""docs/measurements/generalisation.md: how near spaces come to unseen shapes, beside principal components.
+"""docs/measurements/generalisation.md: distance of spaces from unseen shapes, next to principal components.
 
-Five folds of each collection, each with mean, logarithms and modes of its own, for as many modes as the example has
-and half of that. Exponentials stand for networks. A fold that is done is kept under ``--out`` and not done again; a
-collection whose folds are all done has its figures in ``runs/folds/``, and is not measured again while they are there.
+Five folds of each collection have their own mean, logarithms and modes, for the number of modes in the example and for
+half of it. Exponentials replace networks. Finished folds are kept under ``--out``. A collection with five finished
+folds has its figures in ``runs/folds/``, and is not measured again.
 """
 
 from __future__ import annotations
@@ -14,11 +14,13 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.results import COLLECTIONS, MANNEQUIN, MIRRORED, ROOT, SYMMETRIC, open_run
+from benchmarks import pages
+from benchmarks.pages import ROOT
+from benchmarks.results import COLLECTIONS, MANNEQUIN, MIRRORED, SYMMETRIC, open_run
 from shapespace.training.space import stages
 from shapespace.training.space.generalisation import LIGHT_STEPS, folds, held_out, summary
 
-#: What was measured, a file for each collection.
+#: Stored figures, one file for each collection.
 FIGURES = ROOT / "runs" / "folds"
 
 INTRODUCTION = """# Shapes that a space has not seen
@@ -53,7 +55,7 @@ ROWS = tuple(
 
 
 def measure(name: str, data: Path, out: Path) -> dict[str, Any]:
-    """Figures of a collection, by number of coordinates: of all its shapes, each in the fold that held it out."""
+    """Return figures of a collection by number of coordinates, over all shapes, each from the fold that held it out."""
     opened = open_run(name, data, out)
     run, config = opened.directory, opened.config
     if not run.shapes.exists():
@@ -90,17 +92,17 @@ def measure(name: str, data: Path, out: Path) -> dict[str, Any]:
 
 
 def title(name: str) -> str:
-    """Of a row of the table."""
+    """Return the title of a row."""
     return name.replace(MIRRORED, ", with mirror images")
 
 
 def beside_images(own: dict[str, float], images: dict[str, float] | None) -> list[str]:
-    """The last cells of a row: components with images, if there are any, and the share of their error."""
+    """Return the last cells of a row: error of components with mirror images, and the ratio to it, if measured."""
     return [f"{100 * images['mean']:.3f}", f"{own['mean'] / images['mean']:.2f}"] if images else ["", ""]
 
 
 def rows(name: str, found: dict[str, Any]) -> list[str]:
-    """Of the table."""
+    """Return the rows of a collection."""
     result: list[str] = []
     mirrored = found.get("mirrored_components", [None] * len(found["counts"]))
     each = zip(found["counts"], found["modes"], found["components"], mirrored, strict=True)
@@ -115,12 +117,12 @@ def rows(name: str, found: dict[str, Any]) -> list[str]:
             f"{own['mean'] / other['mean']:.2f}",
         ]
         cells += beside_images(own, images)
-        result.append(f"| {' | '.join(cells)} |")
+        result.append(pages.row(cells))
     return result
 
 
 def main() -> None:
-    """Measure and write."""
+    """Measure and write the page."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--data", type=Path, required=True, help="folder of the collections")
     parser.add_argument("--out", type=Path, default=ROOT / "build" / "generalisation")
@@ -135,7 +137,7 @@ def main() -> None:
         done = {each: json.loads(path.read_text()) for each in ROWS if (path := FIGURES / f"{each}.json").exists()}
         table = "\n".join(row for each in done.items() for row in rows(*each))
         page = INTRODUCTION.format(steps=LIGHT_STEPS) + table + "\n"
-        (ROOT / "docs" / "measurements" / "generalisation.md").write_text(page, encoding="utf-8")
+        pages.write("generalisation", page)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Where a model ends: codes beyond the hypercube that it was learned in."""
+"""Accuracy of a model outside its training bounds."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from shapespace.training.learning.networks import predict
 from shapespace.training.runs.latent_coordinates import alone
 from shapespace.training.runs.workers import run
 
-#: Factors by which the hypercube is enlarged, and how many codes are drawn in each.
+#: Factors by which the hypercube is enlarged; number of codes in each.
 REACHES = (1.0, 1.25, 1.5)
 CODES = 100
 SEED = 7
 
 
 def extrapolation(learner: Learner) -> list[dict[str, Any]]:
-    """R² on codes uniform in the hypercube stretched about its centre; those inside it are not left out.
+    """Measure R² on uniform codes in the hypercube stretched about its centre; codes inside the bounds are included.
 
     Returns:
-        For each of ``REACHES`` how many of ``CODES`` exponentials failed, and R² on the others of the composite, the
-        one-factor network and the affine sum of exact factors.
+        For each of ``REACHES`` the number of failed exponentials out of ``CODES``, and R² on the others: composite,
+        one-factor network and affine sum of exact factors.
     """
     collection = learner.collection
     coordinates, factors = collection.coordinates, list(collection.factors.values())

@@ -1,9 +1,9 @@
-"""How fast the page answers the hand: ``python -m benchmarks.page``.
+"""Response time of the web page: ``python -m benchmarks.page``.
 
-Starts the server with the bundled models and opens its page in Chromium without a screen, WebGL in software. Measured
-in the page: from the ``input`` event of a slider until the next frame after new pixels have been read back from the
-canvas (reading forces the renderer to finish). Beside it the page's weight as it travels, and the time from a ready
-server to the first shape.
+Starts the server with the bundled models and opens its page in headless Chromium, with WebGL in software. The script
+in the page measures from the ``input`` event of a slider to the next frame after new pixels were read back from the
+canvas. Reading back forces the renderer to finish. The benchmark also prints the transferred bytes of the page, and
+the time from a ready server to the first shape.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from typing import Any
 
 from playwright.sync_api import Page, sync_playwright
 
-from benchmarks.serving import server
+from benchmarks.processes import server
 from tests.page.conftest import CHROMIUM, FLAGS
 
 #: Time from a slider's event to new pixels, in ms.
@@ -47,7 +47,7 @@ SLIDE = """async ([k, value]) => {
 
 
 def slides(page: Page, count: int) -> list[float]:
-    """Times of moves of one slider to and fro, the first ones left out."""
+    """Return times of moves of one slider to and fro, without the first moves."""
     times = []
     for i in range(count + 3):
         times.append(page.evaluate(SLIDE, [4, 0.5 * (-1) ** i + 0.001 * i]))
@@ -65,7 +65,7 @@ def main() -> None:
         browser = playwright.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
         page = browser.new_page(viewport={"width": 1280, "height": 800})
         page.set_default_timeout(120_000)
-        weights: dict[str, float] = {}  # by request; shapes, which are another matter, are left out
+        weights: dict[str, float] = {}  # by request, without shapes
         devtools = page.context.new_cdp_session(page)
         devtools.send("Network.enable")
 
@@ -79,7 +79,7 @@ def main() -> None:
 
         devtools.on("Network.requestWillBeSent", asked)
         devtools.on("Network.loadingFinished", finished)
-        page.emulate_media(reduced_motion="reduce")  # the shape would move by itself
+        page.emulate_media(reduced_motion="reduce")  # without this the shape would move by itself
         began = time.perf_counter()
         page.goto(str(client.base_url))
         page.wait_for_selector(".stage[data-shown]")

@@ -1,9 +1,9 @@
-"""The paper's own system (section 4) beside a committed run of a generator that was measured without it.
+"""The paper's own system (section 4) for a committed run of a generator that was measured without it.
 
-``python -m benchmarks.paper NAME …`` draws the run's samples once more, which a generator gives equal to rounding,
-learns the paper's factor networks and convolutions from them, and writes what these reach on the run's own test codes
-and fresh codes to ``runs/NAME-paper/evaluation.json``, beside the figures of the run's other models.
-``benchmarks.bundled`` makes the page. It takes an hour on a processor; a call that was ended goes on where it was.
+``python -m benchmarks.paper NAME …`` draws the run's samples again, which a generator reproduces up to rounding. It
+trains the paper's factor networks and convolutions on them. R² on the run's own test codes and fresh codes goes to
+``runs/NAME-paper/evaluation.json``, next to the figures of the run's other models. ``benchmarks.bundled`` writes the
+page. The command takes an hour on a processor; an interrupted call can be continued.
 """
 
 from __future__ import annotations
@@ -16,34 +16,35 @@ from typing import Any
 import numpy as np
 import torch
 
-from benchmarks.bundled import ROOT
-from shapespace.training.learning.evaluation import Model, Split, r_squared, size_bytes
+from benchmarks.pages import ROOT
+from shapespace.training.learning.evaluation import HeldOutSamples, Model, r_squared, size_bytes
 from shapespace.training.learning.networks import predict
 from shapespace.training.pipeline import Run, execute, learner_of
 from shapespace.training.runs.config import load
 from shapespace.training.runs.latent_coordinates import alone
 
-#: How far apart R² of the kernel on codes may be, anew and before: rounding differs from machine to machine.
+#: Largest difference between R² of the kernel on codes now and before, since rounding differs between machines.
 ROUNDING = 1e-6
 
 
 class OtherSamplesError(ValueError):
-    """Samples that are not those of the figures which the paper's system is to stand beside."""
+    """The samples differ from the samples of the stored figures."""
 
 
 def measure(run: Run, evaluation: dict[str, Any]) -> None:
-    """Learn the paper's system of a run, and add its figures to an ``evaluation.json`` of the same run.
+    """Train the paper's system of a run, and add its figures to an ``evaluation.json`` of the same run.
 
     Args:
-        run: of a generator; anew, or with the samples and networks that an earlier call has left.
-        evaluation: of its other models; changed in place. ``paper_factors`` is R² of the paper's factor networks.
+        run: run of a generator; new, or with samples and networks of an earlier call.
+        evaluation: figures of its other models, changed in place. ``paper_factors`` receives R² of the paper's factor
+            networks.
 
     Raises:
-        OtherSamplesError: kernel ridge regression, which is in closed form, reaches something else than it did.
+        OtherSamplesError: kernel ridge regression, which has a closed form, has another R² than before.
     """
     execute(run, "samples", keep_going=True)
     learner, fresh, collection = learner_of(run), evaluation["fresh"], run.collection
-    test = Split.of(learner)
+    test = HeldOutSamples.of(learner)
     codes = collection.coordinates.uniform(fresh["codes"], np.random.default_rng(fresh["seed"]))
     z, latents = collection.shapes(codes).nric, torch.as_tensor(codes, dtype=torch.float32)
 

@@ -1,4 +1,4 @@
-"""docs/measurements/NAME-models.png and NAME-modes.png: what the models of a run make of codes, and its modes.
+"""docs/measurements/NAME-models.png and NAME-modes.png: shapes of a run's models, and its modes.
 
 ``python -m benchmarks.pictures CONFIG RUN`` draws them from a finished run, after figures 4 and 5 of the paper.
 """
@@ -14,6 +14,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from benchmarks.pages import MEASUREMENTS
 from shapespace.arrays import FloatArray
 from shapespace.coordinates.nric import nric
 from shapespace.coordinates.reconstruction import Reconstructor
@@ -26,17 +27,16 @@ from shapespace.training.report.record import Record
 from shapespace.training.runs.config import load
 from shapespace.training.runs.sampling import read
 
-ROOT = Path(__file__).resolve().parents[1]
-#: How many codes are shown (the first fresh ones), how many modes (the strongest), and pixels of a picture's side.
+#: Number of codes (the first fresh codes) and of modes (the strongest); pixels of a picture's side.
 CODES, MODES, SIZE = 4, 6, 260
-#: Room around the shapes, a share of the picture's longer side.
+#: Margin around the shapes, as a share of the picture's longer side.
 MARGIN = 0.02
 #: Errors between which colours change, as shares of the diagonal, on a logarithmic scale.
 LEAST, MOST = 1e-4, 3e-2
 
 
 def models(run: Run, studio: Studio, path: Path) -> None:
-    """Shapes of fresh codes: exact, and by each model, with colours of the distance of vertices from the exact ones."""
+    """Draw shapes of fresh codes: exact, and by each model with colours for the distance from the exact vertices."""
     learner, samples = learner_of(run), read(run.directory.exact / "fresh")
     codes, exact = samples.latents[:CODES], align(samples.vertices[:CODES].astype(np.float64), studio.base)
     latents, composite = torch.as_tensor(codes, dtype=torch.float32), learner.main()
@@ -65,7 +65,7 @@ def models(run: Run, studio: Studio, path: Path) -> None:
 
 
 def modes(run: Run, studio: Studio, path: Path) -> None:
-    """The strongest principal geodesic modes, and sparse ones, each at its largest displacement that is shown."""
+    """Draw the strongest principal geodesic modes and sparse modes, each at its largest shown displacement."""
     found, mean = run.directory.modes_by_strength.read(), run.directory.mean.read()["vertices"]
     rows = {"principal geodesic modes": found["pga_vertices"], "sparse modes": found["vertices"]}
     pictures: list[list[NDArray[np.uint8]]] = [[] for _ in range(MODES)]
@@ -78,7 +78,7 @@ def modes(run: Run, studio: Studio, path: Path) -> None:
 
 
 def moved(studio: Studio, mean: FloatArray, field: FloatArray) -> NDArray[np.uint8]:
-    """A mode (V, 3) as far as it is shown."""
+    """Draw a mode (V, 3) at its largest shown displacement."""
     lengths = np.linalg.norm(field, axis=1)
     size = float(np.linalg.norm(np.ptp(mean, axis=0)))
     shape = mean + MODE_REACH * size / lengths.max() * field
@@ -86,7 +86,7 @@ def moved(studio: Studio, mean: FloatArray, field: FloatArray) -> NDArray[np.uin
 
 
 def save(columns: list[tuple[str, list[NDArray[np.uint8]]]], path: Path, words: str) -> None:
-    """A table of pictures."""
+    """Save a table of pictures."""
     height, width = columns[0][1][0].shape[:2]
     count = len(columns[0][1])
     size = (len(columns) * width / 110, count * height / 110 + 0.7)
@@ -102,7 +102,7 @@ def save(columns: list[tuple[str, list[NDArray[np.uint8]]]], path: Path, words: 
 
 
 def main() -> None:
-    """Draw both; of a collection that is a product by design, no modes."""
+    """Draw both pictures; only the first for a collection that is a product by design."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("config", type=Path)
     parser.add_argument("run", type=Path)
@@ -111,7 +111,7 @@ def main() -> None:
     studio = Studio.of(Record(run.directory))
     if studio is None:
         raise SystemExit("Nothing to draw with: install embreex.")
-    folder, name = ROOT / "docs" / "measurements", given.config.stem
+    folder, name = MEASUREMENTS, given.config.stem
     models(run, studio, folder / f"{name}-models.png")
     if not run.by_design:
         modes(run, studio, folder / f"{name}-modes.png")

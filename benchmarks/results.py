@@ -1,8 +1,8 @@
-"""docs/measurements/results.md: every collection from its meshes to the figures of the paper's tables.
+"""docs/measurements/results.md: the figures of the paper's tables for every collection.
 
-Each collection is a run of its own under ``--out``, so a killed call goes on where it was. What was measured on a run
-that is done is in ``runs/results/``, a file for each, and is not measured again while it is there; the page is made of
-these files. Bundles are written beside the runs: they hold the collections' geometry.
+Each collection is a run under ``--out``, so a killed call can be continued. Figures of finished runs are in
+``runs/results/``, one file for each run, and are not measured again. The page is made from these files. Bundles are
+written next to the runs, since they contain the collections' geometry.
 """
 
 from __future__ import annotations
@@ -13,26 +13,26 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import jinja2
 import matplotlib.pyplot as plt
 import numpy as np
 import tomlkit
 from matplotlib.ticker import LogLocator, NullFormatter
 
 import shapespace
-from benchmarks import limits, space, studies
+from benchmarks import limits, pages, space, studies
+from benchmarks.pages import ROOT
 from shapespace.training.pipeline import Run, execute, learner_of
 from shapespace.training.runs.config import load, parse
 from shapespace.training.runs.directory import RunDirectory
 from shapespace.training.runs.sampling import DONE, KNOWN, columns
 
-ROOT = Path(__file__).resolve().parents[1]
-#: What the names of runs with the paper's modes end in: in the shell's norm, as sparse for all.
+#: Ending of the names of runs with the paper's modes, and their settings: the shell's norm, the same sparsity for all.
 SHELL, SHELL_MODES = "-shell", {"norm": "shell", "sparsity": 0.1, "log_steps": 16}
-#: The largest that 110 shapes give: as many modes and factors as the paper's bodies have.
+#: Run with the most modes that 110 shapes allow; the paper's bodies have as many modes and factors.
 LARGEST = "hippocampus-80"
-#: Collections of real meshes, in the order of the tables; then the hand without sparse modes, with one factor and with
-#: what the paper's outlook names, the dancer from few samples, the largest, and all with the paper's modes.
+#: Collections of real meshes, in the order of the tables. Contrasts are the hand without sparse modes, with one factor
+#: and with the variants of the paper's outlook, the dancer from few samples, the largest run, and runs with the paper's
+#: modes.
 COLLECTIONS = ("hand", "faces", "samba", "makehuman", "horse", "hippocampus")
 CONTRASTS = (
     *("hand-pga", "hand-one-factor", "hand-outlook", "samba-few", LARGEST),
@@ -40,35 +40,34 @@ CONTRASTS = (
 )
 #: The bundled collection of shapes; its other figures are on the page of the bundled models.
 MANNEQUIN = "figure"
-#: What the names of runs with mirror images end in, and the collections that have a symmetric shape.
+#: Ending of the names of runs with mirror images, and the collections with a symmetric shape.
 MIRRORED = "-mirrored"
 SYMMETRIC = ("faces", "makehuman", MANNEQUIN)
 #: Runs whose extrapolation is measured: an easy and a difficult one.
 EXTRAPOLATED = ("hand", "samba")
 #: Studies, each with the last stage whose results it measures.
 STUDIES = {"space": "samples", "limits": "evaluation"}
-#: What was measured, a file for each run.
+#: Stored figures, one file for each run.
 FIGURES = ROOT / "runs" / "results"
-DOCS = ROOT / "docs" / "measurements"
 
 
 def measured(run: RunDirectory, name: str) -> dict[str, Any]:
-    """What a study found on a run as it is now, or nothing: figures of other settings, data or versions don't count."""
+    """Return the figures of a study on the current state of a run; empty if settings, data or version have changed."""
     found, stamp = run.study(name).read_if_written(), run.stamp(STUDIES[name]).read_if_written()
     return found if found.get("key", "") == stamp.get("key") else {}
 
 
 def have(run: RunDirectory, name: str, measure: Callable[[], dict[str, Any]]) -> None:
-    """Measure where there is nothing yet."""
+    """Measure a study if it has no current figures."""
     if not measured(run, name):
         print(f"{name} …")
         run.study(name).write({"key": run.stamp(STUDIES[name]).read()["key"], **measure()})
 
 
 def open_run(name: str, data: Path, out: Path) -> Run:
-    """The run of a collection or the figure, without mirror images of its shapes unless the name ends in ``MIRRORED``.
+    """Return the run of a collection or of the figure; mirror images are used only if the name ends in ``MIRRORED``.
 
-    Where it ends in ``SHELL``, with these modes, and without the paper's system and the grid.
+    A name that ends in ``SHELL`` gets the paper's modes, without the paper's system and the grid.
     """
     plain = name.removesuffix(MIRRORED).removesuffix(SHELL)
     path = ROOT / "examples" / (f"{plain}.toml" if plain == MANNEQUIN else f"collections/{plain}.toml")
@@ -85,7 +84,7 @@ def open_run(name: str, data: Path, out: Path) -> Run:
 
 
 def figures(name: str, run: Run) -> dict[str, Any]:
-    """Do what is missing of a run, and return everything that was measured on it."""
+    """Finish a run, and return all its figures."""
     execute(run, "evaluation" if name in CONTRASTS else None, keep_going=True)
     studies.add(run, studies.Studies.listed(name))
     directory = run.directory
@@ -118,7 +117,7 @@ def figures(name: str, run: Run) -> dict[str, Any]:
 
 
 def drawn(run: RunDirectory, factors: int) -> dict[str, Any]:
-    """Exponentials: ``joint`` and ``of factors``, how many of these ``failed``, and the counts of ``each factor``."""
+    """Count exponentials: ``joint``, ``of factors``, the ``failed`` of both, and the counts of ``each factor``."""
 
     def statuses(folder: Path) -> list[str]:
         return list(columns(folder, "status").get("status", ()))
@@ -134,45 +133,45 @@ def drawn(run: RunDirectory, factors: int) -> dict[str, Any]:
 
 
 def seconds(run: RunDirectory) -> dict[str, float]:
-    """That stages took in all calls that finished them: a later one goes on from what is there."""
+    """Return the seconds of each stage, summed over all calls, since a later call continues an earlier one."""
     ends = [line for line in run.events() if line["event"] == "end"]
     return {stage: sum(e["seconds"] for e in ends if e["stage"] == stage) for stage in {e["stage"] for e in ends}}
 
 
 def spread(row: dict[str, Any], model: str) -> tuple[float, float, float]:
-    """R² of a model over the seeds: mean, smallest, largest."""
+    """Return R² of a model over the seeds: mean, smallest, largest."""
     found = row["evaluation"]
     values = [r2[model]["total"] for r2 in (found["r2"], *(seed["r2"] for seed in found["seeds"]))]
     return sum(values) / len(values), min(values), max(values)
 
 
 def leading(found: dict[str, Any]) -> str:
-    """Cells of composite, one factor and kernel, the largest R² bold."""
+    """Return cells of composite, one factor and kernel, with the largest R² in bold."""
     cells = [f"{found['r2'][model]['total']:.4f}" for model in ("composite", "monolithic", "kernel")]
     return " | ".join(f"**{cell}**" if cell == max(cells) else cell for cell in cells)
 
 
 def joint_exponentials(row: dict[str, Any]) -> list[int]:
-    """How many joint exponentials a model has seen: from all samples, then from each share of them."""
+    """Return the number of joint exponentials that a model has seen: from all samples, then from each share of them."""
     every = row["drawn"]["joint"] - row["drawn"]["failed"]["joint"] - row["evaluation"]["test_samples"]
-    # The composite from a share has each joint code's part in each factor too.
+    # A composite from a share also learns from each joint code's part in each factor.
     shares = [some["exponentials"]["composite"] for some in row["evaluation"]["fractions"]]
     return [every, *(count // (1 + len(row["sizes"])) for count in shares)]
 
 
 def sampling(row: dict[str, Any]) -> float:
-    """What all samples of a run took, in exponentials: a code with its derivatives as many as take as long."""
+    """Return the cost of all samples of a run, in exponentials, including derivatives."""
     return float(row["drawn"]["joint"] + row["drawn"]["of factors"] + worth(row))
 
 
 def worth(row: dict[str, Any]) -> float:
-    """How many exponentials take as long as the derivatives of a run."""
+    """Return the cost of the derivatives of a run, in exponentials."""
     times = row["evaluation"]["times"]
     return float(times["exact, with derivatives"] / times["exact"] * row["evaluation"]["derivatives"])
 
 
 def plot_samples(rows: dict[str, dict[str, Any]], path: Path) -> None:
-    """R² by the exponentials that a model has seen, those of factors and the worth of derivatives included."""
+    """Plot R² by the number of exponentials that a model has seen, including factor samples and derivatives."""
     figure, axes = plt.subplots(
         1, len(rows), figsize=(1.6 + 2.2 * len(rows), 2.9), sharey=True, layout="constrained", squeeze=False
     )
@@ -200,7 +199,7 @@ def plot_samples(rows: dict[str, dict[str, Any]], path: Path) -> None:
 
 
 def write_page() -> None:
-    """From all figures that are there."""
+    """Write the page from all stored figures."""
     rows = {
         name: json.loads(file.read_text())
         for name in (*COLLECTIONS, *CONTRASTS)
@@ -210,14 +209,9 @@ def write_page() -> None:
         row["evaluation"] = studies.EMPTY | row["evaluation"]
     real = {name: rows[name] for name in COLLECTIONS if name in rows}
     if some := {name: row for name, row in real.items() if row["evaluation"]["fractions"]}:
-        plot_samples(some, DOCS / "results-samples.png")
-    environment = jinja2.Environment(  # noqa: S701 - Markdown
-        loader=jinja2.FileSystemLoader(Path(__file__).parent),
-        trim_blocks=True,
-        lstrip_blocks=True,
-        undefined=jinja2.StrictUndefined,
-    )
-    page = environment.get_template("results.md.jinja").render(
+        plot_samples(some, pages.MEASUREMENTS / "results-samples.png")
+    page = pages.render(
+        "results",
         rows=rows,
         real=real,
         shell={name: rows[name + SHELL] for name in COLLECTIONS if name + SHELL in rows},
@@ -229,11 +223,11 @@ def write_page() -> None:
         joint=joint_exponentials,
         sampling=sampling,
     )
-    (DOCS / "results.md").write_text(page, encoding="utf-8")
+    pages.write("results", page)
 
 
 def main() -> None:
-    """Measure what is missing, and write the page after each run."""
+    """Measure missing runs, and write the page after each."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--data", type=Path, required=True, help="folder of the collections, each NAME/fine.npz")
     parser.add_argument("--out", type=Path, default=ROOT / "build" / "results", help="folder of the runs")

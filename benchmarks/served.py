@@ -1,9 +1,9 @@
-"""docs/measurements/served.md: how near served models come to unseen shapes, beside principal components.
+"""docs/measurements/served.md: distance of served models from unseen shapes, next to principal components.
 
-``python -m benchmarks.served --data FOLDER`` trains a model on four fifths of each collection, exports it, and has its
-``encode`` find the codes of the other fifth and of the shapes that it was trained on; then a model without the next
-fifth, until each was held out once, or as many as ``--folds`` says. What is done is kept under ``--out``: a killed call
-goes on. ``python -m benchmarks.fit --data OUT/models`` fits scans of the first fifth.
+``python -m benchmarks.served --data FOLDER`` trains a model on four fifths of each collection and exports it. Its
+``encode`` then finds the codes of the other fifth and of the training shapes. Then follows a model without the next
+fifth, until each fifth was held out once, or ``--folds`` of them. Results are kept under ``--out``, so a killed call
+can be continued. ``python -m benchmarks.fit --data OUT/models`` fits scans of the first fifth.
 """
 
 from __future__ import annotations
@@ -16,9 +16,10 @@ from typing import Any
 import numpy as np
 import tomlkit
 
+from benchmarks import pages
 from benchmarks.generalisation import ROWS, beside_images, title
-from benchmarks.markdown import table
-from benchmarks.results import MIRRORED, ROOT, open_run
+from benchmarks.pages import ROOT, table
+from benchmarks.results import MIRRORED, open_run
 from shapespace.arrays import FloatArray
 from shapespace.mesh.triangle_mesh import TriangleMesh, diagonal
 from shapespace.model.shape_model import ShapeModel, load
@@ -36,16 +37,16 @@ from shapespace.training.space.generalisation import (
 )
 from shapespace.training.space.stages import read_meshes
 
-#: Most exponentials to learn from: joint, and of each factor.
+#: Largest number of exponentials to learn from: joint, and of each factor.
 JOINT, OF_FACTORS = 1000, 300
 COLUMNS = ("unseen", "trained on")
-#: Of the shapes that a model was trained on: by one that remembers nothing of them.
-ALONE = "nothing remembered"
-#: What the names of runs with half as many modes end in.
+#: Key of the figures of a model without stored training shapes.
+WITHOUT_EXAMPLES = "nothing remembered"
+#: Ending of the names of runs with half as many modes.
 HALF = "-half"
 #: Models, in the order of the rows.
 NAMES = tuple(each + ending for each in ROWS for ending in ("", HALF))
-#: What was measured, a file for each row; a fold that is there is not measured again.
+#: Stored figures, one file for each row; a stored fold is not measured again.
 FIGURES = ROOT / "runs" / "collections"
 
 PAGE = """# Served models and shapes that they have not seen
@@ -94,9 +95,9 @@ the model that remembers nothing.
 
 
 def four_fifths(name: str, data: Path, out: Path, fold: int = 0) -> tuple[Run, FloatArray, FloatArray]:
-    """The run of a collection without one of its folds, the fine meshes (n, V, 3) that it knows, and the others.
+    """Return the run of a collection without one fold, its fine training meshes (n, V, 3), and the held-out meshes.
 
-    With half as many modes where the name ends in ``HALF``, and mirror images where ``MIRRORED`` stands before.
+    A name that ends in ``HALF`` gets half as many modes; ``MIRRORED`` before that adds mirror images.
     """
     example = open_run(name.removesuffix(HALF), data, out)
     meshes = read_meshes(example.config)
@@ -125,21 +126,21 @@ def four_fifths(name: str, data: Path, out: Path, fold: int = 0) -> tuple[Run, F
 
 
 def encoded(model: ShapeModel, shapes: FloatArray) -> FloatArray:
-    """(n, V) distances of vertices from shapes (n, V, 3) in correspondence, as shares of the diagonal."""
+    """Return vertex distances (n, V) between shapes (n, V, 3) and their encoded shapes, as shares of the diagonal."""
     size = float(diagonal(model.vertices))
     return np.stack([model.encode(shape).distances for shape in shapes]) / size
 
 
-def forgetful(run: Run) -> ShapeModel:
-    """The model of a run without what its bundle remembers of the training shapes."""
+def without_examples(run: Run) -> ShapeModel:
+    """Return the model of a run without the stored training shapes of its bundle."""
     settings = run.config.export.model_copy(update={"examples": False})
     config = run.config.model_copy(update={"export": settings})
-    other = Run(run.directory.folder, config, run.source, run.models / ALONE)
+    other = Run(run.directory.folder, config, run.source, run.models / WITHOUT_EXAMPLES)
     return load(other.bundle if other.bundle.exists() else write_bundle_of(other, figures={}))
 
 
 def with_images(known: FloatArray, model: ShapeModel) -> PrincipalComponents:
-    """Components of shapes (n, V, 3) and their mirror images.
+    """Return components of shapes (n, V, 3) and their mirror images.
 
     Raises:
         ValueError: none of the shapes is symmetric.
@@ -151,18 +152,18 @@ def with_images(known: FloatArray, model: ShapeModel) -> PrincipalComponents:
 
 
 def measure(name: str, data: Path, out: Path, fold: int) -> dict[str, Any]:
-    """Train without a fold, and measure what is trained; more of the first fold."""
+    """Train without a fold, and measure the model; the first fold has further figures."""
     run, known, unseen = four_fifths(name, data, out, fold)
     execute(run, "samples", keep_going=True)
     model = load(run.bundle if run.bundle.exists() else write_bundle_of(run, figures={}))
     m, size = model.dimension, float(diagonal(model.vertices))
-    linear, without = PrincipalComponents.of(known, model.vertices), forgetful(run)
+    linear, without = PrincipalComponents.of(known, model.vertices), without_examples(run)
     found: dict[str, Any] = {"modes": m}
     for kind, shapes in zip(COLUMNS, (unseen, known), strict=True):
         others = vertex_distances(linear.nearest(shapes, m), shapes, size)
         found[kind] = summary(encoded(model, shapes)) | {
             "components": summary(others),
-            ALONE: summary(encoded(without, shapes)),
+            WITHOUT_EXAMPLES: summary(encoded(without, shapes)),
             "shapes": len(shapes),
         }
     if fold:
@@ -177,14 +178,14 @@ def measure(name: str, data: Path, out: Path, fold: int) -> dict[str, Any]:
 
 
 def average(folds: list[dict[str, Any]], some: list[dict[str, float]], key: str = "mean") -> str:
-    """Of summaries, one for each fold, over all shapes; nothing of a model that was not measured."""
+    """Return a cell with the mean over all shapes of summaries, one for each fold; empty if not measured."""
     if key not in some[0]:
         return ""
     return f"{100 * np.average([each[key] for each in some], weights=[fold['shapes'] for fold in folds]):.3f}"
 
 
 def ratios(folds: list[dict[str, Any]], some: list[dict[str, float]]) -> list[str]:
-    """Cells of the ratio of means to components', and of the folds' least and greatest."""
+    """Return cells: the ratio of means to the components' means, and the folds' smallest and largest ratio."""
     if "mean" not in some[0]:
         return ["", ""]
     found = np.array([(each["mean"], fold["components"]["mean"]) for each, fold in zip(some, folds, strict=True)])
@@ -194,14 +195,14 @@ def ratios(folds: list[dict[str, Any]], some: list[dict[str, float]]) -> list[st
 
 
 def compared(folds: list[dict[str, Any]]) -> list[str]:
-    """Cells of a kind of shapes: model, components, and the model that remembers nothing."""
-    components, alone = ([fold[key] for fold in folds] for key in ("components", ALONE))
+    """Return the cells of a kind of shapes: model, components, and the model without examples."""
+    components, alone = ([fold[key] for fold in folds] for key in ("components", WITHOUT_EXAMPLES))
     means = [average(folds, some, key) for some in (folds, components) for key in ("mean", "p95")]
     return [*means, *ratios(folds, folds), average(folds, alone), *ratios(folds, alone)]
 
 
 def main() -> None:
-    """Measure and write."""
+    """Measure and write the page."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--data", type=Path, required=True, help="folder of the collections")
     parser.add_argument("--out", type=Path, default=ROOT / "build" / "served")
@@ -221,7 +222,7 @@ def main() -> None:
 
 
 def write_page() -> None:
-    """The page of all that was measured."""
+    """Write the page from all stored figures."""
     files = {name: FIGURES / f"{name}.json" for name in NAMES}
     rows = {name: json.loads(file.read_text()) for name, file in files.items() if file.exists()}
     tables: dict[str, list[list[str]]] = {"unseen": [], "known": [], "first": []}
@@ -232,9 +233,9 @@ def write_page() -> None:
         tables["unseen"].append([*start, str(len(found)), *compared(unseen)])
         tables["known"].append([*start, *compared(known)])
         specificity = [f"{100 * figure:.2f}" for figure in found[0]["specificity"]]
-        images = beside_images(unseen[0][ALONE], found[0].get("mirrored_components"))
+        images = beside_images(unseen[0][WITHOUT_EXAMPLES], found[0].get("mirrored_components"))
         tables["first"].append([*start, *specificity, *images])
-    columns = ("95 %", "components", "95 %", "ratio", "of folds", ALONE, "ratio", "of folds")
+    columns = ("95 %", "components", "95 %", "ratio", "of folds", WITHOUT_EXAMPLES, "ratio", "of folds")
     page = PAGE.format(
         joint=JOINT,
         factors=OF_FACTORS,
@@ -243,7 +244,7 @@ def write_page() -> None:
         known=table(("", "m", "trained on", *columns), tables["known"]),
         first=table(("", "m", "specificity", "components", "unseen: components with images", "ratio"), tables["first"]),
     )
-    (ROOT / "docs" / "measurements" / "served.md").write_text(page, encoding="utf-8")
+    pages.write("served", page)
 
 
 if __name__ == "__main__":

@@ -1,9 +1,9 @@
-"""Time exponentials, geodesics and reconstructions on capsules of several sizes: ``python -m benchmarks.shell --help``.
+"""Times of exponentials, geodesics and reconstructions on capsules of several sizes: ``python -m benchmarks.shell``.
 
-Capsules of radius 1 and length 2, closed, of genus 0, in units of their own; bent by 75° in all; η = 4e-4 at unit
-area; one thread. Each time stands beside a multiple of one SuperLU factorisation (symmetric mode) of ``JᵀJ`` of the
-same mesh, timed in turn with it, because machines and their load differ. Residuals are measured afterwards, with a
-factor made afresh for every step. Symbolic analysis is done once a collection and is not counted; it has a column.
+The capsules have radius 1 and length 2, are closed, of genus 0, and are bent by 75° in all; η = 4e-4 at unit area; one
+thread. Each time stands next to a multiple of one SuperLU factorisation (symmetric mode) of ``JᵀJ`` of the same mesh,
+timed in turn with it, because machines and their load differ. Residuals are measured afterwards, with a new factor for
+every step. Symbolic analysis is done once a collection; it has its own column.
 """
 
 from __future__ import annotations
@@ -32,10 +32,10 @@ MATERIAL = Material(eta=4e-4)
 
 
 def even_capsule(count: int, radius: float = 1.0, length: float = 2.0) -> TriangleMesh:
-    """A capsule with exactly this many vertices, evenly spread, axis along x; that of `synthetic` has slivers.
+    """Return a capsule with exactly ``count`` evenly spread vertices, axis along x. `synthetic` makes uneven capsules.
 
-    Points at the golden angle and equal steps along the axis are of equal area (Archimedes). A conformal map takes
-    the capsule to the sphere, where the convex hull is the Delaunay triangulation.
+    Points at the golden angle and equal steps along the axis have equal area (Archimedes). A conformal map takes the
+    capsule to the sphere, where the convex hull is the Delaunay triangulation.
     """
     end = length / 2
     x = ((np.arange(count) + 0.5) / count - 0.5) * (length + 2 * radius)
@@ -52,7 +52,7 @@ def even_capsule(count: int, radius: float = 1.0, length: float = 2.0) -> Triang
 
 
 def timed(task: Callable[[], object], yardstick: Callable[[], object], repeats: int) -> tuple[float, float, float]:
-    """Medians of the task's seconds, of its processor seconds, and of their ratio to the yardstick's before it."""
+    """Return medians of the task's seconds, of its processor seconds, and of their ratio to the yardstick's."""
     task()
     measured = [(clock(yardstick), clock(task)) for _ in range(repeats)]
     wall = [own[0] for _, own in measured]
@@ -62,14 +62,14 @@ def timed(task: Callable[[], object], yardstick: Callable[[], object], repeats: 
 
 
 def clock(task: Callable[[], object]) -> tuple[float, float]:
-    """Seconds on the wall and of the processor, which a second process on the machine disturbs less."""
+    """Return wall seconds and processor seconds; another process on the machine disturbs the latter less."""
     wall, cpu = time.perf_counter(), time.process_time()
     task()
     return time.perf_counter() - wall, time.process_time() - cpu
 
 
 def largest_residual(space: ShellSpace, path: DiscretePath) -> float:
-    """``sqrt(F_kᵀ A_k⁻¹ F_k)``, with A_k of that very shape."""
+    """Return the largest ``sqrt(F_kᵀ A_k⁻¹ F_k)``, with A_k of each shape itself."""
     points = [space.point(x) for x in path.vertices]
     worst, triples = 0.0, zip(points, points[1:], points[2:], strict=False)
     for before, here, after in triples:
@@ -94,11 +94,11 @@ class Case:
         self.superlu = superlu(jacobian.T @ jacobian)
 
     def shoot(self, steps: int) -> DiscretePath:
-        """The exponential."""
+        """Return the exponential."""
         return exponential(self.space, self.mesh.vertices, self.velocity, steps)
 
     def connect(self, steps: int) -> DiscretePath:
-        """The geodesic."""
+        """Return the geodesic."""
         return geodesic(self.space, self.mesh.vertices, self.end, steps)
 
     def report(self, name: str, find: Callable[[], DiscretePath], repeats: int) -> None:
@@ -111,7 +111,7 @@ class Case:
 
 
 def row(name: str, case: Case, task: Callable[[], object], repeats: int) -> str:
-    """The timed columns."""
+    """Return the timed columns of a row."""
     wall, cpu, ratio = timed(task, case.superlu, repeats)
     return f"| {name} | {len(case.mesh.vertices)} | {wall:.3f} | {cpu:.3f} | {ratio:.2f} |"
 
@@ -124,7 +124,7 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=7)
     options = parser.parse_args()
     with threadpool_limits(1):
-        ShellSpace(even_capsule(100)).factorisations(1)  # loads the solver's library
+        ShellSpace(even_capsule(100)).factorisations(1)  # load the solver's library
         print("| | V | seconds | processor | × SuperLU | iterations | residual |")
         print("|---|---|---|---|---|---|---|")
         cases = [Case(count) for count in options.sizes]

@@ -1,7 +1,7 @@
-"""How much of a collection a space explains, by the number of modes: compactness (Davies et al. 2002).
+"""Share of a collection that a space explains, by the number of modes: compactness (Davies et al. 2002).
 
-Beside principal component analysis of the aligned vertices, which is what a user would otherwise take. Generalisation
-is `benchmarks.generalisation`, specificity is in `benchmarks.served`.
+Principal component analysis of the aligned vertices, the usual alternative, stands next to it. Generalisation is in
+`benchmarks.generalisation`, specificity in `benchmarks.served`.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from shapespace.training.space.stages import material
 
 
 def measure(run: RunDirectory, config: Config) -> dict[str, Any]:
-    """Of a run whose modes are found, with half of them and with all."""
+    """Measure a run whose modes are found, with half of the modes and with all."""
     shapes, reference, mean = run.own_shapes(), run.reference_mesh(), run.mean.read()["vertices"]
     found = run.modes_by_strength.read()
     sparse, principal = found["vertices"], found["pga_vertices"]

@@ -1,7 +1,7 @@
-"""docs/measurements/growth.md: processor seconds and memory of every stage of training, by the size of the collection.
+"""docs/measurements/growth.md: processor seconds and memory of every training stage, by the size of the collection.
 
-``python -m benchmarks.stages`` runs the real command, stage after stage, on capsules that bend and bulge, with one size
-changed at a time. What is done is kept under ``--out``.
+``python -m benchmarks.stages`` runs the real command, stage after stage, on capsules that bend and bulge, with one
+size changed at a time. Results are kept under ``--out``.
 """
 
 from __future__ import annotations
@@ -20,7 +20,8 @@ import numpy as np
 import trimesh
 from threadpoolctl import threadpool_limits
 
-from benchmarks.markdown import table
+from benchmarks import pages
+from benchmarks.pages import ROOT, table
 from shapespace.arrays import FloatArray
 from shapespace.bundle.reader import read_bundle
 from shapespace.model.decoder import MeshChoice
@@ -28,8 +29,7 @@ from shapespace.model.latent_space import Distribution
 from shapespace.model.shape_model import ShapeModel
 from shapespace.training.runs.stages import STAGES
 
-ROOT = Path(__file__).resolve().parents[1]
-#: How many joint exponentials, and of each factor (the time is proportional to them), and codes for each median.
+#: Number of joint exponentials and of exponentials of each factor, which determine the time; codes for each median.
 JOINT, OF_FACTORS, CODES = 100, 50, 30
 
 PAGE = """# How training grows
@@ -48,7 +48,7 @@ Measured on {day:%Y-%m-%d}; training may have changed since.
 
 @dataclass(frozen=True)
 class Size:
-    """Of a collection and its model."""
+    """Size of a collection and of its model."""
 
     fine: int = 10_000
     shapes: int = 20
@@ -68,7 +68,7 @@ SIZES = [
 
 
 def collection(size: Size) -> tuple[FloatArray, FloatArray]:
-    """Vertices (n, V, 3) and faces of random smooth deformations of a capsule."""
+    """Return vertices (n, V, 3) and faces of random smooth deformations of a capsule."""
     count = round(np.sqrt(size.fine))
     mesh = trimesh.creation.capsule(height=3, radius=0.5, count=[count, count])
     rng, x = np.random.default_rng(0), np.asarray(mesh.vertices)
@@ -81,7 +81,7 @@ def collection(size: Size) -> tuple[FloatArray, FloatArray]:
 
 
 def config(size: Size, data: Path) -> str:
-    """Of a run."""
+    """Return the configuration of a run."""
     return f"""
 [collection]
 data = "{data}"
@@ -103,7 +103,7 @@ licence = "MIT"
 
 
 def measure(size: Size, folder: Path) -> dict[str, tuple[float, float]]:
-    """Of each stage processor seconds, workers included, and MB of the largest process."""
+    """Return for each stage processor seconds, including workers, and MB of the largest process."""
     folder.mkdir(parents=True, exist_ok=True)
     data, file = folder / "data.npz", folder / "config.toml"
     vertices, faces = collection(size)
@@ -123,14 +123,14 @@ def measure(size: Size, folder: Path) -> dict[str, tuple[float, float]]:
         return used.ru_utime + used.ru_stime, used.ru_maxrss / 1024
 
     found = {stage: until(stage) for stage in STAGES}
-    # A call that finds everything done: what starting costs, and reading what the files are.
+    # A call with nothing to do takes the time of starting and of reading the files.
     start = until("ingest")[0]
     data.unlink()
     return {stage: (max(seconds - start, 0.0), most) for stage, (seconds, most) in found.items()}
 
 
 def serving(folder: Path) -> tuple[float, float]:
-    """Processor ms of a coarse shape of the bundle in a folder, and of what the fine mesh adds."""
+    """Return processor ms of a coarse shape of the bundle in a folder, and the further ms of its fine mesh."""
     model = ShapeModel(read_bundle(next(folder.glob("capsules/*"))))
     times: dict[MeshChoice, list[float]] = {choice: [] for choice in MeshChoice}
     for code in model.latents.sample(CODES + 3, 0, Distribution.UNIFORM):
@@ -143,7 +143,7 @@ def serving(folder: Path) -> tuple[float, float]:
 
 
 def main() -> None:
-    """Measure and write."""
+    """Measure and write the page."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--out", type=Path, default=ROOT / "build" / "stages")
     given = parser.parse_args()
@@ -166,7 +166,7 @@ def main() -> None:
         rows.append([*map(str, asdict(size).values()), *seconds, *(f"{mb:.0f}" for mb in memory)])
         rows[-1] += [f"{ms:.1f}" for ms in kept["serving"]]
     text = PAGE.format(joint=JOINT, factors=OF_FACTORS, codes=CODES, day=datetime.now(UTC)) + table(head, rows) + "\n"
-    (ROOT / "docs" / "measurements" / "growth.md").write_text(text, encoding="utf-8")
+    pages.write("growth", text)
 
 
 if __name__ == "__main__":

@@ -23,7 +23,7 @@ from shapespace.arrays import IntArray
 from shapespace.coordinates.integrability import Integrability
 from shapespace.coordinates.nric import nric
 from shapespace.training.learning.composite import Composite, affine_sum
-from shapespace.training.learning.evaluation import Split, size_bytes
+from shapespace.training.learning.evaluation import HeldOutSamples, size_bytes
 from shapespace.training.learning.learner import Learner
 from shapespace.training.pipeline import Run, learner_of
 from shapespace.training.report.page import write_report
@@ -111,7 +111,7 @@ def variants(learner: Learner, some: dict[str, Variant]) -> dict[str, Any]:
         ``variants``: title, R², bytes and ``closing`` of each. ``closing`` is the root mean square, in radians, by
         which the faces around a vertex fail to close. ``validation``: the same figures of the main recipe.
     """
-    validation, composite = Split.of(learner, "validation"), learner.main()
+    validation, composite = HeldOutSamples.of(learner, "validation"), learner.main()
     reference = learner.collection.reference
     conditions = Integrability(reference.connectivity)
 
@@ -138,7 +138,7 @@ def variants(learner: Learner, some: dict[str, Variant]) -> dict[str, Any]:
 
 def fraction(learner: Learner, share: float) -> dict[str, Any]:
     """Measure networks that learn from a share of the training codes, on all test codes."""
-    test = Split.of(learner)
+    test = HeldOutSamples.of(learner)
     some, free = ShareLearner(learner, share), ShareLearner(learner, share, all_of_factors=True)
     result = {
         "fraction": share,
@@ -159,7 +159,7 @@ def fraction(learner: Learner, share: float) -> dict[str, Any]:
 def other_seed(learner: Learner, seed: int) -> dict[str, Any]:
     """Measure networks of another seed, on the test codes of that seed's split."""
     other = SeedLearner(learner, seed)
-    test = Split.of(other)
+    test = HeldOutSamples.of(other)
     r2 = {"composite": test.r2(other.main()), "monolithic": test.r2(other.monolithic())}
     r2["kernel"] = test.r2(other.kernel())
     learner.histories |= other.histories

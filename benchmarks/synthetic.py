@@ -1,4 +1,4 @@
-"""Bundles of any size for benchmarks: capsules that bulge, with linear networks written down by hand."""
+"""Bundles of any size for benchmarks: capsules that bulge, with linear networks written by hand."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ LATENTS_OF_A_FACTOR = 4
 
 
 def capsule(vertices: int) -> TriangleMesh:
-    """A capsule by meridians and circles of latitude, of about so many vertices and unit area."""
+    """Return a capsule of meridians and circles of latitude, with about ``vertices`` vertices and unit area."""
     count = round(np.sqrt(vertices))
     made = trimesh.creation.capsule(height=2, radius=1, count=[count, count])
     mesh = TriangleMesh.from_arrays(made.vertices, made.faces)
@@ -29,7 +29,7 @@ def capsule(vertices: int) -> TriangleMesh:
 
 
 def directions(mesh: TriangleMesh, count: int) -> FloatArray:
-    """(count, 2E): what each latent adds to lengths and angles, of smooth random deformations."""
+    """Return changes (count, 2E) of lengths and angles by each latent, from smooth random deformations."""
     rng, x = np.random.default_rng(0), mesh.vertices / mesh.diagonal
     rest = nric(mesh.vertices, mesh.connectivity)
     changes = []
@@ -54,7 +54,7 @@ def _network(nodes: list[onnx.NodeProto], weights: dict[str, FloatArray], row_in
 
 
 def write(models: Path, vertices: int, latents: int) -> Path:
-    """A bundle in ``models/``; returns its folder."""
+    """Write a bundle into ``models/``; return its folder."""
     mesh = capsule(vertices)
     name = f"capsule-{vertices}-{latents}"
     rest, changes = nric(mesh.vertices, mesh.connectivity), directions(mesh, latents)

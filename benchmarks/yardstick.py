@@ -1,4 +1,4 @@
-"""What times stand beside, because machines and their load differ."""
+"""A reference computation that makes times on different machines comparable."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from scipy.sparse.linalg import splu
 
 
 def superlu(matrix: sparse.sparray) -> Callable[[], object]:
-    """One symbolic and numeric factorisation by SuperLU, in symmetric mode, of a matrix JᵀWJ and a little of I."""
+    """Return a call that factorises JᵀWJ plus a small multiple of I by SuperLU, in symmetric mode."""
     matrix = sparse.csc_array(matrix)
     shift = 1e-9 * matrix.diagonal().mean()
     lifted = sparse.csc_array(matrix + shift * sparse.eye_array(matrix.shape[0]))

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from playwright.sync_api import Page, sync_playwright
 
-from benchmarks.serving import server
+from benchmarks.processes import server
 from tests.page.conftest import CHROMIUM, FLAGS
 
 DOCS = Path("docs")

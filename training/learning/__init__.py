@@ -1,5 +1,5 @@
-"""The networks: factors, the combiner with its kinds of correction, baselines; fitting, evaluation, export."""
+"""Networks of a run: factor networks, combiners, baselines; fitting, evaluation and export."""
 
 
 class ExportError(RuntimeError):
-    """The bundle would not compute what the networks compute, or could not be read."""
+    """The exported bundle differs from the networks in PyTorch, or cannot be read."""

@@ -22,35 +22,47 @@ from shapespace.training.runs.config import EvaluationSettings
 from shapespace.training.runs.latent_coordinates import Coordinates
 from shapespace.training.runs.sampling import Collection
 
-#: Candidates for the length of the kernel, in multiples of the root of the number of inputs, and for the penalty.
-LENGTHS = (0.5, 1.0, 2.0, 4.0, 8.0)
-PENALTIES = tuple(10.0**k for k in range(-11, -1))
-#: These are chosen by the errors of this many principal coefficients of the shapes.
-CHOSEN_BY = 128
-#: Fewest nodes of a grid along each coordinate: with two it would be linear.
+
+@dataclass(frozen=True)
+class KernelSearch:
+    """Candidates for kernel ridge regression, from which held-out codes choose.
+
+    Attributes:
+        lengths: lengths of the kernel, in multiples of the root of the number of inputs.
+        penalties: ridge penalties.
+        components: number of principal coefficients of the shapes whose error decides.
+    """
+
+    lengths: tuple[float, ...] = (0.5, 1.0, 2.0, 4.0, 8.0)
+    penalties: tuple[float, ...] = tuple(10.0**k for k in range(-11, -1))
+    components: int = 128
+
+
+SEARCH = KernelSearch()
+#: Fewest nodes of a grid along each coordinate: with two nodes it would be linear.
 FEWEST_NODES = 3
 
 
-class Exact(Protocol):
-    """Exact shapes of codes, which are saved under a name."""
+class ExactShapes(Protocol):
+    """Function that computes exact shapes of codes and saves them under a name."""
 
     def __call__(self, name: str, latents: FloatArray, collection: Collection | None = None) -> NDArray[np.float32]:
-        """NRIC (n, 2E) of codes (n, m), NaN for a code without a shape; of the run's collection unless one is given."""
+        """Return NRIC (n, 2E) of codes (n, m), NaN for a code without a shape; by default from the run's collection."""
         ...
 
 
 class LatentKernel(nn.Module):
-    """Kernel ridge regression of NRIC on codes, by the functions of `Centres`, in double precision: γ = 1 / (2 ℓ²).
+    """Kernel ridge regression of NRIC on codes, with the functions of `Centres`, in double precision: γ = 1 / (2 ℓ²).
 
-    The inputs x are bounded coordinates in [−1, 1], and cosine and sine of periodic ones. Length ℓ and penalty are
-    those that suit held-out codes best.
+    The inputs x are bounded coordinates in [−1, 1], and the cosine and sine of periodic coordinates. Held-out codes
+    choose the length ℓ and the penalty.
 
     Args:
-        coordinates: of the codes.
-        scaling: of the values.
-        own: codes (n, m) to fit to, and their NRIC (n, 2E).
-        held_out: pairs that choose length and penalty.
-        slopes: codes (k, m) and derivatives (k, m, 2E) there, to fit to as well, of coordinates without a period.
+        coordinates: bounds and periods of the codes.
+        scaling: scaling of the NRIC.
+        own: training codes (n, m) and their NRIC (n, 2E).
+        held_out: codes and NRIC that choose length and penalty.
+        slopes: codes (k, m) and derivatives (k, m, 2E) there, fitted as well; only for coordinates without a period.
     """
 
     anchors: Tensor
@@ -71,7 +83,7 @@ class LatentKernel(nn.Module):
         x, others = (self.features(codes).double() for codes, _ in (own, held_out))
         y, wanted = (scaling.down(z).double() for _, z in (own, held_out))
         mean = y.mean(dim=0)
-        axes = principal_axes(y - mean, by="rows")[1][:CHOSEN_BY]
+        axes = principal_axes(y - mean, by="rows")[1][: SEARCH.components]
 
         nodes, known = x[:0], None
         if slopes:
@@ -84,9 +96,9 @@ class LatentKernel(nn.Module):
             held_out = others, project(wanted - mean)
             return self._centres(x, nodes, length).fit((x, project(y - mean)), rows, held_out, penalties)
 
-        lengths = [times * self.features.size**0.5 for times in LENGTHS]
+        lengths = [times * self.features.size**0.5 for times in SEARCH.lengths]
         best, self.length = min(
-            ((solved(length, PENALTIES, lambda values: values @ axes.T), length) for length in lengths),
+            ((solved(length, SEARCH.penalties, lambda values: values @ axes.T), length) for length in lengths),
             key=lambda fit: fit[0].error,
         )
         self.register_buffer("anchors", x)
@@ -99,7 +111,7 @@ class LatentKernel(nn.Module):
         return Centres(anchors, nodes, torch.tensor(0.5 / length**2, dtype=anchors.dtype))
 
     def forward(self, codes: Tensor) -> Tensor:
-        """NRIC (n, 2E) of codes (n, m)."""
+        """Return NRIC (n, 2E) of codes (n, m)."""
         found = self._centres(self.anchors, self.nodes, self.length)(self.features(codes).double())
         return self.scaling.up((self.mean + found @ self.weights).float())
 
@@ -119,7 +131,7 @@ class MultilinearGrid:
     size: int
 
     def __call__(self, latents: FloatArray) -> FloatArray:
-        """NRIC (n, 2E) of the factor's part of codes (n, m)."""
+        """Return NRIC (n, 2E) of the factor's part of codes (n, m)."""
         result: FloatArray = self.interpolate(latents[:, self.factor])
         return result
 
@@ -130,9 +142,9 @@ class MultilinearGrid:
         """Evaluate the nodes exactly.
 
         Args:
-            coordinates: of all latents.
-            factor: indices of the factor's.
-            nodes: number along each of them; the end of a period is its beginning and does not count.
+            coordinates: bounds and periods of all latents.
+            factor: indices of the factor's latents.
+            nodes: number of nodes along each latent. The end of a period equals its beginning and does not count.
             shapes: exact NRIC (n, 2E) of codes (n, m).
         """
         own = coordinates[factor]
@@ -143,17 +155,17 @@ class MultilinearGrid:
         latents[:, factor] = np.stack(at_nodes, axis=-1).reshape(-1, len(factor))
         values = shapes(latents).reshape(*[nodes] * len(factor), -1)
         closed = np.pad(values, [*((0, end) for end in ends), (0, 0)], mode="wrap")
-        # Rounding may move a code to just outside of the grid.
+        # Rounding may move a code slightly outside of the grid.
         return cls(factor, RegularGridInterpolator(axes, closed, bounds_error=False, fill_value=None), values.nbytes)
 
 
 def grid_nodes(dimension: int, settings: EvaluationSettings) -> int:
-    """Nodes along each coordinate of a factor's grid; where these are less than FEWEST_NODES there is none."""
+    """Return the number of nodes along each coordinate of a factor's grid; below `FEWEST_NODES` there is no grid."""
     return min(settings.grid_nodes, int(settings.grid_size ** (1 / dimension) + 1e-9))
 
 
-def factor_grids(collection: Collection, settings: EvaluationSettings, exact: Exact) -> list[MultilinearGrid]:
-    """A grid for each factor; none at all where one of them would be too coarse."""
+def factor_grids(collection: Collection, settings: EvaluationSettings, exact: ExactShapes) -> list[MultilinearGrid]:
+    """Return a grid for each factor, or an empty list if the grid of one factor would be too coarse."""
     factors = list(collection.factors.values())
     nodes = [grid_nodes(len(index), settings) for index in factors]
     if min(nodes) < FEWEST_NODES:

@@ -14,11 +14,11 @@ from shapespace.training.learning.networks import FactorNetwork, ShapeNetwork
 
 @dataclass(frozen=True)
 class Composite:
-    """``Φ = Ψ ∘ (ψ_1, …, ψ_J)``.
+    """Factor networks ψ_j and the combiner Ψ, which maps their outputs to the joint shape.
 
     Attributes:
         factors: latent indices of each factor.
-        networks: the ψ_j.
+        networks: the factor networks ψ_j.
         combiner: Ψ.
     """
 
@@ -28,24 +28,24 @@ class Composite:
 
     @property
     def parts(self) -> list[ShapeNetwork]:
-        """All its networks."""
+        """All networks, the combiner last."""
         return [*self.networks, self.combiner]
 
     def __call__(self, latents: Tensor) -> Tensor:
-        """NRIC (n, 2E) of codes (n, m)."""
+        """Return NRIC (n, 2E) of codes (n, m)."""
         result: Tensor = self.combiner(self.factor_shapes(latents))
         return result
 
     def factor_shapes(self, latents: Tensor) -> Tensor:
-        """(n, J, 2E) outputs of the ψ_j."""
+        """Return the outputs (n, J, 2E) of the factor networks for codes (n, m)."""
         return factor_shapes(self.networks, self.factors, latents)
 
 
 def factor_shapes(networks: list[FactorNetwork], factors: list[list[int]], latents: Tensor) -> Tensor:
-    """(n, J, 2E) NRIC of each factor's network, of its part of codes (n, m)."""
+    """Return NRIC (n, J, 2E) of each factor's network for its part of codes (n, m)."""
     return torch.stack([network(latents[:, index]) for network, index in zip(networks, factors, strict=True)], dim=1)
 
 
 def affine_sum(reference: NDArray, factors: NDArray) -> NDArray:
-    """``z̄ + Σ_j (x_j − z̄)`` for factor shapes (n, J, 2E): the direct sum of the paper's condition (2)."""
+    """Return ``z̄ + Σ_j (x_j − z̄)`` for factor shapes (n, J, 2E), the direct sum of the paper's condition (2)."""
     return reference + (factors - reference).sum(axis=1)

@@ -1,4 +1,4 @@
-"""The numbers of the paper's table for one run: R² of every model, vertex error, sizes and times."""
+"""Figures of the paper's table for one run: R² of every model, vertex error, sizes and times."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from shapespace.coordinates.nric import WeightedNorm, nric
 from shapespace.coordinates.reconstruction import Reconstructor
 from shapespace.mesh.rigid_motion import align
 from shapespace.mesh.triangle_mesh import TriangleMesh
-from shapespace.training.learning.baselines import Exact, factor_grids
+from shapespace.training.learning.baselines import ExactShapes, factor_grids
 from shapespace.training.learning.composite import Composite, affine_sum
 from shapespace.training.learning.gallery import extremes, strip
 from shapespace.training.learning.layers import narrowest
@@ -31,7 +31,10 @@ from shapespace.training.runs.sampling import Collection
 
 
 def r_squared(predicted: NDArray, exact: NDArray, norm: WeightedNorm) -> dict[str, float]:
-    """``1 − Σ‖z̃_i − z_i‖² / Σ‖z_i − mean‖²`` of both halves and of each (paper, section 4; mean over these samples)."""
+    """Return ``1 − Σ‖z̃_i − z_i‖² / Σ‖z_i − mean‖²`` in total, of lengths and of angles (paper, section 4).
+
+    The mean is over these samples.
+    """
     half = exact.shape[1] // 2
     exact = exact.astype(np.float64)
     error, spread = (predicted - exact) ** 2, (exact - exact.mean(axis=0)) ** 2
@@ -47,19 +50,19 @@ def r_squared(predicted: NDArray, exact: NDArray, norm: WeightedNorm) -> dict[st
     }
 
 
-#: A map from codes (n, m) to NRIC (n, 2E), or to those of the factors (n, J, 2E).
+#: Map from codes (n, m) to NRIC of joint shapes (n, 2E), or of factor shapes (n, J, 2E).
 Model = Callable[[torch.Tensor], torch.Tensor]
 
 
 @dataclass(frozen=True)
 class Reconstructions:
-    """Shapes reconstructed from predicted lengths and angles, beside the exact ones.
+    """Shapes reconstructed from predicted lengths and angles, compared with the exact shapes.
 
     Attributes:
-        vertices: (n, V, 3), aligned to the exact ones.
-        errors: (n, V) distances, as fractions of the reference's bounding-box diagonal.
-        iterations: (n,) of Gauss–Newton from the reference.
-        statuses: (n,) of the same.
+        vertices: (n, V, 3) reconstructed vertices, aligned to the exact shapes.
+        errors: (n, V) vertex distances, as fractions of the reference's bounding-box diagonal.
+        iterations: (n,) Gauss–Newton iterations from the reference.
+        statuses: (n,) final status of each reconstruction.
     """
 
     vertices: FloatArray
@@ -78,7 +81,7 @@ class Reconstructions:
         return cls(vertices, errors, [f.iterations for f in found], [str(f.status) for f in found])
 
     def figures(self) -> dict[str, Any]:
-        """``mean`` and ``max`` error, mean ``iterations``, and the number of times of each ``status``."""
+        """Return ``mean`` and ``max`` error, mean ``iterations``, and the count of each ``status``."""
         return {
             "mean": float(self.errors.mean()),
             "max": float(self.errors.max()),
@@ -88,15 +91,15 @@ class Reconstructions:
 
 
 @dataclass(frozen=True)
-class Split:
-    """Joint samples that nothing is fitted to: the validation codes, or the test codes, which are read only here.
+class HeldOutSamples:
+    """Joint samples that no network is fitted to: the validation codes, or the test codes, which only evaluation reads.
 
     Attributes:
-        rows: (n,) of the joint samples.
+        rows: (n,) rows of the joint samples.
         latents: (n, m) codes.
         z: (n, 2E) exact NRIC.
-        vertices: (n, V, 3) exact ones.
-        norm: of differences of NRIC.
+        vertices: (n, V, 3) exact vertices.
+        norm: norm of NRIC differences.
     """
 
     rows: IntArray
@@ -106,32 +109,32 @@ class Split:
     norm: WeightedNorm
 
     @classmethod
-    def of(cls, learner: Learner, name: str = "test") -> Split:
-        """That of this seed, by its name."""
+    def of(cls, learner: Learner, name: str = "test") -> HeldOutSamples:
+        """Return the samples of a part of a learner's split, by its name."""
         rows, joint = learner.split[name], learner.joint
         norm = WeightedNorm.of(learner.collection.reference, learner.config.evaluation.eta)
         return cls(rows, joint.latents[rows], joint.nric[rows], joint.vertices[rows], norm)
 
     def r2(self, model: Model) -> dict[str, float]:
-        """R² of what a model makes of all codes."""
+        """Return R² of a model's prediction for all codes."""
         return self.r2_of(self.predicted(model))
 
     def r2_of(self, predicted: NDArray, rows: IntArray | slice = slice(None)) -> dict[str, float]:
-        """R² of NRIC (k, 2E) that were predicted for these rows of the split."""
+        """Return R² of NRIC (k, 2E) predicted for these rows of the held-out samples."""
         return r_squared(predicted, self.z[rows], self.norm)
 
     def predicted(self, model: Model) -> NDArray[np.float32]:
-        """What a model makes of all codes."""
+        """Return a model's prediction for all codes."""
         result: NDArray[np.float32] = predict(model, torch.as_tensor(self.latents, dtype=torch.float32)).numpy()
         return result
 
 
-def evaluate(learner: Learner, exact: Exact) -> tuple[dict[str, Any], dict[str, NDArray]]:
-    """Compare every model with the test split.
+def evaluate(learner: Learner, exact: ExactShapes) -> tuple[dict[str, Any], dict[str, NDArray]]:
+    """Compare every model with the exact shapes of the test codes.
 
     Args:
         learner: networks of the run.
-        exact: exact shapes.
+        exact: computes exact shapes.
 
     Returns:
         The contents of evaluation.json and of gallery.npz.
@@ -139,7 +142,7 @@ def evaluate(learner: Learner, exact: Exact) -> tuple[dict[str, Any], dict[str, 
     config, collection = learner.config, learner.collection
     settings, reference = config.evaluation, collection.reference
     z_reference = nric(reference.vertices, reference.connectivity)
-    test, composite = Split.of(learner), learner.main()
+    test, composite = HeldOutSamples.of(learner), learner.main()
     baselines: dict[str, Composite | nn.Module] = {
         "monolithic": learner.monolithic(),
         "monolithic_paper": learner.monolithic_paper(),
@@ -185,19 +188,21 @@ def evaluate(learner: Learner, exact: Exact) -> tuple[dict[str, Any], dict[str, 
     return figures, gallery | strip(collection, composite, eta) | {"faces": reference.faces}
 
 
-#: Share of the fresh codes whose exponentials are computed once more, with twice as many steps.
+#: Share of the fresh codes whose exponentials are also computed with twice as many steps.
 FINER = 0.2
 
 
 def on_fresh_codes(
-    models: Mapping[str, Composite | nn.Module], learner: Learner, count: int, exact: Exact
+    models: Mapping[str, Composite | nn.Module], learner: Learner, count: int, exact: ExactShapes
 ) -> dict[str, Any] | None:
-    """R² of models on codes that could not be chosen on: they follow from the digest of the first, the composite.
+    """Return R² of models on fresh codes, drawn with a digest of the finished composite as seed.
+
+    No choice can have been made on these codes, since they follow from the networks.
 
     Returns:
-        ``seed``, the first 32 bits of that digest; the SHA-256 of the ``count`` codes as doubles; how many ``failed``,
-        and R² on the others. Where exponentials are made by steps, ``steps``: R² of theirs to those with twice as many.
-        None if there are fewer than two.
+        ``seed``, the first 32 bits of the digest; the SHA-256 of the ``count`` codes as doubles; the number that
+        ``failed``, and R² on the others. ``steps``, where exponentials are made by steps: R² of the exponentials
+        against exponentials of twice as many steps. None if fewer than two codes have a shape.
     """
     collection, coordinates = learner.collection, learner.collection.coordinates
     digest = hashlib.sha256()
@@ -227,12 +232,12 @@ def on_fresh_codes(
     return result
 
 
-def exact_factors(learner: Learner, rows: IntArray, exact: Exact) -> tuple[NDArray[np.float32], IntArray]:
-    """Exact shapes of each factor's part alone of joint samples (n,).
+def exact_factors(learner: Learner, rows: IntArray, exact: ExactShapes) -> tuple[NDArray[np.float32], IntArray]:
+    """Return exact shapes of each factor's part of joint samples (n,).
 
     Returns:
-        NRIC (k, J, 2E) of those samples for which all factors have one, and which these are (k,): a joint shape can
-        exist where one of a factor does not.
+        NRIC (k, J, 2E) of the samples for which all factors have a shape, and the indices (k,) of these samples. A
+        joint shape can exist where the shape of one factor does not.
     """
     count = len(learner.collection.factors)
     shapes = np.stack([_exact_factor(learner, rows, j, exact) for j in range(count)], axis=1)
@@ -240,12 +245,12 @@ def exact_factors(learner: Learner, rows: IntArray, exact: Exact) -> tuple[NDArr
     return shapes[found], found
 
 
-def _exact_factor(learner: Learner, rows: IntArray, j: int, exact: Exact) -> NDArray[np.float32]:
-    """Exact NRIC (n, 2E) of one factor's part alone of joint samples (n,), NaN where there is none."""
+def _exact_factor(learner: Learner, rows: IntArray, j: int, exact: ExactShapes) -> NDArray[np.float32]:
+    """Return exact NRIC (n, 2E) of one factor's part of joint samples (n,), NaN where it has no shape."""
     index = list(learner.collection.factors.values())[j]
     codes, samples = learner.joint.index[rows], learner.factor_samples(j)
     result = np.full((len(rows), samples.nric.shape[1]), np.nan, dtype=np.float32)
-    # Where a sample's code was shortened, its shape is not that of the joint code's part.
+    # A shortened sample has another code than the joint code's part.
     known = np.isin(codes, samples.index[~samples.shortened])
     result[known] = samples.nric[np.searchsorted(samples.index, codes[known])]
     beyond = codes >= learner.config.samples.own(len(learner.collection.factors))[j]
@@ -255,7 +260,7 @@ def _exact_factor(learner: Learner, rows: IntArray, j: int, exact: Exact) -> NDA
 
 
 def size_bytes(model: Composite | nn.Module) -> int:
-    """Bytes of what is large in a bundle, in the types that it has there: numbers, and the places of entries."""
+    """Return the bytes of a model's large tensors in a bundle: floating-point numbers, and places of entries."""
     networks = model.parts if isinstance(model, Composite) else [model]
     every = (item for network in networks for item in network.state_dict().items())
     large = (tensor for name, tensor in every if tensor.is_floating_point() or name == "basis.place")
@@ -263,7 +268,7 @@ def size_bytes(model: Composite | nn.Module) -> int:
 
 
 def median_seconds(function: Callable[[], Any], repeat: int = 20) -> float:
-    """Median wall time of a call, after one that does not count."""
+    """Return the median wall time of a call, after one call that does not count."""
     function()
     times = []
     for _ in range(repeat):
@@ -274,9 +279,9 @@ def median_seconds(function: Callable[[], Any], repeat: int = 20) -> float:
 
 
 def model_times(collection: Collection, composite: Model, eta: float) -> dict[str, float]:
-    """Median seconds for one code: exact shape, composite network, reconstruction from the reference (one thread).
+    """Return median seconds for one code on one thread: exact shape, composite, reconstruction from the reference.
 
-    Where shapes have derivatives, those of the exact shape with these too.
+    Where shapes have derivatives, the time of an exact shape with its derivatives as well.
     """
     rng = np.random.default_rng(0)
     latents = collection.coordinates.uniform(1, rng)

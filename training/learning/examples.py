@@ -1,11 +1,13 @@
-"""What a model misses of its own training shapes, given back where a code is theirs.
+"""Correct a combiner at the codes of the training shapes, so that the model reproduces these shapes.
 
-Modes leave something out of every shape, and networks add an error. Both are known at the codes of the training
-shapes, so that there they can be added: corrections by examples, as in pose space deformation (Lewis, Cordner and
-Fong 2000), of lengths and angles.
+Modes lose a part of every shape, and networks add an error. Both are known at the codes of the training shapes, so
+that the combiner can add them there. This is correction by examples, as in pose space deformation (Lewis, Cordner and
+Fong 2000), applied to lengths and angles.
 """
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -18,28 +20,42 @@ from shapespace.training.learning.layers import in_bytes
 from shapespace.training.learning.linear import principal_axes
 from shapespace.training.learning.networks import predict
 
-#: Most examples, those of which most is missed, and most coordinates in which shapes are told apart.
-MOST, COORDINATES = 512, 64
-#: Standard deviation of an example's Gaussian, as a share of the distance to the nearest other one: there it has fallen
-#: to 0.4 %. Where it is larger, random codes differ from exponentials more (docs/measurements/notes.md, Examples).
-WIDTH = 0.3
-#: Examples that are nearer to each other than this share of the largest distance are not told apart; and combinations
-#: of examples that their Gaussians tell apart less than this, where one is for a single example.
-SAME, TOLD_APART = 1e-3, 0.3
+
+@dataclass(frozen=True)
+class ExampleGaussians:
+    """Settings of the Gaussians around examples.
+
+    Attributes:
+        examples: largest number of examples; the examples with the largest errors are kept.
+        coordinates: largest number of coordinates that distinguish shapes.
+        width: standard deviation of a Gaussian, as a share of the distance to the nearest other example, where it has
+            fallen to 0.4 %. Larger Gaussians change random codes more (docs/measurements/notes.md, Examples).
+        same: examples nearer to each other than this share of the largest distance count as one.
+        distinct: smallest singular value of the Gaussians' matrix that is used; a single example has 1.
+    """
+
+    examples: int = 512
+    coordinates: int = 64
+    width: float = 0.3
+    same: float = 1e-3
+    distinct: float = 0.3
+
+
+GAUSSIANS = ExampleGaussians()
 
 
 class ExampleCorrectedCombiner(CombinerNetwork):
-    """A combiner Ψ that also knows what it misses of examples: ``Ψ(x) + Σ_i φ_i(x) r_i``.
+    """Combiner Ψ plus its errors at training shapes (examples): ``Ψ(x) + Σ_i φ_i(x) r_i``.
 
     The φ_i are sums of Gaussians around the examples, with ``φ_i = δ_ik`` at example k. They depend, as Ψ does, on
-    nothing but the factors' shapes x, by principal coordinates of the sum of these.
+    nothing but the factor shapes x, through principal coordinates of their sum.
 
     Attributes:
-        axes: (2E, d) of the coordinates, integers of 8 bits.
+        axes: (2E, d) axes of the coordinates, integers of 8 bits.
         steps: (1, d) factors of the axes.
-        places: (n, d) of the examples.
+        places: (n, d) coordinates of the examples.
         sharpness: (n,) ``1 / (2 σ_i²)``.
-        weights: (n, 2E) of the Gaussians, in scaled differences; integers of 8 bits.
+        weights: (n, 2E) weights of the Gaussians, in scaled differences; integers of 8 bits.
         units: (n, 1) factors of the weights.
     """
 
@@ -51,52 +67,52 @@ class ExampleCorrectedCombiner(CombinerNetwork):
     units: Tensor
 
     def __init__(self, combiner: CombinerNetwork, factors: Tensor, missed: Tensor) -> None:
-        """Remember.
+        """Fit the Gaussians.
 
         Args:
             combiner: Ψ.
-            factors: (n, J, 2E) the factors' shapes of n examples.
-            missed: (n, 2E) NRIC of these less what Ψ makes of them.
+            factors: (n, J, 2E) factor shapes of n examples.
+            missed: (n, 2E) exact NRIC of the examples minus the output of Ψ.
         """
         super().__init__(combiner.scaling, combiner.settings, combiner.correction, combiner.tried)
         scaling, missed = self.scaling, missed * self.scaling.factor
-        largest = missed.square().sum(dim=1).argsort(descending=True, stable=True)[:MOST]
+        largest = missed.square().sum(dim=1).argsort(descending=True, stable=True)[: GAUSSIANS.examples]
         sums, missed = scaling.down(factors[largest]).sum(dim=1), missed[largest]
         _, axes = principal_axes(sums - sums.mean(dim=0), by="rows")
-        whole, steps = in_bytes(axes[:COORDINATES].T, dim=0)
+        whole, steps = in_bytes(axes[: GAUSSIANS.coordinates].T, dim=0)
         self.register_buffer("axes", whole)
         self.register_buffer("steps", steps)
         places = self._coordinates(factors[largest])
         apart = torch.cdist(places, places)
         widest = float(apart.max())
-        apart = torch.where(apart > SAME * widest, apart, widest).amin(dim=1)
+        apart = torch.where(apart > GAUSSIANS.same * widest, apart, widest).amin(dim=1)
         self.register_buffer("places", places)
-        self.register_buffer("sharpness", 0.5 / (WIDTH * apart.clamp_min(1e-15)).square())
+        self.register_buffer("sharpness", 0.5 / (GAUSSIANS.width * apart.clamp_min(1e-15)).square())
         gaussians = self._gaussians(places).double()
-        # Of shapes that are hardly apart the mean is remembered: their difference would take large weights.
-        solved = torch.linalg.pinv(gaussians, atol=TOLD_APART, rtol=0) @ missed.double()
+        # Of almost equal shapes the mean is stored, since their difference would take large weights.
+        solved = torch.linalg.pinv(gaussians, atol=GAUSSIANS.distinct, rtol=0) @ missed.double()
         weights, units = in_bytes(solved.float(), dim=1)
         self.register_buffer("weights", weights)
         self.register_buffer("units", units)
 
     @classmethod
     def of(cls, composite: Composite, codes: FloatArray, shapes: FloatArray) -> ExampleCorrectedCombiner:
-        """The combiner of a composite, with what this misses of shapes with codes (n, m) and NRIC (n, 2E)."""
+        """Correct the combiner of a composite by shapes with codes (n, m) and NRIC (n, 2E)."""
         factors = predict(composite.factor_shapes, torch.as_tensor(codes, dtype=torch.float32))
         found = predict(composite.combiner, factors)
         exact = unwrap(shapes, found.numpy())
         return cls(composite.combiner, factors, torch.as_tensor(exact, dtype=torch.float32) - found)
 
     def _coordinates(self, factors: Tensor) -> Tensor:
-        """(k, d) of factor shapes (k, J, 2E)."""
+        """Return coordinates (k, d) of factor shapes (k, J, 2E)."""
         return (self.scaling.down(factors).sum(dim=1) @ self.axes) * self.steps
 
     def _gaussians(self, places: Tensor) -> Tensor:
-        """(k, n) of the examples at coordinates (k, d)."""
+        """Return values (k, n) of the examples' Gaussians at coordinates (k, d)."""
         squares = (places[:, None] - self.places).square().sum(dim=2)
         return torch.exp(-self.sharpness * squares)
 
     def coefficients(self, inputs: Tensor) -> Tensor:
-        """Scaled differences (n, 2E) of the joint shape for factor shapes (n, J, 2E)."""
+        """Return scaled differences (n, 2E) of the joint shape for factor shapes (n, J, 2E)."""
         near = self._gaussians(self._coordinates(inputs)) * self.units.T
         return super().coefficients(inputs) + near @ self.weights

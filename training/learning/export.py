@@ -1,4 +1,4 @@
-"""Export: trained networks become ONNX files of a bundle, which is written only where ONNX and PyTorch agree."""
+"""Export trained networks as the ONNX files of a bundle, and check that ONNX and PyTorch agree."""
 
 from __future__ import annotations
 
@@ -30,20 +30,20 @@ from shapespace.shell.energy import Material
 from shapespace.training.learning import ExportError
 from shapespace.training.learning.composite import Composite
 from shapespace.training.learning.layers import narrowest
-from shapespace.training.learning.naming import NamingError, called
+from shapespace.training.learning.naming import NamingError, bundle_names
 from shapespace.training.learning.networks import StartNetwork, predict
 from shapespace.training.runs.config import Config
 from shapespace.training.runs.sampling import Collection
 
 OPSET = 18
-#: Random codes, and codes of training shapes, at which ONNX and PyTorch are compared.
+#: Number of random codes, and of codes of training shapes, at which ONNX and PyTorch are compared.
 CHECKED = 64
 
 
 def to_onnx(network: nn.Module, example: Tensor, names: Network) -> bytes:
-    """An ONNX file of a network, with the names that bundles have for its input and output."""
+    """Return an ONNX file of a network, with the names that bundles use for its input and output."""
     network.eval()
-    # Without gradients networks compute by plain gathers and sums, which ONNX has.
+    # Without gradients, networks compute by plain gathers and sums, which exist in ONNX.
     with torch.no_grad(), warnings.catch_warnings():
         warnings.simplefilter("ignore")
         program: Any = torch.onnx.export(
@@ -57,7 +57,7 @@ def to_onnx(network: nn.Module, example: Tensor, names: Network) -> bytes:
             verbose=False,
         )
     model: onnx.ModelProto = program.model_proto
-    # The metadata of every node tell of the exporting machine: paths of source files.
+    # The metadata of every node contain paths of the exporting machine's source files.
     for node in model.graph.node:
         node.ClearField("metadata_props")
         node.ClearField("doc_string")
@@ -79,14 +79,14 @@ def _narrow(graph: onnx.GraphProto) -> None:
 
 
 def _answer(file: bytes, names: Network, rows: NDArray) -> NDArray:
-    """What an ONNX file says to some rows, computed as a server does it."""
+    """Return the output of an ONNX file for some rows, computed as on a server."""
     session = onnxruntime.InferenceSession(file, providers=["CPUExecutionProvider"])
     answer: NDArray = session.run([names.output], {names.input: rows})[0]
     return answer
 
 
 def difference(composite: Composite, networks: Networks, latents: Tensor, norm: WeightedNorm) -> float:
-    """Largest ``‖z_onnx − z_torch‖ / ‖z_torch‖`` over codes (n, m)."""
+    """Return the largest ``‖z_onnx − z_torch‖ / ‖z_torch‖`` over codes (n, m)."""
     expected = predict(composite, latents, 8).numpy()
     shapes = [
         _answer(file, factor_network(j), latents[:, index].numpy())
@@ -119,25 +119,25 @@ def export(
     geometry: Geometry,
     start: StartNetwork | None = None,
 ) -> Path:
-    """Write ``models/NAME/VERSION/``, replacing what is there.
+    """Write ``models/NAME/VERSION/``, replacing a bundle that is there.
 
     Args:
         composite: the networks.
-        collection: what they parametrise.
-        config: of the run.
-        figures: what was measured of them.
-        data_digest: SHA-256 of the samples they learned from.
+        collection: the parametrised collection.
+        config: configuration of the run.
+        figures: results of the evaluation.
+        data_digest: SHA-256 of the training samples.
         models: the models directory.
-        geometry: of the bundle.
-        start: for start.onnx, where there is one.
+        geometry: meshes of the bundle.
+        start: network of start.onnx, if the bundle has one.
 
     Raises:
-        ExportError: ONNX and PyTorch differ by more than the tolerance at a code, or the bundle contradicts
-            itself, or has no shape at a code inside its bounds.
+        ExportError: ONNX and PyTorch differ by more than the tolerance at a code, the bundle contradicts itself, or a
+            code inside the bounds has no shape.
     """
     settings, reference = config.export, collection.reference
     try:
-        factors, names = called(collection.factors, collection.latent_names, settings)
+        factors, names = bundle_names(collection.factors, collection.latent_names, settings)
     except NamingError as error:
         raise ExportError(str(error)) from None
     rng = np.random.default_rng(0)
@@ -177,7 +177,7 @@ def export(
         origin=Origin(config=_portable(config), data_digest=data_digest, code_version=metadata.version("shapespace")),
     )
     try:
-        # Drafts are measured as they are served, so that a bundle comes first, where no server watches.
+        # Drafts are measured as they are served, which needs a bundle: a first one in a temporary folder.
         with TemporaryDirectory() as folder:
             facts = replace(
                 facts, draft_error=load(write_bundle(Path(folder), facts, networks, geometry)).decoder.draft_error()
@@ -191,7 +191,7 @@ def export(
 
 
 def _portable(config: Config) -> dict[str, Any]:
-    """The configuration without the folders of the machine that it was used on."""
+    """Return the configuration without folders of the training machine."""
     values = config.model_dump(mode="json", by_alias=True)
     if config.collection.data is not None:
         values["collection"]["data"] = config.collection.data.name

@@ -27,14 +27,14 @@ CHECKPOINT_EPOCHS = 5
 
 @dataclass(frozen=True)
 class SavedNetwork:
-    """What a network's file holds.
+    """Contents of a network's file.
 
     Attributes:
-        state: of training: ``done``, ``epoch`` of ``epochs`` at most, ``best`` validation loss, ``history`` of (train,
-            validation) losses.
-        metadata: of the network, see `ShapeNetwork.metadata`.
-        tensors: its ``state_dict()``.
-        extra: of an unfinished one, the rest that is needed to continue.
+        state: training state: ``done``, ``epoch`` of at most ``epochs``, ``best`` validation loss, ``history`` of
+            (train, validation) losses.
+        metadata: see `ShapeNetwork.metadata`.
+        tensors: the network's ``state_dict()``.
+        extra: optimiser moments and random state of an unfinished training.
     """
 
     state: dict[str, Any]
@@ -51,7 +51,7 @@ class SavedNetwork:
 def save_network(
     path: Path, network: ShapeNetwork, state: dict[str, Any], extra: dict[str, Tensor] | None = None
 ) -> None:
-    """Write a network and the state of its training as one safetensors file, whole or not at all."""
+    """Write a network and its training state as one safetensors file, atomically."""
     tensors = {f"network.{k}": v for k, v in network.state_dict().items()} | (extra or {})
     tensors = {k: v.contiguous().clone() for k, v in tensors.items()}
     with whole(path) as file:
@@ -59,7 +59,7 @@ def save_network(
 
 
 def read_network(path: Path) -> SavedNetwork:
-    """What `save_network` wrote."""
+    """Read a file of `save_network`."""
     with safe_open(path, framework="pt") as file:
         metadata = dict(file.metadata())
         tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 - not a mapping
@@ -79,22 +79,22 @@ def fit(
     title: str,
     seed: int,
 ) -> dict[str, Any]:
-    """Fit a network to NRIC samples, and save it as it was after the epoch with the least validation loss.
+    """Fit a network to NRIC samples, and save its state after the epoch with the least validation loss.
 
     Epochs are compared by the network's `error`, usually the mean square difference of `coefficients` and `target`.
-    With a last layer of low rank and orthonormal basis that differs by a constant from the loss on z. An unfinished
+    With a last layer of low rank and orthonormal basis, this differs by a constant from the loss on z. An unfinished
     file at ``path`` is continued: it holds parameters, moments, schedule, random state and history.
 
     Args:
-        network: with its initial parameters.
-        inputs: (n, …) of all samples.
+        network: network with its initial parameters.
+        inputs: (n, …) inputs of all samples.
         z: (n, 2E) NRIC of all samples.
-        train: (n_train,) indices of those to fit to.
-        validation: (n_validation,) indices of those that choose the learning rate and the epoch that is kept.
+        train: (n_train,) indices of the training samples.
+        validation: (n_validation,) indices of the samples that choose the learning rate and the epoch.
         settings: learning rate, number of epochs, batch size.
         path: safetensors file of the result.
-        title: of the progress bar.
-        seed: of the order of batches and of dropout.
+        title: title of the progress bar.
+        seed: seed of the order of batches and of dropout.
 
     Returns:
         The state, see `SavedNetwork`.
@@ -113,7 +113,7 @@ def fit(
             return state
         best = _restore(optimisers, schedules, state, saved.extra)
     else:
-        # What was fitted in closed form may be better than any epoch.
+        # The closed-form fit may be better than any epoch.
         network.eval()
         error = _error(network, inputs[validation], target[validation], settings.batch_size)
         state = {"done": False, "epoch": 0, "epochs": settings.max_epochs, "best": error, "history": []}
@@ -151,18 +151,18 @@ def fit(
 
 
 def _optimisers(network: nn.Module, settings: FitSettings) -> list[Optimizer]:
-    """What updates the parameters, each some of them."""
+    """Return the optimisers; each updates a part of the parameters."""
     parameters = list(network.parameters())
     if settings.optimiser == "adam":
         return [Adam(parameters, settings.learning_rate)]
     matrices = [p for p in parameters if p.ndim == 2]
     others = [p for p in parameters if p.ndim != 2]
-    # One rate suits both where Muon's steps are as large as Adam's.
+    # One rate suits both, since Muon's steps are made as large as Adam's.
     muon = Muon(matrices, settings.learning_rate, weight_decay=0, adjust_lr_fn="match_rms_adamw")
     return [muon, Adam(others, settings.learning_rate)]
 
 
-#: How a learning rate falls.
+#: Schedule of a learning rate.
 Schedule = ReduceLROnPlateau | CosineAnnealingLR
 
 
@@ -180,7 +180,7 @@ def _epoch(
     train: Tensor,
     batch_size: int,
 ) -> float:
-    """One pass over the training samples in random order; returns the mean loss of its batches."""
+    """Pass once over the training samples in random order, and return the mean loss of the batches."""
     network.train()
     order = train[torch.randperm(len(train))]
     total = 0.0
@@ -201,7 +201,7 @@ def _copied(network: ShapeNetwork) -> dict[str, Tensor]:
 
 
 def _shorten(state: dict[str, Any], schedules: Sequence[Schedule], affordable: float) -> None:
-    """End after so many epochs, and let the rate fall sooner."""
+    """Limit the number of epochs, and let the learning rate fall sooner."""
     state["epochs"] = max(1, min(state["epochs"], int(affordable)))
     for schedule in schedules:
         if isinstance(schedule, CosineAnnealingLR):
@@ -237,7 +237,7 @@ def _restore(
     state: dict[str, Any],
     extra: dict[str, Tensor],
 ) -> dict[str, Tensor]:
-    """Restore all but the network from a checkpoint; returns the best parameters so far."""
+    """Restore all state except the network from a checkpoint, and return the best parameters."""
     torch.set_rng_state(extra["rng"])
     rates, schedules_before = state.pop("rates"), state.pop("schedules")
     for k, (optimiser, schedule) in enumerate(zip(optimisers, schedules, strict=True)):

@@ -1,4 +1,4 @@
-"""Shapes for the report: test shapes with the least, the median and the largest error; an interpolation by factors."""
+"""Shapes for the report: test shapes with the least, median and largest error; an interpolation by factors."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ STRIP_FRAMES = 7
 
 
 def extremes(predicted: NDArray, exact: NDArray, errors: NDArray, index: NDArray) -> dict[str, NDArray]:
-    """Three reconstructed test shapes beside the exact ones.
+    """Return three reconstructed test shapes next to the exact shapes.
 
     Args:
-        predicted: (n, V, 3) vertices, aligned to the exact ones.
-        exact: (n, V, 3).
-        errors: (n, V) distances.
-        index: (n,) which samples they are.
+        predicted: (n, V, 3) vertices, aligned to the exact shapes.
+        exact: (n, V, 3) exact vertices.
+        errors: (n, V) vertex distances.
+        index: (n,) sample indices.
     """
     order = np.argsort(errors.mean(axis=1))
     chosen = order[[0, len(order) // 2, -1]]
@@ -38,9 +38,9 @@ def extremes(predicted: NDArray, exact: NDArray, errors: NDArray, index: NDArray
 
 
 def strip(collection: Collection, composite: Composite, eta: float) -> dict[str, NDArray]:
-    """An interpolation between two codes, and those of the factors alone, as the paper's figure of SCAPE shows them.
+    """Interpolate between two codes, jointly and by each factor alone, as in the paper's figure of SCAPE.
 
-    Each frame's reconstruction starts from the one before.
+    The reconstruction of each frame starts from the previous frame.
 
     Returns:
         ``strip_joint`` (T, V, 3) and ``strip_factors`` (J, T, V, 3), aligned to the reference.
@@ -59,7 +59,7 @@ def strip(collection: Collection, composite: Composite, eta: float) -> dict[str,
 
 def _sequence(reconstruct: Callable, rows: FloatArray, collection: Collection) -> FloatArray:
     reference = collection.reference
-    # The first frame is reached from the reference by way of three shapes between.
+    # The first frame is reached from the reference through three intermediate shapes.
     rest = nric(reference.vertices, reference.connectivity)
     start = reference.vertices
     for share in (0.25, 0.5, 0.75):

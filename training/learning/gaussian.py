@@ -1,7 +1,7 @@
-"""Ridge regression by Gaussian kernels and their gradients, of values and of derivatives.
+"""Ridge regression by Gaussian kernels and their gradients, fitted to values and to derivatives.
 
-Beside derivatives kernels alone are a poor space: what suits best, of all functions, is a sum of kernels at the samples
-and of the kernels' gradients where there are derivatives (Hermite–Birkhoff interpolation; Wendland 2005, chapter 16).
+With derivatives, kernels at the samples alone are a poor space. The best space consists of kernels at the samples, and
+of gradients of kernels where derivatives are known (Hermite–Birkhoff interpolation; Wendland 2005, chapter 16).
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ from shapespace.training.learning.linear import Ridge, kernel_ridge, ridge
 
 @dataclass(frozen=True)
 class Centres:
-    """Functions ``k(u, a)`` of each anchor a, and ``√(2γ) k(u, b) (u − b)`` of each node b; ``k = exp(−γ |u − u'|²)``.
+    """Functions ``k(u, a)`` for anchors a, and ``√(2γ) k(u, b) (u − b)`` for nodes b; ``k = exp(−γ |u − u'|²)``.
 
-    In the space of the kernel all of them have the norm one. There may be leading dimensions of a batch.
+    All have norm one in the space of the kernel. Tensors may have leading batch dimensions.
 
     Attributes:
-        anchors: (…, n, r).
-        nodes: (…, k, r).
+        anchors: (…, n, r) centres of the kernels.
+        nodes: (…, k, r) centres of the gradients.
         gamma: γ, (…, 1, 1).
     """
 
@@ -33,7 +33,7 @@ class Centres:
     gamma: Tensor
 
     def __call__(self, u: Tensor) -> Tensor:
-        """(…, m, n + k r) their values at u (…, m, r)."""
+        """Return the values (…, m, n + k r) of the functions at u (…, m, r)."""
         values = _kernel(u, self.anchors, self.gamma)
         if not self.nodes.shape[-2]:
             return values
@@ -42,7 +42,7 @@ class Centres:
         return torch.cat([values, (weights[..., None] * apart).flatten(-2)], dim=-1)
 
     def along(self, u: Tensor, directions: Tensor) -> Tensor:
-        """(m, n + k r) derivatives at u (m, r), each along another direction (m, r)."""
+        """Return derivatives (m, n + k r) of the functions at u (m, r), each row along its own direction (m, r)."""
         gamma, step = self.gamma, (u * directions).sum(dim=1, keepdim=True)
         values = 2 * gamma * (directions @ self.anchors.T - step) * _kernel(u, self.anchors, gamma)
         if not len(self.nodes):
@@ -54,7 +54,7 @@ class Centres:
 
     @property
     def gram(self) -> Tensor:
-        """(n + k r, n + k r) inner products of the functions."""
+        """Inner products (n + k r, n + k r) of the functions."""
         return torch.cat([self(self.anchors), self.along(*every_axis(self.nodes)) / (2 * self.gamma).sqrt()])
 
     def fit(
@@ -64,11 +64,11 @@ class Centres:
         held_out: tuple[Tensor, Tensor],
         penalties: Sequence[float],
     ) -> Ridge:
-        """Ridge regression with these functions.
+        """Fit these functions by ridge regression.
 
         Args:
-            own: coordinates (m, r) of samples, and values (m, q).
-            slopes: coordinates (s, r), directions (s, r), and derivatives along these (s, q).
+            own: coordinates (m, r) and values (m, q) of samples.
+            slopes: coordinates (s, r), directions (s, r), and derivatives along the directions (s, q).
             held_out: samples that choose the penalty.
             penalties: candidates.
 
@@ -84,20 +84,20 @@ class Centres:
             features, values = torch.cat([features, self.along(at, directions)]), torch.cat([values, changes])
         return kernel_ridge(self.gram, features, values, theirs, penalties)
 
-    def some(self, share: float) -> Centres:
-        """A share of the anchors and of the nodes, the first ones."""
+    def first(self, share: float) -> Centres:
+        """Return the functions of the first anchors and the first nodes, a share of each."""
         n, k = (math.ceil(share * len(centres)) for centres in (self.anchors, self.nodes))
         return Centres(self.anchors[:n], self.nodes[:k], self.gamma)
 
 
 def every_axis(u: Tensor) -> tuple[Tensor, Tensor]:
-    """Each of the points (k, r), r times, and a direction along each axis there: both (k r, r)."""
+    """Pair each of the points (k, r) with each of the r axes: points and directions, both (k r, r)."""
     k, r = u.shape
     return u.repeat_interleave(r, dim=0), torch.eye(r, dtype=u.dtype).repeat(k, 1)
 
 
 def _kernel(u: Tensor, centres: Tensor, gamma: Tensor) -> Tensor:
-    """(…, m, n) of coordinates (…, m, r) and (…, n, r)."""
+    """Return kernel values (…, m, n) between coordinates (…, m, r) and centres (…, n, r)."""
     squares = u.square().sum(dim=-1, keepdim=True) + centres.square().sum(dim=-1)[..., None, :]
-    # A sum, as onnxruntime fuses products with numbers into an operation that old ones don't have for doubles.
+    # u + u, not 2 u: onnxruntime fuses products with numbers into an operation that old versions lack for doubles.
     return torch.exp(-gamma * (squares - (u + u) @ centres.mT))

@@ -17,9 +17,9 @@ MOST_MONOMIALS = 20_000
 
 
 class LatentFeatures(nn.Module):
-    """The inputs of a perceptron, (n, m) → (n, size).
+    """Inputs of a perceptron, (n, m) → (n, size).
 
-    A bounded coordinate is mapped to [−1, 1], a periodic one to cos kx, sin kx for k = 1 … order.
+    A bounded coordinate is mapped to [−1, 1], a periodic coordinate to cos kx, sin kx for k = 1 … order.
     """
 
     centre: Tensor
@@ -51,7 +51,7 @@ class LatentFeatures(nn.Module):
 class FourierProducts(nn.Module):
     """Products of waves of several periodic coordinates whose frequencies lie in an ellipse, (n, m) → (n, size).
 
-    ``{Π_i w_i(k_i x_i) : w_i ∈ {cos, sin}, Σ (k_i / K_i)² ≤ 1}``, the constant included.
+    ``{Π_i w_i(k_i x_i) : w_i ∈ {cos, sin}, Σ (k_i / K_i)² ≤ 1}``, including the constant.
     """
 
     columns: Tensor
@@ -86,9 +86,9 @@ class FourierProducts(nn.Module):
 class Polynomials(nn.Module):
     """Products of Legendre polynomials of bounded coordinates up to a total degree, (n, m) → (n, size).
 
-    They are orthogonal over the box, with a root mean square of ``DECAY^degree``: the coefficients of a smooth map
-    fall with the degree, and a ridge penalty that grows with it needs far fewer samples (a hand's factor of 6
-    coordinates from 72 samples: R² 0.999, 0.85 with equal sizes). The constant is the first.
+    They are orthogonal over the box, with a root mean square of ``DECAY^degree``. The coefficients of a smooth map
+    fall with the degree, so a ridge penalty that grows with the degree needs far fewer samples. Example: a hand's
+    factor of 6 coordinates from 72 samples has R² 0.999, and 0.85 with equal sizes. The constant comes first.
     """
 
     DECAY = 0.3
@@ -121,10 +121,10 @@ class Polynomials(nn.Module):
     def forward(self, latent: Tensor) -> Tensor:
         x = (latent - self.centre) / self.radius
         values = (x[:, :, None] ** self.power @ self.legendre).flatten(1)
-        # One gather and one product for all coordinates: the time of a small network is its number of operations.
+        # One gather and one product for all coordinates, since few operations make a small network fast.
         return values.index_select(1, self.columns).unflatten(1, self.exponents.shape).prod(dim=1) * self.sizes
 
 
 def affordable_degree(degree: int, coordinates: int) -> int:
-    """The largest total degree, at most the one given and at least one, with no more than `MOST_MONOMIALS`."""
+    """Return the largest total degree with at most `MOST_MONOMIALS` products, between 1 and ``degree``."""
     return next((d for d in range(degree, 1, -1) if math.comb(coordinates + d, d) <= MOST_MONOMIALS), 1)

@@ -1,8 +1,8 @@
-"""Parts that all networks are made of: scaling, functions of the latents, a last layer of low rank.
+"""Scaling, last layers of low rank, and number formats that all networks share.
 
 Networks put out NRIC ``z`` (n, 2E) and compute in *scaled differences*: ``(z − z̄)`` times the square roots of the
-weights of ``‖·‖_{2,z̄}``, lengths and angles each divided by their own standard deviation, so that a mean square over
-entries is the loss with both halves normalised.
+weights of ``‖·‖_{2,z̄}``. Lengths and angles are each divided by their own standard deviation, so that the mean square
+over entries is the loss with both halves normalised.
 """
 
 from __future__ import annotations
@@ -23,23 +23,23 @@ NARROWED_SIZE = 1024
 
 
 def half_precision(x: Tensor) -> Tensor:
-    """The nearest 16-bit floating-point values, in the type of x."""
+    """Round to the nearest 16-bit floating-point values, in the type of x."""
     return x.half().to(x.dtype)
 
 
 def in_bytes(x: Tensor, dim: int) -> tuple[Tensor, Tensor]:
-    """Integers from −127 to 127, as floating-point numbers, and the factors along ``dim`` that make x of them."""
+    """Return integers from −127 to 127 (floating-point numbers) and factors along ``dim``; x is about their product."""
     unit = x.abs().amax(dim=dim, keepdim=True).clamp_min(1e-30) / 127
     return (x / unit).round(), unit
 
 
 def resized(values: Tensor, size: int) -> Tensor:
-    """The first ``size`` entries of the last dimension; zeros beyond."""
+    """Return the first ``size`` entries of the last dimension, with zeros beyond its end."""
     return nn.functional.pad(values[..., :size], (0, max(0, size - values.shape[-1])))
 
 
 def narrowest(x: Tensor) -> torch.dtype:
-    """The type that a tensor has in a bundle: 8 or 16 bits where they hold all values of a large one exactly."""
+    """Return the type of a tensor in a bundle: 8 or 16 bits where they hold all values of a large tensor exactly."""
     if x.dtype == torch.float32 and x.numel() >= NARROWED_SIZE:
         for narrow in (torch.int8, torch.int16, torch.float16):
             if torch.equal(x, x.to(narrow).to(x.dtype)):
@@ -52,7 +52,7 @@ class Scaling(nn.Module):
 
     Args:
         mean: z̄ of the reference, (2E,).
-        factor: (2E,) scaled differences per unit of z; 0 where an entry has no weight (boundary angles).
+        factor: (2E,) scaled differences per unit of z; 0 for entries without a weight (boundary angles).
     """
 
     mean: Tensor
@@ -68,12 +68,12 @@ class Scaling(nn.Module):
 
     @classmethod
     def blank(cls, size: int) -> Scaling:
-        """Zeros, to load saved tensors into."""
+        """Return a scaling of zeros, to load saved tensors into."""
         return cls(np.zeros(size), np.zeros(size))
 
     @classmethod
     def of(cls, reference: FloatArray, weights: FloatArray, samples: NDArray) -> Scaling:
-        """Scale so that samples (n, 2E) have unit mean square about their mean, per half; weights (2E,) at η = 1."""
+        """Scale samples (n, 2E) to unit mean square about their mean, in each half; weights (2E,) at η = 1."""
         root, half = np.sqrt(weights), len(weights) // 2
         spread = (samples - samples.mean(axis=0)) * root
         factor = root.copy()
@@ -82,16 +82,16 @@ class Scaling(nn.Module):
         return cls(reference, factor)
 
     def down(self, z: Tensor) -> Tensor:
-        """NRIC to scaled differences."""
+        """Map NRIC to scaled differences."""
         return (z - self.mean) * self.factor
 
     def up(self, y: Tensor) -> Tensor:
-        """Scaled differences to NRIC."""
+        """Map scaled differences to NRIC."""
         return self.mean + y * self.inverse
 
 
 def patch_entries(midpoints: FloatArray, count: int, seed: int) -> list[IntArray]:
-    """Entries of NRIC, lengths and then angles, of each patch of neighbouring edges; at most ``count`` patches."""
+    """Return the entries of NRIC, lengths and then angles, for at most ``count`` patches of neighbouring edges."""
     edges = len(midpoints)
     labels = kmeans2(midpoints, count, seed=seed, minit="++")[1] if count > 1 else np.zeros(edges, dtype=int)
     members = (np.flatnonzero(labels == label) for label in np.unique(labels))
@@ -99,7 +99,7 @@ def patch_entries(midpoints: FloatArray, count: int, seed: int) -> list[IntArray
 
 
 def supporting(y: NDArray, share: float) -> NDArray[np.bool_]:
-    """(2E,) entries of the fewest edges that hold this share of the variance of scaled differences y (n, 2E)."""
+    """Mark the entries (2E,) of the fewest edges that hold a share of the variance of scaled differences y (n, 2E)."""
     variance = y.var(axis=0, dtype=np.float64).reshape(2, -1).sum(axis=0)
     strongest = np.argsort(-variance, kind="stable")
     held = np.cumsum(variance[strongest])
@@ -109,11 +109,11 @@ def supporting(y: NDArray, share: float) -> NDArray[np.bool_]:
 
 
 class PatchBasis(nn.Module):
-    """A linear last layer of low rank: an orthonormal principal basis for each patch of neighbouring edges.
+    """Linear last layer of low rank: an orthonormal principal basis for each patch of neighbouring edges.
 
-    A variation that wanders over the surface has no small basis on all of it, but has one within a patch.
-    The basis is orthonormal up to one common factor, so the mean square of what is missed is the same, up to that
-    factor, in coefficients as in scaled differences. Entries in no patch keep their mean.
+    A variation that moves over the surface has no small basis on the whole surface, but has one within a patch. The
+    basis is orthonormal up to one common factor. So the mean square error is the same, up to that factor, in
+    coefficients and in scaled differences. Entries in no patch keep their mean.
     """
 
     mean: Tensor
@@ -129,13 +129,13 @@ class PatchBasis(nn.Module):
         place = np.full(len(mean), len(order), dtype=np.int32)
         place[order] = np.arange(len(order))
         self.register_buffer("order", torch.as_tensor(order))
-        #: Where each entry is among those of all patches, with a zero after them.
+        #: Index of each entry among the entries of all patches, followed by a zero.
         self.place: Tensor | None
         self.register_buffer("place", torch.as_tensor(place) if bases[1:] or len(order) < len(mean) else None)
 
     @classmethod
     def blank(cls, tensors: dict[str, Tensor]) -> PatchBasis:
-        """Zeros of the sizes of saved tensors, to load these into."""
+        """Return a basis of zeros with the sizes of saved tensors, to load these tensors into."""
         sizes = [tensors[f"basis{i}"].shape for i in range(sum(name.startswith("basis") for name in tensors))]
         stops = np.cumsum([size for _, size in sizes])
         entries = [np.arange(stop - size, stop) for stop, (_, size) in zip(stops, sizes, strict=True)]
@@ -145,10 +145,10 @@ class PatchBasis(nn.Module):
     def fit(
         cls, y: NDArray, midpoints: FloatArray, patches: int, energy: float, seed: int, support: float = 1
     ) -> PatchBasis:
-        """Principal bases of scaled differences y (n, 2E).
+        """Fit principal bases to scaled differences y (n, 2E).
 
-        Of all axes of all patches those of the largest variance are kept, until they hold the share ``energy`` of it.
-        Before that only so many edges are, those that vary most, as hold the share ``support`` of all variance.
+        The axes of largest variance over all patches are kept, until they hold the share ``energy`` of the variance.
+        Before that, edges with the least variance are left out; the others hold the share ``support`` of the variance.
         """
         mean, vary = y.mean(axis=0), supporting(y, support)
         entries = [own[vary[own]] for own in patch_entries(midpoints, patches, seed)]
@@ -161,27 +161,27 @@ class PatchBasis(nn.Module):
         every = np.sort(np.concatenate(values))[::-1]
         cut = every[min(np.searchsorted(np.cumsum(every), energy * every.sum()), len(every) - 1)]
         ranks = [max(1, int((value >= cut).sum())) for value in values]
-        # In this unit the coefficients of y have a mean square of one, as the outputs of a new perceptron.
+        # In this unit the coefficients of y have a mean square of one, like the outputs of a new perceptron.
         unit = np.sqrt(every.sum() / len(y) / sum(ranks))
         return cls(entries, [unit * v[:, :r] for v, r in zip(vectors, ranks, strict=True)], mean)
 
     @property
     def rank(self) -> int:
-        """Number of coefficients, all patches together."""
+        """Number of coefficients of all patches together."""
         return sum(self.ranks)
 
     def _bases(self) -> list[Tensor]:
         return [self.get_buffer(f"basis{i}") for i in range(len(self.ranks))]
 
     def encode(self, y: Tensor) -> Tensor:
-        """Coefficients (n, rank) of scaled differences (n, 2E)."""
+        """Return coefficients (n, rank) of scaled differences (n, 2E)."""
         parts = (y - self.mean)[:, self.order].split([b.shape[1] for b in self._bases()], dim=1)
         return torch.cat(
             [part @ basis.T / basis[0].square().sum() for part, basis in zip(parts, self._bases(), strict=True)], dim=1
         )
 
     def forward(self, coefficients: Tensor) -> Tensor:
-        """Scaled differences (n, 2E) of coefficients (n, rank)."""
+        """Return scaled differences (n, 2E) of coefficients (n, rank)."""
         if self.place is None:
             return coefficients @ self._bases()[0] + self.mean
         parts = coefficients.split(self.ranks, dim=1)
@@ -192,7 +192,7 @@ class PatchBasis(nn.Module):
 
 
 def perceptron(sizes: list[int]) -> nn.Sequential:
-    """``MLP[N_1, …, N_T]`` with ELU and batch normalisation after each hidden layer."""
+    """Return ``MLP[N_1, …, N_T]`` with ELU and batch normalisation after each hidden layer."""
     layers: list[nn.Module] = []
     for n_in, n_out in itertools.pairwise(sizes[:-1]):
         layers += [nn.Linear(n_in, n_out), nn.BatchNorm1d(n_out), nn.ELU()]

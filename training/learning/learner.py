@@ -38,18 +38,18 @@ from shapespace.training.runs.config import (
 from shapespace.training.runs.directory import RunDirectory
 from shapespace.training.runs.sampling import DERIVATIVES, DONE, Collection, Samples, columns, read
 
-#: Settings that make factor networks those of the paper.
+#: Settings of the paper's factor networks.
 PAPER_FACTORS = LatentNetworkSettings(fourier=0, skip_degree=0, energy=1, fit=FitSettings())
 
 
 @dataclass(frozen=True)
-class _Data:
-    """What a network is fitted to.
+class TrainingData:
+    """Samples that a network is fitted to.
 
     Attributes:
-        inputs: (n, …) of all samples.
-        z: (n, 2E) their NRIC.
-        rows: indices of samples: train, validation.
+        inputs: (n, …) inputs of all samples.
+        z: (n, 2E) NRIC of all samples.
+        rows: row indices by part: train, validation.
     """
 
     inputs: Tensor
@@ -57,16 +57,17 @@ class _Data:
     rows: dict[str, IntArray]
 
     def part(self, name: str) -> tuple[Tensor, Tensor]:
-        """Inputs and NRIC of a part of the samples."""
+        """Return inputs and NRIC of a part of the samples."""
         rows = self.rows[name]
         return self.inputs[rows], torch.from_numpy(self.z[rows])
 
 
 class Learner:
-    """Fits networks to the samples of a run; each is saved in a file whose name is a digest of all that it depends on.
+    """Fits networks to the samples of a run, and saves each in a file named by a digest of all that determines it.
 
-    So recipes that have a network in common share its file. An unfinished file is continued; a finished one is read,
-    and the samples are not. Studies of fewer samples or other seeds are subclasses (``benchmarks.studies``).
+    So recipes that have a network in common share its file. An unfinished file is continued. A finished file is read,
+    and then the samples are not needed. Studies of fewer samples or other seeds are subclasses
+    (``benchmarks.studies``).
 
     Args:
         collection: the parametrised collection of the samples.
@@ -102,7 +103,7 @@ class Learner:
 
     @cached_property
     def _closing(self) -> sparse.csr_array:
-        """(q, 2E) derivatives of the closing conditions around vertices at the reference."""
+        """Derivatives (q, 2E) of the closing conditions around vertices, at the reference."""
         conditions = Integrability(self.collection.reference.connectivity)
         return conditions.jacobian(self._reference)[: 3 * len(conditions.vertices)]
 
@@ -120,7 +121,7 @@ class Learner:
         return self.split | {"train": np.concatenate([np.flatnonzero(self.joint.index < 0), self.split["train"]])}
 
     def _fit(
-        self, network: ShapeNetwork, data: _Data, fitting: FitSettings, path: Path, share: float
+        self, network: ShapeNetwork, data: TrainingData, fitting: FitSettings, path: Path, share: float
     ) -> dict[str, Any]:
         return fit(
             network,
@@ -145,7 +146,7 @@ class Learner:
         share: float,
         samples: Callable[[], tuple[Samples, dict[str, IntArray]]],
     ) -> FactorNetwork:
-        """A network from the latents ``index`` to shapes, read from ``path`` or fitted to samples and rows of these."""
+        """Return a network from the latents ``index`` to shapes, read from ``path`` or fitted to samples."""
         coordinates = self.collection.coordinates[index]
         saved = read_network(path) if path.exists() else None
         if saved and saved.done:
@@ -158,7 +159,7 @@ class Learner:
             return network
         torch.manual_seed(self.seed)
         drawn, rows = samples()
-        data = _Data(torch.as_tensor(drawn.latents[:, index], dtype=torch.float32), drawn.nric, rows)
+        data = TrainingData(torch.as_tensor(drawn.latents[:, index], dtype=torch.float32), drawn.nric, rows)
         z = drawn.nric[rows["train"]]
         scaling = self._scaling(z)
         network = FactorNetwork(settings, coordinates, scaling, self._basis(settings, scaling, z))
@@ -173,18 +174,18 @@ class Learner:
         return network
 
     def _basis(self, settings: LatentNetworkSettings, scaling: Scaling, z: NDArray) -> PatchBasis | None:
-        """The last layer of a network, from NRIC (n, 2E); None where it is dense."""
+        """Fit the last layer of a network to NRIC (n, 2E); None for a dense last layer."""
         if settings.energy == 1:
             return None
         y, midpoints = scaling.down(torch.from_numpy(z)).numpy(), self.collection.reference.edge_midpoints
         return PatchBasis.fit(y, midpoints, settings.patches, settings.energy, self.seed, settings.support)
 
     def factor_samples(self, j: int) -> Samples:
-        """The samples of a factor alone."""
+        """Return the samples of a factor alone."""
         return read(self.run.factor_samples(j))
 
     def factor(self, j: int, settings: LatentNetworkSettings) -> FactorNetwork:
-        """ψ_j, from samples of the factor alone, none of them at a part of a test code."""
+        """Return ψ_j, fitted to samples of the factor alone, none of them at a part of a test code."""
         index = list(self.collection.factors.values())[j]
 
         def samples() -> tuple[Samples, dict[str, IntArray]]:
@@ -204,12 +205,12 @@ class Learner:
         return {"train": np.flatnonzero(train), "validation": np.flatnonzero(held_out["validation"])}
 
     def exponentials(self) -> int:
-        """Number of samples behind the composite: joint ones and those of factors, held-out ones included."""
+        """Return the number of joint and factor samples behind the composite, including held-out samples."""
         own = (self.factor_rows(self.factor_samples(j).index) for j in range(len(self.collection.factors)))
         return sum(len(rows[part]) for rows in (self.rows, *own) for part in ("train", "validation"))
 
     def composite(self, recipe: Recipe) -> Composite:
-        """The ψ_j first, then Ψ, which is fitted to their outputs."""
+        """Return the composite of a recipe: the ψ_j first, then Ψ, which is fitted to their outputs."""
         indices = list(self.collection.factors.values())
         factors = recipe.factors if isinstance(recipe.factors, list) else [recipe.factors] * len(indices)
         networks = [self.factor(j, settings) for j, settings in enumerate(factors)]
@@ -220,7 +221,7 @@ class Learner:
     def _combiner(
         self, settings: CombinerSettings, path: Path, indices: list[list[int]], networks: list[FactorNetwork]
     ) -> CombinerNetwork:
-        """Ψ, read from ``path`` or fitted to what the networks of factors make of the joint samples."""
+        """Return Ψ, read from ``path`` or fitted to the outputs of the factor networks at the joint samples."""
         reference = self.collection.reference
         if path.exists():
             saved = read_network(path)
@@ -229,7 +230,7 @@ class Learner:
             self._record(path, saved.state)
             return combiner
         latents = torch.as_tensor(self.joint.latents, dtype=torch.float32)
-        data = _Data(predict(partial(factor_shapes, networks, indices), latents), self.joint.nric, self.rows)
+        data = TrainingData(predict(partial(factor_shapes, networks, indices), latents), self.joint.nric, self.rows)
         if settings.symmetries:
             data = self._with_images(data)
         scaling = self._scaling(self.joint.nric[self.rows["train"]])
@@ -257,7 +258,7 @@ class Learner:
         return combiner
 
     def _motion(self, part: str) -> Motion | None:
-        """Of a part of the joint samples."""
+        """Return the positions of moving features for a part of the joint samples; None without moving features."""
         places = self.collection.places
         if places is None:
             return None
@@ -265,7 +266,7 @@ class Learner:
         return Motion(torch.as_tensor(angles, dtype=torch.float32), places)
 
     def differentiated(self) -> tuple[IntArray, NDArray[np.float32]]:
-        """Rows (k,) of the joint samples to learn from that have derivatives, and these (k, m, 2E)."""
+        """Return rows (k,) of training samples that have derivatives, and these derivatives (k, m, 2E)."""
         found = columns(self.run.samples / DERIVATIVES, "index", "status", "derivatives")
         if not found:
             return np.empty(0, dtype=int), np.empty((0, 0, 0), np.float32)
@@ -276,7 +277,14 @@ class Learner:
     def _slopes(
         self, indices: list[list[int]], networks: list[FactorNetwork], shapes: Tensor, scaling: Scaling
     ) -> Slopes | None:
-        """The derivatives, and those of what networks make of the factors (n, J, 2E); None where there are none."""
+        """Return the derivatives of factor shapes and of joint shapes, scaled; None if there are none.
+
+        Args:
+            indices: latents of each factor.
+            networks: factor networks.
+            shapes: (n, J, 2E) outputs of the factor networks at the joint samples.
+            scaling: to scaled differences.
+        """
         rows, derivatives = self.differentiated()
         if not len(rows):
             return None
@@ -292,8 +300,8 @@ class Learner:
         missed = torch.from_numpy(derivatives) * radius[:, None] - own
         return Slopes(scaling.down(shapes[rows]), indices, own * scaling.factor, missed * scaling.factor)
 
-    def _with_images(self, data: _Data) -> _Data:
-        """The same, with the images of the training samples under each symmetry of the collection."""
+    def _with_images(self, data: TrainingData) -> TrainingData:
+        """Add the images of the training samples under each symmetry of the collection."""
         inputs, z, train = data.inputs, data.z, data.rows["train"]
         rows = dict(data.rows)
         for edges in self.collection.symmetries:
@@ -301,37 +309,37 @@ class Learner:
             rows["train"] = np.concatenate([rows["train"], len(z) + np.arange(len(train))])
             inputs = torch.cat([inputs, data.inputs[train][:, :, both_halves]])
             z = np.concatenate([z, data.z[train][:, both_halves]])
-        return _Data(inputs, z, rows)
+        return TrainingData(inputs, z, rows)
 
     def main(self) -> Composite:
-        """By the main recipe, which is exported."""
+        """Return the composite of the main recipe, which is exported."""
         return self.composite(self.config.networks)
 
     def paper(self) -> Composite:
-        """The paper's own system (section 4): perceptrons of bare angles with dense last layers, and its combiner."""
+        """Return the paper's own system (section 4): dense perceptrons of bare angles, and its combiner."""
         combiner = CombinerSettings(correction=PaperSettings(), symmetries=False)
         return self.composite(Recipe(factors=PAPER_FACTORS, combiner=combiner))
 
     def monolithic(self) -> Composite:
-        """Our recipe with one factor: what it makes of the joint samples without a product."""
-        network = self._whole("monolithic", self.config.monolithic)
+        """Return our recipe with one factor of all latents, fitted to the joint samples."""
+        network = self._joint_network("monolithic", self.config.monolithic)
         index, combiner = list(range(len(self.collection.coordinates))), self.config.networks.combiner
         decides = [self.config.monolithic, *choices(combiner.correction)]
         path = self._path("monolithic-combiner", [self.share], combiner, *decides)
         return Composite([index], [network], self._combiner(combiner, path, [index], [network]))
 
     def monolithic_paper(self) -> FactorNetwork:
-        """Φ̃, the paper's fully connected baseline."""
-        return self._whole("monolithic-paper", self.config.monolithic_paper)
+        """Return Φ̃, the paper's fully connected baseline."""
+        return self._joint_network("monolithic-paper", self.config.monolithic_paper)
 
-    def _whole(self, kind: str, settings: LatentNetworkSettings) -> FactorNetwork:
-        """A network from all latents, on the joint samples."""
+    def _joint_network(self, kind: str, settings: LatentNetworkSettings) -> FactorNetwork:
+        """Return a network from all latents, fitted to the joint samples."""
         index = list(range(len(self.collection.coordinates)))
         path = self._path(kind, [self.share], settings)
         return self._latent_network(settings, index, path, self.share, lambda: (self.joint, self.rows))
 
     def kernel(self) -> LatentKernel:
-        """Kernel ridge regression on the joint samples' latents: in closed form, in seconds, and not saved."""
+        """Return kernel ridge regression on the joint samples' latents, in closed form. It is not saved."""
         latents = torch.as_tensor(self.joint.latents, dtype=torch.float32)
         z, rows = torch.from_numpy(self.joint.nric), self.rows
         own, held_out = ((latents[rows[part]], z[rows[part]]) for part in ("train", "validation"))
@@ -340,7 +348,7 @@ class Learner:
         return LatentKernel(self.collection.coordinates, self._scaling(own[1].numpy()), own, held_out, slopes)
 
     def start(self) -> StartNetwork:
-        """The start network, from the joint samples: in closed form, in seconds, and not saved."""
+        """Return the start network, fitted to the joint samples in closed form. It is not saved."""
         collection, samples, rows = self.collection, self.joint, self.rows
         network = StartNetwork(collection.coordinates, collection.reference.vertices)
         latents = torch.as_tensor(samples.latents, dtype=torch.float32)

@@ -1,4 +1,4 @@
-"""Linear algebra of everything that is fitted in closed form: ridge regression and principal axes."""
+"""Ridge regression and principal axes: the linear algebra of everything that is fitted in closed form."""
 
 from __future__ import annotations
 
@@ -11,12 +11,30 @@ from torch import Tensor, nn
 
 #: Eigenvalues below this share of the largest are rounding errors.
 ROUNDING = 1e-12
-#: What is added to the diagonal of a Gram matrix, a share of its trace.
+#: Added to the diagonal of a Gram matrix, as a share of its trace, so that its Cholesky factor exists.
 JITTER = 1e-12
-#: The same for `rounded`.
-SLIGHT = 1e-10
-#: Largest integer that a weight is rounded to, so many of which are left for what makes up for others; rows at once.
-MOST, LEVELS, BLOCK = 32767, 25000, 64
+#: Penalties of `regression`, as shares of the mean square of a feature.
+PENALTIES = tuple(10.0**k for k in range(-6, 3))
+
+
+@dataclass(frozen=True)
+class WeightRounding:
+    """Settings of `rounded`.
+
+    Attributes:
+        largest: largest integer of a weight.
+        levels: largest integer before compensation; the rest is room for compensating other errors.
+        block: rows that are rounded before all later rows are updated.
+        jitter: added to the diagonal of the Gram matrix, as a share of its trace.
+    """
+
+    largest: int = 32767
+    levels: int = 25000
+    block: int = 64
+    jitter: float = 1e-10
+
+
+WEIGHTS = WeightRounding()
 
 
 @dataclass(frozen=True)
@@ -26,7 +44,7 @@ class Ridge:
     Attributes:
         weights: W (p, q).
         penalty: λ.
-        error: mean square of what the solution misses of held-out pairs.
+        error: mean square error on held-out pairs.
     """
 
     weights: Tensor
@@ -35,16 +53,16 @@ class Ridge:
 
 
 def ridge(gram: Tensor, right: Tensor, held_out: tuple[Tensor, Tensor], penalties: Sequence[float]) -> Ridge:
-    """Ridge regression with the penalty that suits held-out pairs best; a Cholesky factorisation for each.
+    """Solve a ridge regression with the penalty that suits held-out pairs best; one Cholesky factorisation a penalty.
 
-    With features X (n, p) of samples, and Y (n, q), these are the normal equations where G = XᵀX and R = XᵀY, and their
-    dual form, or kernel ridge regression, where G = XXᵀ and R = Y.
+    With features X (n, p) of samples and values Y (n, q), these are the normal equations if G = XᵀX and R = XᵀY. They
+    are the dual form, or kernel ridge regression, if G = XXᵀ and R = Y.
 
     Args:
         gram: G (p, p), positive semi-definite.
         right: R (p, q).
-        held_out: features (m, p) of held-out samples, or kernels (m, n) of these with the samples; and their values
-            (m, q).
+        held_out: features (m, p) of held-out samples, or their kernels (m, n) with the samples; and their values (m,
+            q).
         penalties: candidates for λ > 0.
     """
     features, wanted = held_out
@@ -60,19 +78,19 @@ def ridge(gram: Tensor, right: Tensor, held_out: tuple[Tensor, Tensor], penaltie
 def kernel_ridge(
     gram: Tensor, features: Tensor, values: Tensor, held_out: tuple[Tensor, Tensor], penalties: Sequence[float]
 ) -> Ridge:
-    """Ridge regression with functions that are not orthonormal: the penalty is on the norm of what is found.
+    """Solve a ridge regression with functions that are not orthonormal; the penalty is on the norm of the solution.
 
     Args:
         gram: (n, n) inner products of the functions.
-        features: (m, n) the functions at samples, or their derivatives.
-        values: (m, q).
-        held_out: features of held-out samples, and values.
+        features: (m, n) values of the functions at samples, or their derivatives.
+        values: (m, q) values to fit.
+        held_out: features and values of held-out samples.
         penalties: candidates.
 
     Returns:
         Weights (n, q) of the functions.
     """
-    # Functions that all but depend on each other are told apart by as little as rounding allows.
+    # Almost dependent functions are distinguished down to rounding errors.
     half = torch.linalg.cholesky(gram + JITTER * gram.trace() * torch.eye(len(gram)))
     x, theirs = (torch.linalg.solve_triangular(half, rows.T, upper=False).T for rows in (features, held_out[0]))
     found = ridge(x.T @ x, x.T @ values, (theirs, held_out[1]), penalties)
@@ -80,33 +98,33 @@ def kernel_ridge(
 
 
 def rounded(weights: Tensor, features: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Integers of 16 bits, and factors of rows and columns, whose product is nearly as good as some weights.
+    """Round weights to integers of 16 bits with factors of rows and columns, so that their sums stay accurate.
 
-    Kernels that all but depend on each other have large weights of both signs, whose sums are lost if each is rounded
-    for itself. So they are rounded one after the other, and those that are left make up for each error as well as they
-    can at the samples (Frantar et al., GPTQ, ICLR 2023).
+    Kernels that almost depend on each other have large weights of both signs. Rounding each weight by itself would
+    spoil their sums. So weights are rounded one after the other, and the remaining weights compensate each error at
+    the samples as well as they can (Frantar et al., GPTQ, ICLR 2023).
 
     Args:
-        weights: (n, q) of functions.
-        features: (m, n) the functions at samples.
+        weights: (n, q) weights of functions.
+        features: (m, n) values of the functions at samples.
 
     Returns:
-        (n, q), (n, 1) and (1, q).
+        Integers (n, q), factors of rows (n, 1) and factors of columns (1, q).
     """
     gram = features.T @ features
     order = gram.diagonal().argsort(descending=True)
-    gram = gram[order][:, order] + SLIGHT * gram.trace() * torch.eye(len(gram))
-    # Its rows say how the functions after one make up for it.
+    gram = gram[order][:, order] + WEIGHTS.jitter * gram.trace() * torch.eye(len(gram))
+    # Row i holds how later functions compensate an error of function i.
     rows = torch.linalg.cholesky(torch.cholesky_inverse(torch.linalg.cholesky(gram)), upper=True)
     columns = weights.square().mean(dim=0, keepdim=True).sqrt().clamp_min(1e-30)
     left = (weights / columns)[order]
-    units = left.abs().amax(dim=1, keepdim=True).clamp_min(1e-30) / LEVELS
+    units = left.abs().amax(dim=1, keepdim=True).clamp_min(1e-30) / WEIGHTS.levels
     whole = torch.empty_like(left)
-    for start in range(0, len(left), BLOCK):
-        end = min(start + BLOCK, len(left))
+    for start in range(0, len(left), WEIGHTS.block):
+        end = min(start + WEIGHTS.block, len(left))
         errors = torch.empty_like(left[start:end])
         for i, error in zip(range(start, end), errors, strict=True):
-            whole[i] = (left[i] / units[i]).round().clamp(-MOST, MOST)
+            whole[i] = (left[i] / units[i]).round().clamp(-WEIGHTS.largest, WEIGHTS.largest)
             error[:] = (left[i] - whole[i] * units[i]) / rows[i, i]
             left[i:end] -= rows[i, i:end, None] * error
         left[end:] -= rows[start:end, end:].T @ errors
@@ -116,14 +134,14 @@ def rounded(weights: Tensor, features: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 @dataclass(frozen=True)
 class SpectralRidge:
-    """Ridge regression by the eigenvectors of G, which serve all penalties: for many of them, or a map of low rank.
+    """Ridge regression by the eigenvectors of G, which serve all penalties and maps of low rank.
 
     Attributes:
         values: eigenvalues of G (k,), none negative.
-        vectors: V (p, k), its eigenvectors; where k < p, those of all values that count.
+        vectors: V (p, k), eigenvectors of G; where k < p, the eigenvectors of eigenvalues above rounding errors.
         projected: VᵀR (k, q).
-        penalty: λ, which suits held-out pairs best.
-        error: mean square of what the solution misses of them.
+        penalty: λ with the smallest error on held-out pairs.
+        error: mean square error on held-out pairs.
     """
 
     values: Tensor
@@ -136,7 +154,7 @@ class SpectralRidge:
     def fit(
         cls, gram: Tensor, right: Tensor, held_out: tuple[Tensor, Tensor], penalties: Sequence[float]
     ) -> SpectralRidge:
-        """See `ridge` for the arguments."""
+        """Solve for G and R; see `ridge` for the arguments."""
         values, vectors = torch.linalg.eigh(gram)
         return cls._chosen(values.clamp_min(0), vectors, vectors.T @ right, held_out, penalties)
 
@@ -144,7 +162,7 @@ class SpectralRidge:
     def of_samples(
         cls, x: Tensor, y: Tensor, held_out: tuple[Tensor, Tensor], penalties: Sequence[float]
     ) -> SpectralRidge:
-        """The same for G = XᵀX and R = XᵀY, by the smaller of XᵀX and XXᵀ: features x (n, p), values y (n, q)."""
+        """Solve for G = XᵀX and R = XᵀY, by the smaller of XᵀX and XXᵀ: features x (n, p), values y (n, q)."""
         if len(x) >= x.shape[1]:
             return cls.fit(x.T @ x, x.T @ y, held_out, penalties)
         values, left = torch.linalg.eigh(x @ x.T)
@@ -177,8 +195,8 @@ class SpectralRidge:
         return self.vectors @ (self.projected / (self.values + self.penalty)[:, None])
 
     def low_rank(self, rank: int) -> tuple[Tensor, Tensor]:
-        """Factors (p, rank) and (rank, q) of the map of that rank whose values X W are nearest to the solution's."""
-        # The columns of X H are orthonormal but for the penalty, so the error of X H B is that of B.
+        """Return factors (p, rank) and (rank, q) of the map of this rank nearest to the solution in values X W."""
+        # Except for the penalty, the columns of X H are orthonormal, so X H B and B have the same error.
         scale = (self.values + self.penalty).rsqrt()
         h, b = self.vectors * scale, self.projected * scale[:, None]
         strongest = torch.linalg.eigh(b @ b.T)[1][:, -rank:]
@@ -186,27 +204,23 @@ class SpectralRidge:
         return h @ strongest, strongest.T @ b
 
 
-#: Penalties of `regression`, as shares of the mean square of a feature.
-PENALTIES = tuple(10.0**k for k in range(-6, 3))
-
-
 def regression(x: Tensor, y: Tensor, held_out: tuple[Tensor, Tensor]) -> SpectralRidge:
-    """Ridge regression from features x (n, p), of a mean square of about one, to y (n, q), in double precision."""
+    """Fit y (n, q) to features x (n, p), with a mean square of about one, by ridge regression in double precision."""
     x, y = (values.double() / len(x) ** 0.5 for values in (x, y))
     return SpectralRidge.of_samples(x, y, (held_out[0].double(), held_out[1]), PENALTIES)
 
 
 def principal_axes(x: Tensor, by: Literal["svd", "rows", "columns"]) -> tuple[Tensor, Tensor]:
-    """Singular values (k,) of x (n, p), falling, and its right singular vectors as rows (k, p), in the type of x.
+    """Return singular values (k,) of x (n, p), in falling order, and right singular vectors as rows (k, p).
 
-    The caller subtracts the mean.
+    The caller subtracts the mean. The results have the type of x.
 
     Args:
         x: n samples.
-        by: ``svd``, accurate to rounding, k = min(n, p). ``rows``, by the eigenvectors of x xᵀ, k = n: the fastest for
-            n much less than p; axes that are rounding errors (`ROUNDING`), and their singular values, are 0.
-            ``columns``, by those of xᵀ x, k = p: the fastest for n much greater than p. The last two, in double
-            precision, resolve no singular value below 1e-8 of the largest.
+        by: ``svd`` is accurate to rounding, k = min(n, p). ``rows`` uses the eigenvectors of x xᵀ, k = n, the fastest
+            for n much less than p. Axes that are rounding errors (`ROUNDING`), and their singular values, are 0.
+            ``columns`` uses the eigenvectors of xᵀ x, k = p, the fastest for n much greater than p. The last two
+            compute in double precision and resolve no singular value below 1e-8 of the largest.
     """
     if by == "svd":
         _, s, vt = torch.linalg.svd(x, full_matrices=False)

@@ -1,4 +1,4 @@
-"""What factors and coordinates are called in a bundle: by the body's own sides, and as the configuration says."""
+"""Names of factors and coordinates in a bundle: by the sides of the body, and by the configuration."""
 
 from __future__ import annotations
 
@@ -10,29 +10,30 @@ import numpy as np
 from shapespace.arrays import FloatArray
 from shapespace.training.runs.config import ExportSettings
 
-#: Sides as a viewer of the collection's axes sees them, see ``training.space.factors.names``: axis and sign.
+#: Sides as seen by a viewer of the collection's axes, as axis and sign; see ``training.space.factors.names``.
 SIDES = {"left": (0, -1), "right": (0, 1), "lower": (1, -1), "upper": (1, 1), "back": (2, -1), "front": (2, 1)}
 
 
 class NamingError(ValueError):
-    """Names that no factor or coordinate has, or one that two would have."""
+    """The configuration names no existing factor or coordinate, or gives one name to two of them."""
 
 
-def called(
+def bundle_names(
     factors: Mapping[str, list[int]], coordinates: Sequence[str], settings: ExportSettings
 ) -> tuple[dict[str, list[int]], list[str]]:
-    """Factors and the names of coordinates (m,) as a bundle has them.
+    """Return the factors and the names of coordinates (m,) in the bundle.
 
     Args:
-        factors: coordinates by name, as the run found them.
-        coordinates: (m,) names; where they begin with their factor's, they follow it.
-        settings: ``faces`` and ``up`` turn sides into the body's own, ``names`` name what they mention.
+        factors: coordinates by the factor's name in the run.
+        coordinates: (m,) names. A name that begins with the name of its factor is renamed with the factor.
+        settings: ``faces`` and ``up`` turn sides into the body's own; ``names`` renames single factors and
+            coordinates.
 
     Raises:
-        NamingError: names of nothing, or one name for two.
+        NamingError: an unknown name, or one name for two.
 
     >>> plain = ExportSettings(name="a", title="A", description="A.", licence="MIT", faces="+z")
-    >>> called({"upper right": [0]}, ["upper right"], plain)
+    >>> bundle_names({"upper right": [0]}, ["upper right"], plain)
     ({'upper left': [0]}, ['upper left'])
     """
     if unknown := sorted(settings.names.keys() - {*factors, *coordinates}):
@@ -54,7 +55,7 @@ def called(
 
 
 def _of_the_body(name: str, settings: ExportSettings) -> str:
-    """A name with the viewer's sides replaced by those of a body that faces somewhere."""
+    """Replace the viewer's sides in a name by the sides of a body with the configured orientation."""
     if settings.faces is None:
         return name
     up, front = _direction(settings.up), _direction(settings.faces)
@@ -71,5 +72,5 @@ def _of_the_body(name: str, settings: ExportSettings) -> str:
 
 
 def _direction(axis: str) -> FloatArray:
-    """(3,) of an axis such as "+y"."""
+    """Return the unit vector (3,) of an axis such as "+y"."""
     return (1.0 if axis[0] == "+" else -1.0) * np.eye(3)["xyz".index(axis[1])]

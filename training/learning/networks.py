@@ -1,7 +1,4 @@
-"""The networks of a model: factor networks, combiner, start network; and the monolithic baseline.
-
-Paper, sections 3 and 4. All but the start network put out NRIC ``z`` (n, 2E).
-"""
+"""Factor networks, which also serve as monolithic baselines, and the start network (paper, sections 3 and 4)."""
 
 from __future__ import annotations
 
@@ -31,39 +28,40 @@ def predict(network: Callable[[Tensor], Tensor], inputs: Tensor, batch_size: int
 
 
 class ShapeNetwork(nn.Module):
-    """A network that puts out NRIC, and names the coordinates in which it is compared with samples in training."""
+    """Network that puts out NRIC, and defines the coordinates in which training compares it with samples."""
 
     @property
     def metadata(self) -> dict[str, str]:
-        """What its file says beside its tensors."""
+        """Text stored in its file next to the tensors."""
         return {}
 
     def coefficients(self, inputs: Tensor) -> Tensor:
-        """The output in the coordinates of the loss."""
+        """Return the output in the coordinates of the loss."""
         raise NotImplementedError
 
     def target(self, z: Tensor) -> Tensor:
-        """The exact `coefficients` of NRIC (n, 2E)."""
+        """Return the exact `coefficients` of NRIC (n, 2E)."""
         raise NotImplementedError
 
     def error(self, found: Tensor, target: Tensor) -> Tensor:
-        """Mean square error in these coordinates, by which epochs are compared."""
+        """Return the mean square error in these coordinates, by which epochs are compared."""
         return nn.functional.mse_loss(found, target)
 
     def loss(self, inputs: Tensor, target: Tensor) -> Tensor:
-        """This error, or an estimate of it, to train with."""
+        """Return this error, or an estimate of it, for training."""
         return self.error(self.coefficients(inputs), target)
 
 
 class FactorNetwork(ShapeNetwork):
     """ψ_j: latents of one factor (n, m_j) → NRIC (n, 2E).
 
-    A perceptron, and a last layer that maps its coefficients to scaled differences; without ``basis`` the perceptron's
-    own last layer does so. ``skip`` is a linear map from latents to the coefficients beside the perceptron: of Fourier
-    products, for detail too fine for a perceptron, or of polynomials, since an exponential is smooth in its velocity.
+    A perceptron puts out coefficients, and a last layer maps them to scaled differences. Without ``basis`` the
+    perceptron's own last layer does so. ``skip`` is a linear map from latents to coefficients, added to the
+    perceptron. It starts from Fourier products, for detail too fine for a perceptron, or from polynomials, since an
+    exponential is smooth in its velocity.
 
     Attributes:
-        metric: (rank, rank) that errors of coefficients are multiplied with; None for the mean square error.
+        metric: (rank, rank) factor of coefficient errors; None for the mean square error.
     """
 
     skip: Tensor
@@ -84,43 +82,43 @@ class FactorNetwork(ShapeNetwork):
             self.skip_features = Polynomials(coordinates, affordable_degree(settings.skip_degree, len(coordinates)))
         if self.skip_features is not None:
             self.register_buffer("skip", torch.zeros(self.skip_features.size, size))
-            # Training starts from the fitted layer alone.
+            # Training starts from the fitted layer only.
             for parameter in self.hidden[-1].parameters():
                 nn.init.zeros_(parameter)
 
     def target(self, z: Tensor) -> Tensor:
-        """Coefficients (n, rank), or scaled differences, of NRIC (n, 2E)."""
+        """Return coefficients (n, rank), or scaled differences, of NRIC (n, 2E)."""
         y = self.scaling.down(z)
         return y if self.basis is None else self.basis.encode(y)
 
     def coefficients(self, inputs: Tensor) -> Tensor:
-        """Output of all layers but the last."""
+        """Return the output of all layers but the last."""
         result: Tensor = self.hidden(self.features(inputs))
         if self.skip_features is not None:
             result = result + self.skip_features(inputs) @ self.skip
         return result
 
     def penalise(self, basis: PatchBasis, closing: sparse.csr_array, weight: float) -> None:
-        """Let errors that no change of a surface makes count more.
+        """Give more weight to errors that are not the change of any surface.
 
         Args:
             basis: the last layer.
             closing: (q, 2E) derivatives of the closing conditions by NRIC, see `Integrability`.
-            weight: of their squares, scaled to the mean square of errors that are alike in all directions.
+            weight: weight of their squares, relative to the mean square of errors that are equal in all directions.
         """
         each = (basis(torch.eye(basis.rank)) - basis.mean) * self.scaling.inverse
         change = closing @ each.double().numpy().T
         gram = torch.from_numpy(change.T @ change)
-        scale = float(gram.trace()) / len(gram) or 1.0  # a strip has no vertex that faces close around
+        scale = float(gram.trace()) / len(gram) or 1.0  # a strip has no inner vertex
         self.metric = torch.linalg.cholesky(torch.eye(len(gram)) + weight / scale * gram).float()
 
     def error(self, found: Tensor, target: Tensor) -> Tensor:
-        """Mean square error of coefficients, in the metric if there is one."""
+        """Return the mean square error of coefficients, in the metric if there is one."""
         missed = found - target
         return (missed if self.metric is None else missed @ self.metric).square().mean()
 
     def fit_skip(self, latent: Tensor, target: Tensor, held_out: tuple[Tensor, Tensor]) -> None:
-        """Fit the linear layer to coefficients by ridge regression; pairs held out choose its penalty."""
+        """Fit the linear layer to coefficients by ridge regression; held-out pairs choose its penalty."""
         if self.skip_features is not None:
             features, chosen = (predict(self.skip_features, x) for x in (latent, held_out[0]))
             self.skip.copy_(regression(features, target, (chosen, held_out[1])).weights)
@@ -131,12 +129,12 @@ class FactorNetwork(ShapeNetwork):
 
 
 class StartNetwork(nn.Module):
-    """Codes (n, m) → vertices (n, V, 3), roughly: where the reconstruction starts if lengths and angles give no start.
+    """Codes (n, m) → rough vertices (n, V, 3), where reconstruction starts if lengths and angles give no start.
 
-    Polynomials of the latents (cosine and sine of a periodic one), and a linear map of low rank. A position depends on
-    all rotations between it and the middle of the shape, so that polynomials of low degree are not accurate (the
-    figure: 0.8 % of the diagonal at degree 2, 0.7 % at degree 3, where frames leave 0.1 %); but they are never far off,
-    and for that degree 2 is enough.
+    Polynomials of the latents (cosine and sine of a periodic latent), and a linear map of low rank. A position depends
+    on all rotations between it and the middle of the shape, so polynomials of low degree are not accurate. The error
+    on the figure is 0.8 % of the diagonal at degree 2 and 0.7 % at degree 3; frames have 0.1 %. But the error is never
+    large, and for that degree 2 is enough.
     """
 
     #: Total degree of the polynomials, and largest rank of the linear map.
@@ -158,7 +156,7 @@ class StartNetwork(nn.Module):
         self.register_buffer("basis", torch.zeros(rank, reference.size))
 
     def fit(self, latents: Tensor, vertices: NDArray, held_out: tuple[Tensor, NDArray]) -> None:
-        """Fit to codes (n, m) and their shapes (n, V, 3) by ridge regression; held-out pairs choose its penalty."""
+        """Fit to codes (n, m) and vertices (n, V, 3) by ridge regression; held-out pairs choose the penalty."""
         reference = self.reference.double().numpy()
 
         def pair(latents: Tensor, vertices: NDArray) -> tuple[Tensor, Tensor]:

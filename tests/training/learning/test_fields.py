@@ -12,11 +12,10 @@ import torch
 
 from shapespace.coordinates.nric import WeightedNorm, nric
 from shapespace.training.collection.generators.freaky_torus import PAPER, FreakyTorus, edge_permutation
-from shapespace.training.learning.combiners import combiner
+from shapespace.training.learning.combiners import combiner, kernels
 from shapespace.training.learning.combiners.combiner import CombinerNetwork
 from shapespace.training.learning.combiners.correction import JointSamples, Motion
 from shapespace.training.learning.combiners.fields import FieldCorrection
-from shapespace.training.learning.combiners.kernels import KernelCorrection
 from shapespace.training.learning.fitting import read_network, save_network
 from shapespace.training.learning.layers import Scaling
 from shapespace.training.runs.config import AutoSettings, FieldSettings, KernelSettings
@@ -152,8 +151,8 @@ def test_auto_tries_what_follows_a_bump(
     It is chosen by the share of the kernel's error that it has to reach, and not tried where the kernel is slow.
     """
     monkeypatch.setattr(combiner, "KernelSettings", lambda: KernelSettings(coefficients=3, patches=64))
-    monkeypatch.setattr(KernelCorrection, "FUNCTIONS", (40,))
-    monkeypatch.setattr(combiner, "BETTER", better)
+    monkeypatch.setattr(kernels, "LIMITS", replace(kernels.LIMITS, functions=(40,)))
+    monkeypatch.setattr(combiner, "AUTO", replace(combiner.AUTO, better=better))
     trained: list[str] = []
 
     def train(combiner: CombinerNetwork) -> None:

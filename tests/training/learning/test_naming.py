@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 from pydantic import ValidationError
 
-from shapespace.training.learning.naming import NamingError, called
+from shapespace.training.learning.naming import NamingError, bundle_names
 from shapespace.training.runs.config import ExportSettings
 
 FACTORS = {"upper right": [0, 1], "lower left front": [2], "middle": [3]}
@@ -19,7 +19,7 @@ def settings(**given: Any) -> ExportSettings:
 
 
 def test_names_stay_where_nothing_is_said() -> None:
-    assert called(FACTORS, COORDINATES, settings()) == (FACTORS, COORDINATES)
+    assert bundle_names(FACTORS, COORDINATES, settings()) == (FACTORS, COORDINATES)
 
 
 @pytest.mark.parametrize(
@@ -33,7 +33,7 @@ def test_names_stay_where_nothing_is_said() -> None:
     ],
 )
 def test_left_and_right_are_the_bodys_own(faces: str, up: str, expected: list[str]) -> None:
-    factors, coordinates = called(FACTORS, COORDINATES, settings(faces=faces, up=up))
+    factors, coordinates = bundle_names(FACTORS, COORDINATES, settings(faces=faces, up=up))
     assert list(factors) == expected
     assert list(factors.values()) == list(FACTORS.values())
     assert coordinates == [f"{expected[0]}, 1", f"{expected[0]}, 2", *expected[1:]]
@@ -41,23 +41,23 @@ def test_left_and_right_are_the_bodys_own(faces: str, up: str, expected: list[st
 
 def test_names_win_and_coordinates_follow_their_factor() -> None:
     names = {"upper right": "left arm", "upper right, 2": "raise", "middle": "spine"}
-    factors, coordinates = called(FACTORS, COORDINATES, settings(names=names, faces="+z"))
+    factors, coordinates = bundle_names(FACTORS, COORDINATES, settings(names=names, faces="+z"))
     assert list(factors) == ["left arm", "lower right front", "spine"]
     assert coordinates == ["left arm, 1", "raise", "lower right front", "spine"]
 
 
 def test_names_of_a_product_are_named_too() -> None:
-    found = called({"bump": [0, 1]}, ["gamma", "zeta"], settings(names={"gamma": "along", "bump": "a bump"}))
+    found = bundle_names({"bump": [0, 1]}, ["gamma", "zeta"], settings(names={"gamma": "along", "bump": "a bump"}))
     assert found == ({"a bump": [0, 1]}, ["along", "zeta"])
 
 
 def test_names_of_nothing_and_names_for_two_are_refused() -> None:
     with pytest.raises(NamingError, match="'nose', which is neither a factor nor a coordinate"):
-        called(FACTORS, COORDINATES, settings(names={"nose": "a"}))
+        bundle_names(FACTORS, COORDINATES, settings(names={"nose": "a"}))
     with pytest.raises(NamingError, match="Two factors would be called 'middle'"):
-        called(FACTORS, COORDINATES, settings(names={"upper right": "middle"}))
+        bundle_names(FACTORS, COORDINATES, settings(names={"upper right": "middle"}))
     with pytest.raises(NamingError, match="Two coordinates would be called 'b'"):
-        called(FACTORS, COORDINATES, settings(names={"upper right, 1": "b", "upper right, 2": "b"}))
+        bundle_names(FACTORS, COORDINATES, settings(names={"upper right, 1": "b", "upper right, 2": "b"}))
     with pytest.raises(ValidationError, match="cannot have its head along"):
         settings(faces="-y")
     with pytest.raises(ValidationError, match="nothing for 'middle'"):

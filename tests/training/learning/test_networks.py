@@ -293,7 +293,7 @@ def test_outputs_that_change_shapes_by_next_to_nothing_are_left_out(
     x, z = interplay(ball, 60, lambda a, b, f, g: a * b * f + 0.05 * a**2 * b * g)
     found = {}
     for unseen in (1e-3, 0):
-        monkeypatch.setattr(kernels, "UNSEEN", unseen)
+        monkeypatch.setattr(kernels, "LIMITS", replace(kernels.LIMITS, unseen=unseen))
         network = fitted(ball, KernelSettings(coefficients=2), x, z, 40)
         assert isinstance(network.correction, KernelCorrection)
         with torch.no_grad():
@@ -309,8 +309,8 @@ def test_there_are_more_functions_as_long_as_they_gain_what_can_be_seen(
     ball: TriangleMesh, monkeypatch: pytest.MonkeyPatch, unseen: float, functions: int
 ) -> None:
     """Of 40 samples, whose number is the most that there can be."""
-    monkeypatch.setattr(KernelCorrection, "FUNCTIONS", (5, 20, 80))
-    monkeypatch.setattr(kernels, "UNSEEN", unseen)
+    limits = replace(kernels.LIMITS, functions=(5, 20, 80), unseen=unseen)
+    monkeypatch.setattr(kernels, "LIMITS", limits)
     x, z = interplay(ball, 60, cubic)
     correction = fitted(ball, KernelSettings(coefficients=2), x, z, 40).correction
     assert isinstance(correction, KernelCorrection)
@@ -319,7 +319,7 @@ def test_there_are_more_functions_as_long_as_they_gain_what_can_be_seen(
 
 def test_few_functions_have_weights_that_can_be_rounded(ball: TriangleMesh, monkeypatch: pytest.MonkeyPatch) -> None:
     """The penalty that suits held-out samples best before rounding leaves a third of the mean square after it."""
-    monkeypatch.setattr(KernelCorrection, "FUNCTIONS", (40,))
+    monkeypatch.setattr(kernels, "LIMITS", replace(kernels.LIMITS, functions=(40,)))
     x, z = interplay(ball, 400, beyond_cubic)
     network = fitted(ball, KernelSettings(coefficients=3), x, z, 300)
     with torch.no_grad():

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 import torch
 
-from benchmarks import bundled, paper, results, served, studies
+from benchmarks import bundled, pages, paper, results, served, studies
 from benchmarks.results import have, measured
 from benchmarks.studies import SeedLearner, ShareLearner, Studies
 from benchmarks.variants import Variant, recipes
@@ -41,7 +41,7 @@ def test_the_page_of_results_says_what_was_measured(tmp_path: Path, monkeypatch:
     row["evaluation"]["fresh"]["r2"]["composite"]["total"] = 0.87654
     (tmp_path / "horse.json").write_text(json.dumps(row))
     monkeypatch.setattr(results, "FIGURES", tmp_path)
-    monkeypatch.setattr(results, "DOCS", tmp_path)
+    monkeypatch.setattr(pages, "MEASUREMENTS", tmp_path)
     results.write_page()
     page = (tmp_path / "results.md").read_text()
     assert "| horse | 35 | 20 | 5 |" in page
@@ -55,7 +55,11 @@ def test_the_page_of_results_says_what_was_measured(tmp_path: Path, monkeypatch:
 def test_a_row_of_folds_counts_each_shape_once() -> None:
     def fold(own: float, components: float, shapes: int) -> dict[str, object]:
         found = {"mean": own, "p95": 0.1}
-        return found | {"components": {"mean": components, "p95": 0.1}, served.ALONE: found, "shapes": shapes}
+        return found | {
+            "components": {"mean": components, "p95": 0.1},
+            served.WITHOUT_EXAMPLES: found,
+            "shapes": shapes,
+        }
 
     cells = served.compared([fold(0.01, 0.02, 1), fold(0.04, 0.02, 3)])
     assert cells[:6] == ["3.250", "10.000", "2.000", "10.000", "1.62", "0.50 – 2.00"]

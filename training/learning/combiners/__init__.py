@@ -1,1 +1,1 @@
-"""Combiners: the corrections of the affine sum of factor shapes, a module for each kind."""
+"""Combiners: the corrections of the affine sum of factor shapes, one module for each kind."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from typing import Any
 
 from pydantic import TypeAdapter
@@ -30,7 +31,7 @@ from shapespace.training.runs.config import (
     ResolvedCorrection,
 )
 
-#: The classes of corrections, by the kinds of their settings.
+#: Classes of corrections, by the kind of their settings.
 CORRECTIONS: dict[str, type[Correction]] = {
     "kernel": KernelCorrection,
     "products": ProductCorrection,
@@ -39,14 +40,33 @@ CORRECTIONS: dict[str, type[Correction]] = {
 }
 
 
-#: Share of the kernel's squared error on held-out codes below which another kind, which takes longer, is chosen.
-BETTER = 0.9
-#: Of how many shapes of a factor principal components are counted until they hold 99 % of the variance, and from how
-#: many on, in all and for each latent, something wanders over the surface. A bump on a torus needs hundreds for its two
-#: latents; factors of bodies, faces and hippocampi with up to 80 latents at most 3.4 for each.
-LOOKED_AT, WANDERING, FOR_EACH_LATENT = 500, 100, 5
-#: Convolutions that follow a bump over a torus (docs/measurements/notes.md, Freaky Torus for three epochs).
-FOLLOWING = ConvolutionSettings(
+@dataclass(frozen=True)
+class AutoChoice:
+    """Limits by which ``auto`` tries and chooses another kind than the kernel.
+
+    A feature moves over the surface if the shapes of its factor have many principal components. A bump on a torus has
+    hundreds for its two latents. Factors of bodies, faces and hippocampi with up to 80 latents have at most 3.4 for
+    each latent.
+
+    Attributes:
+        better: share of the kernel's squared error on held-out codes below which the other kind, which takes longer,
+            is chosen.
+        shapes: number of shapes of a factor whose principal components are counted.
+        variance: share of the variance that the components hold.
+        components: least number of components that shows a moving feature.
+        components_per_latent: the same, for each latent of the factor.
+    """
+
+    better: float = 0.9
+    shapes: int = 500
+    variance: float = 0.99
+    components: int = 100
+    components_per_latent: int = 5
+
+
+AUTO = AutoChoice()
+#: Convolutions for features that move over the surface (docs/measurements/notes.md, Freaky Torus for three epochs).
+MOVING_FEATURES = ConvolutionSettings(
     layers=5,
     width=40,
     neighbourhood="flaps",
@@ -57,34 +77,34 @@ FOLLOWING = ConvolutionSettings(
 
 
 def choices(settings: CorrectionSettings) -> list[ResolvedCorrection]:
-    """All that ``auto`` may choose; nothing for other settings."""
-    return [KernelSettings(), FieldSettings(), FOLLOWING] if isinstance(settings, AutoSettings) else []
+    """Return the settings that ``auto`` may choose from; an empty list for other settings."""
+    return [KernelSettings(), FieldSettings(), MOVING_FEATURES] if isinstance(settings, AutoSettings) else []
 
 
-def _follower(own: JointSamples) -> FieldSettings | ConvolutionSettings | None:
-    """What ``auto`` tries beside the kernel, by a quick look: nothing where nothing wanders over the surface."""
+def _alternative(own: JointSamples) -> FieldSettings | ConvolutionSettings | None:
+    """Return the settings that ``auto`` tries next to the kernel; None if no feature moves over the surface."""
     if own.motion:
         return FieldSettings()
-    usual = (max(WANDERING, FOR_EACH_LATENT * len(index)) for index in own.latents)
-    shapes = own.scaling.down(own.factors[:LOOKED_AT]).unbind(dim=1)
-    return FOLLOWING if any(_components(y) > most for y, most in zip(shapes, usual, strict=True)) else None
+    usual = (max(AUTO.components, AUTO.components_per_latent * len(index)) for index in own.latents)
+    shapes = own.scaling.down(own.factors[: AUTO.shapes]).unbind(dim=1)
+    return MOVING_FEATURES if any(_components(y) > most for y, most in zip(shapes, usual, strict=True)) else None
 
 
 def _components(y: Tensor) -> int:
-    """How many principal components hold 99 % of the variance of y (n, p)."""
+    """Return the number of principal components that hold 99 % of the variance of y (n, p)."""
     s, _ = principal_axes(y - y.mean(dim=0), by="rows")
     variance = s.square().cumsum(0)
-    return 1 + int((variance < 0.99 * variance[-1]).sum())
+    return 1 + int((variance < AUTO.variance * variance[-1]).sum())
 
 
 class CombinerNetwork(ShapeNetwork):
-    """Ψ: J factor shapes (n, J, 2E) → NRIC (n, 2E) of the joint shape. Nothing but these shapes is its input.
+    """Ψ: factor shapes (n, J, 2E) → NRIC (n, 2E) of the joint shape. Its only input are these shapes.
 
     Args:
-        scaling: to scaled differences.
-        settings: of the correction.
-        correction: what maps scaled differences to scaled differences.
-        tried: where it was chosen, by kind the mean square error of scaled differences on held-out codes.
+        scaling: maps NRIC to scaled differences.
+        settings: settings of the correction.
+        correction: maps scaled differences of factor shapes to scaled differences of the joint shape.
+        tried: by kind, the mean square error on held-out codes in scaled differences; empty if nothing was chosen.
     """
 
     def __init__(
@@ -103,15 +123,15 @@ class CombinerNetwork(ShapeNetwork):
         seed: int,
         train: Callable[[CombinerNetwork], Any] = lambda network: None,
     ) -> CombinerNetwork:
-        """Fit all that has a closed form, see `Correction.fit`, and choose by held-out samples where there is a choice.
+        """Fit all parts that have a closed form, see `Correction.fit`. Held-out samples choose between kinds.
 
         Args:
-            settings: of the correction.
-            reference: the mesh.
-            own: samples to fit to.
+            settings: settings of the correction.
+            reference: the reference mesh.
+            own: training samples.
             held_out: samples that choose.
-            seed: of whatever is random.
-            train: called with each network that was fitted, to train what has no closed form.
+            seed: seed of all random numbers.
+            train: called with each fitted network, to train the parts without a closed form.
         """
 
         def fit(each: ResolvedCorrection) -> CombinerNetwork:
@@ -132,12 +152,12 @@ class CombinerNetwork(ShapeNetwork):
         start = time.monotonic()
         chosen = fit(KernelSettings())
         tried = {"kernel": error(chosen)}
-        follower = _follower(own)
-        if follower and time.monotonic() - start < 60 * settings.minutes:
-            within = follower.fit.model_copy(update={"minutes": settings.minutes})
-            other = fit(follower.model_copy(update={"fit": within}))
-            tried[follower.kind] = error(other)
-            if tried[follower.kind] < BETTER * tried["kernel"]:
+        alternative = _alternative(own)
+        if alternative and time.monotonic() - start < 60 * settings.minutes:
+            within = alternative.fit.model_copy(update={"minutes": settings.minutes})
+            other = fit(alternative.model_copy(update={"fit": within}))
+            tried[alternative.kind] = error(other)
+            if tried[alternative.kind] < AUTO.better * tried["kernel"]:
                 chosen = other
         return cls(own.scaling, chosen.settings, chosen.correction, tried)
 
@@ -145,7 +165,7 @@ class CombinerNetwork(ShapeNetwork):
     def load(
         cls, metadata: Mapping[str, str], reference: TriangleMesh, tensors: Mapping[str, Tensor]
     ) -> CombinerNetwork:
-        """The network whose ``metadata`` and ``state_dict()`` these are."""
+        """Return the network with this ``metadata`` and this ``state_dict()``."""
         settings: ResolvedCorrection = TypeAdapter(ResolvedCorrection).validate_json(metadata["correction"])
         parts: dict[str, dict[str, Tensor]] = {"scaling": {}, "correction": {}}
         for name, tensor in tensors.items():
@@ -158,20 +178,20 @@ class CombinerNetwork(ShapeNetwork):
 
     @property
     def metadata(self) -> dict[str, str]:
-        """``correction``: its settings, with its kind, and ``tried``, as JSON."""
+        """``correction``: its settings and kind, and ``tried``, both as JSON."""
         return {"correction": self.settings.model_dump_json(), "tried": json.dumps(self.tried)}
 
     def target(self, z: Tensor) -> Tensor:
-        """Scaled differences (n, 2E) of NRIC (n, 2E)."""
+        """Return scaled differences (n, 2E) of NRIC (n, 2E)."""
         return self.scaling.down(z)
 
     def coefficients(self, inputs: Tensor) -> Tensor:
-        """Scaled differences (n, 2E) of the joint shape for factor shapes (n, J, 2E)."""
+        """Return scaled differences (n, 2E) of the joint shape for factor shapes (n, J, 2E)."""
         result: Tensor = self.correction(self.scaling.down(inputs))
         return result
 
     def loss(self, inputs: Tensor, target: Tensor) -> Tensor:
-        """The correction's own, which may be an estimate."""
+        """Return the loss of the correction, which may be an estimate."""
         return self.correction.loss(self.scaling.down(inputs), target)
 
     def forward(self, factors: Tensor) -> Tensor:

@@ -22,16 +22,16 @@ from shapespace.training.runs.config import ConvolutionSettings, FitSettings, Pr
 class ConvolutionCorrection(Correction):
     """Graph convolutions on edges, each followed by batch normalisation, ELU and dropout.
 
-    With ``residual`` they correct the affine sum, or what products make of it, and begin as zero; without, they make
-    the joint shape themselves, as in the paper. Features of an edge are the lengths and angles of the J factors, length
-    and angle in the reference, and learned constants.
+    With ``residual`` they correct the affine sum, or its correction by products, and start at zero. Without
+    ``residual`` they put out the joint shape itself, as in the paper. Features of an edge are the lengths and angles
+    of the J factors, length and angle in the reference, and learned constants.
 
     Args:
-        settings: of the network.
-        reference: the mesh.
+        settings: settings of the network.
+        reference: the reference mesh.
         rest: (2E,) NRIC of the reference.
         factor_count: J.
-        products: of the factors' shapes, added to the affine sum first.
+        products: correction by products of factor shapes, added to the affine sum first.
     """
 
     rest: Tensor
@@ -70,7 +70,7 @@ class ConvolutionCorrection(Correction):
         held_out: JointSamples,
         seed: int,
     ) -> ConvolutionCorrection:
-        """The untrained network, with fitted products; see `Correction`."""
+        """Return the untrained network, with fitted products; see `Correction`."""
         products = None
         if settings.products:
             how = ProductSettings(coefficients=settings.products)
@@ -81,7 +81,7 @@ class ConvolutionCorrection(Correction):
     def load(
         cls, settings: ConvolutionSettings, reference: TriangleMesh, tensors: Mapping[str, Tensor]
     ) -> ConvolutionCorrection:
-        """See `Correction`."""
+        """Return the network with these tensors; see `Correction`."""
         prefix, products = "products.", None
         if settings.products:
             own = {name.removeprefix(prefix): t for name, t in tensors.items() if name.startswith(prefix)}
@@ -94,28 +94,28 @@ class ConvolutionCorrection(Correction):
 
     @property
     def descent(self) -> FitSettings:
-        """Adam trains all but the products."""
+        """Settings of the training; the products are not trained."""
         return self.settings.fit
 
     @cached_property
     def crops(self) -> Crops | None:
-        """Where the loss is computed; None on whole shapes.
+        """Crops that the loss is computed on; None for whole shapes.
 
         Raises:
-            ValueError: they are too small.
+            ValueError: crops are too small.
         """
         size, table = self.settings.crop, flaps(self.reference.connectivity)
         return Crops(self.reference.edge_midpoints, table, size, self.settings.layers) if size else None
 
     def _start(self, y: Tensor) -> Tensor:
-        """What the convolutions correct, (n, 2E)."""
+        """Return the shapes (n, 2E) that the convolutions correct."""
         if not self.settings.residual:
             return torch.zeros_like(y[:, 0])
         total = y.sum(dim=1)
         return total if self.products is None else total + self.products.difference(y)
 
     def _constants(self) -> Tensor:
-        """(E, 2 + edge_channels) features of edges that are the same for all shapes."""
+        """Return features (E, 2 + edge_channels) of edges that are the same for all shapes."""
         return torch.cat([self.rest, self.edge_constants], dim=1)
 
     def forward(self, y: Tensor) -> Tensor:
@@ -126,7 +126,7 @@ class ConvolutionCorrection(Correction):
         return start + self._layers(features).permute(1, 2, 0).reshape(n, double)
 
     def _layers(self, x: Tensor, neighbours: Tensor | None = None) -> Tensor:
-        """(E, n, 2) of features (E, n, C) of edges."""
+        """Map features (E, n, C) of edges to outputs (E, n, 2)."""
         for convolution, norm in zip(self.convolutions, self.norms, strict=True):
             new = norm(convolution(x, neighbours).flatten(0, 1))
             new = self.dropout(nn.functional.elu(new)).view(*x.shape[:2], -1)
@@ -134,7 +134,7 @@ class ConvolutionCorrection(Correction):
         return self.readout(x)
 
     def loss(self, y: Tensor, target: Tensor) -> Tensor:
-        """Mean square error, of the inner edges of crops if there are any."""
+        """Return the mean square error on the inner edges of crops, or on whole shapes."""
         if self.crops is None:
             return super().loss(y, target)
         n, j, double = y.shape
@@ -151,11 +151,11 @@ class ConvolutionCorrection(Correction):
 
 
 class EdgeConvolution(nn.Module):
-    """A graph convolution on features (E, n, C) of edges.
+    """Graph convolution on features (E, n, C) of edges.
 
-    `Star`, the paper's: ``W₁ x_e + W₂ Σ_{N(e)} x + b``, where N(e) are the edges that share a vertex with e. It does
-    not distinguish directions. `Flaps` has a matrix for each of the four other edges of the two faces at e, in an order
-    fixed by e's direction and the faces' orientation: ``W₁ x_e + Σ_k W_{2,k} x_{e_k} + b``.
+    `Star`, from the paper: ``W₁ x_e + W₂ Σ_{N(e)} x + b``, where N(e) are the edges that share a vertex with e. It
+    does not distinguish directions. `Flaps` has a matrix for each of the four other edges of the two faces at e, in an
+    order fixed by e's direction and the faces' orientation: ``W₁ x_e + Σ_k W_{2,k} x_{e_k} + b``.
     """
 
     def __init__(self, around: Star | Flaps, n_in: int, n_out: int) -> None:
@@ -165,22 +165,22 @@ class EdgeConvolution(nn.Module):
         self.other = nn.Linear(around.count * n_in, n_out, bias=False)
         if isinstance(around, Star):
             with torch.no_grad():
-                # An edge has about ten neighbours; so their sum is at first of the size of the edge itself.
+                # An edge has about ten neighbours, so their sum starts at the size of the edge's own features.
                 self.other.weight /= 10
 
     def forward(self, x: Tensor, neighbours: Tensor | None = None) -> Tensor:
-        """Features (E, n, n_out) of features (E, n, n_in).
+        """Map features (E, n, n_in) to features (E, n, n_out).
 
         Args:
-            x: of the whole mesh, or (n K, 1, n_in) of the edges of n crops.
-            neighbours: of a `Crop`; None for the whole mesh.
+            x: features on the whole mesh, or (n K, 1, n_in) on the edges of n crops.
+            neighbours: neighbours of a `Crop`; None for the whole mesh.
         """
         around = self.around(x) if neighbours is None else _side_by_side(_gather(x, neighbours))
         return self.own(x) + self.other(around)
 
 
 class Star(nn.Module):
-    """(E, n, C) → the same: sums over the edges that share a vertex with each, by way of sums at the vertices."""
+    """Sums over the edges that share a vertex with each edge, (E, n, C) → (E, n, C)."""
 
     edges: Tensor
     at_vertex: Tensor
@@ -199,7 +199,7 @@ class Star(nn.Module):
 
 
 class Flaps(nn.Module):
-    """(E, n, C) → (E, n, 4 C): the features of the four other edges of the two faces at each edge, see `flaps`."""
+    """Features of the four other edges of the two faces at each edge, (E, n, C) → (E, n, 4 C); see `flaps`."""
 
     neighbours: Tensor
     targets: Tensor
@@ -209,7 +209,7 @@ class Flaps(nn.Module):
     def __init__(self, connectivity: Connectivity) -> None:
         super().__init__()
         table = flaps(connectivity)
-        # For the gradient: the places of each edge in the flat table.
+        # The gradient needs the places of each edge in the flat table.
         flat, count = table.ravel(), connectivity.edge_count
         order = np.argsort(flat, kind="stable")[: int((flat < count).sum())]
         for name, index in {
@@ -228,7 +228,7 @@ class Flaps(nn.Module):
 
 
 def edges_at_vertices(connectivity: Connectivity) -> IntArray:
-    """(V, k) edges at each vertex, padded with E."""
+    """Return the edges (V, k) at each vertex, padded with E."""
     ends, count = connectivity.edges.ravel(), connectivity.edge_count
     order = np.argsort(ends, kind="stable")
     valence = np.bincount(ends, minlength=connectivity.vertex_count)
@@ -238,31 +238,31 @@ def edges_at_vertices(connectivity: Connectivity) -> IntArray:
 
 
 def flaps(connectivity: Connectivity) -> IntArray:
-    """(E, 4) other edges of the faces left and right of i → j, in each the one at i first; E where there is none."""
+    """Return the other edges (E, 4) of the faces left and right of i → j, the edge at i first; E for a missing face."""
     table = np.full((connectivity.edge_count, 4), connectivity.edge_count)
     for side in (0, 1):
         there = np.flatnonzero(connectivity.edge_faces[:, side] >= 0)
         face = connectivity.edge_faces[there, side]
         for column in (0, 1):
-            # Edge k of a face lies opposite to its corner k: the edge at i is the one opposite to j.
+            # Edge k of a face lies opposite to its corner k, so the edge at i lies opposite to j.
             corner = connectivity.faces[face] == connectivity.edges[there, 1 - column, None]
             table[there, 2 * side + column] = connectivity.face_edges[face][corner]
     return table
 
 
 def _gather(x: Tensor, neighbours: Tensor) -> Tensor:
-    """(E, k, n, C) features of the neighbours of each edge, zero where there is none."""
+    """Return features (E, k, n, C) of the neighbours of each edge, zero for a missing neighbour."""
     padded = torch.cat([x, torch.zeros_like(x[:1])])
     return padded.index_select(0, neighbours.flatten()).unflatten(0, neighbours.shape)
 
 
 def _side_by_side(around: Tensor) -> Tensor:
-    """(E, k, n, C) → (E, n, k C)."""
+    """Reshape (E, k, n, C) to (E, n, k C)."""
     return around.transpose(1, 2).flatten(2)
 
 
 class _FlapGather(torch.autograd.Function):
-    """`_gather` with a gradient that is a gather too, several times faster than autograd's scatter."""
+    """`_gather` whose gradient is also a gather, several times faster than autograd's scatter."""
 
     @staticmethod
     def forward(ctx: Any, x: Tensor, neighbours: Tensor, targets: Tensor, offsets: Tensor) -> Tensor:

@@ -16,18 +16,18 @@ from shapespace.training.learning.layers import Scaling
 from shapespace.training.runs.config import FitSettings
 from shapespace.training.runs.sampling import FeaturePositions
 
-#: Factor shapes (n, J, 2E), and the residual (n, 2E) of their affine sum to the joint shape, as scaled differences.
+#: Factor shapes (n, J, 2E), and joint shapes minus affine sums (n, 2E), as scaled differences.
 Pairs = tuple[Tensor, Tensor]
 
 
 @dataclass(frozen=True)
 class Slopes:
-    """Derivatives at some joint samples by the latents, each in halves of its bounds' width; scaled differences.
+    """Derivatives at some joint samples by the latents, per half width of their bounds, as scaled differences.
 
     Attributes:
-        inputs: (k, J, 2E) the factors' shapes of these samples.
-        latents: of each factor, see `JointSamples`.
-        own: (k, m, 2E) derivatives of that factor's shape.
+        inputs: (k, J, 2E) factor shapes of these samples.
+        latents: latents of each factor, see `JointSamples`.
+        own: (k, m, 2E) derivatives of the shape of the latent's factor.
         missed: (k, m, 2E) derivatives of the difference between the joint shape and the affine sum.
     """
 
@@ -37,7 +37,7 @@ class Slopes:
     missed: Tensor
 
     def coefficients(self, axes: Tensor, columns: NDArray | slice = slice(None)) -> Tensor:
-        """(k m, J d) derivatives of coefficients of the factors' shapes, along axes (J, S, d) in S entries of NRIC."""
+        """Return derivatives (k m, J d) of coefficients of factor shapes along axes (J, S, d), in S entries of NRIC."""
         own = self.own[:, :, columns].to(axes.dtype)
         result = torch.zeros(*own.shape[:2], len(axes), axes.shape[2], dtype=axes.dtype)
         for j, index in enumerate(self.latents):
@@ -45,17 +45,17 @@ class Slopes:
         return result.flatten(2).flatten(0, 1)
 
     def repeated(self, inputs: Tensor) -> Tensor:
-        """(k m, …) something (k, …) of each sample, once for each latent."""
+        """Repeat rows (k, …), one for each sample, once for each latent: (k m, …)."""
         return inputs.repeat_interleave(self.own.shape[1], dim=0)
 
 
 @dataclass(frozen=True)
 class Motion:
-    """Where features are that codes move over the surface.
+    """Positions of the features that codes move over the surface.
 
     Attributes:
-        codes: (n, m) of the joint samples, as angles; images under symmetries have none and come after.
-        places: of the latents at the edges.
+        codes: (n, m) codes of the joint samples as angles. Images under symmetries come after these and have no codes.
+        places: positions of the latents relative to the edges.
     """
 
     codes: Tensor
@@ -64,15 +64,15 @@ class Motion:
 
 @dataclass(frozen=True)
 class JointSamples:
-    """What a correction is fitted to, or chosen by.
+    """Samples that a correction is fitted to, or chosen by.
 
     Attributes:
-        factors: (n, J, 2E) NRIC of the factors' shapes.
+        factors: (n, J, 2E) NRIC of the factor shapes.
         joint: (n, 2E) NRIC of the joint shapes.
-        scaling: to scaled differences.
-        latents: of each factor; no other factor's shape depends on them.
-        slopes: derivatives to fit to as well, where there are some.
-        motion: of features, where codes move them.
+        scaling: maps NRIC to scaled differences.
+        latents: latents of each factor; no other factor's shape depends on them.
+        slopes: derivatives to fit as well, if there are any.
+        motion: positions of features, if codes move features.
     """
 
     factors: Tensor
@@ -84,7 +84,7 @@ class JointSamples:
 
     @property
     def inputs(self) -> Tensor:
-        """(n, J, 2E) scaled differences of the factors' shapes."""
+        """Scaled differences (n, J, 2E) of the factor shapes."""
         return self.scaling.down(self.factors)
 
     @property
@@ -94,14 +94,14 @@ class JointSamples:
 
     @property
     def missed(self) -> Tensor:
-        """(n, 2E) scaled differences of the joint shapes from the affine sums, in NRIC of single precision."""
-        # In parts, since all inputs together take J times the room of the result.
+        """Scaled differences (n, 2E) between joint shapes and affine sums, from NRIC in single precision."""
+        # In parts, since all inputs together take J times the memory of the result.
         sums = torch.cat([self.scaling.up(self.scaling.down(part).sum(dim=1)) for part in self.factors.split(32)])
         return (self.joint - sums) * self.scaling.factor
 
 
 class Correction(nn.Module, ABC):
-    """The joint shape from those of the factors, (n, J, 2E) → (n, 2E), all of them as scaled differences.
+    """Map from factor shapes (n, J, 2E) to the joint shape (n, 2E), all as scaled differences.
 
     Every kind implements `fit`, `difference` (or `forward`) and `load`; its state is its ``state_dict()``.
     """
@@ -109,33 +109,33 @@ class Correction(nn.Module, ABC):
     @classmethod
     @abstractmethod
     def fit(cls, settings: Any, reference: TriangleMesh, own: JointSamples, held_out: JointSamples, seed: int) -> Self:
-        """Fit all that has a closed form.
+        """Fit all parts that have a closed form.
 
         Args:
-            settings: of this kind.
-            reference: the mesh.
-            own: samples to fit to.
+            settings: settings of this kind.
+            reference: the reference mesh.
+            own: training samples.
             held_out: samples that choose penalties.
-            seed: of whatever is random.
+            seed: seed of all random numbers.
         """
 
     @classmethod
     @abstractmethod
     def load(cls, settings: Any, reference: TriangleMesh, tensors: Mapping[str, Tensor]) -> Self:
-        """What a ``state_dict()`` was of."""
+        """Return the correction with this ``state_dict()``."""
 
     @property
     def descent(self) -> FitSettings | None:
-        """How to train it by gradient descent after `fit`; None where there is nothing to train."""
+        """Settings of gradient descent after `fit`; None if there is nothing to train."""
         return None
 
     def difference(self, y: Tensor) -> Tensor:
-        """(n, 2E) what is added to the affine sum."""
+        """Return the correction (n, 2E) of the affine sum."""
         raise NotImplementedError
 
     def forward(self, y: Tensor) -> Tensor:
         return y.sum(dim=1) + self.difference(y)
 
     def loss(self, y: Tensor, target: Tensor) -> Tensor:
-        """Mean square error, or an estimate of it, to train with."""
+        """Return the mean square error, or an estimate of it, for training."""
         return nn.functional.mse_loss(self(y), target)

@@ -18,13 +18,13 @@ UNIFORM = 0.25
 
 @dataclass(frozen=True)
 class Crop:
-    """The K edges nearest to one edge, for each of n shapes another, as one graph of n K edges.
+    """The K edges nearest to one edge of each of n shapes, as one graph of n K edges.
 
     Attributes:
         edges: (n, K) their indices in the mesh.
-        neighbours: (n K, k) indices in the graph of the neighbours of each; n K where there is none.
-        inner: (n, K) whether all layers have all their inputs in the crop, so that the output is that on the whole
-            mesh.
+        neighbours: (n K, k) indices of each edge's neighbours in the graph; n K for a missing neighbour.
+        inner: (n, K) whether all layers have all their inputs in the crop, so that the output equals the output on the
+            whole mesh.
     """
 
     edges: Tensor
@@ -36,13 +36,13 @@ class Crops:
     """Draws crops of a mesh.
 
     Args:
-        midpoints: (E, 3) of the edges; their distances are those of neighbours.
-        neighbours: (E, k) neighbours of each edge in a convolution, E where there is none.
-        size: K, at most.
-        layers: number of convolutions, one after the other.
+        midpoints: (E, 3) midpoints of the edges; they define the distances between neighbours.
+        neighbours: (E, k) neighbours of each edge in a convolution, E for a missing neighbour.
+        size: largest K.
+        layers: number of successive convolutions.
 
     Raises:
-        ValueError: crops so small that none of their edges is an inner one.
+        ValueError: crops are so small that none of their edges is an inner edge.
     """
 
     def __init__(self, midpoints: FloatArray, neighbours: IntArray, size: int, layers: int) -> None:
@@ -52,13 +52,13 @@ class Crops:
             raise ValueError(f"a crop of {size} edges is too small for {layers} convolutions")
 
     def draw(self, missed: Tensor) -> Crop:
-        """A crop of each shape, about an edge drawn in proportion to the squared error (n, E) or uniformly."""
+        """Draw a crop of each shape, around an edge chosen in proportion to the squared error (n, E) or uniformly."""
         count = missed.shape[1]
         share = missed / missed.sum(dim=1, keepdim=True).clamp_min(1e-30)
         return self.about(torch.multinomial((1 - UNIFORM) * share + UNIFORM / count, 1)[:, 0])
 
     def about(self, centres: Tensor) -> Crop:
-        """The crops about edges (n,)."""
+        """Return the crops around edges (n,)."""
         edges = self._nearest[centres]
         local, outside = self._local(edges)
         n, size = edges.shape
@@ -66,7 +66,7 @@ class Crops:
         return Crop(edges, graph, self._inner(graph, outside))
 
     def _local(self, edges: Tensor) -> tuple[Tensor, Tensor]:
-        """Places (n, K, k) of neighbours in crops (n, K), −1 outside of them; and whether they are edges outside."""
+        """Return positions (n, K, k) of neighbours in crops (n, K), −1 outside; and which are edges outside."""
         n, size = edges.shape
         place = torch.full((n, len(self._neighbours) + 1), -1)
         place.scatter_(1, edges, torch.arange(size).expand(n, -1))
@@ -75,7 +75,7 @@ class Crops:
         return local, (local < 0) & (neighbours < len(self._neighbours))
 
     def _inner(self, graph: Tensor, outside: Tensor) -> Tensor:
-        """(n, K) whether no path of as many steps as there are layers leads outside.
+        """Mark edges (n, K) from which no path with one step for each layer leads outside.
 
         Args:
             graph: (n K, k) neighbours in the graph.
@@ -89,13 +89,13 @@ class Crops:
 
 
 def _nearest(midpoints: FloatArray, neighbours: IntArray, size: int) -> IntArray:
-    """(E, size) nearest edges of each edge, by the shortest paths over midpoints (E, 3) of neighbours (E, k)."""
+    """Return the nearest edges (E, size) of each edge, by shortest paths over midpoints (E, 3) of neighbours (E, k)."""
     count = len(midpoints)
     edge, column = np.nonzero(neighbours < count)
     other = neighbours[edge, column]
     lengths = np.linalg.norm(midpoints[edge] - midpoints[other], axis=1)
     graph = sparse.csr_array((lengths, (edge, other)), shape=(count, count))
-    # In parts, since all distances together would take E² numbers.
+    # In parts, since all distances together are E² numbers.
     parts = np.array_split(np.arange(count), count // 256 + 1)
     distances = (dijkstra(graph, indices=part) for part in parts)
     return np.concatenate([np.argpartition(d, size - 1, axis=1)[:, :size] for d in distances])

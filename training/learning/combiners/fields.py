@@ -1,7 +1,8 @@
 """Neural fields on the edges of the mesh, for features that move over the surface.
 
-The perceptron is the same at every edge and sees where each feature lies to it. Convolutions have to find that out from
-the factors' shapes around an edge, by way of many layers; kernels in patches have to learn it anew for every place.
+The perceptron is the same at every edge, and gets the position of each feature relative to the edge. Convolutions have
+to find this position from the factor shapes around an edge, through many layers. Kernels in patches have to learn it
+anew for every place.
 """
 
 from __future__ import annotations
@@ -18,29 +19,29 @@ from shapespace.training.learning.combiners.correction import Correction, JointS
 from shapespace.training.learning.linear import regression
 from shapespace.training.runs.config import FieldSettings, FitSettings
 
-#: Share of the edges of a training step that are drawn uniformly; the others in proportion to the affine sum's error.
+#: Share of the edges of a training step that are drawn uniformly. The affine sum's error chooses the others.
 UNIFORM = 0.5
-#: Highest frequency of the waves on the surface that codes are read by.
+#: Highest frequency of the waves on the surface that read codes.
 ORDER = 4
 
 
 class FieldCorrection(Correction):
-    """A perceptron that adds to the affine sum at each edge, by where features lie to this edge.
+    """Perceptron that corrects the affine sum at each edge, by the positions of features relative to this edge.
 
-    Its inputs at an edge are functions of the angle ``r`` from each coordinate's place there to the code: ``cos r``,
-    ``sin r``, and for each concentration κ the density of von Mises' distribution, ``exp(κ (cos r − 1))``, and its
-    derivative; the lengths and angles of the factors and of the reference at this edge; and the edge's constants.
-    So symmetries that move codes and places alike need not be learned.
+    Its inputs at an edge are functions of the angle ``r`` from each coordinate's place there to the code. These are
+    ``cos r``, ``sin r``, and for each concentration κ the density of von Mises' distribution, ``exp(κ (cos r − 1))``,
+    and its derivative. Further inputs are the lengths and angles of the factors and of the reference at this edge, and
+    the edge's constants. So symmetries that move codes and places together need not be learned.
 
-    The combiner's input are the factors' shapes and nothing else, so codes are read from these: the cosine and the sine
-    of a coordinate by a linear map of its factor's shape.
+    The combiner's only input are the factor shapes, so codes are read from these: the cosine and the sine of a
+    coordinate by a linear map of its factor's shape.
 
     Args:
-        settings: of the network.
+        settings: settings of the network.
         rest: (E, 2) lengths and angles of the reference, each with mean 0 and variance 1.
         factor_count: J.
-        places: (E, m) angles, where each coordinate is at an edge.
-        constants: (E, c) of each edge.
+        places: (E, m) angle at which each coordinate is at an edge.
+        constants: (E, c) constants of each edge.
     """
 
     owner: Tensor
@@ -74,10 +75,10 @@ class FieldCorrection(Correction):
     def fit(
         cls, settings: FieldSettings, reference: TriangleMesh, own: JointSamples, held_out: JointSamples, seed: int
     ) -> FieldCorrection:
-        """The untrained network, which can read codes; see `Correction`.
+        """Return the untrained network with a fitted code reader; see `Correction`.
 
         Raises:
-            ValueError: nothing is known of where features move.
+            ValueError: the collection does not know where features move.
         """
         if own.motion is None or held_out.motion is None:
             raise ValueError('kind = "field" needs a collection that knows where its coordinates are on the surface')
@@ -102,7 +103,7 @@ class FieldCorrection(Correction):
 
     @classmethod
     def load(cls, settings: FieldSettings, reference: TriangleMesh, tensors: Mapping[str, Tensor]) -> FieldCorrection:
-        """See `Correction`; sizes are those of the tensors."""
+        """Return the network with these tensors, which determine the sizes; see `Correction`."""
         places, edges = tensors["places"], tensors["edges"]
         known = edges.shape[1] + 2 * places.shape[1] * (1 + len(settings.concentrations))
         factor_count = (tensors["perceptron.0.weight"].shape[1] - known) // 2
@@ -112,7 +113,7 @@ class FieldCorrection(Correction):
 
     @property
     def descent(self) -> FitSettings:
-        """How the perceptron is trained; what reads codes is fitted."""
+        """Settings of the perceptron's training. The code reader is fitted in closed form."""
         return self.settings.fit
 
     def _fit_reader(
@@ -131,12 +132,12 @@ class FieldCorrection(Correction):
         self.offset[index] = (weights[0] - mean @ slope).view(-1, 2)
 
     def codes(self, y: Tensor) -> Tensor:
-        """(n, m, 2) cosine and sine of each coordinate, read from the factors' shapes (n, J, 2E)."""
+        """Return the cosine and sine (n, m, 2) of each coordinate, read from the factor shapes (n, J, 2E)."""
         read = (y[:, self.owner, None] @ self.reader)[:, :, 0] + self.offset
         return read / read.square().sum(dim=2, keepdim=True).clamp_min(1e-12).sqrt()
 
     def _features(self, y: Tensor, edges: Tensor | None = None) -> Tensor:
-        """(n, K, C) inputs of the perceptron at edges (n, K), or at all."""
+        """Return inputs (n, K, C) of the perceptron at edges (n, K), or at all edges."""
         n, j, double = y.shape
         at, constants, shapes = self.places, self.edges, y.view(n, 2 * j, double // 2)
         if edges is not None:
@@ -156,7 +157,7 @@ class FieldCorrection(Correction):
         return self.perceptron(self._features(y)).transpose(1, 2).flatten(1)
 
     def loss(self, y: Tensor, target: Tensor) -> Tensor:
-        """An unbiased estimate of the mean square error from some edges of each shape, chosen by the affine sum."""
+        """Estimate the mean square error, without bias, on some edges of each shape; the affine sum chooses them."""
         missed = (target - y.sum(dim=1)).unflatten(1, (2, -1))
         error, count = missed.square().sum(dim=1), missed.shape[2]
         share = error / error.sum(dim=1, keepdim=True).clamp_min(1e-30)
@@ -168,7 +169,7 @@ class FieldCorrection(Correction):
 
 
 def _waves(surface: Tensor) -> Tensor:
-    """(E, w) products of waves of the surface's angles (E, d), up to `ORDER` in each."""
+    """Return products (E, w) of waves of the surface's angles (E, d), each with frequencies up to `ORDER`."""
     result = torch.ones_like(surface[:, :1])
     for angle in surface.T:
         multiples = angle[:, None] * torch.arange(1, ORDER + 1)
@@ -178,10 +179,10 @@ def _waves(surface: Tensor) -> Tensor:
 
 
 def _reading(samples: JointSamples, motion: Motion, j: int, index: list[int], waves: Tensor) -> tuple[Tensor, Tensor]:
-    """What latents of factor j are read from, (n, 2 w), and what is read, (n, 2 m_j).
+    """Return features (n, 2 w) and targets (n, 2 m_j) of the code reader of factor j.
 
-    These are sums of the factor's shape over edges, weighted by waves: a map of all its entries would know a feature
-    only where it is in some sample. And cosines and sines of the latents.
+    Features are sums of the factor's shape over edges, weighted by waves. A map of all its entries would know a
+    feature only at the places that occur in some sample. Targets are cosines and sines of the latents.
     """
     angles = motion.codes[:, index]
     y = samples.scaling.down(samples.factors[: len(angles), j])

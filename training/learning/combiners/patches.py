@@ -1,8 +1,9 @@
-"""One patch of edges while it is fitted: kernel regression on the shapes of factors there, in a learned metric."""
+"""Fit one patch of edges: kernel regression on the factor shapes there, in a learned metric."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import torch
 from numpy.typing import NDArray
@@ -14,42 +15,54 @@ from shapespace.training.learning.gaussian import Centres
 from shapespace.training.learning.layers import half_precision, in_bytes, resized
 from shapespace.training.learning.linear import Ridge, principal_axes, rounded
 
-#: Candidates for γ, and for the penalty, where the kernel's largest value is 1. With smaller penalties the weights are
-#: too large for single precision.
-GAMMAS = (0.5, 2.0, 8.0, 32.0)
-PENALTIES = tuple(10.0**k for k in range(-6, 0))
-#: Most functions that γ is chosen with.
-SOME = 800
-#: Share of the coordinates' mean square that is left out.
-NEGLIGIBLE = 1e-6
-#: By which factor rounding the weights may increase the squared error.
-ROUGHLY = 1.5
-#: Most samples that the principal axes of factors are computed from.
-AXES = 500
+
+@dataclass(frozen=True)
+class PatchFitting:
+    """Settings of the regression in a patch.
+
+    Attributes:
+        axes_samples: largest number of samples that the principal axes of factors are computed from.
+        negligible: share of the coordinates' mean square that is left out.
+        gammas: candidates for γ.
+        penalties: candidates for the ridge penalty, where the kernel's largest value is 1. Smaller penalties make the
+            weights too large for single precision.
+        functions: largest number of functions with which γ is chosen.
+        rounding: factor by which rounding the weights may increase the squared error.
+    """
+
+    axes_samples: int = 500
+    negligible: float = 1e-6
+    gammas: tuple[float, ...] = (0.5, 2.0, 8.0, 32.0)
+    penalties: tuple[float, ...] = tuple(10.0**k for k in range(-6, 0))
+    functions: int = 800
+    rounding: float = 1.5
+
+
+FITTING = PatchFitting()
 
 
 class Patch:
-    """One patch: first its axes, then its metric, then its functions and weights.
+    """One patch of edges: first its axes, then its metric, then its functions and weights.
 
-    How factors act on each other at an edge depends on what each of them does nearby. So the shape of every factor is
-    projected to a few principal coefficients. All factors' are more coordinates than the samples can tell apart, but
-    only few directions among them matter: they are found first, as a metric (`learned_metric`).
+    How factors interact at an edge depends on the shape of each factor nearby. So every factor shape is projected to a
+    few principal coefficients. All factors together have more coefficients than the samples can tell apart, but only
+    few directions among them matter. A metric finds these first (`learned_metric`).
 
     Attributes:
         columns: (S,) its entries of NRIC, lengths and then angles.
-        axes: (J, d, S) principal axes of the factors' shapes there, integers of 8 bits.
-        units: (J d,) factors of the axes, with which the first coefficient of the widest factor has a variance of one.
+        axes: (J, d, S) principal axes of the factor shapes there, integers of 8 bits.
+        units: (J d,) factors of the axes; with them the first coefficient of the widest factor has a variance of one.
         centre: (J d,) coefficients of the mean shapes.
-        metric: (J d, J d) rows A of the coordinates ``u = A c`` of coefficients c, those of the largest variance first.
+        metric: (J d, J d) rows A of the coordinates ``u = A c`` of coefficients c, in falling order of variance.
         spread: (J d,) mean squares of the coordinates.
         mean: (S,) the constant.
         centres: the n + k r functions, in r coordinates of 16 bits.
-        error: squared error on held-out samples with these weights, their mean summed over the entries.
-        basis: (S, S) principal axes of what is put out.
-        energy: (S,) mean squares along these.
-        weights: (n + k r, q) of the coefficients along the first axes, integers of 16 bits.
+        error: squared error on held-out samples with these weights, summed over the entries.
+        basis: (S, S) principal axes of the output.
+        energy: (S,) mean squares along these axes.
+        weights: (n + k r, q) weights of the coefficients along the first axes, integers of 16 bits.
         steps: (n + k r,) factors of the functions.
-        gains: (q,) of the coefficients.
+        gains: (q,) factors of the coefficients.
     """
 
     metric: Tensor
@@ -65,7 +78,7 @@ class Patch:
 
     def __init__(self, columns: NDArray, coefficients: int, y: Tensor) -> None:
         self.columns, axes, centre, widest = columns, [], [], 0.0
-        for shapes in y[:AXES, :, columns].double().unbind(1):
+        for shapes in y[: FITTING.axes_samples, :, columns].double().unbind(1):
             middle = shapes.mean(dim=0)
             s, vt = principal_axes(shapes - middle, by="svd")
             vt = resized(vt.T, coefficients).T
@@ -78,7 +91,7 @@ class Patch:
         self.centre = torch.cat(centre) / max(widest, 1e-12)
 
     def inputs(self, y: Tensor) -> Tensor:
-        """(n, J d) coefficients of factor shapes (n, J, 2E)."""
+        """Return coefficients (n, J d) of factor shapes (n, J, 2E)."""
         c = torch.einsum("njs,jds->njd", y[:, :, self.columns].double(), self.axes.double())
         return c.flatten(1) * self.units - self.centre
 
@@ -88,32 +101,38 @@ class Patch:
         wanted, theirs = (pairs[1][:, self.columns].double() for pairs in (own, held_out))
         self.mean = wanted.mean(dim=0)
         metric = learned_metric(x, wanted - self.mean, (other, theirs - self.mean))
-        # The kernel is invariant under rotations: in the principal axes of the samples the fewest coordinates matter.
+        # The kernel is invariant under rotations. In principal axes of the samples the fewest coordinates matter.
         z = x @ metric
         s, axes = principal_axes(z, by="columns")
         self.metric, self.spread = half_precision((metric @ axes.T).T.float()), s.square() / len(z)
 
     @property
     def rank(self) -> int:
-        """How many coordinates matter."""
+        """Number of coordinates that matter."""
         left = self.spread.sum() - self.spread.cumsum(0)
-        return 1 + int((left > NEGLIGIBLE * self.spread.sum()).sum())
+        return 1 + int((left > FITTING.negligible * self.spread.sum()).sum())
 
     def coordinates(self, y: Tensor, rank: int) -> Tensor:
-        """(n, rank) first coordinates of factor shapes (n, J, 2E)."""
+        """Return the first ``rank`` coordinates (n, rank) of factor shapes (n, J, 2E)."""
         return self.inputs(y) @ self.metric[:rank].double().T
 
     def slopes(self, slopes: Slopes, rank: int) -> tuple[Tensor, Tensor, Tensor]:
-        """Coordinates (k m, rank) where there are derivatives, those of coordinates, and (k m, S) of the residual."""
+        """Return coordinates (k m, rank) of samples with derivatives, their derivatives, and residual's (k m, S)."""
         axes, metric = self.axes.double().transpose(1, 2), self.metric[:rank].double().T
         along = (slopes.coefficients(axes, self.columns) * self.units) @ metric
         at = slopes.repeated(self.coordinates(slopes.inputs, rank))
         return at, along, slopes.missed[:, :, self.columns].flatten(0, 1).double()
 
     def fit(self, own: Pairs, held_out: Pairs, slopes: Slopes | None, rank: int, most: int, outputs: int) -> None:
-        """Ridge regression on ``rank`` coordinates by at most so many functions, of so many outputs.
+        """Fit by ridge regression on ``rank`` coordinates; held-out samples choose γ and the penalty.
 
-        Held-out samples choose γ and the penalty.
+        Args:
+            own: training pairs.
+            held_out: pairs that choose.
+            slopes: derivatives to fit as well.
+            rank: number of coordinates.
+            most: largest number of functions.
+            outputs: largest rank of the output.
         """
         x, other = (self.coordinates(inputs, rank) for inputs, _ in (own, held_out))
         wanted, theirs = (residual[:, self.columns].double() - self.mean for _, residual in (own, held_out))
@@ -121,16 +140,16 @@ class Patch:
         if slopes:
             nodes = half_precision(self.coordinates(slopes.inputs, rank)[: (most - len(anchors)) // rank])
         known = self.slopes(slopes, rank) if slopes else None
-        share = min(1.0, SOME / (len(anchors) + nodes.numel()))
-        tried = [Centres(anchors, nodes, torch.tensor(gamma, dtype=x.dtype)) for gamma in GAMMAS]
+        share = min(1.0, FITTING.functions / (len(anchors) + nodes.numel()))
+        tried = [Centres(anchors, nodes, torch.tensor(gamma, dtype=x.dtype)) for gamma in FITTING.gammas]
 
-        def fitted(centres: Centres, penalties: Sequence[float] = PENALTIES) -> Ridge:
+        def fitted(centres: Centres, penalties: Sequence[float] = FITTING.penalties) -> Ridge:
             return centres.fit((x, wanted), known, (other, theirs), penalties)
 
-        self.centres = min(tried, key=lambda centres: fitted(centres.some(share)).error)
+        self.centres = min(tried, key=lambda centres: fitted(centres.first(share)).error)
         features, others = self.centres(x), self.centres(other)
         rows = torch.cat([features, self.centres.along(*known[:2])]) if known else features
-        penalties: Sequence[float] = PENALTIES
+        penalties: Sequence[float] = FITTING.penalties
         while penalties:
             found = fitted(self.centres, penalties)
             s, axes = principal_axes(features @ found.weights, by="columns")
@@ -140,7 +159,7 @@ class Patch:
             self.weights, self.steps, self.gains = weights, steps.flatten(), gains.flatten()
             missed = (others * self.steps) @ weights @ (basis * gains).T - theirs
             self.error = float(missed.square().sum(dim=1).mean())
-            # Where few functions have weights so large that rounding them spoils the sums, a larger penalty helps.
-            if self.error <= ROUGHLY * found.error * len(self.columns):
+            # With few functions, weights may be so large that rounding spoils their sums; a larger penalty helps.
+            if self.error <= FITTING.rounding * found.error * len(self.columns):
                 break
             penalties = [penalty for penalty in penalties if penalty > found.penalty]

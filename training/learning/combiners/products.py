@@ -15,11 +15,11 @@ from shapespace.training.runs.config import ProductSettings
 
 
 class ProductCorrection(Correction):
-    """A bilinear map of the factors' shapes, fitted by ridge regression.
+    """Bilinear map of the factor shapes, fitted by ridge regression.
 
-    Features are a few principal coefficients of each factor and their products between every two factors; the linear
+    Features are a few principal coefficients of each factor and their products between every two factors. The linear
     map from these has a low rank. Where two factors overlap widely, their interaction is smooth and global, and a few
-    products represent what many convolutions would be needed for.
+    products replace many convolutions.
     """
 
     centre: Tensor
@@ -42,7 +42,7 @@ class ProductCorrection(Correction):
     def load(
         cls, settings: ProductSettings, reference: TriangleMesh, tensors: Mapping[str, Tensor]
     ) -> ProductCorrection:
-        """See `Correction`; sizes are those of the tensors."""
+        """Return the correction with these tensors, which determine the sizes; see `Correction`."""
         factors, size, coefficients = tensors["axes"].shape
         result = cls(factors, coefficients, size)
         result.load_state_dict(tensors)
@@ -52,7 +52,7 @@ class ProductCorrection(Correction):
     def fit(
         cls, settings: ProductSettings, reference: TriangleMesh, own: JointSamples, held_out: JointSamples, seed: int
     ) -> ProductCorrection:
-        """See `Correction`."""
+        """Fit axes and weights to samples; see `Correction`."""
         y, others = own.inputs, held_out.inputs
         residual, wanted = (s.scaling.down(s.joint) - x.sum(dim=1) for s, x in ((own, y), (held_out, others)))
         result = cls(y.shape[1], settings.coefficients, y.shape[2])
@@ -64,17 +64,17 @@ class ProductCorrection(Correction):
         return result
 
     def _fit_axes(self, y: Tensor) -> None:
-        """Principal axes of the shapes of each factor, scaled so that coefficients have a variance of one."""
+        """Find principal axes of each factor's shapes, scaled to coefficients with a variance of one."""
         self.centre.copy_(y.mean(dim=0))
         for j in range(y.shape[1]):
             s, axes = principal_axes(y[:, j] - self.centre[j], by="svd")
             count = min(self.axes.shape[2], len(s))
-            # Equal variances, so that one penalty suits all products; those of almost no variance are rounding errors
-            # and stay small.
+            # Equal variances, so that one penalty suits all products. Coefficients with almost no variance are rounding
+            # errors and stay small.
             self.axes[j, :, :count] = (axes[:count] / s[:count, None].clamp_min(1e-2 * s[0]) * len(y) ** 0.5).T
 
     def _features(self, y: Tensor) -> Tensor:
-        """(n, 1 + J d + ½ J (J − 1) d²) of the factors' shapes (n, J, 2E)."""
+        """Return features (n, 1 + J d + ½ J (J − 1) d²) of factor shapes (n, J, 2E)."""
         c = torch.einsum("njs,jsr->njr", y - self.centre, self.axes)
         products = [(c[:, i, :, None] * c[:, j, None, :]).flatten(1) for i, j in self.pairs]
         return torch.cat([torch.ones_like(c[:, 0, :1]), c.flatten(1), *products], dim=1)

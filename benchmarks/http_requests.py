@@ -1,0 +1,107 @@
+"""Requests over HTTP to a server process, measured by the clock: part of ``python -m benchmarks.serving``."""
+
+from __future__ import annotations
+
+import statistics
+import threading
+import time
+from pathlib import Path
+
+import httpx
+import numpy as np
+
+from benchmarks.bundles import bundles, draw
+from benchmarks.pages import print_head, print_row
+from benchmarks.processes import processor, resident, server
+from shapespace.bundle.reader import read_bundle
+from shapespace.model.shape_model import ShapeModel
+
+
+def http(models: Path, count: int, duration: float) -> None:
+    """Measure a server process with one client and with sixteen."""
+    names = {path.parent.name: ShapeModel(read_bundle(path)) for path in bundles(models)}
+    with server(models, cache=0) as (client, pid, ready):
+        used, memory = processor(pid), resident(pid)
+        print(
+            f"\nReady {ready:.1f} s ({used:.1f} processor s) after the start of the process; {memory:.0f} MB resident."
+        )
+        print(
+            "\nOver HTTP, no cache: GLB of the fine mesh, ms by the clock, and processor ms of the server a request.\n"
+        )
+        print_head("model", "clients", "requests", "errors", "p50", "p95", "p99", "p99 / p50", "processor", "MB after")
+        for name, model in names.items():
+            for clients, limit in ((1, count), (16, 10**9)):
+                began = processor(pid)
+                times, errors = load(client, name, model, clients, limit, duration if clients > 1 else 1e9)
+                spent = (processor(pid) - began) / len(times)
+                quantiles = [float(np.quantile(times, q)) for q in (0.5, 0.95, 0.99)]
+                ratio = f"{quantiles[2] / quantiles[0]:.1f}"
+                print_row(name, clients, len(times), errors, *quantiles, ratio, spent, f"{resident(pid):.0f}")
+        print("\nInterpolations of 60 frames, fine mesh, streamed as JSON lines and whole as GLB.\n")
+        print_head(
+            "model",
+            "first line, ms",
+            "one frame alone, ms",
+            "frames / s",
+            "frames / processor s",
+            "GLB, frames / processor s",
+        )
+        for name, model in names.items():
+            print_row(name, *interpolation(client, pid, name, model))
+
+
+def load(
+    client: httpx.Client, name: str, model: ShapeModel, clients: int, limit: int, duration: float
+) -> tuple[list[float], int]:
+    """Send requests for new codes; return their times and the number that failed."""
+    codes = iter(draw(model, min(clients * limit, 20_000)).tolist())
+    times: list[float] = []
+    errors = 0
+    lock, end = threading.Lock(), time.perf_counter() + duration
+
+    def work() -> None:
+        nonlocal errors
+        with httpx.Client(base_url=client.base_url, timeout=120) as own:
+            for _ in range(limit):
+                with lock:
+                    code = next(codes, None)
+                if code is None or time.perf_counter() > end:
+                    return
+                began = time.perf_counter()
+                answer = own.post(f"/v1/models/{name}/mesh", json={"latent": code})
+                times.append(time.perf_counter() - began)
+                errors += answer.status_code != 200
+
+    threads = [threading.Thread(target=work) for _ in range(clients)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    return times, errors
+
+
+def interpolation(client: httpx.Client, pid: int, name: str, model: ShapeModel) -> list[object]:
+    """Return the time to the first line, the time of a frame by itself, and rates."""
+    path = f"/v1/models/{name}/interpolations"
+    keyframes = draw(model, 4).tolist()
+    links = client.post(path, json={"keyframes": keyframes, "frames": 60}).raise_for_status().json()["links"]
+    alone = []
+    for k in range(8):
+        began = time.perf_counter()
+        client.get(links["frames"].replace("{k}", str(k)), params={"format": "json"}).raise_for_status()
+        alone.append(time.perf_counter() - began)
+    first = []
+    for _ in range(9):
+        began = time.perf_counter()
+        with client.stream("GET", links["jsonl"]) as answer:
+            next(chunk for chunk in answer.iter_raw() if chunk.endswith(b"\n"))
+            first.append(time.perf_counter() - began)
+        time.sleep(0.5)  # for the frames that were begun and that nobody waits for any more
+    began, spent = time.perf_counter(), processor(pid)
+    with client.stream("GET", links["jsonl"]) as answer:
+        count = sum(1 for _ in answer.iter_lines())
+    rate, per_second = count / (time.perf_counter() - began), count / (processor(pid) - spent)
+    spent = processor(pid)
+    client.get(links["glb"]).raise_for_status()
+    whole = count / (processor(pid) - spent)
+    return [statistics.median(first), statistics.median(alone), f"{rate:.0f}", f"{per_second:.0f}", f"{whole:.0f}"]
