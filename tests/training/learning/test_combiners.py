@@ -90,7 +90,7 @@ def test_the_gradient_of_a_convolution_is_right(sheet: TriangleMesh, neighbourho
 
 
 def fitted(mesh: TriangleMesh, settings: Any, factors: torch.Tensor, z: torch.Tensor, own: int) -> CombinerNetwork:
-    """A combiner fitted in closed form to the first ``own`` samples; the others select its settings."""
+    """Fit a combiner in closed form to the first ``own`` samples; the others choose its settings."""
     scale = scaling(mesh, z.numpy())
     parts = (
         JointSamples(factors[part], z[part], scale, [[0]] * factors.shape[1]) for part in (slice(own), slice(own, None))
@@ -113,7 +113,7 @@ Missed = Callable[[NDArray, NDArray, NDArray, NDArray], NDArray]
 
 
 def interplay(ball: TriangleMesh, count: int, missed: Missed) -> tuple[torch.Tensor, torch.Tensor]:
-    """Shapes z̄ + a d and z̄ + b e of two factors, and joint ones, their sum plus ``missed(a, b, f, g)``."""
+    """Return shapes z̄ + a d and z̄ + b e of two factors, and joint shapes: their sum plus ``missed(a, b, f, g)``."""
     rng = np.random.default_rng(0)
     reference = nric(ball.vertices, ball.connectivity)
     d, e, f, g = 0.01 * rng.normal(size=(4, len(reference)))
@@ -146,7 +146,7 @@ KINDS = [
 def test_every_correction_finds_an_interplay_from_factors_alone(
     ball: TriangleMesh, settings: Any, missed: Missed, left: float
 ) -> None:
-    """On new codes its squared error is less than ``left`` times that of the affine sum."""
+    """The squared error on new codes is less than ``left`` times the error of the affine sum."""
     x, z = interplay(ball, 260, missed)
     network, unseen = fitted(ball, settings, x[:180], z[:180], 150), slice(180, None)
     with torch.no_grad():
@@ -175,7 +175,7 @@ def test_auto_tries_nothing_else_where_shapes_vary_as_much_as_latents_do(
 
 
 def test_derivatives_teach_a_correction(ball: TriangleMesh) -> None:
-    """With those at 12 of 15 samples it errs less than without, and with wrong ones more."""
+    """Derivatives at 12 of 15 samples reduce the error; wrong derivatives increase it."""
     rng, count = np.random.default_rng(0), 12
     reference = nric(ball.vertices, ball.connectivity)
     d, e, f, g = (0.01 * torch.from_numpy(x).float() for x in rng.normal(size=(4, len(reference))))
@@ -270,7 +270,7 @@ def test_outputs_that_change_shapes_by_next_to_nothing_are_left_out(
 def test_there_are_more_functions_as_long_as_they_gain_what_can_be_seen(
     ball: TriangleMesh, monkeypatch: pytest.MonkeyPatch, unseen: float, functions: int
 ) -> None:
-    """Of 40 samples, whose number is the most that there can be."""
+    """There are 40 samples, and at most as many functions."""
     limits = replace(kernels.LIMITS, functions=(5, 20, 80), unseen=unseen)
     monkeypatch.setattr(kernels, "LIMITS", limits)
     x, z = interplay(ball, 60, cubic)
@@ -318,7 +318,7 @@ def test_a_kernel_looks_at_no_other_patch(ball: TriangleMesh) -> None:
 
 
 def test_a_learned_metric_finds_the_direction_that_matters() -> None:
-    """One of twenty directions, from fewer samples than a quadratic in twenty variables has coefficients."""
+    """One of twenty directions matters, and a quadratic in twenty variables has more coefficients than samples."""
     rng = torch.Generator().manual_seed(0)
     x, other = (torch.randn(n, 20, generator=rng, dtype=torch.float64) for n in (120, 200))
     direction = nn.functional.normalize(torch.randn(20, generator=rng, dtype=torch.float64), dim=0)

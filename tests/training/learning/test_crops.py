@@ -1,4 +1,4 @@
-"""Crops: on inner edges their loss is that of the whole mesh, and they are drawn where the error is large."""
+"""Crops have the loss of the whole mesh on inner edges, and are drawn where the error is large."""
 
 from __future__ import annotations
 

@@ -67,7 +67,7 @@ def test_a_shape_that_is_there_twice_is_remembered_once(combiner: CombinerNetwor
 
 
 def test_many_examples_of_few_coordinates_add_no_more_than_was_missed(combiner: CombinerNetwork) -> None:
-    """Two hundred along a line, of which each misses something else, many of them hardly apart."""
+    """Two hundred examples lie along a line with different errors, many of them almost equal."""
     generator = torch.Generator().manual_seed(4)
     codes, mode = torch.rand(1200, 1, 1, generator=generator), torch.randn(1, 2, SIZE, generator=generator)
     missed = 0.1 * torch.randn(200, SIZE, generator=generator)

@@ -31,7 +31,7 @@ def codes(count: int, seed: int) -> np.ndarray:
 
 
 def samples(latents: np.ndarray) -> JointSamples:
-    """Exact shapes, of the factors too."""
+    """Return exact joint shapes and factor shapes."""
     factors = np.stack([TORUS.shapes(alone(latents, index)).nric for index in FACTORS], axis=1)
     joint, reference = TORUS.shapes(latents).nric, TORUS.reference
     rest = nric(reference.vertices, reference.connectivity)
@@ -146,7 +146,7 @@ def test_auto_tries_what_follows_a_bump(
     tried: list[str],
     kind: str,
 ) -> None:
-    """A field where the collection knows where codes move things, convolutions where shapes alone tell.
+    """``auto`` tries a field if the collection knows where codes move features, and convolutions otherwise.
 
     It is chosen by the share of the kernel's error that it has to reach, and not tried where the kernel is slow.
     """

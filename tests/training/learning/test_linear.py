@@ -11,7 +11,7 @@ PENALTIES = (1e-3, 1e-1, 1e1, 1e3)
 
 
 def samples(n: int, p: int, q: int = 3) -> tuple[torch.Tensor, torch.Tensor, tuple[torch.Tensor, torch.Tensor]]:
-    """Features and noisy values of a linear map, and held-out ones; in double precision."""
+    """Return features and noisy values of a linear map, and held-out pairs, in double precision."""
     rng = torch.Generator().manual_seed(n + p)
     x, other, true = (torch.randn(shape, generator=rng, dtype=torch.float64) for shape in ((n, p), (50, p), (p, q)))
     noise, held = (torch.randn((k, q), generator=rng, dtype=torch.float64) for k in (n, 50))
@@ -19,7 +19,7 @@ def samples(n: int, p: int, q: int = 3) -> tuple[torch.Tensor, torch.Tensor, tup
 
 
 def held_out_error(x: torch.Tensor, y: torch.Tensor, held_out: tuple[torch.Tensor, torch.Tensor], p: float) -> float:
-    """By definition: least squares of the samples together with √λ W = 0."""
+    """Solve least squares of the samples together with √λ W = 0, the definition."""
     rows = torch.cat([x, p**0.5 * torch.eye(x.shape[1], dtype=x.dtype)])
     weights = torch.linalg.lstsq(rows, torch.cat([y, torch.zeros(x.shape[1], y.shape[1], dtype=x.dtype)])).solution
     return float((held_out[0] @ weights - held_out[1]).square().mean())
@@ -91,7 +91,7 @@ def test_principal_axes_by_rows_make_no_axes_of_rounding_errors() -> None:
 
 
 def test_rounded_weights_make_up_for_each_other() -> None:
-    """Of kernels that all but depend on each other, at points that chose nothing; each rounded for itself is lost."""
+    """Kernels here almost depend on each other, so rounding each weight by itself would spoil the sums."""
     draw = torch.Generator().manual_seed(0)
     x, unseen = (torch.rand(n, 3, generator=draw, dtype=torch.float64) for n in (300, 500))
     kernel, values = (torch.exp(-2 * torch.cdist(u, x).square()) for u in (x, unseen))

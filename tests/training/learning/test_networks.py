@@ -51,7 +51,7 @@ def test_kernel_regression_on_codes_finds_a_smooth_map(ball: TriangleMesh) -> No
 
 
 def test_derivatives_teach_kernel_regression_on_codes(ball: TriangleMesh) -> None:
-    """From noisy values and the derivatives of what is behind the noise."""
+    """Values are noisy, derivatives are exact."""
     coordinates = Coordinates(np.array([-1.0, -3.0]), np.array([1.0, 5.0]), np.full(2, np.nan))
     codes = torch.as_tensor(coordinates.uniform(120, np.random.default_rng(0)), dtype=torch.float32)
     rng = np.random.default_rng(1)
