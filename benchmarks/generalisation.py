@@ -17,8 +17,8 @@ import numpy as np
 from benchmarks import pages
 from benchmarks.pages import ROOT
 from benchmarks.results import COLLECTIONS, MANNEQUIN, MIRRORED, SYMMETRIC, open_run
-from shapespace.training.space import stages
 from shapespace.training.space.generalisation import LIGHT_STEPS, folds, held_out, summary
+from shapespace.training.stages.ingest import ingest
 
 #: Stored figures, one file for each collection.
 FIGURES = ROOT / "runs" / "folds"
@@ -60,7 +60,7 @@ def measure(name: str, data: Path, out: Path) -> dict[str, Any]:
     run, config = opened.directory, opened.config
     if not run.shapes.exists():
         run.folder.mkdir(parents=True, exist_ok=True)
-        stages.ingest(run, config)
+        ingest(opened)
     reference, given = run.reference_mesh(), run.shapes.read()
     shapes, original, own = given["vertices"], given["original"], run.own_shapes()
     m = config.modes.count
@@ -69,7 +69,7 @@ def measure(name: str, data: Path, out: Path) -> dict[str, Any]:
     for k, index in enumerate(folds(len(own))):
         file = run.study(f"fold-{k}")
         if not file.exists():
-            material = stages.material(config)
+            material = config.shell_material
             found = held_out(reference, shapes, index, counts, config.modes, material, original=original)
             away = found.distances(shapes, reference.diagonal)
             file.write(

@@ -19,9 +19,11 @@ import torch
 from benchmarks.pages import ROOT
 from shapespace.training.learning.evaluation import HeldOutSamples, Model, r_squared, size_bytes
 from shapespace.training.learning.networks import predict
-from shapespace.training.pipeline import Run, execute, learner_of
 from shapespace.training.runs.config import load
 from shapespace.training.runs.latent_coordinates import alone
+from shapespace.training.stages.networks import learner_of
+from shapespace.training.stages.run import execute
+from shapespace.training.stages.stage import Run
 
 #: Largest difference between R² of the kernel on codes now and before, since rounding differs between machines.
 ROUNDING = 1e-6

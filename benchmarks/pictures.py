@@ -21,11 +21,12 @@ from shapespace.coordinates.reconstruction import Reconstructor
 from shapespace.mesh.rigid_motion import align
 from shapespace.training.learning.composite import affine_sum
 from shapespace.training.learning.networks import predict
-from shapespace.training.pipeline import Run, learner_of
 from shapespace.training.report.pictures import CLAY, ERROR, MODE_REACH, Studio, ramp, tint
 from shapespace.training.report.record import Record
 from shapespace.training.runs.config import load
 from shapespace.training.runs.sampling import read
+from shapespace.training.stages.networks import learner_of
+from shapespace.training.stages.stage import Run
 
 #: Number of codes (the first fresh codes) and of modes (the strongest); pixels of a picture's side.
 CODES, MODES, SIZE = 4, 6, 260

@@ -21,10 +21,12 @@ from matplotlib.ticker import LogLocator, NullFormatter
 import shapespace
 from benchmarks import limits, pages, space, studies
 from benchmarks.pages import ROOT
-from shapespace.training.pipeline import Run, execute, learner_of
 from shapespace.training.runs.config import load, parse
 from shapespace.training.runs.directory import RunDirectory
 from shapespace.training.runs.sampling import DONE, KNOWN, columns
+from shapespace.training.stages.networks import learner_of
+from shapespace.training.stages.run import execute
+from shapespace.training.stages.stage import Run
 
 #: Ending of the names of runs with the paper's modes, and their settings: the shell's norm, the same sparsity for all.
 SHELL, SHELL_MODES = "-shell", {"norm": "shell", "sparsity": 0.1, "log_steps": 16}

@@ -24,7 +24,6 @@ from shapespace.arrays import FloatArray
 from shapespace.mesh.triangle_mesh import TriangleMesh, diagonal
 from shapespace.model.shape_model import ShapeModel, load
 from shapespace.training.collection.mirror import find_mirror, mirrored
-from shapespace.training.pipeline import Run, execute, write_bundle_of
 from shapespace.training.runs.config import parse
 from shapespace.training.space.generalisation import (
     FOLDS,
@@ -35,7 +34,10 @@ from shapespace.training.space.generalisation import (
     to_nearest,
     vertex_distances,
 )
-from shapespace.training.space.stages import read_meshes
+from shapespace.training.stages.export import write_bundle_of
+from shapespace.training.stages.ingest import read_meshes
+from shapespace.training.stages.run import execute
+from shapespace.training.stages.stage import Run
 
 #: Largest number of exponentials to learn from: joint, and of each factor.
 JOINT, OF_FACTORS = 1000, 300

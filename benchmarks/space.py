@@ -15,7 +15,6 @@ from shapespace.training.runs.directory import RunDirectory
 from shapespace.training.space import modes
 from shapespace.training.space.generalisation import PrincipalComponents
 from shapespace.training.space.logarithms import logarithms
-from shapespace.training.space.stages import material
 
 
 def measure(run: RunDirectory, config: Config) -> dict[str, Any]:
@@ -26,7 +25,7 @@ def measure(run: RunDirectory, config: Config) -> dict[str, Any]:
     m = len(sparse)
     counts = [-(-m // 2), m]
     linear = PrincipalComponents.of(shapes, reference.vertices)
-    space = ShellSpace(reference.with_vertices(mean), material(config))
+    space = ShellSpace(reference.with_vertices(mean), config.shell_material)
     fields = logarithms(space, mean, shapes, run.decomposition.read()["log_steps"]).fields
 
     def explained(span: FloatArray) -> list[float]:

@@ -27,7 +27,7 @@ from shapespace.bundle.reader import read_bundle
 from shapespace.model.decoder import MeshChoice
 from shapespace.model.latent_space import Distribution
 from shapespace.model.shape_model import ShapeModel
-from shapespace.training.runs.stages import STAGES
+from shapespace.training.stages.run import STAGES
 
 #: Number of joint exponentials and of exponentials of each factor, which determine the time; codes for each median.
 JOINT, OF_FACTORS, CODES = 100, 50, 30

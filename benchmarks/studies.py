@@ -25,10 +25,11 @@ from shapespace.coordinates.nric import nric
 from shapespace.training.learning.composite import Composite, affine_sum
 from shapespace.training.learning.evaluation import HeldOutSamples, size_bytes
 from shapespace.training.learning.learner import Learner
-from shapespace.training.pipeline import Run, learner_of
 from shapespace.training.report.page import write_report
 from shapespace.training.runs.config import load
 from shapespace.training.runs.sampling import split
+from shapespace.training.stages.networks import learner_of
+from shapespace.training.stages.stage import Run
 
 #: The studies of the runs behind the measurement pages, by the name of the run's folder.
 LISTED = Path(__file__).with_name("studies.toml")

@@ -32,7 +32,6 @@ NO_MATHEMATICS = {
     "shapespace.model.networks",
     "shapespace.model.options",
     "shapespace.model.shape_model",
-    "shapespace.training.space.stages",
     "shapespace.training.learning.export",
     "shapespace.training.learning.gallery",
     "shapespace.training.learning.naming",

@@ -14,17 +14,16 @@ from pathlib import Path
 from shapespace.training.collection import init
 from shapespace.training.collection.checks import IngestError
 from shapespace.training.learning import ExportError
-from shapespace.training.pipeline import OldRunError, Run, execute, refuse_old
 from shapespace.training.report.record import Record, ReportError
 from shapespace.training.runs.config import ConfigError, load
 from shapespace.training.runs.directory import RunDirectory
 from shapespace.training.runs.sampling import SamplesError
-from shapespace.training.runs.shortfalls import LostTooMuchError
-from shapespace.training.runs.stages import STAGES
 from shapespace.training.runs.workers import WorkersError
 from shapespace.training.space.factors import FactorError
 from shapespace.training.space.modes import ModeError
-from shapespace.training.space.stages import MeanError
+from shapespace.training.stages.mean import MeanError
+from shapespace.training.stages.run import STAGES, LostTooMuchError, OldRunError, execute, refuse_old
+from shapespace.training.stages.stage import Run
 
 #: Exit codes: a fault of the input or of the machine, a defect of the program (EX_SOFTWARE), and Ctrl+C as in shells.
 FAILURE, DEFECT, STOPPED = 1, 70, 130
@@ -95,11 +94,21 @@ def _run(arguments: argparse.Namespace) -> None:
     folder = _folder(arguments)
     run = Run(folder, config, source, arguments.models, arguments.scheduler, arguments.accept)
     again = " ".join([_program(), *map(shlex.quote, sys.argv[1:])])
-    execute(run, arguments.until, keep_going=arguments.keep_going, command=again)
+    _finish(run, arguments.until, keep_going=arguments.keep_going, command=again)
     if arguments.until not in (None, "export"):
         print(f"Done up to {arguments.until}; the same command without --until goes on from there")
     else:
         print(f"{_here(run.bundle)} is ready. Next: {_serving(run.models)}")
+
+
+def _finish(run: Run, until: str | None = None, *, keep_going: bool, command: str = "") -> None:
+    """Do the stages that are not done yet, then write the report if it is out of date."""
+    done = execute(run, until, keep_going=keep_going, command=command)
+    directory = run.directory
+    if directory.evaluation.exists() and (done or not directory.report.exists()):
+        from shapespace.training.report.page import write_report
+
+        print(f"report: {write_report(directory)}")
 
 
 def _folder(arguments: argparse.Namespace) -> Path:
@@ -126,7 +135,7 @@ def _report(arguments: argparse.Namespace) -> None:
 
 def _export(arguments: argparse.Namespace) -> None:
     run = _open(arguments.run, arguments.models)
-    execute(run, keep_going=True)
+    _finish(run, keep_going=True)
     print(f"{_here(run.bundle)} is ready. Next: {_serving(run.models)}")
 
 

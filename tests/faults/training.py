@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import trimesh
 
-from shapespace.training.runs.stages import STAGES
+from shapespace.training.stages.run import STAGES
 from tests.training.conftest import command
 from tests.training.whole_runs.test_collection import results
 

@@ -20,7 +20,7 @@ from shapespace.training.report.number_format import duration, figure, flatten, 
 from shapespace.training.report.pictures import NEUTRAL, Studio, colour_bar, ramp
 from shapespace.training.report.record import Record
 from shapespace.training.runs.directory import RunDirectory
-from shapespace.training.runs.stages import STAGES
+from shapespace.training.stages.run import STAGES
 
 #: Titles of the models in ``r2`` of evaluation.json.
 MODELS = {

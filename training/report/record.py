@@ -19,9 +19,8 @@ from shapespace.coordinates.nric import WeightedNorm
 from shapespace.mesh.triangle_mesh import TriangleMesh
 from shapespace.training.runs.atomic_files import JsonFile, NpzFile
 from shapespace.training.runs.directory import RunDirectory
-from shapespace.training.runs.shortfalls import shortfalls
-from shapespace.training.runs.stages import STAGES
 from shapespace.training.space.modes import edge_magnitudes
+from shapespace.training.stages.run import STAGES
 
 Value = TypeVar("Value")
 #: Colours of the factors in their order; charts take their colours from here too.
@@ -88,8 +87,8 @@ class Record:
         """Warnings of the finished stages: pairs of a stage and a sentence."""
         found = []
         for stage in (name for name in STAGES if self.seconds.get(name) is not None):
-            lost = _readable(self.run.folder, partial(shortfalls, self.run, stage))
-            found += [(stage, shortfall.sentence) for shortfall in lost]
+            warnings = _readable(self.run.folder, partial(STAGES[stage].warnings, self.run))
+            found += [(stage, warning.sentence) for warning in warnings]
         return found
 
     @cached_property

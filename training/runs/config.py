@@ -509,6 +509,11 @@ class Config(_Section):
     evaluation: EvaluationSettings = EvaluationSettings()
     export: ExportSettings
 
+    @property
+    def shell_material(self) -> Material:
+        """The elastic material of the shell."""
+        return Material(self.material.mu, self.material.lambda_, self.material.eta)
+
     @cached_property
     def recipes(self) -> dict[str, Recipe]:
         """The full recipe of each variant.

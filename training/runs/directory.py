@@ -9,6 +9,8 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from shapespace.arrays import FloatArray
 from shapespace.mesh.triangle_mesh import TriangleMesh
 from shapespace.training.runs.atomic_files import JsonFile, NpzFile, TextFile
@@ -188,7 +190,7 @@ class RunDirectory:
 
     @property
     def generalisation(self) -> JsonFile:
-        """How near spaces come to shapes that they were found without: see space.stages.generalisation."""
+        """How near spaces come to shapes that they were found without: see stages.generalisation."""
         return self._json("generalisation")
 
     @property
@@ -249,3 +251,12 @@ class RunDirectory:
     def mean_mesh(self) -> TriangleMesh:
         """The mesh that is computed with, at the mean shape."""
         return self.reference_mesh().with_vertices(self.mean.read()["vertices"])
+
+    def log_steps(self) -> int:
+        """Time steps K of the logarithms, chosen with the mean."""
+        return int(self.mean.read()["steps"])
+
+    def training_codes(self) -> FloatArray:
+        """Codes (n, m) of all shapes that the run learns from, mirror images last."""
+        modes = self.modes.read()
+        return np.concatenate([modes["coefficients"], modes["mirrored_coefficients"]])

@@ -16,8 +16,9 @@ from shapespace.mesh.attributes import MeshAttributes
 from shapespace.training.collection.appearance import kept, reference_surface
 from shapespace.training.collection.ingest import read_collection
 from shapespace.training.collection.mesh_collection import MeshCollection
-from shapespace.training.pipeline import Run, execute
 from shapespace.training.runs.config import load
+from shapespace.training.stages.run import execute
+from shapespace.training.stages.stage import Run
 from tests.surfaces import ball, corner_uv, same_corners, write_files
 
 REST, SURFACE = ball(1)

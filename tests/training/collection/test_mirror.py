@@ -13,7 +13,9 @@ from shapespace.mesh.rigid_motion import align
 from shapespace.training.collection.mirror import TOLERANCE, find_mirror, mirrored
 from shapespace.training.runs.config import Config
 from shapespace.training.runs.directory import RunDirectory
-from shapespace.training.space import stages
+from shapespace.training.space.generalisation import held_out
+from shapespace.training.stages.ingest import ingest
+from shapespace.training.stages.stage import Run
 
 ROUND = trimesh.creation.icosphere(2)
 FACES = np.asarray(ROUND.faces)
@@ -99,9 +101,9 @@ def ingested(folder: Path, out: Path, mirror: bool) -> tuple[RunDirectory, Confi
         "collection": {"data": folder / "body.npz", "coarse_vertices": 80, "mirror": mirror},
         "export": {"name": "body", "title": "", "description": "", "licence": ""},
     }
-    config, run = Config.model_validate(document), RunDirectory(out)
-    stages.ingest(run, config)
-    return run, config
+    run = Run(out, Config.model_validate(document), "", out / "models")
+    ingest(run)
+    return run.directory, run.config
 
 
 def test_a_run_learns_from_mirror_images_unless_told_otherwise(folder: Path, tmp_path: Path) -> None:
@@ -123,9 +125,7 @@ def test_held_out_shapes_take_their_images_with_them(folder: Path, tmp_path: Pat
     others = shapes["vertices"].copy()
     others[5] *= 1.3  # the image of shape 1
     found, again, without = (
-        stages.held_out(
-            run.reference_mesh(), each, np.array([1]), [2], config.modes, stages.material(config), 4, original
-        )
+        held_out(run.reference_mesh(), each, np.array([1]), [2], config.modes, config.shell_material, 4, original)
         for each, original in (
             (shapes["vertices"], shapes["original"]),
             (others, shapes["original"]),

@@ -10,9 +10,10 @@ import torch
 from shapespace.bundle.reader import read_bundle
 from shapespace.mesh.rigid_motion import align
 from shapespace.training.learning.networks import StartNetwork
-from shapespace.training.pipeline import Run, learner_of
 from shapespace.training.runs.config import load
 from shapespace.training.runs.latent_coordinates import Coordinates
+from shapespace.training.stages.networks import learner_of
+from shapespace.training.stages.stage import Run
 from tests.shapespace.conftest import torus, turned
 
 COORDINATES = Coordinates(np.array([-1.0, 0.0, 2.0]), np.array([1.0, 6.0, 5.0]), np.array([np.nan, 2 * np.pi, np.nan]))

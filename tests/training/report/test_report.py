@@ -26,7 +26,7 @@ from shapespace.training.report.page import write_report
 from shapespace.training.report.record import Record, ReportError
 from shapespace.training.report.rendering import Camera
 from shapespace.training.runs.directory import RunDirectory
-from shapespace.training.runs.stages import STAGES
+from shapespace.training.stages.run import STAGES
 
 NASTY = "<script>alert('thumb')</script>"
 SECTIONS = {"nearness", "shapes", "modes", "factors", "strip", "tests", "figures", "losses", "stages", "configuration"}

@@ -16,7 +16,7 @@ from shapespace.training.runs.config import (
     load,
     parse,
 )
-from shapespace.training.runs.stages import STAGES, stage_keys
+from shapespace.training.stages.run import STAGES, stage_keys
 from tests.training.conftest import TINY
 
 EXAMPLES = sorted((Path(__file__).parents[3] / "examples").rglob("*.toml"))

@@ -25,10 +25,11 @@ from benchmarks.studies import SeedLearner, ShareLearner
 from shapespace.files.attributes.reading import read_attributes
 from shapespace.mesh.rigid_motion import align
 from shapespace.mesh.triangle_mesh import TriangleMesh
-from shapespace.training.pipeline import Run, learner_of
 from shapespace.training.runs.config import load
 from shapespace.training.runs.sampling import read
-from shapespace.training.runs.stages import STAGES
+from shapespace.training.stages.networks import learner_of
+from shapespace.training.stages.run import STAGES
+from shapespace.training.stages.stage import Run
 from tests.service.conftest import starting
 from tests.service.glb import GLB
 from tests.surfaces import ball, corner_uv, parse_obj, same_corners, with_parts, write_files

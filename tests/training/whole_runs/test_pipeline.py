@@ -27,11 +27,12 @@ from shapespace.training.learning import ExportError
 from shapespace.training.learning.evaluation import r_squared
 from shapespace.training.learning.export import export
 from shapespace.training.learning.fitting import read_network
-from shapespace.training.pipeline import Run, learner_of
 from shapespace.training.runs.config import load, parse
 from shapespace.training.runs.directory import RunDirectory
 from shapespace.training.runs.sampling import read
-from shapespace.training.runs.stages import STAGES
+from shapespace.training.stages.networks import learner_of
+from shapespace.training.stages.run import STAGES
+from shapespace.training.stages.stage import Run
 from tests.training.conftest import TINY, command
 
 

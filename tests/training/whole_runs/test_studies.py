@@ -17,9 +17,10 @@ from shapespace.coordinates.nric import WeightedNorm
 from shapespace.training.learning.evaluation import Model, r_squared
 from shapespace.training.learning.learner import Learner
 from shapespace.training.learning.networks import predict
-from shapespace.training.pipeline import Run, learner_of
 from shapespace.training.runs.config import ProductSettings, Recipe, load, parse
 from shapespace.training.runs.directory import RunDirectory
+from shapespace.training.stages.networks import learner_of
+from shapespace.training.stages.stage import Run
 from tests.training.conftest import TINY
 
 

@@ -20,8 +20,7 @@ from shapespace.training import __main__ as command
 from shapespace.training.report.page import page
 from shapespace.training.report.record import Record
 from shapespace.training.runs.directory import RunDirectory
-from shapespace.training.runs.shortfalls import shortfalls
-from shapespace.training.runs.stages import STAGES
+from shapespace.training.stages.run import STAGES
 from tests.faults.training import CONFIG, bars
 
 SHAPES, FACES = bars(6)
@@ -209,7 +208,7 @@ def done_up_to_modes(place: Path, said: Said) -> Path:
 
 def test_lost_logarithms_are_said_and_stop_the_run(place: Path, said: Said) -> None:
     run = done_up_to_modes(place, said)
-    assert [shortfall.sentence for shortfall in shortfalls(RunDirectory(run), "modes")] == []
+    assert STAGES["modes"].warnings(RunDirectory(run)) == []
     modes = json.loads((run / "modes.json").read_text())
     for steps, says, stops in (
         ([4, 4, 4, 8, 4], "took twice as many steps for 1 of 5 logarithms: bar3", False),
@@ -242,7 +241,7 @@ def test_failed_samples_are_counted_by_factor(place: Path) -> None:
         used = latents.copy()
         used[:5] *= 0.85
         np.savez(folder / "part-00000.npz", asked=latents, latents=used, status=status, reason=reason)
-    shortened, joint, own_shortened, own = shortfalls(RunDirectory(run), "samples")
+    shortened, joint, own_shortened, own = STAGES["samples"].warnings(RunDirectory(run))
     assert shortened.sentence.startswith("shortened 5 of 40 codes of joint samples until they had a shape")
     assert own_shortened.sentence == "shortened 5 of 40 codes of samples of factor 'upper right' until they had a shape"
     lost = status == "failed"

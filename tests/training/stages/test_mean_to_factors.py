@@ -9,8 +9,10 @@ import trimesh
 from shapespace.mesh.rigid_motion import align
 from shapespace.mesh.triangle_mesh import TriangleMesh
 from shapespace.training.runs.config import parse
-from shapespace.training.runs.directory import RunDirectory
-from shapespace.training.space.stages import MeanError, collection, factors, mean, modes, write_reference
+from shapespace.training.stages.ingest import write_reference
+from shapespace.training.stages.mean import MeanError, find_mean
+from shapespace.training.stages.run import STAGES
+from shapespace.training.stages.stage import Run
 
 CONFIG = """
 [collection]
@@ -33,13 +35,13 @@ def test_a_run_without_a_mean_ends_with_the_place(tmp_path: Path) -> None:
     # Coarse vertex v is fine vertex 2 v + 1; files have 5 more vertices, which no face uses.
     fine_index = 2 * np.arange(len(mesh.vertices)) + 1
     file_vertices = np.concatenate([np.full(5, -1), np.arange(2 * len(mesh.vertices))])
-    run = RunDirectory(tmp_path)
-    write_reference(run, mesh, 10.0, fine_index=fine_index, file_vertices=file_vertices)
+    run = Run(tmp_path, parse(CONFIG, "balls.toml"), CONFIG, tmp_path / "models")
+    write_reference(run.directory, mesh, 10.0, fine_index=fine_index, file_vertices=file_vertices)
     names = np.array(["one", "two", "three"])
     files, first = np.array(["one.obj", "two.obj", "three.ply"]), np.array([1, 1, 0])
-    run.shapes.write(names=names, vertices=shapes, files=files, first=first, original=np.arange(3))
+    run.directory.shapes.write(names=names, vertices=shapes, files=files, first=first, original=np.arange(3))
     with pytest.raises(MeanError) as error:
-        mean(run, parse(CONFIG, "balls.toml"))
+        find_mean(run)
     faces = mesh.faces[[{i, j} <= set(face) for face in mesh.faces]]
     places = [
         f"one of two.obj at its vertex {2 * v + 1 + 5 + 1} (counted from 1), at ({x:.6g}, {y:.6g}, {z:.6g}), "
@@ -47,9 +49,10 @@ def test_a_run_without_a_mean_ends_with_the_place(tmp_path: Path) -> None:
     ]
     assert sum(place in str(error.value) for place in places) >= 1
     assert "coarse_vertices" in str(error.value)
-    assert not run.mean.exists()
-    run.shapes.write(names=np.array(["one", "three"]), vertices=shapes[[0, 2]], original=np.arange(2))
-    found = mean(run, parse(CONFIG, "balls.toml"))
+    assert not run.directory.mean.exists()
+    run.directory.shapes.write(names=np.array(["one", "three"]), vertices=shapes[[0, 2]], original=np.arange(2))
+    find_mean(run)
+    found = run.directory.mean.read()
     assert (found["status"], found["steps"]) == ("converged", 16)
 
 
@@ -57,13 +60,16 @@ def test_a_run_without_a_mean_ends_with_the_place(tmp_path: Path) -> None:
 def test_codes_of_a_run_stand_for_exponentials_of_the_steps_that_were_chosen(
     blends: tuple[TriangleMesh, np.ndarray], tmp_path: Path, given: int | None, steps: int
 ) -> None:
-    (mesh, shapes), run = blends, RunDirectory(tmp_path)
-    write_reference(run, mesh, 10.0)
-    run.shapes.write(names=np.arange(len(shapes)).astype(str), vertices=shapes, original=np.arange(len(shapes)))
-    config = parse(CONFIG + ("" if given is None else f"[samples]\nsteps = {given}\n"), "balls.toml")
-    for stage in (mean, modes, factors):
-        stage(run, config)
-    found = collection(run, config)
+    mesh, shapes = blends
+    source = CONFIG + ("" if given is None else f"[samples]\nsteps = {given}\n")
+    run = Run(tmp_path, parse(source, "balls.toml"), source, tmp_path / "models")
+    write_reference(run.directory, mesh, 10.0)
+    run.directory.shapes.write(
+        names=np.arange(len(shapes)).astype(str), vertices=shapes, original=np.arange(len(shapes))
+    )
+    for name in ("mean", "modes", "factors"):
+        STAGES[name].run(run)
+    found = run.collection
     assert found.steps == steps
     code = 0.7 * found.upper
     straight = found.reference.vertices + np.tensordot(code, found.modes, axes=1)

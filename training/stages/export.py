@@ -1,0 +1,131 @@
+"""Stage `export`: the bundle, and the distance between its shapes and the collection's."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import shapespace
+from shapespace.bundle.attributes import from_entry
+from shapespace.bundle.geometry import FineMesh, Geometry
+from shapespace.bundle.schema import AttributesEntry
+from shapespace.coordinates.nric import nric
+from shapespace.mesh.attributes import MeshAttributes
+from shapespace.mesh.prolongation import Prolongation
+from shapespace.mesh.triangle_mesh import TriangleMesh
+from shapespace.training.runs.directory import RunDirectory
+from shapespace.training.runs.progress import progress, waiting
+from shapespace.training.space.generalisation import PrincipalComponents, summary, vertex_distances
+from shapespace.training.stages.networks import learner_of
+from shapespace.training.stages.stage import Run, Stage, StageWarning, listed
+
+
+def export_bundle(run: Run) -> None:
+    """Write the bundle; of a collection of meshes also ``encoded.json`` and ``least-near.npz``."""
+    folder = write_bundle_of(run, run.directory.evaluation.read())
+    run.directory.log("exported", bundle=f"{folder.parent.name}/{folder.name}")
+    if not run.by_design:
+        _encode_collection(run, folder)
+
+
+def write_bundle_of(run: Run, figures: dict[str, Any]) -> Path:
+    """Write the bundle of a run that has samples to the models directory, with its figures; return its folder."""
+    from shapespace.training.learning.examples import ExampleCorrectedCombiner
+    from shapespace.training.learning.export import export
+
+    directory = run.directory
+    digest = hashlib.sha256()
+    for path in sorted(directory.samples.rglob("*.npz")):
+        digest.update(path.read_bytes())
+    learner = learner_of(run)
+    geometry = Geometry(reference=run.collection.reference) if run.by_design else _geometry(directory)
+    composite = learner.main()
+    if run.config.export.examples and not run.by_design:
+        shapes = nric(directory.shapes.read()["vertices"], directory.reference_mesh().connectivity)
+        combiner = ExampleCorrectedCombiner.of(composite, directory.training_codes(), shapes)
+        composite = replace(composite, combiner=combiner)
+    with waiting("bundle"):
+        return export(
+            composite,
+            run.collection,
+            run.config,
+            figures,
+            digest.hexdigest(),
+            run.models,
+            geometry,
+            learner.start(),
+        )
+
+
+def _geometry(run: RunDirectory) -> Geometry:
+    """Return the mean, the fine mesh there, the modes, the codes of the shapes, and the attributes of the mesh."""
+    mean, reference, modes = run.mean_mesh(), run.reference.read(), run.modes.read()
+    fine = None
+    if run.prolongation.exists():
+        prolong = Prolongation.from_arrays(run.prolongation.read())
+        fine = FineMesh(TriangleMesh.from_arrays(prolong(mean.vertices), reference["fine_faces"]), prolong)
+    return Geometry(
+        reference=mean,
+        fine=fine,
+        modes=modes["vertices"],
+        training_codes=run.training_codes(),
+        file_vertices=reference.get("file_vertices"),
+        surface=_surface(run),
+    )
+
+
+def _surface(run: RunDirectory) -> MeshAttributes | None:
+    if not run.surface_names.exists():
+        return None
+    entry, arrays = AttributesEntry.model_validate(run.surface_names.read()), run.surface.read()
+    return from_entry(entry, arrays, {name: arrays[name].tobytes() for name in entry.textures})
+
+
+def _encode_collection(run: Run, bundle: Path) -> None:
+    """Write ``encoded.json``: the distance between the collection's shapes and the shapes of their codes.
+
+    Codes are found by ``encode`` as it is served. For comparison there are the distances of exponentials, without
+    networks and without stored training shapes. ``least-near.npz`` has the shape with the largest distance.
+    """
+    directory = run.directory
+    model, reference, names = shapespace.load(bundle), directory.reference_mesh(), directory.shapes.read()["names"]
+    given, scale = directory.own_shapes(), float(directory.reference.read()["scale"])
+    found = [model.encode(scale * shape) for shape in progress(given, "codes of the shapes", "shape", len(given))]
+    near = np.stack([each.shape.vertices for each in found]) / scale
+    linear = PrincipalComponents.of(given, reference.vertices).nearest(given, model.latents.dimension)
+    away, other = (vertex_distances(each, given, reference.diagonal) for each in (near, linear))
+    worst = int(away.mean(axis=1).argmax())
+    facts = summary(away) | {
+        "components": summary(other),
+        "modes": directory.decomposition.read().get("left"),
+        "remembered": run.config.export.examples,
+        "shapes": len(given),
+        "outside": [str(name) for name, each in zip(names, found, strict=False) if not each.inside_bounds],
+        "worst": str(names[worst]),
+    }
+    directory.least_near.write(given=given[worst], found=near[worst])
+    directory.encoded.write(facts)
+    directory.log("encoded", **facts)
+
+
+def _warnings(run: RunDirectory) -> list[StageWarning]:
+    facts = run.encoded.read_if_written()
+    outside = facts.get("outside", [])
+    if not outside:
+        return []
+    sentence = f"the codes of {len(outside)} of {facts['shapes']} shapes lie outside the bounds: {listed(outside)}"
+    return [StageWarning(sentence)]
+
+
+STAGE = Stage(
+    name="export",
+    version=1,
+    settings=lambda config: [config.export],
+    run=export_bundle,
+    results=lambda run: [run.encoded.path, run.least_near.path],
+    warnings=_warnings,
+)

@@ -1,0 +1,52 @@
+"""Stage `factors`: groups of modes whose supports overlap, and the modes in the order of the groups."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+
+from shapespace.coordinates.nric import WeightedNorm
+from shapespace.training.space.factors import between, group, names, overlap
+from shapespace.training.stages.stage import Run, Stage
+
+
+def find_factors(run: Run) -> None:
+    """Write ``factors.json``; of meshes also ``modes.npz``, where each factor's latents are a range, as in bundles.
+
+    Raises:
+        FactorError: there are fewer modes than factors were asked for.
+    """
+    directory = run.directory
+    if run.by_design:
+        given = run.collection.factors
+        directory.factors.write({"factors": list(given.values()), "names": list(given)})
+        return
+    found, centre = directory.modes_by_strength.read(), directory.mean_mesh()
+    norm = WeightedNorm.of(centre, run.config.material.eta)
+    z = np.ascontiguousarray(found["nric"])  # sums round by the order in memory, and files keep that
+    shared = overlap(z, norm)
+    groups = group(shared, run.config.factors.count)
+    order = [j for members in groups for j in members]
+    ordered = {name: found[name][order] for name in ("nric", "vertices", "lower", "upper", "localisation")}
+    ordered |= {name: found[name][:, order] for name in ("coefficients", "mirrored_coefficients")}
+    ordered["rank"] = np.array(order)
+    directory.modes.write(**found | ordered)
+    starts = np.cumsum([0, *map(len, groups)])
+    directory.factors.write(
+        {
+            "factors": [list(range(a, b)) for a, b in itertools.pairwise(starts.tolist())],
+            "names": names(groups, z, norm, centre),
+            "overlap": between(shared, groups).tolist(),
+        }
+    )
+    directory.log("found", factors=len(groups), largest=max(map(len, groups)))
+
+
+STAGE = Stage(
+    name="factors",
+    version=1,
+    settings=lambda config: [config.factors],
+    run=find_factors,
+    results=lambda run: [run.factors.path],
+)

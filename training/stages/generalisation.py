@@ -1,0 +1,65 @@
+"""Stage `generalisation`: the distance between shapes that are left out of training and the space without them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from shapespace.solve.cholesky import NotPositiveDefiniteError
+from shapespace.training.runs.directory import RunDirectory
+from shapespace.training.space.generalisation import held_out, joined, some_folds, summary
+from shapespace.training.space.modes import ModeError
+from shapespace.training.stages.stage import Run, Stage, StageWarning
+
+
+def measure_generalisation(run: Run) -> None:
+    """Write ``generalisation.json``: errors of modes and of principal components on shapes left out of training.
+
+    A fifth of the shapes is left out of everything: mean, logarithms, modes and their number. Below ten shapes, each
+    shape is left out in its turn. Exponentials stand for networks, in at most LIGHT_STEPS steps. The same is measured
+    with half as many modes. ``least-general.npz`` has the shape with the largest error.
+    """
+    directory, material = run.directory, run.config.shell_material
+    reference, given, settings = directory.reference_mesh(), directory.shapes.read(), run.config.modes
+    shapes, original = given["vertices"], given["original"]
+    folds = some_folds(int(original.max()) + 1)
+    facts: dict[str, Any]
+    try:
+        found = joined(
+            [held_out(reference, shapes, index, None, settings, material, original=original) for index in folds]
+        )
+    except (ModeError, NotPositiveDefiniteError) as error:  # the model is still of use
+        facts = {"failed": str(error)}
+    else:
+        away = found.distances(shapes, reference.diagonal)
+        worst = int(away["modes"][-1].mean(axis=1).argmax())
+        number = found.index[worst]
+        directory.least_general.write(given=shapes[number], found=found.by_modes[-1][worst])
+        different = slice(0 if found.counts[0] < found.counts[1] else 1, None)
+        ended = ~found.stuck[-1]
+        facts = {
+            "held_out": len(found.index),
+            "steps": int(found.steps.max()),
+            "counts": found.counts[different],
+            **{name: [summary(each) for each in rows[different]] for name, rows in away.items()},
+            "stuck": int((~ended).sum()),
+            "not_stuck": {name: summary(rows[-1][ended]) for name, rows in away.items() if ended.any()},
+            "worst": str(given["names"][number]),
+        }
+    directory.generalisation.write(facts)
+    directory.log("found", **facts)
+
+
+def _warnings(run: RunDirectory) -> list[StageWarning]:
+    why = run.generalisation.read_if_written().get("failed")
+    return [StageWarning(f"how near the space comes to unseen shapes was not measured: {why}")] if why else []
+
+
+STAGE = Stage(
+    name="generalisation",
+    version=1,
+    settings=lambda config: [],
+    run=measure_generalisation,
+    results=lambda run: [run.generalisation.path, run.least_general.path],
+    warnings=_warnings,
+    meshes_only=True,
+)

@@ -1,0 +1,219 @@
+"""Stage `ingest`: read and check the meshes, scale them, coarsen them, and prepare the way back to the fine mesh."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+
+from shapespace.arrays import FloatArray, IntArray
+from shapespace.bundle.attributes import surface_arrays, surface_entry
+from shapespace.mesh.attached_parts import attach_part
+from shapespace.mesh.coarsening import coarsen
+from shapespace.mesh.prolongation import AttachedPart, Prolongation, submesh
+from shapespace.mesh.triangle_mesh import TriangleMesh
+from shapespace.training.collection.appearance import kept, reference_surface, texture_bytes
+from shapespace.training.collection.generators import MESHES
+from shapespace.training.collection.ingest import read_collection
+from shapespace.training.collection.large_arrays import some_vertices, stacked
+from shapespace.training.collection.mesh_collection import MeshCollection, normalised
+from shapespace.training.collection.mirror import find_mirror, mirrored
+from shapespace.training.runs.config import CollectionSettings, Config, ConfigError
+from shapespace.training.runs.directory import RunDirectory
+from shapespace.training.runs.progress import waiting
+from shapespace.training.space.generalisation import FOLDS
+from shapespace.training.stages.stage import Run, Stage, StageWarning
+
+
+def ingest(run: Run) -> None:
+    """Write ``reference.npz``; of meshes also ``shapes.npz``, ``ingest.json``, their prolongation and their surface.
+
+    ``shapes.npz`` has normalised vertices (n, V, 3), coarsened where the settings ask for it.
+
+    Raises:
+        IngestError: the collection can't be used, or shapes of it have to be accepted first.
+    """
+    directory, settings = run.directory, run.config.collection
+    if run.by_design:
+        write_reference(directory, run.collection.reference, run.collection.scale)
+        return
+    meshes = read_meshes(run.config)
+    meshes.require_accepted(run.accepted)
+    chosen = meshes.index(settings.reference)
+    vertices, scale = normalised(meshes, chosen)
+    fine = TriangleMesh.from_arrays(vertices[chosen], meshes.faces)
+    images, original_index, notes = _mirror_images(settings, meshes, vertices, fine.edges)
+    facts: dict[str, Any] = {"shapes": len(vertices), "vertices": vertices.shape[1], "reference": meshes.names[chosen]}
+    facts["images"] = len(images)
+    facts["notes"] = [*meshes.notes, *notes]
+    facts["warnings"] = [warned.sentence for warned in meshes.warnings]
+    reference, index, coarsened = _coarse_mesh(settings, meshes, fine, vertices, images)
+    facts |= coarsened
+    more = {}
+    if reference is not fine:
+        more = {"fine_vertices": fine.vertices, "fine_faces": fine.faces, "fine_index": index}
+        exact, vertices = vertices, vertices[:, index]
+        others = np.delete(np.arange(len(exact)), chosen)
+        held = others[:: min(FOLDS, len(others))]
+        prolongation = _prolong(directory, meshes, reference, fine, vertices, exact, held)
+        facts["prolongation"] = prolongation
+        facts["notes"] += [
+            f"{part['name']} is carried {part['carried']}: {part['mean']:.2%} of the diagonal away on average, "
+            f"{part['max']:.2%} at most"
+            for part in prolongation.get("parts", ())[1:]
+        ]
+    if meshes.file_vertices is not None and len(meshes.file_vertices) > len(fine.vertices):
+        more["file_vertices"] = meshes.file_vertices
+    write_reference(directory, reference, scale, **more)
+    places = meshes.places or [(name, 0) for name in meshes.names]
+    original = np.concatenate([np.arange(len(vertices)), original_index])
+    files, first = (np.array(each)[original] for each in zip(*places, strict=True))
+    directory.shapes.write(
+        names=np.array([*meshes.names, *(f"{meshes.names[k]} (mirrored)" for k in original_index)]),
+        vertices=np.concatenate([vertices, images[:, index]]),
+        original=original,
+        files=files,
+        first=first,
+    )
+    surface, left_out = reference_surface(settings.data, meshes, chosen)
+    facts["warnings"] += left_out
+    if surface:
+        facts["notes"].append(kept(surface))
+        directory.surface.write(**surface_arrays(surface), **texture_bytes(surface))
+        directory.surface_names.write(surface_entry(surface).model_dump())
+    directory.ingest.write(facts)
+    directory.log("ingested", **facts)
+
+
+def read_meshes(config: Config) -> MeshCollection:
+    """Read the collection of a run; raises ConfigError where none is named, IngestError where it can't be used."""
+    settings = config.collection
+    if settings.generator is not None:
+        return MESHES[settings.generator]()
+    if settings.data is None:
+        raise ConfigError("collection.data: say where the meshes are, here or with --data")
+    return read_collection(settings.data, settings.parts)
+
+
+def write_reference(run: RunDirectory, mesh: TriangleMesh, scale: float, **fine: np.ndarray) -> None:
+    """Write ``reference.npz``, see RunDirectory.reference."""
+    run.reference.write(vertices=mesh.vertices, faces=mesh.faces, edges=mesh.edges, scale=np.array(scale), **fine)
+
+
+def _mirror_images(
+    settings: CollectionSettings, meshes: MeshCollection, vertices: FloatArray, edges: IntArray
+) -> tuple[FloatArray, IntArray, list[str]]:
+    """Return mirror images (k, V, 3) to learn from, the indices (k,) of their originals, and notes."""
+    found = find_mirror(vertices, edges) if settings.mirror else None
+    if found is None:
+        return np.empty((0, *vertices.shape[1:])), np.empty(0, dtype=int), []
+    images, original_index = mirrored(vertices, found[0])
+    note = (
+        f"learns from {len(images)} mirror images too, since {meshes.names[found[1]]} is symmetric; "
+        "collection.mirror = false leaves them out"
+    )
+    return images, original_index, [note] if len(images) else []
+
+
+def _coarse_mesh(
+    settings: CollectionSettings, meshes: MeshCollection, fine: TriangleMesh, vertices: FloatArray, images: FloatArray
+) -> tuple[TriangleMesh, IntArray, dict[str, Any]]:
+    """Return the mesh to compute with, the fine index (V,) of its vertices, and facts about it.
+
+    It is the shell of the fine mesh, coarsened where the settings ask for fewer vertices, or the fine mesh itself.
+    """
+    own = np.unique(meshes.shell_faces)
+    shell = submesh(fine, own) if meshes.parts else fine
+    if not 0 < settings.coarse_vertices < len(own):
+        return shell, own, {}
+    with waiting("coarse mesh"):
+        every = some_vertices(vertices, own)
+        if len(images):
+            every = stacked(len(vertices) + len(images), (x[own] for x in itertools.chain(vertices, images)))
+        coarsening = coarsen(shell, settings.coarse_vertices, every)
+    index = own[coarsening.fine_index]
+    facts = {
+        "coarse_vertices": len(index),
+        "asked_vertices": settings.coarse_vertices,
+        "smallest_angle": float(np.degrees(coarsening.smallest_angle)),
+        "smallest_area": coarsening.smallest_area,
+        "specks": coarsening.specks,
+        "folds": coarsening.folds,
+        "reason": coarsening.reason,
+    }
+    return TriangleMesh.from_arrays(fine.vertices[index], coarsening.faces), index, facts
+
+
+def _prolong(
+    run: RunDirectory,
+    meshes: MeshCollection,
+    reference: TriangleMesh,
+    fine: TriangleMesh,
+    coarse: FloatArray,
+    exact: FloatArray,
+    held: IntArray,
+) -> dict[str, Any]:
+    """Write ``prolongation.npz``; return its errors between fine shapes (n, Vf, 3) and prolonged ones (n, V, 3).
+
+    The weights are fitted to all shapes if weights fitted without the shapes ``held`` come closer to these. The errors
+    are those of the shapes ``held``. The reference is not among them, because the prolongation is exact there.
+    """
+    own = np.unique(meshes.shell_faces)
+    attached = []
+    for part in meshes.parts[1:]:
+        index = np.setdiff1d(meshes.faces[part.faces], own)
+        attached.append(attach_part(reference, fine.vertices[index], index, coarse, some_vertices(exact, index)))
+    prolong = trial = Prolongation.of(reference, fine, attached)
+    every = np.arange(len(exact))
+    fitted = prolong.fitted(coarse, exact, own, np.setdiff1d(every, held))
+    learned, plain = (each.errors(coarse[held], (exact[k] for k in held)) for each in (fitted, prolong))
+    if learned["mean"] < plain["mean"]:
+        prolong, trial = prolong.fitted(coarse, exact, own, every), fitted
+    run.prolongation.write(**prolong.arrays())
+    facts: dict[str, Any] = min(learned, plain, key=lambda errors: errors["mean"])
+    if attached:
+        distances = trial.distances(coarse[held], (exact[k] for k in held))
+        facts["parts"] = _part_errors(meshes, own, attached, distances)
+    return facts
+
+
+def _part_errors(
+    meshes: MeshCollection, own: IntArray, attached: list[AttachedPart], distances: Iterable[FloatArray]
+) -> list[dict[str, Any]]:
+    """Return how each part is carried and its ``mean`` and ``max`` error, from distances (Vf,) for each shape."""
+    indices = [own, *(part.vertices for part in attached)]
+    found = np.array([[(away[index].mean(), away[index].max()) for index in indices] for away in distances])
+    how = ["shell", *("rigidly" if part.rigid else "affinely" for part in attached)]
+    return [
+        {"name": part.name, "carried": carried, "mean": mean, "max": most}
+        for part, carried, mean, most in zip(
+            meshes.parts, how, found[..., 0].mean(axis=0).tolist(), found[..., 1].max(axis=0).tolist(), strict=True
+        )
+    ]
+
+
+def _warnings(run: RunDirectory) -> list[StageWarning]:
+    facts = run.ingest.read_if_written()
+    sentences = [*facts.get("notes", ()), *facts.get("warnings", ())]
+    if facts.get("reason"):
+        sentences.append(f"coarse mesh: {facts['reason']}")
+    return [StageWarning(sentence) for sentence in sentences]
+
+
+STAGE = Stage(
+    name="ingest",
+    version=1,
+    settings=lambda config: [config.collection],
+    run=ingest,
+    results=lambda run: [
+        run.reference.path,
+        run.prolongation.path,
+        run.shapes.path,
+        run.ingest.path,
+        run.surface.path,
+        run.surface_names.path,
+    ],
+    warnings=_warnings,
+)

@@ -1,0 +1,113 @@
+"""Stage `modes`: logarithms of the shapes at the mean, their sparse and principal modes, and codes of the shapes."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from shapespace.coordinates.nric import WeightedNorm
+from shapespace.shell.space import ShellSpace
+from shapespace.training.runs.directory import RunDirectory
+from shapespace.training.runs.progress import waiting
+from shapespace.training.space.codes import box_of, nearest_codes
+from shapespace.training.space.generalisation import summary, vertex_distances
+from shapespace.training.space.logarithms import logarithms
+from shapespace.training.space.modes import find_modes, localisation, mode_count, pga
+from shapespace.training.stages.stage import COARSER_MESH, Run, Stage, StageWarning, listed
+
+
+def decompose(run: Run) -> None:
+    """Write ``modes-by-strength.npz``, ``modes.json``, and ``modes.npz``, which `factors` puts in its order.
+
+    Raises:
+        ModeError: the collection has no modes, or none at this sparsity.
+    """
+    directory, config = run.directory, run.config
+    settings, centre, given = config.modes, directory.mean_mesh(), directory.shapes.read()
+    shapes, original_index = given["vertices"], given["original"]
+    originals = original_index.max() + 1
+    space = ShellSpace(centre, config.shell_material)
+    norm = WeightedNorm.of(centre, config.material.eta)
+    steps = directory.log_steps()
+    found = logarithms(space, centre.vertices, shapes, steps)
+    count = mode_count(settings, space, centre.vertices, found.fields, original_index)
+    dense = pga(space, centre.vertices, found.fields, count, settings.norm)
+    with waiting("sparse modes"):
+        sparse = find_modes(settings, space, centre.vertices, found.fields, count, original_index)
+    codes = nearest_codes(space, centre.vertices, sparse.vertices, shapes, sparse.coefficients, steps)
+    lower, upper = box_of(codes.codes)
+    arrays = {
+        "nric": sparse.nric,
+        "vertices": sparse.vertices,
+        "coefficients": codes.codes[:originals],
+        "mirrored_coefficients": codes.codes[originals:],
+        "lower": lower,
+        "upper": upper,
+        "localisation": localisation(sparse.nric, norm),
+        "pga_nric": dense.nric,
+        "pga_vertices": dense.vertices,
+        "pga_localisation": localisation(dense.nric, norm),
+    }
+    directory.modes_by_strength.write(**arrays)
+    directory.modes.write(**arrays, rank=np.arange(len(sparse)))
+    away = vertex_distances(codes.vertices, shapes, directory.reference_mesh().diagonal)[:originals]
+    facts: dict[str, Any] = {
+        "modes": len(sparse),
+        "converged": sparse.converged,
+        "explained": sparse.explained,
+        "sparsity": sparse.sparsity,
+        "pga_explained": dense.explained,
+        "linearised_logarithms": len(found.fallbacks),
+        "asked": count if settings.count == "auto" else settings.count,
+        "log_steps": steps,
+        "steps": list(found.steps),
+        "via": list(found.via),
+        "codes": [str(status) for status in codes.status],
+        "left": summary(away),
+    }
+    directory.decomposition.write(facts | {"reasons": list(found.reasons), "history": sparse.history})
+    directory.log("found", **facts)
+
+
+def _warnings(run: RunDirectory) -> list[StageWarning]:
+    facts = run.decomposition.read_if_written()
+    if "steps" not in facts:
+        return []
+    names = run.shapes.read()["names"].astype(str)
+    steps, asked, found = np.array(facts["steps"]), facts["asked"], facts["modes"]
+    warnings = []
+    linearised = names[steps == 0].tolist()
+    if linearised:
+        sentence = f"linearised {len(linearised)} of {len(steps)} logarithms: {listed(linearised)}"
+        warnings.append(StageWarning(sentence, len(linearised) / len(steps), COARSER_MESH))
+    finer = names[steps > facts["log_steps"]].tolist()
+    if finer:
+        sentence = f"took twice as many steps for {len(finer)} of {len(steps)} logarithms: {listed(finer)}"
+        warnings.append(StageWarning(sentence))
+    if found < asked:
+        why = (
+            f"{len(steps)} shapes differ in {found} directions"
+            if found == len(steps) - 1
+            else "the others would be zero; a smaller modes.sparsity keeps more, where it isn't 0 already"
+        )
+        warnings.append(StageWarning(f"found {found} of {asked} modes, because {why}"))
+    unfinished = names[np.array(facts.get("codes", ["converged"] * len(names))) != "converged"].tolist()
+    if unfinished:
+        sentence = f"the codes of {len(unfinished)} of {len(names)} shapes may not be the nearest: {listed(unfinished)}"
+        warnings.append(StageWarning(sentence))
+    if not facts.get("converged", True):
+        sentence = "sparse modes: the iteration ended at modes.max_iterations, before it had converged"
+        warnings.append(StageWarning(sentence))
+    return warnings
+
+
+STAGE = Stage(
+    name="modes",
+    version=2,
+    settings=lambda config: [config.modes],
+    run=decompose,
+    results=lambda run: [run.modes_by_strength.path, run.modes.path, run.decomposition.path],
+    warnings=_warnings,
+    meshes_only=True,
+)

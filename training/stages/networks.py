@@ -1,0 +1,62 @@
+"""Stage `networks`: the networks that are exported, and those that are trained for comparison."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from shapespace.training.runs.sampling import FEWEST, SamplesError, indices
+from shapespace.training.stages.stage import Run, Stage
+
+# PyTorch, which takes more than a second to load, is loaded where a stage needs it.
+if TYPE_CHECKING:
+    from shapespace.training.learning.learner import Learner
+
+
+def learner_of(run: Run) -> Learner:
+    """Return the networks of a run that has samples."""
+    from shapespace.training.learning.learner import Learner
+
+    samples = run.directory.stamp("samples").read()["key"]
+    return Learner(run.collection, run.config, run.directory, f"{samples}, {STAGE.version}")
+
+
+def train_networks(run: Run) -> None:
+    """Write ``networks/``: one file for each network and all histories; files that are no longer needed are removed.
+
+    Raises:
+        SamplesError: there are too few samples to learn from.
+    """
+    directory = run.directory
+    kinds = {"joint samples": directory.samples}
+    kinds |= {
+        f"samples of factor {name!r}": directory.factor_samples(j) for j, name in enumerate(run.collection.factors)
+    }
+    for kind, path in kinds.items():
+        if (found := len(indices(path))) < FEWEST:
+            raise SamplesError(f"there are only {found} {kind}, and {FEWEST} are needed to learn from")
+    learner = learner_of(run)
+    learner.main()
+    learner.monolithic()
+    learner.monolithic_paper()
+    if run.config.networks.paper:
+        learner.paper()
+    directory.histories.write(learner.histories)
+    for path in directory.networks():
+        if path.stem not in learner.histories:
+            path.unlink()
+
+
+# A network's file is named by a digest of all that the network depends on. So a change of settings keeps the networks
+# that it does not touch.
+STAGE = Stage(
+    name="networks",
+    version=5,
+    settings=lambda config: [
+        config.networks,
+        config.monolithic,
+        config.monolithic_paper,
+        *config.variants.values(),
+    ],
+    run=train_networks,
+    results=lambda run: [run.histories.path],
+)

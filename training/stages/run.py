@@ -1,0 +1,219 @@
+"""The stages of a run in order. Only stages whose settings, input or version have changed are done again."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+import time
+from collections.abc import Callable
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+from shapespace.training.collection.reading import data_files
+from shapespace.training.runs.config import Config
+from shapespace.training.runs.directory import RunDirectory
+from shapespace.training.stages import (
+    evaluation,
+    export,
+    factors,
+    generalisation,
+    ingest,
+    mean,
+    modes,
+    networks,
+    samples,
+)
+from shapespace.training.stages.stage import Run, Stage, StageWarning
+
+STAGES: dict[str, Stage] = {
+    module.STAGE.name: module.STAGE
+    for module in (ingest, mean, modes, factors, samples, networks, generalisation, evaluation, export)
+}
+
+
+class OldRunError(ValueError):
+    """A run of version 0.1, which can't be continued."""
+
+
+class LostTooMuchError(RuntimeError):
+    """A stage lost too many logarithms or samples. Its files stay, and the message says how to continue."""
+
+
+def refuse_old(directory: RunDirectory) -> None:
+    """Leave a run of version 0.1 as it is: its files and settings may have another meaning today.
+
+    Raises:
+        OldRunError: the run is of version 0.1.
+    """
+    if directory.is_of_0_1():
+        raise OldRunError(
+            f"{directory.folder} is a run of version 0.1: status and report still read it, but it can't be continued "
+            "or exported; run its configuration again with another directory as --out"
+        )
+
+
+def stage_keys(config: Config, data: str) -> dict[str, dict[str, str]]:
+    """Return the digests of each stage by its name, see Stage.keys.
+
+    Args:
+        config: the configuration of the run.
+        data: identifies the files of the collection.
+    """
+    found: dict[str, dict[str, str]] = {}
+    for name, stage in STAGES.items():
+        found[name] = stage.keys(config, data)
+        data = found[name]["key"]
+    return found
+
+
+def execute(
+    run: Run,
+    until: str | None = None,
+    *,
+    keep_going: bool = False,
+    command: str = "",
+    show: Callable[[str], None] = print,
+) -> bool:
+    """Do the stages that are not done yet, up to and including ``until``.
+
+    Args:
+        run: the run.
+        until: name of the last stage; by default all stages are done.
+        keep_going: whether to continue however much is lost.
+        command: command that continues this run, for messages.
+        show: receives one line at a time.
+
+    Returns:
+        Whether any stage was done.
+
+    Raises:
+        LostTooMuchError: more than a quarter of the logarithms or samples are lost, and ``keep_going`` is false.
+    """
+    directory = run.directory
+    keys, data = _prepare(run, show)
+    order = list(STAGES)
+    if until is None or order.index(until) >= order.index("networks"):
+        # First: loaded after the libraries that solve other stages' equations, its results differ in the last bits.
+        import_module("torch")
+    done = False
+    for name, stage in STAGES.items():
+        stamp = directory.stamp(name).read_if_written()
+        if "seconds" in stamp:
+            show(f"{name}: done before ({stamp['seconds']:.0f} s)")
+        else:
+            _do(stage, run, keys[name], stamp, show)
+            done = True
+        if name == "ingest" and data != directory.data.read_if_written():
+            directory.data.write(data)
+        warnings = stage.warnings(directory)
+        for warning in warnings:
+            show(f"  {warning.sentence}")
+        if not keep_going:
+            _refuse_loss(name, warnings, f"{command} --keep-going" if command else "")
+        if name == until:
+            break
+    return done
+
+
+def _prepare(run: Run, show: Callable[[str], None]) -> tuple[dict[str, dict[str, str]], dict[str, dict[str, Any]]]:
+    """Remove outdated results and write the configuration. Return the keys of the stages, and facts about the data."""
+    directory, source = run.directory, run.config.collection.data
+    data, known = _data_facts(run), directory.data.read_if_written()
+    if data:  # a run from a generator has none, and is done again where it is of version 0.1
+        refuse_old(directory)
+    if source and known and not source.exists():
+        show(f"data: {source} is not there any more; the run goes on with what ingest left")
+        data = known
+    elif known and (changes := _changes(known, data)):
+        show(f"data: {changes}; all that follows from them is done again, from ingest on")
+    keys = stage_keys(run.config, json.dumps({name: facts["sha256"] for name, facts in data.items()}) if data else "")
+    _forget(directory, keys, show)
+    directory.config.write(run.source)
+    return keys, data
+
+
+def _do(stage: Stage, run: Run, keys: dict[str, str], stamp: dict[str, Any], show: Callable[[str], None]) -> None:
+    """Do one stage, and write its stamp before and after."""
+    directory, name = run.directory, stage.name
+    if stamp.get("basis") != keys["basis"]:
+        for path in filter(Path.is_dir, stage.results(directory)):
+            shutil.rmtree(path)
+    begun = keys | {"version": stage.version}
+    directory.stamp(name).write(begun)
+    directory.log("begin", stage=name)
+    show(f"{name} …")
+    start = time.monotonic()
+    if stage.meshes_only and run.by_design:
+        directory.log("skipped", why="the generator gives factors and bounds itself")
+    else:
+        stage.run(run)
+    seconds = time.monotonic() - start
+    directory.stamp(name).write(begun | {"seconds": seconds})
+    directory.log("end", stage=name, seconds=round(seconds, 3))
+    show(f"{name}: {seconds:.0f} s")
+
+
+def _data_facts(run: Run) -> dict[str, dict[str, Any]]:
+    """Return ``bytes``, ``time`` and ``sha256`` of each file of the collection, by name; none of a generator.
+
+    A file is read again only where its size or its time differs from ``data.json``.
+    """
+    source = run.config.collection.data
+    known, found = run.directory.data.read_if_written(), {}
+    for path in data_files(source) if source else ():
+        stat = path.stat()
+        facts = {"bytes": stat.st_size, "time": stat.st_mtime_ns}
+        before = known.get(path.name, {})
+        if any(before.get(name) != value for name, value in facts.items()):
+            with path.open("rb") as file:
+                before = {"sha256": hashlib.file_digest(file, "sha256").hexdigest()}
+        found[path.name] = {**facts, "sha256": before["sha256"]}
+    return found
+
+
+def _changes(before: dict[str, dict[str, Any]], now: dict[str, dict[str, Any]]) -> str:
+    """Say which data files were added, removed or changed."""
+
+    def some(word: str, names: set[str]) -> str:
+        more = ", …" if len(names) > 3 else ""
+        return f"{len(names)} {word} ({', '.join(sorted(names)[:3])}{more})" if names else ""
+
+    changed = {name for name in before.keys() & now.keys() if before[name]["sha256"] != now[name]["sha256"]}
+    kinds = {"added": now.keys() - before.keys(), "removed": before.keys() - now.keys(), "changed": changed}
+    return ", ".join(filter(None, (some(word, set(names)) for word, names in kinds.items())))
+
+
+def _forget(directory: RunDirectory, keys: dict[str, dict[str, str]], show: Callable[[str], None]) -> None:
+    """Remove stamps and files of other keys, so that all results in the directory belong together."""
+    outdated = []
+    for name, stage in STAGES.items():
+        stamp = directory.stamp(name).read_if_written()
+        if stamp.get("key") == keys[name]["key"]:
+            continue
+        if "key" in stamp:
+            if stamp.get("version") != stage.version:
+                outdated.append(name)
+            directory.stamp(name).write({of: stamp[of] for of in ("basis", "version") if of in stamp})
+        for path in stage.results(directory):
+            if not path.is_dir():
+                path.unlink(missing_ok=True)
+    for name in outdated[:1]:
+        show(f"{name}: another version of shapespace computed it otherwise; it and all that follows is done again")
+
+
+def _refuse_loss(stage: str, warnings: list[StageWarning], command: str) -> None:
+    """Stop a run that has lost too much.
+
+    Raises:
+        LostTooMuchError: with the loss, advice, and the command that continues nevertheless.
+    """
+    grave = [warning for warning in warnings if warning.too_much]
+    if grave:
+        why = "; ".join(warning.sentence for warning in grave)
+        advice = "; ".join(dict.fromkeys(warning.advice for warning in grave))
+        raise LostTooMuchError(
+            f"stopped after {stage}: {why}, more than a quarter, and what is learned from the rest is worth little.\n"
+            f"What may help: {advice}." + (f"\nTo go on all the same: {command}" if command else "")
+        )

@@ -1,0 +1,169 @@
+"""What all stages share: the description of a stage, its warnings, and the run that it works on."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel
+
+from shapespace.arrays import FloatArray
+from shapespace.training.collection.generators import PRODUCTS
+from shapespace.training.runs.config import Config
+from shapespace.training.runs.directory import RunDirectory
+from shapespace.training.runs.sampling import Collection, draw
+from shapespace.training.space.shell_collection import ShellCollection
+
+#: A stage stops the run if it loses a larger share of its logarithms or samples.
+TOLERATED_LOSS = 0.25
+#: Most names in a sentence.
+LISTED_NAMES = 6
+#: What helps where logarithms or samples fail.
+COARSER_MESH = (
+    "more collection.coarse_vertices or a larger material.eta, as the usual cause are thin or folded parts of the "
+    "coarse mesh"
+)
+
+
+@dataclass(frozen=True)
+class StageWarning:
+    """One thing that a stage could not do.
+
+    Attributes:
+        sentence: what, how much, and where.
+        share: lost share of the logarithms or samples; 0 for a warning that never stops a run.
+        advice: what may help where the share is large.
+    """
+
+    sentence: str
+    share: float = 0.0
+    advice: str = ""
+
+    @property
+    def too_much(self) -> bool:
+        """Whether the run should stop."""
+        return self.share > TOLERATED_LOSS
+
+
+def listed(names: list[str]) -> str:
+    """Return the first names, and the number of the others."""
+    more = f" and {len(names) - LISTED_NAMES} more" if len(names) > LISTED_NAMES else ""
+    return ", ".join(names[:LISTED_NAMES]) + more
+
+
+class Run:
+    """A run: its configuration, its directory, and what it needs from outside.
+
+    Args:
+        folder: the run directory.
+        config: the configuration.
+        source: the text of the configuration.
+        models: folder of the bundles.
+        scheduler: address of a Dask scheduler, see workers.run.
+        accepted: names or files of shapes that `ingest` takes although their size or vertex order differs.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        config: Config,
+        source: str,
+        models: Path,
+        scheduler: str | None = None,
+        accepted: Sequence[str] = (),
+    ) -> None:
+        self.directory, self.config, self.models, self.scheduler = RunDirectory(folder), config, models, scheduler
+        self.accepted, self.source = accepted, source
+
+    @property
+    def by_design(self) -> bool:
+        """Whether the collection is a product whose generator gives factors and bounds."""
+        return self.config.collection.generator in PRODUCTS
+
+    @cached_property
+    def collection(self) -> Collection:
+        """The parametrised collection. A collection of meshes has one after the stage `factors`."""
+        generator = self.config.collection.generator
+        if generator in PRODUCTS:
+            return PRODUCTS[generator]()
+        factors, modes = self.directory.factors.read(), self.directory.modes.read()
+        return ShellCollection(
+            reference=self.directory.mean_mesh(),
+            modes=modes["vertices"],
+            lower=modes["lower"],
+            upper=modes["upper"],
+            factors=dict(zip(factors["names"], factors["factors"], strict=True)),
+            steps=self.config.samples.steps or self.directory.log_steps(),
+            material=self.config.shell_material,
+            scale=float(self.directory.reference.read()["scale"]),
+            codes=self.directory.training_codes(),
+        )
+
+    @property
+    def bundle(self) -> Path:
+        """Folder of the bundle."""
+        return self.models / self.config.export.name / str(self.config.export.version)
+
+    def draw(
+        self, folder: Path, latents: FloatArray, title: str, *, shorten: bool, collection: Collection | None = None
+    ) -> None:
+        """Compute samples of codes (n, m) into a folder, and log the progress; see sampling.draw."""
+        parts = draw(
+            collection or self.collection,
+            folder,
+            latents,
+            self.config.samples.part_size,
+            title,
+            shorten=shorten,
+            scheduler=self.scheduler,
+        )
+        for done, total, failed in parts:
+            self.directory.log("progress", what=title, done=done, total=total, failed=failed)
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One stage of a run.
+
+    Attributes:
+        name: name on the command line and in the run directory.
+        version: version of the numerics. Raise it in the commit after which the same settings and input give other
+            numbers.
+        settings: the part of the configuration that the stage reads.
+        run: does the stage. It continues from what an interrupted call has left.
+        results: paths that are removed where the settings, the version or an earlier stage has changed. Files are
+            removed at once, because a reader would take them for current. Folders of samples are removed when the
+            stage begins, because the change may be taken back until then.
+        warnings: what the finished stage could not do, read from its files.
+        amounts: settings that may change without removing folders, since the stage adds what is missing.
+        meshes_only: whether a product by design skips the stage.
+    """
+
+    name: str
+    version: int
+    settings: Callable[[Config], Sequence[BaseModel | dict[str, Any]]]
+    run: Callable[[Run], None]
+    results: Callable[[RunDirectory], Sequence[Path]]
+    warnings: Callable[[RunDirectory], list[StageWarning]] = lambda _: []
+    amounts: frozenset[str] = frozenset()
+    meshes_only: bool = False
+
+    def keys(self, config: Config, before: str) -> dict[str, str]:
+        """Return digests of what the stage depends on: ``key`` of everything, ``basis`` of all but the amounts.
+
+        Args:
+            config: the configuration of the run.
+            before: key of the stage before, or of the data.
+        """
+        settings = [s if isinstance(s, dict) else s.model_dump(mode="json") for s in self.settings(config)]
+        rest = [{k: v for k, v in s.items() if k not in self.amounts} for s in settings]
+
+        def digest(read: list[dict[str, Any]]) -> str:
+            return hashlib.sha256(json.dumps([self.name, self.version, read, before]).encode()).hexdigest()
+
+        return {"key": digest(settings), "basis": digest(rest)}
