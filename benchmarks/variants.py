@@ -7,7 +7,7 @@ from typing import Any
 
 from pydantic import BaseModel, ConfigDict
 
-from shapespace.training.runs.config import Recipe
+from shapespace.training.runs.network_settings import Recipe
 
 
 class Variant(BaseModel):

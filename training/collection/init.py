@@ -10,15 +10,9 @@ from pathlib import Path
 
 from shapespace.training.collection.ingest import read_collection
 from shapespace.training.collection.mesh_collection import MeshCollection
-from shapespace.training.runs.config import (
-    CollectionSettings,
-    CombinerSettings,
-    ConfigError,
-    LatentNetworkSettings,
-    MaterialSettings,
-    ModeSettings,
-    SampleSettings,
-)
+from shapespace.training.runs.config import ConfigError
+from shapespace.training.runs.network_settings import CombinerSettings, LatentNetworkSettings
+from shapespace.training.runs.settings import CollectionSettings, MaterialSettings, ModeSettings, SampleSettings
 
 TEMPLATE = """\
 # {title}: {shapes} shapes of {vertices} vertices and {faces} faces.

@@ -18,9 +18,9 @@ from shapespace.training.learning.gaussian import Centres, every_axis
 from shapespace.training.learning.latent_features import LatentFeatures
 from shapespace.training.learning.layers import Scaling
 from shapespace.training.learning.linear import Ridge, principal_axes
-from shapespace.training.runs.config import EvaluationSettings
 from shapespace.training.runs.latent_coordinates import Coordinates
 from shapespace.training.runs.sampling import Collection
+from shapespace.training.runs.settings import EvaluationSettings
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ from torch.optim.lr_scheduler import CosineAnnealingLR, ReduceLROnPlateau
 
 from shapespace.training.learning.networks import ShapeNetwork, predict
 from shapespace.training.runs.atomic_files import whole
-from shapespace.training.runs.config import FitSettings
+from shapespace.training.runs.network_settings import FitSettings
 from shapespace.training.runs.progress import bar
 
 #: Epochs between two checkpoints.

@@ -27,15 +27,15 @@ from shapespace.training.learning.composite import Composite, factor_shapes
 from shapespace.training.learning.fitting import fit, read_network, save_network
 from shapespace.training.learning.layers import PatchBasis, Scaling
 from shapespace.training.learning.networks import FactorNetwork, ShapeNetwork, StartNetwork, predict
-from shapespace.training.runs.config import (
+from shapespace.training.runs.config import Config
+from shapespace.training.runs.directory import RunDirectory
+from shapespace.training.runs.network_settings import (
     CombinerSettings,
-    Config,
     FitSettings,
     LatentNetworkSettings,
     PaperSettings,
     Recipe,
 )
-from shapespace.training.runs.directory import RunDirectory
 from shapespace.training.runs.sampling import DERIVATIVES, DONE, Collection, Samples, columns, read
 
 #: Settings of the paper's factor networks.

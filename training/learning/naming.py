@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from shapespace.arrays import FloatArray
-from shapespace.training.runs.config import ExportSettings
+from shapespace.training.runs.settings import ExportSettings
 
 #: Sides as seen by a viewer of the collection's axes, as axis and sign; see ``training.space.factors.names``.
 SIDES = {"left": (0, -1), "right": (0, 1), "lower": (1, -1), "upper": (1, 1), "back": (2, -1), "front": (2, 1)}

@@ -15,10 +15,8 @@ from shapespace.mesh.rigid_motion import align
 from shapespace.training.learning.latent_features import FourierProducts, LatentFeatures, Polynomials, affordable_degree
 from shapespace.training.learning.layers import PatchBasis, Scaling, perceptron
 from shapespace.training.learning.linear import regression
-from shapespace.training.runs.config import (
-    LatentNetworkSettings,
-)
 from shapespace.training.runs.latent_coordinates import Coordinates
+from shapespace.training.runs.network_settings import LatentNetworkSettings
 
 
 def predict(network: Callable[[Tensor], Tensor], inputs: Tensor, batch_size: int = 32) -> Tensor:

@@ -21,11 +21,12 @@ from shapespace.shell.energy import Material
 from shapespace.shell.space import ShellSpace
 from shapespace.solve.cholesky import NotPositiveDefiniteError
 from shapespace.solve.outcome import Status
-from shapespace.training.runs.config import ModeSettings
+from shapespace.training.runs.settings import ModeSettings
 from shapespace.training.space.codes import box_of, nearest_codes
 from shapespace.training.space.logarithms import logarithms
 from shapespace.training.space.mean import centred_mean
-from shapespace.training.space.modes import ModeError, coefficients, find_modes, mode_count, pga
+from shapespace.training.space.modes import ModeError, coefficients, mode_count, pga
+from shapespace.training.space.sparse_modes import find_modes
 
 #: Number of folds; of fewer than twice as many shapes each is held out by itself.
 FOLDS = 5

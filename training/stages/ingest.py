@@ -20,9 +20,10 @@ from shapespace.training.collection.ingest import read_collection
 from shapespace.training.collection.large_arrays import some_vertices, stacked
 from shapespace.training.collection.mesh_collection import MeshCollection, normalised
 from shapespace.training.collection.mirror import find_mirror, mirrored
-from shapespace.training.runs.config import CollectionSettings, Config, ConfigError
+from shapespace.training.runs.config import Config, ConfigError
 from shapespace.training.runs.directory import RunDirectory
 from shapespace.training.runs.progress import waiting
+from shapespace.training.runs.settings import CollectionSettings
 from shapespace.training.space.generalisation import FOLDS
 from shapespace.training.stages.stage import Run, Stage, StageWarning
 

@@ -8,8 +8,8 @@ from shapespace.mesh.rigid_motion import align
 from shapespace.mesh.triangle_mesh import face_areas
 from shapespace.shell.mean import Mean
 from shapespace.solve.outcome import Status
-from shapespace.training.runs.config import ModeSettings
 from shapespace.training.runs.directory import RunDirectory
+from shapespace.training.runs.settings import ModeSettings
 from shapespace.training.space.generalisation import LIGHT_STEPS, time_steps
 from shapespace.training.space.mean import centred_mean
 from shapespace.training.stages.stage import Run, Stage

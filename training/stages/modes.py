@@ -13,7 +13,8 @@ from shapespace.training.runs.progress import waiting
 from shapespace.training.space.codes import box_of, nearest_codes
 from shapespace.training.space.generalisation import summary, vertex_distances
 from shapespace.training.space.logarithms import logarithms
-from shapespace.training.space.modes import find_modes, localisation, mode_count, pga
+from shapespace.training.space.modes import localisation, mode_count, pga
+from shapespace.training.space.sparse_modes import find_modes
 from shapespace.training.stages.stage import COARSER_MESH, Run, Stage, StageWarning, listed
 
 

@@ -28,7 +28,7 @@ from shapespace.training.learning.combiners.metric import learned_metric
 from shapespace.training.learning.composite import affine_sum
 from shapespace.training.learning.export import to_onnx
 from shapespace.training.learning.fitting import read_network, save_network
-from shapespace.training.runs.config import (
+from shapespace.training.runs.network_settings import (
     AutoSettings,
     ConvolutionSettings,
     FieldSettings,

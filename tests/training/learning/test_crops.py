@@ -14,7 +14,7 @@ from shapespace.training.learning.combiners.convolutions import flaps
 from shapespace.training.learning.combiners.correction import JointSamples
 from shapespace.training.learning.combiners.crops import UNIFORM, Crops
 from shapespace.training.learning.layers import Scaling
-from shapespace.training.runs.config import ConvolutionSettings
+from shapespace.training.runs.network_settings import ConvolutionSettings
 
 LAYERS = 3
 

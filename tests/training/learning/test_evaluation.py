@@ -9,8 +9,8 @@ from shapespace.coordinates.nric import WeightedNorm
 from shapespace.training.collection.generators.freaky_torus import FreakyTorus
 from shapespace.training.learning.baselines import MultilinearGrid, grid_nodes
 from shapespace.training.learning.evaluation import Reconstructions, r_squared
-from shapespace.training.runs.config import EvaluationSettings
 from shapespace.training.runs.latent_coordinates import alone
+from shapespace.training.runs.settings import EvaluationSettings
 
 
 @pytest.fixture(scope="module")

@@ -14,7 +14,7 @@ from shapespace.training.learning.composite import Composite
 from shapespace.training.learning.examples import ExampleCorrectedCombiner
 from shapespace.training.learning.export import to_onnx
 from shapespace.training.learning.layers import Scaling
-from shapespace.training.runs.config import KernelSettings
+from shapespace.training.runs.network_settings import KernelSettings
 
 SIZE = 60
 

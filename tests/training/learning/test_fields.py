@@ -18,8 +18,8 @@ from shapespace.training.learning.combiners.correction import JointSamples, Moti
 from shapespace.training.learning.combiners.fields import FieldCorrection
 from shapespace.training.learning.fitting import read_network, save_network
 from shapespace.training.learning.layers import Scaling
-from shapespace.training.runs.config import AutoSettings, FieldSettings, KernelSettings
 from shapespace.training.runs.latent_coordinates import alone
+from shapespace.training.runs.network_settings import AutoSettings, FieldSettings, KernelSettings
 
 TORUS = FreakyTorus()
 FACTORS = list(TORUS.factors.values())

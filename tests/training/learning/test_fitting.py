@@ -16,8 +16,8 @@ from shapespace.mesh.triangle_mesh import TriangleMesh
 from shapespace.training.learning import fitting
 from shapespace.training.learning.layers import Scaling
 from shapespace.training.learning.networks import FactorNetwork
-from shapespace.training.runs.config import FitSettings, LatentNetworkSettings
 from shapespace.training.runs.latent_coordinates import Coordinates
+from shapespace.training.runs.network_settings import FitSettings, LatentNetworkSettings
 
 
 class Killed(Exception):  # noqa: N818 - not an error

@@ -8,7 +8,7 @@ import pytest
 from pydantic import ValidationError
 
 from shapespace.training.learning.naming import NamingError, bundle_names
-from shapespace.training.runs.config import ExportSettings
+from shapespace.training.runs.settings import ExportSettings
 
 FACTORS = {"upper right": [0, 1], "lower left front": [2], "middle": [3]}
 COORDINATES = ["upper right, 1", "upper right, 2", "lower left front", "middle"]

@@ -13,10 +13,8 @@ from shapespace.training.learning.baselines import LatentKernel
 from shapespace.training.learning.latent_features import FourierProducts, LatentFeatures, Polynomials, affordable_degree
 from shapespace.training.learning.layers import PatchBasis, Scaling
 from shapespace.training.learning.networks import FactorNetwork
-from shapespace.training.runs.config import (
-    LatentNetworkSettings,
-)
 from shapespace.training.runs.latent_coordinates import Coordinates
+from shapespace.training.runs.network_settings import LatentNetworkSettings
 from tests.training.learning.conftest import noisy, scaling
 
 TORUS = Coordinates(np.zeros(2), np.full(2, 2 * np.pi), np.full(2, 2 * np.pi))

@@ -8,14 +8,9 @@ from typing import get_args
 import pytest
 
 from shapespace.training.collection.generators import MESHES, PRODUCTS
-from shapespace.training.runs.config import (
-    CollectionSettings,
-    Config,
-    ConfigError,
-    ProductSettings,
-    load,
-    parse,
-)
+from shapespace.training.runs.config import Config, ConfigError, load, parse
+from shapespace.training.runs.network_settings import ProductSettings
+from shapespace.training.runs.settings import CollectionSettings
 from shapespace.training.stages.run import STAGES, stage_keys
 from tests.training.conftest import TINY
 

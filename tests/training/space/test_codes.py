@@ -10,7 +10,7 @@ from shapespace.mesh.rigid_motion import align, without_rigid_motion
 from shapespace.mesh.triangle_mesh import TriangleMesh
 from shapespace.shell.exponential import exponential
 from shapespace.shell.space import ShellSpace
-from shapespace.training.runs.config import ModeSettings
+from shapespace.training.runs.settings import ModeSettings
 from shapespace.training.space.codes import box_of, nearest_codes
 from shapespace.training.space.modes import mode_count, pga
 

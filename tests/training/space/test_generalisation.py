@@ -10,7 +10,7 @@ from shapespace.mesh.triangle_mesh import TriangleMesh
 from shapespace.shell.energy import Material
 from shapespace.shell.exponential import exponential
 from shapespace.shell.space import ShellSpace
-from shapespace.training.runs.config import ModeSettings
+from shapespace.training.runs.settings import ModeSettings
 from shapespace.training.space.generalisation import (
     PrincipalComponents,
     folds,

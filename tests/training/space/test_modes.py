@@ -23,13 +23,12 @@ from shapespace.training.space.modes import (
     ModeError,
     Modes,
     Norm,
-    _fit_in_box,
     coefficients,
     localisation,
     pga,
-    spga,
     worthwhile,
 )
+from shapespace.training.space.sparse_modes import _fit_in_box, spga
 from tests.shapespace.conftest import bent
 
 

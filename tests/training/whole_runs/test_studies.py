@@ -17,8 +17,9 @@ from shapespace.coordinates.nric import WeightedNorm
 from shapespace.training.learning.evaluation import Model, r_squared
 from shapespace.training.learning.learner import Learner
 from shapespace.training.learning.networks import predict
-from shapespace.training.runs.config import ProductSettings, Recipe, load, parse
+from shapespace.training.runs.config import load, parse
 from shapespace.training.runs.directory import RunDirectory
+from shapespace.training.runs.network_settings import ProductSettings, Recipe
 from shapespace.training.stages.networks import learner_of
 from shapespace.training.stages.stage import Run
 from tests.training.conftest import TINY

@@ -20,7 +20,7 @@ from shapespace.training.learning.combiners.products import ProductCorrection
 from shapespace.training.learning.layers import Scaling
 from shapespace.training.learning.linear import principal_axes
 from shapespace.training.learning.networks import ShapeNetwork, predict
-from shapespace.training.runs.config import (
+from shapespace.training.runs.network_settings import (
     AutoSettings,
     ConvolutionSettings,
     CorrectionSettings,

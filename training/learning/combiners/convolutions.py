@@ -16,7 +16,7 @@ from shapespace.mesh.triangle_mesh import Connectivity, TriangleMesh
 from shapespace.training.learning.combiners.correction import Correction, JointSamples
 from shapespace.training.learning.combiners.crops import Crops
 from shapespace.training.learning.combiners.products import ProductCorrection
-from shapespace.training.runs.config import ConvolutionSettings, FitSettings, ProductSettings
+from shapespace.training.runs.network_settings import ConvolutionSettings, FitSettings, ProductSettings
 
 
 class ConvolutionCorrection(Correction):

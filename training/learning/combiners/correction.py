@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from shapespace.mesh.triangle_mesh import TriangleMesh
 from shapespace.training.learning.layers import Scaling
-from shapespace.training.runs.config import FitSettings
+from shapespace.training.runs.network_settings import FitSettings
 from shapespace.training.runs.sampling import FeaturePositions
 
 #: Factor shapes (n, J, 2E), and joint shapes minus affine sums (n, 2E), as scaled differences.

@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from shapespace.mesh.triangle_mesh import TriangleMesh
 from shapespace.training.learning.combiners.correction import Correction, JointSamples, Motion
 from shapespace.training.learning.linear import regression
-from shapespace.training.runs.config import FieldSettings, FitSettings
+from shapespace.training.runs.network_settings import FieldSettings, FitSettings
 
 #: Share of the edges of a training step that are drawn uniformly. The affine sum's error chooses the others.
 UNIFORM = 0.5

@@ -15,7 +15,7 @@ from shapespace.training.learning.combiners.correction import Correction, JointS
 from shapespace.training.learning.combiners.patches import Patch
 from shapespace.training.learning.gaussian import Centres
 from shapespace.training.learning.layers import in_bytes, patch_entries, resized
-from shapespace.training.runs.config import KernelSettings
+from shapespace.training.runs.network_settings import KernelSettings
 from shapespace.training.runs.progress import progress
 
 

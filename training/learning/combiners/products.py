@@ -11,7 +11,7 @@ from torch import Tensor
 from shapespace.mesh.triangle_mesh import TriangleMesh
 from shapespace.training.learning.combiners.correction import Correction, JointSamples
 from shapespace.training.learning.linear import principal_axes, regression
-from shapespace.training.runs.config import ProductSettings
+from shapespace.training.runs.network_settings import ProductSettings
 
 
 class ProductCorrection(Correction):

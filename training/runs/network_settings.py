@@ -1,0 +1,250 @@
+"""The settings of the stage `networks`: factor networks, combiners, and how they are trained."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+from pydantic import Field, model_validator
+
+from shapespace.training.runs.settings import SettingsTable
+
+#: The edges from which a convolution takes its input, see convolutions.EdgeConvolution.
+Neighbourhood = Literal["star", "flaps"]
+
+
+class FitSettings(SettingsTable):
+    """Gradient descent."""
+
+    optimiser: Literal["adam", "muon"] = "adam"
+    """``adam``, as in the paper; or ``muon``, which updates matrices by their orthogonalised momentum and all else as
+    Adam does. It needs fewer steps of large batches."""
+    schedule: Literal["plateau", "cosine"] = "plateau"
+    """Schedule of the learning rate. ``plateau`` divides it by ten whenever the validation loss has not fallen for
+    ``patience`` epochs, as in the paper (section 4). ``cosine`` lets it fall along half a cosine, to zero after
+    ``max_epochs``: fewer epochs are needed."""
+    learning_rate: float = Field(1e-3, gt=0)
+    """Initial learning rate."""
+    final_rate: float = Field(1e-6, gt=0)
+    """Training ends when the learning rate falls below this."""
+    patience: int = Field(10, ge=1)
+    """Epochs without a smaller validation loss before ``plateau`` divides the rate."""
+    max_epochs: int = Field(500, ge=1)
+    """Most passes over the training samples."""
+    batch_size: int = Field(64, ge=2)
+    """Number of samples per step."""
+    minutes: float | None = Field(None, gt=0)
+    """Most minutes of training. The time of the first epoch tells how many epochs fit."""
+
+
+class LatentNetworkSettings(SettingsTable):
+    """A network from latents to NRIC: a factor network, or a baseline on all latents.
+
+    The baselines are ``monolithic``, this network with one factor, and ``monolithic_paper``, the paper's.
+    """
+
+    hidden: list[int] = Field([128, 128])
+    """Width of each hidden layer."""
+    fourier: int = Field(1, ge=0)
+    """Highest frequency of a periodic coordinate among the inputs; 0 takes the angle itself, as the paper does."""
+    skip_orders: list[int] = Field([])
+    """Largest frequency of each coordinate in a linear layer of Fourier products beside the hidden ones, fitted by
+    ridge regression; an empty list leaves it out. All coordinates must be periodic."""
+    skip_degree: int = Field(3, ge=0)
+    """Total degree of the polynomials in such a layer, for factors without a periodic coordinate; 0 leaves it out.
+    The degree is lower for a factor that would have more than 20,000 polynomials."""
+    patches: int = Field(1, ge=1)
+    """Groups of neighbouring edges, each with a principal basis of its own, in the last layer."""
+    energy: float = Field(0.9999, gt=0, le=1)
+    """Share of the variance that this basis keeps; 1 makes the last layer dense, as in the paper."""
+    support: float = Field(1, gt=0, le=1)
+    """Share of the variance on the edges that have entries in this basis. With less than 1 the network is sparse: edges
+    that vary little keep their mean. Files are smaller where the basis has a large rank."""
+    integrability: float = Field(0, ge=0)
+    """Weight, in gradient descent, of errors that no surface can have: the gap between the first and the last face
+    around a vertex, to first order at the mean. The gap is scaled to the mean square of errors in any direction."""
+    fit: FitSettings = FitSettings(schedule="cosine", learning_rate=2e-3, max_epochs=60)
+    """How the network is trained."""
+
+    @model_validator(mode="after")
+    def _of_low_rank(self) -> LatentNetworkSettings:
+        if self.energy == 1 and (self.support < 1 or self.integrability):
+            raise ValueError("support and integrability need energy < 1")
+        return self
+
+
+class KernelSettings(SettingsTable):
+    """Kernel ridge regression on principal coefficients of the factors' shapes, separately for each patch of edges, in
+    a learned metric.
+    """
+
+    kind: Literal["kernel"] = "kernel"
+    coefficients: int = Field(12, ge=1)
+    """Principal coefficients of each factor in a patch."""
+    patches: int = Field(8, ge=1)
+    """Number of patches."""
+
+
+class ProductSettings(SettingsTable):
+    """Ridge regression on products of the principal coefficients of every two factors."""
+
+    kind: Literal["products"] = "products"
+    coefficients: int = Field(8, ge=1)
+    """Principal coefficients of each factor."""
+
+
+class ConvolutionSettings(SettingsTable):
+    """Graph convolutions on the edges, trained by gradient descent."""
+
+    kind: Literal["convolutions"] = "convolutions"
+    layers: int = Field(3, ge=1)
+    """Number of successive convolutions."""
+    width: int = Field(24, ge=1)
+    """Number of features of each edge after each layer."""
+    neighbourhood: Neighbourhood = "star"
+    """The inputs of a convolution beside an edge itself. ``star``, as in the paper, takes the sum over all edges at its
+    ends; ``flaps`` takes the edges of its two faces, each with weights of its own."""
+    crop: int = Field(0, ge=0)
+    """Number of edges in the loss of a training step, a connected part of each shape. The part is chosen at random in
+    proportion to the error of the affine sum there; 0 takes whole shapes. Needs the neighbourhood ``flaps``."""
+    residual: bool = True
+    """Whether the network learns the difference from the affine sum of the factors, and each layer the difference from
+    its input. Otherwise it learns the joint shape itself, as in the paper."""
+    edge_channels: int = Field(4, ge=0)
+    """Number of learned constants of each edge, inputs of the first layer beside the factors' shapes."""
+    products: int = Field(0, ge=0)
+    """Principal coefficients of each factor whose products correct the affine sum first, as the kind ``products`` does;
+    0 leaves them out. Needs ``residual``."""
+    dropout: float = Field(0.0, ge=0, lt=1)
+    """Share of the features that are set to zero after each layer during training."""
+    fit: FitSettings = FitSettings(schedule="cosine", learning_rate=2e-3, batch_size=16, max_epochs=12)
+    """How the network is trained."""
+
+    @model_validator(mode="after")
+    def _consistent(self) -> ConvolutionSettings:
+        if self.crop and self.neighbourhood != "flaps":
+            raise ValueError("crop needs the neighbourhood flaps")
+        if self.products and not self.residual:
+            raise ValueError("products need residual = true")
+        return self
+
+
+class FieldSettings(SettingsTable):
+    """A perceptron at every edge, trained by gradient descent. Its inputs are the angles from this edge to the features
+    that codes move over the surface. For collections that know where their features are: Freaky Torus.
+    """
+
+    kind: Literal["field"] = "field"
+    layers: int = Field(4, ge=1)
+    """Number of hidden layers."""
+    width: int = Field(128, ge=1)
+    """Width of each layer."""
+    concentrations: list[Annotated[float, Field(gt=0)]] = Field([1, 4, 16, 64])
+    """Concentrations κ of the densities exp(κ (cos r − 1)) of the angle r to a feature, inputs beside the cosine and
+    the sine of r. Narrow features need large ones."""
+    relative: bool = True
+    """Whether inputs are functions of the angles from an edge to features, so that the network need not learn
+    symmetries that move both; otherwise inputs are the positions of features and edges."""
+    edges: int = Field(128, ge=1)
+    """Number of edges of each shape in the loss of a training step. Half of them are drawn in proportion to the squared
+    error of the affine sum."""
+    fit: FitSettings = FitSettings(
+        optimiser="muon", schedule="cosine", learning_rate=2e-2, batch_size=64, max_epochs=80
+    )
+    """How the network is trained."""
+
+
+class PaperSettings(SettingsTable):
+    """The paper's combiner (section 4): convolutions on stars that learn the joint shape itself, with dropout 0.1.
+
+    Adam starts with a rate of 1e-3, which is divided by ten on a plateau.
+    """
+
+    kind: Literal["paper"] = "paper"
+    layers: int = Field(3, ge=1)
+    """Number of successive convolutions."""
+    width: int = Field(24, ge=1)
+    """Number of features of each edge after each layer."""
+    fit: FitSettings = FitSettings()
+    """How the network is trained."""
+
+    @property
+    def convolutions(self) -> ConvolutionSettings:
+        """The equivalent convolutions, with every setting written out."""
+        return ConvolutionSettings(
+            layers=self.layers, width=self.width, residual=False, edge_channels=0, dropout=0.1, fit=self.fit
+        )
+
+
+class AutoSettings(SettingsTable):
+    """The kind that suits the collection, by its error on held-out codes.
+
+    That is ``kernel``. Where codes move something over the surface, another kind is tried too, and chosen if its error
+    is a tenth smaller: ``field`` if the collection knows where features are, and ``convolutions`` otherwise.
+    """
+
+    kind: Literal["auto"] = "auto"
+    minutes: float = Field(30, ge=0)
+    """Most minutes of training of the other kind. It is not tried where the kernel alone took longer."""
+
+
+#: All kinds of corrections; ``auto`` and ``paper`` stand for one of them.
+ResolvedCorrection = Annotated[
+    KernelSettings | ProductSettings | ConvolutionSettings | FieldSettings,
+    Field(discriminator="kind"),
+]
+CorrectionSettings = Annotated[ResolvedCorrection | PaperSettings | AutoSettings, Field(discriminator="kind")]
+
+#: Settings of a combiner in version 0.1, and how ``correction`` is written in their place.
+_COMBINER_OF_0_1 = {
+    '{ kind = "kernel", coefficients }': ["kernel", "polynomial", "monomials"],
+    '{ kind = "products", coefficients } or { kind = "convolutions", products, … }': ["pairwise"],
+    '{ kind = "convolutions", … } with the same names': [
+        "layers", "width", "neighbourhood", "crop", "residual", "edge_channels", "dropout", "fit",
+    ],
+}  # fmt: skip
+
+
+class CombinerSettings(SettingsTable):
+    """The map from J factor shapes to the joint one: their affine sum, plus a correction."""
+
+    correction: CorrectionSettings = AutoSettings()
+    """How the difference between the joint shape and the affine sum is learned."""
+    symmetries: bool = True
+    """Whether the training samples include their images under the collection's symmetries, if it has any."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _not_of_0_1(cls, values: Any) -> Any:
+        written = values if isinstance(values, dict) else {}
+        moved = [
+            f"{', '.join(found)} as correction = {new}"
+            for new, old in _COMBINER_OF_0_1.items()
+            if (found := [name for name in old if name in written])
+        ]
+        if moved:
+            raise ValueError(f"settings of version 0.1: write {'; '.join(moved)}; leave out what was 0")
+        return values
+
+
+class Recipe(SettingsTable):
+    """The parts of the composite network."""
+
+    factors: list[LatentNetworkSettings] | LatentNetworkSettings = LatentNetworkSettings()
+    """Settings of the factor networks: one table for each factor, or one for all."""
+    combiner: CombinerSettings = CombinerSettings()
+    """The network that joins the factors' shapes."""
+
+
+class NetworkSettings(Recipe):
+    """The networks that are exported, and those that are trained for comparison."""
+
+    seed: int = 0
+    """Seed of the networks' initial weights and of the order of the samples."""
+    fractions: list[Annotated[float, Field(gt=0, lt=1)]] = Field([])
+    """Shares of the training codes to learn from as well, for the study of their number: each once with the factors'
+    parts of these codes only, as the paper does, and once with all the samples of the factors."""
+    seeds: list[int] = Field([])
+    """Further seeds, of split and networks, to learn with as well, for the spread of the figures."""
+    paper: bool = False
+    """Whether the paper's own system is trained too, for comparison: its factor networks, convolutions on stars and
+    schedules. Takes hours on a processor."""
