@@ -57,10 +57,6 @@ fit = { batch_size = 8, max_epochs = 3 }
 hidden = [16]
 fit = { batch_size = 8, max_epochs = 3 }
 
-[variants.paper]
-title = "the paper's combiner"
-combiner.correction = { kind = "paper", width = 4, layers = 2, fit = { batch_size = 8, max_epochs = 1 } }
-
 [evaluation]
 grid_nodes = 4
 reconstructions = 2

@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Sequence
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import tomlkit
-from pydantic import ValidationError, model_validator
+from pydantic import Field, ValidationError, model_validator
 
 from shapespace.shell.energy import Material
-from shapespace.training.runs.network_settings import FitSettings, LatentNetworkSettings, NetworkSettings, Recipe
+from shapespace.training.runs.network_settings import FitSettings, LatentNetworkSettings, NetworkSettings
 from shapespace.training.runs.settings import (
     CollectionSettings,
     EvaluationSettings,
@@ -29,52 +27,8 @@ class ConfigError(ValueError):
     """A configuration that can't be used, with a line for each fault."""
 
 
-class VariantSettings(SettingsTable):
-    """One row of the ablation: what differs from the main recipe, or from another variant."""
-
-    title: str
-    """Its name in the report and the tables."""
-    base: str | None = None
-    """Name of the variant that this one differs from; it must stand before this one. None is the main recipe."""
-    factors: list[dict[str, Any]] | dict[str, Any] = {}
-    """Settings of the factor networks that differ: one table for each factor, or one that is applied to all."""
-    combiner: dict[str, Any] = {}
-    """Settings of the combiner that differ. A correction of another kind starts from that kind's defaults."""
-
-    def applied(self, base: Recipe) -> Recipe:
-        """The recipe that results from a base.
-
-        Raises:
-            ValueError: as many tables of factors as there are factors in the base are needed.
-            ValidationError: settings that can't be used.
-        """
-        below = base.model_dump(include=set(Recipe.model_fields))
-        mine, theirs = self.factors, below["factors"]
-        if isinstance(mine, list) or isinstance(theirs, list):
-            count = len(theirs if isinstance(theirs, list) else mine)
-            theirs = theirs if isinstance(theirs, list) else [theirs] * count
-            mine = mine if isinstance(mine, list) else [mine] * count
-            if len(mine) != len(theirs):
-                raise ValueError(f"factors: {len(mine)} tables over {len(theirs)}")
-            factors: Any = [_merged(a, b) for a, b in zip(theirs, mine, strict=True)]
-        else:
-            factors = _merged(theirs, mine)
-        return Recipe.model_validate({"factors": factors, "combiner": _merged(below["combiner"], self.combiner)})
-
-
-def _merged(below: dict[str, Any], above: dict[str, Any]) -> dict[str, Any]:
-    """Nested tables, the values of ``above`` over those of ``below``; a table of another ``kind`` replaces its own."""
-    result = dict(below)
-    for name, value in above.items():
-        old = below.get(name)
-        if isinstance(value, dict) and isinstance(old, dict) and value.get("kind", old.get("kind")) == old.get("kind"):
-            value = _merged(old, value)
-        result[name] = value
-    return result
-
-
 class Config(SettingsTable):
-    """What a configuration consists of."""
+    """The tables of a configuration."""
 
     collection: CollectionSettings
     material: MaterialSettings = MaterialSettings()
@@ -86,7 +40,8 @@ class Config(SettingsTable):
     monolithic_paper: LatentNetworkSettings = LatentNetworkSettings(
         hidden=[256, 256], fourier=0, skip_degree=0, energy=1, fit=FitSettings()
     )
-    variants: dict[str, VariantSettings] = {}
+    variants: dict[str, dict[str, Any]] = Field({})
+    """Not used any more. Version 0.2 trained rows of an ablation; ``python -m benchmarks.studies`` does so now."""
     evaluation: EvaluationSettings = EvaluationSettings()
     export: ExportSettings
 
@@ -95,38 +50,28 @@ class Config(SettingsTable):
         """The elastic material of the shell."""
         return Material(self.material.mu, self.material.lambda_, self.material.eta)
 
-    @cached_property
-    def recipes(self) -> dict[str, Recipe]:
-        """The full recipe of each variant.
-
-        Raises:
-            ValueError: naming the variant and its faults.
-        """
-        found: dict[str, Recipe] = {}
-        for name, variant in self.variants.items():
-            if variant.base is not None and variant.base not in found:
-                raise ValueError(f"variants.{name}.base: no variant {variant.base!r} stands before it")
-            try:
-                found[name] = variant.applied(found[variant.base] if variant.base else self.networks)
-            except ValidationError as error:
-                raise ValueError("; ".join(f"variants.{name}.{fault}" for fault in _faults(error))) from error
-            except ValueError as error:
-                raise ValueError(f"variants.{name}.{error}") from error
-        return found
+    @property
+    def unused(self) -> list[str]:
+        """Names of the given settings that only version 0.2 used."""
+        studies = {
+            "networks.fractions": self.networks.fractions,
+            "networks.seeds": self.networks.seeds,
+            "variants": self.variants,
+        }
+        return [name for name, value in studies.items() if value]
 
     @model_validator(mode="after")
-    def _usable_variants(self) -> Config:
-        for name, recipe in {"networks": self.networks, **self.recipes}.items():
-            if recipe.combiner.correction.kind == "field" and self.collection.generator != "freaky-torus":
-                raise ValueError(
-                    f'{name}: kind = "field" is for features that move over the surface, which only the generator '
-                    "freaky-torus has"
-                )
+    def _usable_correction(self) -> Config:
+        if self.networks.combiner.correction.kind == "field" and self.collection.generator != "freaky-torus":
+            raise ValueError(
+                'networks: kind = "field" is for features that move over the surface, which only the generator '
+                "freaky-torus has"
+            )
         return self
 
 
 def _faults(error: ValidationError) -> list[str]:
-    """One line for each setting that can't be used."""
+    """Return one line for each setting that can't be used."""
     words = {"extra_forbidden": "there is no such setting here"}
     faults = ((".".join(map(str, e["loc"])), words.get(e["type"], e["msg"])) for e in error.errors())
     return [": ".join(filter(None, fault)) for fault in faults]
@@ -149,17 +94,16 @@ def parse(text: str, source: str) -> Config:
         raise ConfigError(f"{source}: these settings can't be used{faults}") from error
 
 
-def load(path: Path, data: Path | None = None, fractions: Sequence[float] = ()) -> tuple[Config, str]:
-    """Read a configuration file, and apply the options of the command line to it.
+def load(path: Path, data: Path | None = None) -> tuple[Config, str]:
+    """Read a configuration file.
 
     Args:
-        path: of the file.
+        path: the file.
         data: replaces ``collection.data``.
-        fractions: replace ``networks.fractions``.
 
     Returns:
-        The configuration, and the text that says the same from any folder: ``collection.data`` made absolute, the
-        arguments written in, all else as it stands.
+        The configuration, and a text with the same meaning in any folder: ``collection.data`` is absolute, all else as
+        it stands in the file.
 
     Raises:
         ConfigError: naming the file and every faulty setting.
@@ -171,12 +115,9 @@ def load(path: Path, data: Path | None = None, fractions: Sequence[float] = ()) 
     config = parse(text, str(path))
     if data is None and config.collection.data is not None:
         data = path.parent / config.collection.data
-    if data is not None or fractions:
+    if data is not None:
         document: Any = tomlkit.parse(text)
-        if data is not None:
-            document["collection"]["data"] = str(data.resolve())
-        if fractions:
-            document.setdefault("networks", {})["fractions"] = list(fractions)
+        document["collection"]["data"] = str(data.resolve())
         text = tomlkit.dumps(document)
         config = parse(text, str(path))
     return config, text

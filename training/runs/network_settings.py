@@ -241,10 +241,10 @@ class NetworkSettings(Recipe):
     seed: int = 0
     """Seed of the networks' initial weights and of the order of the samples."""
     fractions: list[Annotated[float, Field(gt=0, lt=1)]] = Field([])
-    """Shares of the training codes to learn from as well, for the study of their number: each once with the factors'
-    parts of these codes only, as the paper does, and once with all the samples of the factors."""
+    """Not used any more. Version 0.2 trained with these shares of the training codes too; ``python -m
+    benchmarks.studies`` does so now."""
     seeds: list[int] = Field([])
-    """Further seeds, of split and networks, to learn with as well, for the spread of the figures."""
+    """Not used any more. Version 0.2 trained with these seeds too; ``python -m benchmarks.studies`` does so now."""
     paper: bool = False
     """Whether the paper's own system is trained too, for comparison: its factor networks, convolutions on stars and
     schedules. Takes hours on a processor."""

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+from pydantic import BaseModel
+
+from shapespace.training.runs.config import Config
 from shapespace.training.runs.sampling import FEWEST, SamplesError, indices
 from shapespace.training.stages.stage import Run, Stage
 
@@ -46,17 +49,19 @@ def train_networks(run: Run) -> None:
             path.unlink()
 
 
+def _settings(config: Config) -> list[BaseModel | dict[str, Any]]:
+    """Return what the key depends on, as in version 0.2, which also trained the variants."""
+    row = {"title": "", "base": None, "factors": {}, "combiner": {}}
+    variants = config.model_dump(mode="json")["variants"].values()
+    return [config.networks, config.monolithic, config.monolithic_paper, *(row | variant for variant in variants)]
+
+
 # A network's file is named by a digest of all that the network depends on. So a change of settings keeps the networks
 # that it does not touch.
 STAGE = Stage(
     name="networks",
     version=5,
-    settings=lambda config: [
-        config.networks,
-        config.monolithic,
-        config.monolithic_paper,
-        *config.variants.values(),
-    ],
+    settings=_settings,
     run=train_networks,
     results=lambda run: [run.histories.path],
 )

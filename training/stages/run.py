@@ -128,6 +128,11 @@ def _prepare(run: Run, show: Callable[[str], None]) -> tuple[dict[str, dict[str,
         data = known
     elif known and (changes := _changes(known, data)):
         show(f"data: {changes}; all that follows from them is done again, from ingest on")
+    if unused := run.config.unused:
+        show(
+            f"{', '.join(unused)}: not used any more; python -m benchmarks.studies, in the repository, makes these "
+            "studies of a finished run"
+        )
     keys = stage_keys(run.config, json.dumps({name: facts["sha256"] for name, facts in data.items()}) if data else "")
     _forget(directory, keys, show)
     directory.config.write(run.source)

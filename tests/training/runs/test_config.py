@@ -9,7 +9,6 @@ import pytest
 
 from shapespace.training.collection.generators import MESHES, PRODUCTS
 from shapespace.training.runs.config import Config, ConfigError, load, parse
-from shapespace.training.runs.network_settings import ProductSettings
 from shapespace.training.runs.settings import CollectionSettings
 from shapespace.training.stages.run import STAGES, stage_keys
 from tests.training.conftest import TINY
@@ -35,9 +34,6 @@ def test_every_example_is_a_configuration(path: Path) -> None:
         ("products = 2", "cofficients = 2", "networks.combiner.correction.convolutions.cofficients"),
         ('kind = "convolutions"', 'kind = "kernels"', "networks.combiner.correction"),
         ("products = 2", "products = 2\nresidual = false", "products need residual"),
-        ('kind = "paper", width', 'kind = "paper", widht', r"variants\.paper\.combiner\.correction\.paper\.widht"),
-        ("[variants.paper]", '[variants.paper]\nbase = "paper"', "no variant 'paper' stands before it"),
-        ("[variants.paper]", "[variants.paper]\nfactors = [{}, {}]", "factors: 2 tables over 3"),
     ],
 )
 def test_a_faulty_setting_is_named(old: str, new: str, says: str) -> None:
@@ -64,9 +60,8 @@ def test_data_lie_relative_to_the_configuration(written: str, tmp_path: Path, mo
 def test_the_command_s_arguments_go_before_the_file_and_into_the_text_that_is_kept(tmp_path: Path) -> None:
     file = tmp_path / "a.toml"
     file.write_text("# kept\n" + TINY.replace('generator = "freaky-torus"', 'data = "old"', 1))
-    config, text = load(file, tmp_path / "new", [0.2, 0.05])
+    config, text = load(file, tmp_path / "new")
     assert config.collection.data == tmp_path / "new"
-    assert config.networks.fractions == [0.2, 0.05]
     assert text.startswith("# kept")
     (tmp_path / "run").mkdir()
     (tmp_path / "run" / "config.toml").write_text(text)
@@ -82,60 +77,6 @@ def test_every_generator_that_can_be_named_is_there() -> None:
     named = set(get_args(get_args(CollectionSettings.model_fields["generator"].annotation)[0]))
     assert named == PRODUCTS.keys() | MESHES.keys()
     assert not PRODUCTS.keys() & MESHES.keys()
-
-
-def variant(text: str) -> Config:
-    return parse(TINY.replace("[evaluation]", text + "\n[evaluation]"), "here")
-
-
-def test_a_variant_is_what_differs_from_the_main_recipe() -> None:
-    config = variant('[variants.a]\ntitle = ""\ncombiner.correction = { width = 3, fit = { max_epochs = 2 } }')
-    main, changed = config.networks, config.recipes["a"]
-    fit = main.combiner.correction.fit.model_copy(update={"max_epochs": 2})
-    assert changed.factors == main.factors
-    assert changed.combiner.correction == main.combiner.correction.model_copy(update={"width": 3, "fit": fit})
-
-
-def test_a_variant_is_what_differs_from_its_base() -> None:
-    config = variant(
-        """
-        [variants.a]
-        title = ""
-        combiner = { symmetries = false, correction = { width = 3 } }
-        [variants.b]
-        title = ""
-        base = "a"
-        combiner.correction.layers = 1
-        """
-    )
-    first, second = (config.recipes[name].combiner for name in "ab")
-    assert second.correction == first.correction.model_copy(update={"layers": 1})
-    assert not second.symmetries
-
-
-def test_a_correction_of_another_kind_starts_from_its_defaults() -> None:
-    config = variant('[variants.a]\ntitle = ""\ncombiner.correction = { kind = "products", coefficients = 7 }')
-    assert config.recipes["a"].combiner.correction == ProductSettings(coefficients=7)
-
-
-def test_factors_of_a_variant_differ_all_alike_or_each_for_itself() -> None:
-    config = variant(
-        """
-        [variants.a]
-        title = ""
-        factors = { energy = 1.0 }
-        [variants.b]
-        title = ""
-        factors = [{}, { hidden = [5] }, { skip_orders = [] }]
-        """
-    )
-    main, alike, each = config.networks.factors, config.recipes["a"].factors, config.recipes["b"].factors
-    assert alike == [factor.model_copy(update={"energy": 1.0}) for factor in main]
-    assert each[0] == main[0]
-    assert (each[1].hidden, each[1].energy) == ([5], main[1].energy)
-    assert (each[2].skip_orders, each[2].fourier) == ([], main[2].fourier)
-    one = parse(TINY[: TINY.index("[[networks")] + TINY[TINY.index("[monolithic]") :], "here")
-    assert one.recipes["paper"].factors == one.networks.factors
 
 
 @pytest.mark.parametrize(
@@ -161,7 +102,6 @@ def test_what_is_kept_of_a_configuration_says_the_same() -> None:
         config = load(path)[0]
         again = Config.model_validate(config.model_dump(mode="json", by_alias=True))
         assert again == config
-        assert again.recipes == config.recipes
 
 
 def test_a_configuration_of_version_0_1_is_refused_in_a_sentence_that_says_what_to_write() -> None:
@@ -174,10 +114,15 @@ def test_a_configuration_of_version_0_1_is_refused_in_a_sentence_that_says_what_
         assert name in line
 
 
-@pytest.mark.parametrize("where", ["networks.combiner.correction", "variants.a.combiner.correction"])
-def test_a_field_needs_features_that_move(where: str) -> None:
-    table = f'[{where}]\nkind = "field"\n' + ('[variants.a]\ntitle = ""\n' if "variants" in where else "")
+def test_a_field_needs_features_that_move() -> None:
+    table = '[networks.combiner.correction]\nkind = "field"\n'
     rest = '[export]\nname = "a"\ntitle = ""\ndescription = ""\nlicence = ""\n'
     assert parse(f'[collection]\ngenerator = "freaky-torus"\n{table}{rest}', "here")
     with pytest.raises(ConfigError, match="features that move over the surface"):
         parse(f'[collection]\ngenerator = "figure"\n{table}{rest}', "here")
+
+
+def test_settings_that_only_version_0_2_used_are_accepted_and_named() -> None:
+    runs = Path(__file__).parents[3] / "runs"
+    assert load(runs / "freaky-torus" / "config.toml")[0].unused == ["networks.seeds", "variants"]
+    assert not load(Path(__file__).parents[3] / "examples" / "freaky-torus.toml")[0].unused
