@@ -146,7 +146,7 @@ wheel: $(VENV)/.created ## build dist/shapespace-….whl, which holds the figure
 openapi: $(VENV)/.serve ## write openapi/openapi.json from the app
 	$(BIN)/python -m shapespace.service.http.openapi
 
-configuration: $(VENV)/.train ## write docs/reference/configuration.md from the settings in training/runs/config.py
+configuration: $(VENV)/.train ## write docs/reference/configuration.md from the settings in training/runs
 	$(BIN)/python -m scripts.configuration
 
 docs: $(VENV)/.docs ## make a site of docs/ in build/site; a link that leads nowhere ends it

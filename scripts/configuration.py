@@ -20,7 +20,8 @@ HEAD = """\
 # Configuration
 
 Every setting of a file for `shapespace-train run`, by its TOML table. `make configuration` writes this page from
-`training/runs/config.py`. A setting without a default has to be there; unknown ones are refused.
+`training/runs/settings.py` and `network_settings.py`. A setting without a default has to be there; unknown ones are
+refused.
 """
 NAMES = {int: "whole number", float: "number", str: "text", bool: "`true` or `false`", Path: "path"}
 

@@ -47,13 +47,13 @@ HOME = Path(__file__).parents[2]
 
 
 def _here(path: Path) -> str:
-    """A path as it can be typed in the working directory."""
+    """Return a path as a user can type it in the working directory."""
     near = os.path.relpath(path)
     return shlex.quote(str(path.resolve()) if near.startswith(os.path.join("..", "..")) else near)
 
 
 def _program() -> str:
-    """This command, so that it can be called again from here."""
+    """Return the command that calls this program again from here."""
     called = Path(sys.argv[0])
     if called.name != "shapespace-train":
         return f"{shlex.quote(sys.executable)} -m shapespace.training"
@@ -61,7 +61,7 @@ def _program() -> str:
 
 
 def _serving(models: Path) -> str:
-    """The command that serves a folder of bundles."""
+    """Return the command that serves a folder of bundles."""
     setting = f"SHAPESPACE_MODELS_DIR={shlex.quote(str(models.resolve()))} "
     if not (HOME / "Makefile").is_file():
         return f"{setting}shapespace-serve"
@@ -94,14 +94,14 @@ def _run(arguments: argparse.Namespace) -> None:
     folder = _folder(arguments)
     run = Run(folder, config, source, arguments.models, arguments.scheduler, arguments.accept)
     again = " ".join([_program(), *map(shlex.quote, sys.argv[1:])])
-    _finish(run, arguments.until, keep_going=arguments.keep_going, command=again)
+    _execute(run, arguments.until, keep_going=arguments.keep_going, command=again)
     if arguments.until not in (None, "export"):
         print(f"Done up to {arguments.until}; the same command without --until goes on from there")
     else:
         print(f"{_here(run.bundle)} is ready. Next: {_serving(run.models)}")
 
 
-def _finish(run: Run, until: str | None = None, *, keep_going: bool, command: str = "") -> None:
+def _execute(run: Run, until: str | None = None, *, keep_going: bool, command: str = "") -> None:
     """Do the stages that are not done yet, then write the report if it is out of date."""
     done = execute(run, until, keep_going=keep_going, command=command)
     directory = run.directory
@@ -112,7 +112,7 @@ def _finish(run: Run, until: str | None = None, *, keep_going: bool, command: st
 
 
 def _folder(arguments: argparse.Namespace) -> Path:
-    """The run directory of a command line; of ``init`` there is none."""
+    """Return the run directory of a command line; ``init`` has none."""
     if "run" in arguments:
         return Path(arguments.run)
     return Path(arguments.out or Path("runs") / arguments.config.stem)
@@ -135,12 +135,12 @@ def _report(arguments: argparse.Namespace) -> None:
 
 def _export(arguments: argparse.Namespace) -> None:
     run = _open(arguments.run, arguments.models)
-    _finish(run, keep_going=True)
+    _execute(run, keep_going=True)
     print(f"{_here(run.bundle)} is ready. Next: {_serving(run.models)}")
 
 
 def parser() -> argparse.ArgumentParser:
-    """The command line."""
+    """Return the parser of the command line."""
     top = argparse.ArgumentParser(prog="shapespace-train", description="Learn a shape manifold and export its bundle.")
     commands = top.add_subparsers(required=True, metavar="COMMAND")
 
@@ -183,7 +183,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 def _keep_traceback(arguments: argparse.Namespace) -> Path:
-    """Write the traceback of what is being handled into the run directory, or where there is none elsewhere."""
+    """Write the traceback of the current exception into the run directory, or into a temporary folder."""
     text = traceback.format_exc()
     folders = [] if "meshes" in arguments else [_folder(arguments)]
     for folder in (*folders, Path(tempfile.mkdtemp())):
@@ -197,7 +197,7 @@ def _keep_traceback(arguments: argparse.Namespace) -> Path:
 
 
 def main() -> int:
-    """Run the command; whatever happens, the end is a message and not a traceback."""
+    """Run the command. Every error ends with a message instead of a traceback."""
     arguments = parser().parse_args()
     try:
         arguments.do(arguments)

@@ -1,1 +1,1 @@
-"""What all stages share: configuration, the list of stages, the run directory, samples, workers."""
+"""The base of all stages: configuration, run directory, samples, workers."""

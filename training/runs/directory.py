@@ -1,4 +1,4 @@
-"""The run directory: every file that a run leaves, by name, with its reader and its writer."""
+"""The run directory: the name, reader and writer of every file of a run."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from shapespace.training.runs.atomic_files import JsonFile, NpzFile, TextFile
 
 @dataclass(frozen=True)
 class RunDirectory:
-    """The files of one run; none need be there.
+    """The files of one run; each may be missing.
 
-    n shapes, m modes, V vertices, E edges of the mesh that is computed with.
+    There are n shapes and m modes. The coarse mesh, on which a run computes, has V vertices and E edges.
 
     Attributes:
-        folder: that holds them.
+        folder: the run directory.
     """
 
     folder: Path
@@ -34,26 +34,26 @@ class RunDirectory:
     def _json(self, name: str) -> JsonFile:
         return JsonFile(self.folder / f"{name}.json")
 
-    # What ran.
+    # The whole run.
 
     @property
     def config(self) -> TextFile:
-        """The configuration, with what the command line changed in it."""
+        """The configuration, with the changes of the command line."""
         return TextFile(self.folder / "config.toml")
 
     def is_run(self) -> bool:
-        """Whether this is a run directory at all."""
+        """Return whether the folder is a run directory."""
         return self.config.path.is_file()
 
     def stamp(self, stage: str) -> JsonFile:
-        """What is known of a stage that has begun: ``key``, ``basis``, ``version``, and at its end ``seconds``.
+        """``key``, ``basis`` and ``version`` of a stage that has begun, and ``seconds`` once it is done.
 
-        Where it is to do again only ``basis`` and ``version``: its folders of samples are of that basis.
+        A stage that has to be done again keeps ``basis`` and ``version`` only, which its folders of samples have.
         """
         return self._json(f"stages/{stage}")
 
     def is_of_0_1(self) -> bool:
-        """Whether version 0.1 began it, which logged what it did but gave stages no version."""
+        """Return whether version 0.1 began the run: it has a log, but no stage has a version."""
         stamps = (JsonFile(path).read() for path in self.folder.glob("stages/*.json"))
         return self._log.exists() and not any("version" in stamp for stamp in stamps)
 
@@ -68,7 +68,7 @@ class RunDirectory:
             file.write(json.dumps(line) + "\n")
 
     def events(self) -> Iterator[dict[str, Any]]:
-        """The lines of ``log.jsonl``; one that a kill cut short is left out."""
+        """Yield the lines of ``log.jsonl``, without a line that a kill cut short."""
         for line in self._log.read_text(encoding="utf-8").splitlines() if self._log.exists() else ():
             try:
                 yield json.loads(line)
@@ -77,74 +77,77 @@ class RunDirectory:
 
     @property
     def traceback(self) -> TextFile:
-        """Of an error that is a fault of this program."""
+        """Traceback of an error that is a defect of this program."""
         return TextFile(self.folder / "traceback.txt")
 
     # ingest
 
     @property
     def data(self) -> JsonFile:
-        """For each file of the collection, by name, ``bytes``, ``time`` and ``sha256`` when it was read."""
+        """``bytes``, ``time`` and ``sha256`` of each file of the collection when it was read, by its name."""
         return self._json("data")
 
     @property
     def reference(self) -> NpzFile:
-        """``vertices (V, 3)``, ``faces``, ``edges``, ``scale``; where the meshes are finer ``fine_vertices``,
-        ``fine_faces`` and ``fine_index (V)``; ``file_vertices`` where the files have others.
+        """``vertices (V, 3)``, ``faces``, ``edges``, ``scale``.
+
+        Where the meshes are finer, also ``fine_vertices``, ``fine_faces`` and ``fine_index (V)``. Where the files have
+        more vertices, also ``file_vertices``.
         """
         return self._npz("reference")
 
     @property
     def prolongation(self) -> NpzFile:
-        """From the mesh that is computed with to the fine one: Prolongation.arrays; where the meshes are finer."""
+        """Prolongation from the coarse mesh to the fine mesh, where the meshes are finer; see Prolongation.arrays."""
         return self._npz("prolongation")
 
     @property
     def shapes(self) -> NpzFile:
-        """``names (n)``, ``vertices (n, V, 3)`` normalised, ``files (n)``, ``first (n)`` number of a vertex in each.
+        """``names (n)``, normalised ``vertices (n, V, 3)``, ``files (n)``, ``first (n)`` vertex number of each file.
 
-        Mirror images come last; ``original (n)`` says which shape each is, or is the image of.
+        Mirror images come last. ``original (n)`` is the index of the original, or of the shape itself.
         """
         return self._npz("shapes")
 
     @property
     def ingest(self) -> JsonFile:
-        """Notes and warnings on the collection, and what the coarse mesh is like."""
+        """Notes and warnings on the collection, and facts about the coarse mesh."""
         return self._json("ingest")
 
     @property
     def surface(self) -> NpzFile:
-        """What the reference's file had beside triangles: bundle.surface.surface_arrays, and ``textures`` as bytes."""
+        """Attributes of the reference's file: bundle.attributes.surface_arrays, and textures as bytes."""
         return self._npz("surface")
 
     @property
     def surface_names(self) -> JsonFile:
-        """The names that belong to it: bundle.schema.SurfaceEntry."""
+        """Names of these attributes: bundle.schema.AttributesEntry."""
         return self._json("surface")
 
     # mean, modes, factors
 
     @property
     def mean(self) -> NpzFile:
-        """``vertices (V, 3)`` of the centred mean; its ``status``, ``iterations``, ``residual``; ``steps``, K."""
+        """``vertices (V, 3)`` of the centred mean, its ``status``, ``iterations`` and ``residual``; ``steps``, K."""
         return self._npz("mean")
 
     @property
     def modes_by_strength(self) -> NpzFile:
-        """The sparse modes as they are found, strongest first: ``nric``, ``vertices``, ``coefficients``, ``lower``,
-        ``upper``, ``localisation``; and ``pga_nric``, ``pga_vertices``, ``pga_localisation`` of the principal ones.
+        """The sparse modes, strongest first: ``nric``, ``vertices``, ``coefficients``, ``lower``, ``upper`` and
+        ``localisation``; ``pga_nric``, ``pga_vertices`` and ``pga_localisation`` are for the principal modes.
         """
         return self._npz("modes-by-strength")
 
     @property
     def decomposition(self) -> JsonFile:
-        """How the modes were found: ``modes``, ``explained``, ``history``, and what each logarithm took."""
+        """Facts about the modes: ``modes``, ``explained``, ``history``, and ``steps`` and ``via`` of each logarithm."""
         return self._json("modes")
 
     @property
     def modes(self) -> NpzFile:
-        """The arrays of `modes_by_strength`, once there are factors in their order; and ``rank (m)``, the place of each
-        mode there.
+        """The arrays of `modes_by_strength`, in the order of the factors once there are any.
+
+        ``rank (m)`` is the position of each mode in `modes_by_strength`.
         """
         return self._npz("modes")
 
@@ -153,17 +156,19 @@ class RunDirectory:
         """``factors``, lists of modes; ``names``; ``overlap (J, J)``."""
         return self._json("factors")
 
-    # samples: see runs.sampling for what is in these folders.
+    # samples: runs.sampling describes the contents of these folders.
 
     @property
     def samples(self) -> Path:
-        """Folder of the joint samples; in ``shapes/`` those at the codes of the collection's shapes, in
-        ``derivatives/`` those of the first training codes with ``derivatives (n, m, 2E)``.
+        """Folder of the joint samples.
+
+        ``shapes/`` has samples at the codes of the collection's shapes. ``derivatives/`` has samples at the first
+        training codes, with ``derivatives (n, m, 2E)``.
         """
         return self.folder / "samples"
 
     def factor_samples(self, j: int) -> Path:
-        """Folder of a factor's own samples."""
+        """Return the folder of a factor's own samples."""
         return self.samples / f"factor-{j}"
 
     @property
@@ -174,40 +179,40 @@ class RunDirectory:
     # networks
 
     def network(self, name: str) -> Path:
-        """The file of a network."""
+        """Return the file of a network."""
         return self.folder / "networks" / f"{name}.safetensors"
 
     def networks(self) -> list[Path]:
-        """The files of all networks that are there."""
+        """Return the files of all networks."""
         return sorted(self.network("*").parent.glob("*.safetensors"))
 
     @property
     def histories(self) -> JsonFile:
-        """``epoch``, ``best`` and losses of each network by the name of its file."""
+        """``epoch``, ``best`` and losses of each network, by the name of its file."""
         return self._json("networks/histories")
 
     # generalisation
 
     @property
     def generalisation(self) -> JsonFile:
-        """How near spaces come to shapes that they were found without: see stages.generalisation."""
+        """Distances between held-out shapes and the space without them: see stages.generalisation."""
         return self._json("generalisation")
 
     @property
     def least_general(self) -> NpzFile:
-        """Of these shapes the farthest, ``given (V, 3)``, and ``found (V, 3)``, the nearest in its space."""
+        """The held-out shape ``given (V, 3)`` with the largest distance, and ``found (V, 3)``, its approximation."""
         return self._npz("least-general")
 
     # evaluation
 
     @property
     def exact(self) -> Path:
-        """Folder of exact shapes that only the evaluation needs, in folders like those of samples."""
+        """Folder of exact shapes that only the evaluation needs, in folders like the folders of samples."""
         return self.folder / "exact"
 
     @property
     def evaluation(self) -> JsonFile:
-        """All figures."""
+        """All figures of the evaluation."""
         return self._json("evaluation")
 
     @property
@@ -219,44 +224,44 @@ class RunDirectory:
 
     @property
     def encoded(self) -> JsonFile:
-        """How near the bundle comes to the shapes that it learned from, and which codes lie outside its bounds."""
+        """Distances between the training shapes and the shapes of their codes; names of shapes outside the bounds."""
         return self._json("encoded")
 
     @property
     def least_near(self) -> NpzFile:
-        """Of these shapes the farthest, ``given (V, 3)``, and ``found (V, 3)``, the shape of its code."""
+        """The training shape ``given (V, 3)`` with the largest distance, and ``found (V, 3)``, its code's shape."""
         return self._npz("least-near")
 
     @property
     def report(self) -> TextFile:
-        """The page."""
+        """The report page."""
         return TextFile(self.folder / "report.html")
 
     def study(self, name: str) -> JsonFile:
-        """What a benchmark measured on this run, with the ``key`` of the stage that it measured."""
+        """Return the file of a benchmark on this run, which has the ``key`` of the measured stage."""
         return self._json(name)
 
-    # Shapes read from the files above.
+    # Values read from the files above.
 
     def reference_mesh(self) -> TriangleMesh:
-        """The mesh that is computed with, at the reference shape."""
+        """Read the coarse mesh at the reference shape."""
         return TriangleMesh.from_mapping(self.reference.read())
 
     def own_shapes(self) -> FloatArray:
-        """(n, V, 3) the shapes of the collection, without mirror images."""
+        """Read the shapes (n, V, 3) of the collection, without mirror images."""
         shapes = self.shapes.read()
         found: FloatArray = shapes["vertices"][: shapes["original"].max() + 1]
         return found
 
     def mean_mesh(self) -> TriangleMesh:
-        """The mesh that is computed with, at the mean shape."""
+        """Read the coarse mesh at the mean shape."""
         return self.reference_mesh().with_vertices(self.mean.read()["vertices"])
 
     def log_steps(self) -> int:
-        """Time steps K of the logarithms, chosen with the mean."""
+        """Read the time steps K of the logarithms, which were chosen with the mean."""
         return int(self.mean.read()["steps"])
 
     def training_codes(self) -> FloatArray:
-        """Codes (n, m) of all shapes that the run learns from, mirror images last."""
+        """Read the codes (n, m) of all training shapes, mirror images last."""
         modes = self.modes.read()
         return np.concatenate([modes["coefficients"], modes["mirrored_coefficients"]])

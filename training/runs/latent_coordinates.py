@@ -29,12 +29,12 @@ class Coordinates:
         return len(self.lower)
 
     def uniform(self, count: int, rng: np.random.Generator) -> FloatArray:
-        """Codes (count, m) uniform in the hypercube."""
+        """Draw codes (count, m) uniformly in the hypercube."""
         return rng.uniform(self.lower, self.upper, (count, len(self)))
 
 
 def alone(latents: FloatArray, factor: list[int]) -> FloatArray:
-    """Codes (n, m) with the latents of one factor only, the others zero."""
+    """Return codes (n, m) with the latents of one factor, and zero for all others."""
     result = np.zeros_like(latents)
     result[:, factor] = latents[:, factor]
     return result

@@ -1,4 +1,4 @@
-"""Progress bars: silent in the first seconds, then with an estimate of the time left."""
+"""Progress bars: silent in the first seconds, then with an estimate of the remaining time."""
 
 from __future__ import annotations
 
@@ -10,23 +10,25 @@ from typing import Any, TypeVar
 
 from tqdm import tqdm
 
-#: Seconds before the first progress output, and between two lines where there is no terminal.
-DELAY, PAUSE = 5, 10
+#: Seconds before the first output.
+DELAY = 5
+#: Seconds between two outputs where there is no terminal.
+PAUSE = 10
 
 Item = TypeVar("Item")
 
 
 class _Lines(tqdm):
-    """A bar for files and pipes, which writes a new line each time."""
+    """A bar for files and pipes, which writes a new line for each update."""
 
     def display(self, msg: str | None = None, pos: int | None = None) -> bool:
         if msg is None:
-            print(self, file=sys.stderr, flush=True)  # noqa: T201 - what a bar is for
+            print(self, file=sys.stderr, flush=True)  # noqa: T201 - a bar has to print
         return True
 
 
 def bar(title: str, unit: str = "it", total: int | None = None, items: Iterable[Any] | None = None, **how: Any) -> tqdm:
-    """A bar on the standard error, removed at the end."""
+    """Return a bar on standard error that is removed at the end."""
     terminal = sys.stderr.isatty()
     kind, pause = (tqdm, 0.1) if terminal else (_Lines, PAUSE)
     return kind(items, desc=title, unit=unit, total=total, delay=DELAY, mininterval=pause, leave=False, **how)

@@ -1,4 +1,4 @@
-"""Samples of a parametrised collection, in files that a killed run leaves whole."""
+"""Samples of a parametrised collection, in files that stay whole if a run is killed."""
 
 from __future__ import annotations
 
@@ -21,18 +21,18 @@ from shapespace.training.runs.workers import run
 
 DONE, FAILED = "done", "failed"
 #: A code whose shape can't be computed is multiplied by SHORTER, up to SHORTENINGS times. Faces collapse mostly at
-#: codes near the corners of the box, which lie farther out than the training shapes do.
+#: codes near the corners of the box, which are farther from 0 than the codes of training shapes.
 SHORTER, SHORTENINGS = 0.85, 3
 #: Subfolder of the joint samples: the samples at the codes of the collection's own shapes.
 KNOWN = "shapes"
-#: Subfolder of the joint samples: derivatives at some of the training codes, in the order of these.
+#: Subfolder of the joint samples: derivatives at the first training codes, in the same order.
 DERIVATIVES = "derivatives"
 #: Fewest samples to learn from: each part of the split needs some.
 FEWEST = 10
 
 
 class SamplesError(RuntimeError):
-    """Samples that nothing can be learned from, with a sentence that says why."""
+    """Too few samples to learn from, with a sentence that says why."""
 
 
 @dataclass(frozen=True)
@@ -40,11 +40,12 @@ class SampledShapes:
     """Shapes of a collection.
 
     Attributes:
-        vertices: (n, V, 3); where a shape could not be found, the last finite one on the way to it.
-        nric: (n, 2E) lengths and angles. Angles are defined up to 2π, and the collection says which value is meant: the
-            nearest to the reference's, or the one at the end of a path from the reference.
-        reasons: for each why it failed, or an empty string.
-        derivatives: (n, m, 2E) of ``nric`` by the code, zero where a shape failed; None where they are not computed.
+        vertices: (n, V, 3); where a shape could not be found, the last finite shape on the way to it.
+        nric: (n, 2E) lengths and angles. Angles are defined up to 2π. The collection chooses the value: the nearest to
+            the reference's angle, or the value at the end of a path from the reference.
+        reasons: (n,) why the shape was not found, or an empty string.
+        derivatives: (n, m, 2E) derivatives of ``nric`` by the code, zero where a shape failed; None where they are not
+            computed.
     """
 
     vertices: FloatArray
@@ -55,13 +56,13 @@ class SampledShapes:
 
 @dataclass(frozen=True)
 class FeaturePositions:
-    """Where the coordinates of a collection are on its surface: a code moves a feature to the edges whose place it is.
+    """Places of a collection's features on the surface. A code moves a feature to the edges with the same place.
 
     Attributes:
         surface: (E, d) angles that tell edges apart.
-        multiples: (m, d) of these, whose sum is the place of a coordinate, in radians of its period.
-        constants: (E, c) what else an edge is, the same for all edges that symmetries which move places as they move
-            codes take to each other.
+        multiples: (m, d) multiples of these angles, whose sum is the place for a coordinate, in radians of its period.
+        constants: (E, c) further properties of edges. They are equal for edges that a symmetry of codes and places
+            takes to each other.
     """
 
     surface: FloatArray
@@ -70,12 +71,12 @@ class FeaturePositions:
 
     @property
     def angles(self) -> FloatArray:
-        """(E, m) the place of each coordinate at each edge."""
+        """Place (E, m) of each edge for each coordinate."""
         return self.surface @ self.multiples.T
 
 
 class Collection(Protocol):
-    """A shape manifold with a parametrisation by codes: what the stages from `factors` on need to know.
+    """A shape manifold that is parametrised by codes, as the stages from `factors` on need it.
 
     Attributes:
         reference: z̄, of unit area.
@@ -83,13 +84,13 @@ class Collection(Protocol):
         factors: latent indices of each factor, by name; consecutive.
         latent_names: (m,) names of the coordinates.
         coordinates: bounds and periods.
-        codes: (n, m) of the shapes that the collection was made from, none where it is by design.
-        symmetries: involutions of the edges, (E,) each, that take shapes of the collection to shapes of the collection
-            and the reference to itself; the combiner sees each training sample's images too.
-        places: where features are that codes move over the surface; None where none move.
-        steps: K of the exponentials; None where shapes are not made by steps.
-        finer: the same by exponentials of twice as many steps; None where that would not be more exact.
-        differentiated: the same, whose shapes come with their derivatives; None where these are not known.
+        codes: (n, m) codes of the training shapes; none where a generator gives the collection by design.
+        symmetries: involutions of the edges, (E,) each. They take shapes of the collection to shapes of the collection
+            and the reference to itself. The combiner also learns from the images of the training samples.
+        places: places of features that codes move over the surface; None where no feature moves.
+        steps: K of the exponentials; None where shapes are not exponentials.
+        finer: the same collection with twice as many steps; None where that would not be more exact.
+        differentiated: the same collection, with derivatives of its shapes; None where these are not known.
     """
 
     @property
@@ -116,20 +117,20 @@ class Collection(Protocol):
     def differentiated(self) -> Collection | None: ...  # noqa: D102
 
     def shapes(self, latents: FloatArray) -> SampledShapes:
-        """The shapes of codes (n, m), each depending on nothing but its own code."""
+        """Compute the shapes of codes (n, m). Each shape depends on its own code alone."""
         ...
 
 
 @dataclass(frozen=True)
 class Samples:
-    """Finished samples, in the order of their index; failed ones are left out.
+    """Finished samples, in the order of their index, without failed ones.
 
     Attributes:
-        index: (n,) increasing; samples of two folders with the same index belong to the same joint code. Below 0 for
-            codes of the collection's own shapes.
-        latents: (n, m) codes that the shapes have.
-        asked: (n, m) codes that were asked for; farther from 0 than ``latents`` where they had no shape.
-        nric: (n, 2E).
+        index: (n,) increasing. Samples of two folders with the same index belong to the same joint code. It is below 0
+            for codes of the collection's own shapes.
+        latents: (n, m) codes of the shapes.
+        asked: (n, m) requested codes; farther from 0 than ``latents`` where a requested code had no shape.
+        nric: (n, 2E) lengths and angles.
         vertices: (n, V, 3).
     """
 
@@ -141,7 +142,7 @@ class Samples:
 
     @property
     def shortened(self) -> NDArray[np.bool_]:
-        """(n,) which codes had to be shortened."""
+        """Whether each code (n,) was shortened."""
         found: NDArray[np.bool_] = (self.latents != self.asked).any(axis=1)
         return found
 
@@ -157,26 +158,26 @@ def draw(
     scheduler: str | None = None,
     workers: int = -1,
 ) -> Iterator[tuple[int, int, int]]:
-    """Compute the shapes of codes (n, m) into ``folder/part-*.npz``, leaving out parts that are there already.
+    """Compute the shapes of codes (n, m) into ``folder/part-*.npz``, except for parts that exist already.
 
-    A part is written whole as soon as it is finished, in whatever order, and says of each of its samples whether it is
-    done or failed and why.
+    Each part is written as soon as it is finished, in any order. It has the status of each sample, done or failed, and
+    the reason of a failure.
 
     Args:
-        collection: what to draw from; sent to the workers.
-        folder: gets one file for each part, and loses parts of other codes or another part size.
-        latents: (n, m).
-        part_size: codes in a part: what a worker is given at a time, and what is lost with it.
-        title: of the progress bar.
-        shorten: whether a code that has no shape is shortened until it has one, see SHORTER; its sample says so.
+        collection: the collection; sent to the workers.
+        folder: folder of the parts. Parts of other codes or another part size are removed.
+        latents: (n, m) codes.
+        part_size: number of codes in a part. A worker computes one part at a time, and loses it if it dies.
+        title: title of the progress bar.
+        shorten: whether a code without a shape is shortened until it has one, see SHORTER. The sample has both codes.
         scheduler: see workers.run.
         workers: see workers.run.
 
     Yields:
-        (done, total, failed) after each part, the failed ones counted among those done.
+        (done, total, failed) after each part; done includes failed.
 
     Raises:
-        workers.WorkersError: no workers to be had; what is finished stays.
+        workers.WorkersError: there are no workers. Finished parts stay.
     """
     folder.mkdir(parents=True, exist_ok=True)
     indices = np.split(np.arange(len(latents)), range(part_size, len(latents), part_size))
@@ -200,7 +201,7 @@ def draw(
 
 
 def _part(collection: Collection, shorten: bool, asked: FloatArray) -> dict[str, NDArray]:
-    """The arrays of a part, except ``index`` and ``asked``."""
+    """Compute the arrays of a part, except ``index`` and ``asked``."""
     shapes, latents = collection.shapes(asked), asked.copy()
     vertices, nric, reasons = shapes.vertices.copy(), shapes.nric.copy(), np.array(shapes.reasons, dtype=object)
     for _ in range(SHORTENINGS if shorten else 0):
@@ -226,7 +227,7 @@ def _part(collection: Collection, shorten: bool, asked: FloatArray) -> dict[str,
 
 
 def _status(path: Path, index: IntArray, latents: FloatArray) -> NDArray[np.str_] | None:
-    """(n,) DONE or FAILED of a part's samples; None where the file is missing, damaged or of other codes."""
+    """Return the status (n,) of a part's samples; None where the file is missing, damaged or of other codes."""
     try:
         # Opened here, because np.load leaves a damaged file open.
         with path.open("rb") as file, np.load(file) as part:
@@ -237,19 +238,19 @@ def _status(path: Path, index: IntArray, latents: FloatArray) -> NDArray[np.str_
 
 
 def asked_for(part: Mapping[str, NDArray]) -> NDArray:
-    """Codes that the samples of a part were asked for; version 0.1 did not shorten any, and stored only those used."""
+    """Return the requested codes of a part. Version 0.1 did not shorten codes, and stored them once."""
     return part["asked"] if "asked" in part else part["latents"]
 
 
 def parts(folder: Path) -> Iterator[Mapping[str, NDArray]]:
-    """The files of a folder's samples, opened one after the other; arrays are read when they are asked for."""
+    """Open the files of a folder's samples, one after the other. An array is read when it is used."""
     for path in sorted(folder.glob("part-*.npz")):
         with np.load(path) as part:
             yield part
 
 
 def columns(folder: Path, *names: str) -> dict[str, NDArray]:
-    """Some arrays of all samples of a folder, failed ones included; an empty mapping where there are no parts."""
+    """Read some arrays of all samples of a folder, including failed ones; an empty mapping where there are no parts."""
     found: dict[str, list[NDArray]] = {name: [] for name in names}
     for part in parts(folder):
         for name, arrays in found.items():
@@ -258,13 +259,13 @@ def columns(folder: Path, *names: str) -> dict[str, NDArray]:
 
 
 def indices(folder: Path) -> IntArray:
-    """Indices of the samples of a folder that have a shape."""
+    """Return the indices of the samples of a folder that have a shape."""
     found = columns(folder, "index", "status")
     return found["index"][found["status"] == DONE]
 
 
 def read(folder: Path) -> Samples:
-    """Read all parts of a folder, and before them those of the collection's shapes, where it has some."""
+    """Read all samples of a folder, after the samples at the collection's shapes where there are any."""
     fields = "index", "latents", "asked", "nric", "vertices"
     found: dict[str, list[NDArray]] = {name: [] for name in fields}
     known = len(columns(folder / KNOWN, "index").get("index", ()))
@@ -278,7 +279,7 @@ def read(folder: Path) -> Samples:
 
 
 def used(folder: Path, asked: FloatArray) -> FloatArray:
-    """Codes (n, m) as asked for, except those that had to be shortened, which are given as they were used."""
+    """Return the requested codes (n, m), each replaced by its shortened code if it was shortened."""
     found, codes = columns(folder, "index", "latents", "status"), asked.copy()
     done = found["status"] == DONE
     codes[found["index"][done]] = found["latents"][done]
@@ -286,7 +287,14 @@ def used(folder: Path, asked: FloatArray) -> FloatArray:
 
 
 def split(index: IntArray, test: float, validation: float, rng: np.random.Generator) -> dict[str, IntArray]:
-    """Split indices at random into sorted parts: a share of all is test, one of the rest validation, the rest train."""
+    """Split indices at random into sorted parts.
+
+    Args:
+        index: the indices.
+        test: share of all indices for the test.
+        validation: share of the other indices for the validation; the rest is for training.
+        rng: random generator.
+    """
     order = rng.permutation(index)
     n_test = max(1, round(test * len(order)))
     n_validation = max(1, round(validation * (len(order) - n_test)))

@@ -1,10 +1,10 @@
 """One function on many items: in processes on this machine, or on a Dask cluster.
 
-Either way an item's result is the same bit for bit, because it depends on the item alone and is computed with one BLAS
-thread (only processors with different instructions may round differently). The item that a worker was busy with when
-it died is done again by another.
+Both give the same result bit for bit, because a result depends on its item alone and is computed with one BLAS thread.
+Only processors with different instructions may round differently. If a worker dies, another worker repeats its item.
 
-The machines of a cluster need this package in the same version, with its ``cluster`` extra, and no common file system.
+The machines of a cluster need this package in the same version, with its ``cluster`` extra. They need no common file
+system.
 """
 
 from __future__ import annotations
@@ -29,34 +29,34 @@ Result = TypeVar("Result")
 
 #: Seconds to wait for a scheduler's answer.
 CONNECT = 10.0
-#: Seconds that a cluster may be without a worker before it is given up.
+#: Seconds without any worker after which the run gives up a cluster.
 ABANDONED = 60.0
-#: Items in flight for each thread of a cluster: one to work on, one on its way.
+#: Items in flight for each thread of a cluster: one in work, one on its way.
 AHEAD = 2
-#: Deaths of workers that are tolerated before the work itself is taken for their cause; on a cluster Dask tolerates
-#: three more for each of these.
+#: Deaths of workers that are tolerated before the item is taken for the cause. On a cluster Dask tolerates three more
+#: for each of these.
 RETRIES = 3
 
 
 class WorkersError(RuntimeError):
-    """The workers can't be used, with a sentence that says why."""
+    """The workers can't be used. The message says why."""
 
 
 def run(
     function: Callable[[Item], Result], items: Sequence[Item], scheduler: str | None = None, workers: int = -1
 ) -> Iterator[tuple[int, Result]]:
-    """Call a function on each of some items, yielding (position, result) in the order in which they are finished.
+    """Call a function on each item, and yield (position, result) as results are finished.
 
     Args:
-        function: picklable. Each thread that works for it unpickles it once and keeps it, so what it builds lazily is
-            built once in a thread, and needn't be safe for several.
-        items: each with enough work to be worth sending.
+        function: a picklable function. Each thread unpickles it once and keeps it. So lazily built attributes are built
+            once in each thread, and needn't be thread-safe.
+        items: arguments. Each should have much more work than sending it.
         scheduler: address of a Dask scheduler; None computes on this machine.
-        workers: processes on this machine, by default one a core; 1 computes in this process.
+        workers: number of processes on this machine, by default one for each core; 1 computes in this process.
 
     Raises:
-        WorkersError: a scheduler that can't be reached or is lost, no workers, workers without this package, or an item
-            that kills them again and again.
+        WorkersError: the scheduler can't be reached or is lost, there are no workers, workers lack this package, or an
+            item kills them repeatedly.
     """
     if scheduler is not None and items:
         return _on_cluster(PickledFunction(function), items, scheduler)
@@ -69,20 +69,20 @@ _kept = threading.local()
 
 
 class PickledFunction(Generic[Item, Result]):
-    """A function that is sent as bytes, and unpickled by a thread that doesn't hold it yet."""
+    """A function that is sent as bytes. A thread unpickles it unless it holds the same function already."""
 
     def __init__(self, function: Callable[[Item], Result]) -> None:
         pickled = pickle.dumps(function)
         self._digest = hashlib.sha256(pickled).hexdigest()
-        # An array, because joblib lets its processes map a large one instead of sending it with every item.
+        # An array, because joblib lets its processes map a large array instead of sending it with every item.
         self._pickled = np.frombuffer(pickled, np.uint8)
 
     def __call__(self, item: Item) -> Result:
         """Call the function."""
         if getattr(_kept, "digest", None) != self._digest:
-            _kept.function = pickle.loads(self._pickled.data)  # noqa: S301 - our own, from where the results go
+            _kept.function = pickle.loads(self._pickled.data)  # noqa: S301 - our own bytes
             _kept.digest = self._digest
-        # Not taken back afterwards: another thread of this process may still be computing.
+        # The limit stays, because another thread of this process may still be computing.
         threadpool_limits(1)
         return _kept.function(item)
 
@@ -141,7 +141,7 @@ def _on_cluster(
         while waiting or flying:
             try:
                 threads = sum(client.nthreads().values())
-            except (OSError, RuntimeError, AttributeError) as error:  # by how far the client is with closing
+            except (OSError, RuntimeError, AttributeError) as error:  # depends on how far the client is with closing
                 raise lost from error
             if threads:
                 seen = time.monotonic()
@@ -149,7 +149,7 @@ def _on_cluster(
                 raise WorkersError(f"the scheduler at {scheduler} has had no worker for {ABANDONED:.0f} s")
             while waiting and len(flying) < AHEAD * threads:
                 k = waiting.popleft()
-                # As a task's result: scattered data are gone with the workers that hold them, a task is done again.
+                # Dask computes a task's result again if the workers that hold it die; scattered data would be lost.
                 sent = sent or client.submit(_itself, function, pure=False)
                 future = client.submit(_call, sent, items[k], pure=False)
                 flying[future.key] = k, future

@@ -1,1 +1,1 @@
-"""What is computed in the space of shells for one collection: mean, logarithms, modes, factors."""
+"""Computations in the space of shells for one collection: mean, logarithms, modes, factors."""

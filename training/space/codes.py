@@ -1,4 +1,4 @@
-"""Codes of the shapes of a collection: whose exponentials come closest to them, in vertices."""
+"""Codes of the shapes of a collection: their exponentials come closest to the shapes, in vertices."""
 
 from __future__ import annotations
 
@@ -17,25 +17,26 @@ from shapespace.solve.outcome import Status
 from shapespace.training.runs.progress import progress
 from shapespace.training.runs.workers import run
 
-#: The search ends when no coefficient would move by more than this, when the sum of squares would fall by less than
-#: this share, or after so many exponentials.
-TOLERANCE, GAIN, EXPONENTIALS = 1e-3, 1e-3, 40
-#: Where there is no exponential at the start, the first of these multiples of it that has one is the start.
-SHARES = (1.0, 0.75, 0.5, 0.25, 0.0)
-#: Margin of the bounds on each side of the shapes' codes, as a share of their range; and the least width of the
-#: negative or positive side, as a share of the other.
-ROOM, MARGIN = 0.05, 0.1
+#: The search ends when no coefficient would move by more than 1e-3, when the sum of squares would fall by less than
+#: 1e-3 of itself, or after 40 exponentials.
+STOPPING = Stopping(1e-3, 1e-3, max_evaluations=40)
+#: The search starts from the first multiple of the given start that has an exponential.
+START_SHARES = (1.0, 0.75, 0.5, 0.25, 0.0)
+#: Margin of the bounds on each side of the shapes' codes, as a share of their range.
+MARGIN = 0.05
+#: Least width of the negative or positive side of the bounds, as a share of the width of the other side.
+SMALLEST_SIDE = 0.1
 
 
 @dataclass(frozen=True)
 class Codes:
-    """Codes and where they lead.
+    """Codes of shapes, and their exponentials.
 
     Attributes:
         codes: (n, m).
-        vertices: (n, V, 3) their exponentials, aligned to the shapes.
-        exponentials: (n,) that each took.
-        status: (n,) of each search.
+        vertices: (n, V, 3) exponentials of the codes, aligned to the shapes.
+        exponentials: (n,) number of exponentials of each search.
+        status: (n,) status of each search.
     """
 
     codes: FloatArray
@@ -53,10 +54,10 @@ def nearest_codes(
     steps: int,
     workers: int = -1,
 ) -> Codes:
-    """The codes ``w`` that minimise ``‖exp_z̄(Σ_j w_j u_j) − x‖²`` over vertices, after rigid alignment.
+    """Find the codes ``w`` that minimise ``‖exp_z̄(Σ_j w_j u_j) − x‖²`` over vertices, after rigid alignment.
 
-    Projections of logarithms, which they start from, are so only to first order: what a mode leaves out bends with the
-    rest of the way. Gauss–Newton, with the derivative of the discrete exponential.
+    The method is Gauss–Newton, with the derivative of the discrete exponential. Projections of logarithms, from which
+    the search starts, are minimisers only to first order, because the exponential is nonlinear.
 
     Args:
         space: the shape space.
@@ -77,11 +78,11 @@ def nearest_codes(
 
 
 def box_of(codes: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Lower and upper bounds (m,) that hold codes (n, m), with some room, and the mean's, which is 0."""
+    """Return lower and upper bounds (m,) around codes (n, m) and the code of the mean, which is 0, with a margin."""
     lower, upper = codes.min(axis=0), codes.max(axis=0)
-    room = ROOM * (upper - lower)
+    room = MARGIN * (upper - lower)
     lower, upper = lower - room, upper + room
-    return np.minimum(lower, -MARGIN * upper), np.maximum(upper, -MARGIN * lower)
+    return np.minimum(lower, -SMALLEST_SIDE * upper), np.maximum(upper, -SMALLEST_SIDE * lower)
 
 
 def _nearest(
@@ -94,7 +95,7 @@ def _nearest(
 ) -> tuple[FloatArray, FloatArray, int, Status]:
     target, start = item
 
-    @lru_cache(2)  # the best code's, and that of the step that is tried
+    @lru_cache(2)  # for the best code and for the code that is tried
     def shoot(code: tuple[float, ...]) -> DiscretePath:
         return exponential(space, mean, np.tensordot(np.array(code), modes, axes=1), steps)
 
@@ -109,7 +110,7 @@ def _nearest(
         changes = aligned_change(path.vertices[-1], ExponentialDerivative(path).push_forward(modes), target)
         return changes.reshape(len(changes), -1).T
 
-    # The mean itself is always there.
-    first = next(share * start for share in SHARES if shoot(tuple(share * start)).converged)
-    fit = least_squares(residuals, jacobian, first, box, Stopping(TOLERANCE, GAIN, max_evaluations=EXPONENTIALS))
+    # The exponential of 0, the mean, always converges.
+    first = next(share * start for share in START_SHARES if shoot(tuple(share * start)).converged)
+    fit = least_squares(residuals, jacobian, first, box, STOPPING)
     return fit.x, align(shoot(tuple(fit.x)).vertices[-1], target), fit.iterations, fit.status

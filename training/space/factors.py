@@ -1,7 +1,7 @@
 """Factors of a product shape manifold: groups of modes whose supports overlap (paper, sections 3 and 4).
 
-Modes that move different parts of a surface hardly know of each other: the exponential of their sum is nearly the sum
-of their exponentials. Modes that share a part do not have that, and go into one factor, which a network learns whole.
+For modes that move different parts of a surface, the exponential of the sum is nearly the sum of the exponentials. This
+does not hold for modes that move the same part. Such modes form one factor, and one network learns it.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ from shapespace.mesh.triangle_mesh import TriangleMesh
 from shapespace.training.space.modes import edge_magnitudes
 
 #: Upper bound of the default threshold: groups whose modes overlap more than this on average are always joined.
-THRESHOLD = 0.5
-#: Default limit on the modes of a factor, since its samples have to fill a box of that dimension.
-LARGEST = 9
-#: Axes along which a mesh spreads less than this share of its largest spread give no names.
+HIGHEST_THRESHOLD = 0.5
+#: Default limit on the modes of a factor, because its samples have to fill a box of that dimension.
+LARGEST_FACTOR = 9
+#: An axis gives no names if the mesh's standard deviation along it is below this share of the largest one.
 THIN = 0.2
 #: A part lies to one side if it is further from the centre than this share of the mesh's standard deviation.
 ASIDE = 0.5
@@ -31,13 +31,13 @@ class FactorError(ValueError):
 
 
 def overlap(nric: FloatArray, norm: WeightedNorm) -> FloatArray:
-    """How much the supports of modes overlap: ``Σ_e |u_i,e| |u_j,e|``, normalised to 1 on the diagonal.
+    """Overlap of the supports of modes: ``Σ_e |u_i,e| |u_j,e|``, normalised to 1 on the diagonal.
 
     ``|u_e|`` is the size of a mode on an edge, of its length and its angle together, in the weighted norm.
 
     Args:
         nric: (m, 2E) modes.
-        norm: at their mean.
+        norm: weighted norm at their mean.
 
     Returns:
         (m, m) symmetric, from 0 where supports are disjoint to 1 where the modes are alike.
@@ -48,10 +48,10 @@ def overlap(nric: FloatArray, norm: WeightedNorm) -> FloatArray:
 
 
 def between(overlaps: FloatArray, groups: Sequence[Sequence[int]]) -> FloatArray:
-    """Overlap of factors (J, J): the average over pairs of modes, one from each.
+    """Overlap of factors (J, J): the average over pairs of modes, one from each factor.
 
     Args:
-        overlaps: (m, m) of the modes.
+        overlaps: (m, m) overlaps of the modes.
         groups: J lists of modes.
     """
     share = np.zeros((len(groups), len(overlaps)))
@@ -61,23 +61,24 @@ def between(overlaps: FloatArray, groups: Sequence[Sequence[int]]) -> FloatArray
 
 
 def group(
-    overlaps: FloatArray, count: int | None = None, *, threshold: float | None = None, largest: int = LARGEST
+    overlaps: FloatArray, count: int | None = None, *, threshold: float | None = None, largest: int = LARGEST_FACTOR
 ) -> list[list[int]]:
-    """Form factors by joining, again and again, the two groups that overlap most on average.
+    """Form factors by repeatedly joining the two groups with the largest average overlap (average linkage).
 
-    With a ``count`` this goes on until that many are left. Without one it ends when no two groups overlap by more
-    than ``threshold`` and have together no more than ``largest`` modes. (Average linkage; written out because a
-    dendrogram has no limit on the size of a group, and the limit has to count while groups grow.)
+    With a ``count``, joining ends when ``count`` groups are left. Without it, joining ends when no two groups overlap
+    by more than ``threshold`` and have together no more than ``largest`` modes. The algorithm is written out because
+    the limit on the size has to count while groups grow, and a dendrogram has no such limit.
 
-    How much modes overlap at all depends on the collection: nearly everything on a captured body in loose clothes moves
-    a little with everything else, the median overlap of two modes is 0.4 there and 0.1 on a hand. So the threshold is
-    by default relative: groups are joined that share more than two modes do on average.
+    The usual overlap depends on the collection. On a captured body in loose clothes nearly everything moves a little
+    with everything else. The median overlap of two modes is 0.4 there, and 0.1 on a hand. So the default threshold is
+    relative: two groups are joined if they overlap more than two modes do on average.
 
     Args:
-        overlaps: (m, m) of the modes, which come strongest first.
+        overlaps: (m, m) overlaps of the modes, strongest mode first.
         count: J, if the user chose it; then ``threshold`` and ``largest`` don't matter.
-        threshold: on the average overlap of two groups; by default that of all pairs of modes, but at most 0.5.
-        largest: modes of a factor.
+        threshold: threshold of the average overlap of two groups; by default the average over all pairs of modes, but
+            at most 0.5.
+        largest: most modes of a factor.
 
     Returns:
         J lists of modes, each in order; the factor of the strongest mode comes first.
@@ -92,7 +93,7 @@ def group(
         raise FactorError(f"a factor needs room for at least one mode, not {largest}")
     if threshold is None:
         pairs = overlaps[np.triu_indices(m, 1)]
-        threshold = min(THRESHOLD, float(pairs.mean())) if len(pairs) else THRESHOLD
+        threshold = min(HIGHEST_THRESHOLD, float(pairs.mean())) if len(pairs) else HIGHEST_THRESHOLD
     groups = [[j] for j in range(m)]
     while len(groups) > (count or 1):
         shared = between(overlaps, groups)
@@ -108,17 +109,17 @@ def group(
 
 
 def names(groups: Sequence[Sequence[int]], nric: FloatArray, norm: WeightedNorm, mean: TriangleMesh) -> list[str]:
-    """Say where on the mean each factor acts, such as "upper left", without claiming to know what is there.
+    """Name each factor by its place on the mean, such as "upper left".
 
-    As a viewer shows it that has x to the right, y up and z towards the eye (glTF's axes). A part is named by the
-    centre of its modes' squares, on every axis that the mesh is not thin along; "middle" where it is to no side.
+    Places are those in a viewer that has x to the right, y up and z towards the eye (glTF's axes). A factor is named by
+    the centre of its modes' squares, on every axis along which the mesh is not thin; "middle" where it is to no side.
     Names are unique: the second "upper left" is "upper left 2".
 
     Args:
         groups: J lists of modes.
         nric: (m, 2E) modes.
-        norm: at the mean.
-        mean: the shape.
+        norm: weighted norm at the mean.
+        mean: the mean shape.
     """
     middles = mean.edge_midpoints
     centre, spread = middles.mean(axis=0), middles.std(axis=0)

@@ -1,7 +1,7 @@
-"""How near a space comes to shapes that it was not made from, beside principal components of the aligned vertices.
+"""Distances between held-out shapes and the space found without them, for modes and for principal components.
 
-Principal components are what a user would otherwise take. Distances are means over vertices after rigid alignment, as
-shares of the diagonal of the reference's bounding box.
+Principal components of the aligned vertices are the usual alternative. Distances are means over vertices after rigid
+alignment, as shares of the diagonal of the reference's bounding box.
 """
 
 from __future__ import annotations
@@ -28,28 +28,48 @@ from shapespace.training.space.mean import centred_mean
 from shapespace.training.space.modes import ModeError, coefficients, mode_count, pga
 from shapespace.training.space.sparse_modes import find_modes
 
-#: Number of folds; of fewer than twice as many shapes each is held out by itself.
+#: Number of folds. Below twice this number of shapes, each shape is held out by itself.
 FOLDS = 5
-#: Steps K of the logarithms and exponentials of a model, and of those by which spaces are compared.
-STEPS, LIGHT_STEPS = 16, 8
-#: Most shapes by which steps are chosen, and modes where the settings give no number.
-SOME, FEW = 100, 10
-#: One step is not chosen if a larger share of so many random shapes folds, with at most so many modes.
-FOLDED, DRAWN, DRAWN_MODES = 0.1, 500, 10
-#: Random shapes, whose distance from the collection is its specificity.
+#: Default steps K of logarithms and exponentials of a model.
+STEPS = 16
+#: Most steps K where spaces are compared, to save time.
+LIGHT_STEPS = 8
+#: Number of random shapes for the specificity.
 RANDOM = 200
 #: Percentile of the vertices' distances that is reported beside their mean.
-SHARE = 95
+PERCENTILE = 95
+
+
+@dataclass(frozen=True)
+class _StepChoice:
+    """Limits of the choice between one step and `STEPS`.
+
+    Attributes:
+        shapes: most shapes that are held out.
+        modes: number of modes of the held-out shapes, where the settings give none.
+        folded: one step is not chosen if a larger share of random shapes folds.
+        random: number of random shapes.
+        random_modes: most modes of the random shapes.
+    """
+
+    shapes: int = 100
+    modes: int = 10
+    folded: float = 0.1
+    random: int = 500
+    random_modes: int = 10
+
+
+STEP_CHOICE = _StepChoice()
 
 
 @dataclass(frozen=True)
 class PrincipalComponents:
-    """Of shapes aligned to their mean.
+    """Principal components of shapes aligned to their mean.
 
     Attributes:
         mean: (V, 3).
         axes: (n, 3V) orthonormal, strongest first.
-        coefficients: (n, n) of the shapes.
+        coefficients: (n, n) coefficients of the shapes.
     """
 
     mean: FloatArray
@@ -57,13 +77,13 @@ class PrincipalComponents:
     coefficients: FloatArray
 
     def explained(self, count: int) -> float:
-        """Share of the shapes' variance that the first components explain."""
+        """Return the share of the shapes' variance that the first components explain."""
         energy = (self.coefficients**2).sum(axis=0)
         return float(energy[:count].sum() / energy.sum())
 
     @classmethod
     def of(cls, shapes: FloatArray, reference: FloatArray) -> PrincipalComponents:
-        """Of shapes (n, V, 3), aligned to the reference and then to their mean."""
+        """Analyse shapes (n, V, 3), aligned to the reference and then to their mean."""
         mean = align(shapes, reference).mean(axis=0)
         shapes = align(shapes, mean)
         mean = shapes.mean(axis=0)
@@ -71,58 +91,58 @@ class PrincipalComponents:
         return cls(mean, axes, u * s)
 
     def nearest(self, shapes: FloatArray, count: int) -> FloatArray:
-        """What the first components make of shapes (n, V, 3)."""
+        """Project shapes (n, V, 3) onto the first components."""
         some = self.axes[:count]
         rows = (align(shapes, self.mean) - self.mean).reshape(len(shapes), -1)
         return self.mean + (rows @ some.T @ some).reshape(shapes.shape)
 
     def random(self, count: int, codes: int, rng: np.random.Generator) -> FloatArray:
-        """Shapes uniform in the box of the first components' coefficients."""
+        """Draw shapes uniformly in the box of the first components' coefficients."""
         some = self.coefficients[:, :count]
         drawn = rng.uniform(some.min(axis=0), some.max(axis=0), (codes, count))
         return self.mean + (drawn @ self.axes[:count]).reshape(codes, *self.mean.shape)
 
 
 def vertex_distances(shapes: FloatArray, others: FloatArray, diagonal: float) -> FloatArray:
-    """(n, V) between shapes (n, V, 3) and others (n, V, 3) or one (V, 3), as shares of a diagonal."""
+    """Return distances (n, V) between shapes (n, V, 3) and others, (n, V, 3) or (V, 3), as shares of a diagonal."""
     result: FloatArray = np.linalg.norm(align(shapes, others) - others, axis=-1) / diagonal
     return result
 
 
 def to_nearest(shapes: FloatArray, collection: FloatArray, diagonal: float) -> float:
-    """Mean distance of shapes (k, V, 3) from the nearest of a collection (n, V, 3)."""
+    """Return the mean distance between shapes (k, V, 3) and the nearest shapes of a collection (n, V, 3)."""
     distances = [vertex_distances(shapes, other, diagonal).mean(axis=1) for other in collection]
     return float(np.min(distances, axis=0).mean())
 
 
 def summary(distances: FloatArray) -> dict[str, float]:
-    """Mean and 95th percentile of distances of vertices."""
-    return {"mean": float(distances.mean()), f"p{SHARE}": float(np.percentile(distances, SHARE))}
+    """Return the mean and the 95th percentile of distances of vertices."""
+    return {"mean": float(distances.mean()), f"p{PERCENTILE}": float(np.percentile(distances, PERCENTILE))}
 
 
 def folds(count: int) -> list[IntArray]:
-    """Indices of the shapes that are held out together."""
+    """Return the indices of the shapes that are held out together, for each fold."""
     parts = FOLDS if count >= 2 * FOLDS else count
     return [np.arange(fold, count, parts) for fold in range(parts)]
 
 
 def some_folds(count: int) -> list[IntArray]:
-    """The first fold, or all where each shape is held out by itself."""
+    """Return the first fold, or all folds where each shape is held out by itself."""
     return folds(count)[: 1 if count >= 2 * FOLDS else None]
 
 
 @dataclass(frozen=True)
 class HeldOut:
-    """Shapes and what a space makes of them that was found without them.
+    """Held-out shapes, approximated in the space that was found without them.
 
     Attributes:
-        index: (k,) which of the collection.
+        index: (k,) indices of the shapes in the collection.
         counts: numbers of modes.
-        by_modes: (k, V, 3) for each, the nearest exponentials.
-        by_components: (k, V, 3) for each, what as many principal components make of them.
-        by_mirrored: likewise, components of the shapes and their mirror images; empty where there are none.
+        by_modes: (k, V, 3) for each number: the nearest exponentials.
+        by_components: (k, V, 3) for each number: projections onto as many principal components.
+        by_mirrored: likewise, with components of the shapes and their mirror images; empty where there are none.
         steps: (k,) K of the exponentials.
-        stuck: (k,) for each, whether the search did not end, as exponentials run into collapsing faces on the way.
+        stuck: (k,) for each number: whether the search did not converge, because faces of exponentials collapse.
     """
 
     index: IntArray
@@ -134,9 +154,9 @@ class HeldOut:
     stuck: list[NDArray[np.bool_]]
 
     def distances(self, shapes: FloatArray, diagonal: float) -> dict[str, list[FloatArray]]:
-        """``modes`` and ``components``, for each number (k, V), from shapes (n, V, 3) of the collection; see above.
+        """Return distances to the shapes (n, V, 3) of the collection: (k, V) for each number of modes.
 
-        And ``mirrored_components``, where there are mirror images.
+        The keys are ``modes``, ``components`` and, where there are mirror images, ``mirrored_components``.
         """
         given = shapes[self.index]
         near = {"modes": self.by_modes, "components": self.by_components}
@@ -146,7 +166,7 @@ class HeldOut:
 
 
 def joined(parts: Sequence[HeldOut]) -> HeldOut:
-    """The shapes of several folds together; the numbers of modes are means."""
+    """Join the shapes of several folds. The numbers of modes are means."""
 
     def together(by_count: Iterable[list[NDArray]]) -> list[NDArray]:
         return [np.concatenate(each) for each in zip(*by_count, strict=True)]
@@ -169,45 +189,47 @@ def time_steps(
     material: Material,
     original_index: IntArray | None = None,
 ) -> int:
-    """K of logarithms and exponentials, as the settings say or as ``auto`` finds.
+    """Return K of logarithms and exponentials, from the settings or by cross-validation.
 
-    With K = 1 the exponential is ``X̄ + Σ_j w_j u_j``: shapes add up in vertices, which may come nearer to others of the
-    kind, but folds them where limbs bend. It is chosen where it comes as near as `LIGHT_STEPS` to every shape, by
-    principal modes of the other folds' logarithms at the mean of all, and hardly ever folds.
+    With K = 1 the exponential is ``X̄ + Σ_j w_j u_j``: modes add up in vertices. This may come closer to unseen shapes,
+    but shapes fold where limbs bend. K = 1 is chosen if it has at most the error of `LIGHT_STEPS` on held-out shapes,
+    and if random shapes rarely fold. Modes are principal modes of the other folds' logarithms, at the mean of all
+    shapes.
 
     Args:
-        settings: of the modes; only ``log_steps`` and ``count`` matter.
+        settings: settings of the modes; only ``log_steps`` and ``count`` matter.
         reference: gives connectivity.
-        shapes: (n, V, 3), of which at most `SOME`, spread evenly, are held out.
-        material: of the shell.
-        original_index: (n,) shapes that they are of, from 0 on, mirror images last; by default none is an image.
+        shapes: (n, V, 3). At most `STEP_CHOICE.shapes` of them, spread evenly, are held out.
+        material: material of the shell.
+        original_index: (n,) index of each shape's original, from 0, mirror images last; by default none is an image.
     """
     if settings.log_steps != "auto":
         return settings.log_steps
     original_index = np.arange(len(shapes)) if original_index is None else original_index
     count = int(original_index.max()) + 1
-    if count < FOLDS:  # too few to tell
+    if count < FOLDS:  # too few to choose
         return STEPS
-    used = original_index % -(-count // SOME) == 0
+    used = original_index % -(-count // STEP_CHOICE.shapes) == 0
     try:
-        if _folded(reference, shapes, material) > FOLDED:
+        if _folded(reference, shapes, material) > STEP_CHOICE.folded:
             return STEPS
         original_index, shapes = np.unique(original_index[used], return_inverse=True)[1], shapes[used]
-        few = max(1, min(FEW if settings.count == "auto" else settings.count, (int(original_index.max()) + 1) // 3))
+        asked = STEP_CHOICE.modes if settings.count == "auto" else settings.count
+        few = max(1, min(asked, (int(original_index.max()) + 1) // 3))
         straight, bent = (
             _missed(reference, shapes, original_index, material, few, steps) for steps in (1, LIGHT_STEPS)
         )
-    except (ModeError, NotPositiveDefiniteError):  # the stages that need mean and modes tell
+    except (ModeError, NotPositiveDefiniteError):  # the stages that need mean and modes report it
         return STEPS
     return 1 if straight <= bent else STEPS
 
 
 def _folded(reference: TriangleMesh, shapes: FloatArray, material: Material) -> float:
-    """Share of random shapes of one step that fold where none of the shapes (n, V, 3) has as much as a crease."""
+    """Return the share of random shapes of one step that fold where none of the shapes (n, V, 3) has a crease."""
     space, mean, fields = _space(reference, shapes, material, 1)
-    modes = pga(space, mean, fields, min(DRAWN_MODES, len(shapes) - 1), "vertices").vertices
+    modes = pga(space, mean, fields, min(STEP_CHOICE.random_modes, len(shapes) - 1), "vertices").vertices
     lower, upper = box_of(coefficients(space, mean, fields, modes, "vertices")[0])
-    codes = np.random.default_rng(0).uniform(lower, upper, (DRAWN, len(modes)))
+    codes = np.random.default_rng(0).uniform(lower, upper, (STEP_CHOICE.random, len(modes)))
     drawn = mean + np.tensordot(codes, modes, axes=1)
     angles, others = (dihedral_angles(each, reference.connectivity) for each in (drawn, shapes))
     return float(folded_anew(angles, others).mean())
@@ -216,7 +238,11 @@ def _folded(reference: TriangleMesh, shapes: FloatArray, material: Material) -> 
 def _space(
     reference: TriangleMesh, shapes: FloatArray, material: Material, steps: int
 ) -> tuple[ShellSpace, FloatArray, FloatArray]:
-    """At the mean of shapes (n, V, 3), the mean (V, 3), and their logarithms there (n, V, 3); raises ModeError."""
+    """Return the space at the mean of shapes (n, V, 3), the mean (V, 3) and the logarithms (n, V, 3).
+
+    Raises:
+        ModeError: the shapes have no mean.
+    """
     found = centred_mean(reference, shapes, material, steps)
     if found.status is not Status.CONVERGED:
         raise ModeError(f"{len(shapes)} shapes that are not held out have no mean: {found.reason}")
@@ -227,7 +253,7 @@ def _space(
 def _missed(
     reference: TriangleMesh, shapes: FloatArray, original_index: IntArray, material: Material, modes: int, steps: int
 ) -> float:
-    """Mean distance of vertices of shapes (n, V, 3), the first of them originals, from what modes of others make."""
+    """Return the mean distance between the originals among shapes (n, V, 3) and the modes of the other folds."""
     space, mean, fields = _space(reference, shapes, material, steps)
     count = int(original_index.max()) + 1
     away = []
@@ -249,21 +275,20 @@ def held_out(
     steps: int | None = None,
     original: IntArray | None = None,
 ) -> HeldOut:
-    """Mean, logarithms and modes without some shapes, and what they make of these.
+    """Find mean, logarithms and modes without some shapes, and approximate these shapes.
 
     Args:
         reference: gives connectivity.
-        shapes: (n, V, 3), all of them.
-        index: (k,) those that are held out, and their mirror images with them.
-        counts: numbers of modes, as far as there are shapes; by default what the settings give, and half of it.
-        settings: of the modes.
-        material: of the shell.
-        steps: K of logarithms and exponentials; by default what the settings give for the others, at most
-            `LIGHT_STEPS`.
-        original: (n,) which shape each is the mirror image of, itself where it is none; by default all are none.
+        shapes: (n, V, 3) all shapes.
+        index: (k,) indices of the shapes that are held out, together with their mirror images.
+        counts: numbers of modes, limited by the number of shapes; by default the configured number, and half of it.
+        settings: settings of the modes.
+        material: material of the shell.
+        steps: K of logarithms and exponentials; by default as configured for the other shapes, at most `LIGHT_STEPS`.
+        original: (n,) index of each shape's original, its own index unless it is a mirror image; by default none is.
 
     Raises:
-        ModeError: the shapes that are left have no mean, or no modes.
+        ModeError: the other shapes have no mean, or no modes.
     """
     original = np.arange(len(shapes)) if original is None else original
     known = np.flatnonzero(~np.isin(original, index))
@@ -279,7 +304,7 @@ def held_out(
         count = mode_count(settings, space, mean, fields, original_index)
         counts = [-(-count // 2), count]
     counts = [min(count, len(kept) - 1) for count in counts]
-    # The search for codes starts from projected logarithms: on the straight line to a far shape faces collapse.
+    # The search for codes starts from projected logarithms, because faces collapse on the straight line to a far shape.
     towards = logarithms(space, mean, unseen, steps).fields
     reached, by_modes, by_components, by_mirrored, stuck = [], [], [], [], []
     for count in counts:

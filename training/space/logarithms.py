@@ -20,11 +20,11 @@ from shapespace.training.runs.progress import progress
 from shapespace.training.runs.workers import run
 from shapespace.training.space.modes import ModeError
 
-#: Of the geodesics to the shapes, as a length; far below what modes leave unexplained.
+#: Tolerance of the geodesics to the shapes, as a length. It is far below the remainder after all modes.
 LOGARITHM_TOLERANCE = 1e-6
-#: Logarithms that a process computes at a time.
+#: Number of logarithms that a process computes at a time.
 CHUNK = 4
-#: Neighbours whose geodesics are tried as initial values.
+#: Number of neighbours whose geodesics are tried as initial values.
 NEIGHBOURS = 4
 
 
@@ -34,10 +34,10 @@ class Logarithms:
 
     Attributes:
         fields: (n, V, 3) vertex fields, without rigid motion.
-        status: of the last geodesic tried; where it is not CONVERGED, the field is the linearised logarithm.
-        steps: K of the geodesic found, 0 where there is none.
-        via: for each shape the neighbour whose geodesic was the initial value of its own, −1 where none was needed.
-        reasons: for each shape why the straight way to it was not found, or an empty string.
+        status: (n,) status of the last geodesic tried. If it is not CONVERGED, the field is the linearised logarithm.
+        steps: (n,) K of the geodesic found, 0 where none was found.
+        via: (n,) neighbour whose geodesic was the initial value, −1 where none was needed.
+        reasons: (n,) why the geodesic was not found from the straight line, or an empty string.
     """
 
     fields: FloatArray
@@ -48,21 +48,26 @@ class Logarithms:
 
     @property
     def fallbacks(self) -> list[int]:
-        """The shapes whose logarithm had to be linearised."""
+        """Indices of shapes whose logarithm had to be linearised."""
         return [i for i, steps in enumerate(self.steps) if steps == 0]
 
 
 def logarithms(space: ShellSpace, mean: FloatArray, shapes: ArrayLike, steps: int, workers: int = -1) -> Logarithms:
-    """The discrete logarithms of shapes at their mean.
+    """Compute the discrete logarithms of shapes at their mean.
 
-    The geodesic to a near shape is found from the straight line of lengths and angles. To a far one that line may lead
-    through what is no surface; then it is found from the geodesic to a neighbour, and so on outwards: a tree, as a
-    minimum spanning tree is grown. Where none of the nearest neighbours helps, from bisection, and last with twice as
-    many steps, where a face would else collapse within one. Failing all, the difference of lengths and angles, with
-    the angles unwrapped from the mean's, is projected to the tangent space: the logarithm to first order.
+    Initial values of the geodesics are tried in this order:
 
-    A logarithm is the inverse of the exponential with as many steps, and converges only to first order in 1/K: on real
-    collections those of 4 and of 8 steps differ by 10 to 35 % of their length.
+    1. the straight line of lengths and angles. On the way to a far shape it may lead through lengths and angles that no
+       surface has;
+    2. the geodesic to a neighbour. So the geodesics grow outwards as a minimum spanning tree does;
+    3. bisection;
+    4. the geodesic to a neighbour, with twice as many steps, because a face may collapse within one long step.
+
+    If all fail, the difference of lengths and angles is projected to the tangent space, with the angles unwrapped from
+    the mean's. This is the logarithm to first order.
+
+    A logarithm is the inverse of the exponential with the same number of steps K. It converges only to first order in
+    1/K: on real collections, logarithms of 4 and of 8 steps differ by 10 to 35 % of their length.
 
     Args:
         space: the shape space; each process gets a copy.
@@ -72,8 +77,8 @@ def logarithms(space: ShellSpace, mean: FloatArray, shapes: ArrayLike, steps: in
         workers: processes, by default one a core; 1 computes here. The result does not depend on it.
 
     Raises:
-        ModeError: a shape with a coordinate that isn't finite.
-        WorkersError: processes that are killed again and again.
+        ModeError: a coordinate of a shape is not finite.
+        WorkersError: processes are killed repeatedly.
     """
     x = np.stack([space.shape(shape) for shape in np.asarray(shapes, dtype=np.float64)])
     bad = np.flatnonzero(~np.isfinite(x).all(axis=(1, 2)))
@@ -88,12 +93,12 @@ def logarithms(space: ShellSpace, mean: FloatArray, shapes: ArrayLike, steps: in
     return search.result()
 
 
-#: A shape found by a geodesic: its shapes, or none, how it ended, and why not.
+#: The shapes of a geodesic, or None; its status; the reason why it was not found.
 _Found = tuple[FloatArray | None, Status, str]
 
 
 class _Search:
-    """Geodesics from the mean to shapes, the easy ones first."""
+    """Search for geodesics from the mean to shapes, the near ones first."""
 
     def __init__(self, space: ShellSpace, mean: FloatArray, shapes: FloatArray, steps: int, workers: int) -> None:
         self._space, self._mean, self._shapes, self._steps, self._workers = space, mean, shapes, steps, workers
@@ -111,7 +116,7 @@ class _Search:
         return [i for i in range(len(self._shapes)) if i not in self._paths]
 
     def _do(self, function: Callable[..., _Found], items: list[tuple[int, tuple]], chunk: int = 1) -> bool:
-        """Try a function on some shapes, each with what else it needs; whether one more is found."""
+        """Try a function on some shapes, each with further arguments. Return whether one more geodesic is found."""
         parts = [items[k : k + chunk] for k in range(0, len(items), chunk)]
         work = [[(self._shapes[i], *more) for i, more in part] for part in parts]
         news = False
@@ -124,11 +129,11 @@ class _Search:
         return news
 
     def straight(self) -> None:
-        """The straight way to each."""
+        """Search from the straight line to each shape."""
         self._do(_straight, [(i, (self._steps,)) for i in self._left], CHUNK)
 
     def by_neighbours(self) -> None:
-        """From each shape's nearest neighbour that is found and hasn't been tried, as long as there are some."""
+        """Search from the nearest neighbour that has a geodesic and was not tried, until no such neighbour is left."""
         tried: dict[int, set[int]] = {i: set() for i in self._left}
         while items := [(i, j) for i in self._left if len(tried[i]) < NEIGHBOURS for j in self._nearest(i, tried[i])]:
             for i, j in items:
@@ -136,15 +141,15 @@ class _Search:
             self._from_neighbours(_towards, items)
 
     def by_bisection(self) -> bool:
-        """From the middle of mean and shape; whether that finds one."""
+        """Search from the middle of mean and shape. Return whether one more geodesic is found."""
         return self._do(_bisected, [(i, (self._steps,)) for i in self._left])
 
     def in_more_steps(self) -> None:
-        """From the nearest neighbour, in twice as many steps."""
+        """Search from the nearest neighbour, in twice as many steps."""
         self._from_neighbours(_halved, [(i, j) for i in self._left for j in self._nearest(i)])
 
     def _nearest(self, i: int, without: Collection[int] = ()) -> list[int]:
-        """The nearest shape that is found, if there is one."""
+        """Return the nearest shape that has a geodesic, if there is one."""
         others = [j for j in self._paths if j not in without]
         return [min(others, key=lambda j: (float(self._distances[i, j]), j))] if others else []
 
@@ -155,7 +160,7 @@ class _Search:
                 self._via[i] = j
 
     def result(self) -> Logarithms:
-        """What is found, and the rest linearised."""
+        """Return the logarithms of all shapes, linearised where there is no geodesic."""
         fields, steps = [], []
         z = self._space.nric(self._mean)
         for i, shape in enumerate(self._shapes):
@@ -194,7 +199,7 @@ def _halved(space: ShellSpace, mean: FloatArray, shape: FloatArray, path: FloatA
 
 
 def _from(near: DiscretePath, space: ShellSpace, mean: FloatArray, shape: FloatArray) -> _Found:
-    """The geodesic that begins as that to a neighbour."""
+    """Search for the geodesic that begins like the geodesic to a neighbour."""
     try:
         first = towards(space, near, shape)
     except NotPositiveDefiniteError as error:

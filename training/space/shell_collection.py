@@ -23,7 +23,8 @@ from shapespace.training.runs.sampling import SampledShapes
 class ShellCollection:
     """The shapes ``exp_z̄(Σ_j w_j u_j)`` of codes w in a hypercube (paper, section 3); see sampling.Collection.
 
-    Pickled without the symbolic analysis of its space: whoever unpickles it repeats that once, at the first shape.
+    It is pickled without the symbolic analysis of its space. A process that unpickles it repeats the analysis once, at
+    the first shape.
 
     Attributes:
         reference: z̄, the mean, of about unit area.
@@ -33,7 +34,7 @@ class ShellCollection:
         steps: K of the exponential.
         material: μ, λ, η.
         scale: length of one unit of the reference in the user's units.
-        codes: (n, m) of the shapes that it was made from.
+        codes: (n, m) codes of the training shapes.
         with_derivatives: whether shapes come with their derivatives.
     """
 
@@ -72,22 +73,22 @@ class ShellCollection:
 
     @property
     def places(self) -> None:
-        """Modes move nothing over the surface."""
+        """None, because modes move no feature over the surface."""
         return None
 
     @property
     def symmetries(self) -> list[IntArray]:
-        """None is known."""
+        """An empty list: no symmetry is known."""
         return []
 
     @property
     def finer(self) -> ShellCollection | None:
-        """The same by exponentials of twice as many steps; None for one step, which approximates no geodesic."""
+        """The same collection with twice as many steps; None for one step, which approximates no geodesic."""
         return replace(self, steps=2 * self.steps) if self.steps > 1 else None
 
     @property
     def differentiated(self) -> ShellCollection:
-        """The same, whose shapes come with their derivatives."""
+        """The same collection, with derivatives of its shapes."""
         return replace(self, with_derivatives=True)
 
     def shapes(self, latents: FloatArray) -> SampledShapes:
@@ -110,6 +111,6 @@ class ShellCollection:
         return SampledShapes(vertices, z, reasons, derivatives)
 
     def _derivative(self, path: DiscretePath) -> FloatArray:
-        """(m, 2E) of the end of a path by the code; raises RuntimeError, see `ExponentialDerivative`."""
+        """Return the derivatives (m, 2E) of a path's end by the code. Raises RuntimeError."""
         end = path.space.point(path.vertices[-1])
         return np.stack([end.push_forward(x) for x in ExponentialDerivative(path).push_forward(self.modes)])

@@ -22,10 +22,10 @@ The right sparsity depends on the shapes. The modes cannot reproduce on held-out
 certain sparsity costs nothing. By default λ is the largest value that raises the square error of held-out shapes by at
 most 3 %. Principal modes in inner folds estimate this error.
 
-The tables show the effect of the sparsity on a hand (57 poses, m = 12), a captured dancer (60, m = 20) and a posed body
-(44, m = 20), at η = 1e-4. Each entry is the share explained / the mean share of edges that carry 95 % of a mode. In
-both norms with vertices, modes were found on four fifths of the shapes, plain modes were rotated first, and the share
-explained is in the norm of vertices.
+The tables show the effect of the sparsity at η = 1e-4. The collections are a hand (57 poses, m = 12), a captured dancer
+(60, m = 20) and a posed body (44, m = 20). Each entry is the share explained / the mean share of edges
+that carry 95 % of a mode. In both norms with vertices, modes were found on four fifths of the shapes, plain modes were
+rotated first, and the share explained is in the norm of vertices.
 
 | sparsity, mixed | hand | dancer | body |
 |---|---|---|---|

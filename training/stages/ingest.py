@@ -159,7 +159,7 @@ def _prolong(
     """Write ``prolongation.npz``; return its errors between fine shapes (n, Vf, 3) and prolonged ones (n, V, 3).
 
     The weights are fitted to all shapes if weights fitted without the shapes ``held`` come closer to these. The errors
-    are those of the shapes ``held``. The reference is not among them, because the prolongation is exact there.
+    are measured on the shapes ``held``. The reference is not among them, because the prolongation is exact there.
     """
     own = np.unique(meshes.shell_faces)
     attached = []

@@ -50,8 +50,8 @@ def train_networks(run: Run) -> None:
 
 
 def _settings(config: Config) -> list[BaseModel | dict[str, Any]]:
-    """Return what the key depends on, as in version 0.2, which also trained the variants."""
-    row = {"title": "", "base": None, "factors": {}, "combiner": {}}
+    """Return the settings in the key. Version 0.2 also trained the variants, and its runs have to keep their keys."""
+    row: dict[str, Any] = {"title": "", "base": None, "factors": {}, "combiner": {}}
     variants = config.model_dump(mode="json")["variants"].values()
     return [config.networks, config.monolithic, config.monolithic_paper, *(row | variant for variant in variants)]
 

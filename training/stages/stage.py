@@ -154,7 +154,7 @@ class Stage:
     meshes_only: bool = False
 
     def keys(self, config: Config, before: str) -> dict[str, str]:
-        """Return digests of what the stage depends on: ``key`` of everything, ``basis`` of all but the amounts.
+        """Return digests of the input of the stage: ``key`` of all input, ``basis`` of all input but the amounts.
 
         Args:
             config: the configuration of the run.

@@ -10,7 +10,6 @@ import pytest
 from shapespace.training.collection.generators import MESHES, PRODUCTS
 from shapespace.training.runs.config import Config, ConfigError, load, parse
 from shapespace.training.runs.settings import CollectionSettings
-from shapespace.training.stages.run import STAGES, stage_keys
 from tests.training.conftest import TINY
 
 EXAMPLES = sorted((Path(__file__).parents[3] / "examples").rglob("*.toml"))
@@ -77,24 +76,6 @@ def test_every_generator_that_can_be_named_is_there() -> None:
     named = set(get_args(get_args(CollectionSettings.model_fields["generator"].annotation)[0]))
     assert named == PRODUCTS.keys() | MESHES.keys()
     assert not PRODUCTS.keys() & MESHES.keys()
-
-
-@pytest.mark.parametrize(
-    ("section", "setting", "again"),
-    [
-        ("export", "eta_reconstruction = 0.001", "evaluation"),  # reconstructs vertices as the bundle will
-        ("export", "tolerance = 0.001", "export"),
-        ("samples", "seed = 5", "samples"),
-    ],
-)
-def test_a_setting_is_read_by_its_stage_and_none_before(section: str, setting: str, again: str) -> None:
-    header = f"[{section}]"
-    assert TINY.count(header) == 1
-    one, other = (
-        stage_keys(parse(text, "here"), "data") for text in (TINY, TINY.replace(header, f"{header}\n{setting}"))
-    )
-    stages = list(STAGES)
-    assert [name for name in stages if one[name] != other[name]] == stages[stages.index(again) :]
 
 
 def test_what_is_kept_of_a_configuration_says_the_same() -> None:

@@ -1,4 +1,4 @@
-"""docs/reference/configuration.md is up to date with the settings in training/runs/config.py."""
+"""docs/reference/configuration.md is up to date with the settings in training/runs."""
 
 from typing import Literal
 

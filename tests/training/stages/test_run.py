@@ -1,4 +1,4 @@
-"""Runs of version 0.2 continue, and no stage hides from the list of stages."""
+"""Runs of version 0.2 continue; a setting belongs to its stage; the list of stages is complete."""
 
 from __future__ import annotations
 
@@ -8,10 +8,11 @@ from pathlib import Path
 import pytest
 
 from shapespace.training import stages
-from shapespace.training.runs.config import load
+from shapespace.training.runs.config import load, parse
 from shapespace.training.runs.directory import RunDirectory
-from shapespace.training.stages.run import STAGES, execute
+from shapespace.training.stages.run import STAGES, execute, stage_keys
 from shapespace.training.stages.stage import Run
+from tests.training.conftest import TINY
 
 #: Stamps that version 0.2 gave to the stages of these runs.
 STAMPS = json.loads(Path(__file__).with_name("stamps_of_0_2.json").read_text())
@@ -29,6 +30,24 @@ def test_no_stage_of_a_run_of_version_0_2_is_done_again(name: str, tmp_path: Pat
     assert "python -m benchmarks.studies" in said[0]
     assert said[1:] == [f"{stage}: done before (1 s)" for stage in STAGES]
     assert [directory.stamp(stage).read() for stage in STAGES] == list(STAMPS[name].values())
+
+
+@pytest.mark.parametrize(
+    ("section", "setting", "again"),
+    [
+        ("export", "eta_reconstruction = 0.001", "evaluation"),  # reconstructs vertices as the bundle will
+        ("export", "tolerance = 0.001", "export"),
+        ("samples", "seed = 5", "samples"),
+    ],
+)
+def test_a_setting_is_read_by_its_stage_and_none_before(section: str, setting: str, again: str) -> None:
+    header = f"[{section}]"
+    assert TINY.count(header) == 1
+    one, other = (
+        stage_keys(parse(text, "here"), "data") for text in (TINY, TINY.replace(header, f"{header}\n{setting}"))
+    )
+    names = list(STAGES)
+    assert [name for name in names if one[name] != other[name]] == names[names.index(again) :]
 
 
 def test_each_stage_has_one_file() -> None:
