@@ -2,29 +2,22 @@
 # `docker buildx imagetools inspect python:3.11-slim-bookworm`. Named once, so that `--from` can put another base in its
 # place where no registry is reachable.
 FROM python:3.11-slim-bookworm@sha256:0a310eeecf4e1f5a0743f9a6520c90c88d089c903ca5fd283f501e3a805f5f89 AS base
-# Machine code that Numba made while the image was built is found again: on any processor, and where nothing can be written.
-ENV NUMBA_CPU_NAME=generic \
-    NUMBA_CACHE_LOCATOR_CLASSES=shapespace.coordinates.compiled.BesideTheModule
 
 FROM base AS build
-# `--build-arg COMPILED=yes` adds Numba, whose loops take a quarter off the time of a shape, and 100 MB of memory.
-ARG COMPILED=
 # Two environments: what builds stays here, and what serves has neither pip nor setuptools.
 RUN python -m venv /opt/build && python -m venv --without-pip /opt/shapespace
 ENV PATH=/opt/build/bin:$PATH PIP_NO_CACHE_DIR=1 PIP_DISABLE_PIP_VERSION_CHECK=1
 WORKDIR /src
 # Dependencies first: they are large and change seldom. The secret is an optional pip.conf for private indexes.
-COPY requirements/build.txt requirements/serve.txt requirements/compiled.txt requirements/
+COPY requirements/build.txt requirements/serve.txt requirements/
 RUN --mount=type=secret,id=pip,target=/etc/pip.conf \
     pip install --require-hashes --requirement requirements/build.txt && \
-    pip --python /opt/shapespace install --require-hashes --requirement requirements/serve.txt \
-        ${COMPILED:+--requirement requirements/compiled.txt}
+    pip --python /opt/shapespace install --require-hashes --requirement requirements/serve.txt
 COPY pyproject.toml setup.py README.md LICENSE ./
 COPY shapespace shapespace
 COPY service service
 RUN pip wheel --no-deps --no-index --no-build-isolation --wheel-dir wheels . && \
-    pip --python /opt/shapespace install --no-deps --no-index wheels/*.whl && \
-    if [ -n "$COMPILED" ]; then /opt/shapespace/bin/python -P -c 'import shapespace.coordinates.compiled'; fi
+    pip --python /opt/shapespace install --no-deps --no-index wheels/*.whl
 
 FROM base
 COPY --from=build /opt/shapespace /opt/shapespace

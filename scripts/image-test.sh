@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # Build the container image, run it as it should be run (read-only, no privileges, 2 GB) and check what it promises:
 # what it holds, a shape, an end, and that it goes on through each of tests/attacks.py for a minute (SECONDS_EACH=60),
-# with a key and without. COMPILED=yes tries the image with Numba.
+# with a key and without.
 #
 # Uses Docker where an engine answers. Elsewhere, as root on Debian: buildah, on a base image that mmdebstrap makes
 # to stand in for python:3.11-slim-bookworm, and podman. Pip inside the build gets this machine's pip configuration.
@@ -27,7 +27,7 @@ build_with_docker() {
   engine=(docker)
   # Paths of this machine don't exist inside a Docker build.
   { echo '[global]'; pip_settings | grep -vE '(= |file://)/' || true; } >"$scratch/pip.conf"
-  DOCKER_BUILDKIT=1 docker build --secret "id=pip,src=$scratch/pip.conf" --build-arg "COMPILED=${COMPILED:-}" --tag "$image" .
+  DOCKER_BUILDKIT=1 docker build --secret "id=pip,src=$scratch/pip.conf" --tag "$image" .
   run_options=(--publish 127.0.0.1::8000)
 }
 
@@ -57,7 +57,7 @@ build_with_buildah() {
     [[ $word == /* && -e $word ]] && volumes+=(--volume "$word:$word:ro")
   done < <(pip_settings | cut -d = -f 2- | tr -s ' ' '\n' | sort -u)
   buildah build --isolation chroot --format docker --layers --from "$base" \
-    --secret "id=pip,src=$scratch/pip.conf" --build-arg "COMPILED=${COMPILED:-}" "${volumes[@]}" --tag "$image" .
+    --secret "id=pip,src=$scratch/pip.conf" "${volumes[@]}" --tag "$image" .
   local port
   port=$(python3 -c 'import socket; s = socket.socket(); s.bind(("127.0.0.1", 0)); print(s.getsockname()[1])')
   # Podman's default limits may be above what this machine can grant; its health timers would need systemd.
@@ -118,11 +118,6 @@ done
 ! inside python -c 'import torch' 2>/dev/null || fail "the image holds torch"
 ! inside python -c 'import pip' 2>/dev/null || fail "the server's environment holds pip"
 echo "ok: neither build tools nor torch"
-if [ -n "${COMPILED:-}" ]; then
-  inside python -c 'from shapespace.coordinates.compiled import misfit; assert misfit.stats.cache_hits' ||
-    fail "the compiled loops are not found as the image was built with them"
-  echo "ok: compiled loops are found, not compiled again"
-fi
 
 python3 - "http://$address" "$scratch/torus.glb" <<'PYTHON' || fail "no mesh came back"
 import json, struct, sys, urllib.request

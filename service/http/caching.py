@@ -11,16 +11,12 @@ from cachetools import LRUCache
 from fastapi import Request, Response
 
 from shapespace import __version__
-from shapespace.coordinates import compiled
 
 
 def entity_tag(*parts: str | bytes) -> str:
-    """A strong entity tag of all that the bytes of an answer depend on.
-
-    The product's version is added, and which code computes: compiled loops round otherwise than NumPy does.
-    """
+    """A strong entity tag of the product's version and of all else that the bytes of an answer depend on."""
     digest = hashlib.sha256()
-    for part in (__version__, "compiled" if compiled.AVAILABLE else "numpy", *parts):
+    for part in (__version__, *parts):
         data = part.encode() if isinstance(part, str) else part
         digest.update(len(data).to_bytes(8, "big") + data)
     return f'"{digest.hexdigest()[:32]}"'

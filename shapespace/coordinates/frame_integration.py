@@ -22,7 +22,7 @@ from scipy.sparse.csgraph import connected_components, dijkstra
 from scipy.spatial.transform import Rotation
 
 from shapespace.arrays import FloatArray, IntArray
-from shapespace.coordinates import compiled, quaternions
+from shapespace.coordinates import quaternions
 from shapespace.coordinates.nric import WeightedNorm
 from shapespace.mesh.triangle_mesh import TriangleMesh, face_normals
 from shapespace.solve.cholesky import Backend, SymmetricPattern, analyse
@@ -188,37 +188,6 @@ class FrameIntegration:
             turns[k + 1] = self._laplacian.solve(column) / 2
         turns /= np.sqrt((turns * turns).sum(axis=0))
         return quaternions.product(turns, frames)
-
-
-class CompiledFrameIntegration(FrameIntegration):
-    """The same in compiled loops."""
-
-    def __init__(self, reference: TriangleMesh, backend: Backend = "auto") -> None:
-        super().__init__(reference, backend)
-        c = self._connectivity
-        self._order: IntArray = np.argsort(self._place)
-        left, right = c.edge_faces[c.hinge_edges].T
-        sides = [left, self._left_sides // self._count, right, self._right_sides // self._count]
-        self._sides = np.ascontiguousarray(np.stack(sides, axis=1))
-        self._from = np.where(self._direction > 0, left[self._tree], right[self._tree])
-        self._roots_first = np.ascontiguousarray(self._root_frames.T)
-        self._hinge_weights = WeightedNorm.of(reference, 1.0).squared[c.edge_count + c.hinge_edges][self._others]
-        self._side_weights = self._divergence.max(axis=0).toarray().reshape(3, -1)
-
-    @np.errstate(divide="ignore", over="ignore", invalid="ignore")
-    def __call__(self, z: FloatArray) -> FloatArray:
-        """See FrameIntegration."""
-        c, z = self._connectivity, np.ascontiguousarray(z, np.float64)
-        triangles = compiled.planes(z, c.face_edges)
-        frames, across = compiled.frames(
-            *(triangles, z.take(c.edge_count + c.hinge_edges), self._sides, self._order, self._from),
-            *(self._tree, self._direction, self._roots_first),
-        )
-        if len(self._others):
-            right = compiled.misfits(frames, across, self._others, self._sides, self._hinge_weights)
-            frames = compiled.turned(frames, np.stack([self._laplacian.solve(row) for row in right]))
-        right = compiled.divergence(frames, triangles, c.faces, self._side_weights, self._anchored)
-        return np.stack([self._poisson.solve(row) for row in right], axis=1)
 
 
 def _spanning_forest(mesh: TriangleMesh) -> IntArray:

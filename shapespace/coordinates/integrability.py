@@ -19,7 +19,7 @@ import numpy as np
 from scipy import sparse
 
 from shapespace.arrays import FloatArray, IntArray
-from shapespace.coordinates import compiled, quaternions
+from shapespace.coordinates import quaternions
 from shapespace.mesh.triangle_mesh import Connectivity
 
 
@@ -41,8 +41,8 @@ class Integrability:
     (3V − 6)-dimensional tangent space of immersed meshes; on a closed surface six rows are redundant.
     """
 
-    def __init__(self, connectivity: Connectivity, kernels: compiled.Kernels = "auto") -> None:
-        self.connectivity, self._compiled = connectivity, compiled.are_used(kernels)
+    def __init__(self, connectivity: Connectivity) -> None:
+        self.connectivity = connectivity
         faces, f_count = connectivity.faces, len(connectivity.faces)
         # Corner c = 3 f + k; walking around its vertex, one leaves face f over the side opposite to corner k + 1.
         k = np.tile(np.arange(3), f_count)
@@ -76,11 +76,6 @@ class Integrability:
 
     def at_vertices(self, z: FloatArray) -> FloatArray:
         """Q(z) at the interior vertices, (n, 3): as long as the sine of half the angle left after a turn around."""
-        if self._compiled:
-            found: FloatArray = compiled.closing(
-                np.ascontiguousarray(z, np.float64), self.connectivity.face_edges, self._fans, self._exit
-            )
-            return found
         cos_gamma, theta = self._cosines(z), z[self.connectivity.edge_count :]
         cos_z, sin_z = np.sqrt((1 + cos_gamma) / 2), np.sqrt((1 - cos_gamma) / 2)
         cos_x, sin_x = (f(theta / 2).take(self._exit) for f in (np.cos, np.sin))

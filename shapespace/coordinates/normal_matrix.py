@@ -75,21 +75,8 @@ class NormalMatrix:
             self._faces(gradients.lengths, form.faces, on_lengths)
             self._angles(gradients.angles, form.angles, on_angles)
             entries = self.pattern.scatter(contributions)
-        return self.regularised(entries)
-
-    def regularised(self, entries: FloatArray) -> FloatArray:
-        """Entries of ``JᵀHJ``, with εI added in place."""
         entries[self.pattern.diagonal] += self.REGULARISATION * entries[self.pattern.diagonal].mean()
         return entries
-
-    @property
-    def slots_of_norms(self) -> tuple[IntArray, IntArray]:
-        """The entry of each product of derivatives of lengths (21, E) and of angles (78, H), for a norm.
-
-        Of a length tail with tail and head with head, of both the upper triangle, then minus tail with head.
-        """
-        lengths, angles = np.split(self._slots_of_edges, [_upper(EDGE) * self._ends.shape[1]])
-        return lengths.reshape(_upper(EDGE), -1), angles.reshape(_upper(HINGE), -1)
 
     def second_derivative(self, second: NRICSecondDerivatives, covector: FloatArray) -> FloatArray:
         """Upper-triangle entries of ``Σ_i p_i D²z_i(X)``: how ``Jᵀp`` changes with X for fixed p (2E,)."""

@@ -12,9 +12,8 @@ import numpy as np
 from scipy import sparse
 
 from shapespace.arrays import FloatArray
-from shapespace.coordinates import compiled
-from shapespace.coordinates.frame_integration import CompiledFrameIntegration, FrameIntegration
-from shapespace.coordinates.least_squares import CompiledLeastSquares, LeastSquares, LeastSquaresPoint
+from shapespace.coordinates.frame_integration import FrameIntegration
+from shapespace.coordinates.least_squares import LeastSquares, LeastSquaresPoint
 from shapespace.coordinates.normal_matrix import NormalMatrix
 from shapespace.coordinates.nric import NRICJacobian, WeightedNorm
 from shapespace.mesh.rigid_motion import rigid_motions
@@ -85,25 +84,16 @@ class Reconstructor:
         reference: gives the weights, and the default start.
         eta: weight of the angles, see DEFAULT_ETA.
         backend: Cholesky backend.
-        kernels: NumPy or compiled loops.
     """
 
-    def __init__(
-        self,
-        reference: TriangleMesh,
-        eta: float = DEFAULT_ETA,
-        backend: Backend = "auto",
-        kernels: compiled.Kernels = "auto",
-    ) -> None:
+    def __init__(self, reference: TriangleMesh, eta: float = DEFAULT_ETA, backend: Backend = "auto") -> None:
         self.reference = reference
         self._diagonal = reference.diagonal
         self.norm = WeightedNorm.of(reference, eta)
         self.jacobian = NRICJacobian(reference.connectivity)
         self.normal_matrix = NormalMatrix(reference.connectivity)
         self._backend: Backend = backend
-        self._compiled = compiled.are_used(kernels)
-        squares = CompiledLeastSquares if self._compiled else LeastSquares
-        self._squares = squares(reference.connectivity, self.norm, self.normal_matrix)
+        self._squares = LeastSquares(reference.connectivity, self.norm, self.normal_matrix)
         self._single = analyse(self.normal_matrix.pattern, backend, precision=np.float32)
 
     def another(self) -> Reconstructor:
@@ -122,8 +112,7 @@ class Reconstructor:
     @cached_property
     def integrate(self) -> FrameIntegration:
         """The shape of integrable z, without iterating."""
-        integration = CompiledFrameIntegration if self._compiled else FrameIntegration
-        return integration(self.reference, self._backend)
+        return FrameIntegration(self.reference, self._backend)
 
     def guess(self, target: FloatArray, *others: Callable[[], FloatArray]) -> FloatArray:
         """A start (V, 3) near the shape of z* (2E,), which depends on nothing but z*.

@@ -7,14 +7,10 @@ import pytest
 import trimesh
 
 from shapespace.arrays import FloatArray
-from shapespace.coordinates import compiled
 from shapespace.coordinates.nric import unwrap
 from shapespace.mesh.triangle_mesh import TriangleMesh
 from shapespace.shell.energy import Material
 from shapespace.shell.space import ShellSpace
-
-#: Ways to compute the same; the lowest versions are tried without Numba.
-KERNELS = ["numpy", *(["compiled"] if compiled.AVAILABLE else [])]
 
 
 def grid_faces(n: int, m: int, *, around_u: bool, around_v: bool) -> np.ndarray:

@@ -24,8 +24,7 @@ EXTRAS = PROJECT["project"]["optional-dependencies"]
 #: Extras in each locked file. Torch is not locked: its builds, and so their hashes, differ between indexes.
 LOCKED = {
     "serve": {"serve"},
-    "dev": EXTRAS.keys() - {"compiled"},
-    "compiled": {"compiled"},
+    "dev": EXTRAS.keys(),
     "lowest": {"serve", "client", "usd", "dev"},
 }
 UNLOCKED = {"torch"}

@@ -3,45 +3,38 @@
 import numpy as np
 import pytest
 
-from shapespace.coordinates.frame_integration import CompiledFrameIntegration, FrameIntegration
+from shapespace.coordinates.frame_integration import FrameIntegration
 from shapespace.coordinates.nric import nric
 from shapespace.coordinates.reconstruction import Reconstructor
 from shapespace.mesh.rigid_motion import align
 from shapespace.mesh.triangle_mesh import TriangleMesh
 from shapespace.solve.outcome import Status
-from tests.shapespace.conftest import KERNELS, bent, closed, sheet
-
-BY_KERNELS = {"numpy": FrameIntegration, "compiled": CompiledFrameIntegration}
-
-
-@pytest.fixture(params=KERNELS)
-def integration(request):
-    return BY_KERNELS[request.param]
+from tests.shapespace.conftest import bent, closed, sheet
 
 
 @pytest.mark.parametrize("backend", ["banded", "pardiso"])
-def test_integrable_lengths_and_angles_give_their_shape(integration, mesh, pose, backend):
-    found = integration(mesh, backend)(nric(pose, mesh.connectivity))
+def test_integrable_lengths_and_angles_give_their_shape(mesh, pose, backend):
+    found = FrameIntegration(mesh, backend)(nric(pose, mesh.connectivity))
     assert np.abs(align(found, pose) - pose).max() < 1e-6 * mesh.diagonal
 
 
-def test_the_reference_stays_where_it_is(integration, mesh):
-    found = integration(mesh)(nric(mesh.vertices, mesh.connectivity))
+def test_the_reference_stays_where_it_is(mesh):
+    found = FrameIntegration(mesh)(nric(mesh.vertices, mesh.connectivity))
     assert np.abs(found - mesh.vertices).max() < 1e-6 * mesh.diagonal
 
 
-def test_parts_that_hang_together_by_nothing_keep_their_places(integration):
+def test_parts_that_hang_together_by_nothing_keep_their_places():
     ball, strip = closed(), sheet()
     both = TriangleMesh.from_arrays(
         np.concatenate([ball.vertices, strip.vertices + np.array([5, 1, 2])]),
         np.concatenate([ball.faces, strip.faces + len(ball.vertices)]),
     )
-    found = integration(both)(nric(both.vertices, both.connectivity))
+    found = FrameIntegration(both)(nric(both.vertices, both.connectivity))
     assert np.abs(found - both.vertices).max() < 1e-6 * both.diagonal
 
 
-def test_small_errors_of_z_make_small_errors_of_the_shape(integration, mesh, pose, rng):
-    integrate, z = integration(mesh), nric(pose, mesh.connectivity)
+def test_small_errors_of_z_make_small_errors_of_the_shape(mesh, pose, rng):
+    integrate, z = FrameIntegration(mesh), nric(pose, mesh.connectivity)
     noise = rng.standard_normal(len(z)) * np.where(np.arange(len(z)) < len(z) // 2, z, 1)
     errors = [np.abs(align(integrate(z + size * noise), pose) - pose).max() for size in (1e-4, 1e-5)]
     assert 0 < errors[0] < 0.01 * mesh.diagonal
@@ -61,10 +54,10 @@ def test_frames_that_fit_at_every_hinge_come_nearer_than_those_of_a_tree(mesh, p
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, 0.0, -1.0])
-def test_what_is_no_shape_raises_nothing(integration, mesh, value):
+def test_what_is_no_shape_raises_nothing(mesh, value):
     z = nric(mesh.vertices, mesh.connectivity)
     z[: mesh.connectivity.edge_count] = value
-    assert integration(mesh)(z).shape == mesh.vertices.shape
+    assert FrameIntegration(mesh)(z).shape == mesh.vertices.shape
 
 
 def test_a_guess_from_frames_saves_steps(mesh, rng):

@@ -4,7 +4,7 @@ import pytest
 from shapespace.coordinates.integrability import Integrability
 from shapespace.coordinates.nric import NRICJacobian, nric
 from shapespace.mesh.triangle_mesh import TriangleMesh
-from tests.shapespace.conftest import KERNELS, grid_faces
+from tests.shapespace.conftest import grid_faces
 
 
 def cylinder(turn: float, n: int = 10, m: int = 5) -> np.ndarray:
@@ -34,9 +34,9 @@ def surface(request, mesh):
     return TriangleMesh.from_arrays(vertices + 0.1 * rng.standard_normal(vertices.shape), faces.reshape(-1, 3))
 
 
-@pytest.fixture(params=KERNELS)
-def conditions(surface, request):
-    return Integrability(surface.connectivity, request.param)
+@pytest.fixture
+def conditions(surface):
+    return Integrability(surface.connectivity)
 
 
 @pytest.fixture
@@ -103,9 +103,8 @@ def test_a_cylinder_that_does_not_close_fails_along_its_loop_only():
     assert np.abs(q[-6:]).max() > 0.1
 
 
-@pytest.mark.parametrize("kernels", KERNELS)
-def test_q_is_finite_where_a_triangle_is_impossible(mesh, kernels):
+def test_q_is_finite_where_a_triangle_is_impossible(mesh):
     connectivity = mesh.connectivity
     z = nric(mesh.vertices, connectivity)
     z[connectivity.face_edges[5, 1]] *= 10
-    assert np.isfinite(Integrability(connectivity, kernels)(z)).all()
+    assert np.isfinite(Integrability(connectivity)(z)).all()
