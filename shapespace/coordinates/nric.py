@@ -14,25 +14,7 @@ from scipy import sparse
 
 from shapespace.arrays import FloatArray
 from shapespace.mesh.triangle_mesh import Connectivity, TriangleMesh
-
-
-def components(vertices: FloatArray) -> FloatArray:
-    """(3, …, V): whole arrays of x, y and z are several times faster to work on than rows of three."""
-    return np.ascontiguousarray(vertices.T if vertices.ndim == 2 else np.moveaxis(vertices, -1, 0))
-
-
-def dot(a: FloatArray, b: FloatArray) -> FloatArray:
-    """Scalar products of vectors by components (3, …)."""
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-
-
-def cross(a: FloatArray, b: FloatArray) -> FloatArray:
-    """Vector products (3, …) of vectors by components (3, …)."""
-    out = np.empty_like(a)
-    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
-        np.multiply(a[j], b[k], out=out[i])
-        out[i] -= a[k] * b[j]
-    return out
+from shapespace.mesh.vectors import components, cross, dot
 
 
 class HingeGeometry:

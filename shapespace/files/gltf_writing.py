@@ -15,9 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shapespace.arrays import FloatArray, IntArray
-from shapespace.coordinates.nric import components, cross, dot
 from shapespace.files.colouring import Colouring
 from shapespace.mesh.attributes import NONE, MeshAttributes, SurfaceMaterial, linear
+from shapespace.mesh.triangle_mesh import vertex_normals
+from shapespace.mesh.vectors import dots
 
 FLOAT, UNSIGNED_INT = 5126, 5125
 ARRAY_BUFFER, ELEMENT_ARRAY_BUFFER = 34962, 34963
@@ -38,29 +39,15 @@ WHITE = MATERIAL | {
 }
 
 
-def vertex_normals(vertices: FloatArray, faces: IntArray) -> FloatArray:
-    """Unit normals (V, 3) at the vertices of a shape (V, 3): means of the face normals, weighted by area."""
-    return _normals(vertices, faces, faces, len(vertices))
-
-
 def surface_normals(vertices: FloatArray, surface: MeshAttributes) -> FloatArray:
     """Unit normals (N, 3) of a shape (V, 3) by the numbers of `MeshAttributes.normal_corners`."""
-    count = int(max(surface.normal_corners.max() + 1, len(vertices) if surface.shading is None else 0))
-    return _normals(vertices, surface.triangles, surface.normal_faces, count)
+    corners = None if surface.shading is None else surface.normal_faces
+    return _filled(vertex_normals(vertices, surface.triangles, corners))
 
 
-def _normals(vertices: FloatArray, faces: IntArray, normal_faces: IntArray, count: int) -> FloatArray:
-    """Means (count, 3) of the normals of faces (F, 3), of those whose corners have one number there, (F, 3)."""
-    x, corners = components(vertices), np.ascontiguousarray(faces.T)
-    a, b, c = (x.take(corner, axis=1) for corner in corners)
-    by_face, into = cross(b - a, c - a), normal_faces.T.ravel()
-    normals = np.empty((count, 3))
-    for axis, normal in enumerate(by_face):
-        normals[:, axis] = np.bincount(into, np.tile(normal, 3), minlength=count)
-    length = np.sqrt(dot(normals.T, normals.T))
-    # A vertex whose faces cancel out has no normal, but the format insists on a unit vector.
-    normals[length == 0] = 0.0, 0.0, 1.0
-    normals /= np.where(length > 0, length, 1)[:, None]
+def _filled(normals: FloatArray) -> FloatArray:
+    """Replace zero normals: the format insists on unit vectors."""
+    normals[dots(normals, normals) < 0.5] = 0.0, 0.0, 1.0
     return normals
 
 
@@ -195,7 +182,7 @@ class GltfBuilder:
     def normals(self, vertices: FloatArray) -> FloatArray:
         """(V', 3) normals of a shape (V, 3) at the document's vertices."""
         if self._surface is None:
-            return vertex_normals(vertices, self._faces)
+            return _filled(vertex_normals(vertices, self._faces))
         return surface_normals(vertices, self._surface)[self._surface.split.normal]
 
     def _indices(self, faces: IntArray) -> int:

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from shapespace.arrays import FloatArray, IntArray
-from shapespace.mesh.triangle_mesh import face_normals
+from shapespace.mesh.triangle_mesh import vertex_normals
 
 
 class VertexFaces:
@@ -21,7 +21,7 @@ class VertexFaces:
 
     Attributes:
         faces: (F, 3).
-        around: (V, k) faces at each vertex, the first one repeated where there are fewer.
+        around: (V, k) faces at each vertex; the first face is repeated where a vertex has fewer than k.
     """
 
     def __init__(self, faces: IntArray, count: int) -> None:
@@ -36,66 +36,59 @@ class VertexFaces:
 
 @dataclass(frozen=True, eq=False)
 class Closest:
-    """Closest points of a surface to n points.
+    """Closest points on a surface to n points.
 
     Attributes:
-        distances: (n,).
-        faces: (n,) on which they lie.
-        shares: (n, 3) weights of the corners there.
-        places: (n, 3).
+        distances: (n,) distances between the points.
+        faces: (n,) faces that contain the closest points.
+        barycentric: (n, 3) barycentric coordinates in these faces.
+        places: (n, 3) positions.
     """
 
     distances: FloatArray
     faces: IntArray
-    shares: FloatArray
+    barycentric: FloatArray
     places: FloatArray
 
 
 class MeshProximity:
-    """Triangles in which closest points are looked for: among the faces around the closest vertex.
+    """Closest points on a mesh. The search looks at the faces around the closest vertex only.
 
     Args:
         vertices: (V, 3), finite.
-        fans: of its connectivity.
+        vertex_faces: faces around each vertex.
     """
 
-    def __init__(self, vertices: FloatArray, fans: VertexFaces) -> None:
-        self.vertices, self.fans = vertices, fans
+    def __init__(self, vertices: FloatArray, vertex_faces: VertexFaces) -> None:
+        self.vertices, self.vertex_faces = vertices, vertex_faces
 
     @cached_property
     def tree(self) -> cKDTree:
-        """Of the vertices."""
+        """k-d tree of the vertices."""
         return cKDTree(self.vertices)
 
     @cached_property
-    def face_normals(self) -> FloatArray:
-        """(F, 3), zero for a face without area."""
-        return unit(face_normals(self.vertices, self.fans.faces, normalised=False))
-
-    @cached_property
     def vertex_normals(self) -> FloatArray:
-        """(V, 3) sums of the normals around, weighted by area, of unit length."""
-        faces, n = self.fans.faces, face_normals(self.vertices, self.fans.faces, normalised=False)
-        sums: FloatArray = np.stack(
-            [np.bincount(faces.ravel(), np.repeat(n[:, k], 3), minlength=len(self.vertices)) for k in range(3)], axis=1
-        )
-        return unit(sums)
+        """(V, 3) unit normals, see `triangle_mesh.vertex_normals`."""
+        return vertex_normals(self.vertices, self.vertex_faces.faces)
 
     def closest(self, points: FloatArray) -> Closest:
-        """Of points (n, 3)."""
+        """Find the closest points to points (n, 3)."""
         _, nearest = self.tree.query(points)
-        candidates = self.fans.around[nearest]
-        shares = nearest_shares(points[:, None], self.vertices[self.fans.faces[candidates]])
-        places = np.einsum("nkc,nkcx->nkx", shares, self.vertices[self.fans.faces[candidates]])
+        candidates = self.vertex_faces.around[nearest]
+        corners = self.vertices[self.vertex_faces.faces[candidates]]
+        barycentric = closest_barycentric(points[:, None], corners)
+        places = np.einsum("nkc,nkcx->nkx", barycentric, corners)
         squares = ((places - points[:, None]) ** 2).sum(axis=-1)
         best = (np.arange(len(points)), squares.argmin(axis=1))
-        return Closest(np.sqrt(squares[best]), candidates[best], shares[best], places[best])
+        return Closest(np.sqrt(squares[best]), candidates[best], barycentric[best], places[best])
 
 
-def nearest_shares(points: FloatArray, corners: FloatArray) -> FloatArray:
-    """Weights (…, 3) of the corners (…, 3, 3) of triangles, at the point of each that is closest to points (…, 3).
+def closest_barycentric(points: FloatArray, corners: FloatArray) -> FloatArray:
+    """Barycentric coordinates (…, 3) of the closest point to each of points (…, 3) in a triangle (…, 3, 3).
 
-    The foot of the perpendicular where it lies inside, otherwise the best of the feet on the three sides.
+    The closest point is the foot of the perpendicular where the foot lies inside. Otherwise it is the best of the
+    closest points on the three sides. Triangles without area are treated as segments.
     """
     a, b, c = (corners[..., k, :] for k in range(3))
     ab, ac, ap = b - a, c - a, points - a
@@ -107,7 +100,7 @@ def nearest_shares(points: FloatArray, corners: FloatArray) -> FloatArray:
     scale = np.where(has_area, scale, 1)
     v, w = (d11 * d20 - d01 * d21) / scale, (d00 * d21 - d01 * d20) / scale
     inside = has_area & (v >= 0) & (w >= 0) & (v + w <= 1)
-    # Along ab, ac, and bc; squares of distances up to |ap|².
+    # Along ab, ac and bc; squares are relative to |ap|².
     s = np.clip(d20 / np.maximum(d00, tiny), 0, 1)
     t = np.clip(d21 / np.maximum(d11, tiny), 0, 1)
     d_bc = d00 - 2 * d01 + d11
@@ -122,9 +115,3 @@ def nearest_shares(points: FloatArray, corners: FloatArray) -> FloatArray:
         best_v, best_w = np.where(better, v_side, best_v), np.where(better, w_side, best_w)
     v, w = np.where(inside, v, best_v), np.where(inside, w, best_w)
     return np.stack([1 - v - w, v, w], axis=-1)
-
-
-def unit(vectors: FloatArray) -> FloatArray:
-    """(n, 3) of length one; zero where they were."""
-    found: FloatArray = vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), np.finfo(float).tiny)
-    return found

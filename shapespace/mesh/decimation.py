@@ -11,7 +11,8 @@ import numpy as np
 from shapespace.arrays import FloatArray, IntArray
 from shapespace.mesh.quadrics import monomials, quadrics_of
 from shapespace.mesh.triangle_mesh import Connectivity
-from shapespace.mesh.triangle_quality import FOLD_LIMIT, Pairs, Triangles, dots, folded_pairs
+from shapespace.mesh.triangle_quality import FOLD_LIMIT, Pairs, Triangles, folded_pairs
+from shapespace.mesh.vectors import dots
 
 #: Largest turn of a face's normal in one collapse.
 TURN_LIMIT = np.cos(np.deg2rad(60))

@@ -1,4 +1,4 @@
-"""From a coarse shape to the fine one: fixed sparse weights on vertices and normals."""
+"""The map from a coarse shape to the fine one: fixed sparse weights for vertices and normals."""
 
 from __future__ import annotations
 
@@ -14,30 +14,36 @@ from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import cKDTree
 
 from shapespace.arrays import FloatArray, IntArray
+from shapespace.mesh.closest_points import closest_barycentric
 from shapespace.mesh.rigid_motion import align
 from shapespace.mesh.triangle_mesh import Connectivity, MeshError, TriangleMesh, diagonal, face_normals
 
-#: Weight of a vertex normal against that of an edge in the fit of a vertex' local affine map.
+#: Weight of a vertex normal relative to the weight of an edge, in the fit of a vertex' local affine map.
 NORMAL_WEIGHT = 0.1
+#: Start of the names of the arrays in a file.
 PREFIX = "prolongation_"
-#: Ridge of `fitted`, relative to the mean square of its regressors, and how many vectors it holds in memory at a time.
-RIDGE, FITTED = 1e-3, 2**20
-#: How many fine vertices are bound to faces at a time: each is compared with dozens of faces, which takes memory.
-CHUNK = 10_000
+#: Ridge of `Prolongation.fitted`, relative to the mean square of its regressors.
+RIDGE = 1e-3
+#: Vectors that `Prolongation.fitted` holds in memory at a time.
+FITTED_VECTORS = 2**20
+#: Barycentric coordinates below this are rounding errors.
+ROUNDING = 1e-15
+#: Fine vertices that are bound to faces at a time: each is compared with dozens of faces, which takes memory.
+BOUND_VERTICES = 10_000
 
 
 class ProlongationError(ValueError):
-    """Arrays that are no prolongation, with a sentence that says why."""
+    """The arrays are not a valid prolongation; the message says why."""
 
 
 class AttachedPart(NamedTuple):
-    """A part of the fine mesh that no coarse face lies under, and what carries it as a whole.
+    """A part of the fine mesh beside the surface of the coarse mesh, such as an eye or a nail, and its anchors.
 
     Attributes:
-        vertices: (k,) of the fine mesh.
-        anchors: (K,) coarse vertices.
-        weights: (K,) of these, with sum 1.
-        rigid: whether it keeps its form.
+        vertices: (k,) vertices of the fine mesh.
+        anchors: (K,) coarse vertices that move the part as a whole.
+        weights: (K,) weights of the anchors, with sum 1.
+        rigid: whether the part moves rigidly.
     """
 
     vertices: IntArray
@@ -47,7 +53,7 @@ class AttachedPart(NamedTuple):
 
 
 class RigidPart(NamedTuple):
-    """Vertices (k,) of the fine mesh that move rigidly, and where they are at rest, (k, 3)."""
+    """Vertices (k,) of the fine mesh that move rigidly together, and their positions at rest (k, 3)."""
 
     vertices: IntArray
     rest: FloatArray
@@ -55,26 +61,25 @@ class RigidPart(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Prolongation:
-    """Carries the fine surface along with a coarse one, around bends too.
+    """The map from coarse vertices y to fine vertices x; it follows bends of the surface.
 
-    A fine vertex X_i hangs on the corners j of the coarse triangle that it lies over, with barycentric
-    weights b_ij: ``x_i = Σ_j b_ij (y_j + A_j (X_i − Y_j))``. A_j is the affine map that takes the edges at
-    vertex j, and its normal, closest to what they have become. It turns with the surface and stretches with
-    it, and being a least-squares fit is linear in vertices and normals: ``x = B y + C n(y)`` with fixed
-    sparse B and C. Normals are scaled by the root of the area around the vertex, so that x moves with y under
-    rigid motion and scaling. Exact at the shapes it was made of, and at coarse vertices that are fine ones.
+    A fine vertex X_i is bound to the corners j of the closest coarse triangle, with barycentric weights b_ij:
+    ``x_i = Σ_j b_ij (y_j + A_j (X_i − Y_j))``. The affine map A_j is the least-squares fit between the rest position
+    and the new position of the edges and the normal at vertex j. So it rotates and stretches with the surface. A
+    least-squares fit is linear in vertices and normals: ``x = B y + C n(y)`` with fixed sparse B and C. Normals are
+    scaled by the root of the area around the vertex, so that x moves with y under rigid motion and scaling. The map is
+    exact at rest, and at fine vertices that coincide with coarse ones.
 
-    Rotations alone, by polar decomposition of A_j (Sumner, Schmid and Pauly 2007), cost ten times as much and
-    are less accurate, because skin stretches where it bends.
+    Rotations alone, by polar decomposition of A_j (Sumner, Schmid and Pauly 2007), cost ten times as much. They are
+    also less accurate, because skin stretches where it bends.
 
-    Weights of a few dozen numbers for each fine vertex leave much to be learned: `fitted` takes those, on the same
-    vertices and normals, that come closest to shapes whose fine vertices are known.
+    Each fine vertex has a few dozen weights. `fitted` learns them from shapes whose fine vertices are known.
 
-    A part that rides along hangs as a whole on its anchors, so that its map is affine; one that is rigid is then
-    replaced by its rest shape in the place that comes closest.
+    An attached part is bound to its anchors as a whole, so its map is affine. If it is rigid, its rest shape then
+    replaces the mapped one, aligned to it.
 
     Args:
-        faces: (F, 3) of the coarse mesh.
+        faces: (F, 3) faces of the coarse mesh.
         weights: (Vf, 2V) B beside C.
         rigid: parts that move rigidly.
     """
@@ -84,22 +89,22 @@ class Prolongation:
     rigid: tuple[RigidPart, ...] = ()
 
     @classmethod
-    def of(cls, coarse: TriangleMesh, fine: TriangleMesh, riders: Sequence[AttachedPart] = ()) -> Prolongation:
-        """Bind a fine mesh to a coarse one at rest; both lie on the same surface, but for parts that ride along."""
+    def of(cls, coarse: TriangleMesh, fine: TriangleMesh, parts: Sequence[AttachedPart] = ()) -> Prolongation:
+        """Bind a fine mesh to a coarse one at rest. Both lie on the same surface, except for attached parts."""
         whole = np.arange(len(fine.vertices))
-        bound = np.setdiff1d(whole, np.concatenate([rider.vertices for rider in riders])) if riders else whole
-        corners, barycentric = _bind(coarse, submesh(fine, bound) if riders else fine)
+        bound = np.setdiff1d(whole, np.concatenate([part.vertices for part in parts])) if parts else whole
+        corners, barycentric = _bind(coarse, submesh(fine, bound) if parts else fine)
         rows, columns, b = [np.repeat(bound, 3)], [corners.ravel()], [barycentric.ravel()]
-        for rider in riders:
-            rows.append(np.repeat(rider.vertices, len(rider.anchors)))
-            columns.append(np.tile(rider.anchors, len(rider.vertices)))
-            b.append(np.tile(rider.weights, len(rider.vertices)))
+        for part in parts:
+            rows.append(np.repeat(part.vertices, len(part.anchors)))
+            columns.append(np.tile(part.anchors, len(part.vertices)))
+            b.append(np.tile(part.weights, len(part.vertices)))
         weights = bind_points(coarse, fine.vertices, *map(np.concatenate, (rows, columns, b)))
-        rigid = (RigidPart(rider.vertices, fine.vertices[rider.vertices]) for rider in riders if rider.rigid)
+        rigid = (RigidPart(part.vertices, fine.vertices[part.vertices]) for part in parts if part.rigid)
         return cls(coarse.faces, weights, tuple(rigid))
 
     def __call__(self, vertices: FloatArray) -> FloatArray:
-        """Fine vertices (…, Vf, 3) of coarse ones (…, V, 3)."""
+        """Map coarse vertices (…, V, 3) to fine ones (…, Vf, 3)."""
         if vertices.ndim > 2:
             return np.stack([self(shape) for shape in vertices]).reshape(*vertices.shape[:-2], -1, 3)
         fine = self.affine(vertices)
@@ -108,36 +113,38 @@ class Prolongation:
         return fine
 
     def affine(self, vertices: FloatArray) -> FloatArray:
-        """Fine vertices (Vf, 3) of coarse ones (V, 3), rigid parts affinely too."""
-        fine: FloatArray = self.weights @ np.concatenate(
-            [vertices, _scaled_normals(vertices, self.faces, self._around)]
-        )
+        """Map coarse vertices (V, 3) to fine ones (Vf, 3), rigid parts affinely too."""
+        fine: FloatArray = self.weights @ self._regressors(vertices)
         return fine
 
-    def fitted(self, coarse: FloatArray, fine: FloatArray, rows: IntArray, shapes: IntArray) -> Prolongation:
-        """The same with weights that bring fine vertices closest to where they are in some shapes.
+    def _regressors(self, vertices: FloatArray) -> FloatArray:
+        """(2V, 3) coarse vertices, then the scaled normals at them."""
+        return np.concatenate([vertices, _scaled_normals(vertices, self.faces, self._around)])
 
-        Ridge regression of each vertex on the vertices and normals that it hangs on already, towards the weights that
-        it has. Lengths of the changes count in all directions alike, and they sum up to 0, so that fine vertices still
-        move as the shape does. Vertices that are coarse ones stay so.
+    def fitted(self, coarse: FloatArray, fine: FloatArray, rows: IntArray, shapes: IntArray) -> Prolongation:
+        """Return a prolongation whose weights are fitted to shapes with known fine vertices.
+
+        Ridge regression for each fine vertex, on the vertices and normals to which it is already bound, towards its
+        present weights. The ridge is isotropic. Changes of the weights on vertices sum to 0, so that fine vertices
+        still follow translations. Fine vertices that coincide with coarse ones keep their weights.
 
         Args:
-            coarse: (n, V, 3) shapes.
-            fine: (n, Vf, 3) what they should become, each in the place of the coarse one.
+            coarse: (n, V, 3) coarse shapes.
+            fine: (n, Vf, 3) the true fine shapes, each aligned to its coarse shape.
             rows: (k,) fine vertices whose weights may change.
-            shapes: (l,) which of the shapes to learn from.
+            shapes: (l,) indices of the shapes to learn from.
         """
         count, weights = coarse.shape[1], self.weights
-        given = np.stack([np.concatenate([y, _scaled_normals(y, self.faces, self._around)]) for y in coarse[shapes]])
+        given = np.stack([self._regressors(y) for y in coarse[shapes]])
         data, sizes = weights.data.copy(), np.diff(weights.indptr)
         for size in np.unique(sizes[rows])[1 if sizes[rows].min() == 1 else 0 :]:
-            those = rows[sizes[rows] == size]
-            for some in np.array_split(those, -(-len(those) * size * len(shapes) // FITTED)):
+            alike = rows[sizes[rows] == size]
+            for some in np.array_split(alike, -(-len(alike) * size * len(shapes) // FITTED_VECTORS)):
                 places = weights.indptr[some][:, None] + np.arange(size)
                 columns = weights.indices[places]
                 x = given[:, columns]
                 misfit = fine[np.ix_(shapes, some)] - np.einsum("rk,nrki->nri", data[places], x)
-                # Changes that sum up to 0 are made of differences from the middle of the vertices.
+                # Subtract the mean over the vertices, so that the changes sum to 0.
                 on_vertices = (columns < count).astype(float)
                 share = on_vertices / on_vertices.sum(axis=1, keepdims=True)
                 x -= on_vertices[..., None] * np.einsum("rk,nrki->nri", share, x)[:, :, None]
@@ -150,12 +157,12 @@ class Prolongation:
 
     @property
     def vertex_count(self) -> int:
-        """Vf."""
+        """Number of fine vertices, Vf."""
         return int(self.weights.shape[0])
 
     @cached_property
     def coarse_vertices(self) -> IntArray:
-        """(V,) the fine vertex that is always where a coarse one is, −1 where there is none."""
+        """(V,) the fine vertex that coincides with each coarse vertex in every shape, −1 where there is none."""
         alone = np.flatnonzero(np.diff(self.weights.indptr) == 1)[::-1]
         column = self.weights.indices[self.weights.indptr[alone]]
         found = np.full(self.weights.shape[1] // 2, -1)
@@ -168,26 +175,26 @@ class Prolongation:
         return _around(self.faces, self.weights.shape[1] // 2)
 
     def errors(self, coarse: FloatArray, fine: Iterable[FloatArray]) -> dict[str, float]:
-        """``mean`` and ``max`` distance to the true fine shapes, after rigid alignment.
+        """Compute the ``mean`` and ``max`` distance to the true fine shapes, over all vertices and shapes.
 
         Args:
             coarse: (n, V, 3) shapes.
-            fine: n times (Vf, 3), what they should become.
+            fine: n true fine shapes (Vf, 3).
 
         Returns:
-            Distances as fractions of the diagonal of each shape's bounding box, over all vertices and shapes.
+            Distances after rigid alignment, as fractions of the diagonal of each shape's bounding box.
         """
-        found = [(away.mean(), away.max()) for away in self.distances(coarse, fine)]
+        found = [(distance.mean(), distance.max()) for distance in self.distances(coarse, fine)]
         means, largest = zip(*found, strict=True)
         return {"mean": float(np.mean(means)), "max": float(np.max(largest))}
 
     def distances(self, coarse: FloatArray, fine: Iterable[FloatArray]) -> Iterator[FloatArray]:
-        """For each shape how far its fine vertices are (Vf,), as `errors` counts."""
+        """Yield the distances (Vf,) of the fine vertices for each shape, in the unit of `errors`."""
         for y, x in zip(coarse, fine, strict=True):
             yield np.linalg.norm(align(self(y), x) - x, axis=1) / diagonal(x)
 
     def arrays(self) -> dict[str, NDArray]:
-        """What a file holds; names begin with ``prolongation_``."""
+        """Arrays for a file; their names begin with ``prolongation_``."""
         return {
             PREFIX + "faces": self.faces.astype(np.int32),
             PREFIX + "indptr": self.weights.indptr.astype(np.int32),
@@ -206,11 +213,11 @@ class Prolongation:
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, NDArray]) -> Prolongation:
-        """Read ``arrays()`` back from any mapping that holds them, such as an opened NPZ file.
+        """Read ``arrays()`` back from a mapping, such as an opened NPZ file.
 
         Raises:
-            ProlongationError: an array is missing, of another form, out of range, not finite, or a fine
-                vertex would not follow when the shape moves.
+            ProlongationError: an array is missing, has another shape or type, is out of range or not finite, or the
+                weights of a fine vertex don't sum to 1.
         """
         faces, indptr, indices, weights = (
             _flat(arrays, name, kind, dimensions)
@@ -238,17 +245,17 @@ class Prolongation:
             raise ProlongationError(f"{PREFIX}weights has an entry that is not finite")
         matrix = sp.csr_array((weights, indices, indptr), shape=(len(indptr) - 1, columns))
         sums = matrix[:, : connectivity.vertex_count].sum(axis=1)
-        astray = np.flatnonzero(np.abs(sums - 1) > 1e-5)
-        if len(astray):
+        wrong = np.flatnonzero(np.abs(sums - 1) > 1e-5)
+        if len(wrong):
             raise ProlongationError(
-                f"the weights of fine vertex {astray[0]} sum up to {sums[astray[0]]:.6g}, not 1; it would not "
+                f"the weights of fine vertex {wrong[0]} sum up to {sums[wrong[0]]:.6g}, not 1; it would not "
                 "move with the shape"
             )
         return cls(connectivity.faces, matrix, _rigid_parts(arrays, len(indptr) - 1))
 
 
 def submesh(mesh: TriangleMesh, vertices: IntArray) -> TriangleMesh:
-    """The faces of a mesh that join some of its vertices (k,), increasing, as a mesh of these alone."""
+    """Return the mesh of the faces whose corners are all among some vertices (k,), given in increasing order."""
     inside = np.isin(mesh.faces, vertices).all(axis=1)
     return TriangleMesh.from_arrays(mesh.vertices[vertices], np.searchsorted(vertices, mesh.faces[inside]))
 
@@ -256,20 +263,20 @@ def submesh(mesh: TriangleMesh, vertices: IntArray) -> TriangleMesh:
 def bind_points(
     coarse: TriangleMesh, points: FloatArray, rows: IntArray, columns: IntArray, b: FloatArray
 ) -> sp.csr_array:
-    """Weights (k, 2V) that carry points (k, 3) with the vertices they hang on: B beside C of `Prolongation`.
+    """Weights (k, 2V) that move points (k, 3) with the coarse vertices they are bound to: B beside C of `Prolongation`.
 
     Args:
-        coarse: at rest.
-        points: at rest.
-        rows: (n,) numbers of points.
-        columns: (n,) coarse vertices that these hang on.
-        b: (n,) with which weight; those of a point have the sum 1.
+        coarse: the coarse mesh at rest.
+        points: (k, 3) points at rest.
+        rows: (n,) index of a point for each bond.
+        columns: (n,) coarse vertex of each bond.
+        b: (n,) weight of each bond; the weights of one point sum to 1.
     """
     count, tail, head = len(coarse.vertices), *np.concatenate([coarse.edges, coarse.edges[:, ::-1]]).T
     around = _around(coarse.faces, count)
     normals = _scaled_normals(coarse.vertices, coarse.faces, around)
 
-    # A_j = Σ_k (y_k − y_j) g_jkᵀ + n_j h_jᵀ, the normal equations being the same for all three coordinates.
+    # A_j = Σ_k (y_k − y_j) g_jkᵀ + n_j h_jᵀ, the normal equations which are the same for all three coordinates.
     edges = coarse.vertices[head] - coarse.vertices[tail]
     weight = 1 / (edges**2).sum(axis=1)
     normal_weight = NORMAL_WEIGHT * np.bincount(tail) / (normals**2).sum(axis=1)
@@ -295,17 +302,17 @@ def bind_points(
 
 
 def _rigid_parts(arrays: Mapping[str, NDArray], count: int) -> tuple[RigidPart, ...]:
-    """Of a mesh with so many fine vertices."""
+    """Read the rigid parts of a mesh with `count` fine vertices."""
     if PREFIX + "rigid" not in arrays and PREFIX + "rest" not in arrays:
         return ()
-    of, rest = _flat(arrays, "rigid", "i", 1), _flat(arrays, "rest", "f", 2)
-    there = np.flatnonzero(of >= 0)
-    if len(of) != count or rest.shape != (len(there), 3) or not np.isfinite(rest).all():
+    part_of, rest = _flat(arrays, "rigid", "i", 1), _flat(arrays, "rest", "f", 2)
+    there = np.flatnonzero(part_of >= 0)
+    if len(part_of) != count or rest.shape != (len(there), 3) or not np.isfinite(rest).all():
         raise ProlongationError(
             f"{PREFIX}rigid must have {count} entries, and {PREFIX}rest a place for each that is not negative"
         )
-    order = np.argsort(of[there], kind="stable")
-    parts = np.split(order, np.flatnonzero(np.diff(of[there][order])) + 1) if len(order) else []
+    order = np.argsort(part_of[there], kind="stable")
+    parts = np.split(order, np.flatnonzero(np.diff(part_of[there][order])) + 1) if len(order) else []
     return tuple(RigidPart(there[part], rest[part]) for part in parts)
 
 
@@ -324,13 +331,13 @@ def _flat(arrays: Mapping[str, NDArray], name: str, kind: str, dimensions: int) 
 
 
 def _around(faces: IntArray, count: int) -> sp.csr_array:
-    """(V, F) ones where a vertex belongs to a face."""
+    """(V, F) sparse matrix with 1 where a vertex belongs to a face."""
     columns = np.repeat(np.arange(len(faces)), 3)
     return sp.csr_array((np.ones(faces.size), (faces.ravel(), columns)), shape=(count, len(faces)))
 
 
 def _scaled_normals(vertices: FloatArray, faces: IntArray, around: sp.csr_array) -> FloatArray:
-    """(V, 3) normals at the vertices, as long as the root of twice the area around them; 0 where there is none."""
+    """(V, 3) vertex normals, as long as the root of twice the area around; 0 where the faces cancel."""
     by_face = face_normals(vertices, faces, normalised=False)
     summed = around @ by_face
     length = np.linalg.norm(summed, axis=1)
@@ -340,38 +347,43 @@ def _scaled_normals(vertices: FloatArray, faces: IntArray, around: sp.csr_array)
 
 
 def _bind(coarse: TriangleMesh, fine: TriangleMesh) -> tuple[IntArray, FloatArray]:
-    """Corners (Vf, 3) of the coarse face that each fine vertex lies over, and its barycentric coordinates there.
+    """Corners (Vf, 3) of the closest coarse face to each fine vertex, and barycentric coordinates (Vf, 3) there.
 
-    Only faces near the coarse vertex that is closest along the fine surface come into question: through the
-    air, fingers and lips are close to what they don't belong to.
+    Candidates are the faces near the coarse vertex that is closest along the fine surface. Distances in space would
+    bind fingers and lips to their neighbours.
     """
     near = _closest_along_surface(coarse, fine)
     around = _around(coarse.faces, len(coarse.vertices))
     two_rings = sp.csr_array((around @ around.T) @ around)
     found = [
-        _over(coarse, fine.vertices[k : k + CHUNK], near[k : k + CHUNK], two_rings) for k in range(0, len(near), CHUNK)
+        _bind_some(coarse, fine.vertices[k : k + BOUND_VERTICES], near[k : k + BOUND_VERTICES], two_rings)
+        for k in range(0, len(near), BOUND_VERTICES)
     ]
     corners, barycentric = zip(*found, strict=True)
     return np.concatenate(corners), np.concatenate(barycentric)
 
 
-def _over(
+def _bind_some(
     coarse: TriangleMesh, points: FloatArray, near: IntArray, two_rings: sp.csr_array
 ) -> tuple[IntArray, FloatArray]:
-    """The same for points (k, 3), whose closest coarse vertices (k,) have faces around them, as rows of (V, F)."""
+    """Do the same for points (k, 3), given their closest coarse vertices (k,) and the faces near each (V, F)."""
     counts = np.diff(two_rings.indptr)[near]
     rows = np.repeat(np.arange(len(near)), counts)
     starts = np.cumsum(counts) - counts
     candidates = two_rings.indices[np.arange(len(rows)) - (starts - two_rings.indptr[near])[rows]]
     corners = coarse.faces[candidates]
-    barycentric, squared = _closest_in_triangle(points[rows], coarse.vertices[corners])
+    barycentric = closest_barycentric(points[rows], coarse.vertices[corners])
+    # On a side, rounding may leave a weight for the opposite corner, which would bind the point to it.
+    barycentric[barycentric < ROUNDING] = 0
+    places = np.einsum("ki,kix->kx", barycentric, coarse.vertices[corners])
+    squared = ((places - points[rows]) ** 2).sum(axis=1)
     # Ties, at corners and edges, go to the first face.
     chosen = np.lexsort((candidates, squared, rows))[starts]
     return corners[chosen], barycentric[chosen]
 
 
 def _closest_along_surface(coarse: TriangleMesh, fine: TriangleMesh) -> IntArray:
-    """(Vf,) coarse vertex with the shortest way along fine edges."""
+    """(Vf,) coarse vertex with the shortest path along fine edges."""
     tail, head = fine.edges.T
     lengths = np.linalg.norm(fine.vertices[tail] - fine.vertices[head], axis=1)
     graph = sp.csr_array((lengths, (tail, head)), shape=(len(fine.vertices),) * 2)
@@ -379,29 +391,7 @@ def _closest_along_surface(coarse: TriangleMesh, fine: TriangleMesh) -> IntArray
     owner = np.zeros(len(fine.vertices), np.int64)
     owner[seeds] = np.arange(len(seeds))
     _, _, source = dijkstra(graph, directed=False, indices=np.unique(seeds), min_only=True, return_predecessors=True)
-    # A part of the fine mesh that has no coarse vertex can only go by distance through the air.
-    through_air = cKDTree(coarse.vertices).query(fine.vertices)[1]
-    closest: IntArray = np.where(source >= 0, owner[source], through_air)
+    # For a component of the fine mesh without a coarse vertex only the distance in space is left.
+    in_space = cKDTree(coarse.vertices).query(fine.vertices)[1]
+    closest: IntArray = np.where(source >= 0, owner[source], in_space)
     return closest
-
-
-def _closest_in_triangle(points: FloatArray, corners: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Barycentric coordinates (k, 3) of the points of triangles (k, 3, 3) closest to points (k, 3), and distances²."""
-    a, p, q = corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-    r = points - a
-    pp, pq, qq, pr, qr = ((x * y).sum(axis=1) for x, y in ((p, p), (p, q), (q, q), (p, r), (q, r)))
-    determinant = pp * qq - pq**2
-    s, t = (qq * pr - pq * qr) / determinant, (pp * qr - pq * pr) / determinant
-    tries = [np.stack([1 - s - t, s, t], axis=1)]
-    for i, j in ((0, 1), (1, 2), (2, 0)):
-        side = corners[:, j] - corners[:, i]
-        along = np.clip(((points - corners[:, i]) * side).sum(axis=1) / (side**2).sum(axis=1), 0, 1)
-        on_side = np.zeros_like(tries[0])
-        on_side[:, i], on_side[:, j] = 1 - along, along
-        tries.append(on_side)
-    coordinates = np.stack(tries)
-    squared = ((np.einsum("tki,kix->tkx", coordinates, corners) - points) ** 2).sum(axis=-1)
-    squared[0, (tries[0] < 0).any(axis=1)] = np.inf
-    best = squared.argmin(axis=0)
-    index = np.arange(len(points))
-    return coordinates[best, index], squared[best, index]

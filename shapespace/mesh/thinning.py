@@ -13,7 +13,8 @@ from scipy import sparse
 from shapespace.arrays import FloatArray, IntArray
 from shapespace.mesh.quadrics import monomials, quadrics_of
 from shapespace.mesh.triangle_mesh import Connectivity
-from shapespace.mesh.triangle_quality import FOLD_LIMIT, dots, normals_and_sides, squared_sines, unit
+from shapespace.mesh.triangle_quality import FOLD_LIMIT, normals_and_sides, squared_sines
+from shapespace.mesh.vectors import dots, unit
 
 #: Smallest angles (degrees) that a collapse may leave, unless there was a smaller one around: the first limit holds
 #: until a round removes less than this share of the vertices, then the next.

@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shapespace.arrays import FloatArray, IntArray
-from shapespace.mesh.triangle_mesh import Connectivity, cross
+from shapespace.mesh.triangle_mesh import Connectivity
+from shapespace.mesh.vectors import cross, dots, unit
 
 #: Largest angle between the normals of two neighbours, as a cosine.
 FOLD_LIMIT = np.cos(np.deg2rad(140))
@@ -82,12 +83,6 @@ class Triangles:
         )
 
 
-def unit(normals: FloatArray) -> FloatArray:
-    """Vectors (…, 3) of length 1; what has no length stays as it is."""
-    result: FloatArray = normals / np.maximum(np.sqrt(dots(normals, normals)), 1e-300)[..., None]
-    return result
-
-
 def folded_pairs(connectivity: Connectivity, normals: FloatArray) -> IntArray:
     """(k, 2) neighbouring faces that are folded onto one another in some shape; normals (F, n, 3) of any length."""
     normals = unit(normals)
@@ -111,16 +106,10 @@ def folded_anew(angles: FloatArray, others: FloatArray) -> NDArray[np.bool_]:
 def normals_and_sides(corners: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Normals (…, 3), as long as twice the area, and squared sides (3, …) of triangles with corners (3, …, 3)."""
     p, q = corners[1] - corners[0], corners[2] - corners[0]
-    return cross(p, q), np.stack([dots(side, side) for side in (p, q, q - p)])
+    return cross(p.T, q.T).T, np.stack([dots(side, side) for side in (p, q, q - p)])
 
 
 def squared_sines(normals: FloatArray, squares: FloatArray) -> FloatArray:
     """sin² of the smallest angle: twice the area over the product of the two longer sides."""
     product = squares.prod(axis=0)
     return dots(normals, normals) * squares.min(axis=0) / np.maximum(product, 1e-300)
-
-
-def dots(a: FloatArray, b: FloatArray) -> FloatArray:
-    """Scalar products (…) of vectors (…, n)."""
-    result: FloatArray = np.einsum("...i,...i->...", a, b)
-    return result

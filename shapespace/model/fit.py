@@ -318,7 +318,7 @@ class _Fit:
         scale = state.placement.scale
         placed = Placement.between(scale * shape.vertices, self.unit * there)
         placement = Placement(placed.rotation, placed.translation, scale)
-        surface = MeshProximity(placement(shape.vertices), search.surface(state.shape).fans)
+        surface = MeshProximity(placement(shape.vertices), search.surface(state.shape).vertex_faces)
         to_model = surface.closest(self.unit * self.scan.points).distances
         to_scan = self.unit * self.scan.distances(surface.vertices / self.unit)
         parts = np.array_split(self.points, -(-len(self.points) // CHUNK)) if options.points else []

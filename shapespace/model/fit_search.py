@@ -225,7 +225,7 @@ class FitSearch:
         most, surface = self.tolerance(state.sigma), self.surface(state.shape)
         explained = surface.closest(state.placement.back(self.scan.points)).distances <= most
         away = self.scan.distances(state.placement(surface.vertices)) / state.placement.scale
-        areas = vertex_areas(surface.vertices, surface.fans.faces)
+        areas = vertex_areas(surface.vertices, surface.vertex_faces.faces)
         return float(explained.mean()), float(areas @ (away <= most) / areas.sum())
 
     def _sigma(self, pairs: Pairs, state: FitState) -> float:

@@ -11,8 +11,9 @@ from scipy import sparse
 from scipy.spatial import cKDTree
 
 from shapespace.arrays import FloatArray, IntArray
-from shapespace.mesh.closest_points import MeshProximity, unit
+from shapespace.mesh.closest_points import MeshProximity
 from shapespace.mesh.rigid_motion import Placement
+from shapespace.mesh.vectors import unit
 from shapespace.model.scan import Scan, nearest_points
 
 #: Cosines of the angle between the normals of a pair: its weight is 0 below the first value and 1 above the second.
@@ -71,10 +72,10 @@ class Pairing:
         some = self.some
         points, normals = placement.back(some.points), some.normals @ placement.rotation
         found = surface.closest(points)
-        corners = surface.fans.faces[found.faces]
-        own = unit(np.einsum("nk,nkx->nx", found.shares, surface.vertex_normals[corners]))
+        corners = surface.vertex_faces.faces[found.faces]
+        own = unit(np.einsum("nk,nkx->nx", found.barycentric, surface.vertex_normals[corners]))
         n, k = len(points), len(self._vertices) if self._both else 0
-        rows = [(found.shares.ravel(), np.repeat(np.arange(n), 3), corners.ravel())]
+        rows = [(found.barycentric.ravel(), np.repeat(np.arange(n), 3), corners.ravel())]
         agree = self._alike(normals, own, some.trust)
         parts = [(points - found.places, own, found.distances, found.places, agree, np.full(n, 1 / n))]
         if k:

@@ -6,8 +6,8 @@ import numpy as np
 from scipy import sparse
 
 from shapespace.arrays import FloatArray
-from shapespace.coordinates.nric import components, cross, dot
 from shapespace.mesh.triangle_mesh import Connectivity
+from shapespace.mesh.vectors import components, cross, dot
 
 
 class VertexRotations:

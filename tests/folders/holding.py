@@ -13,7 +13,8 @@ import numpy as np
 
 from shapespace.bundle.reader import read_bundle
 from shapespace.mesh.triangle_mesh import Connectivity, diagonal, face_normals
-from shapespace.mesh.triangle_quality import FOLD_LIMIT, dots
+from shapespace.mesh.triangle_quality import FOLD_LIMIT
+from shapespace.mesh.vectors import dots
 from shapespace.model.correspondence import Matched
 from shapespace.model.decoder import MeshChoice
 from shapespace.model.shape_model import ShapeModel

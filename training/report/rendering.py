@@ -10,8 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from shapespace.arrays import FloatArray, IntArray
-from shapespace.files.gltf_writing import vertex_normals
-from shapespace.mesh.triangle_mesh import diagonal, face_normals
+from shapespace.mesh.triangle_mesh import diagonal, face_normals, vertex_normals
 
 
 @dataclass(frozen=True)

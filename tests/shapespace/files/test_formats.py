@@ -14,10 +14,11 @@ from pxr import UsdGeom
 from shapespace.files.animated_gltf import DENSE_FRAMES, FRAMES_PER_SECOND, animated_glb
 from shapespace.files.colouring import Colouring, Quantity
 from shapespace.files.formats import MESH_FORMATS, read_arrays
-from shapespace.files.gltf_writing import vertex_normals
+from shapespace.files.gltf_writing import surface_normals
 from shapespace.files.point_cache import point_cache
 from shapespace.files.usd import animated_usd
-from shapespace.mesh.triangle_mesh import MeshError, TriangleMesh
+from shapespace.mesh.attributes import MeshAttributes
+from shapespace.mesh.triangle_mesh import MeshError, TriangleMesh, vertex_normals
 from shapespace.training.collection.generators import freaky_torus
 from tests.meshes import read_mesh
 from tests.sequences import read_point_cache, read_usd
@@ -138,7 +139,7 @@ def test_normals_point_outwards_with_unit_length() -> None:
 
 def test_a_vertex_whose_faces_cancel_still_has_a_unit_normal() -> None:
     vertices = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]])
-    normals = vertex_normals(vertices, np.array([[0, 1, 2], [0, 2, 1]]))
+    normals = surface_normals(vertices, MeshAttributes.of_triangles(np.array([[0, 1, 2], [0, 2, 1]])))
     np.testing.assert_array_equal(np.linalg.norm(normals, axis=1), 1)
 
 

@@ -4,10 +4,9 @@ import io
 
 import numpy as np
 import pytest
-import trimesh
 
 from shapespace.mesh.coarsening import coarsen
-from shapespace.mesh.prolongation import Prolongation, ProlongationError, _closest_in_triangle
+from shapespace.mesh.prolongation import Prolongation, ProlongationError
 from shapespace.mesh.rigid_motion import align
 from shapespace.mesh.triangle_mesh import TriangleMesh
 from tests.shapespace.conftest import MESHES, bent, grid_faces
@@ -91,17 +90,6 @@ def test_follows_affine_maps_of_flat_places_exactly():
     pair = Pair(flat)
     squeezed = flat.vertices @ [[1.4, 0, 0], [0.3, 0.8, 0], [0, 0, 1]]
     np.testing.assert_allclose(pair.prolong(squeezed[pair.index]), squeezed, atol=1e-12)
-
-
-def test_the_closest_point_of_a_triangle_is_the_one_that_trimesh_finds(rng):
-    corners, points = rng.standard_normal((500, 3, 3)), 2 * rng.standard_normal((500, 3))
-    weights, squared = _closest_in_triangle(points, corners)
-    closest = trimesh.triangles.closest_point(corners, points)
-    np.testing.assert_allclose(np.einsum("ki,kix->kx", weights, corners), closest, atol=1e-9)
-    np.testing.assert_allclose(squared, ((points - closest) ** 2).sum(axis=1), atol=1e-9)
-    assert {int(count) for count in (weights > 0).sum(axis=1)} == {1, 2, 3}, (
-        "vertices at corners, on sides and inside of coarse faces"
-    )
 
 
 def tube(around: int, along: int) -> TriangleMesh:

@@ -18,8 +18,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from shapespace.files.gltf_writing import vertex_normals
-from shapespace.mesh.triangle_mesh import TriangleMesh
+from shapespace.mesh.triangle_mesh import TriangleMesh, vertex_normals
 from shapespace.training.__main__ import main
 from shapespace.training.report.number_format import duration
 from shapespace.training.report.page import write_report

@@ -14,6 +14,7 @@ from scipy.spatial import cKDTree
 
 from shapespace.arrays import FloatArray, IntArray
 from shapespace.mesh.triangle_mesh import TriangleMesh
+from shapespace.mesh.vectors import unit
 from shapespace.training.collection.generators.mannequin import (
     ANKLE,
     ARM,
@@ -29,7 +30,6 @@ from shapespace.training.collection.generators.mannequin import (
     Y,
     Z,
     rest,
-    unit,
 )
 
 

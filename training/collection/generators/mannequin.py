@@ -13,15 +13,11 @@ from scipy.spatial import Delaunay, cKDTree
 
 from shapespace.arrays import FloatArray, IntArray
 from shapespace.mesh.triangle_mesh import TriangleMesh
+from shapespace.mesh.vectors import unit
 
 
 def _vector(x: float, y: float, z: float) -> FloatArray:
     return np.array([x, y, z], dtype=np.float64)
-
-
-def unit(v: FloatArray) -> FloatArray:
-    """Scale a vector (3,) to length 1."""
-    return v / np.linalg.norm(v)
 
 
 X, Y, Z = np.eye(3)
