@@ -70,7 +70,7 @@ class MeshProximity:
     @cached_property
     def vertex_normals(self) -> FloatArray:
         """(V, 3) unit normals, see `triangle_mesh.vertex_normals`."""
-        return vertex_normals(self.vertices, self.vertex_faces.faces)
+        return vertex_normals(self.vertices, self.vertex_faces.faces, order="C")
 
     def closest(self, points: FloatArray) -> Closest:
         """Find the closest points to points (n, 3)."""

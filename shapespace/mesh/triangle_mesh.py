@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -264,7 +265,9 @@ def face_normals(vertices: FloatArray, faces: IntArray, *, normalised: bool = Tr
     return n / np.linalg.norm(n, axis=-1, keepdims=True) if normalised else n
 
 
-def vertex_normals(vertices: FloatArray, faces: IntArray, corners: IntArray | None = None) -> FloatArray:
+def vertex_normals(
+    vertices: FloatArray, faces: IntArray, corners: IntArray | None = None, *, order: Literal["C", "F"] = "F"
+) -> FloatArray:
     """Unit normals (N, 3) at the vertices of a shape (V, 3): means of the face normals, weighted by area.
 
     A normal is zero where the normals of all faces around cancel.
@@ -274,10 +277,11 @@ def vertex_normals(vertices: FloatArray, faces: IntArray, corners: IntArray | No
         faces: (F, 3).
         corners: (F, 3) number of the normal at each corner of each face, where the corners of one vertex don't share
             one normal; by default N = V and every corner has the normal of its vertex.
+        order: whether the sums run face by face (C) or corner by corner (F), on which their rounding depends.
     """
     x = components(vertices)
     a, b, c = (x.take(k, axis=1) for k in np.ascontiguousarray(faces.T))
-    into = (faces if corners is None else corners).ravel()
+    into, spread = (faces if corners is None else corners).ravel(order), np.repeat if order == "C" else np.tile
     count = len(vertices) if corners is None else 0
-    sums = [np.bincount(into, np.repeat(n, 3), minlength=count) for n in cross(b - a, c - a)]
+    sums = [np.bincount(into, spread(n, 3), minlength=count) for n in cross(b - a, c - a)]
     return unit(np.stack(sums, axis=1))
