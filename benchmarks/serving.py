@@ -291,7 +291,7 @@ def factor(model: ShapeModel) -> float:
     target = nric(model.reference.vertices, model.reference.connectivity)
     with model.decoder.solver() as reconstruct:
         point = reconstruct._squares(model.reference.vertices, target)
-        return statistics.median(seconds(lambda: reconstruct._factor(point, target)) for _ in range(5))
+        return statistics.median(seconds(lambda: reconstruct.solver.factor(point, target)) for _ in range(5))
 
 
 def seconds(work: Callable[[], object]) -> float:

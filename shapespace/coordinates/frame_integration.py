@@ -1,16 +1,17 @@
-"""Vertices straight from lengths and angles: face frames along a spanning tree of the faces, then one linear solve.
+"""Vertices from lengths and angles without iterating: face frames along a spanning tree, then linear solves.
 
-Lengths give every triangle its form and an angle the rotation between two neighbours, so that a tree gives a frame to
-each face, and with it the vectors of its sides; the vertices that fit these vectors best solve a Poisson equation with
-a fixed matrix (Lipman, Sorkine, Levin and Cohen-Or 2005). Exact where z is integrable. Where it isn't, each path
-through the tree adds up its errors, and at the hinges that are not in the tree frames don't fit each other. Rotating
-each face a little spreads these misfits over all hinges: with small rotations ω, frames across the hinge from face f to
-face g fit where ``ω_g − ω_f`` is the rotation e_fg by which they miss, and the least squares of all hinges are a linear
-equation with a fixed matrix again, the Laplacian of the faces. As a start of Gauss–Newton the shape is then two to six
-times nearer to the one it leads to.
+Lengths determine the form of every triangle. An angle determines the rotation between two neighbours. A spanning tree
+of the faces therefore gives each face a frame, and the frame gives the vectors of its sides. The vertices that fit
+these vectors best solve a Poisson equation with a fixed matrix (Lipman, Sorkine, Levin and Cohen-Or 2005). The result
+is exact where z is integrable.
 
-**Half angles.** A rotation by φ about a unit axis a is the quaternion (cos φ/2, a sin φ/2), so all that is needed of an
-inner angle γ is half of it: from its cosine, by the law of cosines ``cos γ = (b² + c² − a²) / 2bc``, follow
+Elsewhere errors accumulate along each path in the tree, and frames disagree at the hinges outside the tree. Small
+rotations ω of the faces spread this disagreement over all hinges. The frames of faces f and g agree where ``ω_g − ω_f``
+is the rotation e_fg between them. The least squares over all hinges are a linear equation with another fixed matrix,
+the Laplacian of the faces. This brings the start of Gauss–Newton two to six times closer to its result.
+
+**Half angles.** A rotation by φ about a unit axis a is the quaternion (cos φ/2, a sin φ/2), so only half of an inner
+angle γ is needed. Its cosine follows from the law of cosines, ``cos γ = (b² + c² − a²) / 2bc``. Then
 ``sin γ/2 = √((1 − cos γ)/2)`` and ``cos γ/2 = √((1 + cos γ)/2)``, without a trigonometric function.
 """
 
@@ -29,17 +30,18 @@ from shapespace.solve.cholesky import Backend, SymmetricPattern, analyse
 
 
 class FrameIntegration:
-    """Shapes from NRIC of one connectivity, without iterating.
+    """Shapes from lengths and angles (NRIC) of one connectivity, without iterating.
 
-    Everything that depends on the connectivity is found here, once: the tree, the order in which rotations are
-    multiplied, and the factors of the two matrices. Holds these factors: use one per thread.
+    The tree, the order of the products of rotations and the factors of the two matrices are computed once. An instance
+    holds these factors: use one per thread.
 
     Args:
-        reference: gives lengths to the tree, weights to the sides, and a place to each connected part.
+        reference: lengths for the tree, weights for the sides, and the position of each connected part.
         backend: Cholesky backend.
     """
 
-    #: Weight of the reference in the Poisson equation, which only fixes its translations; and of no rotation.
+    #: Relative weight of the reference in the Poisson equation, which fixes translations, and of zero rotations in the
+    #: equation of the rotations. Small enough to change nothing else.
     ANCHOR = 1e-9
 
     def __init__(self, reference: TriangleMesh, backend: Backend = "auto") -> None:
@@ -47,7 +49,7 @@ class FrameIntegration:
         self._connectivity, self._count = c, len(c.faces)
         parents = _spanning_forest(reference)
         depths = _depths(parents)
-        # Faces in the order of their depth, the roots first, and where each face is in that order.
+        # Faces sorted by depth, the roots first, and the position of each face in this order.
         order: IntArray = np.argsort(depths, kind="stable")
         self._place = np.argsort(order)
         self._roots = int((depths == 0).sum())
@@ -58,7 +60,7 @@ class FrameIntegration:
         self._rotation_equation(reference, backend)
 
     def _hinges(self, children: IntArray, parents: IntArray) -> None:
-        """Which side of its two faces each hinge is; and for each face but the roots, the hinge to its parent."""
+        """Find the side that each hinge is of its two faces, and the hinge from each face to its parent."""
         c = self._connectivity
         self._left_sides, self._right_sides = (
             (c.face_edges[faces] == c.hinge_edges[:, None]).argmax(axis=1) * self._count + faces
@@ -68,12 +70,12 @@ class FrameIntegration:
         hinge_of = {(a, b): h for h, (a, b) in enumerate(pairs)} | {(b, a): h for h, (a, b) in enumerate(pairs)}
         to_parents = zip(parents[children].tolist(), children.tolist(), strict=True)
         self._tree: IntArray = np.array([hinge_of[pair] for pair in to_parents], dtype=np.int64)
-        #: 1 where the parent is the left face of the edge, −1 where the rotation is to be reversed.
+        #: 1 where the parent is the left face of the edge, −1 where the rotation is reversed.
         self._direction = np.where(c.edge_faces[c.hinge_edges[self._tree], 0] == parents[children], 1.0, -1.0)
         self._others = np.setdiff1d(np.arange(len(pairs)), self._tree)
 
     def _poisson_equation(self, reference: TriangleMesh, backend: Backend) -> None:
-        """The right-hand side's matrix and the factor of the left-hand side's."""
+        """Build the matrix of the right-hand side, and factorise the matrix of the left-hand side."""
         c = self._connectivity
         # Side k runs from corner k + 1 to corner k + 2.
         tails, heads = c.faces.T[[1, 2, 0]].ravel(), c.faces.T[[2, 0, 1]].ravel()
@@ -93,7 +95,7 @@ class FrameIntegration:
         self._poisson = analyse(pattern, backend).factorise(entries)
 
     def _rotation_equation(self, reference: TriangleMesh, backend: Backend) -> None:
-        """The same for the rotations that make frames fit; an angle counts as in the norm of lengths and angles."""
+        """Do the same for the small rotations of faces. An angle has its weight in the norm of lengths and angles."""
         c = self._connectivity
         left, right = c.edge_faces[c.hinge_edges].T
         weights = WeightedNorm.of(reference, 1.0).squared[c.edge_count + c.hinge_edges]
@@ -116,14 +118,14 @@ class FrameIntegration:
 
     @np.errstate(divide="ignore", over="ignore", invalid="ignore")
     def __call__(self, z: FloatArray) -> FloatArray:
-        """Vertices (V, 3) for lengths and angles (2E,); not finite where lengths are 0 or not finite."""
+        """Compute vertices (V, 3) from lengths and angles (2E,); not finite where lengths are 0 or not finite."""
         c = self._connectivity
         a, b, side = z.take(c.face_sides)
-        # Corner 0 is the origin of a face's plane, corner 1 lies on its first axis. Half angles at both, by cosines.
+        # In the plane of a face, corner 0 is the origin and corner 1 lies on the first axis. Half angles at both.
         cosine = (b * b + side * side - a * a) / (2 * b * side)
         sin_0, cos_0 = _half(cosine)
         sin_1, cos_1 = _half((a * a + side * side - b * b) / (2 * a * side))
-        # Halves of the directions of the sides: (π − corner 1) / 2, (π + corner 0) / 2, 0.
+        # Half the directions of the sides: (π − corner 1) / 2, (π + corner 0) / 2, 0.
         halves = np.empty((2, 3, self._count))
         halves[0] = sin_1, -sin_0, np.ones_like(sin_0)
         halves[1] = cos_1, cos_0, np.zeros_like(sin_0)
@@ -137,19 +139,19 @@ class FrameIntegration:
         np.negative(sides[:, 1], out=sides[:, 0])
         sides[:, 0] -= sides[:, 2]
         right = self._divergence @ sides.reshape(3, -1).T + self._anchored
-        # One by one: Pardiso takes more than twice as long for three at once.
+        # One column at a time: Pardiso takes more than twice as long for three at once.
         return np.stack([self._poisson.solve(column) for column in right.T], axis=1)
 
     def _face_frames(self, halves: FloatArray, angles: FloatArray) -> FloatArray:
         """Unit quaternions (4, F) of the face frames.
 
         Args:
-            halves: (2, 3F) cosines and sines of half the directions of their sides.
-            angles: (H,) halves of the angles of the hinges.
+            halves: (2, 3F) cosines and sines of half the directions of the sides of all faces.
+            angles: (H,) half the angles of the hinges.
         """
-        # Across a hinge: rotate its direction α in the left face to the first axis, fold by θ, rotate to its direction
-        # β in the right face, where it runs the other way. As quaternions z(α) x(θ) z(−β), where (a, b) are cosine and
-        # sine of α/2, and (c, d) of β/2.
+        # Across a hinge: rotate its direction α in the left face to the first axis, fold by θ, rotate the first axis to
+        # its direction β in the right face, where the edge runs the other way. As quaternions this is z(α) x(θ) z(−β),
+        # with (a, b) the cosine and sine of α/2, and (c, d) the cosine and sine of β/2.
         a, b = halves.take(self._left_sides, axis=1)
         d, c = halves.take(self._right_sides, axis=1)
         np.negative(c, out=c)
@@ -164,23 +166,23 @@ class FrameIntegration:
         from_parents = q[:, self._roots :]
         across.take(self._tree, axis=1, out=from_parents)
         from_parents[1:] *= self._direction
-        # Products along the paths from the roots, twice as long in each round.
+        # Products along the paths from the roots; each round doubles their length.
         for first, ancestors in self._rounds:
             q[:, first:] = quaternions.product(q.take(ancestors, axis=1), q[:, first:])
         return self._fitting(q.take(self._place, axis=1), across)
 
     def _fitting(self, frames: FloatArray, across: FloatArray) -> FloatArray:
-        """Frames (4, F), each rotated a little, so that they fit at all hinges as well as can be.
+        """Rotate frames (4, F) a little, so that they agree at all hinges in least squares.
 
         Args:
-            frames: that fit at the hinges of the tree.
+            frames: (4, F) frames that agree at the hinges of the tree.
             across: (4, H) rotations from the left to the right face of each hinge.
         """
         if not len(self._others):
             return frames
         arrived = quaternions.product(frames.take(self._left, axis=1), across.take(self._others, axis=1))
         missed = quaternions.product(arrived, quaternions.conjugate(frames.take(self._right, axis=1)))
-        # A quaternion and its negative are the same rotation: the one by less than half a turn is meant.
+        # A quaternion and its negative are the same rotation. Choose the sign for less than half a turn.
         vectors = 2 * missed[1:] * np.copysign(1, missed[0])
         right = self._misfits @ vectors.T
         turns = np.ones((4, self._count))
@@ -191,10 +193,10 @@ class FrameIntegration:
 
 
 def _spanning_forest(mesh: TriangleMesh) -> IntArray:
-    """The parent (F,) of each face in a tree of short paths from a face in the middle of each part; a root is its own.
+    """Parents (F,) of the faces in trees of shortest paths from a central face of each component; a root is its own.
 
-    A path is as long as the way between the centres of its faces, plus the mean such distance for each hinge, because
-    each hinge adds an error, however short it is.
+    The length of a step is the distance between the centres of the two faces, plus the mean distance over all hinges:
+    each hinge adds an error, even a short one.
     """
     c, centres = mesh.connectivity, mesh.vertices[mesh.faces].mean(axis=1)
     left, right = c.edge_faces[c.hinge_edges].T
@@ -220,15 +222,15 @@ def _depths(parents: IntArray) -> IntArray:
 
 
 def _rounds(depths: IntArray, parents: IntArray) -> list[tuple[int, IntArray]]:
-    """How to multiply along all paths from the roots at once, in as many rounds as the depth has binary digits.
+    """Plan the products along all paths from the roots, in as many rounds as the depth has binary digits.
 
-    In each round every product is multiplied by that of its face's ancestor, which reaches as far up again ("pointer
-    jumping", Wyllie 1979). A round is given as the first face that takes part, and the ancestors of that and all later
-    faces.
+    Each round multiplies the product of every face by the product of its ancestor, which doubles the length of the path
+    ("pointer jumping", Wyllie 1979). A round is the first face that takes part, and the ancestors of this face and all
+    later faces.
 
     Args:
-        depths: (F,) increasing.
-        parents: (F,) of faces in that order, a root's is itself.
+        depths: (F,) depths of the faces, increasing.
+        parents: (F,) parents of the faces in the same order; a root is its own parent.
     """
     rounds, ancestors, reach = [], parents, 1
     while reach <= depths[-1]:
@@ -239,13 +241,13 @@ def _rounds(depths: IntArray, parents: IntArray) -> list[tuple[int, IntArray]]:
 
 
 def _half(cosine: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Sine and cosine of half the angle in [0, π] with this cosine, which is moved into [−1, 1] first."""
+    """Sine and cosine of half the angle in [0, π] with a given cosine, which is clipped to [−1, 1]."""
     cosine = np.clip(cosine, -1, 1)
     return np.sqrt((1 - cosine) / 2), np.sqrt((1 + cosine) / 2)
 
 
 def _middle(graph: sparse.csr_array, part: IntArray) -> int:
-    """A face in the middle of a connected part: half way between two that are far from each other."""
+    """Find a central face of a component: half way between two faces that are far apart."""
     far = part[0]
     distances = []
     for _ in range(3):
@@ -255,7 +257,7 @@ def _middle(graph: sparse.csr_array, part: IntArray) -> int:
 
 
 def _face_frames(mesh: TriangleMesh, faces: IntArray) -> FloatArray:
-    """(4, n) quaternions that take the axes to face frames: along side 2, across it, and the normal."""
+    """(4, n) quaternions that rotate the axes to face frames: along side 2, across it, and along the normal."""
     corners = mesh.vertices[mesh.faces[faces]]
     along = corners[:, 1] - corners[:, 0]
     along /= np.linalg.norm(along, axis=1, keepdims=True)

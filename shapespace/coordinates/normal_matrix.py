@@ -1,4 +1,4 @@
-"""``JᵀHJ``: quadratic forms on lengths and angles, pulled back to vertex positions, on a fixed pattern."""
+"""The matrix ``JᵀHJ``: a quadratic form on lengths and angles, pulled back to vertex positions."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from shapespace.solve.cholesky import SymmetricPattern
 
 @dataclass(frozen=True)
 class QuadraticForm:
-    """A quadratic form H on NRIC that couples nothing but the three lengths of each face.
+    """A quadratic form H on lengths and angles that couples only the three lengths of each face.
 
     Attributes:
-        faces: (…, 3, 3, F) a symmetric block per face, on the lengths of its three sides.
-        angles: (…, E) the diagonal on the angles, 0 on the boundary.
+        faces: (…, 3, 3, F) symmetric blocks on the lengths of the three sides of each face.
+        angles: (…, E) diagonal on the angles, 0 on the boundary.
     """
 
     faces: FloatArray
@@ -27,23 +27,24 @@ class QuadraticForm:
 
 
 def _upper(size: int) -> int:
-    """Entries of the upper triangle of a symmetric block, its diagonal included."""
+    """Number of entries in the upper triangle of a symmetric block, including the diagonal."""
     return size * (size + 1) // 2
 
 
-#: Unknowns of the ends of an edge, of the corners of a face and of the vertices of a hinge: sizes of the blocks.
+#: Sizes of the blocks: coordinates of the ends of an edge, the corners of a face and the vertices of a hinge.
 EDGE, FACE, HINGE = 2 * 3, 3 * 3, 4 * 3
 
 
 class NormalMatrix:
-    """``JᵀHJ + εI`` as entries of a fixed symmetric pattern, by one scatter.
+    """Entries of ``JᵀHJ + εI`` on a fixed symmetric pattern, by one scatter.
 
-    The matrix is a sum of a 9×9 block per face, from lengths, and a 12×12 block per hinge, from angles; only
-    their upper triangles are formed. For a norm, which couples no lengths, a 6×6 block per edge does instead of
-    those per face. εI lifts the six rigid motions out of the null space: forces have no part there. Sparse products
-    would be as fast, but drop entries that cancel exactly: the pattern would change.
+    The matrix is the sum of a 9×9 block per face, from lengths, and a 12×12 block per hinge, from angles. Only upper
+    triangles are computed. For a norm, which couples no lengths, 6×6 blocks per edge replace the blocks per face. εI
+    makes the matrix positive definite: JᵀHJ vanishes on the six rigid motions. Sparse products would take as long, but
+    they drop entries that cancel exactly, so the pattern would change.
     """
 
+    #: ε as a share of the mean diagonal entry.
     REGULARISATION = 1e-9
 
     def __init__(self, connectivity: Connectivity) -> None:
@@ -63,7 +64,7 @@ class NormalMatrix:
         self.pattern = SymmetricPattern(3 * connectivity.vertex_count, np.concatenate(rows), np.concatenate(columns))
 
     def entries(self, gradients: NRICGradients, form: QuadraticForm | WeightedNorm) -> FloatArray:
-        """Upper-triangle entries of ``JᵀHJ + εI`` for one shape's Jacobian."""
+        """Compute the upper-triangle entries of ``JᵀHJ + εI`` for the Jacobian of one shape."""
         if isinstance(form, WeightedNorm):
             edges = gradients.lengths.shape[-1]
             contributions, on_lengths, on_angles = self._work_space(_upper(EDGE), edges)
@@ -79,7 +80,7 @@ class NormalMatrix:
         return entries
 
     def second_derivative(self, second: NRICSecondDerivatives, covector: FloatArray) -> FloatArray:
-        """Upper-triangle entries of ``Σ_i p_i D²z_i(X)``: how ``Jᵀp`` changes with X for fixed p (2E,)."""
+        """Upper-triangle entries of ``Σ_i p_i D²z_i(X)``, the derivative of ``Jᵀp`` by X at fixed p (2E,)."""
         edges = second.lengths.shape[-1]
         contributions, on_lengths, on_angles = self._work_space(_upper(EDGE), edges)
         blocks = second.lengths * covector[:edges]
@@ -91,7 +92,7 @@ class NormalMatrix:
         return self.pattern.scatter(contributions, self._slots_of_edges)
 
     def _work_space(self, entries: int, blocks: int) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Contributions, and views of those from lengths (entries, blocks) and of those from angles, per hinge."""
+        """Allocate contributions, with views of the part from lengths (entries, blocks) and the part from angles."""
         lengths = entries * blocks
         contributions = np.empty(lengths + _upper(HINGE) * len(self._interior))
         on_lengths, on_angles = contributions[:lengths], contributions[lengths:]
@@ -107,7 +108,7 @@ class NormalMatrix:
 
     @cached_property
     def _slots_of_edges(self) -> IntArray:
-        """Where the contributions of a norm go: those of `_edges`, then those of the hinges."""
+        """Entries that receive the contributions of a norm: first from `_edges`, then from the hinges."""
         size = self.pattern.size
         a, b = np.triu_indices(3)
         tails, heads = (3 * end[None] for end in self._ends)
@@ -118,8 +119,8 @@ class NormalMatrix:
         return np.concatenate([slots, self.pattern.slots[_upper(FACE) * self._sides.shape[1] :]])
 
     def _edges(self, directions: FloatArray, weights: FloatArray, out: FloatArray) -> None:
-        # 3×3 blocks: tail with tail and head with head are the same, and of both only the upper triangle is kept; tail
-        # with head is their negative, with all its entries.
+        # 3×3 blocks. Tail with tail and head with head are equal; only their upper triangles are kept. Tail with head
+        # is the negative of these, with all nine entries.
         tails, heads, both = np.split(out, [_upper(3), 2 * _upper(3)])
         weighted = directions * weights
         start = 0
@@ -131,7 +132,7 @@ class NormalMatrix:
 
     def _faces(self, directions: FloatArray, blocks: FloatArray, out: FloatArray) -> None:
         u = directions.take(self._sides, axis=1) * self._signs
-        # (side, corner, xyz, face): derivative of each length by each corner, two of three not zero.
+        # (side, corner, xyz, face): derivative of each length by each corner; one of the three is zero.
         corners = np.zeros((3, 3, 3, u.shape[-1]))
         for k, (tail, head) in enumerate(self._corners):
             corners[k, tail], corners[k, head] = -u[:, k], u[:, k]

@@ -1,8 +1,8 @@
 """Nonlinear rotation-invariant coordinates: edge lengths and signed dihedral angles (paper, appendix C).
 
-A shape is ``z = (l, θ)`` of 2E entries: first every edge length, then every dihedral angle, both in edge
-order. θ is the angle between the two face normals in radians, in (−π, π], zero where flat and positive where
-the surface is convex seen from the side the normals point to. A boundary edge keeps its slot with θ = 0.
+A shape is ``z = (l, θ)`` with 2E entries: first every edge length, then every dihedral angle, both in edge order. θ is
+the angle between the two face normals in radians, in (−π, π]. It is zero where the surface is flat, and positive where
+it is convex on the side of the normals. A boundary edge keeps its entry, with θ = 0.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ from shapespace.mesh.vectors import components, cross, dot
 
 
 class HingeGeometry:
-    """Edge vectors, and at every hinge the vectors and normals that angles are made of, all (3, …).
+    """Edge vectors, and the vectors and normals at every hinge, all by components (3, …).
 
-    Lengths, angles and their derivatives are all computed from these, and these are most of the work.
+    Lengths, angles and their derivatives share them, and they are most of the work.
 
     Args:
         vertices: shapes (…, V, 3).
-        connectivity: of all these shapes.
+        connectivity: connectivity of the shapes.
     """
 
     def __init__(self, vertices: FloatArray, connectivity: Connectivity) -> None:
@@ -50,14 +50,14 @@ class HingeGeometry:
         self.right_normal = cross(self.to_right, self.hinge_edges)
 
     def angles(self) -> FloatArray:
-        """(…, H) by atan2 of (sine, cosine), which stays accurate near 0 and π where arccos does not."""
+        """Compute the angles (…, H) by atan2, which is accurate near 0 and π, where arccos is not."""
         sine = dot(self.left_normal, self.to_right)
         sine *= -self.hinge_lengths
-        sine += 0.0  # never −0, for which arctan2 gives −π instead of π at a hinge folded flat
+        sine += 0.0  # turns −0 into 0: at a hinge folded flat arctan2 would give −π instead of π
         return np.arctan2(sine, dot(self.left_normal, self.right_normal))
 
     def nric(self) -> FloatArray:
-        """(…, 2E) lengths and angles."""
+        """Compute lengths and angles (…, 2E)."""
         connectivity = self.connectivity
         e = connectivity.edge_count
         z = np.zeros((*self.lengths.shape[:-1], 2 * e))
@@ -69,28 +69,28 @@ class HingeGeometry:
         return z
 
     def gradients(self) -> NRICGradients:
-        """The derivatives, of one shape."""
+        """Compute the first derivatives. For one shape only."""
         edge, length = self.hinge_edges, self.hinge_lengths
         square = length**2
-        # The gradient at an opposite vertex is along its face's normal, with 1/height as size.
+        # The gradient at an opposite vertex is normal to its face and has length 1/height.
         angles = np.empty((4, *edge.shape))
         tail, head, left, right = angles
         np.multiply(self.left_normal, -length / dot(self.left_normal, self.left_normal), out=left)
         np.multiply(self.right_normal, -length / dot(self.right_normal, self.right_normal), out=right)
         np.multiply(left, -dot(self.to_left, edge) / square, out=head)
         head -= (dot(self.to_right, edge) / square) * right
-        # The four sum to zero: nothing changes when all move together.
+        # The four sum to zero: a translation changes nothing.
         np.negative(head, out=tail)
         tail -= left
         tail -= right
         return NRICGradients(self.edges / self.lengths, angles)
 
     def second_derivatives(self) -> NRICSecondDerivatives:
-        """The second derivatives, of one shape.
+        """Compute the second derivatives. For one shape only.
 
-        Of an angle by the edge vector e and the vectors a and b to the opposite vertices, whose gradients are
-        ``g_a = −|e| n_a/|n_a|²`` with ``n_a = e × a``, ``g_b = −|e| n_b/|n_b|²`` with ``n_b = b × e`` and
-        ``g_e = −(a·e/|e|²) g_a − (b·e/|e|²) g_b``; by the tail, minus the sum.
+        The first derivatives of an angle are taken by the edge vector e and the vectors a and b from the tail to the
+        opposite vertices: ``g_a = −|e| n_a/|n_a|²`` with ``n_a = e × a``, ``g_b = −|e| n_b/|n_b|²`` with
+        ``n_b = b × e``, and ``g_e = −(a·e/|e|²) g_a − (b·e/|e|²) g_b``. The derivative by the tail is minus their sum.
         """
         direction = self.edges / self.lengths
         eye = np.eye(3)[:, :, None]
@@ -123,7 +123,7 @@ class HingeGeometry:
 
 
 def edge_lengths(vertices: FloatArray, connectivity: Connectivity) -> FloatArray:
-    """Lengths (…, E) of the edges of shapes (…, V, 3)."""
+    """Compute the edge lengths (…, E) of shapes (…, V, 3)."""
     x = components(vertices)
     i, j = connectivity.edge_ends
     edge = x.take(j, axis=-1) - x.take(i, axis=-1)
@@ -131,24 +131,24 @@ def edge_lengths(vertices: FloatArray, connectivity: Connectivity) -> FloatArray
 
 
 def dihedral_angles(vertices: FloatArray, connectivity: Connectivity) -> FloatArray:
-    """Signed dihedral angles (…, E) of shapes (…, V, 3), in (−π, π], zero on boundary edges."""
+    """Compute the signed dihedral angles (…, E) of shapes (…, V, 3), in (−π, π], zero on boundary edges."""
     angles = np.zeros((*vertices.shape[:-2], connectivity.edge_count))
     angles[..., connectivity.hinge_edges] = HingeGeometry(vertices, connectivity).angles()
     return angles
 
 
 def nric(vertices: FloatArray, connectivity: Connectivity) -> FloatArray:
-    """Lengths and angles ``z`` (…, 2E) of shapes (…, V, 3)."""
+    """Compute lengths and angles ``z`` (…, 2E) of shapes (…, V, 3)."""
     return HingeGeometry(vertices, connectivity).nric()
 
 
 def wrap(angles: FloatArray) -> FloatArray:
-    """Bring angles, or differences of angles, into (−π, π]."""
+    """Map angles, or differences of angles, into (−π, π] modulo 2π."""
     return np.pi - np.mod(np.pi - angles, 2 * np.pi)
 
 
 def unwrap(z: FloatArray, reference: FloatArray) -> FloatArray:
-    """Choose the representative of each angle in ``z`` (…, 2E) that lies within π of the reference's (2E)."""
+    """Shift each angle in ``z`` (…, 2E) by a multiple of 2π to within π of the reference (2E)."""
     half = z.shape[-1] // 2
     angles = reference[..., half:] + wrap(z[..., half:] - reference[..., half:])
     return np.concatenate([z[..., :half], angles], axis=-1)
@@ -158,12 +158,12 @@ def unwrap(z: FloatArray, reference: FloatArray) -> FloatArray:
 class WeightedNorm:
     """The norm ``‖·‖_{2,z̄}`` of differences of NRIC (paper, section 3).
 
-    ``‖d‖² = Σ (d_l / l̄)² + η Σ (l̄ a^{-1/2} d_θ)²`` with lengths l̄ of the reference and ``a`` one third of
-    the area of the two faces at an edge. Boundary angles weigh nothing. Dimensionless.
+    ``‖d‖² = Σ (d_l / l̄)² + η Σ (l̄ a^{-1/2} d_θ)²``, with l̄ the lengths of the reference and ``a`` one third of the
+    area of the two faces at an edge. Boundary angles have weight 0. The norm is dimensionless.
 
     Attributes:
-        squared: (2E,) weights of the squared differences, η included.
-        eta: η.
+        squared: (2E,) weights of the squared differences, including η.
+        eta: weight η of the angles.
     """
 
     squared: FloatArray
@@ -171,7 +171,7 @@ class WeightedNorm:
 
     @classmethod
     def of(cls, reference: TriangleMesh, eta: float) -> WeightedNorm:
-        """Weights of a reference shape."""
+        """Compute the weights from a reference shape."""
         connectivity = reference.connectivity
         lengths = edge_lengths(reference.vertices, connectivity)
         angle = np.zeros(connectivity.edge_count)
@@ -181,17 +181,17 @@ class WeightedNorm:
         return cls(np.concatenate([lengths**-2, angle]), eta)
 
     def square(self, difference: FloatArray) -> FloatArray:
-        """Squared norms (…) of differences (…, 2E); angles count as they stand, so unwrap them first."""
+        """Compute squared norms (…) of differences (…, 2E). Angles are not wrapped: unwrap them first."""
         return np.einsum("...e,e,...e->...", difference, self.squared, difference)
 
 
 @dataclass(frozen=True)
 class NRICGradients:
-    """What ``Dz(X)`` is made of, as whole arrays that are quick to work on.
+    """The entries of ``Dz(X)``, by components.
 
     Attributes:
-        lengths: (3, E) derivative of each length by its head; by its tail it is the negative.
-        angles: (4, 3, H) derivative of each interior angle by tail, head, left and right opposite vertex.
+        lengths: (3, E) derivative of each length by its head; the derivative by its tail is the negative.
+        angles: (4, 3, H) derivative of each interior angle by the tail, head, left and right opposite vertex.
     """
 
     lengths: FloatArray
@@ -200,11 +200,12 @@ class NRICGradients:
 
 @dataclass(frozen=True)
 class NRICSecondDerivatives:
-    """What ``D²z(X)`` is made of.
+    """The entries of ``D²z(X)``, by components.
 
     Attributes:
-        lengths: (3, 3, E) second derivative of each length by its head; also by its tail, and minus that by both.
-        angles: (4, 4, 3, 3, H) of each interior angle by tail, head, left and right opposite vertex.
+        lengths: (3, 3, E) second derivative of each length by its head, which is also the one by its tail and the
+            negative of the mixed one.
+        angles: (4, 4, 3, 3, H) second derivatives of each interior angle by the tail, head, left and right vertex.
     """
 
     lengths: FloatArray
@@ -220,11 +221,11 @@ def _cross_matrix(v: FloatArray) -> FloatArray:
 
 
 class NRICJacobian:
-    """``Dz(X)``, the (2E, 3V) Jacobian of the NRIC of a shape, on a sparsity pattern found once.
+    """``Dz(X)``, the (2E, 3V) Jacobian of the lengths and angles of a shape, on a fixed sparsity pattern.
 
-    Lengths depend on 2 vertices, angles on 4; an entry is kept even where it happens to vanish, so that every
-    Jacobian of a connectivity has the same pattern. Angle gradients after Tamstorf and Grinspun, "Discrete
-    bending forces and their Jacobians" (2013), which stay finite for any non-degenerate hinge.
+    Lengths depend on 2 vertices, angles on 4. Entries that happen to vanish are kept, so that all Jacobians of a
+    connectivity have the same pattern. Angle gradients after Tamstorf and Grinspun, "Discrete bending forces and their
+    Jacobians" (2013); they are finite for any non-degenerate hinge.
     """
 
     def __init__(self, connectivity: Connectivity) -> None:
@@ -241,22 +242,22 @@ class NRICJacobian:
         starts[1 : e + 1] = 6
         starts[e + 1 :][connectivity.hinge_edges] = 12
         self._indptr = np.cumsum(starts).astype(np.int32)
-        #: Vertex of each term of a pull-back: tails, heads, then the four of every hinge.
+        #: Vertex of each term of a pull-back: tails, heads, then the four vertices of every hinge.
         self._vertices = np.concatenate([connectivity.edges.T.ravel(), connectivity.hinges.T.ravel()])
 
     def __call__(self, vertices: FloatArray) -> sparse.csr_array:
-        """The Jacobian at a shape (V, 3)."""
+        """Compute the Jacobian at a shape (V, 3)."""
         return self.matrix(self.gradients(vertices))
 
     def matrix(self, gradients: NRICGradients) -> sparse.csr_array:
-        """The Jacobian made of these gradients."""
+        """Assemble the Jacobian from its entries."""
         lengths = np.concatenate([-gradients.lengths, gradients.lengths])
         angles = gradients.angles.reshape(12, -1)
         data = np.concatenate([lengths.T.ravel(), angles.T.ravel()])
         return sparse.csr_array((data, self.columns, self._indptr), shape=self.shape)
 
     def push_forward(self, gradients: NRICGradients, displacement: FloatArray) -> FloatArray:
-        """``J d`` (2E,) of a vertex field (V, 3), without forming J."""
+        """Compute ``J d`` (2E,) for a vertex field d (V, 3), without forming J."""
         e = self.connectivity.edge_count
         d = components(displacement)
         i, j = self.connectivity.edge_ends
@@ -267,7 +268,7 @@ class NRICJacobian:
         return out
 
     def pull_back(self, gradients: NRICGradients, covector: FloatArray) -> FloatArray:
-        """``Jᵀ p`` (V, 3) of a covector (2E,), without forming J."""
+        """Compute ``Jᵀ p`` (V, 3) for a covector p (2E,), without forming J."""
         e = self.connectivity.edge_count
         terms = np.empty((3, len(self._vertices)))
         np.multiply(gradients.lengths, covector[:e], out=terms[:, e : 2 * e])
@@ -279,5 +280,5 @@ class NRICJacobian:
         return np.stack([np.bincount(self._vertices, weights=t, minlength=v) for t in terms], axis=1)
 
     def gradients(self, vertices: FloatArray) -> NRICGradients:
-        """The derivatives at a shape (V, 3)."""
+        """Compute the entries of the Jacobian at a shape (V, 3)."""
         return HingeGeometry(vertices, self.connectivity).gradients()

@@ -1,4 +1,4 @@
-"""Unit quaternions (4, …) as rotations, scalar part first, by whole components."""
+"""Unit quaternions as rotations, by components (4, …), scalar part first."""
 
 from __future__ import annotations
 
@@ -8,21 +8,21 @@ from shapespace.arrays import FloatArray
 
 
 def identity(n: int) -> FloatArray:
-    """(4, n)."""
+    """Return n identities (4, n)."""
     out = np.zeros((4, n))
     out[0] = 1
     return out
 
 
 def turn(angle: FloatArray, axis: int) -> FloatArray:
-    """(4, n) turns by angles (n,) about a coordinate axis."""
+    """Return rotations (4, n) by angles (n,) about a coordinate axis."""
     out = np.zeros((4, len(angle)))
     out[0], out[1 + axis] = np.cos(angle / 2), np.sin(angle / 2)
     return out
 
 
 def product(p: FloatArray, q: FloatArray) -> FloatArray:
-    """The product p q (4, …)."""
+    """Compute the product p q (4, …)."""
     w, x, y, z = p
     a, b, c, d = q
     return np.stack(
@@ -36,12 +36,12 @@ def product(p: FloatArray, q: FloatArray) -> FloatArray:
 
 
 def conjugate(q: FloatArray) -> FloatArray:
-    """The inverses of rotations (4, n)."""
+    """Invert rotations (4, n)."""
     return q * np.array([[1], [-1], [-1], [-1]])
 
 
 def chain(q: FloatArray) -> FloatArray:
-    """The products (4, n) of k quaternions each, (4, k, n), from first to last: neighbours, then their products."""
+    """Multiply k quaternions each, (4, k, n), in order, to (4, n): neighbours first, then their products."""
     while q.shape[1] > 1:
         even = q.shape[1] - q.shape[1] % 2
         q = np.concatenate([product(q[:, 0:even:2], q[:, 1:even:2]), q[:, even:]], axis=1)
@@ -49,7 +49,7 @@ def chain(q: FloatArray) -> FloatArray:
 
 
 def axis(q: FloatArray, index: int) -> FloatArray:
-    """A coordinate axis (3, n) as the rotations turn it."""
+    """Rotate a coordinate axis by each of n rotations, (3, n)."""
     unit = np.zeros_like(q)
     unit[1 + index] = 1
     return product(product(q, unit), conjugate(q))[1:]

@@ -267,12 +267,12 @@ def test_shapes_end_within_the_tolerance_of_the_exact_solution(mesh, pose, recon
         assert np.abs(align(found.vertices, exact.vertices) - exact.vertices).max() < 2e-5 * mesh.diagonal
 
 
-@pytest.mark.parametrize("precision", ["_single", "_double"])
+@pytest.mark.parametrize("precision", ["single", "double"])
 def test_where_single_precision_does_not_do_double_does(mesh, pose, reconstruct, target, monkeypatch, precision):
     def refuse(_: object) -> None:
         raise NotPositiveDefiniteError("refused")
 
-    monkeypatch.setattr(getattr(reconstruct, precision), "factorise", refuse)
+    monkeypatch.setattr(getattr(reconstruct.solver, precision), "factorise", refuse)
     assert_found(reconstruct(target, pose + 1e-3 * mesh.diagonal * np.sin(7 * pose)), pose, mesh)
 
 
@@ -295,7 +295,7 @@ def test_a_collapsed_start_stalls(mesh, reconstruct, target):
 def test_where_the_guess_stalls_others_are_tried(mesh, pose, reconstruct, target, monkeypatch):
     collapsed = pose.copy()
     collapsed[mesh.edges[0, 0]] = collapsed[mesh.edges[0, 1]]
-    monkeypatch.setattr("shapespace.coordinates.reconstruction.GOOD_GUESS", np.inf)
+    monkeypatch.setattr("shapespace.coordinates.gauss_newton.GOOD_MISFIT", np.inf)
     monkeypatch.setitem(vars(reconstruct), "integrate", lambda _: collapsed)
     assert reconstruct(target, reconstruct.guess(target)).status is Status.STALLED
     assert_found(reconstruct.from_guess(target), pose, mesh)
@@ -312,7 +312,7 @@ def test_a_step_that_overflows_stalls(mesh, reconstruct, target, monkeypatch):
     """Without a check, the line search would halve it forever."""
     for value in (np.nan, np.inf):
         broken = SimpleNamespace(solve=lambda right, value=value: np.full_like(right, value))
-        for cholesky in (reconstruct._single, reconstruct._double):
+        for cholesky in (reconstruct.solver.single, reconstruct.solver.double):
             monkeypatch.setattr(cholesky, "factorise", lambda _, broken=broken: broken)
         found = reconstruct(target)
         assert found.status is Status.STALLED
