@@ -1,4 +1,4 @@
-"""What a file says of a mesh beside positions and triangles: polygons, texture coordinates, names, materials."""
+"""Attributes of a mesh beside positions and triangles: polygons, texture coordinates, names and materials."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from numpy.typing import NDArray
 from shapespace.arrays import FloatArray, IntArray
 from shapespace.mesh.triangle_mesh import MeshError
 
-#: Stands for an index that a corner or a polygon doesn't have.
+#: Marks a corner or a polygon without an index.
 NONE = -1
 
 
 class Topology(StrEnum):
-    """Which faces an answer has: the file's polygons, or these cut into triangles."""
+    """The faces of an answer: the polygons of the file, or the triangles that they are split into."""
 
     ORIGINAL = "original"
     TRIANGLES = "triangles"
@@ -27,13 +27,13 @@ class Topology(StrEnum):
 
 @dataclass(frozen=True)
 class SurfaceMaterial:
-    """How a part of a surface looks.
+    """The material of a part of a surface.
 
     Attributes:
-        name: of the material.
-        color: red, green and blue as linear light, and opacity, each from 0 to 1; times the texture.
+        name: name of the material.
+        color: red, green and blue as linear light, and opacity, each from 0 to 1; multiplied by the texture.
         metallic, roughness: from 0 to 1.
-        texture: name of the picture of its base colour, if it has one.
+        texture: name of the picture of the base colour, or None.
     """
 
     name: str
@@ -47,8 +47,8 @@ class Labels(NamedTuple):
     """A name for each polygon, or none.
 
     Attributes:
-        names: the different ones.
-        of: (P,) which of them each polygon has, NONE for none.
+        names: distinct names.
+        of: (P,) index of the name of each polygon, NONE for none.
     """
 
     names: tuple[str, ...]
@@ -56,13 +56,13 @@ class Labels(NamedTuple):
 
 
 class SplitVertices(NamedTuple):
-    """Vertices for formats where each has one texture coordinate and one normal.
+    """Split vertices, for formats where each vertex has one texture coordinate and one normal.
 
     Attributes:
-        vertex: (V',) which vertex each is of, increasing.
-        uv: (V', 2), zeros for those without.
-        normal: (V',) which of the normals of `MeshAttributes.normal_faces` each has.
-        faces: (F, 3) triangles.
+        vertex: (V',) index of the original vertex, increasing.
+        uv: (V', 2) texture coordinates, zeros where there is none.
+        normal: (V',) index of the normal, see `MeshAttributes.normal_faces`.
+        faces: (F, 3) triangles of split vertices.
     """
 
     vertex: IntArray
@@ -73,23 +73,23 @@ class SplitVertices(NamedTuple):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class MeshAttributes:
-    """Polygons on the vertices of a mesh, whose triangles are these cut at the first corner of each.
+    """Polygons on the vertices of a mesh; its triangles are the fans from the first corner of each polygon.
 
-    P polygons have C corners together; corners of one polygon follow each other.
+    P polygons have C corners in total. The corners of one polygon are consecutive.
 
     Attributes:
-        starts: (P + 1,) first corner of each polygon, and C.
+        starts: (P + 1,) first corner of each polygon, then C.
         corners: (C,) vertex of each corner.
-        uv: (U, 2) texture coordinates, from the lower left.
-        uv_corners: (C,) which of them each corner has, NONE for none.
-        shading: (C,) labels: corners of one vertex with the same label are shaded as one, others apart. None where
-            all are smooth.
-        normals: whether the file had normals or said how it is shaded.
-        colors: (V, 3) sRGB from 0 to 1 of each vertex.
+        uv: (U, 2) texture coordinates, with the origin at the lower left.
+        uv_corners: (C,) index of the texture coordinate of each corner, NONE for none.
+        shading: (C,) labels: corners of one vertex with the same label share one normal. None if all corners of each
+            vertex do.
+        normals: whether the file had normals or smoothing groups.
+        colors: (V, 3) sRGB colours of the vertices, from 0 to 1.
         objects, groups: names of parts.
-        material_of: (P,) which of the materials each polygon has, NONE for none.
-        materials: of the surface.
-        textures: the files of the pictures, by name.
+        material_of: (P,) index of the material of each polygon, NONE for none.
+        materials: materials of the surface.
+        textures: picture files by name.
 
     >>> import numpy as np
     >>> square = MeshAttributes(starts=np.array([0, 4]), corners=np.array([0, 1, 3, 2]))
@@ -112,12 +112,12 @@ class MeshAttributes:
 
     @classmethod
     def of_triangles(cls, faces: IntArray) -> MeshAttributes:
-        """Triangles (F, 3) and nothing else."""
+        """Make plain attributes from triangles (F, 3)."""
         return cls(starts=np.arange(0, faces.size + 1, 3), corners=faces.ravel())
 
     @property
     def sizes(self) -> IntArray:
-        """(P,) corners of each polygon."""
+        """(P,) number of corners of each polygon."""
         return np.diff(self.starts)
 
     @cached_property
@@ -140,13 +140,13 @@ class MeshAttributes:
 
     @property
     def is_plain(self) -> bool:
-        """Whether it says nothing that the triangles don't."""
+        """Whether there is nothing beside triangles."""
         parts = (self.uv, self.shading, self.colors, self.objects, self.groups, self.material_of)
         return bool((self.sizes == 3).all()) and not self.normals and all(part is None for part in parts)
 
     @cached_property
     def triangulated(self) -> MeshAttributes:
-        """The same with its triangles as polygons."""
+        """The same attributes on triangles instead of polygons."""
         corners, polygons = self.triangle_corners.ravel(), self.triangle_polygons
 
         def taken(array: IntArray | None, chosen: IntArray) -> IntArray | None:
@@ -167,7 +167,7 @@ class MeshAttributes:
         )
 
     def only(self, polygons: NDArray[np.bool_]) -> MeshAttributes:
-        """Some of its polygons (P,)."""
+        """Keep some of the polygons, given by a mask (P,)."""
         corners = np.repeat(polygons, self.sizes)
 
         def taken(array: IntArray | None, chosen: NDArray[np.bool_]) -> IntArray | None:
@@ -193,24 +193,24 @@ class MeshAttributes:
         )
 
     def welded(self, vertices: IntArray) -> MeshAttributes:
-        """On other vertices: ``vertices`` (N,) is what each has become, NONE for those whose polygons are left out."""
+        """Renumber the vertices: ``vertices`` (N,) has the new index of each, NONE where its polygons are left out."""
         there = np.logical_and.reduceat(vertices[self.corners] >= 0, self.starts[:-1])
         if not there.all():
             return self.only(there).welded(vertices)
         colors = None
         if self.colors is not None:
-            # Backwards, so that the first of welded vertices stays.
+            # In reverse, so that the colour of the first of several welded vertices stays.
             first = np.flatnonzero(vertices >= 0)[::-1]
             colors = np.empty((vertices.max() + 1, 3))
             colors[vertices[first]] = self.colors[first]
         found = replace(self, corners=vertices[self.corners], colors=colors)
-        # Kept only where some vertex has several.
+        # Keep the labels only if some vertex has several normals.
         smooth = found.shading is not None and len(np.unique(found.normal_corners)) == len(np.unique(found.corners))
         return replace(found, shading=None) if smooth else found
 
     @cached_property
     def normal_corners(self) -> IntArray:
-        """(C,) which normal each corner has: its vertex, unless the file shades some apart."""
+        """(C,) index of the normal of each corner: its vertex, unless some vertices have several normals."""
         if self.shading is None:
             return self.corners
         keys = self.corners * (self.shading.max() + 1) + self.shading
@@ -218,13 +218,13 @@ class MeshAttributes:
 
     @cached_property
     def normal_faces(self) -> IntArray:
-        """(F, 3) the same for the corners of triangles."""
+        """(F, 3) index of the normal of each corner of the triangles."""
         return self.normal_corners[self.triangle_corners]
 
     @cached_property
     def split(self) -> SplitVertices:
-        """Its triangles on vertices with one texture coordinate and one normal each."""
-        # By vertex, then texture coordinate, then normal; sorting pairs of numbers as one is much faster.
+        """The triangles on split vertices, which have one texture coordinate and one normal each."""
+        # Sort by vertex, then texture coordinate, then normal. Sorting pairs as one number is much faster.
         number = self.corners
         for further in (self.uv_corners, self.normal_corners):
             if further is not None:
@@ -237,7 +237,7 @@ class MeshAttributes:
         return SplitVertices(self.corners[first], uv, self.normal_corners[first], number[self.triangle_corners])
 
     def check(self, vertex_count: int, faces: IntArray) -> None:
-        """Raise MeshError unless it is one of the mesh with so many vertices and these triangles (F, 3)."""
+        """Raise MeshError unless the attributes fit a mesh with `vertex_count` vertices and these triangles (F, 3)."""
         starts, corners = self.starts, self.corners
         if starts.ndim != 1 or len(starts) < 2 or starts[0] != 0 or starts[-1] != len(corners):
             raise MeshError("polygons do not begin at the first corner and end at the last")
@@ -279,7 +279,7 @@ def _bounds(labels: Labels | None) -> tuple[IntArray | None, int]:
 
 
 def labelled(names: Sequence[str | None]) -> Labels | None:
-    """Labels of polygons, given each one's name; None where none has one."""
+    """Make labels from the names of the polygons; None if no polygon has a name."""
     known = list(dict.fromkeys(name for name in names if name is not None))
     if not known:
         return None
@@ -288,11 +288,11 @@ def labelled(names: Sequence[str | None]) -> Labels | None:
 
 
 def linear(srgb: FloatArray) -> FloatArray:
-    """Colours as screens take them, from 0 to 1, as linear light (IEC 61966-2-1)."""
+    """Convert sRGB colours from 0 to 1 to linear light (IEC 61966-2-1)."""
     return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
 
 
 def srgb(linear: NDArray[np.floating]) -> FloatArray:
-    """The reverse of `linear`."""
+    """Convert linear light to sRGB colours from 0 to 1, the inverse of `linear`."""
     light = np.clip(linear.astype(np.float64), 0, 1)
     return np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)

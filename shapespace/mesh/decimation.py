@@ -1,4 +1,4 @@
-"""Decimating one mesh in all its shapes: half-edge collapses by quadric error, one by one, and edge flips that heal."""
+"""Decimation of one mesh in all its shapes: half-edge collapses by quadric error, one by one, and edge flips."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from shapespace.mesh.triangle_mesh import Connectivity
 from shapespace.mesh.triangle_quality import FOLD_LIMIT, Pairs, Triangles, folded_pairs
 from shapespace.mesh.vectors import dots
 
-#: Largest turn of a face's normal in one collapse.
+#: Cosine of the largest rotation of a face's normal in one collapse.
 TURN_LIMIT = np.cos(np.deg2rad(60))
-#: Shapes, spread evenly over the collection, whose quadrics are summed; every shape is checked.
+#: Number of shapes, evenly spaced in the collection, whose quadrics are summed. Every shape is checked.
 QUADRIC_SHAPES = 16
 
 _Face = tuple[int, int, int]
@@ -24,15 +24,15 @@ _Face = tuple[int, int, int]
 
 @dataclass(frozen=True)
 class _Neighbourhood:
-    """What a collapse changes.
+    """The faces that a collapse changes, before and after.
 
     Attributes:
-        rows: faces as triples of vertices, to which the other lists refer by number.
+        rows: faces as triples of vertices; the other lists have indices of rows.
         old: faces at the vertex that is collapsed.
-        staying: those of them that don't vanish.
-        new: what these become, in the same order.
-        pairs_before: neighbours among the old faces and those across from them.
-        pairs_after: the same among the new ones.
+        staying: old faces that don't vanish.
+        new: these faces after the collapse, in the same order.
+        pairs_before: neighbours among the old faces and the faces around them.
+        pairs_after: neighbours among the new faces and the faces around them.
     """
 
     rows: list[_Face]
@@ -44,20 +44,20 @@ class _Neighbourhood:
 
 
 class Decimation:
-    """The mesh while it is being decimated; which collapses are refused is told at ``coarsening.coarsen``.
+    """A mesh during its decimation. See ``coarsening.coarsen`` for the collapses that are refused.
 
     Args:
-        connectivity: of the fine mesh, Vf vertices.
+        connectivity: connectivity of the fine mesh with Vf vertices.
         shapes: (n, Vf, 3).
-        mean_areas: (n,) area that a coarse face will have on average, in each shape.
-        small: length. Where the mesh is crumpled already and no side of a face at a vertex is longer, any collapse is
-            allowed that makes neither more slivers nor more folds: the place is about to become a point.
-        motion_weight: weight of the squared distance that a vertex moves, against that of the planes of the faces.
+        mean_areas: (n,) expected mean area of the coarse faces in each shape.
+        small: length of a small edge. In a crumpled place, a vertex whose faces have no longer side may collapse freely
+            as long as slivers and folds don't become more: the place is about to become a point.
+        motion_weight: weight of the squared distance that a vertex moves, relative to the planes of the faces.
 
     Attributes:
-        count: of the vertices that are left.
-        faces: those that are left, by their number in the fine mesh, as triples of fine vertices.
-        mean_areas: as given.
+        count: number of vertices that are left.
+        faces: remaining faces as triples of fine vertices, by their index in the fine mesh.
+        mean_areas: see the argument.
     """
 
     def __init__(
@@ -79,16 +79,16 @@ class Decimation:
                 self._star[v].add(f)
         rim = set(connectivity.edges[~connectivity.interior].ravel().tolist())
         self._boundary = [v in rim for v in range(self.count)]
-        # A vertex where sheets touch stays, because removing it would tear them apart.
+        # A vertex where two sheets touch stays: removing it would separate them.
         self._locked = [len(self._fan(self._link(v))) < len(self._star[v]) for v in range(self.count)]
         self._version = [0] * self.count
-        """Grows whenever the offers of a vertex are renewed."""
+        """Increases whenever the candidate collapses of a vertex are renewed."""
         self._heap: list[tuple[float, int, int, int, int]] = []
         self._refused: dict[int, list[tuple[float, int, int, int, int]]] = {}
         self._offer(np.concatenate([connectivity.edges, connectivity.edges[:, ::-1]]))
 
     def run(self, target: int, sine: float) -> bool:
-        """Collapse until ``target`` vertices are left or nothing can be; whether the target is reached."""
+        """Collapse until ``target`` vertices are left or none can go. Returns whether the target is reached."""
         for entries in self._refused.values():
             self._heap += entries
         self._refused.clear()
@@ -105,22 +105,22 @@ class Decimation:
         return self.count <= target
 
     def heal(self, target: int, sine: float, *, folds: bool = True) -> None:
-        """Make slivers, specks and folds fewer by flips, and by collapses while there are over ``target`` vertices."""
+        """Remove slivers, specks and folds by flips, and by collapses while more than ``target`` vertices are left."""
         while vertices := self._faulty(sine, folds=folds):
             changed = [self._flip_one(u, sine) or self._collapse_one([u], target, sine, heal=True) for u in vertices]
             if any(changed):
                 continue
-            # Where nothing heals, thinning the neighbourhood makes room for it.
+            # If nothing helps, remove vertices of the neighbourhood to make room.
             thinned = [self._collapse_one([u, *self._ring(u)], target, sine, heal=False) for u in vertices]
             if not any(thinned):
                 break
 
     def triangles(self, faces: IntArray) -> Triangles:
-        """Faces (k, 3), in fine vertices, in all shapes."""
+        """Measure faces (k, 3) of fine vertices in all shapes."""
         return Triangles.of(self._points[faces.T], self.mean_areas)
 
     def _faulty(self, sine: float, *, folds: bool) -> list[int]:
-        """Vertices at slivers, at specks and, where asked for, at folds in any shape."""
+        """List the vertices at slivers, at specks and, if ``folds``, at folds in any shape."""
         faces = np.array(list(self.faces.values()))
         used, local = np.unique(faces, return_inverse=True)
         connectivity = Connectivity(local.reshape(-1, 3), len(used))
@@ -131,7 +131,7 @@ class Decimation:
         vertices: list[int] = np.unique(faces[bad]).tolist()
         return vertices
 
-    # ------------------------------------------------------------ offers
+    # ------------------------------------------------------------ candidates
 
     def _costs(self, pairs: IntArray) -> FloatArray:
         u, v = pairs.T
@@ -140,13 +140,13 @@ class Decimation:
         return costs + self._motion_weight * self._areas[u] * motion
 
     def _offer(self, pairs: IntArray) -> None:
-        """Put half-edges (k, 2), u → v, on the heap."""
+        """Put half-edges (k, 2), u → v, on the heap as candidates."""
         for cost, (u, v) in zip(self._costs(pairs).tolist(), pairs.tolist(), strict=True):
             if not self._locked[u]:
                 heapq.heappush(self._heap, (cost, u, v, self._version[u], self._version[v]))
 
     def _offer_again(self, vertices: Sequence[int]) -> None:
-        """Renew the offers of vertices whose star has changed, and those refused before at their neighbours."""
+        """Renew the candidates at vertices whose star has changed, and the refused candidates of their neighbours."""
         pairs = set()
         for v in vertices:
             self._version[v] += 1
@@ -163,7 +163,7 @@ class Decimation:
         return sorted({w for f in self._star[v] for w in self.faces[f]} - {v})
 
     def _link(self, v: int) -> dict[int, tuple[int, int]]:
-        """The faces around a vertex: for each face ``(v, a, b)`` an item ``a: (b, number of the face)``."""
+        """Map a to (b, index of the face) for each face ``(v, a, b)`` around a vertex v."""
         link = {}
         for f in self._star[v]:
             a, b, c = self.faces[f]
@@ -173,7 +173,7 @@ class Decimation:
 
     @staticmethod
     def _fan(link: dict[int, tuple[int, int]]) -> list[_Face]:
-        """``(a, b, face)`` in order around the vertex, from its boundary or from the smallest neighbour."""
+        """List ``(a, b, face)`` in order around the vertex, from its boundary or from the smallest neighbour."""
         a = min(link.keys() - {b for b, _ in link.values()} or link)
         fan: list[_Face] = []
         while a in link and not (fan and a == fan[0][0]):
@@ -182,13 +182,13 @@ class Decimation:
         return fan
 
     def _across(self, a: int, b: int, f: int) -> list[int]:
-        """The face on the other side of an edge of face f, if there is one."""
+        """List the face on the other side of an edge of face f, if there is one."""
         return list((self._star[a] & self._star[b]) - {f})
 
     # ------------------------------------------------------------ checks
 
     def _keeps_topology(self, u: int, v: int) -> bool:
-        """The link condition (Dey, Edelsbrunner, Guha and Nekhayev 1999): lk u ∩ lk v = lk uv, with boundary."""
+        """Check the link condition with boundary, lk u ∩ lk v = lk uv (Dey, Edelsbrunner, Guha and Nekhayev 1999)."""
         shared = self._star[u] & self._star[v]
         opposite = {w for f in shared for w in self.faces[f]} - {u, v}
         link_u, link_v = self._link(u), self._link(v)
@@ -202,7 +202,7 @@ class Decimation:
         )
 
     def _keeps_shape(self, u: int, v: int, sine: float, *, heal: bool = False) -> bool:
-        """Whether u → v leaves no fault in any shape that wasn't as bad before; or, to ``heal``, fewer faults."""
+        """Whether u → v makes no shape worse than before; with ``heal``, whether it reduces the number of faults."""
         around = self._around(u, v)
         triangles = self.triangles(np.array(around.rows))
         was = triangles.quality(around.old, around.pairs_before, sine)
@@ -222,13 +222,13 @@ class Decimation:
         )
 
     def _around(self, u: int, v: int) -> _Neighbourhood:
-        """The faces that u → v changes, before and after, and those across their outer sides."""
+        """Collect the faces that u → v changes, before and after, and the faces across their outer sides."""
         fan = self._fan(self._link(u))
         k = len(fan)
         gone = [v in (a, b) for a, b, _ in fan]
         staying = [i for i in range(k) if not gone[i]]
         rows = [(u, a, b) for a, b, _ in fan] + [(v, a, b) for a, b, _ in fan]
-        # A face of u that vanishes has no image: put another in its place rather than one without area.
+        # A face of u that vanishes has no image. Put another face in its place, so that no row lacks area.
         for i in range(k):
             if gone[i]:
                 rows[k + i] = rows[i]
@@ -238,7 +238,7 @@ class Decimation:
             across.append(len(rows) if found else None)
             rows += [self.faces[g] for g in found]
         consecutive = [(i, (i + 1) % k) for i in range(k if fan[-1][1] == fan[0][0] else k - 1)]
-        # Faces that vanish leave the ones behind them as neighbours.
+        # Where a face vanishes, its two outer neighbours become neighbours.
         image = [across[i] if gone[i] else k + i for i in range(k)]
         before = consecutive + [(i, o) for i, o in enumerate(across) if o is not None]
         after = [(image[i], image[j]) for i, j in consecutive if not (gone[i] and gone[j])]
@@ -272,7 +272,7 @@ class Decimation:
         self._offer_again([v])
 
     def _collapse_one(self, vertices: list[int], target: int, sine: float, *, heal: bool) -> bool:
-        """Do the cheapest possible collapse of one of some vertices; whether there was one."""
+        """Make the cheapest possible collapse of one of some vertices. Returns whether there was one."""
         pairs = [(u, v) for u in vertices if not self._locked[u] for v in self._ring(u)]
         if self.count <= target or not pairs:
             return False
@@ -284,13 +284,13 @@ class Decimation:
         return False
 
     def _flip_one(self, u: int, sine: float) -> bool:
-        """Flip an edge at u if that makes slivers and folds fewer; whether there was one."""
+        """Flip an edge at u if this reduces slivers and folds. Returns whether there was one."""
         link = self._link(u)
         for w, (c, f) in sorted(link.items()):
             d, g = next(((a, g) for a, (b, g) in link.items() if b == w), (None, None))
             if d is None or g is None or c == d or c in self._ring(d):
                 continue
-            # An inner vertex keeps three faces, one on the boundary one.
+            # An inner vertex keeps at least three faces, a boundary vertex at least one.
             if any(len(self._star[x]) < (2 if self._boundary[x] else 4) for x in (u, w)):
                 continue
             old, new = [(u, w, c), (w, u, d)], [(u, d, c), (d, w, c)]

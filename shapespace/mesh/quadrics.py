@@ -1,4 +1,4 @@
-"""Quadric error metrics (Garland and Heckbert 1997) of several shapes together: what it costs to move a vertex."""
+"""Quadric error metrics (Garland and Heckbert 1997) summed over several shapes: the cost of moving a vertex."""
 
 from __future__ import annotations
 
@@ -8,23 +8,23 @@ from scipy import sparse
 from shapespace.arrays import FloatArray, IntArray
 from shapespace.mesh.triangle_mesh import Connectivity, face_normals
 
-#: Weight of a plane across the boundary against that of the planes of the faces.
+#: Weight of a plane across the boundary, relative to the planes of the faces.
 BOUNDARY_WEIGHT = 10.0
 
 
 def monomials(points: FloatArray) -> FloatArray:
-    """(Vf, 10n) products of the homogeneous coordinates of points (Vf, n, 3); the mixed ones twice."""
+    """(Vf, 10n) products of the homogeneous coordinates of points (Vf, n, 3); mixed products are doubled."""
     h = np.concatenate([points, np.ones_like(points[..., :1])], axis=-1)
     i, j = np.triu_indices(4)
     return (h[..., i] * h[..., j] * np.where(i == j, 1.0, 2.0)).reshape(len(points), -1)
 
 
 def quadrics_of(connectivity: Connectivity, shapes: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Squared distances to the planes at a vertex in all shapes (n, Vf, 3), by area.
+    """Compute area-weighted squared distances to the planes at each vertex, in all shapes (n, Vf, 3).
 
     Returns:
-        (Vf, 10n) so that the sum over the shapes is a dot product with ``monomials``, and (Vf,) the areas
-        around the vertices, both averaged over the shapes.
+        Quadrics (Vf, 10n), whose dot product with ``monomials`` is the sum over the shapes, and the areas (Vf,) around
+        the vertices, both averaged over the shapes.
     """
     count, (i, j) = connectivity.vertex_count, np.triu_indices(4)
     faces, rim = connectivity.faces, connectivity.edges[~connectivity.interior]
@@ -37,7 +37,7 @@ def quadrics_of(connectivity: Connectivity, shapes: FloatArray) -> tuple[FloatAr
         return gathered
 
     quadrics, areas = np.empty((count, 10 * len(shapes))), np.zeros(len(faces))
-    # Shape by shape: normals of all faces in all shapes take much memory.
+    # One shape at a time: the normals of all faces in all shapes take much memory.
     for k, shape in enumerate(shapes):
         normals = face_normals(shape, faces, normalised=False)
         doubled = np.linalg.norm(normals, axis=-1)
@@ -55,7 +55,7 @@ def quadrics_of(connectivity: Connectivity, shapes: FloatArray) -> tuple[FloatAr
 
 
 def _at_vertices(corners: IntArray, count: int) -> sparse.csr_array:
-    """(count, k) 1 where a vertex is a corner of an element, given the corners (k, d) of each."""
+    """(count, k) sparse matrix with 1 where a vertex is a corner of an element, given the corners (k, d)."""
     elements = len(corners)
     entries = (np.ones(corners.size), corners.T.ravel(), np.arange(corners.size + 1))
     by_vertex = sparse.csr_array(entries, shape=(corners.size, count)).tocsc()  # a counting sort

@@ -1,4 +1,4 @@
-"""Rigid motions, which no length and no angle can see: alignment, and the infinitesimal ones."""
+"""Rigid motions, which change no length and no angle: alignment, and infinitesimal rigid motions."""
 
 from __future__ import annotations
 
@@ -8,18 +8,18 @@ import numpy as np
 
 from shapespace.arrays import FloatArray
 
-#: Singular values of rigid motions below this share of the largest are treated as zero.
+#: Singular values of rigid motions below this share of the largest one count as zero.
 RANK = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
 class Placement:
-    """Takes points from one frame to another: ``x ↦ scale · rotation · x + translation``.
+    """A similarity between two frames: ``x ↦ scale · rotation · x + translation``.
 
     Attributes:
         rotation: (3, 3), without reflection.
-        translation: (3,) in the units of the frame that points are taken to.
-        scale: a factor.
+        translation: (3,) in the unit of the target frame.
+        scale: factor on lengths.
     """
 
     rotation: FloatArray
@@ -27,28 +27,28 @@ class Placement:
     scale: float = 1.0
 
     def __call__(self, points: FloatArray) -> FloatArray:
-        """Points (…, 3) in the other frame."""
+        """Map points (…, 3) to the target frame."""
         return self.scale * points @ self.rotation.T + self.translation
 
     def back(self, points: FloatArray) -> FloatArray:
-        """Points (…, 3) of the other frame in the first one."""
+        """Map points (…, 3) of the target frame back."""
         return (points - self.translation) @ self.rotation / self.scale
 
     def after(self, first: Placement) -> Placement:
-        """This one applied to what ``first`` has placed."""
+        """Return the composition: ``first``, then this placement."""
         return Placement(self.rotation @ first.rotation, self(first.translation), self.scale * first.scale)
 
     @classmethod
     def between(
         cls, points: FloatArray, there: FloatArray, weights: FloatArray | None = None, *, scaled: bool = False
     ) -> Placement:
-        """What brings points (n, 3) closest to others (n, 3) in weighted least squares (Umeyama 1991).
+        """Find the placement that brings points closest to others in weighted least squares (Umeyama 1991).
 
         Args:
             points: (n, 3).
-            there: (n, 3).
-            weights: (n,), by default equal ones.
-            scaled: whether the scale is found too, which is 1 otherwise.
+            there: (n, 3) positions in the target frame.
+            weights: (n,), equal by default.
+            scaled: whether the scale is fitted too; otherwise it is 1.
         """
         share = np.full(len(points), 1 / len(points)) if weights is None else weights / weights.sum()
         middle, centre = share @ points, share @ there
@@ -61,15 +61,15 @@ class Placement:
         return cls(rotation, centre - scale * rotation @ middle, scale)
 
     def angle_to(self, other: Placement) -> float:
-        """Angle between the rotations, in radians."""
+        """Compute the angle between the two rotations, in radians."""
         return float(np.arccos(np.clip((np.trace(self.rotation @ other.rotation.T) - 1) / 2, -1, 1)))
 
 
 def rigid_motions(vertices: FloatArray) -> FloatArray:
-    """(6, 3V) orthonormal basis of the infinitesimal rigid motions of a shape (V, 3)."""
+    """Compute an orthonormal basis (6, 3V) of the infinitesimal rigid motions of a shape (V, 3)."""
     count = len(vertices)
     x = vertices - vertices.mean(axis=0)
-    # About the principal axes rotations are orthogonal to each other.
+    # Rotations about the principal axes are orthogonal to each other.
     moments, axes = np.linalg.eigh(x.T @ x)
     motions = np.zeros((6, count, 3))
     for k, (i, j) in enumerate(((1, 2), (2, 0), (0, 1))):
@@ -80,11 +80,11 @@ def rigid_motions(vertices: FloatArray) -> FloatArray:
 
 
 def without_rigid_motion(displacement: FloatArray, vertices: FloatArray) -> FloatArray:
-    """The part of vertex fields (…, V, 3) orthogonal to infinitesimal rigid motions of a shape.
+    """Project vertex fields (…, V, 3) orthogonally to the infinitesimal rigid motions of a shape.
 
-    A velocity of lengths and angles determines a vertex field only up to these, yet adding one changes
-    discrete results. The field without them is what aligning two shapes in least squares leaves to first
-    order *and* exactly: if X_1 is aligned to X_0, then X_1 − X_0 has no such part.
+    A velocity of lengths and angles determines a vertex field only up to rigid motions, but rigid motions change
+    discrete results. The projection corresponds to least-squares alignment, to first order *and* exactly: if X_1 is
+    aligned to X_0, then X_1 − X_0 has no rigid part.
     """
     motions = rigid_motions(vertices)
     flat = displacement.reshape(*displacement.shape[:-2], -1)
@@ -94,11 +94,11 @@ def without_rigid_motion(displacement: FloatArray, vertices: FloatArray) -> Floa
 def weighted_change(
     fields: FloatArray, points: FloatArray, weights: FloatArray, aligned: FloatArray | None = None
 ) -> FloatArray:
-    """How weighted misfits (n, k, 3) of points (k, 3) change where the points move by fields (n, k, 3).
+    """Compute the changes (n, k, 3) of weighted misfits of points (k, 3) when the points move by fields (n, k, 3).
 
-    A misfit is ``√w (x − target)`` after ``Placement.between``, which takes the infinitesimal rigid motion next to each
-    field away, exactly so where there is no misfit. The placement is by the weights ``aligned`` (k,), where these are
-    others.
+    A misfit is ``√w (x − target)`` after ``Placement.between``. The placement removes the infinitesimal rigid motion
+    closest to each field; this is exact where the misfit is zero. ``aligned`` (k,) are the weights of the placement, if
+    they differ from ``weights``.
     """
     aligned = weights if aligned is None else aligned
     x = points - aligned @ points / aligned.sum()
@@ -107,29 +107,29 @@ def weighted_change(
         motions[k, :, k] = 1
         motions[3 + k] = np.cross(np.eye(3)[k], x)
     roots = np.sqrt(aligned)[:, None]
-    # No rotation about a line of points is seen.
+    # Points on a line don't determine the rotation about it.
     inverse = np.linalg.pinv((roots * motions).reshape(6, -1), rcond=RANK)
     motion = (roots * fields).reshape(len(fields), -1) @ inverse
     return np.sqrt(weights)[:, None] * (fields - np.tensordot(motion, motions, 1))
 
 
 def aligned_change(vertices: FloatArray, fields: FloatArray, target: FloatArray) -> FloatArray:
-    """How a shape (V, 3) aligned to a target (V, 3) changes where the shape changes by vertex fields (n, V, 3).
+    """Compute the change of a shape (V, 3) aligned to a target (V, 3) when the shape changes by fields (n, V, 3).
 
-    To first order, and as far as the two are alike: turned as the shape is, and without the rigid motion that alignment
-    takes away.
+    To first order, for shapes close to the target: the fields are rotated with the shape, and alignment removes their
+    rigid part.
     """
     there = align(vertices, target)
     return without_rigid_motion(align(vertices, target, carried=vertices + fields) - there, there)
 
 
 def align(vertices: FloatArray, target: FloatArray, carried: FloatArray | None = None) -> FloatArray:
-    """Move shapes (…, V, 3) rigidly to come closest to targets (…, V, 3) in least squares over vertices.
+    """Align shapes (…, V, 3) rigidly to targets (…, V, 3) in least squares over the vertices.
 
-    Kabsch's method: rotation and translation, no reflection, no scaling. Instead of the shapes themselves other points
-    (…, n, 3) can be moved as they are, ``carried``.
+    Kabsch's method: rotation and translation, no reflection, no scaling. With ``carried``, the same motion is applied
+    to other points (…, n, 3) instead of the shapes.
     """
-    # Means by products: ten times as fast as `mean` over rows of three.
+    # Matrix products compute means ten times as fast as `mean` over rows of three.
     share = np.full((1, vertices.shape[-2]), 1 / vertices.shape[-2])
     centre, middle = share @ vertices, share @ target
     x, y = vertices - centre, target - middle

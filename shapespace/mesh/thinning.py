@@ -1,7 +1,7 @@
-"""Thinning a large mesh before it is coarsened with care: many half-edge collapses at once, in arrays.
+"""Thinning of a large mesh before its decimation: many half-edge collapses at once, in arrays.
 
-One collapse after the other, each checked in every shape, takes as long as it has to for the last few thousand vertices
-and far too long for the first hundred thousand, which lie so close together that hardly any choice among them matters.
+Decimation makes one collapse after the other, each checked in every shape. For the first hundred thousand vertices this
+takes far too long. They are so close together that the choice among them matters little.
 """
 
 from __future__ import annotations
@@ -16,37 +16,37 @@ from shapespace.mesh.triangle_mesh import Connectivity
 from shapespace.mesh.triangle_quality import FOLD_LIMIT, normals_and_sides, squared_sines
 from shapespace.mesh.vectors import dots, unit
 
-#: Smallest angles (degrees) that a collapse may leave, unless there was a smaller one around: the first limit holds
-#: until a round removes less than this share of the vertices, then the next.
+#: Smallest angles (degrees) that a collapse may leave, unless there was a smaller one around. The next limit replaces
+#: the present one after a round that removes less than the share SLOW of the vertices.
 ANGLE_LIMITS, SLOW = (10.0, 5.0, 2.5), 0.01
-#: Largest turn of a face's normal.
-TURN = np.cos(np.deg2rad(45))
-#: Weight of a vertex's motion relative to the plane errors of its faces: it keeps triangles uniform.
+#: Cosine of the largest rotation of a face's normal in one collapse.
+TURN_LIMIT = np.cos(np.deg2rad(45))
+#: Weight of a vertex's motion relative to the plane errors of its faces. It keeps triangles uniform.
 MOTION_WEIGHT = 0.1
-#: In each round the cheapest of the candidate collapses are made: this share of them.
+#: Share of the candidate collapses that is made in each round, the cheapest first.
 CHEAPEST = 0.5
-#: How often further vertices are chosen, far from those already chosen.
+#: Number of times that further candidates are chosen at a distance from the chosen ones.
 SWEEPS = 3
-#: Faces, or collapses, looked at together.
+#: Number of faces, or collapses, that are checked together.
 CHUNK = 50_000
 #: Thinning ends after VAIN rounds that each remove less than the share FEWEST of the vertices.
 FEWEST, VAIN = 0.001, 5
 
 
 def thin(connectivity: Connectivity, shapes: FloatArray, target: int) -> tuple[IntArray, IntArray]:
-    """Collapse edges until about ``target`` vertices are left, or until hardly any edge can be collapsed.
+    """Collapse edges until about ``target`` vertices are left, or until few edges can be collapsed.
 
-    In each round vertices far enough from each other are drawn at random, so that no collapse changes the faces that
-    another looks at; those are collapsed whose quadrics, of all shapes, say that it costs least (Garland and Heckbert
-    1997). To take the vertices that cost less than all around them instead would give too few of them.
+    Each round draws random vertices far enough from each other: no collapse changes the faces that another collapse
+    checks. The cheapest collapses are made, by the quadrics of all shapes (Garland and Heckbert 1997). Choosing
+    vertices that cost less than all their neighbours instead would find too few.
 
     Args:
         connectivity: F faces on V vertices.
-        shapes: (n, V, 3) a few shapes of similar size, which a collapse must neither fold nor flatten.
+        shapes: (n, V, 3) a few shapes of similar size; a collapse may neither fold nor flatten any of them.
         target: number of vertices.
 
     Returns:
-        Which vertices are left (V'), increasing, and the faces (F', 3) between them.
+        The remaining vertices (V'), increasing, and the faces (F', 3) between them.
     """
     points = np.ascontiguousarray(np.moveaxis(shapes - shapes.mean(axis=1, keepdims=True), 0, 1))
     quadrics, areas = quadrics_of(connectivity, np.moveaxis(points, 1, 0))
@@ -72,10 +72,10 @@ def thin(connectivity: Connectivity, shapes: FloatArray, target: int) -> tuple[I
 
 
 class _Round:
-    """The mesh at the beginning of a round: its faces, and who is next to whom.
+    """The mesh at the beginning of a round: its faces and adjacency.
 
     Attributes:
-        sides: (V, V) of each half-edge the number of its face, from 1.
+        sides: (V, V) index of the face of each half-edge, counted from 1.
         neighbours: (V, V) number of faces at each edge.
     """
 
@@ -91,15 +91,15 @@ class _Round:
         self.valence = np.bincount(faces.ravel(), minlength=self.count)
         self.rim = np.zeros(self.count, dtype=bool)
         self.rim[np.repeat(np.arange(self.count), degree)[self.neighbours.data == 1]] = True
-        # Where sheets touch, a vertex has more edges than its one fan of faces needs.
+        # Where two sheets touch, a vertex has more edges than a single fan of faces needs.
         self.touching = degree != self.valence + self.rim
         corners = (np.ones(3 * len(faces), bool), faces.ravel(), np.arange(3 * len(faces) + 1))
-        # The faces around each vertex, one vertex after the other: a counting sort.
+        # Faces around each vertex, sorted by vertex: a counting sort.
         self._around = sparse.csr_array(corners, shape=(3 * len(faces), self.count)).tocsc().indices // 3
         self._starts = np.cumsum(self.valence) - self.valence
 
     def apart(self, rng: np.random.Generator) -> IntArray:
-        """Vertices (k,) that may go, more than two edges from each other."""
+        """Choose vertices (k,) to remove, more than two edges from each other."""
         rank = rng.permutation(self.count)
         rank[self.touching] = self.count
         chosen = np.zeros(self.count, dtype=bool)
@@ -111,11 +111,11 @@ class _Round:
                 lowest = np.minimum.reduceat(of_face[self._around], self._starts)
             wins = (lowest == rank) & (rank >= 0) & ~self.touching
             chosen |= wins
-            rank[wins] = -1  # nothing near these can win any more
+            rank[wins] = -1  # no vertex near these is chosen any more
         return np.flatnonzero(chosen)
 
     def half_edges(self, tails: IntArray) -> IntArray:
-        """Half-edges (k, 2) from some vertices whose collapse keeps the topology (link condition, Dey et al. 1999)."""
+        """List the half-edges (k, 2) from some vertices that meet the link condition (Dey et al. 1999)."""
         rows = self.neighbours[tails]
         u, v = np.repeat(tails, np.diff(rows.indptr)), rows.indices
         others = sparse.csr_array(self.neighbours[u].multiply(self.neighbours[v]))
@@ -127,7 +127,7 @@ class _Round:
         return pairs
 
     def stars(self, vertices: IntArray) -> tuple[IntArray, IntArray]:
-        """The faces around some vertices, and for each face which of these it is around."""
+        """List the faces around some vertices, with the index of the vertex for each face."""
         counts = self.valence[vertices]
         which = np.repeat(np.arange(len(vertices)), counts)
         offset = np.arange(len(which)) - np.repeat(np.cumsum(counts) - counts, counts)
@@ -135,7 +135,7 @@ class _Round:
 
 
 def _proper(faces: IntArray) -> NDArray[np.bool_]:
-    """Which faces have three different corners."""
+    """Return a mask of the faces with three different corners."""
     a, b, c = faces.T
     proper: NDArray[np.bool_] = (a != b) & (b != c) & (c != a)
     return proper
@@ -144,13 +144,13 @@ def _proper(faces: IntArray) -> NDArray[np.bool_]:
 def _collapses(
     mesh: _Round, quadrics: FloatArray, areas: FloatArray, most: int, sine: float, rng: np.random.Generator
 ) -> IntArray:
-    """Half-edges (k, 2), u → v, that can be collapsed all at once, ``most`` at most."""
+    """Choose at most ``most`` half-edges (k, 2), u → v, that can be collapsed at once."""
     pairs = mesh.half_edges(mesh.apart(rng))
     if not len(pairs):
         return pairs
     u, v = pairs.T
     costs = np.concatenate([_costs(mesh.points, quadrics, areas, some) for some in _chunks(pairs)])
-    # The cheapest half-edge of each vertex, and of these the cheaper ones.
+    # The cheapest half-edge of each vertex, and the cheaper part of these.
     order = np.lexsort((costs, u))
     first = order[np.flatnonzero(np.diff(u[order], prepend=-1))]
     first = first[np.argsort(costs[first], kind="stable")][: max(1, int(CHEAPEST * len(first)))]
@@ -160,7 +160,7 @@ def _collapses(
 
 
 def _costs(points: FloatArray, quadrics: FloatArray, areas: FloatArray, pairs: IntArray) -> FloatArray:
-    """What collapses (k, 2) cost."""
+    """Compute the costs of collapses (k, 2)."""
     u, v = pairs.T
     costs: FloatArray = dots(quadrics[u] + quadrics[v], monomials(points[v]))
     costs += MOTION_WEIGHT * areas[u] * ((points[u] - points[v]) ** 2).sum(axis=(1, 2))
@@ -168,12 +168,12 @@ def _costs(points: FloatArray, quadrics: FloatArray, areas: FloatArray, pairs: I
 
 
 def _chunks(pairs: IntArray) -> list[IntArray]:
-    """Some at a time: what is computed of all of them in all shapes takes much memory."""
+    """Split pairs into chunks: their monomials in all shapes take much memory."""
     return np.array_split(pairs, -(-len(pairs) // CHUNK))
 
 
 def _keep_shape(mesh: _Round, pairs: IntArray, sine: float) -> NDArray[np.bool_]:
-    """Which collapses (k, 2) leave no angle below ``sine`` and turn no face much, in any shape."""
+    """Return a mask of the collapses (k, 2) that leave no small angle and rotate no face much, in any shape."""
     u, v = pairs.T
     star, which = mesh.stars(u)
     old = mesh.faces[star]
@@ -181,19 +181,19 @@ def _keep_shape(mesh: _Round, pairs: IntArray, sine: float) -> NDArray[np.bool_]
     stays = _proper(new)
     which, old, new = which[stays], old[stays], new[stays]
     good = np.ones(len(pairs), dtype=bool)
-    # Some at a time: corners of all faces in all shapes take much memory.
+    # In chunks: the corners of all faces in all shapes take much memory.
     for start in range(0, len(which), CHUNK):
         part = slice(start, start + CHUNK)
         before, was = normals_and_sides(mesh.points[old[part].T])
         after, becomes = normals_and_sides(mesh.points[new[part].T])
         floor = np.minimum(sine**2, squared_sines(before, was))
-        bad = (squared_sines(after, becomes) < floor) | (dots(unit(before), unit(after)) < TURN)
+        bad = (squared_sines(after, becomes) < floor) | (dots(unit(before), unit(after)) < TURN_LIMIT)
         good[which[part][bad.any(axis=1)]] = False
     return good
 
 
 def _without_folds(mesh: _Round, pairs: IntArray) -> IntArray:
-    """Leave out collapses that would fold neighbouring faces onto each other, in any shape."""
+    """Drop collapses that would fold neighbouring faces onto each other in any shape."""
     while len(pairs):
         star, _ = mesh.stars(pairs[:, 0])
         corners = mesh.faces[star]
@@ -202,7 +202,7 @@ def _without_folds(mesh: _Round, pairs: IntArray) -> IntArray:
         near = near[near >= 0]
         goes, by = np.arange(mesh.count), np.full(mesh.count, -1)
         goes[pairs[:, 0]], by[pairs[:, 0]] = pairs[:, 1], np.arange(len(pairs))
-        # A face has one corner that goes, at most.
+        # At most one corner of a face is removed.
         cause, faces = by[mesh.faces[near]].max(axis=1), goes[mesh.faces[near]]
         proper = _proper(faces)
         cause, faces = cause[proper], faces[proper]

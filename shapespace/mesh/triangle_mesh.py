@@ -1,4 +1,4 @@
-"""Triangle meshes: connectivity checked once, positions carried beside it."""
+"""Triangle meshes: connectivity, checked once, and positions."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from shapespace.mesh.vectors import components, cross, unit
 
 
 class MeshError(ValueError):
-    """A mesh that can't be used, with a sentence that says why."""
+    """The mesh can't be used; the message says why."""
 
 
 class PlaceError(MeshError):
-    """A fault at some vertices or faces, which a caller may know by other numbers.
+    """A fault at some vertices or faces, which the caller may count in another way.
 
     Args:
-        sentence: with a field ``{name}`` for each entry of ``numbers``; names of faces begin with ``face``.
-        numbers: by name, counted from 0; several are written as ``(2, 48)``.
+        sentence: message with a field ``{name}`` for each entry of ``numbers``; names of faces begin with ``face``.
+        numbers: indices by name, counted from 0; several indices are written as ``(2, 48)``.
     """
 
     def __init__(self, sentence: str, numbers: Mapping[str, Sequence[int]]) -> None:
@@ -31,12 +31,12 @@ class PlaceError(MeshError):
         self.sentence, self.numbers = sentence, numbers
 
     def numbered(self, first: int = 0, vertices: IntArray | None = None) -> str:
-        """The sentence with numbers counted from ``first``, and those of vertices replaced by ``vertices`` (V,)."""
+        """Format the sentence with indices counted from ``first``, and with vertices renamed by ``vertices`` (V,)."""
         shown = self.sentence
         for name, numbers in self.numbers.items():
             known = numbers if vertices is None or name.startswith("face") else vertices[list(numbers)].tolist()
             text = ", ".join(str(number + first) for number in known)
-            # Only once, because the name of a file may contain braces too.
+            # Replace once only: the name of a file may contain braces too.
             shown = shown.replace(f"{{{name}}}", f"({text})" if len(known) > 1 else text, 1)
         return shown
 
@@ -45,18 +45,18 @@ class PlaceError(MeshError):
 
 
 class Connectivity:
-    """The combinatorics that every mesh of a collection shares.
+    """Faces and edges, shared by all meshes of a collection.
 
-    Edges are undirected, stored as ``(i, j)`` with ``i < j`` and sorted lexicographically; every per-edge
-    array of the project uses this order.
+    Edges are undirected, stored as ``(i, j)`` with ``i < j``, and sorted lexicographically. All arrays over edges have
+    this order.
 
     Args:
         faces: (F, 3) vertex indices, consistently oriented.
-        vertex_count: V, so that every vertex is checked to belong to a face.
+        vertex_count: V; every vertex must belong to a face.
 
     Raises:
-        MeshError: faces out of range or repeating a vertex, an edge with more than two faces,
-            neighbouring faces of opposite orientation, or a vertex without a face.
+        MeshError: a face is out of range or repeats a vertex, an edge has more than two faces, neighbouring faces have
+            opposite orientations, or a vertex has no face.
     """
 
     def __init__(self, faces: ArrayLike, vertex_count: int) -> None:
@@ -85,7 +85,7 @@ class Connectivity:
         unique, side_edge, count = np.unique(key, return_inverse=True, return_counts=True)
         self.edges: IntArray = np.stack([unique // vertex_count, unique % vertex_count], axis=1)
         self.face_edges: IntArray = side_edge.reshape(3, -1).T.copy()
-        """(F, 3): edge k is opposite to corner k of the face."""
+        """(F, 3) edges of each face; edge k is opposite to corner k."""
         if count.max() > 2:
             i, j = self.edges[count.argmax()].tolist()
             raise PlaceError(f"edge {{edge}} has {count.max()} faces; at most two are allowed", {"edge": (i, j)})
@@ -95,7 +95,7 @@ class Connectivity:
             i, j = self.edges[int(np.flatnonzero(np.abs(twice) > 1)[0])].tolist()
             raise PlaceError("the two faces at edge {edge} are oriented oppositely", {"edge": (i, j)})
 
-        # The face to the left of i -> j, then the one to the right; -1 on the boundary.
+        # The face to the left of i → j, then the face to the right; −1 on the boundary.
         side_face = np.tile(np.arange(len(f)), 3)
         self.edge_faces: IntArray = np.full((len(unique), 2), -1)
         self.edge_opposite: IntArray = np.full((len(unique), 2), -1)
@@ -115,37 +115,37 @@ class Connectivity:
 
     @property
     def edge_count(self) -> int:
-        """E."""
+        """Number of edges, E."""
         return len(self.edges)
 
     @cached_property
     def hinges(self) -> IntArray:
-        """(H, 4): tail, head, left and right opposite vertex of every interior edge, in edge order."""
+        """(H, 4) tail, head, left and right opposite vertex of every interior edge, in edge order."""
         return np.concatenate([self.edges, self.edge_opposite], axis=1)[self.interior]
 
     @cached_property
     def edge_ends(self) -> IntArray:
-        """(2, E): the columns of ``edges``, each contiguous, which gathers several times faster."""
+        """(2, E) the columns of ``edges``, each contiguous: gathering with them is several times faster."""
         return np.ascontiguousarray(self.edges.T)
 
     @cached_property
     def hinge_corners(self) -> IntArray:
-        """(4, H): the columns of ``hinges``, each contiguous."""
+        """(4, H) the columns of ``hinges``, each contiguous."""
         return np.ascontiguousarray(self.hinges.T)
 
     @cached_property
     def face_corners(self) -> IntArray:
-        """(3, F): the columns of ``faces``, each contiguous."""
+        """(3, F) the columns of ``faces``, each contiguous."""
         return np.ascontiguousarray(self.faces.T)
 
     @cached_property
     def face_sides(self) -> IntArray:
-        """(3, F): the columns of ``face_edges``, each contiguous."""
+        """(3, F) the columns of ``face_edges``, each contiguous."""
         return np.ascontiguousarray(self.face_edges.T)
 
     @cached_property
     def hinge_edges(self) -> IntArray:
-        """(H,): the interior edges."""
+        """(H,) the interior edges."""
         return np.flatnonzero(self.interior)
 
     @property
@@ -165,14 +165,14 @@ class Connectivity:
 
 @dataclass(frozen=True, eq=False)
 class TriangleMesh:
-    """Positions on a connectivity, validated once and then frozen.
+    """A shape of a connectivity, checked once and then immutable.
 
     Args:
         vertices: (V, 3) positions, finite.
-        connectivity: shared combinatorics.
+        connectivity: faces and edges.
 
     Raises:
-        MeshError: wrong shape, a coordinate that isn't finite, or a face without area.
+        MeshError: the array has the wrong shape, a coordinate is not finite, or a face has no area.
     """
 
     vertices: FloatArray
@@ -194,7 +194,7 @@ class TriangleMesh:
 
     @classmethod
     def from_arrays(cls, vertices: ArrayLike, faces: ArrayLike) -> TriangleMesh:
-        """Build and validate connectivity and mesh from plain arrays."""
+        """Build and check connectivity and mesh from plain arrays."""
         v = np.asarray(vertices)
         if v.ndim != 2 or v.shape[1] != 3:
             raise MeshError(f"vertices must be a (V, 3) array, not of shape {v.shape}")
@@ -202,7 +202,7 @@ class TriangleMesh:
 
     @classmethod
     def from_mapping(cls, arrays: Mapping[str, NDArray]) -> TriangleMesh:
-        """Build from anything with ``vertices`` and ``faces``, such as an opened NPZ file."""
+        """Build from a mapping with ``vertices`` and ``faces``, such as an opened NPZ file."""
         return cls.from_arrays(arrays["vertices"], arrays["faces"])
 
     def with_vertices(self, vertices: ArrayLike) -> TriangleMesh:
@@ -236,17 +236,17 @@ class TriangleMesh:
 
     @property
     def edge_midpoints(self) -> FloatArray:
-        """(E, 3)."""
+        """(E, 3) midpoints of the edges."""
         return self.vertices[self.edges].mean(axis=1)
 
 
 def face_areas(vertices: FloatArray, faces: IntArray) -> FloatArray:
-    """Areas (…, F) of the faces of shapes (…, V, 3)."""
+    """Compute the areas (…, F) of the faces of shapes (…, V, 3)."""
     return 0.5 * np.linalg.norm(face_normals(vertices, faces, normalised=False), axis=-1)
 
 
 def vertex_areas(vertices: FloatArray, faces: IntArray) -> FloatArray:
-    """Areas (V,) that belong to the vertices of a shape (V, 3): a third of each face around."""
+    """Compute the areas (V,) of the vertices of a shape (V, 3): a third of each face around."""
     thirds = np.repeat(face_areas(vertices, faces) / 3, 3)
     areas = np.zeros(len(vertices))
     np.add.at(areas, faces.ravel(), thirds)
@@ -254,12 +254,12 @@ def vertex_areas(vertices: FloatArray, faces: IntArray) -> FloatArray:
 
 
 def diagonal(vertices: FloatArray) -> FloatArray:
-    """Lengths (…) of the bounding boxes' diagonals of shapes (…, V, 3)."""
+    """Compute the lengths (…) of the diagonals of the bounding boxes of shapes (…, V, 3)."""
     return np.linalg.norm(np.ptp(vertices, axis=-2), axis=-1)
 
 
 def face_normals(vertices: FloatArray, faces: IntArray, *, normalised: bool = True) -> FloatArray:
-    """Normals (…, F, 3) of shapes (…, V, 3); of length twice the area unless ``normalised``."""
+    """Compute the face normals (…, F, 3) of shapes (…, V, 3), with length twice the area unless ``normalised``."""
     a, b, c = (vertices.take(faces[:, k], axis=-2) for k in range(3))
     n = cross((b - a).T, (c - a).T).T
     return n / np.linalg.norm(n, axis=-1, keepdims=True) if normalised else n
@@ -268,16 +268,16 @@ def face_normals(vertices: FloatArray, faces: IntArray, *, normalised: bool = Tr
 def vertex_normals(
     vertices: FloatArray, faces: IntArray, corners: IntArray | None = None, *, order: Literal["C", "F"] = "F"
 ) -> FloatArray:
-    """Unit normals (N, 3) at the vertices of a shape (V, 3): means of the face normals, weighted by area.
+    """Compute unit normals (N, 3) at the vertices of a shape (V, 3): means of the face normals, weighted by area.
 
-    A normal is zero where the normals of all faces around cancel.
+    A normal is zero where the normals of the faces around cancel.
 
     Args:
         vertices: (V, 3).
         faces: (F, 3).
-        corners: (F, 3) number of the normal at each corner of each face, where the corners of one vertex don't share
-            one normal; by default N = V and every corner has the normal of its vertex.
-        order: whether the sums run face by face (C) or corner by corner (F), on which their rounding depends.
+        corners: (F, 3) index of the normal at each corner. By default N = V and a corner has the normal of its vertex.
+        order: order of the summation, face by face (C) or corner by corner (F). Their results differ by rounding; files
+            and fits each keep the order of version 0.2.
     """
     x = components(vertices)
     a, b, c = (x.take(k, axis=1) for k in np.ascontiguousarray(faces.T))

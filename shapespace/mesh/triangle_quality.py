@@ -1,4 +1,4 @@
-"""How good the triangles of all shapes of a collection are: slivers, and folds between neighbours."""
+"""Quality of triangles in all shapes of a collection: slivers, specks, and folds between neighbours."""
 
 from __future__ import annotations
 
@@ -11,19 +11,26 @@ from shapespace.arrays import FloatArray, IntArray
 from shapespace.mesh.triangle_mesh import Connectivity
 from shapespace.mesh.vectors import cross, dots, unit
 
-#: Largest angle between the normals of two neighbours, as a cosine.
+#: Cosine of the largest angle between the normals of two neighbours; a larger angle is a fold.
 FOLD_LIMIT = np.cos(np.deg2rad(140))
 #: Indices of pairs of neighbouring faces.
 Pairs = list[tuple[int, int]]
-#: Least area of a face, as a share of the mean area of the coarse mesh's faces in the same shape.
+#: Smallest area of a face, as a share of the mean area of the coarse faces in the same shape.
 SMALLEST_AREA = 0.01
-#: Least area and sine of a face in a shape, as shares of their means over all shapes.
+#: Smallest area and sine of a face in a shape, as shares of their means over all shapes.
 SMALLEST_SHARE = 0.1
 
 
 @dataclass(frozen=True)
 class TriangleQuality:
-    """Of a few faces: smallest sin² of an angle, cosine between neighbours and size, and how many are beyond limits."""
+    """Quality of a few faces: the worst values, and the numbers of faults.
+
+    Attributes:
+        sine: smallest sin² of an angle.
+        fold: smallest cosine between the normals of neighbours.
+        size: smallest size, see `Triangles.sizes`.
+        slivers, folds, specks: numbers of faults.
+    """
 
     sine: float
     fold: float
@@ -34,21 +41,21 @@ class TriangleQuality:
 
     @property
     def faults(self) -> int:
-        """Slivers, folds and specks."""
+        """Total number of faults."""
         return self.slivers + self.folds + self.specks
 
 
 @dataclass(frozen=True)
 class Triangles:
-    """Some faces in all shapes.
+    """Measures of k faces in n shapes.
 
     Attributes:
         sines: (k, n) sin² of the smallest angle.
-        normals: (k, n, 3) of length 1.
+        normals: (k, n, 3) unit normals.
         squares: (3, k, n) squared sides.
-        areas: (k, n) as shares of the mean area of a coarse face.
-        sizes: (k, n) area and smallest sine, whichever is less, as a multiple of the least that a face ought to have:
-            geodesics between the shapes end at a face that is a speck in one of them.
+        areas: (k, n) areas, as shares of the mean area of a coarse face.
+        sizes: (k, n) the smaller of area and smallest sine, each as a multiple of its limit. A face below 1 is a speck:
+            geodesics between the shapes fail there.
     """
 
     sines: FloatArray
@@ -59,7 +66,7 @@ class Triangles:
 
     @classmethod
     def of(cls, corners: FloatArray, mean_areas: FloatArray) -> Triangles:
-        """Faces with corners (3, k, n, 3), of shapes whose coarse faces will have these areas (n,) on average."""
+        """Measure faces with corners (3, k, n, 3), given the expected mean areas (n,) of the coarse faces."""
         normals, squares = normals_and_sides(corners)
         sines = squared_sines(normals, squares)
         doubled = np.sqrt(dots(normals, normals))
@@ -70,7 +77,7 @@ class Triangles:
         return cls(sines, normals / np.maximum(doubled, 1e-300)[..., None], squares, areas, sizes)
 
     def quality(self, faces: list[int], pairs: Pairs, sine: float) -> TriangleQuality:
-        """Quality of some of the faces and of some neighbours among them, all by number."""
+        """Summarise some of the faces and some pairs of neighbours, given by index."""
         angles, sizes = self.sines[faces], self.sizes[faces]
         folds = dots(self.normals[[i for i, _ in pairs]], self.normals[[j for _, j in pairs]])
         return TriangleQuality(
@@ -84,7 +91,12 @@ class Triangles:
 
 
 def folded_pairs(connectivity: Connectivity, normals: FloatArray) -> IntArray:
-    """(k, 2) neighbouring faces that are folded onto one another in some shape; normals (F, n, 3) of any length."""
+    """List pairs (k, 2) of neighbouring faces that are folded onto one another in some shape.
+
+    Args:
+        connectivity: connectivity of the F faces.
+        normals: (F, n, 3) normals in n shapes, of any length.
+    """
     normals = unit(normals)
     pairs = connectivity.edge_faces[connectivity.interior]
     folded: IntArray = pairs[(dots(normals[pairs[:, 0]], normals[pairs[:, 1]]) < FOLD_LIMIT).any(axis=1)]
@@ -92,11 +104,11 @@ def folded_pairs(connectivity: Connectivity, normals: FloatArray) -> IntArray:
 
 
 def folded_anew(angles: FloatArray, others: FloatArray) -> NDArray[np.bool_]:
-    """Whether shapes have two faces folded onto one another where no other shape has as much as a crease, (n,).
+    """Return a mask (n,) of the shapes with two faces folded onto one another at an edge that is smooth in the others.
 
     Args:
-        angles: (n, E) dihedral.
-        others: (k, E) of the others.
+        angles: (n, E) dihedral angles.
+        others: (k, E) dihedral angles of other shapes; an edge is smooth where all are below 90°.
     """
     smooth = (np.abs(others) < np.pi / 2).all(axis=0)
     folded: NDArray[np.bool_] = ((np.cos(angles) < FOLD_LIMIT) & smooth).any(axis=1)
@@ -104,12 +116,12 @@ def folded_anew(angles: FloatArray, others: FloatArray) -> NDArray[np.bool_]:
 
 
 def normals_and_sides(corners: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Normals (…, 3), as long as twice the area, and squared sides (3, …) of triangles with corners (3, …, 3)."""
+    """Compute normals (…, 3) of twice the area, and squared sides (3, …), of triangles with corners (3, …, 3)."""
     p, q = corners[1] - corners[0], corners[2] - corners[0]
     return cross(p.T, q.T).T, np.stack([dots(side, side) for side in (p, q, q - p)])
 
 
 def squared_sines(normals: FloatArray, squares: FloatArray) -> FloatArray:
-    """sin² of the smallest angle: twice the area over the product of the two longer sides."""
+    """Compute sin² of the smallest angle: (twice the area / product of the two longer sides)²."""
     product = squares.prod(axis=0)
     return dots(normals, normals) * squares.min(axis=0) / np.maximum(product, 1e-300)

@@ -122,11 +122,10 @@ def test_what_cannot_be_collapsed_stays() -> None:
 
 
 def test_a_large_mesh_is_coarsened_as_well_by_way_of_a_thinned_one(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(coarsening, "LARGE", 5000)
-    monkeypatch.setattr(coarsening, "THINNED", 2000)
+    monkeypatch.setattr(coarsening, "THINNING", coarsening.Thinning(vertices=5000, left=2000))
     mesh, shapes = bent(False, 5)
     target = 400
-    assert len(mesh.vertices) > max(coarsening.LARGE, coarsening.PLENTY * target)
+    assert len(mesh.vertices) > max(coarsening.THINNING.vertices, coarsening.THINNING.ratio * target)
     found = coarsening.coarsen(mesh, target, shapes)
     assert len(found.fine_index) == target
     assert found.folds == 0
