@@ -1,4 +1,4 @@
-"""The elastic energy of a thin shell in lengths and angles, with the derivatives that geodesics are made of.
+"""The elastic energy of a thin shell in lengths and angles, with its derivatives.
 
 ``W[z, z~] = W_mem + W_bend`` measures the deformation of a rest shape z into z~ (paper, appendix C). On each
 face, with the Cauchy–Green tensor A of the affine map between the two triangles and the rest area a,
@@ -9,18 +9,18 @@ and on each interior edge, with d_e = (a_f + a_f')/3,
 
     W_bend = η Σ_e (θ_e − θ~_e)² l_e² / d_e.
 
-**The paper's misprint.** The paper prints the factor of the logarithm as μ + λ/2. Then the derivative of the
-density at A = I would be (μ/2 + λ/4 − μ − λ/2) I = −κ I: a shell under stress in its own rest shape, and W no
-squared distance to second order. With κ the density and its gradient vanish at A = I; a test holds that.
+**A misprint in the paper.** The paper prints the factor of the logarithm as μ + λ/2. Then the derivative of the density
+at A = I would be (μ/2 + λ/4 − μ − λ/2) I = −κ I. The rest shape would be under stress, and W would not be a squared
+distance to second order. With κ the density and its gradient vanish at A = I; a test checks this.
 
-**How it is computed.** With the squared lengths q_i of a rest face, c_i = q_j + q_k − q_i and
-S = Σ c_i q_i = 16 a² (Heron), tr A = 2/S Σ c_i q~_i and det A = S~/S: no inverse of a first fundamental form
-and no choice of a corner. In the change δ = q~ − q of the squared lengths and γ_i = δ_j + δ_k − δ_i,
+**Computation.** Let q_i be the squared lengths of a rest face, c_i = q_j + q_k − q_i and S = Σ c_i q_i = 16 a² (Heron).
+Then tr A = 2/S Σ c_i q~_i and det A = S~/S. This needs no inverse of a first fundamental form and no choice of a
+corner. In the change δ = q~ − q of the squared lengths and γ_i = δ_j + δ_k − δ_i,
 
     t = tr A − 2 = 2/S Σ c_i δ_i,   s = det A − 1 = t + 1/S Σ γ_i δ_i,
     W_mem/a = μ/2 t + λ/4 s − κ log(1 + s),
 
-so that energy and gradients of a small step are not differences of large numbers.
+so energy and gradients of a small step are no differences of large numbers.
 """
 
 from __future__ import annotations
@@ -37,13 +37,13 @@ from shapespace.mesh.triangle_mesh import Connectivity
 
 @dataclass(frozen=True)
 class Material:
-    """Elastic parameters of a shell of unit area; the defaults of the whole project.
+    """Elastic parameters of a shell of unit area, with the defaults of the project.
 
     Attributes:
         mu: Lamé's μ of the membrane.
         lambda_: Lamé's λ of the membrane.
-        eta: weight η of bending against stretching, about the squared thickness. At values much above the
-            default, geodesics of real collections run into collapsed triangles, whatever the solver.
+        eta: weight η of bending relative to stretching, about the squared thickness. Far above the default, geodesics
+            of real collections lead to collapsed triangles, with any solver.
     """
 
     mu: float = 1.0
@@ -56,16 +56,15 @@ class Material:
 
 
 class ShellEnergy:
-    """``W`` on a connectivity.
+    """The energy ``W`` on a connectivity.
 
-    W_mem scales with area and W_bend does not, so η means nothing without a size. Here it refers to a
-    collection whose reference has ``area``: the membrane part is divided by it. Meshes in any unit then give
-    the same numbers as the same meshes scaled to unit area, and nobody has to scale.
+    W_mem scales with area and W_bend does not, so η has a meaning only for a given size. Therefore the membrane part is
+    divided by the area of the reference. Meshes in any unit then give the same numbers as meshes of unit area.
 
     Args:
-        connectivity: shared combinatorics.
+        connectivity: connectivity of the shapes.
         material: μ, λ and η at unit area.
-        area: surface area of the collection's reference shape.
+        area: surface area of the reference shape of the collection.
     """
 
     def __init__(self, connectivity: Connectivity, material: Material | None = None, area: float = 1.0) -> None:
@@ -77,7 +76,7 @@ class ShellEnergy:
         self.kappa = self.mu / 2 + self.lambda_ / 4
         #: (3, F) the edge on each side of each face.
         self.sides: IntArray = connectivity.face_sides
-        # Where an edge finds its first and second face among the 3F sides; a boundary edge has no second.
+        # Index of the first and the second side of each edge among the 3F sides; a boundary edge has no second side.
         order = np.argsort(self.sides.ravel(), kind="stable")
         starts = np.searchsorted(self.sides.ravel()[order], np.arange(connectivity.edge_count))
         self._first: IntArray = order[starts]
@@ -89,7 +88,7 @@ class ShellEnergy:
         return RestShape(self, z)
 
     def matrix(self, form: QuadraticForm) -> sparse.csr_array:
-        """A quadratic form of one shape as a matrix (2E, 2E)."""
+        """Assemble a quadratic form of one shape as a matrix (2E, 2E)."""
         e = self.connectivity.edge_count
         rows, columns = (np.broadcast_to(x, form.faces.shape).ravel() for x in (self.sides[:, None], self.sides[None]))
         angles = np.arange(e, 2 * e)
@@ -98,7 +97,7 @@ class ShellEnergy:
         return sparse.csr_array((data, place), shape=(2 * e, 2 * e))
 
     def sum_over_faces(self, sides: FloatArray) -> FloatArray:
-        """Add to each edge (…, E) what its one or two faces have for it (…, 3, F)."""
+        """Add the values of the sides of faces (…, 3, F) to their edges (…, E)."""
         flat = sides.reshape(*sides.shape[:-2], -1)
         second = flat.take(self._second, axis=-1)
         second[..., self._boundary] = 0
@@ -107,14 +106,14 @@ class ShellEnergy:
 
 
 def _opposite(q: FloatArray) -> FloatArray:
-    """``q_j + q_k − q_i`` (…, 3, F) of values on the three sides of faces."""
+    """Compute ``q_j + q_k − q_i`` (…, 3, F) from values q on the three sides of faces."""
     return q.sum(axis=-2, keepdims=True) - 2 * q
 
 
 class RestShape:
-    """Rest shapes z (…, 2E) with all that the energy needs of them, to compare many deformed shapes with.
+    """Rest shapes z (…, 2E), prepared for the energy of many deformed shapes.
 
-    Leading dimensions broadcast: K rest shapes meet K deformed ones, or one meets many.
+    Leading dimensions broadcast: K rest shapes with K deformed shapes, or one rest shape with many.
 
     Attributes:
         z: (…, 2E).
@@ -137,7 +136,7 @@ class RestShape:
         self._beta = 3 * energy.eta * self._lengths**2 / self._edge_area * connectivity.interior
 
     def _compare(self, z: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """γ (…, 3, F), t and s (…, F) of the faces, and the angles' change modulo 2π (…, E)."""
+        """Compute γ (…, 3, F), t and s (…, F) of the faces, and the change of the angles modulo 2π (…, E)."""
         lengths, angles = np.split(z, 2, axis=-1)
         delta = lengths.take(self._energy.sides, axis=-1) ** 2 - self._q
         gamma = _opposite(delta)
@@ -147,12 +146,12 @@ class RestShape:
         s /= self._S
         s += t
         turn = angles - self._angles
-        # As `wrap`, in place and ten times faster; half a turn counts the same either way round.
+        # Like `wrap`, but in place and ten times faster. The sign of half a turn doesn't change its square.
         turn -= 2 * np.pi * np.rint(turn / (2 * np.pi))
         return gamma, t, s, turn
 
     def value(self, z: FloatArray) -> FloatArray:
-        """``W[rest, z]`` (…); infinite where a face of the deformed shape z has no area."""
+        """Compute ``W[rest, z]`` (…), infinite where a face of the deformed shape z has no area."""
         m = self._energy
         _, t, s, turn = self._compare(z)
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -161,7 +160,7 @@ class RestShape:
         return np.where(np.isnan(total), np.inf, total)
 
     def gradient_deformed(self, z: FloatArray) -> FloatArray:
-        """``∂₂W[rest, z]`` (…, 2E), the force on the deformed shape.
+        """Compute ``∂₂W[rest, z]`` (…, 2E), the derivative by the deformed shape.
 
         By q~_i it is ``1/(16a) (2κ s/(1+s) c_i + (λ/2 − 2κ/(1+s)) γ_i)``.
         """
@@ -175,10 +174,10 @@ class RestShape:
         return np.concatenate([lengths, 2 * self._beta * turn], axis=-1)
 
     def gradient_rest(self, z: FloatArray) -> FloatArray:
-        """``∂₁W[rest, z]`` (…, 2E), the derivative by the rest shape.
+        """Compute ``∂₁W[rest, z]`` (…, 2E), the derivative by the rest shape.
 
         By q_i the membrane part is ``1/(16a) (μ γ_i − c_i (μ/2 t + λ/4 s + κ log(1+s)))``; the bending part
-        varies l_e and, by ``∂a/∂q_i = c_i/(16a)``, the areas in d_e.
+        depends on l_e and, by ``∂a/∂q_i = c_i/(16a)``, on the areas in d_e.
         """
         m = self._energy
         gamma, t, s, turn = self._compare(z)
@@ -193,7 +192,7 @@ class RestShape:
         return np.concatenate([lengths, -2 * self._beta * turn], axis=-1)
 
     def hessian(self) -> QuadraticForm:
-        """``Hess₂ W[rest, rest]``, twice the metric, which is also ``−∂₁∂₂W[rest, rest]``.
+        """Compute ``Hess₂ W[rest, rest]``, twice the metric, which equals ``−∂₁∂₂W[rest, rest]``.
 
         By the q of a face it is ``1/(16a) ((2μ+λ)/S c cᵀ + μ (2I − 11ᵀ))``.
         """
@@ -208,10 +207,11 @@ class RestShape:
         return QuadraticForm(blocks, 2 * self._beta)
 
     def mixed_hessian(self, z: FloatArray) -> sparse.csr_array:
-        """``∂₂∂₁W[rest, z]`` (2E, 2E): a row per rest and a column per deformed coordinate. One rest shape only.
+        """Compute ``∂₂∂₁W[rest, z]`` (2E, 2E), with rows by rest and columns by deformed coordinates. One rest shape
+        only.
 
-        By q_i and q~_m it is ``1/(16a) (μ (1 − 2δ_im) − c_i (μ c_m + (λ/2 + 2κ/(1+s)) c~_m)/S)``. Exact,
-        unlike ``−hessian()``, and not symmetric: bending depends on rest lengths but not on deformed ones.
+        By q_i and q~_m it is ``1/(16a) (μ (1 − 2δ_im) − c_i (μ c_m + (λ/2 + 2κ/(1+s)) c~_m)/S)``. Unlike ``−hessian()``
+        it is exact, and not symmetric: bending depends on rest lengths but not on deformed lengths.
         """
         m = self._energy
         e = m.connectivity.edge_count
@@ -222,7 +222,7 @@ class RestShape:
         rows = np.broadcast_to(m.sides[:, None], blocks.shape)
         columns = np.broadcast_to(m.sides[None], blocks.shape)
 
-        # ∂₁W_bend by lengths is turn² times something of the rest shape; differentiate turn².
+        # ∂₁W_bend by lengths is turn² times a function of the rest shape; differentiate turn².
         by_turn = 2 * turn * self._beta
         by_area = (-by_turn / self._edge_area)[m.sides]
         areas = by_area[None] * (self._c * self._sides / (8 * self.areas))[:, None]
@@ -237,7 +237,7 @@ class RestShape:
         return sparse.csr_array((data, (i, j)), shape=(2 * e, 2 * e))
 
     def hessian_deformed(self, z: FloatArray) -> QuadraticForm:
-        """``∂₂∂₂W[rest, z]``; at z = rest it is ``hessian()``. One rest shape and one deformed shape only.
+        """Compute ``∂₂∂₂W[rest, z]``, which is ``hessian()`` at z = rest. One rest shape and one deformed shape only.
 
         By q~_i and q~_m it is ``1/(16a) (4κ/(S (1+s)²) c~_i c~_m + (λ/2 − 2κ/(1+s)) (1 − 2δ_im))``.
         """
@@ -251,7 +251,7 @@ class RestShape:
         return QuadraticForm(_by_lengths(blocks, by_q, z[: len(z) // 2][m.sides]) / (16 * self.areas), 2 * self._beta)
 
     def hessian_rest(self, z: FloatArray) -> sparse.csr_array:
-        """``∂₁∂₁W[rest, z]`` (2E, 2E). One rest shape and one deformed shape only.
+        """Compute ``∂₁∂₁W[rest, z]`` (2E, 2E). One rest shape and one deformed shape only.
 
         Membrane part by the q of a face, with ``T = t + 2``, ``c~ = c + γ`` and ``Q = μ/2 t + λ/4 s + κ log(1+s)``:
         ``1/(16a) (−(1 − 2δ_im) (μ + Q) − (μ/S) (c_m γ_i + c_i c~_m) + (c_i c_m/S) (Q + μ T + λ/2 (1+s) + 2κ))``.
@@ -264,7 +264,7 @@ class RestShape:
         Q = m.mu / 2 * t + m.lambda_ / 4 * s + m.kappa * np.log1p(s)
         outer = c[:, None] * c[None]
 
-        # Bending, ``b = 3η l² turn² / A`` with A the areas of the two faces: by l, A and the angle.
+        # Bending is ``b = 3η l² turn² / A`` with A the area of the two faces. Differentiate by l, A and the angle.
         bending = turn**2 * self._beta
         length, A = self._lengths, self._edge_area
         by_A = -bending / A
@@ -298,7 +298,7 @@ _OPPOSITE = (1.0 - 2.0 * np.eye(3))[:, :, None]
 
 
 def _by_lengths(by_q: FloatArray, slope: FloatArray, sides: FloatArray) -> FloatArray:
-    """Second derivatives by lengths (3, 3, F) from those by squared lengths and the first ones (3, F): ``q = l²``."""
+    """Convert second derivatives (3, 3, F) by squared lengths to lengths, given the first ones (3, F)."""
     blocks = 4 * by_q * sides[:, None] * sides[None]
     blocks[np.arange(3), np.arange(3)] += 2 * slope
     return blocks

@@ -1,4 +1,4 @@
-"""The time-discrete exponential map: shooting a geodesic from a shape with a velocity (paper, appendix B)."""
+"""The time-discrete exponential map: the geodesic from a shape with an initial velocity (paper, appendix B)."""
 
 from __future__ import annotations
 
@@ -20,19 +20,42 @@ from shapespace.solve.line_search import backtrack
 from shapespace.solve.outcome import Outcome, Status
 from shapespace.solve.preconditioner import step_length
 
-#: How many shapes the first guess of the next one is extrapolated from: with eight its error is of eighth order in the
-#: time step.
+#: Number of shapes from which the first guess of the next one is extrapolated. With eight, its error is of eighth order
+#: in the time step.
 EXTRAPOLATED = 8
-#: The cost of a new factor, in iterations.
-COST = 8
-#: Once a step needs so many more iterations than the step with a new factor did, old factors are rotated to each shape.
-PATIENCE = 1
-#: If two iterations leave more than this share of the residual, the present factor is replaced.
-SLOW = 0.5
-#: Most iterations of exact Newton, and the smallest step length tried. Where it converges it needs 4 to 8 iterations;
-#: where it needs more, a face is collapsing, and the path would end a few steps later anyway (as posed bodies show).
-NEWTON_ITERATIONS = 12
-SMALLEST_STEP = 1 / 16
+
+
+@dataclass(frozen=True)
+class Renewals:
+    """When a factor is rotated or replaced.
+
+    Attributes:
+        cost: cost of a new factor, in iterations.
+        patience: once a step needs this many more iterations than the step with a new factor, factors are rotated to
+            each shape.
+        slow: an iteration with a factor fails if two iterations leave more than this share of the residual.
+    """
+
+    cost: int = 8
+    patience: int = 1
+    slow: float = 0.5
+
+
+@dataclass(frozen=True)
+class ExactNewton:
+    """Limits of exact Newton.
+
+    Attributes:
+        iterations: largest number of iterations. Where it converges it needs 4 to 8. Where it needs more, a face is
+            collapsing, and the path would end a few steps later anyway (measured on posed bodies).
+        smallest_step: smallest step length of the line search.
+    """
+
+    iterations: int = 12
+    smallest_step: float = 1 / 16
+
+
+RENEWALS, NEWTON = Renewals(), ExactNewton()
 
 
 def exponential(
@@ -44,23 +67,23 @@ def exponential(
     tolerance: float = TOLERANCE,
     deadline: Deadline | None = None,
 ) -> DiscretePath:
-    """Shoot the discrete geodesic of K steps: ``X_1 = X_0 + d/K``, then one equation after the other.
+    """Shoot the discrete geodesic of K steps: ``X_1 = X_0 + d/K``, then solve one equation for each further shape.
 
-    The one-sided first step makes it first-order in 1/K. Rigid motions are taken out of the velocity, see
-    ``without_rigid_motion``; at equal K the discrete logarithm is then the inverse to solver tolerance.
+    The one-sided first step makes the map first-order in 1/K. Rigid motions are removed from the velocity, see
+    ``without_rigid_motion``. The discrete logarithm with equal K is then the inverse, to the tolerance of the solver.
 
     Args:
-        space: where.
+        space: Riemannian space of the shapes.
         start: X_0 (V, 3).
         velocity: d, a vertex field (V, 3); ``space.project`` makes one from lengths and angles.
-        steps: K. A negative number shoots backwards in time: the shapes before X_0 of a geodesic that passes
-            through it with this velocity, which agree with ``−velocity`` to first order in 1/K, and exactly
-            continue a path that was shot forwards.
-        tolerance: of ``sqrt(Fᵀ A⁻¹ F)`` at every step.
-        deadline: after which the status is Status.DEADLINE, looked at before every step.
+        steps: K. A negative number shoots backwards in time: the result is the shapes before X_0 on a geodesic that
+            passes X_0 with this velocity. They agree with ``−velocity`` to first order in 1/K, and they continue a path
+            that was shot forwards exactly.
+        tolerance: tolerance of ``sqrt(Fᵀ A⁻¹ F)`` at every step.
+        deadline: checked before every step; after it the status is Status.DEADLINE.
 
     Returns:
-        |K| + 1 shapes from X_0 on, fewer where a step failed.
+        |K| + 1 shapes from X_0 on, or fewer if a step failed.
     """
     start, velocity = space.shape(start), space.shape(velocity)
     if steps == 0:
@@ -87,20 +110,20 @@ def extrapolate(
     tolerance: float = TOLERANCE,
     deadline: Deadline | None = None,
 ) -> DiscretePath:
-    """Continue two neighbouring shapes of a discrete geodesic by more of its shapes.
+    """Continue a discrete geodesic from two neighbouring shapes.
 
     Args:
-        space: where.
+        space: Riemannian space of the shapes.
         first: (V, 3).
-        second: (V, 3), one time step later; earlier, if not ``forward``.
-        steps: how many shapes to add.
-        forward: whether time runs forward. W isn't symmetric, so going back is another equation, whose solution
-            is exactly the shape that a forward step would have come from.
-        tolerance: of ``sqrt(Fᵀ A⁻¹ F)`` at every step.
-        deadline: after which the status is Status.DEADLINE, looked at before every step.
+        second: (V, 3), one time step later, or earlier if not ``forward``.
+        steps: number of shapes to add.
+        forward: whether time runs forward. W is not symmetric, so a backward step solves another equation: a forward
+            step from its solution and ``second`` leads to ``first`` exactly.
+        tolerance: tolerance of ``sqrt(Fᵀ A⁻¹ F)`` at every step.
+        deadline: checked before every step; after it the status is Status.DEADLINE.
 
     Returns:
-        2 + steps shapes, the given ones first; fewer where a step failed.
+        2 + steps shapes, the given ones first, or fewer if a step failed.
     """
     previous, current = space.point(first), space.point(second)
     shapes: list[FloatArray] = [previous.vertices, current.vertices]
@@ -112,14 +135,14 @@ def extrapolate(
     iterations, residual = 0, 0.0
 
     def path(status: Status, reason: str = "") -> DiscretePath:
-        told = f"step {len(shapes)}: {reason}" if reason else ""
+        where = f"step {len(shapes)}: {reason}" if reason else ""
         return DiscretePath(
             vertices=np.stack(shapes),
             space=space,
             status=status,
             iterations=iterations,
             residual=residual,
-            reason=told,
+            reason=where,
         )
 
     for _ in range(steps):
@@ -140,17 +163,17 @@ def extrapolate(
 
 
 class _Renewal:
-    """When a factor made at one shape of a path is given up for a new one, at the next shape.
+    """The factor of a path, and when it is replaced by a factor at the present shape.
 
-    A factor is, in turn,
+    A factor is first **new**, in the step for which it was computed. ``_when_new`` counts the iterations of this step.
 
-    - **new**, for the step that it is made for. The iterations of that step, ``_when_new``, are what later ones are
-      compared with.
-    - **old**, for the steps after it. What they take more is added up in ``_excess``. Once a step has taken more than
-      PATIENCE iterations more, or has failed, old factors are rotated along to the shape at hand, from the next step
-      to the end of the path: rotating costs little, but for small motions it is of no use.
-    - **spent**, when ``_excess`` reaches COST, for then a new factor would have been cheaper; or when an iteration with
-      it fails or foresees more than COST additional iterations, in which case the step is solved again with a new one.
+    In later steps it is **old**. ``_excess`` sums their additional iterations. Once a step needs more than `patience`
+    additional iterations or fails, old factors are rotated to the present shape, from the next step to the end of the
+    path. Rotating is cheap, but useless for small motions.
+
+    The factor is **spent** once ``_excess`` reaches `cost`, because a new factor would have been cheaper. It is also
+    spent if an iteration fails or predicts more than `cost` additional iterations. Then the step is solved again with a
+    new one.
     """
 
     def __init__(self, space: ShellSpace) -> None:
@@ -160,7 +183,7 @@ class _Renewal:
         self._rotates = False
 
     def solve(self, equation: _Step, start: FloatArray, tolerance: float) -> _Solution:
-        """Solve one step, with the factor at hand if it will do; raises NotPositiveDefiniteError."""
+        """Solve one step, with the old factor if possible. Raises NotPositiveDefiniteError."""
         wasted = 0
         if self._factor is not None:
             solution = self._with_old_factor(self._factor, equation, start, tolerance)
@@ -176,27 +199,27 @@ class _Renewal:
 
     def _with_old_factor(self, factor: ChordSolver, equation: _Step, start: FloatArray, tolerance: float) -> _Solution:
         chord = factor.rotated_to(equation.current) if self._rotates else factor
-        # The factor's matrix may differ from the step's own by a factor of 2 or so.
-        solution = _chord(equation, chord, start, tolerance / 2, self._when_new + COST)
+        # The matrix of the factor may differ from the matrix of the step by about a factor of 2.
+        solution = _chord(equation, chord, start, tolerance / 2, self._when_new + RENEWALS.cost)
         more = solution.iterations - self._when_new
         self._excess += max(more, 0)
-        self._rotates = self._rotates or not solution.converged or more > PATIENCE
-        if self._excess >= COST:
+        self._rotates = self._rotates or not solution.converged or more > RENEWALS.patience
+        if self._excess >= RENEWALS.cost:
             self._factor = None
         return solution
 
 
 def _extrapolated(shapes: list[FloatArray]) -> FloatArray:
-    """The next value of the polynomial through shapes at equal times."""
+    """Extrapolate the polynomial through shapes at equal times by one step."""
     n = len(shapes)
     weights = [(-1.0) ** (j + 1) * comb(n, j) for j in range(n, 0, -1)]
     return np.einsum("n,nvc->vc", weights, np.stack(shapes))
 
 
 class _Step:
-    """The discrete Euler–Lagrange equation of one step, for the shape X that comes next.
+    """The discrete Euler–Lagrange equation of one step, for the next shape X.
 
-    ``F(X) = J_kᵀ (∂₂W[z_{k−1}, z_k] + ∂₁W[z_k, z(X)]) = 0``, and going back in time
+    Forward in time it is ``F(X) = J_kᵀ (∂₂W[z_{k−1}, z_k] + ∂₁W[z_k, z(X)]) = 0``, and backward in time
     ``F(X) = J_kᵀ (∂₁W[z_k, z_{k+1}] + ∂₂W[z(X), z_k]) = 0``.
     """
 
@@ -209,7 +232,7 @@ class _Step:
             self._known = current.rest.gradient_rest(previous.z)
 
     def forces(self, unknown: ShellPoint) -> FloatArray:
-        """F (V, 3)."""
+        """Compute F (V, 3)."""
         if self._forward:
             covector = self.current.rest.gradient_rest(unknown.z)
         else:
@@ -217,7 +240,7 @@ class _Step:
         return self.current.pull_back(covector + self._known)
 
     def derivative(self, unknown: ShellPoint) -> sparse.csc_array:
-        """``DF(X)`` (3V, 3V), near −A and not symmetric; the rigid motions are lifted out of its null space."""
+        """Compute ``DF(X)`` (3V, 3V), close to −A and not symmetric, regularised on rigid motions."""
         matrix = self.current.space.jacobian.matrix
         here, there = matrix(self.current.gradients), matrix(unknown.gradients)
         if self._forward:
@@ -230,13 +253,13 @@ class _Step:
 
 @dataclass(frozen=True, kw_only=True)
 class _Solution(Outcome):
-    """Where an iteration on one step ended."""
+    """The result of an iteration on one step."""
 
     point: ShellPoint
 
 
 def _accepted(equation: _Step, point: ShellPoint, iterations: int, residual: float) -> _Solution:
-    """A solution of the equation, which also has to be a deformation."""
+    """Check that a solution of the equation is a deformation of the present shape."""
     fault = fault_between(equation.current, point)
     status = Status.DEGENERATE if fault else Status.CONVERGED
     return _Solution(status=status, iterations=iterations, residual=residual, reason=fault or "", point=point)
@@ -249,15 +272,15 @@ def _stalled(point: ShellPoint, iterations: int, residual: float, reason: str) -
 def _chord(
     equation: _Step, chord: ChordSolver, start: FloatArray, tolerance: float, limit: float = np.inf
 ) -> _Solution:
-    """``X ← X + A⁻¹F(X)`` with the factor at hand, accelerated, until it is solved or isn't worth going on.
+    """Iterate ``X ← X + A⁻¹F(X)`` with a fixed factor, accelerated, until it converges or slows down.
 
     Args:
         equation: the step to solve.
-        chord: A⁻¹ of a shape nearby.
+        chord: A⁻¹ at a nearby shape.
         start: first guess.
-        tolerance: of ``sqrt(Fᵀ A⁻¹ F)``, with the factor at hand. Where it holds, the step at hand is taken as well:
-            that costs little, and what error it leaves grows a hundredfold when shapes are extrapolated.
-        limit: iterations, above which it is given up as soon as the rate so far says so.
+        tolerance: tolerance of ``sqrt(Fᵀ A⁻¹ F)``. Once it is met, one more step is taken. This costs little, and
+            errors grow a hundredfold when shapes are extrapolated.
+        limit: the iteration ends once its rate predicts more iterations than this.
     """
     space, mixing = equation.current.space, Anderson()
     x, residuals = start, [np.inf, np.inf]
@@ -271,18 +294,18 @@ def _chord(
             return _accepted(equation, space.point(x + step), iterations, residuals[-1])
         rate = (residuals[-1] / residuals[2]) ** (1 / max(iterations, 1))
         needed = iterations + np.log(tolerance / residuals[-1]) / np.log(rate) if rate < 1 else 0
-        if not residuals[-1] < SLOW * residuals[-3] or (iterations > 1 and needed > limit):
+        if not residuals[-1] < RENEWALS.slow * residuals[-3] or (iterations > 1 and needed > limit):
             return _stalled(point, iterations, residuals[-1], f"no convergence, residual {residuals[-1]:.1e}")
         x = mixing(x, forces, step)
 
 
 def _newton(equation: _Step, chord: ChordSolver, tolerance: float) -> _Solution:
-    """Exact Newton with a line search, from the current shape; residuals are measured with the factor of a chord."""
+    """Solve by exact Newton with a line search, from the present shape. A factor measures the residuals."""
     point, forces, residual = equation.current, *_measured(equation, chord, equation.current)
-    for iteration in range(NEWTON_ITERATIONS + 1):
+    for iteration in range(NEWTON.iterations + 1):
         if residual <= tolerance:
             return _accepted(equation, point, iteration, residual)
-        if iteration == NEWTON_ITERATIONS:
+        if iteration == NEWTON.iterations:
             break
         try:
             step = -splu(equation.derivative(point)).solve(forces.ravel()).reshape(-1, 3)
@@ -292,11 +315,11 @@ def _newton(equation: _Step, chord: ChordSolver, tolerance: float) -> _Solution:
         if found is None:
             return _stalled(point, iteration, residual, f"Newton stalls at residual {residual:.1e}")
         point, forces, residual = found
-    return _stalled(point, NEWTON_ITERATIONS, residual, f"Newton is slow, residual {residual:.1e}")
+    return _stalled(point, NEWTON.iterations, residual, f"Newton is slow, residual {residual:.1e}")
 
 
 def _measured(equation: _Step, chord: ChordSolver, point: ShellPoint) -> tuple[FloatArray, float]:
-    """F at a shape, and the residual."""
+    """Compute F at a shape, and the residual."""
     forces = equation.forces(point)
     return forces, step_length(forces, chord.solve(forces))
 
@@ -304,11 +327,11 @@ def _measured(equation: _Step, chord: ChordSolver, point: ShellPoint) -> tuple[F
 def _line_search(
     equation: _Step, chord: ChordSolver, point: ShellPoint, step: FloatArray, residual: float
 ) -> tuple[ShellPoint, FloatArray, float] | None:
-    """The shape after a share t of a step that takes away t/4 of the residual or more, with F and residual there."""
+    """Find a share t of a step that reduces the residual by t/4 or more; returns shape, F and residual there."""
 
     def trial(t: float) -> tuple[ShellPoint, FloatArray, float]:
         there = point.space.point(point.vertices + t * step)
         return there, *_measured(equation, chord, there)
 
-    found = backtrack(trial, lambda t, there: there[2] < (1 - t / 4) * residual, SMALLEST_STEP)
+    found = backtrack(trial, lambda t, there: there[2] < (1 - t / 4) * residual, NEWTON.smallest_step)
     return found and found[1]

@@ -1,4 +1,4 @@
-"""Means of shapes: the elastic mean and the Riemannian centre of mass, both weighted."""
+"""Weighted means of shapes: the elastic mean and the Riemannian centre of mass."""
 
 from __future__ import annotations
 
@@ -18,22 +18,23 @@ from shapespace.solve.outcome import Outcome, Status
 from shapespace.solve.preconditioner import step_length
 from shapespace.solve.truncated_newton import descend
 
-#: Most iterations of either mean.
+#: Largest number of iterations of each mean.
 ITERATIONS = 100
-#: Residual below which the elastic mean keeps its factor and takes full, accelerated steps; and the smallest step that
-#: the line search tries above it.
-RENEW_ABOVE, SMALLEST_STEP = 1e-2, 1e-4
+#: Below this residual the elastic mean keeps its factor and makes full, accelerated steps.
+RENEW_ABOVE = 1e-2
+#: Smallest step length of the line search above this residual.
+SMALLEST_STEP = 1e-4
 
 
 @dataclass(frozen=True, kw_only=True)
 class Mean(Outcome):
-    """A mean shape, with ``sqrt(Fᵀ A⁻¹ F)``, the length of the step still to go, as residual.
+    """A mean shape. Its residual is ``sqrt(Fᵀ A⁻¹ F)``, the length of the next step.
 
     Attributes:
-        vertices: (V, 3), always finite; the best found.
-        worst: of the elastic mean, where it did not converge: number of the shape and of the face whose areas in shape
-            and mean are furthest apart.
-        logarithms: for the centre of mass, those of the shapes at it, in their order.
+        vertices: (V, 3), always finite; the best shape found.
+        logarithms: for the centre of mass, the logarithms of the shapes at the mean, in their order.
+        worst: for an elastic mean that did not converge, the indices of the shape and of the face with the largest
+            ratio between the area in the shape and the area in the mean.
     """
 
     vertices: FloatArray
@@ -49,17 +50,17 @@ def elastic_mean(
     *,
     start: FloatArray | None = None,
 ) -> Mean:
-    """The shape into which all are deformed with least energy: ``min_X Σ w_i W[z_i, z(X)]``.
+    """Compute the shape to which all shapes are deformed with least energy: ``min_X Σ w_i W[z_i, z(X)]``.
 
-    Quasi-Newton with the metric of the current shape: ``Σ w_i ∂₂∂₂W[z_i, z]`` is close to ``Hess₂W[z, z]``,
-    whose J-pull-back is positive definite, so that its steps always lower the energy if short enough;
-    Anderson acceleration takes over where full steps do. Where faces differ so much between the shapes that this is
-    no longer close, Newton's steps go on. Cheap, and a first guess of the centre of mass.
+    The method is quasi-Newton with the metric of the present shape: ``Σ w_i ∂₂∂₂W[z_i, z]`` is close to
+    ``Hess₂W[z, z]``, whose pull-back by J is positive definite. So short steps always lower the energy. Near the mean,
+    full steps are accelerated (Anderson). If the faces of the shapes differ too much for this approximation, truncated
+    Newton continues. The elastic mean is cheap, and a first guess for the centre of mass.
 
     Args:
-        space: where.
+        space: Riemannian space of the shapes.
         shapes: n shapes (V, 3), in any position.
-        weights: n positive weights, equal by default; only their ratios count.
+        weights: n weights, not negative, equal by default; only their ratios matter.
         start: (V, 3) first guess, the shape of least total energy by default.
     """
     shapes, w = _checked(space, shapes, weights)
@@ -74,7 +75,7 @@ def elastic_mean(
 
 
 class _MeanEnergy:
-    """``Σ w_i W[z_i, z(X)]`` of shapes (n, V, 3) with weights (n,); see truncated_newton.Energy."""
+    """``Σ w_i W[z_i, z(X)]`` for shapes (n, V, 3) with weights (n,); see truncated_newton.Energy."""
 
     def __init__(self, space: ShellSpace, shapes: FloatArray, weights: FloatArray) -> None:
         self.space, self._weights = space, weights
@@ -82,11 +83,11 @@ class _MeanEnergy:
         self.length = edge_length(space)
 
     def value_of(self, z: FloatArray) -> float:
-        """Of lengths and angles (2E,)."""
+        """Compute the energy from lengths and angles (2E,)."""
         return float(self._weights @ self._rest.value(z))
 
     def forces_at(self, point: ShellPoint) -> FloatArray:
-        """(V, 3)."""
+        """Compute the forces (V, 3) at a point."""
         return -point.pull_back(self._weights @ self._rest.gradient_deformed(point.z))
 
     def value(self, x: FloatArray) -> float:
@@ -102,14 +103,14 @@ class _MeanEnergy:
         return self.space.factorise(self.space.point(x)).solve
 
     def worst(self, x: FloatArray) -> tuple[int, int]:
-        """The shape and the face whose area is furthest from that in a mean."""
+        """Find the shape and the face with the largest ratio of areas between the shape and a mean."""
         ratios = np.abs(np.log(self._rest.areas / self.space.point(x).rest.areas))
         shape, face = np.unravel_index(np.nan_to_num(ratios, nan=np.inf).argmax(), ratios.shape)
         return int(shape), int(face)
 
 
 def _quasi_newton(mean: _MeanEnergy, start: FloatArray) -> Mean:
-    """With the metric of the current shape, in a line search; near the mean with that of one shape, accelerated."""
+    """Iterate with a line search and a new factor in each step; near the mean with one factor, accelerated."""
     space = mean.space
     point, energy = space.point(start), mean.value(start)
     best, lowest = start, np.inf
@@ -148,7 +149,7 @@ def _quasi_newton(mean: _MeanEnergy, start: FloatArray) -> Mean:
 def _line_search(
     mean: _MeanEnergy, point: ShellPoint, energy: float, step: FloatArray, slope: float
 ) -> tuple[ShellPoint, float] | None:
-    """The shape along a step that lowers the energy enough, and its energy."""
+    """Find a shape along a step that lowers the energy enough, and its energy."""
 
     def trial(t: float) -> tuple[ShellPoint, float]:
         there = mean.space.point(point.vertices + t * step)
@@ -159,7 +160,7 @@ def _line_search(
 
 
 def _newton(mean: _MeanEnergy, begun: Mean) -> Mean:
-    """Go on by truncated Newton from where quasi-Newton ended."""
+    """Continue by truncated Newton where quasi-Newton ended."""
     vertices, iterations, residual = begun.vertices, begun.iterations, begun.residual
     status, reason = Status.DEGENERATE, "a shape has a face without area"
     if np.isfinite(mean.value(vertices)):
@@ -192,19 +193,19 @@ def centre_of_mass(
     start: FloatArray | None = None,
     tolerance: float = 1e-6,
 ) -> Mean:
-    """The Riemannian centre of mass: the shape of least weighted sum of squared distances (paper, section 3).
+    """Compute the Riemannian centre of mass, the shape with the least sum of squared distances (paper, section 3).
 
-    Discretely, the least ``Σ w_i K Σ_k W[z^i_{k−1}, z^i_k]`` over the mean z^i_0 = z and the paths to all
-    shapes: ``F = Σ w_i Jᵀ ∂₁W[z, z^i_1] = 0``, whose quasi-Newton step with the metric is the weighted sum
-    of the logarithms. Karcher's fixed point, accelerated; each iteration costs n geodesics.
+    The discrete problem is to minimise ``Σ w_i K Σ_k W[z^i_{k−1}, z^i_k]`` over the mean z^i_0 = z and the paths to all
+    shapes. At the minimum ``F = Σ w_i Jᵀ ∂₁W[z, z^i_1] = 0``. A quasi-Newton step with the metric is the weighted sum
+    of the logarithms. This is Karcher's fixed-point iteration, with acceleration. Each iteration needs n geodesics.
 
     Args:
-        space: where.
+        space: Riemannian space of the shapes.
         shapes: n shapes (V, 3), in any position.
-        weights: n positive weights, equal by default.
+        weights: n weights, not negative, equal by default.
         steps: K of the geodesics.
         start: (V, 3) first guess, the elastic mean by default.
-        tolerance: of the length of the weighted sum of logarithms.
+        tolerance: tolerance of the length of the weighted sum of logarithms.
     """
     shapes, w = _checked(space, shapes, weights)
     fault = _not_finite(shapes)

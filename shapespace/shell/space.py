@@ -1,14 +1,14 @@
 """The space of discrete shells as a Riemannian manifold, in vertex positions.
 
-The paper works with lengths and angles ``z ∈ R^{2E}`` under 3V integrability constraints. Here the manifold
-of immersed meshes is parametrised by ``X ↦ z(X)`` instead: its tangent space at z(X) is the range of the
-Jacobian ``J = Dz(X)``, so an equation that has to hold on tangent vectors becomes ``Jᵀ(…) = 0``, 3V
-equations in 3V unknowns with only the six rigid motions left over. Integrability is exact, the genus doesn't
-matter, and the matrices are symmetric positive definite and nine times smaller in work than the indefinite
-ones of the constrained form (which the tests compare with).
+The paper works with lengths and angles ``z ∈ R^{2E}`` under integrability constraints. Here ``X ↦ z(X)`` parametrises
+the manifold of immersed meshes instead. Its tangent space at z(X) is the range of the Jacobian ``J = Dz(X)``. An
+equation on tangent vectors becomes ``Jᵀ(…) = 0``: 3V equations in 3V unknowns, determined up to the six rigid motions.
 
-The modules that do something with this space: ``exponential`` (shooting), ``geodesic`` (connecting, logarithm),
-``transport`` and ``mean``.
+So integrability is exact and the genus doesn't matter. The matrices are symmetric positive definite. They take a ninth
+of the work of the indefinite matrices in the constrained form, with which the tests compare.
+
+Operations on this space are in ``exponential`` (shooting), ``geodesic`` (connecting, logarithm), ``transport`` and
+``mean``.
 """
 
 from __future__ import annotations
@@ -32,18 +32,31 @@ from shapespace.solve.cholesky import Backend, Cholesky, analyse
 from shapespace.solve.outcome import Outcome
 from shapespace.solve.preconditioner import Preconditioner
 
-#: Tolerance of equations F = 0: on ``sqrt(Fᵀ A⁻¹ F)``, the length in the metric of a further Newton step.
+#: Tolerance of equations F = 0, for ``sqrt(Fᵀ A⁻¹ F)``: the length in the metric of a further Newton step.
 TOLERANCE = 1e-9
-#: A face has collapsed if a time step leaves less than this share of its area; the energy is near its barrier.
-SMALLEST_AREA_RATIO = 1e-3
-#: Largest share of its area that a face may lose in one step of a descent.
-LARGEST_LOSS = 0.8
-#: If an angle changes by more than this in one time step, the surface has passed through a fold or a collapsed face.
-LARGEST_TURN = 0.75 * np.pi
+
+
+@dataclass(frozen=True)
+class StepLimits:
+    """Limits for one step from shape to shape.
+
+    Attributes:
+        area_ratio: a face has collapsed if a time step leaves less than this share of its area.
+        area_loss: largest share of its area that a face may lose in one step of a descent.
+        turn: largest change of an angle in one time step, in radians. Beyond it the surface has passed through a fold
+            or a collapsed face.
+    """
+
+    area_ratio: float = 1e-3
+    area_loss: float = 0.8
+    turn: float = 0.75 * np.pi
+
+
+STEP = StepLimits()
 
 
 class ShellPoint:
-    """A shape with what its tangent space and its energy are made of, each computed when first asked for.
+    """A shape with its derivatives and its energy, each computed on first use.
 
     Attributes:
         vertices: (V, 3) X.
@@ -57,17 +70,17 @@ class ShellPoint:
 
     @cached_property
     def rest(self) -> RestShape:
-        """The shape as first argument of W."""
+        """The shape as the first argument of W."""
         return self.space.energy.rest(self.z)
 
     @cached_property
     def gradients(self) -> NRICGradients:
-        """``Dz(X)`` in parts."""
+        """The entries of ``Dz(X)``."""
         return self.space.jacobian.gradients(self.vertices)
 
     @cached_property
     def face_frames(self) -> FloatArray:
-        """(xyz, 3, F), see VertexRotations."""
+        """(xyz, 3, F) frames of the faces, see VertexRotations."""
         return self.space.vertex_rotations.face_frames(self.vertices)
 
     @cached_property
@@ -76,15 +89,15 @@ class ShellPoint:
         return self.rest.hessian()
 
     def push_forward(self, displacement: FloatArray) -> FloatArray:
-        """``J d`` (2E,): the change of lengths and angles by a vertex field (V, 3)."""
+        """Compute ``J d`` (2E,), the change of lengths and angles by a vertex field d (V, 3)."""
         return self.space.jacobian.push_forward(self.gradients, displacement)
 
     def pull_back(self, covector: FloatArray) -> FloatArray:
-        """``Jᵀ p`` (V, 3): the forces on vertices by forces on lengths and angles (2E,)."""
+        """Compute ``Jᵀ p`` (V, 3), the forces on vertices from forces p on lengths and angles (2E,)."""
         return self.space.jacobian.pull_back(self.gradients, covector)
 
     def lower(self, tangent: FloatArray) -> FloatArray:
-        """``Hess₂ W[z, z] u`` (2E,) of a change of lengths and angles (2E,)."""
+        """Compute ``Hess₂ W[z, z] u`` (2E,) for a change u of lengths and angles (2E,)."""
         lengths, angles = np.split(tangent, 2)
         energy = self.space.energy
         sides = np.einsum("ijf,jf->if", self.hessian.faces, lengths.take(energy.sides))
@@ -92,46 +105,46 @@ class ShellPoint:
 
 
 def fault_between(old: ShellPoint, new: ShellPoint) -> str | None:
-    """Why the step from one shape to the next is no deformation of a surface; None if it is one."""
+    """Say why the step from one shape to the next is no deformation of a surface; None if it is one."""
     if not np.isfinite(new.z).all():
         return "a vertex is not finite or an edge has no length"
     ratio = new.rest.areas / old.rest.areas
     worst = int(ratio.argmin())
-    if not ratio[worst] > SMALLEST_AREA_RATIO:
+    if not ratio[worst] > STEP.area_ratio:
         return f"face {worst} shrinks to {ratio[worst]:.1e} of its area in one step"
     turn = np.abs(wrap((new.z - old.z)[len(new.z) // 2 :]))
     worst = int(turn.argmax())
-    if not turn[worst] < LARGEST_TURN:
+    if not turn[worst] < STEP.turn:
         i, j = new.space.connectivity.edges[worst]
         return f"the faces at edge ({i}, {j}) turn by {np.degrees(turn[worst]):.0f}° in one step"
     return None
 
 
 def keeps_faces(space: ShellSpace, old: FloatArray, new: FloatArray) -> bool:
-    """Whether no face (F,) of shapes (…, V, 3) loses more than LARGEST_LOSS of its area from old to new.
+    """Whether every face of shapes (…, V, 3) keeps enough of its area from old to new, see `StepLimits.area_loss`.
 
-    The energy is infinite where a face has no area, but a step may pass over that and leave the face turned over.
+    The energy is infinite where a face has no area, but a step may jump over this barrier and turn the face over.
     """
     before, after = (face_areas(x, space.connectivity.faces) for x in (old, new))
-    return bool((after >= (1 - LARGEST_LOSS) * before).all())
+    return bool((after >= (1 - STEP.area_loss) * before).all())
 
 
 def edge_length(space: ShellSpace) -> float:
-    """Mean length of the reference's edges."""
+    """Compute the mean edge length of the reference."""
     return float(edge_lengths(space.reference.vertices, space.connectivity).mean())
 
 
 @dataclass(frozen=True)
 class ChordSolver:
-    """``A = Jᵀ Hess₂W[z, z] J``, factorised at one shape and used for all its neighbours.
+    """The matrix ``A = Jᵀ Hess₂W[z, z] J``, factorised at one shape and used for neighbouring shapes.
 
-    Rigid motions are left out of the forces, see Preconditioner. The spectrum of A relative to a neighbour's matrix is
-    close to 1: 0.95 to 1.05 for a bend by 5°, 0.5 to 2.4 for 75°, measured.
+    Rigid motions are removed from the forces, see Preconditioner. The spectrum of A relative to the matrix of a
+    neighbour is close to 1. Measured values are 0.95 to 1.05 for a bend by 5°, and 0.5 to 2.4 for 75°.
 
     Attributes:
-        at: the shape whose matrix is factorised.
-        inverse: A⁻¹, up to the rigid motions of that shape.
-        rotations: (V, 3, 3) of its vertices to the shape that is served, if they are taken into account.
+        at: the shape of the factor.
+        inverse: A⁻¹, up to the rigid motions of this shape.
+        rotations: (V, 3, 3) rotations of the vertices from this shape to the neighbour, or None to ignore them.
     """
 
     at: ShellPoint
@@ -139,19 +152,19 @@ class ChordSolver:
     rotations: FloatArray | None = None
 
     def rotated_to(self, point: ShellPoint) -> ChordSolver:
-        """The same factor, serving another shape: ``R A⁻¹ Rᵀ`` and ``J Rᵀ`` with rotations of the vertices to it."""
+        """Return the factor for another shape: ``R A⁻¹ Rᵀ`` and ``J Rᵀ``, with rotations R of the vertices to it."""
         return replace(self, rotations=point.space.vertex_rotations(self.at.face_frames, point.face_frames))
 
     def solve(self, forces: FloatArray) -> FloatArray:
-        """``A⁻¹F`` (…, V, 3), up to the rigid motions of the factor's shape."""
+        """Compute ``A⁻¹F`` (…, V, 3), up to the rigid motions of the factor's shape."""
         return self._there(self.inverse(self._back(forces)))
 
     def push_forward(self, displacement: FloatArray) -> FloatArray:
-        """``J d`` (2E,) of a vertex field (V, 3), with the factor's shape's J."""
+        """Compute ``J d`` (2E,) for a vertex field d (V, 3), with J of the factor's shape."""
         return self.at.push_forward(self._back(displacement))
 
     def project(self, tangent: FloatArray) -> FloatArray:
-        """The vertex field (V, 3) whose J d comes closest to a change (2E,) of lengths and angles."""
+        """Find the vertex field d (V, 3) whose J d is closest to a change (2E,) of lengths and angles."""
         return self._there(self.inverse(self.at.pull_back(self.at.lower(tangent))))
 
     def _there(self, field: FloatArray) -> FloatArray:
@@ -161,19 +174,19 @@ class ChordSolver:
         return field if self.rotations is None else np.einsum("vji,...vj->...vi", self.rotations, field)
 
 
-#: Factorises A at a shape; raises NotPositiveDefiniteError. The factor that it returned before becomes unusable.
+#: Factorises A at a shape; raises NotPositiveDefiniteError. Its previous factor can't be used any more.
 Factorise = Callable[[ShellPoint], ChordSolver]
 
 
 class ShellSpace:
     """The Riemannian manifold of the shapes of one connectivity, with metric ``g_z = ½ Hess₂ W[z, z]``.
 
-    The symbolic analysis happens here, once. Holds work space: use one per thread, or pickle it to another
-    process, which sends the reference and repeats the analysis there.
+    The symbolic analysis of A happens once. An instance holds work space: use one per thread. Pickling it sends the
+    reference to another process, which repeats the analysis.
 
     Args:
-        reference: gives connectivity and the area to which η refers, so that units don't matter.
-        material: μ, λ, η.
+        reference: mesh that determines the connectivity, and the area to which η refers, so that units don't matter.
+        material: μ, λ and η.
         backend: Cholesky backend.
     """
 
@@ -192,55 +205,56 @@ class ShellSpace:
         return type(self), (self.reference, self.material, self.backend)
 
     def factorisations(self, count: int) -> list[Factorise]:
-        """That many functions that factorise A at a shape, whose results can be used side by side."""
+        """Return `count` functions that factorise A at a shape; their factors can be used at the same time."""
         if len(self._factorise) < count:
             cholesky = analyse(self._matrix.pattern, self.backend, count)
             self._factorise = [partial(_factorised, self._matrix, cholesky, number) for number in range(count)]
         return self._factorise[:count]
 
     def factorise(self, point: ShellPoint) -> ChordSolver:
-        """A at a shape, by the first of the ``factorisations``."""
+        """Factorise A at a shape, with the first of the ``factorisations``."""
         return self.factorisations(1)[0](point)
 
     def nric(self, vertices: FloatArray) -> FloatArray:
-        """Lengths and angles (…, 2E) of shapes (…, V, 3)."""
+        """Compute lengths and angles (…, 2E) of shapes (…, V, 3)."""
         return nric(vertices, self.connectivity)
 
     def point(self, vertices: FloatArray) -> ShellPoint:
-        """A shape (V, 3) as a point of the manifold."""
+        """Make a point of the manifold from a shape (V, 3)."""
         return ShellPoint(self, self.shape(vertices))
 
     def shape(self, vertices: ArrayLike) -> FloatArray:
-        """Vertices as an array; raises ValueError if they can't be those of this mesh."""
+        """Convert vertices to an array (V, 3); raises ValueError if it has another shape."""
         x = np.asarray(vertices, dtype=np.float64)
         if x.shape != self.reference.vertices.shape:
             raise ValueError(f"vertices must be {self.reference.vertices.shape} like the reference's, not {x.shape}")
         return x
 
     def curvature(self, point: ShellPoint, covector: FloatArray) -> sparse.csc_array:
-        """``Σ_i p_i D²z_i(X)`` (3V, 3V) of a covector p (2E,): how ``Jᵀp`` changes with X."""
+        """Compute ``Σ_i p_i D²z_i(X)`` (3V, 3V) for a covector p (2E,): the derivative of ``Jᵀp`` by X."""
         second = HingeGeometry(point.vertices, self.connectivity).second_derivatives()
         return self._matrix.pattern.matrix(self._matrix.second_derivative(second, covector))
 
     def inner(self, vertices: FloatArray, first: FloatArray, second: FloatArray) -> float:
-        """``g(u, v)`` of two vertex fields (V, 3) at a shape."""
+        """Compute ``g(u, v)`` for two vertex fields (V, 3) at a shape."""
         point = self.point(vertices)
         lowered = point.lower(point.push_forward(first))
         return 0.5 * float(lowered @ point.push_forward(second))
 
     def norm(self, vertices: FloatArray, tangent: FloatArray) -> float:
-        """``sqrt(g(v, v))`` of a vertex field (V, 3) at a shape."""
+        """Compute ``sqrt(g(v, v))`` for a vertex field (V, 3) at a shape."""
         return float(np.sqrt(self.inner(vertices, tangent, tangent)))
 
     def project(self, vertices: FloatArray, change: FloatArray) -> FloatArray:
-        """The vertex field (V, 3) whose J d comes closest, in the metric, to a change (2E,) of lengths and angles.
+        """Find the vertex field d (V, 3) whose J d is closest, in the metric, to a change u (2E,) of lengths and
+        angles.
 
-        ``J d`` is the orthogonal projection to the tangent space: d = (Jᵀ H J)⁻¹ Jᵀ H u. It has no rigid part.
+        ``J d`` is the orthogonal projection to the tangent space: d = (Jᵀ H J)⁻¹ Jᵀ H u. The field has no rigid part.
         """
         point = self.point(vertices)
         chord = self.factorise(point)
         d = chord.project(change)
-        # Once more with what is left, because A is regularised.
+        # Again with the remainder, because A is regularised.
         d += chord.project(change - point.push_forward(d))
         return without_rigid_motion(d, point.vertices)
 
@@ -252,15 +266,15 @@ def _factorised(matrix: NormalMatrix, cholesky: Cholesky, number: int, point: Sh
 
 @dataclass(frozen=True, kw_only=True)
 class DiscretePath(Outcome):
-    """Shapes at equal times, as far as they could be found; converged if the path is complete.
+    """Shapes at equal times, as far as they were found; converged if the path is complete.
 
-    ``iterations`` are those of all its equations together. ``residual`` is the largest ``sqrt(F_kᵀ A_k⁻¹ F_k)`` of the
-    discrete Euler–Lagrange equation at an inner shape, with A_k factorised near it, or 0 where there was nothing to
-    solve; the exponential takes one more step after that was measured.
+    ``iterations`` counts the iterations of all equations. ``residual`` is the largest ``sqrt(F_kᵀ A_k⁻¹ F_k)`` of the
+    discrete Euler–Lagrange equation at an inner shape, with A_k factorised near it, or 0 if there was no equation. The
+    exponential makes one more step after the residual is measured.
 
     Attributes:
         vertices: (n, V, 3), always finite.
-        space: where the path lies.
+        space: the space of the shapes.
     """
 
     vertices: FloatArray
@@ -268,7 +282,7 @@ class DiscretePath(Outcome):
 
     @cached_property
     def nric(self) -> FloatArray:
-        """(n, 2E) lengths and angles, the angles unwrapped along the path from the first shape's."""
+        """(n, 2E) lengths and angles; the angles are unwrapped along the path from the first shape."""
         z = self.space.nric(self.vertices)
         e = self.space.connectivity.edge_count
         z[1:, e:] = z[0, e:] + np.cumsum(wrap(np.diff(z[:, e:], axis=0)), axis=0)
@@ -276,6 +290,6 @@ class DiscretePath(Outcome):
 
     @cached_property
     def energy(self) -> float:
-        """Path energy ``K Σ W[z_{k−1}, z_k]``, for a complete path about the squared length."""
+        """Path energy ``K Σ W[z_{k−1}, z_k]``, about the squared length of a complete path."""
         z = self.nric
         return float((len(z) - 1) * self.space.energy.rest(z[:-1]).value(z[1:]).sum())

@@ -17,13 +17,12 @@ from shapespace.solve.outcome import Outcome, Status
 
 @dataclass(frozen=True, kw_only=True)
 class Transport(Outcome):
-    """A vector carried along a path; converged if it got to the end.
+    """A vector transported along a path; converged if it reached the end.
 
-    Iterations and the largest residual are those of the geodesics and exponentials solved on the way.
+    Iterations and residual sum up the geodesics and exponentials that were solved: their total, and their maximum.
 
     Attributes:
-        velocities: (n, V, 3) vertex fields without rigid motion, one at each shape reached, the given one
-            first.
+        velocities: (n, V, 3) vertex fields without rigid motion at the shapes that were reached, the given field first.
     """
 
     velocities: FloatArray
@@ -32,18 +31,18 @@ class Transport(Outcome):
 def parallel_transport(
     space: ShellSpace, path: DiscretePath, velocity: FloatArray, *, tolerance: float = TOLERANCE
 ) -> Transport:
-    """Carry a tangent vector along a path, a geodesic parallelogram for each of its K steps.
+    """Transport a tangent vector along a path, by a geodesic parallelogram for each of the K steps.
 
-    With v_{k−1} scaled to the length of a step, p = X_{k−1} + v_{k−1}/s is the tip of the vector; c is the
-    middle of a two-step geodesic from p to X_k; the two-step geodesic from X_{k−1} through c ends in the tip
-    at X_k. Two small solves a rung, and no derivative of the metric. First-order in the length of path and
-    vector, exact where the space is flat.
+    The vector v_{k−1} is scaled to the length of a step, so that its tip is p = X_{k−1} + v_{k−1}/s. Let c be the
+    middle of the two-step geodesic from p to X_k. The two-step geodesic from X_{k−1} through c ends at the tip of the
+    transported vector at X_k. This needs two small solves per step and no derivative of the metric. It is first-order
+    in the lengths of path and vector, and exact in flat space.
 
     Args:
-        space: where.
-        path: complete, with at least two shapes.
-        velocity: (V, 3) vertex field at its first shape.
-        tolerance: of each solve.
+        space: Riemannian space of the shapes.
+        path: a complete path with at least two shapes.
+        velocity: (V, 3) vertex field at the first shape.
+        tolerance: tolerance of each solve.
     """
     steps = len(path.vertices) - 1
     if steps < 1:

@@ -11,19 +11,19 @@ from shapespace.mesh.vectors import components, cross, dot
 
 
 class VertexRotations:
-    """A rotation for each vertex: the mean of its faces', then ROUNDS times the mean of its neighbours'.
+    """A rotation for each vertex: the mean over its faces, then ROUNDS times the mean over its neighbours.
 
-    Means are those of quaternions (Markley, Cheng, Crassidis and Oshman, "Averaging quaternions", 2007), in the cheap
-    form for rotations that are near each other: the normalised weighted sum instead of an eigenvector. Between face
-    frames a and b the quaternion is ``(1 + Σ_k a_k · b_k, Σ_k a_k × b_k)``, which is 4w times the unit quaternion
-    (w, v). So a sum doesn't depend on its sign, which is what the eigenvector is for; and rotations by nearly 180°,
-    whose axis is uncertain, weigh little.
+    Means are computed from quaternions (Markley, Cheng, Crassidis and Oshman, "Averaging quaternions", 2007). For
+    rotations close to each other the normalised weighted sum replaces their eigenvector. Between face frames a and b
+    the quaternion is ``(1 + Σ_k a_k · b_k, Σ_k a_k × b_k)``, which is 4w times the unit quaternion (w, v). So sums
+    don't depend on the sign of a quaternion, and rotations by nearly 180°, whose axis is uncertain, have little weight.
 
-    Neighbours have to rotate nearly alike, because differences of rotation stretch a shell, which is much stiffer
-    against that than against bending: without these rounds the rotated matrix of a captured body is further from the
-    new shape's than the old one is.
+    Neighbours must rotate nearly alike. Differences of rotation stretch a shell, and it is much stiffer against
+    stretching than against bending. Without these rounds, the rotated matrix of a captured body is further from the
+    matrix of the new shape than the old matrix is.
     """
 
+    #: Number of means over neighbours.
     ROUNDS = 6
 
     def __init__(self, connectivity: Connectivity) -> None:
@@ -34,7 +34,7 @@ class VertexRotations:
         self._neighbours = sparse.csr_array((self._around @ self._around.T).astype(bool).astype(np.float64))
 
     def face_frames(self, vertices: FloatArray) -> FloatArray:
-        """(xyz, 3, F): unit vectors along a side of each face, across it, and along its normal."""
+        """Compute frames (xyz, 3, F): unit vectors along a side of each face, across it, and along the normal."""
         a, b, c = (components(vertices).take(k, axis=1) for k in self._corners)
         side = b - a
         normal = cross(side, c - a)
@@ -43,9 +43,9 @@ class VertexRotations:
         return np.stack([side, cross(normal, side), normal], axis=1)
 
     def __call__(self, old: FloatArray, new: FloatArray) -> FloatArray:
-        """Rotations (V, 3, 3) that take face frames to face frames, both (xyz, 3, F).
+        """Compute the rotations (V, 3, 3) from old to new face frames, both (xyz, 3, F).
 
-        Not finite where all around a vertex rotate by 180°, or a face has no area.
+        A rotation is not finite where all faces around a vertex rotate by 180°, or a face has no area.
         """
         quaternions = np.empty((4, old.shape[-1]))
         quaternions[0] = 1 + np.einsum("xkf,xkf->f", old, new)
@@ -53,7 +53,7 @@ class VertexRotations:
         means = np.asarray(self._around @ quaternions.T)
         for _ in range(self.ROUNDS):
             means = np.asarray(self._neighbours @ means)
-        # Of length √2, for then the matrix needs no factors of 2.
+        # With length √2 the matrix needs no factors of 2.
         means *= np.sqrt(2) / np.linalg.norm(means, axis=1, keepdims=True)
         w, x, y, z = means.T
         rows = [

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from shapespace.shell.energy import Material
-from shapespace.shell.exponential import exponential, extrapolate
+from shapespace.shell.exponential import Renewals, exponential, extrapolate
 from shapespace.shell.geodesic import geodesic
 from shapespace.shell.space import ShellSpace
 from shapespace.solve.deadline import Deadline
@@ -112,7 +112,7 @@ def test_a_long_way_ends_in_a_finite_path_whatever_happens(mesh, velocity):
 
 def test_exact_newton_takes_over_where_the_chord_fails(space, mesh, velocity, monkeypatch):
     easy = exponential(space, mesh.vertices, velocity, K)
-    monkeypatch.setattr("shapespace.shell.exponential.SLOW", 1e-9)
+    monkeypatch.setattr("shapespace.shell.exponential.RENEWALS", Renewals(slow=1e-9))
     hard = exponential(space, mesh.vertices, velocity, K)
     back = exponential(space, mesh.vertices, velocity, -2)
     assert hard.converged

@@ -8,7 +8,8 @@ import trimesh
 
 from shapespace.mesh.triangle_mesh import TriangleMesh
 from shapespace.shell.exponential import exponential
-from shapespace.shell.geodesic import _Middle, geodesic, halved, logarithm, towards
+from shapespace.shell.geodesic import geodesic, halved, logarithm, towards
+from shapespace.shell.initial_paths import _Middle
 from shapespace.shell.space import ShellSpace
 from tests.shapespace.conftest import bent
 from tests.shapespace.shell.measures import distance, true_residuals

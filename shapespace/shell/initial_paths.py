@@ -1,0 +1,164 @@
+"""Initial paths for the geodesic equation: straight in lengths and angles, bisected, or of least energy."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from shapespace.arrays import FloatArray
+from shapespace.coordinates.nric import unwrap
+from shapespace.mesh.rigid_motion import align
+from shapespace.shell.path_energy import PathEnergy, factorised
+from shapespace.shell.space import ChordSolver, Factorise, ShellPoint, ShellSpace, edge_length, keeps_faces
+from shapespace.solve.line_search import backtrack
+from shapespace.solve.truncated_newton import descend
+
+#: Largest number of Newton steps when the path energy is minimised.
+MOST_DESCENTS = 30
+
+
+@dataclass(frozen=True)
+class MiddleSearch:
+    """Limits of the search for a middle shape, which need not be exact.
+
+    Attributes:
+        iterations: largest number of steps.
+        tolerance: tolerance of the residual.
+    """
+
+    iterations: int = 30
+    tolerance: float = 1e-2
+
+
+@dataclass(frozen=True)
+class NearestSearch:
+    """Limits of the Gauss–Newton steps to each shape of a straight path, which need not be exact.
+
+    Attributes:
+        iterations: largest number of steps.
+        smallest_step: smallest step length.
+        gain: the steps end once one of them reduces the squared misfit by less than this share.
+    """
+
+    iterations: int = 4
+    smallest_step: float = 1 / 32
+    gain: float = 0.1
+
+
+MIDDLE, NEAREST = MiddleSearch(), NearestSearch()
+
+#: A path (K + 1, V, 3), with a factor of A near each inner shape.
+InitialPath = tuple[FloatArray, list[ChordSolver]]
+
+
+def straight(space: ShellSpace, start: FloatArray, end: FloatArray, factorise: list[Factorise]) -> InitialPath:
+    """Find shapes close to a straight line in lengths and angles, by Gauss–Newton with fixed factors.
+
+    The shapes are computed in order, because each is a good start for the next.
+    """
+    first = space.point(start)
+    line = unwrap(space.nric(end), first.z) - first.z
+    steps = len(factorise) + 1
+    shapes, chords = [start], []
+    for k in range(1, steps):
+        guess = space.point(start if k == 1 else 2 * shapes[-1] - shapes[-2])
+        chords.append(factorise[k - 1](guess))
+        shapes.append(nearest(chords[-1], first.z + k / steps * line))
+    return np.stack([*shapes, align(end, shapes[-1])]), chords
+
+
+def nearest(chord: ChordSolver, target: FloatArray) -> FloatArray:
+    """Make a few steps from the shape of a factor towards the shape closest to target lengths and angles (2E,).
+
+    Distances are measured in the metric at the shape of the factor.
+    """
+    point, misfit, square = _compared(chord.at, chord.at, target)
+    for _ in range(NEAREST.iterations):
+        step = chord.solve(point.pull_back(chord.at.lower(misfit)))
+        found = _line_search(chord.at, target, point, step, square)
+        if found is None:
+            break
+        before = square
+        point, misfit, square = found
+        if 1 - square / before < NEAREST.gain:
+            break
+    return point.vertices
+
+
+#: A shape, the misfit (2E,) between its lengths and angles and a target, and the squared misfit in a metric.
+_Compared = tuple[ShellPoint, FloatArray, float]
+
+
+def _compared(metric: ShellPoint, point: ShellPoint, target: FloatArray) -> _Compared:
+    misfit = unwrap(target, point.z) - point.z
+    return point, misfit, float(misfit @ metric.lower(misfit))
+
+
+def _line_search(
+    metric: ShellPoint, target: FloatArray, point: ShellPoint, step: FloatArray, square: float
+) -> _Compared | None:
+    """Find a shape along a step that is closer to the target and has no collapsed face."""
+    found = backtrack(
+        lambda t: _compared(metric, point.space.point(point.vertices + t * step), target),
+        lambda _, there: there[2] < square and keeps_faces(point.space, point.vertices, there[0].vertices),
+        NEAREST.smallest_step,
+    )
+    return found and found[1]
+
+
+def bisected(space: ShellSpace, start: FloatArray, end: FloatArray, factorise: list[Factorise]) -> FloatArray:
+    """Find a path (K + 1, V, 3) between distant shapes: the middle of least energy, then the middles of both halves.
+
+    The search for a middle starts at one of its two ends, so that all shapes on the way are valid. On a straight line
+    of lengths and angles there may be no valid shape.
+    """
+    shapes: dict[int, FloatArray] = {0: start, len(factorise) + 1: end}
+
+    def fill(i: int, j: int) -> None:
+        if j - i < 2:
+            return
+        k = (i + j) // 2
+        between = _Middle(space, shapes[i], shapes[j], (k - i, j - k), factorise[0])
+        nearer = shapes[i] if k - i <= j - k else shapes[j]
+        shapes[k] = descend(between, nearer, MIDDLE.tolerance, MIDDLE.iterations).x
+        fill(i, k)
+        fill(k, j)
+
+    fill(0, len(factorise) + 1)
+    return np.stack([shapes[k] for k in sorted(shapes)])
+
+
+class _Middle:
+    """``W[a, z(X)]/s + W[z(X), b]/t`` for a shape X, s steps after a and t before b; see truncated_newton.Energy."""
+
+    def __init__(
+        self, space: ShellSpace, a: FloatArray, b: FloatArray, steps: tuple[int, int], factorise: Factorise
+    ) -> None:
+        self._space, self._factorise = space, factorise
+        self._first, self._second = 1 / steps[0], 1 / steps[1]
+        self._a, self._b = space.point(a).rest, space.nric(b)
+        self.length = edge_length(space)
+
+    def value(self, x: FloatArray) -> float:
+        z = self._space.nric(x)
+        return float(self._first * self._a.value(z) + self._second * self._space.energy.rest(z).value(self._b))
+
+    def forces(self, x: FloatArray) -> FloatArray:
+        point = self._space.point(x)
+        covector = self._first * self._a.gradient_deformed(point.z) + self._second * point.rest.gradient_rest(self._b)
+        return -point.pull_back(covector)
+
+    def admits(self, x: FloatArray, step: FloatArray) -> bool:
+        return keeps_faces(self._space, x, x + step)
+
+    def precondition(self, x: FloatArray) -> Callable[[FloatArray], FloatArray]:
+        return self._factorise(self._space.point(x)).solve
+
+
+def descended(space: ShellSpace, shapes: FloatArray, factorise: list[Factorise], tolerance: float) -> InitialPath:
+    """Minimise the path energy from a given path."""
+    energy = PathEnergy(space, shapes[0], shapes[-1], factorise)
+    shapes = energy.path(descend(energy, shapes[1:-1], tolerance / 2, MOST_DESCENTS).x)
+    return shapes, factorised(space, shapes, factorise)
