@@ -1,1 +1,1 @@
-"""Parts of iterations: Cholesky, preconditioner, mixing, line search, least squares, truncated Newton, `Outcome`."""
+"""Parts of iterations: Cholesky, preconditioner, acceleration, line search, least squares, Newton and `Outcome`."""

@@ -9,16 +9,16 @@ from shapespace.arrays import FloatArray
 
 
 class Anderson:
-    """Mixes the last iterates of ``x ← x + P F(x)`` so that ``FᵀPF``, linearised, is least.
+    """Combines the last iterates of ``x ← x + P F(x)`` so that the linearised ``FᵀPF`` is minimal.
 
-    With the differences ΔF, ΔG of the last few F and of the last few images ``G = x + P F``, the next iterate is
-    ``G − ΔG γ``, where γ solves ``(ΔFᵀ P ΔF) γ = ΔFᵀ P F``: the unconstrained form of Walker and Ni, "Anderson
-    acceleration for fixed-point iterations" (SIAM J. Numer. Anal. 49, 2011), with P's norm for the Euclidean one. For
-    an affine F it amounts to GMRES preconditioned by P, as they show; it costs a few dot products and needs no
-    derivative. The chord iteration that uses it contracts by 0.03 to 0.3 per step, and faster with each iterate mixed.
+    Let ΔF and ΔG be the differences of the last few F, and of the last few images ``G = x + P F``. The next iterate is
+    ``G − ΔG γ``, where γ solves ``(ΔFᵀ P ΔF) γ = ΔFᵀ P F``. This is the unconstrained form of Walker and Ni, "Anderson
+    acceleration for fixed-point iterations" (SIAM J. Numer. Anal. 49, 2011), in the norm of P instead of the Euclidean
+    norm. For an affine F it is equivalent to GMRES preconditioned by P, as they show. It needs a few dot products and
+    no derivative. The chord iterations here contract by 0.03 to 0.3 per step, and acceleration improves that.
     """
 
-    #: How many earlier iterates are mixed.
+    #: Number of earlier iterates.
     DEPTH = 5
 
     def __init__(self) -> None:
@@ -27,7 +27,7 @@ class Anderson:
         self._history = np.empty(0)
 
     def __call__(self, x: FloatArray, forces: FloatArray, step: FloatArray) -> FloatArray:
-        """The next iterate from x, F(x) and the step P F(x), all of one shape."""
+        """Compute the next iterate from x, F(x) and the step P F(x), arrays of equal shape."""
         now = np.concatenate([x, forces, step], axis=None).reshape(3, -1)
         now[0] += now[2]
         if self._last is None:
@@ -36,6 +36,6 @@ class Anderson:
         np.subtract(now, self._last, out=self._history[:, self._count % self.DEPTH])
         self._last, self._count = now, self._count + 1
         images, df, ds = self._history[:, : self._count]
-        # LAPACK's least squares as numpy.linalg.lstsq has them, without its checks: in half the time.
+        # The LAPACK routine behind numpy.linalg.lstsq, without its checks: in half the time.
         mix = dgelss(ds @ df.T, ds @ now[1], cond=np.finfo(float).eps * len(ds))[1]
         return (now[0] - mix @ images).reshape(x.shape)

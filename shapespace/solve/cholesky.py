@@ -1,8 +1,8 @@
-"""Sparse Cholesky of matrices with one pattern: analyse once, factorise many times, solve with what that returns.
+"""Sparse Cholesky factorisation of matrices with one pattern: analyse once, factorise and solve many times.
 
-Two backends behind one interface. ``pardiso`` (MKL, a wheel for x86-64) is the faster one where it is installed;
-``banded`` needs only SciPy: reverse Cuthill–McKee, then LAPACK on the band. On meshes of about 1000 vertices the two
-lie within a factor of two to three of each other, and both beat SuperLU, which has no symbolic phase to reuse.
+There are two backends with one interface. ``pardiso`` (MKL, a wheel for x86-64) is the faster one. ``banded`` needs
+only SciPy: a reverse Cuthill–McKee ordering, then LAPACK on the band. On meshes of about 1000 vertices it takes two to
+three times as long. Both are faster than SuperLU, which has no symbolic phase to reuse.
 """
 
 from __future__ import annotations
@@ -32,20 +32,20 @@ _MINIMUM_DEGREE, _NESTED_DISSECTION = 0, 2
 
 
 class NotPositiveDefiniteError(ArithmeticError):
-    """The matrix has no Cholesky factor: not positive definite to working precision, or not finite."""
+    """The matrix has no Cholesky factor: it is not positive definite to working precision, or not finite."""
 
 
 class SymmetricPattern:
-    """The upper triangle of a symmetric sparse matrix, as the fixed target of a scatter.
+    """The pattern of the upper triangle of a symmetric sparse matrix, into which contributions are summed.
 
     Args:
         size: N.
-        rows: (C,) row of each contribution; an entry may receive many.
-        columns: (C,) column of each contribution. One below the diagonal is added to the entry it mirrors.
+        rows: (C,) row of each contribution; an entry may receive several.
+        columns: (C,) column of each contribution. A contribution below the diagonal is added to the mirrored entry.
 
     Attributes:
-        slots: (C,) index into the pattern's entries of each contribution.
-        indptr, indices: CSR structure of the upper triangle, every diagonal entry included.
+        slots: (C,) index of the entry of each contribution.
+        indptr, indices: CSR structure of the upper triangle, with all diagonal entries.
         diagonal: (N,) index of each diagonal element among the entries.
     """
 
@@ -69,32 +69,32 @@ class SymmetricPattern:
         return np.repeat(np.arange(self.size), np.diff(self.indptr))
 
     def scatter(self, contributions: FloatArray, slots: IntArray | None = None) -> FloatArray:
-        """Sum contributions (C,) into the entries of the pattern; ``slots`` by default those of its arguments."""
+        """Sum contributions (C,) into the entries of the pattern, at ``slots`` or at the slots of the pattern."""
         sums = np.bincount(self.slots if slots is None else slots, weights=contributions, minlength=len(self))
         return np.asarray(sums, dtype=np.float64)
 
     def matrix(self, entries: FloatArray) -> sparse.csc_array:
-        """The whole symmetric matrix, for checks and comparisons."""
+        """Assemble the whole symmetric matrix, for checks and comparisons."""
         upper = sparse.csr_array((entries, self.indices, self.indptr), shape=(self.size, self.size))
         return sparse.csc_array(upper + sparse.triu(upper, 1).T)
 
 
 class Factorisation(Protocol):
-    """A factorised matrix. Not for use by two threads at once."""
+    """A factorised matrix. Only one thread may use it at a time."""
 
     def solve(self, right: ArrayLike) -> FloatArray:
         """Solve for one right-hand side (N,), or for several (n, N)."""
 
 
 class Cholesky(Protocol):
-    """Factorises symmetric positive definite matrices of one pattern. Not for use by two threads at once.
+    """Factorises symmetric positive definite matrices of one pattern. Only one thread may use it at a time.
 
-    It can hold several factors at a time, each under a number. A new factor replaces the one with the same number,
-    which must not be used afterwards: a backend that has overwritten its memory raises RuntimeError.
+    It can hold several factors, each with a number. A new factor replaces the factor with the same number, which can't
+    be used any more: a backend that has overwritten its memory raises RuntimeError.
     """
 
     def factorise(self, entries: FloatArray, number: int = 0) -> Factorisation:
-        """Factorise the matrix with these upper-triangle entries; raises NotPositiveDefiniteError."""
+        """Factorise the matrix with given upper-triangle entries; raises NotPositiveDefiniteError."""
 
 
 class BandedCholesky:
@@ -109,12 +109,12 @@ class BandedCholesky:
         a, b = place[pattern.rows], place[pattern.indices]
         low, high = np.minimum(a, b), np.maximum(a, b)
         self.bandwidth = int((high - low).max())
-        # Lower form, Fortran order: entry (high, low) lies at row high - low of column low.
+        # Lower form, Fortran order: entry (high, low) is at row high − low of column low.
         self._slots = low * (self.bandwidth + 1) + (high - low)
         self._shape = (self.bandwidth + 1, n)
 
     def factorise(self, entries: FloatArray, number: int = 0) -> Factorisation:
-        """See Cholesky; every factor has its own memory here, so the number is ignored."""
+        """See Cholesky. Every factor has its own memory here, so the number is ignored."""
         band = np.zeros(self._shape, self._precision, order="F")
         band.ravel(order="K")[self._slots] = entries
         if not np.isfinite(band).all():
@@ -143,7 +143,7 @@ class _BandedFactor:
 
 @cache
 def _mkl() -> ctypes.CDLL:
-    """The MKL library. Its wheel's list of files tells where it is; pypardiso's search takes most of a second."""
+    """Load the MKL library. The list of files of its wheel has the path; pypardiso's search takes most of a second."""
     try:
         files = metadata.files("mkl") or []
     except metadata.PackageNotFoundError:
@@ -154,8 +154,8 @@ def _mkl() -> ctypes.CDLL:
         from pypardiso import PyPardisoSolver
 
         library = PyPardisoSolver().libmkl
-    # One thread, as requests and samples run side by side. Left to itself MKL joins whatever OpenMP the process has
-    # loaded already (PyTorch's, say), and rounds differently with each.
+    # One thread, because requests and samples run in parallel. By default MKL uses the OpenMP that the process has
+    # loaded (such as PyTorch's), and the rounding depends on it.
     library.MKL_Set_Threading_Layer(ctypes.c_int(_MKL_SEQUENTIAL))
     pardiso = library.pardiso
     pardiso.argtypes, pardiso.restype = [ctypes.c_void_p] * 16, None
@@ -164,15 +164,15 @@ def _mkl() -> ctypes.CDLL:
 
 @cache
 def _reference(number: int) -> Any:
-    """A pointer to an integer, for arguments that MKL only reads."""
+    """Return a pointer to an integer, for arguments that MKL only reads."""
     return ctypes.byref(ctypes.c_int32(number))
 
 
 class PardisoCholesky:
-    """MKL Pardiso: phase 11 analyses, 22 factorises, 33 solves.
+    """MKL Pardiso: phase 11 analyses, phase 22 factorises, phase 33 solves.
 
-    pypardiso finds the library, but the phases are called directly: its ``solve`` repeats the analysis, and
-    its call of a phase copies the pattern every time, which costs more than a small solve.
+    pypardiso finds the library, but the phases are called directly. Its ``solve`` repeats the analysis. Its call of a
+    phase copies the pattern, which takes longer than a small solve.
     """
 
     _POSITIVE_DEFINITE = 2
@@ -180,21 +180,21 @@ class PardisoCholesky:
     def __init__(self, pattern: SymmetricPattern, factors: int = 1, precision: Precision = np.float64) -> None:
         self._size, self._precision = pattern.size, precision
         self._structure = pattern.indptr + np.int32(1), pattern.indices + np.int32(1)
-        #: How many factors have been made under each number. Factors refer to this object; holding them here too would
-        #: be a reference cycle, and MKL's memory would stay until the garbage collector runs.
+        #: Number of factors made so far for each number. Factors refer to this object. Holding them here too would be a
+        #: reference cycle, and MKL's memory would stay until the garbage collector runs.
         self._versions = [0] * factors
         entries = np.ones(len(pattern), precision)
         entries[pattern.diagonal] = len(pattern)
-        # Minimum degree gives smaller factors for long, thin shapes, nested dissection for compact ones. The better
-        # ordering saves up to a third of the time.
+        # Minimum degree gives smaller factors for long, thin shapes, and nested dissection for compact shapes. The
+        # better ordering saves up to a third of the time.
         sizes = {ordering: self._analyse(ordering, entries) for ordering in (_MINIMUM_DEGREE, _NESTED_DISSECTION)}
         if sizes[_MINIMUM_DEGREE] < sizes[_NESTED_DISSECTION]:
             self._analyse(_MINIMUM_DEGREE, entries)
-        # No iterative refinement: it doubles the cost of a solve, and all callers are iterations that correct errors.
+        # No iterative refinement: it doubles the time of a solve, and all callers iterate and so correct errors.
         self._options[7] = 0
 
     def _analyse(self, ordering: int, entries: NDArray) -> int:
-        """Analyse with an ordering, discarding any earlier analysis; returns how many entries the factor will have."""
+        """Analyse with an ordering, and discard any earlier analysis. Returns the number of entries of the factor."""
         if hasattr(self, "_handle"):
             self._run(-1, entries)
         self._handle = np.zeros(64, dtype=np.int64)
@@ -231,21 +231,21 @@ class PardisoCholesky:
         return _PardisoFactor(self, kept, number, self._versions[number])
 
     def solve(self, factor: _PardisoFactor, right: ArrayLike) -> FloatArray:
-        """Solve with a factor made here; raises RuntimeError where another has taken its place."""
+        """Solve with a factor of this object; raises RuntimeError if a later factor has replaced it."""
         if self._versions[factor.number] != factor.version:
             raise RuntimeError(f"factor {factor.number} has been replaced by a later factorisation")
         solved = self._run(33, factor.entries, np.ascontiguousarray(right, self._precision), factor.number)
         return solved.astype(np.float64, copy=False)
 
     def __del__(self, finalizing: Callable[[], bool] = sys.is_finalizing) -> None:
-        # MKL keeps the factors outside Python's memory until told otherwise. At the end `sys` itself may be gone.
+        # MKL's memory must be freed explicitly. When the interpreter exits, `sys` itself may be gone.
         if hasattr(self, "_versions") and not finalizing():
             self._run(-1, np.zeros(1, self._precision))
 
 
 @dataclass(frozen=True, eq=False)
 class _PardisoFactor:
-    """One of MKL's factors, with the matrix entries, which Pardiso reads again when it solves."""
+    """A factor in MKL's memory, with the entries of the matrix, which Pardiso reads again when it solves."""
 
     cholesky: PardisoCholesky
     entries: NDArray
@@ -260,14 +260,14 @@ class _PardisoFactor:
 def analyse(
     pattern: SymmetricPattern, backend: Backend = "auto", factors: int = 1, precision: Precision = np.float64
 ) -> Cholesky:
-    """Do the symbolic work for a pattern once; ``auto`` takes Pardiso where it is installed.
+    """Analyse a pattern for later factorisations.
 
     Args:
-        pattern: of the matrices to come.
-        backend: which library.
-        factors: how many factors can be kept at a time.
-        precision: of the factors. Single precision takes two thirds of the time and is enough for steps of an
-            iteration that corrects errors, but fails on some matrices that have a factor in double precision.
+        pattern: pattern of the matrices.
+        backend: library; ``auto`` takes Pardiso if it is installed.
+        factors: number of factors that can be held at the same time.
+        precision: precision of the factors. Single precision takes two thirds of the time, and suffices in iterations
+            that correct errors. It fails on some matrices that have a factor in double precision.
     """
     if backend == "auto":
         backend = "pardiso" if importlib.util.find_spec("pypardiso") else "banded"

@@ -1,4 +1,4 @@
-"""How long an iteration may go on."""
+"""A limit on the time of an iteration."""
 
 from __future__ import annotations
 
@@ -6,13 +6,13 @@ import time
 
 
 class Deadline:
-    """The moment by which work has to end, or any earlier one at which it is called off; safe between threads.
+    """The time by which work has to end. It can be called off earlier, from any thread.
 
     Args:
-        seconds: from now.
+        seconds: time from now.
 
     Attributes:
-        time: on the clock of ``time.monotonic``.
+        time: end time on the clock of ``time.monotonic``.
     """
 
     def __init__(self, seconds: float) -> None:
@@ -25,5 +25,5 @@ class Deadline:
         return self._called_off or time.monotonic() > self.time
 
     def call_off(self) -> None:
-        """Stop the work now, because nobody waits for the result any more."""
+        """Stop the work now, because its result is no longer needed."""
         self._called_off = True

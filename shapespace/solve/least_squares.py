@@ -1,4 +1,4 @@
-"""Nonlinear least squares in a box, with few unknowns and residuals that are expensive to compute."""
+"""Nonlinear least squares in a box, for few unknowns and expensive residuals."""
 
 from __future__ import annotations
 
@@ -12,25 +12,52 @@ from shapespace.arrays import FloatArray
 from shapespace.solve.deadline import Deadline
 from shapespace.solve.outcome import Outcome, Status
 
-#: At a minimum, an updated Jacobian is trusted only within this distance, as a fraction of the scale, of the point
-#: where it was computed; further away a new one is computed.
-TRUSTED = 0.05
-#: Thresholds for the ratio of a step's actual gain to the gain that the Jacobian predicts: above the first the step is
-#: taken, above the second an updated Jacobian is kept, above the third the damping decreases.
-TAKEN, POOR, GOOD = 1e-3, 0.25, 0.5
-#: Damping as a share of the largest diagonal entry of JᵀJ: the smallest value, the first after a failed step, and the
-#: largest; then the factor by which it increases or decreases.
-SMALLEST_DAMPING, FIRST_DAMPING, LARGEST_DAMPING, DAMPING_FACTOR = 1e-10, 1e-3, 1e3, 10
+
+@dataclass(frozen=True)
+class SecantLimits:
+    """When an updated Jacobian is replaced by a new one.
+
+    Attributes:
+        distance: at a minimum, largest distance to the point where the Jacobian was computed, in units of the scale.
+        gain: smallest ratio of a step's actual gain to its predicted gain at which the Jacobian is kept.
+    """
+
+    distance: float = 0.05
+    gain: float = 0.25
+
+
+@dataclass(frozen=True)
+class StepControl:
+    """Acceptance of steps, and damping as a share of the largest diagonal entry of JᵀJ.
+
+    Attributes:
+        taken: smallest ratio of actual to predicted gain at which a step is taken.
+        good: smallest ratio at which the damping decreases.
+        smallest: smallest damping.
+        first: first damping after a failed step.
+        largest: the iteration stalls beyond this damping.
+        factor: increase and decrease of the damping.
+    """
+
+    taken: float = 1e-3
+    good: float = 0.5
+    smallest: float = 1e-10
+    first: float = 1e-3
+    largest: float = 1e3
+    factor: float = 10
+
+
+SECANT, CONTROL = SecantLimits(), StepControl()
 
 
 @dataclass(frozen=True)
 class Box:
-    """Where the unknowns may be, each (m,).
+    """Bounds and scales of the unknowns, each (m,).
 
     Attributes:
         lower: lower bounds, −∞ where there is none.
         upper: upper bounds, ∞ where there is none.
-        scale: for each coordinate the length that counts as one unit.
+        scale: typical size of each unknown; steps are measured in it.
     """
 
     lower: FloatArray
@@ -43,10 +70,11 @@ class Stopping:
     """When the iteration ends.
 
     Attributes:
-        tolerance: it has converged once no coordinate would move further than this fraction of its scale,
-        gain_tolerance: or once ``‖r‖²`` would shrink by no more than this fraction of itself.
-        large: where ``‖r‖`` is larger, that fraction is of ``large · ‖r‖``: most of such a residual can't vanish.
-        max_evaluations: most evaluations of the residuals.
+        tolerance: the iteration has converged once no unknown would move further than this fraction of its scale.
+        gain_tolerance: it has also converged once ``‖r‖²`` would decrease by at most this fraction of itself.
+        large: if ``‖r‖`` is larger than this, the fraction refers to ``large · ‖r‖``: most of such a residual can't
+            vanish.
+        max_evaluations: largest number of evaluations of the residuals.
         deadline: no evaluation begins after it.
     """
 
@@ -57,13 +85,13 @@ class Stopping:
     deadline: Deadline | None = None
 
     def nothing_to_gain(self, step: FloatArray, predicted: float, cost: float) -> bool:
-        """Whether a step, in units of the scale, would gain too little to be worth an evaluation."""
+        """Whether a step, in units of the scale, is too small or gains too little for another evaluation."""
         return bool(
             np.abs(step).max() <= self.tolerance or predicted <= self.gain_tolerance * shrinkable(cost, self.large)
         )
 
     def reached(self, evaluations: int) -> Status | None:
-        """The limit that is reached after so many evaluations, if one is."""
+        """Return the limit that is reached after a number of evaluations, or None."""
         if evaluations >= self.max_evaluations:
             return Status.ITERATION_LIMIT
         return Status.DEADLINE if self.deadline is not None and self.deadline.passed else None
@@ -71,10 +99,10 @@ class Stopping:
 
 @dataclass(frozen=True, kw_only=True)
 class Fit(Outcome):
-    """What the iteration found. Iterations are evaluations of the residuals, those of Jacobians not counted.
+    """The result of the iteration. Its iterations count evaluations of the residuals, without Jacobians.
 
     Attributes:
-        x: (m,) inside the box.
+        x: (m,) unknowns in the box.
         residuals: (n,) r(x), whose norm is the residual.
     """
 
@@ -99,18 +127,18 @@ def least_squares(
 ) -> Fit:
     """Minimise ``‖r(x)‖²`` over a box by Gauss–Newton with damping (Levenberg and Marquardt).
 
-    A Jacobian here costs as much as m residuals. It is computed once and then updated by Broyden's secant formula
-    (Nocedal and Wright 2006, section 11.1). A new one is computed where a step gains less than predicted, after m
-    steps, and at the end if the point has moved far since: where residuals don't vanish, the minimum found is only as
-    accurate as the Jacobian. ``scipy.optimize.least_squares`` would compute one at each step.
+    A Jacobian takes as long as m residuals. It is computed once and then updated by Broyden's secant formula (Nocedal
+    and Wright 2006, section 11.1). A new one is computed after a step that gains less than predicted, and after m
+    steps. If the point has moved far since, a new one is also computed at the end: where residuals don't vanish, the
+    minimum is only as accurate as the Jacobian. ``scipy.optimize.least_squares`` would compute a Jacobian in each step.
 
     Args:
-        residuals: r, (m,) to (n,).
-        jacobian: x and r(x) to (n, m).
-        start: (m,); coordinates outside the box are moved to its nearest side.
+        residuals: function r from (m,) to (n,).
+        jacobian: function from x and r(x) to (n, m).
+        start: (m,); unknowns outside the box are clipped to it.
         box: bounds and scales of the unknowns.
         stopping: when to end.
-        secant: whether to save Jacobians by secant updates; otherwise one is computed at each step.
+        secant: whether to use secant updates; otherwise a Jacobian is computed in each step.
     """
     stopping = stopping or Stopping()
     scale, low, high = box.scale, box.lower / box.scale, box.upper / box.scale
@@ -139,26 +167,26 @@ def least_squares(
         trial_r = residuals(trial * scale)
         evaluations += 1
         gain = float((r @ r - trial_r @ trial_r) / predicted)
-        taken = bool(gain > TAKEN)  # not where it isn't a number
+        taken = bool(gain > CONTROL.taken)  # False for NaN
         if taken:
             J.follow(step, trial_r - r)
             u, r = trial, trial_r
-            if gain >= GOOD:
-                damping = damping / DAMPING_FACTOR if damping > FIRST_DAMPING else 0.0
+            if gain >= CONTROL.good:
+                damping = damping / CONTROL.factor if damping > CONTROL.first else 0.0
         elif not J.updates:
-            damping = max(DAMPING_FACTOR * damping, FIRST_DAMPING)
-            if damping > LARGEST_DAMPING:
+            damping = max(CONTROL.factor * damping, CONTROL.first)
+            if damping > CONTROL.largest:
                 return fit(Status.STALLED, "no damped step lowers the residual")
         J.renew_or_keep(u, r, taken, gain)
     return fit(reached)
 
 
 class _Jacobian:
-    """A Jacobian that is computed at some points and updated by Broyden's formula between them.
+    """A Jacobian that is computed at some points, and updated by Broyden's formula in between.
 
     Attributes:
         matrix: (n, m), in units of the scale.
-        updates: how many steps it has been updated for since it was computed.
+        updates: number of updates since it was computed.
     """
 
     matrix: FloatArray
@@ -171,24 +199,24 @@ class _Jacobian:
         self.renew(u, r)
 
     def renew(self, u: FloatArray, r: FloatArray) -> None:
-        """Compute it at a point."""
+        """Compute the Jacobian at a point."""
         self.matrix, self._made_at, self.updates = self._make(u, r), u, 0
 
     def is_outdated(self, u: FloatArray) -> bool:
-        """Whether it has been updated since it was made, too far from this point to tell a minimum."""
-        return self.updates > 0 and bool(np.abs(u - self._made_at).max() > TRUSTED)
+        """Whether the Jacobian has been updated and was computed too far from this point to identify a minimum."""
+        return self.updates > 0 and bool(np.abs(u - self._made_at).max() > SECANT.distance)
 
     def follow(self, step: FloatArray, change: FloatArray) -> None:
-        """Update it so that it predicts how the residuals have changed along a step that was taken.
+        """Update the Jacobian so that it predicts the change of the residuals along a step that was taken.
 
-        Steps that were not taken are ignored: residuals may jump along them, which says nothing of the slope elsewhere.
+        Steps that were not taken are ignored: residuals may jump along them, which has no meaning for the slope.
         """
         if self._secant:
             self.matrix += np.outer(change - self.matrix @ step, step / (step @ step))
 
     def renew_or_keep(self, u: FloatArray, r: FloatArray, taken: bool, gain: float) -> None:
-        """Compute it anew if that is due, after a step that has gained this share of the predicted gain."""
-        disappointing = self.updates > 0 and not gain > POOR
+        """Compute a new Jacobian if necessary, after a step with this ratio of actual to predicted gain."""
+        disappointing = self.updates > 0 and not gain > SECANT.gain
         if (taken and not self._secant) or disappointing or self.updates == len(u):
             self.renew(u, r)
         else:
@@ -196,22 +224,22 @@ class _Jacobian:
 
 
 def shrinkable(cost: float, large: float) -> float:
-    """What gains of a cost ``‖r‖²`` are compared with: itself, or ``large · ‖r‖`` where ``‖r‖`` is larger."""
+    """Return the scale for gains of a cost ``‖r‖²``: the cost itself, or ``large · ‖r‖`` if ``‖r‖ > large``."""
     return float(min(cost, large * np.sqrt(cost)))
 
 
 def _step(J: FloatArray, r: FloatArray, low: FloatArray, high: FloatArray, damping: float) -> FloatArray:
-    """The minimiser of ``‖J d + r‖² + μ‖d‖²`` with low ≤ d ≤ high."""
+    """Minimise ``‖J d + r‖² + μ‖d‖²`` over low ≤ d ≤ high."""
     H, g = J.T @ J, J.T @ r
-    # Where the Jacobian is all zero, no step is determined.
-    shift = max(damping, SMALLEST_DAMPING) * max(H.diagonal().max(), np.sqrt(np.finfo(float).tiny))
+    # A Jacobian of zeros determines no step.
+    shift = max(damping, CONTROL.smallest) * max(H.diagonal().max(), np.sqrt(np.finfo(float).tiny))
     R = cholesky(H + shift * np.eye(len(g)))
     b = -solve_triangular(R, g, trans="T")
     d: FloatArray = solve_triangular(R, b)
     if ((d < low) | (d > high)).any():
-        # Imported here: it takes 9 MB and a tenth of a second, and most servers never need it.
+        # Imported on demand: it takes 9 MB and a tenth of a second, and most servers never need it.
         from scipy.optimize import lsq_linear
 
-        # The solver refuses bounds that are equal.
+        # The solver rejects equal bounds.
         d = lsq_linear(R, b, (low, np.maximum(high, low + np.finfo(float).eps)), method="bvls").x
     return d

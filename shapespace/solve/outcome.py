@@ -1,4 +1,4 @@
-"""What every iteration returns besides its result. How it ended is a value, not an exception."""
+"""The outcome of an iteration: how it ended is a value, not an exception."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 
 
 class Status(StrEnum):
-    """How an iteration ended; anything but CONVERGED still comes with finite vertices."""
+    """How an iteration ended. Vertices are finite with every status."""
 
     CONVERGED = "converged"
     STALLED = "stalled"
@@ -24,10 +24,10 @@ class Outcome:
     """How an iteration ended. Subclasses add the result, which is finite whatever the status.
 
     Attributes:
-        status: CONVERGED, or why the iteration ended before that.
-        iterations: steps tried.
-        residual: of the equations or of the target, in the norm that the subclass names; ∞ where none was computed.
-        reason: in words, why it did not converge; may be empty.
+        status: CONVERGED, or why the iteration ended earlier.
+        iterations: number of steps tried.
+        residual: residual of the equations or of the target, in the norm of the subclass; ∞ if none was computed.
+        reason: why it did not converge, in words; may be empty.
     """
 
     status: Status

@@ -1,4 +1,4 @@
-"""Minimises an energy with a barrier: Newton steps by conjugate gradients, each followed by a line search."""
+"""Minimisation of an energy with a barrier: Newton steps by conjugate gradients, each with a line search."""
 
 from __future__ import annotations
 
@@ -13,42 +13,56 @@ from shapespace.solve.line_search import backtrack, sufficient_decrease
 from shapespace.solve.outcome import Outcome, Status
 from shapespace.solve.preconditioner import step_length
 
-#: Most iterations of conjugate gradients in a step, and the largest and smallest relative residual that ends them.
-GRADIENTS = 60
-LOOSEST, TIGHTEST = 0.3, 1e-3
-#: Displacement for the difference quotients of forces that stand for Hessian products, as a share of the energy's
-#: ``length``.
-PROBE = 1e-6
-#: Relative rounding error of an energy, and the smallest step length tried.
-ROUNDING, SMALLEST_STEP = 1e-15, 1e-6
+
+@dataclass(frozen=True)
+class NewtonLimits:
+    """Accuracy of truncated Newton.
+
+    Attributes:
+        gradients: largest number of iterations of conjugate gradients in a step.
+        loosest, tightest: largest and smallest relative residual that ends them.
+        probe: displacement for Hessian products by differences of forces, as a share of the energy's ``length``.
+        rounding: relative rounding error of an energy.
+        smallest_step: smallest step length of the line search.
+    """
+
+    gradients: int = 60
+    loosest: float = 0.3
+    tightest: float = 1e-3
+    probe: float = 1e-6
+    rounding: float = 1e-15
+    smallest_step: float = 1e-6
+
+
+LIMITS = NewtonLimits()
 
 
 class Energy(Protocol):
-    """What is minimised, over an array of unknowns of any shape."""
+    """An energy of an array of unknowns of any shape."""
 
     @property
     def length(self) -> float:
-        """Size of an edge, in the unit of the unknowns."""
+        """Typical length of an edge, in the unit of the unknowns."""
 
     def value(self, x: FloatArray) -> float:
-        """The energy; infinite beyond the barrier."""
+        """Compute the energy, infinite beyond the barrier."""
 
     def forces(self, x: FloatArray) -> FloatArray:
-        """Its negative gradient."""
+        """Compute the negative gradient."""
 
     def admits(self, x: FloatArray, step: FloatArray) -> bool:
-        """Whether a step stays on this side of the barrier. A straight step can land beyond it."""
+        """Whether a step stays on this side of the barrier. A long step may end beyond it."""
 
     def precondition(self, x: FloatArray) -> Callable[[FloatArray], FloatArray]:
-        """Map forces to a step, by a symmetric positive definite approximation of the inverse Hessian at x."""
+        """Return a map from forces to a step, symmetric positive definite and close to the inverse Hessian at x."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Descent(Outcome):
-    """Where a descent ended, with the length of the preconditioned forces there, ``sqrt(Fᵀ P F)``, as residual.
+    """The result of a descent. Its residual is the length of the preconditioned forces, ``sqrt(Fᵀ P F)``.
 
     Attributes:
-        x: the unknowns.
+        x: unknowns.
     """
 
     x: FloatArray
@@ -56,16 +70,16 @@ class Descent(Outcome):
 
 @np.errstate(divide="ignore", over="ignore", invalid="ignore")
 def descend(energy: Energy, x: FloatArray, tolerance: float, max_iterations: int) -> Descent:
-    """Truncated Newton (Nocedal and Wright 2006, algorithm 7.1): steps always lower the energy if short enough.
+    """Minimise by truncated Newton (Nocedal and Wright 2006, algorithm 7.1): short steps always lower the energy.
 
-    Products with the Hessian are differences of forces. Where its curvature is negative the step goes no further along
-    that direction. Raises NotPositiveDefiniteError where the problem's ``precondition`` does.
+    Products with the Hessian are differences of forces. A step ends at the first direction of negative curvature.
+    Exceptions of ``energy.precondition`` are passed on, such as NotPositiveDefiniteError.
 
     Args:
         energy: see Energy.
-        x: start, of finite energy.
-        tolerance: of the residual.
-        max_iterations: most steps.
+        x: start, with finite energy.
+        tolerance: tolerance of the residual.
+        max_iterations: largest number of steps.
     """
     value, residual, status = energy.value(x), np.inf, Status.ITERATION_LIMIT
     for iteration in range(max_iterations + 1):
@@ -93,12 +107,12 @@ def descend(energy: Energy, x: FloatArray, tolerance: float, max_iterations: int
 def _line_search(
     energy: Energy, x: FloatArray, value: float, step: FloatArray, slope: float
 ) -> tuple[float, float] | None:
-    """The share of a step that is admitted and lowers the energy enough, and the energy there."""
-    rounding = ROUNDING * abs(value)
+    """Find a share of a step that is admitted and lowers the energy enough, and the energy there."""
+    rounding = LIMITS.rounding * abs(value)
     return backtrack(
         lambda t: energy.value(x + t * step) if energy.admits(x, t * step) else np.nan,
         lambda t, trial: sufficient_decrease(value, trial, t, slope, rounding),
-        SMALLEST_STEP,
+        LIMITS.smallest_step,
     )
 
 
@@ -110,12 +124,12 @@ def _newton_step(
     solve: Callable[[FloatArray], FloatArray],
     residual: float,
 ) -> FloatArray:
-    """About the minimiser of the quadratic model, or of its part along which it curves upwards."""
+    """Minimise the quadratic model approximately, as far as its curvature is positive."""
     step, left, direction = np.zeros_like(x), forces, first
     square = residual**2
-    enough = float(np.clip(np.sqrt(residual), TIGHTEST, LOOSEST)) ** 2 * square
-    for _ in range(GRADIENTS):
-        probe = PROBE * energy.length / np.abs(direction).max()
+    enough = float(np.clip(np.sqrt(residual), LIMITS.tightest, LIMITS.loosest)) ** 2 * square
+    for _ in range(LIMITS.gradients):
+        probe = LIMITS.probe * energy.length / np.abs(direction).max()
         curved = (forces - energy.forces(x + probe * direction)) / probe
         curvature = float(np.vdot(direction, curved))
         if not curvature > 0:
