@@ -1,4 +1,8 @@
 .DEFAULT_GOAL := help
+ifeq ($(wildcard shapespace/service/__init__.py),)
+$(error shapespace/service is a text file where a link to ../service should be: on Windows switch on developer mode, then \
+run `git config core.symlinks true` and `git checkout -- shapespace`)
+endif
 VENV := .venv
 BIN := $(VENV)/bin
 MODULES := tests/node_modules/.package-lock.json

@@ -62,6 +62,7 @@ operations of a model over HTTP.
 """
 
 from importlib import import_module
+from os.path import isfile
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -175,6 +176,14 @@ _MODULES = {
     "parallel_transport": "shell.transport",
 }
 
+
+for _name in ("models", "service", "training"):
+    if isfile(f"{__path__[0]}/{_name}"):
+        raise ImportError(
+            f"shapespace/{_name} is a text file where a link to ../{_name} should be, because git made this checkout "
+            "without links: on Windows switch on developer mode, then run `git config core.symlinks true` and "
+            "`git checkout -- shapespace`."
+        )
 
 if not TYPE_CHECKING:  # a type checker would accept any name
 

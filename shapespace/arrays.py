@@ -1,4 +1,4 @@
-"""Types of the arrays in signatures."""
+"""Array types for signatures."""
 
 import numpy as np
 from numpy.typing import NDArray
