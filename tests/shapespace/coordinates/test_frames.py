@@ -1,4 +1,4 @@
-"""Shapes by integrating frames along a tree: exact where z is integrable, near where it nearly is."""
+"""Shapes from frames along a tree: exact for integrable z, and close for nearly integrable z."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Vertices from lengths and angles that are exact, noisy, or far from those of any shape."""
+"""Vertices from lengths and angles that are exact, noisy, or far from all shapes."""
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -50,7 +50,7 @@ def assert_found(result, expected, mesh):
 
 
 def gradient(reconstruct, vertices, target):
-    """Gradient of the misfit by the vertices, and the size of its terms, which it is compared with."""
+    """Gradient of the misfit by the vertices, relative to the size of its terms."""
     c = reconstruct.reference.connectivity
     misfit = nric(vertices, c) - target
     misfit[c.edge_count :] = np.angle(np.exp(1j * misfit[c.edge_count :]))
@@ -150,7 +150,7 @@ def test_the_unit_of_length_does_not_matter(mesh, pose, reconstruct, target):
 
 
 def test_noise_is_left_over_and_nothing_else(mesh, reconstruct, target, rng):
-    """The result is stationary, not farther from the target than the exact shape, and tells its misfit."""
+    """The result is stationary, at most as far from the target as the exact shape, and reports its misfit."""
     e = mesh.connectivity.edge_count
     noise = np.concatenate([0.01 * target[:e] * rng.standard_normal(e), 0.02 * rng.standard_normal(e)])
     noisy = target + noise

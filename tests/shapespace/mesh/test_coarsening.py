@@ -1,4 +1,4 @@
-"""Coarsening all shapes to one connectivity: what it preserves, and which collapses it refuses."""
+"""Coarsening all shapes to one connectivity: preserved properties and refused collapses."""
 
 import numpy as np
 import pytest
@@ -30,7 +30,7 @@ def poses(mesh: TriangleMesh) -> np.ndarray:
 
 
 def angles(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """(…, F, 3) of shapes (…, V, 3), by the law of cosines."""
+    """Angles (…, F, 3) of shapes (…, V, 3), by the law of cosines."""
     corners = vertices[..., faces, :]
     a, b, c = (np.linalg.norm(corners[..., i, :] - corners[..., j, :], axis=-1) for i, j in ((1, 2), (2, 0), (0, 1)))
     opposite = ((a, b, c), (b, c, a), (c, a, b))
@@ -45,7 +45,7 @@ def neighbour_cosines(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
 
 def parts(edges: np.ndarray, count: int) -> np.ndarray:
-    """(count,) the number of the connected component of each vertex."""
+    """(count,) index of the connected component of each vertex."""
     graph = csr_array((np.ones(len(edges)), tuple(edges.T)), shape=(count, count))
     return connected_components(graph, directed=False)[1]
 
@@ -202,7 +202,7 @@ def test_slivers_of_the_fine_mesh_are_healed(rng):
 
 @pytest.mark.parametrize("seed", [0, 2])
 def test_a_crumpled_place_smaller_than_a_coarse_face_is_cleared_away(seed):
-    """As at the corner of a mouth, where in some shapes many small faces are folded onto one another."""
+    """A place like the corner of a mouth: in some shapes many small faces are folded onto one another."""
     ball = trimesh.creation.icosphere(subdivisions=4)
     mesh = TriangleMesh.from_arrays(ball.vertices, ball.faces)
     place = np.linalg.norm(mesh.vertices - mesh.vertices[100], axis=1) < 0.15

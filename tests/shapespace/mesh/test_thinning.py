@@ -1,4 +1,4 @@
-"""Thinning: the number of vertices asked for, the same topology, and no fold or sliver in any shape."""
+"""Thinning: the target number of vertices, the same topology, and no fold or sliver in any shape."""
 
 from __future__ import annotations
 

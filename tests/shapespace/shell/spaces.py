@@ -32,7 +32,7 @@ class Space(Protocol):
     Points that differ by a rigid motion may count as the same; then their ``distance`` is 0.
 
     Attributes:
-        tolerance: of distances, where equations are solved exactly.
+        tolerance: tolerance of distances, where equations are solved exactly.
         flat: whether laws that hold to first order hold exactly.
     """
 

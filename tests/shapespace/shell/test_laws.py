@@ -1,6 +1,6 @@
 """Laws of Riemannian geometry, each written once and tested in every space.
 
-Those of time-discrete operations (Rumpf and Wirth 2015) hold either exactly, to the tolerance of the solvers, or to
+Laws of time-discrete operations (Rumpf and Wirth 2015) hold either exactly, to the tolerance of the solvers, or to
 first order in the step: then the error halves when the number of steps doubles, and vanishes in a flat space.
 """
 

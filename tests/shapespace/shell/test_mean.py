@@ -24,7 +24,7 @@ def test_forces_balance_at_the_elastic_mean(space, mesh, pose):
 
 @pytest.mark.parametrize(("name", "seed", "size"), [("sheet", 1, 0.25), ("closed", 3, 0.35), ("torus", 2, 0.35)])
 def test_faces_that_differ_much_between_shapes_have_a_mean(name, seed, size):
-    """Quasi-Newton steps stall: their metric is that of one shape, but faces differ much between shapes."""
+    """Quasi-Newton steps stall: their metric belongs to one shape, but faces differ much between shapes."""
     mesh = MESHES[name]()
     edge = np.linalg.norm(mesh.vertices[mesh.edges[:, 0]] - mesh.vertices[mesh.edges[:, 1]], axis=1).mean()
     noise = np.random.default_rng(seed).standard_normal((5, *mesh.vertices.shape))

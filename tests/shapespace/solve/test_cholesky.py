@@ -1,4 +1,4 @@
-"""Both Cholesky backends, compared with dense algebra on the normal matrices that they are used for."""
+"""Both Cholesky backends, compared with dense algebra on normal matrices."""
 
 import importlib.util
 import weakref
