@@ -24,6 +24,7 @@ ROOMS = {
 NO_MATHEMATICS = {
     "shapespace.solve.deadline",
     "shapespace.mesh.attributes",
+    "shapespace.mesh.vectors",
     "shapespace.model.correspondence",
     "shapespace.model.fit_constraints",
     "shapespace.model.fit_result",
