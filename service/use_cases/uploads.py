@@ -17,8 +17,8 @@ from python_multipart.exceptions import FormParserError
 from python_multipart.multipart import MultipartParser, parse_options_header
 
 from shapespace.arrays import FloatArray, IntArray
-from shapespace.files.formats import OCTET_STREAM, READ_FORMATS, SCAN_FORMATS, read_arrays
 from shapespace.files.limits import Limits, clipped, count_bytes
+from shapespace.files.reading import OCTET_STREAM, READ_FORMATS, SCAN_FORMATS, read_arrays
 from shapespace.mesh.triangle_mesh import MeshError
 from shapespace.service.limits.sandbox_errors import FailedError
 from shapespace.service.limits.sandbox_wire import Arrays, Facts

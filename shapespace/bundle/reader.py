@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import hashlib
-import io
 import os
 import re
 import stat
-import zipfile
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,7 +17,7 @@ from pydantic import ValidationError
 
 from shapespace.bundle.geometry import Geometry, GeometryError
 from shapespace.bundle.schema import MANIFEST, NAME_PATTERN, VERSION_PATTERN, FileEntry, Manifest
-from shapespace.files.npz_reading import PackedArray
+from shapespace.files.npz import npz_headers, read_npz
 
 #: Most bytes of a manifest.
 MANIFEST_LIMIT = 4 * 2**20
@@ -149,29 +147,18 @@ def _verified(path: Path, entry: FileEntry) -> bytes:
 def _geometry(content: bytes, manifest: Manifest, textures: Mapping[str, bytes]) -> Geometry:
     file = manifest.geometry.file
     try:
-        arrays = _arrays(content)
-    except BundleError as error:
-        raise BundleError(f"{file}: {error}") from None
-    except Exception as error:  # zip and array headers fail in many ways
+        total, most = sum(header.nbytes for header in npz_headers(content).values()), UNPACKED * len(content) + BESIDE
+        if total > most:
+            raise BundleError(f"{file}: its arrays would come to {total} bytes, where {most} are the most")
+        arrays = read_npz(content)
+    except BundleError:
+        raise
+    except Exception as error:  # damaged files raise exceptions of many classes
         raise BundleError(f"{file} is not a readable NPZ file: {error}") from None
     try:
         return Geometry.from_arrays(arrays, manifest, textures)
     except GeometryError as error:
         raise BundleError(str(error)) from None
-
-
-def _arrays(content: bytes) -> dict[str, NDArray]:
-    """The arrays of an NPZ file; memory is taken only after the sizes in its directory have been checked."""
-    with zipfile.ZipFile(io.BytesIO(content)) as archive:
-        entries = archive.infolist()
-        most = UNPACKED * len(content) + BESIDE
-        if (total := sum(entry.file_size for entry in entries)) > most:
-            raise BundleError(f"its arrays would come to {total} bytes, where {most} are the most")
-        arrays = {}
-        for entry in entries:
-            with archive.open(entry) as member:
-                arrays[entry.filename.removesuffix(".npy")] = PackedArray(member, entry).read(most)
-        return arrays
 
 
 def _check_network(file: str, content: bytes) -> None:

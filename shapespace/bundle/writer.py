@@ -3,17 +3,13 @@
 from __future__ import annotations
 
 import hashlib
-import io
 import json
-import os
-import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from shapespace.arrays import FloatArray
 from shapespace.bundle.attributes import surface_entry
@@ -30,6 +26,8 @@ from shapespace.bundle.schema import (
     Tolerance,
     factor_network,
 )
+from shapespace.files.atomic import replaced_folder, synced_file
+from shapespace.files.npz import npz_bytes
 from shapespace.shell.energy import Material
 
 
@@ -98,7 +96,7 @@ def write_bundle(models: Path, facts: Facts, networks: Networks, geometry: Geome
         OSError: the folder can't be written.
     """
     files = {factor_network(j).file: content for j, content in enumerate(networks.factors)}
-    files |= {COMBINER.file: networks.combiner, GEOMETRY.file: _npz(geometry.arrays())}
+    files |= {COMBINER.file: networks.combiner, GEOMETRY.file: npz_bytes(geometry.arrays(), compressed=False)}
     if networks.start is not None:
         files[START.file] = networks.start
     if geometry.surface:
@@ -107,32 +105,16 @@ def write_bundle(models: Path, facts: Facts, networks: Networks, geometry: Geome
     text = json.dumps(manifest.model_dump(by_alias=True), indent=2, ensure_ascii=False) + "\n"
 
     folder = models / facts.name / facts.version
-    part, old = (folder.with_name(f".{folder.name}.{end}") for end in ("part", "old"))  # hidden from a watching server
-    shutil.rmtree(part, ignore_errors=True)
-    part.mkdir(parents=True)
-    for name, content in (files | {MANIFEST: text.encode()}).items():
-        with (part / name).open("wb") as file:
-            file.write(content)
-            # Renamed before it is on the disk, it could be empty after a power cut.
-            file.flush()
-            os.fsync(file.fileno())
-    shutil.rmtree(old, ignore_errors=True)
-    if folder.exists():
-        os.replace(folder, old)
-    os.replace(part, folder)
-    shutil.rmtree(old, ignore_errors=True)
+    with replaced_folder(folder) as part:
+        for name, content in (files | {MANIFEST: text.encode()}).items():
+            with synced_file(part / name) as file:
+                file.write(content)
     return folder
 
 
 def entry(content: bytes) -> FileEntry:
     """What a manifest says of a file."""
     return FileEntry(sha256=hashlib.sha256(content).hexdigest(), bytes=len(content))
-
-
-def _npz(arrays: Mapping[str, NDArray]) -> bytes:
-    file = io.BytesIO()
-    np.savez(file, **arrays)  # type: ignore[arg-type]
-    return file.getvalue()
 
 
 def _manifest(facts: Facts, geometry: Geometry, files: Mapping[str, bytes]) -> Manifest:

@@ -301,3 +301,17 @@ class GltfBuilder:
         binary = b"".join(self._chunks)
         uri = "data:application/octet-stream;base64," + base64.b64encode(binary).decode()
         return self._json({"byteLength": len(binary), "uri": uri})
+
+
+def write_glb(
+    vertices: FloatArray, faces: IntArray, colouring: Colouring | None = None, surface: MeshAttributes | None = None
+) -> bytes:
+    """Write one mesh as GLB; see `formats.MeshWriter`."""
+    return GltfBuilder(vertices, faces, colouring=colouring, surface=surface).glb()
+
+
+def write_gltf(
+    vertices: FloatArray, faces: IntArray, colouring: Colouring | None = None, surface: MeshAttributes | None = None
+) -> bytes:
+    """Write one mesh as glTF with its buffer inside; see `formats.MeshWriter`."""
+    return GltfBuilder(vertices, faces, colouring=colouring, surface=surface).gltf()

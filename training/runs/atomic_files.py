@@ -3,28 +3,15 @@
 from __future__ import annotations
 
 import json
-import os
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-
-@contextmanager
-def whole(path: Path) -> Iterator[IO[bytes]]:
-    """A file to write to that takes the path's place at the end, whole, or not at all; its folder is made."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_suffix(".part")
-    with part.open("wb") as file:
-        yield file
-        # Renamed before it is on the disk, it could be empty after a power cut.
-        file.flush()
-        os.fsync(file.fileno())
-    os.replace(part, path)
+from shapespace.files.atomic import replaced_file
+from shapespace.files.npz import read_npz
 
 
 @dataclass(frozen=True)
@@ -45,7 +32,7 @@ class TextFile(_AtomicFile):
 
     def write(self, text: str) -> None:
         """Replace the file."""
-        with whole(self.path) as file:
+        with replaced_file(self.path) as file:
             file.write(text.encode())
 
 
@@ -70,8 +57,7 @@ class NpzFile(_AtomicFile):
 
     def read(self) -> dict[str, NDArray]:
         """All arrays; raises OSError, ValueError, EOFError or zipfile.BadZipFile."""
-        with np.load(self.path) as file:
-            return dict(file)
+        return read_npz(self.path)
 
     def read_if_written(self) -> dict[str, NDArray]:
         """All arrays, none where the file has not been written."""
@@ -79,5 +65,5 @@ class NpzFile(_AtomicFile):
 
     def write(self, **arrays: Any) -> None:
         """Replace the file."""
-        with whole(self.path) as file:
+        with replaced_file(self.path) as file:
             np.savez(file, **arrays)

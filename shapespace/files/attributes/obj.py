@@ -10,7 +10,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from shapespace.arrays import FloatArray
+from shapespace.arrays import FloatArray, IntArray
+from shapespace.files.archives import zip_pieces
 from shapespace.files.attributes.textures import Textures, beside
 from shapespace.files.colouring import Colouring
 from shapespace.files.gltf_writing import surface_normals
@@ -280,16 +281,21 @@ def polygon_lines(surface: MeshAttributes, numbers: NDArray, line: Callable[[int
 
 
 def write_obj(
-    vertices: FloatArray, surface: MeshAttributes, colouring: Colouring | None = None, library: str | None = None
-) -> str:
-    """An OBJ file; it refers to a library of materials if that is named."""
-    begin = f"mtllib {library}\n" if library else ""
-    return begin + obj_vertices(vertices, colouring, surface) + obj_faces(surface)
+    vertices: FloatArray, faces: IntArray, colouring: Colouring | None = None, surface: MeshAttributes | None = None
+) -> bytes:
+    """Write one mesh as OBJ without materials; see `formats.MeshWriter`."""
+    shown = surface or MeshAttributes.of_triangles(faces)
+    return (obj_vertices(vertices, colouring, shown) + obj_faces(shown)).encode()
 
 
-def write_mtl(surface: MeshAttributes) -> str:
-    """The library of a surface's materials, which names its textures."""
-    return "\n".join("".join(_material(material)) for material in surface.materials)
+def write_obj_zip(
+    vertices: FloatArray, faces: IntArray, colouring: Colouring | None = None, surface: MeshAttributes | None = None
+) -> bytes:
+    """Write one mesh as a ZIP archive of OBJ, MTL and textures; see `formats.MeshWriter`."""
+    files = obj_files(surface, "shape") if surface else {}
+    head = b"mtllib shape.mtl\n" if files else b""
+    members = {"shape.obj": head + write_obj(vertices, faces, colouring, surface), **files}
+    return b"".join(zip_pieces((name, [content]) for name, content in members.items()))
 
 
 def _material(material: SurfaceMaterial) -> Iterator[str]:
@@ -305,4 +311,5 @@ def obj_files(surface: MeshAttributes, stem: str) -> Mapping[str, bytes]:
     """What belongs beside OBJ files: the library of materials, and textures, by name; nothing without materials."""
     if not surface.materials:
         return {}
-    return {f"{stem}.mtl": write_mtl(surface).encode(), **surface.textures}
+    library = "\n".join("".join(_material(material)) for material in surface.materials)
+    return {f"{stem}.mtl": library.encode(), **surface.textures}

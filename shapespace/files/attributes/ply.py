@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from shapespace.arrays import FloatArray
+from shapespace.arrays import FloatArray, IntArray
 from shapespace.files.attributes.obj import polygon_lines
 from shapespace.files.colouring import Colouring
 from shapespace.files.limits import UNLIMITED
@@ -82,12 +82,15 @@ def _surface(
     return MeshAttributes(starts=starts, corners=corners, uv=uv, uv_corners=of_uv, colors=colors, normals=normals)
 
 
-def write_ply(vertices: FloatArray, surface: MeshAttributes, colouring: Colouring | None = None) -> bytes:
-    """A PLY file, as text where faces have different numbers of corners.
+def write_ply(
+    vertices: FloatArray, faces: IntArray, colouring: Colouring | None = None, surface: MeshAttributes | None = None
+) -> bytes:
+    """Write one mesh as PLY, as text if faces have different numbers of corners; see `formats.MeshWriter`.
 
-    Texture coordinates are at the vertices, or at corners where a vertex has several; not where corners of faces
-    differ in number too.
+    Texture coordinates are at the vertices. If a vertex has several, they are at the corners of the faces. They are
+    left out if the faces then have different numbers of corners.
     """
+    surface = surface or MeshAttributes.of_triangles(faces)
     fields: list[tuple[str, str, str, NDArray]] = [
         (name, "float", "<f4", column) for name, column in zip("xyz", vertices.T, strict=True)
     ]
@@ -119,8 +122,8 @@ def write_ply(vertices: FloatArray, surface: MeshAttributes, colouring: Colourin
     if mixed:
         line = " ".join("%d" if kind == "u1" else "%.9g" for _, _, kind, _ in fields) + "\n"
         text = line * len(rows) % tuple(value for row in rows.tolist() for value in row)
-        faces = polygon_lines(surface, surface.corners[:, None], lambda size: f"{size}{' %d' * size}\n")
-        body = (text + "".join(faces.tolist())).encode()
+        lines = polygon_lines(surface, surface.corners[:, None], lambda size: f"{size}{' %d' * size}\n")
+        body = (text + "".join(lines.tolist())).encode()
     else:
         body = rows.tobytes() + _face_rows(surface, lists, length[1])
     return "\n".join([*head, "end_header\n"]).encode() + body
