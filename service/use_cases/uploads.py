@@ -6,18 +6,18 @@ takes time in proportion to their number, and memory that the limits bound.
 
 from __future__ import annotations
 
+import json
 from array import array
 from collections.abc import Collection, Iterable
 from itertools import chain
 from pathlib import PurePath
 
 import numpy as np
-import orjson
 from python_multipart.exceptions import FormParserError
 from python_multipart.multipart import MultipartParser, parse_options_header
 
 from shapespace.arrays import FloatArray, IntArray
-from shapespace.files.limits import Limits, clipped, count_bytes
+from shapespace.files.limits import Limits, clipped
 from shapespace.files.reading import OCTET_STREAM, READ_FORMATS, SCAN_FORMATS, read_arrays
 from shapespace.mesh.triangle_mesh import MeshError
 from shapespace.service.limits.sandbox_errors import FailedError
@@ -41,13 +41,6 @@ _MAGIC = {b"glTF": "glb", b"ply": "ply", b"PK": "npz", b"OFF": "off"}
 _LONGEST_HEADER = 1000
 _MOST_FIELDS = 16
 _LONGEST_OPTIONS = 2**18
-#: Limits of a mesh as JSON: bytes for each vertex and face, with all digits; and besides these bytes, lists, objects
-#: and quotation marks.
-_BYTES_OF_EACH, _BYTES_BESIDE, _LISTS_BESIDE, _OBJECTS, _QUOTES = 128, 2**20, 1000, 1000, 4000
-#: Replaces characters outside ASCII, which occur only in names, and names are ignored: with them Python would store the
-#: whole text with four bytes a character.
-_TO_ASCII = bytes(range(128)) + b"?" * 128
-_PIECE = 2**20
 
 
 class UploadError(ValueError):
@@ -219,38 +212,17 @@ class _Form:
 
 
 def _read_json(data: memoryview, limits: Limits) -> tuple[FloatArray, IntArray]:
-    each = limits.vertices + limits.faces
-    # As many as there can be, before any of them is made.
-    for most, characters, name in (
-        (_OBJECTS, b"{", "objects"),
-        (_QUOTES, b'"', "quotes"),
-        (_LISTS_BESIDE + each, b"[", "lists"),
-        # Three in a vertex or face, one behind it, and one for its colour.
-        (_LISTS_BESIDE + 5 * each, b",", "commas"),
-    ):
-        if count_bytes(data, characters) > most:
-            raise MeshError(f"it has more than {most} {name}")
-    if len(data) > _BYTES_BESIDE + _BYTES_OF_EACH * each:
-        raise MeshError(f"it has {len(data)} bytes, where {_BYTES_BESIDE + _BYTES_OF_EACH * each} are enough")
     try:
-        content = orjson.loads(_in_ascii(data))
-    except orjson.JSONDecodeError as error:
+        # orjson would crash at the end of its memory, where this module raises MemoryError.
+        content = json.loads(bytes(data))
+    except (ValueError, RecursionError) as error:
         raise MeshError(f"not JSON: {clipped(error)}") from None
     if not isinstance(content, dict) or "vertices" not in content:
         raise MeshError('not an object {"vertices": [[x, y, z], …], "faces": [[a, b, c], …]}')
     vertices = _triples("d", content["vertices"], "vertices must be lists of three numbers each")
     faces = _triples("q", content.get("faces") or [], "faces must be lists of three whole numbers each")
+    limits.check(len(vertices), len(faces))
     return vertices, faces
-
-
-def _in_ascii(data: memoryview) -> bytes | memoryview:
-    """The same with other characters replaced: in its place, as there may be no room for a copy."""
-    if data.readonly:
-        return bytes(data).translate(_TO_ASCII)
-    for start in range(0, len(data), _PIECE):
-        piece = data[start : start + _PIECE]
-        piece[:] = bytes(piece).translate(_TO_ASCII)
-    return data
 
 
 def _triples(kind: str, rows: object, otherwise: str) -> np.ndarray:

@@ -5,12 +5,7 @@ from __future__ import annotations
 import sys
 from dataclasses import dataclass
 
-import numpy as np
-
 from shapespace.mesh.triangle_mesh import MeshError
-
-#: How many bytes are examined at a time.
-PIECE = 2**20
 
 
 @dataclass(frozen=True)
@@ -35,13 +30,6 @@ class Limits:
 
 #: For files that are trusted.
 UNLIMITED = Limits()
-
-
-def count_bytes(data: memoryview, *characters: bytes) -> int:
-    """How many bytes of the data are one of these characters."""
-    # In pieces: a comparison needs as many bytes as it compares.
-    pieces = (np.frombuffer(data[start : start + PIECE], np.uint8) for start in range(0, len(data), PIECE))
-    return sum(int(np.count_nonzero(piece == character[0])) for piece in pieces for character in characters)
 
 
 def label(text: object) -> str | None:

@@ -19,14 +19,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shapespace.arrays import FloatArray, IntArray
-from shapespace.files.limits import Limits, clipped, count_bytes
+from shapespace.files.limits import Limits, clipped
 from shapespace.mesh.triangle_mesh import MeshError
 
-#: Most bytes of a line, and of the header of a PLY file.
-LONGEST_LINE, LONGEST_HEAD = 2**20, 2**16
-#: Most ends of lines for each vertex and face, and beside these: an ASCII STL file has seven lines for a face, an OBJ
-#: file up to seven with texture and normals, and each may end in two characters.
-_LINES_OF_EACH, _LINES_BESIDE = 16, 100_000
+#: Bytes at the start of a PLY file in which its header has to end.
+_PLY_HEADER = 2**16
+#: Bytes that are copied at once to count the lines before an error.
+_PIECE = 2**20
 _ENDS = "it ends before all that it says is there"
 
 
@@ -44,29 +43,22 @@ class Lines:
     Args:
         line: a pattern of the lines that count, each its first group.
 
-    Raises:
-        MeshError: more or longer lines than a mesh needs.
     """
 
-    def __init__(self, data: memoryview, limits: Limits, line: re.Pattern[bytes] = _LINE) -> None:
-        most = _LINES_BESIDE + _LINES_OF_EACH * (limits.vertices + limits.faces)
-        lines = count_bytes(data, b"\n", b"\r")
-        if lines > most:
-            raise MeshError(f"it has {lines} lines, where {most} are enough")
+    def __init__(self, data: memoryview, line: re.Pattern[bytes] = _LINE) -> None:
         self._data, self._place = data, 0
         self._matches = line.finditer(data)
         self._lines = self._all()
 
     def _all(self) -> Iterator[bytes]:
         for match in self._matches:
-            self._place, stop = match.span(1)
-            if stop - self._place > LONGEST_LINE:
-                raise MeshError(f"line {self._number} has more than {LONGEST_LINE} bytes")
+            self._place = match.start(1)
             yield match.group(1).rstrip()
 
     @property
     def _number(self) -> int:
-        return 1 + count_bytes(self._data[: self._place], b"\n")
+        before = self._data[: self._place]
+        return 1 + sum(bytes(before[k : k + _PIECE]).count(b"\n") for k in range(0, len(before), _PIECE))
 
     def __iter__(self) -> Iterator[bytes]:
         return self._lines
@@ -115,7 +107,7 @@ class _Triangles:
 def read_obj(data: memoryview, limits: Limits) -> tuple[FloatArray, IntArray]:
     """Vertices (V, 3) and faces (F, 3) of an OBJ file; everything else in it is left out."""
     coordinates, triangles = array("d"), _Triangles(limits)
-    with Lines(data, limits, _OBJ_LINE) as lines:
+    with Lines(data, _OBJ_LINE) as lines:
         for line in lines:
             keyword, *values = line.split(None, 1)
             if keyword == b"v":
@@ -137,7 +129,7 @@ def _point(values: bytes) -> tuple[float, float, float]:
 def read_off(data: memoryview, limits: Limits) -> tuple[FloatArray, IntArray]:
     """Vertices (V, 3) and faces (F, 3) of an OFF file, colours and normals left out."""
     coordinates, triangles = array("d"), _Triangles(limits)
-    with Lines(data, limits) as lines:
+    with Lines(data) as lines:
         keyword, *counts = lines.next().split()
         if not re.fullmatch(rb"(ST)?C?N?OFF", keyword):
             raise ValueError("another kind of file")
@@ -157,7 +149,7 @@ def read_off(data: memoryview, limits: Limits) -> tuple[FloatArray, IntArray]:
 def read_xyz(data: memoryview, limits: Limits) -> tuple[FloatArray, IntArray]:
     """Points (N, 3) of a text with a point on each line, and no faces; normals or colours behind them are left out."""
     coordinates = array("d")
-    with Lines(data, limits) as lines:
+    with Lines(data) as lines:
         for line in lines:
             coordinates.extend(_point(line.replace(b",", b" ")))
             limits.check(len(coordinates) // 3, 0)
@@ -191,7 +183,7 @@ def read_stl(data: memoryview, limits: Limits) -> tuple[FloatArray, IntArray]:
 
 def _ascii_stl(data: memoryview, limits: Limits) -> FloatArray:
     coordinates, solids = array("d"), 0
-    with Lines(data, limits, _STL_LINE) as lines:
+    with Lines(data, _STL_LINE) as lines:
         for line in lines:
             keyword = line[:8].lower()
             if keyword.startswith(b"vertex"):
@@ -211,8 +203,6 @@ _PLY_TYPES = {
     "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4", "int64": "i8",
     "uint64": "u8", "double": "f8", "float32": "f4", "float64": "f8",
 }  # fmt: skip
-#: Most properties of a PLY element, and most lists among them: rows with lists of unequal length are read one by one.
-_MOST_PROPERTIES, _MOST_LISTS = 256, 4
 _PLY_ORDERS = {b"binary_little_endian": "<", b"binary_big_endian": ">", b"ascii": ""}
 
 
@@ -296,7 +286,7 @@ def read_ply(data: memoryview, limits: Limits) -> tuple[FloatArray, IntArray]:
 
 def ply_head(data: memoryview) -> tuple[bool, list[Element], memoryview]:
     """Whether a PLY file is text, its elements, and what comes behind its head."""
-    head = bytes(data[:LONGEST_HEAD])
+    head = bytes(data[:_PLY_HEADER])
     end = re.search(rb"^end_header[ \t]*\r?\n", head, re.MULTILINE)
     if not head.startswith(b"ply") or not end:
         raise ValueError("damaged, or another kind of file")
@@ -313,9 +303,6 @@ def ply_head(data: memoryview) -> tuple[bool, list[Element], memoryview]:
                 elements[-1].properties.append(_property(name, kind, None, order))
     if order is None or len({e.name for e in elements}) < len(elements) or any(e.rows < 0 for e in elements):
         raise ValueError("its head is damaged")
-    for element in elements:
-        if len(element.lists) > _MOST_LISTS or len(element.properties) > _MOST_PROPERTIES:
-            raise MeshError(f"its {clipped(element.name)} rows have more properties than any program writes")
     return order == "", elements, data[end.end() :]
 
 
@@ -330,7 +317,7 @@ class TextTable:
     """The rows of an ASCII PLY file, one on a line."""
 
     def __init__(self, data: memoryview, limits: Limits) -> None:
-        self._limits, self._lines = limits, Lines(data, limits)
+        self._limits, self._lines = limits, Lines(data)
 
     def skip(self, element: Element) -> None:
         """Go behind the rows of an element."""
