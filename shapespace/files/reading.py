@@ -12,7 +12,8 @@ import numpy as np
 from shapespace.files.gltf_reading import read_gltf
 from shapespace.files.limits import UNLIMITED, Limits, clipped
 from shapespace.files.npz import read_mesh_npz
-from shapespace.files.polygon_reading import read_obj, read_off, read_ply, read_stl, read_xyz
+from shapespace.files.ply_reading import read_ply
+from shapespace.files.polygon_reading import read_obj, read_off, read_stl, read_xyz
 from shapespace.mesh.triangle_mesh import MeshError
 
 #: Media type of formats that have none registered at IANA.

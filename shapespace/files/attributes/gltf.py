@@ -13,7 +13,8 @@ import numpy as np
 
 from shapespace.arrays import FloatArray
 from shapespace.files.attributes.textures import Textures
-from shapespace.files.gltf_reading import Accessor, PlacedPrimitive, Scene, open_scene
+from shapespace.files.gltf_document import Accessor
+from shapespace.files.gltf_reading import PlacedPrimitive, Scene, open_scene
 from shapespace.files.limits import UNLIMITED, label
 from shapespace.mesh.attributes import NONE, MeshAttributes, SurfaceMaterial, labelled, srgb
 

@@ -11,7 +11,7 @@ from shapespace.arrays import FloatArray, IntArray
 from shapespace.files.attributes.obj import polygon_lines
 from shapespace.files.colouring import Colouring
 from shapespace.files.limits import UNLIMITED
-from shapespace.files.polygon_reading import BinaryTable, TextTable, ply_head
+from shapespace.files.ply_reading import BinaryTable, TextTable, read_header
 from shapespace.mesh.attributes import NONE, MeshAttributes
 from shapespace.mesh.triangle_mesh import MeshError
 
@@ -22,7 +22,7 @@ _RGB = ("red", "green", "blue")
 
 def read(path: Path, faults: list[str]) -> MeshAttributes:
     """The surface of a PLY file; sentences on what is left out are appended to ``faults``."""
-    text, elements, body = ply_head(memoryview(path.read_bytes()))
+    text, elements, body = read_header(memoryview(path.read_bytes()))
     table = TextTable(body, UNLIMITED) if text else BinaryTable(body, UNLIMITED)
     at_vertices: FloatArray | None = None
     colors: FloatArray | None = None
