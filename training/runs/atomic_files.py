@@ -1,4 +1,4 @@
-"""Files that a killed run, or a power cut, leaves whole: each is written beside its place, then renamed into it."""
+"""Files of a run that are replaced as a whole, so that a killed run or a power cut leaves no half-written file."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ class _AtomicFile:
     path: Path
 
     def exists(self) -> bool:
-        """Whether it has been written."""
+        """Return whether the file has been written."""
         return self.path.exists()
 
 
 class TextFile(_AtomicFile):
-    """A text in UTF-8."""
+    """A text file in UTF-8."""
 
     def read(self) -> str:
-        """The text; raises OSError or UnicodeDecodeError."""
+        """Return the text; raises OSError or UnicodeDecodeError."""
         return self.path.read_text(encoding="utf-8")
 
     def write(self, text: str) -> None:
@@ -37,14 +37,14 @@ class TextFile(_AtomicFile):
 
 
 class JsonFile(_AtomicFile):
-    """A JSON object."""
+    """A file with a JSON object."""
 
     def read(self) -> dict[str, Any]:
-        """The object; raises OSError or ValueError."""
+        """Return the object; raises OSError or ValueError."""
         return dict(json.loads(self.path.read_text(encoding="utf-8")))
 
     def read_if_written(self) -> dict[str, Any]:
-        """The object, an empty one where the file has not been written."""
+        """Return the object, or an empty object if the file has not been written."""
         return self.read() if self.exists() else {}
 
     def write(self, value: dict[str, Any]) -> None:
@@ -53,14 +53,14 @@ class JsonFile(_AtomicFile):
 
 
 class NpzFile(_AtomicFile):
-    """Arrays by name."""
+    """An NPZ file."""
 
     def read(self) -> dict[str, NDArray]:
-        """All arrays; raises OSError, ValueError, EOFError or zipfile.BadZipFile."""
+        """Return all arrays by name; raises OSError, ValueError, EOFError or zipfile.BadZipFile."""
         return read_npz(self.path)
 
     def read_if_written(self) -> dict[str, NDArray]:
-        """All arrays, none where the file has not been written."""
+        """Return all arrays by name, or none if the file has not been written."""
         return self.read() if self.exists() else {}
 
     def write(self, **arrays: Any) -> None:
