@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from shapespace.files.formats import read_arrays
+from shapespace.files.reading import read_arrays
 from shapespace.mesh.triangle_mesh import TriangleMesh
 
 

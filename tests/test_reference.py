@@ -7,7 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from shapespace.bundle.schema import ARRAYS, MANIFEST, Manifest
-from shapespace.files.formats import MESH_FORMATS, SCAN_FORMATS, USD_FORMATS
+from shapespace.files.formats import MESH_FORMATS, USD_FORMATS
+from shapespace.files.reading import SCAN_FORMATS
 from shapespace.training.runs.directory import RunDirectory
 
 ROOT = Path(__file__).parents[1]

@@ -1,3 +1,4 @@
-"""How work is bounded: threads with a queue and a deadline, processes that can be ended, memory, shares of clients. The
-numbers are in `settings` or beside the check.
+"""Limits on work: worker threads, processes that can be killed, memory, and quotas of clients.
+
+The numbers are in `settings`, or beside the check.
 """

@@ -1,4 +1,4 @@
-"""How much memory this process has, and what glibc keeps of it; elsewhere than on Linux there is nothing to do."""
+"""Memory of this process, and settings of glibc's allocator. On systems other than Linux the functions do nothing."""
 
 from __future__ import annotations
 
@@ -8,17 +8,17 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
-#: Allocations of at least this many bytes are mapped instead of taken from the heap, so that freeing them returns the
-#: memory to the system at once.
+#: Allocations of at least this many bytes are mapped instead of taken from the heap. When they are freed, the system
+#: gets the memory back at once.
 MMAP_THRESHOLD = 4 * 2**20
 _TRIM_THRESHOLD, _MMAP_THRESHOLD, _ARENA_MAX = -1, -3, -8  # malloc.h
 
 
 def tune_malloc() -> None:
-    """One heap for all threads, given back at its end; to be called before there are threads.
+    """Make all threads use one heap, whose free end goes back to the system. Call it before threads start.
 
-    By default each thread has a heap of its own that keeps the largest shape it has worked on: 40 MB more with two
-    workers. Arrays of a request stay on the heap, because fresh pages for each would cost time.
+    By default each thread has its own heap, which keeps the memory of the largest shape: 40 MB more with two workers.
+    Arrays of a request stay on the heap, because fresh pages for each array would take time.
     """
     if mallopt := _glibc("mallopt"):
         for parameter, value in ((_ARENA_MAX, 1), (_TRIM_THRESHOLD, 16 * 2**20), (_MMAP_THRESHOLD, MMAP_THRESHOLD)):
@@ -26,18 +26,18 @@ def tune_malloc() -> None:
 
 
 def trim_heap() -> None:
-    """Return to the system what making models has left over."""
+    """Return free memory of the heap to the system."""
     if trim := _glibc("malloc_trim"):
         trim(ctypes.c_size_t(0))
 
 
 def mapped_size() -> int:
-    """Bytes of addresses that this process has mapped; 0 where the system doesn't tell."""
+    """Return the mapped memory of this process in bytes, or 0 if it is unknown."""
     return _pages(0)
 
 
 def resident_size() -> int:
-    """Bytes of this process that are in memory; 0 where the system doesn't tell."""
+    """Return the resident memory of this process in bytes, or 0 if it is unknown."""
     return _pages(1)
 
 

@@ -1,4 +1,4 @@
-"""How much of a thing all clients together may have, and one of them alone."""
+"""Quotas: how much of a resource all clients together, and one client alone, may use."""
 
 from __future__ import annotations
 
@@ -8,56 +8,54 @@ from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-#: Share of a resource that the address of one client may take, so that the others always have some left.
+#: Share of a resource that the address of one client may use, so that other clients always have some.
 SHARE = 0.75
-#: Number of bodies of the largest size that may be in memory, being received or read, at one time.
+#: Number of uploads of the largest size that may be in memory at one time.
 UPLOADS = 4
-#: Leading bits of an IPv6 address that one customer of a provider usually has to himself.
+#: Leading bits of an IPv6 address. A provider usually gives all addresses with the same bits to one customer.
 _IPV6_NETWORK = 64
 
 
 class QuotaError(RuntimeError):
-    """There is no more of it."""
+    """The quota is used up."""
 
 
 class Quota:
-    """A limited thing, counted by the address of the client that uses it.
-
-    Touched from the event loop only.
+    """A limited resource, counted for each client. Use it from the event loop only.
 
     Args:
-        limit: most of it for all clients together.
+        limit: amount for all clients together.
 
     Attributes:
-        limit: the same.
-        used: how much of it is used.
+        limit: amount for all clients together.
+        used: amount in use.
     """
 
     def __init__(self, limit: int) -> None:
         self.limit, self.used = limit, 0
         self._share = max(1, math.ceil(SHARE * limit))
-        self._of: Counter[str | None] = Counter()
+        self._by_client: Counter[str | None] = Counter()
 
     def take(self, client: str | None, amount: int = 1) -> None:
-        """Count a client's use in; raises QuotaError where that would be too much, and counts nothing then.
+        """Take an amount for a client; raises QuotaError, and takes nothing, if that is too much.
 
-        None is a client that stands for many, and may have all there is.
+        The client None stands for many clients and may use the whole resource.
         """
-        if self.used + amount > self.limit or (client is not None and self._of[client] + amount > self._share):
+        if self.used + amount > self.limit or (client is not None and self._by_client[client] + amount > self._share):
             raise QuotaError
         self.used += amount
-        self._of[client] += amount
+        self._by_client[client] += amount
 
     def give_back(self, client: str | None, amount: int = 1) -> None:
-        """Count it out again."""
+        """Give an amount back."""
         self.used -= amount
-        self._of[client] -= amount
-        if not self._of[client]:
-            del self._of[client]
+        self._by_client[client] -= amount
+        if not self._by_client[client]:
+            del self._by_client[client]
 
     @contextmanager
     def taken(self, client: str | None, amount: int = 1) -> Iterator[None]:
-        """``take`` for the duration of a block."""
+        """Take an amount for the duration of a block."""
         self.take(client, amount)
         try:
             yield
@@ -66,7 +64,7 @@ class Quota:
 
 
 def client_name(address: str) -> str:
-    """Whom an address stands for: itself, or for IPv6 the network that belongs to one customer."""
+    """Return the client for an address: the address itself, or for IPv6 the network of one customer."""
     try:
         parsed = ipaddress.ip_address(address)
     except ValueError:

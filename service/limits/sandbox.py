@@ -1,10 +1,16 @@
-"""Work on what strangers wrote, in processes of its own: with a limit of memory, and ended where it takes too long.
+"""Child processes for untrusted data, with limits of memory and time.
 
-A child is a fresh interpreter and no fork of the server. It is sent the name of a function, its arguments as JSON and
-a body as bytes; back come JSON and arrays, no longer than the caller expects, and never a pickle. What is wrong with a
-file may break the child: the caller then gets a sentence, and the next call another child.
+This is the only defence against hostile uploads and bundles. The readers of files have no limits of their own except
+on the size of the mesh, which they need for their messages. Limits in the readers were the alternative. The process is
+better for three reasons. ONNX Runtime, which runs the networks of a bundle, has no such limits, so that the process is
+needed in any case. Only a process also stops a reader that is slow, hangs or crashes. And a limit of the kernel holds
+for every line of every reader, while a reader has to count at each of its allocations.
 
-The children see none of the server's settings, write no file, and end with the server, however that ends.
+A child is a fresh interpreter, not a fork of the server. The server sends it the name of a function, arguments as JSON
+and a body as bytes. The child answers with JSON and arrays, at most as many bytes as the caller allows, and never with
+a pickle. If a file breaks the child, the caller gets an error in one sentence, and the next call a new child.
+
+A child has none of the server's settings, can't write files, and ends when the server ends, in whatever way.
 """
 
 from __future__ import annotations
@@ -36,7 +42,7 @@ from shapespace.service.limits.sandbox_errors import (
 from shapespace.service.limits.sandbox_wire import (
     LONGEST_SENTENCE,
     Arrays,
-    Facts,
+    JsonObject,
     receive,
     receive_arrays,
     send,
@@ -44,32 +50,32 @@ from shapespace.service.limits.sandbox_wire import (
 )
 from shapespace.solve.deadline import Deadline
 
-#: The tasks of children, by name: functions ``(body: bytearray, **facts) -> (facts, arrays)`` that raise FailedError
-#: for bad input. Given as strings, because only children import these modules, which belong to a layer above this one.
+#: Tasks by name: functions ``(body: bytearray, **facts) -> (facts, arrays)`` that raise FailedError for bad input.
+#: They are strings, because only children import these modules, which belong to a layer above this one.
 TASKS = {
     # Load a bundle that is to be served, and run its networks once.
     "validate": "shapespace.service.repository.validation_task:validate_bundle",
     # Read an uploaded mesh file.
     "read": "shapespace.service.use_cases.uploads:read_in_sandbox",
 }
-#: The part of a body that hasn't been sent to the child yet.
+#: Parts of a body that haven't been sent to the child yet.
 Pieces = deque[memoryview]
 
-#: A child is replaced once it holds this many bytes more than at its start.
+#: A child is replaced when it uses this many bytes more than at its start.
 GROWTH = 128 * 2**20
-#: Milliseconds between two checks of the deadline, because a request may be cancelled.
-_LOOK = 200
-#: Seconds within which a child that has closed its connection has to end.
-_END = 5.0
+#: Milliseconds between two checks of the deadline. A cancelled request moves its deadline to now.
+_CHECK_INTERVAL = 200
+#: Seconds in which a child has to exit after it has closed its connection.
+_EXIT_TIME = 5.0
 
 
 class Sandbox:
-    """A few children, made when they are needed and used again and again.
+    """A pool of child processes, which start when they are needed.
 
-    For any number of threads: who calls waits until a child is free.
+    Any number of threads can call it. A call waits until a child is free.
 
     Args:
-        processes: children at once.
+        processes: largest number of children.
     """
 
     def __init__(self, processes: int) -> None:
@@ -80,8 +86,8 @@ class Sandbox:
         self._closed = False
 
     def prepare(self, task: str) -> None:
-        """Make a child, unless one is idle, and have it import what a task needs; doesn't wait for it."""
-        with self._lock, suppress(OSError):  # a call will say what is the matter
+        """Start a child that imports the modules of a task, unless a child is idle. Doesn't wait for it."""
+        with self._lock, suppress(OSError):  # the next call raises the error
             if not (self._idle or self._closed):
                 self._idle.append(_Child(TASKS[task]))
 
@@ -94,20 +100,24 @@ class Sandbox:
         deadline: Deadline,
         memory: int,
         most: int = 0,
-    ) -> tuple[Facts, Arrays]:
-        """Run a task in a child, and wait for what it says.
+    ) -> tuple[JsonObject, Arrays]:
+        """Run a task in a child and return its result.
 
         Args:
-            task: one of TASKS.
-            facts: its arguments, as JSON has them.
-            body: sent piece by piece, and emptied meanwhile, so that it is never here and there in full.
-            deadline: after which the child is ended.
-            memory: bytes that the task may map beside the body. Kept on Linux, elsewhere as the system likes.
-            most: bytes of arrays that may come back.
+            task: name of one of TASKS.
+            facts: arguments of the task; JSON must be able to represent them.
+            body: data for the task. It is emptied while it is sent, so that it is never in both processes in full.
+            deadline: time at which the child is killed.
+            memory: bytes that the task may map in addition to the body. Linux enforces this; other systems may not.
+            most: largest number of bytes of arrays in the result.
 
         Raises:
-            LateError, OutOfMemoryError, NoProcessError, DiedError, FailedError: by which the call came to nothing.
-            ClosedError: the sandbox is closed, or was meanwhile.
+            LateError: the deadline passed.
+            OutOfMemoryError: the task needs more memory.
+            NoProcessError: no process can be started.
+            DiedError: the child ended.
+            FailedError: the task reports bad input.
+            ClosedError: the sandbox is closed, or was closed meanwhile.
         """
         if not self._free.acquire(timeout=max(0.0, deadline.time - time.monotonic())):
             raise LateError("every process was at work until the time was over")
@@ -129,12 +139,12 @@ class Sandbox:
             self._free.release()
 
     def close(self) -> None:
-        """End every child at once; calls that still run raise ClosedError."""
+        """Kill every child; running calls raise ClosedError."""
         with self._lock:
             self._closed = True
             idle, self._idle = self._idle, []
             for child in self._busy:
-                child.kill()  # and its caller does the rest
+                child.kill()  # the thread that called it cleans up
         for child in idle:
             child.end()
 
@@ -176,29 +186,29 @@ class Sandbox:
 
 
 class _Child:
-    """One process and the connection to it; for one thread at a time.
+    """One process and the connection to it, for one thread at a time.
 
     Args:
-        path: what it should import at once.
+        path: function whose module the process imports at its start.
     """
 
     def __init__(self, path: str) -> None:
         hidden = {name for name in os.environ if name.startswith("SHAPESPACE_")}
         environment = {name: value for name, value in os.environ.items() if name not in hidden}
-        # The same modules as in this process, and one thread for each library, as everywhere in the server.
+        # The child imports the same modules as this process. Its libraries use one thread each, as in the server.
         own, paths = str(Path(__file__).parents[3]), [path for path in sys.path if path]
         environment["PYTHONPATH"] = os.pathsep.join(paths if own in paths else [own, *paths])
         environment |= dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
         self._connection, theirs = socket.socketpair()
         self._connection.setblocking(False)
         try:
-            self._process = subprocess.Popen(  # noqa: S603 - this interpreter, and a number
+            self._process = subprocess.Popen(  # noqa: S603 - the arguments are this interpreter, a number and a name of TASKS
                 [sys.executable, "-P", "-m", "shapespace.service.limits.sandbox_child", str(theirs.fileno()), path],
                 env=environment,
                 pass_fds=[theirs.fileno()],
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,
-                # Libraries print parts of the uploaded file there.
+                # Libraries print parts of the uploaded file to it.
                 stderr=subprocess.DEVNULL,
             )
         except OSError:
@@ -206,18 +216,18 @@ class _Child:
             raise
         finally:
             theirs.close()
-        self._begun: int | None = None
-        self._now = 0
+        self._memory_at_start: int | None = None
+        self._memory = 0
 
     @property
     def dead(self) -> bool:
-        """Whether something has ended it, as the system does where memory runs out."""
+        """Whether the process has ended; for example, the system kills processes when memory runs out."""
         return self._process.poll() is not None
 
     @property
     def grown(self) -> bool:
-        """Whether it keeps much more memory than it began with."""
-        return self._now - (self._begun or 0) > GROWTH
+        """Whether the process uses much more memory than at its start."""
+        return self._memory - (self._memory_at_start or 0) > GROWTH
 
     def call(
         self,
@@ -227,20 +237,20 @@ class _Child:
         deadline: Deadline,
         memory: int,
         most: int,
-    ) -> tuple[Facts, Arrays]:
-        """As Sandbox.call; after any exception but FailedError the child is of no use any more."""
+    ) -> tuple[JsonObject, Arrays]:
+        """Run a task, as `Sandbox.call`. After an exception other than FailedError the child can't be used again."""
 
         def wait(event: int) -> None:
             poll = select.poll()
             poll.register(self._connection, event)
             while not deadline.passed:
-                if poll.poll(_LOOK):
+                if poll.poll(_CHECK_INTERVAL):
                     return
             raise TimeoutError
 
-        with self._told(deadline):
-            if self._begun is None:
-                self._begun = int(receive(self._connection, wait)["memory"])
+        with self._as_sandbox_errors(deadline):
+            if self._memory_at_start is None:
+                self._memory_at_start = int(receive(self._connection, wait)["memory"])
             length = sum(map(len, body)) if body else 0
             seconds = math.ceil(deadline.time - time.monotonic())
             request = {"task": path, "facts": facts, "body": length, "memory": memory, "seconds": seconds}
@@ -248,26 +258,26 @@ class _Child:
             while body:
                 send_all(self._connection, body.popleft(), wait)
             reply = receive(self._connection, wait)
-            self._now = int(reply["memory"])
+            self._memory = int(reply["memory"])
             _raise(reply)
             return dict(reply["facts"]), receive_arrays(self._connection, reply["arrays"], most, wait)
 
     @contextmanager
-    def _told(self, deadline: Deadline) -> Iterator[None]:
-        """What goes wrong between the two processes, as a SandboxError."""
+    def _as_sandbox_errors(self, deadline: Deadline) -> Iterator[None]:
+        """Raise errors of the connection as SandboxError."""
         seconds = deadline.time - time.monotonic()
         try:
             yield
         except TimeoutError:
             raise LateError(f"it took longer than {max(round(seconds, 1), 0):g} s") from None
         except (OSError, EOFError):
-            raise self._death() from None
+            raise self._exit_error() from None
         except (ValueError, TypeError, LookupError, RecursionError):
             raise DiedError("it answered what can't be read") from None
 
-    def _death(self) -> SandboxError:
+    def _exit_error(self) -> SandboxError:
         try:
-            status = self._process.wait(_END)
+            status = self._process.wait(_EXIT_TIME)
         except subprocess.TimeoutExpired:
             return DiedError("it closed the connection")
         if status >= 0:
@@ -280,11 +290,11 @@ class _Child:
         return DiedError(f"it died of {name}")
 
     def kill(self) -> None:
-        """End it, whatever it does, for its caller to see."""
+        """Kill the process; its caller gets an error."""
         self._process.kill()
 
     def end(self) -> None:
-        """End it, whatever it does, and leave nothing of it behind."""
+        """Kill the process and release its resources."""
         self._process.kill()
         self._process.wait()
         self._connection.close()

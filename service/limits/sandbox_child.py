@@ -1,6 +1,6 @@
-"""A sandbox's child: an interpreter that does one task after the other until its parent is gone.
+"""Child process of a sandbox: an interpreter that runs one task after another until its parent ends.
 
-It imports little but what a task needs: its memory is what tasks are measured against.
+It imports little except what a task needs, because the memory limit counts from the memory before the task.
 """
 
 from __future__ import annotations
@@ -21,28 +21,28 @@ from typing import TYPE_CHECKING, Any
 
 from shapespace.service.limits.process_memory import mapped_size, resident_size, trim_heap, tune_malloc
 from shapespace.service.limits.sandbox_errors import FailedError, in_a_line
-from shapespace.service.limits.sandbox_wire import LONGEST_SENTENCE, Arrays, Facts, receive, receive_exactly, send
+from shapespace.service.limits.sandbox_wire import LONGEST_SENTENCE, Arrays, JsonObject, receive, receive_exactly, send
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 #: A function ``(body, **facts)`` that returns facts and arrays.
-Task = Callable[..., tuple[Facts, Arrays]]
+Task = Callable[..., tuple[JsonObject, Arrays]]
 
 
 def main() -> None:
-    """Serve the parent's calls until it is gone."""
+    """Serve the calls of the parent until the parent ends."""
     connection = socket.socket(fileno=int(sys.argv[1]))
-    # Ctrl-C in a terminal, or a signal to the process group, reaches the children too; only the parent ends them.
+    # Ctrl-C in a terminal, or a signal to the process group, reaches the children too. Only the parent may end them.
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)
-    threading.Thread(target=_end_with, args=[connection], daemon=True).start()
+    threading.Thread(target=_exit_with_parent, args=[connection], daemon=True).start()
     tune_malloc()
-    with suppress(OSError):  # where memory runs out, this process goes before the server
+    with suppress(OSError):  # when memory runs out, the system kills this process before the server
         Path("/proc/self/oom_score_adj").write_text("1000")
     for limit in (resource.RLIMIT_CORE, resource.RLIMIT_FSIZE):
         resource.setrlimit(limit, (0, 0))
-    with suppress(Exception):  # a call will say what is the matter
+    with suppress(Exception):  # the first call raises the error
         _function(sys.argv[2])
     send(connection, {"memory": resident_size()})
     with suppress(EOFError, ConnectionError):
@@ -50,10 +50,10 @@ def main() -> None:
             _serve(connection, receive(connection))
 
 
-def _end_with(connection: socket.socket) -> None:
-    """End this process when its parent is gone, whatever it does at that moment."""
+def _exit_with_parent(connection: socket.socket) -> None:
+    """End this process when its parent ends, even in the middle of a task."""
     poll = select.poll()
-    poll.register(connection, 0)  # nothing but the other side's end
+    poll.register(connection, 0)  # no event but the end of the connection
     poll.poll()
     os._exit(1)
 
@@ -61,10 +61,10 @@ def _end_with(connection: socket.socket) -> None:
 def _serve(connection: socket.socket, request: Mapping[str, Any]) -> None:
     bodies = [receive_exactly(connection, request["body"])]
 
-    def run() -> tuple[Facts, Arrays]:
+    def run() -> tuple[JsonObject, Arrays]:
         task = _function(request["task"])
         with _limited(request["memory"], request["seconds"]):
-            return task(bodies.pop(), **request["facts"])  # and nobody keeps it longer
+            return task(bodies.pop(), **request["facts"])  # no reference stays here, so that the task can free it
 
     reply, arrays = _outcome(run)
     trim_heap()
@@ -74,8 +74,8 @@ def _serve(connection: socket.socket, request: Mapping[str, Any]) -> None:
         connection.sendall(array.data.cast("B") if array.size else b"")
 
 
-def _outcome(run: Callable[[], tuple[Facts, Arrays]]) -> tuple[Facts, Arrays]:
-    """A reply, and the arrays that go with it."""
+def _outcome(run: Callable[[], tuple[JsonObject, Arrays]]) -> tuple[JsonObject, Arrays]:
+    """Run a task; return the reply and the arrays that follow it."""
     try:
         facts, arrays = run()
         return {"facts": facts}, {name: _contiguous(array) for name, array in arrays.items()}
@@ -99,8 +99,8 @@ def _function(path: str) -> Task:
     return function
 
 
-def allow(memory: int) -> None:
-    """For tasks that have learned what they need: so many bytes more than the caller said."""
+def raise_memory_limit(memory: int) -> None:
+    """Allow the running task ``memory`` more bytes than its caller did."""
     soft, hard = resource.getrlimit(resource.RLIMIT_AS)
     if soft != hard:
         more = soft + memory
@@ -109,7 +109,7 @@ def allow(memory: int) -> None:
 
 @contextmanager
 def _limited(memory: int, seconds: int) -> Iterator[None]:
-    """Bound what is mapped beyond what is so now, and the processor's time, where the system knows such limits."""
+    """Limit the memory that is mapped in addition to the present memory, and the CPU time."""
     usage = resource.getrusage(resource.RUSAGE_SELF)
     limits = {resource.RLIMIT_CPU: math.ceil(usage.ru_utime + usage.ru_stime) + seconds + 1}
     if now := mapped_size():

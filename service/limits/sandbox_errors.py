@@ -1,4 +1,4 @@
-"""Why a call of a sandbox comes to nothing; on both sides of its connection."""
+"""Errors of calls to a sandbox, for both sides of its connection."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ from pathlib import Path
 
 
 class SandboxError(Exception):
-    """A call without an answer."""
+    """A call that has no result."""
 
 
 class LateError(SandboxError):
-    """The deadline passed, and the child was ended."""
+    """The deadline passed, and the child was killed."""
 
 
 class OutOfMemoryError(SandboxError):
@@ -19,23 +19,23 @@ class OutOfMemoryError(SandboxError):
 
 
 class NoProcessError(SandboxError):
-    """The system gives no process."""
+    """No process can be started."""
 
 
 class DiedError(SandboxError):
-    """The child died of what it was given."""
+    """The child crashed or exited during the call."""
 
 
 class ClosedError(SandboxError):
-    """Nothing is done here any more."""
+    """The sandbox is closed."""
 
 
 class FailedError(SandboxError):
-    """What a task itself found wrong; raised by the task, and again where it was called.
+    """Bad input that a task reports. The task raises it, and the sandbox raises it again for the caller.
 
     Attributes:
-        kind: of fault, in a word; UNEXPECTED for an exception that the task was not prepared for.
-        sentence: for people.
+        kind: kind of fault, in one word; UNEXPECTED for an exception that the task doesn't handle.
+        sentence: description for people.
     """
 
     UNEXPECTED = "unexpected"
@@ -46,7 +46,7 @@ class FailedError(SandboxError):
 
 
 def in_a_line(error: BaseException) -> str:
-    """An exception that nobody expected, and where it was raised."""
+    """Describe an unexpected exception, and where it was raised, in one line."""
     where = traceback.extract_tb(error.__traceback__)[-1:]
     places = "".join(f" ({Path(frame.filename).name}, line {frame.lineno})" for frame in where)
     return f"{type(error).__name__}: {' '.join(str(error).split())}{places}"

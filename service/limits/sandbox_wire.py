@@ -1,4 +1,4 @@
-"""What goes between a sandbox and its children: JSON behind its length, then plain bytes; never a pickle."""
+"""Messages between a sandbox and its children: length of a JSON text, the text, then plain bytes. Never a pickle."""
 
 from __future__ import annotations
 
@@ -15,23 +15,23 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-Facts = dict[str, Any]
+JsonObject = dict[str, Any]
 Arrays = dict[str, "NDArray[Any]"]
-#: Waits until a connection is ready for an event of ``select.poll``.
+#: A function that waits until a connection is ready for an event of ``select.poll``.
 Wait = Callable[[int], None]
 
-#: Bytes of JSON in one message, and characters of a sentence in it.
+#: Most bytes of JSON in one message, and most characters of a sentence in it.
 LONGEST_MESSAGE, LONGEST_SENTENCE = 2**20, 1000
 _LENGTH = struct.Struct("!I")
 _PIECE = 2**20
 _DTYPE = re.compile(r"[<|>][fiub][1248]")
 
 
-def _blocks(_: int) -> None:
-    """What children wait for is the connection itself."""
+def _no_wait(_: int) -> None:
+    """Return at once: the connection of a child blocks by itself."""
 
 
-def send(connection: socket.socket, message: Mapping[str, Any], wait: Wait = _blocks) -> None:
+def send(connection: socket.socket, message: Mapping[str, Any], wait: Wait = _no_wait) -> None:
     """Send a message; raises OSError."""
     data = json.dumps(message).encode()
     send_all(connection, _LENGTH.pack(len(data)) + data, wait)
@@ -46,8 +46,8 @@ def send_all(connection: socket.socket, data: bytes | bytearray | memoryview, wa
             rest = rest[connection.send(rest[:_PIECE]) :]
 
 
-def receive(connection: socket.socket, wait: Wait = _blocks) -> dict[str, Any]:
-    """The next message; raises EOFError, and ValueError for what is none."""
+def receive(connection: socket.socket, wait: Wait = _no_wait) -> dict[str, Any]:
+    """Return the next message; raises EOFError at the end, and ValueError if it is no message."""
     (length,) = _LENGTH.unpack(receive_exactly(connection, _LENGTH.size, wait))
     if length > LONGEST_MESSAGE:
         raise ValueError
@@ -57,9 +57,9 @@ def receive(connection: socket.socket, wait: Wait = _blocks) -> dict[str, Any]:
     return message
 
 
-def receive_exactly(connection: socket.socket, length: int, wait: Wait = _blocks) -> bytearray:
-    """So many bytes; raises EOFError where the connection ends before."""
-    # By pieces: what hasn't come yet takes no memory.
+def receive_exactly(connection: socket.socket, length: int, wait: Wait = _no_wait) -> bytearray:
+    """Return ``length`` bytes; raises EOFError if the connection ends before."""
+    # Piece by piece, so that data that never come take no memory.
     data = bytearray()
     while len(data) < length:
         wait(select.POLLIN)
@@ -71,7 +71,14 @@ def receive_exactly(connection: socket.socket, length: int, wait: Wait = _blocks
 
 
 def receive_arrays(connection: socket.socket, described: Any, most: int, wait: Wait) -> Arrays:
-    """Arrays whose names, types and shapes a message has told; raises ValueError for more than ``most`` bytes."""
+    """Return the arrays that follow a message; raises ValueError for more than ``most`` bytes.
+
+    Args:
+        connection: connection that the message came from.
+        described: name, type and shape of each array, from the message.
+        most: largest number of bytes of all arrays.
+        wait: see `Wait`.
+    """
     import numpy as np
 
     arrays = {}

@@ -1,8 +1,8 @@
-"""The threads that compute: as many as there are processors, with a bounded queue and a deadline.
+"""Threads that compute, with a bounded queue and a deadline for each request.
 
-Whatever a thread does, the request that waits for it is answered from the event loop: by its deadline, once its client
-has left, or when the server ends. Work looks at its deadline by itself and ends soon after; a thread that doesn't is
-given up, and another one takes its place.
+The event loop answers a request by its deadline, when its client leaves, or when the server ends, whatever its thread
+does. Work checks its deadline itself and ends soon after. A thread that does not is abandoned, and a new one takes its
+place.
 """
 
 from __future__ import annotations
@@ -23,10 +23,11 @@ from shapespace.solve.deadline import Deadline
 logger = logging.getLogger(__name__)
 S = TypeVar("S")
 T = TypeVar("T")
-#: Seconds after its deadline within which a thread should stop, and how many threads may be abandoned because they
-#: don't.
-PATIENCE, SPARE = 2.0, 16
-#: Memory, in bytes, that all answers with many shapes may take together.
+#: Seconds after its deadline in which a thread has to stop. Otherwise it is abandoned.
+GRACE_SECONDS = 2.0
+#: Largest number of abandoned threads.
+MOST_ABANDONED = 16
+#: Bytes that all answers with many shapes may use together.
 MEMORY = 384 * 2**20
 
 
@@ -35,11 +36,11 @@ class BusyError(RuntimeError):
 
 
 class DeadlineError(TimeoutError):
-    """The time a request may take has passed."""
+    """The deadline of a request has passed."""
 
 
 class DisconnectedError(ConnectionError):
-    """Nobody waits for the answer any more."""
+    """The client has left."""
 
 
 class EndingError(RuntimeError):
@@ -48,11 +49,11 @@ class EndingError(RuntimeError):
 
 @dataclass(frozen=True)
 class Caller:
-    """Who waits for an answer.
+    """The client of a request.
 
     Attributes:
-        client: the address that it counts for, see ``client_name``; empty where it is unknown.
-        gone: waits until nobody waits for the answer any more, and gives the error to end the work with.
+        client: name for quotas, see ``client_name``; empty if it is unknown.
+        gone: waits until the client has left, and returns the error for its work.
     """
 
     client: str
@@ -63,8 +64,8 @@ class Call(Deadline):
     """A deadline that also ends the waiting of a request on the event loop.
 
     Args:
-        seconds: from now.
-        late: the error to end with once they have passed.
+        seconds: time until the deadline.
+        late: error that the request gets at the deadline.
     """
 
     def __init__(self, seconds: float, late: Exception) -> None:
@@ -81,11 +82,11 @@ class Call(Deadline):
             self._over.set_exception(error)
 
     def close(self) -> None:
-        """The work is done, and the deadline doesn't matter any more."""
+        """Stop the timer, because the work is done."""
         self._timer.cancel()
 
     async def first(self, work: Awaitable[T]) -> T:
-        """The result of some work, or the error with which this call ends before it is there."""
+        """Return the result of some work, or raise the error of this call if the call ends first."""
         task = asyncio.ensure_future(work)
         try:
             await asyncio.wait((task, self._over), return_when=asyncio.FIRST_COMPLETED)
@@ -97,22 +98,22 @@ class Call(Deadline):
 
 
 class Workers:
-    """One long-lived pool of threads for everything that would block the event loop.
+    """A pool of threads for everything that would block the event loop.
 
-    Requests are admitted up to a limit. An admitted request hands over one shape after the other, never more
-    at once than there are threads, so that a long animation doesn't keep a single shape waiting for its end.
-    Streams have a limit of their own: they wait for their readers most of the time, and then hold no thread.
+    Requests are admitted up to a limit. A request submits its shapes one by one, at most as many at once as there are
+    threads. So a single shape doesn't wait for the end of a long animation. Streams have their own limit: most of the
+    time they wait for their clients, and then use no thread.
 
     Args:
-        threads: size of the pool.
-        queue: requests admitted beyond those at work.
-        deadline: seconds a request may take from its admission.
+        threads: number of threads.
+        queue: number of admitted requests that can wait for a thread.
+        deadline: seconds that a request may take after it is admitted.
 
     Attributes:
-        places: requests at work or waiting.
-        streams: answers that are read while they are computed.
-        memory: bytes of answers in which many shapes are gathered.
-        lost: threads given up, and still running.
+        places: quota of requests that are admitted.
+        streams: quota of answers that are read while they are computed.
+        memory: quota of bytes for answers with many shapes.
+        lost: number of abandoned threads that still run.
     """
 
     def __init__(self, threads: int, queue: int, deadline: float) -> None:
@@ -130,10 +131,10 @@ class Workers:
 
     @asynccontextmanager
     async def admit(self, caller: Caller) -> AsyncIterator[Call]:
-        """Admit a request for the block's duration; yields its deadline.
+        """Admit a request for the duration of the block; yields its deadline.
 
         Raises:
-            BusyError: too many requests are being worked on or waiting, of all clients or of this one.
+            BusyError: there are too many requests, in total or from this client.
         """
         with self._place(self.places, caller), self._call() as call:
             watching = asyncio.create_task(self._watch(caller, call))
@@ -144,26 +145,26 @@ class Workers:
 
     @contextmanager
     def stream(self, caller: Caller) -> Iterator[None]:
-        """Admit, for the block's duration, a request whose answer is read while it is computed; raises BusyError."""
+        """Admit a streamed answer for the duration of the block; raises BusyError."""
         with self._place(self.streams, caller):
             yield
 
     @contextmanager
     def holding(self, caller: Caller, size: int) -> Iterator[ExitStack]:
-        """Reserve bytes for an answer until the block ends, or until the stack is closed by whoever has taken it over.
+        """Reserve bytes for an answer until the block ends, or until another owner of the stack closes it.
 
         Raises:
-            BusyError: all requests together hold too much, or those of one client.
+            BusyError: answers use too much memory, in total or for this client.
         """
         with ExitStack() as held:
             held.enter_context(self._place(self.memory, caller, size))
             yield held
 
     async def run(self, function: Callable[[Call], T], call: Call) -> T:
-        """Run work in a thread, given its deadline.
+        """Run a function in a thread, with the deadline as its argument.
 
         Raises:
-            DeadlineError, DisconnectedError, EndingError: the call has ended before.
+            DeadlineError, DisconnectedError, EndingError: the call ended first.
         """
         turn = asyncio.ensure_future(self._free.acquire())
         try:
@@ -184,9 +185,9 @@ class Workers:
     async def map(
         self, function: Callable[[S, Call], T], items: Iterable[S], call: Call | None
     ) -> AsyncGenerator[T, None]:
-        """Run one piece of work for every item, side by side, and give the results in order.
+        """Run a function for every item in parallel, and yield the results in order.
 
-        Without a deadline for all of them each piece has its own, from the moment it is handed over.
+        Without a common deadline each item has its own, which starts when the item is submitted.
         """
         running: deque[asyncio.Task[T]] = deque()
         try:
@@ -199,31 +200,31 @@ class Workers:
         finally:
             for task in running:
                 task.cancel()
-            # What else went wrong doesn't matter any more, but asyncio would log it as never looked at.
+            # asyncio would log other errors as never retrieved.
             await asyncio.gather(*running, return_exceptions=True)
 
     async def piece(self, function: Callable[[Call], T], call: Call | None) -> T:
-        """``run`` with this deadline, or without one with a deadline of its own; raises as ``run`` does."""
+        """Run a function as `run` does, with this deadline or a new one."""
         if call is not None:
             return await self.run(function, call)
         with self._call() as own:
             return await self.run(function, own)
 
     def late(self) -> DeadlineError:
-        """The error for work whose deadline has passed."""
+        """Return the error for work whose deadline has passed."""
         return DeadlineError(
             f"The answer was not ready within {self.deadline:g} s. Ask for fewer shapes at once, "
             "stream the frames as JSON lines, or try again when there is less to do."
         )
 
     def end(self) -> None:
-        """Answer everything that waits: nothing more will be computed."""
+        """End every call, because the server ends."""
         self._ending = True
         for call in tuple(self._calls):
             call.give_up(_ending())
 
     def close(self) -> None:
-        """End the threads that have nothing to do; those that have are left alone."""
+        """End idle threads; busy threads finish their work."""
         self._pool.shutdown(wait=False, cancel_futures=True)
 
     @contextmanager
@@ -256,18 +257,20 @@ class Workers:
         call.give_up(await caller.gone())
 
     def _abandon(self, work: Future[T]) -> None:
-        """Wait for a thread whose result nobody wants; if it goes on, another one takes its place."""
+        """Wait for a thread whose call has ended; replace the thread if it doesn't stop."""
         loop, free = asyncio.get_running_loop(), True
 
         def lose() -> None:
             nonlocal free
-            if self.lost < SPARE:
+            if self.lost < MOST_ABANDONED:
                 free = False
                 self.lost += 1
-                self._pool.shutdown(wait=False)  # what runs in it goes on
+                self._pool.shutdown(wait=False)  # running work goes on
                 self._pool = self._threads()
                 self._free.release()
-                logger.error("a thread is still at work %g s after its deadline, and another takes its place", PATIENCE)
+                logger.error(
+                    "a thread is still at work %g s after its deadline, and another takes its place", GRACE_SECONDS
+                )
 
         def find() -> None:
             timer.cancel()
@@ -276,7 +279,7 @@ class Workers:
             else:
                 self.lost -= 1
 
-        timer = loop.call_later(PATIENCE, lose)
+        timer = loop.call_later(GRACE_SECONDS, lose)
         work.add_done_callback(lambda _: None if loop.is_closed() else loop.call_soon_threadsafe(find))
 
 

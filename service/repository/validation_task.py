@@ -8,9 +8,9 @@ import numpy as np
 
 from shapespace.bundle.reader import BundleError, read_bundle
 from shapespace.model.decoder import Decoder
-from shapespace.service.limits.sandbox_child import allow
+from shapespace.service.limits.sandbox_child import raise_memory_limit
 from shapespace.service.limits.sandbox_errors import FailedError
-from shapespace.service.limits.sandbox_wire import Arrays, Facts
+from shapespace.service.limits.sandbox_wire import Arrays, JsonObject
 from shapespace.solve.cholesky import SymmetricPattern, analyse
 
 #: Bytes that the solver may take for each vertex of the coarse mesh, about twice its need.
@@ -21,7 +21,7 @@ SOLVER_MEMORY = 4 * 2**30
 analyse(SymmetricPattern(1, np.array([0]), np.array([0])))
 
 
-def validate_bundle(body: bytearray, folder: str) -> tuple[Facts, Arrays]:
+def validate_bundle(body: bytearray, folder: str) -> tuple[JsonObject, Arrays]:
     """Load a bundle, and compute with it once as the server does.
 
     Args:
@@ -36,7 +36,7 @@ def validate_bundle(body: bytearray, folder: str) -> tuple[Facts, Arrays]:
     """
     try:
         bundle = read_bundle(Path(folder))
-        allow(min(MEMORY_PER_VERTEX * bundle.manifest.vertices, SOLVER_MEMORY))
+        raise_memory_limit(min(MEMORY_PER_VERTEX * bundle.manifest.vertices, SOLVER_MEMORY))
         Decoder(bundle).self_test()
     except (BundleError, OSError) as error:
         raise FailedError("refused", str(error)) from None

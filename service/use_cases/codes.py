@@ -256,7 +256,8 @@ def read_upload(
     except ClosedError as error:
         raise EndingError("The server is about to end. Send the file to another one.") from error
     except SandboxError as error:
-        raise _unusable(str(error)) from None
+        logger.warning("the process that reads an uploaded file ended: %s", error)
+        raise _unusable("it breaks its reader") from None
     return arrays["vertices"], arrays["faces"], str(said["options"])
 
 

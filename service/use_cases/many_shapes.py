@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from shapespace.files.archives import Buffer, npz_pieces
-from shapespace.files.formats import OCTET_STREAM
+from shapespace.files.archives import Buffer
+from shapespace.files.npz import npz_pieces
+from shapespace.files.reading import OCTET_STREAM
 from shapespace.mesh.rigid_motion import Placement
 from shapespace.model.decoder import Diagnostics, MeshChoice, Quality
 from shapespace.model.exact_shapes import ExactShape, exact_shape, require_tangent_space

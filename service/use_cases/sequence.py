@@ -23,7 +23,7 @@ from shapespace.service.use_cases.animation import Animation, UnknownInterpolati
 from shapespace.service.use_cases.batch import EncodedFile, batch, solve
 from shapespace.service.use_cases.many_shapes import shapes, shapes_size
 from shapespace.service.use_cases.one_shape import ColourOptions
-from shapespace.service.use_cases.sequence_formats import SEQUENCE_FORMATS, Frames, json_line
+from shapespace.service.use_cases.sequence_formats import Frames, encode_frames, json_line
 from shapespace.service.use_cases.shape_formats import summarise, with_topology
 from shapespace.solve.deadline import Deadline
 
@@ -113,18 +113,17 @@ async def sequence_file(
                 colourings = Colouring.of_frames(
                     colour_by.quantity, found.vertices[:number], against, whole.connectivity
                 )
-            return SEQUENCE_FORMATS[format].encode(
-                Frames(
-                    found.vertices[:number],
-                    found.diagnostics[:number],
-                    whole.faces,
-                    animation.positions,
-                    codes[:number],
-                    surface,
-                    fps,
-                    colourings,
-                )
+            frames = Frames(
+                found.vertices[:number],
+                found.diagnostics[:number],
+                whole.faces,
+                animation.positions,
+                codes[:number],
+                surface,
+                fps,
+                colourings,
             )
+            return encode_frames(frames, format)
 
         return await work.write(encode, found.seconds, summarise(found.diagnostics[:number]))
 

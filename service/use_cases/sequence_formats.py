@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -12,11 +11,12 @@ from numpy.typing import NDArray
 
 from shapespace.arrays import FloatArray, IntArray
 from shapespace.files.animated_gltf import FRAMES_PER_SECOND, animated_glb
-from shapespace.files.archives import Buffer, npz_pieces, zip_pieces
+from shapespace.files.archives import Buffer, zip_pieces
 from shapespace.files.attributes.obj import obj_faces, obj_files, obj_vertices
 from shapespace.files.colouring import Colouring
-from shapespace.files.formats import OCTET_STREAM
+from shapespace.files.npz import npz_pieces
 from shapespace.files.point_cache import point_cache
+from shapespace.files.reading import OCTET_STREAM
 from shapespace.files.usd import animated_usd
 from shapespace.mesh.attributes import MeshAttributes
 from shapespace.model.decoder import Diagnostics, Shape
@@ -55,13 +55,11 @@ class SequenceFormat:
 
     Attributes:
         media_type: as registered with IANA.
-        encode: returns the pieces of the file, and facts for the diagnostics.
         polygons: whether files hold polygons; otherwise they hold triangles.
         timed: whether files hold the time of a frame; then they can hold colours that change, too.
     """
 
     media_type: str
-    encode: Callable[[Frames], tuple[Iterator[Buffer], dict[str, Any]]]
     polygons: bool = False
     timed: bool = False
 
@@ -75,37 +73,44 @@ def json_line(k: int, t: float, shape: Shape, faces: IntArray | None) -> bytes:
     return dump_json(line) + b"\n"
 
 
-def _glb(frames: Frames) -> tuple[Iterator[Buffer], dict[str, Any]]:
-    animated = animated_glb(frames.vertices, frames.faces, frames.surface, frames.fps, frames.colourings)
-    return iter([animated.data]), {"targets": animated.targets, "max_vertex_error": animated.max_vertex_error}
+def encode_frames(frames: Frames, format: str) -> tuple[Iterator[Buffer], dict[str, Any]]:
+    """Encode an animation in one of SEQUENCE_FORMATS.
 
-
-def _npz(frames: Frames) -> tuple[Iterator[Buffer], dict[str, Any]]:
-    arrays = diagnostics_arrays(frames.diagnostics)
-    return npz_pieces(
-        vertices=frames.vertices,
-        faces=frames.faces.astype(np.int32),
-        t=frames.positions,
-        latents=frames.codes,
-        **arrays,
-    ), {}
-
-
-def _point_cache(frames: Frames) -> tuple[Iterator[Buffer], dict[str, Any]]:
-    return point_cache(frames.vertices), {}
-
-
-def _usd(frames: Frames, *, packed: bool = False) -> tuple[Iterator[Buffer], dict[str, Any]]:
-    def pieces() -> Iterator[Buffer]:
-        with catch_write_errors():
-            yield from animated_usd(
-                frames.vertices, frames.faces, frames.surface, frames.fps, frames.colourings, packed=packed
+    Returns:
+        The file in pieces, and members for the diagnostics.
+    """
+    pieces: Iterator[Buffer]
+    match format:
+        case "glb":
+            animated = animated_glb(frames.vertices, frames.faces, frames.surface, frames.fps, frames.colourings)
+            return iter([animated.data]), {"targets": animated.targets, "max_vertex_error": animated.max_vertex_error}
+        case "npz":
+            pieces = npz_pieces(
+                vertices=frames.vertices,
+                faces=frames.faces.astype(np.int32),
+                t=frames.positions,
+                latents=frames.codes,
+                **diagnostics_arrays(frames.diagnostics),
             )
+        case "zip":
+            pieces = _obj_pieces(frames)
+        case "pc2":
+            pieces = point_cache(frames.vertices)
+        case "usd" | "usdz":
+            pieces = _usd_pieces(frames, packed=format == "usdz")
+        case _:
+            raise ValueError(f"no format {format}")
+    return pieces, {}
 
-    return pieces(), {}
+
+def _usd_pieces(frames: Frames, *, packed: bool) -> Iterator[Buffer]:
+    with catch_write_errors():
+        yield from animated_usd(
+            frames.vertices, frames.faces, frames.surface, frames.fps, frames.colourings, packed=packed
+        )
 
 
-def _zip(frames: Frames) -> tuple[Iterator[Buffer], dict[str, Any]]:
+def _obj_pieces(frames: Frames) -> Iterator[Buffer]:
     surface = frames.surface or MeshAttributes.of_triangles(frames.faces)
     beside = obj_files(surface, "frames")
     head, faces = "mtllib frames.mtl\n" if beside else "", obj_faces(surface)
@@ -117,18 +122,18 @@ def _zip(frames: Frames) -> tuple[Iterator[Buffer], dict[str, Any]]:
         for name, content in beside.items():
             yield name, [content]
 
-    return zip_pieces(members()), {}
+    return zip_pieces(members())
 
 
 JSON_LINES = "application/jsonl"
 #: Formats of a whole animation except JSON lines, which are streamed; the first is the default.
 SEQUENCE_FORMATS = {
-    "glb": SequenceFormat("model/gltf-binary", _glb, timed=True),
-    "npz": SequenceFormat(OCTET_STREAM, _npz),
-    "zip": SequenceFormat("application/zip", _zip, polygons=True),
-    "pc2": SequenceFormat(OCTET_STREAM, _point_cache),
-    "usd": SequenceFormat(OCTET_STREAM, _usd, polygons=True, timed=True),
-    "usdz": SequenceFormat("model/vnd.usdz+zip", partial(_usd, packed=True), polygons=True, timed=True),
+    "glb": SequenceFormat("model/gltf-binary", timed=True),
+    "npz": SequenceFormat(OCTET_STREAM),
+    "zip": SequenceFormat("application/zip", polygons=True),
+    "pc2": SequenceFormat(OCTET_STREAM),
+    "usd": SequenceFormat(OCTET_STREAM, polygons=True, timed=True),
+    "usdz": SequenceFormat("model/vnd.usdz+zip", polygons=True, timed=True),
 }
 #: Media types of all formats of a whole animation, by name.
 MEDIA_TYPES = {name: format.media_type for name, format in SEQUENCE_FORMATS.items()} | {"jsonl": JSON_LINES}

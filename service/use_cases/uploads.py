@@ -1,33 +1,33 @@
-"""Mesh files in requests: as the body itself or as a part of a form, in a format that something says.
+"""Mesh files in requests: a request's body, or one part of a form.
 
-Nothing here knows of servers or models, so that a process of its own can do it. Whatever the bytes are, reading them
-takes time in proportion to their number, and memory that the limits bound.
+This module imports neither the server nor models, so that a sandbox process can import it fast. That process limits the
+time and memory of reading, see `shapespace.service.limits.sandbox`.
 """
 
 from __future__ import annotations
 
+import json
 from array import array
 from collections.abc import Collection, Iterable
 from itertools import chain
 from pathlib import PurePath
 
 import numpy as np
-import orjson
 from python_multipart.exceptions import FormParserError
 from python_multipart.multipart import MultipartParser, parse_options_header
 
 from shapespace.arrays import FloatArray, IntArray
-from shapespace.files.formats import OCTET_STREAM, READ_FORMATS, SCAN_FORMATS, read_arrays
-from shapespace.files.limits import Limits, clipped, count_bytes
+from shapespace.files.limits import Limits, clipped
+from shapespace.files.reading import OCTET_STREAM, READ_FORMATS, SCAN_FORMATS, read_arrays
 from shapespace.mesh.triangle_mesh import MeshError
 from shapespace.service.limits.sandbox_errors import FailedError
-from shapespace.service.limits.sandbox_wire import Arrays, Facts
+from shapespace.service.limits.sandbox_wire import Arrays, JsonObject
 
 #: Media types of the formats that can be read, by name.
 FORMATS = READ_FORMATS | {"json": "application/json"}
-#: The same of scans, which may be points without faces.
+#: Media types of the formats of scans, which may be points without faces.
 POINT_FORMATS = SCAN_FORMATS | {"json": "application/json"}
-#: The same the other way round, with other names of media types.
+#: Formats by media type, with further names of media types.
 MEDIA_TYPES = {
     "text/plain": "obj",
     "model/x.stl-ascii": "stl",
@@ -39,55 +39,51 @@ MEDIA_TYPES = {
 _MAGIC = {b"glTF": "glb", b"ply": "ply", b"PK": "npz", b"OFF": "off"}
 #: Most characters of a Content-Type or Content-Disposition header.
 _LONGEST_HEADER = 1000
+#: Most fields of a form besides the file.
 _MOST_FIELDS = 16
+#: Most bytes of the field ``options``.
 _LONGEST_OPTIONS = 2**18
-#: Limits of a mesh as JSON: bytes for each vertex and face, with all digits; and besides these bytes, lists, objects
-#: and quotation marks.
-_BYTES_OF_EACH, _BYTES_BESIDE, _LISTS_BESIDE, _OBJECTS, _QUOTES = 128, 2**20, 1000, 1000, 4000
-#: Replaces characters outside ASCII, which occur only in names, and names are ignored: with them Python would store the
-#: whole text with four bytes a character.
-_TO_ASCII = bytes(range(128)) + b"?" * 128
-_PIECE = 2**20
 
 
 class UploadError(ValueError):
-    """An upload that can't be used: what is wrong, and what to do."""
+    """An upload that can't be used. The message says what is wrong and what to do."""
 
 
 class UnusableMeshError(UploadError):
-    """No file, or one that holds no mesh within the limits."""
+    """There is no file, or it holds no mesh within the limits."""
 
 
 class UnreadableFormError(UploadError):
-    """A form that breaks the rules of its format, or holds more than one file."""
+    """The form breaks the rules of its format, or holds more than one file."""
 
 
 class UnknownFormatError(UploadError):
-    """A format that nothing tells, or that nobody knows."""
+    """The request names no format, or an unknown one."""
 
 
-#: The same by name, by which they travel from one process to another.
+#: Classes of errors by name. A sandbox process sends the name.
 UPLOAD_ERRORS = {error.__name__: error for error in (UnusableMeshError, UnreadableFormError, UnknownFormatError)}
 
 
 def read_mesh_file(
     body: bytes | bytearray, content_type: str, format: str | None, limits: Limits, *, points: bool = False
 ) -> tuple[FloatArray, IntArray, str, str]:
-    """The mesh in the body of a request.
+    """Read the mesh in the body of a request.
+
+    The format is ``format``, or else follows from the content type, the name of the file, or its first bytes.
 
     Args:
-        body: a mesh file, or a ``multipart/form-data`` form with one.
-        content_type: the header, or nothing.
-        format: what ``?format=`` says, which wins; then the content type, the file's name, its first bytes.
-        limits: where reading ends without a mesh.
-        points: whether points without faces will do.
+        body: a mesh file, or a ``multipart/form-data`` form with a mesh file.
+        content_type: the header; empty if there is none.
+        format: value of ``?format=``, if any.
+        limits: largest numbers of vertices and faces.
+        points: whether points without faces are accepted.
 
     Returns:
-        Vertices (V, 3) as they stand in the file, faces (F, 3), none where it doesn't say, its format, and the text of
-        a form's field ``options``.
+        Vertices (V, 3) as in the file, faces (F, 3) or none, the format, and the form's field ``options``.
 
     Raises:
-        UploadError: no file, a form or a file that can't be read, or a format that nothing tells or nobody knows.
+        UploadError: there is no file, the form or the file can't be read, or the format is unknown.
     """
     data, name, said, formats = memoryview(body), "", b"", POINT_FORMATS if points else FORMATS
     declared, options = parse_options_header(content_type[:_LONGEST_HEADER])
@@ -124,8 +120,8 @@ def _guess(declared: str, name: str, start: bytes, formats: Collection[str]) -> 
 
 def read_in_sandbox(
     body: bytearray, content_type: str, format: str | None, vertices: int, faces: int, points: bool = False
-) -> tuple[Facts, Arrays]:
-    """``read_mesh_file`` as a task of a sandbox; raises FailedError."""
+) -> tuple[JsonObject, Arrays]:
+    """Run `read_mesh_file` as a task of a sandbox; raises FailedError."""
     try:
         found = read_mesh_file(body, content_type, format, Limits(vertices, faces), points=points)
     except UploadError as error:
@@ -134,11 +130,14 @@ def read_in_sandbox(
 
 
 class _Form:
-    """A form, in which the place of the only file is looked for.
+    """Parser of a ``multipart/form-data`` form with one file. It copies no file.
 
     Args:
-        body: all of it.
-        boundary: what stands between its parts.
+        body: the whole form.
+        boundary: boundary between its parts, from the content type.
+
+    Attributes:
+        options: content of the field ``options``.
     """
 
     def __init__(self, body: bytes | bytearray, boundary: bytes | None) -> None:
@@ -149,14 +148,13 @@ class _Form:
         self._is_file, self._start, self._stop = False, 0, 0
         self._found: tuple[memoryview, str, bytes] | None = None
         self._field = b""
-        #: Content of the field ``options``, which says how the file is to be used.
         self.options = b""
 
     def file(self) -> tuple[memoryview, str, bytes]:
-        """Its content, its name, and its declared type.
+        """Return content, name and declared media type of the file.
 
         Raises:
-            UploadError: no form, more fields or files than one may send, or no file.
+            UploadError: the body is no form, has too many fields or files, or no file.
         """
         if self._boundary is None:
             raise self._unreadable("Missing boundary in multipart.")
@@ -174,7 +172,7 @@ class _Form:
                     "on_part_end": self._on_part_end,
                 },
             )
-            # At once, so that places are those in the body.
+            # In one call, so that positions are positions in the body.
             parser.write(self._body)  # type: ignore[arg-type]
         except FormParserError:
             raise self._unreadable("Invalid multipart data.") from None
@@ -219,42 +217,21 @@ class _Form:
 
 
 def _read_json(data: memoryview, limits: Limits) -> tuple[FloatArray, IntArray]:
-    each = limits.vertices + limits.faces
-    # As many as there can be, before any of them is made.
-    for most, characters, name in (
-        (_OBJECTS, b"{", "objects"),
-        (_QUOTES, b'"', "quotes"),
-        (_LISTS_BESIDE + each, b"[", "lists"),
-        # Three in a vertex or face, one behind it, and one for its colour.
-        (_LISTS_BESIDE + 5 * each, b",", "commas"),
-    ):
-        if count_bytes(data, characters) > most:
-            raise MeshError(f"it has more than {most} {name}")
-    if len(data) > _BYTES_BESIDE + _BYTES_OF_EACH * each:
-        raise MeshError(f"it has {len(data)} bytes, where {_BYTES_BESIDE + _BYTES_OF_EACH * each} are enough")
     try:
-        content = orjson.loads(_in_ascii(data))
-    except orjson.JSONDecodeError as error:
+        # orjson would crash at the end of its memory, where this module raises MemoryError.
+        content = json.loads(bytes(data))
+    except (ValueError, RecursionError) as error:
         raise MeshError(f"not JSON: {clipped(error)}") from None
     if not isinstance(content, dict) or "vertices" not in content:
         raise MeshError('not an object {"vertices": [[x, y, z], …], "faces": [[a, b, c], …]}')
     vertices = _triples("d", content["vertices"], "vertices must be lists of three numbers each")
     faces = _triples("q", content.get("faces") or [], "faces must be lists of three whole numbers each")
+    limits.check(len(vertices), len(faces))
     return vertices, faces
 
 
-def _in_ascii(data: memoryview) -> bytes | memoryview:
-    """The same with other characters replaced: in its place, as there may be no room for a copy."""
-    if data.readonly:
-        return bytes(data).translate(_TO_ASCII)
-    for start in range(0, len(data), _PIECE):
-        piece = data[start : start + _PIECE]
-        piece[:] = bytes(piece).translate(_TO_ASCII)
-    return data
-
-
 def _triples(kind: str, rows: object, otherwise: str) -> np.ndarray:
-    """Rows of three numbers as an array; raises MeshError where they are something else."""
+    """Return rows of three numbers as an array; raises MeshError(otherwise) for anything else."""
     numbers = array(kind)
     try:
         if not isinstance(rows, list) or any(len(row) != 3 for row in rows):
@@ -271,5 +248,5 @@ def _checked(vertices: np.ndarray, faces: np.ndarray) -> tuple[FloatArray, IntAr
         raise MeshError(f"vertices must be (V, 3) numbers, not {clipped(vertices.dtype)} of shape {vertices.shape}")
     if faces.size and (faces.ndim != 2 or faces.shape[1] != 3 or faces.dtype.kind not in "iu"):
         raise MeshError(f"faces must be (F, 3) whole numbers, not {clipped(faces.dtype)} of shape {faces.shape}")
-    with np.errstate(all="ignore"):  # a long double may be beyond doubles
+    with np.errstate(all="ignore"):  # a long double may be too large for a double
         return vertices.astype(np.float64, copy=False), faces.reshape(-1, 3).astype(np.int64, copy=False)

@@ -1,1 +1,1 @@
-"""What passes from training to serving: `schema` says what is in a bundle, `geometry` holds its arrays."""
+"""Bundles, the files that pass from training to serving: schema, reader and writer."""

@@ -1,4 +1,4 @@
-"""A surface as a bundle holds it, and a run: arrays by name, an entry of names, and textures as files."""
+"""Mesh attributes as bundles and runs store them: arrays by name, an entry with names, and textures as files."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from shapespace.mesh.triangle_mesh import MeshError
 
 
 def surface_arrays(surface: MeshAttributes) -> dict[str, NDArray]:
-    """The arrays of a surface by the names that `from_entry` reads."""
+    """Return the arrays of mesh attributes, by the names that `from_entry` reads."""
     found = {
         "starts": surface.starts,
         "corners": surface.corners,
@@ -30,7 +30,7 @@ def surface_arrays(surface: MeshAttributes) -> dict[str, NDArray]:
 
 
 def surface_entry(surface: MeshAttributes) -> AttributesEntry:
-    """What a manifest says of a surface."""
+    """Return the entry of mesh attributes in a manifest."""
     return AttributesEntry(
         objects=list(surface.objects.names) if surface.objects else [],
         groups=list(surface.groups.names) if surface.groups else [],
@@ -40,11 +40,12 @@ def surface_entry(surface: MeshAttributes) -> AttributesEntry:
 
 
 def from_entry(entry: AttributesEntry, arrays: Mapping[str, NDArray], textures: Mapping[str, bytes]) -> MeshAttributes:
-    """The surface of an entry.
+    """Return mesh attributes from an entry, its arrays and its textures.
+
+    This function does not check whether the arrays fit each other and the mesh; `MeshAttributes.check` does.
 
     Raises:
-        MeshError: an array that is missing, or a texture that is none or too large. Whether arrays fit each other and
-            the mesh says `MeshAttributes.check`.
+        MeshError: an array is missing, or a texture is too large or no picture.
     """
 
     def whole(name: str) -> NDArray | None:

@@ -1,4 +1,4 @@
-"""The shapes of a bundle, and ``geometry.npz``, which holds them."""
+"""The meshes, modes and codes of a bundle, which are in ``geometry.npz``."""
 
 from __future__ import annotations
 
@@ -18,22 +18,22 @@ from shapespace.mesh.attributes import MeshAttributes
 from shapespace.mesh.prolongation import PREFIX, Prolongation, ProlongationError
 from shapespace.mesh.triangle_mesh import MeshError, TriangleMesh
 
-#: Largest distance of a vertex of the fine mesh from the prolonged reference, as a fraction of the diagonal: the
-#: rounding of float32.
+#: Largest distance of a vertex of the fine mesh from the prolonged reference, as a fraction of the diagonal. It allows
+#: for the rounding of float32.
 FINE_TOLERANCE = 1e-5
 
 
 class GeometryError(ValueError):
-    """Arrays that don't fit each other or the manifest, with a sentence that says why."""
+    """Arrays don't fit each other or the manifest."""
 
 
 @dataclass(frozen=True)
 class FineMesh:
-    """A finer mesh that follows the coarse one.
+    """A fine mesh that follows the coarse mesh.
 
     Attributes:
-        reference: at the coarse reference.
-        prolong: coarse vertices to fine ones.
+        reference: the fine mesh at the coarse reference.
+        prolong: maps coarse vertices to fine vertices.
     """
 
     reference: TriangleMesh
@@ -41,7 +41,7 @@ class FineMesh:
 
     @cached_property
     def nearby(self) -> FloatArray:
-        """How many vertices of the reference lie nearest to each coarse one, itself among them, (V,)."""
+        """Number of fine vertices whose nearest coarse vertex is each coarse vertex, at least 1, (V,)."""
         own = self.prolong.coarse_vertices
         nearest = cKDTree(self.reference.vertices[own]).query(self.reference.vertices)[1]
         return np.maximum(np.bincount(nearest, minlength=len(own)), 1).astype(float)
@@ -49,16 +49,16 @@ class FineMesh:
 
 @dataclass(frozen=True, kw_only=True)
 class Geometry:
-    """What ``geometry.npz`` holds.
+    """Content of ``geometry.npz``.
 
     Attributes:
         reference: the reference shape, normalised.
-        fine: the finer mesh, if there is one.
-        modes: (m, V, 3) vertex fields d_j at the reference, where codes are coefficients of tangent vectors.
-        training_codes: (n, m) codes of the shapes that the model was made from, if there are any.
-        surface: what the user's file had on the finest mesh beside triangles, if anything.
-        file_vertices: (N,) vertex of the finest mesh that each vertex of the user's files became, −1 for those in no
-            face; None where that is each by itself.
+        fine: the fine mesh, if there is one.
+        modes: (m, V, 3) vertex fields d_j at the reference, if codes are coefficients of tangent vectors.
+        training_codes: (n, m) codes of the training shapes, if there are any.
+        file_vertices: (N,) for each vertex of the user's files its vertex of the finest mesh, or −1 if it is in no
+            face; None if the vertices are the same.
+        surface: attributes of the finest mesh in the user's file, if any.
     """
 
     reference: TriangleMesh
@@ -69,7 +69,7 @@ class Geometry:
     surface: MeshAttributes | None = None
 
     def arrays(self) -> dict[str, NDArray]:
-        """The arrays of the file, by name, in the types of `ARRAYS`."""
+        """Return the arrays of the file by name, in the types of `ARRAYS`."""
         mesh = self.reference
         found = {
             "vertices": mesh.vertices,
@@ -90,15 +90,15 @@ class Geometry:
     def from_arrays(
         cls, arrays: Mapping[str, NDArray], manifest: Manifest, textures: Mapping[str, bytes] = MappingProxyType({})
     ) -> Geometry:
-        """Read `arrays` back, checked against each other and the manifest; arrays of other names are left alone.
+        """Return the geometry in arrays, after checks against each other and the manifest.
 
         Args:
-            arrays: of the file.
-            manifest: of the bundle.
-            textures: contents of the files that the manifest names so.
+            arrays: arrays of the file. Unknown names are ignored.
+            manifest: manifest of the bundle.
+            textures: contents of the textures by file name.
 
         Raises:
-            GeometryError: naming the file, the array and the fault.
+            GeometryError: the message names the file, the array and the fault.
         """
         file = manifest.geometry.file
         try:
@@ -116,7 +116,7 @@ class Geometry:
             raise GeometryError(f"{file} has (V, F, E) = {counts}, the manifest says {said}")
         if not np.array_equal(edges, reference.edges):
             raise GeometryError(f"{file}: edges are not those of the faces in lexicographic order")
-        fine = _fine(file, arrays, reference)
+        fine = _fine_mesh(file, arrays, reference)
         places = arrays.get("file_vertices")
         if places is not None:
             _check_file_vertices(file, places, fine.reference if fine else reference)
@@ -160,7 +160,7 @@ def _check_type(name: str, array: NDArray, wanted: ArrayType, sizes: Mapping[str
 
 
 def _check_file_vertices(file: str, places: NDArray, mesh: TriangleMesh) -> None:
-    """Refuse what isn't whole numbers (N,) that name every vertex of the finest mesh."""
+    """Raise GeometryError unless the array (N,) has whole numbers and every vertex of the finest mesh."""
     count = len(mesh.vertices)
     if places.ndim != 1 or not np.issubdtype(places.dtype, np.integer) or len(places) < count:
         raise GeometryError(
@@ -170,7 +170,7 @@ def _check_file_vertices(file: str, places: NDArray, mesh: TriangleMesh) -> None
         raise GeometryError(f"{file}: file_vertices must name each of the vertices 0 to {count - 1}, or -1")
 
 
-def _fine(file: str, arrays: Mapping[str, NDArray], reference: TriangleMesh) -> FineMesh | None:
+def _fine_mesh(file: str, arrays: Mapping[str, NDArray], reference: TriangleMesh) -> FineMesh | None:
     if not any(name.startswith(("fine_", PREFIX)) for name in arrays):
         return None
     try:

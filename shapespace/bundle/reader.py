@@ -1,13 +1,11 @@
-"""Reading one bundle: every byte checked against the manifest before anything is parsed."""
+"""Reader of bundles. It checks every byte against the manifest before it parses a file."""
 
 from __future__ import annotations
 
 import hashlib
-import io
 import os
 import re
 import stat
-import zipfile
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,21 +17,21 @@ from pydantic import ValidationError
 
 from shapespace.bundle.geometry import Geometry, GeometryError
 from shapespace.bundle.schema import MANIFEST, NAME_PATTERN, VERSION_PATTERN, FileEntry, Manifest
-from shapespace.files.npz_reading import PackedArray
+from shapespace.files.npz import npz_headers, read_npz
 
 #: Most bytes of a manifest.
 MANIFEST_LIMIT = 4 * 2**20
-#: Most bytes of a bundle's files together.
+#: Most bytes of all files of a bundle.
 LARGEST = 2**30
-#: Limit on the unpacked arrays of an NPZ file: so many times its own length, and so many bytes more. Compression makes
-#: meshes two to six times smaller; data that shrink much more are not a mesh.
+#: Largest size of the arrays of an NPZ file: this multiple of the size of the file, plus a constant in bytes.
+#: Compression makes meshes two to six times smaller; data that become much smaller are not a mesh.
 UNPACKED, BESIDE = 16, 2**20
-#: Most characters of a reason: libraries quote what they can't read, and names inside a file may be of any length.
+#: Most characters of a message. Libraries quote what they can't read, and names in a file can have any length.
 LONGEST_REASON = 300
 
 
 class BundleError(ValueError):
-    """A bundle that must not be served, with one line that says why."""
+    """A bundle can't be used; the message is one line."""
 
     def __init__(self, reason: str) -> None:
         super().__init__(reason if len(reason) <= LONGEST_REASON else f"{reason[:LONGEST_REASON]} …")
@@ -41,13 +39,13 @@ class BundleError(ValueError):
 
 @dataclass(frozen=True, kw_only=True)
 class Bundle(Geometry):
-    """A bundle whose files are what the manifest says, read into memory, with the shapes of its geometry.
+    """Content of a bundle, verified against its manifest.
 
     Attributes:
-        manifest: what it says about itself.
-        digest: SHA-256 of the manifest in hexadecimal. The manifest holds the digests of all files, so this
-            one identifies every byte of the bundle.
-        networks: bytes of each ONNX file by its name.
+        manifest: the manifest.
+        digest: SHA-256 of the manifest in hexadecimal. The manifest has the digests of all files, so this digest
+            identifies every byte of the bundle.
+        networks: content of each ONNX file by name.
     """
 
     manifest: Manifest
@@ -56,13 +54,13 @@ class Bundle(Geometry):
 
 
 def check_place(folder: Path) -> None:
-    """Refuse folders that aren't called NAME/VERSION; raises BundleError."""
+    """Raise BundleError unless a folder is called NAME/VERSION."""
     if not re.fullmatch(NAME_PATTERN, folder.parent.name) or not re.fullmatch(VERSION_PATTERN, folder.name):
         raise BundleError("a bundle lies in NAME/VERSION: a name in small letters, a version that is a whole number")
 
 
 def manifest_digest(folder: Path) -> str:
-    """The digest of the bundle that lies there at the moment; raises BundleError or OSError."""
+    """Return the digest of the bundle that is in a folder now; raises BundleError or OSError."""
     return hashlib.sha256(_manifest(folder)).hexdigest()
 
 
@@ -70,11 +68,11 @@ def read_bundle(folder: Path, digest: str | None = None) -> Bundle:
     """Read and verify ``models/NAME/VERSION``.
 
     Args:
-        folder: of the bundle.
-        digest: that it must have; by default any.
+        folder: folder of the bundle.
+        digest: digest that the bundle must have; by default any.
 
     Raises:
-        BundleError: anything that isn't exactly as the manifest and the contract say.
+        BundleError: the bundle differs from its manifest, or breaks the schema.
     """
     check_place(folder)
     name, version = folder.parent.name, folder.name
@@ -98,7 +96,7 @@ def read_bundle(folder: Path, digest: str | None = None) -> Bundle:
 
 
 def read_files(folder: Path, manifest: Manifest) -> dict[str, bytes]:
-    """The files of a bundle, which are what its manifest says; raises BundleError or OSError."""
+    """Return the files of a bundle, verified against its manifest; raises BundleError or OSError."""
     present = _regular_files(folder)
     for missing in sorted(manifest.files.keys() - present):
         raise BundleError(f"{missing} is missing")
@@ -128,13 +126,13 @@ def _regular_files(folder: Path) -> set[str]:
 
 
 def _read(path: Path, limit: int) -> bytes:
-    # The flags close the gap between looking at the folder and opening the file: no link, no waiting for a pipe.
+    # The file could have become a link or a pipe since the folder was listed. The flags refuse both.
     descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0))
     with os.fdopen(descriptor, "rb") as file:
         status = os.fstat(descriptor)
         if not stat.S_ISREG(status.st_mode) or status.st_size > limit:
             raise BundleError(f"{path.name} is longer than {limit} bytes")
-        return file.read(status.st_size + 1)  # not the limit: a manifest may promise a terabyte
+        return file.read(status.st_size + 1)  # not the limit, because a manifest can declare a terabyte
 
 
 def _verified(path: Path, entry: FileEntry) -> bytes:
@@ -149,29 +147,18 @@ def _verified(path: Path, entry: FileEntry) -> bytes:
 def _geometry(content: bytes, manifest: Manifest, textures: Mapping[str, bytes]) -> Geometry:
     file = manifest.geometry.file
     try:
-        arrays = _arrays(content)
-    except BundleError as error:
-        raise BundleError(f"{file}: {error}") from None
-    except Exception as error:  # zip and array headers fail in many ways
+        total, most = sum(header.nbytes for header in npz_headers(content).values()), UNPACKED * len(content) + BESIDE
+        if total > most:
+            raise BundleError(f"{file}: its arrays would come to {total} bytes, where {most} are the most")
+        arrays = read_npz(content)
+    except BundleError:
+        raise
+    except Exception as error:  # damaged files raise exceptions of many classes
         raise BundleError(f"{file} is not a readable NPZ file: {error}") from None
     try:
         return Geometry.from_arrays(arrays, manifest, textures)
     except GeometryError as error:
         raise BundleError(str(error)) from None
-
-
-def _arrays(content: bytes) -> dict[str, NDArray]:
-    """The arrays of an NPZ file; memory is taken only after the sizes in its directory have been checked."""
-    with zipfile.ZipFile(io.BytesIO(content)) as archive:
-        entries = archive.infolist()
-        most = UNPACKED * len(content) + BESIDE
-        if (total := sum(entry.file_size for entry in entries)) > most:
-            raise BundleError(f"its arrays would come to {total} bytes, where {most} are the most")
-        arrays = {}
-        for entry in entries:
-            with archive.open(entry) as member:
-                arrays[entry.filename.removesuffix(".npy")] = PackedArray(member, entry).read(most)
-        return arrays
 
 
 def _check_network(file: str, content: bytes) -> None:
@@ -186,7 +173,7 @@ def _check_network(file: str, content: bytes) -> None:
             raise BundleError(f"{file}: {name} keeps its data in another file")
         try:
             values = onnx.numpy_helper.to_array(tensor)
-        except Exception as error:  # of an unknown type, or too little for its shape
+        except Exception as error:  # an unknown type, or too few data
             raise BundleError(f"{file}: {name} can't be read: {error}") from None
         if not _is_finite(values):
             raise BundleError(f"{file}: {name} has a weight that is not finite")

@@ -1,6 +1,6 @@
-"""What a bundle ``models/NAME/VERSION/`` is made of: its files, its manifest, and the arrays of its geometry.
+"""Schema of a bundle ``models/NAME/VERSION/``: its files, its manifest, and the arrays of its geometry.
 
-The writer and the reader both go by this module, and nothing else spells these names.
+The reader and the writer use this module. No other module spells these names.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ class _Strict(BaseModel):
 
 
 class Network(_Strict):
-    """An ONNX file with the names of its one input and its one output."""
+    """An ONNX file with one input and one output, and their names."""
 
     file: FileName
     input: str
@@ -45,11 +45,11 @@ class _Range(_Strict):
 
 
 class FactorEntry(Network, _Range):
-    """The network ψ_j of one factor, fed with latents from ``start`` to just before ``stop``."""
+    """The network ψ_j of one factor. Its input are the latents from ``start`` to ``stop`` − 1."""
 
 
 class GeometryFile(_Strict):
-    """The NPZ file that holds the arrays of `ARRAYS`."""
+    """The NPZ file with the arrays of `ARRAYS`."""
 
     file: FileName
 
@@ -71,36 +71,36 @@ class MaterialEntry(_Strict):
 
 
 class AttributesEntry(_Strict):
-    """Names of parts and materials of the finest mesh, whose arrays begin with `SURFACE`; see mesh.attributes."""
+    """Names of parts and materials of the finest mesh; see mesh.attributes. Its arrays have the prefix `SURFACE`."""
 
     objects: Labels
     groups: Labels
     materials: list[MaterialEntry] = Field(max_length=10_000)
-    #: Whether the file had normals.
+    #: Whether the user's file had normals.
     normals: bool
 
     @property
     def textures(self) -> list[str]:
-        """Files of textures, each once."""
+        """Names of the texture files, sorted and unique."""
         return sorted({material.texture for material in self.materials if material.texture is not None})
 
 
 class Tolerance(_Strict):
-    """The largest allowed difference between ONNX and PyTorch, and the measured one: relative, in the weighted norm."""
+    """Allowed and measured difference between ONNX and PyTorch: relative, in the weighted norm."""
 
     required: PositiveFloat
     measured: NonNegativeFloat
 
 
 class DraftError(_Strict):
-    """How far drafts are from solved shapes, over vertices and codes inside the bounds, as shares of the diagonal."""
+    """Vertex distances between drafts and solved shapes for codes inside the bounds, as fractions of the diagonal."""
 
     mean: NonNegativeFloat
     p95: NonNegativeFloat
 
 
 class Origin(_Strict):
-    """Where a bundle comes from."""
+    """Configuration, data and code that a bundle was made from."""
 
     config: Any
     data_digest: str
@@ -108,14 +108,14 @@ class Origin(_Strict):
 
 
 class FileEntry(_Strict):
-    """What a file's content must be."""
+    """Digest and size of a file."""
 
     sha256: str = Field(pattern=r"^[0-9a-f]{64}$")
     bytes: int = Field(ge=0)
 
 
 class Manifest(_Strict):
-    """What a bundle says about itself. Lengths are normalised: one unit is ``scale`` units of the user."""
+    """Manifest of a bundle. Lengths are normalised: one unit is ``scale`` units of the user."""
 
     schema_version: Literal[1]  # SCHEMA_VERSION; a type can't name it
     name: str = Field(pattern=NAME_PATTERN)
@@ -136,7 +136,7 @@ class Manifest(_Strict):
     lambda_: NonNegativeFloat = Field(alias="lambda")
     eta: PositiveFloat
     eta_reconstruction: PositiveFloat
-    #: K, the number of time steps of the exponentials that codes stand for, where the bundle has modes.
+    #: K, the number of time steps of the exponentials, if the bundle has modes.
     exponential_steps: PositiveInt | None = None
     scale: PositiveFloat
     combiner: Network
@@ -169,11 +169,11 @@ class Manifest(_Strict):
 
 
 class ArrayType(NamedTuple):
-    """How ``geometry.npz`` holds an array.
+    """Shape and type of an array in ``geometry.npz``.
 
     Attributes:
-        shape: a letter is a number: m, V, F and E those of the manifest, another one any number above 0.
-        dtype: as it is written; any other of the same kind, real or whole numbers, can be read.
+        shape: sizes. The letters m, V, F and E are sizes from the manifest; other letters stand for any size above 0.
+        dtype: type in which the array is written. The reader accepts every real or every whole type, respectively.
     """
 
     shape: tuple[int | str, ...]
@@ -181,29 +181,29 @@ class ArrayType(NamedTuple):
 
 
 SURFACE = "surface_"
-#: The arrays of ``geometry.npz``. The first three are always there; ``fine_*`` and ``prolongation_*`` all or none.
+#: The arrays of ``geometry.npz``. The first three are required. ``fine_*`` and ``prolongation_*`` come together.
 ARRAYS = {
     # The reference, normalised, and its edges in lexicographic order.
     "vertices": ArrayType(("V", 3), np.float64),
     "faces": ArrayType(("F", 3), np.int32),
     "edges": ArrayType(("E", 2), np.int32),
-    # Vertex fields d_j at the reference, where codes are coefficients of tangent vectors.
+    # Vertex fields d_j at the reference, if codes are coefficients of tangent vectors.
     "modes": ArrayType(("m", "V", 3), np.float32),
-    # Codes of the shapes that the model was made from.
+    # Codes of the training shapes.
     "training_codes": ArrayType(("n", "m"), np.float64),
-    # For each vertex of the user's files the vertex of the finest mesh that it became, or -1.
+    # For each vertex of the user's files its vertex of the finest mesh, or -1.
     "file_vertices": ArrayType(("N",), np.int32),
-    # A finer mesh at the reference, and what takes vertices of the coarse one to it: see mesh.prolongation.
+    # A fine mesh at the reference, and the map from coarse to fine vertices: see mesh.prolongation.
     "fine_vertices": ArrayType(("W", 3), np.float64),
     "fine_faces": ArrayType(("G", 3), np.int32),
     "prolongation_faces": ArrayType(("F", 3), np.int32),
     "prolongation_indptr": ArrayType(("W + 1",), np.int32),
     "prolongation_indices": ArrayType(("weights",), np.int32),
     "prolongation_weights": ArrayType(("weights",), np.float64),
-    # Where parts move rigidly: of each fine vertex the number of its part or -1, and places at rest of those with one.
+    # If parts move rigidly: for each fine vertex the index of its part or -1, and rest positions of these vertices.
     "prolongation_rigid": ArrayType(("W",), np.int32),
     "prolongation_rest": ArrayType(("R", 3), np.float64),
-    # What the user's file had on the finest mesh beside triangles: P polygons with C corners. See mesh.attributes.
+    # Attributes of the finest mesh in the user's file, with P polygons and C corners: see mesh.attributes.
     "surface_starts": ArrayType(("P + 1",), np.int32),
     "surface_corners": ArrayType(("C",), np.int32),
     "surface_uv": ArrayType(("U", 2), np.float32),
@@ -214,12 +214,12 @@ ARRAYS = {
     "surface_group_of": ArrayType(("P",), np.int32),
     "surface_material_of": ArrayType(("P",), np.int32),
 }
-#: The files of a bundle as they are written. They are read under the names that the manifest gives them.
+#: Names with which files are written. The reader uses the names in the manifest.
 COMBINER = Network(file="combiner.onnx", input="factors", output="nric")
 START = Network(file="start.onnx", input="latent", output="vertices")
 GEOMETRY = GeometryFile(file="geometry.npz")
 
 
 def factor_network(j: int) -> Network:
-    """The file of ψ_j as it is written."""
+    """Return name, input and output with which ψ_j is written."""
     return Network(file=f"factor-{j}.onnx", input="latent", output="nric")

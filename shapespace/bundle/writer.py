@@ -1,19 +1,15 @@
-"""Writing a bundle: whole or not at all."""
+"""Writer of bundles. It writes a whole bundle or nothing."""
 
 from __future__ import annotations
 
 import hashlib
-import io
 import json
-import os
-import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from shapespace.arrays import FloatArray
 from shapespace.bundle.attributes import surface_entry
@@ -30,17 +26,19 @@ from shapespace.bundle.schema import (
     Tolerance,
     factor_network,
 )
+from shapespace.files.atomic import replaced_folder, synced_file
+from shapespace.files.npz import npz_bytes
 from shapespace.shell.energy import Material
 
 
 @dataclass(frozen=True, kw_only=True)
 class Networks:
-    """The ONNX files of a bundle; the batch, n, is dynamic in all of them.
+    """Contents of the ONNX files of a bundle. Their batch size n is dynamic.
 
     Attributes:
-        factors: for each factor ψ_j, its latents to lengths and angles (n, 2E).
-        combiner: shapes of all factors (n, J, 2E) to lengths and angles (n, 2E).
-        start: latents (n, m) to vertices (n, V, 3), where Gauss–Newton starts; optional.
+        factors: network ψ_j of each factor: latents of the factor to lengths and angles (n, 2E).
+        combiner: lengths and angles of all factors (n, J, 2E) to lengths and angles (n, 2E).
+        start: latents (n, m) to start vertices (n, V, 3) of Gauss–Newton; optional.
     """
 
     factors: Sequence[bytes]
@@ -50,22 +48,22 @@ class Networks:
 
 @dataclass(frozen=True, kw_only=True)
 class Facts:
-    """What a manifest says that does not follow from the bundle's files; see schema.Manifest.
+    """Members of a manifest that do not follow from the files of the bundle; see `schema.Manifest`.
 
     Attributes:
-        name, version: also the folders of the bundle.
-        latent_names: (m,).
-        factors: indices of each factor's latents, by name; consecutive.
+        name, version: names of the bundle's folders.
+        latent_names: (m,) names of the latents.
+        factors: consecutive indices of the latents of each factor, by name.
         lower, upper: (m,) bounds of the latents.
-        period: (m,), NaN for latents without one.
+        period: (m,) periods, NaN for latents without a period.
         material: μ, λ, η of the shell.
         eta_reconstruction: η of Gauss–Newton.
-        draft_error: ``mean`` and ``p95`` of drafts, where that was measured.
-        exponential_steps: K of the exponentials that a code stands for, where the bundle has modes.
+        draft_error: ``mean`` and ``p95`` of the error of drafts, if it was measured.
+        exponential_steps: number K of steps of the exponentials, if the bundle has modes.
         scale: length of one unit of the reference in the user's units.
-        tolerance: of ONNX against PyTorch.
-        figures: of the evaluation, as JSON.
-        origin: where the bundle comes from.
+        tolerance: difference between ONNX and PyTorch.
+        figures: results of the evaluation, as JSON.
+        origin: configuration, data and code that the bundle was made from.
     """
 
     name: str
@@ -89,16 +87,16 @@ class Facts:
 
 
 def write_bundle(models: Path, facts: Facts, networks: Networks, geometry: Geometry) -> Path:
-    """Write ``models/NAME/VERSION/``, replacing what is there, and return it.
+    """Write or replace the bundle ``models/NAME/VERSION/``, and return its folder.
 
     Equal contents give equal bytes.
 
     Raises:
-        pydantic.ValidationError: the facts contradict each other or the files; nothing is written.
+        pydantic.ValidationError: the facts contradict each other or the files. Nothing is written.
         OSError: the folder can't be written.
     """
     files = {factor_network(j).file: content for j, content in enumerate(networks.factors)}
-    files |= {COMBINER.file: networks.combiner, GEOMETRY.file: _npz(geometry.arrays())}
+    files |= {COMBINER.file: networks.combiner, GEOMETRY.file: npz_bytes(geometry.arrays(), compressed=False)}
     if networks.start is not None:
         files[START.file] = networks.start
     if geometry.surface:
@@ -107,32 +105,16 @@ def write_bundle(models: Path, facts: Facts, networks: Networks, geometry: Geome
     text = json.dumps(manifest.model_dump(by_alias=True), indent=2, ensure_ascii=False) + "\n"
 
     folder = models / facts.name / facts.version
-    part, old = (folder.with_name(f".{folder.name}.{end}") for end in ("part", "old"))  # hidden from a watching server
-    shutil.rmtree(part, ignore_errors=True)
-    part.mkdir(parents=True)
-    for name, content in (files | {MANIFEST: text.encode()}).items():
-        with (part / name).open("wb") as file:
-            file.write(content)
-            # Renamed before it is on the disk, it could be empty after a power cut.
-            file.flush()
-            os.fsync(file.fileno())
-    shutil.rmtree(old, ignore_errors=True)
-    if folder.exists():
-        os.replace(folder, old)
-    os.replace(part, folder)
-    shutil.rmtree(old, ignore_errors=True)
+    with replaced_folder(folder) as part:
+        for name, content in (files | {MANIFEST: text.encode()}).items():
+            with synced_file(part / name) as file:
+                file.write(content)
     return folder
 
 
 def entry(content: bytes) -> FileEntry:
-    """What a manifest says of a file."""
+    """Return the entry of a file in a manifest."""
     return FileEntry(sha256=hashlib.sha256(content).hexdigest(), bytes=len(content))
-
-
-def _npz(arrays: Mapping[str, NDArray]) -> bytes:
-    file = io.BytesIO()
-    np.savez(file, **arrays)  # type: ignore[arg-type]
-    return file.getvalue()
 
 
 def _manifest(facts: Facts, geometry: Geometry, files: Mapping[str, bytes]) -> Manifest:

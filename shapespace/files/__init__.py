@@ -1,1 +1,1 @@
-"""Mesh and animation files, read and written; the only room that knows trimesh and pxr."""
+"""Reading and writing of mesh and animation files. Only this package imports trimesh and pxr."""

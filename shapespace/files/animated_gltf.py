@@ -1,4 +1,4 @@
-"""A sequence of shapes as one animated GLB: morph targets, and the curves of their weights."""
+"""Animations as GLB: morph targets, and curves of their weights."""
 
 from __future__ import annotations
 
@@ -14,15 +14,17 @@ from shapespace.files.gltf_writing import GltfBuilder
 from shapespace.mesh.attributes import MeshAttributes
 from shapespace.mesh.triangle_mesh import diagonal
 
-#: Up to this many frames each frame is a morph target of its own. Longer animations have a basis of at most this many
-#: targets: every target has a weight in every frame, and viewers keep targets in a texture of at most 256 layers.
+#: Up to this number of frames, each frame is a morph target. Longer animations have a basis of at most this number of
+#: targets, because every target has a weight in every frame, and viewers keep targets in a texture of 256 layers.
 DENSE_FRAMES = 64
-#: Enough targets are kept for every vertex to be within this distance, a fraction of the bounding box's diagonal.
+#: Largest distance of a vertex from its position, as a fraction of the bounding box's diagonal, that the basis aims at.
 BASIS_TOLERANCE = 1e-4
-#: The default.
+#: Default frame rate.
 FRAMES_PER_SECOND = 30.0
-#: Bytes of displacements, and frames of normals, that are held in memory at once.
-BLOCK, _FRAMES_AT_ONCE = 2**21, 16
+#: Bytes of displacements that are in memory at once.
+BLOCK = 2**21
+#: Frames whose normals are in memory at once.
+_FRAMES_AT_ONCE = 16
 
 
 @dataclass(frozen=True)
@@ -30,10 +32,9 @@ class AnimatedGLB:
     """An encoded animation.
 
     Attributes:
-        data: the GLB.
+        data: content of the GLB file.
         targets: number of morph targets.
-        max_vertex_error: largest distance of a vertex at a key from where it should be, in the unit of the
-            vertices.
+        max_vertex_error: largest distance of a vertex from its position in a key frame, in the unit of the vertices.
     """
 
     data: bytes
@@ -48,14 +49,21 @@ def animated_glb(
     fps: float = FRAMES_PER_SECOND,
     colourings: Sequence[Colouring] = (),
 ) -> AnimatedGLB:
-    """Encode shapes (n, V, 3), with their surface where there is one, and with a colouring of each or of none.
+    """Encode shapes (n, V, 3) as an animation whose key k, at ``k / fps`` seconds, shows frame k.
 
-    Key k, at ``k / fps`` seconds, shows frame k.
-    The mesh at rest is frame 0. Up to DENSE_FRAMES each later frame is a target of its own, so that keys are
-    exact to float32; longer sequences are spanned by the leading singular vectors of the displacements from
-    frame 0. Weights lie between 0 and 1. The error is measured on what is written and stored in ``asset.extras`` too.
+    Frame 0 is the mesh at rest. Up to DENSE_FRAMES frames, each later frame is a target, so that keys are exact to
+    float32. Longer sequences use the leading singular vectors of the displacements from frame 0 as targets. Weights are
+    between 0 and 1. The vertex error is measured on the written values, and is in ``asset.extras`` too.
 
-    Positions are float32. Displacements are never held in full: there may be hundreds of megabytes of them.
+    Positions are float32. Displacements are computed block by block, because together they can take hundreds of
+    megabytes.
+
+    Args:
+        frames: (n, V, 3) positions.
+        faces: (F, 3).
+        surface: polygons, texture coordinates and materials of the mesh, if any.
+        fps: frames per second.
+        colourings: colours for each frame, or empty.
     """
     frames = frames.astype(np.float32, copy=False)
     rest = frames[0].astype(np.float64)
@@ -66,7 +74,7 @@ def animated_glb(
     else:
         weights = _basis_weights(frames, BASIS_TOLERANCE * _diagonal(frames))
         fit = np.asarray(np.linalg.pinv(weights), np.float64)
-        # Blender (at least up to 5.0) cuts off weights below 0: a vector with both signs becomes two targets.
+        # Blender, at least up to 5.0, clips weights below 0. So a vector with both signs becomes two targets.
         both = (weights < 0).any(axis=0)
         weights = np.hstack([weights.clip(0), -weights[:, both].clip(max=0)])
         fit = np.concatenate([fit, -fit[both]])
@@ -107,7 +115,7 @@ def animated_glb(
 
 
 def _blocks(frames: NDArray[np.floating]) -> Iterator[slice]:
-    """Ranges of vertices whose positions in all frames fit into BLOCK bytes as float64."""
+    """Yield ranges of vertices whose positions in all frames take at most BLOCK bytes as float64."""
     size = max(1, BLOCK // (24 * len(frames)))
     return (slice(start, start + size) for start in range(0, frames.shape[1], size))
 
@@ -115,7 +123,7 @@ def _blocks(frames: NDArray[np.floating]) -> Iterator[slice]:
 def _normal_targets(
     frames: NDArray[np.floating], normals_of: Callable[[FloatArray], FloatArray], fit: FloatArray
 ) -> NDArray[np.float32]:
-    """(K, V', 3): what each target adds to the normals, given how targets come from frames (K, n − 1)."""
+    """Return the change of normals (K, V', 3) by each target; ``fit`` (K, n − 1) maps frames to targets."""
     rest = normals_of(frames[0].astype(np.float64))
     targets = np.zeros((len(fit), *rest.shape), np.float32)
     for start in range(1, len(frames), _FRAMES_AT_ONCE):
@@ -128,16 +136,16 @@ def _normal_targets(
 
 
 def _colour_targets(colourings: Sequence[Colouring], fit: FloatArray) -> Iterator[NDArray[np.float32]]:
-    """What each target (V, 3) adds to the colours, given how targets come from frames (K, n − 1)."""
+    """Yield the change of colours (V, 3) by each target; ``fit`` (K, n − 1) maps frames to targets."""
     rest = colourings[0].linear
     changes = np.stack([(each.linear - rest).astype(np.float32) for each in colourings[1:]])
     return (np.tensordot(row, changes, 1).astype(np.float32) for row in fit)
 
 
 def _basis_weights(frames: NDArray[np.floating], tolerance: float) -> FloatArray:
-    """Weights (n − 1, K) of the fewest leading singular vectors that bring every vertex within ``tolerance``.
+    """Return weights (n − 1, K) of the fewest leading singular vectors for which the vertex error is ≤ ``tolerance``.
 
-    From the eigenvectors of the Gram matrix of the displacements from frame 0: n is far below 3V. K is at most
+    They are eigenvectors of the Gram matrix of the displacements from frame 0, because n is far below 3V. K is at most
     DENSE_FRAMES.
     """
 
@@ -149,9 +157,9 @@ def _basis_weights(frames: NDArray[np.floating], tolerance: float) -> FloatArray
     for flat in map(displacements, _blocks(frames)):
         gram += flat @ flat.T
     values, vectors = np.linalg.eigh(gram)
-    # Rank beyond rounding only: the rest is noise that a pseudo-inverse would blow up.
+    # Vectors below rounding are noise, which a pseudo-inverse would amplify.
     vectors = vectors[:, ::-1][:, values[::-1] > 1e-12 * max(values[-1], 0)][:, :DENSE_FRAMES]
-    left = np.zeros(vectors.shape[1] + 1)  # the largest distance with so many of them
+    left = np.zeros(vectors.shape[1] + 1)  # largest vertex error for each number of vectors
     for flat in map(displacements, _blocks(frames)):
         for kept in range(len(left)):
             if kept:
@@ -159,7 +167,7 @@ def _basis_weights(frames: NDArray[np.floating], tolerance: float) -> FloatArray
                 flat -= np.outer(vector, vector @ flat)
             left[kept] = max(left[kept], np.linalg.norm(flat.reshape(len(flat), -1, 3), axis=-1).max())
     kept = int(np.argmax(left <= tolerance)) if (left <= tolerance).any() else len(left) - 1
-    # Largest weight 1, and positive: eigenvectors have no sign of their own.
+    # The sign of an eigenvector is arbitrary: make the largest weight of each 1.
     weights: FloatArray = vectors[:, :kept]
     return weights / weights[np.abs(weights).argmax(axis=0), np.arange(kept)]
 

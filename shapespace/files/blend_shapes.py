@@ -1,4 +1,4 @@
-"""Shapes beside one at rest, as the morph targets of a GLB: a set of sliders for programs that know no networks."""
+"""Blend shapes: a rest shape and further shapes as morph targets of a GLB, for programs that run no networks."""
 
 from __future__ import annotations
 
@@ -18,15 +18,16 @@ def blend_shapes_glb(
     surface: MeshAttributes | None = None,
     extras: Mapping[str, Any] | None = None,
 ) -> bytes:
-    """Encode a shape and others that weights of 1 lead to.
+    """Encode a rest shape, and shapes that a weight of 1 of their morph target leads to.
 
     Args:
-        rest: (V, 3), in any unit.
-        ends: (n, V, 3).
-        names: of these, which go into the mesh's ``extras.targetNames``, where Blender, three.js and others look.
+        rest: (V, 3) rest shape, in any unit.
+        ends: (n, V, 3) shapes of the morph targets.
+        names: names of the morph targets. They go into ``extras.targetNames`` of the mesh, where Blender and three.js
+            look for them.
         faces: (F, 3).
-        surface: of the mesh, where its file had more than triangles.
-        extras: of the ``asset``.
+        surface: polygons, texture coordinates and materials of the mesh, if any.
+        extras: ``extras`` of the file's ``asset``.
     """
     document = GltfBuilder(rest, faces, "shape", surface=surface, joined=True)
     normals = document.normals(rest)

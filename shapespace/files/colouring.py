@@ -1,4 +1,4 @@
-"""What a shape does to another's lengths and angles, vertex by vertex, and as colours."""
+"""Differences of two shapes in lengths and angles at each vertex, and colours for them."""
 
 from __future__ import annotations
 
@@ -21,20 +21,21 @@ _COOLWARM = (
     "aec9fc b9d0f9 c3d5f4 ccd9ed d5dbe5 dddcdc e5d8d1 ecd3c5 f1ccb8 f5c4ac f7ba9f "
     "f7b093 f6a586 f4987a f08b6e eb7d62 e46e56 dd5f4b d44e41 ca3b37 be242e b40426"
 )
-#: The legend ends at this quantile of the sizes, so that one stray vertex doesn't take the colour from all others.
+#: The legend ends at this quantile of the absolute values. With the maximum, one outlier would make all others grey.
 _QUANTILE = 0.98
-#: Smallest end of the legend, in percent or degrees: rounding errors of unchanged vertices stay grey.
+#: Smallest end of the legend, so that rounding errors of unchanged vertices stay grey.
 _SMALLEST = 0.01
-#: The same for a standard deviation, in any unit.
+#: Smallest end of the legend of a standard deviation, in any unit.
 _SMALLEST_SPREAD = 1e-9
 
 
 class Quantity(StrEnum):
-    """What is coloured; of the first two a mean over the edges at a vertex, weighted by their lengths.
+    """Quantity that colours show.
 
-    ``stretch`` is the logarithm of an edge's length by its length in the other shape, ``bending`` the change of its
-    dihedral angle in radians, positive where it got more convex. ``spread`` is the standard deviation of where the
-    vertex is, in the units of the training meshes.
+    ``stretch`` is log(l / l₀), where l is the length of an edge and l₀ its length in the other shape. ``bending`` is
+    the change of its dihedral angle in radians, positive if the edge became more convex. Both are means over the edges
+    at a vertex, weighted by their lengths. ``spread`` is the standard deviation of the position of a vertex, in the
+    units of the training meshes.
     """
 
     STRETCH = "stretch"
@@ -47,10 +48,10 @@ class Colouring:
     """A quantity at the vertices of a mesh.
 
     Attributes:
-        quantity: which.
-        values: (V,), positive or negative; a spread is never negative.
-        limit: the legend goes from −limit, of a spread from 0, to limit, which is 1, 2 or 5 times a power of ten, so
-            that it stays the same from one frame to the next; values beyond have the colours of its ends.
+        quantity: the quantity.
+        values: (V,) values, positive or negative; a spread is never negative.
+        limit: end of the legend, 1, 2 or 5 times a power of ten, so that it rarely changes between frames. The legend
+            starts at −limit, for a spread at 0. Values beyond an end have its colour.
     """
 
     quantity: Quantity
@@ -61,10 +62,10 @@ class Colouring:
     def between(
         cls, quantity: Quantity, vertices: FloatArray, against: FloatArray, connectivity: Connectivity
     ) -> Colouring:
-        """How a shape (V, 3) differs in stretch or bending from another one (V, 3) of the same connectivity."""
+        """Compare a shape (V, 3) in stretch or bending with another shape (V, 3) of the same connectivity."""
         lengths = edge_lengths(against, connectivity)
         weights = lengths
-        # Faces that collapse have edges without length: no warning, and no infinite colour.
+        # Edges of collapsed faces can have no length. They cause neither warnings nor infinite colours.
         with np.errstate(divide="ignore", invalid="ignore"):
             if quantity is Quantity.STRETCH:
                 change = np.log(edge_lengths(vertices, connectivity) / lengths)
@@ -87,14 +88,14 @@ class Colouring:
         against: FloatArray,
         connectivity: Connectivity,
     ) -> list[Colouring]:
-        """Each of shapes (n, V, 3) as `between` has it, with the largest of their legends for all."""
+        """Compare each of the shapes (n, V, 3) as `between` does; all have the largest of their legends."""
         found = [cls.between(quantity, frame.astype(np.float64), against, connectivity) for frame in frames]
         limit = max(each.limit for each in found)
         return [replace(each, limit=limit) for each in found]
 
     @classmethod
     def of_spread(cls, values: FloatArray) -> Colouring:
-        """Standard deviations (V,), from blue to red."""
+        """Colour standard deviations (V,) from blue to red."""
         limit = _round_up(float(np.quantile(values, _QUANTILE)), _SMALLEST_SPREAD)
         return cls(Quantity.SPREAD, values, limit)
 
@@ -105,7 +106,7 @@ class Colouring:
 
     @property
     def srgb(self) -> FloatArray:
-        """(V, 3) colours between 0 and 1 as screens take them."""
+        """(V, 3) colours in sRGB, between 0 and 1."""
         table = np.array([list(bytes.fromhex(colour)) for colour in _COOLWARM.split()]) / 255
         low, high = self.ends
         place = (self.values - low) / (high - low)
@@ -113,17 +114,17 @@ class Colouring:
 
     @property
     def linear(self) -> FloatArray:
-        """(V, 3) the same colours as linear light, which glTF wants."""
+        """(V, 3) colours as linear light, as glTF requires."""
         return linear(self.srgb)
 
     @property
     def srgb_bytes(self) -> NDArray[np.uint8]:
-        """(V, 3) the colours as bytes."""
+        """(V, 3) colours in sRGB as bytes."""
         return np.rint(255 * self.srgb).astype(np.uint8)
 
     @property
     def legend(self) -> dict[str, object]:
-        """What one needs to read the colours."""
+        """Quantity, range and colour map, for a legend."""
         return {"quantity": str(self.quantity), "range": [*self.ends], "map": "coolwarm"}
 
 

@@ -1,31 +1,26 @@
-"""Mesh files: writing every format the project offers, and reading them back with the vertices in order."""
+"""Every format that mesh files are written in."""
 
 from __future__ import annotations
 
-import io
 from dataclasses import dataclass
-from pathlib import Path
-from typing import TYPE_CHECKING, Protocol
+from functools import partial
+from typing import Protocol
 
 import numpy as np
 
 from shapespace.arrays import FloatArray, IntArray
-from shapespace.files.gltf_reading import read_gltf
-from shapespace.files.limits import UNLIMITED, Limits, clipped
-from shapespace.files.npz_reading import load_npz
-from shapespace.files.polygon_reading import read_obj, read_off, read_ply, read_stl, read_xyz
+from shapespace.files.attributes.obj import write_obj, write_obj_zip
+from shapespace.files.attributes.ply import write_ply
+from shapespace.files.colouring import Colouring
+from shapespace.files.gltf_writing import write_glb, write_gltf
+from shapespace.files.npz import npz_bytes
+from shapespace.files.reading import OCTET_STREAM, READ_FORMATS
+from shapespace.files.usd import still_usd
 from shapespace.mesh.attributes import MeshAttributes
-from shapespace.mesh.triangle_mesh import MeshError
-
-if TYPE_CHECKING:
-    from shapespace.files.colouring import Colouring
-
-#: Media type of formats that have none registered at IANA.
-OCTET_STREAM = "application/octet-stream"
 
 
-class Encode(Protocol):
-    """Writes a file."""
+class MeshWriter(Protocol):
+    """A function that writes one mesh."""
 
     def __call__(
         self,
@@ -35,72 +30,34 @@ class Encode(Protocol):
         surface: MeshAttributes | None = None,
         /,
     ) -> bytes:
-        """Encode vertices (V, 3) in any unit and faces (F, 3), with what the surface has; positions are float32."""
+        """Return a mesh as the content of a file; positions are float32.
+
+        Args:
+            vertices: (V, 3) positions in any unit.
+            faces: (F, 3).
+            colouring: colours of the vertices, if any.
+            surface: polygons, texture coordinates and materials, if any.
+        """
 
 
 @dataclass(frozen=True)
 class MeshFormat:
-    """A file format.
+    """A file format for one mesh.
 
     Attributes:
-        media_type: as IANA has it; OCTET_STREAM without a registration.
-        encode: a mesh, with the colours of its vertices or without, to the file's bytes.
-        coloured: whether files can carry colours; where not, ``encode`` leaves them out.
-        polygons: whether faces are those of the surface, where there is one; otherwise they are triangles.
+        media_type: media type as registered at IANA; OCTET_STREAM for formats without a registration.
+        encode: writer of the format.
+        coloured: whether files can have colours; otherwise ``encode`` leaves them out.
+        polygons: whether files can have polygons; otherwise faces are written as triangles.
     """
 
     media_type: str
-    encode: Encode
+    encode: MeshWriter
     coloured: bool = True
     polygons: bool = False
 
 
-def _glb(
-    vertices: FloatArray, faces: IntArray, colouring: Colouring | None = None, surface: MeshAttributes | None = None
-) -> bytes:
-    from shapespace.files.gltf_writing import GltfBuilder
-
-    return GltfBuilder(vertices, faces, colouring=colouring, surface=surface).glb()
-
-
-def _gltf(
-    vertices: FloatArray, faces: IntArray, colouring: Colouring | None = None, surface: MeshAttributes | None = None
-) -> bytes:
-    from shapespace.files.gltf_writing import GltfBuilder
-
-    return GltfBuilder(vertices, faces, colouring=colouring, surface=surface).gltf()
-
-
-def _obj(
-    vertices: FloatArray, faces: IntArray, colouring: Colouring | None = None, surface: MeshAttributes | None = None
-) -> bytes:
-    from shapespace.files.attributes.obj import write_obj
-
-    return write_obj(vertices, surface or MeshAttributes.of_triangles(faces), colouring).encode()
-
-
-def _obj_zip(
-    vertices: FloatArray, faces: IntArray, colouring: Colouring | None = None, surface: MeshAttributes | None = None
-) -> bytes:
-    from shapespace.files.archives import zip_pieces
-    from shapespace.files.attributes.obj import obj_files, write_obj
-
-    shown = surface or MeshAttributes.of_triangles(faces)
-    files = obj_files(shown, "shape")
-    text = write_obj(vertices, shown, colouring, "shape.mtl" if files else None)
-    members = {"shape.obj": text.encode(), **files}
-    return b"".join(zip_pieces((name, [content]) for name, content in members.items()))
-
-
-def _ply(
-    vertices: FloatArray, faces: IntArray, colouring: Colouring | None = None, surface: MeshAttributes | None = None
-) -> bytes:
-    from shapespace.files.attributes.ply import write_ply
-
-    return write_ply(vertices, surface or MeshAttributes.of_triangles(faces), colouring)
-
-
-def _stl(
+def _write_stl(
     vertices: FloatArray, faces: IntArray, colouring: Colouring | None = None, surface: MeshAttributes | None = None
 ) -> bytes:
     import trimesh
@@ -109,116 +66,32 @@ def _stl(
     return content if isinstance(content, bytes) else str(content).encode()
 
 
-def _npz(
+def _write_npz(
     vertices: FloatArray, faces: IntArray, colouring: Colouring | None = None, surface: MeshAttributes | None = None
 ) -> bytes:
-    colours = {}
+    arrays: dict[str, np.ndarray] = {"vertices": vertices.astype(np.float32), "faces": faces.astype(np.int32)}
     if colouring:
-        colours = {
+        arrays |= {
             "color_quantity": np.array(str(colouring.quantity)),
             "color_range": np.array(colouring.ends),
             "color_values": colouring.values.astype(np.float32),
         }
-    return npz(vertices=vertices.astype(np.float32), faces=faces.astype(np.int32), **colours)
-
-
-def _usd(
-    vertices: FloatArray, faces: IntArray, colouring: Colouring | None = None, surface: MeshAttributes | None = None
-) -> bytes:
-    from shapespace.files.usd import still_usd
-
-    return still_usd(vertices, faces, colouring, surface)
-
-
-def _usdz(
-    vertices: FloatArray, faces: IntArray, colouring: Colouring | None = None, surface: MeshAttributes | None = None
-) -> bytes:
-    from shapespace.files.usd import still_usd
-
-    return still_usd(vertices, faces, colouring, surface, packed=True)
+    return npz_bytes(arrays)
 
 
 #: Every mesh format by its name, which is also the extension of its files. The first is the default.
 MESH_FORMATS: dict[str, MeshFormat] = {
-    "glb": MeshFormat("model/gltf-binary", _glb),
-    "gltf": MeshFormat("model/gltf+json", _gltf),
-    "obj": MeshFormat("model/obj", _obj, polygons=True),
-    "ply": MeshFormat(OCTET_STREAM, _ply, polygons=True),
-    "stl": MeshFormat("model/stl", _stl, coloured=False),
-    "npz": MeshFormat(OCTET_STREAM, _npz),
+    "glb": MeshFormat(READ_FORMATS["glb"], write_glb),
+    "gltf": MeshFormat(READ_FORMATS["gltf"], write_gltf),
+    "obj": MeshFormat(READ_FORMATS["obj"], write_obj, polygons=True),
+    "ply": MeshFormat(READ_FORMATS["ply"], write_ply, polygons=True),
+    "stl": MeshFormat(READ_FORMATS["stl"], _write_stl, coloured=False),
+    "npz": MeshFormat(READ_FORMATS["npz"], _write_npz),
 }
-#: An archive of an OBJ file with its materials and textures beside it, which is not read.
-OBJ_ZIP = MeshFormat("application/zip", _obj_zip, polygons=True)
-#: What the package ``usd-core`` writes, where it is installed; files are binary layers, which are not read.
+#: An archive of an OBJ file with its materials and textures. It is not read.
+OBJ_ZIP = MeshFormat("application/zip", write_obj_zip, polygons=True)
+#: Binary USD files, which are not read. Writing them needs the package ``usd-core``.
 USD_FORMATS = {
-    "usd": MeshFormat(OCTET_STREAM, _usd, polygons=True),
-    "usdz": MeshFormat("model/vnd.usdz+zip", _usdz, polygons=True),
+    "usd": MeshFormat(OCTET_STREAM, still_usd, polygons=True),
+    "usdz": MeshFormat("model/vnd.usdz+zip", partial(still_usd, packed=True), polygons=True),
 }
-#: Media types of the formats that can be read, by name.
-READ_FORMATS = {name: format.media_type for name, format in MESH_FORMATS.items()} | {"off": OCTET_STREAM}
-#: The same for point clouds, which may do without faces.
-SCAN_FORMATS = READ_FORMATS | {"xyz": OCTET_STREAM}
-
-
-def npz(**arrays: np.ndarray) -> bytes:
-    """Arrays as the bytes of a compressed NPZ file; equal arrays give equal bytes."""
-    buffer = io.BytesIO()
-    np.savez_compressed(buffer, **arrays)  # type: ignore[arg-type]
-    return buffer.getvalue()
-
-
-def read_arrays(
-    source: bytes | bytearray | memoryview | Path,
-    format: str | None = None,
-    limits: Limits = UNLIMITED,
-    *,
-    points: bool = False,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Read one mesh as it stands in its file: vertices (V, 3) and faces (F, 3), nothing merged and nothing checked.
-
-    STL has three vertices a face. A path also finds the buffers that lie beside a glTF file.
-
-    Args:
-        source: the file's bytes, or its path.
-        format: one of READ_FORMATS; by default the path's extension.
-        limits: where reading ends without a mesh; they bound its time and memory, whatever the bytes are.
-        points: whether points without faces will do; then one of SCAN_FORMATS.
-
-    Raises:
-        MeshError: unreadable, too large, or not exactly one mesh; with the reason.
-
-    >>> import numpy as np
-    >>> corners, faces = np.eye(4, 3), np.array([[0, 1, 2], [0, 3, 1], [1, 3, 2], [2, 3, 0]])
-    >>> content = MESH_FORMATS["obj"].encode(corners, faces)
-    >>> vertices, triangles = read_arrays(content, "obj")
-    >>> bool((vertices == corners).all() and (triangles == faces).all())
-    True
-    """
-    beside = source if isinstance(source, Path) else None
-    if isinstance(source, Path):
-        format = format or source.suffix.lstrip(".").lower()
-        try:
-            source = source.read_bytes()
-        except OSError as error:
-            raise MeshError(f"can't be read: {error.strerror}") from error
-    data = memoryview(source)
-    try:
-        # Whether coordinates that are not finite are a fault is for the caller to decide.
-        with np.errstate(all="ignore"):
-            match format:
-                case "glb" | "gltf":
-                    return read_gltf(data, limits, binary=format == "glb", beside=beside)
-                case "npz":
-                    arrays = load_npz(data, limits=limits, needed=("vertices",) if points else ("vertices", "faces"))
-                    return arrays["vertices"], arrays.get("faces", np.zeros((0, 3), np.int64))
-                case "xyz" if points:
-                    return read_xyz(data, limits)
-                case _:
-                    return _READERS[str(format)](data, limits)
-    except MeshError:
-        raise
-    except Exception as error:  # bytes from outside may raise anything
-        raise MeshError(f"not a readable {format} file: {clipped(error, 300)}") from error
-
-
-_READERS = {"obj": read_obj, "off": read_off, "ply": read_ply, "stl": read_stl}

@@ -1,6 +1,6 @@
-"""Writer of glTF 2.0: a shape, still or animated, as GLB or as JSON with its buffer inside.
+"""Writer of glTF 2.0: still and animated shapes, as GLB or as JSON with the buffer inside.
 
-Written here because trimesh writes no animations, and because every served mesh passes through it.
+The writer of trimesh has no animations. Every mesh that the server sends as glTF comes from this module.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from shapespace.mesh.vectors import dots
 
 FLOAT, UNSIGNED_INT = 5126, 5125
 ARRAY_BUFFER, ELEMENT_ARRAY_BUFFER = 34962, 34963
-#: Without a material a viewer assumes bare metal, which is black where there is nothing to reflect.
+#: Default material. Without one, viewers assume bare metal, which is black if there is nothing to reflect.
 MATERIAL = {
     "name": "clay",
     "doubleSided": True,
@@ -32,7 +32,7 @@ MATERIAL = {
         "roughnessFactor": 0.75,
     },
 }
-#: For meshes with vertex colours, which are multiplied with the material's colour.
+#: Material of meshes with vertex colours, which viewers multiply with the colour of the material.
 WHITE = MATERIAL | {
     "name": "coloured",
     "pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 0.75},
@@ -40,19 +40,19 @@ WHITE = MATERIAL | {
 
 
 def surface_normals(vertices: FloatArray, surface: MeshAttributes) -> FloatArray:
-    """Unit normals (N, 3) of a shape (V, 3) by the numbers of `MeshAttributes.normal_corners`."""
+    """Return unit normals (N, 3) of a shape (V, 3), in the order of `MeshAttributes.normal_corners`."""
     corners = None if surface.shading is None else surface.normal_faces
     return _filled(vertex_normals(vertices, surface.triangles, corners))
 
 
 def _filled(normals: FloatArray) -> FloatArray:
-    """Replace zero normals: the format insists on unit vectors."""
+    """Replace zero normals, where face normals cancel out: the format requires unit vectors."""
     normals[dots(normals, normals) < 0.5] = 0.0, 0.0, 1.0
     return normals
 
 
 def picture_type(data: bytes) -> str:
-    """The media type of a picture, which is PNG or JPEG."""
+    """Return the media type of a PNG or JPEG picture."""
     return "image/png" if data.startswith(b"\x89PNG") else "image/jpeg"
 
 
@@ -68,47 +68,47 @@ def _material(material: SurfaceMaterial, pictures: dict[str | None, int]) -> dic
     return found | ({"alphaMode": "BLEND"} if material.color[3] < 1 else {})
 
 
-class _Piece(NamedTuple):
-    """The triangles of one object and one material, NONE for none."""
+class _TriangleGroup(NamedTuple):
+    """Indices of the triangles with one object and one material; NONE for no object or no material."""
 
     object: int
     material: int
     triangles: IntArray
 
 
-def _pieces(surface: MeshAttributes, *, objects: bool, materials: bool) -> list[_Piece]:
-    """Of a surface, told apart by these or not."""
+def _triangle_groups(surface: MeshAttributes, *, objects: bool, materials: bool) -> list[_TriangleGroup]:
+    """Group the triangles of a surface by object, by material, or by both."""
     count = len(surface.triangle_polygons)
     of_objects = surface.objects.of if objects and surface.objects else None
     of_materials = surface.material_of if materials else None
     columns = [
         np.full(count, NONE) if of is None else of[surface.triangle_polygons] for of in (of_objects, of_materials)
     ]
-    # One number for each pair: sorting these is much faster than sorting pairs.
+    # Sorting one number for each pair is much faster than sorting pairs.
     width = int(columns[1].max()) + 2
     pairs, of = np.unique(columns[0] * width + columns[1], return_inverse=True)
     found = []
     for k, pair in enumerate(pairs.tolist()):
         object, material = divmod(pair + 1, width)
-        found.append(_Piece(object, material - 1, np.flatnonzero(of == k)))
+        found.append(_TriangleGroup(object, material - 1, np.flatnonzero(of == k)))
     return found
 
 
 class GltfBuilder:
-    """A glTF document with a mesh on a node for each object of the surface, filled from arrays that all share.
+    """Builder of a glTF document. Each object of the surface is a mesh on a node; all meshes share one set of arrays.
 
     Args:
         vertices: (V, 3) positions at rest, in any unit.
         faces: (F, 3).
-        name: of the mesh and its node, where the surface has none.
-        colouring: of the vertices, instead of materials; its legend goes into the mesh's extras.
-        surface: of the mesh. Vertices that have several texture coordinates or normals are there for each of them; the
-            attribute _VERTEX numbers them then.
+        name: name of the mesh and its node, if the surface has no names.
+        colouring: colours of the vertices, instead of materials. The legend goes into the mesh's ``extras``.
+        surface: polygons, texture coordinates and materials, if any. A vertex with several texture coordinates or
+            normals is repeated; the attribute _VERTEX then has the index of the vertex.
         joined: whether all objects are one mesh, with one set of sliders.
 
     Attributes:
-        nodes: number of these.
-        rows: (V',) the vertex that each vertex of the document is.
+        nodes: number of nodes.
+        rows: (V',) index of the vertex for each vertex of the document.
     """
 
     def __init__(
@@ -131,9 +131,9 @@ class GltfBuilder:
             "POSITION": self.add(vertices[self.rows], bounds=True, target=ARRAY_BUFFER),
             "NORMAL": self.add(self.normals(vertices), target=ARRAY_BUFFER),
         }
-        #: Common to all primitives; there is one for each material.
+        #: Members that all primitives have. There is one primitive for each material.
         self.primitive: dict[str, Any] = {"attributes": attributes}
-        #: Common to all meshes.
+        #: Members that all meshes have.
         self.mesh: dict[str, Any] = {}
         colors = colouring.linear if colouring else None
         if colouring:
@@ -142,13 +142,13 @@ class GltfBuilder:
             colors = linear(surface.colors)
         if surface:
             if surface.split.uv is not None:
-                # From the upper left.
+                # The origin of glTF's texture coordinates is the upper left corner.
                 uv = surface.split.uv * [1, -1] + [0, 1]
                 attributes["TEXCOORD_0"] = self.add(uv, target=ARRAY_BUFFER)
             labels = None if joined else surface.objects
             several = labels is not None and len(np.unique(labels.of)) > 1
             if several or len(self.rows) > len(vertices):
-                # As real numbers: integers of that size are not allowed here (3.7.2.1).
+                # As real numbers, because attributes can't be integers of this size (3.7.2.1).
                 attributes["_VERTEX"] = self.add(self.rows.astype(np.float32), target=ARRAY_BUFFER)
         if colors is not None:
             attributes["COLOR_0"] = self.add(colors[self.rows], target=ARRAY_BUFFER)
@@ -156,9 +156,9 @@ class GltfBuilder:
         plain = MATERIAL if colors is None else WHITE
         self.tree["materials"] = [plain]
         triangles = faces if surface is None else surface.split.faces
-        pieces = [_Piece(NONE, NONE, np.arange(0))]
+        pieces = [_TriangleGroup(NONE, NONE, np.arange(0))]
         if surface:
-            pieces = _pieces(surface, objects=not joined, materials=not colouring)
+            pieces = _triangle_groups(surface, objects=not joined, materials=not colouring)
             used = sorted({piece.material for piece in pieces})
             if used != [NONE]:
                 pictures = self._pictures(surface, {surface.materials[k].texture for k in used if k != NONE})
@@ -166,7 +166,7 @@ class GltfBuilder:
                 self.tree["materials"] = looks
         else:
             used = [NONE]
-        #: Primitives by the index of the object that they belong to.
+        #: Primitives by the index of their object.
         self._primitives: dict[int, list[dict[str, int]]] = {}
         for piece in pieces:
             some = triangles if len(pieces) == 1 else triangles[piece.triangles]
@@ -180,7 +180,7 @@ class GltfBuilder:
         self.tree["nodes"] = [{"name": own, "mesh": k} for k, own in enumerate(self._names)]
 
     def normals(self, vertices: FloatArray) -> FloatArray:
-        """(V', 3) normals of a shape (V, 3) at the document's vertices."""
+        """Return normals (V', 3) of a shape (V, 3) at the vertices of the document."""
         if self._surface is None:
             return _filled(vertex_normals(vertices, self._faces))
         return surface_normals(vertices, self._surface)[self._surface.split.normal]
@@ -189,7 +189,7 @@ class GltfBuilder:
         return self.add(faces.ravel(), target=ELEMENT_ARRAY_BUFFER)
 
     def _pictures(self, surface: MeshAttributes, names: set[str | None]) -> dict[str | None, int]:
-        """Numbers of the textures by name."""
+        """Add the textures; return their indices by name."""
         found = sorted(name for name in names if name is not None)
         if found:
             self.tree["images"] = [
@@ -201,18 +201,18 @@ class GltfBuilder:
         return {name: k for k, name in enumerate(found)}
 
     def _view(self, data: bytes, target: int | None = None) -> int:
-        """Append bytes and return the number of their view."""
+        """Append bytes; return the index of their buffer view."""
         view = {"buffer": 0, "byteOffset": self._size, "byteLength": len(data)}
         if target is not None:
             view["target"] = target
         self.views.append(view)
-        # Pictures are of any length, and arrays have components of four bytes.
+        # Pictures can have any length, and arrays need an alignment of four bytes.
         self._chunks += [data, bytes(-len(data) % 4)]
         self._size += len(data) + -len(data) % 4
         return len(self.views) - 1
 
     def add(self, array: NDArray, *, bounds: bool = False, target: int | None = None) -> int:
-        """Append an array, scalars or vectors, and return the index of its accessor."""
+        """Append an array of scalars or vectors; return the index of its accessor."""
         indices = np.issubdtype(array.dtype, np.integer)
         data = np.ascontiguousarray(array, dtype="<u4" if indices else "<f4")
         accessor: dict[str, Any] = {
@@ -222,8 +222,8 @@ class GltfBuilder:
             "type": "SCALAR" if data.ndim == 1 else f"VEC{data.shape[1]}",
         }
         if bounds:
-            # As float32, or rounding could leave a position outside its own bounds. By components that lie together:
-            # twenty times as fast as over rows of three.
+            # From float32 values, because rounding could put a position outside the bounds. Contiguous components are
+            # twenty times as fast as rows of three.
             components = np.ascontiguousarray(data.reshape(len(data), -1).T)
             accessor["min"], accessor["max"] = (
                 extreme(components, axis=1).astype(float).tolist() for extreme in (np.min, np.max)
@@ -238,13 +238,13 @@ class GltfBuilder:
         names: Sequence[str] = (),
         colors: Iterable[NDArray] | None = None,
     ) -> None:
-        """Add morph targets, at rest with weights 0.
+        """Add morph targets, whose weights at rest are 0.
 
         Args:
-            moves: of each (V, 3) what it adds to the positions.
-            normals: of each (V', 3) what it adds to the normals of the document's vertices.
-            names: of each, where they have some.
-            colors: of each (V, 3) what it adds to the colours, where there are some.
+            moves: for each target the change (V, 3) of the positions.
+            normals: for each target the change (V', 3) of the normals at the vertices of the document.
+            names: names of the targets, if any.
+            colors: for each target the change (V, 3) of the colours, if there are colours.
         """
         self.primitive["targets"] = [
             {
@@ -268,7 +268,7 @@ class GltfBuilder:
         return json.dumps({**self.tree, **lists}, separators=(",", ":")).encode()
 
     def glb(self) -> bytes:
-        """The document as one binary file."""
+        """Return the document as one binary file."""
         binary = b"".join(self._chunks)
         text = self._json({"byteLength": len(binary)})
         text += b" " * (-len(text) % 4)
@@ -284,7 +284,21 @@ class GltfBuilder:
         )
 
     def gltf(self) -> bytes:
-        """The document as JSON, with its buffer as a data URI."""
+        """Return the document as JSON, with the buffer as a data URI."""
         binary = b"".join(self._chunks)
         uri = "data:application/octet-stream;base64," + base64.b64encode(binary).decode()
         return self._json({"byteLength": len(binary), "uri": uri})
+
+
+def write_glb(
+    vertices: FloatArray, faces: IntArray, colouring: Colouring | None = None, surface: MeshAttributes | None = None
+) -> bytes:
+    """Write one mesh as GLB; see `formats.MeshWriter`."""
+    return GltfBuilder(vertices, faces, colouring=colouring, surface=surface).glb()
+
+
+def write_gltf(
+    vertices: FloatArray, faces: IntArray, colouring: Colouring | None = None, surface: MeshAttributes | None = None
+) -> bytes:
+    """Write one mesh as glTF with its buffer inside; see `formats.MeshWriter`."""
+    return GltfBuilder(vertices, faces, colouring=colouring, surface=surface).gltf()

@@ -1,55 +1,43 @@
-"""How much of a file is read, and how much of it messages quote."""
+"""Limits on the size of a mesh, and text from files as messages quote it."""
 
 from __future__ import annotations
 
 import sys
 from dataclasses import dataclass
 
-import numpy as np
-
 from shapespace.mesh.triangle_mesh import MeshError
-
-#: How many bytes are examined at a time.
-PIECE = 2**20
 
 
 @dataclass(frozen=True)
 class Limits:
-    """Sizes of a mesh beyond which its reader stops; by default none.
+    """Largest size of a mesh; by default there is no limit.
 
     Attributes:
-        vertices: most vertices.
-        faces: most triangles.
+        vertices: largest number of vertices.
+        faces: largest number of triangles.
     """
 
     vertices: int = sys.maxsize
     faces: int = sys.maxsize
 
     def check(self, vertices: int, faces: int) -> None:
-        """Raise MeshError for a mesh that is larger."""
+        """Raise MeshError if a mesh has more vertices or faces."""
         if vertices > self.vertices:
             raise MeshError(f"it has more than {self.vertices} vertices")
         if faces > self.faces:
             raise MeshError(f"it has more than {self.faces} faces")
 
 
-#: For files that are trusted.
+#: For files of the user's own.
 UNLIMITED = Limits()
 
 
-def count_bytes(data: memoryview, *characters: bytes) -> int:
-    """How many bytes of the data are one of these characters."""
-    # In pieces: a comparison needs as many bytes as it compares.
-    pieces = (np.frombuffer(data[start : start + PIECE], np.uint8) for start in range(0, len(data), PIECE))
-    return sum(int(np.count_nonzero(piece == character[0])) for piece in pieces for character in characters)
-
-
 def label(text: object) -> str | None:
-    """A name from a file, on one line and not too long; None where nothing of it can be shown."""
+    """Return a name from a file on one line, shortened; None if it has no printable character."""
     return clipped("".join(c if c.isprintable() else " " for c in str(text)[:1000])) or None
 
 
 def clipped(text: object, most: int = 100) -> str:
-    """Text from a file as messages quote it: on one line, and at most so many characters of it."""
+    """Return text from a file on one line, shortened to ``most`` characters."""
     line = " ".join(str(text)[:1000].split())
     return line if len(line) <= most else f"{line[:most]}…"

@@ -1,4 +1,4 @@
-"""Point cache 2: the positions of every frame and nothing else, as Blender, 3ds Max and Houdini play them on a mesh."""
+"""Point cache 2 files, which hold only the positions of every frame. Blender, 3ds Max and Houdini read them."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ _HEADER = struct.Struct("<12siiffi")
 
 
 def point_cache(frames: NDArray) -> Iterator[bytes]:
-    """Encode shapes (n, V, 3) as samples one frame apart, from frame 0, in pieces; positions are float32.
+    """Yield a point cache of shapes (n, V, 3) in pieces, one sample for each frame from frame 0; positions are float32.
 
-    The mesh itself, with its vertices in the same order, comes from another file.
+    Readers need the mesh from another file, with its vertices in the same order.
     """
     yield _HEADER.pack(b"POINTCACHE2\0", 1, frames.shape[1], 0.0, 1.0, len(frames))
     for frame in frames:

@@ -1,4 +1,4 @@
-"""A shape as a USD file, or a sequence of shapes with time samples; needs the package ``usd-core``."""
+"""Writer of USD: a shape, or an animation with time samples. It needs the package ``usd-core``."""
 
 from __future__ import annotations
 
@@ -19,16 +19,17 @@ from shapespace.files.colouring import Colouring
 from shapespace.files.gltf_writing import picture_type, surface_normals
 from shapespace.mesh.attributes import MeshAttributes, srgb
 
+#: Bytes of the file that are yielded at once, and frames that are in memory at once.
 _PIECE, _FRAMES_AT_ONCE = 2**20, 32
-#: Modification time of all files in a package: noon UTC on the second day that ZIP can represent, so that it is
-#: representable in every time zone.
+#: Modification time of all files in a package: noon UTC on the second day that ZIP can represent, which exists in every
+#: time zone.
 _TIME = 315_662_400
-#: The colour of the glTF writer's material.
+#: Colour of the default material of the glTF writer.
 _COLOUR = (0.72, 0.76, 0.82)
 
 
 def usd_installed() -> bool:
-    """Whether ``usd-core`` is installed, found out without importing it, which is slow."""
+    """Return whether ``usd-core`` is installed, without importing it, which is slow."""
     return find_spec("pxr") is not None
 
 
@@ -40,15 +41,7 @@ def still_usd(
     *,
     packed: bool = False,
 ) -> bytes:
-    """Encode a shape (V, 3) with faces (F, 3); arguments and errors as `animated_usd` has them.
-
-    Args:
-        vertices: (V, 3).
-        faces: (F, 3).
-        colouring: of the vertices, instead of materials.
-        surface: with polygons, materials and textures.
-        packed: see `animated_usd`.
-    """
+    """Write one mesh as USD; see `formats.MeshWriter`, and `animated_usd` for ``packed`` and errors."""
     colourings = [colouring] if colouring else []
     return b"".join(_pieces(vertices[None], faces, surface, None, colourings, packed=packed))
 
@@ -62,22 +55,21 @@ def animated_usd(
     *,
     packed: bool = False,
 ) -> Iterator[bytes]:
-    """Encode shapes (n, V, 3), with the polygons of their surface where there is one, as a binary USD layer, in pieces.
+    """Yield an animation as a binary USD layer, in pieces. Time code k shows frame k; y is up and lengths are metres.
 
-    Time code k shows frame k, y up and in metres as glTF is. Points are float32. Normals
-    at the vertices and extents are sampled with them.
+    Points are float32. Normals at the vertices and extents are sampled too.
 
     Args:
-        frames: (n, V, 3).
+        frames: (n, V, 3) positions.
         faces: (F, 3).
-        surface: with polygons, materials and textures.
-        fps: time codes in a second.
-        colourings: of each frame, instead of materials, or of none.
-        packed: whether the layer comes in a USDZ package, as phones want it, with the textures beside it.
+        surface: polygons, materials and textures, if any.
+        fps: time codes per second.
+        colourings: colours for each frame, instead of materials, or empty.
+        packed: whether to put the layer and its textures into a USDZ package, which phones open.
 
     Raises:
         ImportError: ``usd-core`` is not installed.
-        OSError: there is no room for a temporary file.
+        OSError: a temporary file can't be written.
     """
     return _pieces(frames, faces, surface, fps, colourings, packed=packed)
 
@@ -91,11 +83,11 @@ def _pieces(
     *,
     packed: bool,
 ) -> Iterator[bytes]:
-    """Of a file with time samples; of one frame without any where it has no frames in a second."""
+    """Yield a file, with time samples if ``fps`` is given; otherwise of the only frame."""
     from pxr import Gf, Sdf, Tf, Usd, UsdGeom, Vt
 
     name = "shape" if fps is None else "animation"
-    # The writer of binary layers takes nothing but a path.
+    # The writer of binary layers needs a path.
     with TemporaryDirectory(prefix="shapespace-") as folder:
         path = Path(folder, f"{name}.usdc")
         try:
@@ -125,7 +117,7 @@ def _pieces(
         textures = {}
         if packed:
             for number, (name, data) in enumerate(shown.textures.items()):
-                # As short as they can be: what the file called them may be no name for a file here.
+                # The name in the user's file may not be a valid name of a file here.
                 textures[name] = f"{number}.{picture_type(data).partition('/')[2]}"
                 Path(folder, textures[name]).write_bytes(data)
         add_surface(stage, mesh, shown, textures)
@@ -133,7 +125,7 @@ def _pieces(
         colors = mesh.GetDisplayColorPrimvar()
         frames = frames.astype(np.float32, copy=False)
         for start in range(0, len(frames), _FRAMES_AT_ONCE):
-            # One notification at the end, instead of three for each frame.
+            # One change notification at the end, instead of three for each frame.
             with Sdf.ChangeBlock():
                 for k, frame in enumerate(frames[start : start + _FRAMES_AT_ONCE], start):
                     box = np.stack([frame.min(axis=0), frame.max(axis=0)])
@@ -146,17 +138,17 @@ def _pieces(
                         time = Usd.TimeCode.Default() if fps is None else Usd.TimeCode(k)
                         attribute.Set(Vt.Vec3fArray.FromNumpy(rows), time)
             try:
-                stage.GetRootLayer().Save()  # what is saved is in the file and no longer in memory
+                stage.GetRootLayer().Save()  # saved frames are in the file, no longer in memory
             except Tf.ErrorException as error:
                 raise OSError(f"can't write {path}") from error
         del stage, mesh, points, normals, extent, colors
         if packed:
             package = Path(folder, f"{name}.usdz")
-            # The layer first. Versions of USD differ in where they have the writer.
+            # The layer has to be first. The place of the writer depends on the version of USD.
             writer = getattr(Sdf, "ZipFileWriter", None) or Usd.ZipFileWriter
             archive = writer.CreateNew(str(package))
             for member in (path, *(Path(folder, picture) for picture in textures.values())):
-                # Equal shapes give equal bytes, but for this: a package has the times of its files.
+                # A package has the times of its files. Equal shapes should give equal bytes.
                 os.utime(member, (_TIME, _TIME))
                 if not archive.AddFile(str(member), member.name):
                     raise OSError(f"can't write {package}")

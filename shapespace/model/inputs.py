@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from shapespace.arrays import FloatArray, IntArray
-from shapespace.files.formats import read_arrays
+from shapespace.files.reading import read_arrays
 from shapespace.mesh.triangle_mesh import TriangleMesh
 from shapespace.model.correspondence import InvalidMeshError, Matched, match
 from shapespace.model.decoder import Decoder

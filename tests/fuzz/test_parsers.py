@@ -25,8 +25,9 @@ from pydantic import ValidationError
 
 from shapespace.bundle.reader import BundleError, read_bundle
 from shapespace.bundle.schema import Manifest
-from shapespace.files.formats import MESH_FORMATS, read_arrays
+from shapespace.files.formats import MESH_FORMATS
 from shapespace.files.limits import Limits
+from shapespace.files.reading import read_arrays
 from shapespace.mesh.triangle_mesh import MeshError
 from shapespace.model.correspondence import InvalidMeshError, Matched, limits, match
 from shapespace.model.latent_space import LatentError

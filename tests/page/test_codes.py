@@ -7,7 +7,8 @@ from pathlib import Path
 import httpx
 import numpy as np
 
-from shapespace.files.formats import MESH_FORMATS, read_arrays
+from shapespace.files.formats import MESH_FORMATS
+from shapespace.files.reading import read_arrays
 from tests.page.conftest import CODE, Open
 from tests.page.studio import Studio
 from tests.service.conftest import Server

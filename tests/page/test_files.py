@@ -14,7 +14,8 @@ from zipfile import ZipFile
 import httpx
 import numpy as np
 
-from shapespace.files.formats import MESH_FORMATS, read_arrays
+from shapespace.files.formats import MESH_FORMATS
+from shapespace.files.reading import read_arrays
 from tests.page.conftest import CODE, Open
 from tests.page.studio import Studio, difference
 

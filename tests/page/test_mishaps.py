@@ -10,7 +10,7 @@ import httpx
 import pytest
 from playwright.sync_api import Browser, Route
 
-from shapespace.files.formats import read_arrays
+from shapespace.files.reading import read_arrays
 from tests.page.conftest import CHROMIUM, Open
 from tests.page.studio import Studio
 from tests.page.test_path import keyframes

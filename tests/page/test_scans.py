@@ -11,7 +11,8 @@ from playwright.sync_api import Route
 from scipy.spatial.transform import Rotation
 
 from shapespace.arrays import FloatArray
-from shapespace.files.formats import MESH_FORMATS, read_arrays
+from shapespace.files.formats import MESH_FORMATS
+from shapespace.files.reading import read_arrays
 from tests.page.conftest import Open
 from tests.page.studio import Studio, difference
 from tests.page.test_operation import AXE, check

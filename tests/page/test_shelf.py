@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from playwright.sync_api import Route
 
-from shapespace.files.formats import read_arrays
+from shapespace.files.reading import read_arrays
 from tests.page.conftest import Open
 from tests.page.studio import Studio, difference
 

@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 
 from shapespace.arrays import FloatArray, IntArray
-from shapespace.files.formats import READ_FORMATS, read_arrays
-from shapespace.files.npz_reading import load_npz
+from shapespace.files.npz import read_mesh_npz
+from shapespace.files.reading import READ_FORMATS, read_arrays
 from shapespace.mesh.triangle_mesh import MeshError, PlaceError, diagonal
 from shapespace.training.collection.checks import (
     TOLERANCES,
@@ -228,7 +228,7 @@ def _npz_arrays(path: Path) -> dict[str, np.ndarray]:
         MeshError: the file can't be read, an array is missing or has a wrong shape, or two shapes have the same name.
     """
     try:
-        arrays = load_npz(memoryview(path.read_bytes()), ("vertices", "faces", "names"))
+        arrays = read_mesh_npz(memoryview(path.read_bytes()), ("vertices", "faces", "names"))
     except OSError as error:
         raise MeshError(f"can't be read: {error.strerror}") from error
     shapes = arrays["vertices"]

@@ -16,8 +16,8 @@ from torch import Tensor, nn
 from torch.optim import Adam, Muon, Optimizer
 from torch.optim.lr_scheduler import CosineAnnealingLR, ReduceLROnPlateau
 
+from shapespace.files.atomic import replaced_file
 from shapespace.training.learning.networks import ShapeNetwork, predict
-from shapespace.training.runs.atomic_files import whole
 from shapespace.training.runs.network_settings import FitSettings
 from shapespace.training.runs.progress import bar
 
@@ -54,7 +54,7 @@ def save_network(
     """Write a network and its training state as one safetensors file, atomically."""
     tensors = {f"network.{k}": v for k, v in network.state_dict().items()} | (extra or {})
     tensors = {k: v.contiguous().clone() for k, v in tensors.items()}
-    with whole(path) as file:
+    with replaced_file(path) as file:
         file.write(save(tensors, metadata={"state": json.dumps(state), **network.metadata}))
 
 

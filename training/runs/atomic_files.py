@@ -1,30 +1,17 @@
-"""Files that a killed run, or a power cut, leaves whole: each is written beside its place, then renamed into it."""
+"""Files of a run that are replaced as a whole, so that a killed run or a power cut leaves no half-written file."""
 
 from __future__ import annotations
 
 import json
-import os
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-
-@contextmanager
-def whole(path: Path) -> Iterator[IO[bytes]]:
-    """A file to write to that takes the path's place at the end, whole, or not at all; its folder is made."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_suffix(".part")
-    with part.open("wb") as file:
-        yield file
-        # Renamed before it is on the disk, it could be empty after a power cut.
-        file.flush()
-        os.fsync(file.fileno())
-    os.replace(part, path)
+from shapespace.files.atomic import replaced_file
+from shapespace.files.npz import read_npz
 
 
 @dataclass(frozen=True)
@@ -32,32 +19,32 @@ class _AtomicFile:
     path: Path
 
     def exists(self) -> bool:
-        """Whether it has been written."""
+        """Return whether the file has been written."""
         return self.path.exists()
 
 
 class TextFile(_AtomicFile):
-    """A text in UTF-8."""
+    """A text file in UTF-8."""
 
     def read(self) -> str:
-        """The text; raises OSError or UnicodeDecodeError."""
+        """Return the text; raises OSError or UnicodeDecodeError."""
         return self.path.read_text(encoding="utf-8")
 
     def write(self, text: str) -> None:
         """Replace the file."""
-        with whole(self.path) as file:
+        with replaced_file(self.path) as file:
             file.write(text.encode())
 
 
 class JsonFile(_AtomicFile):
-    """A JSON object."""
+    """A file with a JSON object."""
 
     def read(self) -> dict[str, Any]:
-        """The object; raises OSError or ValueError."""
+        """Return the object; raises OSError or ValueError."""
         return dict(json.loads(self.path.read_text(encoding="utf-8")))
 
     def read_if_written(self) -> dict[str, Any]:
-        """The object, an empty one where the file has not been written."""
+        """Return the object, or an empty object if the file has not been written."""
         return self.read() if self.exists() else {}
 
     def write(self, value: dict[str, Any]) -> None:
@@ -66,18 +53,17 @@ class JsonFile(_AtomicFile):
 
 
 class NpzFile(_AtomicFile):
-    """Arrays by name."""
+    """An NPZ file."""
 
     def read(self) -> dict[str, NDArray]:
-        """All arrays; raises OSError, ValueError, EOFError or zipfile.BadZipFile."""
-        with np.load(self.path) as file:
-            return dict(file)
+        """Return all arrays by name; raises OSError, ValueError, EOFError or zipfile.BadZipFile."""
+        return read_npz(self.path)
 
     def read_if_written(self) -> dict[str, NDArray]:
-        """All arrays, none where the file has not been written."""
+        """Return all arrays by name, or none if the file has not been written."""
         return self.read() if self.exists() else {}
 
     def write(self, **arrays: Any) -> None:
         """Replace the file."""
-        with whole(self.path) as file:
+        with replaced_file(self.path) as file:
             np.savez(file, **arrays)

@@ -9,7 +9,7 @@ from typing import Any
 from fastapi import APIRouter, Request, Response
 
 from shapespace import __version__
-from shapespace.files.formats import OCTET_STREAM
+from shapespace.files.reading import OCTET_STREAM
 from shapespace.service.http.dependencies import CallerDependency, Model, ServiceDependency
 from shapespace.service.http.description import problems
 from shapespace.service.http.messages.binary_tensors import HEADER, read_codes, read_request, write_answer

@@ -1,1 +1,1 @@
-"""What files say of a mesh beside positions and triangles: its polygons, texture coordinates, names and materials."""
+"""Polygons, texture coordinates, names and materials of a mesh, in each file format."""

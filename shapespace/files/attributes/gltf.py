@@ -1,4 +1,4 @@
-"""The surface of a glTF scene. Its triangles are its polygons: the format has no others."""
+"""Attributes of a glTF scene. The format has no polygons except triangles."""
 
 from __future__ import annotations
 
@@ -13,16 +13,19 @@ import numpy as np
 
 from shapespace.arrays import FloatArray
 from shapespace.files.attributes.textures import Textures
-from shapespace.files.gltf_reading import Accessor, PlacedPrimitive, Scene, open_scene
+from shapespace.files.gltf_document import Accessor
+from shapespace.files.gltf_reading import PlacedPrimitive, Scene, open_scene
 from shapespace.files.limits import UNLIMITED, label
 from shapespace.mesh.attributes import NONE, MeshAttributes, SurfaceMaterial, labelled, srgb
 
+#: Component types of texture coordinates and colours: bytes and shorts stand for fractions (3.7.2.1).
 _REAL = (5121, 5123, 5126)
+#: Normals that agree to this number of decimals are equal.
 _NORMAL_DECIMALS = 3
 
 
 def read(path: Path, faults: list[str]) -> MeshAttributes:
-    """The surface of a GLB or glTF file; sentences on what is left out are appended to ``faults``."""
+    """Read the attributes of a GLB or glTF file; appends a sentence to ``faults`` for everything left out."""
     binary = path.suffix.lower() == ".glb"
     scene = open_scene(memoryview(path.read_bytes()), UNLIMITED, binary=binary, beside=path)
     corners = scene.corners.ravel()
@@ -36,7 +39,7 @@ def read(path: Path, faults: list[str]) -> MeshAttributes:
     materials: list[SurfaceMaterial] = []
     for number in used:
         material = _material(scene, number, path, textures)
-        # Other formats know materials by their names alone.
+        # Other formats identify materials by name.
         taken = material.name in {known.name for known in materials}
         materials.append(replace(material, name=f"{material.name[:80]} {number}") if taken else material)
     names = [label(part.mesh.get("name", "")) for part in scene.parts]
@@ -64,7 +67,7 @@ def _labels(normals: FloatArray) -> np.ndarray:
 def _attribute(
     scene: Scene, name: str, kinds: tuple[str, ...], components: tuple[int, ...] = _REAL
 ) -> FloatArray | None:
-    """Rows of an attribute for the vertices as they are listed; None where a part has none."""
+    """Return an attribute of the listed vertices of a scene; None if a primitive doesn't have it."""
     if not all(name in part.primitive["attributes"] for part in scene.read):
         return None
 

@@ -1,4 +1,4 @@
-"""OBJ with what stands in it beside positions, and MTL: both ways."""
+"""Attributes of OBJ and MTL files: reader and writer."""
 
 from __future__ import annotations
 
@@ -10,30 +10,31 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from shapespace.arrays import FloatArray
+from shapespace.arrays import FloatArray, IntArray
+from shapespace.files.archives import zip_pieces
 from shapespace.files.attributes.textures import Textures, beside
 from shapespace.files.colouring import Colouring
 from shapespace.files.gltf_writing import surface_normals
-from shapespace.files.limits import UNLIMITED, clipped, label
+from shapespace.files.limits import clipped, label
 from shapespace.files.polygon_reading import Lines
 from shapespace.mesh.attributes import NONE, Labels, MeshAttributes, SurfaceMaterial, labelled
 from shapespace.mesh.triangle_mesh import MeshError
 
-#: Decimals to which normals of one vertex have to agree.
+#: Normals that agree to this number of decimals are equal.
 _NORMAL_DECIMALS = 3
-#: Options of a map in MTL, by how many values they take at most.
+#: Options of a map in MTL, with their largest number of values.
 _MAP_OPTIONS = {b"-blendu": 1, b"-blendv": 1, b"-boost": 1, b"-mm": 2, b"-o": 3, b"-s": 3, b"-t": 3, b"-texres": 1}
 _MAP_OPTIONS |= {b"-clamp": 1, b"-bm": 1, b"-imfchan": 1, b"-type": 1, b"-cc": 1, b"-colorspace": 1}
 
 
 def read(path: Path, faults: list[str]) -> MeshAttributes:
-    """The surface of an OBJ file; sentences on what is left out are appended to ``faults``."""
+    """Read the attributes of an OBJ file; appends a sentence to ``faults`` for everything left out."""
     uv, normals, colors, starts, corners = array("d"), array("d"), array("d"), [0], array("q")
     uv_corners, shading, smoothing = array("q"), array("q"), array("q")
     objects, groups, materials = list[str | None](), list[str | None](), list[str | None]()
     current: dict[bytes, str | None] = {b"o": None, b"g": None, b"usemtl": None}
     libraries, smooth, told, points = list[str](), 0, False, 0
-    with Lines(memoryview(path.read_bytes()), UNLIMITED) as lines:
+    with Lines(memoryview(path.read_bytes())) as lines:
         for line in lines:
             keyword, *values = line.split(None, 1)
             rest = values[0].partition(b"#")[0].strip() if values else b""
@@ -94,7 +95,7 @@ def read(path: Path, faults: list[str]) -> MeshAttributes:
 
 
 def _number(text: bytes, count: int) -> int:
-    """An index from 0; negative ones count back from the last of so many, and nothing is NONE."""
+    """Return an index that counts from 0, or NONE for no text; negative numbers count back from ``count``."""
     if not text:
         return NONE
     number = int(text) - 1 if int(text) > 0 else count + int(text)
@@ -106,13 +107,13 @@ def _number(text: bytes, count: int) -> int:
 def _shading(
     sizes: np.ndarray, of_normal: np.ndarray, normals: array[float], smoothing: np.ndarray, *, told: bool
 ) -> np.ndarray | None:
-    """Labels of corners, see MeshAttributes.shading: by normals where there are some, otherwise by smoothing groups."""
+    """Return labels of corners, see `MeshAttributes.shading`, from normals, or else from smoothing groups."""
     if (of_normal >= 0).all():
         values = np.array(normals).reshape(-1, 3).round(_NORMAL_DECIMALS)
         return np.unique(values, axis=0, return_inverse=True)[1].reshape(-1)[of_normal]
     if not told:
         return None
-    # Group 0 shades each polygon flat.
+    # Polygons of group 0 are flat.
     flat = smoothing.max() + 1 + np.arange(len(sizes))
     labels: np.ndarray = np.unique(np.where(smoothing == 0, flat, smoothing), return_inverse=True)[1]
     return np.repeat(labels, sizes)
@@ -125,14 +126,14 @@ def _colors(values: array[float], points: int, faults: list[str]) -> FloatArray 
     if len(colors) != points:
         faults.append(f"its vertex colours are left out: {len(colors)} of {points} vertices have one")
         return None
-    # Some programs write them from 0 to 255.
+    # Some programs write values from 0 to 255.
     return np.clip(colors / 255 if colors.max() > 1 else colors, 0, 1)
 
 
 def _read_libraries(
     path: Path, names: list[str], textures: Textures, wanted: Labels, faults: list[str]
 ) -> dict[str, SurfaceMaterial]:
-    """Materials of MTL files by name, as far as the surface uses them."""
+    """Return the materials of MTL files that the surface uses, by name."""
     found: dict[str, SurfaceMaterial] = {}
     for name in names:
         whole = [beside(path.parent, name)]
@@ -158,7 +159,7 @@ def _read_library(path: Path, textures: Textures, wanted: set[str]) -> dict[str,
             opacity = look.pop("opacity", 1.0)
             found[name] = SurfaceMaterial(name, (*color, opacity), texture=kept, **look)  # type: ignore[arg-type, misc]
 
-    with Lines(memoryview(path.read_bytes()), UNLIMITED) as lines:
+    with Lines(memoryview(path.read_bytes())) as lines:
         for line in lines:
             keyword, *values = line.split(None, 1)
             if keyword == b"newmtl":
@@ -183,7 +184,7 @@ def _share(text: bytes) -> float:
 
 
 def _map(text: bytes) -> str:
-    """The file of a map, behind its options; names may have spaces in them."""
+    """Return the file of a map, which follows its options and may contain spaces."""
     words = text.split()
     while len(words) > 1 and words[0] in _MAP_OPTIONS:
         most, words = _MAP_OPTIONS[words[0]], words[1:]
@@ -203,18 +204,18 @@ def _is_number(text: bytes) -> bool:
 def obj_vertices(
     vertices: FloatArray, colouring: Colouring | None = None, surface: MeshAttributes | None = None
 ) -> str:
-    """The positions (V, 3) of an OBJ file, with colours behind them in the way that most readers understand.
+    """Return the vertex lines of an OBJ file, with colours after the positions, and the lines of normals.
 
-    What of a surface changes with the shape, its normals, follows.
+    These lines depend on the shape; the lines of `obj_faces` do not.
     """
-    # Nine significant digits hold a float32 whatever the unit; trimesh writes a fixed number of decimals.
+    # Nine significant digits represent a float32 in any unit. A fixed number of decimals would not.
     comment, rows, colors = "", vertices.astype(np.float32), None
     if colouring:
         comment, colors = f"# color {json.dumps(colouring.legend)}\n", colouring.srgb
     elif surface:
         colors = surface.colors
     line = "v %.9g %.9g %.9g\n" if colors is None else "v %.9g %.9g %.9g %.4g %.4g %.4g\n"
-    # All at once is twice as fast as line by line.
+    # One format operation for all lines is twice as fast as one for each line.
     text = comment + _lines(line, rows if colors is None else np.hstack([rows, colors]))
     if surface and surface.normals:
         text += _lines("vn %.4f %.4f %.4f\n", surface_normals(vertices, surface))
@@ -226,7 +227,7 @@ def _lines(line: str, rows: np.ndarray) -> str:
 
 
 def obj_faces(surface: MeshAttributes) -> str:
-    """The faces of an OBJ file, with texture coordinates, and the names of what they belong to."""
+    """Return the lines of texture coordinates, faces, and names of objects, groups and materials."""
     uv = "" if surface.uv is None else _lines("vt %.9g %.9g\n", surface.uv.astype(np.float32))
     lines = _face_lines(surface)
     named = {
@@ -236,7 +237,7 @@ def obj_faces(surface: MeshAttributes) -> str:
         if surface.material_of is None
         else Labels(tuple(material.name for material in surface.materials), surface.material_of),
     }
-    # Backwards, as each stands in front of what is there.
+    # In reverse order, because each keyword is put in front of the line.
     for keyword, labels in reversed(named.items()):
         if labels:
             for k in np.flatnonzero(np.diff(labels.of, prepend=NONE)).tolist():
@@ -246,7 +247,7 @@ def obj_faces(surface: MeshAttributes) -> str:
 
 
 def _face_lines(surface: MeshAttributes) -> NDArray:
-    """(P,) a line for each polygon."""
+    """Return a line for each polygon, (P,)."""
     corners, form = [surface.corners + 1], "%d"
     if surface.uv_corners is not None:
         corners, form = [*corners, surface.uv_corners + 1], "%d/%d"
@@ -264,12 +265,12 @@ def _face_lines(surface: MeshAttributes) -> NDArray:
 
 
 def polygon_lines(surface: MeshAttributes, numbers: NDArray, line: Callable[[int], str]) -> NDArray:
-    """(P,) a line for each polygon, filled with the numbers (C, k) of its corners.
+    """Return a line for each polygon, (P,).
 
     Args:
-        surface: whose polygons they are.
-        numbers: of each corner.
-        line: by how many corners a polygon has the line, to be filled by ``%``.
+        surface: the polygons.
+        numbers: (C, k) numbers of each corner.
+        line: returns the format of a line, for ``%``, for a number of corners.
     """
     lines = np.empty(len(surface.sizes), object)
     for size in np.unique(surface.sizes).tolist():
@@ -280,16 +281,21 @@ def polygon_lines(surface: MeshAttributes, numbers: NDArray, line: Callable[[int
 
 
 def write_obj(
-    vertices: FloatArray, surface: MeshAttributes, colouring: Colouring | None = None, library: str | None = None
-) -> str:
-    """An OBJ file; it refers to a library of materials if that is named."""
-    begin = f"mtllib {library}\n" if library else ""
-    return begin + obj_vertices(vertices, colouring, surface) + obj_faces(surface)
+    vertices: FloatArray, faces: IntArray, colouring: Colouring | None = None, surface: MeshAttributes | None = None
+) -> bytes:
+    """Write one mesh as OBJ without materials; see `formats.MeshWriter`."""
+    shown = surface or MeshAttributes.of_triangles(faces)
+    return (obj_vertices(vertices, colouring, shown) + obj_faces(shown)).encode()
 
 
-def write_mtl(surface: MeshAttributes) -> str:
-    """The library of a surface's materials, which names its textures."""
-    return "\n".join("".join(_material(material)) for material in surface.materials)
+def write_obj_zip(
+    vertices: FloatArray, faces: IntArray, colouring: Colouring | None = None, surface: MeshAttributes | None = None
+) -> bytes:
+    """Write one mesh as a ZIP archive of OBJ, MTL and textures; see `formats.MeshWriter`."""
+    files = obj_files(surface, "shape") if surface else {}
+    head = b"mtllib shape.mtl\n" if files else b""
+    members = {"shape.obj": head + write_obj(vertices, faces, colouring, surface), **files}
+    return b"".join(zip_pieces((name, [content]) for name, content in members.items()))
 
 
 def _material(material: SurfaceMaterial) -> Iterator[str]:
@@ -302,7 +308,8 @@ def _material(material: SurfaceMaterial) -> Iterator[str]:
 
 
 def obj_files(surface: MeshAttributes, stem: str) -> Mapping[str, bytes]:
-    """What belongs beside OBJ files: the library of materials, and textures, by name; nothing without materials."""
+    """Return the MTL file and the textures that go with an OBJ file, by name; empty without materials."""
     if not surface.materials:
         return {}
-    return {f"{stem}.mtl": write_mtl(surface).encode(), **surface.textures}
+    library = "\n".join("".join(_material(material)) for material in surface.materials)
+    return {f"{stem}.mtl": library.encode(), **surface.textures}

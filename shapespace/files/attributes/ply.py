@@ -1,4 +1,4 @@
-"""PLY with what stands in it beside positions: both ways."""
+"""Attributes of PLY files: reader and writer."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from shapespace.arrays import FloatArray
+from shapespace.arrays import FloatArray, IntArray
 from shapespace.files.attributes.obj import polygon_lines
 from shapespace.files.colouring import Colouring
 from shapespace.files.limits import UNLIMITED
-from shapespace.files.polygon_reading import BinaryTable, TextTable, ply_head
+from shapespace.files.ply_reading import BinaryTable, TextTable, read_header
 from shapespace.mesh.attributes import NONE, MeshAttributes
 from shapespace.mesh.triangle_mesh import MeshError
 
@@ -21,8 +21,8 @@ _RGB = ("red", "green", "blue")
 
 
 def read(path: Path, faults: list[str]) -> MeshAttributes:
-    """The surface of a PLY file; sentences on what is left out are appended to ``faults``."""
-    text, elements, body = ply_head(memoryview(path.read_bytes()))
+    """Read the attributes of a PLY file; appends a sentence to ``faults`` for everything left out."""
+    text, elements, body = read_header(memoryview(path.read_bytes()))
     table = TextTable(body, UNLIMITED) if text else BinaryTable(body, UNLIMITED)
     at_vertices: FloatArray | None = None
     colors: FloatArray | None = None
@@ -49,7 +49,7 @@ def read(path: Path, faults: list[str]) -> MeshAttributes:
                 if coordinates:
                     at_corners.append(_at_corners(np.array(coordinates[0]).astype(np.float64), len(polygon)))
             if at_vertices is not None and len(at_corners):
-                at_vertices = None  # what is said of each corner says more
+                at_vertices = None  # coordinates at corners are more precise
             return _surface(np.array(starts), np.concatenate(corners), at_vertices, at_corners, colors, normals=normals)
         else:
             table.skip(element)
@@ -57,7 +57,7 @@ def read(path: Path, faults: list[str]) -> MeshAttributes:
 
 
 def _at_corners(values: FloatArray, count: int) -> FloatArray:
-    """(count, 2), NaN where a face has none."""
+    """Return texture coordinates (count, 2) of a face, NaN if it has none."""
     return values.reshape(count, 2) if len(values) else np.full((count, 2), np.nan)
 
 
@@ -82,12 +82,15 @@ def _surface(
     return MeshAttributes(starts=starts, corners=corners, uv=uv, uv_corners=of_uv, colors=colors, normals=normals)
 
 
-def write_ply(vertices: FloatArray, surface: MeshAttributes, colouring: Colouring | None = None) -> bytes:
-    """A PLY file, as text where faces have different numbers of corners.
+def write_ply(
+    vertices: FloatArray, faces: IntArray, colouring: Colouring | None = None, surface: MeshAttributes | None = None
+) -> bytes:
+    """Write one mesh as PLY, as text if faces have different numbers of corners; see `formats.MeshWriter`.
 
-    Texture coordinates are at the vertices, or at corners where a vertex has several; not where corners of faces
-    differ in number too.
+    Texture coordinates are at the vertices. If a vertex has several, they are at the corners of the faces. They are
+    left out if the faces then have different numbers of corners.
     """
+    surface = surface or MeshAttributes.of_triangles(faces)
     fields: list[tuple[str, str, str, NDArray]] = [
         (name, "float", "<f4", column) for name, column in zip("xyz", vertices.T, strict=True)
     ]
@@ -104,7 +107,7 @@ def write_ply(vertices: FloatArray, surface: MeshAttributes, colouring: Colourin
     rows = np.empty(len(vertices), [(name, kind) for name, _, kind, _ in fields])
     for name, _, _, column in fields:
         rows[name] = column
-    # Many readers take binary faces only where all have as many corners, and other lists of a face only then.
+    # Many readers read binary faces, and other lists of a face, only if all faces have equally many corners.
     mixed = surface.sizes.min() < surface.sizes.max()
     lists: list[tuple[str, str, NDArray]] = [("vertex_indices", "int", surface.corners[:, None].astype("<i4"))]
     if surface.uv is not None and surface.uv_corners is not None and uv is None and not mixed:
@@ -119,15 +122,15 @@ def write_ply(vertices: FloatArray, surface: MeshAttributes, colouring: Colourin
     if mixed:
         line = " ".join("%d" if kind == "u1" else "%.9g" for _, _, kind, _ in fields) + "\n"
         text = line * len(rows) % tuple(value for row in rows.tolist() for value in row)
-        faces = polygon_lines(surface, surface.corners[:, None], lambda size: f"{size}{' %d' * size}\n")
-        body = (text + "".join(faces.tolist())).encode()
+        lines = polygon_lines(surface, surface.corners[:, None], lambda size: f"{size}{' %d' * size}\n")
+        body = (text + "".join(lines.tolist())).encode()
     else:
         body = rows.tobytes() + _face_rows(surface, lists, length[1])
     return "\n".join([*head, "end_header\n"]).encode() + body
 
 
 def _of_vertices(surface: MeshAttributes) -> FloatArray | None:
-    """(V, 2) texture coordinates, where each vertex has exactly one."""
+    """Return texture coordinates (V, 2) if each vertex has exactly one, otherwise None."""
     if surface.uv is None or surface.uv_corners is None or (surface.uv_corners < 0).any():
         return None
     one = np.empty(surface.corners.max() + 1, np.int64)
@@ -137,7 +140,7 @@ def _of_vertices(surface: MeshAttributes) -> FloatArray | None:
 
 
 def _face_rows(surface: MeshAttributes, lists: list[tuple[str, str, NDArray]], length: str) -> bytes:
-    """Faces of as many corners each."""
+    """Return binary rows of faces with equally many corners."""
     count = len(surface.sizes)
     pieces: list[NDArray] = []
     for _, _, array in lists:

@@ -1,4 +1,4 @@
-"""Reading the surface of a file that is trusted; what of it can't be kept is left out, with a sentence."""
+"""Reading the attributes of a file of the user's own. Each part that can't be kept is left out, with a sentence."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from shapespace.mesh.attributes import MeshAttributes
 from shapespace.mesh.triangle_mesh import MeshError
 
 _READERS = {"glb": gltf.read, "gltf": gltf.read, "obj": obj.read, "ply": ply.read}
-#: Formats whose files may have more than triangles.
+#: Formats whose files can have attributes.
 FORMATS = tuple(_READERS)
 
 
 def read_attributes(path: Path) -> tuple[MeshAttributes | None, list[str]]:
-    """The surface of a mesh file, on the vertices that ``read_arrays`` gives; None where it has triangles only.
+    """Read the attributes of a mesh file, for the vertices that `reading.read_arrays` returns.
 
     Returns:
-        The surface, and a sentence on each thing that is left out.
+        The attributes, or None if the file has only triangles; and a sentence on each part that is left out.
 
     Raises:
         OSError: the file can't be read.
@@ -34,7 +34,7 @@ def read_attributes(path: Path) -> tuple[MeshAttributes | None, list[str]]:
         )
     except OSError:
         raise
-    except Exception as error:  # of what nobody has looked at until now, any
+    except Exception as error:  # damaged files raise exceptions of many classes
         reason = str(error) if isinstance(error, MeshError) else f"it can't be understood: {clipped(error, 200)}"
         return None, [f"its polygons, texture coordinates and materials are left out: {reason}"]
     return (None if surface.is_plain else surface), faults

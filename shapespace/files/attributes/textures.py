@@ -1,4 +1,4 @@
-"""Pictures that materials name: copied as they are, if they are there, PNG or JPEG, and not too large."""
+"""Textures of materials: PNG and JPEG pictures up to a size, copied without a change."""
 
 from __future__ import annotations
 
@@ -8,16 +8,17 @@ from pathlib import Path, PurePosixPath
 
 from shapespace.files.limits import clipped
 
-#: Most bytes of one picture, and of all pictures of a surface together: every answer holds them.
+#: Most bytes of one picture, and of all pictures of a mesh. Every answer in some formats holds all of them.
 LARGEST, ALL = 16 * 2**20, 32 * 2**20
 #: The first bytes of PNG and JPEG files.
 BEGINNINGS = (b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff")
 
 
 def beside(folder: Path, name: str) -> Path:
-    """Where a file lies that is named in one of the folder: there or below, whatever other place it names.
+    """Return the path of a file that another file names. It is always in ``folder`` or below.
 
-    Names from other machines are looked for by their last part, and nothing from elsewhere gets into a bundle.
+    If the name leads to another place, only its last part counts, as for absolute names from other machines. So no
+    file from elsewhere gets into a bundle.
     """
     inside = PurePosixPath(name.replace("\\", "/"))
     away = inside.is_absolute() or ".." in inside.parts or not (folder / inside).is_file()
@@ -25,13 +26,13 @@ def beside(folder: Path, name: str) -> Path:
 
 
 class Textures:
-    """The pictures of a surface.
+    """The pictures of a mesh.
 
     Args:
-        faults: gets a sentence for each that can't be kept.
+        faults: gets a sentence for each picture that can't be kept.
 
     Attributes:
-        files: their contents by name.
+        files: contents of the pictures by name.
     """
 
     def __init__(self, faults: list[str]) -> None:
@@ -39,7 +40,7 @@ class Textures:
         self._faults, self._known = faults, dict[object, str | None]()
 
     def add_file(self, folder: Path, name: str, material: str) -> str | None:
-        """The name by which a file is kept; None where it can't be."""
+        """Add a file; return its name in `files`, or None if it can't be kept."""
         path = beside(folder, name)
 
         def content() -> bytes:
@@ -50,7 +51,7 @@ class Textures:
         return self.add(path.resolve(), path.name, content, material)
 
     def add(self, key: object, name: str, content: Callable[[], bytes], material: str) -> str | None:
-        """The same for a picture that is the same for the same key."""
+        """Add a picture, once for each key; return its name in `files`, or None if it can't be kept."""
         if key not in self._known:
             try:
                 self._known[key] = self._kept(name, content())
@@ -69,7 +70,7 @@ class Textures:
             raise ValueError("it is neither PNG nor JPEG; save it as one of them")
         if len(data) > LARGEST or sum(map(len, self.files.values())) + len(data) > ALL:
             raise ValueError(_too_large(len(data)))
-        # A plain name of a bundle's file, with the ending that it should have.
+        # A valid file name in a bundle, with the extension of its format.
         stem = re.sub(r"[^A-Za-z0-9_-]+", "-", Path(name).stem).strip("-_")[:60] or "texture"
         ending = "png" if data.startswith(BEGINNINGS[0]) else "jpg"
         taken = {known.casefold() for known in self.files}

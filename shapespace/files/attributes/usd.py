@@ -1,4 +1,4 @@
-"""What a surface adds to a mesh of USD."""
+"""Attributes of a USD mesh: writer."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from shapespace.mesh.attributes import Labels, MeshAttributes, SurfaceMaterial, 
 def add_surface(
     stage: Any, mesh: Any, surface: MeshAttributes, pictures: Mapping[str, str] = MappingProxyType({})
 ) -> None:
-    """Texture coordinates at corners, materials and names of parts for a mesh whose faces are those of the surface.
+    """Add texture coordinates, materials and names of parts to a mesh that has the polygons of ``surface``.
 
     Args:
-        stage: that the mesh is on.
+        stage: stage of the mesh.
         mesh: a UsdGeom.Mesh.
-        surface: what it has.
-        pictures: paths of textures by name; others are left out, since a layer by itself has no files beside it.
+        surface: the attributes.
+        pictures: paths of textures by name. Other textures are left out, because a single layer has no other files.
 
     Raises:
         ImportError: ``usd-core`` is not installed.
@@ -30,7 +30,7 @@ def add_surface(
     primvars = UsdGeom.PrimvarsAPI(mesh)
     if surface.uv is not None and surface.uv_corners is not None:
         coordinates = primvars.CreatePrimvar("st", Sdf.ValueTypeNames.TexCoord2fArray, UsdGeom.Tokens.faceVarying)
-        # Corners without any take a further one.
+        # Corners without coordinates get one more entry.
         rows = np.vstack([surface.uv, np.zeros((1, 2))]).astype(np.float32)
         coordinates.Set(Vt.Vec2fArray.FromNumpy(rows if (surface.uv_corners < 0).any() else rows[:-1]))
         indices = np.where(surface.uv_corners < 0, len(surface.uv), surface.uv_corners)
@@ -41,7 +41,7 @@ def add_surface(
         shown.Set(Vt.Vec3fArray.FromNumpy(linear(surface.colors).astype(np.float32)))
 
     def path(folder: Any, name: str) -> Any:
-        """One that is not taken."""
+        """Return a path in a folder that is not taken."""
         word = Tf.MakeValidIdentifier(name)
         taken = {child.GetName() for child in stage.GetPrimAtPath(folder).GetChildren()}
         numbered = (f"{word}_{k}" for k in range(2, len(taken) + 3))

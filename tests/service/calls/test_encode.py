@@ -11,7 +11,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from shapespace.bundle.reader import read_bundle
-from shapespace.files.formats import MESH_FORMATS, npz
+from shapespace.files.formats import MESH_FORMATS
+from shapespace.files.npz import npz_bytes
 from shapespace.mesh.rigid_motion import align
 from shapespace.mesh.triangle_mesh import TriangleMesh
 from shapespace.model.correspondence import InvalidMeshError, Matched, limits, match
@@ -200,7 +201,7 @@ def written(format: str, vertices: np.ndarray = MESH.vertices, faces: np.ndarray
 
 
 def npz_with_objects() -> bytes:
-    return npz(vertices=MESH.vertices, faces=MESH.faces, more=np.array([{}], dtype=object))
+    return npz_bytes({"vertices": MESH.vertices, "faces": MESH.faces, "more": np.array([{}], dtype=object)})
 
 
 BAD = {
@@ -269,7 +270,7 @@ def of_files(tmp_path: Path) -> ShapeModel:
     with np.load(folder / "geometry.npz") as file:
         arrays = dict(file)
     arrays["file_vertices"] = np.array([-1, *range(64), 7])
-    (folder / "geometry.npz").write_bytes(npz(**arrays))
+    (folder / "geometry.npz").write_bytes(npz_bytes(arrays))
     seal(folder)
     return ShapeModel(read_bundle(folder))
 

@@ -8,7 +8,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from shapespace.client import Client, ClientError, Mesh
-from shapespace.files.formats import MESH_FORMATS, npz
+from shapespace.files.formats import MESH_FORMATS
+from shapespace.files.npz import npz_bytes
 from shapespace.model.shape_model import ShapeModel, load
 from tests.service.conftest import ROOT, starting
 
@@ -52,7 +53,7 @@ def as_off(points: np.ndarray) -> bytes:
 
 
 def as_npz(points: np.ndarray) -> bytes:
-    return npz(vertices=points)
+    return npz_bytes({"vertices": points})
 
 
 POINTS = {"xyz": as_xyz, "json": as_json, "ply": as_ply, "obj": as_obj, "off": as_off, "npz": as_npz}

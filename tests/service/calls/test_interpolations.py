@@ -19,7 +19,7 @@ import pytest
 from pxr import UsdGeom
 
 from shapespace.bundle.reader import read_bundle
-from shapespace.files.formats import read_arrays
+from shapespace.files.reading import read_arrays
 from shapespace.model.latent_space import LatentSpace
 from shapespace.service.use_cases.animation import Animation
 from tests.sequences import read_point_cache, read_usd

@@ -12,7 +12,8 @@ import pytest
 from starlette.responses import Response
 from starlette.types import Message, Receive, Scope, Send
 
-from shapespace.files.archives import npz_pieces, zip_pieces
+from shapespace.files.archives import zip_pieces
+from shapespace.files.npz import npz_pieces
 from shapespace.service.http.middleware import memory
 from shapespace.service.http.middleware.memory import PIECE_BYTES, LimitUnreadAnswers
 from tests.service.conftest import Start

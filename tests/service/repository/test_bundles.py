@@ -18,7 +18,7 @@ from onnx import TensorProto, helper, numpy_helper
 
 from benchmarks import synthetic
 from shapespace.bundle.reader import BundleError, read_bundle
-from shapespace.files.formats import npz
+from shapespace.files.npz import npz_bytes
 from shapespace.mesh.prolongation import Prolongation
 from shapespace.model.shape_model import ShapeModel
 from shapespace.service.limits import sandbox
@@ -209,7 +209,7 @@ def no_network(folder: Path) -> None:
 
 
 def geometry(folder: Path, **changes: np.ndarray) -> None:
-    (folder / "geometry.npz").write_bytes(npz(**geometry_of().arrays() | changes))
+    (folder / "geometry.npz").write_bytes(npz_bytes(geometry_of().arrays() | changes))
     seal(folder)
 
 
@@ -239,7 +239,7 @@ def pickled_geometry(folder: Path) -> None:
 
 def no_edges(folder: Path) -> None:
     mesh = reference()
-    (folder / "geometry.npz").write_bytes(npz(vertices=mesh.vertices, faces=mesh.faces))
+    (folder / "geometry.npz").write_bytes(npz_bytes({"vertices": mesh.vertices, "faces": mesh.faces}))
     seal(folder)
 
 

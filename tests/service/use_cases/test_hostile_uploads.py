@@ -1,15 +1,21 @@
-"""Uploads made to be expensive: each takes at most 64 MiB in addition to the file, and a few seconds."""
+"""Uploads made to be expensive: a process with limits reads them, and the server goes on."""
 
 import os
+import re
 import subprocess
 import sys
+from collections import deque
 from collections.abc import Iterator
 from pathlib import Path
 
 import httpx
 import pytest
 
-from tests.cost import SECONDS, Costs, costs
+from shapespace.files.limits import Limits
+from shapespace.service.limits.sandbox import Sandbox
+from shapespace.service.use_cases.codes import Upload, read_upload
+from shapespace.service.use_cases.uploads import UploadError
+from shapespace.solve.deadline import Deadline
 from tests.faults.serving import peak_memory
 from tests.hostile import BINARY, HOSTILE, MIB, MOST, chain, document, doubling, glb, graph, ring
 from tests.service.bundles import write_bundle
@@ -18,21 +24,34 @@ from tests.service.conftest import Server, starting
 ENCODE = "/v1/models/small/encode"
 
 
+#: Seconds that reading may take: far more than it needs, even on a busy machine.
+SECONDS = 300.0
+#: Bytes of an attack here. `tests/faults/on_requests.py` sends them with up to 64 MiB to a server.
+SIZE = 16 * MIB
+#: Limits of a model with meshes no larger than this.
+LIMITS = Limits(2**15, 2**16)
+
+
 @pytest.fixture(scope="module")
-def cost() -> Iterator[Costs]:
-    with costs() as ask:
-        yield ask
+def sandbox() -> Iterator[Sandbox]:
+    with Sandbox(1) as sandbox:
+        yield sandbox
 
 
 @pytest.mark.parametrize("name", HOSTILE)
-def test_what_reading_costs(name: str, cost: Costs) -> None:
-    said, body = HOSTILE[name](MOST)
+def test_an_attack_is_refused_in_one_sentence_or_read_as_the_mesh_it_holds(name: str, sandbox: Sandbox) -> None:
+    said, body = HOSTILE[name](SIZE)
     assert len(body) <= MOST
-    answer = cost(body, said)
-    assert "ended" not in answer, f"more than {SECONDS} seconds of a processor, or a crash: {answer}"
-    assert answer["memory"] <= 64 * MIB, answer
-    assert "\n" not in answer["said"]
-    assert len(answer["said"]) < 400
+    form = "/" in said
+    upload = Upload(deque([memoryview(body)]), said if form else "", None if form else said)
+    sentence = ""
+    try:
+        vertices, faces, _ = read_upload(sandbox, upload, LIMITS, Deadline(SECONDS))
+    except UploadError as error:
+        sentence = str(error)
+    assert (sentence and "\n" not in sentence and len(sentence) < 400) or (
+        0 < len(vertices) <= LIMITS.vertices and len(faces) <= LIMITS.faces
+    )
 
 
 def test_the_reader_is_light() -> None:
@@ -66,7 +85,7 @@ ACCESSORS = [
 GRAPHS = {
     "a chain of 3000 nodes with matrices": (lambda: chain(3000), 230_000, "more than 100 deep"),
     "a chain of 9,990 nodes with matrices": (lambda: chain(9990), 780_000, "more than 100 deep"),
-    "a graph of nodes": (lambda: graph(2400), 7_000_000, "bytes without data, where 4194304 are the most"),
+    "a graph of nodes": (lambda: graph(2400), 7_000_000, "lies in two others|takes more memory"),
     "a smaller graph of nodes": (lambda: graph(800), 800_000, "lies in two others"),
     "nodes that double": (lambda: doubling(30), 2000, "lies in two others"),
     "a ring": (ring, 1000, "lies in another one"),
@@ -85,6 +104,6 @@ def test_scenes_that_brought_the_server_down(name: str, small: Server) -> None:
         answer = client.post(ENCODE, params={"format": "glb"}, content=body)
         assert answer.status_code == 422
         assert answer.json()["type"] == "urn:shapespace:problem:invalid-mesh"
-        assert says in answer.json()["detail"]
+        assert re.search(says, answer.json()["detail"])
     assert peak_memory(small) < memory + len(body) + 64 * MIB
     assert processor_seconds(small) < seconds + 5

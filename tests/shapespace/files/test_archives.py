@@ -6,8 +6,9 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from shapespace.files import archives
-from shapespace.files.archives import npz_pieces, zip_pieces
+from shapespace.files import npz
+from shapespace.files.archives import zip_pieces
+from shapespace.files.npz import npz_pieces
 
 
 def test_members_are_read_back_whole(rng: np.random.Generator) -> None:
@@ -53,10 +54,10 @@ def test_arrays_of_every_form_are_read_back(rng: np.random.Generator) -> None:
 
 def test_rows_are_written_many_at_a_time_and_large_ones_alone(rng: np.random.Generator) -> None:
     faces = rng.integers(5000, size=(10_000, 3))
-    parts = list(archives._npy(faces))[1:]
+    parts = list(npz._npy_pieces(faces))[1:]
     assert b"".join(parts) == faces.tobytes()
-    assert {len(part) > 0.9 * archives.PIECE for part in parts[:-1]} == {True}
-    assert max(map(len, parts)) <= archives.PIECE
+    assert {len(part) > 0.9 * npz.PIECE for part in parts[:-1]} == {True}
+    assert max(map(len, parts)) <= npz.PIECE
     shapes = rng.standard_normal((4, 20_000, 3))
-    assert [len(part) for part in archives._npy(shapes)][1:] == [shapes[0].nbytes] * 4
-    assert [*archives._npy(np.empty((0, 3)))][1:] == []
+    assert [len(part) for part in npz._npy_pieces(shapes)][1:] == [shapes[0].nbytes] * 4
+    assert [*npz._npy_pieces(np.empty((0, 3)))][1:] == []

@@ -19,8 +19,9 @@ from shapespace.files.animated_gltf import animated_glb
 from shapespace.files.attributes.reading import read_attributes
 from shapespace.files.attributes.textures import LARGEST
 from shapespace.files.colouring import Colouring, Quantity
-from shapespace.files.formats import MESH_FORMATS, OBJ_ZIP, USD_FORMATS, read_arrays
+from shapespace.files.formats import MESH_FORMATS, OBJ_ZIP, USD_FORMATS
 from shapespace.files.limits import Limits
+from shapespace.files.reading import read_arrays
 from shapespace.files.usd import animated_usd
 from shapespace.mesh.attributes import Labels, MeshAttributes, SurfaceMaterial
 from shapespace.mesh.triangle_mesh import MeshError

@@ -13,9 +13,10 @@ from pxr import UsdGeom
 
 from shapespace.files.animated_gltf import DENSE_FRAMES, FRAMES_PER_SECOND, animated_glb
 from shapespace.files.colouring import Colouring, Quantity
-from shapespace.files.formats import MESH_FORMATS, read_arrays
+from shapespace.files.formats import MESH_FORMATS
 from shapespace.files.gltf_writing import surface_normals
 from shapespace.files.point_cache import point_cache
+from shapespace.files.reading import read_arrays
 from shapespace.files.usd import animated_usd
 from shapespace.mesh.attributes import MeshAttributes
 from shapespace.mesh.triangle_mesh import MeshError, TriangleMesh, vertex_normals

@@ -14,8 +14,9 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from shapespace.files.animated_gltf import animated_glb
-from shapespace.files.formats import MESH_FORMATS, read_arrays
+from shapespace.files.formats import MESH_FORMATS
 from shapespace.files.limits import Limits
+from shapespace.files.reading import read_arrays
 from shapespace.mesh.triangle_mesh import MeshError
 from shapespace.training.collection.generators import freaky_torus
 from tests.hostile import BINARY, FACES, MATRIX, VERTICES, chain, document, doubling, glb, graph, ring

@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 import trimesh
 
-from shapespace.files.formats import MESH_FORMATS, read_arrays
+from shapespace.files.formats import MESH_FORMATS
 from shapespace.files.limits import Limits
-from shapespace.files.npz_reading import load_npz
+from shapespace.files.npz import read_mesh_npz
+from shapespace.files.reading import read_arrays
 from shapespace.mesh.triangle_mesh import MeshError
 from tests.hostile import INDICES, XYZ, archive, npy, ply_head
 
@@ -141,11 +142,11 @@ def test_only_the_arrays_that_are_asked_for_are_unpacked() -> None:
         columns, vertices=np.asfortranarray(BALL.vertices), faces=BALL.faces.astype(">u2"), names=np.array(["a", "b"])
     )
     data = memoryview(columns.getvalue())
-    assert load_npz(data).keys() == {"vertices", "faces"}
-    arrays = load_npz(data, ("vertices", "names"))
+    assert read_mesh_npz(data).keys() == {"vertices", "faces"}
+    arrays = read_mesh_npz(data, ("vertices", "names"))
     assert np.array_equal(arrays["vertices"], BALL.vertices)
     assert arrays["names"].tolist() == ["a", "b"]
-    assert np.array_equal(load_npz(data)["faces"], BALL.faces)
+    assert np.array_equal(read_mesh_npz(data)["faces"], BALL.faces)
 
 
 POINT = npy("(1, 3)", bytes(24))
@@ -161,7 +162,6 @@ REFUSED: dict[str, tuple[str, bytes, str]] = {
     "OBJ: two numbers": ("obj", LINE + b"v 1 2\n", "line 2 is 'v 1 2'"),
     "OBJ: two corners": ("obj", LINE + b"f 1 1\n", "line 2 is 'f 1 1'"),
     "OBJ: a number of a million digits": ("obj", LINE + b"f 1 1 " + b"9" * 10**6, "line 2 is 'f 1 1 9999"),
-    "OBJ: a long line": ("obj", b"f 1" * 400_000, "line 1 has more than 1048576 bytes"),
     "OFF: of four dimensions": ("off", b"4OFF\n1 0 0\n0 0 0 0\n", "line 1 is '4OFF'"),
     "OFF: rows are missing": ("off", b"OFF\n3 1 0\n0 0 0\n1 0 0\n", "it ends before"),
     "OFF: corners are missing": ("off", b"OFF\n1 1 0\n0 0 0\n3 0 0\n", "line 4 is '3 0 0'"),
@@ -195,11 +195,6 @@ REFUSED: dict[str, tuple[str, bytes, str]] = {
         ply_head("binary_big_endian", "element face 2", INDICES) + b"\3" + bytes(12) + b"\4" + bytes(12),
         "says 2 rows of face",
     ),
-    "PLY: properties without end": (
-        "ply",
-        ply_head("ascii", "element vertex 1", *(f"property int x{k}" for k in range(300))),
-        "more properties",
-    ),
     "PLY: no end": ("ply", b"ply\nformat ascii 1.0\n" + b"comment\n" * 10**5, "damaged"),
     "NPZ: a checksum": ("npz", npz().replace(bytes(24), bytes(23) + b"\1", 1), "damaged"),
     "NPZ: cut short": ("npz", npz(npy("(9, 3)", bytes(24))), "damaged"),
@@ -207,7 +202,6 @@ REFUSED: dict[str, tuple[str, bytes, str]] = {
     "NPZ: text": ("npz", npz(npy("(1, 3)", bytes(1200), "<U100")), "an array of numbers, not <U100"),
     "NPZ: encrypted": ("npz", npz(patch=(8, 1, "<H")), "damaged"),
     "NPZ: LZMA": ("npz", npz(method=zipfile.ZIP_LZMA), "damaged"),
-    "NPZ: thousands of arrays": ("npz", archive({f"{k}.npy": b"" for k in range(1001)}), "holds 1001 arrays"),
     "unknown": ("fbx", b"", "not a readable fbx file"),
 }  # fmt: skip
 

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from shapespace.files.formats import MESH_FORMATS, READ_FORMATS
+from shapespace.files.formats import MESH_FORMATS
+from shapespace.files.reading import READ_FORMATS
 from shapespace.mesh.triangle_mesh import TriangleMesh, face_areas
 from shapespace.training.collection.checks import IngestError
 from shapespace.training.collection.ingest import read_collection

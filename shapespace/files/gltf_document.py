@@ -1,0 +1,345 @@
+"""Document of a glTF 2.0 file, from GLB or JSON: the tree of its JSON, and the data that accessors refer to.
+
+Sections in comments are sections of the Khronos Group's glTF 2.0 specification.
+"""
+
+from __future__ import annotations
+
+import binascii
+import json
+import re
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import Any
+from urllib.parse import unquote
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shapespace.arrays import FloatArray
+from shapespace.files.limits import clipped
+from shapespace.mesh.triangle_mesh import MeshError
+
+#: Most levels of nodes. Programs that model write far fewer.
+_MOST_LEVELS = 100
+#: Prefixes of extensions that change no triangle, so that a file may require them.
+_APPEARANCE = ("KHR_materials_", "KHR_texture_", "EXT_texture_", "KHR_lights_", "EXT_lights_")
+#: Extension that allows positions as integers. It is implemented here.
+_QUANTIZATION = "KHR_mesh_quantization"
+#: NumPy types of component types, and components of element types (3.6.2.2).
+_DTYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
+_WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
+#: Largest ``byteStride`` (3.6.2.4).
+_LARGEST_STRIDE = 252
+_DATA_URI = re.compile(rb'"(data:[^"\\]*+)"')
+
+
+def read_document(data: memoryview, *, binary: bool, beside: Path | None) -> tuple[GltfDocument, Buffers]:
+    """Return the JSON of a file and its buffers.
+
+    Args:
+        data: content of the file.
+        binary: whether it is GLB.
+        beside: path of the file, if buffers in files beside it may be read.
+    """
+    text, chunk = _chunks(data) if binary else (data, None)
+    tree, uris = _parse(text)
+    document = GltfDocument(tree)
+    return document, Buffers(document.buffers, chunk, uris, beside)
+
+
+def _chunks(data: memoryview) -> tuple[memoryview, memoryview | None]:
+    """Split a GLB file into its JSON and its data (4.4)."""
+    magic, version, length, size, kind = struct.unpack_from("<4sIII4s", data)
+    if (magic, kind) != (b"glTF", b"JSON"):
+        raise ValueError("damaged, or another kind of file")
+    if version != 2:
+        raise MeshError(f"it is GLB {version}, and 2 is read")
+    if not 20 + size <= length <= len(data):
+        raise ValueError(f"it says {length} bytes, and has {len(data)}")
+    text, rest = data[20 : 20 + size], data[20 + size : length]
+    if len(rest) < 8:
+        return text, None
+    size, kind = struct.unpack_from("<I4s", rest)
+    if size > len(rest) - 8:
+        raise ValueError("it is cut short")
+    return text, rest[8 : 8 + size] if kind == b"BIN\0" else None
+
+
+def _parse(text: memoryview) -> tuple[dict[str, Any], list[memoryview]]:
+    """Parse JSON without its data URIs, which can be much longer than the rest.
+
+    Returns:
+        The JSON object, with ``data:K`` in place of data URI K, and the data URIs.
+    """
+    pieces: list[bytes | memoryview] = []
+    uris: list[memoryview] = []
+    place = 0
+    for match in _DATA_URI.finditer(text):
+        start, stop = match.span(1)
+        pieces += [text[place:start], b"data:%d" % len(uris)]
+        uris.append(text[start:stop])
+        place = stop
+    tree = json.loads(b"".join([*pieces, text[place:]]))
+    if not isinstance(tree, dict):
+        raise ValueError("its JSON is no object")
+    return tree, uris
+
+
+class GltfDocument:
+    """The parts of the JSON that describe triangles.
+
+    Attributes:
+        tree: the whole JSON object.
+        buffers, views, accessors, meshes, nodes: entries of the members with these names.
+
+    Raises:
+        MeshError: the file is not glTF 2, or requires an extension that is not read.
+        ValueError: one of these members is not a list of objects.
+    """
+
+    def __init__(self, tree: dict[str, Any]) -> None:
+        self.tree = tree
+        version = clipped(tree.get("asset", {}).get("version", "2.0"))
+        if version.partition(".")[0] != "2":
+            raise MeshError(f"it is glTF {version}, and 2 is read")
+        required = [name for name in tree.get("extensionsRequired", []) if name != _QUANTIZATION]
+        unknown = [name for name in required if not name.startswith(_APPEARANCE)]
+        if unknown:
+            raise MeshError(f"it requires {clipped(', '.join(unknown))}, which is not read: export it without")
+        kinds = ("buffers", "bufferViews", "accessors", "meshes", "nodes", "scenes")
+        self.buffers, self.views, self.accessors, self.meshes, self.nodes, self._scenes = (
+            objects(tree, kind) for kind in kinds
+        )
+        self._scene = tree.get("scene", 0)
+
+    def roots(self) -> list[int]:
+        """Return the root nodes of the default scene. Without scenes, these are all nodes that have no parent.
+
+        Raises:
+            MeshError: a node has two parents, or is a root and a child.
+        """
+        children = set[int]()
+        for node in self.nodes:
+            for child in node.get("children", []):
+                if child in children:
+                    raise MeshError(f"its node {clipped(child)} lies in two others")
+                children.add(child)
+        if not self._scenes:
+            return [k for k in range(len(self.nodes)) if k not in children]
+        roots: list[int] = entry_at(self._scenes, self._scene).get("nodes", [])
+        if len(set(roots)) < len(roots) or children & set(roots):
+            raise MeshError("a node of its scene lies in another one, or is there twice")
+        return roots
+
+    def placed_meshes(self) -> Iterator[tuple[int, FloatArray | None]]:
+        """Yield each mesh of the scene by its index, with its matrix (4, 4), or None for the identity."""
+        if not self.nodes:
+            yield from ((k, None) for k in range(len(self.meshes)))
+        # The last root is first. Bundles and codes depend on this order.
+        waiting: list[tuple[int, FloatArray | None, int]] = [(root, None, 1) for root in self.roots()]
+        while waiting:
+            number, outer, depth = waiting.pop()
+            if depth > _MOST_LEVELS:
+                raise MeshError(f"its nodes lie more than {_MOST_LEVELS} deep in each other")
+            node = entry_at(self.nodes, number)
+            inner = _matrix(node)
+            place = outer if inner is None else inner if outer is None else outer @ inner
+            waiting += [(child, place, depth + 1) for child in node.get("children", [])]
+            if "mesh" in node:
+                yield node["mesh"], place
+
+
+def objects(tree: dict[str, Any], name: str) -> list[dict[str, Any]]:
+    """Return a member that is a list of objects; raises ValueError if it is something else."""
+    entries = tree.get(name, [])
+    if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
+        raise ValueError(f"its {name} are no list of objects")
+    return entries
+
+
+def entry_at(entries: list[dict[str, Any]], index: object) -> dict[str, Any]:
+    """Return the entry at an index; raises ValueError or IndexError if it is not an index of an entry."""
+    return entries[_natural(index)]
+
+
+def _natural(value: object) -> int:
+    if type(value) is not int or value < 0:
+        raise ValueError(f"{clipped(value)} stands where a whole number should")
+    return value
+
+
+def _matrix(node: dict[str, Any]) -> FloatArray | None:
+    """Return the matrix (4, 4) of a node, or None for the identity (3.5.3)."""
+    if not node.keys() & {"matrix", "translation", "rotation", "scale"}:
+        return None
+    matrix = np.eye(4)
+    if "rotation" in node:
+        matrix[:3, :3] = _rotation(*_numbers(node["rotation"], 4))
+    if "scale" in node:
+        matrix[:3, :3] *= _numbers(node["scale"], 3)
+    if "translation" in node:
+        matrix[:3, 3] = _numbers(node["translation"], 3)
+    if "matrix" in node:
+        given = _numbers(node["matrix"], 16).reshape(4, 4).T
+        if (given[3] != [0, 0, 0, 1]).any():
+            raise ValueError("the last row of a matrix is not 0, 0, 0, 1")
+        matrix = given @ matrix
+    return None if np.array_equal(matrix, np.eye(4)) else matrix
+
+
+def _rotation(x: float, y: float, z: float, w: float) -> FloatArray:
+    """Return the rotation matrix (3, 3) of a quaternion of any length."""
+    rotation = [
+        [w * w + x * x - y * y - z * z, 2 * (x * y - z * w), 2 * (x * z + y * w)],
+        [2 * (x * y + z * w), w * w - x * x + y * y - z * z, 2 * (y * z - x * w)],
+        [2 * (x * z - y * w), 2 * (y * z + x * w), w * w - x * x - y * y + z * z],
+    ]
+    return np.array(rotation) / (x * x + y * y + z * z + w * w)
+
+
+def _numbers(value: object, length: int) -> FloatArray:
+    numbers = np.array(value, np.float64)
+    if numbers.shape != (length,):
+        raise ValueError(f"{length} numbers are needed in a node, not {clipped(value)}")
+    return numbers
+
+
+@dataclass(frozen=True)
+class Accessor:
+    """Location and type of an array of elements (3.6.2).
+
+    Attributes:
+        buffer: index of the buffer.
+        start: offset of the first byte in the buffer.
+        stride: bytes from one element to the next.
+        count: number of elements.
+        dtype: type of the components.
+        width: number of components in an element.
+        normalized: whether integers stand for numbers between 0 or −1 and 1.
+    """
+
+    buffer: int
+    start: int
+    stride: int
+    count: int
+    dtype: np.dtype
+    width: int
+    normalized: bool
+
+    @classmethod
+    def of(cls, document: GltfDocument, index: object, kind: str, components: tuple[int, ...]) -> Accessor:
+        """Return an accessor of a document.
+
+        Args:
+            document: document of the file.
+            index: index of the accessor.
+            kind: type that its elements must have.
+            components: component types that it may have.
+
+        Raises:
+            MeshError: the accessor is sparse or has no data.
+            ValueError: it has another type, or more elements than there are data.
+        """
+        accessor = entry_at(document.accessors, index)
+        if "sparse" in accessor:
+            raise MeshError(f"its accessor {index} is sparse, which is not read: export every value")
+        if "bufferView" not in accessor:
+            raise MeshError(f"its accessor {index} has no data")
+        if accessor["type"] != kind or accessor["componentType"] not in components:
+            raise ValueError(f"its accessor {index} is of another type than it has to be")
+        dtype, width = np.dtype(_DTYPES[accessor["componentType"]]), _WIDTHS[kind]
+        number, size = _natural(accessor["count"]), width * dtype.itemsize
+        view = entry_at(document.views, accessor["bufferView"])
+        stride, inside = _natural(view.get("byteStride", size)), _natural(accessor.get("byteOffset", 0))
+        if not number or not size <= stride <= _LARGEST_STRIDE:
+            raise ValueError(f"its accessor {index} has {number} elements, {stride} bytes apart")
+        start, length = _natural(view.get("byteOffset", 0)), _natural(view["byteLength"])
+        buffer = _natural(view["buffer"])
+        if (
+            inside + (number - 1) * stride + size > length
+            or start + length > _natural(entry_at(document.buffers, buffer)["byteLength"])
+        ):  # fmt: skip
+            raise ValueError(f"its accessor {index} has {number} elements, which is more than there are data")
+        return cls(buffer, start + inside, stride, number, dtype, width, accessor.get("normalized", False) is True)
+
+    def real(self, buffers: Buffers) -> FloatArray:
+        """Return the elements (count, width) as float64; normalised integers become fractions."""
+        given = self.read(buffers)
+        values = given.astype(np.float64)
+        if self.normalized and given.dtype.kind != "f":
+            values /= np.iinfo(given.dtype).max
+            np.maximum(values, -1, out=values)
+        return values
+
+    def read(self, buffers: Buffers) -> NDArray:
+        """Return the elements (count, width) in the type of the file."""
+        size = self.width * self.dtype.itemsize
+        content = buffers.read(self.buffer, self.start, self.start + (self.count - 1) * self.stride + size)
+        return np.ndarray((self.count, self.width), self.dtype, content, 0, (self.stride, self.dtype.itemsize))
+
+
+class Buffers:
+    """Buffers of a document: in the data of a GLB file, in the JSON, or in files beside it (3.6.1).
+
+    `read` opens files and decodes base64 only for the bytes that it returns.
+
+    Args:
+        entries: entries of the document's ``buffers``.
+        chunk: data of a GLB file.
+        uris: data URIs of the JSON, see `_parse`.
+        beside: path of the file, if buffers in files beside it may be read.
+    """
+
+    def __init__(
+        self, entries: list[dict[str, Any]], chunk: memoryview | None, uris: list[memoryview], beside: Path | None
+    ) -> None:
+        self._sources: list[memoryview | Path | None] = []
+        self._encoded, self._uris = set[int](), uris
+        for k, entry in enumerate(entries):
+            uri = entry.get("uri")
+            if uri is None:
+                self._sources.append(chunk if k == 0 else None)
+            elif uri.startswith("data:"):
+                text = self.text(uri)
+                header, comma, _ = bytes(text[:1000]).partition(b",")
+                if not comma or not header.endswith(b";base64"):
+                    raise ValueError("it has data that aren't base64")
+                self._encoded.add(k)
+                self._sources.append(text[len(header) + 1 :])
+            else:
+                self._sources.append(_beside(unquote(uri), beside))
+
+    def text(self, uri: str) -> memoryview:
+        """Return the data URI for a ``uri`` of the JSON, see `_parse`."""
+        return self._uris[int(uri[5:])] if uri[5:].isdecimal() else memoryview(uri.encode())
+
+    def read(self, index: int, start: int, stop: int) -> bytes | memoryview:
+        """Return bytes of a buffer; raises ValueError if the buffer ends before ``stop``."""
+        source = self._sources[index]
+        content: bytes | memoryview
+        if source is None:
+            raise ValueError(f"its buffer {index} has no data")
+        if isinstance(source, Path):
+            with source.open("rb") as file:
+                file.seek(start)
+                content = file.read(stop - start)
+        elif index in self._encoded:
+            first, last = start // 3 * 4, -(-stop // 3) * 4
+            decoded = binascii.a2b_base64(source[first:last], strict_mode=True)
+            content = memoryview(decoded)[start % 3 :][: stop - start]
+        else:
+            content = source[start:stop]
+        if len(content) < stop - start:
+            raise ValueError(f"its buffer {index} ends before its data")
+        return content
+
+
+def _beside(name: str, path: Path | None) -> Path:
+    """Return the path of a file in the folder of ``path`` or below; raises ValueError if there is none."""
+    inside = PurePosixPath(name)
+    if path is None or inside.is_absolute() or ".." in inside.parts or not (path.parent / inside).is_file():
+        raise ValueError(f"it needs {clipped(name)}, which is not beside it")
+    return path.parent / inside

@@ -1,0 +1,271 @@
+"""Reader of PLY, ASCII and binary: the vertices in the order of the file, and its polygons as triangles."""
+
+from __future__ import annotations
+
+import re
+from array import array
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shapespace.arrays import FloatArray, IntArray
+from shapespace.files.limits import Limits, clipped
+from shapespace.files.polygon_reading import Lines, TriangleFans, first_values
+
+#: Bytes at the start of a file in which its header has to end.
+_LONGEST_HEADER = 2**16
+_DTYPES = {
+    "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4",
+    "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4", "int64": "i8",
+    "uint64": "u8", "double": "f8", "float32": "f4", "float64": "f8",
+}  # fmt: skip
+_BYTE_ORDERS = {b"binary_little_endian": "<", b"binary_big_endian": ">", b"ascii": ""}
+
+
+@dataclass(frozen=True)
+class PlyProperty:
+    """A property of the rows of an element.
+
+    Attributes:
+        name: name of the property.
+        type: type of the value, or of the entries of a list.
+        length: type of the number of entries of a list; None if the property is no list.
+    """
+
+    name: str
+    type: np.dtype
+    length: np.dtype | None
+
+
+@dataclass(frozen=True)
+class PlyElement:
+    """An element of a PLY file, which is a table.
+
+    Attributes:
+        name: name of the element.
+        rows: number of rows.
+        properties: columns, in order.
+    """
+
+    name: str
+    rows: int
+    properties: list[PlyProperty]
+
+    @cached_property
+    def lists(self) -> list[int]:
+        """Indices of the properties that are lists."""
+        return [k for k, p in enumerate(self.properties) if p.length is not None]
+
+    @cached_property
+    def steps(self) -> list[tuple[int, np.dtype, int]]:
+        """For each list: bytes between it and the previous list, type of its length, and bytes of an entry."""
+        steps, gap = [], 0
+        for p in self.properties:
+            if p.length is None:
+                gap += p.type.itemsize
+            else:
+                steps.append((gap, p.length, p.type.itemsize))
+                gap = 0
+        return steps
+
+    @cached_property
+    def rest(self) -> int:
+        """Bytes after the last list of a row."""
+        return sum(p.type.itemsize for p in self.properties[max(self.lists, default=-1) + 1 :])
+
+    @property
+    def coordinates(self) -> list[int]:
+        """Indices of the properties x, y and z; raises ValueError if one is missing."""
+        names = [p.name for p in self.properties]
+        if self.lists or not {"x", "y", "z"} <= set(names):
+            raise ValueError("its vertices have lists, or no x, y and z")
+        return [names.index(axis) for axis in "xyz"]
+
+    @property
+    def corners(self) -> int:
+        """Index of the property that lists the vertices of a face; raises ValueError if there is none."""
+        for k, p in enumerate(self.properties):
+            if p.name in ("vertex_indices", "vertex_index") and p.length is not None and p.type.kind != "f":
+                return k
+        raise ValueError("its faces have no list of vertex_indices")
+
+
+def read_ply(data: memoryview, limits: Limits) -> tuple[FloatArray, IntArray]:
+    """Return vertices (V, 3) and faces (F, 3) of a PLY file; other elements are ignored."""
+    text, elements, body = read_header(data)
+    table = TextTable(body, limits) if text else BinaryTable(body, limits)
+    vertices, faces = np.zeros((0, 3)), np.zeros((0, 3), np.int64)
+    # Elements after these two are not read.
+    wanted = {element.name for element in elements if element.rows} & {"vertex", "face"}
+    for element in elements:
+        if not wanted:
+            break
+        if element.name == "vertex":
+            limits.check(element.rows, 0)
+            vertices = table.columns(element, element.coordinates)
+        elif element.name == "face" and element.rows:
+            limits.check(0, element.rows)
+            faces = table.polygons(element)
+        else:
+            table.skip(element)
+        wanted.discard(element.name)
+    return vertices, faces
+
+
+def read_header(data: memoryview) -> tuple[bool, list[PlyElement], memoryview]:
+    """Return whether a file is ASCII, its elements, and the content after its header."""
+    head = bytes(data[:_LONGEST_HEADER])
+    end = re.search(rb"^end_header[ \t]*\r?\n", head, re.MULTILINE)
+    if not head.startswith(b"ply") or not end:
+        raise ValueError("damaged, or another kind of file")
+    order, elements = None, list[PlyElement]()
+    for line in head[: end.start()].splitlines():
+        match line.split():
+            case [b"format", kind, _]:
+                order = _BYTE_ORDERS[kind]
+            case [b"element", name, rows]:
+                elements.append(PlyElement(name.decode("latin-1"), int(rows), []))
+            case [b"property", b"list", length, kind, name]:
+                elements[-1].properties.append(_property(name, kind, length, order))
+            case [b"property", kind, name]:
+                elements[-1].properties.append(_property(name, kind, None, order))
+    if order is None or len({e.name for e in elements}) < len(elements) or any(e.rows < 0 for e in elements):
+        raise ValueError("its head is damaged")
+    return order == "", elements, data[end.end() :]
+
+
+def _property(name: bytes, kind: bytes, length: bytes | None, order: str | None) -> PlyProperty:
+    types = [np.dtype((order or "") + _DTYPES[k.decode("latin-1")]) for k in (kind, length) if k is not None]
+    if length is not None and types[1].kind == "f":
+        raise ValueError("the length of a list is no whole number")
+    return PlyProperty(name.decode("latin-1"), types[0], types[1] if length is not None else None)
+
+
+class TextTable:
+    """Rows of an ASCII file, one on each line.
+
+    Elements have to be read or skipped in their order in the file.
+
+    Args:
+        data: content after the header.
+        limits: largest number of triangles.
+    """
+
+    def __init__(self, data: memoryview, limits: Limits) -> None:
+        self._limits, self._lines = limits, Lines(data)
+
+    def skip(self, element: PlyElement) -> None:
+        """Skip the rows of an element."""
+        with self._lines:
+            self._lines.skip(element.rows)
+
+    def columns(self, element: PlyElement, which: Sequence[int]) -> FloatArray:
+        """Return the properties ``which`` of an element without lists, (rows, k)."""
+        values = array("d")
+        with self._lines:
+            for _ in range(element.rows):
+                row = self._lines.next().split()
+                values.extend(float(row[k]) for k in which)
+        return np.array(values, np.float64).reshape(-1, len(which))
+
+    def polygons(self, element: PlyElement) -> IntArray:
+        """Return the polygons in the rows of an element as triangles (F, 3)."""
+        triangles = TriangleFans(self._limits)
+        with self._lines:
+            for (corners,) in self.lists(element, [element.corners]):
+                triangles.add([int(value) for value in corners])
+        return triangles.faces
+
+    def lists(self, element: PlyElement, which: Sequence[int]) -> Iterator[list[Sequence[bytes]]]:
+        """Yield the lists ``which`` of each row."""
+        for _ in range(element.rows):
+            row, start, found = self._lines.next().split(), 0, dict[int, Sequence[bytes]]()
+            for k, p in enumerate(element.properties[: max(which) + 1]):
+                if p.length is None:
+                    start += 1
+                    continue
+                if k in which:
+                    found[k] = first_values(int(row[start]), row[start + 1 :])
+                start += 1 + int(row[start])
+            yield [found[k] for k in which]
+
+
+class BinaryTable:
+    """Rows of a binary file; with the methods of `TextTable`."""
+
+    def __init__(self, data: memoryview, limits: Limits) -> None:
+        self._data, self._limits, self._place = data, limits, 0
+
+    def _equal_rows(self, element: PlyElement, lengths: Sequence[int] = ()) -> NDArray:
+        """View the rows of an element as a structured array, if all lists have these lengths.
+
+        Fields have the index of their property as name.
+        """
+        fields: list[tuple] = []
+        left = iter(lengths)
+        for k, p in enumerate(element.properties):
+            if p.length is None:
+                fields.append((f"{k}", p.type, (1,)))
+            else:
+                fields += [(f"length {k}", p.length), (f"{k}", p.type, (next(left),))]
+        row = np.dtype(fields)
+        if element.rows * row.itemsize > len(self._data) - self._place:
+            raise ValueError(f"it says {element.rows} rows of {clipped(element.name)}, and ends before")
+        return np.ndarray((element.rows,), row, self._data, self._place)
+
+    def skip(self, element: PlyElement) -> None:
+        """Skip the rows of an element."""
+        if element.lists:
+            raise ValueError(f"its {clipped(element.name)} rows, before the faces, have lists")
+        self._place += self._equal_rows(element).nbytes
+
+    def columns(self, element: PlyElement, which: Sequence[int]) -> FloatArray:
+        """Return the properties ``which`` of an element without lists, (rows, k)."""
+        rows = self._equal_rows(element)
+        self._place += rows.nbytes
+        return np.hstack([rows[f"{k}"] for k in which]).astype(np.float64)
+
+    def polygons(self, element: PlyElement) -> IntArray:
+        """Return the polygons in the rows of an element as triangles (F, 3)."""
+        corners = element.corners
+        which = element.lists.index(corners)
+        spans, _ = self._row(element)
+        try:
+            rows = self._equal_rows(element, [length for _, length in spans])
+            lengths = zip(element.lists, spans, strict=True)
+            equal = all((rows[f"length {k}"] == length).all() for k, (_, length) in lengths)
+        except ValueError:  # the file is too short for rows like the first one
+            equal = False
+        if equal and spans[which][1] == 3:
+            self._place += rows.nbytes
+            return rows[f"{corners}"].astype(np.int64)
+        triangles = TriangleFans(self._limits)
+        for (polygon,) in self.lists(element, [corners]):
+            self._limits.check(0, len(polygon) - 2)
+            triangles.add(polygon.tolist())
+        return triangles.faces
+
+    def lists(self, element: PlyElement, which: Sequence[int]) -> Iterator[list[NDArray]]:
+        """Yield the lists ``which`` of each row."""
+        places = [(element.lists.index(k), element.properties[k].type) for k in which]
+        for _ in range(element.rows):
+            spans, self._place = self._row(element)
+            yield [np.ndarray((spans[place][1],), kind, self._data, spans[place][0]) for place, kind in places]
+
+    def _row(self, element: PlyElement) -> tuple[list[tuple[int, int]], int]:
+        """Return start and number of entries of each list of the next row, and the end of the row."""
+        spans, place = [], self._place
+        for gap, kind, size in element.steps:
+            start = place + gap + kind.itemsize
+            order: Any = "big" if kind.str[0] == ">" else "little"
+            length = int.from_bytes(self._data[place + gap : start], order, signed=kind.kind == "i")
+            spans.append((start, length))
+            place = start + max(length, 0) * size
+        place += element.rest
+        if place > len(self._data):
+            raise ValueError(f"it says {element.rows} rows of {clipped(element.name)}, and ends before")
+        return spans, place

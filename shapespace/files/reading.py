@@ -1,0 +1,89 @@
+"""Reading one mesh file of any format, with the vertices in the order of the file.
+
+This module imports no writer, because the process that reads uploads should start fast and need little memory.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from shapespace.files.gltf_reading import read_gltf
+from shapespace.files.limits import UNLIMITED, Limits, clipped
+from shapespace.files.npz import read_mesh_npz
+from shapespace.files.ply_reading import read_ply
+from shapespace.files.polygon_reading import read_obj, read_off, read_stl, read_xyz
+from shapespace.mesh.triangle_mesh import MeshError
+
+#: Media type of formats that have none registered at IANA.
+OCTET_STREAM = "application/octet-stream"
+#: Media types of the mesh formats that can be read, by name.
+READ_FORMATS = {
+    "glb": "model/gltf-binary",
+    "gltf": "model/gltf+json",
+    "obj": "model/obj",
+    "ply": OCTET_STREAM,
+    "stl": "model/stl",
+    "npz": OCTET_STREAM,
+    "off": OCTET_STREAM,
+}
+#: Media types of the formats of point clouds, which may have no faces.
+SCAN_FORMATS = READ_FORMATS | {"xyz": OCTET_STREAM}
+_READERS = {"obj": read_obj, "off": read_off, "ply": read_ply, "stl": read_stl}
+
+
+def read_arrays(
+    source: bytes | bytearray | memoryview | Path,
+    format: str | None = None,
+    limits: Limits = UNLIMITED,
+    *,
+    points: bool = False,
+) -> tuple[np.ndarray, np.ndarray]:
+    r"""Read one mesh as it is in its file: vertices (V, 3) and faces (F, 3), nothing merged and nothing checked.
+
+    An STL file has three vertices for each face. With a path, the buffers that lie beside a glTF file are found too.
+
+    A damaged or hostile file can take long, or as much memory as there is. Read files of untrusted clients in a process
+    with limits, as the server does (`shapespace.service.limits.sandbox`).
+
+    Args:
+        source: content of the file, or its path.
+        format: one of READ_FORMATS; by default the extension of the path.
+        limits: largest numbers of vertices and faces. A larger mesh is refused.
+        points: whether points without faces are accepted. The format can then be one of SCAN_FORMATS.
+
+    Raises:
+        MeshError: the file is unreadable, too large, or doesn't hold exactly one mesh.
+
+    >>> content = b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"
+    >>> vertices, faces = read_arrays(content, "obj")
+    >>> vertices.shape, faces.tolist()
+    ((3, 3), [[0, 1, 2]])
+    """
+    beside = source if isinstance(source, Path) else None
+    if isinstance(source, Path):
+        format = format or source.suffix.lstrip(".").lower()
+        try:
+            source = source.read_bytes()
+        except OSError as error:
+            raise MeshError(f"can't be read: {error.strerror}") from error
+    data = memoryview(source)
+    try:
+        # The caller decides whether coordinates that are not finite are a fault.
+        with np.errstate(all="ignore"):
+            match format:
+                case "glb" | "gltf":
+                    return read_gltf(data, limits, binary=format == "glb", beside=beside)
+                case "npz":
+                    needed = ("vertices",) if points else ("vertices", "faces")
+                    arrays = read_mesh_npz(data, limits=limits, needed=needed)
+                    return arrays["vertices"], arrays.get("faces", np.zeros((0, 3), np.int64))
+                case "xyz" if points:
+                    return read_xyz(data, limits)
+                case _:
+                    return _READERS[str(format)](data, limits)
+    except (MeshError, MemoryError):
+        raise
+    except Exception as error:  # damaged files raise exceptions of many classes
+        raise MeshError(f"not a readable {format} file: {clipped(error, 300)}") from error
