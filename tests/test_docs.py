@@ -2,10 +2,13 @@
 
 import re
 import tomllib
+from collections import defaultdict
 from pathlib import Path
 
 import pytest
 import yaml
+
+from tests.long.__main__ import BEGIN, END, RECORD, TESTS, recorded
 
 ROOT = Path(__file__).parents[1]
 PAGES = [*sorted(ROOT.glob("*.md")), *sorted((ROOT / "docs").rglob("*.md"))]
@@ -57,6 +60,22 @@ def test_the_workflow_runs_what_people_run() -> None:
     jobs = yaml.safe_load((ROOT / ".github" / "workflows" / "ci.yml").read_text(encoding="utf-8"))["jobs"]
     assert {"run": ".ci/run"} in jobs["suite"]["steps"]
     assert set(jobs["wheel"]["strategy"]["matrix"]["os"]) == {"ubuntu-latest", "macos-latest", "windows-latest"}
+
+
+def test_every_long_test_is_listed_with_its_folders() -> None:
+    table = text_of(ROOT / "CONTRIBUTING.md").partition("## Long tests")[2].partition("\n## ")[0]
+    told = defaultdict(set)
+    for row in re.findall(r"^\| (`.*`) \| (`.*`) \|$", table, re.MULTILINE):
+        folders, names = (re.findall("`([^`]+)`", cell) for cell in row)
+        for name in names:
+            told[name] |= {folder.rstrip("/") for folder in folders}
+    assert told == {name: set(test.folders) for name, test in TESTS.items()}
+    assert all((ROOT / folder).exists() for test in TESTS.values() for folder in test.folders)
+
+
+def test_the_record_of_long_tests_has_tests_that_are_there() -> None:
+    assert all(RECORD.read_text(encoding="utf-8").count(mark) == 1 for mark in (BEGIN, END))
+    assert recorded().keys() <= TESTS.keys()
 
 
 def test_the_site_has_every_page() -> None:

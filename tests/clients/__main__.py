@@ -1,6 +1,6 @@
 """``python -m tests.clients BLENDER_PYTHON``: open the server's files of all bundled models elsewhere.
 
-``make clients`` installs Blender's package in an environment of its own and calls this.
+``make long clients`` installs Blender's package in an environment of its own and calls this.
 """
 
 import subprocess

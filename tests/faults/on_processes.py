@@ -27,7 +27,8 @@ from tests.service.truth import Truth, fingerprint, good_calls
 def terminated(arena: Arena, rng: np.random.Generator) -> str:
     server = arena.start(arena.steady.models, workers=2, drain=rng.choice([0, 0.5]))
     load = Load(server, 6)
-    time.sleep(rng.uniform(0.5, 2))
+    enough = rng.integers(1, 100)
+    eventually(lambda: load.outcomes["answered"] >= enough)
     server.process.send_signal(signal.SIGTERM)
     load.wait()
     assert set(load.outcomes) == {"answered", "refused"}, load.outcomes

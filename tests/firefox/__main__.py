@@ -1,4 +1,4 @@
-"""``python -m tests.firefox``: the page in Firefox, driven by WebDriver BiDi; ``make firefox`` sets it up."""
+"""``python -m tests.firefox``: the page in Firefox, driven by WebDriver BiDi; ``make long firefox`` sets it up."""
 
 import os
 import shutil

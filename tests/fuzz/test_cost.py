@@ -1,7 +1,7 @@
 """Requests generated to be expensive: none may exceed its budget.
 
-The suite sends one request of each quick kind, always the same; ``make fuzz`` sends thousands of new ones
-and prints the most expensive. ``python -m tests.fuzz`` sends single kinds and seeds.
+Budgets are of processor time, so these tests need a machine with little else to do. ``make long costs`` sends
+thousands of new requests and prints the most expensive. ``python -m tests.fuzz`` sends single kinds and seeds.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ import pytest
 from tests.fuzz.cost import COSTS, Arena, serving
 from tests.fuzz.kinds import KINDS, World, made, shares
 
+pytestmark = pytest.mark.long
 EXAMPLES = int(os.environ.get("FUZZ_EXAMPLES", "0"))
 COUNTS = shares(EXAMPLES) if EXAMPLES else {name: 1 for name, kind in KINDS.items() if not kind.long}
 FIRST = int(time.time()) if EXAMPLES else 0

@@ -1,4 +1,4 @@
-"""three.js opens files of the server; ``make clients`` does the same in Blender."""
+"""three.js opens files of the server; ``make long clients`` does the same in Blender."""
 
 import json
 import subprocess

@@ -25,9 +25,9 @@ EXTRAS = PROJECT["project"]["optional-dependencies"]
 LOCKED = {
     "serve": {"serve"},
     "dev": EXTRAS.keys(),
-    "lowest": {"serve", "client", "usd", "dev"},
+    "lowest": {"serve", "client", "usd", "check", "dev"},
 }
-UNLOCKED = {"torch"}
+UNLOCKED = {"torch", PROJECT["project"]["name"]}
 
 
 def manifests() -> dict[str, Any]:

@@ -115,7 +115,7 @@ def test_examples_are_as_described_and_answered_as_described(served: Server, nam
 
 
 def test_schemathesis_finds_nothing(served: Server, tmp_path: Path) -> None:
-    """All checks of schemathesis on every call; `make fuzz-api` uses more examples, each time new ones."""
+    """All checks of schemathesis on every call; `make long fuzz-api` uses more examples, each time new ones."""
     count = os.environ.get("FUZZ_EXAMPLES")
     share = ["--max-examples", count or "10"]
     if not count:
