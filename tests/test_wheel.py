@@ -91,6 +91,7 @@ def test_shapespace_is_alone_at_its_top(wheel: Path) -> None:
     assert inside == own
 
 
+@pytest.mark.long
 def test_a_wheel_from_the_source_distribution_is_the_same(wheel: Path, tmp_path: Path) -> None:
     sources = checkout(tmp_path / "sources")
     program = "import sys, setuptools.build_meta; setuptools.build_meta.build_sdist(sys.argv[1])"
@@ -117,6 +118,7 @@ def test_a_checkout_without_links_is_refused_in_a_sentence(tmp_path: Path) -> No
         build(sources)
 
 
+@pytest.mark.long
 def test_type_checkers_know_it(installed: Path, tmp_path: Path) -> None:
     (tmp_path / "user.py").write_text("""
 import shapespace

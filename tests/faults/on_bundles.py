@@ -15,9 +15,10 @@ import httpx
 import numpy as np
 
 from tests.faults.catalogue import Arena, fault
-from tests.faults.serving import Steady, eventually, peak_memory
+from tests.faults.serving import Steady, peak_memory
 from tests.service import hostile
 from tests.service.truth import Truth, bad_calls, good_calls
+from tests.service.watching import eventually
 
 #: Number of bundles damaged at the same time.
 BATCH = 8

@@ -10,8 +10,8 @@ import time
 import numpy as np
 
 from tests.faults.catalogue import Arena, fault
-from tests.faults.serving import Steady, eventually
-from tests.service.watching import admitted
+from tests.faults.serving import Steady
+from tests.service.watching import admitted, eventually
 
 MODEL = "/v1/models/small"
 CODE = b'{"latent": [0.1, 0.7, 0.4]}'

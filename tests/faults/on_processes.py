@@ -17,10 +17,10 @@ import pytest
 from tests.faults.catalogue import Arena, fault
 from tests.faults.clock import YEAR, jumping_clock
 from tests.faults.on_training import read_only
-from tests.faults.serving import eventually
 from tests.service.bundles import SCALE, rescale, write_bundle
 from tests.service.operation.test_draining import Load
 from tests.service.truth import Truth, fingerprint, good_calls
+from tests.service.watching import eventually
 
 
 @fault("the server is told to end (SIGTERM) under load")

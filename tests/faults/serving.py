@@ -3,19 +3,15 @@
 from __future__ import annotations
 
 import re
-from functools import partial
 from pathlib import Path
 
 import httpx
 import numpy as np
 
-from tests.service import watching
 from tests.service.bundles import write_bundle
 from tests.service.conftest import Server, Start
 from tests.service.truth import Truth, bad_calls, good_calls
-
-#: With a longer limit than elsewhere, as recovery from a fault takes time.
-eventually = partial(watching.eventually, seconds=60)
+from tests.service.watching import admitted, eventually
 
 
 def peak_memory(server: Server) -> int:
@@ -60,7 +56,7 @@ class Steady:
         """Assert that it is idle, answers as before, has no more handles or threads, and logged no error."""
         assert self.server.process.poll() is None, self.server.log
         assert self.truth.differing() == []
-        eventually(lambda: watching.admitted(self.client) == 0)
+        eventually(lambda: admitted(self.client) == 0)
         eventually(lambda: self.handles <= self._handles + 2)
         # Threads of workers and for reading bodies are started when they are first needed.
         assert self.threads <= self._threads + 4

@@ -12,8 +12,8 @@ import httpx
 import numpy as np
 
 from tests.faults.catalogue import Arena
-from tests.faults.serving import eventually
 from tests.service.bundles import SCALE, rescale, write_bundle
+from tests.service.watching import eventually
 
 CODE = {"latents": [[0.1, 0.7, 0.4]]}
 

@@ -107,6 +107,7 @@ def test_a_scan_is_fitted_and_lies_over_its_shape(window: Open, given: Given, na
     assert studio["#verdict"].is_hidden()
 
 
+@pytest.mark.long
 def test_how_sure_the_shape_of_a_scan_is_shows_where_it_was_not_seen(window: Open, given: Given) -> None:
     studio = window(complains=True).open(FIGURE)
     assert studio["#sure"].is_hidden()
@@ -161,6 +162,7 @@ def test_other_units_are_told_and_the_size_is_found(window: Open, given: Given) 
     assert float(times) == pytest.approx(1000, rel=0.01)
 
 
+@pytest.mark.long
 def test_what_is_no_such_shape_leaves_the_user_their_own(window: Open) -> None:
     studio = window().open(FIGURE)
     studio.type(4, 0.3)

@@ -63,6 +63,7 @@ def changes(pictures: list[np.ndarray], least: float) -> int:
     return sum(difference(one, other) > least for one, other in pairwise(pictures))
 
 
+@pytest.mark.long
 def test_a_picture_a_turntable_and_the_path_as_a_video(window: Open) -> None:
     studio = window().open("#model=with-fine&z=0,0,0.5&keys=-0.2,0,0;0.2,0,1&seconds=2")
     studio.tab("Files")

@@ -206,11 +206,11 @@ def test_the_end_of_a_replica_under_load_loses_nothing(small: Path, tmp_path: Pa
         clients = [threading.Thread(target=load, args=(method, 20 + k)) for k, method in enumerate(["GET", "POST"] * 4)]
         for one in clients:
             one.start()
-        time.sleep(1)
+        eventually(lambda: all(counts["200"] > 20 for counts in outcomes.values()))
         getattr(replicas[0].process, ending)()
         replicas[0].process.wait(60)
         gone.set()
-        time.sleep(1)
+        eventually(lambda: all(counts["200"] > 20 for counts in late.values()))
         over.set()
         for one in clients:
             one.join()
@@ -221,7 +221,6 @@ def test_the_end_of_a_replica_under_load_loses_nothing(small: Path, tmp_path: Pa
     assert outcomes["GET"].keys() <= {"200"} | broken
     assert outcomes["POST"].keys() <= ({"200"} if ending == "terminate" else {"200", "502"}) | broken
     assert sum(counts["broken off"] for counts in outcomes.values()) <= len(clients), "each client once at most"
-    assert min(outcomes[method]["200"] + late[method]["200"] for method in outcomes) > 20
 
 
 def test_idle_connections_end_before_the_replicas_end_them() -> None:
@@ -251,6 +250,7 @@ def test_a_client_has_so_many_requests_at_once_and_others_go_on(pair: list[Serve
         eventually(lambda: same.get("/v1/models").status_code == 200)
 
 
+@pytest.mark.long
 def test_a_client_that_never_stops_asking_is_slowed_down_alone(proxy: str) -> None:
     found: Counter[int] = Counter()
     over = threading.Event()
@@ -265,7 +265,7 @@ def test_a_client_that_never_stops_asking_is_slowed_down_alone(proxy: str) -> No
         floods = [pool.submit(flood) for _ in range(4)]
         try:
             statuses = {other.get("/v1/models").status_code for _ in range(60)}
-            eventually(lambda: found[503] > 0, seconds=20)
+            eventually(lambda: found[503] > 0)  # if this machine sends more than 100 requests a second
         finally:
             over.set()
         for one in floods:
@@ -275,6 +275,7 @@ def test_a_client_that_never_stops_asking_is_slowed_down_alone(proxy: str) -> No
     assert found[200] <= 200 + 100 * passed + 1
 
 
+@pytest.mark.long
 def test_who_sends_or_reads_nothing_is_closed(proxy: str) -> None:
     with client(proxy) as asking:
         made = asking.post(
@@ -283,9 +284,9 @@ def test_who_sends_or_reads_nothing_is_closed(proxy: str) -> None:
         link = httpx.URL(made.raise_for_status().json()["links"]["jsonl"])
     # Each with the seconds after which it must have been closed.
     kinds = {
-        b"GET /v1/models HTTP/1.1\r\nHost: x\r\nX-Slow: a": 15,
-        b"POST %s HTTP/1.1\r\nHost: x\r\nContent-Length: 100\r\n\r\n{" % MESH.encode(): 15,
-        b"GET %s HTTP/1.1\r\nHost: x\r\n\r\n" % link.raw_path: 40,
+        b"GET /v1/models HTTP/1.1\r\nHost: x\r\nX-Slow: a": 25,
+        b"POST %s HTTP/1.1\r\nHost: x\r\nContent-Length: 100\r\n\r\n{" % MESH.encode(): 25,
+        b"GET %s HTTP/1.1\r\nHost: x\r\n\r\n" % link.raw_path: 60,
     }
     with ExitStack() as stack:
         began = time.monotonic()

@@ -264,6 +264,7 @@ def resident(server: Server) -> float:
         return samples(client)["process_resident_memory_bytes", frozenset()]
 
 
+@pytest.mark.long
 def test_reloads_leave_no_memory_behind(folder: Path, start: Start) -> None:
     server = start(folder, workers=2)
     sizes = []

@@ -444,6 +444,7 @@ def test_a_server_starts_without_models_and_says_so(tmp_path: Path, start: Start
     assert "bundle small/1 is not served: factor-0.onnx" in server.stop()
 
 
+@pytest.mark.long
 def test_a_fine_mesh_of_a_hundred_and_sixty_thousand_vertices_is_no_bomb(tmp_path: Path) -> None:
     folder = synthetic.write(tmp_path, 500, 4)
     coarse, fine = synthetic.capsule(500), synthetic.capsule(160_000)
@@ -487,7 +488,13 @@ ATTACKS: dict[str, tuple[Callable[[Path], object], str]] = {
 }
 
 
-@pytest.mark.parametrize("attack", ATTACKS)
+@pytest.mark.parametrize(
+    "attack",
+    [
+        pytest.param(name, marks=[] if name in {"loops", "allocates", "forges a line"} else pytest.mark.long)
+        for name in ATTACKS
+    ],
+)
 def test_a_server_starts_beside_any_bundle(tmp_path: Path, start: Start, attack: str) -> None:
     make, line = ATTACKS[attack]
     models = tmp_path / "models"

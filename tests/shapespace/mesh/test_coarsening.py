@@ -200,7 +200,7 @@ def test_slivers_of_the_fine_mesh_are_healed(rng):
     assert np.rad2deg(found.smallest_angle) > 3
 
 
-@pytest.mark.parametrize("seed", [0, 2])
+@pytest.mark.parametrize("seed", [0, pytest.param(2, marks=pytest.mark.long)])
 def test_a_crumpled_place_smaller_than_a_coarse_face_is_cleared_away(seed):
     """A place like the corner of a mouth: in some shapes many small faces are folded onto one another."""
     ball = trimesh.creation.icosphere(subdivisions=4)
@@ -247,6 +247,7 @@ def whiskered() -> tuple[TriangleMesh, np.ndarray]:
     return mesh, np.stack(shapes)
 
 
+@pytest.mark.long
 def test_a_thin_part_is_left_to_the_fine_mesh_where_it_would_be_all_slivers():
     mesh, shapes = whiskered()
     found = coarsen(mesh, 150, shapes)

@@ -18,7 +18,7 @@ from shapespace.model.shape_model import ShapeModel
 CODE = np.array([0.1, 0.7, 0.4])
 
 
-@pytest.mark.parametrize("kind", list(PriorKind))
+@pytest.mark.parametrize("kind", [PriorKind.RIDGE, pytest.param(PriorKind.GROUPS, marks=pytest.mark.long)])
 def test_a_limb_follows_and_the_others_stay(figure: ShapeModel, kind: PriorKind) -> None:
     parts, moved, changed = limbs(), [], []
     for pull in pulls(figure, 6, 1):

@@ -81,6 +81,7 @@ def test_a_code_comes_back_from_points_anywhere(figure: ShapeModel) -> None:
         assert found.solved + found.rough / 3 < 60
 
 
+@pytest.mark.long
 def test_landmarks_tell_a_ring_how_it_is_turned(ring: ShapeModel) -> None:
     # A ring turned by 180° or upside down is that of another code: only landmarks tell vertices apart.
     given = Moved.of(ring, 1)
@@ -217,7 +218,7 @@ def test_one_seed_gives_one_answer(figure: ShapeModel) -> None:
     assert (one.samples != other.samples).any()
 
 
-@pytest.mark.parametrize("name", ["ball", "box"])
+@pytest.mark.parametrize("name", [pytest.param("ball", marks=pytest.mark.long), "box"])
 def test_what_is_no_such_shape_is_told_so(figure: ShapeModel, name: str) -> None:
     solids = {"ball": trimesh.creation.icosphere(4, 0.6), "box": trimesh.creation.box((1, 0.5, 1.5)).subdivide_loop(5)}
     found = figure.fit_scan((solids[name].vertices, solids[name].faces))
@@ -226,6 +227,7 @@ def test_what_is_no_such_shape_is_told_so(figure: ShapeModel, name: str) -> None
     assert "no such shape" in found.reason
 
 
+@pytest.mark.long
 def test_a_mirrored_scan_is_told_so(figure: ShapeModel) -> None:
     # Fixed coordinates of arms and legs distinguish left from right, in a pose that is far from its own mirror image.
     given = Moved.of(figure, 3)
@@ -237,6 +239,7 @@ def test_a_mirrored_scan_is_told_so(figure: ShapeModel) -> None:
     assert figure.fit_scan(given.points(), fixed=fixed).mirrored is None
 
 
+@pytest.mark.long
 def test_a_mirrored_scan_with_landmarks_is_told_so(figure: ShapeModel) -> None:
     given = Moved.of(figure, 2)
     some = np.linspace(0, len(given.shape) - 1, 6).astype(int)

@@ -76,7 +76,9 @@ def bumps(figure: ShapeModel, size: float, width: float, rng: np.random.Generato
     return size * noise / np.sqrt((noise**2).mean())
 
 
-@pytest.mark.parametrize("width", [None, 0.05], ids=["independent", "alike"])
+@pytest.mark.parametrize(
+    "width", [pytest.param(None, id="independent", marks=pytest.mark.long), pytest.param(0.05, id="alike")]
+)
 def test_the_truth_lies_in_the_intervals_of_a_noisy_mesh(figure: ShapeModel, width: float | None) -> None:
     rng = np.random.default_rng(0)
     scores = []

@@ -206,6 +206,7 @@ def test_a_code_outside_is_answered_only_where_none_inside_is_as_near(figure: Sh
     assert outside.distances.mean() < 0.1 * away
 
 
+@pytest.mark.long
 def test_a_code_outside_is_no_farther_than_one_inside(figure: ShapeModel) -> None:
     """Of twisted shapes, which no code makes: what a search far outside comes to need not be the shape of its code."""
     for k in (1, 2):

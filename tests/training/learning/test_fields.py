@@ -131,9 +131,9 @@ def test_descent_brings_it_nearer_to_new_shapes_than_the_affine_sum(own: JointSa
 @pytest.mark.parametrize(
     ("known", "minutes", "better", "tried", "kind"),
     [
-        (True, 30, 1e-3, ["kernel", "field"], "kernel"),
+        pytest.param(True, 30, 1e-3, ["kernel", "field"], "kernel", marks=pytest.mark.long),
         (True, 0, 99, ["kernel"], "kernel"),
-        (False, 30, 99, ["kernel", "convolutions"], "convolutions"),
+        pytest.param(False, 30, 99, ["kernel", "convolutions"], "convolutions", marks=pytest.mark.long),
     ],
 )
 def test_auto_tries_what_follows_a_bump(

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import onnxruntime
+import pytest
 import torch
 
 from shapespace.bundle.reader import read_bundle
@@ -45,6 +46,7 @@ def test_a_quadratic_map_is_found_from_shapes_that_lie_anywhere() -> None:
     assert np.abs(align(found.astype(float), torus().vertices) - expected).max() < 0.05 * spread
 
 
+@pytest.mark.long
 def test_a_bundle_has_the_start_of_its_samples(tiny_run: Path) -> None:
     folder = tiny_run / "models" / "tiny-torus" / "1"
     bundle = read_bundle(folder)

@@ -62,6 +62,7 @@ def test_nothing_is_known_of_what_is_held_out(reference, shapes):
     assert found.by_components[0][0] == pytest.approx(again.by_components[0][0], abs=1e-12)
 
 
+@pytest.mark.long
 def test_one_step_is_chosen_for_blend_shapes_and_many_for_bends(reference, shapes, blends):
     mesh, linear = blends
     assert time_steps(ModeSettings(), mesh, linear, Material()) == 1

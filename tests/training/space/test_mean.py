@@ -45,6 +45,7 @@ def test_logarithms_have_next_to_nothing_in_common(reference, shapes):
     assert common(reference, found.vertices, shapes) < 0.2 * common(reference, before, shapes)
 
 
+@pytest.mark.long
 def test_with_more_steps_it_comes_to_the_centre_of_mass(reference, shapes):
     """Centred mean and discrete centre of mass differ to first order in the step."""
     space = ShellSpace(reference)

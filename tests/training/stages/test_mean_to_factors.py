@@ -56,7 +56,7 @@ def test_a_run_without_a_mean_ends_with_the_place(tmp_path: Path) -> None:
     assert (found["status"], found["steps"]) == ("converged", 16)
 
 
-@pytest.mark.parametrize(("given", "steps"), [(None, 1), (3, 3)])
+@pytest.mark.parametrize(("given", "steps"), [(None, 1), pytest.param(3, 3, marks=pytest.mark.long)])
 def test_codes_of_a_run_stand_for_exponentials_of_the_steps_that_were_chosen(
     blends: tuple[TriangleMesh, np.ndarray], tmp_path: Path, given: int | None, steps: int
 ) -> None:

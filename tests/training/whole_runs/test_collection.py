@@ -245,7 +245,7 @@ def test_derivatives_are_learned_from_at_training_codes_only(run: Path) -> None:
     assert figures["times"]["exact, with derivatives"] > figures["times"]["exact"] > 0
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def url(run: Path) -> Iterator[str]:
     with starting() as start:
         yield start(run / "models").url
@@ -439,6 +439,7 @@ def results(run: Path) -> dict[str, object]:
     return found
 
 
+@pytest.mark.long
 def test_a_run_killed_in_every_stage_ends_as_one_that_nobody_disturbed(run: Path, folder: Path) -> None:
     again, rng = folder / "again", np.random.default_rng(0)
     log = again / "log.jsonl"
@@ -458,6 +459,7 @@ def test_a_run_killed_in_every_stage_ends_as_one_that_nobody_disturbed(run: Path
     assert [name for name in one if one[name] != other[name]] == []
 
 
+@pytest.mark.long
 def test_init_writes_a_configuration_that_the_command_takes(folder: Path, tmp_path: Path) -> None:
     few, out = tmp_path / "few", tmp_path / "mine.toml"
     # Each mesh is held out in turn, so that the time grows with their square.

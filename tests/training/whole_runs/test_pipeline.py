@@ -35,6 +35,8 @@ from shapespace.training.stages.run import STAGES
 from shapespace.training.stages.stage import Run
 from tests.training.conftest import TINY, command
 
+pytestmark = pytest.mark.long
+
 
 def seconds(run: Path) -> dict[str, float]:
     return {name: json.loads((run / "stages" / f"{name}.json").read_text())["seconds"] for name in STAGES}

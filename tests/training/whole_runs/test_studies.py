@@ -68,6 +68,7 @@ def test_a_row_of_folds_counts_each_shape_once() -> None:
     assert cells[6:] == ["3.250", "1.62", "0.50 – 2.00"]
 
 
+@pytest.mark.long
 def test_a_model_measured_later_meets_the_codes_of_the_others(
     tiny_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -76,12 +76,14 @@ def test_faults_of_the_user_s_making_are_one_message(place: Path, said: Said) ->
         assert says in said.errors
 
 
+@pytest.mark.long
 def test_status_tells_how_far_a_run_is(tiny_run: Path, said: Said) -> None:
     lines = dict(line.split(maxsplit=1) for line in said("status", str(tiny_run)).splitlines())
     assert list(lines) == list(STAGES)
     assert all(state.startswith("done in") for state in lines.values())
 
 
+@pytest.mark.long
 def test_status_of_a_stage_at_work_tells_its_samples(tiny_run: Path, tmp_path: Path, said: Said) -> None:
     copy = shutil.copytree(tiny_run, tmp_path / "run")
     (copy / "stages" / "samples.json").write_text('{"key": "", "basis": ""}')
@@ -269,6 +271,7 @@ def test_a_traceback_is_written_and_not_shown(place: Path, said: Said) -> None:
     assert "Traceback" in (place / "runs" / "bars" / "traceback.txt").read_text()
 
 
+@pytest.mark.long
 def test_the_next_command_works_from_where_one_stands(
     tiny_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, said: Said
 ) -> None:
