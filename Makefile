@@ -70,12 +70,10 @@ QUICK = tests/shapespace tests/service/use_cases/test_use_cases.py $(wildcard te
 	--ignore tests/shapespace/files/test_colouring.py \
 	--deselect tests/shapespace/files/test_attributes.py::test_the_khronos_validator_finds_nothing_in_a_textured_animation
 
-# What the libraries of serving take part in, and training doesn't; processes, signals, slow clients and fits are the same
-# with all.
-NOT_SERVING = blocks bundled_files clients deployment proxy replicas draining operation reloading untrusted_clients fit
-SERVING = $(filter-out $(foreach name,$(NOT_SERVING),%/test_$(name).py), \
-	$(wildcard tests/service/*/test_*.py)) $(foreach name,files/test_formats files/test_polygon_reading files/test_gltf_reading \
-	coordinates/test_reconstruction solve/test_cholesky,tests/shapespace/$(name).py)
+# Tests in which the libraries of serving take part: each call, HTTP, the formats. The rest is the same with all versions.
+SERVING = $(filter-out %/test_fit.py %/test_untrusted_clients.py,$(wildcard tests/service/calls/test_*.py tests/service/http/test_*.py)) \
+	tests/service/use_cases/test_use_cases.py tests/service/operation/test_observability.py \
+	$(foreach name,files/test_formats files/test_polygon_reading files/test_gltf_reading solve/test_cholesky,tests/shapespace/$(name).py)
 
 lowest: $(VENV)-lowest/.installed ## run the server's tests with the lowest versions that pyproject.toml allows
 	PATH="$(CURDIR)/$(VENV)-lowest/bin:$$PATH" $(VENV)-lowest/bin/python -m pytest --numprocesses $(JOBS) --dist loadfile $(or $(ARGS),$(SERVING))
