@@ -54,9 +54,8 @@ test: $(VENV)/.all $(MODULES) $(VENV)/.browser ## run the whole suite (ARGS="-k 
 check: $(VENV)/.check ## what is quick: style, types, imports; the tests of the library, the use cases and the pages
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	$(BIN)/lint-imports
-	$(BIN)/mypy shapespace --exclude '^shapespace/training/'
-	PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/python -m pytest --numprocesses $(JOBS) --dist loadfile $(QUICK) $(ARGS)
+	@$(BIN)/mypy shapespace --exclude '^shapespace/training/' & types=$$!; \
+		$(BIN)/lint-imports && PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/python -m pytest --numprocesses $(JOBS) $(QUICK) $(ARGS) && wait $$types
 
 lint: $(VENV)/.all $(BIN)/hadolint ## check style, types, imports between packages and the Dockerfile
 	$(BIN)/ruff check .
@@ -65,9 +64,10 @@ lint: $(VENV)/.all $(BIN)/hadolint ## check style, types, imports between packag
 	$(BIN)/lint-imports
 	$(BIN)/hadolint Dockerfile
 
-# Those that need matplotlib or Node are left out.
-QUICK = tests/shapespace tests/service/use_cases/test_use_cases.py $(wildcard tests/test_[cdm]*.py) \
-	--ignore tests/shapespace/files/test_colouring.py \
+# Left out are tests that need matplotlib or Node, and those of the library that take more than ten seconds together.
+QUICK = $(addprefix tests/,shapespace service/use_cases/test_use_cases.py test_contracts.py test_docs.py) \
+	$(foreach name,files/test_colouring model/test_fit model/test_posterior model/test_shape_model mesh/test_coarsening, \
+		--ignore tests/shapespace/$(name).py) \
 	--deselect tests/shapespace/files/test_attributes.py::test_the_khronos_validator_finds_nothing_in_a_textured_animation
 
 # Tests in which the libraries of serving take part: each call, HTTP, the formats. The rest is the same with all versions.
