@@ -38,7 +38,7 @@ CONNECTIONS = 20_000
 
 
 @dataclass
-class Outcome:
+class AttackOutcome:
     """The outcome of an attack.
 
     Attributes:
@@ -76,7 +76,7 @@ class Outcome:
 
 
 @dataclass
-class Target:
+class AttackTarget:
     """The server that is attacked, for how long, with which key, and from which local address.
 
     Attributes:
@@ -132,9 +132,9 @@ class Target:
         return first["name"], first["latent_dimension"]
 
 
-def f1(url: str, seconds: float, key: str | None = None, **of_target: Any) -> Outcome:
+def f1(url: str, seconds: float, key: str | None = None, **of_target: Any) -> AttackOutcome:
     """Scene graphs that cost more than their size suggests: long chains, and few nodes with many edges."""
-    target = Target(url, seconds, key, **of_target)
+    target = AttackTarget(url, seconds, key, **of_target)
     name, _ = target.model()
     with target.client() as client:
         glb = client.get(f"/v1/models/{name}/mesh", params={"format": "glb"}).raise_for_status().content
@@ -142,9 +142,9 @@ def f1(url: str, seconds: float, key: str | None = None, **of_target: Any) -> Ou
     return _posting(target, f"/v1/models/{name}/encode?format=glb", bodies)
 
 
-def f2(url: str, seconds: float, key: str | None = None, **of_target: Any) -> Outcome:
+def f2(url: str, seconds: float, key: str | None = None, **of_target: Any) -> AttackOutcome:
     """Endless heads and trailers: with many lines, and with one."""
-    target = Target(url, seconds, key, **of_target)
+    target = AttackTarget(url, seconds, key, **of_target)
     get = target.head("GET /v1/models HTTP/1.1")
     chunked = target.head("POST /v1/models/x/mesh HTTP/1.1") + b"Transfer-Encoding: chunked\r\n"
     trailers = chunked + b"Content-Type: application/json\r\n\r\n2\r\n{}\r\n0\r\n"
@@ -156,7 +156,7 @@ def f2(url: str, seconds: float, key: str | None = None, **of_target: Any) -> Ou
         (b"GET /", b"a" * 2**20),
     ]
 
-    def endless(outcome: Outcome, begin: bytes, more: bytes) -> None:
+    def endless(outcome: AttackOutcome, begin: bytes, more: bytes) -> None:
         while target.going_on and outcome.answers.total() < CONNECTIONS:
             with _counted(outcome) as answered, target.connect() as connection:
                 connection.sendall(begin)
@@ -169,9 +169,9 @@ def f2(url: str, seconds: float, key: str | None = None, **of_target: Any) -> Ou
     return _meanwhile(target, [partial(endless, begin=begin, more=more) for begin, more in kinds])
 
 
-def f3(url: str, seconds: float, key: str | None = None, **of_target: Any) -> Outcome:
+def f3(url: str, seconds: float, key: str | None = None, **of_target: Any) -> AttackOutcome:
     """JSON of 1 and 8 MiB in which every element is invalid, or none."""
-    target = Target(url, seconds, key, **of_target)
+    target = AttackTarget(url, seconds, key, **of_target)
     name, dimension = target.model()
     mesh, infer = f"/v1/models/{name}/mesh", f"/v2/models/{name}/infer"
     calls = []
@@ -182,15 +182,15 @@ def f3(url: str, seconds: float, key: str | None = None, **of_target: Any) -> Ou
         data = b"[%s0]" % (b"0," * (count * dimension - 1))
         calls.append((infer, b'{"inputs":[%s,"data":%s}]}' % (json.dumps(tensor).encode()[:-1], data)))
 
-    def post(outcome: Outcome, path: str, body: bytes) -> None:
+    def post(outcome: AttackOutcome, path: str, body: bytes) -> None:
         _post(target, outcome, path, itertools.repeat(body))
 
     return _meanwhile(target, [partial(post, path=path, body=body) for path, body in calls])
 
 
-def f4(url: str, seconds: float, key: str | None = None, **of_target: Any) -> Outcome:
+def f4(url: str, seconds: float, key: str | None = None, **of_target: Any) -> AttackOutcome:
     """Clients that request a stream of frames and read nothing."""
-    target = Target(url, seconds, key, **of_target)
+    target = AttackTarget(url, seconds, key, **of_target)
     name, dimension = target.model()
     with target.client() as client:
         made = client.post(
@@ -200,7 +200,7 @@ def f4(url: str, seconds: float, key: str | None = None, **of_target: Any) -> Ou
         link = urlsplit(made.raise_for_status().json()["links"]["jsonl"])
     request = target.head(f"GET {link.path}?{link.query} HTTP/1.1") + b"\r\n"
 
-    def read_nothing(outcome: Outcome) -> None:
+    def read_nothing(outcome: AttackOutcome) -> None:
         hung_up = select.poll()
         readers: dict[int, socket.socket] = {}
         try:
@@ -227,7 +227,7 @@ def f4(url: str, seconds: float, key: str | None = None, **of_target: Any) -> Ou
     return _meanwhile(target, [read_nothing])
 
 
-ATTACKS: dict[str, Callable[..., Outcome]] = {"f1": f1, "f2": f2, "f3": f3, "f4": f4}
+ATTACKS: dict[str, Callable[..., AttackOutcome]] = {"f1": f1, "f2": f2, "f3": f3, "f4": f4}
 
 
 def chain(glb: bytes, length: int) -> bytes:
@@ -268,14 +268,14 @@ def _put_together(tree: dict[str, Any], rest: bytes) -> bytes:
     return struct.pack("<4sII", b"glTF", 2, 12 + len(chunk)) + chunk
 
 
-def _posting(target: Target, path: str, bodies: list[bytes]) -> Outcome:
-    def post(outcome: Outcome, first: int) -> None:
+def _posting(target: AttackTarget, path: str, bodies: list[bytes]) -> AttackOutcome:
+    def post(outcome: AttackOutcome, first: int) -> None:
         _post(target, outcome, path, itertools.cycle(bodies[first:] + bodies[:first]))
 
     return _meanwhile(target, [partial(post, first=k % len(bodies)) for k in range(CLIENTS)])
 
 
-def _post(target: Target, outcome: Outcome, path: str, bodies: Iterator[bytes]) -> None:
+def _post(target: AttackTarget, outcome: AttackOutcome, path: str, bodies: Iterator[bytes]) -> None:
     with target.client(attacks=True) as client:
         while target.going_on and outcome.answers.total() < CONNECTIONS:
             with _counted(outcome) as answered:
@@ -287,7 +287,7 @@ _JSON = {"Content-Type": "application/json"}
 
 
 @contextlib.contextmanager
-def _counted(outcome: Outcome) -> Iterator[Callable[[str], None]]:
+def _counted(outcome: AttackOutcome) -> Iterator[Callable[[str], None]]:
     """Count one answer, or the kind of failure."""
     found: list[str] = []
     try:
@@ -298,9 +298,9 @@ def _counted(outcome: Outcome) -> Iterator[Callable[[str], None]]:
     outcome.answers.update(found[:1])
 
 
-def _meanwhile(target: Target, attackers: list[Callable[[Outcome], None]]) -> Outcome:
+def _meanwhile(target: AttackTarget, attackers: list[Callable[[AttackOutcome], None]]) -> AttackOutcome:
     """Run attackers until the time is over while others ask, each on a new connection, for health and for shapes."""
-    outcome = Outcome()
+    outcome = AttackOutcome()
     name, dimension = target.model()
     target.end = time.monotonic() + target.seconds
     threads = [threading.Thread(target=attack, args=(outcome,), daemon=True) for attack in attackers]
@@ -313,7 +313,7 @@ def _meanwhile(target: Target, attackers: list[Callable[[Outcome], None]]) -> Ou
     return outcome
 
 
-def _ask_health(target: Target, outcome: Outcome) -> None:
+def _ask_health(target: AttackTarget, outcome: AttackOutcome) -> None:
     while target.going_on:
         began = time.monotonic()
         took = float("inf")
@@ -324,7 +324,7 @@ def _ask_health(target: Target, outcome: Outcome) -> None:
         time.sleep(0.1)
 
 
-def _ask_shapes(target: Target, outcome: Outcome, name: str, dimension: int) -> None:
+def _ask_shapes(target: AttackTarget, outcome: AttackOutcome, name: str, dimension: int) -> None:
     for k in itertools.count():
         if not target.going_on:
             break

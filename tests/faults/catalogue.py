@@ -16,7 +16,7 @@ from tests.service.conftest import Start
 
 
 @dataclass(frozen=True)
-class Arena:
+class FaultTarget:
     """What a fault is injected into.
 
     Attributes:
@@ -33,7 +33,7 @@ class Arena:
 
 
 #: Injects a random instance of a fault, checks that nothing is lost, and returns the outcome in a few words.
-Inflict = Callable[[Arena, np.random.Generator], str]
+Inflict = Callable[[FaultTarget, np.random.Generator], str]
 FAULTS: dict[str, Inflict] = {}
 OUTCOMES: defaultdict[str, Counter[str]] = defaultdict(Counter)
 #: How often each fault is injected, each time a different instance.

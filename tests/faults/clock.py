@@ -25,7 +25,7 @@ time.time_ns = lambda: real_ns() + int(offset() * 1e9)
 
 
 @dataclass(frozen=True)
-class Clock:
+class JumpingClock:
     """A clock's offset, in a file."""
 
     file: Path
@@ -44,10 +44,10 @@ class Clock:
 
 
 @contextmanager
-def jumping_clock(folder: Path) -> Iterator[Clock]:
+def jumping_clock(folder: Path) -> Iterator[JumpingClock]:
     """A clock without an offset yet."""
     (folder / "clock").mkdir()
     (folder / "clock" / "sitecustomize.py").write_text(_SHIM)
-    clock = Clock(folder / "clock" / "offset")
+    clock = JumpingClock(folder / "clock" / "offset")
     clock.jump(0)
     yield clock

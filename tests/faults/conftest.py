@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.faults.catalogue import OUTCOMES, Arena, table
+from tests.faults.catalogue import OUTCOMES, FaultTarget, table
 from tests.faults.serving import Steady
 from tests.faults.training import Undisturbed
 from tests.service.conftest import starting
@@ -28,9 +28,9 @@ def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> object:
 
 
 @pytest.fixture
-def arena(tmp_path: Path, steady: Steady, undisturbed: object) -> Iterator[Arena]:
+def target(tmp_path: Path, steady: Steady, undisturbed: object) -> Iterator[FaultTarget]:
     with starting() as start:
-        yield Arena(tmp_path, steady, start, undisturbed)
+        yield FaultTarget(tmp_path, steady, start, undisturbed)
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:

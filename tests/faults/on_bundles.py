@@ -14,7 +14,7 @@ from typing import Any
 import httpx
 import numpy as np
 
-from tests.faults.catalogue import Arena, fault
+from tests.faults.catalogue import FaultTarget, fault
 from tests.faults.serving import Steady, peak_memory
 from tests.service import hostile
 from tests.service.truth import Truth, bad_calls, good_calls
@@ -64,25 +64,25 @@ def victims(folder: Path) -> list[Path]:
 
 
 @fault("files of a bundle are cut short")
-def cut(arena: Arena, rng: np.random.Generator) -> str:
+def cut(target: FaultTarget, rng: np.random.Generator) -> str:
     def spoil(folder: Path, k: int) -> None:
         files = [*victims(folder), folder / "manifest.json"]
         path = files[rng.integers(len(files))]
         os.truncate(path, int(rng.integers(path.stat().st_size)))
 
-    require_refusals(arena.steady, spoil)
+    require_refusals(target.steady, spoil)
     return f"all {BATCH} at a time refused, a line each; the others served as before"
 
 
 @fault("bits of a bundle's files are flipped")
-def flip(arena: Arena, rng: np.random.Generator) -> str:
+def flip(target: FaultTarget, rng: np.random.Generator) -> str:
     def spoil(folder: Path, k: int) -> None:
         path = victims(folder)[rng.integers(len(victims(folder)))]
         data = bytearray(path.read_bytes())
         data[rng.integers(len(data))] ^= 1 << int(rng.integers(8))
         path.write_bytes(data)
 
-    require_refusals(arena.steady, spoil, files="does not have the digest")
+    require_refusals(target.steady, spoil, files="does not have the digest")
     return f"all {BATCH} at a time refused, a line each; the others served as before"
 
 
@@ -125,14 +125,14 @@ LIES = (nudge, wrong_digest, wrong_size, shorter_list, wrong_slice, wrong_wire, 
 
 
 @fault("the manifest lies about shapes, digests, sizes or names")
-def lie(arena: Arena, rng: np.random.Generator) -> str:
+def lie(target: FaultTarget, rng: np.random.Generator) -> str:
     def spoil(folder: Path, k: int) -> None:
         path = folder / "manifest.json"
         facts = json.loads(path.read_text())
         LIES[k % len(LIES)](facts, rng)
         path.write_text(json.dumps(facts))
 
-    require_refusals(arena.steady, spoil)
+    require_refusals(target.steady, spoil)
     return f"all {BATCH} at a time refused, a line each; the others served as before"
 
 
@@ -149,20 +149,20 @@ HARMS: dict[str, Callable[[Path, np.random.Generator], None]] = {
 
 
 @fault("bundles that are what they say loop, fail or take memory when they are loaded or run")
-def harm(arena: Arena, rng: np.random.Generator) -> str:
+def harm(target: FaultTarget, rng: np.random.Generator) -> str:
     assert len(HARMS) == BATCH
-    require_refusals(arena.steady, lambda folder, k: list(HARMS.values())[k](folder, rng))
-    assert peak_memory(arena.steady.server) < 300 * 2**20
+    require_refusals(target.steady, lambda folder, k: list(HARMS.values())[k](folder, rng))
+    assert peak_memory(target.steady.server) < 300 * 2**20
     return f"all {BATCH} at a time refused, a line each; the others served as before, in less than 300 MiB"
 
 
 @fault("a network hangs at some codes, and eight clients ask for them")
-def hangs(arena: Arena, rng: np.random.Generator) -> str:
-    models = arena.folder / "models"
-    shutil.copytree(arena.steady.models, models)
+def hangs(target: FaultTarget, rng: np.random.Generator) -> str:
+    models = target.folder / "models"
+    shutil.copytree(target.steady.models, models)
     nest = str(rng.choice(["", "if", "scan"]))
     hostile.hostile(models, "hangs", hostile.loops, beyond=hostile.BEYOND, nest=nest)
-    server = arena.start(models, workers=2)
+    server = target.start(models, workers=2)
     code = {"latents": [[rng.uniform(0.4, 1), 0.7, 0.4]]}
     with httpx.Client(base_url=server.url, timeout=120) as client, ThreadPoolExecutor(8) as others:
         truth = Truth(client, good_calls(client, "small", rng, 1) + bad_calls("small"))
@@ -203,8 +203,8 @@ def ring(folder: Path, file: str) -> None:
 
 
 @fault("links, pipes and `..` in the names of a bundle")
-def ways_out(arena: Arena, rng: np.random.Generator) -> str:
-    steady = arena.steady
+def ways_out(target: FaultTarget, rng: np.random.Generator) -> str:
+    steady = target.steady
 
     def spoil(folder: Path, k: int) -> None:
         file = str(rng.choice([path.name for path in victims(folder)]))
@@ -238,7 +238,7 @@ def ways_out(arena: Arena, rng: np.random.Generator) -> str:
 
 
 @fault("bundles appear, change, break and vanish while requests run")
-def swapped(arena: Arena, rng: np.random.Generator) -> str:
+def swapped(target: FaultTarget, rng: np.random.Generator) -> str:
     from tests.faults.swapping import swap
 
-    return swap(arena, rng)
+    return swap(target, rng)

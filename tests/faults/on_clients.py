@@ -9,7 +9,7 @@ import time
 
 import numpy as np
 
-from tests.faults.catalogue import Arena, fault
+from tests.faults.catalogue import FaultTarget, fault
 from tests.faults.serving import Steady
 from tests.service.watching import admitted, eventually
 
@@ -30,8 +30,8 @@ def stream_link(steady: Steady, frames: int) -> str:
 
 
 @fault("40 clients send a byte at a time, or read one")
-def slow(arena: Arena, rng: np.random.Generator) -> str:
-    steady = arena.steady
+def slow(target: FaultTarget, rng: np.random.Generator) -> str:
+    steady = target.steady
     link = stream_link(steady, 600)
     with contextlib.ExitStack() as stack:
         writers = [stack.enter_context(connect(steady)) for _ in range(36)]
@@ -66,8 +66,8 @@ def slow(arena: Arena, rng: np.random.Generator) -> str:
 
 
 @fault("clients vanish while they send, wait or read")
-def vanishing(arena: Arena, rng: np.random.Generator) -> str:
-    steady = arena.steady
+def vanishing(target: FaultTarget, rng: np.random.Generator) -> str:
+    steady = target.steady
     link = stream_link(steady, 600)
     many = json.dumps({"latents": rng.uniform(0, 0.2, (200, 3)).tolist()}).encode()
     long = REQUEST.replace(b"/mesh", b"/vertices").replace(b"%d" % len(CODE), b"%d" % len(many), 1).replace(CODE, many)

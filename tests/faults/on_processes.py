@@ -14,7 +14,7 @@ import httpx
 import numpy as np
 import pytest
 
-from tests.faults.catalogue import Arena, fault
+from tests.faults.catalogue import FaultTarget, fault
 from tests.faults.clock import YEAR, jumping_clock
 from tests.faults.on_training import read_only
 from tests.service.bundles import SCALE, rescale, write_bundle
@@ -24,8 +24,8 @@ from tests.service.watching import eventually
 
 
 @fault("the server is told to end (SIGTERM) under load")
-def terminated(arena: Arena, rng: np.random.Generator) -> str:
-    server = arena.start(arena.steady.models, workers=2, drain=rng.choice([0, 0.5]))
+def terminated(target: FaultTarget, rng: np.random.Generator) -> str:
+    server = target.start(target.steady.models, workers=2, drain=rng.choice([0, 0.5]))
     load = Load(server, 6)
     enough = rng.integers(1, 100)
     eventually(lambda: load.outcomes["answered"] >= enough)
@@ -66,15 +66,15 @@ class Askers:
 
 
 @fault("the server is killed (SIGKILL) under load, and started again")
-def killed(arena: Arena, rng: np.random.Generator) -> str:
-    server = arena.start(arena.steady.models, workers=2)
-    askers = Askers(arena.steady.truth, [server.url], 4)
+def killed(target: FaultTarget, rng: np.random.Generator) -> str:
+    server = target.start(target.steady.models, workers=2)
+    askers = Askers(target.steady.truth, [server.url], 4)
     try:
         time.sleep(rng.uniform(0.5, 2))
         server.process.kill()
         server.process.wait(60)
         right = askers.outcomes["right"]
-        askers._urls.append(arena.start(arena.steady.models, workers=2).url)
+        askers._urls.append(target.start(target.steady.models, workers=2).url)
         eventually(lambda: askers.outcomes["right"] > right + 20)
     finally:
         askers.end()
@@ -84,14 +84,14 @@ def killed(arena: Arena, rng: np.random.Generator) -> str:
 
 
 @fault("the clock jumps while serving")
-def clock(arena: Arena, rng: np.random.Generator) -> str:
-    folder = arena.folder / "models"
+def clock(target: FaultTarget, rng: np.random.Generator) -> str:
+    folder = target.folder / "models"
     bundle = write_bundle(folder, "small")
-    with jumping_clock(arena.folder) as clock:
+    with jumping_clock(target.folder) as clock:
         with pytest.MonkeyPatch.context() as patch:
             for name, value in clock.environment.items():
                 patch.setenv(name, value)
-            server = arena.start(folder, workers=2, watch=0.1, deadline=30)
+            server = target.start(folder, workers=2, watch=0.1, deadline=30)
         with httpx.Client(base_url=server.url, timeout=60) as client:
             truth = Truth(client, good_calls(client, "small", np.random.default_rng(0), 2))
             askers = Askers(truth, [server.url], 2)
@@ -115,17 +115,17 @@ def clock(arena: Arena, rng: np.random.Generator) -> str:
 
 
 @fault("the server's disk is full")
-def full_disk(arena: Arena, rng: np.random.Generator) -> str:
+def full_disk(target: FaultTarget, rng: np.random.Generator) -> str:
     # No file can grow, not even the log; the limit applies to root too.
-    server = arena.start(arena.steady.models, workers=2, log_format=rng.choice(["text", "json"]))
+    server = target.start(target.steady.models, workers=2, log_format=rng.choice(["text", "json"]))
     with httpx.Client(base_url=server.url, timeout=60) as client:
         resource.prlimit(server.process.pid, resource.RLIMIT_FSIZE, (0, resource.RLIM_INFINITY))
         for _ in range(2):
-            assert arena.steady.truth.differing(client) == []
+            assert target.steady.truth.differing(client) == []
         usd_without_disk(client)
         resource.prlimit(server.process.pid, resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
         assert client.get(usd_link(client)).content[:8] == b"PXR-USDC"
-    arena.steady.check()
+    target.steady.check()
     return "answers as before, uploads too; USD, which needs a temporary file, 507 until there is room again"
 
 
@@ -140,16 +140,16 @@ def usd_without_disk(client: httpx.Client) -> None:
 
 
 @fault("the server's folders are read-only")
-def read_only_folders(arena: Arena, rng: np.random.Generator) -> str:
-    models = arena.folder / "models"
-    shutil.copytree(arena.steady.models, models)
-    server = arena.start(models, workers=2)
+def read_only_folders(target: FaultTarget, rng: np.random.Generator) -> str:
+    models = target.folder / "models"
+    shutil.copytree(target.steady.models, models)
+    server = target.start(models, workers=2)
     with read_only(models) as reason, httpx.Client(base_url=server.url, timeout=60) as client:
         server.process.send_signal(signal.SIGHUP)
-        assert arena.steady.truth.differing(client) == []
+        assert target.steady.truth.differing(client) == []
         if reason != "Not a directory":  # otherwise the folder is a file, which no server can read
-            with httpx.Client(base_url=arena.start(models, workers=2).url, timeout=60) as other:
-                assert arena.steady.truth.differing(other) == []
+            with httpx.Client(base_url=target.start(models, workers=2).url, timeout=60) as other:
+                assert target.steady.truth.differing(other) == []
     assert server.process.poll() is None
     assert "Traceback" not in server.log
     return "nothing is written: answers as before"

@@ -9,10 +9,10 @@ import socket
 import httpx
 import numpy as np
 
-from tests.faults.catalogue import SEEDS, Arena, fault
+from tests.faults.catalogue import SEEDS, FaultTarget, fault
 from tests.faults.serving import peak_memory
 from tests.hostile import HOSTILE
-from tests.service.truth import Call, post
+from tests.service.truth import RecordedCall, post
 
 MIB = 2**20
 #: How many MiB of the two gigabytes are sent.
@@ -30,12 +30,12 @@ SAMPLE = 20
 
 
 @fault("`encode` and `fit` are sent files made to need gigabytes or minutes")
-def bomb(arena: Arena, rng: np.random.Generator) -> str:
-    before = peak_memory(arena.steady.server)
+def bomb(target: FaultTarget, rng: np.random.Generator) -> str:
+    before = peak_memory(target.steady.server)
     for name in rng.choice(sorted(HOSTILE), SAMPLE, replace=False):
         said, body = HOSTILE[name](int(rng.integers(1, 65)) * MIB)
         form = "/" in said
-        answer = arena.steady.client.post(
+        answer = target.steady.client.post(
             f"{MODEL}/{rng.choice(['encode', 'fit'])}",
             params={} if form else {"format": said},
             headers={"Content-Type": said} if form else {},
@@ -46,14 +46,14 @@ def bomb(arena: Arena, rng: np.random.Generator) -> str:
         kinds = ("malformed-request", "unsupported-media-type", "invalid-mesh")
         assert answer.json()["type"].rpartition(":")[2] in kinds
         assert len(answer.text) < 600
-    assert peak_memory(arena.steady.server) < before + MOST
-    arena.steady.check()
+    assert peak_memory(target.steady.server) < before + MOST
+    target.steady.check()
     return f"{SAMPLE} of {len(HOSTILE)} kinds, of 1 to 64 MiB, refused in one line, in less than {MOST // MIB} MiB"
 
 
 @fault("`encode` is sent a body of 2 GB, announced or in chunks")
-def huge_body(arena: Arena, rng: np.random.Generator) -> str:
-    steady, block = arena.steady, bytes(MIB)
+def huge_body(target: FaultTarget, rng: np.random.Generator) -> str:
+    steady, block = target.steady, bytes(MIB)
     before = peak_memory(steady.server)
     told_after = []
     for length in (f"Content-Length: {2000 * MIB}", "Transfer-Encoding: chunked"):
@@ -77,12 +77,12 @@ def huge_body(arena: Arena, rng: np.random.Generator) -> str:
     return "413 at once, or after 64 MiB of chunks; what still comes is dropped, in less than 160 MiB of memory"
 
 
-def bodies(number: str) -> list[Call]:
+def bodies(number: str) -> list[RecordedCall]:
     """Every call that has a number, with this one in its place."""
     code = f"[0.1, {number}, 0.2]"
     return [
-        Call("GET", f"{MODEL}/mesh?latent=0.1,{number},0.2"),
-        Call("GET", f"{MODEL}/mesh?latent=0,0,0&color=stretch&against=0.1,{number},0.2&format=ply"),
+        RecordedCall("GET", f"{MODEL}/mesh?latent=0.1,{number},0.2"),
+        RecordedCall("GET", f"{MODEL}/mesh?latent=0,0,0&color=stretch&against=0.1,{number},0.2&format=ply"),
         post(f"{MODEL}/mesh", f'{{"latent": {code}}}'.encode()),
         post(f"{MODEL}/vertices", f'{{"latents": [{code}]}}'.encode()),
         post(f"{MODEL}/nric", f'{{"latents": [{code}], "factors": true}}'.encode()),
@@ -105,39 +105,41 @@ def bodies(number: str) -> list[Call]:
             "/v2/models/small/infer",
             f'{{"inputs": [{{"name": "latent", "shape": [1, 3], "datatype": "FP32", "data": {code}}}]}}'.encode(),
         ),
-        Call("POST", f"{MODEL}/encode", f"v {number} 0 0\n".encode() * 64 + b"f 1 2 3\n", "model/obj"),
-        Call("POST", f"{MODEL}/fit?format=xyz", f"{number} 0 0\n0 1 0\n0 0 1\n".encode() * 64, "text/plain"),
-        Call("POST", f"{MODEL}/fit?noise={number}&format=xyz", b"0 0 0\n0 1 0\n0 0 1\n1 0 0\n" * 64, "text/plain"),
+        RecordedCall("POST", f"{MODEL}/encode", f"v {number} 0 0\n".encode() * 64 + b"f 1 2 3\n", "model/obj"),
+        RecordedCall("POST", f"{MODEL}/fit?format=xyz", f"{number} 0 0\n0 1 0\n0 0 1\n".encode() * 64, "text/plain"),
+        RecordedCall(
+            "POST", f"{MODEL}/fit?noise={number}&format=xyz", b"0 0 0\n0 1 0\n0 0 1\n1 0 0\n" * 64, "text/plain"
+        ),
     ]
 
 
 @fault("codes and positions are NaN, infinite, 1e30 or 1e308")
-def numbers(arena: Arena, rng: np.random.Generator) -> str:
+def numbers(target: FaultTarget, rng: np.random.Generator) -> str:
     told: dict[str, set[int]] = {}
     for number in ("NaN", "Infinity", "-1e999", "1e30", "-1e30", "1e308", "3.4e38", "1e-320"):
         for call in bodies(number):
-            answer = call.send(arena.steady.client)
+            answer = call.send(target.steady.client)
             told.setdefault(number, set()).add(answer.status_code)
             assert answer.status_code < 500, (call, answer.text)
             if number in {"NaN", "Infinity", "-1e999"}:
                 assert answer.status_code in {400, 422}, (call, answer.text)
             if answer.status_code == 201:
                 link = answer.json()["links"]["frames"].replace("{k}", "1")
-                followed = arena.steady.client.get(link)
+                followed = target.steady.client.get(link)
                 assert followed.status_code in {200, 422}, (call, link, followed.text)
     assert 200 in told["1e30"], "codes beyond the bounds are extrapolated"
-    arena.steady.check()
+    target.steady.check()
     return "NaN and infinities 400 or 422; large ones 422 or an answer with its diagnostics"
 
 
 @fault("10,000 frames are asked for")
-def frames(arena: Arena, rng: np.random.Generator) -> str:
-    steady = arena.steady
+def frames(target: FaultTarget, rng: np.random.Generator) -> str:
+    steady = target.steady
     body = {"keyframes": rng.uniform(0, 0.2, (3, 3)).tolist(), "frames": 10_000, "mesh": "coarse"}
     answer = steady.client.post(f"{MODEL}/interpolations", json=body)
     assert (answer.status_code, answer.json()["type"]) == (422, "urn:shapespace:problem:too-many-frames")
     # An id from another server with a higher limit.
-    generous = arena.start(steady.models, max_frames=10_000, workers=2)
+    generous = target.start(steady.models, max_frames=10_000, workers=2)
     with httpx.Client(base_url=generous.url, timeout=300) as client:
         links = client.post(f"{MODEL}/interpolations", json=body).raise_for_status().json()["links"]
         for name in ("glb", "zip", "jsonl"):

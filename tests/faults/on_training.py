@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from tests.faults.catalogue import Arena, fault
+from tests.faults.catalogue import FaultTarget, fault
 from tests.faults.clock import jumping_clock
 from tests.faults.training import LAST, train
 from tests.training.conftest import command
@@ -27,8 +27,8 @@ def stage_at_work(run: Path) -> str:
 
 
 @fault("training is killed (SIGKILL, with its workers) at random moments")
-def kill(arena: Arena, rng: np.random.Generator) -> str:
-    whole, run = arena.undisturbed(), arena.folder / "run"
+def kill(target: FaultTarget, rng: np.random.Generator) -> str:
+    whole, run = target.undisturbed(), target.folder / "run"
     kills = 0
     for moment in rng.uniform(0, whole.seconds, 2):
         process = subprocess.Popen(
@@ -73,8 +73,8 @@ def small_disk(folder: Path, size: int) -> Iterator[list[str]]:
 
 
 @fault("the disk is full while training")
-def full_disk(arena: Arena, rng: np.random.Generator) -> str:
-    whole, disk = arena.undisturbed(), arena.folder / "disk"
+def full_disk(target: FaultTarget, rng: np.random.Generator) -> str:
+    whole, disk = target.undisturbed(), target.folder / "disk"
     size = int(rng.uniform(0.02, 0.25) * whole.bytes)  # the samples alone take more
     with small_disk(disk, size) as prefix:
         arguments = [*prefix, *command(whole.config, disk / "run", "--until", "samples")]
@@ -118,8 +118,8 @@ def read_only(folder: Path) -> Iterator[str]:
 
 
 @fault("the run directory is read-only")
-def read_only_run(arena: Arena, rng: np.random.Generator) -> str:
-    whole, run = arena.undisturbed(), arena.folder / "run"
+def read_only_run(target: FaultTarget, rng: np.random.Generator) -> str:
+    whole, run = target.undisturbed(), target.folder / "run"
     before = str(rng.choice(["ingest", "mean", "modes", "factors"]))
     assert train(whole.config, run, "--until", before).returncode == 0
     with read_only(run) as reason:
@@ -133,9 +133,9 @@ def read_only_run(arena: Arena, rng: np.random.Generator) -> str:
 
 
 @fault("the clock jumps while training")
-def clock_while_training(arena: Arena, rng: np.random.Generator) -> str:
-    whole, run = arena.undisturbed(), arena.folder / "run"
-    with jumping_clock(arena.folder) as clock:
+def clock_while_training(target: FaultTarget, rng: np.random.Generator) -> str:
+    whole, run = target.undisturbed(), target.folder / "run"
+    with jumping_clock(target.folder) as clock:
         process = subprocess.Popen(
             command(whole.config, run, "--until", "samples"),
             env=clock.environment,

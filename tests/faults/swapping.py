@@ -11,19 +11,19 @@ import time
 import httpx
 import numpy as np
 
-from tests.faults.catalogue import Arena
+from tests.faults.catalogue import FaultTarget
 from tests.service.bundles import SCALE, rescale, write_bundle
 from tests.service.watching import eventually
 
 CODE = {"latents": [[0.1, 0.7, 0.4]]}
 
 
-def swap(arena: Arena, rng: np.random.Generator) -> str:
+def swap(target: FaultTarget, rng: np.random.Generator) -> str:
     """Change a bundle twelve times under load from four clients; each answer must be of one version."""
-    folder = arena.folder / "models"
+    folder = target.folder / "models"
     small = write_bundle(folder, "small")
-    aside = arena.folder / "aside"
-    server = arena.start(folder, workers=2, watch=0.1)
+    aside = target.folder / "aside"
+    server = target.start(folder, workers=2, watch=0.1)
     answers: dict[str, set[str]] = {}
     statuses: dict[int, int] = {}
     stop = threading.Event()

@@ -10,7 +10,7 @@ import pytest
 
 # These modules add their faults to the catalogue.
 from tests.faults import on_bundles, on_clients, on_processes, on_requests, on_training  # noqa: F401
-from tests.faults.catalogue import FAULTS, OUTCOMES, SEEDS, Arena
+from tests.faults.catalogue import FAULTS, OUTCOMES, SEEDS, FaultTarget
 
 #: One fault of each kind: of bundles, of requests, of clients and of processes.
 IN_SUITE = {
@@ -25,6 +25,6 @@ IN_SUITE = {
 @pytest.mark.parametrize(
     "name", [pytest.param(name, marks=[] if name in IN_SUITE else pytest.mark.long) for name in FAULTS]
 )
-def test_nothing_is_lost(name: str, seed: int, arena: Arena) -> None:
-    outcome = FAULTS[name](arena, np.random.default_rng([seed, zlib.crc32(name.encode())]))
+def test_nothing_is_lost(name: str, seed: int, target: FaultTarget) -> None:
+    outcome = FAULTS[name](target, np.random.default_rng([seed, zlib.crc32(name.encode())]))
     OUTCOMES[name][outcome] += 1

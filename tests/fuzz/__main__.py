@@ -23,11 +23,11 @@ def main() -> int:
     given = parser.parse_args()
     names = [name for name in KINDS if given.kind in name]
     costs = []
-    with serving(given.deadline) as arena:
-        world = World.of(arena.server.url)
+    with serving(given.deadline) as trial:
+        world = World.of(trial.server.url)
         for k in range(given.examples):
             name, seed = names[k % len(names)], given.seed + k // len(names)
-            costs.append(arena.try_out(name, seed, partial(made, name, seed, world)))
+            costs.append(trial.try_out(name, seed, partial(made, name, seed, world)))
             if costs[-1].over:
                 print(f"{name} {seed}: {'; '.join(costs[-1].over)}", flush=True)
     print(summary(costs, given.most))

@@ -191,7 +191,7 @@ class Measured(Server):
 
     def settle(self) -> bool:
         """Wait until no thread computes, except the meter's beat; returns whether that happened in time."""
-        clock = Clock(self.process.pid)
+        clock = ProcessorClock(self.process.pid)
         while clock.seconds < SETTLING:
             looks = []
             for _ in range(5):
@@ -234,7 +234,7 @@ class Measured(Server):
 
     def exchange(self, request: Request, cost: Cost) -> None:
         """Send a request, and read until the server closes the connection."""
-        clock, began, patience = Clock(self.process.pid), time.monotonic(), self.deadline + LATE
+        clock, began, patience = ProcessorClock(self.process.pid), time.monotonic(), self.deadline + LATE
         answer = bytearray()
         with socket.create_connection(self.place, timeout=10) as connection:
             connection.setblocking(False)
@@ -287,7 +287,7 @@ class Measured(Server):
         cost.faults += [f"status {status}" for status in cost.statuses if status >= 500 and status not in _BUSY]
 
 
-class Clock:
+class ProcessorClock:
     """Seconds since its creation, less those in which this thread or a server's waited for a processor."""
 
     def __init__(self, pid: int) -> None:
@@ -366,7 +366,7 @@ class Peaks:
         self.growth = max(self.growth, total)
 
 
-class Arena:
+class CostTrial:
     """A server that is replaced when a request has brought it down.
 
     Args:
@@ -398,7 +398,7 @@ class Arena:
     def _end(self) -> list[str]:
         """Send SIGTERM, on which it has to end whatever it computes; returns the faults."""
         self.server.process.terminate()
-        clock = Clock(self.server.process.pid)
+        clock = ProcessorClock(self.server.process.pid)
         while self.server.process.poll() is None:
             if clock.seconds > ENDING:
                 return [f"SIGTERM is ignored for {ENDING:g} s"]
@@ -427,7 +427,7 @@ def warm_up(url: str) -> None:
 
 
 @contextlib.contextmanager
-def serving(deadline: float = DEADLINE, **settings: object) -> Iterator[Arena]:
+def serving(deadline: float = DEADLINE, **settings: object) -> Iterator[CostTrial]:
     """A server with the bundled models and two small ones."""
     with TemporaryDirectory() as folder:
         models = Path(folder, "models")
@@ -440,11 +440,11 @@ def serving(deadline: float = DEADLINE, **settings: object) -> Iterator[Arena]:
             warm_up(server.url)
             return server
 
-        arena = Arena(start)
+        trial = CostTrial(start)
         try:
-            yield arena
+            yield trial
         finally:
-            arena.server.kill()
+            trial.server.kill()
 
 
 #: All measurements of this run.

@@ -108,7 +108,7 @@ Make = Callable[[Rng, World], Request]
 
 
 @dataclass(frozen=True)
-class Kind:
+class RequestKind:
     """A kind of request.
 
     Attributes:
@@ -122,14 +122,14 @@ class Kind:
     limit: bool = False
 
 
-KINDS: dict[str, Kind] = {}
+KINDS: dict[str, RequestKind] = {}
 
 
 def kind(name: str, *, long: bool = False, limit: bool = False) -> Callable[[Make], Make]:
     """A decorator that adds a kind to the list."""
 
     def enter(make: Make) -> Make:
-        KINDS[name] = Kind(make, long or limit, limit)
+        KINDS[name] = RequestKind(make, long or limit, limit)
         return make
 
     return enter

@@ -13,7 +13,7 @@ from functools import partial
 
 import pytest
 
-from tests.fuzz.cost import COSTS, Arena, serving
+from tests.fuzz.cost import COSTS, CostTrial, serving
 from tests.fuzz.kinds import KINDS, World, made, shares
 
 pytestmark = pytest.mark.long
@@ -23,34 +23,34 @@ FIRST = int(time.time()) if EXAMPLES else 0
 
 
 @pytest.fixture(scope="module")
-def arena() -> Iterator[Arena]:
-    with serving() as arena:
-        yield arena
+def trial() -> Iterator[CostTrial]:
+    with serving() as trial:
+        yield trial
 
 
 @pytest.fixture(scope="module")
-def world(arena: Arena) -> World:
-    return World.of(arena.server.url)
+def world(trial: CostTrial) -> World:
+    return World.of(trial.server.url)
 
 
-def try_out(name: str, seeds: Iterable[int], arena: Arena, world: World) -> None:
-    costs = [arena.try_out(name, seed, partial(made, name, seed, world)) for seed in seeds]
+def try_out(name: str, seeds: Iterable[int], trial: CostTrial, world: World) -> None:
+    costs = [trial.try_out(name, seed, partial(made, name, seed, world)) for seed in seeds]
     COSTS.extend(costs)
     assert not [f"{cost.name}, seed {cost.seed}: {'; '.join(cost.over)}" for cost in costs if cost.over]
 
 
 @pytest.mark.parametrize("name", COUNTS)
-def test_no_request_is_over_its_budget(name: str, arena: Arena, world: World) -> None:
-    try_out(name, range(FIRST, FIRST + COUNTS[name]), arena, world)
+def test_no_request_is_over_its_budget(name: str, trial: CostTrial, world: World) -> None:
+    try_out(name, range(FIRST, FIRST + COUNTS[name]), trial, world)
 
 
 if EXAMPLES:  # these take minutes each
 
     @pytest.fixture(scope="module")
-    def patient() -> Iterator[Arena]:
-        with serving(deadline=600) as arena:
-            yield arena
+    def patient() -> Iterator[CostTrial]:
+        with serving(deadline=600) as trial:
+            yield trial
 
     @pytest.mark.parametrize("name", [name for name, kind in KINDS.items() if kind.limit])
-    def test_what_may_be_asked_for_is_within_the_budget(name: str, patient: Arena, world: World) -> None:
+    def test_what_may_be_asked_for_is_within_the_budget(name: str, patient: CostTrial, world: World) -> None:
         try_out(name, [FIRST], patient, World([world.largest]))

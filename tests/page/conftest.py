@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 from playwright.sync_api import Browser, sync_playwright
 
-from shapespace.files.reading import read_arrays
-from tests.page.studio import Studio
+from shapespace.files.formats import read_arrays
+from tests.page.studio import OpenPage
 from tests.service.bundles import write_bundle
 from tests.service.conftest import ROOT, Server, Start, starting
 
@@ -24,7 +24,7 @@ FLAGS = ["--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
 #: A code of the small torus.
 CODE = (0.1, 1, 0.5)
 
-Open = Callable[..., Studio]
+Open = Callable[..., OpenPage]
 
 
 @pytest.fixture(scope="session")
@@ -64,13 +64,13 @@ def browser() -> Iterator[Browser]:
 @pytest.fixture
 def window(browser: Browser, server: Server) -> Iterator[Open]:
     """Opens windows; checks at the end that none had errors or sent requests to another host."""
-    windows: list[tuple[Studio, bool]] = []
+    windows: list[tuple[OpenPage, bool]] = []
 
-    def open(url: str = server.url, *, complains: bool = False, **options: Any) -> Studio:
+    def open(url: str = server.url, *, complains: bool = False, **options: Any) -> OpenPage:
         context = browser.new_context(
             **{"viewport": {"width": 1000, "height": 640}, "reduced_motion": "reduce", **options}
         )
-        studio = Studio(context.new_page(), url)
+        studio = OpenPage(context.new_page(), url)
         windows.append((studio, complains))
         return studio
 
@@ -82,7 +82,7 @@ def window(browser: Browser, server: Server) -> Iterator[Open]:
 
 
 @pytest.fixture
-def studio(window: Open) -> Studio:
+def studio(window: Open) -> OpenPage:
     """The page with the small torus, after its shape has been drawn."""
     return window().open()
 

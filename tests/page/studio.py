@@ -17,7 +17,7 @@ T = TypeVar("T")
 PATIENCE = 120.0  # seconds; the machine may be busy with other things
 
 
-class Studio:
+class OpenPage:
     """An open page, with its errors and requests.
 
     Playwright's own way to wait for conditions needs `eval`, which the page's content security policy
@@ -61,7 +61,7 @@ class Studio:
             self.page.wait_for_timeout(30)  # also processes the browser's events
         return value
 
-    def open(self, hash: str = "#model=with-fine") -> Studio:
+    def open(self, hash: str = "#model=with-fine") -> OpenPage:
         """Load the page and wait until its full shape is drawn."""
         self.page.goto(f"{self.url}/{hash}")
         self.rest()

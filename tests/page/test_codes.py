@@ -10,11 +10,11 @@ import numpy as np
 from shapespace.files.formats import MESH_FORMATS
 from shapespace.files.reading import read_arrays
 from tests.page.conftest import CODE, Open
-from tests.page.studio import Studio
+from tests.page.studio import OpenPage
 from tests.service.conftest import Server
 
 
-def test_a_file_is_encoded(studio: Studio, expected: np.ndarray, server: Server, tmp_path: Path) -> None:
+def test_a_file_is_encoded(studio: OpenPage, expected: np.ndarray, server: Server, tmp_path: Path) -> None:
     faces = read_arrays(httpx.get(f"{server.url}/v1/models/with-fine/mesh?format=npz").content, "npz")[1]
     turned = expected @ np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1]]) + [1, 2, 3]
     path = tmp_path / "pose.obj"
@@ -55,7 +55,7 @@ def test_a_file_that_is_none_is_refused_in_the_page(window: Open) -> None:
     assert studio.code in ([], [0, 0, 0])
 
 
-def test_random_shapes_repeat_by_their_seed(studio: Studio) -> None:
+def test_random_shapes_repeat_by_their_seed(studio: OpenPage) -> None:
     start = studio.picture()
     studio["#random"].click()
     studio.until_different(start)
@@ -70,7 +70,7 @@ def test_random_shapes_repeat_by_their_seed(studio: Studio) -> None:
     studio.until_code([*first[:2], locked])
 
 
-def test_a_pull_keeps_what_is_locked(studio: Studio) -> None:
+def test_a_pull_keeps_what_is_locked(studio: OpenPage) -> None:
     studio.coordinate(1).locator("[data-do=lock]").click()
     sent = []
     studio.page.on("request", lambda request: sent.append(request.post_data_json) if "/edit" in request.url else None)
@@ -91,7 +91,7 @@ def test_a_pull_keeps_what_is_locked(studio: Studio) -> None:
     assert sent[0]["fixed"] == {"1": 0}
 
 
-def test_pulling_at_a_vertex_takes_the_shape_along(studio: Studio) -> None:
+def test_pulling_at_a_vertex_takes_the_shape_along(studio: OpenPage) -> None:
     studio["#pull"].click()
     before = studio.picture()
     box = studio["#canvas"].bounding_box()

@@ -17,17 +17,17 @@ import numpy as np
 from shapespace.files.formats import MESH_FORMATS
 from shapespace.files.reading import read_arrays
 from tests.page.conftest import CODE, Open
-from tests.page.studio import Studio, difference
+from tests.page.studio import OpenPage, difference
 
 
-def move(studio: Studio, code: tuple[float, ...] = CODE) -> None:
+def move(studio: OpenPage, code: tuple[float, ...] = CODE) -> None:
     for k, value in enumerate(code):
         studio.type(k, value)
     studio.until_code(code)
     studio.rest()
 
 
-def test_a_download_in_every_format(studio: Studio, expected: np.ndarray, tmp_path: Path) -> None:
+def test_a_download_in_every_format(studio: OpenPage, expected: np.ndarray, tmp_path: Path) -> None:
     move(studio)
     studio.tab("Files")
     formats = studio["#format option"].all_inner_texts()
@@ -53,7 +53,7 @@ def test_a_download_in_every_format(studio: Studio, expected: np.ndarray, tmp_pa
         assert np.allclose(vertices, expected, atol=1e-5), format
 
 
-def test_a_download_of_the_path(studio: Studio, expected: np.ndarray) -> None:
+def test_a_download_of_the_path(studio: OpenPage, expected: np.ndarray) -> None:
     studio.tab("Path")
     studio["#add-keyframe"].click()
     studio.tab("Shape")
@@ -82,7 +82,7 @@ def test_a_download_of_the_path(studio: Studio, expected: np.ndarray) -> None:
             assert content.startswith(begins[format])
 
 
-def test_the_copied_calls_answer_the_shape(studio: Studio, expected: np.ndarray, tmp_path: Path) -> None:
+def test_the_copied_calls_answer_the_shape(studio: OpenPage, expected: np.ndarray, tmp_path: Path) -> None:
     studio.page.context.grant_permissions(["clipboard-read", "clipboard-write"])
     move(studio)
     studio.tab("Files")
@@ -108,7 +108,7 @@ def test_the_copied_calls_answer_the_shape(studio: Studio, expected: np.ndarray,
         assert np.allclose(read_arrays(content, "obj")[0], expected, atol=1e-5)
 
 
-def test_the_address_restores_everything(studio: Studio, window: Open) -> None:
+def test_the_address_restores_everything(studio: OpenPage, window: Open) -> None:
     studio.page.context.grant_permissions(["clipboard-read", "clipboard-write"])
     move(studio)
     studio.tab("Path")

@@ -12,12 +12,12 @@ from playwright.sync_api import Browser, Route
 
 from shapespace.files.reading import read_arrays
 from tests.page.conftest import CHROMIUM, Open
-from tests.page.studio import Studio
+from tests.page.studio import OpenPage
 from tests.page.test_path import keyframes
 from tests.service.conftest import Server, Start
 
 
-def without(studio: Studio) -> None:
+def without(studio: OpenPage) -> None:
     studio.eventually(studio["#without"].is_visible)
     assert "WebGL" in studio["#without"].inner_text()
     assert "v1/models/NAME/mesh" in studio["#without"].inner_text()
@@ -35,7 +35,7 @@ def test_without_scripts_the_calls_are_told(window: Open) -> None:
 def test_without_webgl_the_calls_are_told(browser: Browser, server: Server) -> None:
     alone = browser.browser_type.launch(executable_path=CHROMIUM, args=["--disable-gpu", "--disable-3d-apis"])
     try:
-        studio = Studio(alone.new_page(), server.url)
+        studio = OpenPage(alone.new_page(), server.url)
         studio.page.goto(studio.url)
         without(studio)
         assert studio.complaints == []
@@ -90,7 +90,7 @@ def test_a_model_that_is_not_served_is_told(window: Open) -> None:
     studio.eventually(lambda: "asks for the model dragon, which is not served here. This is Figure" in studio.messages)
 
 
-def test_a_second_click_on_play_waits_for_the_same_frames(studio: Studio) -> None:
+def test_a_second_click_on_play_waits_for_the_same_frames(studio: OpenPage) -> None:
     keyframes(studio, (-0.2, 0, 0), (0.2, 0, 1))
     held: list[Route] = []
     frames: list[int] = []
@@ -121,7 +121,7 @@ def test_numbers_are_not_cut(window: Open, width: int) -> None:
     assert not box.evaluate(script), "the measurement must detect a number that is cut off"
 
 
-def test_every_kind_of_file_that_is_offered_is_read(studio: Studio, server: Server) -> None:
+def test_every_kind_of_file_that_is_offered_is_read(studio: OpenPage, server: Server) -> None:
     studio.tab("Files")
     offered = (studio["#mesh-file"].get_attribute("accept") or "").replace(".", "").split(",")
     call = f"{server.url}/v1/models/with-fine"
@@ -141,7 +141,7 @@ def test_every_kind_of_file_that_is_offered_is_read(studio: Studio, server: Serv
         assert found.status_code == 200, (name, found.text)
 
 
-def test_theme_tab_and_seed_survive_a_reload(studio: Studio) -> None:
+def test_theme_tab_and_seed_survive_a_reload(studio: OpenPage) -> None:
     before = studio["html"].evaluate("e => getComputedStyle(e).colorScheme")
     studio["#theme"].click()
     studio["#seed"].fill("41")
@@ -157,7 +157,7 @@ def test_theme_tab_and_seed_survive_a_reload(studio: Studio) -> None:
     assert studio["#tab-shape"].is_hidden()
 
 
-def test_ten_arrow_keys_are_one_step(studio: Studio) -> None:
+def test_ten_arrow_keys_are_one_step(studio: OpenPage) -> None:
     slider = studio.coordinate(0).locator("input[type=range]")
     slider.focus()
     for _ in range(10):
@@ -195,7 +195,7 @@ def test_legend_and_diagnostics_lie_apart(window: Open, width: int, height: int)
 
 
 @pytest.mark.parametrize("loop", [False, True])
-def test_the_file_lasts_as_long_as_the_player(studio: Studio, loop: bool) -> None:
+def test_the_file_lasts_as_long_as_the_player(studio: OpenPage, loop: bool) -> None:
     keyframes(studio, (-0.2, 0, 0), (0.2, 0, 1), (0.1, 0, 0))
     if loop:
         studio["#loop"].check()

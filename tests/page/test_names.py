@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from tests.page.conftest import Open
-from tests.page.studio import Studio
+from tests.page.studio import OpenPage
 from tests.page.test_operation import AXE, check
 
 
-def headings(studio: Studio) -> list[str]:
+def headings(studio: OpenPage) -> list[str]:
     return studio[".factor h2"].all_inner_texts()
 
 

@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 
 from tests.page.conftest import Open
-from tests.page.studio import Studio, difference
+from tests.page.studio import OpenPage, difference
 from tests.service.conftest import ROOT, Server, Start
 
 AXE = ROOT / "tests" / "node_modules" / "axe-core" / "axe.min.js"
 
 
-def test_the_models_and_their_cards(studio: Studio) -> None:
+def test_the_models_and_their_cards(studio: OpenPage) -> None:
     assert studio["#model option"].all_inner_texts() == ["Figure", "Small torus"]
     studio["#about"].click()
     studio.eventually(studio["#card"].is_visible)
@@ -151,13 +151,13 @@ def test_axe_finds_no_fault(window: Open, scheme: str) -> None:
         check(studio, tab)
 
 
-def check(studio: Studio, where: str) -> None:
+def check(studio: OpenPage, where: str) -> None:
     found = studio.page.evaluate("async () => (await axe.run()).violations")
     serious = [(fault["id"], fault["impact"], fault["nodes"][0]["html"]) for fault in found]
     assert serious == [], where
 
 
-def test_everything_is_reached_by_keyboard(studio: Studio) -> None:
+def test_everything_is_reached_by_keyboard(studio: OpenPage) -> None:
     def focused() -> str:
         return studio.page.evaluate("document.activeElement.id || document.activeElement.dataset.do || ''")
 
@@ -213,7 +213,7 @@ def test_the_page_is_light_and_all_from_here(window: Open, server: Server) -> No
         assert client.get("/page/%2e%2e/app.py").status_code == 404
 
 
-def test_pixels_stay_when_nothing_happens(studio: Studio) -> None:
+def test_pixels_stay_when_nothing_happens(studio: OpenPage) -> None:
     first = studio.picture()
     studio.page.wait_for_timeout(300)
     assert difference(first, studio.picture()) == 0

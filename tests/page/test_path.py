@@ -12,7 +12,7 @@ import pytest
 from playwright.sync_api import Route
 
 from tests.page.conftest import Open
-from tests.page.studio import Studio, body, difference
+from tests.page.studio import OpenPage, body, difference
 
 #: Presses play and, once the time has moved on, pause; run in the page, so that a busy machine doesn't press too late.
 PLAY_A_WHILE = """async (button) => {
@@ -24,7 +24,7 @@ PLAY_A_WHILE = """async (button) => {
 }"""
 
 
-def keyframes(studio: Studio, *codes: tuple[float, float, float]) -> None:
+def keyframes(studio: OpenPage, *codes: tuple[float, float, float]) -> None:
     """Set codes and make each a keyframe."""
     for i, code in enumerate(codes):
         for k, value in enumerate(code):
@@ -37,7 +37,7 @@ def keyframes(studio: Studio, *codes: tuple[float, float, float]) -> None:
     studio.tab("Path")
 
 
-def test_play_pause_and_the_sliders_follow(studio: Studio) -> None:
+def test_play_pause_and_the_sliders_follow(studio: OpenPage) -> None:
     studio.tab("Path")
     assert studio["#play"].is_disabled()
     studio.tab("Shape")
@@ -69,7 +69,7 @@ def test_play_pause_and_the_sliders_follow(studio: Studio) -> None:
     assert len(studio.asked) <= asked + 2, "frames are requested only once"
 
 
-def test_a_loop_goes_on_and_back_to_the_start(studio: Studio) -> None:
+def test_a_loop_goes_on_and_back_to_the_start(studio: OpenPage) -> None:
     keyframes(studio, (0, 0, 0), (0.1, 0, 1))
     studio["#loop"].check()
     assert studio["#beyond"].is_disabled()
@@ -87,7 +87,7 @@ def test_a_loop_goes_on_and_back_to_the_start(studio: Studio) -> None:
     studio.until_code([0.1, 0, 1])
 
 
-def test_past_the_ends_and_the_shorter_way_round(studio: Studio) -> None:
+def test_past_the_ends_and_the_shorter_way_round(studio: OpenPage) -> None:
     keyframes(studio, (0, 3, 0), (0.1, -3, 0))
     studio["#beyond"].select_option("0.5")
     timeline = studio["#timeline"]
@@ -105,7 +105,7 @@ def test_past_the_ends_and_the_shorter_way_round(studio: Studio) -> None:
     assert studio.hash["easing"] == "soft"
 
 
-def test_frames_are_played_as_they_come(studio: Studio) -> None:
+def test_frames_are_played_as_they_come(studio: OpenPage) -> None:
     keyframes(studio, (-0.2, 0, 0), (0.2, 0, 1))
     held: list[Route] = []
 
@@ -172,7 +172,7 @@ def test_a_saved_path_goes_where_the_player_goes(window: Open, path: str) -> Non
     assert (pace[0] < 0.1 * pace.max()) == soft, "slow at keyframes only with the soft pace"
 
 
-def test_keyframes_can_be_visited_reordered_replaced_and_removed(studio: Studio) -> None:
+def test_keyframes_can_be_visited_reordered_replaced_and_removed(studio: OpenPage) -> None:
     keyframes(studio, (0, 0, 0), (0.1, 0, 0), (0.2, 1, 0))
     items = studio["#keyframes > li"]
     items.nth(2).drag_to(items.nth(0))
@@ -192,7 +192,7 @@ def test_keyframes_can_be_visited_reordered_replaced_and_removed(studio: Studio)
     assert studio["#keyframes > li"].count() == 2
 
 
-def test_the_strip_shows_each_factor_alone(studio: Studio) -> None:
+def test_the_strip_shows_each_factor_alone(studio: OpenPage) -> None:
     keyframes(studio, (-0.2, 0, 1), (0.2, 0, 1))
     studio["#draw-strip"].click()
     studio.eventually(lambda: studio["#strip canvas.drawn"].count() == 15)
@@ -206,7 +206,7 @@ def test_the_strip_shows_each_factor_alone(studio: Studio) -> None:
     assert np.abs(rows[2][0] - rows[1][0]).mean() > 1, "and its shape differs from the other factor's"
 
 
-def test_colours_by_stretch_and_bending(studio: Studio) -> None:
+def test_colours_by_stretch_and_bending(studio: OpenPage) -> None:
     assert studio["#legend"].is_hidden()
     studio.type(0, 0.2)
     studio.until_code([0.2, 0, 0])
@@ -235,13 +235,13 @@ def test_colours_by_stretch_and_bending(studio: Studio) -> None:
     studio.eventually(studio["#legend"].is_hidden)
 
 
-def numbers(studio: Studio) -> list[float]:
+def numbers(studio: OpenPage) -> list[float]:
     """Average, minimum and maximum in the legend."""
     text = studio["#legend .numbers"].inner_text().replace("−", "-")
     return [float(part) for part in re.findall(r"[-+]?\d+\.?\d*(?:e-?\d+)?", text)]
 
 
-def test_lengths_and_angles_in_the_page_are_those_of_the_server(studio: Studio) -> None:
+def test_lengths_and_angles_in_the_page_are_those_of_the_server(studio: OpenPage) -> None:
     from shapespace.coordinates.nric import nric
     from shapespace.mesh.triangle_mesh import TriangleMesh
 
@@ -267,7 +267,7 @@ def test_lengths_and_angles_in_the_page_are_those_of_the_server(studio: Studio) 
 
 
 @pytest.mark.parametrize("loop", [False, True])
-def test_codes_along_a_path_are_those_of_the_server(studio: Studio, loop: bool) -> None:
+def test_codes_along_a_path_are_those_of_the_server(studio: OpenPage, loop: bool) -> None:
     codes = [[0.1, 3, 0], [0.2, -3, 0.5], [0, 0.1, 1], [0.1, -3.1, 1]]
     ends = (0, 1) if loop else (-0.5, 1.25)
     asked = {"keyframes": codes, "frames": 30, "start": ends[0], "stop": ends[1], "loop": loop, "mesh": "coarse"}
@@ -285,7 +285,7 @@ def test_codes_along_a_path_are_those_of_the_server(studio: Studio, loop: bool) 
     assert np.allclose(studio.page.evaluate(script, [closed, times.tolist()]), arrays["latents"], atol=1e-5)
 
 
-def test_pictures_of_keyframes_differ(studio: Studio) -> None:
+def test_pictures_of_keyframes_differ(studio: OpenPage) -> None:
     keyframes(studio, (-0.2, 0, 0), (0.2, 0, 0))
     first, second = (body(studio["#keyframes canvas"].nth(i))[..., :3] for i in range(2))
     assert difference(first.astype(int), second.astype(int)) > 0.05

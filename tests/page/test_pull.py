@@ -8,11 +8,11 @@ import numpy as np
 from playwright.sync_api import Locator
 
 from tests.page.conftest import Open
-from tests.page.studio import Studio, difference
+from tests.page.studio import OpenPage, difference
 from tests.page.test_operation import AXE, check
 
 
-def hand(studio: Studio, right: bool = True) -> tuple[float, float]:
+def hand(studio: OpenPage, right: bool = True) -> tuple[float, float]:
     """Window position of the figure's hand on one side of the picture."""
     picture, box = studio.picture(), studio["#canvas"].bounding_box()
     assert box
@@ -23,7 +23,7 @@ def hand(studio: Studio, right: bool = True) -> tuple[float, float]:
     return box["x"] + x, box["y"] + 60 + int(np.median(np.flatnonzero(ink[:, x])))
 
 
-def pull(studio: Studio, place: tuple[float, float], by: tuple[float, float]) -> None:
+def pull(studio: OpenPage, place: tuple[float, float], by: tuple[float, float]) -> None:
     mouse = studio.page.mouse
     mouse.move(*place)
     mouse.down()
@@ -32,7 +32,7 @@ def pull(studio: Studio, place: tuple[float, float], by: tuple[float, float]) ->
     mouse.up()
 
 
-def edits(studio: Studio) -> list[dict[str, Any]]:
+def edits(studio: OpenPage) -> list[dict[str, Any]]:
     """A list to which the bodies of all later `edit` requests are added."""
     sent: list[dict[str, Any]] = []
     studio.page.on("request", lambda request: "/edit" in request.url and sent.append(request.post_data_json))

@@ -14,7 +14,7 @@ from shapespace.arrays import FloatArray
 from shapespace.files.formats import MESH_FORMATS
 from shapespace.files.reading import read_arrays
 from tests.page.conftest import Open
-from tests.page.studio import Studio, difference
+from tests.page.studio import OpenPage, difference
 from tests.page.test_operation import AXE, check
 from tests.service.conftest import Server
 
@@ -49,20 +49,20 @@ def given(server: Server) -> Given:
     return Given(*read_arrays(httpx.get(call, timeout=60).raise_for_status().content, "npz"))
 
 
-def choose(studio: Studio, file: object) -> None:
+def choose(studio: OpenPage, file: object) -> None:
     studio.tab("Files")
     studio["#mesh-file"].set_input_files(file)  # type: ignore[arg-type]
 
 
-def verdict(studio: Studio) -> str:
+def verdict(studio: OpenPage) -> str:
     return studio["#verdict"].inner_text()
 
 
-def until_said(studio: Studio, text: str) -> str:
+def until_said(studio: OpenPage, text: str) -> str:
     return studio.eventually(lambda: words if text in (words := verdict(studio)) else None)
 
 
-def ghost(studio: Studio) -> float:
+def ghost(studio: OpenPage) -> float:
     """Share of pixels that the scan changes."""
     box = studio["#ghost"]
     with_it = studio.picture()

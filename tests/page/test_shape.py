@@ -9,7 +9,7 @@ import pytest
 from playwright.sync_api import Route
 
 from tests.page.conftest import Open
-from tests.page.studio import Studio, body, difference
+from tests.page.studio import OpenPage, body, difference
 
 BACKGROUND = 12  # largest difference between colours of the background
 
@@ -33,7 +33,7 @@ def test_the_figure_is_there_first_and_follows_a_slider(window: Open) -> None:
     assert "ms to the picture" in (studio["#frame-time"].text_content() or "")
 
 
-def test_several_coordinates_at_once_number_lock_and_reset(studio: Studio) -> None:
+def test_several_coordinates_at_once_number_lock_and_reset(studio: OpenPage) -> None:
     start = studio.picture()
     studio.type(0, 0.15)
     studio.type(2, 0.5)
@@ -60,7 +60,7 @@ def test_several_coordinates_at_once_number_lock_and_reset(studio: Studio) -> No
     studio.until_code([0.1, 0, 0])
 
 
-def test_the_range_of_the_training_data_is_marked_and_leaving_it_is_said(studio: Studio) -> None:
+def test_the_range_of_the_training_data_is_marked_and_leaving_it_is_said(studio: OpenPage) -> None:
     slider = studio.coordinate(2).locator("input[type=range]")
     low, high = (
         float(slider.evaluate(f"s => s.style.getPropertyValue('--{end}')").rstrip("%")) for end in ("low", "high")
@@ -74,7 +74,7 @@ def test_the_range_of_the_training_data_is_marked_and_leaving_it_is_said(studio:
     studio.eventually(lambda: "Outside the range" in (studio["#diagnostics"].text_content() or ""))
 
 
-def test_an_angle_goes_round(studio: Studio) -> None:
+def test_an_angle_goes_round(studio: OpenPage) -> None:
     studio.type(1, 4)
     studio.until_code([0, 4 - 2 * np.pi, 0])
     slider = studio.coordinate(1).locator("input[type=range]")
@@ -86,7 +86,7 @@ def test_an_angle_goes_round(studio: Studio) -> None:
     studio.until_code([0, 3.14, 0], 1e-3)
 
 
-def test_drafts_as_it_moves_the_full_shape_as_it_rests_and_nothing_queues(studio: Studio) -> None:
+def test_drafts_as_it_moves_the_full_shape_as_it_rests_and_nothing_queues(studio: OpenPage) -> None:
     studio.asked.clear()
     values = np.linspace(0.01, 0.15, 40).tolist()
     studio.coordinate(0).locator("input[type=range]").evaluate(
@@ -102,7 +102,7 @@ def test_drafts_as_it_moves_the_full_shape_as_it_rests_and_nothing_queues(studio
     assert [asked["latents"][0][0] for asked in studio.asked] == pytest.approx([0.01, 0.15, 0.15])
 
 
-def test_a_draft_turns_into_the_full_shape_pixel_by_pixel(studio: Studio) -> None:
+def test_a_draft_turns_into_the_full_shape_pixel_by_pixel(studio: OpenPage) -> None:
     script = """async ([draft, full]) => {
         const { between } = await import('/page/js/server/shape-loop.js');
         return Array.from(between(Float64Array.from(draft), Float64Array.from(full)), (x) => Array.from(x));
@@ -118,7 +118,7 @@ def test_a_draft_turns_into_the_full_shape_pixel_by_pixel(studio: Studio) -> Non
         assert away == 1 or moves.max() <= 2 / 1080
 
 
-def test_shapes_that_take_their_time_are_asked_for_once(studio: Studio) -> None:
+def test_shapes_that_take_their_time_are_asked_for_once(studio: OpenPage) -> None:
     waiting: list[Route] = []
 
     def keep(route: Route) -> None:
@@ -199,7 +199,7 @@ def test_one_line_says_how_good_the_shape_is_by_what_is_usual_for_the_model(wind
     assert studio["#diagnostics"].get_attribute("class") == "poor"
 
 
-def test_a_slider_is_dragged(studio: Studio) -> None:
+def test_a_slider_is_dragged(studio: OpenPage) -> None:
     before = studio.picture()
     box = studio.coordinate(0).locator("input[type=range]").bounding_box()
     assert box
@@ -218,7 +218,7 @@ def test_a_slider_is_dragged(studio: Studio) -> None:
     studio.until_different(during)
 
 
-def test_a_shape_that_is_already_old_is_dropped(studio: Studio) -> None:
+def test_a_shape_that_is_already_old_is_dropped(studio: OpenPage) -> None:
     dropped: list[str] = []
     studio.page.on("requestfailed", lambda request: dropped.append(request.post_data or ""))
     studio.page.route("**/vertices*", lambda route: '"full"' in (route.request.post_data or "") or route.continue_())
@@ -234,7 +234,7 @@ def test_a_shape_that_is_already_old_is_dropped(studio: Studio) -> None:
     assert studio.messages == ""
 
 
-def test_undo_and_redo(studio: Studio) -> None:
+def test_undo_and_redo(studio: OpenPage) -> None:
     assert studio["#undo"].is_disabled()
     start = studio.picture()
     studio.slide(0, 0.1)
@@ -256,7 +256,7 @@ def test_undo_and_redo(studio: Studio) -> None:
     assert studio["#redo"].is_disabled(), "a new step clears the redo steps"
 
 
-def test_turn_and_zoom_by_mouse_and_keyboard(studio: Studio) -> None:
+def test_turn_and_zoom_by_mouse_and_keyboard(studio: OpenPage) -> None:
     start = studio.picture()
     box = studio["#canvas"].bounding_box()
     assert box
@@ -279,7 +279,7 @@ def test_turn_and_zoom_by_mouse_and_keyboard(studio: Studio) -> None:
     assert studio.code == [0, 0, 0]
 
 
-def test_wireframe_normals_and_the_coarse_mesh(studio: Studio) -> None:
+def test_wireframe_normals_and_the_coarse_mesh(studio: OpenPage) -> None:
     start = studio.picture()
     for switch in ("wireframe", "normals", "fine"):
         before = studio.picture()
@@ -346,7 +346,7 @@ def test_pointing_at_a_factor_colours_where_it_changes_lengths_and_angles(window
     assert not coloured[int(0.75 * height) :].any()
 
 
-def test_pictures_of_each_coordinate(studio: Studio) -> None:
+def test_pictures_of_each_coordinate(studio: OpenPage) -> None:
     studio.eventually(lambda: studio[".pictures canvas.drawn"].count() == 9)
     less, mean, more = (body(studio.coordinate(0).locator("canvas").nth(i)) for i in range(3))
     covered = [(picture[..., 3] > 0).mean() for picture in (less, mean, more)]
@@ -355,7 +355,7 @@ def test_pictures_of_each_coordinate(studio: Studio) -> None:
     studio.until_code([0.2, 0, 0])
 
 
-def test_the_view_fits_every_window(studio: Studio) -> None:
+def test_the_view_fits_every_window(studio: OpenPage) -> None:
     for width, height in ((1400, 500), (700, 900), (390, 700)):
         studio.page.set_viewport_size({"width": width, "height": height})
         studio.eventually(

@@ -9,15 +9,15 @@ from playwright.sync_api import Route
 
 from shapespace.files.reading import read_arrays
 from tests.page.conftest import Open
-from tests.page.studio import Studio, difference
+from tests.page.studio import OpenPage, difference
 
 
-def kept(studio: Studio) -> list[str]:
+def kept(studio: OpenPage) -> list[str]:
     names: list[str] = studio["#shelf input"].evaluate_all("boxes => boxes.map((box) => box.value)")
     return names
 
 
-def focused(studio: Studio) -> str:
+def focused(studio: OpenPage) -> str:
     label: str = studio.page.evaluate("document.activeElement.getAttribute('aria-label') ?? ''")
     return label
 
@@ -128,7 +128,7 @@ def test_two_shapes_beside_each_other(window: Open) -> None:
     assert studio["#against"].input_value() == "-1"
 
 
-def test_from_the_shape_to_the_one_beside(studio: Studio) -> None:
+def test_from_the_shape_to_the_one_beside(studio: OpenPage) -> None:
     assert studio["#blend"].is_hidden()
     studio.type(1, -3)
     studio.until_code([0, -3, 0])
@@ -166,7 +166,7 @@ def test_from_the_shape_to_the_one_beside(studio: Studio) -> None:
     assert studio["#blend"].is_hidden()
 
 
-def test_the_view_stays_as_it_was_turned(studio: Studio, window: Open) -> None:
+def test_the_view_stays_as_it_was_turned(studio: OpenPage, window: Open) -> None:
     studio["#keep-shape"].click()
     studio.slide(0, 0.2)
     studio["#canvas"].focus()
@@ -196,15 +196,15 @@ def test_the_view_stays_as_it_was_turned(studio: Studio, window: Open) -> None:
     studio.eventually(lambda: "view" not in studio.hash)
 
 
-def test_two_windows_have_one_shelf(studio: Studio) -> None:
-    other = Studio(studio.page.context.new_page(), studio.url).open()
+def test_two_windows_have_one_shelf(studio: OpenPage) -> None:
+    other = OpenPage(studio.page.context.new_page(), studio.url).open()
     studio["#keep-shape"].click()
     other.eventually(lambda: kept(other) == ["Shape 1"])
     other["#keep-shape"].click()
     studio.eventually(lambda: kept(studio) == ["Shape 1", "Shape 2"])
 
 
-def furthest(studio: Studio) -> float:
+def furthest(studio: OpenPage) -> float:
     """Largest distance between the two shapes, from the server, in percent of the reference's diagonal."""
 
     def vertices(*code: float) -> np.ndarray:

@@ -16,7 +16,7 @@ import pytest
 from playwright.sync_api import Page
 
 from tests.page.conftest import Open
-from tests.page.studio import Studio, difference, pixels
+from tests.page.studio import OpenPage, difference, pixels
 from tests.service.conftest import Start
 
 #: A script that returns pictures of a video at nine times from its beginning to its end, as PNG.
@@ -45,7 +45,7 @@ STILLS = """async (content) => {
 }"""
 
 
-def kept(studio: Studio, button: str) -> tuple[str, bytes]:
+def kept(studio: OpenPage, button: str) -> tuple[str, bytes]:
     """Name and content of the file that a button downloads."""
     with studio.page.expect_download() as download:
         studio[button].click()

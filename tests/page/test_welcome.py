@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from tests.page.conftest import Open
-from tests.page.studio import Studio, difference
+from tests.page.studio import OpenPage, difference
 
 
-def values(studio: Studio) -> list[float]:
+def values(studio: OpenPage) -> list[float]:
     """The sliders' values."""
     return studio[".coordinate input[type=range]"].evaluate_all("all => all.map(({ value }) => Number(value))")
 

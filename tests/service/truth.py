@@ -17,7 +17,7 @@ ANIMATIONS = ("glb", "npz", "zip", "pc2", "jsonl")
 
 
 @dataclass(frozen=True)
-class Call:
+class RecordedCall:
     """One request."""
 
     method: str
@@ -30,21 +30,23 @@ class Call:
         return client.request(self.method, self.path, content=self.content, headers=headers)
 
 
-def post(path: str, body: Any) -> Call:
-    return Call("POST", path, body if isinstance(body, bytes) else json.dumps(body).encode(), "application/json")
+def post(path: str, body: Any) -> RecordedCall:
+    return RecordedCall(
+        "POST", path, body if isinstance(body, bytes) else json.dumps(body).encode(), "application/json"
+    )
 
 
-def good_calls(client: httpx.Client, name: str, rng: np.random.Generator, count: int) -> list[Call]:
+def good_calls(client: httpx.Client, name: str, rng: np.random.Generator, count: int) -> list[RecordedCall]:
     """Calls of every kind about one model, as a user would send them."""
     card = client.get(f"/v1/models/{name}").raise_for_status().json()
     lower, upper = np.array(card["lower"]), np.array(card["upper"])
     model = f"/v1/models/{name}"
-    calls = [Call("GET", "/v1/models"), Call("GET", model)]
+    calls = [RecordedCall("GET", "/v1/models"), RecordedCall("GET", model)]
     for k in range(count):
         a, b = (rng.uniform(lower, upper).round(4).tolist() for _ in range(2))
         text = ",".join(map(str, a))
         calls += [
-            Call("GET", f"{model}/mesh?latent={text}&format={SHAPES[k % len(SHAPES)]}"),
+            RecordedCall("GET", f"{model}/mesh?latent={text}&format={SHAPES[k % len(SHAPES)]}"),
             post(f"{model}/mesh?format=npz", {"latent": a, "mesh": "coarse"}),
             post(f"{model}/vertices", {"latents": [a, b]}),
             post(f"{model}/nric", {"latents": [a], "factors": True}),
@@ -56,14 +58,14 @@ def good_calls(client: httpx.Client, name: str, rng: np.random.Generator, count:
             ),
         ]
         mesh = client.get(f"{model}/mesh", params={"latent": text, "format": "obj"}).raise_for_status().content
-        calls.append(Call("POST", f"{model}/encode", mesh, "model/obj"))
+        calls.append(RecordedCall("POST", f"{model}/encode", mesh, "model/obj"))
         path = client.post(f"{model}/interpolations", json={"keyframes": [a, b], "frames": 4}).raise_for_status().json()
-        calls.append(Call("GET", path["links"][ANIMATIONS[k % len(ANIMATIONS)]]))
-        calls.append(Call("GET", path["links"]["frames"].replace("{k}", "1")))
+        calls.append(RecordedCall("GET", path["links"][ANIMATIONS[k % len(ANIMATIONS)]]))
+        calls.append(RecordedCall("GET", path["links"]["frames"].replace("{k}", "1")))
     return calls
 
 
-def bad_calls(name: str) -> list[Call]:
+def bad_calls(name: str) -> list[RecordedCall]:
     """Calls that must be refused."""
     model = f"/v1/models/{name}"
     return [
@@ -74,15 +76,15 @@ def bad_calls(name: str) -> list[Call]:
         post(f"{model}/interpolations", {"keyframes": [[0.0]], "frames": 10_000}),
         post(f"{model}/sample", {"count": -1}),
         post(f"{model}/edit", {"latent": [], "targets": []}),
-        Call("POST", f"{model}/encode", b"\x93no mesh" * 500, "model/gltf-binary"),
-        Call("POST", f"{model}/encode", b"v 1 2 nan\nf 1 1 1\n", "model/obj"),
-        Call("POST", f"{model}/mesh", b"latent=1", "application/x-www-form-urlencoded"),
-        Call("GET", f"{model}/mesh?latent=nan,inf"),
-        Call("GET", f"{model}/mesh?format=fbx"),
-        Call("GET", "/v1/models/nobody"),
-        Call("GET", "/v1/interpolations/AAAA"),
-        Call("GET", "/page/%2e%2e/%2e%2e/settings.py"),
-        Call("DELETE", model),
+        RecordedCall("POST", f"{model}/encode", b"\x93no mesh" * 500, "model/gltf-binary"),
+        RecordedCall("POST", f"{model}/encode", b"v 1 2 nan\nf 1 1 1\n", "model/obj"),
+        RecordedCall("POST", f"{model}/mesh", b"latent=1", "application/x-www-form-urlencoded"),
+        RecordedCall("GET", f"{model}/mesh?latent=nan,inf"),
+        RecordedCall("GET", f"{model}/mesh?format=fbx"),
+        RecordedCall("GET", "/v1/models/nobody"),
+        RecordedCall("GET", "/v1/interpolations/AAAA"),
+        RecordedCall("GET", "/page/%2e%2e/%2e%2e/settings.py"),
+        RecordedCall("DELETE", model),
     ]
 
 
@@ -103,11 +105,11 @@ def fingerprint(answer: httpx.Response) -> Fingerprint:
 class Truth:
     """The answers of calls while nothing disturbs the server."""
 
-    def __init__(self, client: httpx.Client, calls: Iterable[Call]) -> None:
+    def __init__(self, client: httpx.Client, calls: Iterable[RecordedCall]) -> None:
         self._client = client
-        self.answers: dict[Call, Fingerprint] = {call: fingerprint(call.send(client)) for call in calls}
+        self.answers: dict[RecordedCall, Fingerprint] = {call: fingerprint(call.send(client)) for call in calls}
 
-    def differing(self, client: httpx.Client | None = None) -> list[Call]:
+    def differing(self, client: httpx.Client | None = None) -> list[RecordedCall]:
         """Calls whose answers now differ from the recorded ones."""
         client = client or self._client
         return [call for call, then in self.answers.items() if fingerprint(call.send(client)) != then]
