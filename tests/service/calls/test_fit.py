@@ -78,6 +78,7 @@ def test_points_in_every_format_give_what_the_library_gives(
         assert np.linalg.norm(points[:, None] - there[None, ::7], axis=-1).min(axis=1).max() < 0.15
 
 
+@pytest.mark.long
 def test_meshes_are_read_in_every_format_that_encode_reads(client: httpx.Client, figure: ShapeModel) -> None:
     shape = figure.decode(CODE) + np.ones(3)
     for format in MESH_FORMATS:

@@ -38,6 +38,7 @@ def test_one_call_gives_a_valid_glb_with_the_bump_where_it_was_asked_for(client:
     assert moved[here].max() > 0.5 * freaky_torus.PAPER.bump_height
 
 
+@pytest.mark.long
 def test_fresh_codes_come_within_a_hundredth_of_the_formula(client: httpx.Client) -> None:
     codes = np.random.default_rng(20_000).uniform(0, 2 * np.pi, (100, 4))
     found, statuses = [], []
