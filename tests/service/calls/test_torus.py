@@ -5,6 +5,7 @@ from pathlib import Path
 
 import httpx
 import numpy as np
+import pytest
 
 from shapespace.mesh.rigid_motion import align
 from shapespace.training.collection.generators import freaky_torus
