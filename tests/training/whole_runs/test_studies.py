@@ -103,6 +103,7 @@ def r2(learner: Learner, model: Model, part: str) -> float:
     return r_squared(z, joint.nric[rows], norm)["total"]
 
 
+@pytest.mark.long
 def test_studies_add_their_figures_and_networks_to_a_finished_run(finished: Run) -> None:
     directory, variant = finished.directory, Variant(title="other", combiner={"symmetries": False})
     before = directory.evaluation.read()
