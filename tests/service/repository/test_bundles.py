@@ -175,7 +175,7 @@ def arrays_with(*, fine: bool = False, **changes: Change) -> Spoil:
             new = change(arrays[name].copy()) if callable(change) else change
             arrays = {key: array for key, array in arrays.items() if key != name}
             arrays |= {} if new is None else {name: new}
-        (folder / "geometry.npz").write_bytes(npz(**arrays))
+        (folder / "geometry.npz").write_bytes(npz_bytes(arrays))
         seal(folder)
 
     return spoil
