@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from playwright.sync_api import Browser, sync_playwright
 
-from shapespace.files.formats import read_arrays
+from shapespace.files.reading import read_arrays
 from tests.page.studio import OpenPage
 from tests.service.bundles import write_bundle
 from tests.service.conftest import ROOT, Server, Start, starting

@@ -481,7 +481,7 @@ def test_what_nobody_expected_is_a_line_as_well(
 ) -> None:
     for name in ("a", "b", "c"):
         write_bundle(tmp_path, name)
-    real = ModelRepository._take_up
+    real = ModelRepository._load
 
     def broken(self: ModelRepository, folder: Path, *more: object) -> ShapeModel:
         if folder.parent.name == "b":
@@ -489,7 +489,7 @@ def test_what_nobody_expected_is_a_line_as_well(
         return real(self, folder, *more)  # type: ignore[arg-type]
 
     with monkeypatch.context() as patch:
-        patch.setattr(ModelRepository, "_take_up", broken)
+        patch.setattr(ModelRepository, "_load", broken)
         repository = ModelRepository(tmp_path)
     assert [model.manifest.name for model in repository] == ["a", "c"]
     (line,) = messages(caplog)
