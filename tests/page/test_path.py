@@ -69,6 +69,7 @@ def test_play_pause_and_the_sliders_follow(studio: OpenPage) -> None:
     assert len(studio.asked) <= asked + 2, "frames are requested only once"
 
 
+@pytest.mark.long
 def test_a_loop_goes_on_and_back_to_the_start(studio: OpenPage) -> None:
     keyframes(studio, (0, 0, 0), (0.1, 0, 1))
     studio["#loop"].check()

@@ -72,7 +72,7 @@ def ghost(studio: OpenPage) -> float:
     return float((np.abs(with_it - without).max(axis=2) > 12).mean())
 
 
-@pytest.mark.parametrize("name", ["scan.ply", "points.xyz"])
+@pytest.mark.parametrize("name", ["scan.ply", pytest.param("points.xyz", marks=pytest.mark.long)])
 def test_a_scan_is_fitted_and_lies_over_its_shape(window: Open, given: Given, name: str) -> None:
     studio = window(complains=name.endswith("ply")).open(FIGURE)  # the console logs that `encode` refuses it
     start = studio.picture()

@@ -178,7 +178,7 @@ def test_a_post_that_broke_a_replica_is_not_sent_to_the_next(small: Path, tmp_pa
         assert posts(replicas[1 - broken]) == 6
 
 
-@pytest.mark.parametrize("ending", ["terminate", "kill"])
+@pytest.mark.parametrize("ending", ["terminate", pytest.param("kill", marks=pytest.mark.long)])
 def test_the_end_of_a_replica_under_load_loses_nothing(small: Path, tmp_path: Path, ending: str) -> None:
     with starting() as start, ExitStack() as stack:
         replicas = [start(small, workers=2, queue=100, drain=5) for _ in range(2)]

@@ -11,7 +11,7 @@ import httpx
 import pytest
 
 from shapespace.client import Client
-from tests.service.conftest import Server, Start
+from tests.service.conftest import Server, Start, starting
 
 HOP = {"connection", "transfer-encoding", "keep-alive", "host", "content-length"}
 
@@ -58,9 +58,9 @@ def round_robin(servers: list[Server]) -> Iterator[str]:
         proxy.server_close()
 
 
-@pytest.fixture
-def address(models: Path, start: Start) -> Iterator[str]:
-    with round_robin([start(models, workers=1), start(models, workers=2)]) as address:
+@pytest.fixture(scope="module")
+def address(models: Path) -> Iterator[str]:
+    with starting() as start, round_robin([start(models, workers=1), start(models, workers=2)]) as address:
         yield address
 
 

@@ -438,6 +438,7 @@ def messages(caplog: pytest.LogCaptureFixture) -> list[str]:
     return found
 
 
+@pytest.mark.long
 def test_a_validation_that_never_ends_or_dies_keeps_no_other_bundle_out(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
