@@ -43,11 +43,7 @@ def r_squared(predicted: NDArray, exact: NDArray, norm: WeightedNorm) -> dict[st
         weights = norm.squared[part]
         return float(1 - (error[:, part] @ weights).sum() / (spread[:, part] @ weights).sum())
 
-    return {
-        "total": ratio(slice(None)),
-        "lengths": ratio(slice(0, half)),
-        "angles": ratio(slice(half, None)),
-    }
+    return {"total": ratio(slice(None)), "lengths": ratio(slice(0, half)), "angles": ratio(slice(half, None))}
 
 
 #: Map from codes (n, m) to NRIC of joint shapes (n, 2E), or of factor shapes (n, J, 2E).

@@ -232,10 +232,7 @@ def _checkpoint(
 
 
 def _restore(
-    optimisers: Sequence[Optimizer],
-    schedules: Sequence[Schedule],
-    state: dict[str, Any],
-    extra: dict[str, Tensor],
+    optimisers: Sequence[Optimizer], schedules: Sequence[Schedule], state: dict[str, Any], extra: dict[str, Tensor]
 ) -> dict[str, Tensor]:
     """Restore all state except the network from a checkpoint, and return the best parameters."""
     torch.set_rng_state(extra["rng"])

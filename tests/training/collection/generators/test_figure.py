@@ -181,9 +181,7 @@ def test_collection_begins_at_rest_and_keeps_triangles_and_volume(
     assert not any(figure._touches(shape) for shape in vertices)
 
 
-def test_poses_differ_but_are_the_same_for_the_same_seed(
-    collection: tuple[list[str], FloatArray, np.ndarray],
-) -> None:
+def test_poses_differ_but_are_the_same_for_the_same_seed(collection: tuple[list[str], FloatArray, np.ndarray]) -> None:
     names, vertices, _ = collection
     again, same, _ = figure.poses(count=12)
     assert again == names[:12]

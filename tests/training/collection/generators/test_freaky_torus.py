@@ -26,11 +26,7 @@ def tau(eta, a, b, t):
 
 def f(alpha, beta, u, v):
     large, small = tau(alpha, A_R, B_R, u), tau(beta, A_r, B_r, v)
-    return (
-        R * large[0] + r * cmath.cos(u) * small[0],
-        R * large[1] + r * cmath.sin(u) * small[0],
-        r * small[1],
-    )
+    return (R * large[0] + r * cmath.cos(u) * small[0], R * large[1] + r * cmath.sin(u) * small[0], r * small[1])
 
 
 def normal(alpha, beta, u, v):
