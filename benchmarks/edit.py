@@ -44,19 +44,12 @@ changed by more than 1 % of the bounds' width, and the shapes that the search ha
 
 @dataclass(frozen=True)
 class Pull:
-    """A vertex and its target.
+    """A vertex and its target."""
 
-    Attributes:
-        start: (m,) code to start from.
-        before: (V, 3) shape of the code.
-        limb: name of the limb.
-        target: target of the vertex, at the distance ``PULL``.
-    """
-
-    start: Codes
-    before: FloatArray
-    limb: str
-    target: Target
+    start: Codes  # (m,) code to start from
+    before: FloatArray  # (V, 3) shape of the code
+    limb: str  # name of the limb
+    target: Target  # target of the vertex, at the distance ``PULL``
 
 
 def limbs() -> dict[str, NDArray[np.bool_]]:

@@ -23,15 +23,10 @@ class IngestError(ValueError):
 
 @dataclass(frozen=True)
 class Tolerances:
-    """Distances between vertices, as shares of the diagonal of the shape's bounding box.
+    """Distances between vertices, as shares of the diagonal of the shape's bounding box."""
 
-    Attributes:
-        weld: vertices that are closer coincide; storing a coordinate as float32 moves it by up to 6e-8.
-        seam: border vertices that are closer were probably meant to be one vertex.
-    """
-
-    weld: float = 1e-6
-    seam: float = 1e-4
+    weld: float = 1e-6  # vertices that are closer coincide; storing a coordinate as float32 moves it by up to 6e-8
+    seam: float = 1e-4  # border vertices that are closer were probably meant to be one vertex
 
 
 TOLERANCES = Tolerances()
@@ -39,16 +34,11 @@ TOLERANCES = Tolerances()
 
 @dataclass(frozen=True)
 class ShapeSource:
-    """The place that a shape was read from.
+    """The place that a shape was read from."""
 
-    Attributes:
-        label: the file's path, followed by the shape's name if the file holds several shapes.
-        name: the shape's name.
-        first: number that the file gives to its first vertex and its first face: 1 in OBJ, 0 in all other formats.
-    """
-
-    label: str
-    name: str
+    label: str  # the file's path, followed by the shape's name if the file holds several shapes
+    name: str  # the shape's name
+    # Number that the file gives to its first vertex and its first face: 1 in OBJ, 0 in all other formats.
     first: int = 0
 
     @classmethod

@@ -19,30 +19,20 @@ from shapespace.training.collection.warnings import CollectionWarning
 
 @dataclass(frozen=True, eq=False)
 class MeshCollection:
-    """Shapes in correspondence, each a valid TriangleMesh, in the user's units.
+    """Shapes in correspondence, each a valid TriangleMesh, in the user's units."""
 
-    Attributes:
-        names: the n shapes' names: the names of their files in natural order (pose2 before pose10), or the NPZ's own.
-        vertices: (n, V, 3) positions as in the files. A large array lies on disk, so read it shape by shape.
-        faces: (F, 3) of every shape, in the order of the files.
-        file_vertices: (N,) index here of each vertex of a file, −1 for vertices that were left out. None if there are
-            no files.
-        notes: what was found in the files and handled, one sentence each.
-        warnings: single shapes that look wrong.
-        central: index of the shape with the least mean square distance from the others, after rigid alignment.
-        places: for each shape its file, and the number that the file gives its first vertex. Empty if there are no
-            files.
-        parts: if there are several, the shell and then the attached parts. Edges join the faces of one part.
-    """
-
+    # The n shapes' names: the names of their files in natural order (pose2 before pose10), or the NPZ's own.
     names: tuple[str, ...]
-    vertices: FloatArray
-    faces: IntArray
+    vertices: FloatArray  # (n, V, 3) positions as in the files. A large array lies on disk, so read it shape by shape.
+    faces: IntArray  # (F, 3) of every shape, in the order of the files
+    # (N,) index here of each vertex of a file, −1 for vertices that were left out. None if there are no files.
     file_vertices: IntArray | None = None
-    notes: tuple[str, ...] = ()
-    warnings: tuple[CollectionWarning, ...] = ()
-    central: int = 0
+    notes: tuple[str, ...] = ()  # what was found in the files and handled, one sentence each
+    warnings: tuple[CollectionWarning, ...] = ()  # single shapes that look wrong
+    central: int = 0  # index of the shape with the least mean square distance from the others, after rigid alignment
+    # For each shape its file, and the number that the file gives its first vertex. Empty if there are no files.
     places: tuple[tuple[str, int], ...] = ()
+    # If there are several, the shell and then the attached parts. Edges join the faces of one part.
     parts: tuple[MeshPart, ...] = ()
 
     @property

@@ -20,32 +20,23 @@ from shapespace.training.collection.welding import NumberedShapes
 
 
 class MeshPart(NamedTuple):
-    """A part of a mesh.
+    """A part of a mesh."""
 
-    Attributes:
-        name: the name of its object, group or material in the file, or "part 1" and so on.
-        faces: (k,) indices of its faces.
-    """
-
-    name: str
-    faces: IntArray
+    name: str  # the name of its object, group or material in the file, or "part 1" and so on
+    faces: IntArray  # (k,) indices of its faces
 
 
 @dataclass(frozen=True)
 class PartLimits:
-    """Limits on the parts of a mesh.
+    """Limits on the parts of a mesh."""
 
-    Attributes:
-        area: largest area of an attached part that deforms, as a share of the shell's area. Lengths and angles of the
-            shell don't say how two large surfaces lie to each other.
-        rigid: a part keeps its form if each of its shapes is this close to the first one after rigid alignment, on
-            average over the vertices; a share of the part's diagonal.
-        count: most parts: each takes time in every answer.
-    """
-
+    # Largest area of an attached part that deforms, as a share of the shell's area. Lengths and angles of the shell
+    # don't say how two large surfaces lie to each other.
     area: float = 0.2
+    # A part keeps its form if each of its shapes is this close to the first one after rigid alignment, on average over
+    # the vertices; a share of the part's diagonal.
     rigid: float = 0.005
-    count: int = 100
+    count: int = 100  # most parts: each takes time in every answer
 
 
 LIMITS = PartLimits()

@@ -35,21 +35,13 @@ _COMPANIONS = ("bin", "mtl", "png", "jpg", "jpeg")
 
 @dataclass(frozen=True, eq=False)
 class FileShapes:
-    """Shapes as they stand in their files, all with the same faces.
+    """Shapes as they stand in their files, all with the same faces."""
 
-    Attributes:
-        sources: the n shapes' files and names.
-        vertices: (n, N, 3).
-        faces: (F, 3).
-        paths: the shapes' files, if each shape has one.
-        triangles_only: whether no file says which vertices its triangles share, as in STL.
-    """
-
-    sources: tuple[ShapeSource, ...]
-    vertices: FloatArray
-    faces: IntArray
-    paths: tuple[Path, ...] = ()
-    triangles_only: bool = False
+    sources: tuple[ShapeSource, ...]  # the n shapes' files and names
+    vertices: FloatArray  # (n, N, 3)
+    faces: IntArray  # (F, 3)
+    paths: tuple[Path, ...] = ()  # the shapes' files, if each shape has one
+    triangles_only: bool = False  # whether no file says which vertices its triangles share, as in STL
 
 
 def read_shapes(path: Path) -> FileShapes:

@@ -23,34 +23,23 @@ from shapespace.training.collection.large_arrays import TOGETHER, columns, room
 
 @dataclass(frozen=True)
 class WarningThresholds:
-    """Differences between shapes that cause a warning.
+    """Differences between shapes that cause a warning."""
 
-    Attributes:
-        area_factor: an area that differs from the median by more than this factor suggests another unit.
-        stretch: a vertex is misplaced in a shape if its shortest edge there is longer than ``stretch`` times its
-            longest edge in other shapes,
-        long: and longer than ``long`` times the shape's median edge.
-        scrambled: the vertices have another order if the median of all ratios of edges to the same edges in other
-            shapes is larger.
-        quantile: "in other shapes" means this quantile over all shapes, so that faults are found even if only a
-            quarter of the shapes are right.
-        mirrored: a reflection explains why a shape differs from another if it reduces the squared distance to less
-            than this share.
-        turned: the same for a rotation.
-        quarter_turn: largest angle, in degrees, between a rotation and one that exchanges coordinate axes, to count as
-            such an exchange.
-        alike: largest angle, in degrees, between shapes that count as having the same orientation.
-    """
-
-    area_factor: float = 3.0
+    area_factor: float = 3.0  # an area that differs from the median by more than this factor suggests another unit
+    # A vertex is misplaced in a shape if its shortest edge is longer than ``stretch`` times its longest edge in other
+    # shapes, and longer than ``long`` times the shape's median edge.
     stretch: float = 2.0
     long: float = 3.0
+    # The vertices have another order if the median of all ratios of edges to the same edges in other shapes is larger.
     scrambled: float = 2.5
+    # "In other shapes" means this quantile over all shapes, so that it is enough if a quarter of the shapes are right.
     quantile: float = 0.25
+    # A reflection, or a rotation, explains why a shape differs from another if it reduces the squared distance to less
+    # than this share.
     mirrored: float = 0.5
     turned: float = 0.1
-    quarter_turn: float = 25.0
-    alike: float = 30.0
+    quarter_turn: float = 25.0  # largest angle in degrees between a rotation and an exchange of coordinate axes
+    alike: float = 30.0  # largest angle, in degrees, between shapes that count as having the same orientation
 
 
 THRESHOLDS = WarningThresholds()
@@ -60,19 +49,13 @@ SAMPLE = 2000
 
 @dataclass(frozen=True)
 class CollectionWarning:
-    """A warning about one shape of a collection.
+    """A warning about one shape of a collection."""
 
-    Attributes:
-        shape: index of the shape.
-        sentence: what seems wrong. From `find_warnings` it follows the file's name and may have a field ``{vertex}``.
-        grave: whether a model of such a shape is useless, so that the user must accept the shape by name.
-        vertex: index of the vertex that the sentence names.
-    """
-
-    shape: int
+    shape: int  # index of the shape
+    # What seems wrong. From `find_warnings` it follows the file's name and may have a field ``{vertex}``.
     sentence: str
-    grave: bool = False
-    vertex: int = 0
+    grave: bool = False  # whether a model of such a shape is useless, so that the user must accept the shape by name
+    vertex: int = 0  # index of the vertex that the sentence names
 
 
 class Placements:

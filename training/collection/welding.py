@@ -22,19 +22,12 @@ from shapespace.training.collection.large_arrays import some_vertices
 
 @dataclass(frozen=True, eq=False)
 class NumberedShapes:
-    """Shapes in correspondence, and the numbers of their vertices in the files.
+    """Shapes in correspondence, and the numbers of their vertices in the files."""
 
-    Attributes:
-        vertices: (n, V, 3).
-        faces: (F, 3).
-        file_numbers: (V,) index that the files give each vertex, or the first of the vertices merged into it.
-        file_vertices: (N,) index here of each vertex of a file, −1 for vertices that were left out.
-    """
-
-    vertices: FloatArray
-    faces: IntArray
-    file_numbers: IntArray
-    file_vertices: IntArray
+    vertices: FloatArray  # (n, V, 3)
+    faces: IntArray  # (F, 3)
+    file_numbers: IntArray  # (V,) index that the files give each vertex, or the first of the vertices merged into it
+    file_vertices: IntArray  # (N,) index here of each vertex of a file, −1 for vertices that were left out
 
     @classmethod
     def from_files(cls, vertices: FloatArray, faces: IntArray) -> NumberedShapes:
@@ -68,17 +61,11 @@ class NumberedShapes:
 
 
 class Coincidences(NamedTuple):
-    """Vertices of shapes (n, V, 3) that coincide in every shape.
+    """Vertices of shapes (n, V, 3) that coincide in every shape."""
 
-    Attributes:
-        first: (V,) index of the first vertex that each vertex coincides with.
-        shares: (n,) share of the first shape's coinciding pairs that coincide in each shape.
-        apart: number of the first shape's coinciding pairs that don't coincide in every shape.
-    """
-
-    first: IntArray
-    shares: FloatArray
-    apart: int
+    first: IntArray  # (V,) index of the first vertex that each vertex coincides with
+    shares: FloatArray  # (n,) share of the first shape's coinciding pairs that coincide in each shape
+    apart: int  # number of the first shape's coinciding pairs that don't coincide in every shape
 
 
 def find_coincidences(vertices: FloatArray) -> Coincidences:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Protocol
 
 import numpy as np
 import torch
@@ -25,17 +24,12 @@ from shapespace.training.runs.settings import EvaluationSettings
 
 @dataclass(frozen=True)
 class KernelSearch:
-    """Candidates for kernel ridge regression, from which held-out codes choose.
+    """Candidates for kernel ridge regression, from which held-out codes choose."""
 
-    Attributes:
-        lengths: lengths of the kernel, in multiples of the root of the number of inputs.
-        penalties: ridge penalties.
-        components: number of principal coefficients of the shapes whose error decides.
-    """
-
+    # Lengths of the kernel, in multiples of the root of the number of inputs.
     lengths: tuple[float, ...] = (0.5, 1.0, 2.0, 4.0, 8.0)
-    penalties: tuple[float, ...] = tuple(10.0**k for k in range(-11, -1))
-    components: int = 128
+    penalties: tuple[float, ...] = tuple(10.0**k for k in range(-11, -1))  # ridge penalties
+    components: int = 128  # number of principal coefficients of the shapes whose error decides
 
 
 SEARCH = KernelSearch()
@@ -43,12 +37,9 @@ SEARCH = KernelSearch()
 FEWEST_NODES = 3
 
 
-class ExactShapes(Protocol):
-    """Function that computes exact shapes of codes and saves them under a name."""
-
-    def __call__(self, name: str, latents: FloatArray, collection: Collection | None = None) -> NDArray[np.float32]:
-        """Return NRIC (n, 2E) of codes (n, m), NaN for a code without a shape; by default from the run's collection."""
-        ...
+#: Function of a name, codes (n, m) and, if it isn't the run's, a collection. It computes exact NRIC (n, 2E), NaN for a
+#: code without a shape, and saves them under the name.
+ExactShapes = Callable[..., NDArray[np.float32]]
 
 
 class LatentKernel(nn.Module):
@@ -116,37 +107,19 @@ class LatentKernel(nn.Module):
         return self.scaling.up((self.mean + found @ self.weights).float())
 
 
-@dataclass(frozen=True)
 class MultilinearGrid:
     """Multilinear interpolation of exact shapes on a regular grid of one factor (Sassen et al. 2020).
 
-    Attributes:
+    Args:
+        coordinates: bounds and periods of all latents.
         factor: indices of the factor's latents.
-        interpolate: NRIC (n, 2E) of these latents (n, m_j).
-        size: bytes of the values at the nodes.
+        nodes: number of nodes along each latent. The end of a period equals its beginning and does not count.
+        shapes: exact NRIC (n, 2E) of codes (n, m).
     """
 
-    factor: list[int]
-    interpolate: RegularGridInterpolator
-    size: int
-
-    def __call__(self, latents: FloatArray) -> FloatArray:
-        """Return NRIC (n, 2E) of the factor's part of codes (n, m)."""
-        result: FloatArray = self.interpolate(latents[:, self.factor])
-        return result
-
-    @classmethod
-    def of(
-        cls, coordinates: Coordinates, factor: list[int], nodes: int, shapes: Callable[[FloatArray], NDArray]
-    ) -> MultilinearGrid:
-        """Evaluate the nodes exactly.
-
-        Args:
-            coordinates: bounds and periods of all latents.
-            factor: indices of the factor's latents.
-            nodes: number of nodes along each latent. The end of a period equals its beginning and does not count.
-            shapes: exact NRIC (n, 2E) of codes (n, m).
-        """
+    def __init__(
+        self, coordinates: Coordinates, factor: list[int], nodes: int, shapes: Callable[[FloatArray], NDArray]
+    ) -> None:
         own = coordinates[factor]
         ends = np.isfinite(own.period).astype(int)
         axes = [np.linspace(a, b, nodes + end) for a, b, end in zip(own.lower, own.upper, ends, strict=True)]
@@ -156,7 +129,13 @@ class MultilinearGrid:
         values = shapes(latents).reshape(*[nodes] * len(factor), -1)
         closed = np.pad(values, [*((0, end) for end in ends), (0, 0)], mode="wrap")
         # Rounding may move a code slightly outside of the grid.
-        return cls(factor, RegularGridInterpolator(axes, closed, bounds_error=False, fill_value=None), values.nbytes)
+        self.interpolate = RegularGridInterpolator(axes, closed, bounds_error=False, fill_value=None)
+        self.factor, self.size = factor, values.nbytes  # bytes of the values at the nodes
+
+    def __call__(self, latents: FloatArray) -> FloatArray:
+        """Return NRIC (n, 2E) of the factor's part of codes (n, m)."""
+        result: FloatArray = self.interpolate(latents[:, self.factor])
+        return result
 
 
 def grid_nodes(dimension: int, settings: EvaluationSettings) -> int:
@@ -171,6 +150,6 @@ def factor_grids(collection: Collection, settings: EvaluationSettings, exact: Ex
     if min(nodes) < FEWEST_NODES:
         return []
     return [
-        MultilinearGrid.of(collection.coordinates, index, count, partial(exact, f"grid-{j}"))
+        MultilinearGrid(collection.coordinates, index, count, partial(exact, f"grid-{j}"))
         for j, (index, count) in enumerate(zip(factors, nodes, strict=True))
     ]

@@ -14,17 +14,11 @@ from shapespace.training.learning.networks import FactorNetwork, ShapeNetwork
 
 @dataclass(frozen=True)
 class Composite:
-    """Factor networks ψ_j and the combiner Ψ, which maps their outputs to the joint shape.
+    """Factor networks ψ_j and the combiner Ψ, which maps their outputs to the joint shape."""
 
-    Attributes:
-        factors: latent indices of each factor.
-        networks: the factor networks ψ_j.
-        combiner: Ψ.
-    """
-
-    factors: list[list[int]]
-    networks: list[FactorNetwork]
-    combiner: CombinerNetwork
+    factors: list[list[int]]  # latent indices of each factor
+    networks: list[FactorNetwork]  # the factor networks ψ_j
+    combiner: CombinerNetwork  # Ψ
 
     @property
     def parts(self) -> list[ShapeNetwork]:

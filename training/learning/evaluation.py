@@ -50,59 +50,38 @@ def r_squared(predicted: NDArray, exact: NDArray, norm: WeightedNorm) -> dict[st
 Model = Callable[[torch.Tensor], torch.Tensor]
 
 
-@dataclass(frozen=True)
-class Reconstructions:
-    """Shapes reconstructed from predicted lengths and angles, compared with the exact shapes.
+def reconstruct(
+    reference: TriangleMesh, eta: float, predicted: NDArray, exact: NDArray
+) -> tuple[FloatArray, FloatArray, dict[str, Any]]:
+    """Reconstruct predicted NRIC (n, 2E), and compare with exact vertices (n, V, 3) after rigid alignment.
 
-    Attributes:
-        vertices: (n, V, 3) reconstructed vertices, aligned to the exact shapes.
-        errors: (n, V) vertex distances, as fractions of the reference's bounding-box diagonal.
-        iterations: (n,) Gauss–Newton iterations from the reference.
-        statuses: (n,) final status of each reconstruction.
+    Returns:
+        The aligned vertices (n, V, 3); vertex distances (n, V), as fractions of the reference's bounding-box diagonal;
+        ``mean`` and ``max`` distance, mean Gauss–Newton ``iterations``, and the count of each ``status``.
     """
-
-    vertices: FloatArray
-    errors: FloatArray
-    iterations: list[int]
-    statuses: list[str]
-
-    @classmethod
-    def of(cls, reference: TriangleMesh, eta: float, predicted: NDArray, exact: NDArray) -> Reconstructions:
-        """Reconstruct NRIC (n, 2E) and compare with vertices (n, V, 3) after rigid alignment."""
-        reconstruct = Reconstructor(reference, eta)
-        shapes = progress(predicted, "reconstructed shapes", "shape", len(predicted))
-        found = [reconstruct(z, tolerance=1e-6) for z in shapes]
-        vertices = align(np.array([f.vertices for f in found]), exact)
-        errors = np.linalg.norm(vertices - exact, axis=2) / reference.diagonal
-        return cls(vertices, errors, [f.iterations for f in found], [str(f.status) for f in found])
-
-    def figures(self) -> dict[str, Any]:
-        """Return ``mean`` and ``max`` error, mean ``iterations``, and the count of each ``status``."""
-        return {
-            "mean": float(self.errors.mean()),
-            "max": float(self.errors.max()),
-            "iterations": float(np.mean(self.iterations)),
-            "status": dict(Counter(self.statuses)),
-        }
+    reconstructor = Reconstructor(reference, eta)
+    shapes = progress(predicted, "reconstructed shapes", "shape", len(predicted))
+    found = [reconstructor(z, tolerance=1e-6) for z in shapes]
+    vertices = align(np.array([f.vertices for f in found]), exact)
+    errors = np.linalg.norm(vertices - exact, axis=2) / reference.diagonal
+    figures = {
+        "mean": float(errors.mean()),
+        "max": float(errors.max()),
+        "iterations": float(np.mean([f.iterations for f in found])),
+        "status": dict(Counter(str(f.status) for f in found)),
+    }
+    return vertices, errors, figures
 
 
 @dataclass(frozen=True)
 class HeldOutSamples:
-    """Joint samples that no network is fitted to: the validation codes, or the test codes, which only evaluation reads.
+    """Joint samples that no network is fitted to: of the validation codes, or of the test codes."""
 
-    Attributes:
-        rows: (n,) rows of the joint samples.
-        latents: (n, m) codes.
-        z: (n, 2E) exact NRIC.
-        vertices: (n, V, 3) exact vertices.
-        norm: norm of NRIC differences.
-    """
-
-    rows: IntArray
-    latents: FloatArray
-    z: NDArray[np.float32]
-    vertices: NDArray[np.float32]
-    norm: WeightedNorm
+    rows: IntArray  # (n,) rows of the joint samples
+    latents: FloatArray  # (n, m) codes
+    z: NDArray[np.float32]  # (n, 2E) exact NRIC
+    vertices: NDArray[np.float32]  # (n, V, 3) exact vertices
+    norm: WeightedNorm  # norm of NRIC differences
 
     @classmethod
     def of(cls, learner: Learner, name: str = "test") -> HeldOutSamples:
@@ -139,19 +118,18 @@ def evaluate(learner: Learner, exact: ExactShapes) -> tuple[dict[str, Any], dict
     settings, reference = config.evaluation, collection.reference
     z_reference = nric(reference.vertices, reference.connectivity)
     test, composite = HeldOutSamples.of(learner), learner.main()
-    baselines: dict[str, Composite | nn.Module] = {
+    models: dict[str, Composite | nn.Module] = {
+        "composite": composite,
         "monolithic": learner.monolithic(),
         "monolithic_paper": learner.monolithic_paper(),
         "kernel": learner.kernel(),
     }
     if config.networks.paper:
-        baselines["paper"] = learner.paper()
+        models["paper"] = learner.paper()
     shapes, found = exact_factors(learner, test.rows[: settings.exact_factors], exact)
-    learned, predicted = test.predicted(composite.factor_shapes), test.predicted(composite)
-    models: dict[str, Composite | nn.Module] = {"composite": composite, **baselines}
+    learned = test.predicted(composite.factor_shapes)
     r2 = {
-        "composite": test.r2_of(predicted),
-        **{name: test.r2(model) for name, model in baselines.items()},
+        **{name: test.r2(model) for name, model in models.items()},
         "affine": test.r2_of(affine_sum(z_reference, shapes), found),
         "affine of learned factors": test.r2_of(affine_sum(z_reference, learned)),
     }
@@ -163,7 +141,7 @@ def evaluate(learner: Learner, exact: ExactShapes) -> tuple[dict[str, Any], dict
             r2["grid"] = test.r2_of(interpolated)
             sizes["grid"] = sum(grid.size for grid in grids)
     first, eta = slice(settings.reconstructions), config.export.eta_reconstruction
-    reconstructed = Reconstructions.of(reference, eta, predicted[first], test.vertices[first])
+    vertices, errors, vertex_error = reconstruct(reference, eta, test.predicted(composite)[first], test.vertices[first])
     figures = {
         "eta": settings.eta,
         "test_samples": len(test.rows),
@@ -176,11 +154,11 @@ def evaluate(learner: Learner, exact: ExactShapes) -> tuple[dict[str, Any], dict
         "exponentials": learner.exponentials(),
         "derivatives": len(learner.differentiated()[0]),
         "correction": {"kind": composite.combiner.settings.kind, "tried": composite.combiner.tried},
-        "vertex_error": reconstructed.figures(),
+        "vertex_error": vertex_error,
         "sizes": sizes,
         "times": model_times(collection, composite, eta),
     }
-    gallery = extremes(reconstructed.vertices, test.vertices[first], reconstructed.errors, test.rows[first])
+    gallery = extremes(vertices, test.vertices[first], errors, test.rows[first])
     return figures, gallery | strip(collection, composite, eta) | {"faces": reference.faces}
 
 
@@ -279,10 +257,9 @@ def model_times(collection: Collection, composite: Model, eta: float) -> dict[st
 
     Where shapes have derivatives, the time of an exact shape with its derivatives as well.
     """
-    rng = np.random.default_rng(0)
-    latents = collection.coordinates.uniform(1, rng)
+    latents = collection.coordinates.uniform(1, np.random.default_rng(0))
     z = collection.shapes(latents).nric[0]
-    reconstruct = Reconstructor(collection.reference, eta)
+    reconstructor = Reconstructor(collection.reference, eta)
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
@@ -291,7 +268,7 @@ def model_times(collection: Collection, composite: Model, eta: float) -> dict[st
             times = {
                 "exact": median_seconds(lambda: collection.shapes(latents)),
                 "networks": median_seconds(lambda: composite(code)),
-                "reconstruction": median_seconds(lambda: reconstruct(z, tolerance=1e-6), repeat=5),
+                "reconstruction": median_seconds(lambda: reconstructor(z, tolerance=1e-6), repeat=5),
             }
             if differentiated := collection.differentiated:
                 times["exact, with derivatives"] = median_seconds(lambda: differentiated.shapes(latents), repeat=5)

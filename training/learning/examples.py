@@ -23,22 +23,15 @@ from shapespace.training.learning.networks import predict
 
 @dataclass(frozen=True)
 class ExampleGaussians:
-    """Settings of the Gaussians around examples.
+    """Settings of the Gaussians around examples."""
 
-    Attributes:
-        examples: largest number of examples; the examples with the largest errors are kept.
-        coordinates: largest number of coordinates that distinguish shapes.
-        width: standard deviation of a Gaussian, as a share of the distance to the nearest other example, where it has
-            fallen to 0.4 %. Larger Gaussians change random codes more (docs/measurements/notes.md, Examples).
-        same: examples nearer to each other than this share of the largest distance count as one.
-        distinct: smallest singular value of the Gaussians' matrix that is used; a single example has 1.
-    """
-
-    examples: int = 512
-    coordinates: int = 64
+    examples: int = 512  # largest number of examples; the examples with the largest errors are kept
+    coordinates: int = 64  # largest number of coordinates that distinguish shapes
+    # Standard deviation of a Gaussian, as a share of the distance to the nearest other example, where it has fallen to
+    # 0.4 %. Larger Gaussians change random codes more (docs/measurements/notes.md, Examples).
     width: float = 0.3
-    same: float = 1e-3
-    distinct: float = 0.3
+    same: float = 1e-3  # examples nearer to each other than this share of the largest distance count as one
+    distinct: float = 0.3  # smallest singular value of the Gaussians' matrix that is used; a single example has 1
 
 
 GAUSSIANS = ExampleGaussians()
@@ -49,22 +42,14 @@ class ExampleCorrectedCombiner(CombinerNetwork):
 
     The φ_i are sums of Gaussians around the examples, with ``φ_i = δ_ik`` at example k. They depend, as Ψ does, on
     nothing but the factor shapes x, through principal coordinates of their sum.
-
-    Attributes:
-        axes: (2E, d) axes of the coordinates, integers of 8 bits.
-        steps: (1, d) factors of the axes.
-        places: (n, d) coordinates of the examples.
-        sharpness: (n,) ``1 / (2 σ_i²)``.
-        weights: (n, 2E) weights of the Gaussians, in scaled differences; integers of 8 bits.
-        units: (n, 1) factors of the weights.
     """
 
-    axes: Tensor
-    steps: Tensor
-    places: Tensor
-    sharpness: Tensor
-    weights: Tensor
-    units: Tensor
+    axes: Tensor  # (2E, d) axes of the coordinates, integers of 8 bits
+    steps: Tensor  # (1, d) factors of the axes
+    places: Tensor  # (n, d) coordinates of the examples
+    sharpness: Tensor  # (n,) ``1 / (2 σ_i²)``
+    weights: Tensor  # (n, 2E) weights of the Gaussians, in scaled differences; integers of 8 bits
+    units: Tensor  # (n, 1) factors of the weights
 
     def __init__(self, combiner: CombinerNetwork, factors: Tensor, missed: Tensor) -> None:
         """Fit the Gaussians.

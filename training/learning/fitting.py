@@ -27,20 +27,14 @@ CHECKPOINT_EPOCHS = 5
 
 @dataclass(frozen=True)
 class SavedNetwork:
-    """Contents of a network's file.
+    """Contents of a network's file."""
 
-    Attributes:
-        state: training state: ``done``, ``epoch`` of at most ``epochs``, ``best`` validation loss, ``history`` of
-            (train, validation) losses.
-        metadata: see `ShapeNetwork.metadata`.
-        tensors: the network's ``state_dict()``.
-        extra: optimiser moments and random state of an unfinished training.
-    """
-
+    # Training state: ``done``, ``epoch`` of at most ``epochs``, ``best`` validation loss, ``history`` of (train,
+    # validation) losses.
     state: dict[str, Any]
-    metadata: dict[str, str]
-    tensors: dict[str, Tensor]
-    extra: dict[str, Tensor]
+    metadata: dict[str, str]  # see `ShapeNetwork.metadata`
+    tensors: dict[str, Tensor]  # the network's ``state_dict()``
+    extra: dict[str, Tensor]  # optimiser moments and random state of an unfinished training
 
     @property
     def done(self) -> bool:

@@ -21,16 +21,11 @@ class Centres:
     """Functions ``k(u, a)`` for anchors a, and ``√(2γ) k(u, b) (u − b)`` for nodes b; ``k = exp(−γ |u − u'|²)``.
 
     All have norm one in the space of the kernel. Tensors may have leading batch dimensions.
-
-    Attributes:
-        anchors: (…, n, r) centres of the kernels.
-        nodes: (…, k, r) centres of the gradients.
-        gamma: γ, (…, 1, 1).
     """
 
-    anchors: Tensor
-    nodes: Tensor
-    gamma: Tensor
+    anchors: Tensor  # (…, n, r) centres of the kernels
+    nodes: Tensor  # (…, k, r) centres of the gradients
+    gamma: Tensor  # γ, (…, 1, 1)
 
     def __call__(self, u: Tensor) -> Tensor:
         """Return the values (…, m, n + k r) of the functions at u (…, m, r)."""
@@ -99,5 +94,5 @@ def every_axis(u: Tensor) -> tuple[Tensor, Tensor]:
 def _kernel(u: Tensor, centres: Tensor, gamma: Tensor) -> Tensor:
     """Return kernel values (…, m, n) between coordinates (…, m, r) and centres (…, n, r)."""
     squares = u.square().sum(dim=-1, keepdim=True) + centres.square().sum(dim=-1)[..., None, :]
-    # u + u, not 2 u: onnxruntime fuses products with numbers into an operation that old versions lack for doubles.
+    # U + u, not 2 u: onnxruntime fuses products with numbers into an operation that old versions lack for doubles.
     return torch.exp(-gamma * (squares - (u + u) @ centres.mT))

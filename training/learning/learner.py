@@ -44,17 +44,11 @@ PAPER_FACTORS = LatentNetworkSettings(fourier=0, skip_degree=0, energy=1, fit=Fi
 
 @dataclass(frozen=True)
 class TrainingData:
-    """Samples that a network is fitted to.
+    """Samples that a network is fitted to."""
 
-    Attributes:
-        inputs: (n, …) inputs of all samples.
-        z: (n, 2E) NRIC of all samples.
-        rows: row indices by part: train, validation.
-    """
-
-    inputs: Tensor
-    z: NDArray[np.float32]
-    rows: dict[str, IntArray]
+    inputs: Tensor  # (n, …) inputs of all samples
+    z: NDArray[np.float32]  # (n, 2E) NRIC of all samples
+    rows: dict[str, IntArray]  # row indices by part: train, validation
 
     def part(self, name: str) -> tuple[Tensor, Tensor]:
         """Return inputs and NRIC of a part of the samples."""
@@ -150,8 +144,8 @@ class Learner:
         coordinates = self.collection.coordinates[index]
         saved = read_network(path) if path.exists() else None
         if saved and saved.done:
-            own = {k.removeprefix("basis."): v for k, v in saved.tensors.items() if k.startswith("basis.")}
-            basis = PatchBasis.blank(own) if settings.energy < 1 else None
+            tensors = {k.removeprefix("basis."): v for k, v in saved.tensors.items() if k.startswith("basis.")}
+            basis = PatchBasis.blank(tensors) if settings.energy < 1 else None
             network = FactorNetwork(settings, coordinates, Scaling.blank(len(self._reference)), basis)
             network.load_state_dict(saved.tensors)
             network.eval()
@@ -161,24 +155,18 @@ class Learner:
         drawn, rows = samples()
         data = TrainingData(torch.as_tensor(drawn.latents[:, index], dtype=torch.float32), drawn.nric, rows)
         z = drawn.nric[rows["train"]]
-        scaling = self._scaling(z)
-        network = FactorNetwork(settings, coordinates, scaling, self._basis(settings, scaling, z))
-        if network.basis is not None and settings.integrability:
-            network.penalise(network.basis, self._closing, settings.integrability)
+        scaling, basis = self._scaling(z), None
+        if settings.energy < 1:
+            y, midpoints = scaling.down(torch.from_numpy(z)).numpy(), self.collection.reference.edge_midpoints
+            basis = PatchBasis.fit(y, midpoints, settings.patches, settings.energy, self.seed, settings.support)
+        network = FactorNetwork(settings, coordinates, scaling, basis)
+        if basis is not None and settings.integrability:
+            network.penalise(basis, self._closing, settings.integrability)
         if not saved:
-            own_pair, held_out = (
-                (latents, network.target(exact)) for latents, exact in map(data.part, ("train", "validation"))
-            )
-            network.fit_skip(*own_pair, held_out)
+            own, held_out = ((x, network.target(exact)) for x, exact in map(data.part, ("train", "validation")))
+            network.fit_skip(*own, held_out)
         self._record(path, self._fit(network, data, settings.fit, path, share))
         return network
-
-    def _basis(self, settings: LatentNetworkSettings, scaling: Scaling, z: NDArray) -> PatchBasis | None:
-        """Fit the last layer of a network to NRIC (n, 2E); None for a dense last layer."""
-        if settings.energy == 1:
-            return None
-        y, midpoints = scaling.down(torch.from_numpy(z)).numpy(), self.collection.reference.edge_midpoints
-        return PatchBasis.fit(y, midpoints, settings.patches, settings.energy, self.seed, settings.support)
 
     def factor_samples(self, j: int) -> Samples:
         """Return the samples of a factor alone."""

@@ -19,19 +19,12 @@ PENALTIES = tuple(10.0**k for k in range(-6, 3))
 
 @dataclass(frozen=True)
 class WeightRounding:
-    """Settings of `rounded`.
+    """Settings of `rounded`."""
 
-    Attributes:
-        largest: largest integer of a weight.
-        levels: largest integer before compensation; the rest is room for compensating other errors.
-        block: rows that are rounded before all later rows are updated.
-        jitter: added to the diagonal of the Gram matrix, as a share of its trace.
-    """
-
-    largest: int = 32767
-    levels: int = 25000
-    block: int = 64
-    jitter: float = 1e-10
+    largest: int = 32767  # largest integer of a weight
+    levels: int = 25000  # largest integer before compensation; the rest is room for compensating other errors
+    block: int = 64  # rows that are rounded before all later rows are updated
+    jitter: float = 1e-10  # added to the diagonal of the Gram matrix, as a share of its trace
 
 
 WEIGHTS = WeightRounding()
@@ -39,17 +32,11 @@ WEIGHTS = WeightRounding()
 
 @dataclass(frozen=True)
 class Ridge:
-    """A solution of ``(G + λ I) W = R``.
+    """A solution of ``(G + λ I) W = R``."""
 
-    Attributes:
-        weights: W (p, q).
-        penalty: λ.
-        error: mean square error on held-out pairs.
-    """
-
-    weights: Tensor
-    penalty: float
-    error: float
+    weights: Tensor  # W (p, q)
+    penalty: float  # λ
+    error: float  # mean square error on held-out pairs
 
 
 def ridge(gram: Tensor, right: Tensor, held_out: tuple[Tensor, Tensor], penalties: Sequence[float]) -> Ridge:
@@ -134,21 +121,13 @@ def rounded(weights: Tensor, features: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 @dataclass(frozen=True)
 class SpectralRidge:
-    """Ridge regression by the eigenvectors of G, which serve all penalties and maps of low rank.
+    """Ridge regression by the eigenvectors of G, which serve all penalties and maps of low rank."""
 
-    Attributes:
-        values: eigenvalues of G (k,), none negative.
-        vectors: V (p, k), eigenvectors of G; where k < p, the eigenvectors of eigenvalues above rounding errors.
-        projected: VᵀR (k, q).
-        penalty: λ with the smallest error on held-out pairs.
-        error: mean square error on held-out pairs.
-    """
-
-    values: Tensor
-    vectors: Tensor
-    projected: Tensor
-    penalty: float
-    error: float
+    values: Tensor  # eigenvalues of G (k,), none negative
+    vectors: Tensor  # V (p, k), eigenvectors of G; where k < p, the eigenvectors of eigenvalues above rounding errors
+    projected: Tensor  # VᵀR (k, q)
+    penalty: float  # λ with the smallest error on held-out pairs
+    error: float  # mean square error on held-out pairs
 
     @classmethod
     def fit(

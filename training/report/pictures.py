@@ -28,17 +28,11 @@ ERROR = LinearSegmentedColormap.from_list("error", [CLAY, "#f2c14e", "#e4572e", 
 
 @dataclass(frozen=True)
 class Studio:
-    """A camera and colours for all shapes of one run.
+    """A camera and colours for all shapes of one run."""
 
-    Attributes:
-        camera: a view that holds every shape of the run.
-        base: (V, 3) shape that all other shapes are aligned to.
-        faces: (F, 3).
-    """
-
-    camera: Camera
-    base: FloatArray
-    faces: IntArray
+    camera: Camera  # a view that holds every shape of the run
+    base: FloatArray  # (V, 3) shape that all other shapes are aligned to
+    faces: IntArray  # (F, 3)
 
     @classmethod
     def of(cls, record: Record) -> Studio | None:

@@ -50,16 +50,11 @@ SETTINGS = RenderingSettings()
 
 @dataclass(frozen=True)
 class Camera:
-    """A perspective camera. All shapes of a run have the same camera, so that their pictures can be compared.
+    """A perspective camera. All shapes of a run have the same camera, so that their pictures can be compared."""
 
-    Attributes:
-        axes: (3, 3) directions right, up and towards the viewer, as rows.
-        eye: (3,) position.
-        window: left, right, bottom and top of the picture, at one unit of length before the eye.
-    """
-
-    axes: FloatArray
-    eye: FloatArray
+    axes: FloatArray  # (3, 3) directions right, up and towards the viewer, as rows
+    eye: FloatArray  # (3,) position
+    # Left, right, bottom and top of the picture, at one unit of length before the eye.
     window: tuple[float, float, float, float]
 
     @classmethod

@@ -8,7 +8,7 @@ import pytest
 from shapespace.coordinates.nric import WeightedNorm
 from shapespace.training.collection.generators.freaky_torus import FreakyTorus
 from shapespace.training.learning.baselines import MultilinearGrid, grid_nodes
-from shapespace.training.learning.evaluation import Reconstructions, r_squared
+from shapespace.training.learning.evaluation import r_squared, reconstruct
 from shapespace.training.runs.latent_coordinates import alone
 from shapespace.training.runs.settings import EvaluationSettings
 
@@ -49,7 +49,7 @@ def test_a_grid_has_no_more_nodes_than_allowed(dimension: int, nodes: int) -> No
 
 
 def test_the_grid_is_exact_at_its_nodes_linear_between_them_and_closes_up(torus: FreakyTorus) -> None:
-    grid = MultilinearGrid.of(torus.coordinates, [2, 3], 5, lambda codes: torus.shapes(codes).nric)
+    grid = MultilinearGrid(torus.coordinates, [2, 3], 5, lambda codes: torus.shapes(codes).nric)
     step = 2 * np.pi / 5
     nodes = np.array([[1, 3], [2, 3], [4, 0], [0, 0]]) * step
     full = np.concatenate([np.zeros((4, 2)), nodes], axis=1)
@@ -63,8 +63,8 @@ def test_the_grid_is_exact_at_its_nodes_linear_between_them_and_closes_up(torus:
 
 def test_vertex_error_of_exact_lengths_and_angles_is_nothing(torus: FreakyTorus) -> None:
     exact = torus.shapes(np.array([[1.0, 2.0, 3.0, 4.0]]))
-    figures = Reconstructions.of(torus.reference, 1e-2, exact.nric, exact.vertices).figures()
+    _, _, figures = reconstruct(torus.reference, 1e-2, exact.nric, exact.vertices)
     assert figures["max"] < 1e-6
     assert figures["status"] == {"converged": 1}
-    wrong = Reconstructions.of(torus.reference, 1e-2, 1.05 * exact.nric, exact.vertices).figures()
+    _, _, wrong = reconstruct(torus.reference, 1e-2, 1.05 * exact.nric, exact.vertices)
     assert wrong["mean"] > 1e-3

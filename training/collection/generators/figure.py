@@ -53,28 +53,19 @@ ANGLES: dict[str, tuple[float, float]] = {
 
 @dataclass(frozen=True)
 class Joint:
-    """A joint of the figure: its rotation grows smoothly from zero at one plane to the full angle at another.
+    """A joint of the figure: its rotation grows smoothly from zero at one plane to the full angle at another."""
 
-    Attributes:
-        name: the joint's name.
-        centre: (3,) fixed point of the rotation.
-        start: point and normal of the plane where the motion begins.
-        end: point and normal of the plane beyond which the motion is rigid.
-        tip: (3,) near the end of the limb. Beyond the first plane, the connected piece with the tip moves.
-        axes: (3,) axis of rotation at each degree of freedom; they add as rotation vectors.
-        softness: with 0, points between the planes turn by a part of the angle, which keeps their distance from the
-            centre. With 1, they move a part of the way to their place after the full rotation, which rounds hips and
-            armpits off. Values in between mix both.
-        carries: joints whose moving points also move with this joint, even outside its planes.
-    """
-
-    name: str
-    centre: FloatArray
-    start: tuple[FloatArray, FloatArray]
-    end: tuple[FloatArray, FloatArray]
-    tip: FloatArray
-    axes: Mapping[str, FloatArray]
+    name: str  # the joint's name
+    centre: FloatArray  # (3,) fixed point of the rotation
+    start: tuple[FloatArray, FloatArray]  # point and normal of the plane where the motion begins
+    end: tuple[FloatArray, FloatArray]  # point and normal of the plane beyond which the motion is rigid
+    tip: FloatArray  # (3,) near the end of the limb. Beyond the first plane, the connected piece with the tip moves.
+    axes: Mapping[str, FloatArray]  # (3,) axis of rotation at each degree of freedom; they add as rotation vectors
+    # With 0, points between the planes turn by a part of the angle, which keeps their distance from the centre. With 1,
+    # they move a part of the way to their place after the full rotation, which rounds hips and armpits off. Values in
+    # between mix both.
     softness: float = 0.0
+    # Joints whose moving points also move with this joint, even outside its planes.
     carries: Sequence[str] = field(default=())
 
     def shares(self, mesh: TriangleMesh) -> FloatArray:

@@ -15,25 +15,15 @@ from shapespace.training.runs.sampling import FeaturePositions, SampledShapes
 
 @dataclass(frozen=True)
 class TorusForm:
-    """Grid and sizes of the torus; the defaults are from the paper's appendix A, lengths without a unit.
+    """Grid and sizes of the torus; the defaults are from the paper's appendix A, lengths without a unit."""
 
-    Attributes:
-        columns: number of vertices around the axis, along u.
-        rows: number of vertices around the ring, along v.
-        major_radius: size of the ellipse around the axis.
-        minor_radius: size of the ellipse around the ring.
-        semi_axes: semi-axes of both ellipses, as multiples of their sizes.
-        bump_height: height of the bump over the surface.
-        bump_width: distance at which the bump has fallen to 1/e.
-    """
-
-    columns: int = 64
-    rows: int = 32
-    major_radius: float = 0.375
-    minor_radius: float = 0.125
-    semi_axes: tuple[float, float] = (1.0, 0.5)
-    bump_height: float = 0.075
-    bump_width: float = 0.05
+    columns: int = 64  # number of vertices around the axis, along u
+    rows: int = 32  # number of vertices around the ring, along v
+    major_radius: float = 0.375  # size of the ellipse around the axis
+    minor_radius: float = 0.125  # size of the ellipse around the ring
+    semi_axes: tuple[float, float] = (1.0, 0.5)  # semi-axes of both ellipses, as multiples of their sizes
+    bump_height: float = 0.075  # height of the bump over the surface
+    bump_width: float = 0.05  # distance at which the bump has fallen to 1/e
 
 
 PAPER = TorusForm()
@@ -110,6 +100,8 @@ class FreakyTorus:
     latent_names = LATENTS
     coordinates = Coordinates(np.zeros(4), np.full(4, PERIOD), np.full(4, PERIOD))
     codes = np.empty((0, 4))
+    #: A formula has no steps and is exact, and the convolutions for this collection don't learn from derivatives.
+    steps = finer = differentiated = None
     #: Sizes of the shapes; the reference always has the paper's.
     form = PAPER
 
@@ -143,21 +135,6 @@ class FreakyTorus:
             multiples=np.array([[2, 0], [0, 2], [1, 0], [0, 1]]),
             constants=np.concatenate([step == 0, np.cos(row), np.sin(row)], axis=1),
         )
-
-    @property
-    def steps(self) -> None:
-        """None: a formula has no steps."""
-        return None
-
-    @property
-    def finer(self) -> None:
-        """None: a formula is exact."""
-        return None
-
-    @property
-    def differentiated(self) -> None:
-        """None: the convolutions for this collection don't learn from derivatives."""
-        return None
 
     def shapes(self, latents: FloatArray) -> SampledShapes:
         """Return the shapes for codes (n, 4); each angle differs from the reference's by at most π. Never fails."""

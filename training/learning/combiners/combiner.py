@@ -47,21 +47,14 @@ class AutoChoice:
     A feature moves over the surface if the shapes of its factor have many principal components. A bump on a torus has
     hundreds for its two latents. Factors of bodies, faces and hippocampi with up to 80 latents have at most 3.4 for
     each latent.
-
-    Attributes:
-        better: share of the kernel's squared error on held-out codes below which the other kind, which takes longer,
-            is chosen.
-        shapes: number of shapes of a factor whose principal components are counted.
-        variance: share of the variance that the components hold.
-        components: least number of components that shows a moving feature.
-        components_per_latent: the same, for each latent of the factor.
     """
 
+    # Share of the kernel's squared error on held-out codes below which the other kind, which takes longer, is chosen.
     better: float = 0.9
-    shapes: int = 500
-    variance: float = 0.99
-    components: int = 100
-    components_per_latent: int = 5
+    shapes: int = 500  # number of shapes of a factor whose principal components are counted
+    variance: float = 0.99  # share of the variance that the components hold
+    components: int = 100  # least number of components that shows a moving feature
+    components_per_latent: int = 5  # the same, for each latent of the factor
 
 
 AUTO = AutoChoice()

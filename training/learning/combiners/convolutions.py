@@ -29,7 +29,7 @@ class ConvolutionCorrection(Correction):
     Args:
         settings: settings of the network.
         reference: the reference mesh.
-        rest: (2E,) NRIC of the reference.
+        rest: (E, 2) see `JointSamples.rest`.
         factor_count: J.
         products: correction by products of factor shapes, added to the affine sum first.
     """
@@ -44,11 +44,10 @@ class ConvolutionCorrection(Correction):
         factor_count: int,
         products: ProductCorrection | None,
     ) -> None:
-        super().__init__()
+        super().__init__({})
         self.settings, self.reference = settings, reference
         connectivity = reference.connectivity
-        rest = rest.view(2, -1).T
-        self.register_buffer("rest", (rest - rest.mean(dim=0)) / rest.std(dim=0).clamp_min(1e-6))
+        self.register_buffer("rest", rest)
         self.edge_constants = nn.Parameter(0.1 * torch.randn(connectivity.edge_count, settings.edge_channels))
         widths = [2 * factor_count + 2 + settings.edge_channels] + [settings.width] * settings.layers
         around = Star(connectivity) if settings.neighbourhood == "star" else Flaps(connectivity)
@@ -75,7 +74,7 @@ class ConvolutionCorrection(Correction):
         if settings.products:
             how = ProductSettings(coefficients=settings.products)
             products = ProductCorrection.fit(how, reference, own, held_out, seed)
-        return cls(settings, reference, own.scaling.mean, own.factors.shape[1], products)
+        return cls(settings, reference, own.rest, own.factors.shape[1], products)
 
     @classmethod
     def load(
@@ -85,10 +84,10 @@ class ConvolutionCorrection(Correction):
         prefix, products = "products.", None
         if settings.products:
             own = {name.removeprefix(prefix): t for name, t in tensors.items() if name.startswith(prefix)}
-            products = ProductCorrection.load(ProductSettings(coefficients=settings.products), reference, own)
+            products = ProductCorrection(own)
         inputs = tensors["convolutions.0.own.weight"].shape[1]
         factor_count = (inputs - 2 - settings.edge_channels) // 2
-        result = cls(settings, reference, torch.zeros(2 * len(tensors["rest"])), factor_count, products)
+        result = cls(settings, reference, tensors["rest"], factor_count, products)
         result.load_state_dict(tensors)
         return result
 

@@ -22,19 +22,12 @@ Pairs = tuple[Tensor, Tensor]
 
 @dataclass(frozen=True)
 class Slopes:
-    """Derivatives at some joint samples by the latents, per half width of their bounds, as scaled differences.
+    """Derivatives at some joint samples by the latents, per half width of their bounds, as scaled differences."""
 
-    Attributes:
-        inputs: (k, J, 2E) factor shapes of these samples.
-        latents: latents of each factor, see `JointSamples`.
-        own: (k, m, 2E) derivatives of the shape of the latent's factor.
-        missed: (k, m, 2E) derivatives of the difference between the joint shape and the affine sum.
-    """
-
-    inputs: Tensor
-    latents: list[list[int]]
-    own: Tensor
-    missed: Tensor
+    inputs: Tensor  # (k, J, 2E) factor shapes of these samples
+    latents: list[list[int]]  # latents of each factor, see `JointSamples`
+    own: Tensor  # (k, m, 2E) derivatives of the shape of the latent's factor
+    missed: Tensor  # (k, m, 2E) derivatives of the difference between the joint shape and the affine sum
 
     def coefficients(self, axes: Tensor, columns: NDArray | slice = slice(None)) -> Tensor:
         """Return derivatives (k m, J d) of coefficients of factor shapes along axes (J, S, d), in S entries of NRIC."""
@@ -51,36 +44,29 @@ class Slopes:
 
 @dataclass(frozen=True)
 class Motion:
-    """Positions of the features that codes move over the surface.
+    """Positions of the features that codes move over the surface."""
 
-    Attributes:
-        codes: (n, m) codes of the joint samples as angles. Images under symmetries come after these and have no codes.
-        places: positions of the latents relative to the edges.
-    """
-
+    # (n, m) codes of the joint samples as angles. Images under symmetries come after these and have no codes.
     codes: Tensor
-    places: FeaturePositions
+    places: FeaturePositions  # positions of the latents relative to the edges
 
 
 @dataclass(frozen=True)
 class JointSamples:
-    """Samples that a correction is fitted to, or chosen by.
+    """Samples that a correction is fitted to, or chosen by."""
 
-    Attributes:
-        factors: (n, J, 2E) NRIC of the factor shapes.
-        joint: (n, 2E) NRIC of the joint shapes.
-        scaling: maps NRIC to scaled differences.
-        latents: latents of each factor; no other factor's shape depends on them.
-        slopes: derivatives to fit as well, if there are any.
-        motion: positions of features, if codes move features.
-    """
+    factors: Tensor  # (n, J, 2E) NRIC of the factor shapes
+    joint: Tensor  # (n, 2E) NRIC of the joint shapes
+    scaling: Scaling  # maps NRIC to scaled differences
+    latents: list[list[int]]  # latents of each factor; no other factor's shape depends on them
+    slopes: Slopes | None = None  # derivatives to fit as well, if there are any
+    motion: Motion | None = None  # positions of features, if codes move features
 
-    factors: Tensor
-    joint: Tensor
-    scaling: Scaling
-    latents: list[list[int]]
-    slopes: Slopes | None = None
-    motion: Motion | None = None
+    @property
+    def rest(self) -> Tensor:
+        """Lengths and angles (E, 2) of the reference, each with mean 0 and variance 1."""
+        rest = self.scaling.mean.view(2, -1).T
+        return (rest - rest.mean(dim=0)) / rest.std(dim=0).clamp_min(1e-6)
 
     @property
     def inputs(self) -> Tensor:
@@ -103,8 +89,14 @@ class JointSamples:
 class Correction(nn.Module, ABC):
     """Map from factor shapes (n, J, 2E) to the joint shape (n, 2E), all as scaled differences.
 
-    Every kind implements `fit`, `difference` (or `forward`) and `load`; its state is its ``state_dict()``.
+    Every kind implements `fit` and `difference` (or `forward`); its state is its ``state_dict()``. Kinds without
+    trained parameters are made of these tensors.
     """
+
+    def __init__(self, tensors: Mapping[str, Tensor]) -> None:
+        super().__init__()
+        for name, tensor in tensors.items():
+            self.register_buffer(name, tensor)
 
     @classmethod
     @abstractmethod
@@ -120,9 +112,9 @@ class Correction(nn.Module, ABC):
         """
 
     @classmethod
-    @abstractmethod
     def load(cls, settings: Any, reference: TriangleMesh, tensors: Mapping[str, Tensor]) -> Self:
         """Return the correction with this ``state_dict()``."""
+        return cls(tensors)
 
     @property
     def descent(self) -> FitSettings | None:

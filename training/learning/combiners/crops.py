@@ -18,18 +18,11 @@ UNIFORM = 0.25
 
 @dataclass(frozen=True)
 class Crop:
-    """The K edges nearest to one edge of each of n shapes, as one graph of n K edges.
+    """The K edges nearest to one edge of each of n shapes, as one graph of n K edges."""
 
-    Attributes:
-        edges: (n, K) their indices in the mesh.
-        neighbours: (n K, k) indices of each edge's neighbours in the graph; n K for a missing neighbour.
-        inner: (n, K) whether all layers have all their inputs in the crop, so that the output equals the output on the
-            whole mesh.
-    """
-
-    edges: Tensor
-    neighbours: Tensor
-    inner: Tensor
+    edges: Tensor  # (n, K) their indices in the mesh
+    neighbours: Tensor  # (n K, k) indices of each edge's neighbours in the graph; n K for a missing neighbour
+    inner: Tensor  # (n, K) whether all inputs of all layers are in the crop: the output is the whole mesh's
 
 
 class Crops:
@@ -60,32 +53,18 @@ class Crops:
     def about(self, centres: Tensor) -> Crop:
         """Return the crops around edges (n,)."""
         edges = self._nearest[centres]
-        local, outside = self._local(edges)
-        n, size = edges.shape
-        graph = torch.where(local < 0, n * size, local + size * torch.arange(n)[:, None, None]).flatten(0, 1)
-        return Crop(edges, graph, self._inner(graph, outside))
-
-    def _local(self, edges: Tensor) -> tuple[Tensor, Tensor]:
-        """Return positions (n, K, k) of neighbours in crops (n, K), −1 outside; and which are edges outside."""
-        n, size = edges.shape
+        (n, size), neighbours = edges.shape, self._neighbours[edges]
         place = torch.full((n, len(self._neighbours) + 1), -1)
         place.scatter_(1, edges, torch.arange(size).expand(n, -1))
-        neighbours = self._neighbours[edges]
+        # Positions (n, K, k) of neighbours in the crops, −1 outside.
         local = place.gather(1, neighbours.flatten(1)).view_as(neighbours)
-        return local, (local < 0) & (neighbours < len(self._neighbours))
-
-    def _inner(self, graph: Tensor, outside: Tensor) -> Tensor:
-        """Mark edges (n, K) from which no path with one step for each layer leads outside.
-
-        Args:
-            graph: (n K, k) neighbours in the graph.
-            outside: (n, K, k) whether a neighbour lies outside of the crop.
-        """
-        inner = ~outside.any(dim=2)
+        graph = torch.where(local < 0, n * size, local + size * torch.arange(n)[:, None, None]).flatten(0, 1)
+        # An edge is an inner edge if no path with one step for each layer leads out of the crop.
+        inner = ~((local < 0) & (neighbours < len(self._neighbours))).any(dim=2)
         for _ in range(self._layers - 1):
             known = torch.cat([inner.flatten(), torch.ones(1, dtype=torch.bool)])
             inner = inner & known[graph].all(dim=1).view_as(inner)
-        return inner
+        return Crop(edges, graph, inner)
 
 
 def _nearest(midpoints: FloatArray, neighbours: IntArray, size: int) -> IntArray:

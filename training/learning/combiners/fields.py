@@ -38,7 +38,7 @@ class FieldCorrection(Correction):
 
     Args:
         settings: settings of the network.
-        rest: (E, 2) lengths and angles of the reference, each with mean 0 and variance 1.
+        rest: (E, 2) see `JointSamples.rest`.
         factor_count: J.
         places: (E, m) angle at which each coordinate is at an edge.
         constants: (E, c) constants of each edge.
@@ -53,7 +53,7 @@ class FieldCorrection(Correction):
     def __init__(
         self, settings: FieldSettings, rest: Tensor, factor_count: int, places: Tensor, constants: Tensor
     ) -> None:
-        super().__init__()
+        super().__init__({})
         self.settings = settings
         count, m = places.shape
         self.register_buffer("owner", torch.zeros(m, dtype=torch.long))
@@ -82,18 +82,12 @@ class FieldCorrection(Correction):
         """
         if own.motion is None or held_out.motion is None:
             raise ValueError('kind = "field" needs a collection that knows where its coordinates are on the surface')
-        places, rest = own.motion.places, own.scaling.mean.view(2, -1).T
-        rest = (rest - rest.mean(dim=0)) / rest.std(dim=0).clamp_min(1e-6)
+        places = own.motion.places
         angles, constants = places.angles, places.constants
         if not settings.relative:
             angles, constants = 0 * angles, np.concatenate([constants, np.cos(angles), np.sin(angles)], axis=1)
-        result = cls(
-            settings,
-            rest,
-            own.factors.shape[1],
-            torch.as_tensor(angles, dtype=torch.float32),
-            torch.as_tensor(constants, dtype=torch.float32),
-        )
+        edges = (torch.as_tensor(values, dtype=torch.float32) for values in (angles, constants))
+        result = cls(settings, own.rest, own.factors.shape[1], *edges)
         waves = _waves(torch.as_tensor(places.surface, dtype=torch.float32))
         for j, index in enumerate(own.latents):
             result.owner[index] = j

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass
-from typing import Any, Self
 
 import torch
 from torch import Tensor, nn
@@ -21,22 +20,16 @@ from shapespace.training.runs.progress import progress
 
 @dataclass(frozen=True)
 class KernelLimits:
-    """Limits of the kernel regression.
+    """Limits of the kernel regression."""
 
-    Attributes:
-        edges: fewest edges of a patch, on average.
-        functions: numbers of functions of a patch, tried in turn while more functions gain a visible accuracy.
-            Learning takes a time that grows with the cube of the number; the time of a shape grows with the number.
-        rank: largest rank of the output.
-        slack: share by which limiting the rank may increase the squared error on held-out samples.
-        unseen: invisible mean squared error, as a share of the shapes' mean square. Smaller gains are left out, since
-            they cost time at every shape.
-    """
-
-    edges: int = 24
+    edges: int = 24  # fewest edges of a patch, on average
+    # Numbers of functions of a patch, tried in turn while more functions gain a visible accuracy. Learning takes a time
+    # that grows with the cube of the number; the time of a shape grows with the number.
     functions: tuple[int, ...] = (750, 1500, 3000)
-    rank: int = 176
-    slack: float = 0.125
+    rank: int = 176  # largest rank of the output
+    slack: float = 0.125  # share by which limiting the rank may increase the squared error on held-out samples
+    # Invisible mean squared error, as a share of the shapes' mean square. Smaller gains are left out, since they cost
+    # time at every shape.
     unseen: float = 2e-5
 
 
@@ -50,49 +43,24 @@ class KernelCorrection(Correction):
     two or three coefficients describe how factors interact; such a kernel approximates them. If there are derivatives,
     gradients of the kernel are used too (`Centres`).
 
-    With P patches of at most S entries of NRIC, rank r of the metric and q of the output, n anchors and k nodes:
-
-    Attributes:
-        entries: (P, S) indices of the entries in each patch, padded with 2E.
-        place: (2E,) index of each entry of NRIC in the flat ``entries``.
-        axes: (P, J, d, S) principal axes of the factor shapes, integers of 8 bits.
-        units: (P, J d) factors of the axes.
-        centre: (P, J d) coefficients of the mean shapes.
-        metric: (P, r, J d) maps coefficients c to coordinates u, ``u = A c``.
-        mean: (2E,) the constant.
-        anchors: (P, n, r) coordinates of samples.
-        nodes: (P, k, r) coordinates of samples with derivatives.
-        gammas: (P,) γ of each patch.
-        weights: (P, q, n + k r) weights of the functions, integers of 16 bits.
-        steps: (P, n + k r) factors of the functions.
-        gains: (P, q) factors of the weights and of the basis.
-        basis: (P, S, q) basis of the output, integers of 8 bits.
+    There are P patches of at most S entries of NRIC, with rank r of the metric and q of the output, n anchors and k
+    nodes.
     """
 
-    entries: Tensor
-    place: Tensor
-    axes: Tensor
-    units: Tensor
-    centre: Tensor
-    metric: Tensor
-    mean: Tensor
-    anchors: Tensor
-    nodes: Tensor
-    gammas: Tensor
-    weights: Tensor
-    steps: Tensor
-    gains: Tensor
-    basis: Tensor
-
-    def __init__(self, tensors: Mapping[str, Tensor]) -> None:
-        super().__init__()
-        for name, tensor in tensors.items():
-            self.register_buffer(name, tensor)
-
-    @classmethod
-    def load(cls, settings: Any, reference: TriangleMesh, tensors: Mapping[str, Tensor]) -> Self:
-        """Return the correction with these tensors; see `Correction`."""
-        return cls(tensors)
+    entries: Tensor  # (P, S) indices of the entries in each patch, padded with 2E
+    place: Tensor  # (2E,) index of each entry of NRIC in the flat ``entries``
+    axes: Tensor  # (P, J, d, S) principal axes of the factor shapes, integers of 8 bits
+    units: Tensor  # (P, J d) factors of the axes
+    centre: Tensor  # (P, J d) coefficients of the mean shapes
+    metric: Tensor  # (P, r, J d) maps coefficients c to coordinates u, ``u = A c``
+    mean: Tensor  # (2E,) the constant
+    anchors: Tensor  # (P, n, r) coordinates of samples
+    nodes: Tensor  # (P, k, r) coordinates of samples with derivatives
+    gammas: Tensor  # (P,) γ of each patch
+    weights: Tensor  # (P, q, n + k r) weights of the functions, integers of 16 bits
+    steps: Tensor  # (P, n + k r) factors of the functions
+    gains: Tensor  # (P, q) factors of the weights and of the basis
+    basis: Tensor  # (P, S, q) basis of the output, integers of 8 bits
 
     @classmethod
     def fit(

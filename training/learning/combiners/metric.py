@@ -14,25 +14,16 @@ from shapespace.training.learning.linear import SpectralRidge, principal_axes
 
 @dataclass(frozen=True)
 class MetricLearning:
-    """Settings of the metric's iteration.
+    """Settings of the metric's iteration."""
 
-    Attributes:
-        penalties: candidates for the ridge penalty; the kernel is 1 at the centre.
-        samples: largest number of samples to learn from.
-        gradients: number of samples at which gradients are computed.
-        outputs: number of principal components of the values whose gradients are used.
-        steps: number of updates.
-        power: power of the mean outer product of gradients. The consistent power 1/2 fits noise.
-        scale: root mean square of the strongest coefficient in the first metric.
-    """
-
+    # Candidates for the ridge penalty; the kernel is 1 at the centre.
     penalties: tuple[float, ...] = tuple(10.0 ** (k / 2) for k in range(-14, 1))
-    samples: int = 800
-    gradients: int = 150
-    outputs: int = 16
-    steps: int = 4
-    power: float = 0.25
-    scale: float = 1 / 8
+    samples: int = 800  # largest number of samples to learn from
+    gradients: int = 150  # number of samples at which gradients are computed
+    outputs: int = 16  # number of principal components of the values whose gradients are used
+    steps: int = 4  # number of updates
+    power: float = 0.25  # power of the mean outer product of gradients. The consistent power 1/2 fits noise.
+    scale: float = 1 / 8  # root mean square of the strongest coefficient in the first metric
 
 
 LEARNING = MetricLearning()
@@ -41,11 +32,6 @@ LEARNING = MetricLearning()
 def _kernel(s: Tensor) -> Tensor:
     """Return ``κ(s)``, the exponential series to degree three."""
     return 1 + s * (1 + s * (1 / 2 + s / 6))
-
-
-def _kernel_slope(s: Tensor) -> Tensor:
-    """Return ``κ'(s)``."""
-    return 1 + s * (1 + s / 2)
 
 
 def learned_metric(x: Tensor, y: Tensor, held_out: Pairs) -> Tensor:
@@ -82,6 +68,7 @@ def _updated(metric: Tensor, z: Tensor, s: Tensor, weights: Tensor) -> Tensor:
         s: (m, n) inner products of the samples where gradients are taken with all samples.
         weights: (n, q) weights of the kernel regression.
     """
-    gradients = torch.einsum("pn,nq,nk->pqk", _kernel_slope(s), weights, z).flatten(0, 1) @ metric.T
+    slope = 1 + s * (1 + s / 2)  # κ'(s)
+    gradients = torch.einsum("pn,nq,nk->pqk", slope, weights, z).flatten(0, 1) @ metric.T
     value, vector = torch.linalg.eigh(gradients.T @ gradients)
     return vector * (value / value[-1].clamp_min(1e-30)).clamp_min(1e-12) ** LEARNING.power

@@ -18,24 +18,16 @@ from shapespace.training.learning.linear import Ridge, principal_axes, rounded
 
 @dataclass(frozen=True)
 class PatchFitting:
-    """Settings of the regression in a patch.
+    """Settings of the regression in a patch."""
 
-    Attributes:
-        axes_samples: largest number of samples that the principal axes of factors are computed from.
-        negligible: share of the coordinates' mean square that is left out.
-        gammas: candidates for γ.
-        penalties: candidates for the ridge penalty, where the kernel's largest value is 1. Smaller penalties make the
-            weights too large for single precision.
-        functions: largest number of functions with which γ is chosen.
-        rounding: factor by which rounding the weights may increase the squared error.
-    """
-
-    axes_samples: int = 500
-    negligible: float = 1e-6
-    gammas: tuple[float, ...] = (0.5, 2.0, 8.0, 32.0)
+    axes_samples: int = 500  # largest number of samples that the principal axes of factors are computed from
+    negligible: float = 1e-6  # share of the coordinates' mean square that is left out
+    gammas: tuple[float, ...] = (0.5, 2.0, 8.0, 32.0)  # candidates for γ
+    # Candidates for the ridge penalty, where the kernel's largest value is 1. Smaller penalties make the weights too
+    # large for single precision.
     penalties: tuple[float, ...] = tuple(10.0**k for k in range(-6, 0))
-    functions: int = 800
-    rounding: float = 1.5
+    functions: int = 800  # largest number of functions with which γ is chosen
+    rounding: float = 1.5  # factor by which rounding the weights may increase the squared error
 
 
 FITTING = PatchFitting()
@@ -47,37 +39,26 @@ class Patch:
     How factors interact at an edge depends on the shape of each factor nearby. So every factor shape is projected to a
     few principal coefficients. All factors together have more coefficients than the samples can tell apart, but only
     few directions among them matter. A metric finds these first (`learned_metric`).
-
-    Attributes:
-        columns: (S,) its entries of NRIC, lengths and then angles.
-        axes: (J, d, S) principal axes of the factor shapes there, integers of 8 bits.
-        units: (J d,) factors of the axes; with them the first coefficient of the widest factor has a variance of one.
-        centre: (J d,) coefficients of the mean shapes.
-        metric: (J d, J d) rows A of the coordinates ``u = A c`` of coefficients c, in falling order of variance.
-        spread: (J d,) mean squares of the coordinates.
-        mean: (S,) the constant.
-        centres: the n + k r functions, in r coordinates of 16 bits.
-        error: squared error on held-out samples with these weights, summed over the entries.
-        basis: (S, S) principal axes of the output.
-        energy: (S,) mean squares along these axes.
-        weights: (n + k r, q) weights of the coefficients along the first axes, integers of 16 bits.
-        steps: (n + k r,) factors of the functions.
-        gains: (q,) factors of the coefficients.
     """
 
-    metric: Tensor
-    spread: Tensor
-    mean: Tensor
-    centres: Centres
-    error: float
-    basis: Tensor
-    energy: Tensor
-    weights: Tensor
-    steps: Tensor
-    gains: Tensor
+    columns: NDArray  # (S,) its entries of NRIC, lengths and then angles
+    axes: Tensor  # (J, d, S) principal axes of the factor shapes there, integers of 8 bits
+    units: Tensor  # (J d,) factors of the axes; the first coefficient of the widest factor has a variance of one
+    centre: Tensor  # (J d,) coefficients of the mean shapes
+    metric: Tensor  # (J d, J d) rows A of the coordinates ``u = A c`` of coefficients c, in falling order of variance
+    spread: Tensor  # (J d,) mean squares of the coordinates
+    mean: Tensor  # (S,) the constant
+    centres: Centres  # the n + k r functions, in r coordinates of 16 bits
+    error: float  # squared error on held-out samples with these weights, summed over the entries
+    basis: Tensor  # (S, S) principal axes of the output
+    energy: Tensor  # (S,) mean squares along these axes
+    weights: Tensor  # (n + k r, q) weights of the coefficients along the first axes, integers of 16 bits
+    steps: Tensor  # (n + k r,) factors of the functions
+    gains: Tensor  # (q,) factors of the coefficients
 
     def __init__(self, columns: NDArray, coefficients: int, y: Tensor) -> None:
-        self.columns, axes, centre, widest = columns, [], [], 0.0
+        self.columns = columns
+        axes, centre, widest = [], [], 0.0
         for shapes in y[: FITTING.axes_samples, :, columns].double().unbind(1):
             middle = shapes.mean(dim=0)
             s, vt = principal_axes(shapes - middle, by="svd")

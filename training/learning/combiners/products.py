@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping
 
 import torch
 from torch import Tensor
@@ -22,31 +21,12 @@ class ProductCorrection(Correction):
     products replace many convolutions.
     """
 
-    centre: Tensor
-    axes: Tensor
-    weights: Tensor
-    basis: Tensor
+    centre: Tensor  # (J, 2E) mean shape of each factor
+    axes: Tensor  # (J, 2E, d) principal axes of each factor's shapes, scaled to coefficients with a variance of one
+    weights: Tensor  # (1 + J d + ½ J (J − 1) d², r)
+    basis: Tensor  # (r, 2E)
     #: Largest rank of the linear map.
     RANK = 64
-
-    def __init__(self, factor_count: int, coefficients: int, size: int) -> None:
-        super().__init__()
-        self.pairs = list(itertools.combinations(range(factor_count), 2))
-        self.register_buffer("centre", torch.zeros(factor_count, size))
-        self.register_buffer("axes", torch.zeros(factor_count, size, coefficients))
-        features = 1 + factor_count * coefficients + len(self.pairs) * coefficients**2
-        self.register_buffer("weights", torch.zeros(features, min(features, self.RANK)))
-        self.register_buffer("basis", torch.zeros(min(features, self.RANK), size))
-
-    @classmethod
-    def load(
-        cls, settings: ProductSettings, reference: TriangleMesh, tensors: Mapping[str, Tensor]
-    ) -> ProductCorrection:
-        """Return the correction with these tensors, which determine the sizes; see `Correction`."""
-        factors, size, coefficients = tensors["axes"].shape
-        result = cls(factors, coefficients, size)
-        result.load_state_dict(tensors)
-        return result
 
     @classmethod
     def fit(
@@ -55,28 +35,25 @@ class ProductCorrection(Correction):
         """Fit axes and weights to samples; see `Correction`."""
         y, others = own.inputs, held_out.inputs
         residual, wanted = (s.scaling.down(s.joint) - x.sum(dim=1) for s, x in ((own, y), (held_out, others)))
-        result = cls(y.shape[1], settings.coefficients, y.shape[2])
-        result._fit_axes(y)
-        fitted = regression(result._features(y), residual, (result._features(others), wanted))
-        weights, basis = fitted.low_rank(len(result.basis))
-        result.weights.copy_(weights)
-        result.basis.copy_(basis)
-        return result
-
-    def _fit_axes(self, y: Tensor) -> None:
-        """Find principal axes of each factor's shapes, scaled to coefficients with a variance of one."""
-        self.centre.copy_(y.mean(dim=0))
-        for j in range(y.shape[1]):
-            s, axes = principal_axes(y[:, j] - self.centre[j], by="svd")
-            count = min(self.axes.shape[2], len(s))
+        centre = y.mean(dim=0)
+        axes = torch.zeros(*centre.shape, settings.coefficients)
+        for j in range(len(centre)):
+            s, vectors = principal_axes(y[:, j] - centre[j], by="svd")
+            count = min(settings.coefficients, len(s))
             # Equal variances, so that one penalty suits all products. Coefficients with almost no variance are rounding
             # errors and stay small.
-            self.axes[j, :, :count] = (axes[:count] / s[:count, None].clamp_min(1e-2 * s[0]) * len(y) ** 0.5).T
+            axes[j, :, :count] = (vectors[:count] / s[:count, None].clamp_min(1e-2 * s[0]) * len(y) ** 0.5).T
+        result = cls({"centre": centre, "axes": axes})
+        features = result._features(y)
+        fitted = regression(features, residual, (result._features(others), wanted))
+        weights, basis = fitted.low_rank(min(features.shape[1], cls.RANK))
+        return cls({"centre": centre, "axes": axes, "weights": weights.float(), "basis": basis.float()})
 
     def _features(self, y: Tensor) -> Tensor:
         """Return features (n, 1 + J d + ½ J (J − 1) d²) of factor shapes (n, J, 2E)."""
         c = torch.einsum("njs,jsr->njr", y - self.centre, self.axes)
-        products = [(c[:, i, :, None] * c[:, j, None, :]).flatten(1) for i, j in self.pairs]
+        pairs = itertools.combinations(range(c.shape[1]), 2)
+        products = [(c[:, i, :, None] * c[:, j, None, :]).flatten(1) for i, j in pairs]
         return torch.cat([torch.ones_like(c[:, 0, :1]), c.flatten(1), *products], dim=1)
 
     def difference(self, y: Tensor) -> Tensor:
