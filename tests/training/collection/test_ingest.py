@@ -131,13 +131,6 @@ def test_seams_are_welded_and_unused_vertices_dropped(format: str, tmp_path: Pat
     assert [re.sub(r"\D+", " ", note).split() for note in found.notes] == [["1"], ["43", "42"]]
 
 
-def test_a_vertex_of_a_file_is_found_again_behind_those_left_out(tmp_path: Path) -> None:
-    shapes = np.concatenate([np.zeros((3, 2, 3)), SHAPES], axis=1)
-    found = read_collection(write(tmp_path, shapes, FACES + 2))
-    assert np.array_equal(found.file_vertices, [-1, -1, *range(42)])
-    np.testing.assert_allclose(found.vertices, shapes[:, 2:], atol=1e-6)
-
-
 @pytest.mark.parametrize("touching", [0, 2])
 def test_vertices_that_coincide_in_one_shape_only_stay_apart(touching: int, tmp_path: Path) -> None:
     flat, faces = sheet()

@@ -17,7 +17,7 @@ from shapespace.training.space.generalisation import held_out
 from shapespace.training.stages.ingest import ingest
 from shapespace.training.stages.stage import Run
 
-ROUND = trimesh.creation.icosphere(2)
+ROUND = trimesh.creation.icosphere(1)
 FACES = np.asarray(ROUND.faces)
 EDGES = np.asarray(ROUND.edges_unique)
 FLIP = np.array([-1.0, 1, 1])
@@ -88,17 +88,12 @@ def test_a_mirror_image_is_what_a_mirror_shows() -> None:
         np.testing.assert_allclose(align(image, shape), image, atol=1e-12, err_msg="it stands where the shape stands")
 
 
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    result = tmp_path_factory.mktemp("body")
+def ingested(out: Path, mirror: bool) -> tuple[RunDirectory, Config]:
+    out.mkdir(exist_ok=True)
     sizes = [(0, 0), (0.5, 0), (0.3, 0.1), (0.1, 0.4), (0.2, 0.2)]
-    np.savez(result / "body.npz", vertices=np.stack([bent(*each) for each in sizes]), faces=FACES)
-    return result
-
-
-def ingested(folder: Path, out: Path, mirror: bool) -> tuple[RunDirectory, Config]:
+    np.savez(out / "body.npz", vertices=np.stack([bent(*each) for each in sizes]), faces=FACES)
     document = {
-        "collection": {"data": folder / "body.npz", "coarse_vertices": 80, "mirror": mirror},
+        "collection": {"data": out / "body.npz", "coarse_vertices": 30, "mirror": mirror},
         "export": {"name": "body", "title": "", "description": "", "licence": ""},
     }
     run = Run(out, Config.model_validate(document), "", out / "models")
@@ -106,21 +101,28 @@ def ingested(folder: Path, out: Path, mirror: bool) -> tuple[RunDirectory, Confi
     return run.directory, run.config
 
 
-def test_a_run_learns_from_mirror_images_unless_told_otherwise(folder: Path, tmp_path: Path) -> None:
-    run, _ = ingested(folder, tmp_path, True)
+@pytest.fixture(scope="module")
+def with_images(tmp_path_factory: pytest.TempPathFactory) -> tuple[RunDirectory, Config]:
+    return ingested(tmp_path_factory.mktemp("body"), True)
+
+
+def test_a_run_learns_from_mirror_images_unless_told_otherwise(
+    with_images: tuple[RunDirectory, Config], tmp_path: Path
+) -> None:
+    run, _ = with_images
     shapes = run.shapes.read()
     assert shapes["original"].tolist() == [0, 1, 2, 3, 4, 1, 2, 3]
     assert [name.endswith(" (mirrored)") for name in shapes["names"].tolist()] == 5 * [False] + 3 * [True]
     assert len(run.own_shapes()) == 5
     assert run.ingest.read()["images"] == 3
     assert any("mirror images" in note for note in run.ingest.read()["notes"])
-    plain, _ = ingested(folder, tmp_path / "plain", False)
+    plain, _ = ingested(tmp_path, False)
     assert plain.shapes.read()["original"].tolist() == [0, 1, 2, 3, 4]
     assert plain.ingest.read()["images"] == 0
 
 
-def test_held_out_shapes_take_their_images_with_them(folder: Path, tmp_path: Path) -> None:
-    run, config = ingested(folder, tmp_path, True)
+def test_held_out_shapes_take_their_images_with_them(with_images: tuple[RunDirectory, Config]) -> None:
+    run, config = with_images
     shapes = run.shapes.read()
     others = shapes["vertices"].copy()
     others[5] *= 1.3  # the image of shape 1

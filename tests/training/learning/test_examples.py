@@ -1,18 +1,15 @@
-"""Laws of corrections by examples: exact at the examples, nothing elsewhere, the same when exported."""
+"""Laws of corrections by examples: exact at the examples, nothing elsewhere. Each run checks its exported ones."""
 
 from __future__ import annotations
 
 import numpy as np
-import onnxruntime
 import pytest
 import torch
 from torch import Tensor, nn
 
-from shapespace.bundle.schema import COMBINER
 from shapespace.training.learning.combiners.combiner import CombinerNetwork
 from shapespace.training.learning.composite import Composite
 from shapespace.training.learning.examples import ExampleCorrectedCombiner
-from shapespace.training.learning.export import to_onnx
 from shapespace.training.learning.layers import Scaling
 from shapespace.training.runs.network_settings import KernelSettings
 
@@ -89,12 +86,3 @@ def test_angles_are_missed_by_the_shorter_way(combiner: CombinerNetwork) -> None
         remembering = ExampleCorrectedCombiner.of(composite, codes, turned)
         again = remembering(composite.factor_shapes(torch.from_numpy(codes))).numpy()
     np.testing.assert_allclose(again, wanted, atol=1e-3)
-
-
-def test_the_exported_combiner_remembers_too(combiner: CombinerNetwork) -> None:
-    factors, missed = shapes(12, 1), 0.1 * torch.randn(12, SIZE, generator=torch.Generator().manual_seed(2))
-    remembering = ExampleCorrectedCombiner(combiner, factors, missed)
-    session = onnxruntime.InferenceSession(to_onnx(remembering, factors[:2], COMBINER))
-    some = torch.cat([factors, shapes(5, 4)])
-    (answer,) = session.run(None, {COMBINER.input: some.numpy()})
-    np.testing.assert_allclose(answer, at(remembering, some).numpy(), atol=1e-4)

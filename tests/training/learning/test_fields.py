@@ -12,14 +12,14 @@ import torch
 
 from shapespace.coordinates.nric import WeightedNorm, nric
 from shapespace.training.collection.generators.freaky_torus import PAPER, FreakyTorus, edge_permutation
-from shapespace.training.learning.combiners import combiner, kernels
+from shapespace.training.learning.combiners import combiner
 from shapespace.training.learning.combiners.combiner import CombinerNetwork
-from shapespace.training.learning.combiners.correction import JointSamples, Motion
+from shapespace.training.learning.combiners.correction import Correction, JointSamples, Motion
 from shapespace.training.learning.combiners.fields import FieldCorrection
 from shapespace.training.learning.fitting import read_network, save_network
 from shapespace.training.learning.layers import Scaling
 from shapespace.training.runs.latent_coordinates import alone
-from shapespace.training.runs.network_settings import AutoSettings, FieldSettings, KernelSettings
+from shapespace.training.runs.network_settings import AutoSettings, FieldSettings
 
 TORUS = FreakyTorus()
 FACTORS = list(TORUS.factors.values())
@@ -128,12 +128,24 @@ def test_descent_brings_it_nearer_to_new_shapes_than_the_affine_sum(own: JointSa
     assert left < 0.65 * (held_out.inputs.sum(dim=1) - wanted).square().mean()
 
 
+class Nothing(Correction):
+    """A correction that leaves the affine sum as it is, in the place of the kernel."""
+
+    @classmethod
+    def fit(cls, *_: object) -> Nothing:
+        return cls({})
+
+    def difference(self, y: torch.Tensor) -> torch.Tensor:
+        return 0 * y[:, 0]
+
+
 @pytest.mark.parametrize(
     ("known", "minutes", "better", "tried", "kind"),
     [
-        pytest.param(True, 30, 1e-3, ["kernel", "field"], "kernel", marks=pytest.mark.long),
+        (True, 30, 1e-3, ["kernel", "field"], "kernel"),
+        (True, 30, 0.9, ["kernel", "field"], "field"),
         (True, 0, 99, ["kernel"], "kernel"),
-        pytest.param(False, 30, 99, ["kernel", "convolutions"], "convolutions", marks=pytest.mark.long),
+        (False, 30, 99, ["kernel", "convolutions"], "convolutions"),
     ],
 )
 def test_auto_tries_what_follows_a_bump(
@@ -148,26 +160,25 @@ def test_auto_tries_what_follows_a_bump(
 ) -> None:
     """``auto`` tries a field if the collection knows where codes move features, and convolutions otherwise.
 
-    It is chosen by the share of the kernel's error that it has to reach, and not tried where the kernel is slow.
+    It is chosen, as it was after its training, by the share of the kernel's error that it has to reach, and not tried
+    where the kernel is slow.
     """
-    monkeypatch.setattr(combiner, "KernelSettings", lambda: KernelSettings(coefficients=3, patches=64))
-    monkeypatch.setattr(kernels, "LIMITS", replace(kernels.LIMITS, functions=(40,)))
+    monkeypatch.setitem(combiner.CORRECTIONS, "kernel", Nothing)
+    monkeypatch.setattr(combiner, "FieldSettings", lambda: SMALL)
     monkeypatch.setattr(combiner, "AUTO", replace(combiner.AUTO, better=better))
     trained: list[str] = []
 
     def train(combiner: CombinerNetwork) -> None:
         trained.append(combiner.settings.kind)
         if combiner.settings.kind == "field":
-            descend(combiner, own, 60, 3e-3)
+            descend(combiner, own, 60, 1e-2)
 
-    motion = Motion(own.motion.codes[:130], TORUS.places) if known else None
-    samples = replace(own, factors=own.factors[:130], joint=own.joint[:130], motion=motion)
-    found = CombinerNetwork.fit(AutoSettings(minutes=minutes), TORUS.reference, samples, held_out, 0, train)
+    if not known:
+        own = replace(own, factors=own.factors[:130], joint=own.joint[:130], motion=None)
+        held_out = replace(held_out, factors=held_out.factors[:10], joint=held_out.joint[:10], motion=None)
+    found = CombinerNetwork.fit(AutoSettings(minutes=minutes), TORUS.reference, own, held_out, 0, train)
     assert trained == list(found.tried) == tried
     assert found.settings.kind == kind
-    if "field" in tried:  # it was judged as it was after it had been trained
-        affine = (held_out.inputs.sum(dim=1) - found.target(held_out.joint)).square().mean()
-        assert found.tried["field"] < 0.9 * affine
 
 
 def test_it_comes_back_from_its_file(own: JointSamples, held_out: JointSamples, tmp_path: Path) -> None:

@@ -89,10 +89,6 @@ def test_meshing_again_gives_the_same_bits(monkeypatch: pytest.MonkeyPatch) -> N
     assert np.array_equal(again.faces, once.faces)
 
 
-def test_zero_angles_give_the_rest_pose(rest: TriangleMesh) -> None:
-    assert np.array_equal(figure.pose(angles())[0], rest.vertices)
-
-
 def test_mirrored_angles_give_mirrored_shapes(some: FloatArray) -> None:
     def mirrored(name: str) -> str:
         swap = {"left": "right", "right": "left"}

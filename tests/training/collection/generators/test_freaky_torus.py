@@ -102,20 +102,6 @@ def test_every_latent_has_the_period_of_a_full_turn(codes, latent):
     assert pytest.approx(2 * np.pi) == freaky_torus.PERIOD
 
 
-def test_the_tip_of_the_bump_is_farthest_from_the_plain_torus(codes):
-    for (alpha, beta, *_), (i, j) in zip(codes, [(0, 0), (63, 31), (5, 9), (40, 16), (32, 1)], strict=False):
-        gamma, zeta = 2 * np.pi * i / N, 2 * np.pi * j / M
-        moved = freaky_torus.vertices([[alpha, beta, gamma, zeta]])[0] - plain(alpha, beta).reshape(-1, 3)
-        distance = np.linalg.norm(moved, axis=1)
-        tip = 32 * i + j
-        assert distance.argmax() == tip
-        assert distance[tip] == pytest.approx(H)
-        assert np.sort(distance)[-2] < 0.999 * H
-        assert np.median(distance) < 1e-6 * H
-        # All vertices move along the normal at the tip.
-        np.testing.assert_allclose(moved, distance[:, None] * normal(alpha, beta, gamma, zeta), atol=1e-14)
-
-
 def test_the_bump_points_outward(reference, codes):
     edges = reference.edges
     for (alpha, beta, *_), (i, j) in zip(codes, [(0, 0), (20, 12), (50, 30)], strict=False):
@@ -170,13 +156,6 @@ def test_the_collection_has_a_reference_of_unit_area(reference, codes):
     shapes = collection.shapes(codes)
     np.testing.assert_allclose(collection.scale * shapes.vertices, freaky_torus.vertices(codes), atol=1e-15)
     assert shapes.reasons == [""] * len(codes)
-
-
-def test_factors_are_two_circles_and_a_flat_torus():
-    collection = freaky_torus.FreakyTorus()
-    assert list(collection.factors.values()) == [[0], [1], [2, 3]]
-    assert len(collection.latent_names) == 4
-    assert collection.coordinates.period.tolist() == [2 * np.pi] * 4
 
 
 def test_its_symmetry_takes_the_shape_of_a_code_to_that_of_the_opposite_code(codes):
