@@ -1,10 +1,13 @@
-"""Bundles on disk, and random codes of their models."""
+"""Bundles on disk, random codes of their models, and a reference that makes times on machines comparable."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+from scipy import sparse
+from scipy.sparse.linalg import splu
 
 from shapespace.model.latent_space import Codes
 from shapespace.model.shape_model import ShapeModel
@@ -22,3 +25,12 @@ def draw(model: ShapeModel, count: int, spread: float = 1.0) -> Codes:
     radius = spread * (model.latents.upper - model.latents.lower) / 2
     codes = centre + radius * np.random.default_rng(0).uniform(-1, 1, (count, len(centre)))
     return model.latents.codes(codes.tolist())[0]
+
+
+def superlu(matrix: sparse.sparray) -> Callable[[], object]:
+    """Return a call that factorises JᵀWJ plus a small multiple of I by SuperLU, in symmetric mode."""
+    matrix = sparse.csc_array(matrix)
+    shift = 1e-9 * matrix.diagonal().mean()
+    lifted = sparse.csc_array(matrix + shift * sparse.eye_array(matrix.shape[0]))
+    options = {"SymmetricMode": True}
+    return lambda: splu(lifted, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)

@@ -28,7 +28,7 @@ def http(models: Path, count: int, duration: float) -> None:
         print(
             "\nOver HTTP, no cache: GLB of the fine mesh, ms by the clock, and processor ms of the server a request.\n"
         )
-        print_head("model", "clients", "requests", "errors", "p50", "p95", "p99", "p99 / p50", "processor", "MB after")
+        print_head("model | clients | requests | errors | p50 | p95 | p99 | p99 / p50 | processor | MB after")
         for name, model in names.items():
             for clients, limit in ((1, count), (16, 10**9)):
                 began = processor(pid)
@@ -39,12 +39,8 @@ def http(models: Path, count: int, duration: float) -> None:
                 print_row(name, clients, len(times), errors, *quantiles, ratio, spent, f"{resident(pid):.0f}")
         print("\nInterpolations of 60 frames, fine mesh, streamed as JSON lines and whole as GLB.\n")
         print_head(
-            "model",
-            "first line, ms",
-            "one frame alone, ms",
-            "frames / s",
-            "frames / processor s",
-            "GLB, frames / processor s",
+            "model | first line, ms | one frame alone, ms | frames / s | frames / processor s | "
+            "GLB, frames / processor s"
         )
         for name, model in names.items():
             print_row(name, *interpolation(client, pid, name, model))

@@ -41,10 +41,10 @@ def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     return "\n".join(map(row, (head, ["---"] * len(head), *rows)))
 
 
-def print_head(*columns: str) -> None:
-    """Print the head of a table."""
-    print(row(columns))
-    print("|" + "---|" * len(columns))
+def print_head(columns: str) -> None:
+    """Print the head of a table, from the titles of its columns with bars between them."""
+    print(f"| {columns} |")
+    print("|" + "---|" * len(columns.split(" | ")))
 
 
 def print_row(*cells: object) -> None:

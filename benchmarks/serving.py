@@ -28,11 +28,10 @@ from scipy import sparse
 from threadpoolctl import threadpool_limits
 
 from benchmarks import pages, synthetic
-from benchmarks.bundles import bundles, draw
+from benchmarks.bundles import bundles, draw, superlu
 from benchmarks.http_requests import http
 from benchmarks.pages import print_head, print_row
 from benchmarks.processes import resident
-from benchmarks.yardstick import superlu
 from shapespace.arrays import FloatArray
 from shapespace.bundle.reader import read_bundle
 from shapespace.coordinates.nric import NRICJacobian, WeightedNorm, nric
@@ -134,22 +133,10 @@ def stages(folders: list[Path], count: int) -> None:
     print("\nCode → GLB of the fine mesh in process, ms, medians; in brackets steps of Gauss–Newton. *Without")
     print("MKL*: multiple of the sum. *Away*: the furthest vertex from a solution of tolerance 1e-10, in")
     print("millionths of the diagonal, median and most over the codes.\n")
-    columns = (
-        "network",
-        "reconstruct",
-        "encode",
-        "sum",
-        "p95",
-        "p99",
-        "draft",
-        "SuperLU",
-        "sum / SuperLU",
-        "draft / SuperLU",
-        "without MKL",
-        "away",
-        "blend shapes",
+    print_head(
+        "model | network | reconstruct | encode | sum | p95 | p99 | draft | SuperLU | sum / SuperLU | "
+        "draft / SuperLU | without MKL | away | blend shapes | exponential, K = 16"
     )
-    print_head("model", *columns, "exponential, K = 16")
     for path in (path for folder in folders for path in bundles(folder)):
         model = ShapeModel(read_bundle(path))
         codes = draw(model, count + 3)
@@ -188,7 +175,7 @@ def starts(models: Path, count: int) -> None:
     """Print Gauss–Newton steps by start, and whether all starts of a code end in one shape."""
     print(f"\nSteps (processor ms) by start, and codes at which two results are more than {AGREEMENT:g} of the")
     print("diagonal apart; `ours` is what the product does. The neighbour is a shape a tenth of the box away.\n")
-    print_head("model, box", "ours", "frames", "learned", "neighbour", "reference", "codes", "apart", "status")
+    print_head("model, box | ours | frames | learned | neighbour | reference | codes | apart | status")
     for path in bundles(models):
         model = ShapeModel(read_bundle(path))
         for spread in (1.0, 1.5):
@@ -247,17 +234,10 @@ def growth(count: int) -> None:
             ("m", [(1000, m) for m in (4, 20, 40, 80)]),
         ):
             print(f"\nSynthetic capsules, growing {kind}; medians, ms. *Factor*: one of Gauss–Newton.\n")
-            columns = (
-                "network",
-                "reconstruct (steps)",
-                "factor",
-                "encode",
-                "sum",
-                "SuperLU",
-                "sum / SuperLU",
-                "blend shapes",
+            print_head(
+                "V | m | network | reconstruct (steps) | factor | encode | sum | SuperLU | sum / SuperLU | "
+                "blend shapes | MB"
             )
-            print_head("V", "m", *columns, "MB")
             sizes, sums, factors = [], [], []
             for vertices, latents in cases:
                 path = synthetic.write(Path(folder) / kind, vertices, latents)

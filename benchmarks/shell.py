@@ -17,7 +17,7 @@ import numpy as np
 from scipy.spatial import ConvexHull
 from threadpoolctl import threadpool_limits
 
-from benchmarks.yardstick import superlu
+from benchmarks.bundles import superlu
 from shapespace.coordinates.nric import nric, unwrap
 from shapespace.coordinates.reconstruction import Reconstructor
 from shapespace.mesh.triangle_mesh import TriangleMesh

@@ -11,8 +11,7 @@ import torch
 
 from benchmarks import bundled, pages, paper, results, served, studies
 from benchmarks.results import have, measured
-from benchmarks.studies import SeedLearner, ShareLearner, Studies
-from benchmarks.variants import Variant, recipes
+from benchmarks.studies import SeedLearner, ShareLearner, Studies, Variant, recipes
 from shapespace.coordinates.nric import WeightedNorm
 from shapespace.training.learning.evaluation import Model, r_squared
 from shapespace.training.learning.learner import Learner
