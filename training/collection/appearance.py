@@ -17,10 +17,7 @@ def reference_surface(
 ) -> tuple[MeshAttributes | None, list[str]]:
     """Read the mesh attributes of the reference's file, or of the first file whose format has more than triangles.
 
-    Args:
-        data: the folder of mesh files. With None or a single file there are no attributes.
-        meshes: the collection read from the folder.
-        chosen: index of the reference.
+    Without a folder of mesh files there are none.
 
     Returns:
         The attributes, if any, and a sentence about each attribute that is left out.

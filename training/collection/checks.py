@@ -122,13 +122,7 @@ def same_connectivity(
 
 
 def check_meshes(sources: Sequence[ShapeSource], vertices: FloatArray, faces: IntArray, numbers: IntArray) -> None:
-    """Check that shapes (n, V, 3) with common faces (F, 3) are valid triangle meshes.
-
-    Args:
-        sources: the n shapes' files.
-        vertices: (n, V, 3), each vertex in a face.
-        faces: (F, 3).
-        numbers: (V,) index that the files give each vertex.
+    """Check that shapes (n, V, 3), each vertex in a face (F, 3), are valid meshes; ``numbers`` (V,) are the files'.
 
     Raises:
         IngestError: the faces form no oriented manifold, or a face of a shape has no area.

@@ -47,10 +47,7 @@ class MeshCollection:
         return self.central if name is None else self.names.index(name)
 
     def require_accepted(self, accepted: Sequence[str]) -> None:
-        """Refuse shapes with a grave warning, unless the user accepts them.
-
-        Args:
-            accepted: names or files of shapes.
+        """Refuse shapes with a grave warning, unless the user accepts them by their names or files.
 
         Raises:
             IngestError: with each such shape, or with a name that no shape has.

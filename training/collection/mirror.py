@@ -30,13 +30,9 @@ def find_mirror(shapes: Sequence[FloatArray] | FloatArray, edges: IntArray) -> t
     A shape with several reflections, such as a straight bar, doesn't tell left from right: if the bar can bend forward,
     it need not be able to bend backward.
 
-    Args:
-        shapes: (n, V, 3).
-        edges: (E, 2) of all shapes.
-
     Returns:
-        The index (V,) of each vertex's mirror image, and the index of the symmetric shape. None if no shape is
-        symmetric.
+        For shapes (n, V, 3) with edges (E, 2), the index (V,) of each vertex's mirror image, and the index of the
+        symmetric shape. None if no shape is symmetric.
     """
     known = np.unique(np.sort(edges, axis=1) @ [len(shapes[0]), 1])
     for number, shape in enumerate(shapes):
@@ -64,14 +60,9 @@ def find_mirror(shapes: Sequence[FloatArray] | FloatArray, edges: IntArray) -> t
 
 
 def mirrored(shapes: FloatArray, image: IntArray) -> tuple[FloatArray, IntArray]:
-    """Return mirror images of shapes, each aligned to its shape. Symmetric shapes get no image.
+    """Return mirror images of shapes (n, V, 3), each aligned to its shape; ``image`` (V,) is as in `find_mirror`.
 
-    Args:
-        shapes: (n, V, 3).
-        image: (V,) index of each vertex's mirror image.
-
-    Returns:
-        The images (k, V, 3), and the indices (k,) of the shapes that they mirror.
+    Symmetric shapes get no image. The second result is the index (k,) of the shape that each image mirrors.
     """
     flipped = np.array([-1.0, 1, 1])
 

@@ -19,13 +19,10 @@ def may_have_names(path: Path) -> bool:
 
 
 def part_names(parts: Sequence[IntArray], path: Path | None) -> list[str]:
-    """Return a name for each part: the file's objects, groups or materials, whichever first tells parts apart.
+    """Return a name for each part, given by its faces (k,): the file's object, group or material.
 
-    Parts without a name are numbered: "part 1", "part 2" and so on.
-
-    Args:
-        parts: faces (k,) of each part, see `parts.separate`.
-        path: a mesh file with these faces, if there is one.
+    The first of these three that tells parts apart counts. Parts without a name are numbered: "part 1", "part 2" and so
+    on, and so are all parts without a file.
     """
     numbered = [f"part {k + 1}" for k in range(len(parts))]
     firsts = np.array([faces[0] for faces in parts])

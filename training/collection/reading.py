@@ -115,17 +115,9 @@ def _read_folder(folder: Path) -> FileShapes:
 def _read_like(
     path: Path, template: Path, vertices: FloatArray, faces: IntArray, *, triangles_only: bool
 ) -> FloatArray:
-    """Read the vertices of a file that must have the faces of a template.
+    """Read the vertices of a file that must have the faces of a template, vertices (V, 3) and faces (F, 3).
 
-    Args:
-        path: the file.
-        template: another file of the collection.
-        vertices: (V, 3) in the template.
-        faces: (F, 3) in the template.
-        triangles_only: whether the file doesn't say which vertices triangles share, and the template does.
-
-    Raises:
-        IngestError: the file can't be read, is cut short, or has other faces.
+    With ``triangles_only`` the file doesn't say which vertices triangles share, and the template does.
     """
     try:
         own_vertices, own_faces = _read_mesh(path)
@@ -176,11 +168,7 @@ def _refuse_cut_short(path: Path, count: int, faces: IntArray, other_count: int,
 
 
 def _on_shared_vertices(corners: FloatArray, faces: IntArray, vertex_count: int, other: str) -> FloatArray:
-    """Find the vertices (V, 3) of separate triangles (F, 3, 3) that have the faces of another file, in its order.
-
-    Raises:
-        MeshError: the triangles are not those faces.
-    """
+    """Find the vertices (V, 3) of separate triangles (F, 3, 3) that have the faces of another file, in its order."""
     if len(corners) != len(faces):
         raise MeshError(
             f"has {len(corners)} faces, but {other} has {len(faces)}; all meshes need the same connectivity"
@@ -214,11 +202,7 @@ def _read_npz(path: Path) -> FileShapes:
 
 
 def _npz_arrays(path: Path) -> dict[str, np.ndarray]:
-    """Read ``vertices`` (n, V, 3), ``faces`` (F, 3) and ``names`` (n,) of an NPZ; names default to numbers from 0.
-
-    Raises:
-        MeshError: the file can't be read, an array is missing or has a wrong shape, or two shapes have the same name.
-    """
+    """Read ``vertices`` (n, V, 3), ``faces`` (F, 3) and ``names`` (n,) of an NPZ; names default to numbers from 0."""
     try:
         arrays = read_mesh_npz(memoryview(path.read_bytes()), ("vertices", "faces", "names"))
     except OSError as error:

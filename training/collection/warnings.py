@@ -137,16 +137,9 @@ def _exchanges() -> list[FloatArray]:
 def find_warnings(
     vertices: FloatArray, connectivity: Connectivity, names: Sequence[str], placements: Placements
 ) -> list[CollectionWarning]:
-    """Find shapes that look wrong beside the others.
+    """Find shapes (n, V, 3) that look wrong beside the others, in the order of the shapes, grave warnings first.
 
-    Args:
-        vertices: (n, V, 3).
-        connectivity: the edges and faces of all shapes.
-        names: the n shapes' names, for sentences that refer to another shape.
-        placements: distances and rotations between the shapes.
-
-    Returns:
-        The warnings in the order of the shapes, grave ones first.
+    Sentences that refer to another shape use its name.
     """
     edges = _EdgeLengths(vertices, connectivity)
     found = edges.warnings()
@@ -200,10 +193,6 @@ class _EdgeLengths:
 
     A shape may be in another unit, or rolled up. An edge counts as long only if it is long in the units of the file
     and also as a share of the shape's extent.
-
-    Attributes:
-        scrambled: indices of shapes whose vertices have another order.
-        misplaced: by the index of a shape, its vertices that are far from their neighbours.
     """
 
     def __init__(self, vertices: FloatArray, connectivity: Connectivity) -> None:
@@ -235,6 +224,7 @@ class _EdgeLengths:
             scaled = (values / relative) / np.quantile(usual / relative, THRESHOLDS.quantile, axis=0)
             return np.minimum(raw, scaled)
 
+        # Indices of shapes whose vertices have another order.
         self.scrambled = np.flatnonzero(np.median(ratios(sample, sample), axis=1) > THRESHOLDS.scrambled)
         places = []
         for part in columns(*shortest.shape):
@@ -243,6 +233,7 @@ class _EdgeLengths:
             stretched &= short > THRESHOLDS.long * self._middle[:, None]
             places.append(np.argwhere(stretched) + np.array([0, part.start]))
         shape_of, vertex_of = np.concatenate(places).T
+        # By the index of a shape, its vertices that are far from their neighbours.
         self.misplaced = {int(k): vertex_of[shape_of == k] for k in np.unique(shape_of)}
 
     def warnings(self) -> list[CollectionWarning]:

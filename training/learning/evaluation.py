@@ -107,10 +107,6 @@ class HeldOutSamples:
 def evaluate(learner: Learner, exact: ExactShapes) -> tuple[dict[str, Any], dict[str, NDArray]]:
     """Compare every model with the exact shapes of the test codes.
 
-    Args:
-        learner: networks of the run.
-        exact: computes exact shapes.
-
     Returns:
         The contents of evaluation.json and of gallery.npz.
     """

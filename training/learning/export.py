@@ -121,19 +121,11 @@ def export(
 ) -> Path:
     """Write ``models/NAME/VERSION/``, replacing a bundle that is there.
 
-    Args:
-        composite: the networks.
-        collection: the parametrised collection.
-        config: configuration of the run.
-        figures: results of the evaluation.
-        data_digest: SHA-256 of the training samples.
-        models: the models directory.
-        geometry: meshes of the bundle.
-        start: network of start.onnx, if the bundle has one.
+    The digest is the SHA-256 of the training samples.
 
     Raises:
-        ExportError: ONNX and PyTorch differ by more than the tolerance at a code, the bundle contradicts itself, or a
-            code inside the bounds has no shape.
+        ExportError: ONNX and PyTorch differ by more than the tolerance at a code, the bundle contradicts itself, or
+            a code inside the bounds has no shape.
     """
     settings, reference = config.export, collection.reference
     try:

@@ -19,13 +19,10 @@ STRIP_FRAMES = 7
 
 
 def extremes(predicted: NDArray, exact: NDArray, errors: NDArray, index: NDArray) -> dict[str, NDArray]:
-    """Return three reconstructed test shapes next to the exact shapes.
+    """Return the test shapes with the least, the median and the largest error next to the exact shapes.
 
-    Args:
-        predicted: (n, V, 3) vertices, aligned to the exact shapes.
-        exact: (n, V, 3) exact vertices.
-        errors: (n, V) vertex distances.
-        index: (n,) sample indices.
+    Vertices (n, V, 3) are aligned to exact ones; ``errors`` (n, V) are their distances, ``index`` (n,) the samples'
+    indices.
     """
     order = np.argsort(errors.mean(axis=1))
     chosen = order[[0, len(order) // 2, -1]]

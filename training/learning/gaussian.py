@@ -59,16 +59,10 @@ class Centres:
         held_out: tuple[Tensor, Tensor],
         penalties: Sequence[float],
     ) -> Ridge:
-        """Fit these functions by ridge regression.
+        """Return weights (n + k r, q) of these functions by ridge regression.
 
-        Args:
-            own: coordinates (m, r) and values (m, q) of samples.
-            slopes: coordinates (s, r), directions (s, r), and derivatives along the directions (s, q).
-            held_out: samples that choose the penalty.
-            penalties: candidates.
-
-        Returns:
-            Weights (n + k r, q) of the functions.
+        Held-out samples choose the penalty. Samples ``own`` have coordinates (m, r) and values (m, q). Slopes are
+        coordinates (s, r), directions (s, r), and derivatives along the directions (s, q).
         """
         theirs = self(held_out[0]), held_out[1]
         if own[0] is self.anchors and slopes is None:  # the dual form needs no other basis

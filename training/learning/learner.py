@@ -60,14 +60,8 @@ class Learner:
     """Fits networks to the samples of a run, and saves each in a file named by a digest of all that determines it.
 
     So recipes that have a network in common share its file. An unfinished file is continued. A finished file is read,
-    and then the samples are not needed. Studies of fewer samples or other seeds are subclasses
-    (``benchmarks.studies``).
-
-    Args:
-        collection: the parametrised collection of the samples.
-        config: configuration of the run.
-        run: directory that holds the samples and receives the networks.
-        data_key: identifies the samples and the version of the training code.
+    and then the samples are not needed. The key of the data stands for the samples and the version of the training
+    code. Studies of fewer samples or other seeds are subclasses (``benchmarks.studies``).
     """
 
     #: Shares of the training codes that joint networks and factor networks learn from. The number of epochs is divided
@@ -267,11 +261,7 @@ class Learner:
     ) -> Slopes | None:
         """Return the derivatives of factor shapes and of joint shapes, scaled; None if there are none.
 
-        Args:
-            indices: latents of each factor.
-            networks: factor networks.
-            shapes: (n, J, 2E) outputs of the factor networks at the joint samples.
-            scaling: to scaled differences.
+        ``shapes`` (n, J, 2E) are the outputs of the factor networks at the joint samples.
         """
         rows, derivatives = self.differentiated()
         if not len(rows):

@@ -65,17 +65,14 @@ def ridge(gram: Tensor, right: Tensor, held_out: tuple[Tensor, Tensor], penaltie
 def kernel_ridge(
     gram: Tensor, features: Tensor, values: Tensor, held_out: tuple[Tensor, Tensor], penalties: Sequence[float]
 ) -> Ridge:
-    """Solve a ridge regression with functions that are not orthonormal; the penalty is on the norm of the solution.
+    """Return weights (n, q) of functions that are not orthonormal; the penalty is on the norm of their sum.
 
     Args:
         gram: (n, n) inner products of the functions.
         features: (m, n) values of the functions at samples, or their derivatives.
         values: (m, q) values to fit.
-        held_out: features and values of held-out samples.
+        held_out: features and values that choose one of the penalties.
         penalties: candidates.
-
-    Returns:
-        Weights (n, q) of the functions.
     """
     # Almost dependent functions are distinguished down to rounding errors.
     half = torch.linalg.cholesky(gram + JITTER * gram.trace() * torch.eye(len(gram)))

@@ -57,9 +57,6 @@ class FactorNetwork(ShapeNetwork):
     perceptron's own last layer does so. ``skip`` is a linear map from latents to coefficients, added to the
     perceptron. It starts from Fourier products, for detail too fine for a perceptron, or from polynomials, since an
     exponential is smooth in its velocity.
-
-    Attributes:
-        metric: (rank, rank) factor of coefficient errors; None for the mean square error.
     """
 
     skip: Tensor
@@ -69,7 +66,7 @@ class FactorNetwork(ShapeNetwork):
     ) -> None:
         super().__init__()
         self.scaling, self.basis = scaling, basis
-        self.metric: Tensor | None = None
+        self.metric: Tensor | None = None  # (rank, rank) factor of coefficient errors
         size = basis.rank if basis is not None else len(scaling.mean)
         self.features = LatentFeatures(coordinates, settings.fourier)
         self.hidden = perceptron([self.features.size, *settings.hidden, size])

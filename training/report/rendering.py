@@ -15,34 +15,22 @@ from shapespace.mesh.triangle_mesh import diagonal, face_normals, vertex_normals
 
 @dataclass(frozen=True)
 class RenderingSettings:
-    """View, light and quality of all pictures.
+    """View, light and quality of all pictures."""
 
-    Attributes:
-        azimuth: degrees to the right of the shape's front.
-        elevation: degrees above the shape's front.
-        distance: distance of the camera, in diagonals of all shapes: from far away, perspective distorts little.
-        margin: space around the shapes, a share of the picture's longer side.
-        lights: for each light its direction (right, up, towards the viewer) and its brightness.
-        ambient: ambient light on surfaces that face down, and on surfaces that face up.
-        wrap: how far diffuse light reaches around a surface that turns away from it; 0 is Lambertian shading.
-        occlusion_rays: number of rays from each vertex that test which directions are occluded.
-        supersampling: rays per pixel along each side, which smooths outlines.
-        gamma: exponent between light and its encoding as sRGB.
-    """
-
-    azimuth: float = 25.0
-    elevation: float = 18.0
-    distance: float = 2.5
-    margin: float = 0.03
+    azimuth: float = 25.0  # degrees to the right of the shape's front
+    elevation: float = 18.0  # degrees above the shape's front
+    distance: float = 2.5  # of the camera, in diagonals of all shapes: from far away, perspective distorts little
+    margin: float = 0.03  # space around the shapes, a share of the picture's longer side
+    # For each light its direction (right, up, towards the viewer) and its brightness.
     lights: tuple[tuple[tuple[float, float, float], float], ...] = (
         ((-0.55, 0.75, 0.65), 0.78),
         ((0.85, 0.10, 0.50), 0.20),
     )
-    ambient: tuple[float, float] = (0.20, 0.46)
-    wrap: float = 0.3
-    occlusion_rays: int = 96
-    supersampling: int = 2
-    gamma: float = 2.2
+    ambient: tuple[float, float] = (0.20, 0.46)  # ambient light on surfaces that face down, and that face up
+    wrap: float = 0.3  # how far diffuse light reaches around a surface that turns away from it; 0 is Lambertian
+    occlusion_rays: int = 96  # number of rays from each vertex that test which directions are occluded
+    supersampling: int = 2  # rays per pixel along each side, which smooths outlines
+    gamma: float = 2.2  # exponent between light and its encoding as sRGB
 
 
 SETTINGS = RenderingSettings()

@@ -218,19 +218,13 @@ def _touches(vertices: FloatArray) -> bool:
 
 
 def poses(count: int = 60, seed: int = 0) -> tuple[list[str], FloatArray, IntArray]:
-    """Return the collection: the named poses, the rest pose first, and random poses in which no limb touches another.
+    """Return the collection: names (n), vertices (n, V, 3) and faces (F, 3).
 
-    Random angles have a triangular distribution between their bounds with its mode at rest.
-
-    Args:
-        count: number n of poses.
-        seed: seed of the random angles.
-
-    Returns:
-        Names (n), vertices (n, V, 3) and faces (F, 3).
+    The named poses come first, beginning with the rest pose; then random poses in which no limb touches another. Random
+    angles have a triangular distribution between their bounds with its mode at rest.
 
     Raises:
-        FigureError: the count is below 1.
+        FigureError: the count n is below 1.
     """
     if count < 1:
         raise FigureError(f"count must be at least 1, not {count}")

@@ -195,11 +195,7 @@ def _edge_length(points: FloatArray) -> FloatArray:
 
 
 def _scatter() -> tuple[FloatArray, int]:
-    """Scatter points (n, 3) over the surface with x ≥ 0, nearly an edge apart.
-
-    Returns:
-        The points, those at x = 0 first, and the number of points at x = 0.
-    """
+    """Scatter points (n, 3) over the surface with x ≥ 0, nearly an edge apart; the first, counted, have x = 0."""
     cell = 0.03
     axes = [np.arange(a, b, cell) for a, b in ((0, 0.7), (-0.02, 1.75), (-0.2, 0.25))]
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)

@@ -118,13 +118,7 @@ class CombinerNetwork(ShapeNetwork):
     ) -> CombinerNetwork:
         """Fit all parts that have a closed form, see `Correction.fit`. Held-out samples choose between kinds.
 
-        Args:
-            settings: settings of the correction.
-            reference: the reference mesh.
-            own: training samples.
-            held_out: samples that choose.
-            seed: seed of all random numbers.
-            train: called with each fitted network, to train the parts without a closed form.
+        Each fitted network is passed to ``train``, which trains the parts without a closed form.
         """
 
         def fit(each: ResolvedCorrection) -> CombinerNetwork:

@@ -101,15 +101,7 @@ class Correction(nn.Module, ABC):
     @classmethod
     @abstractmethod
     def fit(cls, settings: Any, reference: TriangleMesh, own: JointSamples, held_out: JointSamples, seed: int) -> Self:
-        """Fit all parts that have a closed form.
-
-        Args:
-            settings: settings of this kind.
-            reference: the reference mesh.
-            own: training samples.
-            held_out: samples that choose penalties.
-            seed: seed of all random numbers.
-        """
+        """Fit all parts that have a closed form to training samples; held-out samples choose penalties."""
 
     @classmethod
     def load(cls, settings: Any, reference: TriangleMesh, tensors: Mapping[str, Tensor]) -> Self:

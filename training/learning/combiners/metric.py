@@ -62,11 +62,8 @@ def learned_metric(x: Tensor, y: Tensor, held_out: Pairs) -> Tensor:
 def _updated(metric: Tensor, z: Tensor, s: Tensor, weights: Tensor) -> Tensor:
     """Return a power of the mean outer product of gradients, up to a factor.
 
-    Args:
-        metric: A (k, k).
-        z: (n, k) = x A.
-        s: (m, n) inner products of the samples where gradients are taken with all samples.
-        weights: (n, q) weights of the kernel regression.
+    ``s`` (m, n) has inner products of the samples where gradients are taken with all samples z = x A (n, k), and
+    ``weights`` (n, q) are of the kernel regression.
     """
     slope = 1 + s * (1 + s / 2)  # κ'(s)
     gradients = torch.einsum("pn,nq,nk->pqk", slope, weights, z).flatten(0, 1) @ metric.T

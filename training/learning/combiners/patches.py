@@ -105,15 +105,10 @@ class Patch:
         return at, along, slopes.missed[:, :, self.columns].flatten(0, 1).double()
 
     def fit(self, own: Pairs, held_out: Pairs, slopes: Slopes | None, rank: int, most: int, outputs: int) -> None:
-        """Fit by ridge regression on ``rank`` coordinates; held-out samples choose γ and the penalty.
+        """Fit ``most`` functions of ``rank`` coordinates by ridge regression.
 
-        Args:
-            own: training pairs.
-            held_out: pairs that choose.
-            slopes: derivatives to fit as well.
-            rank: number of coordinates.
-            most: largest number of functions.
-            outputs: largest rank of the output.
+        Held-out samples choose γ and the penalty. The output has the rank ``outputs`` at most. Derivatives are fitted
+        as well, if there are any.
         """
         x, other = (self.coordinates(inputs, rank) for inputs, _ in (own, held_out))
         wanted, theirs = (residual[:, self.columns].double() - self.mean for _, residual in (own, held_out))
