@@ -71,9 +71,6 @@ def volume(vertices, faces):
     return np.linalg.det(vertices[faces]).sum() / 6
 
 
-# ---------------------------------------------------------------- formula
-
-
 def test_shapes_are_those_of_the_paper_at_index_32_i_plus_j(codes):
     shapes = freaky_torus.vertices(codes)
     assert shapes.shape == (8, 2048, 3)
@@ -115,9 +112,6 @@ def test_the_bump_points_outward(reference, codes):
         assert change.sum() > 0.5
 
 
-# ---------------------------------------------------------------- triangulation
-
-
 def test_the_mesh_is_a_closed_torus(reference):
     c = reference.connectivity
     assert (c.vertex_count, c.edge_count, len(c.faces)) == (2048, 6144, 4096)
@@ -143,9 +137,6 @@ def test_faces_look_outward(reference, codes):
     a, b, c = np.moveaxis(smooth[reference.faces], 1, 0)
     n = [normal(0.3, 0, 2 * math.pi * (k // M) / N, 2 * math.pi * (k % M) / M) for k in reference.faces[:, 0]]
     assert ((np.cross(b - a, c - a) * n).sum(axis=1) > 0).all()
-
-
-# ---------------------------------------------------------------- collection
 
 
 def test_the_collection_has_a_reference_of_unit_area(reference, codes):
