@@ -21,7 +21,7 @@ LAYERS = 3
 
 @pytest.fixture(params=["closed", "open"])
 def mesh(request: pytest.FixtureRequest) -> TriangleMesh:
-    sphere = trimesh.creation.icosphere(3)
+    sphere = trimesh.creation.icosphere(2)
     faces = sphere.faces if request.param == "closed" else sphere.faces[sphere.triangles_center[:, 2] < 0.5]
     used, faces = np.unique(faces, return_inverse=True)
     return TriangleMesh.from_arrays(sphere.vertices[used], faces.reshape(-1, 3))
