@@ -203,8 +203,7 @@ class NRICSecondDerivatives:
     """The entries of ``D²z(X)``, by components.
 
     Attributes:
-        lengths: (3, 3, E) second derivative of each length by its head, which is also the one by its tail and the
-            negative of the mixed one.
+        lengths: (3, 3, E) second derivative of each length by its head, and by its tail; the mixed one is the negative.
         angles: (4, 4, 3, 3, H) second derivatives of each interior angle by the tail, head, left and right vertex.
     """
 
@@ -246,7 +245,7 @@ class NRICJacobian:
         self._vertices = np.concatenate([connectivity.edges.T.ravel(), connectivity.hinges.T.ravel()])
 
     def __call__(self, vertices: FloatArray) -> sparse.csr_array:
-        """Compute the Jacobian at a shape (V, 3)."""
+        """Compute the matrix at a shape (V, 3)."""
         return self.matrix(self.gradients(vertices))
 
     def matrix(self, gradients: NRICGradients) -> sparse.csr_array:

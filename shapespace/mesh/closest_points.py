@@ -39,9 +39,8 @@ class Closest:
     """Closest points on a surface to n points.
 
     Attributes:
-        distances: (n,) distances between the points.
-        faces: (n,) faces that contain the closest points.
-        barycentric: (n, 3) barycentric coordinates in these faces.
+        distances: (n,).
+        faces, barycentric: (n,) faces that contain the closest points, and (n, 3) coordinates there.
         places: (n, 3) positions.
     """
 

@@ -23,18 +23,11 @@ SMALLEST_SHARE = 0.1
 
 @dataclass(frozen=True)
 class TriangleQuality:
-    """Quality of a few faces: the worst values, and the numbers of faults.
+    """Quality of a few faces: the worst values, and the numbers of faults."""
 
-    Attributes:
-        sine: smallest sin² of an angle.
-        fold: smallest cosine between the normals of neighbours.
-        size: smallest size, see `Triangles.sizes`.
-        slivers, folds, specks: numbers of faults.
-    """
-
-    sine: float
-    fold: float
-    size: float
+    sine: float  # smallest sin² of an angle
+    fold: float  # smallest cosine between the normals of neighbours
+    size: float  # smallest size, see `Triangles.sizes`
     slivers: int
     folds: int
     specks: int
@@ -98,9 +91,8 @@ def folded_pairs(connectivity: Connectivity, normals: FloatArray) -> IntArray:
         normals: (F, n, 3) normals in n shapes, of any length.
     """
     normals = unit(normals)
-    pairs = connectivity.edge_faces[connectivity.interior]
-    folded: IntArray = pairs[(dots(normals[pairs[:, 0]], normals[pairs[:, 1]]) < FOLD_LIMIT).any(axis=1)]
-    return folded
+    pairs: IntArray = connectivity.edge_faces[connectivity.interior]
+    return pairs[(dots(normals[pairs[:, 0]], normals[pairs[:, 1]]) < FOLD_LIMIT).any(axis=1)]
 
 
 def folded_anew(angles: FloatArray, others: FloatArray) -> NDArray[np.bool_]:
@@ -111,8 +103,7 @@ def folded_anew(angles: FloatArray, others: FloatArray) -> NDArray[np.bool_]:
         others: (k, E) dihedral angles of other shapes; an edge is smooth where all are below 90°.
     """
     smooth = (np.abs(others) < np.pi / 2).all(axis=0)
-    folded: NDArray[np.bool_] = ((np.cos(angles) < FOLD_LIMIT) & smooth).any(axis=1)
-    return folded
+    return np.asarray(((np.cos(angles) < FOLD_LIMIT) & smooth).any(axis=1))
 
 
 def normals_and_sides(corners: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -226,14 +226,10 @@ class RestShape:
         by_turn = 2 * turn * self._beta
         by_area = (-by_turn / self._edge_area)[m.sides]
         areas = by_area[None] * (self._c * self._sides / (8 * self.areas))[:, None]
-        edges = np.arange(e)
-        entries = [
-            (blocks, rows, columns),
-            (areas, rows, e + columns),
-            (2 * by_turn / self._lengths, edges, e + edges),
-            (-2 * self._beta, e + edges, e + edges),
-        ]
-        data, i, j = (np.concatenate([np.ravel(x[k]) for x in entries]) for k in range(3))
+        angles = np.arange(e, 2 * e)
+        i = np.concatenate([rows, rows, angles - e, angles], axis=None)
+        j = np.concatenate([columns, e + columns, angles, angles], axis=None)
+        data = np.concatenate([blocks, areas, 2 * by_turn / self._lengths, -2 * self._beta], axis=None)
         return sparse.csr_array((data, (i, j)), shape=(2 * e, 2 * e))
 
     def hessian_deformed(self, z: FloatArray) -> QuadraticForm:

@@ -172,7 +172,7 @@ def test_others_read_our_colours(format: str) -> None:
         assert found.visual.material.metallicFactor == 0
     else:
         colours = loaded(data, format).visual.vertex_colors
-        np.testing.assert_allclose(colours[:, :3], colouring.srgb_bytes, atol=1)
+        np.testing.assert_allclose(colours[:, :3], 255 * colouring.srgb, atol=1)
         assert (colours[:, 3] == 255).all()
     if format == "glb":
         assert GLB(data).tree["meshes"][0]["extras"]["color"] == colouring.legend
