@@ -121,7 +121,6 @@ def test_what_cannot_be_collapsed_stays() -> None:
     assert np.array_equal(faces, tetrahedron.faces)
 
 
-@pytest.mark.long
 def test_a_large_mesh_is_coarsened_as_well_by_way_of_a_thinned_one(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(coarsening, "THINNING", coarsening.Thinning(vertices=1500, left=800))
     mesh, shapes = bent(False)
