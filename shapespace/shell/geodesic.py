@@ -111,12 +111,7 @@ class Logarithm:
 
 
 def logarithm(
-    space: ShellSpace,
-    start: FloatArray,
-    end: FloatArray,
-    steps: int = 8,
-    *,
-    tolerance: float = TOLERANCE,
+    space: ShellSpace, start: FloatArray, end: FloatArray, steps: int = 8, *, tolerance: float = TOLERANCE
 ) -> Logarithm:
     """Compute the discrete logarithm of ``end`` at ``start``, the inverse of ``exponential`` with equal steps.
 

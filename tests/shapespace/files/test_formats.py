@@ -62,10 +62,7 @@ def test_we_read_what_we_write(format: str, tmp_path: Path) -> None:
     mesh = freaky_torus.reference()
     path = tmp_path / f"torus.{format}"
     path.write_bytes(MESH_FORMATS[format].encode(mesh.vertices, mesh.faces))
-    for found in (
-        read_mesh(path),
-        read_mesh(path.read_bytes(), format),
-    ):
+    for found in (read_mesh(path), read_mesh(path.read_bytes(), format)):
         np.testing.assert_allclose(found.vertices, mesh.vertices, atol=1e-6)
         assert np.array_equal(found.faces, mesh.faces)
 
