@@ -29,15 +29,10 @@ class GeometryError(ValueError):
 
 @dataclass(frozen=True)
 class FineMesh:
-    """A fine mesh that follows the coarse mesh.
+    """A fine mesh that follows the coarse mesh."""
 
-    Attributes:
-        reference: the fine mesh at the coarse reference.
-        prolong: maps coarse vertices to fine vertices.
-    """
-
-    reference: TriangleMesh
-    prolong: Prolongation
+    reference: TriangleMesh  # the fine mesh at the coarse reference
+    prolong: Prolongation  # maps coarse vertices to fine vertices
 
     @cached_property
     def nearby(self) -> FloatArray:

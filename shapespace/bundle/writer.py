@@ -33,17 +33,11 @@ from shapespace.shell.energy import Material
 
 @dataclass(frozen=True, kw_only=True)
 class Networks:
-    """Contents of the ONNX files of a bundle. Their batch size n is dynamic.
+    """Contents of the ONNX files of a bundle. Their batch size n is dynamic."""
 
-    Attributes:
-        factors: network ψ_j of each factor: latents of the factor to lengths and angles (n, 2E).
-        combiner: lengths and angles of all factors (n, J, 2E) to lengths and angles (n, 2E).
-        start: latents (n, m) to start vertices (n, V, 3) of Gauss–Newton; optional.
-    """
-
-    factors: Sequence[bytes]
-    combiner: bytes
-    start: bytes | None = None
+    factors: Sequence[bytes]  # network ψ_j of each factor: latents of the factor to lengths and angles (n, 2E)
+    combiner: bytes  # lengths and angles of all factors (n, J, 2E) to lengths and angles (n, 2E)
+    start: bytes | None = None  # latents (n, m) to start vertices (n, V, 3) of Gauss–Newton; optional
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -50,19 +50,12 @@ REUSE, DAMPING = FactorReuse(), Damping()
 
 @dataclass(frozen=True)
 class IterationLimits:
-    """When to stop. Lengths are in the unit of the mesh.
+    """When to stop. Lengths are in the unit of the mesh."""
 
-    Attributes:
-        step: the iteration has converged once no vertex moves further.
-        reach: a factor is replaced once a vertex has moved further.
-        iterations: largest number of iterations, for both kinds together.
-        deadline: no iteration begins after it.
-    """
-
-    step: float
-    reach: float
-    iterations: int
-    deadline: Deadline | None
+    step: float  # the iteration has converged once no vertex moves further
+    reach: float  # a factor is replaced once a vertex has moved further
+    iterations: int  # largest number of iterations, for both kinds together
+    deadline: Deadline | None  # no iteration begins after it
 
     def reached(self, iterations: int) -> Status | None:
         """Return the limit that is reached after a number of iterations, or None."""

@@ -187,15 +187,10 @@ class WeightedNorm:
 
 @dataclass(frozen=True)
 class NRICGradients:
-    """The entries of ``Dz(X)``, by components.
+    """The entries of ``Dz(X)``, by components."""
 
-    Attributes:
-        lengths: (3, E) derivative of each length by its head; the derivative by its tail is the negative.
-        angles: (4, 3, H) derivative of each interior angle by the tail, head, left and right opposite vertex.
-    """
-
-    lengths: FloatArray
-    angles: FloatArray
+    lengths: FloatArray  # (3, E) derivative of each length by its head; the derivative by its tail is the negative
+    angles: FloatArray  # (4, 3, H) derivative of each interior angle by the tail, head, left and right opposite vertex
 
 
 @dataclass(frozen=True)

@@ -24,19 +24,12 @@ MeshWriter = Callable[[FloatArray, IntArray, Colouring | None, MeshAttributes | 
 
 @dataclass(frozen=True)
 class MeshFormat:
-    """A file format for one mesh.
+    """A file format for one mesh."""
 
-    Attributes:
-        media_type: media type as registered at IANA; OCTET_STREAM for formats without a registration.
-        write: writer of the format.
-        coloured: whether files can have colours; otherwise they are left out.
-        polygons: whether files can have polygons; otherwise faces are written as triangles.
-    """
-
-    media_type: str
-    write: MeshWriter
-    coloured: bool = True
-    polygons: bool = False
+    media_type: str  # media type as registered at IANA; OCTET_STREAM for formats without a registration
+    write: MeshWriter  # writer of the format
+    coloured: bool = True  # whether files can have colours; otherwise they are left out
+    polygons: bool = False  # whether files can have polygons; otherwise faces are written as triangles
 
     def encode(
         self,

@@ -209,25 +209,15 @@ def _numbers(value: object, length: int) -> FloatArray:
 
 @dataclass(frozen=True)
 class Accessor:
-    """Location and type of an array of elements (3.6.2).
+    """Location and type of an array of elements (3.6.2)."""
 
-    Attributes:
-        buffer: index of the buffer.
-        start: offset of the first byte in the buffer.
-        stride: bytes from one element to the next.
-        count: number of elements.
-        dtype: type of the components.
-        width: number of components in an element.
-        normalized: whether integers stand for numbers between 0 or −1 and 1.
-    """
-
-    buffer: int
-    start: int
-    stride: int
-    count: int
-    dtype: np.dtype
-    width: int
-    normalized: bool
+    buffer: int  # index of the buffer
+    start: int  # offset of the first byte in the buffer
+    stride: int  # bytes from one element to the next
+    count: int  # number of elements
+    dtype: np.dtype  # type of the components
+    width: int  # number of components in an element
+    normalized: bool  # whether integers stand for numbers between 0 or −1 and 1
 
     @classmethod
     def of(cls, document: GltfDocument, index: object, kind: str, components: tuple[int, ...]) -> Accessor:

@@ -112,25 +112,15 @@ class Scene:
 
 @dataclass(frozen=True)
 class PlacedPrimitive:
-    """A primitive at one of its places (3.7.2).
+    """A primitive at one of its places (3.7.2)."""
 
-    Attributes:
-        positions: accessor of the vertices.
-        indices: accessor of the corners; None if each vertex is one corner, in order.
-        numbers: accessor of the attribute _VERTEX, if any.
-        mode: how the corners form triangles.
-        place: matrix (4, 4) of the place; None for the identity.
-        primitive: entry of the primitive in the file.
-        mesh: entry of its mesh.
-    """
-
-    positions: Accessor
-    indices: Accessor | None
-    numbers: Accessor | None
-    mode: int
-    place: FloatArray | None
-    primitive: dict[str, Any]
-    mesh: dict[str, Any]
+    positions: Accessor  # accessor of the vertices
+    indices: Accessor | None  # accessor of the corners; None if each vertex is one corner, in order
+    numbers: Accessor | None  # accessor of the attribute _VERTEX, if any
+    mode: int  # how the corners form triangles
+    place: FloatArray | None  # matrix (4, 4) of the place; None for the identity
+    primitive: dict[str, Any]  # entry of the primitive in the file
+    mesh: dict[str, Any]  # entry of its mesh
 
     @property
     def corners(self) -> int:

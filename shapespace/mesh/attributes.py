@@ -44,31 +44,19 @@ class SurfaceMaterial:
 
 
 class Labels(NamedTuple):
-    """A name for each polygon, or none.
+    """A name for each polygon, or none."""
 
-    Attributes:
-        names: distinct names.
-        of: (P,) index of the name of each polygon, NONE for none.
-    """
-
-    names: tuple[str, ...]
-    of: IntArray
+    names: tuple[str, ...]  # distinct names
+    of: IntArray  # (P,) index of the name of each polygon, NONE for none
 
 
 class SplitVertices(NamedTuple):
-    """Split vertices, for formats where each vertex has one texture coordinate and one normal.
+    """Split vertices, for formats where each vertex has one texture coordinate and one normal."""
 
-    Attributes:
-        vertex: (V',) index of the original vertex, increasing.
-        uv: (V', 2) texture coordinates, zeros where there is none.
-        normal: (V',) index of the normal, see `MeshAttributes.normal_corners`.
-        faces: (F, 3) triangles of split vertices.
-    """
-
-    vertex: IntArray
-    uv: FloatArray | None
-    normal: IntArray
-    faces: IntArray
+    vertex: IntArray  # (V',) index of the original vertex, increasing
+    uv: FloatArray | None  # (V', 2) texture coordinates, zeros where there is none
+    normal: IntArray  # (V',) index of the normal, see `MeshAttributes.normal_corners`
+    faces: IntArray  # (F, 3) triangles of split vertices
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -37,19 +37,12 @@ class ProlongationError(ValueError):
 
 
 class AttachedPart(NamedTuple):
-    """A part of the fine mesh beside the surface of the coarse mesh, such as an eye or a nail, and its anchors.
+    """A part of the fine mesh beside the surface of the coarse mesh, such as an eye or a nail, and its anchors."""
 
-    Attributes:
-        vertices: (k,) vertices of the fine mesh.
-        anchors: (K,) coarse vertices that move the part as a whole.
-        weights: (K,) weights of the anchors, with sum 1.
-        rigid: whether the part moves rigidly.
-    """
-
-    vertices: IntArray
-    anchors: IntArray
-    weights: FloatArray
-    rigid: bool
+    vertices: IntArray  # (k,) vertices of the fine mesh
+    anchors: IntArray  # (K,) coarse vertices that move the part as a whole
+    weights: FloatArray  # (K,) weights of the anchors, with sum 1
+    rigid: bool  # whether the part moves rigidly
 
 
 class RigidPart(NamedTuple):

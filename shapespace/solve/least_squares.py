@@ -38,17 +38,11 @@ SECANT, CONTROL = SecantLimits(), StepControl()
 
 @dataclass(frozen=True)
 class Box:
-    """Bounds and scales of the unknowns, each (m,).
+    """Bounds and scales of the unknowns, each (m,)."""
 
-    Attributes:
-        lower: lower bounds, −∞ where there is none.
-        upper: upper bounds, ∞ where there is none.
-        scale: typical size of each unknown; steps are measured in it.
-    """
-
-    lower: FloatArray
-    upper: FloatArray
-    scale: FloatArray
+    lower: FloatArray  # lower bounds, −∞ where there is none
+    upper: FloatArray  # upper bounds, ∞ where there is none
+    scale: FloatArray  # typical size of each unknown; steps are measured in it
 
 
 @dataclass(frozen=True)
@@ -168,15 +162,10 @@ def least_squares(
 
 
 class _Jacobian:
-    """A Jacobian that is computed at some points, and updated by Broyden's formula in between.
+    """A Jacobian that is computed at some points, and updated by Broyden's formula in between."""
 
-    Attributes:
-        matrix: (n, m), in units of the scale.
-        updates: number of updates since it was computed.
-    """
-
-    matrix: FloatArray
-    updates: int
+    matrix: FloatArray  # (n, m), in units of the scale
+    updates: int  # number of updates since it was computed
 
     def __init__(
         self, make: Callable[[FloatArray, FloatArray], FloatArray], secant: bool, u: FloatArray, r: FloatArray

@@ -51,13 +51,9 @@ class Energy(Protocol):
 
 @dataclass(frozen=True, kw_only=True)
 class Descent(Outcome):
-    """The result of a descent. Its residual is the length of the preconditioned forces, ``sqrt(Fᵀ P F)``.
+    """The result of a descent. Its residual is the length of the preconditioned forces, ``sqrt(Fᵀ P F)``."""
 
-    Attributes:
-        x: unknowns.
-    """
-
-    x: FloatArray
+    x: FloatArray  # unknowns
 
 
 @np.errstate(divide="ignore", over="ignore", invalid="ignore")
