@@ -87,11 +87,6 @@ class Geometry:
     ) -> Geometry:
         """Return the geometry in arrays, after checks against each other and the manifest.
 
-        Args:
-            arrays: arrays of the file. Unknown names are ignored.
-            manifest: manifest of the bundle.
-            textures: contents of the textures by file name.
-
         Raises:
             GeometryError: the message names the file, the array and the fault.
         """

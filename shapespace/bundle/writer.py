@@ -44,20 +44,8 @@ class Networks:
 class Facts:
     """Members of a manifest that do not follow from the files of the bundle; see `schema.Manifest`.
 
-    Attributes:
-        name, version: names of the bundle's folders.
-        latent_names: (m,) names of the latents.
-        factors: consecutive indices of the latents of each factor, by name.
-        lower, upper: (m,) bounds of the latents.
-        period: (m,) periods, NaN for latents without a period.
-        material: μ, λ, η of the shell.
-        eta_reconstruction: η of Gauss–Newton.
-        draft_error: ``mean`` and ``p95`` of the error of drafts, if it was measured.
-        exponential_steps: number K of steps of the exponentials, if the bundle has modes.
-        scale: length of one unit of the reference in the user's units.
-        tolerance: difference between ONNX and PyTorch.
-        figures: results of the evaluation, as JSON.
-        origin: configuration, data and code that the bundle was made from.
+    Factors are names with the consecutive indices of their latents. Bounds and periods are (m,) arrays, NaN where there
+    is no period. One unit of the reference has length ``scale`` in the user's units.
     """
 
     name: str

@@ -34,10 +34,6 @@ class FrameIntegration:
 
     The tree, the order of the products of rotations and the factors of the two matrices are computed once. An instance
     holds these factors: use one per thread.
-
-    Args:
-        reference: lengths for the tree, weights for the sides, and the position of each connected part.
-        backend: Cholesky backend.
     """
 
     #: Relative weight of the reference in the Poisson equation, which fixes translations, and of zero rotations in the
@@ -153,12 +149,7 @@ class FrameIntegration:
         return self._fitting(q.take(self._place, axis=1), across)
 
     def _fitting(self, frames: FloatArray, across: FloatArray) -> FloatArray:
-        """Rotate frames (4, F) a little, so that they agree at all hinges in least squares.
-
-        Args:
-            frames: (4, F) frames that agree at the hinges of the tree.
-            across: (4, H) rotations from the left to the right face of each hinge.
-        """
+        """Rotate frames (4, F) that agree along the tree a little, so that all hinges agree in least squares."""
         if not len(self._others):
             return frames
         arrived = quaternions.product(frames.take(self._left, axis=1), across.take(self._others, axis=1))
@@ -224,10 +215,6 @@ def _rounds(depths: IntArray, parents: IntArray) -> list[tuple[int, IntArray]]:
     Each round multiplies the product of every face by the product of its ancestor, which doubles the length of the path
     ("pointer jumping", Wyllie 1979). A round is the first face that takes part, and the ancestors of this face and all
     later faces.
-
-    Args:
-        depths: (F,) depths of the faces, increasing.
-        parents: (F,) parents of the faces in the same order; a root is its own parent.
     """
     rounds, ancestors, reach = [], parents, 1
     while reach <= depths[-1]:

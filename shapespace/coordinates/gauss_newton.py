@@ -82,11 +82,6 @@ class GaussNewton:
 
     **Damping.** If even a short step with a new factor doesn't lower the misfit, a face has nearly collapsed, and
     angles change too fast for a linearisation. Then Levenberg and Marquardt's damped steps continue. See Damping.
-
-    Args:
-        squares: objective.
-        faces: (F, 3).
-        backend: Cholesky backend.
     """
 
     def __init__(self, squares: LeastSquares, faces: IntArray, backend: Backend) -> None:

@@ -14,13 +14,7 @@ from shapespace.mesh.triangle_mesh import Connectivity
 
 
 class LeastSquares:
-    """The misfit between shapes of one connectivity and a target.
-
-    Args:
-        connectivity: connectivity of the shapes.
-        norm: norm of the misfit.
-        matrix: pattern of the normal matrix.
-    """
+    """The misfit between shapes of one connectivity and a target."""
 
     def __init__(self, connectivity: Connectivity, norm: WeightedNorm, matrix: NormalMatrix) -> None:
         self.connectivity, self.norm, self.matrix = connectivity, norm, matrix

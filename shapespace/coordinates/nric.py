@@ -18,13 +18,9 @@ from shapespace.mesh.vectors import components, cross, dot
 
 
 class HingeGeometry:
-    """Edge vectors, and the vectors and normals at every hinge, all by components (3, …).
+    """Edge vectors of shapes (…, V, 3), and the vectors and normals at every hinge, all by components (3, …).
 
     Lengths, angles and their derivatives share them, and they are most of the work.
-
-    Args:
-        vertices: shapes (…, V, 3).
-        connectivity: connectivity of the shapes.
     """
 
     def __init__(self, vertices: FloatArray, connectivity: Connectivity) -> None:

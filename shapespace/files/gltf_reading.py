@@ -63,11 +63,6 @@ class Scene:
     The *listed* vertices are the vertices of the primitives in `read`, one primitive after the other. `vertices` has
     each listed vertex once.
 
-    Args:
-        document: document of the file.
-        buffers: its buffers.
-        limits: largest numbers of vertices and faces.
-
     Attributes:
         parts: the primitives, each at one of its places.
         read: primitives with vertices of their own. The other primitives use the vertices of one of these.

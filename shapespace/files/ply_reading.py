@@ -134,13 +134,9 @@ def _property(name: bytes, kind: bytes, length: bytes | None, order: str | None)
 
 
 class TextTable:
-    """Rows of an ASCII file, one on each line.
+    """Rows of an ASCII file, one on each line, after its header.
 
     Elements have to be read or skipped in their order in the file.
-
-    Args:
-        data: content after the header.
-        limits: largest number of triangles.
     """
 
     def __init__(self, data: memoryview, limits: Limits) -> None:

@@ -162,11 +162,7 @@ def _pieces(
 def _add_surface(stage: Any, mesh: Any, surface: MeshAttributes, pictures: Mapping[str, str]) -> None:
     """Add texture coordinates, materials and names of parts to a mesh that has the polygons of ``surface``.
 
-    Args:
-        stage: stage of the mesh.
-        mesh: a UsdGeom.Mesh.
-        surface: the attributes.
-        pictures: paths of textures by name. Other textures are left out, because a single layer has no other files.
+    Only textures with a path in ``pictures`` are kept, because a single layer has no other files.
     """
     from pxr import Gf, Sdf, Tf, UsdGeom, UsdShade, Vt
 

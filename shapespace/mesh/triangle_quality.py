@@ -84,12 +84,7 @@ class Triangles:
 
 
 def folded_pairs(connectivity: Connectivity, normals: FloatArray) -> IntArray:
-    """List pairs (k, 2) of neighbouring faces that are folded onto one another in some shape.
-
-    Args:
-        connectivity: connectivity of the F faces.
-        normals: (F, n, 3) normals in n shapes, of any length.
-    """
+    """List pairs (k, 2) of neighbouring faces with normals (F, n, 3) that are folded together in some shape."""
     normals = unit(normals)
     pairs: IntArray = connectivity.edge_faces[connectivity.interior]
     return pairs[(dots(normals[pairs[:, 0]], normals[pairs[:, 1]]) < FOLD_LIMIT).any(axis=1)]
@@ -98,9 +93,7 @@ def folded_pairs(connectivity: Connectivity, normals: FloatArray) -> IntArray:
 def folded_anew(angles: FloatArray, others: FloatArray) -> NDArray[np.bool_]:
     """Return a mask (n,) of the shapes with two faces folded onto one another at an edge that is smooth in the others.
 
-    Args:
-        angles: (n, E) dihedral angles.
-        others: (k, E) dihedral angles of other shapes; an edge is smooth where all are below 90°.
+    Angles are (n, E) and (k, E). An edge is smooth where all are below 90°.
     """
     smooth = (np.abs(others) < np.pi / 2).all(axis=0)
     return np.asarray(((np.cos(angles) < FOLD_LIMIT) & smooth).any(axis=1))

@@ -59,12 +59,7 @@ class ShellEnergy:
     """The energy ``W`` on a connectivity.
 
     W_mem scales with area and W_bend does not, so η has a meaning only for a given size. Therefore the membrane part is
-    divided by the area of the reference. Meshes in any unit then give the same numbers as meshes of unit area.
-
-    Args:
-        connectivity: connectivity of the shapes.
-        material: μ, λ and η at unit area.
-        area: surface area of the reference shape of the collection.
+    divided by the ``area`` of the reference. Meshes in any unit then give the same numbers as meshes of unit area.
     """
 
     def __init__(self, connectivity: Connectivity, material: Material | None = None, area: float = 1.0) -> None:

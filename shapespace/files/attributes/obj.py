@@ -265,13 +265,7 @@ def _face_lines(surface: MeshAttributes) -> NDArray:
 
 
 def polygon_lines(surface: MeshAttributes, numbers: NDArray, line: Callable[[int], str]) -> NDArray:
-    """Return a line for each polygon, (P,).
-
-    Args:
-        surface: the polygons.
-        numbers: (C, k) numbers of each corner.
-        line: returns the format of a line, for ``%``, for a number of corners.
-    """
+    """Return a line for each polygon, (P,), from numbers (C, k) and a format for each number of corners."""
     lines = np.empty(len(surface.sizes), object)
     for size in np.unique(surface.sizes).tolist():
         chosen = np.flatnonzero(surface.sizes == size)
