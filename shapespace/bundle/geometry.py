@@ -29,15 +29,10 @@ class GeometryError(ValueError):
 
 @dataclass(frozen=True)
 class FineMesh:
-    """A fine mesh that follows the coarse mesh.
+    """A fine mesh that follows the coarse mesh."""
 
-    Attributes:
-        reference: the fine mesh at the coarse reference.
-        prolong: maps coarse vertices to fine vertices.
-    """
-
-    reference: TriangleMesh
-    prolong: Prolongation
+    reference: TriangleMesh  # the fine mesh at the coarse reference
+    prolong: Prolongation  # maps coarse vertices to fine vertices
 
     @cached_property
     def nearby(self) -> FloatArray:
@@ -91,11 +86,6 @@ class Geometry:
         cls, arrays: Mapping[str, NDArray], manifest: Manifest, textures: Mapping[str, bytes] = MappingProxyType({})
     ) -> Geometry:
         """Return the geometry in arrays, after checks against each other and the manifest.
-
-        Args:
-            arrays: arrays of the file. Unknown names are ignored.
-            manifest: manifest of the bundle.
-            textures: contents of the textures by file name.
 
         Raises:
             GeometryError: the message names the file, the array and the fault.

@@ -65,11 +65,7 @@ def manifest_digest(folder: Path) -> str:
 
 
 def read_bundle(folder: Path, digest: str | None = None) -> Bundle:
-    """Read and verify ``models/NAME/VERSION``.
-
-    Args:
-        folder: folder of the bundle.
-        digest: digest that the bundle must have; by default any.
+    """Read and verify ``models/NAME/VERSION``, which must have the digest if one is given.
 
     Raises:
         BundleError: the bundle differs from its manifest, or breaks the schema.

@@ -33,37 +33,19 @@ from shapespace.shell.energy import Material
 
 @dataclass(frozen=True, kw_only=True)
 class Networks:
-    """Contents of the ONNX files of a bundle. Their batch size n is dynamic.
+    """Contents of the ONNX files of a bundle. Their batch size n is dynamic."""
 
-    Attributes:
-        factors: network ψ_j of each factor: latents of the factor to lengths and angles (n, 2E).
-        combiner: lengths and angles of all factors (n, J, 2E) to lengths and angles (n, 2E).
-        start: latents (n, m) to start vertices (n, V, 3) of Gauss–Newton; optional.
-    """
-
-    factors: Sequence[bytes]
-    combiner: bytes
-    start: bytes | None = None
+    factors: Sequence[bytes]  # network ψ_j of each factor: latents of the factor to lengths and angles (n, 2E)
+    combiner: bytes  # lengths and angles of all factors (n, J, 2E) to lengths and angles (n, 2E)
+    start: bytes | None = None  # latents (n, m) to start vertices (n, V, 3) of Gauss–Newton; optional
 
 
 @dataclass(frozen=True, kw_only=True)
 class Facts:
     """Members of a manifest that do not follow from the files of the bundle; see `schema.Manifest`.
 
-    Attributes:
-        name, version: names of the bundle's folders.
-        latent_names: (m,) names of the latents.
-        factors: consecutive indices of the latents of each factor, by name.
-        lower, upper: (m,) bounds of the latents.
-        period: (m,) periods, NaN for latents without a period.
-        material: μ, λ, η of the shell.
-        eta_reconstruction: η of Gauss–Newton.
-        draft_error: ``mean`` and ``p95`` of the error of drafts, if it was measured.
-        exponential_steps: number K of steps of the exponentials, if the bundle has modes.
-        scale: length of one unit of the reference in the user's units.
-        tolerance: difference between ONNX and PyTorch.
-        figures: results of the evaluation, as JSON.
-        origin: configuration, data and code that the bundle was made from.
+    Factors are names with the consecutive indices of their latents. Bounds and periods are (m,) arrays, NaN where there
+    is no period. One unit of the reference has length ``scale`` in the user's units.
     """
 
     name: str

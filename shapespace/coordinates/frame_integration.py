@@ -26,7 +26,7 @@ from shapespace.arrays import FloatArray, IntArray
 from shapespace.coordinates import quaternions
 from shapespace.coordinates.nric import WeightedNorm
 from shapespace.mesh.triangle_mesh import TriangleMesh, face_normals
-from shapespace.solve.cholesky import Backend, SymmetricPattern, analyse
+from shapespace.solve.cholesky import Backend, Factorisation, SymmetricPattern, analyse
 
 
 class FrameIntegration:
@@ -34,10 +34,6 @@ class FrameIntegration:
 
     The tree, the order of the products of rotations and the factors of the two matrices are computed once. An instance
     holds these factors: use one per thread.
-
-    Args:
-        reference: lengths for the tree, weights for the sides, and the position of each connected part.
-        backend: Cholesky backend.
     """
 
     #: Relative weight of the reference in the Poisson equation, which fixes translations, and of zero rotations in the
@@ -80,41 +76,22 @@ class FrameIntegration:
         # Side k runs from corner k + 1 to corner k + 2.
         tails, heads = c.faces.T[[1, 2, 0]].ravel(), c.faces.T[[2, 0, 1]].ravel()
         weights = ((reference.vertices[heads] - reference.vertices[tails]) ** 2).sum(axis=1) ** -1.0
-        sides = np.arange(len(tails))
-        self._divergence = sparse.csr_array(
-            (np.concatenate([-weights, weights]), (np.concatenate([tails, heads]), np.tile(sides, 2))),
-            shape=(c.vertex_count, len(tails)),
-        )
-        pattern = SymmetricPattern(
-            c.vertex_count, np.concatenate([tails, heads, tails]), np.concatenate([tails, heads, heads])
-        )
-        entries = pattern.scatter(np.concatenate([weights, weights, -weights]))
+        self._divergence = _differences(c.vertex_count, tails, heads, weights)
         anchor = self.ANCHOR * weights.mean()
-        entries[pattern.diagonal] += anchor
         self._anchored = anchor * reference.vertices
-        self._poisson = analyse(pattern, backend).factorise(entries)
+        self._poisson = _laplacian(c.vertex_count, tails, heads, weights, anchor, backend)
 
     def _rotation_equation(self, reference: TriangleMesh, backend: Backend) -> None:
         """Do the same for the small rotations of faces. An angle has its weight in the norm of lengths and angles."""
         c = self._connectivity
         left, right = c.edge_faces[c.hinge_edges].T
         weights = WeightedNorm.of(reference, 1.0).squared[c.edge_count + c.hinge_edges]
-        count, others = len(self._others), self._others
+        others = self._others
         self._left, self._right = left[others], right[others]
-        self._misfits = sparse.csr_array(
-            (
-                np.concatenate([-weights[others], weights[others]]),
-                (np.concatenate([self._left, self._right]), np.tile(np.arange(count), 2)),
-            ),
-            shape=(self._count, count),
-        )
-        if count:
-            pattern = SymmetricPattern(
-                self._count, np.concatenate([left, right, left]), np.concatenate([left, right, right])
-            )
-            entries = pattern.scatter(np.concatenate([weights, weights, -weights]))
-            entries[pattern.diagonal] += self.ANCHOR * weights.mean()
-            self._laplacian = analyse(pattern, backend).factorise(entries)
+        self._misfits = _differences(self._count, self._left, self._right, weights[others])
+        if len(others):
+            anchor = self.ANCHOR * weights.mean()
+            self._laplacian = _laplacian(self._count, left, right, weights, anchor, backend)
 
     @np.errstate(divide="ignore", over="ignore", invalid="ignore")
     def __call__(self, z: FloatArray) -> FloatArray:
@@ -172,12 +149,7 @@ class FrameIntegration:
         return self._fitting(q.take(self._place, axis=1), across)
 
     def _fitting(self, frames: FloatArray, across: FloatArray) -> FloatArray:
-        """Rotate frames (4, F) a little, so that they agree at all hinges in least squares.
-
-        Args:
-            frames: (4, F) frames that agree at the hinges of the tree.
-            across: (4, H) rotations from the left to the right face of each hinge.
-        """
+        """Rotate frames (4, F) that agree along the tree a little, so that all hinges agree in least squares."""
         if not len(self._others):
             return frames
         arrived = quaternions.product(frames.take(self._left, axis=1), across.take(self._others, axis=1))
@@ -190,6 +162,22 @@ class FrameIntegration:
             turns[k + 1] = self._laplacian.solve(column) / 2
         turns /= np.sqrt((turns * turns).sum(axis=0))
         return quaternions.product(turns, frames)
+
+
+def _differences(size: int, tails: IntArray, heads: IntArray, weights: FloatArray) -> sparse.csr_array:
+    """(size, n) matrix that adds n weighted values to their heads and subtracts them from their tails."""
+    places = np.concatenate([tails, heads]), np.tile(np.arange(len(tails)), 2)
+    return sparse.csr_array((np.concatenate([-weights, weights]), places), shape=(size, len(tails)))
+
+
+def _laplacian(
+    size: int, tails: IntArray, heads: IntArray, weights: FloatArray, anchor: float, backend: Backend
+) -> Factorisation:
+    """Factorise the Laplacian of a weighted graph, with ``anchor`` added to its diagonal."""
+    pattern = SymmetricPattern(size, np.concatenate([tails, heads, tails]), np.concatenate([tails, heads, heads]))
+    entries = pattern.scatter(np.concatenate([weights, weights, -weights]))
+    entries[pattern.diagonal] += anchor
+    return analyse(pattern, backend).factorise(entries)
 
 
 def _spanning_forest(mesh: TriangleMesh) -> IntArray:
@@ -227,10 +215,6 @@ def _rounds(depths: IntArray, parents: IntArray) -> list[tuple[int, IntArray]]:
     Each round multiplies the product of every face by the product of its ancestor, which doubles the length of the path
     ("pointer jumping", Wyllie 1979). A round is the first face that takes part, and the ancestors of this face and all
     later faces.
-
-    Args:
-        depths: (F,) depths of the faces, increasing.
-        parents: (F,) parents of the faces in the same order; a root is its own parent.
     """
     rounds, ancestors, reach = [], parents, 1
     while reach <= depths[-1]:

@@ -26,41 +26,23 @@ GOOD_MISFIT = 0.05
 
 @dataclass(frozen=True)
 class FactorReuse:
-    """When a Cholesky factor is used again, and its precision.
+    """When a Cholesky factor is used again, and its precision."""
 
-    Attributes:
-        steps: largest number of steps with one factor; these steps together cost about as much as a new factor.
-        reach: distance from the shape of the factor within which it is used, as a fraction of the diagonal.
-        tolerance: factor on the tolerance of the last step with a reused factor. Along the directions in which the
-            energy changes little, the remaining error is longer than the step.
-        diagonal_shift: relative increase of the diagonal in single precision, a few times its rounding error, so that
-            the matrix stays positive definite.
-    """
-
-    steps: int = 16
-    reach: float = 1e-2
-    tolerance: float = 0.25
-    diagonal_shift: float = 2e-7
+    steps: int = 16  # most steps with one factor; together they cost about as much as a new factor
+    reach: float = 1e-2  # a factor is used within this distance from its shape, as a fraction of the diagonal
+    tolerance: float = 0.25  # share of the tolerance for the last step with a reused factor: the error may be longer
+    diagonal_shift: float = 2e-7  # relative, a few rounding errors of single precision, so that a factor exists
 
 
 @dataclass(frozen=True)
 class Damping:
-    """Damping of steps where Gauss–Newton stalls, as a share of each diagonal entry (Marquardt 1963).
+    """Damping of steps where Gauss–Newton stalls, as a share of each diagonal entry (Marquardt 1963)."""
 
-    Attributes:
-        first: initial value.
-        factor: increase after a failed step, and decrease after a successful one.
-        largest: the iteration stalls beyond this value.
-        at_minimum: largest value at which a step within the tolerance counts as convergence; more damping would shorten
-            every step.
-        least_area: smallest share of its area that a step may leave to a face.
-    """
-
-    first: float = 1e-6
-    factor: float = 10
-    largest: float = 1e3
-    at_minimum: float = 1e-4
-    least_area: float = 0.1
+    first: float = 1e-6  # initial value
+    factor: float = 10  # increase after a failed step, and decrease after a successful one
+    largest: float = 1e3  # the iteration stalls beyond this value
+    at_minimum: float = 1e-4  # largest value at which a short step means convergence; more would shorten every step
+    least_area: float = 0.1  # smallest share of its area that a step may leave to a face
 
 
 REUSE, DAMPING = FactorReuse(), Damping()
@@ -68,19 +50,12 @@ REUSE, DAMPING = FactorReuse(), Damping()
 
 @dataclass(frozen=True)
 class IterationLimits:
-    """When to stop. Lengths are in the unit of the mesh.
+    """When to stop. Lengths are in the unit of the mesh."""
 
-    Attributes:
-        step: the iteration has converged once no vertex moves further.
-        reach: a factor is replaced once a vertex has moved further.
-        iterations: largest number of iterations, for both kinds together.
-        deadline: no iteration begins after it.
-    """
-
-    step: float
-    reach: float
-    iterations: int
-    deadline: Deadline | None
+    step: float  # the iteration has converged once no vertex moves further
+    reach: float  # a factor is replaced once a vertex has moved further
+    iterations: int  # largest number of iterations, for both kinds together
+    deadline: Deadline | None  # no iteration begins after it
 
     def reached(self, iterations: int) -> Status | None:
         """Return the limit that is reached after a number of iterations, or None."""
@@ -107,11 +82,6 @@ class GaussNewton:
 
     **Damping.** If even a short step with a new factor doesn't lower the misfit, a face has nearly collapsed, and
     angles change too fast for a linearisation. Then Levenberg and Marquardt's damped steps continue. See Damping.
-
-    Args:
-        squares: objective.
-        faces: (F, 3).
-        backend: Cholesky backend.
     """
 
     def __init__(self, squares: LeastSquares, faces: IntArray, backend: Backend) -> None:

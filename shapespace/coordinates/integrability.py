@@ -45,18 +45,16 @@ class Integrability:
     def __init__(self, connectivity: Connectivity) -> None:
         self.connectivity = connectivity
         faces, f_count = connectivity.faces, len(connectivity.faces)
-        # Corner c = 3 f + k. A walk around its vertex leaves face f across the side opposite to corner k +
-        # 1.
-        k = np.tile(np.arange(3), f_count)
-        f = np.repeat(np.arange(f_count), 3)
+        # Corner c = 3 f + k. A walk around its vertex leaves face f across the side opposite to corner k + 1.
+        f, k = np.divmod(np.arange(3 * f_count), 3)
         self._exit: IntArray = connectivity.face_edges[f, (k + 1) % 3]
         other = connectivity.edge_faces[self._exit].sum(axis=1) - f
         entry = np.argmax(faces[other] == faces.ravel()[:, None], axis=1)
         following = np.where(connectivity.interior[self._exit], 3 * other + entry, -1)
 
-        boundary = np.unique(connectivity.edges[~connectivity.interior])
+        boundary = connectivity.edges[~connectivity.interior]
+        #: The interior vertices.
         self.vertices: IntArray = np.setdiff1d(np.arange(connectivity.vertex_count), boundary)
-        """The interior vertices."""
         first = np.zeros(connectivity.vertex_count, dtype=np.int64)
         first[faces.ravel()] = np.arange(3 * f_count)
         corners = [first[self.vertices]]
@@ -100,23 +98,18 @@ class Integrability:
         scalar, vector = before[0], before[1:]
 
         rows, columns, values = [], [], []
-
-        def add(row: IntArray, column: IntArray, value: FloatArray) -> None:
-            for i in range(3):
-                rows.append(3 * row + i)
-                columns.append(column)
-                values.append(value[i])
-
         vertex = np.arange(n)
         for corners, axis_pair in zip(self._vertex_corners, axes, strict=True):
             there = corners >= 0
             c = corners[there]
             # d(product) = (axis/2) · product: half of w a + a × p in the vector part.
             by_gamma, by_theta = (0.5 * (scalar * a + np.cross(a, vector, axis=0))[:, there] for a in axis_pair)
-            add(vertex[there], e + self._exit[c], by_theta)
-            for side in range(3):
-                edge = self.connectivity.face_edges[c // 3, side]
-                add(vertex[there], edge, by_gamma * by_length[c, side])
+            by = [(e + self._exit[c], by_theta)]
+            by += [(self.connectivity.face_edges[c // 3, side], by_gamma * by_length[c, side]) for side in range(3)]
+            for column, value in by:
+                rows += [3 * vertex[there] + i for i in range(3)]
+                columns += [column] * 3
+                values += [*value]
         matrix = sparse.csr_array(
             (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))), shape=(3 * n, 2 * e)
         )
@@ -157,13 +150,10 @@ class Integrability:
 
     def _turns(self, gamma: FloatArray, theta: FloatArray) -> list[tuple[FloatArray, FloatArray]]:
         """Quaternions of every corner and edge around the vertices; identities where there is no corner."""
-        turns = []
-        for corners in self._vertex_corners:
-            there = corners >= 0
-            turn_z = np.where(there, gamma[corners], 0.0)
-            turn_x = np.where(there, -theta[self._exit[corners]], 0.0)
-            turns.append((quaternions.turn(turn_z, 2), quaternions.turn(turn_x, 0)))
-        return turns
+        there = self._vertex_corners >= 0
+        turn_z = np.where(there, gamma[self._vertex_corners], 0.0)
+        turn_x = np.where(there, -theta[self._exit[self._vertex_corners]], 0.0)
+        return [(quaternions.turn(z, 2), quaternions.turn(x, 0)) for z, x in zip(turn_z, turn_x, strict=True)]
 
     def _along(
         self, moves: list[_Move], gamma: FloatArray, z: FloatArray
@@ -258,7 +248,6 @@ def _generators(connectivity: Connectivity) -> list[list[int]]:
 
 
 def _ascent(parent: dict[int, tuple[int, int]], face: int) -> list[int]:
-    """List face, edge, face, … from a face up to the root of the tree."""
     out = [face]
     while parent[face][0] >= 0:
         face, edge = parent[face]

@@ -14,13 +14,7 @@ from shapespace.mesh.triangle_mesh import Connectivity
 
 
 class LeastSquares:
-    """The misfit between shapes of one connectivity and a target.
-
-    Args:
-        connectivity: connectivity of the shapes.
-        norm: norm of the misfit.
-        matrix: pattern of the normal matrix.
-    """
+    """The misfit between shapes of one connectivity and a target."""
 
     def __init__(self, connectivity: Connectivity, norm: WeightedNorm, matrix: NormalMatrix) -> None:
         self.connectivity, self.norm, self.matrix = connectivity, norm, matrix
@@ -40,21 +34,13 @@ class LeastSquares:
 
 @dataclass(frozen=True)
 class LeastSquaresPoint:
-    """A shape and its misfit.
+    """A shape and its misfit."""
 
-    Attributes:
-        vertices: (V, 3).
-        misfit: (2E,) ``z(X) − z*``, angles modulo 2π.
-        energy: squared norm of the misfit.
-        squares: the objective.
-        geometry: edge vectors and normals of the shape.
-    """
-
-    vertices: FloatArray
-    misfit: FloatArray
-    energy: float
-    squares: LeastSquares
-    geometry: HingeGeometry
+    vertices: FloatArray  # (V, 3)
+    misfit: FloatArray  # (2E,) ``z(X) − z*``, angles modulo 2π
+    energy: float  # squared norm of the misfit
+    squares: LeastSquares  # the objective
+    geometry: HingeGeometry  # edge vectors and normals of the shape
 
     @cached_property
     def gradients(self) -> NRICGradients:

@@ -15,15 +15,10 @@ from shapespace.solve.cholesky import SymmetricPattern
 
 @dataclass(frozen=True)
 class QuadraticForm:
-    """A quadratic form H on lengths and angles that couples only the three lengths of each face.
+    """A quadratic form H on lengths and angles that couples only the three lengths of each face."""
 
-    Attributes:
-        faces: (…, 3, 3, F) symmetric blocks on the lengths of the three sides of each face.
-        angles: (…, E) diagonal on the angles, 0 on the boundary.
-    """
-
-    faces: FloatArray
-    angles: FloatArray
+    faces: FloatArray  # (…, 3, 3, F) symmetric blocks on the lengths of the three sides of each face
+    angles: FloatArray  # (…, E) diagonal on the angles, 0 on the boundary
 
 
 def _upper(size: int) -> int:

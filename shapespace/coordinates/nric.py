@@ -18,13 +18,9 @@ from shapespace.mesh.vectors import components, cross, dot
 
 
 class HingeGeometry:
-    """Edge vectors, and the vectors and normals at every hinge, all by components (3, …).
+    """Edge vectors of shapes (…, V, 3), and the vectors and normals at every hinge, all by components (3, …).
 
     Lengths, angles and their derivatives share them, and they are most of the work.
-
-    Args:
-        vertices: shapes (…, V, 3).
-        connectivity: connectivity of the shapes.
     """
 
     def __init__(self, vertices: FloatArray, connectivity: Connectivity) -> None:
@@ -187,15 +183,10 @@ class WeightedNorm:
 
 @dataclass(frozen=True)
 class NRICGradients:
-    """The entries of ``Dz(X)``, by components.
+    """The entries of ``Dz(X)``, by components."""
 
-    Attributes:
-        lengths: (3, E) derivative of each length by its head; the derivative by its tail is the negative.
-        angles: (4, 3, H) derivative of each interior angle by the tail, head, left and right opposite vertex.
-    """
-
-    lengths: FloatArray
-    angles: FloatArray
+    lengths: FloatArray  # (3, E) derivative of each length by its head; the derivative by its tail is the negative
+    angles: FloatArray  # (4, 3, H) derivative of each interior angle by the tail, head, left and right opposite vertex
 
 
 @dataclass(frozen=True)
@@ -203,8 +194,7 @@ class NRICSecondDerivatives:
     """The entries of ``D²z(X)``, by components.
 
     Attributes:
-        lengths: (3, 3, E) second derivative of each length by its head, which is also the one by its tail and the
-            negative of the mixed one.
+        lengths: (3, 3, E) second derivative of each length by its head, and by its tail; the mixed one is the negative.
         angles: (4, 4, 3, 3, H) second derivatives of each interior angle by the tail, head, left and right vertex.
     """
 
@@ -246,7 +236,7 @@ class NRICJacobian:
         self._vertices = np.concatenate([connectivity.edges.T.ravel(), connectivity.hinges.T.ravel()])
 
     def __call__(self, vertices: FloatArray) -> sparse.csr_array:
-        """Compute the Jacobian at a shape (V, 3)."""
+        """Compute the matrix at a shape (V, 3)."""
         return self.matrix(self.gradients(vertices))
 
     def matrix(self, gradients: NRICGradients) -> sparse.csr_array:

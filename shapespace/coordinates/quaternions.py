@@ -9,9 +9,7 @@ from shapespace.arrays import FloatArray
 
 def identity(n: int) -> FloatArray:
     """Return n identities (4, n)."""
-    out = np.zeros((4, n))
-    out[0] = 1
-    return out
+    return turn(np.zeros(n), 0)
 
 
 def turn(angle: FloatArray, axis: int) -> FloatArray:

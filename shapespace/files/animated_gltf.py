@@ -1,9 +1,10 @@
-"""Animations as GLB: morph targets, and curves of their weights."""
+"""GLB files with morph targets: animations with curves of their weights, and blend shapes."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -72,7 +73,8 @@ def animated_glb(
     if len(frames) <= DENSE_FRAMES:
         weights = fit = np.eye(len(frames) - 1)
     else:
-        weights = _basis_weights(frames, BASIS_TOLERANCE * _diagonal(frames))
+        corners = np.stack([frames.min(axis=(0, 1)), frames.max(axis=(0, 1))]).astype(np.float64)
+        weights = _basis_weights(frames, BASIS_TOLERANCE * float(diagonal(corners)))
         fit = np.asarray(np.linalg.pinv(weights), np.float64)
         # Blender, at least up to 5.0, clips weights below 0. So a vector with both signs becomes two targets.
         both = (weights < 0).any(axis=0)
@@ -87,24 +89,14 @@ def animated_glb(
         shown = np.tensordot(keys[1:].astype(np.float64), targets[:, block], 1)
         error = max(error, float(np.linalg.norm(shown - displacements, axis=-1).max(initial=0)))
     first = colourings[0] if colourings else None
-    document = GltfBuilder(rest, faces, "animation", first, surface)
+    document = GltfBuilder(rest, faces, first, surface, name="animation")
     normal_targets = _normal_targets(frames, document.normals, fit)
     if len(targets):
         document.add_targets(targets, normal_targets, colors=_colour_targets(colourings, fit) if first else None)
-        times = np.arange(len(frames)) / fps
-        document.tree["animations"] = [
-            {
-                "name": "animation",
-                "samplers": [
-                    {
-                        "input": document.add(times, bounds=True),
-                        "output": document.add(keys.ravel()),
-                        "interpolation": "LINEAR",
-                    }
-                ],
-                "channels": [{"sampler": 0, "target": {"node": k, "path": "weights"}} for k in range(document.nodes)],
-            }
-        ]
+        times = document.add(np.arange(len(frames)) / fps, bounds=True)
+        sampler = {"input": times, "output": document.add(keys.ravel()), "interpolation": "LINEAR"}
+        channels = [{"sampler": 0, "target": {"node": k, "path": "weights"}} for k in range(document.nodes)]
+        document.tree["animations"] = [{"name": "animation", "samplers": [sampler], "channels": channels}]
     document.tree["asset"]["extras"] = {
         "frames": len(frames),
         "targets": len(targets),
@@ -123,7 +115,7 @@ def _blocks(frames: NDArray[np.floating]) -> Iterator[slice]:
 def _normal_targets(
     frames: NDArray[np.floating], normals_of: Callable[[FloatArray], FloatArray], fit: FloatArray
 ) -> NDArray[np.float32]:
-    """Return the change of normals (K, V', 3) by each target; ``fit`` (K, n − 1) maps frames to targets."""
+    """Return the changes of normals (K, V', 3) by the targets; ``fit`` (K, n − 1) maps frames to targets."""
     rest = normals_of(frames[0].astype(np.float64))
     targets = np.zeros((len(fit), *rest.shape), np.float32)
     for start in range(1, len(frames), _FRAMES_AT_ONCE):
@@ -172,6 +164,28 @@ def _basis_weights(frames: NDArray[np.floating], tolerance: float) -> FloatArray
     return weights / weights[np.abs(weights).argmax(axis=0), np.arange(kept)]
 
 
-def _diagonal(frames: NDArray[np.floating]) -> float:
-    corners = np.stack([frames.min(axis=(0, 1)), frames.max(axis=(0, 1))]).astype(np.float64)
-    return float(diagonal(corners))
+def blend_shapes_glb(
+    rest: FloatArray,
+    ends: FloatArray,
+    names: Sequence[str],
+    faces: IntArray,
+    surface: MeshAttributes | None = None,
+    extras: Mapping[str, Any] | None = None,
+) -> bytes:
+    """Encode a rest shape, and shapes that a weight of 1 of their morph target leads to.
+
+    Args:
+        rest: (V, 3) rest shape, in any unit.
+        ends: (n, V, 3) shapes of the morph targets.
+        names: names of the morph targets. They go into ``extras.targetNames`` of the mesh, where Blender and three.js
+            look for them.
+        faces: (F, 3).
+        surface: polygons, texture coordinates and materials of the mesh, if any.
+        extras: ``extras`` of the file's ``asset``.
+    """
+    document = GltfBuilder(rest, faces, surface=surface, joined=True)
+    normals = document.normals(rest)
+    document.add_targets((end - rest for end in ends), (document.normals(end) - normals for end in ends), names)
+    if extras:
+        document.tree["asset"]["extras"] = dict(extras)
+    return document.glb()

@@ -31,13 +31,10 @@ class _Sink(io.RawIOBase):
 
 
 def zip_pieces(members: Iterable[tuple[str, Iterable[Buffer]]]) -> Iterator[bytes]:
-    """Yield a ZIP archive piece by piece.
+    """Yield a ZIP archive of files, each a name and the parts of its content, piece by piece.
 
     Equal members give equal bytes, whatever the date. Sizes follow the members and are in the directory. They do not
     precede the members, so a reader has to use the directory.
-
-    Args:
-        members: name and content of each file; a content consists of parts.
     """
     sink = _Sink()
     with zipfile.ZipFile(sink, "w", zipfile.ZIP_DEFLATED, compresslevel=LEVEL) as archive:

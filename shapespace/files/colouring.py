@@ -82,11 +82,7 @@ class Colouring:
 
     @classmethod
     def of_frames(
-        cls,
-        quantity: Quantity,
-        frames: NDArray[np.floating],
-        against: FloatArray,
-        connectivity: Connectivity,
+        cls, quantity: Quantity, frames: NDArray[np.floating], against: FloatArray, connectivity: Connectivity
     ) -> list[Colouring]:
         """Compare each of the shapes (n, V, 3) as `between` does; all have the largest of their legends."""
         found = [cls.between(quantity, frame.astype(np.float64), against, connectivity) for frame in frames]
@@ -116,11 +112,6 @@ class Colouring:
     def linear(self) -> FloatArray:
         """(V, 3) colours as linear light, as glTF requires."""
         return linear(self.srgb)
-
-    @property
-    def srgb_bytes(self) -> NDArray[np.uint8]:
-        """(V, 3) colours in sRGB as bytes."""
-        return np.rint(255 * self.srgb).astype(np.uint8)
 
     @property
     def legend(self) -> dict[str, object]:

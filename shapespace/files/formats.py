@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Protocol
 
 import numpy as np
 
@@ -18,47 +18,32 @@ from shapespace.files.reading import OCTET_STREAM, READ_FORMATS
 from shapespace.files.usd import still_usd
 from shapespace.mesh.attributes import MeshAttributes
 
+#: A function that writes one mesh, see `MeshFormat.encode`.
+MeshWriter = Callable[[FloatArray, IntArray, Colouring | None, MeshAttributes | None], bytes]
 
-class MeshWriter(Protocol):
-    """A function that writes one mesh."""
 
-    def __call__(
+@dataclass(frozen=True)
+class MeshFormat:
+    """A file format for one mesh."""
+
+    media_type: str  # media type as registered at IANA; OCTET_STREAM for formats without a registration
+    write: MeshWriter  # writer of the format
+    coloured: bool = True  # whether files can have colours; otherwise they are left out
+    polygons: bool = False  # whether files can have polygons; otherwise faces are written as triangles
+
+    def encode(
         self,
         vertices: FloatArray,
         faces: IntArray,
         colouring: Colouring | None = None,
         surface: MeshAttributes | None = None,
-        /,
     ) -> bytes:
-        """Return a mesh as the content of a file; positions are float32.
-
-        Args:
-            vertices: (V, 3) positions in any unit.
-            faces: (F, 3).
-            colouring: colours of the vertices, if any.
-            surface: polygons, texture coordinates and materials, if any.
-        """
-
-
-@dataclass(frozen=True)
-class MeshFormat:
-    """A file format for one mesh.
-
-    Attributes:
-        media_type: media type as registered at IANA; OCTET_STREAM for formats without a registration.
-        encode: writer of the format.
-        coloured: whether files can have colours; otherwise ``encode`` leaves them out.
-        polygons: whether files can have polygons; otherwise faces are written as triangles.
-    """
-
-    media_type: str
-    encode: MeshWriter
-    coloured: bool = True
-    polygons: bool = False
+        """Return a mesh as the content of a file; positions (V, 3) in any unit become float32."""
+        return self.write(vertices, faces, colouring, surface)
 
 
 def _write_stl(
-    vertices: FloatArray, faces: IntArray, colouring: Colouring | None = None, surface: MeshAttributes | None = None
+    vertices: FloatArray, faces: IntArray, colouring: Colouring | None, surface: MeshAttributes | None
 ) -> bytes:
     import trimesh
 
@@ -67,7 +52,7 @@ def _write_stl(
 
 
 def _write_npz(
-    vertices: FloatArray, faces: IntArray, colouring: Colouring | None = None, surface: MeshAttributes | None = None
+    vertices: FloatArray, faces: IntArray, colouring: Colouring | None, surface: MeshAttributes | None
 ) -> bytes:
     arrays: dict[str, np.ndarray] = {"vertices": vertices.astype(np.float32), "faces": faces.astype(np.int32)}
     if colouring:

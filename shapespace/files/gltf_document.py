@@ -37,13 +37,7 @@ _DATA_URI = re.compile(rb'"(data:[^"\\]*+)"')
 
 
 def read_document(data: memoryview, *, binary: bool, beside: Path | None) -> tuple[GltfDocument, Buffers]:
-    """Return the JSON of a file and its buffers.
-
-    Args:
-        data: content of the file.
-        binary: whether it is GLB.
-        beside: path of the file, if buffers in files beside it may be read.
-    """
+    """Return the JSON of a file and its buffers, see `gltf_reading.open_scene`."""
     text, chunk = _chunks(data) if binary else (data, None)
     tree, uris = _parse(text)
     document = GltfDocument(tree)
@@ -209,35 +203,19 @@ def _numbers(value: object, length: int) -> FloatArray:
 
 @dataclass(frozen=True)
 class Accessor:
-    """Location and type of an array of elements (3.6.2).
+    """Location and type of an array of elements (3.6.2)."""
 
-    Attributes:
-        buffer: index of the buffer.
-        start: offset of the first byte in the buffer.
-        stride: bytes from one element to the next.
-        count: number of elements.
-        dtype: type of the components.
-        width: number of components in an element.
-        normalized: whether integers stand for numbers between 0 or −1 and 1.
-    """
-
-    buffer: int
-    start: int
-    stride: int
-    count: int
-    dtype: np.dtype
-    width: int
-    normalized: bool
+    buffer: int  # index of the buffer
+    start: int  # offset of the first byte in the buffer
+    stride: int  # bytes from one element to the next
+    count: int  # number of elements
+    dtype: np.dtype  # type of the components
+    width: int  # number of components in an element
+    normalized: bool  # whether integers stand for numbers between 0 or −1 and 1
 
     @classmethod
     def of(cls, document: GltfDocument, index: object, kind: str, components: tuple[int, ...]) -> Accessor:
-        """Return an accessor of a document.
-
-        Args:
-            document: document of the file.
-            index: index of the accessor.
-            kind: type that its elements must have.
-            components: component types that it may have.
+        """Return an accessor of a document that has this element type, and one of these component types.
 
         Raises:
             MeshError: the accessor is sparse or has no data.
@@ -285,12 +263,6 @@ class Buffers:
     """Buffers of a document: in the data of a GLB file, in the JSON, or in files beside it (3.6.1).
 
     `read` opens files and decodes base64 only for the bytes that it returns.
-
-    Args:
-        entries: entries of the document's ``buffers``.
-        chunk: data of a GLB file.
-        uris: data URIs of the JSON, see `_parse`.
-        beside: path of the file, if buffers in files beside it may be read.
     """
 
     def __init__(

@@ -63,11 +63,6 @@ class Scene:
     The *listed* vertices are the vertices of the primitives in `read`, one primitive after the other. `vertices` has
     each listed vertex once.
 
-    Args:
-        document: document of the file.
-        buffers: its buffers.
-        limits: largest numbers of vertices and faces.
-
     Attributes:
         parts: the primitives, each at one of its places.
         read: primitives with vertices of their own. The other primitives use the vertices of one of these.
@@ -112,25 +107,15 @@ class Scene:
 
 @dataclass(frozen=True)
 class PlacedPrimitive:
-    """A primitive at one of its places (3.7.2).
+    """A primitive at one of its places (3.7.2)."""
 
-    Attributes:
-        positions: accessor of the vertices.
-        indices: accessor of the corners; None if each vertex is one corner, in order.
-        numbers: accessor of the attribute _VERTEX, if any.
-        mode: how the corners form triangles.
-        place: matrix (4, 4) of the place; None for the identity.
-        primitive: entry of the primitive in the file.
-        mesh: entry of its mesh.
-    """
-
-    positions: Accessor
-    indices: Accessor | None
-    numbers: Accessor | None
-    mode: int
-    place: FloatArray | None
-    primitive: dict[str, Any]
-    mesh: dict[str, Any]
+    positions: Accessor  # accessor of the vertices
+    indices: Accessor | None  # accessor of the corners; None if each vertex is one corner, in order
+    numbers: Accessor | None  # accessor of the attribute _VERTEX, if any
+    mode: int  # how the corners form triangles
+    place: FloatArray | None  # matrix (4, 4) of the place; None for the identity
+    primitive: dict[str, Any]  # entry of the primitive in the file
+    mesh: dict[str, Any]  # entry of its mesh
 
     @property
     def corners(self) -> int:

@@ -33,15 +33,12 @@ MATERIAL = {
     },
 }
 #: Material of meshes with vertex colours, which viewers multiply with the colour of the material.
-WHITE = MATERIAL | {
-    "name": "coloured",
-    "pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 0.75},
-}
+WHITE = MATERIAL | {"name": "coloured", "pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 0.75}}
 
 
 def surface_normals(vertices: FloatArray, surface: MeshAttributes) -> FloatArray:
     """Return unit normals (N, 3) of a shape (V, 3), in the order of `MeshAttributes.normal_corners`."""
-    corners = None if surface.shading is None else surface.normal_faces
+    corners = None if surface.shading is None else surface.normal_corners[surface.triangle_corners]
     return _filled(vertex_normals(vertices, surface.triangles, corners))
 
 
@@ -81,9 +78,8 @@ def _triangle_groups(surface: MeshAttributes, *, objects: bool, materials: bool)
     count = len(surface.triangle_polygons)
     of_objects = surface.objects.of if objects and surface.objects else None
     of_materials = surface.material_of if materials else None
-    columns = [
-        np.full(count, NONE) if of is None else of[surface.triangle_polygons] for of in (of_objects, of_materials)
-    ]
+    nothing, of_polygon = np.full(count, NONE), surface.triangle_polygons
+    columns = [nothing if of is None else of[of_polygon] for of in (of_objects, of_materials)]
     # Sorting one number for each pair is much faster than sorting pairs.
     width = int(columns[1].max()) + 2
     pairs, of = np.unique(columns[0] * width + columns[1], return_inverse=True)
@@ -115,10 +111,10 @@ class GltfBuilder:
         self,
         vertices: FloatArray,
         faces: IntArray,
-        name: str = "shape",
         colouring: Colouring | None = None,
         surface: MeshAttributes | None = None,
         *,
+        name: str = "shape",
         joined: bool = False,
     ) -> None:
         self._chunks: list[bytes] = []
@@ -170,7 +166,8 @@ class GltfBuilder:
         self._primitives: dict[int, list[dict[str, int]]] = {}
         for piece in pieces:
             some = triangles if len(pieces) == 1 else triangles[piece.triangles]
-            primitive = {"indices": self._indices(some), "material": used.index(piece.material)}
+            indices = self.add(some.ravel(), target=ELEMENT_ARRAY_BUFFER)
+            primitive = {"indices": indices, "material": used.index(piece.material)}
             self._primitives.setdefault(piece.object, []).append(primitive)
         given = surface and surface.objects
         first = given.names[0] if given else name
@@ -185,17 +182,14 @@ class GltfBuilder:
             return _filled(vertex_normals(vertices, self._faces))
         return surface_normals(vertices, self._surface)[self._surface.split.normal]
 
-    def _indices(self, faces: IntArray) -> int:
-        return self.add(faces.ravel(), target=ELEMENT_ARRAY_BUFFER)
-
     def _pictures(self, surface: MeshAttributes, names: set[str | None]) -> dict[str | None, int]:
         """Add the textures; return their indices by name."""
         found = sorted(name for name in names if name is not None)
         if found:
+            data = [surface.textures[name] for name in found]
             self.tree["images"] = [
-                {"name": name, "mimeType": picture_type(surface.textures[name]), "bufferView": self._view(data)}
-                for name in found
-                for data in [surface.textures[name]]
+                {"name": name, "mimeType": picture_type(picture), "bufferView": self._view(picture)}
+                for name, picture in zip(found, data, strict=True)
             ]
             self.tree["textures"] = [{"source": k} for k in range(len(found))]
         return {name: k for k, name in enumerate(found)}
@@ -225,9 +219,7 @@ class GltfBuilder:
             # From float32 values, because rounding could put a position outside the bounds. Contiguous components are
             # twenty times as fast as rows of three.
             components = np.ascontiguousarray(data.reshape(len(data), -1).T)
-            accessor["min"], accessor["max"] = (
-                extreme(components, axis=1).astype(float).tolist() for extreme in (np.min, np.max)
-            )
+            accessor["min"], accessor["max"] = (e(components, axis=1).astype(float).tolist() for e in (np.min, np.max))
         self.accessors.append(accessor)
         return len(self.accessors) - 1
 
@@ -272,16 +264,8 @@ class GltfBuilder:
         binary = b"".join(self._chunks)
         text = self._json({"byteLength": len(binary)})
         text += b" " * (-len(text) % 4)
-        header = struct.pack("<4sII", b"glTF", 2, 12 + 8 + len(text) + 8 + len(binary))
-        return b"".join(
-            [
-                header,
-                struct.pack("<I4s", len(text), b"JSON"),
-                text,
-                struct.pack("<I4s", len(binary), b"BIN\0"),
-                binary,
-            ]
-        )
+        header = struct.pack("<4sIII4s", b"glTF", 2, 12 + 8 + len(text) + 8 + len(binary), len(text), b"JSON")
+        return b"".join([header, text, struct.pack("<I4s", len(binary), b"BIN\0"), binary])
 
     def gltf(self) -> bytes:
         """Return the document as JSON, with the buffer as a data URI."""
@@ -293,12 +277,12 @@ class GltfBuilder:
 def write_glb(
     vertices: FloatArray, faces: IntArray, colouring: Colouring | None = None, surface: MeshAttributes | None = None
 ) -> bytes:
-    """Write one mesh as GLB; see `formats.MeshWriter`."""
-    return GltfBuilder(vertices, faces, colouring=colouring, surface=surface).glb()
+    """Write one mesh as GLB; see `MeshFormat.encode`."""
+    return GltfBuilder(vertices, faces, colouring, surface).glb()
 
 
 def write_gltf(
     vertices: FloatArray, faces: IntArray, colouring: Colouring | None = None, surface: MeshAttributes | None = None
 ) -> bytes:
-    """Write one mesh as glTF with its buffer inside; see `formats.MeshWriter`."""
-    return GltfBuilder(vertices, faces, colouring=colouring, surface=surface).gltf()
+    """Write one mesh as glTF with its buffer inside; see `MeshFormat.encode`."""
+    return GltfBuilder(vertices, faces, colouring, surface).gltf()

@@ -10,15 +10,10 @@ from shapespace.mesh.triangle_mesh import MeshError
 
 @dataclass(frozen=True)
 class Limits:
-    """Largest size of a mesh; by default there is no limit.
+    """Largest size of a mesh; by default there is no limit."""
 
-    Attributes:
-        vertices: largest number of vertices.
-        faces: largest number of triangles.
-    """
-
-    vertices: int = sys.maxsize
-    faces: int = sys.maxsize
+    vertices: int = sys.maxsize  # largest number of vertices
+    faces: int = sys.maxsize  # largest number of triangles
 
     def check(self, vertices: int, faces: int) -> None:
         """Raise MeshError if a mesh has more vertices or faces."""

@@ -28,32 +28,20 @@ _BYTE_ORDERS = {b"binary_little_endian": "<", b"binary_big_endian": ">", b"ascii
 
 @dataclass(frozen=True)
 class PlyProperty:
-    """A property of the rows of an element.
+    """A property of the rows of an element."""
 
-    Attributes:
-        name: name of the property.
-        type: type of the value, or of the entries of a list.
-        length: type of the number of entries of a list; None if the property is no list.
-    """
-
-    name: str
-    type: np.dtype
-    length: np.dtype | None
+    name: str  # name of the property
+    type: np.dtype  # type of the value, or of the entries of a list
+    length: np.dtype | None  # type of the number of entries of a list; None if the property is no list
 
 
 @dataclass(frozen=True)
 class PlyElement:
-    """An element of a PLY file, which is a table.
+    """An element of a PLY file, which is a table."""
 
-    Attributes:
-        name: name of the element.
-        rows: number of rows.
-        properties: columns, in order.
-    """
-
-    name: str
-    rows: int
-    properties: list[PlyProperty]
+    name: str  # name of the element
+    rows: int  # number of rows
+    properties: list[PlyProperty]  # columns, in order
 
     @cached_property
     def lists(self) -> list[int]:
@@ -146,13 +134,9 @@ def _property(name: bytes, kind: bytes, length: bytes | None, order: str | None)
 
 
 class TextTable:
-    """Rows of an ASCII file, one on each line.
+    """Rows of an ASCII file, one on each line, after its header.
 
     Elements have to be read or skipped in their order in the file.
-
-    Args:
-        data: content after the header.
-        limits: largest number of triangles.
     """
 
     def __init__(self, data: memoryview, limits: Limits) -> None:

@@ -33,12 +33,7 @@ _LINE, _OBJ_LINE, _STL_LINE = map(_lines_with, (rb"[^\s#]", rb"[vf]\b", rb"(?i:v
 
 
 class Lines:
-    """The lines of a text that are neither empty nor a remark; where one can't be understood, the error names it.
-
-    Args:
-        line: a pattern of the lines that count, each its first group.
-
-    """
+    """The lines of a text that are neither empty nor a remark; where one can't be understood, the error names it."""
 
     def __init__(self, data: memoryview, line: re.Pattern[bytes] = _LINE) -> None:
         self._data, self._place = data, 0
@@ -80,11 +75,7 @@ class Lines:
 
 
 class TriangleFans:
-    """Triangles from polygons: the triangles of a polygon have its first corner in common.
-
-    Args:
-        limits: largest number of triangles.
-    """
+    """Triangles from polygons: the triangles of a polygon have its first corner in common."""
 
     def __init__(self, limits: Limits) -> None:
         self._limits, self._corners = limits, array("q")

@@ -44,31 +44,19 @@ class SurfaceMaterial:
 
 
 class Labels(NamedTuple):
-    """A name for each polygon, or none.
+    """A name for each polygon, or none."""
 
-    Attributes:
-        names: distinct names.
-        of: (P,) index of the name of each polygon, NONE for none.
-    """
-
-    names: tuple[str, ...]
-    of: IntArray
+    names: tuple[str, ...]  # distinct names
+    of: IntArray  # (P,) index of the name of each polygon, NONE for none
 
 
 class SplitVertices(NamedTuple):
-    """Split vertices, for formats where each vertex has one texture coordinate and one normal.
+    """Split vertices, for formats where each vertex has one texture coordinate and one normal."""
 
-    Attributes:
-        vertex: (V',) index of the original vertex, increasing.
-        uv: (V', 2) texture coordinates, zeros where there is none.
-        normal: (V',) index of the normal, see `MeshAttributes.normal_faces`.
-        faces: (F, 3) triangles of split vertices.
-    """
-
-    vertex: IntArray
-    uv: FloatArray | None
-    normal: IntArray
-    faces: IntArray
+    vertex: IntArray  # (V',) index of the original vertex, increasing
+    uv: FloatArray | None  # (V', 2) texture coordinates, zeros where there is none
+    normal: IntArray  # (V',) index of the normal, see `MeshAttributes.normal_corners`
+    faces: IntArray  # (F, 3) triangles of split vertices
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -147,33 +135,14 @@ class MeshAttributes:
     @cached_property
     def triangulated(self) -> MeshAttributes:
         """The same attributes on triangles instead of polygons."""
-        corners, polygons = self.triangle_corners.ravel(), self.triangle_polygons
-
-        def taken(array: IntArray | None, chosen: IntArray) -> IntArray | None:
-            return None if array is None else array[chosen]
-
-        def labelled(labels: Labels | None) -> Labels | None:
-            return labels and Labels(labels.names, labels.of[polygons])
-
-        return replace(
-            self,
-            starts=np.arange(0, len(corners) + 1, 3),
-            corners=self.corners[corners],
-            uv_corners=taken(self.uv_corners, corners),
-            shading=taken(self.shading, corners),
-            objects=labelled(self.objects),
-            groups=labelled(self.groups),
-            material_of=taken(self.material_of, polygons),
-        )
+        polygons = self.triangle_polygons
+        labels = (given and Labels(given.names, given.of[polygons]) for given in (self.objects, self.groups))
+        return self._taken(np.full(len(polygons), 3), self.triangle_corners.ravel(), polygons, *labels)
 
     def only(self, polygons: NDArray[np.bool_]) -> MeshAttributes:
         """Keep some of the polygons, given by a mask (P,)."""
-        corners = np.repeat(polygons, self.sizes)
 
-        def taken(array: IntArray | None, chosen: NDArray[np.bool_]) -> IntArray | None:
-            return None if array is None else array[chosen]
-
-        def labelled(labels: Labels | None) -> Labels | None:
+        def used(labels: Labels | None) -> Labels | None:
             if labels is None:
                 return None
             there = np.unique(labels.of[polygons])
@@ -181,14 +150,25 @@ class MeshAttributes:
             of = np.where(labels.of[polygons] < 0, NONE, np.searchsorted(there, labels.of[polygons]))
             return Labels(tuple(labels.names[k] for k in there), of) if len(there) else None
 
+        corners = np.repeat(polygons, self.sizes)
+        return self._taken(self.sizes[polygons], corners, polygons, used(self.objects), used(self.groups))
+
+    def _taken(
+        self, sizes: IntArray, corners: NDArray, polygons: NDArray, objects: Labels | None, groups: Labels | None
+    ) -> MeshAttributes:
+        """Return polygons with these sizes, given which corners and polygons they are made of."""
+
+        def taken(array: IntArray | None, chosen: NDArray) -> IntArray | None:
+            return None if array is None else array[chosen]
+
         return replace(
             self,
-            starts=np.concatenate([[0], np.cumsum(self.sizes[polygons])]),
+            starts=np.concatenate([[0], np.cumsum(sizes)]),
             corners=self.corners[corners],
             uv_corners=taken(self.uv_corners, corners),
             shading=taken(self.shading, corners),
-            objects=labelled(self.objects),
-            groups=labelled(self.groups),
+            objects=objects,
+            groups=groups,
             material_of=taken(self.material_of, polygons),
         )
 
@@ -217,11 +197,6 @@ class MeshAttributes:
         return np.unique(keys, return_inverse=True)[1]
 
     @cached_property
-    def normal_faces(self) -> IntArray:
-        """(F, 3) index of the normal of each corner of the triangles."""
-        return self.normal_corners[self.triangle_corners]
-
-    @cached_property
     def split(self) -> SplitVertices:
         """The triangles on split vertices, which have one texture coordinate and one normal each."""
         # Sort by vertex, then texture coordinate, then normal. Sorting pairs as one number is much faster.
@@ -245,17 +220,17 @@ class MeshAttributes:
             raise MeshError(f"polygon {int((self.sizes < 3).argmax())} has fewer than three corners")
         if not np.array_equal(self.triangles, faces):
             raise MeshError("polygons are not those of the triangles")
-        for name, of, count in (
-            ("texture coordinate", self.uv_corners, 0 if self.uv is None else len(self.uv)),
-            ("shading label", self.shading, len(corners)),
-            ("object", *_bounds(self.objects)),
-            ("group", *_bounds(self.groups)),
-            ("material", self.material_of, len(self.materials)),
+        places, polygons = len(corners), len(self.sizes)
+        for name, of, length, count in (
+            ("texture coordinate", self.uv_corners, places, 0 if self.uv is None else len(self.uv)),
+            ("shading label", self.shading, places, places),
+            ("object", self.objects and self.objects.of, polygons, len(self.objects.names) if self.objects else 0),
+            ("group", self.groups and self.groups.of, polygons, len(self.groups.names) if self.groups else 0),
+            ("material", self.material_of, polygons, len(self.materials)),
         ):
-            per_corner = name in ("texture coordinate", "shading label")
             if of is None:
                 continue
-            if len(of) != (len(corners) if per_corner else len(self.sizes)):
+            if len(of) != length:
                 raise MeshError(f"there are {len(of)} numbers of a {name}, which is not one for each")
             if of.min() < NONE or of.max() >= count:
                 raise MeshError(f"a {name} is numbered {of.min()} to {of.max()}, but there are {count}")
@@ -272,10 +247,6 @@ class MeshAttributes:
         for material in self.materials:
             if material.texture is not None and material.texture not in self.textures:
                 raise MeshError(f"material {material.name} has no file {material.texture}")
-
-
-def _bounds(labels: Labels | None) -> tuple[IntArray | None, int]:
-    return (None, 0) if labels is None else (labels.of, len(labels.names))
 
 
 def labelled(names: Sequence[str | None]) -> Labels | None:

@@ -15,10 +15,6 @@ from shapespace.mesh.triangle_mesh import vertex_normals
 class VertexFaces:
     """The faces around each vertex of a connectivity, in rows of equal length.
 
-    Args:
-        faces: (F, 3).
-        count: V.
-
     Attributes:
         faces: (F, 3).
         around: (V, k) faces at each vertex; the first face is repeated where a vertex has fewer than k.
@@ -39,9 +35,8 @@ class Closest:
     """Closest points on a surface to n points.
 
     Attributes:
-        distances: (n,) distances between the points.
-        faces: (n,) faces that contain the closest points.
-        barycentric: (n, 3) barycentric coordinates in these faces.
+        distances: (n,).
+        faces, barycentric: (n,) faces that contain the closest points, and (n, 3) coordinates there.
         places: (n, 3) positions.
     """
 
@@ -52,12 +47,7 @@ class Closest:
 
 
 class MeshProximity:
-    """Closest points on a mesh. The search looks at the faces around the closest vertex only.
-
-    Args:
-        vertices: (V, 3), finite.
-        vertex_faces: faces around each vertex.
-    """
+    """Closest points on a mesh (V, 3). The search looks at the faces around the closest vertex only."""
 
     def __init__(self, vertices: FloatArray, vertex_faces: VertexFaces) -> None:
         self.vertices, self.vertex_faces = vertices, vertex_faces

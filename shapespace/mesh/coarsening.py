@@ -31,20 +31,13 @@ NEARLY_BEST = 0.9
 
 @dataclass(frozen=True)
 class Thinning:
-    """When and how far a large mesh is thinned before it is decimated: one collapse after the other takes too long.
+    """When and how far a large mesh is thinned before it is decimated: one collapse after the other takes too long."""
 
-    Attributes:
-        vertices, ratio: a mesh is thinned if it has more vertices than ``vertices`` and than ``ratio`` times the
-            target.
-        left, left_ratio: number of vertices afterwards, the larger of ``left`` and ``left_ratio`` times the target.
-        shapes: number of shapes, evenly spaced in the collection, that thinning takes into account.
-    """
-
-    vertices: int = 20_000
-    ratio: int = 20
-    left: int = 5000
-    left_ratio: int = 8
-    shapes: int = 4
+    vertices: int = 20_000  # a mesh is thinned if it has more vertices than this
+    ratio: int = 20  # and than this multiple of the target
+    left: int = 5000  # number of vertices afterwards
+    left_ratio: int = 8  # or this multiple of the target, if that is more
+    shapes: int = 4  # number of shapes, evenly spaced in the collection, that thinning takes into account
 
 
 THINNING = Thinning()
@@ -155,7 +148,6 @@ def _decimated(fine: TriangleMesh, target: int, wanted: int, shapes: FloatArray,
 
 
 def _result(decimation: Decimation, target: int) -> Coarsening:
-    """Summarise a decimation."""
     fine_index, local = np.unique(list(decimation.faces.values()), return_inverse=True)
     connectivity = Connectivity(local.reshape(-1, 3), len(fine_index))
     faces = connectivity.faces
@@ -178,16 +170,11 @@ def _result(decimation: Decimation, target: int) -> Coarsening:
 def _reason(count: int, target: int, specks: int) -> str:
     """Say what differs from the target, and why."""
     parts = []
-    if count > target:
-        parts.append(
-            f"{count} vertices instead of {target}: any other collapse would change the topology, or leave a sliver or "
-            "a fold in some shape"
-        )
-    elif count < target:
-        parts.append(
-            f"{count} vertices instead of {target}: thin parts that could only be had with slivers are left to the "
-            "fine mesh"
-        )
+    if count != target:
+        why = "thin parts that could only be had with slivers are left to the fine mesh"
+        if count > target:
+            why = "any other collapse would change the topology, or leave a sliver or a fold in some shape"
+        parts.append(f"{count} vertices instead of {target}: {why}")
     if specks:
         parts.append(f"{specks} faces have next to no area or height in some shape, and no collapse or flip mends that")
     return "; ".join(parts)

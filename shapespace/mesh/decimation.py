@@ -24,15 +24,11 @@ _Face = tuple[int, int, int]
 
 @dataclass(frozen=True)
 class _Neighbourhood:
-    """The faces that a collapse changes, before and after.
+    """Faces that a collapse changes, as triples of vertices in ``rows``. All other lists have indices of rows.
 
     Attributes:
-        rows: faces as triples of vertices; the other lists have indices of rows.
-        old: faces at the vertex that is collapsed.
-        staying: old faces that don't vanish.
-        new: these faces after the collapse, in the same order.
-        pairs_before: neighbours among the old faces and the faces around them.
-        pairs_after: neighbours among the new faces and the faces around them.
+        staying, new: faces at the collapsed vertex that don't vanish, and these faces after the collapse.
+        pairs_before, pairs_after: neighbours among the old or the new faces and the faces around them.
     """
 
     rows: list[_Face]
@@ -81,8 +77,8 @@ class Decimation:
         self._boundary = [v in rim for v in range(self.count)]
         # A vertex where two sheets touch stays: removing it would separate them.
         self._locked = [len(self._fan(self._link(v))) < len(self._star[v]) for v in range(self.count)]
+        #: Increases whenever the candidate collapses of a vertex are renewed.
         self._version = [0] * self.count
-        """Increases whenever the candidate collapses of a vertex are renewed."""
         self._heap: list[tuple[float, int, int, int, int]] = []
         self._refused: dict[int, list[tuple[float, int, int, int, int]]] = {}
         self._offer(np.concatenate([connectivity.edges, connectivity.edges[:, ::-1]]))
@@ -131,8 +127,6 @@ class Decimation:
         vertices: list[int] = np.unique(faces[bad]).tolist()
         return vertices
 
-    # ------------------------------------------------------------ candidates
-
     def _costs(self, pairs: IntArray) -> FloatArray:
         u, v = pairs.T
         costs: FloatArray = dots(self._quadrics[u] + self._quadrics[v], self._monomials[v])
@@ -157,8 +151,6 @@ class Decimation:
                     heapq.heappush(self._heap, entry)
         self._offer(np.array(sorted(pairs)))
 
-    # ------------------------------------------------------------ neighbourhoods
-
     def _ring(self, v: int) -> list[int]:
         return sorted({w for f in self._star[v] for w in self.faces[f]} - {v})
 
@@ -182,10 +174,8 @@ class Decimation:
         return fan
 
     def _across(self, a: int, b: int, f: int) -> list[int]:
-        """List the face on the other side of an edge of face f, if there is one."""
+        """List the face beside face f at an edge, if there is one."""
         return list((self._star[a] & self._star[b]) - {f})
-
-    # ------------------------------------------------------------ checks
 
     def _keeps_topology(self, u: int, v: int) -> bool:
         """Check the link condition with boundary, lk u ∩ lk v = lk uv (Dey, Edelsbrunner, Guha and Nekhayev 1999)."""
@@ -251,8 +241,6 @@ class Decimation:
             pairs_before=before,
             pairs_after=[(i, j) for i, j in after if i is not None and j is not None],
         )
-
-    # ------------------------------------------------------------ changes
 
     def _collapse(self, u: int, v: int) -> None:
         shared = self._star[u] & self._star[v]

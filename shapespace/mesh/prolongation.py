@@ -37,19 +37,12 @@ class ProlongationError(ValueError):
 
 
 class AttachedPart(NamedTuple):
-    """A part of the fine mesh beside the surface of the coarse mesh, such as an eye or a nail, and its anchors.
+    """A part of the fine mesh beside the surface of the coarse mesh, such as an eye or a nail, and its anchors."""
 
-    Attributes:
-        vertices: (k,) vertices of the fine mesh.
-        anchors: (K,) coarse vertices that move the part as a whole.
-        weights: (K,) weights of the anchors, with sum 1.
-        rigid: whether the part moves rigidly.
-    """
-
-    vertices: IntArray
-    anchors: IntArray
-    weights: FloatArray
-    rigid: bool
+    vertices: IntArray  # (k,) vertices of the fine mesh
+    anchors: IntArray  # (K,) coarse vertices that move the part as a whole
+    weights: FloatArray  # (K,) weights of the anchors, with sum 1
+    rigid: bool  # whether the part moves rigidly
 
 
 class RigidPart(NamedTuple):
@@ -107,14 +100,9 @@ class Prolongation:
         """Map coarse vertices (…, V, 3) to fine ones (…, Vf, 3)."""
         if vertices.ndim > 2:
             return np.stack([self(shape) for shape in vertices]).reshape(*vertices.shape[:-2], -1, 3)
-        fine = self.affine(vertices)
+        fine: FloatArray = self.weights @ self._regressors(vertices)
         for part in self.rigid:
             fine[part.vertices] = align(part.rest, fine[part.vertices])
-        return fine
-
-    def affine(self, vertices: FloatArray) -> FloatArray:
-        """Map coarse vertices (V, 3) to fine ones (Vf, 3), rigid parts affinely too."""
-        fine: FloatArray = self.weights @ self._regressors(vertices)
         return fine
 
     def _regressors(self, vertices: FloatArray) -> FloatArray:
@@ -195,21 +183,18 @@ class Prolongation:
 
     def arrays(self) -> dict[str, NDArray]:
         """Arrays for a file; their names begin with ``prolongation_``."""
-        return {
-            PREFIX + "faces": self.faces.astype(np.int32),
-            PREFIX + "indptr": self.weights.indptr.astype(np.int32),
-            PREFIX + "indices": self.weights.indices.astype(np.int32),
-            PREFIX + "weights": self.weights.data,
-        } | self._rigid_arrays()
-
-    def _rigid_arrays(self) -> dict[str, NDArray]:
-        if not self.rigid:
-            return {}
-        part = np.full(self.vertex_count, -1, np.int32)
-        rest = np.zeros((self.vertex_count, 3))
-        for k, (vertices, places) in enumerate(self.rigid):
-            part[vertices], rest[vertices] = k, places
-        return {PREFIX + "rigid": part, PREFIX + "rest": rest[part >= 0]}
+        found: dict[str, NDArray] = {
+            "faces": self.faces.astype(np.int32),
+            "indptr": self.weights.indptr.astype(np.int32),
+            "indices": self.weights.indices.astype(np.int32),
+            "weights": self.weights.data,
+        }
+        if self.rigid:
+            part, rest = np.full(self.vertex_count, -1, np.int32), np.zeros((self.vertex_count, 3))
+            for k, (vertices, places) in enumerate(self.rigid):
+                part[vertices], rest[vertices] = k, places
+            found |= {"rigid": part, "rest": rest[part >= 0]}
+        return {PREFIX + name: array for name, array in found.items()}
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, NDArray]) -> Prolongation:
@@ -219,15 +204,8 @@ class Prolongation:
             ProlongationError: an array is missing, has another shape or type, is out of range or not finite, or the
                 weights of a fine vertex don't sum to 1.
         """
-        faces, indptr, indices, weights = (
-            _flat(arrays, name, kind, dimensions)
-            for name, kind, dimensions in (
-                ("faces", "i", 2),
-                ("indptr", "i", 1),
-                ("indices", "i", 1),
-                ("weights", "f", 1),
-            )
-        )
+        faces, weights = _flat(arrays, "faces", np.int64, 2), _flat(arrays, "weights", np.float64, 1)
+        indptr, indices = (_flat(arrays, name, np.int64, 1) for name in ("indptr", "indices"))
         try:
             connectivity = Connectivity(faces, int(faces.max(initial=-1)) + 1)
         except MeshError as error:
@@ -238,19 +216,16 @@ class Prolongation:
         if len(indptr) < 2 or indptr[0] != 0 or indptr[-1] != len(indices) or (np.diff(indptr) < 0).any():
             raise ProlongationError(f"{PREFIX}indptr must rise from 0 to {len(indices)}, the number of weights")
         if len(indices) and (indices.min() < 0 or indices.max() >= columns):
-            raise ProlongationError(
-                f"{PREFIX}indices must lie in [0, {columns}), but reach {indices.min()} to {indices.max()}"
-            )
+            reach = f"{indices.min()} to {indices.max()}"
+            raise ProlongationError(f"{PREFIX}indices must lie in [0, {columns}), but reach {reach}")
         if not np.isfinite(weights).all():
             raise ProlongationError(f"{PREFIX}weights has an entry that is not finite")
         matrix = sp.csr_array((weights, indices, indptr), shape=(len(indptr) - 1, columns))
         sums = matrix[:, : connectivity.vertex_count].sum(axis=1)
         wrong = np.flatnonzero(np.abs(sums - 1) > 1e-5)
         if len(wrong):
-            raise ProlongationError(
-                f"the weights of fine vertex {wrong[0]} sum up to {sums[wrong[0]]:.6g}, not 1; it would not "
-                "move with the shape"
-            )
+            found = f"the weights of fine vertex {wrong[0]} sum up to {sums[wrong[0]]:.6g}, not 1"
+            raise ProlongationError(f"{found}; it would not move with the shape")
         return cls(connectivity.faces, matrix, _rigid_parts(arrays, len(indptr) - 1))
 
 
@@ -305,7 +280,7 @@ def _rigid_parts(arrays: Mapping[str, NDArray], count: int) -> tuple[RigidPart, 
     """Read the rigid parts of a mesh with `count` fine vertices."""
     if PREFIX + "rigid" not in arrays and PREFIX + "rest" not in arrays:
         return ()
-    part_of, rest = _flat(arrays, "rigid", "i", 1), _flat(arrays, "rest", "f", 2)
+    part_of, rest = _flat(arrays, "rigid", np.int64, 1), _flat(arrays, "rest", np.float64, 2)
     there = np.flatnonzero(part_of >= 0)
     if len(part_of) != count or rest.shape != (len(there), 3) or not np.isfinite(rest).all():
         raise ProlongationError(
@@ -316,18 +291,15 @@ def _rigid_parts(arrays: Mapping[str, NDArray], count: int) -> tuple[RigidPart, 
     return tuple(RigidPart(there[part], rest[part]) for part in parts)
 
 
-def _flat(arrays: Mapping[str, NDArray], name: str, kind: str, dimensions: int) -> NDArray:
-    try:
-        array = np.asarray(arrays[PREFIX + name])
-    except KeyError:
-        raise ProlongationError(f"there is no array {PREFIX}{name}") from None
-    if array.ndim != dimensions or not np.issubdtype(array.dtype, np.integer if kind == "i" else np.floating):
-        wanted = "integers" if kind == "i" else "real numbers"
-        raise ProlongationError(
-            f"{PREFIX}{name} must be a {dimensions}-dimensional array of {wanted}, "
-            f"not {array.dtype} of shape {array.shape}"
-        )
-    return array.astype(np.int64 if kind == "i" else np.float64)
+def _flat(arrays: Mapping[str, NDArray], name: str, kind: type[np.number], dimensions: int) -> NDArray:
+    if PREFIX + name not in arrays:
+        raise ProlongationError(f"there is no array {PREFIX}{name}")
+    array = np.asarray(arrays[PREFIX + name])
+    whole = issubclass(kind, np.integer)
+    if array.ndim != dimensions or not np.issubdtype(array.dtype, np.integer if whole else np.floating):
+        wanted = f"a {dimensions}-dimensional array of {'integers' if whole else 'real numbers'}"
+        raise ProlongationError(f"{PREFIX}{name} must be {wanted}, not {array.dtype} of shape {array.shape}")
+    return array.astype(kind)
 
 
 def _around(faces: IntArray, count: int) -> sp.csr_array:
@@ -359,8 +331,8 @@ def _bind(coarse: TriangleMesh, fine: TriangleMesh) -> tuple[IntArray, FloatArra
         _bind_some(coarse, fine.vertices[k : k + BOUND_VERTICES], near[k : k + BOUND_VERTICES], two_rings)
         for k in range(0, len(near), BOUND_VERTICES)
     ]
-    corners, barycentric = zip(*found, strict=True)
-    return np.concatenate(corners), np.concatenate(barycentric)
+    corners, barycentric = map(np.concatenate, zip(*found, strict=True))
+    return corners, barycentric
 
 
 def _bind_some(

@@ -137,8 +137,7 @@ class _Round:
 def _proper(faces: IntArray) -> NDArray[np.bool_]:
     """Return a mask of the faces with three different corners."""
     a, b, c = faces.T
-    proper: NDArray[np.bool_] = (a != b) & (b != c) & (c != a)
-    return proper
+    return np.asarray((a != b) & (b != c) & (c != a))
 
 
 def _collapses(
@@ -149,7 +148,9 @@ def _collapses(
     if not len(pairs):
         return pairs
     u, v = pairs.T
-    costs = np.concatenate([_costs(mesh.points, quadrics, areas, some) for some in _chunks(pairs)])
+    # In chunks: the monomials of all vertices in all shapes take much memory.
+    chunks = np.array_split(pairs, -(-len(pairs) // CHUNK))
+    costs = np.concatenate([_costs(mesh.points, quadrics, areas, some) for some in chunks])
     # The cheapest half-edge of each vertex, and the cheaper part of these.
     order = np.lexsort((costs, u))
     first = order[np.flatnonzero(np.diff(u[order], prepend=-1))]
@@ -160,16 +161,10 @@ def _collapses(
 
 
 def _costs(points: FloatArray, quadrics: FloatArray, areas: FloatArray, pairs: IntArray) -> FloatArray:
-    """Compute the costs of collapses (k, 2)."""
     u, v = pairs.T
     costs: FloatArray = dots(quadrics[u] + quadrics[v], monomials(points[v]))
     costs += MOTION_WEIGHT * areas[u] * ((points[u] - points[v]) ** 2).sum(axis=(1, 2))
     return costs
-
-
-def _chunks(pairs: IntArray) -> list[IntArray]:
-    """Split pairs into chunks: their monomials in all shapes take much memory."""
-    return np.array_split(pairs, -(-len(pairs) // CHUNK))
 
 
 def _keep_shape(mesh: _Round, pairs: IntArray, sine: float) -> NDArray[np.bool_]:

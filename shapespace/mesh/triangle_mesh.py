@@ -103,50 +103,22 @@ class Connectivity:
             self.edge_faces[side_edge[mask], column] = side_face[mask]
             self.edge_opposite[side_edge[mask], column] = apex[mask]
         self.interior: NDArray[np.bool_] = count == 2
-        for array in (
-            self.faces,
-            self.edges,
-            self.face_edges,
-            self.edge_faces,
-            self.edge_opposite,
-            self.interior,
-        ):
+        for array in (self.faces, self.edges, self.face_edges, self.edge_faces, self.edge_opposite, self.interior):
             array.setflags(write=False)
+        self.hinge_edges: IntArray = np.flatnonzero(self.interior)
+        """(H,) interior edges."""
+        self.hinges: IntArray = np.concatenate([self.edges, self.edge_opposite], axis=1)[self.interior]
+        """(H, 4) tail, head, left and right opposite vertex of every interior edge, in edge order."""
+        # Contiguous columns of these arrays, (2, E), (4, H), (3, F) and (3, F): gathering with them is several times
+        # faster.
+        self.edge_ends, self.hinge_corners, self.face_corners, self.face_sides = (
+            np.ascontiguousarray(array.T) for array in (self.edges, self.hinges, self.faces, self.face_edges)
+        )
 
     @property
     def edge_count(self) -> int:
         """Number of edges, E."""
         return len(self.edges)
-
-    @cached_property
-    def hinges(self) -> IntArray:
-        """(H, 4) tail, head, left and right opposite vertex of every interior edge, in edge order."""
-        return np.concatenate([self.edges, self.edge_opposite], axis=1)[self.interior]
-
-    @cached_property
-    def edge_ends(self) -> IntArray:
-        """(2, E) the columns of ``edges``, each contiguous: gathering with them is several times faster."""
-        return np.ascontiguousarray(self.edges.T)
-
-    @cached_property
-    def hinge_corners(self) -> IntArray:
-        """(4, H) the columns of ``hinges``, each contiguous."""
-        return np.ascontiguousarray(self.hinges.T)
-
-    @cached_property
-    def face_corners(self) -> IntArray:
-        """(3, F) the columns of ``faces``, each contiguous."""
-        return np.ascontiguousarray(self.faces.T)
-
-    @cached_property
-    def face_sides(self) -> IntArray:
-        """(3, F) the columns of ``face_edges``, each contiguous."""
-        return np.ascontiguousarray(self.face_edges.T)
-
-    @cached_property
-    def hinge_edges(self) -> IntArray:
-        """(H,) the interior edges."""
-        return np.flatnonzero(self.interior)
 
     @property
     def is_closed(self) -> bool:
@@ -231,7 +203,7 @@ class TriangleMesh:
 
     @property
     def diagonal(self) -> float:
-        """Length of the bounding box's diagonal."""
+        """Length of the diagonal of the bounding box."""
         return float(diagonal(self.vertices))
 
     @property

@@ -23,18 +23,11 @@ SMALLEST_SHARE = 0.1
 
 @dataclass(frozen=True)
 class TriangleQuality:
-    """Quality of a few faces: the worst values, and the numbers of faults.
+    """Quality of a few faces: the worst values, and the numbers of faults."""
 
-    Attributes:
-        sine: smallest sin² of an angle.
-        fold: smallest cosine between the normals of neighbours.
-        size: smallest size, see `Triangles.sizes`.
-        slivers, folds, specks: numbers of faults.
-    """
-
-    sine: float
-    fold: float
-    size: float
+    sine: float  # smallest sin² of an angle
+    fold: float  # smallest cosine between the normals of neighbours
+    size: float  # smallest size, see `Triangles.sizes`
     slivers: int
     folds: int
     specks: int
@@ -91,28 +84,19 @@ class Triangles:
 
 
 def folded_pairs(connectivity: Connectivity, normals: FloatArray) -> IntArray:
-    """List pairs (k, 2) of neighbouring faces that are folded onto one another in some shape.
-
-    Args:
-        connectivity: connectivity of the F faces.
-        normals: (F, n, 3) normals in n shapes, of any length.
-    """
+    """List pairs (k, 2) of neighbouring faces with normals (F, n, 3) that are folded together in some shape."""
     normals = unit(normals)
-    pairs = connectivity.edge_faces[connectivity.interior]
-    folded: IntArray = pairs[(dots(normals[pairs[:, 0]], normals[pairs[:, 1]]) < FOLD_LIMIT).any(axis=1)]
-    return folded
+    pairs: IntArray = connectivity.edge_faces[connectivity.interior]
+    return pairs[(dots(normals[pairs[:, 0]], normals[pairs[:, 1]]) < FOLD_LIMIT).any(axis=1)]
 
 
 def folded_anew(angles: FloatArray, others: FloatArray) -> NDArray[np.bool_]:
     """Return a mask (n,) of the shapes with two faces folded onto one another at an edge that is smooth in the others.
 
-    Args:
-        angles: (n, E) dihedral angles.
-        others: (k, E) dihedral angles of other shapes; an edge is smooth where all are below 90°.
+    Angles are (n, E) and (k, E). An edge is smooth where all are below 90°.
     """
     smooth = (np.abs(others) < np.pi / 2).all(axis=0)
-    folded: NDArray[np.bool_] = ((np.cos(angles) < FOLD_LIMIT) & smooth).any(axis=1)
-    return folded
+    return np.asarray(((np.cos(angles) < FOLD_LIMIT) & smooth).any(axis=1))
 
 
 def normals_and_sides(corners: FloatArray) -> tuple[FloatArray, FloatArray]:

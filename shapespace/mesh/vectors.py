@@ -35,8 +35,7 @@ def cross(a: FloatArray, b: FloatArray) -> FloatArray:
 
 def dots(a: FloatArray, b: FloatArray) -> FloatArray:
     """Scalar products (…) of vectors (…, n)."""
-    result: FloatArray = np.einsum("...i,...i->...", a, b)
-    return result
+    return np.asarray(np.einsum("...i,...i->...", a, b))
 
 
 def unit(vectors: FloatArray) -> FloatArray:
@@ -46,5 +45,4 @@ def unit(vectors: FloatArray) -> FloatArray:
     [[0.0, 0.6, 0.8], [0.0, 0.0, 0.0]]
     """
     length = np.linalg.norm(vectors, axis=-1, keepdims=True)
-    result: FloatArray = vectors / np.where(length > 0, length, 1)
-    return result
+    return np.asarray(vectors / np.where(length > 0, length, 1))

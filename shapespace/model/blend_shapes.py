@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from shapespace.arrays import FloatArray, IntArray
-from shapespace.files.blend_shapes import blend_shapes_glb
+from shapespace.files.animated_gltf import blend_shapes_glb
 from shapespace.mesh.attributes import MeshAttributes
 from shapespace.mesh.rigid_motion import align
 from shapespace.model.decoder import Decoder, MeshChoice, Shape

@@ -59,12 +59,7 @@ class ShellEnergy:
     """The energy ``W`` on a connectivity.
 
     W_mem scales with area and W_bend does not, so η has a meaning only for a given size. Therefore the membrane part is
-    divided by the area of the reference. Meshes in any unit then give the same numbers as meshes of unit area.
-
-    Args:
-        connectivity: connectivity of the shapes.
-        material: μ, λ and η at unit area.
-        area: surface area of the reference shape of the collection.
+    divided by the ``area`` of the reference. Meshes in any unit then give the same numbers as meshes of unit area.
     """
 
     def __init__(self, connectivity: Connectivity, material: Material | None = None, area: float = 1.0) -> None:
@@ -226,14 +221,10 @@ class RestShape:
         by_turn = 2 * turn * self._beta
         by_area = (-by_turn / self._edge_area)[m.sides]
         areas = by_area[None] * (self._c * self._sides / (8 * self.areas))[:, None]
-        edges = np.arange(e)
-        entries = [
-            (blocks, rows, columns),
-            (areas, rows, e + columns),
-            (2 * by_turn / self._lengths, edges, e + edges),
-            (-2 * self._beta, e + edges, e + edges),
-        ]
-        data, i, j = (np.concatenate([np.ravel(x[k]) for x in entries]) for k in range(3))
+        angles = np.arange(e, 2 * e)
+        i = np.concatenate([rows, rows, angles - e, angles], axis=None)
+        j = np.concatenate([columns, e + columns, angles, angles], axis=None)
+        data = np.concatenate([blocks, areas, 2 * by_turn / self._lengths, -2 * self._beta], axis=None)
         return sparse.csr_array((data, (i, j)), shape=(2 * e, 2 * e))
 
     def hessian_deformed(self, z: FloatArray) -> QuadraticForm:

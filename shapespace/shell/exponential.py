@@ -27,32 +27,19 @@ EXTRAPOLATED = 8
 
 @dataclass(frozen=True)
 class Renewals:
-    """When a factor is rotated or replaced.
+    """When a factor is rotated or replaced."""
 
-    Attributes:
-        cost: cost of a new factor, in iterations.
-        patience: once a step needs this many more iterations than the step with a new factor, factors are rotated to
-            each shape.
-        slow: an iteration with a factor fails if two iterations leave more than this share of the residual.
-    """
-
-    cost: int = 8
-    patience: int = 1
-    slow: float = 0.5
+    cost: int = 8  # cost of a new factor, in iterations
+    patience: int = 1  # once a step needs this many more iterations than with a new factor, factors are rotated
+    slow: float = 0.5  # an iteration with a factor fails if two iterations leave more than this share of the residual
 
 
 @dataclass(frozen=True)
 class ExactNewton:
-    """Limits of exact Newton.
+    """Limits of exact Newton."""
 
-    Attributes:
-        iterations: largest number of iterations. Where it converges it needs 4 to 8. Where it needs more, a face is
-            collapsing, and the path would end a few steps later anyway (measured on posed bodies).
-        smallest_step: smallest step length of the line search.
-    """
-
-    iterations: int = 12
-    smallest_step: float = 1 / 16
+    iterations: int = 12  # 4 to 8 suffice where it converges; beyond, a face collapses (posed bodies)
+    smallest_step: float = 1 / 16  # smallest step length of the line search
 
 
 RENEWALS, NEWTON = Renewals(), ExactNewton()
@@ -136,14 +123,8 @@ def extrapolate(
 
     def path(status: Status, reason: str = "") -> DiscretePath:
         where = f"step {len(shapes)}: {reason}" if reason else ""
-        return DiscretePath(
-            vertices=np.stack(shapes),
-            space=space,
-            status=status,
-            iterations=iterations,
-            residual=residual,
-            reason=where,
-        )
+        found = DiscretePath(vertices=np.stack(shapes), space=space, status=status, reason=where)
+        return replace(found, iterations=iterations, residual=residual)
 
     for _ in range(steps):
         if deadline is not None and deadline.passed:
@@ -165,15 +146,12 @@ def extrapolate(
 class _Renewal:
     """The factor of a path, and when it is replaced by a factor at the present shape.
 
-    A factor is first **new**, in the step for which it was computed. ``_when_new`` counts the iterations of this step.
-
-    In later steps it is **old**. ``_excess`` sums their additional iterations. Once a step needs more than `patience`
-    additional iterations or fails, old factors are rotated to the present shape, from the next step to the end of the
-    path. Rotating is cheap, but useless for small motions.
-
-    The factor is **spent** once ``_excess`` reaches `cost`, because a new factor would have been cheaper. It is also
-    spent if an iteration fails or predicts more than `cost` additional iterations. Then the step is solved again with a
-    new one.
+    A factor is **new** in the step for which it was computed, which takes ``_when_new`` iterations. It is **old** in
+    later steps, whose additional iterations ``_excess`` sums. Once a step needs more than `patience` of these, or
+    fails, old factors are rotated to the present shape until the end of the path. Rotating is cheap, but useless for
+    small motions. A factor is **spent** once ``_excess`` reaches `cost`, because a new one would have been cheaper. It
+    is also spent if an iteration fails or predicts more than `cost` additional iterations. Then the step is solved
+    again with a new one.
     """
 
     def __init__(self, space: ShellSpace) -> None:

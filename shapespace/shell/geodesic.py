@@ -21,19 +21,12 @@ from shapespace.solve.outcome import Status
 
 @dataclass(frozen=True)
 class Relaxation:
-    """Limits of the iteration on all equations of a path at once.
+    """Limits of the iteration on all equations of a path at once."""
 
-    Attributes:
-        iterations: largest number of iterations with one set of factors.
-        renewals: largest number of sets of factors.
-        slow: factors are renewed after three iterations that leave more than this share of the residual.
-        jump: a time step with more than this many times the mean energy is a jump: a geodesic has constant speed.
-    """
-
-    iterations: int = 40
-    renewals: int = 20
-    slow: float = 0.1
-    jump: float = 4.0
+    iterations: int = 40  # most iterations with one set of factors
+    renewals: int = 20  # most sets of factors
+    slow: float = 0.1  # factors are renewed after three iterations that leave more than this share of the residual
+    jump: float = 4.0  # a step with this many times the mean energy is a jump: a geodesic has constant speed
 
 
 RELAXATION = Relaxation()
@@ -73,12 +66,10 @@ def geodesic(
     start, end = space.shape(start), space.shape(end)
     if steps < 1:
         raise ValueError(f"a path needs at least one step, not {steps}")
-    if not np.isfinite(start).all():
-        nowhere, reason = space.reference.vertices[None], "start has an entry that is not finite"
-        return DiscretePath(vertices=nowhere, space=space, status=Status.NOT_FINITE, reason=reason)
-    if not np.isfinite(end).all():
-        reason = "end has an entry that is not finite"
-        return DiscretePath(vertices=start[None], space=space, status=Status.NOT_FINITE, reason=reason)
+    for name, shape, first_shape in (("start", start, space.reference.vertices), ("end", end, start)):
+        if not np.isfinite(shape).all():
+            reason = f"{name} has an entry that is not finite"
+            return DiscretePath(vertices=first_shape[None], space=space, status=Status.NOT_FINITE, reason=reason)
     if steps == 1:
         both = np.stack([start, align(end, start)])
         return DiscretePath(vertices=both, space=space, status=Status.CONVERGED, residual=0)
@@ -120,12 +111,7 @@ class Logarithm:
 
 
 def logarithm(
-    space: ShellSpace,
-    start: FloatArray,
-    end: FloatArray,
-    steps: int = 8,
-    *,
-    tolerance: float = TOLERANCE,
+    space: ShellSpace, start: FloatArray, end: FloatArray, steps: int = 8, *, tolerance: float = TOLERANCE
 ) -> Logarithm:
     """Compute the discrete logarithm of ``end`` at ``start``, the inverse of ``exponential`` with equal steps.
 
@@ -198,14 +184,9 @@ def _relax(space: ShellSpace, begun: InitialPath, factorise: list[Factorise], to
 
 
 def _stalled(space: ShellSpace, shapes: FloatArray, iterations: int, residual: float) -> DiscretePath:
-    return DiscretePath(
-        vertices=shapes,
-        space=space,
-        status=Status.STALLED,
-        iterations=iterations,
-        residual=residual,
-        reason=f"residual {residual:.1e} after {iterations} iterations",
-    )
+    reason = f"residual {residual:.1e} after {iterations} iterations"
+    path = DiscretePath(vertices=shapes, space=space, status=Status.STALLED, reason=reason)
+    return replace(path, iterations=iterations, residual=residual)
 
 
 def _round(space: ShellSpace, shapes: FloatArray, chords: list[ChordSolver], tolerance: float) -> DiscretePath:
@@ -223,14 +204,9 @@ def _round(space: ShellSpace, shapes: FloatArray, chords: list[ChordSolver], tol
         if residuals[-1] <= tolerance:
             faults = (fault_between(a, b) for a, b in pairwise(points))
             fault = next((f for f in faults if f), None) or _jump(space, shapes)
-            return DiscretePath(
-                vertices=shapes,
-                space=space,
-                status=Status.DEGENERATE if fault else Status.CONVERGED,
-                iterations=len(residuals) - 1,
-                residual=residuals[-1],
-                reason=fault or "",
-            )
+            status = Status.DEGENERATE if fault else Status.CONVERGED
+            path = DiscretePath(vertices=shapes, space=space, status=status, reason=fault or "")
+            return replace(path, iterations=len(residuals) - 1, residual=residuals[-1])
         if residuals[-1] < lowest:
             lowest, best = residuals[-1], shapes.copy()
         if not np.isfinite(residuals[-1]) or (len(residuals) > 3 and residuals[-1] > RELAXATION.slow * residuals[-4]):

@@ -21,30 +21,19 @@ MOST_DESCENTS = 30
 
 @dataclass(frozen=True)
 class MiddleSearch:
-    """Limits of the search for a middle shape, which need not be exact.
+    """Limits of the search for a middle shape, which need not be exact."""
 
-    Attributes:
-        iterations: largest number of steps.
-        tolerance: tolerance of the residual.
-    """
-
-    iterations: int = 30
-    tolerance: float = 1e-2
+    iterations: int = 30  # most steps
+    tolerance: float = 1e-2  # of the residual
 
 
 @dataclass(frozen=True)
 class NearestSearch:
-    """Limits of the Gauss–Newton steps to each shape of a straight path, which need not be exact.
+    """Limits of the Gauss–Newton steps to each shape of a straight path, which need not be exact."""
 
-    Attributes:
-        iterations: largest number of steps.
-        smallest_step: smallest step length.
-        gain: the steps end once one of them reduces the squared misfit by less than this share.
-    """
-
-    iterations: int = 4
-    smallest_step: float = 1 / 32
-    gain: float = 0.1
+    iterations: int = 4  # most steps
+    smallest_step: float = 1 / 32  # smallest step length
+    gain: float = 0.1  # the steps end once one of them reduces the squared misfit by less than this share
 
 
 MIDDLE, NEAREST = MiddleSearch(), NearestSearch()

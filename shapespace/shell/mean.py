@@ -63,10 +63,9 @@ def elastic_mean(
         weights: n weights, not negative, equal by default; only their ratios matter.
         start: (V, 3) first guess, the shape of least total energy by default.
     """
-    shapes, w = _checked(space, shapes, weights)
-    fault = _not_finite(shapes)
+    shapes, w, fault = _checked(space, shapes, weights)
     if fault:
-        return Mean(vertices=space.reference.vertices, status=Status.NOT_FINITE, reason=fault)
+        return fault
     energy = _MeanEnergy(space, shapes, w)
     if start is None:
         start = shapes[int(np.argmin([energy.value(x) for x in shapes]))]
@@ -82,16 +81,14 @@ class _MeanEnergy:
         self._rest = space.energy.rest(space.nric(shapes))
         self.length = edge_length(space)
 
-    def value_of(self, z: FloatArray) -> float:
-        """Compute the energy from lengths and angles (2E,)."""
-        return float(self._weights @ self._rest.value(z))
+    def value_at(self, point: ShellPoint) -> float:
+        return float(self._weights @ self._rest.value(point.z))
 
     def forces_at(self, point: ShellPoint) -> FloatArray:
-        """Compute the forces (V, 3) at a point."""
         return -point.pull_back(self._weights @ self._rest.gradient_deformed(point.z))
 
     def value(self, x: FloatArray) -> float:
-        return self.value_of(self.space.nric(x))
+        return self.value_at(self.space.point(x))
 
     def forces(self, x: FloatArray) -> FloatArray:
         return self.forces_at(self.space.point(x))
@@ -121,13 +118,8 @@ def _quasi_newton(mean: _MeanEnergy, start: FloatArray) -> Mean:
             try:
                 chord = space.factorise(point)
             except NotPositiveDefiniteError as error:
-                return Mean(
-                    vertices=best,
-                    status=Status.DEGENERATE,
-                    iterations=iterations,
-                    residual=residual,
-                    reason=str(error),
-                )
+                found = Mean(vertices=best, status=Status.DEGENERATE, reason=str(error))
+                return replace(found, iterations=iterations, residual=residual)
         step = chord.solve(forces)
         residual = step_length(forces, step)
         if residual <= TOLERANCE:
@@ -139,10 +131,10 @@ def _quasi_newton(mean: _MeanEnergy, start: FloatArray) -> Mean:
             if np.isfinite(point.z).all():
                 continue
             break
-        found = _line_search(mean, point, energy, step, residual**2)
-        if found is None:
+        there = _line_search(mean, point, energy, step, residual**2)
+        if there is None:
             break
-        point, energy = found
+        point, energy = there
     return Mean(vertices=best, status=Status.STALLED, iterations=iterations, residual=lowest)
 
 
@@ -153,7 +145,7 @@ def _line_search(
 
     def trial(t: float) -> tuple[ShellPoint, float]:
         there = mean.space.point(point.vertices + t * step)
-        return there, mean.value_of(there.z)
+        return there, mean.value_at(there)
 
     found = backtrack(trial, lambda t, there: sufficient_decrease(energy, there[1], t, slope), SMALLEST_STEP)
     return found and found[1]
@@ -173,14 +165,8 @@ def _newton(mean: _MeanEnergy, begun: Mean) -> Mean:
             if found.converged:
                 return Mean(vertices=vertices, status=Status.CONVERGED, iterations=iterations, residual=residual)
             status, reason = Status.STALLED, f"residual {residual:.1e} after {iterations} iterations"
-    return Mean(
-        vertices=vertices,
-        status=status,
-        iterations=iterations,
-        residual=residual,
-        reason=reason,
-        worst=mean.worst(vertices),
-    )
+    ended = Mean(vertices=vertices, status=status, iterations=iterations, residual=residual, reason=reason)
+    return replace(ended, worst=mean.worst(vertices))
 
 
 @np.errstate(divide="ignore", over="ignore", invalid="ignore")
@@ -207,10 +193,9 @@ def centre_of_mass(
         start: (V, 3) first guess, the elastic mean by default.
         tolerance: tolerance of the length of the weighted sum of logarithms.
     """
-    shapes, w = _checked(space, shapes, weights)
-    fault = _not_finite(shapes)
-    if fault:
-        return Mean(vertices=space.reference.vertices, status=Status.NOT_FINITE, reason=fault)
+    shapes, w, failed = _checked(space, shapes, weights)
+    if failed:
+        return failed
     if start is None:
         start = elastic_mean(space, shapes, w).vertices
     mixing, residual = Anderson(), np.inf
@@ -221,9 +206,9 @@ def centre_of_mass(
 
     for iteration in range(ITERATIONS):
         logarithms = tuple(logarithm(space, vertices, shape, steps) for shape in shapes)
-        failed = next((i for i, log in enumerate(logarithms) if not log.path.converged), None)
-        if failed is not None:
-            return mean(Status.STALLED, iteration, f"no geodesic to shape {failed}: {logarithms[failed].path.reason}")
+        for i, log in enumerate(logarithms):
+            if not log.path.converged:
+                return mean(Status.STALLED, iteration, f"no geodesic to shape {i}: {log.path.reason}")
         point = space.point(vertices)
         first = np.stack([log.path.nric[1] for log in logarithms])
         forces = -steps * point.pull_back(w @ point.rest.gradient_rest(first))
@@ -246,16 +231,17 @@ def centre_of_mass(
 
 def _checked(
     space: ShellSpace, shapes: Sequence[FloatArray] | FloatArray, weights: ArrayLike | None
-) -> tuple[FloatArray, FloatArray]:
+) -> tuple[FloatArray, FloatArray, Mean | None]:
+    """Return shapes (n, V, 3), weights (n,) with sum 1, and the failed result if a shape is not finite."""
     if len(shapes) == 0:
         raise ValueError("there is no mean of no shapes")
     shapes = np.stack([space.shape(x) for x in shapes])
     w = np.ones(len(shapes)) if weights is None else np.asarray(weights, dtype=np.float64)
     if w.shape != (len(shapes),) or not (w >= 0).all() or not 0 < w.sum() < np.inf:
         raise ValueError("weights must be as many as shapes, not negative, and not all zero")
-    return shapes, w / w.sum()
-
-
-def _not_finite(shapes: FloatArray) -> str | None:
+    failed = None
     bad = np.flatnonzero(~np.isfinite(shapes).all(axis=(1, 2)))
-    return f"shape {bad[0]} has a coordinate that is not finite" if len(bad) else None
+    if len(bad):
+        reason = f"shape {bad[0]} has a coordinate that is not finite"
+        failed = Mean(vertices=space.reference.vertices, status=Status.NOT_FINITE, reason=reason)
+    return shapes, w / w.sum(), failed

@@ -44,7 +44,7 @@ class PathEnergy:
         return np.concatenate([self._start, x, self._end])
 
     def value(self, x: FloatArray) -> float:
-        """See truncated_newton.Energy."""
+        """See `Energy`."""
         z = self._space.nric(self.path(x))
         return float(self._space.energy.rest(z[:-1]).value(z[1:]).sum())
 

@@ -38,18 +38,11 @@ TOLERANCE = 1e-9
 
 @dataclass(frozen=True)
 class StepLimits:
-    """Limits for one step from shape to shape.
+    """Limits for one step from shape to shape."""
 
-    Attributes:
-        area_ratio: a face has collapsed if a time step leaves less than this share of its area.
-        area_loss: largest share of its area that a face may lose in one step of a descent.
-        turn: largest change of an angle in one time step, in radians. Beyond it the surface has passed through a fold
-            or a collapsed face.
-    """
-
-    area_ratio: float = 1e-3
-    area_loss: float = 0.8
-    turn: float = 0.75 * np.pi
+    area_ratio: float = 1e-3  # a face has collapsed if a time step leaves less than this share of its area
+    area_loss: float = 0.8  # largest share of its area that a face may lose in one step of a descent
+    turn: float = 0.75 * np.pi  # largest change of an angle in a time step; beyond, the surface passes through a fold
 
 
 STEP = StepLimits()
@@ -220,7 +213,7 @@ class ShellSpace:
         return nric(vertices, self.connectivity)
 
     def point(self, vertices: FloatArray) -> ShellPoint:
-        """Make a point of the manifold from a shape (V, 3)."""
+        """Return a shape (V, 3) with its derivatives and its energy."""
         return ShellPoint(self, self.shape(vertices))
 
     def shape(self, vertices: ArrayLike) -> FloatArray:

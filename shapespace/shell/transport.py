@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -65,13 +65,9 @@ def parallel_transport(
             iterations += half.iterations
         iterations, residual = iterations + rung.iterations, max(residual, half.residual, rung.residual)
         if not rung.converged:
-            return Transport(
-                velocities=np.stack(carried),
-                status=rung.status,
-                iterations=iterations,
-                residual=residual,
-                reason=f"step {len(carried)}: {rung.reason}",
-            )
+            reason = f"step {len(carried)}: {rung.reason}"
+            found = Transport(velocities=np.stack(carried), status=rung.status, reason=reason)
+            return replace(found, iterations=iterations, residual=residual)
         tip = align(rung.vertices[-1], y)
         carried.append((tip - y) / shrink)
     return Transport(velocities=np.stack(carried), status=Status.CONVERGED, iterations=iterations, residual=residual)

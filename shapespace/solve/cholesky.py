@@ -12,6 +12,7 @@ import importlib.util
 import re
 import sys
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
 from importlib import metadata
@@ -133,21 +134,18 @@ class _BandedFactor:
 
     def solve(self, right: ArrayLike) -> FloatArray:
         """See Factorisation."""
-        right = np.asarray(right, self.band.dtype)
-        x = np.empty(right.shape)
-        x[..., self.order] = linalg.cho_solve_banded(
-            (self.band, True), right[..., self.order].T, check_finite=False, overwrite_b=True
-        ).T
+        b = np.asarray(right, self.band.dtype)[..., self.order].T
+        x = np.empty(b.shape[::-1])
+        x[..., self.order] = linalg.cho_solve_banded((self.band, True), b, check_finite=False, overwrite_b=True).T
         return x
 
 
 @cache
 def _mkl() -> ctypes.CDLL:
     """Load the MKL library. The list of files of its wheel has the path; pypardiso's search takes most of a second."""
-    try:
+    files: list[metadata.PackagePath] = []
+    with suppress(metadata.PackageNotFoundError):
         files = metadata.files("mkl") or []
-    except metadata.PackageNotFoundError:
-        files = []
     if found := [file for file in files if re.fullmatch(r"(lib)?mkl_rt\b.*\.(so|dll)\b.*", file.name)]:
         library = ctypes.CDLL(str(found[0].locate()))
     else:
@@ -231,7 +229,7 @@ class PardisoCholesky:
         return _PardisoFactor(self, kept, number, self._versions[number])
 
     def solve(self, factor: _PardisoFactor, right: ArrayLike) -> FloatArray:
-        """Solve with a factor of this object; raises RuntimeError if a later factor has replaced it."""
+        """Solve with a factor of this object; raises RuntimeError if a later one has replaced it."""
         if self._versions[factor.number] != factor.version:
             raise RuntimeError(f"factor {factor.number} has been replaced by a later factorisation")
         solved = self._run(33, factor.entries, np.ascontiguousarray(right, self._precision), factor.number)

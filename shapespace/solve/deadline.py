@@ -6,10 +6,7 @@ import time
 
 
 class Deadline:
-    """The time by which work has to end. It can be called off earlier, from any thread.
-
-    Args:
-        seconds: time from now.
+    """The time by which work has to end, in seconds from now. It can be called off earlier, from any thread.
 
     Attributes:
         time: end time on the clock of ``time.monotonic``.

@@ -15,36 +15,22 @@ from shapespace.solve.outcome import Outcome, Status
 
 @dataclass(frozen=True)
 class SecantLimits:
-    """When an updated Jacobian is replaced by a new one.
+    """When an updated Jacobian is replaced by a new one."""
 
-    Attributes:
-        distance: at a minimum, largest distance to the point where the Jacobian was computed, in units of the scale.
-        gain: smallest ratio of a step's actual gain to its predicted gain at which the Jacobian is kept.
-    """
-
-    distance: float = 0.05
-    gain: float = 0.25
+    distance: float = 0.05  # at a minimum, largest distance to where it was computed, in units of the scale
+    gain: float = 0.25  # smallest ratio of a step's actual to its predicted gain at which it is kept
 
 
 @dataclass(frozen=True)
 class StepControl:
-    """Acceptance of steps, and damping as a share of the largest diagonal entry of JᵀJ.
+    """Acceptance of steps, and damping as a share of the largest diagonal entry of JᵀJ."""
 
-    Attributes:
-        taken: smallest ratio of actual to predicted gain at which a step is taken.
-        good: smallest ratio at which the damping decreases.
-        smallest: smallest damping.
-        first: first damping after a failed step.
-        largest: the iteration stalls beyond this damping.
-        factor: increase and decrease of the damping.
-    """
-
-    taken: float = 1e-3
-    good: float = 0.5
-    smallest: float = 1e-10
-    first: float = 1e-3
-    largest: float = 1e3
-    factor: float = 10
+    taken: float = 1e-3  # smallest ratio of actual to predicted gain at which a step is taken
+    good: float = 0.5  # smallest ratio at which the damping decreases
+    smallest: float = 1e-10  # smallest damping
+    first: float = 1e-3  # first damping after a failed step
+    largest: float = 1e3  # the iteration stalls beyond this damping
+    factor: float = 10  # increase and decrease of the damping
 
 
 SECANT, CONTROL = SecantLimits(), StepControl()
@@ -52,17 +38,11 @@ SECANT, CONTROL = SecantLimits(), StepControl()
 
 @dataclass(frozen=True)
 class Box:
-    """Bounds and scales of the unknowns, each (m,).
+    """Bounds and scales of the unknowns, each (m,)."""
 
-    Attributes:
-        lower: lower bounds, −∞ where there is none.
-        upper: upper bounds, ∞ where there is none.
-        scale: typical size of each unknown; steps are measured in it.
-    """
-
-    lower: FloatArray
-    upper: FloatArray
-    scale: FloatArray
+    lower: FloatArray  # lower bounds, −∞ where there is none
+    upper: FloatArray  # upper bounds, ∞ where there is none
+    scale: FloatArray  # typical size of each unknown; steps are measured in it
 
 
 @dataclass(frozen=True)
@@ -182,15 +162,10 @@ def least_squares(
 
 
 class _Jacobian:
-    """A Jacobian that is computed at some points, and updated by Broyden's formula in between.
+    """A Jacobian that is computed at some points, and updated by Broyden's formula in between."""
 
-    Attributes:
-        matrix: (n, m), in units of the scale.
-        updates: number of updates since it was computed.
-    """
-
-    matrix: FloatArray
-    updates: int
+    matrix: FloatArray  # (n, m), in units of the scale
+    updates: int  # number of updates since it was computed
 
     def __init__(
         self, make: Callable[[FloatArray, FloatArray], FloatArray], secant: bool, u: FloatArray, r: FloatArray

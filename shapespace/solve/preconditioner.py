@@ -14,11 +14,8 @@ class Preconditioner:
     For an energy that is invariant under rigid motions, the null space of A is spanned by the six infinitesimal rigid
     motions of the shape at which A was computed. Forces at a neighbouring shape are orthogonal to the rigid motions of
     the neighbour, but not to these. So a solve would rotate the shape by a huge amount. Removing this component of the
-    forces fixes the gauge, and the remaining equation still determines the shape.
-
-    Args:
-        factor: factor of ``A + εI``.
-        null_space: (n, 3V) orthonormal basis of the null space.
+    forces fixes the gauge, and the remaining equation still determines the shape. The basis ``null_space`` (n, 3V)
+    is orthonormal.
     """
 
     def __init__(self, factor: Factorisation, null_space: FloatArray) -> None:

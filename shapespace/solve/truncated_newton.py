@@ -16,22 +16,14 @@ from shapespace.solve.preconditioner import step_length
 
 @dataclass(frozen=True)
 class NewtonLimits:
-    """Accuracy of truncated Newton.
+    """Accuracy of truncated Newton."""
 
-    Attributes:
-        gradients: largest number of iterations of conjugate gradients in a step.
-        loosest, tightest: largest and smallest relative residual that ends them.
-        probe: displacement for Hessian products by differences of forces, as a share of the energy's ``length``.
-        rounding: relative rounding error of an energy.
-        smallest_step: smallest step length of the line search.
-    """
-
-    gradients: int = 60
-    loosest: float = 0.3
-    tightest: float = 1e-3
-    probe: float = 1e-6
-    rounding: float = 1e-15
-    smallest_step: float = 1e-6
+    gradients: int = 60  # most iterations of conjugate gradients in a step
+    loosest: float = 0.3  # largest
+    tightest: float = 1e-3  # and smallest relative residual that ends them
+    probe: float = 1e-6  # displacement for Hessian products by differences, as a share of the energy's ``length``
+    rounding: float = 1e-15  # relative rounding error of an energy
+    smallest_step: float = 1e-6  # smallest step length of the line search
 
 
 LIMITS = NewtonLimits()
@@ -59,13 +51,9 @@ class Energy(Protocol):
 
 @dataclass(frozen=True, kw_only=True)
 class Descent(Outcome):
-    """The result of a descent. Its residual is the length of the preconditioned forces, ``sqrt(Fᵀ P F)``.
+    """The result of a descent. Its residual is the length of the preconditioned forces, ``sqrt(Fᵀ P F)``."""
 
-    Attributes:
-        x: unknowns.
-    """
-
-    x: FloatArray
+    x: FloatArray  # unknowns
 
 
 @np.errstate(divide="ignore", over="ignore", invalid="ignore")

@@ -21,7 +21,7 @@ def grid_faces(n: int, m: int, *, around_u: bool, around_v: bool) -> np.ndarray:
 
 
 def closed() -> TriangleMesh:
-    ball = trimesh.creation.icosphere(subdivisions=2)
+    ball = trimesh.creation.icosphere(subdivisions=1)
     return TriangleMesh.from_arrays(ball.vertices * [2, 1, 1], ball.faces)
 
 

@@ -265,13 +265,7 @@ def _face_lines(surface: MeshAttributes) -> NDArray:
 
 
 def polygon_lines(surface: MeshAttributes, numbers: NDArray, line: Callable[[int], str]) -> NDArray:
-    """Return a line for each polygon, (P,).
-
-    Args:
-        surface: the polygons.
-        numbers: (C, k) numbers of each corner.
-        line: returns the format of a line, for ``%``, for a number of corners.
-    """
+    """Return a line for each polygon, (P,), from numbers (C, k) and a format for each number of corners."""
     lines = np.empty(len(surface.sizes), object)
     for size in np.unique(surface.sizes).tolist():
         chosen = np.flatnonzero(surface.sizes == size)
@@ -283,7 +277,7 @@ def polygon_lines(surface: MeshAttributes, numbers: NDArray, line: Callable[[int
 def write_obj(
     vertices: FloatArray, faces: IntArray, colouring: Colouring | None = None, surface: MeshAttributes | None = None
 ) -> bytes:
-    """Write one mesh as OBJ without materials; see `formats.MeshWriter`."""
+    """Write one mesh as OBJ without materials; see `MeshFormat.encode`."""
     shown = surface or MeshAttributes.of_triangles(faces)
     return (obj_vertices(vertices, colouring, shown) + obj_faces(shown)).encode()
 
@@ -291,7 +285,7 @@ def write_obj(
 def write_obj_zip(
     vertices: FloatArray, faces: IntArray, colouring: Colouring | None = None, surface: MeshAttributes | None = None
 ) -> bytes:
-    """Write one mesh as a ZIP archive of OBJ, MTL and textures; see `formats.MeshWriter`."""
+    """Write one mesh as a ZIP archive of OBJ, MTL and textures; see `MeshFormat.encode`."""
     files = obj_files(surface, "shape") if surface else {}
     head = b"mtllib shape.mtl\n" if files else b""
     members = {"shape.obj": head + write_obj(vertices, faces, colouring, surface), **files}

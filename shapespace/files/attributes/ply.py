@@ -85,7 +85,7 @@ def _surface(
 def write_ply(
     vertices: FloatArray, faces: IntArray, colouring: Colouring | None = None, surface: MeshAttributes | None = None
 ) -> bytes:
-    """Write one mesh as PLY, as text if faces have different numbers of corners; see `formats.MeshWriter`.
+    """Write one mesh as PLY, as text if faces have different numbers of corners; see `MeshFormat.encode`.
 
     Texture coordinates are at the vertices. If a vertex has several, they are at the corners of the faces. They are
     left out if the faces then have different numbers of corners.

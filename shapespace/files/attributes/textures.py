@@ -26,10 +26,7 @@ def beside(folder: Path, name: str) -> Path:
 
 
 class Textures:
-    """The pictures of a mesh.
-
-    Args:
-        faults: gets a sentence for each picture that can't be kept.
+    """The pictures of a mesh. ``faults`` gets a sentence for each one that can't be kept.
 
     Attributes:
         files: contents of the pictures by name.

@@ -317,11 +317,7 @@ def test_corners_with_and_without_texture_coordinates_and_normals_go_round(tmp_p
         (["vt 0 nan"], ["f 1/1 2/1 4/1 3/1", *PLAIN[1:]], "left out: a texture coordinate is not finite"),
         (["mtllib none.mtl", "usemtl skin"], PLAIN, "the materials of none.mtl are left out: No such file"),
         (["mtllib gone.mtl", "usemtl skin"], PLAIN, "texture gone.png of material skin is left out: No such file"),
-        (
-            ["mtllib huge.mtl", "usemtl skin"],
-            PLAIN,
-            "texture huge.png of material skin is left out: it has 16.0 MiB",
-        ),
+        (["mtllib huge.mtl", "usemtl skin"], PLAIN, "texture huge.png of material skin is left out: it has 16.0 MiB"),
         (["mtllib text.mtl", "usemtl skin"], PLAIN, "texture text.png of material skin is left out: it is neither PNG"),
         (["mtllib odd.mtl", "usemtl skin"], PLAIN, "the materials of odd.mtl are left out: line 2 is 'Kd x'"),
     ],

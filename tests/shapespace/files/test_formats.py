@@ -62,10 +62,7 @@ def test_we_read_what_we_write(format: str, tmp_path: Path) -> None:
     mesh = freaky_torus.reference()
     path = tmp_path / f"torus.{format}"
     path.write_bytes(MESH_FORMATS[format].encode(mesh.vertices, mesh.faces))
-    for found in (
-        read_mesh(path),
-        read_mesh(path.read_bytes(), format),
-    ):
+    for found in (read_mesh(path), read_mesh(path.read_bytes(), format)):
         np.testing.assert_allclose(found.vertices, mesh.vertices, atol=1e-6)
         assert np.array_equal(found.faces, mesh.faces)
 
@@ -172,7 +169,7 @@ def test_others_read_our_colours(format: str) -> None:
         assert found.visual.material.metallicFactor == 0
     else:
         colours = loaded(data, format).visual.vertex_colors
-        np.testing.assert_allclose(colours[:, :3], colouring.srgb_bytes, atol=1)
+        np.testing.assert_allclose(colours[:, :3], 255 * colouring.srgb, atol=1)
         assert (colours[:, 3] == 255).all()
     if format == "glb":
         assert GLB(data).tree["meshes"][0]["extras"]["color"] == colouring.legend

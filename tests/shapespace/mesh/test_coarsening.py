@@ -12,17 +12,25 @@ from shapespace.mesh.triangle_mesh import Connectivity, MeshError, TriangleMesh,
 from tests.shapespace.conftest import MESHES, TETRAHEDRON, bent, grid_faces
 
 
-def fine_mesh(name: str, rng: np.random.Generator) -> TriangleMesh:
-    """About four times as fine as the meshes of the other tests, without symmetries."""
+def fine_mesh(name: str) -> TriangleMesh:
+    """Several times as fine as the meshes of the other tests, without symmetries."""
     mesh = MESHES[name]()
-    v, f = trimesh.remesh.subdivide(mesh.vertices, mesh.faces)
-    v = v + 0.01 * mesh.diagonal / np.sqrt(len(v)) * rng.standard_normal(v.shape)
+    v, f = mesh.vertices, mesh.faces
+    while len(v) < 250:
+        v, f = trimesh.remesh.subdivide(v, f)
+    v = v + 0.01 * mesh.diagonal / np.sqrt(len(v)) * np.random.default_rng(7).standard_normal(v.shape)
     return TriangleMesh.from_arrays(v, f)
 
 
-@pytest.fixture(params=MESHES)
-def fine(request: pytest.FixtureRequest, rng: np.random.Generator) -> TriangleMesh:
-    return fine_mesh(request.param, rng)
+@pytest.fixture(params=MESHES, scope="module")
+def fine(request: pytest.FixtureRequest) -> TriangleMesh:
+    return fine_mesh(request.param)
+
+
+@pytest.fixture(scope="module")
+def quarter(fine: TriangleMesh) -> Coarsening:
+    """A quarter of the vertices, in all poses."""
+    return coarsen(fine, len(fine.vertices) // 4, poses(fine))
 
 
 def poses(mesh: TriangleMesh) -> np.ndarray:
@@ -55,63 +63,54 @@ def loops(connectivity: Connectivity) -> int:
     return len(np.unique(parts(rim, connectivity.vertex_count)[rim]))
 
 
-def test_the_topology_is_kept(fine):
-    found = coarsen(fine, len(fine.vertices) // 4, poses(fine))
+def test_the_topology_is_kept(fine, quarter):
+    found = quarter
     assert found.reason == ""
     assert len(found.fine_index) == len(fine.vertices) // 4
     assert (np.diff(found.fine_index) > 0).all()
     coarse = Connectivity(found.faces, len(found.fine_index))  # manifold and oriented, or it raises
     assert coarse.euler_characteristic == fine.connectivity.euler_characteristic
     assert loops(coarse) == loops(fine.connectivity)
-    assert (
-        connected_components(
-            csr_array((np.ones(coarse.edge_count), tuple(coarse.edges.T)), shape=(coarse.vertex_count,) * 2)
-        )[0]
-        == 1
-    )
+    assert parts(coarse.edges, coarse.vertex_count).max() == 0
 
 
-def test_no_shape_gets_a_sliver_or_a_fold(fine):
-    shapes = poses(fine)
-    found = coarsen(fine, len(fine.vertices) // 4, shapes)
-    everything = np.concatenate([fine.vertices[None], shapes])[:, found.fine_index]
-    smallest = angles(everything, found.faces).min()
-    assert found.smallest_angle == pytest.approx(smallest, rel=1e-9)
+def test_no_shape_gets_a_sliver_or_a_fold_or_another_place(fine, quarter):
+    everything = np.concatenate([fine.vertices[None], poses(fine)])
+    kept = everything[:, quarter.fine_index]
+    smallest = angles(kept, quarter.faces).min()
+    assert quarter.smallest_angle == pytest.approx(smallest, rel=1e-9)
     assert smallest > np.deg2rad(5.9)
-    assert neighbour_cosines(everything, found.faces).min() > np.cos(np.deg2rad(140))
+    assert neighbour_cosines(kept, quarter.faces).min() > np.cos(np.deg2rad(140))
+    areas = face_areas(kept, quarter.faces).sum(axis=1)
+    np.testing.assert_allclose(areas, face_areas(everything, fine.faces).sum(axis=1), rtol=0.06)
 
 
-def test_the_surface_stays_where_it_is(fine):
-    shapes = poses(fine)
-    found = coarsen(fine, len(fine.vertices) // 4, shapes)
-    for shape in (fine.vertices, *shapes):
-        area = face_areas(shape[found.fine_index], found.faces).sum()
-        assert area == pytest.approx(face_areas(shape, fine.faces).sum(), rel=0.06)
-
-
-def test_the_same_again(fine):
-    first, second = (coarsen(fine, 60, poses(fine)) for _ in range(2))
+def test_the_same_again():
+    fine = MESHES["sheet"]()
+    first, second = (coarsen(fine, 30, poses(fine)) for _ in range(2))
     assert np.array_equal(first.faces, second.faces)
     assert np.array_equal(first.fine_index, second.fine_index)
 
 
-def test_a_boundary_keeps_its_outline(rng):
-    x, y = np.meshgrid(np.linspace(0, 3, 25), np.linspace(0, 1, 13), indexing="ij")
+def test_a_boundary_keeps_its_outline():
+    mesh = flat_sheet(25, 13)
+    found = coarsen(mesh, 60, np.empty((0, len(mesh.vertices), 3)))
+    kept = mesh.vertices[found.fine_index]
+    assert face_areas(kept, found.faces).sum() == pytest.approx(24 * 12, rel=1e-9)
+    assert {(0, 0), (24, 0), (0, 12), (24, 12)} <= {(a, b) for a, b, _ in kept.tolist()}
+
+
+def flat_sheet(n: int, m: int) -> TriangleMesh:
+    x, y = np.meshgrid(np.arange(float(n)), np.arange(float(m)), indexing="ij")
     flat = np.stack([x, y, 0 * x], -1).reshape(-1, 3)
-    mesh = TriangleMesh.from_arrays(flat, grid_faces(25, 13, around_u=False, around_v=False))
-    found = coarsen(mesh, 60, np.empty((0, len(flat), 3)))
-    kept = flat[found.fine_index]
-    assert face_areas(kept, found.faces).sum() == pytest.approx(3, rel=1e-9)
-    assert {(0, 0), (3, 0), (0, 1), (3, 1)} <= {(a, b) for a, b, _ in kept.tolist()}
+    return TriangleMesh.from_arrays(flat, grid_faces(n, m, around_u=False, around_v=False))
 
 
 def sheet_with_a_wrinkle() -> tuple[TriangleMesh, np.ndarray]:
     """A flat sheet, and a shape in which one strip of it is bent up to a low ridge."""
-    x, y = np.meshgrid(np.arange(21.0), np.arange(9.0), indexing="ij")
-    flat = np.stack([x, y, 0 * x], -1).reshape(-1, 3)
-    mesh = TriangleMesh.from_arrays(flat, grid_faces(21, 9, around_u=False, around_v=False))
-    ridge = flat.copy()
-    ridge[:, 2] = 0.5 * np.maximum(0, 3 - np.abs(flat[:, 0] - 10))
+    mesh = flat_sheet(21, 9)
+    ridge = mesh.vertices.copy()
+    ridge[:, 2] = 0.5 * np.maximum(0, 3 - np.abs(ridge[:, 0] - 10))
     return mesh, ridge
 
 
@@ -130,8 +129,10 @@ def test_what_bends_in_any_shape_is_kept():
     )
 
 
-def test_limits_hold_however_few_vertices_are_asked_for(fine):
+@pytest.mark.parametrize("name", MESHES)
+def test_limits_hold_however_few_vertices_are_asked_for(name):
     """The shapes are squeezed, each in another direction, and pleated; the reference isn't."""
+    fine = MESHES[name]()
     x, y, z = fine.vertices.T
     pleats = np.stack([x, y, z + 0.15 * np.abs(np.mod(4 * x, 2) - 1)], axis=1)
     thin = [fine.vertices * stretch for stretch in ([1, 0.2, 1], [0.2, 1, 1], [1, 1, 0.2])]
@@ -153,8 +154,7 @@ def test_a_sliver_in_any_shape_is_refused_as_long_as_there_are_others(fine):
 
 def test_a_face_that_would_turn_over_in_one_shape_alone_is_refused():
     """A spike that only one shape has: without its tip, every face there would turn by more than 60 degrees."""
-    mesh, _ = sheet_with_a_wrinkle()
-    tip = 10 * 9 + 4
+    mesh, tip = flat_sheet(21, 9), 10 * 9 + 4
     spiked = mesh.vertices.copy()
     spiked[tip, 2] = 2.5
     found = coarsen(mesh, 12, spiked[None])
@@ -186,7 +186,7 @@ def test_a_flat_tetrahedron_does_not_become_two_faces_back_to_back():
 
 
 def test_slivers_of_the_fine_mesh_are_healed(rng):
-    mesh = fine_mesh("closed", rng)
+    mesh = fine_mesh("closed")
     hit = rng.permutation(len(mesh.vertices))[:5]
     spoiled = mesh.vertices.copy()
     for v in hit:
@@ -200,43 +200,38 @@ def test_slivers_of_the_fine_mesh_are_healed(rng):
     assert np.rad2deg(found.smallest_angle) > 3
 
 
-@pytest.mark.parametrize("seed", [0, pytest.param(2, marks=pytest.mark.long)])
-def test_a_crumpled_place_smaller_than_a_coarse_face_is_cleared_away(seed):
+@pytest.mark.parametrize(("subdivisions", "seed"), [(3, 0), pytest.param(4, 2, marks=pytest.mark.long)])
+def test_a_crumpled_place_smaller_than_a_coarse_face_is_cleared_away(subdivisions, seed):
     """A place like the corner of a mouth: in some shapes many small faces are folded onto one another."""
-    ball = trimesh.creation.icosphere(subdivisions=4)
+    ball = trimesh.creation.icosphere(subdivisions)
     mesh = TriangleMesh.from_arrays(ball.vertices, ball.faces)
-    place = np.linalg.norm(mesh.vertices - mesh.vertices[100], axis=1) < 0.15
+    size = 2**-subdivisions
+    place = np.linalg.norm(mesh.vertices - mesh.vertices[100], axis=1) < 2.4 * size
     shapes = np.repeat(mesh.vertices[None], 8, axis=0)
-    shapes[:, place] += 0.05 * np.random.default_rng(seed).standard_normal((8, place.sum(), 3))
+    shapes[:, place] += 0.8 * size * np.random.default_rng(seed).standard_normal((8, place.sum(), 3))
     folded = np.cos(np.deg2rad(140))
     assert (neighbour_cosines(shapes, mesh.faces) < folded).sum() > 10
-    found = coarsen(mesh, 150, shapes)
+    found = coarsen(mesh, {3: 40, 4: 150}[subdivisions], shapes)
     assert found.reason == ""
     assert neighbour_cosines(shapes[:, found.fine_index], found.faces).min() > folded
     assert np.rad2deg(found.smallest_angle) > 5
 
 
 def whiskered() -> tuple[TriangleMesh, np.ndarray]:
-    """A ball that ends in a long whisker, of rings with twelve vertices, and shapes whose whisker bends and thins."""
-    polar = np.linspace(0, np.pi, 32)[1:-1]
+    """A ball that ends in a long whisker, of rings with eight vertices, and shapes whose whisker bends and thins."""
+    polar = np.linspace(0, np.pi, 22)[1:-1]
     profile = np.stack([np.cos(polar), np.sin(polar)], axis=1)[::-1]
-    thread = np.stack([np.linspace(1.02, 3, 40), np.full(40, 4e-3)], axis=1)
+    thread = np.stack([np.linspace(1.02, 3, 30), np.full(30, 4e-3)], axis=1)
     profile = np.concatenate([profile, thread])
-    turn = np.arange(12) * np.pi / 6
-    rings = np.stack(
-        [
-            np.repeat(profile[:, :1], 12, axis=1),
-            profile[:, 1:] * np.cos(turn),
-            profile[:, 1:] * np.sin(turn),
-        ],
-        axis=-1,
-    ).reshape(-1, 3)
+    turn = np.arange(8) * np.pi / 4
+    x, radius = profile[:, :1], profile[:, 1:]
+    rings = np.stack([x + 0 * turn, radius * np.cos(turn), radius * np.sin(turn)], axis=-1).reshape(-1, 3)
     vertices = np.concatenate([rings, [[-1, 0, 0], [3.01, 0, 0]]])
     n, tips = len(profile), len(rings)
-    tube = grid_faces(n, 12, around_u=False, around_v=True)[:, ::-1]
-    k = np.arange(12)
-    first = np.stack([np.full(12, tips), (k + 1) % 12, k], axis=1)
-    last = np.stack([np.full(12, tips + 1), (n - 1) * 12 + k, (n - 1) * 12 + (k + 1) % 12], axis=1)
+    tube = grid_faces(n, 8, around_u=False, around_v=True)[:, ::-1]
+    k = np.arange(8)
+    first = np.stack([np.full(8, tips), (k + 1) % 8, k], axis=1)
+    last = np.stack([np.full(8, tips + 1), (n - 1) * 8 + k, (n - 1) * 8 + (k + 1) % 8], axis=1)
     mesh = TriangleMesh.from_arrays(vertices, np.concatenate([tube, first, last]))
     shapes = []
     for bend, width in ((0.2, 1.0), (-0.1, 0.3), (0.3, 0.5)):
@@ -247,10 +242,9 @@ def whiskered() -> tuple[TriangleMesh, np.ndarray]:
     return mesh, np.stack(shapes)
 
 
-@pytest.mark.long
 def test_a_thin_part_is_left_to_the_fine_mesh_where_it_would_be_all_slivers():
     mesh, shapes = whiskered()
-    found = coarsen(mesh, 150, shapes)
+    found = coarsen(mesh, 80, shapes)
     kept = np.concatenate([mesh.vertices[None], shapes])[:, found.fine_index]
     areas = face_areas(kept, found.faces)
     assert found.specks == 0
@@ -259,8 +253,8 @@ def test_a_thin_part_is_left_to_the_fine_mesh_where_it_would_be_all_slivers():
     assert (areas / areas.mean(axis=0)).min() > 0.09
     assert angles(kept, found.faces).min() > np.deg2rad(1.4)
     # This costs few vertices, and the reason says so.
-    assert 130 <= len(found.fine_index) <= 150
-    assert bool(found.reason) == (len(found.fine_index) != 150)
+    assert 70 <= len(found.fine_index) <= 80
+    assert bool(found.reason) == (len(found.fine_index) != 80)
 
 
 def test_what_cannot_be_reached_is_said():
@@ -272,7 +266,8 @@ def test_what_cannot_be_reached_is_said():
     assert Connectivity(found.faces, len(found.fine_index)).euler_characteristic == 2
 
 
-def test_nothing_to_do(fine):
+def test_nothing_to_do():
+    fine = MESHES["torus"]()
     found = coarsen(fine, len(fine.vertices), poses(fine))
     assert np.array_equal(found.fine_index, np.arange(len(fine.vertices)))
     assert found.reason == ""
@@ -293,7 +288,8 @@ def test_sheets_that_touch_at_a_vertex_stay_together():
     assert parts(Connectivity(found.faces, len(found.fine_index)).edges, len(found.fine_index)).max() == 0
 
 
-def test_bad_shapes_are_refused(fine):
+def test_bad_shapes_are_refused():
+    fine = MESHES["sheet"]()
     shapes = poses(fine)
     with pytest.raises(MeshError, match=r"shapes must be \(n, "):
         coarsen(fine, 10, shapes[:, 1:])
@@ -324,7 +320,8 @@ def test_the_evenest_is_taken_whose_faces_keep_their_areas(monkeypatch, folds, s
     assert coarsen(mesh, 30, ridge[None]).fine_index[0] == taken
 
 
-def test_what_is_left_of_the_smallest_face_is_told(fine):
+def test_what_is_left_of_the_smallest_face_is_told():
+    fine = MESHES["torus"]()
     shapes = np.stack([fine.vertices, 0.5 * fine.vertices])
     found = coarsen(fine, 40, shapes)
     areas = face_areas(np.concatenate([fine.vertices[None], shapes])[:, found.fine_index], found.faces)
@@ -333,7 +330,7 @@ def test_what_is_left_of_the_smallest_face_is_told(fine):
 
 
 def test_the_folds_that_are_left_are_counted():
-    mesh, _ = sheet_with_a_wrinkle()
+    mesh = flat_sheet(11, 5)
     vertices = mesh.vertices.copy()
     vertices[:, 2] += 3.0 * np.abs(np.mod(np.arange(len(vertices)), 2))
     found = coarsen(mesh, len(mesh.vertices), np.stack([mesh.vertices, vertices]))

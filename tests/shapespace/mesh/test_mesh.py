@@ -81,11 +81,7 @@ CONNECTIVITY_REFUSALS = {
         "edge (0, 1) has 3 faces; at most two are allowed",
     ),
     "same face twice": ([[0, 1, 2], [0, 1, 2]], 3, "the two faces at edge (0, 1) are oriented oppositely"),
-    "one face turned over": (
-        [*TETRAHEDRON[:3], [0, 2, 3]],
-        4,
-        "the two faces at edge (0, 2) are oriented oppositely",
-    ),
+    "one face turned over": ([*TETRAHEDRON[:3], [0, 2, 3]], 4, "the two faces at edge (0, 2) are oriented oppositely"),
     "turned over, against the order": (
         [[2, 1, 0], [3, 2, 1]],
         4,
