@@ -9,8 +9,8 @@ import binascii
 import json
 import re
 import struct
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import Any
 from urllib.parse import unquote
@@ -30,7 +30,7 @@ _APPEARANCE = ("KHR_materials_", "KHR_texture_", "EXT_texture_", "KHR_lights_", 
 _QUANTIZATION = "KHR_mesh_quantization"
 #: NumPy types of component types, and components of element types (3.6.2.2).
 _DTYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
-_WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
+_WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
 #: Largest ``byteStride`` (3.6.2.4).
 _LARGEST_STRIDE = 252
 _DATA_URI = re.compile(rb'"(data:[^"\\]*+)"')
@@ -87,7 +87,7 @@ class GltfDocument:
 
     Attributes:
         tree: the whole JSON object.
-        buffers, views, accessors, meshes, nodes: entries of the members with these names.
+        buffers, views, accessors, meshes, nodes, skins: entries of the members with these names.
 
     Raises:
         MeshError: the file is not glTF 2, or requires an extension that is not read.
@@ -103,8 +103,8 @@ class GltfDocument:
         unknown = [name for name in required if not name.startswith(_APPEARANCE)]
         if unknown:
             raise MeshError(f"it requires {clipped(', '.join(unknown))}, which is not read: export it without")
-        kinds = ("buffers", "bufferViews", "accessors", "meshes", "nodes", "scenes")
-        self.buffers, self.views, self.accessors, self.meshes, self.nodes, self._scenes = (
+        kinds = ("buffers", "bufferViews", "accessors", "meshes", "nodes", "skins", "scenes")
+        self.buffers, self.views, self.accessors, self.meshes, self.nodes, self.skins, self._scenes = (
             objects(tree, kind) for kind in kinds
         )
         self._scene = tree.get("scene", 0)
@@ -128,10 +128,11 @@ class GltfDocument:
             raise MeshError("a node of its scene lies in another one, or is there twice")
         return roots
 
-    def placed_meshes(self) -> Iterator[tuple[int, FloatArray | None]]:
-        """Yield each mesh of the scene by its index, with its matrix (4, 4), or None for the identity."""
+    def placed_meshes(self) -> Iterator[PlacedMesh]:
+        """Yield the meshes of the scene, each as its node poses it."""
         if not self.nodes:
-            yield from ((k, None) for k in range(len(self.meshes)))
+            yield from (PlacedMesh(mesh, {}, None, {}) for mesh in self.meshes)
+        places: dict[int, FloatArray | None] = {}
         # The last root is first. Bundles and codes depend on this order.
         waiting: list[tuple[int, FloatArray | None, int]] = [(root, None, 1) for root in self.roots()]
         while waiting:
@@ -140,10 +141,36 @@ class GltfDocument:
                 raise MeshError(f"its nodes lie more than {_MOST_LEVELS} deep in each other")
             node = entry_at(self.nodes, number)
             inner = _matrix(node)
-            place = outer if inner is None else inner if outer is None else outer @ inner
-            waiting += [(child, place, depth + 1) for child in node.get("children", [])]
+            places[number] = outer if inner is None else inner if outer is None else outer @ inner
+            waiting += [(child, places[number], depth + 1) for child in node.get("children", [])]
+        for number, place in places.items():
+            node = self.nodes[number]
             if "mesh" in node:
-                yield node["mesh"], place
+                yield PlacedMesh(entry_at(self.meshes, node["mesh"]), node, place, places)
+
+
+@dataclass(frozen=True, eq=False)
+class PlacedMesh:
+    """A mesh with the node that places it.
+
+    Attributes:
+        mesh: entry of the mesh.
+        node: entry of the node; empty if the file has no nodes.
+        place: matrix (4, 4) of the node in the scene; None for the identity.
+        places: the same of every node of the scene, by its index.
+    """
+
+    mesh: dict[str, Any]
+    node: dict[str, Any]
+    place: FloatArray | None
+    places: Mapping[int, FloatArray | None]
+
+    def joint_place(self, number: int) -> FloatArray:
+        """Return the matrix (4, 4) of a joint; raises ValueError if it is not in the scene."""
+        if number not in self.places:
+            raise ValueError(f"its joint {clipped(number)} is no node of the scene")
+        place = self.places[number]
+        return np.eye(4) if place is None else place
 
 
 def objects(tree: dict[str, Any], name: str) -> list[dict[str, Any]]:
@@ -205,43 +232,63 @@ def _numbers(value: object, length: int) -> FloatArray:
 class Accessor:
     """Location and type of an array of elements (3.6.2)."""
 
-    buffer: int  # index of the buffer
+    buffer: int | None  # index of the buffer; None for elements that are zero
     start: int  # offset of the first byte in the buffer
     stride: int  # bytes from one element to the next
     count: int  # number of elements
     dtype: np.dtype  # type of the components
     width: int  # number of components in an element
     normalized: bool  # whether integers stand for numbers between 0 or −1 and 1
+    sparse: tuple[Accessor, Accessor] | None = None  # indices of elements that are replaced, and their values
 
     @classmethod
     def of(cls, document: GltfDocument, index: object, kind: str, components: tuple[int, ...]) -> Accessor:
         """Return an accessor of a document that has this element type, and one of these component types.
 
         Raises:
-            MeshError: the accessor is sparse or has no data.
+            MeshError: the accessor has no data.
             ValueError: it has another type, or more elements than there are data.
         """
         accessor = entry_at(document.accessors, index)
-        if "sparse" in accessor:
-            raise MeshError(f"its accessor {index} is sparse, which is not read: export every value")
-        if "bufferView" not in accessor:
-            raise MeshError(f"its accessor {index} has no data")
         if accessor["type"] != kind or accessor["componentType"] not in components:
             raise ValueError(f"its accessor {index} is of another type than it has to be")
-        dtype, width = np.dtype(_DTYPES[accessor["componentType"]]), _WIDTHS[kind]
-        number, size = _natural(accessor["count"]), width * dtype.itemsize
-        view = entry_at(document.views, accessor["bufferView"])
-        stride, inside = _natural(view.get("byteStride", size)), _natural(accessor.get("byteOffset", 0))
-        if not number or not size <= stride <= _LARGEST_STRIDE:
-            raise ValueError(f"its accessor {index} has {number} elements, {stride} bytes apart")
+        normalized = accessor.get("normalized", False) is True
+        count, sparse = _natural(accessor["count"]), accessor.get("sparse")
+        if "bufferView" in accessor:
+            found = cls._in_view(document, accessor, accessor["componentType"], kind, count, f"accessor {index}")
+        elif sparse is None:
+            raise MeshError(f"its accessor {index} has no data")
+        else:
+            found = cls(None, 0, 0, count, np.dtype(_DTYPES[accessor["componentType"]]), _WIDTHS[kind], False)
+        pair = None
+        if sparse is not None:
+            number, where = _natural(sparse["count"]), f"sparse accessor {index}"
+            indices, values = sparse["indices"], sparse["values"]
+            pair = (
+                cls._in_view(document, indices, indices["componentType"], "SCALAR", number, where),
+                cls._in_view(document, values, accessor["componentType"], kind, number, where),
+            )
+        return replace(found, normalized=normalized, sparse=pair)
+
+    @classmethod
+    def _in_view(
+        cls, document: GltfDocument, entry: dict[str, Any], component: int, kind: str, count: int, name: str
+    ) -> Accessor:
+        """Return the elements of an entry that has a buffer view."""
+        dtype, width = np.dtype(_DTYPES[component]), _WIDTHS[kind]
+        size = width * dtype.itemsize
+        view = entry_at(document.views, entry["bufferView"])
+        stride, inside = _natural(view.get("byteStride", size)), _natural(entry.get("byteOffset", 0))
+        if not count or not size <= stride <= _LARGEST_STRIDE:
+            raise ValueError(f"its {name} has {count} elements, {stride} bytes apart")
         start, length = _natural(view.get("byteOffset", 0)), _natural(view["byteLength"])
         buffer = _natural(view["buffer"])
         if (
-            inside + (number - 1) * stride + size > length
+            inside + (count - 1) * stride + size > length
             or start + length > _natural(entry_at(document.buffers, buffer)["byteLength"])
         ):  # fmt: skip
-            raise ValueError(f"its accessor {index} has {number} elements, which is more than there are data")
-        return cls(buffer, start + inside, stride, number, dtype, width, accessor.get("normalized", False) is True)
+            raise ValueError(f"its {name} has {count} elements, which is more than there are data")
+        return cls(buffer, start + inside, stride, count, dtype, width, normalized=False)
 
     def real(self, buffers: Buffers) -> FloatArray:
         """Return the elements (count, width) as float64; normalised integers become fractions."""
@@ -254,9 +301,19 @@ class Accessor:
 
     def read(self, buffers: Buffers) -> NDArray:
         """Return the elements (count, width) in the type of the file."""
-        size = self.width * self.dtype.itemsize
-        content = buffers.read(self.buffer, self.start, self.start + (self.count - 1) * self.stride + size)
-        return np.ndarray((self.count, self.width), self.dtype, content, 0, (self.stride, self.dtype.itemsize))
+        if self.buffer is None:
+            elements: NDArray = np.zeros((self.count, self.width), self.dtype)
+        else:
+            size = self.width * self.dtype.itemsize
+            content = buffers.read(self.buffer, self.start, self.start + (self.count - 1) * self.stride + size)
+            strides = (self.stride, self.dtype.itemsize)
+            elements = np.ndarray((self.count, self.width), self.dtype, content, 0, strides)
+        if self.sparse is None:
+            return elements
+        indices, values = self.sparse
+        elements = elements.copy()
+        elements[indices.read(buffers).ravel()] = values.read(buffers)
+        return elements
 
 
 class Buffers:

@@ -1,20 +1,30 @@
-"""Reader of glTF 2.0: the triangles of the scene at rest.
+"""Reader of glTF 2.0: the triangles of the scene as the file poses it.
 
-Skins, morph targets, animations, cameras, lights and materials are ignored. A file is refused if it requires something
-that would change the triangles and that is not read here. Each node is visited once, and the size of the scene is known
-before its data are unpacked. Sections in comments are sections of the Khronos Group's glTF 2.0 specification.
+Morph targets have the weights that the file gives them, and skins the pose of their joints. Animations, cameras, lights
+and materials are ignored. A file is refused if it requires something that would change the triangles and that is not
+read here. Each node is visited once, and the size of the scene is known before its data are unpacked. Sections in
+comments are sections of the Khronos Group's glTF 2.0 specification.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import count
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from shapespace.arrays import FloatArray, IntArray
-from shapespace.files.gltf_document import Accessor, Buffers, GltfDocument, entry_at, objects, read_document
+from shapespace.files.gltf_document import (
+    Accessor,
+    Buffers,
+    GltfDocument,
+    PlacedMesh,
+    entry_at,
+    objects,
+    read_document,
+)
 from shapespace.files.limits import Limits
 from shapespace.mesh.triangle_mesh import MeshError
 
@@ -26,6 +36,8 @@ _TRIANGLES, _STRIP, _FAN = 4, 5, 6
 _POSITIONS, _INDICES = (5120, 5121, 5122, 5123, 5126), (5121, 5123, 5125)
 #: Component types of attributes whose elements are integers: glTF allows no larger ones there (3.7.2.1).
 _NUMBERS = (5121, 5123, 5126)
+#: Component types of joints and of their weights (3.7.3.3).
+_JOINTS, _WEIGHTS = (5121, 5123), (5121, 5123, 5126)
 
 
 def read_gltf(
@@ -76,8 +88,11 @@ class Scene:
         self.document, self.buffers, self.parts = document, buffers, _placed_primitives(document)
         numbered = all(part.numbers for part in self.parts)
         # Files of this project have one primitive for each material, with common vertices.
-        sources = [(part.positions, part.numbers) if numbered and part.place is None else k
-                   for k, part in enumerate(self.parts)]  # fmt: skip
+        still = [part.place is None and part.skin is None for part in self.parts]
+        sources = [
+            (part.positions, part.numbers, part.targets) if numbered and still[k] else k
+            for k, part in enumerate(self.parts)
+        ]
         self.read = [self.parts[sources.index(source)] for source in dict.fromkeys(sources)]
         limits.check(sum(part.positions.count for part in self.read), sum(part.most_faces for part in self.parts))
         begins = np.cumsum([0, *(part.positions.count for part in self.read)])
@@ -107,13 +122,15 @@ class Scene:
 
 @dataclass(frozen=True)
 class PlacedPrimitive:
-    """A primitive at one of its places (3.7.2)."""
+    """A primitive as one node of the scene poses it (3.7.2)."""
 
     positions: Accessor  # accessor of the vertices
     indices: Accessor | None  # accessor of the corners; None if each vertex is one corner, in order
     numbers: Accessor | None  # accessor of the attribute _VERTEX, if any
     mode: int  # how the corners form triangles
-    place: FloatArray | None  # matrix (4, 4) of the place; None for the identity
+    targets: tuple[tuple[Accessor, float], ...]  # morph targets with their weights, where these are not zero
+    skin: Skin | None  # joints that move the vertices, if any
+    place: FloatArray | None  # matrix (4, 4); None for the identity, and for a skin, whose node has no effect (3.7.3.3)
     primitive: dict[str, Any]  # entry of the primitive in the file
     mesh: dict[str, Any]  # entry of its mesh
 
@@ -128,11 +145,15 @@ class PlacedPrimitive:
         return self.corners // 3 if self.mode == _TRIANGLES else max(0, self.corners - 2)
 
     def vertices(self, buffers: Buffers) -> FloatArray:
-        """Return the vertices (count, 3) at this place."""
+        """Return the vertices (count, 3) in the scene."""
         vertices = self.positions.real(buffers)
-        if self.place is not None:
-            # The caller decides about coordinates that aren't finite.
-            with np.errstate(all="ignore"):
+        # The caller decides about coordinates that aren't finite.
+        with np.errstate(all="ignore"):
+            for target, weight in self.targets:
+                vertices += weight * target.real(buffers)
+            if self.skin:
+                return self.skin.posed(vertices, buffers)
+            if self.place is not None:
                 vertices = vertices @ self.place[:3, :3].T + self.place[:3, 3]
         return vertices
 
@@ -156,40 +177,117 @@ class PlacedPrimitive:
                 faces[1::2] = faces[1::2, [0, 2, 1]]
             # Triangles without area join strips.
             faces = faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)]
-        mirrored = self.place is not None and np.linalg.det(self.place[:3, :3]) < 0
+        matrices = self.skin.matrices(buffers) if self.skin else self.place
+        mirrored = matrices is not None and (np.linalg.det(matrices[..., :3, :3]) < 0).all()
         return faces[:, ::-1] if mirrored else faces
 
 
+@dataclass(frozen=True, eq=False)
+class Skin:
+    """Joints of a skin with their influence on the vertices of a primitive (3.7.3).
+
+    Attributes:
+        places: (J, 4, 4) matrices of the joints in the scene.
+        inverse_bind: accessor of matrices (J, 16) that take the mesh to the joints; None for identities.
+        joints, weights: accessors of sets of four joints for each vertex, and of their weights.
+    """
+
+    places: FloatArray
+    inverse_bind: Accessor | None
+    joints: tuple[Accessor, ...]
+    weights: tuple[Accessor, ...]
+
+    def matrices(self, buffers: Buffers) -> FloatArray:
+        """Return the motion (J, 4, 4) of each joint from the mesh at rest to the scene."""
+        if self.inverse_bind is None:
+            return self.places
+        inverse = self.inverse_bind.real(buffers)[: len(self.places)].reshape(-1, 4, 4)
+        return self.places @ inverse.transpose(0, 2, 1)
+
+    def posed(self, vertices: FloatArray, buffers: Buffers) -> FloatArray:
+        """Return the vertices (count, 3) moved by the joints, by linear blend skinning."""
+        matrices = self.matrices(buffers)
+        joints = np.hstack([accessor.read(buffers) for accessor in self.joints])
+        weights = np.hstack([accessor.real(buffers) for accessor in self.weights])
+        if joints[weights != 0].max(initial=0) >= len(matrices):
+            raise ValueError(f"its skin has {len(matrices)} joints, and a vertex names joint {joints.max()}")
+        # Viewers normalise weights, and let the first joint carry a vertex that has none.
+        weights[weights.sum(axis=1) == 0, 0] = 1.0
+        weights /= weights.sum(axis=1, keepdims=True)
+        posed = np.zeros_like(vertices)
+        for joint, weight in zip(joints.T, weights.T, strict=True):
+            used = np.flatnonzero(weight)
+            moved = (
+                np.einsum("nij,nj->ni", matrices[joint[used], :3, :3], vertices[used]) + matrices[joint[used], :3, 3]
+            )
+            posed[used] += weight[used, None] * moved
+        return posed
+
+
 def _placed_primitives(document: GltfDocument) -> list[PlacedPrimitive]:
-    """Return every primitive of the scene, once for each of its places."""
+    """Return every primitive of the scene, once for each node that places it."""
     found: list[PlacedPrimitive] = []
-    for number, place in document.placed_meshes():
-        mesh = entry_at(document.meshes, number)
-        for primitive in objects(mesh, "primitives"):
+    for placed in document.placed_meshes():
+        for primitive in objects(placed.mesh, "primitives"):
             if len(found) == _MOST_PRIMITIVES:
                 raise MeshError(f"its scene comes to more than {_MOST_PRIMITIVES} parts")
-            found.append(_placed_primitive(document, primitive, place, mesh))
+            found.append(_placed_primitive(document, primitive, placed))
     if not found:
         raise MeshError("holds no mesh")
     return found
 
 
-def _placed_primitive(
-    document: GltfDocument, primitive: dict[str, Any], place: FloatArray | None, mesh: dict[str, Any]
-) -> PlacedPrimitive:
-    mode = primitive.get("mode", _TRIANGLES)
+def _placed_primitive(document: GltfDocument, primitive: dict[str, Any], placed: PlacedMesh) -> PlacedPrimitive:
+    mode, attributes = primitive.get("mode", _TRIANGLES), primitive["attributes"]
     if mode not in (_TRIANGLES, _STRIP, _FAN):
         raise MeshError("has points or lines: export triangles only")
-    positions = Accessor.of(document, primitive["attributes"]["POSITION"], "VEC3", _POSITIONS)
+    positions = Accessor.of(document, attributes["POSITION"], "VEC3", _POSITIONS)
     indices = None
     if "indices" in primitive:
         indices = Accessor.of(document, primitive["indices"], "SCALAR", _INDICES)
     numbers = None
-    if "_VERTEX" in primitive["attributes"]:
-        numbers = Accessor.of(document, primitive["attributes"]["_VERTEX"], "SCALAR", _NUMBERS)
+    if "_VERTEX" in attributes:
+        numbers = Accessor.of(document, attributes["_VERTEX"], "SCALAR", _NUMBERS)
         if numbers.count != positions.count:
             raise ValueError(f"_VERTEX numbers {numbers.count} of {positions.count} vertices")
-    part = PlacedPrimitive(positions, indices, numbers, mode, place, primitive, mesh)
+    targets, skin = _targets(document, primitive, placed, positions.count), None
+    if "skin" in placed.node and "JOINTS_0" in attributes:
+        skin = _skin(document, attributes, placed, positions.count)
+    place = None if skin else placed.place
+    part = PlacedPrimitive(positions, indices, numbers, mode, targets, skin, place, primitive, placed.mesh)
     if part.corners < 3 or (mode == _TRIANGLES and part.corners % 3):
         raise ValueError(f"{part.corners} corners make no triangles")
     return part
+
+
+def _targets(
+    document: GltfDocument, primitive: dict[str, Any], placed: PlacedMesh, vertices: int
+) -> tuple[tuple[Accessor, float], ...]:
+    """Return the morph targets that move vertices, with their weights: the weights of a node win (3.7.2.2)."""
+    weights = placed.node.get("weights", placed.mesh.get("weights", []))
+    found = []
+    for target, weight in zip(objects(primitive, "targets"), map(float, weights), strict=False):
+        if weight and "POSITION" in target:
+            accessor = Accessor.of(document, target["POSITION"], "VEC3", _POSITIONS)
+            if accessor.count != vertices:
+                raise ValueError(f"a morph target has {accessor.count} of {vertices} vertices")
+            found.append((accessor, weight))
+    return tuple(found)
+
+
+def _skin(document: GltfDocument, attributes: dict[str, Any], placed: PlacedMesh, vertices: int) -> Skin:
+    entry = entry_at(document.skins, placed.node["skin"])
+    places = np.array([placed.joint_place(joint) for joint in entry["joints"]])
+    inverse = entry.get("inverseBindMatrices")
+    inverse_bind = None if inverse is None else Accessor.of(document, inverse, "MAT4", (5126,))
+    if inverse_bind is not None and inverse_bind.count < len(places):
+        raise ValueError(f"its skin has {len(places)} joints and {inverse_bind.count} matrices for them")
+    joints, weights = [], []
+    for k in count():
+        if f"JOINTS_{k}" not in attributes:
+            break
+        joints.append(Accessor.of(document, attributes[f"JOINTS_{k}"], "VEC4", _JOINTS))
+        weights.append(Accessor.of(document, attributes[f"WEIGHTS_{k}"], "VEC4", _WEIGHTS))
+    if any(accessor.count != vertices for accessor in (*joints, *weights)):
+        raise ValueError("its skin has other numbers of joints and weights than of vertices")
+    return Skin(places, inverse_bind, tuple(joints), tuple(weights))

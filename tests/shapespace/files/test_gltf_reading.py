@@ -304,11 +304,8 @@ REFUSED: dict[str, tuple[bytes | dict[str, Any], str]] = {
     "a node in itself": (document(nodes=[{"mesh": 0, "children": [0]}]), "lies in another one"),
     "a root twice": (document(scenes=[{"nodes": [0, 0]}]), "is there twice"),
     "a child twice": (document(nodes=[{"children": [1, 1]}, {"mesh": 0}]), "lies in two others"),
-    "sparse": (accessor(sparse=SPARSE), "accessor 0 is sparse"),
-    "sparse without more": (
-        document(accessors=[HOLLOW | {"sparse": SPARSE}] * 2),
-        "accessor 0 is sparse",
-    ),
+    "sparse beyond": (accessor(sparse=SPARSE | {"count": 20}), "sparse accessor 0 has 20 elements"),
+    "sparse without a view": (accessor(sparse={"count": 1, "indices": {}, "values": {}}), "not a readable glb"),
     "no data": (document(accessors=[HOLLOW] * 2), "accessor 0 has no data"),
     "Draco": (document(extensionsRequired=["KHR_draco_mesh_compression"]), "KHR_draco_mesh_compression, which"),
     "several": (document(extensionsRequired=["KHR_materials_unlit", "A", "B"]), "requires A, B, which is not read"),
