@@ -1,4 +1,4 @@
-"""Readers of OBJ, OFF, STL and XYZ: the vertices in the order of the file, and its polygons as triangles.
+"""Readers of OBJ, OFF and STL: the vertices in the order of the file, and its polygons as triangles.
 
 Other readers split and reorder vertices along seams of texture, so this project has its own. Each goes through its file
 once.
@@ -135,19 +135,6 @@ def read_off(data: memoryview, limits: Limits) -> tuple[FloatArray, IntArray]:
             corners, *values = lines.next().split()
             triangles.add([int(value) for value in first_values(int(corners), values)])
     return np.array(coordinates, np.float64).reshape(-1, 3), triangles.faces
-
-
-def read_xyz(data: memoryview, limits: Limits) -> tuple[FloatArray, IntArray]:
-    """Return the points (N, 3) of a text with one point on each line, and no faces.
-
-    Numbers after the first three of a line are ignored.
-    """
-    coordinates = array("d")
-    with Lines(data) as lines:
-        for line in lines:
-            coordinates.extend(_point(line.replace(b",", b" ")))
-            limits.check(len(coordinates) // 3, 0)
-    return np.array(coordinates, np.float64).reshape(-1, 3), np.zeros((0, 3), np.int64)
 
 
 def first_values(count: int, values: Sequence[bytes]) -> Sequence[bytes]:

@@ -12,8 +12,10 @@ import numpy as np
 from shapespace.files.gltf_reading import read_gltf
 from shapespace.files.limits import UNLIMITED, Limits, clipped
 from shapespace.files.npz import read_mesh_npz
+from shapespace.files.pcd_reading import read_pcd
 from shapespace.files.ply_reading import read_ply
-from shapespace.files.polygon_reading import read_obj, read_off, read_stl, read_xyz
+from shapespace.files.point_text_reading import read_point_text
+from shapespace.files.polygon_reading import read_obj, read_off, read_stl
 from shapespace.mesh.triangle_mesh import MeshError
 
 #: Media type of formats that have none registered at IANA.
@@ -29,7 +31,13 @@ READ_FORMATS = {
     "off": OCTET_STREAM,
 }
 #: Media types of the formats of point clouds, which may have no faces.
-SCAN_FORMATS = READ_FORMATS | {"xyz": OCTET_STREAM}
+SCAN_FORMATS = READ_FORMATS | {
+    "xyz": OCTET_STREAM,
+    "pts": OCTET_STREAM,
+    "csv": "text/csv",
+    "txt": "text/plain",
+    "pcd": OCTET_STREAM,
+}
 _READERS = {"obj": read_obj, "off": read_off, "ply": read_ply, "stl": read_stl}
 
 
@@ -79,8 +87,10 @@ def read_arrays(
                     needed = ("vertices",) if points else ("vertices", "faces")
                     arrays = read_mesh_npz(data, limits=limits, needed=needed)
                     return arrays["vertices"], arrays.get("faces", np.zeros((0, 3), np.int64))
-                case "xyz" if points:
-                    return read_xyz(data, limits)
+                case "xyz" | "pts" | "csv" | "txt" if points:
+                    return read_point_text(data, limits)
+                case "pcd" if points:
+                    return read_pcd(data, limits)
                 case _:
                     return _READERS[str(format)](data, limits)
     except (MeshError, MemoryError):

@@ -230,8 +230,6 @@ def test_points_come_without_faces_where_they_will_do() -> None:
         points, faces = read_arrays(content, format, points=True)
         np.testing.assert_array_equal(points, CORNERS)
         assert faces.shape == (0, 3)
-    commas, _ = read_arrays(rows.replace("\t", ",").encode(), "xyz", points=True)
-    np.testing.assert_array_equal(commas, CORNERS)
 
 
 def test_points_alone_are_no_mesh() -> None:
