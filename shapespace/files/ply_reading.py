@@ -117,10 +117,10 @@ def read_header(data: memoryview) -> tuple[bool, list[PlyElement], memoryview]:
                 order = _BYTE_ORDERS[kind]
             case [b"element", name, rows]:
                 elements.append(PlyElement(name.decode("latin-1"), int(rows), []))
-            case [b"property", b"list", length, kind, name]:
-                elements[-1].properties.append(_property(name, kind, length, order))
-            case [b"property", kind, name]:
-                elements[-1].properties.append(_property(name, kind, None, order))
+            case [b"property", b"list", length, kind, name, *more]:
+                elements[-1].properties.append(_property(b" ".join([name, *more]), kind, length, order))
+            case [b"property", kind, name, *more]:
+                elements[-1].properties.append(_property(b" ".join([name, *more]), kind, None, order))
     if order is None or len({e.name for e in elements}) < len(elements) or any(e.rows < 0 for e in elements):
         raise ValueError("its head is damaged")
     return order == "", elements, data[end.end() :]
@@ -227,11 +227,29 @@ class BinaryTable:
         if equal and spans[which][1] == 3:
             self._place += rows.nbytes
             return rows[f"{corners}"].astype(np.int64)
-        triangles = TriangleFans(self._limits)
-        for (polygon,) in self.lists(element, [corners]):
-            self._limits.check(0, len(polygon) - 2)
-            triangles.add(polygon.tolist())
-        return triangles.faces
+        starts, sizes = self._spans(element, which)
+        if sizes.min() < 3:
+            raise ValueError(f"a face has {sizes.min()} corners")
+        ends = np.cumsum(sizes - 2)
+        self._limits.check(0, int(ends[-1]))
+        faces = np.empty((ends[-1], 3), np.int64)
+        kind = element.properties[corners].type
+        content = np.frombuffer(self._data, np.uint8)
+        for size in np.unique(sizes).tolist():
+            of_size = np.flatnonzero(sizes == size)
+            values = content[starts[of_size, None] + np.arange(size * kind.itemsize)].view(kind).astype(np.int64)
+            for k in range(size - 2):
+                faces[ends[of_size] - (size - 2) + k] = values[:, [0, k + 1, k + 2]]
+        return faces
+
+    def _spans(self, element: PlyElement, which: int) -> tuple[IntArray, IntArray]:
+        """Return first byte and number of entries of list ``which`` in each row of an element, (rows,) each."""
+        starts, lengths = array("q"), array("q")
+        for _ in range(element.rows):
+            spans, self._place = self._row(element)
+            starts.append(spans[which][0])
+            lengths.append(spans[which][1])
+        return np.array(starts), np.array(lengths)
 
     def lists(self, element: PlyElement, which: Sequence[int]) -> Iterator[list[NDArray]]:
         """Yield the lists ``which`` of each row."""

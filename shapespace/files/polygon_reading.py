@@ -22,6 +22,9 @@ from shapespace.mesh.triangle_mesh import MeshError
 #: Bytes that are copied at once to count the lines before an error.
 _PIECE = 2**20
 ENDS_EARLY = "it ends before all that it says is there"
+_BYTE_ORDER_MARK = b"\xef\xbb\xbf"
+#: A line of OBJ that goes on in the next one.
+_CONTINUED = re.compile(rb"\\[ \t]*\r?\n")
 
 
 def _lines_with(start: bytes) -> re.Pattern[bytes]:
@@ -29,15 +32,20 @@ def _lines_with(start: bytes) -> re.Pattern[bytes]:
     return re.compile(rb"(?<![^\r\n])[^\S\r\n]*+(" + start + rb"[^\r\n]*+)")
 
 
-_LINE, _OBJ_LINE, _STL_LINE = map(_lines_with, (rb"[^\s#]", rb"[vf]\b", rb"(?i:vertex|endsolid)"))
+_LINE, _OBJ_LINE, _STL_LINE = map(_lines_with, (rb"[^\s#]", rb"[vfVF]\b", rb"(?i:vertex|endsolid)"))
 
 
 class Lines:
-    """The lines of a text that are neither empty nor a remark; where one can't be understood, the error names it."""
+    """The lines of a text that are neither empty nor a remark; where one can't be understood, the error names it.
+
+    Args:
+        data: the text in UTF-8, with or without a byte-order mark, or in UTF-16 with one.
+        line: a pattern of the lines that count, each its first group.
+    """
 
     def __init__(self, data: memoryview, line: re.Pattern[bytes] = _LINE) -> None:
-        self._data, self._place = data, 0
-        self._matches = line.finditer(data)
+        self._data, self._place = _as_utf8(data), 0
+        self._matches = line.finditer(self._data)
         self._lines = self._all()
 
     def _all(self) -> Iterator[bytes]:
@@ -74,6 +82,20 @@ class Lines:
             raise ValueError(f"line {self._number} is {clipped(text)!r}") from None
 
 
+def _as_utf8(data: memoryview) -> memoryview:
+    """Return a text without its byte-order mark."""
+    if data[:3] == _BYTE_ORDER_MARK:
+        return data[3:]
+    if bytes(data[:2]) in (b"\xff\xfe", b"\xfe\xff"):
+        return memoryview(str(data, "utf-16").encode())
+    return data
+
+
+def joined_lines(data: memoryview) -> memoryview:
+    """Return an OBJ or MTL text with lines that end in a backslash joined to the next one."""
+    return memoryview(_CONTINUED.sub(b" ", data)) if _CONTINUED.search(data) else data
+
+
 class TriangleFans:
     """Triangles from polygons: the triangles of a polygon have its first corner in common."""
 
@@ -98,13 +120,13 @@ class TriangleFans:
 def read_obj(data: memoryview, limits: Limits) -> tuple[FloatArray, IntArray]:
     """Return vertices (V, 3) and faces (F, 3) of an OBJ file; everything else is ignored."""
     coordinates, triangles = array("d"), TriangleFans(limits)
-    with Lines(data, _OBJ_LINE) as lines:
+    with Lines(joined_lines(data), _OBJ_LINE) as lines:
         for line in lines:
             keyword, *values = line.split(None, 1)
-            if keyword == b"v":
+            if keyword in b"vV":
                 coordinates.extend(_point(values[0]))
                 limits.check(len(coordinates) // 3, 0)
-            elif keyword == b"f":
+            else:
                 here = len(coordinates) // 3
                 numbers = [int(value.partition(b"/")[0]) for value in values[0].partition(b"#")[0].split()]
                 # Negative numbers count back from the last vertex before this line.
@@ -118,23 +140,38 @@ def _point(values: bytes) -> tuple[float, float, float]:
 
 
 def read_off(data: memoryview, limits: Limits) -> tuple[FloatArray, IntArray]:
-    """Return vertices (V, 3) and faces (F, 3) of an OFF file; colours and normals are ignored."""
+    """Return vertices (V, 3) and faces (F, 3) of an OFF file; colours, normals and texture coordinates are ignored.
+
+    The keyword can be OFF with any of ST, C and N in front. Counts and rows may go on in the next line.
+    """
     coordinates, triangles = array("d"), TriangleFans(limits)
     with Lines(data) as lines:
-        keyword, *counts = lines.next().split()
-        if not re.fullmatch(rb"(ST)?C?N?OFF", keyword):
+        found = re.fullmatch(rb"(?i:(?:ST)?[CN]{0,2}OFF)(\s+BINARY\b.*|[\s\d].*)?", lines.next())
+        if not found:
             raise ValueError("another kind of file")
-        # The counts are on the line of the keyword or on the next one.
-        vertex_count, face_count, *_ = (int(value) for value in counts or lines.next().split())
+        if found[1] and found[1].split()[0].upper() == b"BINARY":
+            raise MeshError("it is binary OFF, which is not read: save it as text")
+        counts = _row(lines, 1, (found[1] or b"").split())
+        counts = counts if len(counts) > 1 else _row(lines, 3, counts)
+        vertex_count, face_count = int(counts[0]), int(counts[1])
         limits.check(vertex_count, face_count)
         if min(vertex_count, face_count) < 0:
             raise ValueError("less than none")
-        for _ in range(vertex_count):
-            coordinates.extend(_point(lines.next()))
+        while len(coordinates) < 3 * vertex_count:
+            coordinates.extend(map(float, _row(lines, 3)[:3]))
         for _ in range(face_count):
-            corners, *values = lines.next().split()
-            triangles.add([int(value) for value in first_values(int(corners), values)])
+            row = _row(lines, 1)
+            corners = int(row[0])
+            triangles.add([int(value) for value in first_values(corners, _row(lines, 1 + corners, row)[1:])])
     return np.array(coordinates, np.float64).reshape(-1, 3), triangles.faces
+
+
+def _row(lines: Lines, count: int, row: list[bytes] | None = None) -> list[bytes]:
+    """Return a row of at least ``count`` values, from one line or several; ``row`` has its first values."""
+    row = row or []
+    while len(row) < count:
+        row += lines.next().partition(b"#")[0].split()
+    return row
 
 
 def first_values(count: int, values: Sequence[bytes]) -> Sequence[bytes]:
@@ -152,28 +189,32 @@ _STL_HEADER, _STL_COUNT = 84, 80
 def read_stl(data: memoryview, limits: Limits) -> tuple[FloatArray, IntArray]:
     """Return vertices (3F, 3) and faces (F, 3) of a binary or ASCII STL file, with three vertices for each face."""
     triangles = struct.unpack_from("<I", data, _STL_COUNT)[0] if len(data) >= _STL_HEADER else 0
-    # A binary file may start like a text, but its length shows what it is.
-    if len(data) == _STL_HEADER + triangles * _STL.itemsize:
+    binary = _STL_HEADER + triangles * _STL.itemsize
+    # A binary file may start like a text, but its length shows what it is. Some programs append bytes.
+    if len(data) == binary or (triangles > 0 and binary < len(data) and not _is_ascii_stl(data)):
         limits.check(3 * triangles, triangles)
-        corners = np.frombuffer(data, _STL, offset=_STL_HEADER)["corners"]
+        corners = np.frombuffer(data, _STL, triangles, _STL_HEADER)["corners"]
         vertices = corners.astype(np.float64).reshape(-1, 3)
     else:
         vertices = _ascii_stl(data, limits)
     return vertices, np.arange(len(vertices)).reshape(-1, 3)
 
 
+def _is_ascii_stl(data: memoryview) -> bool:
+    start = bytes(data[:1000]).lower()
+    return start.lstrip(_BYTE_ORDER_MARK + b" \t\r\n").startswith(b"solid") and b"\0" not in start
+
+
 def _ascii_stl(data: memoryview, limits: Limits) -> FloatArray:
+    """Return the corners (3F, 3) of all solids, one after the other."""
     coordinates, solids = array("d"), 0
     with Lines(data, _STL_LINE) as lines:
         for line in lines:
-            keyword = line[:8].lower()
-            if keyword.startswith(b"vertex"):
+            if line[:6].lower() == b"vertex":
                 coordinates.extend(_point(line[6:]))
                 limits.check(len(coordinates) // 3, len(coordinates) // 9)
-            elif keyword == b"endsolid":
+            else:
                 solids += 1
     if not solids or len(coordinates) % 9:
         raise ValueError("damaged, or another kind of file")
-    if solids > 1:
-        raise MeshError(f"holds {solids} meshes; a file needs exactly one")
     return np.array(coordinates, np.float64).reshape(-1, 3)

@@ -16,7 +16,7 @@ from shapespace.files.attributes.textures import Textures, beside
 from shapespace.files.colouring import Colouring
 from shapespace.files.gltf_writing import surface_normals
 from shapespace.files.limits import clipped, label
-from shapespace.files.polygon_reading import Lines
+from shapespace.files.polygon_reading import Lines, joined_lines
 from shapespace.mesh.attributes import NONE, Labels, MeshAttributes, SurfaceMaterial, labelled
 from shapespace.mesh.triangle_mesh import MeshError
 
@@ -34,9 +34,10 @@ def read(path: Path, faults: list[str]) -> MeshAttributes:
     objects, groups, materials = list[str | None](), list[str | None](), list[str | None]()
     current: dict[bytes, str | None] = {b"o": None, b"g": None, b"usemtl": None}
     libraries, smooth, told, points = list[str](), 0, False, 0
-    with Lines(memoryview(path.read_bytes())) as lines:
+    with Lines(joined_lines(memoryview(path.read_bytes()))) as lines:
         for line in lines:
             keyword, *values = line.split(None, 1)
+            keyword = keyword.lower() if keyword in (b"V", b"F") else keyword
             rest = values[0].partition(b"#")[0].strip() if values else b""
             if keyword == b"v":
                 row = rest.split()
@@ -159,7 +160,7 @@ def _read_library(path: Path, textures: Textures, wanted: set[str]) -> dict[str,
             opacity = look.pop("opacity", 1.0)
             found[name] = SurfaceMaterial(name, (*color, opacity), texture=kept, **look)  # type: ignore[arg-type, misc]
 
-    with Lines(memoryview(path.read_bytes())) as lines:
+    with Lines(joined_lines(memoryview(path.read_bytes()))) as lines:
         for line in lines:
             keyword, *values = line.split(None, 1)
             if keyword == b"newmtl":
