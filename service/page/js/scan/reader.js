@@ -11,7 +11,7 @@ import { fixedBy, sameCode } from "../server/space.js";
 import { encodeInWords, fitInWords } from "./words.js";
 import { Verdict } from "./verdict.js";
 
-const POINTS_ONLY = ["xyz"];
+const POINTS_ONLY = ["xyz", "pts", "csv", "txt", "pcd"];
 const UNITS = "scale=free"; // the server suggests this for a scan in other units
 
 export class Reader {
