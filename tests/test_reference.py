@@ -1,6 +1,5 @@
 """docs/reference has everything that the code reads, writes or answers, and nothing else."""
 
-import inspect
 import json
 import re
 from pathlib import Path
@@ -9,7 +8,7 @@ from typing import Any
 from shapespace.bundle.schema import ARRAYS, MANIFEST, Manifest
 from shapespace.files.formats import MESH_FORMATS, USD_FORMATS
 from shapespace.files.reading import SCAN_FORMATS
-from shapespace.training.runs.directory import RunDirectory
+from shapespace.training.runs.directory import RunDirectory, RunFile
 
 ROOT = Path(__file__).parents[1]
 
@@ -36,8 +35,9 @@ def test_every_member_and_array_of_a_bundle() -> None:
 
 def test_every_file_of_a_run_directory() -> None:
     run = RunDirectory(Path("RUN"))
-    properties = inspect.getmembers(RunDirectory, lambda member: isinstance(member, property))
-    files: list[Any] = [getattr(run, name) for name, _ in properties]
+    files: list[Any] = [
+        getattr(run, name) for name, member in vars(RunDirectory).items() if isinstance(member, RunFile)
+    ]
     files += [run.stamp("STAGE"), run.factor_samples(0), run.network("NAME")]
     names = {str(getattr(file, "path", file)).removeprefix("RUN/").replace("factor-0", "factor-J") for file in files}
     table = page("run-directory").split("| file | holds |")[1]

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 
@@ -15,31 +15,35 @@ from shapespace.arrays import FloatArray
 from shapespace.mesh.triangle_mesh import TriangleMesh
 from shapespace.training.runs.atomic_files import JsonFile, NpzFile, TextFile
 
+File = TypeVar("File")
+
+
+class RunFile(Generic[File]):
+    """A file or folder of each run directory, by its path there."""
+
+    def __init__(self, kind: Callable[[Path], File], path: str) -> None:
+        self.kind, self.path = kind, path
+
+    def __get__(self, run: RunDirectory, _: type[RunDirectory]) -> File:
+        return self.kind(run.folder / self.path)
+
 
 @dataclass(frozen=True)
 class RunDirectory:
     """The files of one run; each may be missing.
 
     There are n shapes and m modes. The coarse mesh, on which a run computes, has V vertices and E edges.
-
-    Attributes:
-        folder: the run directory.
     """
 
     folder: Path
 
-    def _npz(self, name: str) -> NpzFile:
-        return NpzFile(self.folder / f"{name}.npz")
-
-    def _json(self, name: str) -> JsonFile:
-        return JsonFile(self.folder / f"{name}.json")
-
     # The whole run.
 
-    @property
-    def config(self) -> TextFile:
-        """The configuration, with the changes of the command line."""
-        return TextFile(self.folder / "config.toml")
+    config = RunFile(TextFile, "config.toml")
+    """The configuration, with the changes of the command line."""
+    traceback = RunFile(TextFile, "traceback.txt")
+    """Traceback of an error that is a defect of this program."""
+    _log = RunFile(Path, "log.jsonl")
 
     def is_run(self) -> bool:
         """Return whether the folder is a run directory."""
@@ -50,16 +54,12 @@ class RunDirectory:
 
         A stage that has to be done again keeps ``basis`` and ``version`` only, which its folders of samples have.
         """
-        return self._json(f"stages/{stage}")
+        return JsonFile(self.folder / "stages" / f"{stage}.json")
 
     def is_of_0_1(self) -> bool:
         """Return whether version 0.1 began the run: it has a log, but no stage has a version."""
         stamps = (JsonFile(path).read() for path in self.folder.glob("stages/*.json"))
         return self._log.exists() and not any("version" in stamp for stamp in stamps)
-
-    @property
-    def _log(self) -> Path:
-        return self.folder / "log.jsonl"
 
     def log(self, event: str, **facts: Any) -> None:
         """Append one line to ``log.jsonl``."""
@@ -75,108 +75,56 @@ class RunDirectory:
             except json.JSONDecodeError:
                 continue
 
-    @property
-    def traceback(self) -> TextFile:
-        """Traceback of an error that is a defect of this program."""
-        return TextFile(self.folder / "traceback.txt")
-
     # ingest
 
-    @property
-    def data(self) -> JsonFile:
-        """``bytes``, ``time`` and ``sha256`` of each file of the collection when it was read, by its name."""
-        return self._json("data")
-
-    @property
-    def reference(self) -> NpzFile:
-        """``vertices (V, 3)``, ``faces``, ``edges``, ``scale``.
-
-        Where the meshes are finer, also ``fine_vertices``, ``fine_faces`` and ``fine_index (V)``. Where the files have
-        more vertices, also ``file_vertices``.
-        """
-        return self._npz("reference")
-
-    @property
-    def prolongation(self) -> NpzFile:
-        """Prolongation from the coarse mesh to the fine mesh, where the meshes are finer; see Prolongation.arrays."""
-        return self._npz("prolongation")
-
-    @property
-    def shapes(self) -> NpzFile:
-        """``names (n)``, normalised ``vertices (n, V, 3)``, ``files (n)``, ``first (n)`` vertex number of each file.
-
-        Mirror images come last. ``original (n)`` is the index of the original, or of the shape itself.
-        """
-        return self._npz("shapes")
-
-    @property
-    def ingest(self) -> JsonFile:
-        """Notes and warnings on the collection, and facts about the coarse mesh."""
-        return self._json("ingest")
-
-    @property
-    def surface(self) -> NpzFile:
-        """Attributes of the reference's file: bundle.attributes.surface_arrays, and textures as bytes."""
-        return self._npz("surface")
-
-    @property
-    def surface_names(self) -> JsonFile:
-        """Names of these attributes: bundle.schema.AttributesEntry."""
-        return self._json("surface")
+    data = RunFile(JsonFile, "data.json")
+    """``bytes``, ``time`` and ``sha256`` of each file of the collection when it was read, by its name."""
+    reference = RunFile(NpzFile, "reference.npz")
+    """``vertices (V, 3)``, ``faces``, ``edges``, ``scale``; where the meshes are finer, also ``fine_vertices``,
+    ``fine_faces`` and ``fine_index (V)``; where the files have more vertices, also ``file_vertices``."""
+    prolongation = RunFile(NpzFile, "prolongation.npz")
+    """Prolongation from the coarse mesh to the fine mesh, where the meshes are finer; see Prolongation.arrays."""
+    shapes = RunFile(NpzFile, "shapes.npz")
+    """``names (n)``, normalised ``vertices (n, V, 3)``, ``files (n)``, ``first (n)`` vertex number of each file.
+    Mirror images come last. ``original (n)`` is the index of the original, or of the shape itself."""
+    ingest = RunFile(JsonFile, "ingest.json")
+    """Notes and warnings on the collection, and facts about the coarse mesh."""
+    surface = RunFile(NpzFile, "surface.npz")
+    """Attributes of the reference's file: bundle.attributes.surface_arrays, and textures as bytes."""
+    surface_names = RunFile(JsonFile, "surface.json")
+    """Names of these attributes: bundle.schema.AttributesEntry."""
 
     # mean, modes, factors
 
-    @property
-    def mean(self) -> NpzFile:
-        """``vertices (V, 3)`` of the centred mean, its ``status``, ``iterations`` and ``residual``; ``steps``, K."""
-        return self._npz("mean")
-
-    @property
-    def modes_by_strength(self) -> NpzFile:
-        """The sparse modes, strongest first: ``nric``, ``vertices``, ``coefficients``, ``lower``, ``upper`` and
-        ``localisation``; ``pga_nric``, ``pga_vertices`` and ``pga_localisation`` are for the principal modes.
-        """
-        return self._npz("modes-by-strength")
-
-    @property
-    def decomposition(self) -> JsonFile:
-        """Facts about the modes: ``modes``, ``explained``, ``history``, and ``steps`` and ``via`` of each logarithm."""
-        return self._json("modes")
-
-    @property
-    def modes(self) -> NpzFile:
-        """The arrays of `modes_by_strength`, in the order of the factors once there are any.
-
-        ``rank (m)`` is the position of each mode in `modes_by_strength`.
-        """
-        return self._npz("modes")
-
-    @property
-    def factors(self) -> JsonFile:
-        """``factors``, lists of modes; ``names``; ``overlap (J, J)``."""
-        return self._json("factors")
+    mean = RunFile(NpzFile, "mean.npz")
+    """``vertices (V, 3)`` of the centred mean, its ``status``, ``iterations`` and ``residual``; ``steps``, K."""
+    modes_by_strength = RunFile(NpzFile, "modes-by-strength.npz")
+    """The sparse modes, strongest first: ``nric``, ``vertices``, ``coefficients``, ``lower``, ``upper`` and
+    ``localisation``; ``pga_nric``, ``pga_vertices`` and ``pga_localisation`` are for the principal modes."""
+    decomposition = RunFile(JsonFile, "modes.json")
+    """Facts about the modes: ``modes``, ``explained``, ``history``, and ``steps`` and ``via`` of each logarithm."""
+    modes = RunFile(NpzFile, "modes.npz")
+    """The arrays of `modes_by_strength`, in the order of the factors once there are any. ``rank (m)`` is the position
+    of each mode in `modes_by_strength`."""
+    factors = RunFile(JsonFile, "factors.json")
+    """``factors``, lists of modes; ``names``; ``overlap (J, J)``."""
 
     # samples: runs.sampling describes the contents of these folders.
 
-    @property
-    def samples(self) -> Path:
-        """Folder of the joint samples.
-
-        ``shapes/`` has samples at the codes of the collection's shapes. ``derivatives/`` has samples at the first
-        training codes, with ``derivatives (n, m, 2E)``.
-        """
-        return self.folder / "samples"
+    samples = RunFile(Path, "samples")
+    """Folder of the joint samples. ``shapes/`` has samples at the codes of the collection's shapes, ``derivatives/``
+    samples at the first training codes, with ``derivatives (n, m, 2E)``."""
+    split = RunFile(NpzFile, "samples/split.npz")
+    """Indices of the joint samples: ``train``, ``validation``, ``test``."""
 
     def factor_samples(self, j: int) -> Path:
         """Return the folder of a factor's own samples."""
         return self.samples / f"factor-{j}"
 
-    @property
-    def split(self) -> NpzFile:
-        """Indices of the joint samples: ``train``, ``validation``, ``test``."""
-        return NpzFile(self.samples / "split.npz")
-
     # networks
+
+    histories = RunFile(JsonFile, "networks/histories.json")
+    """``epoch``, ``best`` and losses of each network, by the name of its file."""
 
     def network(self, name: str) -> Path:
         """Return the file of a network."""
@@ -186,60 +134,34 @@ class RunDirectory:
         """Return the files of all networks."""
         return sorted(self.network("*").parent.glob("*.safetensors"))
 
-    @property
-    def histories(self) -> JsonFile:
-        """``epoch``, ``best`` and losses of each network, by the name of its file."""
-        return self._json("networks/histories")
-
     # generalisation
 
-    @property
-    def generalisation(self) -> JsonFile:
-        """Distances between held-out shapes and the space without them: see stages.generalisation."""
-        return self._json("generalisation")
-
-    @property
-    def least_general(self) -> NpzFile:
-        """The held-out shape ``given (V, 3)`` with the largest distance, and ``found (V, 3)``, its approximation."""
-        return self._npz("least-general")
+    generalisation = RunFile(JsonFile, "generalisation.json")
+    """Distances between held-out shapes and the space without them: see stages.generalisation."""
+    least_general = RunFile(NpzFile, "least-general.npz")
+    """The held-out shape ``given (V, 3)`` with the largest distance, and ``found (V, 3)``, its approximation."""
 
     # evaluation
 
-    @property
-    def exact(self) -> Path:
-        """Folder of exact shapes that only the evaluation needs, in folders like the folders of samples."""
-        return self.folder / "exact"
-
-    @property
-    def evaluation(self) -> JsonFile:
-        """All figures of the evaluation."""
-        return self._json("evaluation")
-
-    @property
-    def gallery(self) -> NpzFile:
-        """Shapes for the report."""
-        return self._npz("gallery")
+    exact = RunFile(Path, "exact")
+    """Folder of exact shapes that only the evaluation needs, in folders like the folders of samples."""
+    evaluation = RunFile(JsonFile, "evaluation.json")
+    """All figures of the evaluation."""
+    gallery = RunFile(NpzFile, "gallery.npz")
+    """Shapes for the report."""
+    report = RunFile(TextFile, "report.html")
+    """The report page."""
 
     # export
 
-    @property
-    def encoded(self) -> JsonFile:
-        """Distances between the training shapes and the shapes of their codes; names of shapes outside the bounds."""
-        return self._json("encoded")
-
-    @property
-    def least_near(self) -> NpzFile:
-        """The training shape ``given (V, 3)`` with the largest distance, and ``found (V, 3)``, its code's shape."""
-        return self._npz("least-near")
-
-    @property
-    def report(self) -> TextFile:
-        """The report page."""
-        return TextFile(self.folder / "report.html")
+    encoded = RunFile(JsonFile, "encoded.json")
+    """Distances between the training shapes and the shapes of their codes; names of shapes outside the bounds."""
+    least_near = RunFile(NpzFile, "least-near.npz")
+    """The training shape ``given (V, 3)`` with the largest distance, and ``found (V, 3)``, its code's shape."""
 
     def study(self, name: str) -> JsonFile:
         """Return the file of a benchmark on this run, which has the ``key`` of the measured stage."""
-        return self._json(name)
+        return JsonFile(self.folder / f"{name}.json")
 
     # Values read from the files above.
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import partial
 from pathlib import Path
 from typing import Protocol
@@ -161,11 +161,11 @@ def draw(
     """Compute the shapes of codes (n, m) into ``folder/part-*.npz``, except for parts that exist already.
 
     Each part is written as soon as it is finished, in any order. It has the status of each sample, done or failed, and
-    the reason of a failure.
+    the reason of a failure. Parts of other codes or of another part size are removed.
 
     Args:
         collection: the collection; sent to the workers.
-        folder: folder of the parts. Parts of other codes or another part size are removed.
+        folder: folder of the parts.
         latents: (n, m) codes.
         part_size: number of codes in a part. A worker computes one part at a time, and loses it if it dies.
         title: title of the progress bar.
@@ -249,52 +249,40 @@ def parts(folder: Path) -> Iterator[Mapping[str, NDArray]]:
             yield part
 
 
-def columns(folder: Path, *names: str) -> dict[str, NDArray]:
-    """Read some arrays of all samples of a folder, including failed ones; an empty mapping where there are no parts."""
+def columns(folder: Path, *names: str, done: bool = False) -> dict[str, NDArray]:
+    """Read some arrays of the samples of a folder, all or the done ones; an empty mapping where there are no parts."""
     found: dict[str, list[NDArray]] = {name: [] for name in names}
     for part in parts(folder):
+        chosen = part["status"] == DONE if done else slice(None)
         for name, arrays in found.items():
-            arrays.append(asked_for(part) if name == "asked" else part[name])
+            arrays.append((asked_for(part) if name == "asked" else part[name])[chosen])
     return {name: np.concatenate(arrays) for name, arrays in found.items() if arrays}
 
 
 def indices(folder: Path) -> IntArray:
     """Return the indices of the samples of a folder that have a shape."""
-    found = columns(folder, "index", "status")
-    return found["index"][found["status"] == DONE]
+    return columns(folder, "index", done=True)["index"]
 
 
 def read(folder: Path) -> Samples:
     """Read all samples of a folder, after the samples at the collection's shapes where there are any."""
-    fields = "index", "latents", "asked", "nric", "vertices"
-    found: dict[str, list[NDArray]] = {name: [] for name in fields}
-    known = len(columns(folder / KNOWN, "index").get("index", ()))
-    for place, first in ((folder / KNOWN, -known), (folder, 0)):
-        for part in parts(place):
-            done = part["status"] == DONE
-            for name in fields:
-                found[name].append((asked_for(part) if name == "asked" else part[name])[done])
-            found["index"][-1] = found["index"][-1] + first
-    return Samples(*(np.concatenate(found[name]) for name in fields))
+    names = [field.name for field in fields(Samples)]
+    known, joint = (columns(place, *names, done=True) for place in (folder / KNOWN, folder))
+    if not known:
+        return Samples(**joint)
+    known["index"] = known["index"] - len(columns(folder / KNOWN, "index")["index"])
+    return Samples(**{name: np.concatenate([known[name], joint[name]]) for name in names})
 
 
 def used(folder: Path, asked: FloatArray) -> FloatArray:
     """Return the requested codes (n, m), each replaced by its shortened code if it was shortened."""
-    found, codes = columns(folder, "index", "latents", "status"), asked.copy()
-    done = found["status"] == DONE
-    codes[found["index"][done]] = found["latents"][done]
+    found, codes = columns(folder, "index", "latents", done=True), asked.copy()
+    codes[found["index"]] = found["latents"]
     return codes
 
 
 def split(index: IntArray, test: float, validation: float, rng: np.random.Generator) -> dict[str, IntArray]:
-    """Split indices at random into sorted parts.
-
-    Args:
-        index: the indices.
-        test: share of all indices for the test.
-        validation: share of the other indices for the validation; the rest is for training.
-        rng: random generator.
-    """
+    """Split indices at random into sorted parts: a share for the test, and a share of the rest for the validation."""
     order = rng.permutation(index)
     n_test = max(1, round(test * len(order)))
     n_validation = max(1, round(validation * (len(order) - n_test)))

@@ -10,6 +10,7 @@ system.
 from __future__ import annotations
 
 import hashlib
+import operator
 import pickle
 import threading
 import time
@@ -151,7 +152,7 @@ def _on_cluster(
                 k = waiting.popleft()
                 # Dask computes a task's result again if the workers that hold it die; scattered data would be lost.
                 sent = sent or client.submit(_itself, function, pure=False)
-                future = client.submit(_call, sent, items[k], pure=False)
+                future = client.submit(operator.call, sent, items[k], pure=False)
                 flying[future.key] = k, future
                 future.add_done_callback(finished.put)
             try:
@@ -177,10 +178,6 @@ def _on_cluster(
                 sent = None
             else:
                 yield k, result
-
-
-def _call(function: Callable[[Item], Result], item: Item) -> Result:
-    return function(item)
 
 
 def _client(scheduler: str) -> Client:

@@ -16,9 +16,9 @@ from shapespace.coordinates.nric import WeightedNorm
 from shapespace.mesh.triangle_mesh import TriangleMesh
 from shapespace.training.space.modes import edge_magnitudes
 
-#: Upper bound of the default threshold: groups whose modes overlap more than this on average are always joined.
+#: Groups whose modes overlap more than this on average are joined in any collection.
 HIGHEST_THRESHOLD = 0.5
-#: Default limit on the modes of a factor, because its samples have to fill a box of that dimension.
+#: Most modes of a factor, because its samples have to fill a box of that dimension.
 LARGEST_FACTOR = 9
 #: An axis gives no names if the mesh's standard deviation along it is below this share of the largest one.
 THIN = 0.2
@@ -60,47 +60,37 @@ def between(overlaps: FloatArray, groups: Sequence[Sequence[int]]) -> FloatArray
     return share @ overlaps @ share.T
 
 
-def group(
-    overlaps: FloatArray, count: int | None = None, *, threshold: float | None = None, largest: int = LARGEST_FACTOR
-) -> list[list[int]]:
+def group(overlaps: FloatArray, count: int | None = None) -> list[list[int]]:
     """Form factors by repeatedly joining the two groups with the largest average overlap (average linkage).
 
-    With a ``count``, joining ends when ``count`` groups are left. Without it, joining ends when no two groups overlap
-    by more than ``threshold`` and have together no more than ``largest`` modes. The algorithm is written out because
-    the limit on the size has to count while groups grow, and a dendrogram has no such limit.
-
-    The usual overlap depends on the collection. On a captured body in loose clothes nearly everything moves a little
-    with everything else. The median overlap of two modes is 0.4 there, and 0.1 on a hand. So the default threshold is
-    relative: two groups are joined if they overlap more than two modes do on average.
+    With a ``count``, J, joining ends when ``count`` groups are left. Without it, two groups are joined if they have
+    together at most `LARGEST_FACTOR` modes and overlap more than two modes do on average, since the usual overlap
+    depends on the collection: its median is 0.4 on a captured body in loose clothes, where nearly everything moves a
+    little with everything else, and 0.1 on a hand. The algorithm is written out because a dendrogram has no limit on
+    the size of groups.
 
     Args:
         overlaps: (m, m) overlaps of the modes, strongest mode first.
-        count: J, if the user chose it; then ``threshold`` and ``largest`` don't matter.
-        threshold: threshold of the average overlap of two groups; by default the average over all pairs of modes, but
-            at most 0.5.
-        largest: most modes of a factor.
+        count: J, if the user chose it.
 
     Returns:
         J lists of modes, each in order; the factor of the strongest mode comes first.
 
     Raises:
-        FactorError: a count or a limit that is not possible.
+        FactorError: the count is not possible.
     """
     m = len(overlaps)
     if count is not None and not 1 <= count <= m:
         raise FactorError(f"the number of factors must be from 1 to the number of modes, {m}, not {count}")
-    if largest < 1:
-        raise FactorError(f"a factor needs room for at least one mode, not {largest}")
-    if threshold is None:
-        pairs = overlaps[np.triu_indices(m, 1)]
-        threshold = min(HIGHEST_THRESHOLD, float(pairs.mean())) if len(pairs) else HIGHEST_THRESHOLD
+    pairs = overlaps[np.triu_indices(m, 1)]
+    threshold = min(HIGHEST_THRESHOLD, float(pairs.mean())) if len(pairs) else HIGHEST_THRESHOLD
     groups = [[j] for j in range(m)]
     while len(groups) > (count or 1):
         shared = between(overlaps, groups)
         np.fill_diagonal(shared, -np.inf)
         if count is None:
             sizes = np.array([len(g) for g in groups])
-            shared[np.add.outer(sizes, sizes) > largest] = -np.inf
+            shared[np.add.outer(sizes, sizes) > LARGEST_FACTOR] = -np.inf
             if shared.max() <= threshold:
                 break
         a, b = sorted(divmod(int(shared.argmax()), len(groups)))

@@ -38,28 +38,11 @@ LIGHT_STEPS = 8
 RANDOM = 200
 #: Percentile of the vertices' distances that is reported beside their mean.
 PERCENTILE = 95
-
-
-@dataclass(frozen=True)
-class _StepChoice:
-    """Limits of the choice between one step and `STEPS`.
-
-    Attributes:
-        shapes: most shapes that are held out.
-        modes: number of modes of the held-out shapes, where the settings give none.
-        folded: one step is not chosen if a larger share of random shapes folds.
-        random: number of random shapes.
-        random_modes: most modes of the random shapes.
-    """
-
-    shapes: int = 100
-    modes: int = 10
-    folded: float = 0.1
-    random: int = 500
-    random_modes: int = 10
-
-
-STEP_CHOICE = _StepChoice()
+#: For the choice between one step and `STEPS`: most shapes that are held out, and their number of modes where the
+#: settings give none.
+CHOICE_SHAPES, CHOICE_MODES = 100, 10
+#: One step is not chosen if a larger share of that many random shapes, of at most that many modes, folds.
+FOLDED_SHARE, FOLDED_SHAPES, FOLDED_MODES = 0.1, 500, 10
 
 
 @dataclass(frozen=True)
@@ -126,11 +109,6 @@ def folds(count: int) -> list[IntArray]:
     return [np.arange(fold, count, parts) for fold in range(parts)]
 
 
-def some_folds(count: int) -> list[IntArray]:
-    """Return the first fold, or all folds where each shape is held out by itself."""
-    return folds(count)[: 1 if count >= 2 * FOLDS else None]
-
-
 @dataclass(frozen=True)
 class HeldOut:
     """Held-out shapes, approximated in the space that was found without them.
@@ -138,31 +116,23 @@ class HeldOut:
     Attributes:
         index: (k,) indices of the shapes in the collection.
         counts: numbers of modes.
-        by_modes: (k, V, 3) for each number: the nearest exponentials.
-        by_components: (k, V, 3) for each number: projections onto as many principal components.
-        by_mirrored: likewise, with components of the shapes and their mirror images; empty where there are none.
+        near: (k, V, 3) for each number: ``modes`` has the nearest exponentials, ``components`` the projections onto as
+            many principal components, and ``mirrored_components`` those of the shapes and their mirror images, where
+            there are any.
         steps: (k,) K of the exponentials.
         stuck: (k,) for each number: whether the search did not converge, because faces of exponentials collapse.
     """
 
     index: IntArray
     counts: Sequence[float]
-    by_modes: list[FloatArray]
-    by_components: list[FloatArray]
-    by_mirrored: list[FloatArray]
+    near: dict[str, list[FloatArray]]
     steps: IntArray
     stuck: list[NDArray[np.bool_]]
 
     def distances(self, shapes: FloatArray, diagonal: float) -> dict[str, list[FloatArray]]:
-        """Return distances to the shapes (n, V, 3) of the collection: (k, V) for each number of modes.
-
-        The keys are ``modes``, ``components`` and, where there are mirror images, ``mirrored_components``.
-        """
+        """Return distances to the shapes (n, V, 3) of the collection: (k, V) for each kind and number of modes."""
         given = shapes[self.index]
-        near = {"modes": self.by_modes, "components": self.by_components}
-        if self.by_mirrored:
-            near["mirrored_components"] = self.by_mirrored
-        return {name: [vertex_distances(each, given, diagonal) for each in found] for name, found in near.items()}
+        return {kind: [vertex_distances(each, given, diagonal) for each in found] for kind, found in self.near.items()}
 
 
 def joined(parts: Sequence[HeldOut]) -> HeldOut:
@@ -174,9 +144,7 @@ def joined(parts: Sequence[HeldOut]) -> HeldOut:
     return HeldOut(
         index=np.concatenate([part.index for part in parts]),
         counts=np.mean([part.counts for part in parts], axis=0).tolist(),
-        by_modes=together(part.by_modes for part in parts),
-        by_components=together(part.by_components for part in parts),
-        by_mirrored=together(part.by_mirrored for part in parts),
+        near={kind: together(part.near[kind] for part in parts) for kind in parts[0].near},
         steps=np.concatenate([part.steps for part in parts]),
         stuck=together(part.stuck for part in parts),
     )
@@ -199,7 +167,7 @@ def time_steps(
     Args:
         settings: settings of the modes; only ``log_steps`` and ``count`` matter.
         reference: gives connectivity.
-        shapes: (n, V, 3). At most `STEP_CHOICE.shapes` of them, spread evenly, are held out.
+        shapes: (n, V, 3). At most `CHOICE_SHAPES` of them, spread evenly, are held out.
         material: material of the shell.
         original_index: (n,) index of each shape's original, from 0, mirror images last; by default none is an image.
     """
@@ -209,12 +177,12 @@ def time_steps(
     count = int(original_index.max()) + 1
     if count < FOLDS:  # too few to choose
         return STEPS
-    used = original_index % -(-count // STEP_CHOICE.shapes) == 0
+    used = original_index % -(-count // CHOICE_SHAPES) == 0
     try:
-        if _folded(reference, shapes, material) > STEP_CHOICE.folded:
+        if _folded(reference, shapes, material) > FOLDED_SHARE:
             return STEPS
         original_index, shapes = np.unique(original_index[used], return_inverse=True)[1], shapes[used]
-        asked = STEP_CHOICE.modes if settings.count == "auto" else settings.count
+        asked = CHOICE_MODES if settings.count == "auto" else settings.count
         few = max(1, min(asked, (int(original_index.max()) + 1) // 3))
         straight, bent = (
             _missed(reference, shapes, original_index, material, few, steps) for steps in (1, LIGHT_STEPS)
@@ -227,9 +195,9 @@ def time_steps(
 def _folded(reference: TriangleMesh, shapes: FloatArray, material: Material) -> float:
     """Return the share of random shapes of one step that fold where none of the shapes (n, V, 3) has a crease."""
     space, mean, fields = _space(reference, shapes, material, 1)
-    modes = pga(space, mean, fields, min(STEP_CHOICE.random_modes, len(shapes) - 1), "vertices").vertices
+    modes = pga(space, mean, fields, min(FOLDED_MODES, len(shapes) - 1), "vertices").vertices
     lower, upper = box_of(coefficients(space, mean, fields, modes, "vertices")[0])
-    codes = np.random.default_rng(0).uniform(lower, upper, (STEP_CHOICE.random, len(modes)))
+    codes = np.random.default_rng(0).uniform(lower, upper, (FOLDED_SHAPES, len(modes)))
     drawn = mean + np.tensordot(codes, modes, axes=1)
     angles, others = (dihedral_angles(each, reference.connectivity) for each in (drawn, shapes))
     return float(folded_anew(angles, others).mean())
@@ -306,15 +274,18 @@ def held_out(
     counts = [min(count, len(kept) - 1) for count in counts]
     # The search for codes starts from projected logarithms, because faces collapse on the straight line to a far shape.
     towards = logarithms(space, mean, unseen, steps).fields
-    reached, by_modes, by_components, by_mirrored, stuck = [], [], [], [], []
+    reached, stuck = [], []
+    near: dict[str, list[FloatArray]] = {"modes": [], "components": []}
+    if mirrored:
+        near["mirrored_components"] = []
     for count in counts:
         modes = find_modes(settings, space, mean, fields, count, original_index)
         start, _ = coefficients(space, mean, towards, modes.vertices, settings.norm)
-        near = nearest_codes(space, mean, modes.vertices, unseen, start, steps)
-        by_modes.append(near.vertices)
-        stuck.append(np.array([status is not Status.CONVERGED for status in near.status]))
-        by_components.append(components.nearest(unseen, len(modes)))
+        found = nearest_codes(space, mean, modes.vertices, unseen, start, steps)
+        near["modes"].append(found.vertices)
+        stuck.append(np.array([status is not Status.CONVERGED for status in found.status]))
+        near["components"].append(components.nearest(unseen, len(modes)))
         if mirrored:
-            by_mirrored.append(mirrored.nearest(unseen, len(modes)))
+            near["mirrored_components"].append(mirrored.nearest(unseen, len(modes)))
         reached.append(len(modes))
-    return HeldOut(index, reached, by_modes, by_components, by_mirrored, np.full(len(index), steps), stuck)
+    return HeldOut(index, reached, near, np.full(len(index), steps), stuck)

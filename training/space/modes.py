@@ -43,22 +43,10 @@ SHELL_SHARE = 0.1
 NEGLIGIBLE = 1e-9
 #: The localisation of a mode is the share of the edges that carries this part of its square norm.
 LOCALISED_PART = 0.95
-
-
-@dataclass(frozen=True)
-class _ModeCountCriterion:
-    """How the number of modes is chosen.
-
-    Attributes:
-        folds: number of inner folds, each held out in its turn.
-        worth: a further mode has to lower the mean error of held-out logarithms by this share of their mean length.
-    """
-
-    folds: int = 5
-    worth: float = 0.005
-
-
-MODE_COUNT = _ModeCountCriterion()
+#: Number of inner folds by which the number of modes is chosen, each held out in its turn.
+INNER_FOLDS = 5
+#: A further mode has to lower the mean error of held-out logarithms by this share of their mean length.
+WORTH = 0.005
 
 
 class ModeError(ValueError):
@@ -96,17 +84,10 @@ class Modes:
 
 
 def pga(space: ShellSpace, mean: FloatArray, fields: FloatArray, count: int, norm: Norm = "mixed") -> Modes:
-    """Principal geodesic analysis: the modes whose span comes closest to the logarithms.
-
-    Args:
-        space: the shape space.
-        mean: X̄ (V, 3).
-        fields: (n, V, 3) logarithms.
-        count: m, at most n.
-        norm: norm of the misfit.
+    """Find at most ``count`` modes whose span comes closest to logarithms (n, V, 3) at a mean (V, 3), in a norm.
 
     Raises:
-        ModeError: the count is not possible, or all fields are zero.
+        ModeError: the count, at most n, is not possible, or all fields are zero.
     """
     problem = ModeProblem(space, mean, fields, count, norm)
     return problem.modes(problem.principal(count)[0])
@@ -119,38 +100,27 @@ def mode_count(
     fields: FloatArray,
     original_index: IntArray | None = None,
 ) -> int:
-    """Return the configured number of modes, less than n, for logarithms (n, V, 3) at a mean (V, 3)."""
-    asked = (
-        worthwhile(space, mean, fields, settings.norm, original_index) if settings.count == "auto" else settings.count
-    )
-    return max(1, min(asked, len(fields) - 1))
+    """Return the number of modes, as configured or by cross-validation, and less than n.
 
-
-def worthwhile(
-    space: ShellSpace,
-    mean: FloatArray,
-    fields: FloatArray,
-    norm: Norm = "vertices",
-    original_index: IntArray | None = None,
-) -> int:
-    """Choose the number of modes by cross-validation.
-
-    The result m minimises ``error(m) + worth · m``. The error is the distance between held-out logarithms and the span
+    The choice m minimises ``error(m) + WORTH · m``. The error is the distance between held-out logarithms and the span
     of m principal modes of the other shapes, as a share of the logarithms' length. No exponentials are computed.
 
     Args:
+        settings: settings of the modes; only ``count`` and ``norm`` matter.
         space: the shape space.
         mean: X̄ (V, 3).
         fields: (n, V, 3) logarithms.
-        norm: norm of the modes.
         original_index: (n,) index of each shape's original, from 0; a shape and its mirror image are held out together.
 
     Raises:
         ModeError: the fields can't be used.
     """
-    left = np.sqrt(ModeProblem(space, mean, fields, 1, validation_norm(norm)).left_of_held_out(original_index))
+    if settings.count != "auto":
+        return max(1, min(settings.count, len(fields) - 1))
+    problem = ModeProblem(space, mean, fields, 1, validation_norm(settings.norm))
+    left = np.sqrt(problem.left_of_held_out(original_index))
     errors = left.mean(axis=0) / left[:, 0].mean()
-    return max(1, int(np.argmin(errors + MODE_COUNT.worth * np.arange(len(fields)))))
+    return max(1, int(np.argmin(errors + WORTH * np.arange(len(fields)))))
 
 
 def validation_norm(norm: Norm) -> Norm:
@@ -161,17 +131,10 @@ def validation_norm(norm: Norm) -> Norm:
 def coefficients(
     space: ShellSpace, mean: FloatArray, fields: FloatArray, modes: FloatArray, norm: Norm
 ) -> tuple[FloatArray, float]:
-    """Project logarithms orthogonally onto the span of modes.
-
-    Args:
-        space: the shape space.
-        mean: X̄ (V, 3).
-        fields: (n, V, 3) logarithms.
-        modes: (m, V, 3) vertex fields.
-        norm: norm of the projection.
+    """Project logarithms (n, V, 3) orthogonally onto the span of modes (m, V, 3), at a mean (V, 3).
 
     Returns:
-        (n, m), and the share of ``Σ ‖v^i‖²`` that the projections keep.
+        Coefficients (n, m), and the share of ``Σ ‖v^i‖²`` that the projections keep.
 
     Raises:
         ModeError: the logarithms can't be used.
@@ -188,15 +151,7 @@ def edge_magnitudes(nric: FloatArray, norm: WeightedNorm) -> FloatArray:
 
 
 def localisation(nric: FloatArray, norm: WeightedNorm) -> FloatArray:
-    """Return the smallest share of the edges that carries `LOCALISED_PART` of each mode's square ``‖u_j‖²``.
-
-    Args:
-        nric: (m, 2E) modes.
-        norm: weighted norm at their mean.
-
-    Returns:
-        (m,) between 1/E and 1.
-    """
+    """Return the smallest share (m,) of the edges that carries `LOCALISED_PART` of ``‖u_j‖²``, of modes (m, 2E)."""
     squares = np.sort(edge_magnitudes(nric, norm) ** 2, axis=1)[:, ::-1].cumsum(axis=1)
     return ((squares < LOCALISED_PART * squares[:, -1:]).sum(axis=1) + 1) / squares.shape[1]
 
@@ -257,13 +212,11 @@ class ModeProblem:
 
     def energies(self, D: FloatArray, W: FloatArray) -> FloatArray:
         """Return ``|w_j|² ‖u_j‖²`` (m,) of fields (m, 3V) with coefficients (m, n)."""
-        energies: FloatArray = (W**2).sum(axis=1) * self.squares(D)
-        return energies
+        return (W**2).sum(axis=1) * self.squares(D)
 
     def squares(self, D: FloatArray) -> FloatArray:
         """Return ``‖u_j‖²`` (m,) of fields (m, 3V)."""
-        squares: FloatArray = np.einsum("jx,xj->j", D, self.M @ D.T)
-        return squares
+        return np.einsum("jx,xj->j", D, self.M @ D.T)
 
     def project(self, D: FloatArray) -> tuple[NDArray, float]:
         """Project the logarithms onto fields (m, 3V). Return coefficients (m, n) and the share explained."""
@@ -275,7 +228,7 @@ class ModeProblem:
         """Return square errors (n, n) of held-out logarithms for 0, 1, 2 … principal modes of the other logarithms."""
         gram, n = self.D @ self.MD, len(self.D)
         original_index = np.arange(n) if original_index is None else original_index
-        parts = min(MODE_COUNT.folds, int(original_index.max()) + 1)
+        parts = min(INNER_FOLDS, int(original_index.max()) + 1)
         left = np.zeros((n, n))
         for held in (np.flatnonzero(original_index % parts == part) for part in range(parts)):
             kept = np.delete(np.arange(n), held)

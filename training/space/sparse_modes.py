@@ -22,39 +22,12 @@ The right sparsity depends on the shapes. The modes cannot reproduce on held-out
 certain sparsity costs nothing. By default λ is the largest value that raises the square error of held-out shapes by at
 most 3 %. Principal modes in inner folds estimate this error.
 
-The tables show the effect of the sparsity at η = 1e-4. The collections are a hand (57 poses, m = 12), a captured dancer
-(60, m = 20) and a posed body (44, m = 20). Each entry is the share explained / the mean share of edges
-that carry 95 % of a mode. In both norms with vertices, modes were found on four fifths of the shapes, plain modes were
-rotated first, and the share explained is in the norm of vertices.
-
-| sparsity, mixed | hand | dancer | body |
-|---|---|---|---|
-| plain | 0.9994 / 0.15 | 0.9978 / 0.37 | 0.9995 / 0.22 |
-| 0.001 | 0.9994 / 0.12 | 0.9977 / 0.30 | 0.9994 / 0.09 |
-| 0.002 | 0.9994 / 0.10 | 0.9975 / 0.26 | 0.9993 / 0.07 |
-| 0.005 | 0.9993 / 0.08 | 0.9964 / 0.19 | 0.9988 / 0.05 |
-| 0.01 | 0.9991 / 0.06 | 0.9949 / 0.15 | 0.9982 / 0.04 |
-
-| sparsity, by vertices | hand | dancer | body |
-|---|---|---|---|
-| plain | 0.9995 / 0.15 | 0.9979 / 0.37 | 0.9996 / 0.23 |
-| 0.0001 | 0.9995 / 0.10 | 0.9978 / 0.27 | 0.9995 / 0.08 |
-| 0.0003 | 0.9994 / 0.09 | 0.9975 / 0.21 | 0.9993 / 0.05 |
-| 0.001 | 0.9991 / 0.07 | 0.9966 / 0.14 | 0.9988 / 0.04 |
-
-| sparsity, by the shell | hand | dancer | body |
-|---|---|---|---|
-| plain | 0.983 / 0.20 | 0.943 / 0.38 | 0.969 / 0.31 |
-| 0.03 | 0.980 / 0.07 | 0.939 / 0.28 | |
-| 0.1 | 0.970 / 0.06 | 0.916 / 0.20 | 0.917 / 0.04 |
-| 0.2 | | 0.878 / 0.14 | |
-| 0.3 | 0.929 / 0.05 | 0.837 / 0.11 | |
+What a sparsity costs in each norm is in docs/measurements/notes.md.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
 import numpy as np
 from scipy import sparse
@@ -65,51 +38,21 @@ from shapespace.coordinates.nric import WeightedNorm
 from shapespace.shell.space import ShellSpace
 from shapespace.solve.cholesky import analyse
 from shapespace.training.runs.settings import ModeSettings
-from shapespace.training.space.modes import ModeError, ModeProblem, Modes, Norm, localisation, pga, validation_norm
+from shapespace.training.space.modes import ModeProblem, Modes, Norm, localisation, pga, validation_norm
 
-
-@dataclass(frozen=True)
-class _SparseIterations:
-    """Iterations of the sparse analysis.
-
-    Attributes:
-        rounds: default of the most rounds through all modes.
-        admm: ADMM iterations on a mode before the next mode.
-        overrelaxation: over-relaxation of ADMM, between 1 and 2.
-        varimax: most rounds of the rotation at the start.
-        sweeps: most rounds of coordinate descent on the coefficients.
-        patience: the objective is compared with its value this many rounds ago.
-        tolerance: by norm, the relative decrease in these rounds at which the iteration ends. It is larger in vertices:
-            there the objective is a thousandth of its value in the shell's metric, and keeps falling long after the
-            modes have stopped changing.
-    """
-
-    rounds: int = ModeSettings().max_iterations
-    admm: int = 10
-    overrelaxation: float = 1.6
-    varimax: int = 200
-    sweeps: int = 100
-    patience: int = 10
-    tolerance: Mapping[Norm, float] = field(default_factory=lambda: {"mixed": 5e-3, "vertices": 5e-3, "shell": 1e-3})
-
-
-ITERATIONS = _SparseIterations()
-
-
-@dataclass(frozen=True)
-class _SparsityChoice:
-    """How the sparsity is chosen: the first candidate whose modes are good enough.
-
-    Attributes:
-        allowed: relative increase of the square error of held-out logarithms, over that of principal modes.
-        candidates: sparsities, largest first.
-    """
-
-    allowed: float = 0.03
-    candidates: tuple[float, ...] = (0.128, 0.064, 0.032, 0.016, 0.008, 0.004, 0.002, 0.001, 0.0005)
-
-
-SPARSITY = _SparsityChoice()
+#: ADMM iterations on a mode before the next mode, and their over-relaxation, between 1 and 2.
+ADMM_ITERATIONS, OVERRELAXATION = 10, 1.6
+#: Most rounds of the rotation at the start, and of coordinate descent on the coefficients.
+VARIMAX_ROUNDS, SWEEPS = 200, 100
+#: The iteration ends when the objective falls by less than this part of itself in `PATIENCE` rounds. The part is larger
+#: in vertices: there the objective is a thousandth of its value in the shell's metric, and keeps falling long after the
+#: modes have stopped changing.
+TOLERANCE: dict[Norm, float] = {"mixed": 5e-3, "vertices": 5e-3, "shell": 1e-3}
+PATIENCE = 10
+#: The sparsity is the first of these whose modes raise the square error of held-out logarithms by at most this share of
+#: the error of principal modes.
+SPARSITIES = (0.128, 0.064, 0.032, 0.016, 0.008, 0.004, 0.002, 0.001, 0.0005)
+ALLOWED_ERROR = 0.03
 
 
 def find_modes(
@@ -136,7 +79,7 @@ def find_modes(
         settings.norm,
         original_index=original_index,
         max_iterations=settings.max_iterations,
-        tolerance=ITERATIONS.tolerance[settings.norm],
+        tolerance=TOLERANCE[settings.norm],
     )
 
 
@@ -149,7 +92,7 @@ def spga(
     norm: Norm = "mixed",
     *,
     original_index: IntArray | None = None,
-    max_iterations: int = ITERATIONS.rounds,
+    max_iterations: int = 200,
     tolerance: float = 1e-3,
 ) -> Modes:
     """Sparse principal geodesic analysis: localised modes that still come close to the logarithms.
@@ -163,25 +106,23 @@ def spga(
         fields: (n, V, 3) logarithms.
         count: m, at most n.
         sparsity: λ as a share of ``max_j 2 |w_j|² ‖u_j‖² / ‖u_j‖_1`` over the modes of the plain analysis. At that
-            price the last of these modes vanishes. 0 gives the span of the plain analysis. None chooses λ, see
-            `_SparsityChoice`; errors are in vertices unless the norm is "shell".
+            price the last of these modes vanishes. 0 gives the span of the plain analysis. None chooses one of
+            `SPARSITIES` by errors in vertices, or in the norm "shell" where that is the norm.
         norm: norm of the misfit.
-        original_index: see `modes.worthwhile`.
+        original_index: see modes.mode_count.
         max_iterations: most rounds through all modes.
-        tolerance: the iteration ends when the objective fell by less than this part of itself in ten rounds.
+        tolerance: see `TOLERANCE`.
 
     Raises:
-        ModeError: the count or the sparsity is not possible, or the sparsity leaves no mode.
+        ModeError: the count is not possible, or the sparsity leaves no mode.
     """
-    if sparsity is not None and not 0 <= sparsity < np.inf:
-        raise ModeError(f"sparsity must be a number from 0 up, not {sparsity}")
     problem = _SparseProblem(space, mean, fields, count, norm)
     D, W = problem.principal(count)
     highest = problem.highest_price(D, W)
     enough = _SparsityCriterion(space, mean, fields, D, norm, original_index) if sparsity is None else None
     rotation = _varimax(problem.scaled(D))
     D, W = _normalised(rotation.T @ D, rotation.T @ W)
-    for share in SPARSITY.candidates if sparsity is None else [sparsity]:
+    for share in SPARSITIES if sparsity is None else [sparsity]:
         converged, history = _alternate(problem, D, W, share * highest, max_iterations, tolerance)
         if enough and enough(D):
             break
@@ -226,7 +167,7 @@ class _SparseProblem(ModeProblem):
 
 
 class _SparsityCriterion:
-    """Whether sparse modes keep enough of the logarithms, compared with principal modes (m, 3V); see `SPARSITY`."""
+    """Whether sparse modes keep enough of the logarithms, compared with principal modes (m, 3V); see `SPARSITIES`."""
 
     def __init__(
         self,
@@ -239,7 +180,7 @@ class _SparsityCriterion:
     ) -> None:
         self._problem = ModeProblem(space, mean, fields, 1, validation_norm(norm))
         left = self._problem.left_of_held_out(original_index)[:, min(len(D), len(fields) - 1)].sum()
-        self._least = self._problem.project(D)[1] - SPARSITY.allowed * float(left) / self._problem.total
+        self._least = self._problem.project(D)[1] - ALLOWED_ERROR * float(left) / self._problem.total
 
     def __call__(self, D: FloatArray) -> bool:
         """Return whether modes (m, 3V) keep enough."""
@@ -267,9 +208,9 @@ class _Shrinkage:
         """Improve mode j (3V,) towards a target."""
         z, y, threshold = self._z[j], self._y[j], price * self._threshold
         pull = self._M @ target
-        for _ in range(ITERATIONS.admm):
+        for _ in range(ADMM_ITERATIONS):
             d = self._factor.solve(pull + self._JtG @ (z - y))
-            y += ITERATIONS.overrelaxation * (self._J @ d) + (1 - ITERATIONS.overrelaxation) * z
+            y += OVERRELAXATION * (self._J @ d) + (1 - OVERRELAXATION) * z
             z[:] = np.sign(y) * np.maximum(np.abs(y) - threshold, 0)
             y -= z
         return d
@@ -300,8 +241,8 @@ def _alternate(
                 "support": float(support.mean()),
             }
         )
-        if iteration >= ITERATIONS.patience:
-            then, now = history[-1 - ITERATIONS.patience]["objective"], history[-1]["objective"]
+        if iteration >= PATIENCE:
+            then, now = history[-1 - PATIENCE]["objective"], history[-1]["objective"]
             if then - now <= tolerance * now:
                 return True, history
         _fit_in_box(gram, B, W)
@@ -326,7 +267,7 @@ def _alternate(
 
 def _fit_in_box(gram: FloatArray, B: FloatArray, W: FloatArray) -> None:
     """Minimise ``wᵀ gram w − 2 wᵀ b`` over |w|_∞ ≤ 1 for each column of B (m, n), in place, by coordinate descent."""
-    for _ in range(ITERATIONS.sweeps):
+    for _ in range(SWEEPS):
         before = W.copy()
         for j in np.flatnonzero(gram.diagonal()):
             W[j] = np.clip(W[j] + (B[j] - gram[j] @ W) / gram[j, j], -1, 1)
@@ -343,7 +284,7 @@ def _normalised(D: FloatArray, W: FloatArray) -> tuple[FloatArray, FloatArray]:
 def _varimax(loadings: FloatArray) -> FloatArray:
     """Return the rotation (m, m) of maximal variance of the squares of loadings (p, m), by SVD (Kaiser 1958)."""
     rotation, before = np.eye(loadings.shape[1]), 0.0
-    for _ in range(ITERATIONS.varimax):
+    for _ in range(VARIMAX_ROUNDS):
         turned = loadings @ rotation
         left, values, right = np.linalg.svd(loadings.T @ (turned**3 - turned * (turned**2).mean(axis=0)))
         rotation = left @ right

@@ -134,7 +134,7 @@ def test_held_out_shapes_take_their_images_with_them(with_images: tuple[RunDirec
             (shapes["vertices"][:5], None),
         )
     )
-    assert np.array_equal(found.by_modes[0], again.by_modes[0])
+    assert np.array_equal(found.near["modes"][0], again.near["modes"][0])
     away = found.distances(shapes["vertices"], 1.0)
     assert away["modes"][0].mean() < 0.7 * without.distances(shapes["vertices"], 1.0)["modes"][0].mean()
     assert np.array_equal(away["components"][0], without.distances(shapes["vertices"], 1.0)["components"][0])

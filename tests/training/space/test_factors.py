@@ -93,21 +93,16 @@ def test_every_count_is_kept_and_every_mode_has_one_factor(rng):
 
 
 def test_a_limit_keeps_factors_small():
-    shared = np.full((10, 10), 0.9) + 0.1 * np.eye(10)
-    assert len(group(shared)) == 2
-    assert max(map(len, group(shared, largest=4))) == 4
-    assert group(shared, 1, largest=4) == [list(range(10))]
-    assert group(shared, largest=1) == [[j] for j in range(10)]
-    with pytest.raises(FactorError, match="room for at least one mode, not 0"):
-        group(shared, largest=0)
+    shared = np.full((20, 20), 0.9) + 0.1 * np.eye(20)
+    assert sorted(map(len, group(shared))) == [6, 7, 7], "at most nine"
+    assert group(shared, 1) == [list(range(20))]
 
 
-def test_a_threshold_decides_what_is_joined():
+def test_what_overlaps_more_than_usual_is_joined():
     shared = np.array([[1, 0.6, 0.3], [0.6, 1, 0.2], [0.3, 0.2, 1]])
-    assert group(shared, threshold=0.7) == [[0], [1], [2]]
-    assert group(shared, threshold=0.3) == [[0, 1], [2]]
-    assert group(shared, threshold=0.2) == [[0, 1, 2]]
     assert group(shared) == [[0, 1], [2]]
+    assert group(1.5 * shared - 0.5 * np.eye(3)) == [[0, 1], [2]]
+    assert group(shared + 0.3) == [[0, 1, 2]], "more than half, whatever is usual"
 
 
 def test_overlap_of_factors_is_the_average_over_pairs_of_modes(modes, norm):

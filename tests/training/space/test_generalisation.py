@@ -42,10 +42,8 @@ def shapes(reference: TriangleMesh) -> np.ndarray:
 def test_two_modes_follow_a_curved_family_where_components_cut_across(reference, shapes):
     found = held_out(reference, shapes, np.array([1, 4]), [1, 2], ModeSettings(), Material(), STEPS)
     assert found.counts == [1, 2]
-    modes, components = (
-        [vertex_distances(near, shapes[[1, 4]], reference.diagonal).mean() for near in each]
-        for each in (found.by_modes, found.by_components)
-    )
+    away = found.distances(shapes, reference.diagonal)
+    modes, components = ([each.mean() for each in away[kind]] for kind in ("modes", "components"))
     assert modes[0] < components[0]
     assert modes[1] < 0.2 * components[1]
 
@@ -58,8 +56,8 @@ def test_nothing_is_known_of_what_is_held_out(reference, shapes):
     found, again = (held_out(reference, each, *how) for each in (shapes, others))
     assert found.counts == again.counts == [1, 1]
     # The start of the search depends on both held-out shapes, its end hardly.
-    assert found.by_modes[0][0] == pytest.approx(again.by_modes[0][0], abs=1e-4)
-    assert found.by_components[0][0] == pytest.approx(again.by_components[0][0], abs=1e-12)
+    assert found.near["modes"][0][0] == pytest.approx(again.near["modes"][0][0], abs=1e-4)
+    assert found.near["components"][0][0] == pytest.approx(again.near["components"][0][0], abs=1e-12)
 
 
 @pytest.mark.long
@@ -74,7 +72,7 @@ def test_one_step_is_chosen_for_blend_shapes_and_many_for_bends(reference, shape
     index, plain = np.array([0, 5]), ModeSettings(sparsity=0)
     found, bent = (held_out(mesh, linear, index, [3], plain, Material(), steps) for steps in (None, 8))
     assert found.steps.tolist() == [1, 1]
-    away, more = (vertex_distances(each.by_modes[0], linear[index], mesh.diagonal).mean() for each in (found, bent))
+    away, more = (each.distances(linear, mesh.diagonal)["modes"][0].mean() for each in (found, bent))
     assert away < 0.4 * more
 
 
