@@ -70,19 +70,8 @@ class Config(SettingsTable):
         return self
 
 
-def _faults(error: ValidationError) -> list[str]:
-    """Return one line for each setting that can't be used."""
-    words = {"extra_forbidden": "there is no such setting here"}
-    faults = ((".".join(map(str, e["loc"])), words.get(e["type"], e["msg"])) for e in error.errors())
-    return [": ".join(filter(None, fault)) for fault in faults]
-
-
 def parse(text: str, source: str) -> Config:
-    """Read a configuration from TOML text.
-
-    Raises:
-        ConfigError: naming the source and every faulty setting.
-    """
+    """Read a configuration from TOML text. Raises ConfigError, which names the source and every faulty setting."""
     try:
         values: dict[str, Any] = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
@@ -90,8 +79,10 @@ def parse(text: str, source: str) -> Config:
     try:
         return Config.model_validate(values)
     except ValidationError as error:
-        faults = "".join(f"\n  {fault}" for fault in _faults(error))
-        raise ConfigError(f"{source}: these settings can't be used{faults}") from error
+        words = {"extra_forbidden": "there is no such setting here"}
+        faults = [(".".join(map(str, e["loc"])), words.get(e["type"], e["msg"])) for e in error.errors()]
+        lines = [f"{source}: these settings can't be used", *(": ".join(filter(None, fault)) for fault in faults)]
+        raise ConfigError("\n  ".join(lines)) from error
 
 
 def load(path: Path, data: Path | None = None) -> tuple[Config, str]:

@@ -11,12 +11,7 @@ from shapespace.arrays import FloatArray
 
 @dataclass(frozen=True)
 class Coordinates:
-    """Bounds and periods of m latent coordinates.
-
-    Attributes:
-        lower, upper: (m,) bounds of the hypercube.
-        period: (m,) period, NaN for coordinates without one.
-    """
+    """Bounds (m,) of the hypercube of latent coordinates, and their periods, NaN where there is none."""
 
     lower: FloatArray
     upper: FloatArray

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
 from functools import partial
 from pathlib import Path
@@ -106,7 +106,7 @@ class Collection(Protocol):
     @property
     def codes(self) -> FloatArray: ...  # noqa: D102
     @property
-    def symmetries(self) -> list[IntArray]: ...  # noqa: D102
+    def symmetries(self) -> Sequence[IntArray]: ...  # noqa: D102
     @property
     def places(self) -> FeaturePositions | None: ...  # noqa: D102
     @property

@@ -85,11 +85,11 @@ def logarithms(space: ShellSpace, mean: FloatArray, shapes: ArrayLike, steps: in
     if len(bad):
         raise ModeError(f"shape {bad[0]} has a coordinate that is not finite")
     search = _Search(space, mean, x, steps, workers)
-    search.straight()
+    search.directly(bisect=False)
     search.by_neighbours()
-    if search.by_bisection():
+    if search.directly(bisect=True):
         search.by_neighbours()
-    search.in_more_steps()
+    search.from_neighbours([(i, j) for i in search.left for j in search.nearest(i)], finer=True)
     return search.result()
 
 
@@ -112,7 +112,8 @@ class _Search:
         self._distances: FloatArray = np.add.outer(squares, squares) - 2 * scaled @ scaled.T
 
     @property
-    def _left(self) -> list[int]:
+    def left(self) -> list[int]:
+        """Shapes without a geodesic."""
         return [i for i in range(len(self._shapes)) if i not in self._paths]
 
     def _do(self, function: Callable[..., _Found], items: list[tuple[int, tuple]], chunk: int = 1) -> bool:
@@ -128,33 +129,26 @@ class _Search:
                     self._paths[i], news = path, True
         return news
 
-    def straight(self) -> None:
-        """Search from the straight line to each shape."""
-        self._do(_straight, [(i, (self._steps,)) for i in self._left], CHUNK)
+    def directly(self, *, bisect: bool) -> bool:
+        """Search from the straight line to each shape, or by bisection. Return whether one more geodesic is found."""
+        return self._do(_direct, [(i, (self._steps, bisect)) for i in self.left], 1 if bisect else CHUNK)
 
     def by_neighbours(self) -> None:
         """Search from the nearest neighbour that has a geodesic and was not tried, until no such neighbour is left."""
-        tried: dict[int, set[int]] = {i: set() for i in self._left}
-        while items := [(i, j) for i in self._left if len(tried[i]) < NEIGHBOURS for j in self._nearest(i, tried[i])]:
-            for i, j in items:
+        tried: dict[int, set[int]] = {i: set() for i in self.left}
+        while pairs := [(i, j) for i in self.left if len(tried[i]) < NEIGHBOURS for j in self.nearest(i, tried[i])]:
+            for i, j in pairs:
                 tried[i].add(j)
-            self._from_neighbours(_towards, items)
+            self.from_neighbours(pairs, finer=False)
 
-    def by_bisection(self) -> bool:
-        """Search from the middle of mean and shape. Return whether one more geodesic is found."""
-        return self._do(_bisected, [(i, (self._steps,)) for i in self._left])
-
-    def in_more_steps(self) -> None:
-        """Search from the nearest neighbour, in twice as many steps."""
-        self._from_neighbours(_halved, [(i, j) for i in self._left for j in self._nearest(i)])
-
-    def _nearest(self, i: int, without: Collection[int] = ()) -> list[int]:
+    def nearest(self, i: int, without: Collection[int] = ()) -> list[int]:
         """Return the nearest shape that has a geodesic, if there is one."""
         others = [j for j in self._paths if j not in without]
         return [min(others, key=lambda j: (float(self._distances[i, j]), j))] if others else []
 
-    def _from_neighbours(self, function: Callable[..., _Found], pairs: list[tuple[int, int]]) -> None:
-        self._do(function, [(i, (self._paths[j],)) for i, j in pairs])
+    def from_neighbours(self, pairs: list[tuple[int, int]], *, finer: bool) -> None:
+        """Search for the geodesic to the first shape of each pair from the geodesic to the second."""
+        self._do(_from_neighbour, [(i, (self._paths[j], finer)) for i, j in pairs])
         for i, j in pairs:
             if i in self._paths:
                 self._via[i] = j
@@ -177,32 +171,19 @@ def _each(function: Callable[..., _Found], space: ShellSpace, mean: FloatArray, 
     return [function(space, mean, *item) for item in items]
 
 
-def _found(path: DiscretePath) -> _Found:
-    return (path.vertices if path.converged else None), path.status, path.reason
+def _direct(space: ShellSpace, mean: FloatArray, shape: FloatArray, steps: int, bisect: bool) -> _Found:
+    return _found(geodesic(space, mean, shape, steps, tolerance=LOGARITHM_TOLERANCE, bisect=bisect))
 
 
-def _straight(space: ShellSpace, mean: FloatArray, shape: FloatArray, steps: int) -> _Found:
-    return _found(geodesic(space, mean, shape, steps, tolerance=LOGARITHM_TOLERANCE, bisect=False))
-
-
-def _bisected(space: ShellSpace, mean: FloatArray, shape: FloatArray, steps: int) -> _Found:
-    return _found(geodesic(space, mean, shape, steps, tolerance=LOGARITHM_TOLERANCE))
-
-
-def _towards(space: ShellSpace, mean: FloatArray, shape: FloatArray, path: FloatArray) -> _Found:
+def _from_neighbour(space: ShellSpace, mean: FloatArray, shape: FloatArray, path: FloatArray, finer: bool) -> _Found:
+    """Search for the geodesic that begins like the geodesic to a neighbour, or like that with twice as many steps."""
     near = DiscretePath(vertices=path, space=space, status=Status.CONVERGED)
-    return _from(near, space, mean, shape)
-
-
-def _halved(space: ShellSpace, mean: FloatArray, shape: FloatArray, path: FloatArray) -> _Found:
-    return _from(halved(space, DiscretePath(vertices=path, space=space, status=Status.CONVERGED)), space, mean, shape)
-
-
-def _from(near: DiscretePath, space: ShellSpace, mean: FloatArray, shape: FloatArray) -> _Found:
-    """Search for the geodesic that begins like the geodesic to a neighbour."""
     try:
-        first = towards(space, near, shape)
+        first = towards(space, halved(space, near) if finer else near, shape)
     except NotPositiveDefiniteError as error:
         return None, Status.DEGENERATE, f"a shape on the way is degenerate: {error}"
-    steps = len(first) - 1
-    return _found(geodesic(space, mean, shape, steps, tolerance=LOGARITHM_TOLERANCE, first=first))
+    return _found(geodesic(space, mean, shape, len(first) - 1, tolerance=LOGARITHM_TOLERANCE, first=first))
+
+
+def _found(path: DiscretePath) -> _Found:
+    return (path.vertices if path.converged else None), path.status, path.reason

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from shapespace.arrays import FloatArray, IntArray
+from shapespace.arrays import FloatArray
 from shapespace.mesh.triangle_mesh import TriangleMesh
 from shapespace.shell.energy import Material
 from shapespace.shell.exponential import exponential
@@ -48,6 +48,9 @@ class ShellCollection:
     scale: float
     codes: FloatArray
     with_derivatives: bool = False
+    #: Modes move no feature over the surface, and no symmetry is known.
+    places = None
+    symmetries = ()
 
     def __getstate__(self) -> dict[str, Any]:
         return {name: value for name, value in self.__dict__.items() if name != "space"}
@@ -70,16 +73,6 @@ class ShellCollection:
     def coordinates(self) -> Coordinates:
         """The hypercube, of coordinates without a period."""
         return Coordinates(self.lower, self.upper, np.full(len(self.modes), np.nan))
-
-    @property
-    def places(self) -> None:
-        """None, because modes move no feature over the surface."""
-        return None
-
-    @property
-    def symmetries(self) -> list[IntArray]:
-        """An empty list: no symmetry is known."""
-        return []
 
     @property
     def finer(self) -> ShellCollection | None:

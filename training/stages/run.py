@@ -14,7 +14,7 @@ from typing import Any
 from shapespace.training.collection.reading import data_files
 from shapespace.training.runs.config import Config
 from shapespace.training.runs.directory import RunDirectory
-from shapespace.training.stages import (
+from shapespace.training.stages import (  # fmt: skip
     evaluation,
     export,
     factors,
@@ -25,7 +25,7 @@ from shapespace.training.stages import (
     networks,
     samples,
 )
-from shapespace.training.stages.stage import Run, Stage, StageWarning
+from shapespace.training.stages.stage import TOLERATED_LOSS, Run, Stage, StageWarning
 
 STAGES: dict[str, Stage] = {
     module.STAGE.name: module.STAGE
@@ -42,11 +42,7 @@ class LostTooMuchError(RuntimeError):
 
 
 def refuse_old(directory: RunDirectory) -> None:
-    """Leave a run of version 0.1 as it is: its files and settings may have another meaning today.
-
-    Raises:
-        OldRunError: the run is of version 0.1.
-    """
+    """Raise OldRunError for a run of version 0.1: its files and settings may have another meaning today."""
     if directory.is_of_0_1():
         raise OldRunError(
             f"{directory.folder} is a run of version 0.1: status and report still read it, but it can't be continued "
@@ -55,12 +51,7 @@ def refuse_old(directory: RunDirectory) -> None:
 
 
 def stage_keys(config: Config, data: str) -> dict[str, dict[str, str]]:
-    """Return the digests of each stage by its name, see Stage.keys.
-
-    Args:
-        config: the configuration of the run.
-        data: identifies the files of the collection.
-    """
+    """Return the digests of each stage by its name, see Stage.keys; ``data`` identifies the files of the collection."""
     found: dict[str, dict[str, str]] = {}
     for name, stage in STAGES.items():
         found[name] = stage.keys(config, data)
@@ -140,7 +131,6 @@ def _prepare(run: Run, show: Callable[[str], None]) -> tuple[dict[str, dict[str,
 
 
 def _do(stage: Stage, run: Run, keys: dict[str, str], stamp: dict[str, Any], show: Callable[[str], None]) -> None:
-    """Do one stage, and write its stamp before and after."""
     directory, name = run.directory, stage.name
     if stamp.get("basis") != keys["basis"]:
         for path in filter(Path.is_dir, stage.results(directory)):
@@ -179,8 +169,6 @@ def _data_facts(run: Run) -> dict[str, dict[str, Any]]:
 
 
 def _changes(before: dict[str, dict[str, Any]], now: dict[str, dict[str, Any]]) -> str:
-    """Say which data files were added, removed or changed."""
-
     def some(word: str, names: set[str]) -> str:
         more = ", …" if len(names) > 3 else ""
         return f"{len(names)} {word} ({', '.join(sorted(names)[:3])}{more})" if names else ""
@@ -209,12 +197,7 @@ def _forget(directory: RunDirectory, keys: dict[str, dict[str, str]], show: Call
 
 
 def _refuse_loss(stage: str, warnings: list[StageWarning], command: str) -> None:
-    """Stop a run that has lost too much.
-
-    Raises:
-        LostTooMuchError: with the loss, advice, and the command that continues nevertheless.
-    """
-    grave = [warning for warning in warnings if warning.too_much]
+    grave = [warning for warning in warnings if warning.share > TOLERATED_LOSS]
     if grave:
         why = "; ".join(warning.sentence for warning in grave)
         advice = "; ".join(dict.fromkeys(warning.advice for warning in grave))

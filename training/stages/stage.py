@@ -32,22 +32,11 @@ COARSER_MESH = (
 
 @dataclass(frozen=True)
 class StageWarning:
-    """One thing that a stage could not do.
-
-    Attributes:
-        sentence: what, how much, and where.
-        share: lost share of the logarithms or samples; 0 for a warning that never stops a run.
-        advice: what may help where the share is large.
-    """
+    """One thing that a stage could not do, the lost share of logarithms or samples, and what may help."""
 
     sentence: str
     share: float = 0.0
     advice: str = ""
-
-    @property
-    def too_much(self) -> bool:
-        """Whether the run should stop."""
-        return self.share > TOLERATED_LOSS
 
 
 def listed(names: list[str]) -> str:
