@@ -18,6 +18,7 @@ from shapespace.shell.exponential import exponential
 from shapespace.shell.geodesic import geodesic
 from shapespace.shell.space import ShellSpace
 from shapespace.solve.outcome import Status
+from shapespace.training.runs.settings import ModeSettings
 from shapespace.training.space.logarithms import logarithms
 from shapespace.training.space.modes import (
     ModeError,
@@ -25,8 +26,8 @@ from shapespace.training.space.modes import (
     Norm,
     coefficients,
     localisation,
+    mode_count,
     pga,
-    worthwhile,
 )
 from shapespace.training.space.sparse_modes import _fit_in_box, spga
 from tests.shapespace.conftest import bent
@@ -81,15 +82,12 @@ class Bumps:
         return WeightedNorm.of(self.space.reference, self.space.material.eta)
 
 
-def ellipsoid() -> TriangleMesh:
+@pytest.fixture(scope="module")
+def mixed() -> Bumps:
+    """For what does not depend on the norm, or hardly."""
     ball = trimesh.creation.icosphere(subdivisions=2)
     bumpy = 1 + 0.1 * np.sin(ball.vertices @ [3.0, 5.0, 7.0])
-    return TriangleMesh.from_arrays(ball.vertices * [2, 1, 1] * bumpy[:, None], ball.faces)
-
-
-@pytest.fixture(scope="module", params=get_args(Norm))
-def bumps(request) -> Bumps:
-    mesh = ellipsoid()
+    mesh = TriangleMesh.from_arrays(ball.vertices * [2, 1, 1] * bumpy[:, None], ball.faces)
     x = mesh.vertices
     space = ShellSpace(mesh)
     planted = np.zeros((3, *x.shape))
@@ -98,7 +96,12 @@ def bumps(request) -> Bumps:
         field += 0.1 * height[:, None] * centre / np.linalg.norm(centre)
         field /= space.norm(x, field)
     mixing = np.random.default_rng(3).uniform(-1, 1, (14, 3)) * [1, 1.02, 0.98]
-    return Bumps(space, x, planted, without_rigid_motion(np.tensordot(mixing, planted, 1), x), request.param)
+    return Bumps(space, x, planted, without_rigid_motion(np.tensordot(mixing, planted, 1), x), "mixed")
+
+
+@pytest.fixture(scope="module", params=get_args(Norm))
+def bumps(mixed: Bumps, request: pytest.FixtureRequest) -> Bumps:
+    return replace(mixed, misfit=request.param)
 
 
 @pytest.fixture(scope="module")
@@ -153,7 +156,7 @@ def test_the_start_is_concentrated_already(bumps, plain, sparse):
     assert sparse.history[0]["support"] < 0.7 * localisation(plain.nric, bumps.norm).mean()
 
 
-@pytest.mark.parametrize("sparsity", [0.02, 0.1, 0.4])
+@pytest.mark.parametrize("sparsity", [0.1, 0.4])
 def test_the_objective_never_rises_and_is_that_of_the_problem(bumps, sparsity):
     modes = bumps.spga(bumps.fields, 3, sparsity)
     objective = np.array([h["objective"] for h in modes.history])
@@ -188,8 +191,8 @@ def test_modes_are_as_sparse_as_shapes_that_are_held_out_allow(bumps, rng):
     assert left(sparser) > left(plain) + 0.03 * lost
 
 
-def test_an_iteration_cut_short_says_so(bumps):
-    modes = bumps.spga(bumps.fields, 3, 0.1, max_iterations=4)
+def test_an_iteration_cut_short_says_so(mixed):
+    modes = mixed.spga(mixed.fields, 3, 0.1, max_iterations=4)
     assert not modes.converged
     assert len(modes.history) == 5
 
@@ -259,36 +262,35 @@ def test_directions_that_shapes_do_not_have_give_no_modes(bumps, plain):
     assert len(bumps.spga(bumps.fields, 7, 0.02)) == 3
 
 
-def test_a_high_price_leaves_fewer_modes_and_then_none(bumps):
-    weak = np.concatenate([bumps.fields, 0.05 * (bumps.planted[:1] - bumps.planted[1:2])])
-    first = bumps.planted[:1] / bumps.length(bumps.planted[0])
-    weak[:-1] -= np.tensordot(bumps.inner(weak[:-1], first)[:, 0], first[0], 0)
-    assert len(bumps.spga(weak, 3, 1e-3)) == 3
-    assert len(bumps.spga(weak, 3, 0.5)) == 2
+def test_a_high_price_leaves_fewer_modes_and_then_none(mixed):
+    weak = np.concatenate([mixed.fields, 0.05 * (mixed.planted[:1] - mixed.planted[1:2])])
+    first = mixed.planted[:1] / mixed.length(mixed.planted[0])
+    weak[:-1] -= np.tensordot(mixed.inner(weak[:-1], first)[:, 0], first[0], 0)
+    assert len(mixed.spga(weak, 3, 1e-3)) == 3
+    assert len(mixed.spga(weak, 3, 0.5)) == 2
     with pytest.raises(ModeError, match="sparsity is too high"):
-        bumps.spga(bumps.fields, 3, 50)
+        mixed.spga(mixed.fields, 3, 50)
 
 
-def test_nothing_is_random(bumps, sparse):
-    again = bumps.spga(bumps.fields, 3, 0.02)
-    assert (again.vertices == sparse.vertices).all()
-    assert (again.coefficients == sparse.coefficients).all()
+def test_sparsity_means_the_same_in_other_units_and_for_twice_the_shapes_and_nothing_is_random(mixed):
+    larger = ShellSpace(mixed.space.reference.with_vertices(3 * mixed.mean))
+    smaller_twice = 0.1 * np.concatenate([mixed.fields, mixed.fields])
+    modes, again, same = (
+        spga(larger, 3 * mixed.mean, 3 * smaller_twice, 3, 0.02, mixed.misfit),
+        *(mixed.spga(mixed.fields, 3, 0.02) for _ in range(2)),
+    )
+    assert modes.coefficients[:14] == pytest.approx(again.coefficients, abs=1e-4)
+    assert modes.history[-1]["objective"] == pytest.approx(again.history[-1]["objective"], rel=1e-4)
+    assert (again.vertices == same.vertices).all()
+    assert (again.coefficients == same.coefficients).all()
 
 
-def test_sparsity_means_the_same_in_other_units_and_for_twice_the_shapes(bumps, sparse):
-    larger = ShellSpace(bumps.space.reference.with_vertices(3 * bumps.mean))
-    smaller_twice = 0.1 * np.concatenate([bumps.fields, bumps.fields])
-    modes = spga(larger, 3 * bumps.mean, 3 * smaller_twice, 3, 0.02, bumps.misfit)
-    assert modes.coefficients[:14] == pytest.approx(sparse.coefficients, abs=1e-4)
-    assert modes.history[-1]["objective"] == pytest.approx(sparse.history[-1]["objective"], rel=1e-4)
-
-
-def test_localisation_counts_edges(bumps):
-    e = bumps.space.connectivity.edge_count
+def test_localisation_counts_edges(mixed):
+    e = mixed.space.connectivity.edge_count
     nric = np.zeros((2, 2 * e))
     nric[0, 5] = 3
-    nric[1] = 1 / np.sqrt(bumps.norm.squared)
-    assert localisation(nric, bumps.norm) == pytest.approx([1 / e, 0.95], abs=1.01 / e)
+    nric[1] = 1 / np.sqrt(mixed.norm.squared)
+    assert localisation(nric, mixed.norm) == pytest.approx([1 / e, 0.95], abs=1.01 / e)
 
 
 @pytest.mark.parametrize(
@@ -299,33 +301,31 @@ def test_localisation_counts_edges(bumps):
         ({"fields": np.zeros((3, 7, 3))}, r"fields must be \(n, 162, 3\), not \(3, 7, 3\)"),
         ({"fields": np.zeros((3, 162, 3))}, "all shapes are the same as the mean"),
         ({"fields": np.full((3, 162, 3), np.nan)}, "not finite"),
-        ({"sparsity": -0.1}, "sparsity must be a number from 0 up, not -0.1"),
-        ({"sparsity": np.nan}, "sparsity must be a number from 0 up, not nan"),
     ],
 )
-def test_what_is_not_possible_is_refused(bumps, change, message):
-    settings = {"fields": bumps.fields, "count": 3, "sparsity": 0.1} | change
+def test_what_is_not_possible_is_refused(mixed, change, message):
+    settings = {"fields": mixed.fields, "count": 3, "sparsity": 0.1} | change
     with pytest.raises(ModeError, match=message):
-        bumps.spga(**settings)
+        mixed.spga(**settings)
 
 
-def test_logarithms_lead_back_to_the_shapes_wherever_they_are(bumps, rng):
+def test_logarithms_lead_back_to_the_shapes_wherever_they_are(mixed, rng):
     turn = np.linalg.qr(rng.standard_normal((3, 3)))[0]
-    shapes = (bumps.mean + 0.3 * bumps.fields[:2]) @ (turn * np.linalg.det(turn)) + [1, 2, 3]
-    found = logarithms(bumps.space, bumps.mean, shapes, 4, workers=1)
+    shapes = (mixed.mean + 0.3 * mixed.fields[:2]) @ (turn * np.linalg.det(turn)) + [1, 2, 3]
+    found = logarithms(mixed.space, mixed.mean, shapes, 4, workers=1)
     assert found.status == (Status.CONVERGED,) * 2
     assert found.steps == (4, 4)
     assert found.fallbacks == []
     for shape, field in zip(shapes, found.fields, strict=True):
-        assert np.abs(rigid_motions(bumps.mean) @ field.ravel()).max() < 1e-12
-        end = exponential(bumps.space, bumps.mean, field, 4).vertices[-1]
-        assert align(end, bumps.mean) == pytest.approx(align(shape, bumps.mean), abs=1e-4)
+        assert np.abs(rigid_motions(mixed.mean) @ field.ravel()).max() < 1e-12
+        end = exponential(mixed.space, mixed.mean, field, 4).vertices[-1]
+        assert align(end, mixed.mean) == pytest.approx(align(shape, mixed.mean), abs=1e-4)
 
 
-def test_processes_give_what_one_gives(bumps):
-    shapes = bumps.mean + 0.1 * bumps.fields[:5]
-    here = logarithms(bumps.space, bumps.mean, shapes, 4, workers=1)
-    there = logarithms(bumps.space, bumps.mean, shapes, 4, workers=2)
+def test_processes_give_what_one_gives(mixed):
+    shapes = mixed.mean + 0.1 * mixed.fields[:5]
+    here = logarithms(mixed.space, mixed.mean, shapes, 4, workers=1)
+    there = logarithms(mixed.space, mixed.mean, shapes, 4, workers=2)
     assert (here.fields == there.fields).all()
     assert here.reasons == there.reasons == ("",) * 5
 
@@ -353,31 +353,31 @@ def test_far_shapes_are_reached_by_way_of_their_neighbours():
         assert space.norm(start, field) == pytest.approx(np.sqrt(whole.energy), rel=0.3)
 
 
-def test_where_there_is_no_geodesic_the_logarithm_is_linearised(bumps, rng):
-    crumpled = bumps.mean + 0.8 * rng.standard_normal(bumps.mean.shape)
-    i, j, k = bumps.space.connectivity.faces[7]
+def test_where_there_is_no_geodesic_the_logarithm_is_linearised(mixed, rng):
+    crumpled = mixed.mean + 0.8 * rng.standard_normal(mixed.mean.shape)
+    i, j, k = mixed.space.connectivity.faces[7]
     crumpled[[i, j, k]] = [[0, 0, 0], [1, 0, 0], [3, 0, 0]]  # a face without area
-    found = logarithms(bumps.space, bumps.mean, np.stack([crumpled, bumps.mean + 0.1 * bumps.fields[0]]), 4, workers=1)
+    found = logarithms(mixed.space, mixed.mean, np.stack([crumpled, mixed.mean + 0.1 * mixed.fields[0]]), 4, workers=1)
     assert found.fallbacks == [0]
     assert found.steps == (0, 4)
     assert found.status[0] is not Status.CONVERGED
     assert found.reasons[0]
     assert found.reasons[1] == ""
-    z = bumps.space.nric(bumps.mean)
-    assert (found.fields[0] == bumps.space.project(bumps.mean, unwrap(bumps.space.nric(crumpled), z) - z)).all()
+    z = mixed.space.nric(mixed.mean)
+    assert (found.fields[0] == mixed.space.project(mixed.mean, unwrap(mixed.space.nric(crumpled), z) - z)).all()
 
 
-def test_a_shape_that_is_not_finite_has_no_logarithm(bumps):
-    shapes = np.stack([bumps.mean, np.where(np.arange(3) == 1, np.nan, bumps.mean)])
+def test_a_shape_that_is_not_finite_has_no_logarithm(mixed):
+    shapes = np.stack([mixed.mean, np.where(np.arange(3) == 1, np.nan, mixed.mean)])
     with pytest.raises(ModeError, match="shape 1 has a coordinate that is not finite"):
-        logarithms(bumps.space, bumps.mean, shapes, 4, workers=1)
+        logarithms(mixed.space, mixed.mean, shapes, 4, workers=1)
 
 
-def test_a_shape_and_its_mirror_image_are_held_out_together(bumps: Bumps) -> None:
+def test_a_shape_and_its_mirror_image_are_held_out_together(mixed: Bumps) -> None:
     """The count of modes of each logarithm twice is that of each once; held out alone, each would be known already."""
     rng = np.random.default_rng(5)
-    noisy = bumps.fields + 0.3 * np.abs(bumps.fields).max() * rng.normal(size=bumps.fields.shape)
+    noisy = mixed.fields + 0.3 * np.abs(mixed.fields).max() * rng.normal(size=mixed.fields.shape)
     twice, whose = np.concatenate([noisy, noisy]), np.tile(np.arange(len(noisy)), 2)
-    once = worthwhile(bumps.space, bumps.mean, noisy)
-    assert worthwhile(bumps.space, bumps.mean, twice, original_index=whose) == once
-    assert worthwhile(bumps.space, bumps.mean, twice) > once
+    once = mode_count(ModeSettings(), mixed.space, mixed.mean, noisy)
+    assert mode_count(ModeSettings(), mixed.space, mixed.mean, twice, whose) == once
+    assert mode_count(ModeSettings(), mixed.space, mixed.mean, twice) > once
