@@ -22,116 +22,25 @@ from pxr import Usd, UsdGeom
 from safetensors.numpy import load_file
 
 from benchmarks.studies import SeedLearner, ShareLearner
+from shapespace.bundle.geometry import Geometry
+from shapespace.bundle.reader import read_bundle
 from shapespace.files.attributes.reading import read_attributes
 from shapespace.mesh.rigid_motion import align
 from shapespace.mesh.triangle_mesh import TriangleMesh
-from shapespace.training.runs.config import load
+from shapespace.training.__main__ import main
+from shapespace.training.learning import ExportError
+from shapespace.training.learning.export import export
+from shapespace.training.runs.config import load, parse
+from shapespace.training.runs.directory import RunDirectory
 from shapespace.training.runs.sampling import read
 from shapespace.training.stages.networks import learner_of
 from shapespace.training.stages.run import STAGES
 from shapespace.training.stages.stage import Run
 from tests.service.conftest import starting
 from tests.service.glb import GLB
-from tests.surfaces import ball, corner_uv, parse_obj, same_corners, with_parts, write_files
+from tests.surfaces import corner_uv, parse_obj, same_corners
 from tests.training.conftest import command
-
-CONFIG = """
-[collection]
-data = "meshes"
-coarse_vertices = 120
-
-[modes]
-count = 3
-log_steps = 4
-
-[factors]
-count = 2
-
-[samples]
-count = 60
-steps = 4
-part_size = 10
-
-[networks.factors]
-hidden = [16]
-skip_degree = 2
-fit = { batch_size = 16, max_epochs = 8 }
-
-[networks.combiner]
-correction = { kind = "kernel", coefficients = 4 }
-
-[monolithic]
-hidden = [16]
-fit = { batch_size = 16, max_epochs = 8 }
-
-[monolithic_paper]
-hidden = [16]
-fit = { batch_size = 16, max_epochs = 8 }
-
-[evaluation]
-grid_nodes = 5
-grid_size = 30
-reconstructions = 4
-
-[export]
-name = "bars"
-title = "Bars"
-description = "A run for the tests."
-licence = "MIT"
-"""
-
-
-SPHERE, SURFACE = with_parts(ball())
-EYE, BAR, NAIL = (np.unique(SURFACE.corners[np.repeat(SURFACE.objects.of == k, SURFACE.sizes)]) for k in range(3))
-
-
-def bars(count: int = 8) -> tuple[np.ndarray, np.ndarray]:
-    """A thick bar in several poses, far from the origin and in large units, whose ends bend independently.
-
-    The files have textured quads, with an eye and a nail as separate parts; returned are their triangles.
-    """
-    rest = SPHERE * [300.0, 80.0, 60.0]
-    centre = rest[EYE].mean(axis=0)
-    rest[EYE] = centre + 20 * (SPHERE[EYE] - SPHERE[EYE].mean(axis=0))
-    rng = np.random.default_rng(1)
-    shapes = []
-
-    def bent(points: np.ndarray, left: float, right: float, twist: float) -> np.ndarray:
-        x, y, z = points.T
-        bend = left * np.clip(-x / 300, 0, 1) ** 2 + right * np.clip(x / 300, 0, 1) ** 2
-        turn = 0.5 * twist * np.clip(x / 300, 0, 1)
-        y, z = np.cos(turn) * y - np.sin(turn) * z, np.sin(turn) * y + np.cos(turn) * z
-        x, z = x * np.cos(bend) - z * np.sin(bend), np.abs(x) * np.sin(bend) + z * np.cos(bend)
-        return np.stack([1000 + x, y, z], axis=1)
-
-    for pose in np.vstack([np.zeros(3), rng.uniform(-0.8, 0.8, (count - 1, 3))]):
-        shape = bent(rest, *pose)
-        # An eye is rigid and follows the skin around it.
-        shape[EYE] = align(rest[EYE], shape[EYE])
-        shapes.append(shape)
-    return np.array(shapes), SURFACE.triangles
-
-
-@pytest.fixture(scope="session")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("collection")
-    (folder / "meshes").mkdir()
-    vertices, _ = bars()
-    for k, shape in enumerate(vertices):
-        path = folder / "meshes" / f"bar{k}.obj"
-        write_files(path, shape, SURFACE)
-        path.write_text(path.read_text() + "\nv 1 2 3\n")  # a vertex in no face, as exporters leave them
-    (folder / "bars.toml").write_text(CONFIG)
-    return folder
-
-
-@pytest.fixture(scope="session")
-def run(folder: Path) -> Path:
-    done = subprocess.run(command(folder / "bars.toml", folder / "run"), capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    assert "3 separate parts: the model computes with 'Bar'" in done.stdout
-    assert "Eye is carried rigidly: " in done.stdout
-    return folder / "run"
+from tests.training.whole_runs.conftest import BAR, CONFIG, EYE, NAIL, SURFACE, bars
 
 
 def test_a_run_leaves_what_the_contract_promises(run: Path) -> None:
@@ -169,6 +78,9 @@ def test_a_run_leaves_what_the_contract_promises(run: Path) -> None:
         "Nail": "affinely",
     }
     assert all(1e-6 < part["mean"] < part["max"] < 0.02 for part in parts.values())
+    said = (run.parent / "said.txt").read_text()
+    assert "3 separate parts: the model computes with 'Bar'" in said
+    assert "Eye is carried rigidly: " in said
     report = (run / "report.html").read_text()
     assert "<html" in report
     assert "Eye, carried rigidly" in report
@@ -422,6 +334,76 @@ def test_the_server_has_the_exponentials_that_the_networks_learned_from(url: str
         np.testing.assert_allclose(exact, align(shape, np.array(exact)), atol=0.01)
 
 
+def again(copy: Run, monkeypatch: pytest.MonkeyPatch, old: str = "", new: str = "", until: str = "export") -> None:
+    """The same command on a copy of the run, with a change of the configuration."""
+    config = copy.directory.folder.parent / "bars.toml"
+    assert copy.source.count(old or "[export]") == 1
+    config.write_text(copy.source.replace(old, new) if old else copy.source)
+    folder = copy.directory.folder
+    arguments = ["run", str(config), "--out", str(folder), "--models", str(copy.models), "--until", until]
+    monkeypatch.setattr(sys, "argv", ["shapespace-train", *arguments])
+    assert main() == 0
+
+
+def test_the_same_command_again_does_nothing_and_a_changed_setting_only_its_stages(
+    copy: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def seconds() -> dict[str, float]:
+        return {name: copy.directory.stamp(name).read()["seconds"] for name in STAGES}
+
+    before, name = seconds(), copy.directory.factors.read()["names"][0]
+    again(copy, monkeypatch)
+    assert seconds() == before
+    described = f'"Another description."\nnames = {{ "{name}" = "the end" }}'
+    again(copy, monkeypatch, '"A run for the tests."', described)
+    after = seconds()
+    assert {name for name in STAGES if before[name] != after[name]} == {"export"}
+    manifest = read_bundle(copy.bundle).manifest
+    assert manifest.description == "Another description."
+    assert manifest.factors[0].name == "the end"
+    assert manifest.latent_names[0].startswith("the end")
+
+
+def test_more_samples_are_drawn_beside_those_that_are_there(copy: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    files = sorted(copy.directory.samples.glob("part-*.npz")) + sorted(copy.directory.samples.glob("factor-*/*.npz"))
+    before = {path: path.stat().st_mtime_ns for path in files}
+    again(copy, monkeypatch, "\ncount = 60", "\ncount = 70", "samples")
+    assert not any("seconds" in copy.directory.stamp(name).read() for name in list(STAGES)[-3:])
+    shown = ("evaluation.json", "gallery.npz", "report.html", "networks/histories.json")
+    assert not any((copy.directory.folder / name).exists() for name in shown), "figures of the former samples"
+    drawn = read(copy.directory.samples).index
+    assert len(drawn[drawn >= 0]) == 70
+    assert {path: path.stat().st_mtime_ns for path in files} == before
+    copy.source = copy.source.replace("steps = 4\npart", "steps = 2\npart")
+    again(copy, monkeypatch, "\ncount = 60", "\ncount = 10", "samples")
+    assert all(path.stat().st_mtime_ns != before[path] for path in files if path.exists())
+
+
+def test_networks_that_are_not_needed_any_more_are_removed(
+    run: Path, copy: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    again(copy, monkeypatch, "[monolithic]\nhidden = [16]", "[monolithic]\nhidden = [8]", "networks")
+    before, after = ({path.stem for path in directory.networks()} for directory in (RunDirectory(run), copy.directory))
+    changed = sorted(name.rpartition("-")[0] for name in before ^ after)
+    assert changed == ["monolithic"] * 2 + ["monolithic-combiner"] * 2
+    assert len(before) == len(after)
+    assert copy.directory.histories.read().keys() == after
+
+
+@pytest.mark.parametrize(
+    ("more", "says"),
+    [("tolerance = 1e-12\n", "differ by"), ('names = { nose = "a" }\n', "'nose', which is neither")],
+)
+def test_export_refuses_networks_that_onnx_computes_otherwise_and_a_name_for_nothing(
+    more: str, says: str, run: Path, tmp_path: Path
+) -> None:
+    opened = Run(run, *load(run / "config.toml"), tmp_path)
+    geometry = Geometry(reference=opened.collection.reference)
+    with pytest.raises(ExportError, match=says):
+        export(learner_of(opened).main(), opened.collection, parse(CONFIG + more, "more"), {}, "", tmp_path, geometry)
+    assert not opened.bundle.exists()
+
+
 def results(run: Path) -> dict[str, object]:
     """Contents of all files of a run, except times, logs and the report."""
     found: dict[str, object] = {}
@@ -440,8 +422,8 @@ def results(run: Path) -> dict[str, object]:
 
 
 @pytest.mark.long
-def test_a_run_killed_in_every_stage_ends_as_one_that_nobody_disturbed(run: Path, folder: Path) -> None:
-    again, rng = folder / "again", np.random.default_rng(0)
+def test_a_run_killed_in_every_stage_ends_as_one_that_nobody_disturbed(run: Path, folder: Path, tmp_path: Path) -> None:
+    again, rng = tmp_path / "again", np.random.default_rng(0)
     log = again / "log.jsonl"
     for stage in STAGES:
         process = subprocess.Popen(

@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-import shutil
 import signal
 import subprocess
 import time
@@ -18,17 +17,13 @@ import torch
 
 import shapespace
 from benchmarks.studies import ShareLearner
-from shapespace.bundle.geometry import Geometry
 from shapespace.bundle.reader import read_bundle
 from shapespace.coordinates.nric import WeightedNorm, nric
 from shapespace.model.shape_model import ShapeModel
 from shapespace.training.collection.generators.freaky_torus import FreakyTorus, vertices
-from shapespace.training.learning import ExportError
 from shapespace.training.learning.evaluation import r_squared
-from shapespace.training.learning.export import export
 from shapespace.training.learning.fitting import read_network
-from shapespace.training.runs.config import load, parse
-from shapespace.training.runs.directory import RunDirectory
+from shapespace.training.runs.config import load
 from shapespace.training.runs.sampling import read
 from shapespace.training.stages.networks import learner_of
 from shapespace.training.stages.run import STAGES
@@ -36,10 +31,6 @@ from shapespace.training.stages.stage import Run
 from tests.training.conftest import TINY, command
 
 pytestmark = pytest.mark.long
-
-
-def seconds(run: Path) -> dict[str, float]:
-    return {name: json.loads((run / "stages" / f"{name}.json").read_text())["seconds"] for name in STAGES}
 
 
 def test_a_run_leaves_what_the_contract_promises(tiny_run: Path) -> None:
@@ -137,83 +128,6 @@ def test_fresh_codes_follow_from_the_networks_and_their_figure_is_that_of_the_bu
     assert found == pytest.approx(fresh["r2"]["composite"], abs=1e-4)
     assert set(fresh["r2"]) == {"composite", "monolithic", "monolithic_paper", "kernel"}
     assert "steps" not in fresh, "shapes of a formula have no steps"
-
-
-def test_export_refuses_where_onnx_and_torch_disagree(tiny_run: Path, tmp_path: Path) -> None:
-    run = Run(tiny_run, *load(tiny_run / "config.toml"), tmp_path)
-    strict = parse(TINY + "tolerance = 1e-12\n", "strict")
-    with pytest.raises(ExportError, match="differ by"):
-        export(
-            learner_of(run).main(),
-            run.collection,
-            strict,
-            {},
-            "",
-            tmp_path,
-            Geometry(reference=FreakyTorus().reference),
-        )
-    assert not (tmp_path / "tiny-torus" / "1").exists()
-
-
-def test_export_refuses_a_name_for_nothing(tiny_run: Path, tmp_path: Path) -> None:
-    run = Run(tiny_run, *load(tiny_run / "config.toml"), tmp_path)
-    config, geometry = parse(TINY + 'names = { nose = "a" }\n', "named"), Geometry(reference=FreakyTorus().reference)
-    with pytest.raises(ExportError, match="'nose', which is neither"):
-        export(learner_of(run).main(), run.collection, config, {}, "", tmp_path, geometry)
-
-
-def test_the_same_command_again_does_nothing_and_a_changed_setting_only_its_stages(
-    tiny_run: Path, tmp_path: Path
-) -> None:
-    copy = tmp_path / "run"
-    shutil.copytree(tiny_run, copy)
-    config = tmp_path / "tiny.toml"
-    config.write_text(TINY)
-    before = seconds(copy)
-    subprocess.run(command(config, copy), check=True, capture_output=True)
-    assert seconds(copy) == before
-    names = 'names = { bump = "hill", gamma = "along" }\n'
-    config.write_text(TINY.replace("A run for the tests.", "Another description.") + names)
-    subprocess.run(command(config, copy), check=True, capture_output=True)
-    after = seconds(copy)
-    assert {name for name in STAGES if before[name] != after[name]} == {"export"}
-    manifest = read_bundle(copy / "models" / "tiny-torus" / "1").manifest
-    assert manifest.description == "Another description."
-    own = list(FreakyTorus().factors)
-    assert [factor.name for factor in manifest.factors] == ["hill" if name == "bump" else name for name in own]
-    assert manifest.latent_names == ["alpha", "beta", "along", "zeta"]
-
-
-def test_more_samples_are_drawn_beside_those_that_are_there(tiny_run: Path, tmp_path: Path) -> None:
-    copy, config = tmp_path / "run", tmp_path / "tiny.toml"
-    shutil.copytree(tiny_run, copy)
-    files = sorted(copy.glob("samples/**/part-*.npz"))
-    before = {path: path.stat().st_mtime_ns for path in files}
-
-    def draw(text: str) -> None:
-        config.write_text(text)
-        subprocess.run(command(config, copy, "--until", "samples"), check=True, capture_output=True)
-
-    draw(TINY.replace("\ncount = 60", "\ncount = 80"))
-    assert not any("seconds" in RunDirectory(copy).stamp(name).read() for name in list(STAGES)[-3:])
-    shown = ("evaluation.json", "gallery.npz", "report.html", "networks/histories.json")
-    assert not any((copy / name).exists() for name in shown), "figures of the former samples"
-    assert len(read(copy / "samples").index) == 80
-    assert {path: path.stat().st_mtime_ns for path in files} == before
-    draw(TINY.replace("\ncount = 60", "\ncount = 80\nsteps = 5"))
-    assert all(path.stat().st_mtime_ns != before[path] for path in files)
-
-
-def test_networks_that_are_not_needed_any_more_are_removed(tiny_run: Path, tmp_path: Path) -> None:
-    copy, config = tmp_path / "run", tmp_path / "tiny.toml"
-    shutil.copytree(tiny_run, copy)
-    config.write_text(TINY.replace("[monolithic]\nhidden = [16]", "[monolithic]\nhidden = [8]"))
-    subprocess.run(command(config, copy, "--until", "networks"), check=True, capture_output=True)
-    before, after = ({path.stem for path in (run / "networks").glob("*.safetensors")} for run in (tiny_run, copy))
-    changed = sorted(name.rpartition("-")[0] for name in before ^ after)
-    assert changed == ["monolithic"] * 2 + ["monolithic-combiner"] * 2
-    assert len(before) == len(after)
-    assert json.loads((copy / "networks" / "histories.json").read_text()).keys() == after
 
 
 def test_a_run_killed_in_descent_ends_with_the_same_networks(tiny_run: Path, tmp_path: Path) -> None:

@@ -1,7 +1,6 @@
 """Studies on finished runs, recipes of variants, and rows of the measurement pages."""
 
 import json
-import shutil
 from copy import deepcopy
 from pathlib import Path
 from typing import Any
@@ -67,17 +66,12 @@ def test_a_row_of_folds_counts_each_shape_once() -> None:
     assert cells[6:] == ["3.250", "1.62", "0.50 – 2.00"]
 
 
-@pytest.mark.long
-def test_a_model_measured_later_meets_the_codes_of_the_others(
-    tiny_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_model_measured_later_meets_the_codes_of_the_others(copy: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     """The main networks, in the place of the paper's that take hours, reach again what they have reached."""
-    folder = shutil.copytree(tiny_run, tmp_path / "run")
-    run = Run(folder, *load(folder / "config.toml"), tmp_path / "models")
-    before = json.loads((folder / "evaluation.json").read_text())
+    before = copy.directory.evaluation.read()
     monkeypatch.setattr(Learner, "paper", Learner.main)
     after = deepcopy(before)
-    paper.measure(run, after)
+    paper.measure(copy, after)
     for old, new in ((before, after), (before["fresh"], after["fresh"])):
         assert new["r2"]["paper"] == pytest.approx(old["r2"]["composite"], abs=1e-6)
     bundled.add_paper(before, after)
@@ -85,14 +79,7 @@ def test_a_model_measured_later_meets_the_codes_of_the_others(
 
     before["fresh"]["seed"] += 1
     with pytest.raises(paper.OtherSamplesError, match="the kernel has"):
-        paper.measure(run, before)
-
-
-@pytest.fixture
-def finished(tiny_run: Path, tmp_path: Path) -> Run:
-    """A copy of the small run that studies may write to."""
-    folder = shutil.copytree(tiny_run, tmp_path / "run")
-    return Run(folder, *load(folder / "config.toml"), tmp_path / "models")
+        paper.measure(copy, before)
 
 
 def r2(learner: Learner, model: Model, part: str) -> float:
@@ -102,12 +89,11 @@ def r2(learner: Learner, model: Model, part: str) -> float:
     return r_squared(z, joint.nric[rows], norm)["total"]
 
 
-@pytest.mark.long
-def test_studies_add_their_figures_and_networks_to_a_finished_run(finished: Run) -> None:
-    directory, variant = finished.directory, Variant(title="other", combiner={"symmetries": False})
+def test_studies_add_their_figures_and_networks_to_a_finished_run(copy: Run) -> None:
+    directory, variant = copy.directory, Variant(title="other", combiner={"correction": {"coefficients": 3}})
     before = directory.evaluation.read()
     main = {path.stem: path.read_bytes() for path in directory.networks()}
-    studies.add(finished, Studies(variants={"a": variant}, fractions=[0.5], seeds=[1]))
+    studies.add(copy, Studies(variants={"a": variant}, fractions=[0.5], seeds=[1]))
     figures = directory.evaluation.read()
     assert {name: figures[name] for name in before} == before
     networks = {path.stem: path.read_bytes() for path in directory.networks()}
@@ -115,9 +101,9 @@ def test_studies_add_their_figures_and_networks_to_a_finished_run(finished: Run)
     assert directory.histories.read().keys() == networks.keys()
     assert "other" in directory.report.read()
 
-    learner = learner_of(finished)
+    learner = learner_of(copy)
     half, free = ShareLearner(learner, 0.5), ShareLearner(learner, 0.5, all_of_factors=True)
-    recipe = recipes(finished.config.networks, {"a": variant})["a"]
+    recipe = recipes(copy.config.networks, {"a": variant})["a"]
     assert figures["validation"]["samples"] == len(learner.split["validation"])
     (share,), (seed,) = figures["fractions"], figures["seeds"]
     assert share["training_samples"] == len(half.rows["train"]) == 22

@@ -6,7 +6,6 @@ import json
 import os
 import re
 import shlex
-import shutil
 import subprocess
 import sys
 from dataclasses import replace
@@ -21,6 +20,7 @@ from shapespace.training.report.page import page
 from shapespace.training.report.record import Record
 from shapespace.training.runs.directory import RunDirectory
 from shapespace.training.stages.run import STAGES
+from shapespace.training.stages.stage import Run
 from tests.faults.training import CONFIG, bars
 
 SHAPES, FACES = bars(6)
@@ -76,21 +76,19 @@ def test_faults_of_the_user_s_making_are_one_message(place: Path, said: Said) ->
         assert says in said.errors
 
 
-@pytest.mark.long
-def test_status_tells_how_far_a_run_is(tiny_run: Path, said: Said) -> None:
-    lines = dict(line.split(maxsplit=1) for line in said("status", str(tiny_run)).splitlines())
+def test_status_tells_how_far_a_run_is(run: Path, said: Said) -> None:
+    lines = dict(line.split(maxsplit=1) for line in said("status", str(run)).splitlines())
     assert list(lines) == list(STAGES)
     assert all(state.startswith("done in") for state in lines.values())
 
 
-@pytest.mark.long
-def test_status_of_a_stage_at_work_tells_its_samples(tiny_run: Path, tmp_path: Path, said: Said) -> None:
-    copy = shutil.copytree(tiny_run, tmp_path / "run")
-    (copy / "stages" / "samples.json").write_text('{"key": "", "basis": ""}')
-    log = (copy / "log.jsonl").read_text().splitlines()
-    at = max(k for k, line in enumerate(log) if '"samples of factor 1"' in line)
-    (copy / "log.jsonl").write_text("\n".join(log[: at + 1]))
-    assert "samples      begun: samples of factor 1: 60 of 60" in said("status", str(copy)).splitlines()
+def test_status_of_a_stage_at_work_tells_its_samples(copy: Run, said: Said) -> None:
+    copy.directory.stamp("samples").write({"key": "", "basis": ""})
+    log = copy.directory.folder / "log.jsonl"
+    lines = log.read_text().splitlines()
+    at = max(k for k, line in enumerate(lines) if '"samples of factor 1"' in line)
+    log.write_text("\n".join(lines[: at + 1]))
+    assert "samples      begun: samples of factor 1: 60 of 60" in said("status", str(log.parent)).splitlines()
 
 
 def test_changed_data_are_read_again_and_it_is_said(place: Path, said: Said) -> None:
@@ -273,17 +271,14 @@ def test_a_traceback_is_written_and_not_shown(place: Path, said: Said) -> None:
 
 @pytest.mark.long
 def test_the_next_command_works_from_where_one_stands(
-    tiny_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, said: Said
+    copy: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, said: Said
 ) -> None:
-    from tests.training.conftest import TINY
-
     (tmp_path / "here").mkdir()
     monkeypatch.chdir(tmp_path / "here")
-    (tmp_path / "tiny.toml").write_text(TINY)
-    shutil.copytree(tiny_run, tmp_path / "run")
-    words = said("run", "../tiny.toml", "--out", "../run", "--models", "../run/models").splitlines()[-1]
+    (tmp_path / "bars.toml").write_text(copy.source)
+    words = said("run", "../bars.toml", "--out", "../run", "--models", "../run/models").splitlines()[-1]
     bundle, following = words.split(" is ready. Next: ")
-    assert bundle == "../run/models/tiny-torus/1"
+    assert bundle == "../run/models/bars/1"
     assert (Path(bundle) / "manifest.json").is_file()
     setting, *words_of = shlex.split(following)
     name, _, value = setting.partition("=")
