@@ -35,10 +35,13 @@ RUN_OF_0_1 = Path(__file__).parent / "run_of_0_1"
 
 
 def today(name: str, config: dict[str, Any]) -> Config:
-    """A configuration; the torus' is of before time steps were chosen."""
+    """A configuration; the torus' is of before time steps were chosen, and bundles have variants written out."""
     steps: dict[str, dict[str, Any]] = {"modes": {"log_steps": 16}, "samples": {"steps": 16}}
+    variant: dict[str, Any] = {"base": None, "factors": {}, "combiner": {}}
     before = steps if name == "freaky-torus" else {}
-    return Config.model_validate(config | {section: each | config.get(section, {}) for section, each in before.items()})
+    sections = {section: each | config.get(section, {}) for section, each in before.items()}
+    sections["variants"] = {key: variant | each for key, each in config.get("variants", {}).items()}
+    return Config.model_validate(config | sections)
 
 
 @pytest.mark.parametrize("name", MODELS)

@@ -6,8 +6,10 @@ import json
 import os
 import re
 import shlex
+import signal
 import subprocess
 import sys
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -22,6 +24,8 @@ from shapespace.training.runs.directory import RunDirectory
 from shapespace.training.stages.run import STAGES
 from shapespace.training.stages.stage import Run
 from tests.faults.training import CONFIG, bars
+from tests.training.conftest import TINY
+from tests.training.whole_runs.test_collection import results
 
 SHAPES, FACES = bars(6)
 
@@ -185,6 +189,37 @@ def test_a_setting_that_came_and_went_leaves_nothing_and_costs_no_samples(place:
     assert all(np.array_equal(before[name], after[name]) for name in before)
     strongest = run.modes_by_strength.read()
     np.testing.assert_array_equal(strongest["nric"][after["rank"]], after["nric"])
+
+
+def test_a_killed_run_goes_on_and_ends_as_one_that_nobody_disturbed(place: Path, said: Said) -> None:
+    whole, killed = (("run", "bars.toml", "--out", out, "--until", "samples") for out in ("whole", "killed"))
+    process = subprocess.Popen(
+        [sys.executable, "-m", "shapespace.training", *killed],
+        stdout=subprocess.DEVNULL,
+        start_new_session=True,
+        env={**os.environ, "PYTHONPATH": str(command.HOME)},
+    )
+    while not list(place.glob("killed/samples/part-*.npz")):
+        assert process.poll() is None, "the run ended before it could be killed"
+        time.sleep(0.001)
+    os.killpg(process.pid, signal.SIGKILL)
+    process.wait()
+    said(*whole)
+    words = said(*killed)
+    assert "factors: done before" in words
+    one, other = (results(place / out) for out in ("whole", "killed"))
+    assert one == other
+    assert any("samples/split" in name for name in one)
+
+
+def test_a_product_by_design_has_its_factors_without_modes(place: Path, said: Said) -> None:
+    (place / "torus.toml").write_text(TINY)
+    said("run", "torus.toml", "--until", "factors")
+    run = RunDirectory(place / "runs" / "torus")
+    assert run.factors.read()["factors"] == [[0], [1], [2, 3]]
+    assert run.reference_mesh().vertices.shape == (2048, 3)
+    assert not run.mean.exists()
+    assert not run.modes.exists()
 
 
 def test_an_odd_shape_stops_the_run_until_it_is_accepted(place: Path, said: Said) -> None:
