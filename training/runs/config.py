@@ -88,9 +88,7 @@ def parse(text: str, source: str) -> Config:
 def load(path: Path, data: Path | None = None) -> tuple[Config, str]:
     """Read a configuration file.
 
-    Args:
-        path: the file.
-        data: replaces ``collection.data``.
+    ``data`` replaces ``collection.data``.
 
     Returns:
         The configuration, and a text with the same meaning in any folder: ``collection.data`` is absolute, all else as

@@ -48,12 +48,9 @@ def run(
 ) -> Iterator[tuple[int, Result]]:
     """Call a function on each item, and yield (position, result) as results are finished.
 
-    Args:
-        function: a picklable function. Each thread unpickles it once and keeps it. So lazily built attributes are built
-            once in each thread, and needn't be thread-safe.
-        items: arguments. Each should have much more work than sending it.
-        scheduler: address of a Dask scheduler; None computes on this machine.
-        workers: number of processes on this machine, by default one for each core; 1 computes in this process.
+    Each thread unpickles the function once and keeps it, so that lazily built attributes are built once in each thread
+    and needn't be thread-safe. Without the address of a Dask scheduler all is computed on this machine, in as many
+    processes as it has cores unless ``workers`` says otherwise; 1 computes in this process.
 
     Raises:
         WorkersError: the scheduler can't be reached or is lost, there are no workers, workers lack this package, or an

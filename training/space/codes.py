@@ -59,14 +59,8 @@ def nearest_codes(
     The method is Gauss–Newton, with the derivative of the discrete exponential. Projections of logarithms, from which
     the search starts, are minimisers only to first order, because the exponential is nonlinear.
 
-    Args:
-        space: the shape space.
-        mean: X̄ (V, 3).
-        modes: (m, V, 3) vertex fields, scaled so that codes are about 1.
-        shapes: (n, V, 3), in any position.
-        start: (n, m) codes nearby.
-        steps: K of the exponentials.
-        workers: processes, by default one a core; the result does not depend on it.
+    Modes (m, V, 3) are vertex fields at the mean (V, 3), scaled so that codes are about 1. Shapes (n, V, 3) may be in
+    any position; ``start`` (n, m) has codes nearby. The result does not depend on the number of workers.
     """
     everywhere = np.full(len(modes), np.inf)
     box = Box(-everywhere, everywhere, np.ones(len(modes)))

@@ -33,11 +33,7 @@ class FactorError(ValueError):
 def overlap(nric: FloatArray, norm: WeightedNorm) -> FloatArray:
     """Overlap of the supports of modes: ``Σ_e |u_i,e| |u_j,e|``, normalised to 1 on the diagonal.
 
-    ``|u_e|`` is the size of a mode on an edge, of its length and its angle together, in the weighted norm.
-
-    Args:
-        nric: (m, 2E) modes.
-        norm: weighted norm at their mean.
+    ``|u_e|`` is the size of a mode (2E,) on an edge, of its length and its angle together, in the norm at the mean.
 
     Returns:
         (m, m) symmetric, from 0 where supports are disjoint to 1 where the modes are alike.
@@ -48,12 +44,7 @@ def overlap(nric: FloatArray, norm: WeightedNorm) -> FloatArray:
 
 
 def between(overlaps: FloatArray, groups: Sequence[Sequence[int]]) -> FloatArray:
-    """Overlap of factors (J, J): the average over pairs of modes, one from each factor.
-
-    Args:
-        overlaps: (m, m) overlaps of the modes.
-        groups: J lists of modes.
-    """
+    """Overlap of factors (J, J): the average of the overlaps (m, m) over pairs of modes, one from each factor."""
     share = np.zeros((len(groups), len(overlaps)))
     for row, group in zip(share, groups, strict=True):
         row[list(group)] = 1 / len(group)
@@ -68,10 +59,6 @@ def group(overlaps: FloatArray, count: int | None = None) -> list[list[int]]:
     depends on the collection: its median is 0.4 on a captured body in loose clothes, where nearly everything moves a
     little with everything else, and 0.1 on a hand. The algorithm is written out because a dendrogram has no limit on
     the size of groups.
-
-    Args:
-        overlaps: (m, m) overlaps of the modes, strongest mode first.
-        count: J, if the user chose it.
 
     Returns:
         J lists of modes, each in order; the factor of the strongest mode comes first.
@@ -103,13 +90,7 @@ def names(groups: Sequence[Sequence[int]], nric: FloatArray, norm: WeightedNorm,
 
     Places are those in a viewer that has x to the right, y up and z towards the eye (glTF's axes). A factor is named by
     the centre of its modes' squares, on every axis along which the mesh is not thin; "middle" where it is to no side.
-    Names are unique: the second "upper left" is "upper left 2".
-
-    Args:
-        groups: J lists of modes.
-        nric: (m, 2E) modes.
-        norm: weighted norm at the mean.
-        mean: the mean shape.
+    Names are unique: the second "upper left" is "upper left 2". Modes are (m, 2E), the norm is that at the mean.
     """
     middles = mean.edge_midpoints
     centre, spread = middles.mean(axis=0), middles.std(axis=0)

@@ -164,12 +164,8 @@ def time_steps(
     and if random shapes rarely fold. Modes are principal modes of the other folds' logarithms, at the mean of all
     shapes.
 
-    Args:
-        settings: settings of the modes; only ``log_steps`` and ``count`` matter.
-        reference: gives connectivity.
-        shapes: (n, V, 3). At most `CHOICE_SHAPES` of them, spread evenly, are held out.
-        material: material of the shell.
-        original_index: (n,) index of each shape's original, from 0, mirror images last; by default none is an image.
+    The settings ``log_steps`` and ``count`` matter. At most `CHOICE_SHAPES` shapes (n, V, 3), spread evenly, are held
+    out. ``original_index`` (n,) is the index of each shape's original, from 0, mirror images last.
     """
     if settings.log_steps != "auto":
         return settings.log_steps
@@ -245,15 +241,9 @@ def held_out(
 ) -> HeldOut:
     """Find mean, logarithms and modes without some shapes, and approximate these shapes.
 
-    Args:
-        reference: gives connectivity.
-        shapes: (n, V, 3) all shapes.
-        index: (k,) indices of the shapes that are held out, together with their mirror images.
-        counts: numbers of modes, limited by the number of shapes; by default the configured number, and half of it.
-        settings: settings of the modes.
-        material: material of the shell.
-        steps: K of logarithms and exponentials; by default as configured for the other shapes, at most `LIGHT_STEPS`.
-        original: (n,) index of each shape's original, its own index unless it is a mirror image; by default none is.
+    Shapes (n, V, 3) at ``index`` (k,) are held out, with their mirror images: ``original`` (n,) is the index of each
+    shape's original. ``counts`` are numbers of modes, by default the configured number and half of it, and at most the
+    number of the other shapes. ``steps`` is K, by default as configured for these, and at most `LIGHT_STEPS`.
 
     Raises:
         ModeError: the other shapes have no mean, or no modes.

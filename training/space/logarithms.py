@@ -69,12 +69,7 @@ def logarithms(space: ShellSpace, mean: FloatArray, shapes: ArrayLike, steps: in
     A logarithm is the inverse of the exponential with the same number of steps K. It converges only to first order in
     1/K: on real collections, logarithms of 4 and of 8 steps differ by 10 to 35 % of their length.
 
-    Args:
-        space: the shape space; each process gets a copy.
-        mean: X̄ (V, 3).
-        shapes: (n, V, 3), in any position.
-        steps: K of the geodesics.
-        workers: processes, by default one a core; 1 computes here. The result does not depend on it.
+    Shapes (n, V, 3) may be in any position; the mean is (V, 3). The result does not depend on the number of workers.
 
     Raises:
         ModeError: a coordinate of a shape is not finite.

@@ -24,12 +24,7 @@ def centred_mean(
     mode would be spent on the common part of all logarithms. On faces the step lowers the error of unseen shapes by a
     tenth, with twelve modes.
 
-    Args:
-        reference: gives connectivity.
-        shapes: (n, V, 3), in any position.
-        material: material of the shell.
-        steps: K of logarithms and exponential.
-        workers: processes, by default one a core; the result does not depend on it.
+    The reference gives connectivity, shapes (n, V, 3) may be in any position, and ``steps`` is K of the logarithms.
 
     Returns:
         The mean, with the status of the elastic mean. Without an exponential it is the elastic mean itself.

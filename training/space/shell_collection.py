@@ -24,18 +24,8 @@ class ShellCollection:
     """The shapes ``exp_z̄(Σ_j w_j u_j)`` of codes w in a hypercube (paper, section 3); see sampling.Collection.
 
     It is pickled without the symbolic analysis of its space. A process that unpickles it repeats the analysis once, at
-    the first shape.
-
-    Attributes:
-        reference: z̄, the mean, of about unit area.
-        modes: (m, V, 3) vertex fields d_j at the mean, ``u_j = Dz d_j``.
-        lower, upper: (m,) bounds of the coefficients.
-        factors: indices of modes of each factor, by name.
-        steps: K of the exponential.
-        material: μ, λ, η.
-        scale: length of one unit of the reference in the user's units.
-        codes: (n, m) codes of the training shapes.
-        with_derivatives: whether shapes come with their derivatives.
+    the first shape. The reference is the mean z̄, modes (m, V, 3) are vertex fields d_j there, ``u_j = Dz d_j``, and
+    ``lower`` and ``upper`` (m,) are the bounds of the coefficients.
     """
 
     reference: TriangleMesh

@@ -67,17 +67,9 @@ def execute(
     command: str = "",
     show: Callable[[str], None] = print,
 ) -> bool:
-    """Do the stages that are not done yet, up to and including ``until``.
+    """Do the stages that are not done yet, by default all, up to and including ``until``. Return whether any was done.
 
-    Args:
-        run: the run.
-        until: name of the last stage; by default all stages are done.
-        keep_going: whether to continue however much is lost.
-        command: command that continues this run, for messages.
-        show: receives one line at a time.
-
-    Returns:
-        Whether any stage was done.
+    ``command`` continues this run, for messages; ``show`` receives one line at a time.
 
     Raises:
         LostTooMuchError: more than a quarter of the logarithms or samples are lost, and ``keep_going`` is false.

@@ -46,15 +46,9 @@ def listed(names: list[str]) -> str:
 
 
 class Run:
-    """A run: its configuration, its directory, and what it needs from outside.
+    """A run: its directory, its configuration with its text, the folder of bundles, and what it needs from outside.
 
-    Args:
-        folder: the run directory.
-        config: the configuration.
-        source: the text of the configuration.
-        models: folder of the bundles.
-        scheduler: address of a Dask scheduler, see workers.run.
-        accepted: names or files of shapes that `ingest` takes although their size or vertex order differs.
+    ``scheduler`` is for workers.run. `ingest` takes the shapes ``accepted`` though their size or vertex order differs.
     """
 
     def __init__(
@@ -145,9 +139,7 @@ class Stage:
     def keys(self, config: Config, before: str) -> dict[str, str]:
         """Return digests of the input of the stage: ``key`` of all input, ``basis`` of all input but the amounts.
 
-        Args:
-            config: the configuration of the run.
-            before: key of the stage before, or of the data.
+        ``before`` is the key of the stage before, or of the data.
         """
         settings = [s if isinstance(s, dict) else s.model_dump(mode="json") for s in self.settings(config)]
         rest = [{k: v for k, v in s.items() if k not in self.amounts} for s in settings]

@@ -304,7 +304,6 @@ def test_a_traceback_is_written_and_not_shown(place: Path, said: Said) -> None:
     assert "Traceback" in (place / "runs" / "bars" / "traceback.txt").read_text()
 
 
-@pytest.mark.long
 def test_the_next_command_works_from_where_one_stands(
     copy: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, said: Said
 ) -> None:
