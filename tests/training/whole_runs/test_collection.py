@@ -109,6 +109,11 @@ def test_a_run_leaves_what_the_contract_promises(run: Path) -> None:
     assert report.index("Shapes it has not seen") < report.index("Shapes it has learned from") < report.index("R²")
     events = [json.loads(line) for line in (run / "log.jsonl").read_text().splitlines()]
     assert [e["stage"] for e in events if e["event"] == "end"] == list(STAGES)
+    assert all(e["time"] for e in events)
+    with np.load(run / "samples" / "split.npz") as split:
+        drawn = np.concatenate([split[k] for k in ("train", "validation", "test")])
+        assert sorted(drawn) == list(range(60))
+        assert len(split["test"]) == 12
 
 
 def test_a_factor_s_samples_are_the_parts_of_the_joint_codes(run: Path) -> None:

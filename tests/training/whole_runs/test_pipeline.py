@@ -26,7 +26,6 @@ from shapespace.training.learning.fitting import read_network
 from shapespace.training.runs.config import load
 from shapespace.training.runs.sampling import read
 from shapespace.training.stages.networks import learner_of
-from shapespace.training.stages.run import STAGES
 from shapespace.training.stages.stage import Run
 from tests.training.conftest import TINY, command
 
@@ -47,22 +46,11 @@ def test_a_run_leaves_what_the_contract_promises(tiny_run: Path) -> None:
         np.testing.assert_allclose(scale * part["vertices"], vertices(part["latents"]), atol=1e-6)
         assert set(part["status"]) == {"done"}
         assert part["nric"].shape == (20, 2 * 6144)
-    with np.load(tiny_run / "samples" / "factor-2" / "part-00000.npz") as part:
-        assert np.all(part["latents"][:, :2] == 0)
-    with np.load(tiny_run / "samples" / "split.npz") as split:
-        every = np.concatenate([split[k] for k in ("train", "validation", "test")])
-        assert sorted(every) == list(range(60))
-        assert len(split["test"]) == 12
     figures = json.loads((tiny_run / "evaluation.json").read_text())
-    for model in ("composite", "monolithic", "monolithic_paper", "kernel", "affine", "grid"):
-        assert set(figures["r2"][model]) == {"total", "lengths", "angles"}
     assert 0.9 < figures["r2"]["affine"]["total"] < 0.99
     assert figures["r2"]["composite"]["total"] > 0.5
     assert not figures.keys() & {"variants", "validation", "fractions", "seeds"}, "figures of studies"
     assert figures["vertex_error"]["max"] > figures["vertex_error"]["mean"] > 0
-    events = [json.loads(line) for line in (tiny_run / "log.jsonl").read_text().splitlines()]
-    assert [e["stage"] for e in events if e["event"] == "end"] == list(STAGES)
-    assert all(e["time"] for e in events)
 
 
 def test_no_factor_learns_from_parts_of_test_codes(tiny_run: Path) -> None:
