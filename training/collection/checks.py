@@ -98,6 +98,10 @@ def mesh_arrays(vertices: np.ndarray, faces: np.ndarray) -> tuple[FloatArray, In
     return vertices.astype(np.float64), faces.astype(np.int64)
 
 
+#: Exporters split vertices where normals or texture coordinates differ.
+_SPLIT = "; vertices split by flat shading or seams of texture do no harm, if all files have their faces in one order"
+
+
 def same_connectivity(
     vertices: FloatArray, faces: IntArray, other_vertices: FloatArray, other_faces: IntArray, other: str
 ) -> None:
@@ -107,9 +111,10 @@ def same_connectivity(
         MeshError: the meshes differ.
     """
     if (len(vertices), len(faces)) != (len(other_vertices), len(other_faces)):
+        advice = _SPLIT if len(faces) == len(other_faces) else ""
         raise MeshError(
             f"has {len(vertices)} vertices and {len(faces)} faces, but {other} has {len(other_vertices)} and "
-            f"{len(other_faces)}; all meshes need the same connectivity"
+            f"{len(other_faces)}; all meshes need the same connectivity{advice}"
         )
     differing = np.flatnonzero((faces != other_faces).any(axis=1))
     if len(differing):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -123,8 +124,13 @@ def _read_like(
         own_vertices, own_faces = _read_mesh(path)
         _refuse_cut_short(path, len(own_vertices), own_faces, len(vertices), faces)
         with refusing(ShapeSource.of_file(path)):
+            corners = own_vertices[own_faces]
             if triangles_only:
-                return _on_shared_vertices(own_vertices[own_faces], faces, len(vertices), template.name)
+                return _on_shared_vertices(corners, faces, len(vertices), template.name)
+            if len(own_faces) == len(faces) and not np.array_equal(own_faces, faces):
+                # Exporters split vertices along sharp edges and seams, in each pose where they like.
+                with suppress(MeshError):
+                    return _on_shared_vertices(corners, faces, len(vertices), template.name)
             _refuse_cut_short(template, len(vertices), faces, len(own_vertices), own_faces)
             same_connectivity(own_vertices, own_faces, vertices, faces, template.name)
     except IngestError as error:

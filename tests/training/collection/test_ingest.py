@@ -73,6 +73,37 @@ def same_surfaces(found: MeshCollection, shapes: np.ndarray = SHAPES, faces: np.
     np.testing.assert_allclose(found.vertices[:, found.faces], shapes[:, faces], rtol=0, atol=1e-6)
 
 
+def split(shape: np.ndarray, faces: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """The mesh with some corners on vertices of their own, and all vertices in another order."""
+    corners = faces.ravel().copy()
+    alone = rng.random(len(corners)) < 0.5
+    corners[alone] = len(shape) + np.arange(alone.sum())
+    vertices = np.concatenate([shape, shape[faces.ravel()[alone]]])
+    order = rng.permutation(len(vertices))
+    return vertices[order], np.argsort(order)[corners].reshape(-1, 3)
+
+
+@pytest.mark.parametrize("formats", [("glb", "glb", "glb"), ("obj", "ply", "off"), ("stl", "glb", "npz")])
+def test_vertices_may_be_split_and_numbered_otherwise_in_each_file(formats: tuple[str, ...], tmp_path: Path) -> None:
+    rng = np.random.default_rng(3)
+    for name, shape, format in zip(NAMES, SHAPES, formats, strict=True):
+        (tmp_path / f"{name}.{format}").write_bytes(encoded(*split(shape, FACES, rng), format))
+    found = read_collection(tmp_path)
+    assert found.vertices.shape == (3, 42, 3)
+    same_surfaces(found)
+
+
+def test_split_vertices_do_not_hide_other_faces(tmp_path: Path) -> None:
+    rng = np.random.default_rng(3)
+    write(tmp_path, formats=["obj", "obj", "glb"])
+    vertices, faces = split(SHAPES[1], FACES, rng)
+    (tmp_path / "pose2.obj").write_bytes(encoded(vertices, np.roll(faces, 1, axis=0), "obj"))
+    with pytest.raises(
+        IngestError, match=r"pose2\.obj: has \d+ vertices and 80 faces, but .*if all files have their faces"
+    ):
+        read_collection(tmp_path)
+
+
 @pytest.mark.parametrize("format", READ_FORMATS)
 def test_every_format_gives_the_same_surfaces(format: str, tmp_path: Path) -> None:
     found = read_collection(write(tmp_path, formats=[format] * 3))
@@ -254,7 +285,6 @@ TURNED = np.concatenate([FACES[:7], FACES[7:8, ::-1], FACES[8:]])
 #: Two vertices of face 5 stand almost in one place in every shape.
 NEARLY_ONE = SHAPES.copy()
 NEARLY_ONE[:, FACES[5, 0]] = SHAPES[:, FACES[5, 1]] + 1e-7 * (SHAPES[:, FACES[5, 0]] - SHAPES[:, FACES[5, 1]])
-SOLID = trimesh.Trimesh(SHAPES[1], FACES, process=False).export(file_type="stl_ascii").encode() + b"\n"
 GLB, STL = (encoded(SHAPES[1], FACES, format) for format in ("glb", "stl"))
 REFUSALS: dict[str, tuple[Callable[[Path], Path | None], str]] = {
     "path that isn't there": (lambda folder: folder / "none", r"none: no such file or folder"),
@@ -282,7 +312,6 @@ REFUSALS: dict[str, tuple[Callable[[Path], Path | None], str]] = {
         bad_file("pose2.obj", encoded(SHAPES[1], FACES, "obj") + b"f 1 2 43\n"),
         r"pose2\.obj: faces name vertices 1 to 43, but there are 42 vertices \(counted from 1\)",
     ),
-    "two solids in one STL": (bad_file("pose2.stl", 2 * SOLID), r"pose2\.stl: holds 2 meshes"),
     "dangling link": (
         lambda folder: (write(folder) / "pose3.obj").symlink_to("gone.obj"),
         r"pose3\.obj: can't be read: No such file",
