@@ -160,7 +160,8 @@ class Reconstructor:
         if found.status is not Status.STALLED:
             return found
         iterations = found.iterations
-        for other in (*others, lambda: self.reference.vertices):
+        starts: list[Callable[[], FloatArray]] = [*others, lambda: self.reference.vertices]
+        for other in starts:
             if np.array_equal(start := other(), guess.vertices):
                 continue
             again = self._iterate(target, self._squares(start, target), tolerance, max_iterations, deadline)
