@@ -14,7 +14,6 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from shapespace.files.animated_gltf import animated_glb
-from shapespace.files.formats import MESH_FORMATS
 from shapespace.files.limits import Limits
 from shapespace.files.reading import read_arrays
 from shapespace.mesh.triangle_mesh import MeshError
@@ -90,15 +89,6 @@ def test_vertices_of_one_number_are_one(kind: int) -> None:
 def test_numbers_of_vertices_that_can_t_be_are_refused(numbers: list[float], says: str) -> None:
     with pytest.raises(MeshError, match=says):
         numbered(numbers)
-
-
-@pytest.mark.parametrize("format", ["glb", "gltf"])
-def test_what_we_write_comes_back_bit_for_bit(format: str) -> None:
-    mesh = freaky_torus.reference()
-    vertices, faces = read_arrays(MESH_FORMATS[format].encode(mesh.vertices, mesh.faces), format)
-    assert vertices.dtype == np.float64
-    assert np.array_equal(vertices, mesh.vertices.astype(np.float32))
-    assert np.array_equal(faces, mesh.faces)
 
 
 def test_an_animation_is_read_at_rest() -> None:

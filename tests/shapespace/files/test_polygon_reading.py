@@ -64,7 +64,7 @@ def test_polygons_in_text(ends: str) -> None:
         "obj": "o pyramid\n"
         + "".join(f" \tv  {line}\n" for line in POINT_LINES.splitlines())
         + "vt 0 0\nvn 0 0 1\nusemtl v 1 2 3\n\n  # v 1 2 3\n"
-        + "".join("f " + " ".join(f"{c + 1}/1/1" for c in side) + " # a side\n" for side in SIDES),
+        + "".join("f " + " ".join(f"{c - 5}/1/1" for c in side) + " # a side\n" for side in SIDES),
     }
     for format, text in files.items():
         vertices, faces = read_arrays(text.replace("\n", ends).encode(), format)

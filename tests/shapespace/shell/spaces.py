@@ -1,9 +1,9 @@
-"""The spaces in which the laws are tested, with one interface: the space of shells, and a flat one."""
+"""The spaces in which the laws are tested, with one interface on points and vectors (V, 3): shells, and a flat space."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol, TypeVar
+from typing import TypeVar
 
 import numpy as np
 
@@ -26,46 +26,9 @@ def found(outcome: Ended) -> Ended:
     return outcome
 
 
-class Space(Protocol):
-    """A Riemannian manifold with time-discrete operations on points and vectors (V, 3).
-
-    Points that differ by a rigid motion may count as the same; then their ``distance`` is 0.
-
-    Attributes:
-        tolerance: tolerance of distances, where equations are solved exactly.
-        flat: whether laws that hold to first order hold exactly.
-    """
-
-    tolerance: float
-    flat: bool
-
-    def exponential(self, start: FloatArray, velocity: FloatArray, steps: int) -> FloatArray: ...
-
-    def geodesic(self, start: FloatArray, end: FloatArray, steps: int) -> FloatArray: ...
-
-    def logarithm(self, start: FloatArray, end: FloatArray, steps: int) -> FloatArray: ...
-
-    def transport(self, path: FloatArray, velocity: FloatArray) -> FloatArray: ...
-
-    def means(self, shapes: FloatArray, weights: FloatArray, start: FloatArray, steps: int) -> list[FloatArray]:
-        """The weighted mean by every definition that the space has, the centre of mass last."""
-
-    def energy(self, path: FloatArray) -> float: ...
-
-    def inner(self, at: FloatArray, first: FloatArray, second: FloatArray) -> float: ...
-
-    def distance(self, first: FloatArray, second: FloatArray) -> float: ...
-
-    def difference(self, end: FloatArray, start: FloatArray) -> FloatArray:
-        """The vector at ``start`` that leads to the neighbouring point ``end``, to first order."""
-
-    def scaled(self, factor: float) -> Space:
-        """The same space for shapes scaled by this factor."""
-
-
 @dataclass(frozen=True)
 class FlatSpace:
-    """R^{V×3} with the Euclidean product: geodesics are straight lines."""
+    """R^{V×3} with the Euclidean product: geodesics are straight lines, and laws to first order hold exactly."""
 
     tolerance = 1e-12
     flat = True
@@ -103,7 +66,7 @@ class FlatSpace:
 
 @dataclass(frozen=True)
 class Shells:
-    """The space of shells; every operation must converge."""
+    """The space of shells, up to rigid motions; every operation must converge. Distances have this tolerance."""
 
     space: ShellSpace
     tolerance = 1e-6
@@ -148,3 +111,6 @@ class Shells:
     def scaled(self, factor: float) -> Shells:
         reference = self.space.reference
         return Shells(ShellSpace(reference.with_vertices(factor * reference.vertices), self.space.material))
+
+
+Space = FlatSpace | Shells

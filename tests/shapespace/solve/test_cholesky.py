@@ -70,15 +70,6 @@ def test_contributions_add_up_and_those_below_the_diagonal_are_mirrored():
     assert pattern.diagonal.tolist() == [0, 2, 3]
 
 
-def test_scattering_is_the_sum_that_scipy_makes(pattern, rng):
-    rows, columns = rng.integers(0, 40, (2, 300))
-    pattern = SymmetricPattern(40, rows, columns)
-    values = rng.standard_normal(300)
-    one = sparse.coo_array((values, (rows, columns)), shape=(40, 40)).toarray()
-    expected = one + one.T - np.diag(np.diag(one))
-    np.testing.assert_allclose(pattern.matrix(pattern.scatter(values)).toarray(), expected, atol=1e-14)
-
-
 # ---------------------------------------------------------------- solving
 
 
