@@ -10,9 +10,10 @@ from functools import cached_property
 import numpy as np
 
 from shapespace.arrays import FloatArray, IntArray
-from shapespace.coordinates.least_squares import LeastSquares, LeastSquaresPoint
+from shapespace.coordinates.normal_matrix import NormalMatrix
+from shapespace.coordinates.nric import HingeGeometry, NRICGradients, NRICJacobian, WeightedNorm
 from shapespace.mesh.rigid_motion import rigid_motions
-from shapespace.mesh.triangle_mesh import face_areas
+from shapespace.mesh.triangle_mesh import Connectivity, face_areas
 from shapespace.solve.anderson import Anderson
 from shapespace.solve.cholesky import Backend, Cholesky, Factorisation, NotPositiveDefiniteError, analyse
 from shapespace.solve.deadline import Deadline
@@ -46,6 +47,49 @@ class Damping:
 
 
 REUSE, DAMPING = FactorReuse(), Damping()
+
+
+class LeastSquares:
+    """The misfit between shapes of one connectivity and a target."""
+
+    def __init__(self, connectivity: Connectivity, norm: WeightedNorm, matrix: NormalMatrix) -> None:
+        self.connectivity, self.norm, self.matrix = connectivity, norm, matrix
+        self.jacobian = NRICJacobian(connectivity)
+
+    @np.errstate(divide="ignore", over="ignore", invalid="ignore")
+    def __call__(self, vertices: FloatArray, target: FloatArray) -> LeastSquaresPoint:
+        """Compare a shape (V, 3) with a target z* (2E,)."""
+        geometry = HingeGeometry(vertices, self.connectivity)
+        misfit = geometry.nric()
+        misfit -= target
+        half = len(misfit) // 2
+        # Like `wrap`, but in place and ten times faster. The sign of half a turn doesn't change its square.
+        misfit[half:] -= 2 * np.pi * np.rint(misfit[half:] / (2 * np.pi))
+        return LeastSquaresPoint(vertices, misfit, float(self.norm.square(misfit)), self, geometry)
+
+
+@dataclass(frozen=True)
+class LeastSquaresPoint:
+    """A shape and its misfit."""
+
+    vertices: FloatArray  # (V, 3)
+    misfit: FloatArray  # (2E,) ``z(X) − z*``, angles modulo 2π
+    energy: float  # squared norm of the misfit
+    squares: LeastSquares  # the objective
+    geometry: HingeGeometry  # edge vectors and normals of the shape
+
+    @cached_property
+    def gradients(self) -> NRICGradients:
+        """Derivatives of the lengths and angles, computed on demand: the last shape doesn't need them."""
+        return self.geometry.gradients()
+
+    def forces(self) -> FloatArray:
+        """Negative gradient (V, 3) of half the energy."""
+        return -self.squares.jacobian.pull_back(self.gradients, self.squares.norm.squared * self.misfit)
+
+    def entries(self) -> FloatArray:
+        """Entries of the normal matrix ``JᵀWJ + εI``, on its pattern."""
+        return self.squares.matrix.entries(self.gradients, self.squares.norm)
 
 
 @dataclass(frozen=True)

@@ -12,8 +12,7 @@ from scipy import sparse
 
 from shapespace.arrays import FloatArray
 from shapespace.coordinates.frame_integration import FrameIntegration
-from shapespace.coordinates.gauss_newton import REUSE, GaussNewton, IterationLimits
-from shapespace.coordinates.least_squares import LeastSquares, LeastSquaresPoint
+from shapespace.coordinates.gauss_newton import REUSE, GaussNewton, IterationLimits, LeastSquares, LeastSquaresPoint
 from shapespace.coordinates.normal_matrix import NormalMatrix
 from shapespace.coordinates.nric import NRICJacobian, WeightedNorm
 from shapespace.mesh.triangle_mesh import TriangleMesh

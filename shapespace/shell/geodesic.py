@@ -11,8 +11,16 @@ import numpy as np
 from shapespace.arrays import FloatArray
 from shapespace.coordinates.nric import unwrap
 from shapespace.mesh.rigid_motion import align
-from shapespace.shell.initial_paths import InitialPath, bisected, descended, nearest, straight
-from shapespace.shell.path_energy import factorised, inverse_in_time, path_forces
+from shapespace.shell.initial_paths import (
+    InitialPath,
+    bisected,
+    descended,
+    factorised,
+    inverse_in_time,
+    nearest,
+    path_forces,
+    straight,
+)
 from shapespace.shell.space import TOLERANCE, ChordSolver, DiscretePath, Factorise, ShellSpace, fault_between
 from shapespace.solve.anderson import Anderson
 from shapespace.solve.cholesky import NotPositiveDefiniteError

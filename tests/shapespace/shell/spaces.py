@@ -1,4 +1,4 @@
-"""The spaces in which the laws are tested, with one interface on points and vectors (V, 3): shells, and a flat space."""
+"""The two spaces in which the laws are tested, with the same operations on points and vectors (V, 3)."""
 
 from __future__ import annotations
 
