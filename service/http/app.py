@@ -22,10 +22,8 @@ from shapespace.service.http.middleware.access import RequireHost, RequireKey
 from shapespace.service.http.middleware.memory import LimitBody, LimitUnreadAnswers
 from shapespace.service.http.middleware.observe import HeadAsGet, Observe
 from shapespace.service.http.routes import (
-    blend_shapes,
     codes,
     fits,
-    health,
     interpolations,
     models,
     open_inference,
@@ -52,11 +50,9 @@ LOOPBACK = ("localhost", "127.0.0.1", "[::1]")
 
 
 def create_app(settings: Settings | None = None, validator: BundleValidator | None = None) -> FastAPI:
-    """Return the service as an ASGI application; it loads the bundles when it starts.
+    """Return the service as an ASGI application, with settings from the environment by default.
 
-    Args:
-        settings: settings of the server; by default from the environment.
-        validator: validation of the bundles that has begun already.
+    It loads the bundles when it starts, and takes over a validation of them that has begun already.
     """
     settings = settings or Settings()
 
@@ -100,7 +96,7 @@ def create_app(settings: Settings | None = None, validator: BundleValidator | No
         openapi_url=None,
     )
     error_handlers.install(app)
-    calls = (models, shapes, blend_shapes, codes, fits, interpolations, open_inference, health, operation, page)
+    calls = (models, shapes, codes, fits, interpolations, open_inference, operation, page)
     routers = [module.router for module in calls]
     for router in routers:
         app.include_router(router)

@@ -21,15 +21,7 @@ class QuotaError(RuntimeError):
 
 
 class Quota:
-    """A limited resource, counted for each client. Use it from the event loop only.
-
-    Args:
-        limit: amount for all clients together.
-
-    Attributes:
-        limit: amount for all clients together.
-        used: amount in use.
-    """
+    """A limited resource, counted for each client, of an amount for all together; for the event loop only."""
 
     def __init__(self, limit: int) -> None:
         self.limit, self.used = limit, 0

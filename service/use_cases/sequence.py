@@ -89,8 +89,7 @@ async def sequence_file(
     """Return all frames as one file in a format of SEQUENCE_FORMATS.
 
     Raises:
-        TooManyCodesError, BusyError: the frames exceed the limit of one answer, or of all together.
-        DeadlineError, DisconnectedError, EndingError: the call ended before the file was ready.
+        TooManyCodesError: the frames exceed the limit of one answer.
         NoRoomError: there is no room for a temporary file.
     """
     codes, inside = model.latents.codes(animation.codes(model.latents))
@@ -101,28 +100,18 @@ async def sequence_file(
     # Colours take as much memory as positions.
     async with batch(workers, caller, shapes_size(model, len(codes) * (2 if colour_by else 1), mesh)) as work:
         found = await shapes(work, model, codes, inside, mesh, quality)
-        whole, surface = model.mesh(mesh), with_topology(model.decoder.surface(mesh), topology)
+        vertices, whole = found.vertices[:number], model.mesh(mesh)
+        surface = with_topology(model.decoder.surface(mesh), topology)
 
         def encode() -> tuple[Iterator[Buffer], dict[str, Any]]:
             colourings: list[Colouring] = []
             if colour_by:
-                reference = colour_by.against is None
-                against = (
-                    model.decoder.reference_shape(mesh).vertices if reference else found.vertices[-1].astype(np.float64)
-                )
-                colourings = Colouring.of_frames(
-                    colour_by.quantity, found.vertices[:number], against, whole.connectivity
-                )
-            frames = Frames(
-                found.vertices[:number],
-                found.diagnostics[:number],
-                whole.faces,
-                animation.positions,
-                codes[:number],
-                surface,
-                fps,
-                colourings,
-            )
+                against = found.vertices[-1].astype(np.float64)
+                if colour_by.against is None:
+                    against = model.decoder.reference_shape(mesh).vertices
+                colourings = Colouring.of_frames(colour_by.quantity, vertices, against, whole.connectivity)
+            each = found.diagnostics[:number]
+            frames = Frames(vertices, each, whole.faces, animation.positions, codes[:number], surface, fps, colourings)
             return encode_frames(frames, format)
 
         return await work.write(encode, found.seconds, summarise(found.diagnostics[:number]))

@@ -21,7 +21,7 @@ from pathlib import Path
 import httpx
 import pytest
 
-from shapespace.service.http.connections import LIMITS
+from shapespace.service.http.connections import HEAD_BYTES, HEAD_LINES, HEAD_SECONDS, STALL_SECONDS
 from shapespace.service.use_cases.animation import Animation, UnknownInterpolationError
 from tests.faults.serving import peak_memory
 from tests.service.conftest import ROOT, Server, Start, starting
@@ -76,7 +76,7 @@ def long_heads(server: Server) -> float:
 
 
 def test_a_head_that_is_too_long_and_malformed_is_refused_once(quiet: Server) -> None:
-    head = b"GET / HTTP/1.1\r\nHost: localhost\r\nX: " + b"a" * LIMITS.head_bytes
+    head = b"GET / HTTP/1.1\r\nHost: localhost\r\nX: " + b"a" * HEAD_BYTES
     with cheap(quiet), connect(quiet) as connection:
         connection.sendall(head + b"\0" * 8000)
         assert rest(connection).count(b"HTTP/1.1 400") == 1
@@ -125,9 +125,7 @@ def test_trailers_are_no_headers(quiet: Server) -> None:
 
 
 def test_a_head_within_the_limits_is_read(quiet: Server) -> None:
-    lines = {
-        f"X-{k}": "y" * ((LIMITS.head_bytes - 4000) // (LIMITS.head_lines - 10)) for k in range(LIMITS.head_lines - 10)
-    }
+    lines = {f"X-{k}": "y" * ((HEAD_BYTES - 4000) // (HEAD_LINES - 10)) for k in range(HEAD_LINES - 10)}
     assert httpx.get(f"{quiet.url}/v1/models", headers=lines).status_code == 200
 
 
@@ -240,7 +238,7 @@ def test_who_sends_no_head_is_let_go(models: Path, start: Start) -> None:
         assert rest(silent) == b""
         status, problem = status_and_problem(rest(slow))
         assert (status, problem["type"]) == (408, "urn:shapespace:problem:request-timeout")
-        assert time.monotonic() - began > LIMITS.head_seconds - 1
+        assert time.monotonic() - began > HEAD_SECONDS - 1
         time.sleep(3)
         assert b" 408 " not in reading.recv(MIB)
         select.select([reading], [], [], 10)
@@ -361,7 +359,7 @@ def test_readers_who_do_not_read_keep_nobody_waiting(models: Path, start: Start)
             other.sendall(f"GET {link} HTTP/1.1\r\nHost: localhost\r\n\r\n".encode())
             assert other.recv(15) == b"HTTP/1.1 200 OK"
         # At last they are disconnected.
-        eventually(lambda: value(samples(client), "shapespace_streams") == 0, LIMITS.stall_seconds + 40)
+        eventually(lambda: value(samples(client), "shapespace_streams") == 0, STALL_SECONDS + 40)
     assert "Traceback" not in server.log
 
 
