@@ -51,6 +51,7 @@ def test_files(client: httpx.Client, choice: dict[str, str], rest: TriangleMesh,
     post = client.post(f"{MODEL}/mesh", json={"latent": CODE, **choice}, params={"format": format})
     assert link.content == post.raise_for_status().content
     assert link.headers["ETag"] == post.headers["ETag"]
+    assert f".{format}" in link.headers["Content-Disposition"]
     if format == "json":
         assert np.array_equal(link.json()["faces"], rest.faces)
         return
