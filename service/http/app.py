@@ -21,16 +21,7 @@ from shapespace.service.http.description import describe
 from shapespace.service.http.middleware.access import RequireHost, RequireKey
 from shapespace.service.http.middleware.memory import LimitBody, LimitUnreadAnswers
 from shapespace.service.http.middleware.observe import HeadAsGet, Observe
-from shapespace.service.http.routes import (
-    codes,
-    fits,
-    interpolations,
-    models,
-    open_inference,
-    operation,
-    page,
-    shapes,
-)
+from shapespace.service.http.routes import codes, fits, interpolations, models, open_inference, operation, page, shapes
 from shapespace.service.limits.quota import UPLOADS
 from shapespace.service.limits.sandbox import Sandbox
 from shapespace.service.limits.workers import Workers

@@ -46,13 +46,11 @@ class Animation(Body):
     """
 
     model_config = ConfigDict(
-        frozen=True,
-        json_schema_extra={"examples": [{"keyframes": [[0, 0, 0, 0], [1, 2, 3, 4]], "frames": 30}]},
+        frozen=True, json_schema_extra={"examples": [{"keyframes": [[0, 0, 0, 0], [1, 2, 3, 4]], "frames": 30}]}
     )
 
     keyframes: Annotated[
-        list[Annotated[list[Number], Field(fail_fast=True, json_schema_extra={"minItems": 1})]],
-        Field(fail_fast=True),
+        list[Annotated[list[Number], Field(fail_fast=True, json_schema_extra={"minItems": 1})]], Field(fail_fast=True)
     ] = Field(min_length=2, description="At least two latent codes.")
     times: Annotated[list[Number], Field(fail_fast=True)] | None = Field(
         None,
@@ -60,9 +58,7 @@ class Animation(Body):
         "last segment, back to the first keyframe, takes the mean time of the others.",
     )
     frames: Whole = Field(
-        30,
-        ge=2,
-        description="Number n of frames, including both ends; `loop` leaves out the last frame.",
+        30, ge=2, description="Number n of frames, including both ends; `loop` leaves out the last frame."
     )
     start: Number = Field(0.0, description="t of the first frame; below 0 extrapolates.")
     stop: Number = Field(1.0, description="t of the last frame; above 1 extrapolates.")

@@ -60,11 +60,7 @@ MOST_FPS = 240
 Id = Annotated[str, Path(description="Id of an interpolation.")]
 
 
-@router.post(
-    "/models/{name}/interpolations",
-    status_code=201,
-    responses=problems(400, 404, 413, 415, 422),
-)
+@router.post("/models/{name}/interpolations", status_code=201, responses=problems(400, 404, 413, 415, 422))
 async def create_interpolation(
     service: ServiceDependency,
     model: Model,
@@ -95,8 +91,7 @@ async def get_interpolation(
     color: ColorQuery = NO_COLOR,
     topology: TopologyQuery = None,
     fps: Annotated[
-        float | None,
-        Query(ge=1, le=MOST_FPS, description="Frames per second of GLB, USD and USDZ; by default 30."),
+        float | None, Query(ge=1, le=MOST_FPS, description="Frames per second of GLB, USD and USDZ; by default 30.")
     ] = None,
     format: Annotated[Format, one_of([*MEDIA_TYPES, "obj"])] = None,
 ) -> Response:

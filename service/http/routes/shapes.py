@@ -66,9 +66,7 @@ async def get_mesh(
 
 
 @router.post(
-    "/mesh",
-    responses=_MESH_RESPONSES | problems(400, 404, 406, 413, 415, 422, 503, 504),
-    response_class=Response,
+    "/mesh", responses=_MESH_RESPONSES | problems(400, 404, 406, 413, 415, 422, 503, 504), response_class=Response
 )
 async def post_mesh(
     service: ServiceDependency,
