@@ -20,7 +20,7 @@ from shapespace.service.http.dependencies import Service, known_query
 from shapespace.service.http.description import describe
 from shapespace.service.http.middleware.access import RequireHost, RequireKey
 from shapespace.service.http.middleware.memory import LimitBody, LimitUnreadAnswers
-from shapespace.service.http.middleware.observe import HeadAsGet, Observe
+from shapespace.service.http.middleware.observe import Observe
 from shapespace.service.http.routes import codes, fits, interpolations, models, open_inference, operation, page, shapes
 from shapespace.service.limits.quota import UPLOADS
 from shapespace.service.limits.sandbox import Sandbox
@@ -99,7 +99,6 @@ def create_app(settings: Settings | None = None, validator: BundleValidator | No
 def _middleware(settings: Settings) -> list[Middleware]:
     """Return the middleware, from the outermost to the innermost."""
     stack = [
-        Middleware(HeadAsGet),
         Middleware(Observe),
         Middleware(LimitUnreadAnswers),
         Middleware(RequireHost, hosts=_hosts(settings)),

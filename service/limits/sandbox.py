@@ -109,12 +109,7 @@ class Sandbox:
             most: largest number of bytes of arrays in the result.
 
         Raises:
-            LateError: the deadline passed.
-            OutOfMemoryError: the task needs more memory.
-            NoProcessError: no process can be started.
-            DiedError: the child ended.
-            FailedError: the task reports bad input.
-            ClosedError: the sandbox is closed, or was closed meanwhile.
+            SandboxError: one of those of `sandbox_errors`, as the cause is.
         """
         if not self._free.acquire(timeout=max(0.0, deadline.time - time.monotonic())):
             raise LateError("every process was at work until the time was over")

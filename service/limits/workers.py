@@ -95,12 +95,8 @@ class Workers:
 
     Requests are admitted up to a limit. A request submits its shapes one by one, at most as many at once as there are
     threads. So a single shape doesn't wait for the end of a long animation. Streams have their own limit: most of the
-    time they wait for their clients, and then use no thread.
-
-    Args:
-        threads: number of threads.
-        queue: number of admitted requests that can wait for a thread.
-        deadline: seconds that a request may take after it is admitted.
+    time they wait for their clients, and then use no thread. ``queue`` requests can wait for one of the ``threads``.
+    A request has ``deadline`` seconds after it is admitted.
 
     Attributes:
         places, streams: quotas of requests that are admitted, and of answers that are read while they are computed.

@@ -23,11 +23,7 @@ COPIES = 6
 
 
 def bundle_folders(folder: Path) -> tuple[list[Path], dict[Path, OSError]]:
-    """Return folders NAME/VERSION, and folders NAME that cannot be read; hidden entries and plain files are ignored.
-
-    Raises:
-        OSError: the folder cannot be read.
-    """
+    """Return folders NAME/VERSION, and folders NAME that cannot be read, but no hidden entries; raises OSError."""
     found: list[Path] = []
     unreadable = {}
     for name in sorted(folder.iterdir()):
@@ -60,12 +56,7 @@ class BundleValidator:
                     self._digests[folder] = self._thread.submit(self._validate, folder)
 
     def digest(self, folder: Path) -> str:
-        """Return the digest of a valid bundle, and wait for its validation.
-
-        Raises:
-            SandboxError: the bundle is invalid.
-            ClosedError: the validator was closed before.
-        """
+        """Return the digest of a bundle once it is validated; raises SandboxError, ClosedError if it never will be."""
         self.begin([folder])
         try:
             return self._digests[folder].result()

@@ -112,11 +112,8 @@ class Animation(Body):
     def to_id(self, model_digest: str, latents: LatentSpace) -> str:
         """Return an id that holds the whole animation, so that any replica can answer it at any time.
 
-        The id is of the animation's canonical form: equal animations of a model have equal ids.
-
-        Raises:
-            LatentError: a keyframe is no code of the model.
-            PathTooLongError: there are too many keyframes for a URL.
+        The id is of the animation's canonical form: equal animations of a model have equal ids. Raises LatentError, or
+        PathTooLongError for too many keyframes.
         """
         too_long = PathTooLongError(
             f"{len(self.keyframes)} keyframes of {latents.dimension} numbers don't fit into an "
@@ -136,11 +133,7 @@ class Animation(Body):
 
     @classmethod
     def from_id(cls, name: str) -> tuple[Animation, str]:
-        """Return the animation of an id, and the first digits of its model's digest.
-
-        Raises:
-            UnknownInterpolationError: the id is damaged, invented, or from another version of this software.
-        """
+        """Return the animation of an id, and how its model's digest begins; raises UnknownInterpolationError."""
         try:
             if len(name) > ID_LENGTH:
                 raise ValueError

@@ -227,9 +227,7 @@ async def nric_file(
 ) -> EncodedFile:
     """Return lengths and angles as the networks predict them, as JSON, on request also those of each factor.
 
-    Raises:
-        LatentError: a code is invalid.
-        TooManyCodesError: the predictions exceed the limit of one answer.
+    Raises LatentError, and TooManyCodesError if they exceed the limit of one answer.
     """
     codes, _ = model.latents.codes(latents, bounds)
     async with batch(workers, caller, nric_size(model, len(codes), factors=factors)) as work:

@@ -25,20 +25,11 @@ LONGEST_PATH = 1000
 QUIET = HEALTH | {"/metrics"}
 
 
-class HeadAsGet(HTTPMiddleware):
-    """Answers ``HEAD`` as ``GET``; uvicorn leaves out the body."""
-
-    async def handle(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Pass a request on, HEAD as GET."""
-        if scope["method"] == "HEAD":
-            scope = {**scope, "method": "GET", "original_method": "HEAD"}
-        await self.app(scope, receive, send)
-
-
 class Observe(HTTPMiddleware):
     """Gives each request an id, counts and times it, and logs one line about it.
 
-    An unexpected exception is answered as an internal error. Every answer tells browsers not to guess its type.
+    ``HEAD`` is answered as ``GET``; uvicorn leaves out the body. An unexpected exception is answered as an internal
+    error. Every answer tells browsers not to guess its type.
     """
 
     async def handle(self, scope: Scope, receive: Receive, send: Send) -> None:
@@ -46,7 +37,8 @@ class Observe(HTTPMiddleware):
         given = Headers(scope=scope).get("x-request-id", "")
         id = given if REQUEST_ID.fullmatch(given) else uuid4().hex
         context = logs.request_id.set(id)
-        service, method = scope["app"].state.service, scope.get("original_method", scope["method"])
+        service, method = scope["app"].state.service, scope["method"]
+        scope = {**scope, "method": "GET"} if method == "HEAD" else scope
         status = 499  # the status of nginx for a client that closed the connection
         answered = False
         began = time.perf_counter()
