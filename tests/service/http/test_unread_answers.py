@@ -98,8 +98,7 @@ def test_answers_in_pieces_are_the_same_as_whole_ones(models: Path, start: Start
         rows = np.float32(tensor["data"]).reshape(tensor["shape"])
         np.testing.assert_array_equal(rows[:3], np.float32(np.hstack([few["lengths"], few["angles"]])))
         binary = client.post(
-            "/v2/models/figure/infer",
-            json=asked | {"outputs": [{"name": "nric", "parameters": {"binary_data": True}}]},
+            "/v2/models/figure/infer", json=asked | {"outputs": [{"name": "nric", "parameters": {"binary_data": True}}]}
         )
         length = int(binary.headers["Inference-Header-Content-Length"])
         assert json.loads(binary.content[:length])["outputs"][0]["parameters"]["binary_data_size"] == rows.nbytes
