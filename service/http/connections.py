@@ -8,8 +8,8 @@ from __future__ import annotations
 import asyncio
 import ipaddress
 import logging
+import resource
 import socket
-import sys
 import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
@@ -103,10 +103,6 @@ class Connections:
 
 def _file_handles() -> int:
     """Return the number of files that this process may open."""
-    if sys.platform == "win32":
-        return 2**20
-    import resource
-
     limit = resource.getrlimit(resource.RLIMIT_NOFILE)[0]
     return 2**20 if limit == resource.RLIM_INFINITY else limit
 

@@ -75,8 +75,7 @@ class Server(uvicorn.Server):
             logger.error("can't listen on %s, port %d: %s", self._settings.host, self._settings.port, error.strerror)
             raise SystemExit(STARTUP_FAILURE) from None
         await super().startup(sockets=list(listeners))
-        if hasattr(signal, "SIGHUP"):
-            asyncio.get_running_loop().add_signal_handler(signal.SIGHUP, self._hang_up)
+        asyncio.get_running_loop().add_signal_handler(signal.SIGHUP, self._hang_up)
         # Port 0 lets the system choose one.
         host, port = self.servers[0].sockets[0].getsockname()[:2]
         host = f"[{host}]" if ":" in host else host

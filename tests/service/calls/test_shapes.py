@@ -1,6 +1,5 @@
 """Codes to meshes, positions, lengths and angles."""
 
-import io
 import json
 from concurrent.futures import ThreadPoolExecutor
 
@@ -18,13 +17,6 @@ CODE = [0.1, 0.7, 0.4]
 
 def positions(answer: httpx.Response) -> np.ndarray:
     return np.array(answer.raise_for_status().json()["vertices"])
-
-
-def test_the_reference_is_the_answer_without_a_code(client: httpx.Client) -> None:
-    answer = client.get(MESH, params={"format": "json"})
-    assert np.array_equal(answer.json()["faces"], reference().faces)
-    np.testing.assert_allclose(positions(answer), SCALE * reference().vertices, atol=1e-6)
-    assert json.loads(answer.headers["Shape-Diagnostics"])["iterations"] == 0
 
 
 def test_a_uniform_scaling_comes_out_exactly_in_the_users_units(client: httpx.Client) -> None:
@@ -91,19 +83,6 @@ def test_lengths_and_angles_are_those_of_the_networks(client: httpx.Client) -> N
             np.testing.assert_allclose(psi[:half], SCALE * expected[:half], rtol=1e-5)
             np.testing.assert_allclose(psi[half:], expected[half:], atol=1e-5)
     assert "factors" not in client.post("/v1/models/small/nric", json={"latents": codes}).json()
-
-
-def test_vertices_of_several_codes_are_those_of_each_alone(client: httpx.Client) -> None:
-    codes = [CODE, [0, 0, 0], [0.2, 3.0, 1.0]]
-    answer = client.post("/v1/models/small/vertices", json={"latents": codes}).raise_for_status().json()
-    assert len(answer["diagnostics"]) == 3
-    for code, vertices in zip(codes, answer["vertices"], strict=True):
-        assert np.array_equal(positions(client.post(MESH, json={"latent": code}, params={"format": "json"})), vertices)
-    packed = client.post("/v1/models/small/vertices", json={"latents": codes}, params={"format": "npz"})
-    with np.load(io.BytesIO(packed.content)) as arrays:
-        np.testing.assert_array_equal(arrays["vertices"], np.array(answer["vertices"], np.float32))
-        np.testing.assert_array_equal(arrays["faces"], reference().faces)
-        assert list(arrays["iterations"]) == [d["iterations"] for d in answer["diagnostics"]]
 
 
 def test_a_start_network_changes_the_way_and_not_the_shape(client: httpx.Client) -> None:
