@@ -49,8 +49,7 @@ def _serve(validator: BundleValidator) -> None:
         log.warning("%s is no setting: docs/reference/settings.md lists all settings", name)
     if settings.models_dir == BUNDLED:
         log.info("serving what is installed with the package; a folder models or SHAPESPACE_MODELS_DIR gives others")
-    if hasattr(signal, "SIGHUP"):
-        signal.signal(signal.SIGHUP, signal.SIG_IGN)  # until the server can reload
+    signal.signal(signal.SIGHUP, signal.SIG_IGN)  # until the server can reload
     # Uvicorn raises the signal again after the shutdown, which is a success.
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: sys.exit(0))

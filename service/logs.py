@@ -25,13 +25,7 @@ def printable(text: str) -> str:
 
 
 class RateLimitedLog:
-    """One log line for many equal events, at most once in LOG_INTERVAL, with their number.
-
-    Args:
-        logger: takes the lines.
-        level: of the lines.
-        text: of each line.
-    """
+    """One log line for many equal events, at most once in LOG_INTERVAL, with their number."""
 
     def __init__(self, logger: logging.Logger, level: int, text: str) -> None:
         self._logger, self._level, self._text = logger, level, text

@@ -20,19 +20,8 @@ from shapespace.service.http.dependencies import Service, known_query
 from shapespace.service.http.description import describe
 from shapespace.service.http.middleware.access import RequireHost, RequireKey
 from shapespace.service.http.middleware.memory import LimitBody, LimitUnreadAnswers
-from shapespace.service.http.middleware.observe import HeadAsGet, Observe
-from shapespace.service.http.routes import (
-    blend_shapes,
-    codes,
-    fits,
-    health,
-    interpolations,
-    models,
-    open_inference,
-    operation,
-    page,
-    shapes,
-)
+from shapespace.service.http.middleware.observe import Observe
+from shapespace.service.http.routes import codes, fits, interpolations, models, open_inference, operation, page, shapes
 from shapespace.service.limits.quota import UPLOADS
 from shapespace.service.limits.sandbox import Sandbox
 from shapespace.service.limits.workers import Workers
@@ -52,11 +41,9 @@ LOOPBACK = ("localhost", "127.0.0.1", "[::1]")
 
 
 def create_app(settings: Settings | None = None, validator: BundleValidator | None = None) -> FastAPI:
-    """Return the service as an ASGI application; it loads the bundles when it starts.
+    """Return the service as an ASGI application, with settings from the environment by default.
 
-    Args:
-        settings: settings of the server; by default from the environment.
-        validator: validation of the bundles that has begun already.
+    It loads the bundles when it starts, and takes over a validation of them that has begun already.
     """
     settings = settings or Settings()
 
@@ -100,7 +87,7 @@ def create_app(settings: Settings | None = None, validator: BundleValidator | No
         openapi_url=None,
     )
     error_handlers.install(app)
-    calls = (models, shapes, blend_shapes, codes, fits, interpolations, open_inference, health, operation, page)
+    calls = (models, shapes, codes, fits, interpolations, open_inference, operation, page)
     routers = [module.router for module in calls]
     for router in routers:
         app.include_router(router)
@@ -112,7 +99,6 @@ def create_app(settings: Settings | None = None, validator: BundleValidator | No
 def _middleware(settings: Settings) -> list[Middleware]:
     """Return the middleware, from the outermost to the innermost."""
     stack = [
-        Middleware(HeadAsGet),
         Middleware(Observe),
         Middleware(LimitUnreadAnswers),
         Middleware(RequireHost, hosts=_hosts(settings)),

@@ -36,12 +36,7 @@ def not_modified(request: Request, tag: str) -> Response | None:
 
 @dataclass(frozen=True)
 class CachedAnswer:
-    """A file in the cache.
-
-    Attributes:
-        content: bytes of the file.
-        headers: headers of every answer with this file.
-    """
+    """A file in the cache, and the headers of every answer with it."""
 
     content: bytes
     headers: Mapping[str, str]
@@ -53,11 +48,7 @@ class CachedAnswer:
 
 
 class AnswerCache(LRUCache[str, CachedAnswer]):
-    """The most recently used answers by entity tag, for the event loop only.
-
-    Args:
-        limit: most bytes of all answers together.
-    """
+    """The most recently used answers by entity tag, of ``limit`` bytes together; for the event loop only."""
 
     def __init__(self, limit: int) -> None:
         super().__init__(limit, getsizeof=lambda answer: answer.size)

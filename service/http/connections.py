@@ -8,12 +8,11 @@ from __future__ import annotations
 import asyncio
 import ipaddress
 import logging
+import resource
 import socket
-import sys
 import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from enum import Enum, auto
 from typing import Any
 from uuid import uuid4
@@ -32,35 +31,18 @@ SPARE_HANDLES = 100
 CHECK_INTERVAL = 1.0
 
 
-@dataclass(frozen=True)
-class ConnectionLimits:
-    """Limits of one connection.
-
-    Attributes:
-        head_bytes: longest head of a request, and longest trailers, in bytes; other servers have 8 to 64 KiB.
-        head_lines: most lines of a head and its trailers together.
-        parse_bytes: bytes given to the parser at once; a head may exceed its limit by this much.
-        pipelined: pipelined requests that are parsed ahead of their answers.
-        waiting_bytes: most bytes that may wait behind pipelined requests.
-        head_seconds: time within which a client has to send a whole head.
-        stall_seconds: time within which a client has to read at least a part of its answer.
-        unsent_bytes: bytes that the kernel may buffer unsent; its default is megabytes.
-        linger_seconds: time after a refusal in which further bytes are read and dropped. Closing the connection at
-            once could lose the answer.
-    """
-
-    head_bytes: int = 32 * 2**10
-    head_lines: int = 100
-    parse_bytes: int = 8 * 2**10
-    pipelined: int = 32
-    waiting_bytes: int = 2**20
-    head_seconds: float = 10.0
-    stall_seconds: float = 30.0
-    unsent_bytes: int = 128 * 2**10
-    linger_seconds: float = 1.0
-
-
-LIMITS = ConnectionLimits()
+#: Most bytes and lines of a request's head, and of its trailers; other servers have 8 to 64 KiB.
+HEAD_BYTES, HEAD_LINES = 32 * 2**10, 100
+#: Bytes given to the parser at once; a head may exceed its limit by this much.
+PARSE_BYTES = 8 * 2**10
+#: Pipelined requests that are parsed ahead of their answers, and most bytes that may wait behind them.
+PIPELINED, WAITING_BYTES = 32, 2**20
+#: Seconds in which a client has to send a whole head, and in which it has to read at least a part of its answer.
+HEAD_SECONDS, STALL_SECONDS = 10.0, 30.0
+#: Bytes that the kernel may buffer unsent; its default is megabytes.
+UNSENT_BYTES = 128 * 2**10
+#: Seconds after a refusal in which further bytes are read and dropped: closing at once could lose the answer.
+LINGER_SECONDS = 1.0
 
 
 class Connections:
@@ -70,15 +52,11 @@ class Connections:
         most: limit on the number of connections; file handles may allow fewer.
         seconds: time that the body of a request may take.
         proxies: networks of proxies, whose connections belong to many clients.
-
-    Attributes:
-        quota: connections in use, for each client.
-        seconds: the same as the argument.
-        on_refusal: called with the kind of problem of every refusal, to count it.
     """
 
     def __init__(self, most: int, seconds: float, proxies: Sequence[str] = ()) -> None:
         self.quota, self.seconds = Quota(max(1, min(most, _file_handles() - SPARE_HANDLES))), seconds
+        #: Called with the kind of problem of every refusal, to count it.
         self.on_refusal: Callable[[str], None] = lambda kind: None
         self._proxies = [ipaddress.ip_network(proxy) for proxy in proxies]
         self._open: set[Connection] = set()
@@ -125,29 +103,18 @@ class Connections:
 
 def _file_handles() -> int:
     """Return the number of files that this process may open."""
-    if sys.platform == "win32":
-        return 2**20
-    import resource
-
     limit = resource.getrlimit(resource.RLIMIT_NOFILE)[0]
     return 2**20 if limit == resource.RLIM_INFINITY else limit
 
 
 class _Phase(Enum):
-    """The part of a request that a connection waits for."""
-
     REQUEST = auto()
     HEAD = auto()
     BODY = auto()
 
 
 class Connection(HttpToolsProtocol):
-    """One connection, with the limits of LIMITS.
-
-    Args:
-        connections: all connections of the server.
-        arguments: arguments of uvicorn.
-    """
+    """One connection within these limits; takes the arguments of uvicorn too."""
 
     def __init__(self, connections: Connections, **arguments: Any) -> None:
         super().__init__(**arguments)
@@ -164,9 +131,8 @@ class Connection(HttpToolsProtocol):
         super().connection_made(transport)
         if hasattr(socket, "TCP_NOTSENT_LOWAT"):
             with suppress(OSError):
-                transport.get_extra_info("socket").setsockopt(
-                    socket.IPPROTO_TCP, socket.TCP_NOTSENT_LOWAT, LIMITS.unsent_bytes
-                )
+                own = transport.get_extra_info("socket")
+                own.setsockopt(socket.IPPROTO_TCP, socket.TCP_NOTSENT_LOWAT, UNSENT_BYTES)
         self._client = self._all.client(self.client[0] if self.client else "")
         if not self._all.add(self, self._client):
             self._refuse("busy", "There are too many connections. Try again after the time in Retry-After.")
@@ -182,20 +148,20 @@ class Connection(HttpToolsProtocol):
             self._begin(_Phase.HEAD)
         if self._waiting:
             data, self._waiting = self._waiting + data, b""
-        for start in range(0, len(data), LIMITS.parse_bytes):
+        for start in range(0, len(data), PARSE_BYTES):
             if self._refused or self.transport.is_closing():
                 return
-            if len(self.pipeline) >= LIMITS.pipelined:
+            if len(self.pipeline) >= PIPELINED:
                 self._postpone(data[start:])
                 return
-            piece = data[start : start + LIMITS.parse_bytes]
+            piece = data[start : start + PARSE_BYTES]
             self._bytes += len(piece)
             super().data_received(piece)
-            if not self._refused and (self._bytes > LIMITS.head_bytes or self._lines > LIMITS.head_lines):
+            if not self._refused and (self._bytes > HEAD_BYTES or self._lines > HEAD_LINES):
                 self._refuse(
                     "head-too-large",
                     "The head of the request, or the trailers after its body, are over the limit of "
-                    f"{LIMITS.head_bytes} bytes or {LIMITS.head_lines} lines. Send less in headers and address; "
+                    f"{HEAD_BYTES} bytes or {HEAD_LINES} lines. Send less in headers and address; "
                     "codes go into the body of a POST.",
                 )
 
@@ -215,25 +181,25 @@ class Connection(HttpToolsProtocol):
     def on_header(self, name: bytes, value: bytes) -> None:
         """Take a line of the head. Trailers are counted and dropped: the server needs none."""
         self._lines += 1
-        if self._phase is _Phase.HEAD and self._lines <= LIMITS.head_lines:
+        if self._phase is _Phase.HEAD and self._lines <= HEAD_LINES:
             super().on_header(name, value)
 
     def on_headers_complete(self) -> None:
         """End the head."""
         self._begin(_Phase.BODY)
-        if self._lines <= LIMITS.head_lines:
+        if self._lines <= HEAD_LINES:
             super().on_headers_complete()
 
     def on_body(self, body: bytes) -> None:
         """Take a part of the body."""
         self._bytes = 0
-        if self._lines <= LIMITS.head_lines:
+        if self._lines <= HEAD_LINES:
             super().on_body(body)
 
     def on_message_complete(self) -> None:
         """End the request."""
         self._begin(_Phase.REQUEST)
-        if self._lines <= LIMITS.head_lines:
+        if self._lines <= HEAD_LINES:
             super().on_message_complete()
 
     def send_400_response(self, msg: str) -> None:
@@ -248,9 +214,9 @@ class Connection(HttpToolsProtocol):
         answering = self.cycle is not None and not self.cycle.response_complete
         if self.flow.read_paused or (answering and self._phase is _Phase.HEAD):  # the server is slow, not the client
             self._since = now
-        elif self._phase is _Phase.HEAD and waited > LIMITS.head_seconds:
+        elif self._phase is _Phase.HEAD and waited > HEAD_SECONDS:
             if self._bytes:
-                detail = f"The head of the request took over {LIMITS.head_seconds:g} s. Send it again."
+                detail = f"The head of the request took over {HEAD_SECONDS:g} s. Send it again."
                 self._refuse("request-timeout", detail)
             else:
                 self.transport.close()
@@ -259,7 +225,7 @@ class Connection(HttpToolsProtocol):
         unsent = self.transport.get_write_buffer_size()
         if unsent != self._unsent:
             self._unsent, self._unsent_since = unsent, now
-        elif unsent and now - self._unsent_since > LIMITS.stall_seconds:
+        elif unsent and now - self._unsent_since > STALL_SECONDS:
             self.transport.abort()
 
     def _begin(self, phase: _Phase) -> None:
@@ -269,7 +235,7 @@ class Connection(HttpToolsProtocol):
         """Keep data to parse it once some earlier requests have been answered."""
         self.flow.pause_reading()
         self._waiting = data
-        if len(data) > LIMITS.waiting_bytes:
+        if len(data) > WAITING_BYTES:
             self._drop()
 
     def _drop(self) -> None:
@@ -296,4 +262,4 @@ class Connection(HttpToolsProtocol):
         self.transport.write(STATUS_LINE[KINDS[kind].status] + lines + b"\r\n" + body)
         self.transport.write_eof()
         self.flow.resume_reading()
-        self.loop.call_later(LIMITS.linger_seconds, self.transport.abort)
+        self.loop.call_later(LINGER_SECONDS, self.transport.abort)

@@ -26,11 +26,7 @@ from shapespace.service.settings import Settings
 
 @dataclass
 class Service:
-    """The parts of a running service.
-
-    Attributes:
-        draining: whether the server is shutting down, so that clients should use another one.
-    """
+    """The parts of a running service."""
 
     settings: Settings
     repository: ModelRepository
@@ -40,6 +36,7 @@ class Service:
     reloader: Reloader
     answers: AnswerCache
     sandbox: Sandbox
+    #: Whether the server is shutting down, so that clients should use another one.
     draining: bool = False
 
 

@@ -53,11 +53,7 @@ def describe(app: FastAPI, routers: Iterable[APIRouter]) -> None:
     def generate() -> dict[str, Any]:
         if app.openapi_schema is None:
             schema = get_openapi(
-                title=app.title,
-                version=app.version,
-                summary=app.summary,
-                description=DESCRIPTION,
-                routes=app.routes,
+                title=app.title, version=app.version, summary=app.summary, description=DESCRIPTION, routes=app.routes
             )
             models = dict.fromkeys((*_MODELS, *bodies.values()))
             _, definitions = models_json_schema(

@@ -88,11 +88,8 @@ async def _http(request: Request, error: Exception) -> Response:
         allowed = ", ".join(_allowed(request)) or (error.headers or {}).get("Allow", "")
         detail = f"{path} does not take {method}. Use {allowed}."
         return problem(request.scope, "method-not-allowed", detail, {"Allow": allowed})
-    return problem(
-        request.scope,
-        "malformed-request",
-        "The body can't be read. Send one JSON object in UTF-8, as /openapi.json describes it.",
-    )
+    detail = "The body can't be read. Send one JSON object in UTF-8, as /openapi.json describes it."
+    return problem(request.scope, "malformed-request", detail)
 
 
 def _allowed(request: Request) -> list[str]:
@@ -108,56 +105,41 @@ async def _validation(request: Request, error: Exception) -> Response:
     assert isinstance(error, RequestValidationError)  # noqa: S101 - as above
     faults = error.errors()
     if any(fault["type"] == "json_invalid" for fault in faults):
-        where = faults[0]["loc"][-1]
-        reason = faults[0].get("ctx", {}).get("error", "")
-        return problem(
-            request.scope,
-            "malformed-request",
-            f"The body is not JSON (character {where}: {reason}). Send one valid JSON object.",
-        )
+        place = f"character {faults[0]['loc'][-1]}: {faults[0].get('ctx', {}).get('error', '')}"
+        detail = f"The body is not JSON ({place}). Send one valid JSON object."
+        return problem(request.scope, "malformed-request", detail)
     kind = "not-finite" if all(fault["type"] == "finite_number" for fault in faults) else "invalid-request"
+    places = [fault["loc"][1:] if fault["loc"][:1] == ("body",) else fault["loc"] for fault in faults[:10]]
     errors = [
-        {"pointer": shortened(_pointer(fault["loc"])), "detail": shortened(_advice(fault))} for fault in faults[:10]
+        {"pointer": shortened("#/" + "/".join(map(str, place))), "detail": shortened(_advice(fault))}
+        for place, fault in zip(places, faults, strict=False)
     ]
     more = f" ({len(faults) - 1} more under errors.)" if len(faults) > 1 else ""
     return problem(request.scope, kind, errors[0]["detail"] + more, errors=errors)
 
 
-def _pointer(loc: tuple[Any, ...]) -> str:
-    place = loc[1:] if loc and loc[0] == "body" else loc
-    return "#/" + "/".join(map(str, place))
+#: How to correct a fault that pydantic found, by its type.
+_ADVICE = {
+    "extra_forbidden": "Remove {name!r}: there is no such field. /openapi.json lists those there are.",
+    "finite_number": "Send finite numbers only: {name} is NaN or infinite.",
+    "list_type": "Send a list for {name}.",
+    "too_short": "Send at least {min_length} entries for {name}, not {actual_length}.",
+    "greater_than_equal": "Send a number of at least {ge} for {name}.",
+    "value_error": "Correct {name}: {error}.",
+    **dict.fromkeys(("float_type", "float_parsing"), "Send a number for {name}."),
+    **dict.fromkeys(("int_type", "int_from_float", "int_parsing"), "Send a whole number for {name}."),
+    **dict.fromkeys(("bool_type", "bool_parsing"), "Send true or false for {name}."),
+    **dict.fromkeys(("model_attributes_type", "model_type", "dict_type"), "Send a JSON object for {name}."),
+    **dict.fromkeys(("enum", "literal_error"), "Send {expected} for {name}."),
+}
 
 
 def _advice(fault: Mapping[str, Any]) -> str:
-    """Return a sentence that says how to correct one fault that pydantic found."""
+    """Return a sentence that says how to correct one fault."""
     where, *place = fault["loc"]
     name = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in place).lstrip(".")
     name = name or f"the {where}"
-    limits = fault.get("ctx", {})
-    match fault["type"]:
-        case "missing":
-            return f"Add {name!r}: it is required." if place else "Send a JSON object as the body."
-        case "extra_forbidden":
-            return f"Remove {name!r}: there is no such field. /openapi.json lists those there are."
-        case "finite_number":
-            return f"Send finite numbers only: {name} is NaN or infinite."
-        case "float_type" | "float_parsing":
-            return f"Send a number for {name}."
-        case "int_type" | "int_from_float" | "int_parsing":
-            return f"Send a whole number for {name}."
-        case "bool_type" | "bool_parsing":
-            return f"Send true or false for {name}."
-        case "list_type":
-            return f"Send a list for {name}."
-        case "model_attributes_type" | "model_type" | "dict_type":
-            return f"Send a JSON object for {name}."
-        case "enum" | "literal_error":
-            return f"Send {limits['expected']} for {name}."
-        case "too_short":
-            return f"Send at least {limits['min_length']} entries for {name}, not {limits['actual_length']}."
-        case "greater_than_equal":
-            return f"Send a number of at least {limits['ge']} for {name}."
-        case "value_error":
-            return f"Correct {name}: {limits['error']}."
-        case _:
-            return f"Correct {name}: {fault['msg']}."
+    if fault["type"] == "missing":
+        return f"Add {name!r}: it is required." if place else "Send a JSON object as the body."
+    advice = _ADVICE.get(fault["type"], "Correct {name}: {msg}.")
+    return advice.format(**{**fault.get("ctx", {}), "name": name, "msg": fault["msg"]})

@@ -22,7 +22,7 @@ def choose(
     accept: str | None,
     unavailable: Mapping[str, str] = MappingProxyType({}),
 ) -> str:
-    """Return the name of the format to answer in.
+    """Return the name of the format to answer in; raises ProblemError, not-acceptable, with the choices.
 
     Args:
         formats: media type of each format by name. The first is the default. ``Accept`` gets the first of two
@@ -30,9 +30,6 @@ def choose(
         format: the query parameter ``format``.
         accept: the header ``Accept``.
         unavailable: reason why a format is missing that a client may expect, by name.
-
-    Raises:
-        ProblemError: not-acceptable, with the choices.
     """
     if format is not None:
         if format in formats:

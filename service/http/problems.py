@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 from fastapi import HTTPException, Response
 from starlette.types import Scope
@@ -15,14 +14,8 @@ MEDIA_TYPE = "application/problem+json"
 TYPE_PREFIX = "urn:shapespace:problem:"
 
 
-@dataclass(frozen=True)
-class ProblemKind:
-    """A kind of problem.
-
-    Attributes:
-        status: HTTP status of its answers.
-        title: the same in every release.
-    """
+class ProblemKind(NamedTuple):
+    """HTTP status of a kind of problem, and its title, the same in every release."""
 
     status: int
     title: str
@@ -72,18 +65,10 @@ _HEADERS = {
     "not-ready": {"Retry-After": "1"},
     "unauthorized": {"WWW-Authenticate": "Bearer"},
 }
-#: Below this path, problems also have the member ``error`` of the Open Inference Protocol.
-_INFERENCE_PATHS = "/v2"
 
 
 class ProblemError(HTTPException):
-    """A problem that a route or a middleware finds.
-
-    Args:
-        kind: a key of KINDS.
-        detail: a sentence that says what to do.
-        extensions: further members of the answer.
-    """
+    """A problem that a route or a middleware finds: a key of KINDS, what to do, and further members of the answer."""
 
     def __init__(self, kind: str, detail: str, **extensions: Any) -> None:
         super().__init__(KINDS[kind].status, detail)
@@ -94,7 +79,7 @@ def problem(
     scope: Scope, kind: str, detail: str, headers: Mapping[str, str] | None = None, **extensions: Any
 ) -> Response:
     """Return a problem as the answer to a request."""
-    if scope["path"].startswith(_INFERENCE_PATHS):
+    if scope["path"].startswith("/v2"):  # also in the form of the Open Inference Protocol
         extensions["error"] = shortened(detail)
     content, own = description(kind, detail, **extensions)
     return Response(content, KINDS[kind].status, {**own, **(headers or {})}, MEDIA_TYPE)
@@ -115,12 +100,3 @@ def shortened(text: str) -> str:
     """Return a text cut to the length of a detail, with characters replaced that UTF-8 cannot encode."""
     start = text[:_LONGEST].encode(errors="replace").decode()
     return start if len(text) <= _LONGEST else f"{start} …"
-
-
-def internal_error(scope: Scope) -> Response:
-    """Return the answer to an unexpected exception, without its traceback, which only the log has."""
-    return problem(
-        scope,
-        "internal-error",
-        "The server made a mistake, which its log describes. Try again, and report it if it happens again.",
-    )

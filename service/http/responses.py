@@ -55,15 +55,7 @@ async def cached_response(
     media_type: str,
     compute: Callable[[], Awaitable[tuple[CachedAnswer, Timings]]],
 ) -> Response:
-    """Return a file from the cache, computed first where it is not there; 304 where the client has it already.
-
-    Args:
-        service: keeps the cache.
-        request: may name entity tags in ``If-None-Match``.
-        tag: entity tag of the file.
-        media_type: of the file.
-        compute: gives the file and the time that it took, by stage.
-    """
+    """Return a file from the cache, computed first where it is not there; 304 where the client has it already."""
     if unchanged := not_modified(request, tag):
         return unchanged
     answer, seconds = service.answers.get(tag), _CACHED

@@ -11,7 +11,6 @@ import struct
 import sys
 import threading
 from array import array
-from dataclasses import dataclass
 from types import FrameType
 from typing import Any
 
@@ -30,22 +29,9 @@ _DROP_SYN = ((0x30, 0, 0, 13), (0x45, 0, 1, 0x02), (0x06, 0, 0, 0), (0x06, 0, 0,
 _SO_ATTACH_FILTER = 26
 
 
-@dataclass(frozen=True)
-class ShutdownTimes:
-    """Times of a shutdown, in seconds from the end of the drain.
-
-    Attributes:
-        linger: how long requests on open connections are still accepted.
-        finish: how long running requests may take; then they get 503.
-        exit: when the process ends, whatever it does.
-    """
-
-    linger: float = 1.0
-    finish: float = 1.5
-    exit: float = 2.3
-
-
-TIMES = ShutdownTimes()
+#: Seconds from the end of the drain in which requests on open connections are still accepted, after which running
+#: requests get 503, and after which the process ends, whatever it does.
+LINGER, FINISH, EXIT = 1.0, 1.5, 2.3
 
 
 class Server(uvicorn.Server):
@@ -89,8 +75,7 @@ class Server(uvicorn.Server):
             logger.error("can't listen on %s, port %d: %s", self._settings.host, self._settings.port, error.strerror)
             raise SystemExit(STARTUP_FAILURE) from None
         await super().startup(sockets=list(listeners))
-        if hasattr(signal, "SIGHUP"):
-            asyncio.get_running_loop().add_signal_handler(signal.SIGHUP, self._hang_up)
+        asyncio.get_running_loop().add_signal_handler(signal.SIGHUP, self._hang_up)
         # Port 0 lets the system choose one.
         host, port = self.servers[0].sockets[0].getsockname()[:2]
         host = f"[{host}]" if ":" in host else host
@@ -112,7 +97,7 @@ class Server(uvicorn.Server):
         self._signals.append(sig)
         self._app.state.service.draining = True
         drain = self._settings.drain if sig == signal.SIGTERM and len(self._signals) == 1 else 0.0
-        leave = threading.Timer(drain + TIMES.exit, os._exit, [0])
+        leave = threading.Timer(drain + EXIT, os._exit, [0])
         leave.daemon = True
         leave.start()
 
@@ -121,7 +106,7 @@ class Server(uvicorn.Server):
         loop = asyncio.get_running_loop()
         # SIGINT comes from a person, who does not want to wait.
         drained = loop.time() if signal.SIGINT in self._signals else await self._drain()
-        loop.call_at(drained + TIMES.finish, self._app.state.service.workers.end)
+        loop.call_at(drained + FINISH, self._app.state.service.workers.end)
         await super().shutdown(sockets)
 
     def _connection(self, **arguments: Any) -> Connection:
@@ -139,7 +124,7 @@ class Server(uvicorn.Server):
             for listener in server.sockets:
                 _drop_new_connections(listener)
         await asyncio.sleep(0.05)  # connections that are being opened are still accepted
-        while self.server_state.connections and time() < drained + TIMES.linger:
+        while self.server_state.connections and time() < drained + LINGER:
             await asyncio.sleep(0.05)
         return drained
 

@@ -5,8 +5,6 @@ from __future__ import annotations
 import ipaddress
 import math
 from collections import Counter
-from collections.abc import Iterator
-from contextlib import contextmanager
 
 #: Share of a resource that the address of one client may use, so that other clients always have some.
 SHARE = 0.75
@@ -21,15 +19,7 @@ class QuotaError(RuntimeError):
 
 
 class Quota:
-    """A limited resource, counted for each client. Use it from the event loop only.
-
-    Args:
-        limit: amount for all clients together.
-
-    Attributes:
-        limit: amount for all clients together.
-        used: amount in use.
-    """
+    """A limited resource, counted for each client, of an amount for all together; for the event loop only."""
 
     def __init__(self, limit: int) -> None:
         self.limit, self.used = limit, 0
@@ -52,15 +42,6 @@ class Quota:
         self._by_client[client] -= amount
         if not self._by_client[client]:
             del self._by_client[client]
-
-    @contextmanager
-    def taken(self, client: str | None, amount: int = 1) -> Iterator[None]:
-        """Take an amount for the duration of a block."""
-        self.take(client, amount)
-        try:
-            yield
-        finally:
-            self.give_back(client, amount)
 
 
 def client_name(address: str) -> str:

@@ -70,12 +70,9 @@ _EXIT_TIME = 5.0
 
 
 class Sandbox:
-    """A pool of child processes, which start when they are needed.
+    """A pool of at most so many child processes, which start when they are needed.
 
     Any number of threads can call it. A call waits until a child is free.
-
-    Args:
-        processes: largest number of children.
     """
 
     def __init__(self, processes: int) -> None:
@@ -112,12 +109,7 @@ class Sandbox:
             most: largest number of bytes of arrays in the result.
 
         Raises:
-            LateError: the deadline passed.
-            OutOfMemoryError: the task needs more memory.
-            NoProcessError: no process can be started.
-            DiedError: the child ended.
-            FailedError: the task reports bad input.
-            ClosedError: the sandbox is closed, or was closed meanwhile.
+            SandboxError: one of those of `sandbox_errors`, as the cause is.
         """
         if not self._free.acquire(timeout=max(0.0, deadline.time - time.monotonic())):
             raise LateError("every process was at work until the time was over")
@@ -186,11 +178,7 @@ class Sandbox:
 
 
 class _Child:
-    """One process and the connection to it, for one thread at a time.
-
-    Args:
-        path: function whose module the process imports at its start.
-    """
+    """One process, which begins by importing a function, and the connection to it, for one thread at a time."""
 
     def __init__(self, path: str) -> None:
         hidden = {name for name in os.environ if name.startswith("SHAPESPACE_")}
@@ -221,7 +209,7 @@ class _Child:
 
     @property
     def dead(self) -> bool:
-        """Whether the process has ended; for example, the system kills processes when memory runs out."""
+        """Whether the process has ended, as where the system kills it when memory runs out."""
         return self._process.poll() is not None
 
     @property
@@ -230,13 +218,7 @@ class _Child:
         return self._memory - (self._memory_at_start or 0) > GROWTH
 
     def call(
-        self,
-        path: str,
-        facts: Mapping[str, Any],
-        body: Pieces | None,
-        deadline: Deadline,
-        memory: int,
-        most: int,
+        self, path: str, facts: Mapping[str, Any], body: Pieces | None, deadline: Deadline, memory: int, most: int
     ) -> tuple[JsonObject, Arrays]:
         """Run a task, as `Sandbox.call`. After an exception other than FailedError the child can't be used again."""
 
@@ -295,7 +277,7 @@ class _Child:
 
     def end(self) -> None:
         """Kill the process and release its resources."""
-        self._process.kill()
+        self.kill()
         self._process.wait()
         self._connection.close()
 

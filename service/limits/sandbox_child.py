@@ -17,14 +17,11 @@ import threading
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from shapespace.service.limits.process_memory import mapped_size, resident_size, trim_heap, tune_malloc
 from shapespace.service.limits.sandbox_errors import FailedError, in_a_line
 from shapespace.service.limits.sandbox_wire import LONGEST_SENTENCE, Arrays, JsonObject, receive, receive_exactly, send
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
 
 #: A function ``(body, **facts)`` that returns facts and arrays.
 Task = Callable[..., tuple[JsonObject, Arrays]]
@@ -78,19 +75,15 @@ def _outcome(run: Callable[[], tuple[JsonObject, Arrays]]) -> tuple[JsonObject, 
     """Run a task; return the reply and the arrays that follow it."""
     try:
         facts, arrays = run()
-        return {"facts": facts}, {name: _contiguous(array) for name, array in arrays.items()}
+        return {"facts": facts}, {
+            name: array if array.flags.c_contiguous else array.copy() for name, array in arrays.items()
+        }
     except MemoryError:
         return {"error": "memory"}, {}
     except FailedError as error:
         return {"error": error.kind, "sentence": error.sentence[:LONGEST_SENTENCE]}, {}
     except Exception as error:
         return {"error": FailedError.UNEXPECTED, "sentence": in_a_line(error)[:LONGEST_SENTENCE]}, {}
-
-
-def _contiguous(array: NDArray[Any]) -> NDArray[Any]:
-    import numpy as np
-
-    return np.ascontiguousarray(array)
 
 
 def _function(path: str) -> Task:

@@ -71,14 +71,7 @@ def receive_exactly(connection: socket.socket, length: int, wait: Wait = _no_wai
 
 
 def receive_arrays(connection: socket.socket, described: Any, most: int, wait: Wait) -> Arrays:
-    """Return the arrays that follow a message; raises ValueError for more than ``most`` bytes.
-
-    Args:
-        connection: connection that the message came from.
-        described: name, type and shape of each array, from the message.
-        most: largest number of bytes of all arrays.
-        wait: see `Wait`.
-    """
+    """Return the arrays that follow a message, which describes them; raises ValueError for more than ``most`` bytes."""
     import numpy as np
 
     arrays = {}

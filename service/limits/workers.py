@@ -49,11 +49,9 @@ class EndingError(RuntimeError):
 
 @dataclass(frozen=True)
 class Caller:
-    """The client of a request.
+    """The client of a request: its name for quotas, empty if it is unknown.
 
-    Attributes:
-        client: name for quotas, see ``client_name``; empty if it is unknown.
-        gone: waits until the client has left, and returns the error for its work.
+    ``gone`` waits until it has left, and returns the error for its work.
     """
 
     client: str
@@ -61,12 +59,7 @@ class Caller:
 
 
 class Call(Deadline):
-    """A deadline that also ends the waiting of a request on the event loop.
-
-    Args:
-        seconds: time until the deadline.
-        late: error that the request gets at the deadline.
-    """
+    """A deadline that also ends the waiting of a request on the event loop, with the error ``late``."""
 
     def __init__(self, seconds: float, late: Exception) -> None:
         super().__init__(seconds)
@@ -102,16 +95,11 @@ class Workers:
 
     Requests are admitted up to a limit. A request submits its shapes one by one, at most as many at once as there are
     threads. So a single shape doesn't wait for the end of a long animation. Streams have their own limit: most of the
-    time they wait for their clients, and then use no thread.
-
-    Args:
-        threads: number of threads.
-        queue: number of admitted requests that can wait for a thread.
-        deadline: seconds that a request may take after it is admitted.
+    time they wait for their clients, and then use no thread. ``queue`` requests can wait for one of the ``threads``.
+    A request has ``deadline`` seconds after it is admitted.
 
     Attributes:
-        places: quota of requests that are admitted.
-        streams: quota of answers that are read while they are computed.
+        places, streams: quotas of requests that are admitted, and of answers that are read while they are computed.
         memory: quota of bytes for answers with many shapes.
         lost: number of abandoned threads that still run.
     """
@@ -131,11 +119,7 @@ class Workers:
 
     @asynccontextmanager
     async def admit(self, caller: Caller) -> AsyncIterator[Call]:
-        """Admit a request for the duration of the block; yields its deadline.
-
-        Raises:
-            BusyError: there are too many requests, in total or from this client.
-        """
+        """Admit a request for the duration of the block, and yield its deadline; raises BusyError."""
         with self._place(self.places, caller), self._call() as call:
             watching = asyncio.create_task(self._watch(caller, call))
             try:
@@ -151,21 +135,13 @@ class Workers:
 
     @contextmanager
     def holding(self, caller: Caller, size: int) -> Iterator[ExitStack]:
-        """Reserve bytes for an answer until the block ends, or until another owner of the stack closes it.
-
-        Raises:
-            BusyError: answers use too much memory, in total or for this client.
-        """
+        """Reserve bytes for an answer until the block ends or a new owner of the stack closes it; raises BusyError."""
         with ExitStack() as held:
             held.enter_context(self._place(self.memory, caller, size))
             yield held
 
     async def run(self, function: Callable[[Call], T], call: Call) -> T:
-        """Run a function in a thread, with the deadline as its argument.
-
-        Raises:
-            DeadlineError, DisconnectedError, EndingError: the call ended first.
-        """
+        """Run a function of the call in a thread; raises the error of the call if it ends first."""
         turn = asyncio.ensure_future(self._free.acquire())
         try:
             await call.first(turn)
@@ -268,9 +244,8 @@ class Workers:
                 self._pool.shutdown(wait=False)  # running work goes on
                 self._pool = self._threads()
                 self._free.release()
-                logger.error(
-                    "a thread is still at work %g s after its deadline, and another takes its place", GRACE_SECONDS
-                )
+                text = "a thread is still at work %g s after its deadline, and another takes its place"
+                logger.error(text, GRACE_SECONDS)
 
         def find() -> None:
             timer.cancel()

@@ -19,44 +19,26 @@ METHODS = frozenset({"GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS"}
 
 
 class Metrics:
-    """Metrics of one server, in a registry of their own.
-
-    Args:
-        repository: served models.
-        workers: threads that compute.
-        connections: number of open connections, and its limit.
-    """
+    """Metrics of one server, in a registry of their own."""
 
     def __init__(self, repository: ModelRepository, workers: Workers, connections: Quota) -> None:
         self.registry = registry = CollectorRegistry()
         ProcessCollector(registry=registry)
         registry.register(_ModelInfo(repository))
-        self._requests = Counter(
-            "shapespace_requests", "Requests answered.", ["route", "method", "status"], registry=registry
-        )
-        self._seconds = Histogram(
-            "shapespace_request_seconds",
-            "Time from a request's head to the end of its answer.",
-            ["route", "method"],
-            buckets=BUCKETS,
-            registry=registry,
-        )
-        self._stages = Histogram(
-            "shapespace_stage_seconds",
-            "Time of an answer by stage, as its Server-Timing says.",
-            ["stage"],
-            buckets=BUCKETS,
-            registry=registry,
-        )
-        self._reloads = Counter(
-            "shapespace_reloaded_bundles",
-            "Bundles that reloads loaded, removed or refused, and reloads that failed whole.",
-            ["result"],
-            registry=registry,
-        )
-        self._refusals = Counter(
-            "shapespace_refusals", "Connections that were refused without a whole request.", ["kind"], registry=registry
-        )
+
+        def counter(name: str, text: str, *labels: str) -> Counter:
+            return Counter(f"shapespace_{name}", text, labels, registry=registry)
+
+        def histogram(name: str, text: str, *labels: str) -> Histogram:
+            return Histogram(f"shapespace_{name}", text, labels, buckets=BUCKETS, registry=registry)
+
+        self._requests = counter("requests", "Requests answered.", "route", "method", "status")
+        text = "Time from a request's head to the end of its answer."
+        self._seconds = histogram("request_seconds", text, "route", "method")
+        self._stages = histogram("stage_seconds", "Time of an answer by stage, as its Server-Timing says.", "stage")
+        text = "Bundles that reloads loaded, removed or refused, and reloads that failed whole."
+        self._reloads = counter("reloaded_bundles", text, "result")
+        self._refusals = counter("refusals", "Connections that were refused without a whole request.", "kind")
         for name, text, value in (
             ("bundles_refused", "Bundles that the latest look refused.", lambda: len(repository.refused)),
             ("admitted", "Requests at work or waiting for a worker.", lambda: workers.places.used),
@@ -72,14 +54,7 @@ class Metrics:
         Gauge("shapespace_build_info", "Always 1.", ["version"], registry=registry).labels(__version__).set(1)
 
     def answered(self, route: str, method: str, status: int, seconds: float) -> None:
-        """Count an answer.
-
-        Args:
-            route: template of the path, not the path.
-            method: method of the request; unknown methods share a label.
-            status: status of the answer.
-            seconds: time from the head of the request to the end of the answer.
-        """
+        """Count an answer, by the template of its path, and with one label for all unknown methods."""
         method = method if method in METHODS else "other"
         self._requests.labels(route, method, str(status)).inc()
         self._seconds.labels(route, method).observe(seconds)

@@ -27,12 +27,8 @@ class Reloader:
                 logger.exception("the reload failed, so that nothing changes")
                 changes = Changes(failed=True)
             self._metrics.reloaded(changes)
-            logger.info(
-                "reloaded: %d bundles loaded, %d removed, %d refused",
-                len(changes.loaded),
-                len(changes.removed),
-                len(changes.refused),
-            )
+            numbers = map(len, (changes.loaded, changes.removed, changes.refused))
+            logger.info("reloaded: %d bundles loaded, %d removed, %d refused", *numbers)
 
     async def watch(self, seconds: float) -> None:
         """Check the folder regularly, and reload once a change is complete: when two checks find the same.

@@ -40,14 +40,7 @@ class UnknownVersionError(LookupError):
 
 @dataclass(frozen=True)
 class Changes:
-    """Result of a reload; bundles are given as NAME/VERSION.
-
-    Attributes:
-        loaded: new or changed bundles.
-        removed: bundles that are gone.
-        refused: invalid bundles.
-        failed: whether the folder could not be read, so that nothing changed.
-    """
+    """Result of a reload: bundles as NAME/VERSION, or failed if the folder could not be read and nothing changed."""
 
     loaded: list[str] = field(default_factory=list)
     removed: list[str] = field(default_factory=list)
@@ -67,16 +60,13 @@ class ModelRepository:
         folder: holds NAME/VERSION/; hidden entries and plain files are ignored.
         threads: number of shapes that a model may compute at once.
         validator: validation that has begun already, for the first load.
-
-    Attributes:
-        refused: bundles that the latest reload refused.
-        seen: signature of the folder before the latest reload.
     """
 
     def __init__(self, folder: Path, threads: int = 1, validator: BundleValidator | None = None) -> None:
         self._folder, self._threads = folder, threads
         self._models: Mapping[str, Mapping[int, ShapeModel]] = {}
         self._validator, self._closed = validator or BundleValidator(), False
+        #: Bundles that the latest reload refused, and signature of the folder before it.
         self.refused: list[str] = []
         self.seen: Signature = ()
         self.reload()
@@ -188,9 +178,9 @@ class ModelRepository:
             if str(number) == version:
                 return model
         if version is not None:
+            known = ", ".join(map(str, sorted(versions)))
             raise UnknownVersionError(
-                f"{name} has no version {version!r}. Choose one of {', '.join(map(str, sorted(versions)))}, or none "
-                "for the newest."
+                f"{name} has no version {version!r}. Choose one of {known}, or none for the newest."
             )
         return versions[max(versions)]
 

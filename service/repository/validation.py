@@ -6,41 +6,24 @@ import os
 import threading
 from collections.abc import Iterable
 from concurrent.futures import CancelledError, Future, ThreadPoolExecutor
-from dataclasses import dataclass
 from pathlib import Path
 
 from shapespace.service.limits.sandbox import Sandbox
 from shapespace.service.limits.sandbox_errors import ClosedError
 from shapespace.solve.deadline import Deadline
 
+# Limits on the validation of one bundle. Memory for the solver is added once the size of the mesh is known.
 
-@dataclass(frozen=True)
-class ValidationLimits:
-    """Limits on the validation of one bundle. Memory for the solver is added once the size of the mesh is known.
-
-    Attributes:
-        seconds: time.
-        memory: bytes, in addition to the bytes for the files.
-        copies: factor of the size of the files. While ONNX Runtime loads a network, memory holds it as read, as parsed,
-            as checked, and three times in ONNX Runtime.
-        files: largest size in bytes of all files of a bundle.
-    """
-
-    seconds: float = 60.0
-    memory: int = 512 * 2**20
-    copies: int = 6
-    files: int = 2**30
-
-
-LIMITS = ValidationLimits()
+SECONDS = 60.0
+#: Bytes in addition to those for the files, of which a bundle may have at most MOST_FILE_BYTES.
+MEMORY, MOST_FILE_BYTES = 512 * 2**20, 2**30
+#: Factor of the size of the files. While ONNX Runtime loads a network, memory holds it as read, as parsed, as checked,
+#: and three times in ONNX Runtime.
+COPIES = 6
 
 
 def bundle_folders(folder: Path) -> tuple[list[Path], dict[Path, OSError]]:
-    """Return folders NAME/VERSION, and folders NAME that cannot be read; hidden entries and plain files are ignored.
-
-    Raises:
-        OSError: the folder cannot be read.
-    """
+    """Return folders NAME/VERSION, and folders NAME that cannot be read, but no hidden entries; raises OSError."""
     found: list[Path] = []
     unreadable = {}
     for name in sorted(folder.iterdir()):
@@ -73,12 +56,7 @@ class BundleValidator:
                     self._digests[folder] = self._thread.submit(self._validate, folder)
 
     def digest(self, folder: Path) -> str:
-        """Return the digest of a valid bundle, and wait for its validation.
-
-        Raises:
-            SandboxError: the bundle is invalid.
-            ClosedError: the validator was closed before.
-        """
+        """Return the digest of a bundle once it is validated; raises SandboxError, ClosedError if it never will be."""
         self.begin([folder])
         try:
             return self._digests[folder].result()
@@ -93,10 +71,8 @@ class BundleValidator:
         self._thread.shutdown(cancel_futures=True)
 
     def _validate(self, folder: Path) -> str:
-        memory = LIMITS.memory + LIMITS.copies * min(_bytes(folder), LIMITS.files)
-        facts, _ = self._sandbox.call(
-            "validate", {"folder": str(folder)}, deadline=Deadline(LIMITS.seconds), memory=memory
-        )
+        memory = MEMORY + COPIES * min(_bytes(folder), MOST_FILE_BYTES)
+        facts, _ = self._sandbox.call("validate", {"folder": str(folder)}, deadline=Deadline(SECONDS), memory=memory)
         return str(facts["digest"])
 
 

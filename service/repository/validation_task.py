@@ -22,18 +22,7 @@ analyse(SymmetricPattern(1, np.array([0]), np.array([0])))
 
 
 def validate_bundle(body: bytearray, folder: str) -> tuple[JsonObject, Arrays]:
-    """Load a bundle, and compute with it once as the server does.
-
-    Args:
-        body: empty.
-        folder: folder of the bundle.
-
-    Returns:
-        The ``digest`` of the bundle.
-
-    Raises:
-        FailedError: the bundle must not be served; the message says why.
-    """
+    """Load a bundle, and compute with it once as the server does; returns its ``digest``, or raises FailedError."""
     try:
         bundle = read_bundle(Path(folder))
         raise_memory_limit(min(MEMORY_PER_VERTEX * bundle.manifest.vertices, SOLVER_MEMORY))

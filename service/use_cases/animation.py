@@ -6,7 +6,6 @@ import base64
 import binascii
 import hashlib
 import zlib
-from dataclasses import dataclass
 from itertools import pairwise
 from typing import Annotated
 
@@ -20,29 +19,14 @@ from shapespace.model.latent_space import LatentSpace
 from shapespace.service.use_cases.fields import Body, Number, Whole
 from shapespace.service.use_cases.shape_formats import holds_more_values
 
+# An id is base64 of a checksum and compressed JSON. With these limits, reading it takes a few milliseconds at most.
 
-@dataclass(frozen=True)
-class IdFormat:
-    """Format and limits of an animation's id: base64 of a checksum and compressed JSON.
-
-    With these limits, reading an id takes a few milliseconds at most.
-
-    Attributes:
-        length: most characters of an id; most proxies allow a URL of at most 16 KiB.
-        payload_bytes: most bytes that an id may unpack to.
-        values: most JSON values in these bytes.
-        checksum_bytes: length of the checksum, the first bytes of SHA-256 of the JSON.
-        digest_digits: number of hexadecimal digits of the model's digest that an id holds.
-    """
-
-    length: int = 15_000
-    payload_bytes: int = 2**16
-    values: int = 2**13
-    checksum_bytes: int = 9
-    digest_digits: int = 32
-
-
-ID = IdFormat()
+#: Most characters of an id; most proxies allow a URL of at most 16 KiB.
+ID_LENGTH = 15_000
+#: Most bytes that an id may unpack to, and most JSON values in them.
+ID_BYTES, ID_VALUES = 2**16, 2**13
+#: Bytes of the checksum, the first of SHA-256 of the JSON, and hexadecimal digits of the model's digest.
+CHECKSUM_BYTES, DIGEST_DIGITS = 9, 32
 
 
 class UnknownInterpolationError(LookupError):
@@ -62,13 +46,11 @@ class Animation(Body):
     """
 
     model_config = ConfigDict(
-        frozen=True,
-        json_schema_extra={"examples": [{"keyframes": [[0, 0, 0, 0], [1, 2, 3, 4]], "frames": 30}]},
+        frozen=True, json_schema_extra={"examples": [{"keyframes": [[0, 0, 0, 0], [1, 2, 3, 4]], "frames": 30}]}
     )
 
     keyframes: Annotated[
-        list[Annotated[list[Number], Field(fail_fast=True, json_schema_extra={"minItems": 1})]],
-        Field(fail_fast=True),
+        list[Annotated[list[Number], Field(fail_fast=True, json_schema_extra={"minItems": 1})]], Field(fail_fast=True)
     ] = Field(min_length=2, description="At least two latent codes.")
     times: Annotated[list[Number], Field(fail_fast=True)] | None = Field(
         None,
@@ -76,9 +58,7 @@ class Animation(Body):
         "last segment, back to the first keyframe, takes the mean time of the others.",
     )
     frames: Whole = Field(
-        30,
-        ge=2,
-        description="Number n of frames, including both ends; `loop` leaves out the last frame.",
+        30, ge=2, description="Number n of frames, including both ends; `loop` leaves out the last frame."
     )
     start: Number = Field(0.0, description="t of the first frame; below 0 extrapolates.")
     stop: Number = Field(1.0, description="t of the last frame; above 1 extrapolates.")
@@ -132,51 +112,46 @@ class Animation(Body):
     def to_id(self, model_digest: str, latents: LatentSpace) -> str:
         """Return an id that holds the whole animation, so that any replica can answer it at any time.
 
-        The id is of the animation's canonical form: equal animations of a model have equal ids.
-
-        Raises:
-            LatentError: a keyframe is no code of the model.
-            PathTooLongError: there are too many keyframes for a URL.
+        The id is of the animation's canonical form: equal animations of a model have equal ids. Raises LatentError, or
+        PathTooLongError for too many keyframes.
         """
         too_long = PathTooLongError(
             f"{len(self.keyframes)} keyframes of {latents.dimension} numbers don't fit into an "
             "interpolation's address. Send fewer keyframes, or the parts of the path one by one."
         )
-        if len(self.keyframes) + sum(map(len, self.keyframes)) > ID.values:
+        if len(self.keyframes) + sum(map(len, self.keyframes)) > ID_VALUES:
             raise too_long  # before computing anything from them
         content = self.model_dump(mode="json", exclude_none=True)
         content["keyframes"] = latents.codes(self.keyframes)[0]
-        content["model"] = model_digest[: ID.digest_digits]
+        content["model"] = model_digest[:DIGEST_DIGITS]
         payload = orjson.dumps(content, option=orjson.OPT_SERIALIZE_NUMPY | orjson.OPT_SORT_KEYS)
         packed = _checksum(payload) + zlib.compress(payload, 9)
         name = base64.urlsafe_b64encode(packed).rstrip(b"=").decode()
-        if len(name) > ID.length or len(payload) > ID.payload_bytes or holds_more_values(payload, ID.values):
+        if len(name) > ID_LENGTH or len(payload) > ID_BYTES or holds_more_values(payload, ID_VALUES):
             raise too_long
         return name
 
     @classmethod
     def from_id(cls, name: str) -> tuple[Animation, str]:
-        """Return the animation of an id, and the first digits of its model's digest.
-
-        Raises:
-            UnknownInterpolationError: the id is damaged, invented, or from another version of this software.
-        """
+        """Return the animation of an id, and how its model's digest begins; raises UnknownInterpolationError."""
         try:
-            if len(name) > ID.length:
+            if len(name) > ID_LENGTH:
                 raise ValueError
             packed = base64.b64decode(name + "=" * (-len(name) % 4), altchars=b"-_", validate=True)
             inflate = zlib.decompressobj()
             # With a limit, because a short id could unpack to gigabytes.
-            payload = inflate.decompress(packed[ID.checksum_bytes :], ID.payload_bytes)
-            if not inflate.eof or inflate.unused_data or packed[: ID.checksum_bytes] != _checksum(payload):
-                raise ValueError
-            if base64.urlsafe_b64encode(packed).rstrip(b"=").decode() != name:
-                raise ValueError
-            if holds_more_values(payload, ID.values):
+            payload = inflate.decompress(packed[CHECKSUM_BYTES:], ID_BYTES)
+            if (
+                not inflate.eof
+                or inflate.unused_data
+                or packed[:CHECKSUM_BYTES] != _checksum(payload)
+                or base64.urlsafe_b64encode(packed).rstrip(b"=").decode() != name
+                or holds_more_values(payload, ID_VALUES)
+            ):
                 raise ValueError
             content = orjson.loads(payload)
             digest = content.pop("model")
-            if not isinstance(digest, str) or len(digest) != ID.digest_digits:
+            if not isinstance(digest, str) or len(digest) != DIGEST_DIGITS:
                 raise ValueError
             return cls.model_validate(content), digest
         except (ValueError, KeyError, AttributeError, TypeError, binascii.Error, zlib.error, ValidationError):
@@ -187,4 +162,4 @@ class Animation(Body):
 
 
 def _checksum(payload: bytes) -> bytes:
-    return hashlib.sha256(payload).digest()[: ID.checksum_bytes]
+    return hashlib.sha256(payload).digest()[:CHECKSUM_BYTES]

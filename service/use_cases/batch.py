@@ -7,7 +7,6 @@ from collections.abc import AsyncGenerator, AsyncIterator, Callable, Iterable, I
 from contextlib import ExitStack, aclosing, asynccontextmanager
 from dataclasses import dataclass
 from itertools import chain
-from types import TracebackType
 from typing import Any, TypeVar
 
 from shapespace.files.archives import Buffer
@@ -38,12 +37,7 @@ class TooManyCodesError(ValueError):
 class PiecewiseFile:
     """A file that a worker thread writes piece by piece, as fast as the client reads it.
 
-    It is a context manager; its reservation of memory lasts until the context ends.
-
-    Args:
-        pieces: computes the pieces of the file.
-        workers: threads that compute the pieces.
-        held: reservation of memory.
+    It is a context manager; ``held``, its reservation of memory, lasts until the context ends.
     """
 
     def __init__(self, pieces: Iterator[Buffer], workers: Workers, held: ExitStack) -> None:
@@ -56,9 +50,7 @@ class PiecewiseFile:
     def __enter__(self) -> PiecewiseFile:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._held.close()
 
 
@@ -80,17 +72,7 @@ class EncodedFile:
 
 
 class Batch:
-    """An admitted request for many codes.
-
-    Args:
-        workers: threads that compute.
-        call: deadline of the request.
-        size: bytes of the arrays of the answer.
-        held: reservation of this memory.
-
-    Attributes:
-        workers: the same as the argument.
-    """
+    """An admitted request for many codes, whose answer has arrays of ``size`` bytes, reserved by ``held``."""
 
     def __init__(self, workers: Workers, call: Call, size: int, held: ExitStack) -> None:
         self.workers, self._call, self._size, self._held = workers, call, size, held
@@ -106,13 +88,7 @@ class Batch:
         seconds: Timings,
         diagnostics: Mapping[str, Any] | None = None,
     ) -> EncodedFile:
-        """Write the file; of a large one only the first piece.
-
-        Args:
-            encode: returns the pieces of the file, and facts about it.
-            seconds: time by stage so far.
-            diagnostics: summary over all shapes.
-        """
+        """Write the file; of a large one only the first piece. ``encode`` returns its pieces, and facts about it."""
         began = time.perf_counter()
 
         def start(_: Call) -> tuple[bytes | Buffer, Iterator[Buffer], Mapping[str, Any]]:

@@ -1,9 +1,11 @@
-"""Positions of the vertices of many shapes, with the true discrete exponentials on request."""
+"""Many shapes in one answer: positions, true discrete exponentials, lengths and angles, and a model as blend shapes."""
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -13,7 +15,8 @@ from shapespace.files.archives import Buffer
 from shapespace.files.npz import npz_pieces
 from shapespace.files.reading import OCTET_STREAM
 from shapespace.mesh.rigid_motion import Placement
-from shapespace.model.decoder import Diagnostics, MeshChoice, Quality
+from shapespace.model.blend_shapes import blend_shapes, require_ends
+from shapespace.model.decoder import Diagnostics, MeshChoice, Quality, Shape
 from shapespace.model.exact_shapes import ExactShape, exact_shape, require_tangent_space
 from shapespace.model.latent_space import Bounds, CheckedCode, Codes
 from shapespace.model.shape_model import ShapeModel
@@ -27,18 +30,21 @@ from shapespace.service.use_cases.batch import (
     solve,
     total_seconds,
 )
-from shapespace.service.use_cases.nric import nric_size, predictions
 from shapespace.service.use_cases.one_shape import place_vertices
 from shapespace.service.use_cases.shape_formats import (
     diagnostics_arrays,
     exponential_arrays,
     exponential_lists,
+    float32,
     json_pieces,
     summarise,
 )
+from shapespace.solve.deadline import Deadline
 
 #: Most vertices of all shapes of one answer together: 48 MiB of positions.
 MOST_VERTICES = 2**22
+#: Most bytes of the predictions in one answer. Networks with convolutions need more memory than their outputs.
+MOST_NRIC_BYTES = 2**25
 #: Three coordinates in float32.
 BYTES_PER_VERTEX = 12
 #: Media types of the formats of many shapes, by name; the first is the default.
@@ -47,13 +53,7 @@ VERTICES_TYPES = {"json": "application/json", "npz": OCTET_STREAM}
 
 @dataclass(frozen=True)
 class ShapeBatch:
-    """Several shapes.
-
-    Attributes:
-        vertices: (n, V, 3) float32, in the units of the training meshes.
-        diagnostics: diagnostics of each shape.
-        seconds: total time by stage.
-    """
+    """Several shapes: vertices (n, V, 3), in the units of the training meshes, and the total time by stage."""
 
     vertices: NDArray[np.float32]
     diagnostics: list[Diagnostics]
@@ -76,24 +76,12 @@ async def vertices_file(
 ) -> EncodedFile:
     """Return positions and diagnostics of shapes, in a format of VERTICES_TYPES.
 
-    Args:
-        workers: threads that compute.
-        caller: client that waits.
-        model: decodes the codes.
-        latents: n codes of m numbers.
-        bounds: what to do with codes outside the bounds.
-        mesh: fine or coarse.
-        format: name of the format.
-        quality: draft or full.
-        exponentials: whether to add the true discrete exponentials.
-        place: rigid motion and scale of the answer, relative to the reference.
-        faces: whether NPZ holds the faces of the mesh.
+    With the true discrete exponentials if asked for, elsewhere by ``place``, and in NPZ with the ``faces`` of the mesh.
 
     Raises:
         NoTangentSpaceError: the model has no exponentials.
         LatentError: a code is invalid.
-        TooManyCodesError, BusyError: the shapes exceed the limit of one answer, or of all together.
-        DeadlineError, DisconnectedError, EndingError: the call ended before the file was ready.
+        TooManyCodesError: the shapes exceed the limit of one answer.
     """
     if exponentials:
         require_tangent_space(model.decoder)
@@ -140,11 +128,7 @@ async def infer(
     outputs: Sequence[str],
     write: WriteOutputs,
 ) -> EncodedFile:
-    """Return the requested outputs for codes (n, m): ``nric`` (n, 2E), ``vertices`` (n, V, 3), or both.
-
-    Raises:
-        LatentError, TooManyCodesError, BusyError, DeadlineError, DisconnectedError, EndingError: as ``vertices_file``.
-    """
+    """Return the outputs for codes (n, m): ``nric`` (n, 2E), ``vertices`` (n, V, 3); raises as ``vertices_file``."""
     codes, inside = model.latents.codes(latents, bounds)
     size = sum(
         shapes_size(model, len(codes), mesh) if name == "vertices" else nric_size(model, len(codes)) for name in outputs
@@ -159,7 +143,7 @@ async def infer(
                 found = await shapes(work, model, codes, inside, mesh, quality)
                 arrays[name] = found.vertices
             else:
-                arrays[name] = (await predictions(work, model, codes)).nric
+                arrays[name] = (await predictions(work, model, codes))[0]
         seconds, diagnostics = (found.seconds, summarise(found.diagnostics)) if found else ({}, None)
         return await work.write(lambda: write(arrays), seconds, diagnostics)
 
@@ -202,3 +186,89 @@ async def _exponentials(
         return exact_shape(model.decoder, *item, mesh, call)
 
     return await work.map(one, zip(codes, found.vertices, strict=True))
+
+
+async def blend_shapes_file(
+    workers: Workers, caller: Caller, model: ShapeModel, mesh: MeshChoice
+) -> tuple[bytes, Timings]:
+    """Return a GLB with a morph target for each bound of each coordinate, and its time by stage.
+
+    Raises:
+        PeriodicError: a coordinate is periodic, so that it has no bounds.
+        TooManyCodesError: all targets together have more vertices than one answer may hold.
+        NotFiniteError, ModelFailedError: the model has no shape at a bound.
+    """
+    require_ends(model.decoder)
+    size = shapes_size(model, 2 * model.latents.dimension + 1, mesh)
+
+    def shape(deadline: Deadline, code: Codes) -> Shape:
+        return solve(workers, model, mesh, Quality.FULL, (code, True), deadline)
+
+    def make(deadline: Deadline) -> tuple[bytes, Timings]:
+        began = time.perf_counter()
+        found = blend_shapes(model.decoder, mesh, partial(shape, deadline))
+        solved = time.perf_counter()
+        content = found.glb()
+        return content, {"reconstruct": solved - began, "encode": time.perf_counter() - solved}
+
+    with workers.holding(caller, size):
+        async with workers.admit(caller) as call:
+            return await workers.run(make, call)
+
+
+async def nric_file(
+    workers: Workers,
+    caller: Caller,
+    model: ShapeModel,
+    latents: Sequence[Sequence[float]],
+    bounds: Bounds,
+    *,
+    factors: bool,
+) -> EncodedFile:
+    """Return lengths and angles as the networks predict them, as JSON, on request also those of each factor.
+
+    Raises LatentError, and TooManyCodesError if they exceed the limit of one answer.
+    """
+    codes, _ = model.latents.codes(latents, bounds)
+    async with batch(workers, caller, nric_size(model, len(codes), factors=factors)) as work:
+        began = time.perf_counter()
+        found, parts = await predictions(work, model, codes, factors=factors)
+        seconds = {"network": time.perf_counter() - began}
+
+        def encode() -> tuple[Iterator[Buffer], dict[str, Any]]:
+            lengths, angles = np.split(found, 2, axis=1)
+            lists: dict[str, Iterable[Any]] = {"lengths": map(float32, lengths), "angles": map(float32, angles)}
+            if parts is not None:
+                lists["factors"] = parts
+            return json_pieces(lists), {}
+
+        return await work.write(encode, seconds)
+
+
+def nric_size(model: ShapeModel, count: int, *, factors: bool = False) -> int:
+    """Return the size of predictions in bytes; raises TooManyCodesError above the limit of one answer."""
+    size = 8 * model.manifest.edges * (1 + (len(model.manifest.factors) if factors else 0))
+    if count * size > MOST_NRIC_BYTES:
+        raise TooManyCodesError(
+            f"{count} codes are too many for one answer. Ask for {MOST_NRIC_BYTES // size} at most."
+        )
+    return count * size
+
+
+async def predictions(
+    work: Batch, model: ShapeModel, codes: Codes, *, factors: bool = False
+) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
+    """Return the predictions (n, 2E) of the networks for codes (n, m), and those of the factors (n, J, 2E) if asked."""
+    n, wide = len(codes), 2 * model.manifest.edges
+    found = np.empty((n, wide), np.float32)
+    parts = np.empty((n, len(model.manifest.factors), wide), np.float32) if factors else None
+
+    def predict(item: tuple[int, Codes], _: Call) -> None:
+        k, code = item
+        z = model.decoder.lengths_and_angles(code)
+        found[k] = np.concatenate([z.lengths, z.angles])
+        if parts is not None:
+            parts[k] = z.factors
+
+    await work.map(predict, enumerate(codes))
+    return found, parts

@@ -26,13 +26,7 @@ from shapespace.solve.deadline import Deadline
 
 @dataclass(frozen=True)
 class ColourOptions:
-    """Options of a coloured mesh.
-
-    Attributes:
-        quantity: stretch, bending or spread.
-        against: code of the shape to compare with; None is the reference.
-        covariance: (m, m), of codes around this one; for spread only.
-    """
+    """What colours a mesh: the difference from a code, None for the reference, or a spread by a covariance (m, m)."""
 
     quantity: Quantity
     against: CheckedCode | None
@@ -41,16 +35,10 @@ class ColourOptions:
 
 @dataclass(frozen=True)
 class ShapeRequest:
-    """A request for one shape.
+    """A request for one shape, in a format of SHAPE_FORMATS.
 
-    Attributes:
-        code: checked latent code; None is the reference.
-        mesh: fine or coarse.
-        format: a key of SHAPE_FORMATS.
-        quality: draft or full, also for the shape that colours compare with.
-        colour_by: options of colours; None for no colours.
-        place: rigid motion and scale of the answer, relative to the reference.
-        topology: polygons or triangles, in formats that can hold polygons.
+    The code None is the reference. ``quality`` is that of the shape that colours compare with too, and ``place`` is
+    relative to the reference.
     """
 
     code: CheckedCode | None
@@ -64,14 +52,7 @@ class ShapeRequest:
 
 @dataclass(frozen=True)
 class ShapeFile:
-    """A shape as a file.
-
-    Attributes:
-        content: bytes of the file.
-        diagnostics: diagnostics of the shape.
-        legend: legend of the colours, if there are any.
-        seconds: time by stage.
-    """
+    """A shape as a file, with the legend of its colours, if there are any, and its time by stage."""
 
     content: bytes
     diagnostics: Diagnostics
@@ -92,28 +73,19 @@ def place_vertices(vertices: NDArray[np.floating], place: Placement | None) -> F
 
 
 async def shape_file(workers: Workers, caller: Caller, model: ShapeModel, wanted: ShapeRequest) -> ShapeFile:
-    """Return one shape as a file.
-
-    Raises:
-        BusyError: the queue is full.
-        DeadlineError, DisconnectedError, EndingError: the call ended before the file was ready.
-        NotFiniteError, ModelFailedError: the model has no shape for the code.
-    """
+    """Return one shape as a file; raises NotFiniteError or ModelFailedError if the model has none for the code."""
     mesh, colour_by = wanted.mesh, wanted.colour_by
 
     def find(code: CheckedCode | None, deadline: Deadline) -> Shape:
-        return (
-            model.decoder.reference_shape(mesh)
-            if code is None
-            else solve(workers, model, mesh, wanted.quality, code, deadline)
-        )
+        if code is None:
+            return model.decoder.reference_shape(mesh)
+        return solve(workers, model, mesh, wanted.quality, code, deadline)
 
     def make(deadline: Deadline) -> ShapeFile:
         found, colouring = [find(wanted.code, deadline)], None
         if colour_by and wanted.code and colour_by.covariance is not None:
-            colouring = Colouring.of_spread(
-                vertex_uncertainty(model.decoder, wanted.code[0], colour_by.covariance, mesh, deadline)
-            )
+            spread = vertex_uncertainty(model.decoder, wanted.code[0], colour_by.covariance, mesh, deadline)
+            colouring = Colouring.of_spread(spread)
         elif colour_by:
             found.append(find(colour_by.against, deadline))
         began = time.perf_counter()

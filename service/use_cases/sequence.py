@@ -37,13 +37,7 @@ class UnknownFrameError(LookupError):
 
 
 def interpolation_id(model: ShapeModel, animation: Animation, most_frames: int) -> str:
-    """Return an id that holds an animation; nothing is stored.
-
-    Raises:
-        TooManyFramesError: the animation has more than ``most_frames``.
-        LatentError: a keyframe or a frame is no code of the model.
-        PathTooLongError: the keyframes do not fit into an id.
-    """
+    """Return an id that holds an animation; raises TooManyFramesError, LatentError or PathTooLongError."""
     _require_frames(animation, most_frames)
     id = animation.to_id(model.digest, model.latents)
     model.latents.codes(animation.codes(model.latents))  # every frame must be a code
@@ -51,12 +45,7 @@ def interpolation_id(model: ShapeModel, animation: Animation, most_frames: int) 
 
 
 def find_interpolation(repository: ModelRepository, id: str, most_frames: int) -> tuple[Animation, ShapeModel]:
-    """Return the animation of an id, and its model.
-
-    Raises:
-        UnknownInterpolationError: the id is damaged, or its model is not served.
-        TooManyFramesError: the animation has more than ``most_frames``.
-    """
+    """Return the animation of an id, and its model; raises UnknownInterpolationError or TooManyFramesError."""
     animation, digest = Animation.from_id(id)
     _require_frames(animation, most_frames)
     model = repository.by_digest(digest)
@@ -86,13 +75,7 @@ async def sequence_file(
     fps: float = FRAMES_PER_SECOND,
     colour_by: ColourOptions | None = None,
 ) -> EncodedFile:
-    """Return all frames as one file in a format of SEQUENCE_FORMATS.
-
-    Raises:
-        TooManyCodesError, BusyError: the frames exceed the limit of one answer, or of all together.
-        DeadlineError, DisconnectedError, EndingError: the call ended before the file was ready.
-        NoRoomError: there is no room for a temporary file.
-    """
+    """Return all frames as one file in a format of SEQUENCE_FORMATS; raises TooManyCodesError or NoRoomError."""
     codes, inside = model.latents.codes(animation.codes(model.latents))
     number, mesh = len(codes), animation.mesh
     if colour_by and colour_by.against is not None:  # computed as one more shape, the last
@@ -101,28 +84,18 @@ async def sequence_file(
     # Colours take as much memory as positions.
     async with batch(workers, caller, shapes_size(model, len(codes) * (2 if colour_by else 1), mesh)) as work:
         found = await shapes(work, model, codes, inside, mesh, quality)
-        whole, surface = model.mesh(mesh), with_topology(model.decoder.surface(mesh), topology)
+        vertices, whole = found.vertices[:number], model.mesh(mesh)
+        surface = with_topology(model.decoder.surface(mesh), topology)
 
         def encode() -> tuple[Iterator[Buffer], dict[str, Any]]:
             colourings: list[Colouring] = []
             if colour_by:
-                reference = colour_by.against is None
-                against = (
-                    model.decoder.reference_shape(mesh).vertices if reference else found.vertices[-1].astype(np.float64)
-                )
-                colourings = Colouring.of_frames(
-                    colour_by.quantity, found.vertices[:number], against, whole.connectivity
-                )
-            frames = Frames(
-                found.vertices[:number],
-                found.diagnostics[:number],
-                whole.faces,
-                animation.positions,
-                codes[:number],
-                surface,
-                fps,
-                colourings,
-            )
+                against = found.vertices[-1].astype(np.float64)
+                if colour_by.against is None:
+                    against = model.decoder.reference_shape(mesh).vertices
+                colourings = Colouring.of_frames(colour_by.quantity, vertices, against, whole.connectivity)
+            each = found.diagnostics[:number]
+            frames = Frames(vertices, each, whole.faces, animation.positions, codes[:number], surface, fps, colourings)
             return encode_frames(frames, format)
 
         return await work.write(encode, found.seconds, summarise(found.diagnostics[:number]))

@@ -30,13 +30,13 @@ class Frames:
 
     Attributes:
         vertices: (n, V, 3) float32, in the units of the training meshes.
-        diagnostics: diagnostics of each frame.
+        diagnostics: of each frame.
         faces: (F, 3) vertex indices.
         positions: (n,) position t of each frame on the path.
         codes: (n, m).
         surface: attributes of the mesh, if its training file had more than triangles.
         fps: frames per second.
-        colourings: colours of each frame; empty for none.
+        colourings: of each frame; empty for none.
     """
 
     vertices: NDArray[np.float32]
@@ -53,10 +53,7 @@ class Frames:
 class SequenceFormat:
     """A file format for a whole animation.
 
-    Attributes:
-        media_type: as registered with IANA.
-        polygons: whether files hold polygons; otherwise they hold triangles.
-        timed: whether files hold the time of a frame; then they can hold colours that change, too.
+    Files hold triangles or ``polygons``. If they are ``timed``, they hold the time of a frame, and colours that change.
     """
 
     media_type: str
@@ -74,40 +71,32 @@ def json_line(k: int, t: float, shape: Shape, faces: IntArray | None) -> bytes:
 
 
 def encode_frames(frames: Frames, format: str) -> tuple[Iterator[Buffer], dict[str, Any]]:
-    """Encode an animation in one of SEQUENCE_FORMATS.
-
-    Returns:
-        The file in pieces, and members for the diagnostics.
-    """
-    pieces: Iterator[Buffer]
+    """Return an animation in one of SEQUENCE_FORMATS: the file in pieces, and members for the diagnostics."""
+    shown = frames.vertices, frames.faces, frames.surface, frames.fps, frames.colourings
     match format:
         case "glb":
-            animated = animated_glb(frames.vertices, frames.faces, frames.surface, frames.fps, frames.colourings)
+            animated = animated_glb(*shown)
             return iter([animated.data]), {"targets": animated.targets, "max_vertex_error": animated.max_vertex_error}
         case "npz":
-            pieces = npz_pieces(
-                vertices=frames.vertices,
-                faces=frames.faces.astype(np.int32),
-                t=frames.positions,
-                latents=frames.codes,
-                **diagnostics_arrays(frames.diagnostics),
-            )
+            arrays: dict[str, NDArray] = {
+                "faces": frames.faces.astype(np.int32),
+                "t": frames.positions,
+                "latents": frames.codes,
+            }
+            return npz_pieces(vertices=frames.vertices, **arrays, **diagnostics_arrays(frames.diagnostics)), {}
         case "zip":
-            pieces = _obj_pieces(frames)
+            return _obj_pieces(frames), {}
         case "pc2":
-            pieces = point_cache(frames.vertices)
+            return point_cache(frames.vertices), {}
         case "usd" | "usdz":
-            pieces = _usd_pieces(frames, packed=format == "usdz")
+            return _with_write_errors(animated_usd(*shown, packed=format == "usdz")), {}
         case _:
             raise ValueError(f"no format {format}")
-    return pieces, {}
 
 
-def _usd_pieces(frames: Frames, *, packed: bool) -> Iterator[Buffer]:
+def _with_write_errors(pieces: Iterator[Buffer]) -> Iterator[Buffer]:
     with catch_write_errors():
-        yield from animated_usd(
-            frames.vertices, frames.faces, frames.surface, frames.fps, frames.colourings, packed=packed
-        )
+        yield from pieces
 
 
 def _obj_pieces(frames: Frames) -> Iterator[Buffer]:

@@ -20,6 +20,8 @@ from shapespace.model.exact_shapes import ExactShape
 
 #: Bytes in which values are counted at once; counting ends after the piece in which they exceed the limit.
 _PIECE = 2**16
+#: Numbers in diagnostics, of which a summary has the largest.
+_FIGURES = ("iterations", "residual", "flipped_faces", "integrability")
 
 
 def dump_json(content: Any) -> bytes:
@@ -90,10 +92,7 @@ def diagnostics_arrays(diagnostics: Sequence[Diagnostics]) -> dict[str, NDArray]
     """Return the diagnostics of n shapes as arrays (n,), for NPZ files."""
     return {
         "status": np.array([str(d.status) for d in diagnostics]),
-        "iterations": np.array([d.iterations for d in diagnostics]),
-        "residual": np.array([d.residual for d in diagnostics]),
-        "flipped_faces": np.array([d.flipped_faces for d in diagnostics]),
-        "integrability": np.array([d.integrability for d in diagnostics]),
+        **{name: np.array([getattr(d, name) for d in diagnostics]) for name in _FIGURES},
         "plausibility": np.array([d.plausibility for d in diagnostics], dtype=np.float64),
         "inside_bounds": np.array([d.inside_bounds for d in diagnostics]),
         "quality": np.array([str(d.quality) for d in diagnostics]),
@@ -136,10 +135,7 @@ def summarise(diagnostics: Sequence[Diagnostics]) -> dict[str, Any]:
     bad = [d.status for d in diagnostics if d.status != "converged"]
     return {
         "status": bad[0] if bad else diagnostics[0].status,
-        "iterations": max(d.iterations for d in diagnostics),
-        "residual": max(d.residual for d in diagnostics),
-        "flipped_faces": max(d.flipped_faces for d in diagnostics),
-        "integrability": max(d.integrability for d in diagnostics),
+        **{name: max(getattr(d, name) for d in diagnostics) for name in _FIGURES},
         "plausibility": max((d.plausibility for d in diagnostics if d.plausibility is not None), default=None),
         "inside_bounds": all(d.inside_bounds for d in diagnostics),
         "model": diagnostics[0].model,

@@ -67,7 +67,7 @@ UPLOAD_ERRORS = {error.__name__: error for error in (UnusableMeshError, Unreadab
 
 def read_mesh_file(
     body: bytes | bytearray, content_type: str, format: str | None, limits: Limits, *, points: bool = False
-) -> tuple[FloatArray, IntArray, str, str]:
+) -> tuple[FloatArray, IntArray, str]:
     """Read the mesh in the body of a request.
 
     The format is ``format``, or else follows from the content type, the name of the file, or its first bytes.
@@ -80,7 +80,7 @@ def read_mesh_file(
         points: whether points without faces are accepted.
 
     Returns:
-        Vertices (V, 3) as in the file, faces (F, 3) or none, the format, and the form's field ``options``.
+        Vertices (V, 3) as in the file, faces (F, 3) or none, and the form's field ``options``.
 
     Raises:
         UploadError: there is no file, the form or the file can't be read, or the format is unknown.
@@ -98,15 +98,13 @@ def read_mesh_file(
         listed = ", ".join(f"{name} ({media_type})" for name, media_type in formats.items())
         told = clipped(declared.decode("latin-1")) or "No content type"
         fault = f"There is no format {clipped(format)!r} here" if format else f"{told} tells no format"
-        raise UnknownFormatError(
-            f"{fault}. Say by ?format= or Content-Type which: {listed}.",
-        )
+        raise UnknownFormatError(f"{fault}. Say by ?format= or Content-Type which: {listed}.")
     try:
         if found == "json":
             vertices, faces = _read_json(data, limits)
         else:
             vertices, faces = read_arrays(data, found, limits, points=points)
-        return *_checked(vertices, faces), found, said.decode(errors="replace")
+        return *_checked(vertices, faces), said.decode(errors="replace")
     except MeshError as error:
         sentence = f"The mesh can't be used: {str(error).rstrip('.')}. Send one {found} file."
         raise UnusableMeshError(sentence) from None
@@ -126,19 +124,11 @@ def read_in_sandbox(
         found = read_mesh_file(body, content_type, format, Limits(vertices, faces), points=points)
     except UploadError as error:
         raise FailedError(type(error).__name__, str(error)) from None
-    return {"format": found[2], "options": found[3]}, {"vertices": found[0], "faces": found[1]}
+    return {"options": found[2]}, {"vertices": found[0], "faces": found[1]}
 
 
 class _Form:
-    """Parser of a ``multipart/form-data`` form with one file. It copies no file.
-
-    Args:
-        body: the whole form.
-        boundary: boundary between its parts, from the content type.
-
-    Attributes:
-        options: content of the field ``options``.
-    """
+    """Parser of a ``multipart/form-data`` form with one file, and maybe a field ``options``. It copies no file."""
 
     def __init__(self, body: bytes | bytearray, boundary: bytes | None) -> None:
         self._body, self._boundary = body, boundary
@@ -151,11 +141,7 @@ class _Form:
         self.options = b""
 
     def file(self) -> tuple[memoryview, str, bytes]:
-        """Return content, name and declared media type of the file.
-
-        Raises:
-            UploadError: the body is no form, has too many fields or files, or no file.
-        """
+        """Return content, name and declared media type of the file; raises UploadError if there is not one."""
         if self._boundary is None:
             raise self._unreadable("Missing boundary in multipart.")
         if self._body.count(b"\r\n--" + self._boundary) > 2 * _MOST_FIELDS:

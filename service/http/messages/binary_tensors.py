@@ -26,11 +26,7 @@ _FLOAT = np.dtype("<f4")
 
 
 def read_request(body: bytes, header: str | None) -> tuple[InferenceRequest, bytes]:
-    """Return the request in a body, and the bytes after its JSON.
-
-    Args:
-        body: JSON, followed by the bytes of the input if the JSON does not hold it.
-        header: value of HEADER; None stands for the length of the body.
+    """Return the request in a body, whose JSON is as long as HEADER says, and the bytes of the input after it.
 
     Raises:
         ProblemError: the lengths contradict each other.
@@ -80,13 +76,7 @@ def _invalid(detail: str) -> ProblemError:
 def write_answer(
     request: InferenceRequest, model: ShapeModel, outputs: Mapping[str, NDArray[np.float32]]
 ) -> tuple[Iterator[Buffer], Mapping[str, int]]:
-    """Return the body of an answer in pieces, and HEADER with the length of its JSON part if bytes follow.
-
-    Args:
-        request: says which outputs are bytes.
-        model: computed the outputs.
-        outputs: arrays (n, …) by name.
-    """
+    """Return the body of an answer in pieces, and HEADER with the length of its JSON part if bytes follow."""
     text = _json(request, model, outputs)
     tail = [array.astype(_FLOAT, copy=False).data for name, array in outputs.items() if request.binary(name)]
     if not tail:

@@ -1,4 +1,4 @@
-"""Query parameters of the calls that answer one mesh file."""
+"""Query parameters of the calls that answer meshes: codes, colours, polygons, placements, formats."""
 
 from __future__ import annotations
 
@@ -6,31 +6,171 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Annotated
 
-from fastapi import Depends, Request
+import numpy as np
+from fastapi import Depends, Query, Request
+from pydantic import Field, TypeAdapter, model_validator
 
+from shapespace.files.colouring import Quantity
 from shapespace.mesh.attributes import Topology
 from shapespace.mesh.rigid_motion import Placement
 from shapespace.model.decoder import MeshChoice, Quality
 from shapespace.model.latent_space import Bounds, CheckedCode
 from shapespace.model.shape_model import ShapeModel
+from shapespace.model.vertex_uncertainty import require_covariance
 from shapespace.service.http.dependencies import Format, one_of
-from shapespace.service.http.messages.color_query import NO_COLOR, ColorQuery, ColourParameters, choose_mesh
-from shapespace.service.http.messages.place_query import PlaceQuery
-from shapespace.service.http.messages.topology_query import TopologyQuery, choose_topology
-from shapespace.service.use_cases.one_shape import ShapeRequest
-from shapespace.service.use_cases.shape_formats import SHAPE_FORMATS
+from shapespace.service.http.messages.json_query import read_query
+from shapespace.service.http.negotiation import choose
+from shapespace.service.http.problems import ProblemError
+from shapespace.service.use_cases.fields import Body, Number
+from shapespace.service.use_cases.one_shape import ColourOptions, ShapeRequest
+from shapespace.service.use_cases.shape_formats import SHAPE_FORMATS, UNAVAILABLE, writable
+
+_NUMBER = r"[-+]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][-+]?[0-9]+)?"
+#: Pattern of comma-separated numbers in a query, for the description of the interface.
+NUMBERS = f"^{_NUMBER}(,{_NUMBER})*$"
+#: Tolerance of the products of a rotation's rows, which should be 0 or 1.
+_ROUNDING = 1e-3
+_EXAMPLE = '{"rotation": [[0, -1, 0], [1, 0, 0], [0, 0, 1]], "translation": [0, 0, 2], "scale": 1}'
+_Three = Annotated[list[Number], Field(min_length=3, max_length=3, fail_fast=True)]
+#: Reasons why formats can't hold a coloured mesh.
+_UNCOLOURED = {
+    name: f"{name.upper()} files can't carry colours" for name, format in SHAPE_FORMATS.items() if not format.coloured
+}
+
+
+def numbers(text: str, name: str) -> list[float]:
+    """Read a code from a query; raises ProblemError, invalid-request."""
+    try:
+        if "_" in text or not text.isascii():  # Python accepts more spellings of numbers than other languages
+            raise ValueError
+        return [float(part) for part in text.split(",")] if text else []
+    except ValueError:
+        raise ProblemError(
+            "invalid-request", f"{name} is not a list of numbers. Send them separated by commas: ?{name}=0.1,0.2"
+        ) from None
+
+
+@dataclass(frozen=True)
+class ColourParameters:
+    """Values of ``?color=`` and ``?against=``."""
+
+    quantity: Quantity | None
+    against: list[float] | None
+
+    def on(
+        self, model: ShapeModel, bounds: Bounds = Bounds.ALLOW, covariance: Sequence[Sequence[float]] | None = None
+    ) -> ColourOptions | None:
+        """Return the colouring, with the other code checked like the first; raises LatentError or ProblemError."""
+        if self.quantity is Quantity.SPREAD:
+            if covariance is None:
+                raise ProblemError(
+                    "invalid-request", "color=spread shows how sure a code is. POST it with its covariance in the body."
+                )
+            return ColourOptions(self.quantity, None, require_covariance(model.decoder, covariance))
+        if covariance is not None:
+            raise ProblemError("invalid-request", "covariance is what color=spread shows. Add ?color=spread.")
+        if self.quantity is None:
+            return None
+        return ColourOptions(self.quantity, None if self.against is None else model.latents.code(self.against, bounds))
+
+
+async def _color(
+    color: Annotated[
+        Quantity | None,
+        Query(
+            description="Colour the vertices by how their edges differ from the other shape's: `stretch` is the "
+            "logarithm of the lengths' ratio, `bending` the change of the dihedral angles in radians. Or by `spread`, "
+            "the standard deviation of each vertex by the `covariance` in the body of a POST. Every format but STL "
+            "carries colours; NPZ and JSON carry the values."
+        ),
+    ] = None,
+    against: Annotated[
+        str | None,
+        Query(
+            description="With `color`: code of the other shape, coordinates separated by commas; without it the "
+            "reference.",
+            openapi_examples={"a code": {"value": "0,0,0,0"}},
+            json_schema_extra={"pattern": NUMBERS},
+        ),
+    ] = None,
+) -> ColourParameters:
+    if against is not None and color in (None, Quantity.SPREAD):
+        raise ProblemError("invalid-request", "against says what colours compare with. Add color=stretch or bending.")
+    return ColourParameters(color, None if against is None else numbers(against, "against"))
+
+
+ColorQuery = Annotated[ColourParameters, Depends(_color)]
+NO_COLOR = ColourParameters(None, None)
+
+TopologyQuery = Annotated[
+    Topology | None,
+    Query(
+        description="`original`, the default where a format can: faces are the polygons of the files that the model is "
+        "of; OBJ (also in a zip), PLY and USD can. `triangles`: these cut at their first corner."
+    ),
+]
+
+
+def choose_topology(
+    asked: Topology | None, format: str, model: ShapeModel, mesh: MeshChoice, *, polygons: bool
+) -> Topology:
+    """Return the topology of an answer; raises ProblemError for polygons that are not available."""
+    if asked is Topology.ORIGINAL:
+        if not polygons:
+            raise ProblemError(
+                "invalid-request",
+                f"{format.upper()} answers have triangles only. For topology=original ask for obj, zip, ply or usd.",
+            )
+        if model.decoder.fine and not model.decoder.finer(mesh):
+            raise ProblemError(
+                "invalid-request", "The coarse mesh has triangles only. For topology=original ask for mesh=fine."
+            )
+    return asked or Topology.ORIGINAL
+
+
+class _PlacementRequest(Body):
+    """Placement in the form that ``edit`` and ``fit`` answer."""
+
+    rotation: Annotated[list[_Three], Field(min_length=3, max_length=3, fail_fast=True)] = Field(
+        [[1, 0, 0], [0, 1, 0], [0, 0, 1]]
+    )
+    translation: _Three = Field([0, 0, 0])
+    scale: Number = Field(1, gt=0)
+
+    @model_validator(mode="after")
+    def _turns(self) -> _PlacementRequest:
+        matrix = np.array(self.rotation)
+        largest = np.abs(matrix).max()
+        if not (largest < 2 and np.abs(matrix @ matrix.T - np.eye(3)).max() < _ROUNDING and np.linalg.det(matrix) > 0):
+            raise ValueError("rotation is none: its rows must be orthogonal, of length 1, and without a reflection")
+        return self
+
+
+_ADAPTER = TypeAdapter(_PlacementRequest)
+
+
+async def _place(
+    place: Annotated[
+        str | None,
+        Query(
+            description="Answer the mesh elsewhere: a placement as JSON, as `edit` and `fit` answer it: it takes x to "
+            "`scale` · `rotation` · x + `translation`. Members left out change nothing.",
+            openapi_examples={"a quarter turn": {"value": _EXAMPLE}},
+        ),
+    ] = None,
+) -> Placement | None:
+    if place is None:
+        return None
+    given = read_query(place, "place", _ADAPTER)
+    return Placement(np.array(given.rotation, float), np.array(given.translation, float), given.scale)
+
+
+PlaceQuery = Annotated[Placement | None, Depends(_place)]
 
 
 @dataclass(frozen=True)
 class MeshOptions:
-    """How a call answers a mesh.
-
-    Attributes:
-        format: name of the format, by ``?format=`` or ``Accept``.
-        color: what colours the mesh.
-        topology: polygons or triangles; None leaves the choice to the format.
-        place: rigid motion and scale of the answered mesh.
-    """
+    """How a call answers a mesh; ``topology`` None leaves the choice to the format."""
 
     format: str
     color: ColourParameters
@@ -46,15 +186,9 @@ class MeshOptions:
         bounds: Bounds = Bounds.ALLOW,
         covariance: Sequence[Sequence[float]] | None = None,
     ) -> ShapeRequest:
-        """Return the request for the shape of a code; raises ProblemError or LatentError.
+        """Return the request for the shape of a code, None for the reference; raises ProblemError or LatentError.
 
-        Args:
-            model: decodes the code.
-            code: checked latent code; None is the reference.
-            mesh: fine or coarse.
-            quality: draft or full.
-            bounds: what to do with a code outside the bounds that the colours compare with.
-            covariance: (m, m), of codes around this one, for ``color=spread``.
+        ``bounds`` are for the code that colours compare with, and ``covariance`` (m, m) is for ``color=spread``.
         """
         colour_by = self.color.on(model, bounds, covariance)
         polygons = SHAPE_FORMATS[self.format].polygons
@@ -68,7 +202,9 @@ async def _frame(
     topology: TopologyQuery = None,
     format: Annotated[Format, one_of(SHAPE_FORMATS)] = None,
 ) -> MeshOptions:
-    return MeshOptions(choose_mesh(format, request, color), color, topology)
+    formats = {name: f.media_type for name, f in SHAPE_FORMATS.items() if f.coloured or color.quantity is None}
+    chosen = choose(writable(formats), format, request.headers.get("accept"), _UNCOLOURED | UNAVAILABLE)
+    return MeshOptions(chosen, color, topology)
 
 
 #: Options of a frame, which has its place by the animation.

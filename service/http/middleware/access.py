@@ -9,7 +9,6 @@ import re
 import time
 from collections import OrderedDict
 from collections.abc import Collection
-from dataclasses import dataclass
 
 from pydantic import SecretStr
 from starlette.datastructures import Headers
@@ -21,17 +20,17 @@ from shapespace.service.http.problems import problem
 #: Paths that need no key: health checks of orchestrators, and pages that say nothing about the models.
 OPEN = re.compile(r"/|/page/.*|/openapi\.json|/v2/health/(live|ready)")
 HEALTH = frozenset({"/v2/health/live", "/v2/health/ready"})
+#: After a wrong key: seconds between two checks for its address, so that no key is found by trying; longest time that a
+#: request waits for its check, others get 503 unchecked; and number of addresses that are remembered.
+KEY_INTERVAL, KEY_WAIT, KEY_ADDRESSES = 0.1, 1.0, 10_000
 
 
 class RequireHost(HTTPMiddleware):
     """Refuses requests without exactly one ``Host``, and requests for another host.
 
     This prevents DNS rebinding: an attacker lets the name of his web site resolve to the visitor's machine, so that
-    his page may call a server there. The name in ``Host`` is still the attacker's.
-
-    Args:
-        app: the next application.
-        hosts: accepted names, without ports and in lower case; none accepts all.
+    his page may call a server there. The name in ``Host`` is still the attacker's. ``hosts`` are the accepted names,
+    without ports and in lower case; none accepts all.
     """
 
     def __init__(self, app: ASGIApp, hosts: Collection[str]) -> None:
@@ -56,32 +55,10 @@ class RequireHost(HTTPMiddleware):
         return None
 
 
-@dataclass(frozen=True)
-class KeyRate:
-    """Limits on the rate at which keys are checked after a wrong one, so that no key is found by trying.
-
-    Attributes:
-        interval: seconds between two checks for one address.
-        wait: longest time in seconds that a request waits for its check; others get 503 unchecked.
-        addresses: number of addresses that are remembered.
-    """
-
-    interval: float = 0.1
-    wait: float = 1.0
-    addresses: int = 10_000
-
-
-KEY_RATE = KeyRate()
-
-
 class RequireKey(HTTPMiddleware):
     """Refuses requests without the key, in ``Authorization: Bearer`` or ``X-API-Key``.
 
-    After a wrong key, the next keys from its address have to wait as KEY_RATE says, right or wrong.
-
-    Args:
-        app: the next application.
-        key: the expected key.
+    After a wrong key, the next keys from its address have to wait, right or wrong.
     """
 
     def __init__(self, app: ASGIApp, key: SecretStr) -> None:
@@ -98,7 +75,7 @@ class RequireKey(HTTPMiddleware):
         if given := _given_key(Headers(scope=scope)):
             client = client_of(scope)
             wait = self._next.get(client, 0.0) - time.monotonic()
-            if wait > KEY_RATE.wait:
+            if wait > KEY_WAIT:
                 detail = "Too many wrong keys came from this address. Try again after the time in Retry-After."
                 await problem(scope, "busy", detail)(scope, receive, send)
                 return
@@ -115,8 +92,8 @@ class RequireKey(HTTPMiddleware):
         await problem(scope, "unauthorized", detail)(scope, receive, send)
 
     def _postpone(self, client: str) -> None:
-        self._next[client] = max(time.monotonic(), self._next.pop(client, 0.0)) + KEY_RATE.interval
-        if len(self._next) > KEY_RATE.addresses:
+        self._next[client] = max(time.monotonic(), self._next.pop(client, 0.0)) + KEY_INTERVAL
+        if len(self._next) > KEY_ADDRESSES:
             self._next.popitem(last=False)
 
 

@@ -8,11 +8,7 @@ from shapespace.service.limits.quota import client_name
 
 
 class HTTPMiddleware:
-    """Middleware for HTTP requests, as plain ASGI, which leaves contexts and streams untouched.
-
-    Args:
-        app: the next application.
-    """
+    """Middleware for HTTP requests, as plain ASGI, which leaves contexts and streams untouched."""
 
     def __init__(self, app: ASGIApp) -> None:
         self.app = app

@@ -18,12 +18,8 @@ PIECE_BYTES = 2**18
 class LimitBody(HTTPMiddleware):
     """Refuses request bodies over a limit, announced or not, and compressed bodies.
 
-    All bodies in memory have a limit together as well. Starlette's own limit for a single body answers in plain text.
-
-    Args:
-        app: the next application.
-        limit: largest body in bytes.
-        upload: largest mesh file in bytes, for ``…/encode`` and ``…/fit``.
+    All bodies in memory have a limit together as well; mesh files, for ``…/encode`` and ``…/fit``, have their own,
+    ``upload``. Starlette's own limit for a single body answers in plain text.
     """
 
     def __init__(self, app: ASGIApp, limit: int, upload: int) -> None:

@@ -13,7 +13,7 @@ from starlette.types import Message, Receive, Scope, Send
 from shapespace.service import logs
 from shapespace.service.http.middleware.access import HEALTH
 from shapespace.service.http.middleware.base import HTTPMiddleware
-from shapespace.service.http.problems import internal_error
+from shapespace.service.http.problems import problem
 
 #: Named in docs/how-to/operate.md, so that operators can filter by it.
 logger = logging.getLogger("shapespace.service.http.middleware")
@@ -25,20 +25,11 @@ LONGEST_PATH = 1000
 QUIET = HEALTH | {"/metrics"}
 
 
-class HeadAsGet(HTTPMiddleware):
-    """Answers ``HEAD`` as ``GET``; uvicorn leaves out the body."""
-
-    async def handle(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Pass a request on, HEAD as GET."""
-        if scope["method"] == "HEAD":
-            scope = {**scope, "method": "GET", "original_method": "HEAD"}
-        await self.app(scope, receive, send)
-
-
 class Observe(HTTPMiddleware):
     """Gives each request an id, counts and times it, and logs one line about it.
 
-    An unexpected exception is answered as an internal error. Every answer tells browsers not to guess its type.
+    ``HEAD`` is answered as ``GET``; uvicorn leaves out the body. An unexpected exception is answered as an internal
+    error. Every answer tells browsers not to guess its type.
     """
 
     async def handle(self, scope: Scope, receive: Receive, send: Send) -> None:
@@ -46,7 +37,8 @@ class Observe(HTTPMiddleware):
         given = Headers(scope=scope).get("x-request-id", "")
         id = given if REQUEST_ID.fullmatch(given) else uuid4().hex
         context = logs.request_id.set(id)
-        service, method = scope["app"].state.service, scope.get("original_method", scope["method"])
+        service, method = scope["app"].state.service, scope["method"]
+        scope = {**scope, "method": "GET"} if method == "HEAD" else scope
         status = 499  # the status of nginx for a client that closed the connection
         answered = False
         began = time.perf_counter()
@@ -69,10 +61,13 @@ class Observe(HTTPMiddleware):
             logger.exception("a mistake of the server")
             if answered:
                 raise  # breaks the connection, the only way left to tell the client
-            await internal_error(scope)(scope, receive, observed)
+            detail = "The server made a mistake, which its log describes. Try again, and report it if it happens again."
+            await problem(scope, "internal-error", detail)(scope, receive, observed)  # only the log has the traceback
         finally:
             seconds = time.perf_counter() - began
-            route = _template(scope)
+            # With its parameters unfilled, and one word for all paths without a route.
+            unmatched = f"{scope['root_path']}/*" if scope.get("root_path") else "unmatched"
+            route = scope["route"].path if "route" in scope else unmatched
             service.metrics.answered(route, method, status, seconds)
             # As received, percent-encoded, so that a path cannot break a line.
             path = scope.get("raw_path", b"")[:LONGEST_PATH].decode("ascii", "replace")
@@ -81,11 +76,3 @@ class Observe(HTTPMiddleware):
             level = logging.DEBUG if route in QUIET else logging.INFO
             logger.log(level, "%s %s %d in %.3f s", method, path, status, seconds, extra=facts)
             logs.request_id.reset(context)
-
-
-def _template(scope: Scope) -> str:
-    """Return the route's path with its parameters unfilled; one word for all paths without a route."""
-    if "route" in scope:
-        template: str = scope["route"].path
-        return template
-    return f"{scope['root_path']}/*" if scope.get("root_path") else "unmatched"

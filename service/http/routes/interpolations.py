@@ -24,10 +24,15 @@ from shapespace.service.http.dependencies import (
 from shapespace.service.http.description import binary, mesh_answers, problems
 from shapespace.service.http.error_handlers import DOMAIN_ERRORS, domain_problem
 from shapespace.service.http.messages.bodies import JSONBody
-from shapespace.service.http.messages.color_query import NO_COLOR, ColorQuery, ColourParameters
-from shapespace.service.http.messages.mesh_query import FrameQuery
+from shapespace.service.http.messages.mesh_query import (
+    NO_COLOR,
+    ColorQuery,
+    ColourParameters,
+    FrameQuery,
+    TopologyQuery,
+    choose_topology,
+)
 from shapespace.service.http.messages.schemas import InterpolationAnswer
-from shapespace.service.http.messages.topology_query import TopologyQuery, choose_topology
 from shapespace.service.http.negotiation import choose
 from shapespace.service.http.problems import ProblemError
 from shapespace.service.http.responses import encoded_response, file_headers, shape_response, tag_options
@@ -39,11 +44,7 @@ from shapespace.service.use_cases.sequence import (
     sequence_file,
     sequence_lines,
 )
-from shapespace.service.use_cases.sequence_formats import (
-    JSON_LINES,
-    MEDIA_TYPES,
-    SEQUENCE_FORMATS,
-)
+from shapespace.service.use_cases.sequence_formats import JSON_LINES, MEDIA_TYPES, SEQUENCE_FORMATS
 from shapespace.service.use_cases.shape_formats import UNAVAILABLE, writable
 
 router = APIRouter(prefix="/v1", tags=["interpolations"])
@@ -59,11 +60,7 @@ MOST_FPS = 240
 Id = Annotated[str, Path(description="Id of an interpolation.")]
 
 
-@router.post(
-    "/models/{name}/interpolations",
-    status_code=201,
-    responses=problems(400, 404, 413, 415, 422),
-)
+@router.post("/models/{name}/interpolations", status_code=201, responses=problems(400, 404, 413, 415, 422))
 async def create_interpolation(
     service: ServiceDependency,
     model: Model,
@@ -94,8 +91,7 @@ async def get_interpolation(
     color: ColorQuery = NO_COLOR,
     topology: TopologyQuery = None,
     fps: Annotated[
-        float | None,
-        Query(ge=1, le=MOST_FPS, description="Frames per second of GLB, USD and USDZ; by default 30."),
+        float | None, Query(ge=1, le=MOST_FPS, description="Frames per second of GLB, USD and USDZ; by default 30.")
     ] = None,
     format: Annotated[Format, one_of([*MEDIA_TYPES, "obj"])] = None,
 ) -> Response:

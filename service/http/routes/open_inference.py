@@ -45,10 +45,7 @@ _INFER: dict[str, Any] = {
     }
     | problems(400, 404, 413, 415, 422, 503, 504),
     "openapi_extra": {
-        "requestBody": {
-            "required": True,
-            "content": {"application/json": {"schema": _REQUEST}, **_BYTES},
-        },
+        "requestBody": {"required": True, "content": {"application/json": {"schema": _REQUEST}, **_BYTES}},
         "parameters": [
             {
                 "name": HEADER,

@@ -1,4 +1,4 @@
-"""Calls for operators: metrics, and the description of every call."""
+"""Calls for operators: health, as the Open Inference Protocol has it, metrics, and the description of every call."""
 
 from __future__ import annotations
 
@@ -6,12 +6,33 @@ from fastapi import APIRouter, Request, Response
 from prometheus_client import CONTENT_TYPE_PLAIN_0_0_4, generate_latest
 
 from shapespace.service.http.dependencies import ServiceDependency
+from shapespace.service.http.description import problems
+from shapespace.service.http.messages.schemas import Health, Readiness
+from shapespace.service.http.problems import ProblemError
 
-router = APIRouter(tags=["operation"])
+router = APIRouter()
+
+
+@router.get("/v2/health/live", tags=["health"])
+async def live() -> Health:
+    """Whether the process answers."""
+    return Health(live=True)
+
+
+@router.get("/v2/health/ready", tags=["health"], responses=problems(503))
+async def ready(service: ServiceDependency) -> Readiness:
+    """Whether the server has a model and is not shutting down."""
+    if service.draining:
+        raise ProblemError("not-ready", "The server is about to end. Send requests to another one.", ready=False)
+    if len(service.repository) == 0:
+        detail = "No model is served. Put a bundle into the models folder; the log says more."
+        raise ProblemError("not-ready", detail, ready=False)
+    return Readiness(ready=True)
 
 
 @router.get(
     "/metrics",
+    tags=["operation"],
     response_class=Response,
     responses={
         200: {"description": "Prometheus's text format.", "content": {"text/plain": {"schema": {"type": "string"}}}}

@@ -8,6 +8,7 @@ from fastapi import APIRouter, Depends, Query, Request, Response
 
 from shapespace.model.decoder import MeshChoice, Quality
 from shapespace.model.latent_space import Bounds
+from shapespace.service.http.caching import CachedAnswer, entity_tag
 from shapespace.service.http.dependencies import (
     CallerDependency,
     Format,
@@ -20,9 +21,7 @@ from shapespace.service.http.dependencies import (
 )
 from shapespace.service.http.description import binary, mesh_answers, problems
 from shapespace.service.http.messages.bodies import JSONBody
-from shapespace.service.http.messages.latent_query import NUMBERS, numbers
-from shapespace.service.http.messages.mesh_query import SingleMeshQuery
-from shapespace.service.http.messages.place_query import PlaceQuery
+from shapespace.service.http.messages.mesh_query import NUMBERS, PlaceQuery, SingleMeshQuery, numbers
 from shapespace.service.http.messages.schemas import (
     MeshRequest,
     NRICAnswer,
@@ -31,13 +30,14 @@ from shapespace.service.http.messages.schemas import (
     VerticesRequest,
 )
 from shapespace.service.http.negotiation import choose
-from shapespace.service.http.responses import encoded_response, file_headers, shape_response
-from shapespace.service.use_cases.batch import require_count
-from shapespace.service.use_cases.many_shapes import VERTICES_TYPES, vertices_file
-from shapespace.service.use_cases.nric import nric_file
+from shapespace.service.http.responses import cached_response, encoded_response, file_headers, shape_response
+from shapespace.service.use_cases.batch import Timings, require_count
+from shapespace.service.use_cases.many_shapes import VERTICES_TYPES, blend_shapes_file, nric_file, vertices_file
+from shapespace.service.use_cases.shape_formats import SHAPE_FORMATS
 
 router = APIRouter(prefix="/v1/models/{name}", tags=["shapes"])
 
+_GLB = {"glb": SHAPE_FORMATS["glb"].media_type}
 _MESH_RESPONSES = mesh_answers("The mesh, with its diagnostics in `Shape-Diagnostics`.")
 
 
@@ -66,9 +66,7 @@ async def get_mesh(
 
 
 @router.post(
-    "/mesh",
-    responses=_MESH_RESPONSES | problems(400, 404, 406, 413, 415, 422, 503, 504),
-    response_class=Response,
+    "/mesh", responses=_MESH_RESPONSES | problems(400, 404, 406, 413, 415, 422, 503, 504), response_class=Response
 )
 async def post_mesh(
     service: ServiceDependency,
@@ -140,3 +138,29 @@ async def post_nric(
     require_count(len(body.latents), service.settings.max_codes)
     written = await nric_file(service.workers, caller, model, body.latents, body.bounds, factors=body.factors)
     return encoded_response(service, written, {}, "application/json")
+
+
+@router.get(
+    "/blendshapes",
+    responses=binary(_GLB, "A GLB with morph targets.") | problems(404, 422, 503, 504),
+    response_class=Response,
+)
+async def get_blend_shapes(
+    service: ServiceDependency,
+    request: Request,
+    caller: CallerDependency,
+    model: Model,
+    mesh: Annotated[MeshChoice, Query(description="The mesh, if the model has a fine one.")] = MeshChoice.FINE,
+) -> Response:
+    """The shape of code 0 with a morph target for each bound of each coordinate: sliders without this server.
+
+    `asset.extras.error` of the file is the distance of the linear blend from the model's shapes.
+    """
+
+    async def compute() -> tuple[CachedAnswer, Timings]:
+        content, seconds = await blend_shapes_file(service.workers, caller, model, mesh)
+        name = f"{model.manifest.name}-blendshapes.glb"
+        return CachedAnswer(content, {"Content-Disposition": f'inline; filename="{name}"'}), seconds
+
+    tag = entity_tag("blend shapes", model.digest, mesh)
+    return await cached_response(service, request, tag, _GLB["glb"], compute)

@@ -16,7 +16,7 @@ from shapespace.model.shape_model import ShapeModel, load
 from shapespace.service.limits.workers import Caller, Workers
 from shapespace.service.use_cases import many_shapes
 from shapespace.service.use_cases.batch import TooManyCodesError
-from shapespace.service.use_cases.blend_shapes import blend_shapes_file
+from shapespace.service.use_cases.many_shapes import blend_shapes_file
 from tests.service.conftest import ROOT, Server
 from tests.service.glb import GLB, khronos_report
 

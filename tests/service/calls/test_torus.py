@@ -63,15 +63,3 @@ def test_the_reference_is_the_generators(client: httpx.Client) -> None:
     assert [(f["start"], f["stop"]) for f in card["factors"]] == [(0, 1), (1, 2), (2, 4)]
     assert card["period"] == [freaky_torus.PERIOD] * 4
     assert card["figures"]["r2"]["composite"]["total"] >= 0.99
-
-
-def test_its_frames_are_those_of_its_animated_glb(client: httpx.Client, tmp_path: Path) -> None:
-    body = {"keyframes": [[6, 0, 0, 0], [1, 2, 3, 4]], "frames": 4}
-    created = client.post(f"{MODEL}/interpolations", json=body).raise_for_status().json()
-    content = client.get(created["links"]["glb"]).raise_for_status().content
-    animated = GLB(content)
-    for k in range(4):
-        frame = client.get(f"/v1/interpolations/{created['id']}/frames/{k}", params={"format": "json"})
-        np.testing.assert_allclose(animated.key(k), frame.json()["vertices"], atol=1e-7)
-    (tmp_path / "torus.glb").write_bytes(content)
-    assert khronos_report(tmp_path / "torus.glb")["issues"]["numErrors"] == 0

@@ -1,9 +1,7 @@
 """Large answers: sent as fast as they are read, with a limit on the memory that they take."""
 
 import asyncio
-import io
 import json
-import zipfile
 from pathlib import Path
 
 import httpx
@@ -12,8 +10,6 @@ import pytest
 from starlette.responses import Response
 from starlette.types import Message, Receive, Scope, Send
 
-from shapespace.files.archives import zip_pieces
-from shapespace.files.npz import npz_pieces
 from shapespace.service.http.middleware import memory
 from shapespace.service.http.middleware.memory import PIECE_BYTES, LimitUnreadAnswers
 from tests.service.conftest import Start
@@ -74,19 +70,7 @@ def test_answers_that_nobody_reads_are_limited_together(monkeypatch: pytest.Monk
     assert asyncio.run(ask())[-1] == 200
 
 
-def test_archives_in_pieces_are_archives() -> None:
-    arrays = {"a": np.arange(24.0).reshape(2, 3, 4), "name": np.array("x"), "none": np.zeros((0, 3)), "f": np.eye(3).T}
-    with np.load(io.BytesIO(b"".join(npz_pieces(**arrays)))) as found:
-        assert found.files == list(arrays)
-        for name, array in arrays.items():
-            np.testing.assert_array_equal(found[name], array)
-    pieces = [b"".join(zip_pieces([("a.obj", [b"v 1 2 3\n"] * 1000), ("b.obj", [b""])])) for _ in range(2)]
-    assert pieces[0] == pieces[1]
-    with zipfile.ZipFile(io.BytesIO(pieces[0])) as archive:
-        assert archive.testzip() is None
-        assert archive.read("a.obj") == b"v 1 2 3\n" * 1000
-
-
+@pytest.mark.long
 def test_answers_in_pieces_are_the_same_as_whole_ones(models: Path, start: Start) -> None:
     """More than four MiB of shapes are sent in pieces, less as a whole."""
     with httpx.Client(base_url=start(models, workers=2).url, timeout=120) as client:
@@ -114,8 +98,7 @@ def test_answers_in_pieces_are_the_same_as_whole_ones(models: Path, start: Start
         rows = np.float32(tensor["data"]).reshape(tensor["shape"])
         np.testing.assert_array_equal(rows[:3], np.float32(np.hstack([few["lengths"], few["angles"]])))
         binary = client.post(
-            "/v2/models/figure/infer",
-            json=asked | {"outputs": [{"name": "nric", "parameters": {"binary_data": True}}]},
+            "/v2/models/figure/infer", json=asked | {"outputs": [{"name": "nric", "parameters": {"binary_data": True}}]}
         )
         length = int(binary.headers["Inference-Header-Content-Length"])
         assert json.loads(binary.content[:length])["outputs"][0]["parameters"]["binary_data_size"] == rows.nbytes

@@ -17,6 +17,7 @@ import httpx
 import pytest
 
 from tests.service.conftest import ROOT, Server, Start
+from tests.service.watching import eventually
 
 MESH = "/v1/models/small/mesh"
 
@@ -90,7 +91,7 @@ def test_a_connection_opened_before_the_end_is_answered_after_it(small_models: P
         # Once this is answered, the earlier connection has been accepted too.
         assert httpx.get(f"{server.url}/v2/health/live").status_code == 200
         server.process.send_signal(signal.SIGTERM)
-        time.sleep(0.5)
+        eventually(lambda: "no longer ready" in server.log)
         connection.sendall(b"GET /v1/models/small HTTP/1.1\r\nHost: localhost\r\n\r\n")
         with connection.makefile("rb") as answer:
             assert b"200" in answer.readline()
@@ -98,25 +99,26 @@ def test_a_connection_opened_before_the_end_is_answered_after_it(small_models: P
     assert server.process.wait(60) == 0
 
 
-def test_it_ends_with_its_terminal(small_models: Path) -> None:
+def test_it_ends_with_its_terminal(small_models: Path, tmp_path: Path) -> None:
     terminal, shell = pty.openpty()
-    process = subprocess.Popen(
-        [sys.executable, "-m", "shapespace.service"],
-        cwd=ROOT,
-        env=os.environ | {"SHAPESPACE_MODELS_DIR": str(small_models), "SHAPESPACE_PORT": "0"},
-        stdin=shell,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.DEVNULL,
-        start_new_session=True,
-        preexec_fn=lambda: fcntl.ioctl(0, termios.TIOCSCTTY, 0),  # noqa: PLW1509 - what a login does
-    )
+    log = tmp_path / "log"
+    with log.open("w") as lines:
+        process = subprocess.Popen(
+            [sys.executable, "-m", "shapespace.service"],
+            cwd=ROOT,
+            env=os.environ | {"SHAPESPACE_MODELS_DIR": str(small_models), "SHAPESPACE_PORT": "0"},
+            stdin=shell,
+            stdout=subprocess.PIPE,
+            stderr=lines,
+            start_new_session=True,
+            preexec_fn=lambda: fcntl.ioctl(0, termios.TIOCSCTTY, 0),  # noqa: PLW1509 - what a login does
+        )
     os.close(shell)
     with process:
         assert process.stdout
         assert b"http://" in process.stdout.readline()
         os.kill(process.pid, signal.SIGHUP)  # while the terminal exists, SIGHUP means reload
-        time.sleep(0.5)
-        assert process.poll() is None
+        eventually(lambda: "reloaded:" in log.read_text())
         os.close(terminal)
         assert process.wait(60) == 0
 

@@ -33,8 +33,7 @@ from shapespace.service.use_cases.batch import (
     TooManyCodesError,
     require_count,
 )
-from shapespace.service.use_cases.many_shapes import infer, vertices_file
-from shapespace.service.use_cases.nric import nric_file
+from shapespace.service.use_cases.many_shapes import infer, nric_file, vertices_file
 from shapespace.service.use_cases.one_shape import ColourOptions, ShapeRequest, shape_file
 from shapespace.service.use_cases.sequence import (
     TooManyFramesError,
