@@ -250,14 +250,14 @@ class Accessor:
             ValueError: it has another type, or more elements than there are data.
         """
         accessor = entry_at(document.accessors, index)
+        if "bufferView" not in accessor and "sparse" not in accessor:
+            raise MeshError(f"its accessor {index} has no data")
         if accessor["type"] != kind or accessor["componentType"] not in components:
             raise ValueError(f"its accessor {index} is of another type than it has to be")
         normalized = accessor.get("normalized", False) is True
         count, sparse = _natural(accessor["count"]), accessor.get("sparse")
         if "bufferView" in accessor:
             found = cls._in_view(document, accessor, accessor["componentType"], kind, count, f"accessor {index}")
-        elif sparse is None:
-            raise MeshError(f"its accessor {index} has no data")
         else:
             found = cls(None, 0, 0, count, np.dtype(_DTYPES[accessor["componentType"]]), _WIDTHS[kind], False)
         pair = None

@@ -42,8 +42,9 @@ def limits(model: Decoder) -> Limits:
 def match(model: Decoder, vertices: FloatArray, faces: IntArray) -> Matched:
     """Find which of the model's meshes a file holds.
 
-    Vertices must be in the model's order, faces may be in any order. JSON may leave faces out. STL shares no vertices
-    and must have the model's order of faces. Vertices that training has welded may be separate, as in its files.
+    Either the vertices are in the model's order, and the faces in any; JSON may leave faces out. Or the faces are in
+    the model's order, and vertices may be split or numbered otherwise, as in STL and after flat shading. Vertices that
+    training has welded may be separate, as in its files.
 
     Args:
         model: decoder with the meshes.
@@ -57,16 +58,25 @@ def match(model: Decoder, vertices: FloatArray, faces: IntArray) -> Matched:
     bad = np.flatnonzero(~(np.abs(vertices) < np.finfo(np.float32).max).all(axis=1))
     if len(bad):
         raise InvalidMeshError(f"Vertex {bad[0]} has a coordinate that is not a finite number. Send finite positions.")
-    soup = len(vertices) == faces.size and np.array_equal(faces.ravel(), np.arange(len(vertices)))
     faults = []
     for layout in layouts:
-        if soup and len(faces) == len(layout.faces):
-            return _of_soup(layout, vertices[faces])
         if len(vertices) == layout.count:
             fault = layout.fault(faces)
             if fault is None:
                 return Matched(vertices[layout.places], layout.mesh)
             faults.append(fault)
+    for layout in layouts:
+        if len(faces) == len(layout.faces) and faces.min() >= 0 and faces.max() < len(vertices):
+            shape, torn = _on_vertices(layout.faces, vertices[faces])
+            # The other way round too: vertices that the file shares have to coincide in the reference.
+            reference = model.mesh(layout.mesh).vertices
+            more = _on_vertices(faces, reference[layout.faces])[1]
+            if not len(torn) and not len(more):
+                return Matched(shape, layout.mesh)
+            faults.append(
+                f"Face {[*torn, *more][0]} does not meet its neighbours as in the model. Vertices may be split by flat "
+                "shading or seams of texture, or as in STL, if the faces are in the model's order."
+            )
     if faults:
         raise InvalidMeshError(f"{faults[0]} Send a mesh with the faces and the vertex order of the model's.")
     known = " or ".join(f"{layout.count} vertices and {len(layout.faces)} faces" for layout in layouts)
@@ -142,15 +152,9 @@ def _layouts(model: Decoder) -> list[_Layout]:
     return layouts
 
 
-def _of_soup(layout: _Layout, corners: FloatArray) -> Matched:
-    """Return the mesh of separate triangles (F, 3, 3) in the order of its faces."""
-    vertices = np.zeros((layout.faces.max() + 1, 3))
-    vertices[layout.faces] = corners
-    apart = np.linalg.norm(vertices[layout.faces] - corners, axis=-1).max(axis=1)
-    torn = np.flatnonzero(apart > 1e-5 * diagonal(vertices))
-    if len(torn):
-        raise InvalidMeshError(
-            f"Face {torn[0]} does not meet its neighbours as in the model. Send STL with the faces in the model's "
-            "order, or a format that keeps vertices: glb, obj, ply, npz or json."
-        )
-    return Matched(vertices, layout.mesh)
+def _on_vertices(faces: IntArray, corners: FloatArray) -> tuple[FloatArray, IntArray]:
+    """Return the vertices (V, 3) of faces (F, 3) whose corners (F, 3, 3) are given, and the faces that are torn."""
+    vertices = np.zeros((faces.max() + 1, 3))
+    vertices[faces] = corners
+    apart = np.linalg.norm(vertices[faces] - corners, axis=-1).max(axis=1)
+    return vertices, np.flatnonzero(apart > 1e-5 * diagonal(vertices))

@@ -130,7 +130,10 @@ def _read_like(
             if len(own_faces) == len(faces) and not np.array_equal(own_faces, faces):
                 # Exporters split vertices along sharp edges and seams, in each pose where they like.
                 with suppress(MeshError):
-                    return _on_shared_vertices(corners, faces, len(vertices), template.name)
+                    shape = _on_shared_vertices(corners, faces, len(vertices), template.name)
+                    # The other way round too: vertices that this file shares have to coincide in the template.
+                    _on_shared_vertices(vertices[faces], own_faces, len(own_vertices), path.name)
+                    return shape
             _refuse_cut_short(template, len(vertices), faces, len(own_vertices), own_faces)
             same_connectivity(own_vertices, own_faces, vertices, faces, template.name)
     except IngestError as error:

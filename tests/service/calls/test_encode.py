@@ -18,7 +18,7 @@ from shapespace.mesh.triangle_mesh import TriangleMesh
 from shapespace.model.correspondence import InvalidMeshError, Matched, limits, match
 from shapespace.model.decoder import MeshChoice
 from shapespace.model.shape_model import ShapeModel
-from shapespace.service.use_cases.uploads import FORMATS, read_mesh_file
+from shapespace.service.use_cases.uploads import FORMATS, POINT_FORMATS, read_mesh_file
 from tests.hostile import HOSTILE, MIB
 from tests.service.bundles import SCALE, fine_reference, reference, seal, write_bundle
 
@@ -101,8 +101,7 @@ def test_off_is_read_though_it_is_never_written(client: httpx.Client) -> None:
 
 def test_the_page_lets_choose_every_format(client: httpx.Client) -> None:
     (accepted,) = re.findall(r'id="mesh-file" accept="(.*?)"', client.get("/").text)
-    # XYZ is for scans, which `fit` reads.
-    assert set(accepted.split(",")) == {f".{format}" for format in FORMATS} | {".xyz"}
+    assert set(accepted.split(",")) == {f".{format}" for format in POINT_FORMATS}
 
 
 def test_what_the_query_says_wins(client: httpx.Client) -> None:
@@ -215,7 +214,7 @@ BAD = {
     "a face less": (written("ply", faces=MESH.faces[1:]), "ply", "has 127 faces, but the model's has 128"),
     "inside out": (written("obj", faces=MESH.faces[:, ::-1]), "obj", "inside out"),
     "faces out of range": (as_json(MESH.vertices, MESH.faces + 1), "json", "vertices 1 to 64"),
-    "STL in another order": (written("stl", faces=SHUFFLED), "stl", "Send STL with the faces in the model's order"),
+    "STL in another order": (written("stl", faces=SHUFFLED), "stl", "if the faces are in the model's order"),
     "a single point": (as_json(0 * MESH.vertices), "json", "no edge has a length"),
     "JSON of numbers": (b"[1, 2, 3]", "json", "not an object"),
     "JSON of text": (b'{"vertices": ["a", "b"]}', "json", "vertices must be"),
@@ -334,3 +333,17 @@ def test_the_code_is_the_minimum_over_vertices(client: httpx.Client) -> None:
     for step in [*0.02 * np.eye(len(code)), *-0.02 * np.eye(len(code))]:
         inside = ((lower <= code + step) & (code + step <= upper)).all()
         assert squares(code) < squares(code + step) * (1 if inside else 1.02**2)
+
+
+def test_vertices_may_be_split_and_numbered_otherwise(client: httpx.Client) -> None:
+    """As after flat shading, or once a program has read our STL: the faces are in the model's order."""
+    rng = np.random.default_rng(4)
+    shape = mesh_file(client).json()
+    vertices, faces = np.array(shape["vertices"]), np.array(shape["faces"])
+    corners = faces.ravel().copy()
+    alone = rng.random(len(corners)) < 0.3
+    corners[alone] = len(vertices) + np.arange(alone.sum())
+    split = np.concatenate([vertices, vertices[faces.ravel()[alone]]])
+    order = rng.permutation(len(split))
+    renumbered = as_json(split[order], np.argsort(order)[corners].reshape(-1, 3))
+    assert encode(client, renumbered) == encode(client, as_json(vertices, faces))
