@@ -24,7 +24,6 @@ from shapespace.service.http.middleware.observe import HeadAsGet, Observe
 from shapespace.service.http.routes import (
     blend_shapes,
     codes,
-    fits,
     health,
     interpolations,
     models,
@@ -100,7 +99,7 @@ def create_app(settings: Settings | None = None, validator: BundleValidator | No
         openapi_url=None,
     )
     error_handlers.install(app)
-    calls = (models, shapes, blend_shapes, codes, fits, interpolations, open_inference, health, operation, page)
+    calls = (models, shapes, blend_shapes, codes, interpolations, open_inference, health, operation, page)
     routers = [module.router for module in calls]
     for router in routers:
         app.include_router(router)

@@ -1,10 +1,10 @@
-"""Find latent codes: of mesh files, of edited vertices, and random ones."""
+"""Find latent codes: of mesh files, of edited vertices, of scans, and random ones."""
 
 from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -15,8 +15,9 @@ from shapespace.files.limits import Limits
 from shapespace.mesh.rigid_motion import Placement
 from shapespace.model.correspondence import limits, match
 from shapespace.model.edit import require_targets
+from shapespace.model.fit_result import Distances, FitStatus
 from shapespace.model.latent_space import Bounds, Codes, Distribution
-from shapespace.model.options import EditOptions, EncodeOptions, SearchOptions, Target
+from shapespace.model.options import EditOptions, EncodeOptions, FitOptions, SearchOptions, Target
 from shapespace.model.shape_model import ShapeModel
 from shapespace.service.limits.sandbox import Pieces, Sandbox
 from shapespace.service.limits.sandbox_errors import (
@@ -37,6 +38,8 @@ from shapespace.solve.outcome import Status
 logger = logging.getLogger(__name__)
 #: Memory in bytes that reading a file may take in addition to the file.
 MEMORY = 64 * 2**20
+#: Maximum numbers of vertices and faces of a scan; memory in bytes that reading may take in addition to the file.
+SCAN_LIMITS, SCAN_MEMORY = Limits(2**21, 2**21), 256 * 2**20
 #: Bytes of a reading process's answer beside the arrays.
 _ANSWER = 2**16
 
@@ -101,7 +104,8 @@ async def encode(
 
     def make(deadline: Deadline) -> Found:
         began = time.perf_counter()
-        given = match(model.decoder, *read_mesh(sandbox, upload, limits(model.decoder), deadline))
+        vertices, faces, _ = read_upload(sandbox, upload, limits(model.decoder), deadline)
+        given = match(model.decoder, vertices, faces)
         read = time.perf_counter()
         found = model.encode(given, options, deadline=deadline)
         if found.status is Status.DEADLINE:
@@ -181,6 +185,62 @@ async def edit(
         return await workers.run(make, call)
 
 
+async def fit(
+    workers: Workers,
+    sandbox: Sandbox,
+    caller: Caller,
+    model: ShapeModel,
+    upload: Upload,
+    options: Callable[[str], FitOptions],
+) -> Found:
+    """Find the code, placement and size that explain a scan; see ShapeModel.fit_scan.
+
+    Args:
+        workers: workers that compute.
+        sandbox: sandbox that reads the file.
+        caller: caller who waits.
+        model: model to fit.
+        upload: scan file.
+        options: returns the options, given the form's field ``options``, which may be empty.
+
+    Raises:
+        UploadError, InvalidScanError: the scan can't be used.
+        BusyError, DeadlineError, DisconnectedError, EndingError: the server is busy, or the call ended early.
+    """
+
+    def make(deadline: Deadline) -> Found:
+        began = time.perf_counter()
+        points, faces, said = read_upload(sandbox, upload, SCAN_LIMITS, deadline, points=True, memory=SCAN_MEMORY)
+        asked = options(said)
+        read = time.perf_counter()
+        found = model.fit_scan((points, faces), asked, deadline=deadline)
+        if found.status is FitStatus.DEADLINE:
+            raise workers.late()
+        content = {
+            "latent": found.code,
+            "covariance": found.covariance,
+            "placement": placement(found.placement),
+            "distances": {"scan": _distances(found.scan), "model": _distances(found.model)},
+            "explained": found.explained,
+            "seen": found.seen,
+            "noise": found.noise,
+            "mirrored": found.mirrored,
+            "status": found.status,
+            "reason": found.reason,
+            "sampled": found.sampled,
+            "shapes": {"solved": found.solved, "rough": found.rough},
+            "diagnostics": asdict(found.shape.diagnostics),
+        }
+        if found.used is not None:
+            content["used"] = {"positions": float32(found.used[:, :3]), "distances": float32(found.used[:, 3])}
+        if asked.samples:
+            content["samples"] = found.samples
+        return Found(dump_json(content), {"read": read - began, "search": time.perf_counter() - read})
+
+    async with workers.admit(caller) as call:
+        return await workers.run(make, call)
+
+
 def sample(
     model: ShapeModel, count: int, seed: int, distribution: Distribution, temperature: float, most: int
 ) -> Codes:
@@ -194,6 +254,11 @@ def sample(
     return model.sample(count, seed, distribution, temperature)
 
 
+def _distances(found: Distances) -> dict[str, Any]:
+    figures: dict[str, Any] = {"mean": found.mean, "p95": found.p95, "max": found.max}
+    return figures if found.points is None else figures | {"points": float32(found.points)}
+
+
 def _require_few_samples(options: SearchOptions, most: int) -> None:
     if options.samples:
         require_count(options.samples, most, "samples")
@@ -203,12 +268,6 @@ def placement(found: Placement) -> dict[str, Any]:
     """Return a placement as answers hold it."""
     rotation = np.ascontiguousarray(found.rotation)  # the JSON writer needs contiguous arrays
     return {"rotation": rotation, "translation": found.translation, "scale": found.scale}
-
-
-def read_mesh(sandbox: Sandbox, upload: Upload, limits: Limits, deadline: Deadline) -> tuple[FloatArray, IntArray]:
-    """Return vertices (V, 3) and faces (F, 3) of an uploaded file; raises as ``read_upload``."""
-    vertices, faces, _ = read_upload(sandbox, upload, limits, deadline)
-    return vertices, faces
 
 
 def read_upload(
