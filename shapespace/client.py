@@ -258,11 +258,7 @@ class Client:
         return Interpolation(self, answer["id"], answer["frames"], quality)
 
     def encode(
-        self,
-        name: str,
-        mesh: Mesh | bytes | Path,
-        format: str | None = None,
-        **options: Unpack[EncodeParameters],
+        self, name: str, mesh: Mesh | bytes | Path, format: str | None = None, **options: Unpack[EncodeParameters]
     ) -> dict[str, Any]:
         """Find the code whose shape comes closest to a mesh in correspondence, in any rigid pose.
 

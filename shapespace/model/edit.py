@@ -71,11 +71,7 @@ def require_targets(decoder: Decoder, targets: Sequence[Target], mesh: MeshChoic
 
 
 def edited(
-    decoder: Decoder,
-    start: Codes,
-    targets: Sequence[Target],
-    options: EditOptions,
-    deadline: Deadline | None = None,
+    decoder: Decoder, start: Codes, targets: Sequence[Target], options: EditOptions, deadline: Deadline | None = None
 ) -> Edited:
     """Find the code inside the bounds whose shape comes closest to the targets; other vertices stay where possible.
 

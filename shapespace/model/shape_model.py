@@ -306,12 +306,7 @@ class ShapeModel:
         return edited(self.decoder, start, listed_targets(targets, chosen.sigma), chosen, deadline)
 
     def fit_scan(
-        self,
-        scan: ScanLike,
-        options: FitOptions | None = None,
-        *,
-        deadline: Deadline | None = None,
-        **changes: Any,
+        self, scan: ScanLike, options: FitOptions | None = None, *, deadline: Deadline | None = None, **changes: Any
     ) -> Fitted:
         """Find the code of a scan: points or a mesh without correspondence, whole or in part, in any pose, with noise.
 

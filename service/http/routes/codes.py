@@ -24,6 +24,7 @@ from shapespace.service.http.messages.schemas import (
 )
 from shapespace.service.http.responses import found_response
 from shapespace.service.use_cases import codes
+from shapespace.service.use_cases.batch import require_count
 from shapespace.service.use_cases.shape_formats import dump_json
 from shapespace.service.use_cases.uploads import FORMATS, POINT_FORMATS
 
@@ -43,9 +44,7 @@ async def encode(
     model: Model,
     options: Annotated[EncodeQuery, Query()],
     format: Annotated[
-        str | None,
-        one_of(FORMATS),
-        Query(description="Format of the file, which wins over `Content-Type`."),
+        str | None, one_of(FORMATS), Query(description="Format of the file, which wins over `Content-Type`.")
     ] = None,
 ) -> Response:
     """Find the code whose shape comes closest to a mesh in correspondence, in any rigid pose.
@@ -59,11 +58,7 @@ async def encode(
     return found_response(service, found)
 
 
-@router.post(
-    "/edit",
-    responses=problems(400, 404, 413, 415, 422, 503, 504),
-    response_model=EditAnswer,
-)
+@router.post("/edit", responses=problems(400, 404, 413, 415, 422, 503, 504), response_model=EditAnswer)
 async def edit(
     service: ServiceDependency,
     caller: CallerDependency,
@@ -83,17 +78,13 @@ async def edit(
     return found_response(service, found)
 
 
-@router.post(
-    "/sample",
-    responses=problems(400, 404, 413, 415, 422),
-    response_model=SampleAnswer,
-)
+@router.post("/sample", responses=problems(400, 404, 413, 415, 422), response_model=SampleAnswer)
 async def sample(
     service: ServiceDependency, model: Model, body: Annotated[SampleRequest, Depends(JSONBody(SampleRequest))]
 ) -> Response:
     """Draw random codes, inside the bounds or from the population; one seed gives the same codes everywhere."""
-    most = service.settings.max_codes
-    latents = codes.sample(model, body.count, body.seed, body.distribution, body.temperature, most)
+    require_count(body.count, service.settings.max_codes, "count")
+    latents = model.sample(body.count, body.seed, body.distribution, body.temperature)
     return Response(dump_json({"latents": latents}), media_type="application/json")
 
 
@@ -117,9 +108,7 @@ async def fit(
     model: Model,
     options: Annotated[FitQuery, Query()],
     format: Annotated[
-        str | None,
-        one_of(POINT_FORMATS),
-        Query(description="Format of the file, which wins over `Content-Type`."),
+        str | None, one_of(POINT_FORMATS), Query(description="Format of the file, which wins over `Content-Type`.")
     ] = None,
 ) -> Response:
     """Find the code, the placement and the size that explain a scan without correspondence, with their covariance.

@@ -244,10 +244,7 @@ def test_what_is_no_such_shape_is_told_so(request: pytest.FixtureRequest, name: 
 
 @pytest.mark.parametrize("known", ["landmarks", pytest.param("fixed", marks=pytest.mark.long)])
 def test_a_mirrored_scan_is_told_so(
-    figure: ShapeModel,
-    plain: Plain,
-    monkeypatch: pytest.MonkeyPatch,
-    known: str,
+    figure: ShapeModel, plain: Plain, monkeypatch: pytest.MonkeyPatch, known: str
 ) -> None:
     # Fixed coordinates of arms and legs distinguish left from right, in a pose that is far from its own mirror image.
     monkeypatch.setattr("shapespace.model.fit.SETTINGS", replace(SETTINGS, attempts=1))
