@@ -1,7 +1,4 @@
-"""The model that library users load, with all its operations.
-
-Most lines of its class are documentation and tested examples.
-"""
+"""The model that library users load, with all its operations; most lines are documentation and tested examples."""
 
 from __future__ import annotations
 
