@@ -14,7 +14,6 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
 from typing import Any, TypedDict, Unpack
 
 import httpx
@@ -27,31 +26,38 @@ Parameter = str | int | float | bool | None
 Placement = Mapping[str, Any]
 
 
-class EncodeParameters(TypedDict, total=False):
-    """Parameters of ``encode``, as the server describes them.
+class SearchParameters(TypedDict, total=False):
+    """Parameters of every search for a code, as the server describes them.
 
     Attributes:
         version: version of the model; by default the newest.
         fixed: values of coordinates that the code keeps, by index.
         samples: number of codes to draw from the posterior.
         seed: seed of the random numbers.
-        bounds: "allow", "clamp" or "reject".
-        objective: "vertices" or "nric".
     """
 
     version: str | None
     fixed: Mapping[int, float] | None
     samples: int
     seed: int
+
+
+class EncodeParameters(SearchParameters, total=False):
+    """Parameters of ``encode``.
+
+    Attributes:
+        bounds: "allow", "clamp" or "reject".
+        objective: "vertices" or "nric".
+    """
+
     bounds: str
     objective: str
 
 
-class EditParameters(TypedDict, total=False):
-    """Parameters of ``edit``, as the server describes them.
+class EditParameters(SearchParameters, total=False):
+    """Parameters of ``edit``.
 
     Attributes:
-        version, fixed, samples, seed: as for ``encode``.
         prior: weight of changes of the code.
         prior_kind: "groups" changes few factors, "ridge" all factors a little.
         mesh: mesh that the vertices belong to, "fine" or "coarse".
@@ -59,10 +65,6 @@ class EditParameters(TypedDict, total=False):
         anchored: whether only vertices without a target decide where the whole shape lies.
     """
 
-    version: str | None
-    fixed: Mapping[int, float] | None
-    samples: int
-    seed: int
     prior: float
     prior_kind: str
     mesh: str
@@ -70,11 +72,10 @@ class EditParameters(TypedDict, total=False):
     anchored: bool
 
 
-class FitParameters(TypedDict, total=False):
-    """Parameters of ``fit``, as the server describes them.
+class FitParameters(SearchParameters, total=False):
+    """Parameters of ``fit``.
 
     Attributes:
-        version, fixed, samples, seed: as for ``encode``.
         scale: "fixed", or "free" if the fit estimates the scan's size.
         partial: whether the scan shows only a part of the shape.
         noise: standard deviation of the scan's points.
@@ -84,10 +85,6 @@ class FitParameters(TypedDict, total=False):
         used: whether to return the points that represented the scan.
     """
 
-    version: str | None
-    fixed: Mapping[int, float] | None
-    samples: int
-    seed: int
     scale: str
     partial: bool
     noise: float | None
@@ -151,7 +148,7 @@ class Client:
     def __enter__(self) -> Client:
         return self
 
-    def __exit__(self, _: type[BaseException] | None, __: BaseException | None, ___: TracebackType | None) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def close(self) -> None:
@@ -160,8 +157,8 @@ class Client:
 
     def models(self) -> list[dict[str, Any]]:
         """Return the newest version of every model."""
-        found: list[dict[str, Any]] = self._send("GET", "/v1/models").json()["models"]
-        return found
+        models: list[dict[str, Any]] = self._send("GET", "/v1/models").json()["models"]
+        return models
 
     def model(self, name: str, version: str | None = None) -> dict[str, Any]:
         """Return a model's card."""
@@ -212,8 +209,7 @@ class Client:
             name: name of a model without angles among its coordinates.
             options: version, mesh ("fine" or "coarse").
         """
-        content: bytes = self._send("GET", f"/v1/models/{name}/blendshapes", params=options).content
-        return content
+        return self._send("GET", f"/v1/models/{name}/blendshapes", params=options).content
 
     def vertices(
         self,
@@ -233,24 +229,16 @@ class Client:
             place: placement of the shapes, see ``mesh``.
             options: mesh ("fine" or "coarse"), bounds ("allow", "clamp" or "reject"), quality ("full" or "draft").
         """
-        answer = self._send(
-            "POST",
-            f"/v1/models/{name}/vertices",
-            params={"version": version, "format": "npz", "place": _json(place)},
-            json={"latents": _numbers(latents), "faces": False, **options},
-        )
+        params = {"version": version, "format": "npz", "place": _json(place)}
+        body = {"latents": _numbers(latents), "faces": False, **options}
+        answer = self._send("POST", f"/v1/models/{name}/vertices", params=params, json=body)
         return _arrays(answer.content)["vertices"].astype(np.float32)
 
     def nric(
         self, name: str, latents: ArrayLike, *, version: str | None = None, **options: Parameter
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return edge lengths and dihedral angles, (n, E) each, of codes (n, m); options: bounds."""
-        answer = self._send(
-            "POST",
-            f"/v1/models/{name}/nric",
-            params={"version": version},
-            json={"latents": _numbers(latents), **options},
-        ).json()
+        answer = self._post(name, "nric", {"version": version}, json={"latents": _numbers(latents), **options})
         return np.array(answer["lengths"]), np.array(answer["angles"])
 
     def interpolate(
@@ -265,20 +253,12 @@ class Client:
             quality: quality of the frames, "full" or "draft".
             options: frames, times, start, stop, loop, mesh.
         """
-        answer = self._send(
-            "POST",
-            f"/v1/models/{name}/interpolations",
-            params={"version": version},
-            json={"keyframes": _numbers(keyframes), **options},
-        ).json()
+        body = {"keyframes": _numbers(keyframes), **options}
+        answer = self._post(name, "interpolations", {"version": version}, json=body)
         return Interpolation(self, answer["id"], answer["frames"], quality)
 
     def encode(
-        self,
-        name: str,
-        mesh: Mesh | bytes | Path,
-        format: str | None = None,
-        **options: Unpack[EncodeParameters],
+        self, name: str, mesh: Mesh | bytes | Path, format: str | None = None, **options: Unpack[EncodeParameters]
     ) -> dict[str, Any]:
         """Find the code whose shape comes closest to a mesh in correspondence, in any rigid pose.
 
@@ -294,10 +274,7 @@ class Client:
         content, format = _file(mesh, format)
         headers = {"Content-Type": "application/octet-stream"}
         params: dict[str, Any] = {"format": format, **options, "fixed": _json(_by_index(options.get("fixed")))}
-        found: dict[str, Any] = self._send(
-            "POST", f"/v1/models/{name}/encode", params=params, content=content, headers=headers
-        ).json()
-        return found
+        return self._post(name, "encode", params, content=content, headers=headers)
 
     def fit(
         self,
@@ -320,21 +297,13 @@ class Client:
         if isinstance(scan, bytes | Path | Mesh):
             content, format = _file(scan, format)
         else:
-            buffer = io.BytesIO()
-            np.savez(buffer, vertices=np.asarray(scan, dtype=np.float64))
-            content, format = buffer.getvalue(), "npz"
+            content, format = _npz(vertices=np.asarray(scan, dtype=np.float64)), "npz"
         sent: dict[str, Any] = {**options}
         version = sent.pop("version", None)
         if "fixed" in sent:
             sent["fixed"] = _by_index(sent["fixed"]) or {}
-        found: dict[str, Any] = self._send(
-            "POST",
-            f"/v1/models/{name}/fit",
-            params={"version": version, "format": format},
-            files={"file": ("scan", content)},
-            data={"options": _json(sent)},
-        ).json()
-        return found
+        params, form = {"version": version, "format": format}, {"options": _json(sent)}
+        return self._post(name, "fit", params, files={"file": ("scan", content)}, data=form)
 
     def edit(
         self,
@@ -361,13 +330,8 @@ class Client:
             given = target if isinstance(target, Mapping) else {"position": _numbers(target)}
             places.append({"vertex": int(vertex)} | ({} if sigma is None else {"sigma": sigma}) | dict(given))
         held = {} if fixed is None else {"fixed": _by_index(fixed)}
-        found: dict[str, Any] = self._send(
-            "POST",
-            f"/v1/models/{name}/edit",
-            params={"version": version},
-            json={"latent": _numbers(latent), "targets": places, **held, **sent},
-        ).json()
-        return found
+        body = {"latent": _numbers(latent), "targets": places, **held, **sent}
+        return self._post(name, "edit", {"version": version}, json=body)
 
     def sample(self, name: str, count: int, *, version: str | None = None, **options: Parameter) -> NDArray[np.float64]:
         """Return random codes (count, m).
@@ -379,12 +343,16 @@ class Client:
             options: seed; distribution, "uniform" or "gaussian" inside the bounds, or "population", the Gaussian of the
                 training codes; temperature, the factor of the population's differences from its mean.
         """
-        answer = self._send(
-            "POST", f"/v1/models/{name}/sample", params={"version": version}, json={"count": count, **options}
-        ).json()
+        answer = self._post(name, "sample", {"version": version}, json={"count": count, **options})
         return np.array(answer["latents"])
 
-    def _send(self, method: str, path: str, *, params: Mapping[str, Parameter] | None = None, **sent: Any) -> Any:
+    def _post(self, name: str, call: str, params: Mapping[str, Parameter], **sent: Any) -> dict[str, Any]:
+        answer: dict[str, Any] = self._send("POST", f"/v1/models/{name}/{call}", params=params, **sent).json()
+        return answer
+
+    def _send(
+        self, method: str, path: str, *, params: Mapping[str, Parameter] | None = None, **sent: Any
+    ) -> httpx.Response:
         given = {key: value for key, value in (params or {}).items() if value is not None}
         for attempt in range(self._retries + 1):
             answer = self._http.request(method, path, params=given, **sent)
@@ -439,8 +407,7 @@ class Interpolation:
 
     def _get(self, path: str, format: str, **more: Parameter) -> bytes:
         params = {"format": format, "quality": self.quality, **more}
-        content: bytes = self.client._send("GET", f"/v1/interpolations/{self.id}{path}", params=params).content
-        return content
+        return self.client._send("GET", f"/v1/interpolations/{self.id}{path}", params=params).content
 
 
 def _by_index(fixed: Mapping[int, float] | None) -> dict[str, float] | None:
@@ -456,9 +423,7 @@ def _json(value: Mapping[Any, Any] | None) -> str | None:
 def _file(mesh: Mesh | bytes | Path, format: str | None) -> tuple[bytes, str | None]:
     """Return the content of a mesh file, and its format if that is known."""
     if isinstance(mesh, Mesh):
-        buffer = io.BytesIO()
-        np.savez(buffer, vertices=mesh.vertices, faces=mesh.faces)
-        return buffer.getvalue(), "npz"
+        return _npz(vertices=mesh.vertices, faces=mesh.faces), "npz"
     if isinstance(mesh, Path):
         return mesh.read_bytes(), format or mesh.suffix.lstrip(".")
     return mesh, format
@@ -467,6 +432,12 @@ def _file(mesh: Mesh | bytes | Path, format: str | None) -> tuple[bytes, str | N
 def _numbers(values: ArrayLike) -> Any:
     """Return nested lists, as JSON takes them."""
     return np.asarray(values, dtype=np.float64).tolist()
+
+
+def _npz(**arrays: Any) -> bytes:
+    buffer = io.BytesIO()
+    np.savez(buffer, **arrays)
+    return buffer.getvalue()
 
 
 def _arrays(content: bytes) -> dict[str, NDArray]:

@@ -21,7 +21,7 @@ from shapespace.service.http.description import describe
 from shapespace.service.http.middleware.access import RequireHost, RequireKey
 from shapespace.service.http.middleware.memory import LimitBody, LimitUnreadAnswers
 from shapespace.service.http.middleware.observe import Observe
-from shapespace.service.http.routes import codes, fits, interpolations, models, open_inference, operation, page, shapes
+from shapespace.service.http.routes import codes, interpolations, models, open_inference, operation, page, shapes
 from shapespace.service.limits.quota import UPLOADS
 from shapespace.service.limits.sandbox import Sandbox
 from shapespace.service.limits.workers import Workers
@@ -87,7 +87,7 @@ def create_app(settings: Settings | None = None, validator: BundleValidator | No
         openapi_url=None,
     )
     error_handlers.install(app)
-    calls = (models, shapes, codes, fits, interpolations, open_inference, operation, page)
+    calls = (models, shapes, codes, interpolations, open_inference, operation, page)
     routers = [module.router for module in calls]
     for router in routers:
         app.include_router(router)

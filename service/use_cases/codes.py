@@ -1,10 +1,10 @@
-"""Find latent codes: of mesh files, of edited vertices, and random ones."""
+"""Find latent codes: of mesh files, of edited vertices, of scans, and random ones."""
 
 from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -15,8 +15,9 @@ from shapespace.files.limits import Limits
 from shapespace.mesh.rigid_motion import Placement
 from shapespace.model.correspondence import limits, match
 from shapespace.model.edit import require_targets
-from shapespace.model.latent_space import Bounds, Codes, Distribution
-from shapespace.model.options import EditOptions, EncodeOptions, SearchOptions, Target
+from shapespace.model.fit_result import Distances, FitStatus
+from shapespace.model.latent_space import Bounds
+from shapespace.model.options import EditOptions, EncodeOptions, FitOptions, SearchOptions, Target
 from shapespace.model.shape_model import ShapeModel
 from shapespace.service.limits.sandbox import Pieces, Sandbox
 from shapespace.service.limits.sandbox_errors import (
@@ -37,8 +38,14 @@ from shapespace.solve.outcome import Status
 logger = logging.getLogger(__name__)
 #: Memory in bytes that reading a file may take in addition to the file.
 MEMORY = 64 * 2**20
+#: Maximum numbers of vertices and faces of a scan; memory in bytes that reading may take in addition to the file.
+SCAN_LIMITS, SCAN_MEMORY = Limits(2**21, 2**21), 256 * 2**20
 #: Bytes of a reading process's answer beside the arrays.
 _ANSWER = 2**16
+
+
+#: Members of an answer, and the time by stage.
+Answered = tuple[dict[str, Any], Timings]
 
 
 @dataclass(frozen=True)
@@ -78,16 +85,7 @@ async def encode(
     options: EncodeOptions,
     most: int,
 ) -> Found:
-    """Find the code whose shape comes closest to a mesh in correspondence; see ShapeModel.encode.
-
-    Args:
-        workers: workers that compute.
-        sandbox: sandbox that reads the file.
-        caller: caller who waits.
-        model: model of the code.
-        upload: mesh file.
-        options: options of the search.
-        most: maximum number of samples.
+    """Find the code of an uploaded mesh in correspondence, with at most ``most`` samples; see ShapeModel.encode.
 
     Raises:
         UploadError, InvalidMeshError: the mesh can't be used.
@@ -99,13 +97,12 @@ async def encode(
     _require_few_samples(options, most)
     model.latents.fixed(options.fixed)  # refused before the file is read
 
-    def make(deadline: Deadline) -> Found:
+    def make(deadline: Deadline) -> Answered:
         began = time.perf_counter()
-        given = match(model.decoder, *read_mesh(sandbox, upload, limits(model.decoder), deadline))
+        vertices, faces, _ = read_upload(sandbox, upload, limits(model.decoder), deadline)
+        given = match(model.decoder, vertices, faces)
         read = time.perf_counter()
         found = model.encode(given, options, deadline=deadline)
-        if found.status is Status.DEADLINE:
-            raise workers.late()
         seconds = {"read": read - began, "search": time.perf_counter() - read}
         content = {
             "latent": found.code,
@@ -120,10 +117,9 @@ async def encode(
             "covariance": found.covariance,
             "samples": found.samples,
         }
-        return Found(dump_json(content), seconds)
+        return content, seconds
 
-    async with workers.admit(caller) as call:
-        return await workers.run(make, call)
+    return await _searched(workers, caller, make)
 
 
 async def edit(
@@ -135,16 +131,9 @@ async def edit(
     options: EditOptions,
     most: int,
 ) -> Found:
-    """Find the code whose shape comes closest to having some vertices at given positions; see ShapeModel.edit.
+    """Find the code from ``latent`` on that brings vertices to targets, with at most ``most`` samples.
 
-    Args:
-        workers: workers that compute.
-        caller: caller who waits.
-        model: model of the code.
-        latent: (m,) code to start from, clamped to the bounds.
-        targets: vertices and their positions.
-        options: options of the edit.
-        most: maximum number of samples.
+    See ShapeModel.edit.
 
     Raises:
         InvalidTargetError: no such vertex, or too many targets.
@@ -158,11 +147,9 @@ async def edit(
     model.latents.code(latent, Bounds.CLAMP)
     model.latents.fixed(options.fixed)
 
-    def make(deadline: Deadline) -> Found:
+    def make(deadline: Deadline) -> Answered:
         began = time.perf_counter()
         found = model.edit(latent, targets, options, deadline=deadline)
-        if found.status is Status.DEADLINE:
-            raise workers.late()
         seconds = {"search": time.perf_counter() - began}
         content = {
             "latent": found.code,
@@ -175,23 +162,72 @@ async def edit(
             "covariance": found.covariance,
             "samples": found.samples,
         }
+        return content, seconds
+
+    return await _searched(workers, caller, make)
+
+
+async def fit(
+    workers: Workers,
+    sandbox: Sandbox,
+    caller: Caller,
+    model: ShapeModel,
+    upload: Upload,
+    options: Callable[[str], FitOptions],
+) -> Found:
+    """Find the code, placement and size that explain an uploaded scan; see ShapeModel.fit_scan.
+
+    ``options`` returns the options, given the form's field ``options``, which may be empty.
+
+    Raises:
+        UploadError, InvalidScanError: the scan can't be used.
+        BusyError, DeadlineError, DisconnectedError, EndingError: the server is busy, or the call ended early.
+    """
+
+    def make(deadline: Deadline) -> Answered:
+        began = time.perf_counter()
+        points, faces, said = read_upload(sandbox, upload, SCAN_LIMITS, deadline, points=True, memory=SCAN_MEMORY)
+        asked = options(said)
+        read = time.perf_counter()
+        found = model.fit_scan((points, faces), asked, deadline=deadline)
+        content = {
+            "latent": found.code,
+            "covariance": found.covariance,
+            "placement": placement(found.placement),
+            "distances": {"scan": _distances(found.scan), "model": _distances(found.model)},
+            "explained": found.explained,
+            "seen": found.seen,
+            "noise": found.noise,
+            "mirrored": found.mirrored,
+            "status": found.status,
+            "reason": found.reason,
+            "sampled": found.sampled,
+            "shapes": {"solved": found.solved, "rough": found.rough},
+            "diagnostics": asdict(found.shape.diagnostics),
+        }
+        if found.used is not None:
+            content["used"] = {"positions": float32(found.used[:, :3]), "distances": float32(found.used[:, 3])}
+        if asked.samples:
+            content["samples"] = found.samples
+        return content, {"read": read - began, "search": time.perf_counter() - read}
+
+    return await _searched(workers, caller, make)
+
+
+async def _searched(workers: Workers, caller: Caller, make: Callable[[Deadline], Answered]) -> Found:
+    def search(deadline: Deadline) -> Found:
+        content, seconds = make(deadline)
+        if content["status"] in (Status.DEADLINE, FitStatus.DEADLINE):
+            raise workers.late()
         return Found(dump_json(content), seconds)
 
     async with workers.admit(caller) as call:
-        return await workers.run(make, call)
+        return await workers.run(search, call)
 
 
-def sample(
-    model: ShapeModel, count: int, seed: int, distribution: Distribution, temperature: float, most: int
-) -> Codes:
-    """Return random codes (count, m); see ShapeModel.sample.
-
-    Raises:
-        NoCodesError, TooManyCodesError: ``count`` is not between 1 and ``most``.
-        LatentError: a temperature at which numbers overflow.
-    """
-    require_count(count, most, "count")
-    return model.sample(count, seed, distribution, temperature)
+def _distances(found: Distances) -> dict[str, Any]:
+    figures: dict[str, Any] = {"mean": found.mean, "p95": found.p95, "max": found.max}
+    return figures if found.points is None else figures | {"points": float32(found.points)}
 
 
 def _require_few_samples(options: SearchOptions, most: int) -> None:
@@ -205,20 +241,8 @@ def placement(found: Placement) -> dict[str, Any]:
     return {"rotation": rotation, "translation": found.translation, "scale": found.scale}
 
 
-def read_mesh(sandbox: Sandbox, upload: Upload, limits: Limits, deadline: Deadline) -> tuple[FloatArray, IntArray]:
-    """Return vertices (V, 3) and faces (F, 3) of an uploaded file; raises as ``read_upload``."""
-    vertices, faces, _ = read_upload(sandbox, upload, limits, deadline)
-    return vertices, faces
-
-
 def read_upload(
-    sandbox: Sandbox,
-    upload: Upload,
-    limits: Limits,
-    deadline: Deadline,
-    *,
-    points: bool = False,
-    memory: int = MEMORY,
+    sandbox: Sandbox, upload: Upload, limits: Limits, deadline: Deadline, *, points: bool = False, memory: int = MEMORY
 ) -> tuple[FloatArray, IntArray, str]:
     """Read vertices (V, 3), faces (F, 3) and the form's ``options`` of an uploaded file in a process of its own.
 

@@ -265,10 +265,9 @@ async def predictions(
 
     def predict(item: tuple[int, Codes], _: Call) -> None:
         k, code = item
-        z = model.decoder.lengths_and_angles(code)
-        found[k] = np.concatenate([z.lengths, z.angles])
+        found[k], of_factors = model.decoder.lengths_and_angles(code)
         if parts is not None:
-            parts[k] = z.factors
+            parts[k] = of_factors
 
     await work.map(predict, enumerate(codes))
     return found, parts

@@ -110,20 +110,6 @@ class Shape:
     seconds: dict[str, float] = field(compare=False)
 
 
-@dataclass(frozen=True)
-class LengthsAndAngles:
-    """NRIC in the units of the training meshes.
-
-    Attributes:
-        lengths, angles: (E,) edge lengths and dihedral angles in radians.
-        factors: (J, 2E) lengths and angles of each factor.
-    """
-
-    lengths: FloatArray
-    angles: FloatArray
-    factors: FloatArray
-
-
 class Decoder:
     """Networks and Gauss–Newton solvers of a bundle; any number of threads may use it.
 
@@ -146,6 +132,10 @@ class Decoder:
         self.reference, self.fine = bundle.reference, bundle.fine
         self.modes, self.file_vertices = bundle.modes, bundle.file_vertices
         self._surface = bundle.surface
+        self._overflow = (
+            "The code lies so far outside the bounds that the model's numbers overflow. Choose one "
+            f'nearer to the bounds, which the card of {manifest.name} lists, or send "bounds": "clamp".'
+        )
         codes = self.training_codes = bundle.training_codes
         self._training = None if codes is None else TrainingCodes(self.latents, codes)
         #: Distribution of codes: of the training codes, or of uniform codes if there are no training codes.
@@ -253,8 +243,11 @@ class Decoder:
             away.append(np.linalg.norm(draft - full, axis=1) / size)
         return {"mean": float(np.mean(away)), "p95": float(np.percentile(away, 95))}
 
-    def lengths_and_angles(self, code: Codes) -> LengthsAndAngles:
-        """Return the networks' prediction for a code (m,) in the user's units; raises NotFiniteError."""
+    def lengths_and_angles(self, code: Codes) -> tuple[FloatArray, FloatArray]:
+        """Return edge lengths and dihedral angles in radians (2E,) that the networks predict for a code (m,).
+
+        Also return those of each factor (J, 2E). Lengths are in the user's units. Raises NotFiniteError.
+        """
         factors, z = (array[0].astype(np.float64) for array in self._networks(code[None]))
         half = self.manifest.edges
         for array in (factors, z):
@@ -262,7 +255,7 @@ class Decoder:
             with np.errstate(over="ignore"):
                 if not np.isfinite(array.astype(np.float32)).all():
                     raise NotFiniteError(self._overflow)
-        return LengthsAndAngles(z[:half], z[half:], factors)
+        return z, factors
 
     def nric(self, code: FloatArray) -> FloatArray:
         """Return the predicted NRIC (2E,) of a code (m,), normalised; not finite where the networks overflow."""
@@ -289,7 +282,9 @@ class Decoder:
         for network in (*self._factors, self._combiner, *([self._start] if self._start else [])):
             network.check()
         try:
-            middle, *others = self._middle_and_ends()
+            lower, upper = self.latents.lower, self.latents.upper
+            ends = [x.tolist() for x in (lower + (upper - lower) / 2, lower, upper)]
+            middle, *others = self.latents.codes(ends, Bounds.CLAMP)[0]
             for code in (*others, *self.latents.sample(TESTED_CODES, 0, Distribution.UNIFORM)):
                 self._networks(code[None])
             for start in self._learned_start(middle):
@@ -299,10 +294,6 @@ class Decoder:
             raise BundleError(f"{error.__cause__}, at a code inside its bounds") from None
         except NotFiniteError:
             raise BundleError("the shape in the middle of its bounds is not finite") from None
-
-    def _middle_and_ends(self) -> Codes:
-        lower, upper = self.latents.lower, self.latents.upper
-        return self.latents.codes([x.tolist() for x in (lower + (upper - lower) / 2, lower, upper)], Bounds.CLAMP)[0]
 
     def finish(self, shape: FloatArray, mesh: MeshChoice) -> FloatArray:
         """Bring a shape (V, 3) in any pose to the mesh of choice, aligned, in the user's units."""
@@ -370,10 +361,3 @@ class Decoder:
             make = self._solvers_left > 0
             self._solvers_left -= make
         return self._first_solver.another() if make else self._solvers.get()
-
-    @property
-    def _overflow(self) -> str:
-        return (
-            "The code lies so far outside the bounds that the model's numbers overflow. Choose one "
-            f'nearer to the bounds, which the card of {self.manifest.name} lists, or send "bounds": "clamp".'
-        )

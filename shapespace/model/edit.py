@@ -10,7 +10,7 @@ import numpy as np
 from shapespace.arrays import FloatArray
 from shapespace.mesh.rigid_motion import Placement
 from shapespace.model.decoder import Decoder, MeshChoice, Shape
-from shapespace.model.edit_search import SETTINGS, EditGoal, EditSearch
+from shapespace.model.edit_search import SETTINGS, EditSearch
 from shapespace.model.latent_space import Bounds, Codes, NotFiniteError
 from shapespace.model.options import EditOptions, Target
 from shapespace.model.posterior import Posterior
@@ -71,11 +71,7 @@ def require_targets(decoder: Decoder, targets: Sequence[Target], mesh: MeshChoic
 
 
 def edited(
-    decoder: Decoder,
-    start: Codes,
-    targets: Sequence[Target],
-    options: EditOptions,
-    deadline: Deadline | None = None,
+    decoder: Decoder, start: Codes, targets: Sequence[Target], options: EditOptions, deadline: Deadline | None = None
 ) -> Edited:
     """Find the code inside the bounds whose shape comes closest to the targets; other vertices stay where possible.
 
@@ -114,7 +110,6 @@ def edited(
         raise NotFiniteError("A target lies so far away that the numbers overflow. Send finite positions.")
     sigmas = np.array([SETTINGS.sigma * size if target.sigma is None else target.sigma / scale for target in targets])
     sigmas = np.maximum(sigmas, SETTINGS.least_sigma * size) / size
-    goal = EditGoal(positions, sigmas, options.prior, options.prior_kind, options.anchored)
     fixed = decoder.latents.fixed(options.fixed)
     begin = fixed.into(start.astype(np.float64))
     # Decoded before the edit borrows a solver, because decoding needs a solver too.
@@ -126,7 +121,7 @@ def edited(
             for rough in (True, False)
         )
         here = pulled.placed(before.vertices / scale)
-        search = EditSearch(decoder, rough, pulled, begin, here, goal, fixed, deadline)
+        search = EditSearch(decoder, rough, pulled, begin, here, positions, sigmas, options, fixed, deadline)
         try:
             best = search.best()
             code, inside = decoder.latents.found(best.x, Bounds.CLAMP, fixed)
@@ -139,7 +134,7 @@ def edited(
     points = pulled.placed(found.vertices / scale)
     placement = search.placement(points, best.bound)
     distances = scale * np.linalg.norm(placement(points)[: len(targets)] - positions, axis=1)
-    slopes = changes / (size * goal.sigmas[:, None])
+    slopes = changes / (size * sigmas[:, None])
     slopes = slopes.reshape(len(slopes), -1)
     posterior = Posterior.of(slopes @ slopes.T, decoder.population, fixed.mask)
     ended = (before.diagnostics.status, found.diagnostics.status)

@@ -12,7 +12,7 @@ from shapespace.mesh.rigid_motion import Placement, weighted_change
 from shapespace.model.decoder import Decoder
 from shapespace.model.derivatives import batches, nodes
 from shapespace.model.latent_space import Fixed
-from shapespace.model.options import PriorKind
+from shapespace.model.options import EditOptions, PriorKind
 from shapespace.model.pulled_vertices import PulledVertices
 from shapespace.solve.deadline import Deadline
 from shapespace.solve.least_squares import Box, Fit, Stopping, least_squares, shrinkable
@@ -62,25 +62,6 @@ SETTINGS = EditSettings()
 
 
 @dataclass(frozen=True, eq=False)
-class EditGoal:
-    """Targets of an edit, and what its prior and its placement depend on.
-
-    Attributes:
-        positions: (k, 3) normalised positions of the targets.
-        sigmas: (k,) standard deviations of the targets, as fractions of the diagonal.
-        prior: weight of the change of the code.
-        kind: cost of a change.
-        anchored: whether only vertices without a target determine the placement.
-    """
-
-    positions: FloatArray
-    sigmas: FloatArray
-    prior: float
-    kind: PriorKind
-    anchored: bool
-
-
-@dataclass(frozen=True, eq=False)
 class QuadraticBound:
     """Weights of a quadratic upper bound of the objective that is tight at one code.
 
@@ -124,7 +105,9 @@ class EditSearch:
         rough, pulled: positions of rough shapes and of solved shapes.
         start: (m,) start, with fixed values inserted.
         here: (k + V, 3) positions of the start's shape.
-        goal: targets and prior.
+        positions, sigmas: normalised positions (k, 3) of the targets, and their standard deviations (k,) as fractions
+            of the diagonal.
+        options: options of the edit.
         fixed: coordinates that keep their value.
         deadline: time limit of the descents.
     """
@@ -136,15 +119,18 @@ class EditSearch:
         pulled: PulledVertices,
         start: FloatArray,
         here: FloatArray,
-        goal: EditGoal,
+        positions: FloatArray,
+        sigmas: FloatArray,
+        options: EditOptions,
         fixed: Fixed,
         deadline: Deadline | None,
     ) -> None:
         self.rough, self.pulled, self.start = rough, pulled, start
-        self._decoder, self._goal, self._fixed, self._deadline = decoder, goal, fixed, deadline
-        self._count, self._size = len(goal.positions), decoder.reference.diagonal
+        self._decoder, self._options, self._fixed, self._deadline = decoder, options, fixed, deadline
+        self._count, self._size = len(positions), decoder.reference.diagonal
         self._box = Box(*decoder.latents.box_around(fixed), decoder.latents.width)
-        self._goals = np.concatenate([goal.positions, here[self._count :]])
+        self._pull = (SETTINGS.sigma / sigmas) ** 2 / self._count
+        self._goals = np.concatenate([positions, here[self._count :]])
         # Rough shapes differ a little from solved ones. Their goals are shifted so that the movements are the same.
         self._rough_goals = self._goals + (rough.positions(start) - here)
         self._factor_of = np.zeros(len(start), np.int64)
@@ -173,7 +159,7 @@ class EditSearch:
 
     def _aligned(self, bound: QuadraticBound) -> FloatArray:
         """Return the weights (k + V,) by which a shape is placed."""
-        if not self._goal.anchored:
+        if not self._options.anchored:
             return bound.points
         return np.concatenate([np.zeros(self._count), bound.points[self._count :]])
 
@@ -241,25 +227,25 @@ class EditSearch:
         """Evaluate the objective at a code."""
         away = self._misfits(pulled.positions(x), pulled, bound)[1] / self._size
         square = (away**2).sum(axis=1)
-        pull = (SETTINGS.sigma / self._goal.sigmas) ** 2 / self._count
-        misfit = float(pull @ square[: self._count])
+        misfit = float(self._pull @ square[: self._count])
         small = SETTINGS.small
         stayed = SETTINGS.still * float((2 * small * (np.sqrt(square[self._count :] + small**2) - small)).mean())
         change = self._change(x) / self._decoder.latents.width
-        moved = float(change @ change if self._goal.kind is PriorKind.RIDGE else self._norms(change).sum() ** 2)
-        cost = misfit + stayed + self._goal.prior * moved / len(x)
+        moved = float(
+            change @ change if self._options.prior_kind is PriorKind.RIDGE else self._norms(change).sum() ** 2
+        )
+        cost = misfit + stayed + self._options.prior * moved / len(x)
         return EditCandidate(x, cost, float(np.sqrt(misfit)), status, bound)
 
     def _bound(self, x: FloatArray, pulled: PulledVertices, before: QuadraticBound | None = None) -> QuadraticBound:
         """Build the quadratic upper bound of the objective that is tight at a code."""
-        pull = (SETTINGS.sigma / self._goal.sigmas) ** 2 / self._count
         still = np.full(len(self._goals) - self._count, SETTINGS.still / (len(self._goals) - self._count))
-        prior = self._goal.prior / len(x) / self._decoder.latents.width**2
-        points = np.concatenate([pull, still]) / self._size**2
+        prior = self._options.prior / len(x) / self._decoder.latents.width**2
+        points = np.concatenate([self._pull, still]) / self._size**2
         first = QuadraticBound(points, prior)
         away = self._misfits(pulled.positions(x), pulled, before or first)[1][self._count :] / self._size
         points[self._count :] /= np.sqrt((away**2).sum(axis=1) / SETTINGS.small**2 + 1)
-        if self._goal.kind is PriorKind.GROUPS:
+        if self._options.prior_kind is PriorKind.GROUPS:
             norms = np.sqrt(self._norms(self._change(x) / self._decoder.latents.width) ** 2 + SETTINGS.unmoved**2)
             prior = prior * (norms.sum() / norms)[self._factor_of]
         return QuadraticBound(points, prior)

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from shapespace.arrays import FloatArray
 from shapespace.model.decoder import Decoder, MeshChoice
 from shapespace.model.latent_space import Codes
 from shapespace.shell.energy import Material
@@ -37,13 +38,14 @@ class ExactShape:
     max: float | None
 
 
-def require_tangent_space(model: Decoder) -> None:
-    """Raise NoTangentSpaceError if the model has no tangent space."""
+def require_tangent_space(model: Decoder) -> tuple[FloatArray, int]:
+    """Return the modes (m, V, 3) and K of a model; raises NoTangentSpaceError if it has no tangent space."""
     if model.modes is None or model.manifest.exponential_steps is None:
         raise NoTangentSpaceError(
             f"The codes of {model.manifest.name} are no tangent vectors: it is a product by design, without exact "
             'exponentials. Leave out "exact".'
         )
+    return model.modes, model.manifest.exponential_steps
 
 
 def exact_shape(
@@ -58,19 +60,15 @@ def exact_shape(
         mesh: fine or coarse mesh.
         deadline: time limit after which the status is Status.DEADLINE.
     """
-    require_tangent_space(model)
-    assert model.modes is not None  # noqa: S101 - required above
-    assert model.manifest.exponential_steps is not None  # noqa: S101 - as above
-    velocity = np.tensordot(code.astype(np.float64), model.modes, axes=1)
+    modes, steps = require_tangent_space(model)
+    velocity = np.tensordot(code.astype(np.float64), modes, axes=1)
     try:
         space = model.spaces.get_nowait()
     except queue.Empty:
         manifest = model.manifest
         space = ShellSpace(model.reference, Material(manifest.mu, manifest.lambda_, manifest.eta))
     try:
-        path = exponential(
-            space, model.reference.vertices, velocity, model.manifest.exponential_steps, deadline=deadline
-        )
+        path = exponential(space, model.reference.vertices, velocity, steps, deadline=deadline)
     finally:
         model.spaces.put(space)
     if not path.converged:

@@ -248,10 +248,6 @@ class FitSearch:
         scores: FloatArray = self._whiten @ self._decoder.latents.shorter(code - self.constraints.prior.mean)
         return scores
 
-    def _prior(self) -> FloatArray:
-        """Return the derivative (m, f) of the scores by the movable coordinates."""
-        return self._whiten[:, self.constraints.movable]
-
     def _derivatives(self, state: FitState) -> FloatArray:
         """Return derivatives (V, 3, f) of vertices by movable coordinates; cached while the code changes little."""
         if self._fields is not None and np.abs(self._whiten @ (state.code - self._fields[0])).max() <= SETTINGS.kept:
@@ -321,7 +317,7 @@ class FitSearch:
         g = normal.T @ (above * pairs.heights) + flat.T @ (beside[:, None] * pairs.gaps).ravel()
         for own, part in zip((H, g), self._landmarks(state, fields), strict=True):
             own += part
-        prior, count = self._prior(), fields.shape[-1]
+        prior, count = self._whiten[:, self.constraints.movable], fields.shape[-1]
         H[:count, :count] += prior.T @ prior
         g[:count] -= prior.T @ self._away(state.code)
         if not (np.isfinite(H).all() and np.isfinite(g).all()):  # networks overflow far outside the bounds

@@ -119,7 +119,11 @@ class LatentSpace:
                 )
         with np.errstate(over="ignore"):
             x = np.array(values, dtype=np.float64).reshape(-1, self.dimension).astype(np.float32)
-        self._require_finite(x)
+        bad = np.argwhere(~np.isfinite(x))
+        if len(bad):
+            raise NotFiniteError(
+                f"Coordinate {bad[0, 1]} of code {bad[0, 0]} is not a finite number. Send finite numbers."
+            )
         if self.periodic.any():
             x = self._remainder(x.astype(np.float64)).astype(np.float32)
         if bounds is Bounds.CLAMP:
@@ -204,14 +208,6 @@ class LatentSpace:
             shares = 0.5 + ndtri(low + (high - low) * shares) / 4
         values = self.lower + shares * self.width
         return self.codes(values.tolist(), Bounds.CLAMP)[0]
-
-    def _require_finite(self, x: Codes) -> None:
-        finite = np.isfinite(x)
-        if not finite.all():
-            bad = np.argwhere(~finite)
-            raise NotFiniteError(
-                f"Coordinate {bad[0, 1]} of code {bad[0, 0]} is not a finite number. Send finite numbers."
-            )
 
     def _remainder(self, x: FloatArray) -> FloatArray:
         # Codes already in range keep their exact value.

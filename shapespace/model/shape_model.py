@@ -1,7 +1,4 @@
-"""The model that library users load, with all its operations.
-
-The module is one class. Most of its lines are documentation and tested examples.
-"""
+"""The model that library users load, with all its operations; most lines are documentation and tested examples."""
 
 from __future__ import annotations
 
@@ -18,7 +15,7 @@ from numpy.typing import ArrayLike
 
 from shapespace.arrays import FloatArray, IntArray
 from shapespace.bundle.reader import Bundle, BundleError, read_bundle
-from shapespace.bundle.schema import MANIFEST, VERSION_PATTERN, Manifest
+from shapespace.bundle.schema import MANIFEST, VERSION_PATTERN
 from shapespace.mesh.triangle_mesh import TriangleMesh
 from shapespace.model.blend_shapes import BlendShapes, blend_shapes
 from shapespace.model.correspondence import Matched
@@ -28,9 +25,8 @@ from shapespace.model.encode import Encoded, Encoder
 from shapespace.model.fit import Fitter
 from shapespace.model.fit_result import Fitted
 from shapespace.model.inputs import MeshLike, ScanLike, listed_targets, matched, points_and_faces
-from shapespace.model.latent_space import Bounds, Codes, Distribution, LatentSpace, NotFiniteError, WrongLengthError
+from shapespace.model.latent_space import Bounds, Codes, Distribution, NotFiniteError, WrongLengthError
 from shapespace.model.options import EditOptions, EncodeOptions, FitOptions, Target
-from shapespace.model.population import Population
 from shapespace.model.vertex_uncertainty import require_covariance, vertex_uncertainty
 from shapespace.solve.deadline import Deadline
 from shapespace.solve.outcome import Status
@@ -80,6 +76,14 @@ class ShapeModel:
 
     Attributes:
         decoder: networks and solver of the model.
+        manifest, digest: manifest of the bundle, and its SHA-256.
+        latents: latent coordinates with their names, bounds and periods.
+        population: Gaussian of the training codes, or of uniform codes where the model has no training codes.
+        reference: reference mesh, coarse and normalised.
+        dimension: number m of coordinates of a code.
+        names: name of each coordinate.
+        lower, upper: bounds (m,) of the coordinates: the smallest and largest values in training.
+        period: period of each coordinate; None for a coordinate that is no angle.
 
     >>> import shapespace
     >>> model = shapespace.load("models/figure")
@@ -92,7 +96,11 @@ class ShapeModel:
     """
 
     def __init__(self, bundle: Bundle, threads: int = 1) -> None:
-        self.decoder = Decoder(bundle, threads)
+        self.decoder = decoder = Decoder(bundle, threads)
+        self.manifest, self.digest, self.reference = decoder.manifest, decoder.digest, decoder.reference
+        self.latents, self.population = decoder.latents, decoder.population
+        self.dimension, self.names = self.latents.dimension, self.latents.names
+        self.lower, self.upper, self.period = self.latents.lower, self.latents.upper, self.manifest.period
 
     def __repr__(self) -> str:
         facts = self.manifest
@@ -100,56 +108,6 @@ class ShapeModel:
             f"<ShapeModel {facts.name}/{facts.version}: {self.dimension} coordinates, {len(facts.factors)} factors, "
             f"{len(self.vertices)} vertices>"
         )
-
-    @property
-    def manifest(self) -> Manifest:
-        """Manifest of the bundle."""
-        return self.decoder.manifest
-
-    @property
-    def digest(self) -> str:
-        """SHA-256 of the manifest."""
-        return self.decoder.digest
-
-    @property
-    def latents(self) -> LatentSpace:
-        """Latent coordinates with their names, bounds and periods."""
-        return self.decoder.latents
-
-    @property
-    def population(self) -> Population:
-        """Gaussian of the training codes, or of uniform codes where the model has no training codes."""
-        return self.decoder.population
-
-    @property
-    def reference(self) -> TriangleMesh:
-        """Reference mesh, coarse and normalised."""
-        return self.decoder.reference
-
-    @property
-    def dimension(self) -> int:
-        """Number m of coordinates of a code."""
-        return self.latents.dimension
-
-    @property
-    def names(self) -> list[str]:
-        """Name of each coordinate."""
-        return self.latents.names
-
-    @property
-    def lower(self) -> FloatArray:
-        """Lower bounds (m,) of the coordinates: the smallest values in training."""
-        return self.latents.lower
-
-    @property
-    def upper(self) -> FloatArray:
-        """Upper bounds (m,) of the coordinates."""
-        return self.latents.upper
-
-    @property
-    def period(self) -> list[float | None]:
-        """Period of each coordinate; None for a coordinate that is no angle."""
-        return self.manifest.period
 
     @property
     def faces(self) -> IntArray:
@@ -345,12 +303,7 @@ class ShapeModel:
         return edited(self.decoder, start, listed_targets(targets, chosen.sigma), chosen, deadline)
 
     def fit_scan(
-        self,
-        scan: ScanLike,
-        options: FitOptions | None = None,
-        *,
-        deadline: Deadline | None = None,
-        **changes: Any,
+        self, scan: ScanLike, options: FitOptions | None = None, *, deadline: Deadline | None = None, **changes: Any
     ) -> Fitted:
         """Find the code of a scan: points or a mesh without correspondence, whole or in part, in any pose, with noise.
 
@@ -383,25 +336,7 @@ class ShapeModel:
         """
         return self._fitter(*points_and_faces(scan), FitOptions.of(options, changes), deadline)
 
-    def fit(
-        self,
-        scan: ScanLike,
-        options: FitOptions | None = None,
-        *,
-        deadline: Deadline | None = None,
-        **changes: Any,
-    ) -> Fitted:
-        """Call ``fit_scan``. This old name remains for one release.
-
-        Raises:
-            MeshError, InvalidScanError, LatentError, ModelFailedError: as ``fit_scan``.
-
-        >>> import shapespace
-        >>> model = shapespace.load("models/figure")
-        >>> model.fit(model.vertices).status
-        <FitStatus.CONVERGED: 'converged'>
-        """
-        return self.fit_scan(scan, options, deadline=deadline, **changes)
+    fit = fit_scan  # The old name remains for one release.
 
     def sample(
         self, count: int, seed: int = 0, distribution: DistributionName = "uniform", temperature: float = 1.0
@@ -451,18 +386,7 @@ class ShapeModel:
         checked, _ = self.latents.code(np.asarray(code, dtype=np.float64).tolist())
         return vertex_uncertainty(self.decoder, checked, require_covariance(self.decoder, covariance), MeshChoice(mesh))
 
-    def spread(self, code: ArrayLike, covariance: ArrayLike, mesh: MeshName = "fine") -> FloatArray:
-        """Call ``vertex_uncertainty``. This old name remains for one release.
-
-        Raises:
-            LatentError, ModelFailedError: as ``vertex_uncertainty``.
-
-        >>> import numpy as np, shapespace
-        >>> model = shapespace.load("models/figure")
-        >>> model.spread(np.zeros(20), model.population.covariance).shape
-        (4601,)
-        """
-        return self.vertex_uncertainty(code, covariance, mesh)
+    spread = vertex_uncertainty  # The old name remains for one release.
 
     @cached_property
     def _encoder(self) -> Encoder:

@@ -84,8 +84,7 @@ class EditRequest(Body):
 
     latent: Latent
     targets: Annotated[
-        list[TargetRequest],
-        Field(fail_fast=True, min_length=1, examples=[[{"vertex": 0, "position": [0.3, 0.1, 0]}]]),
+        list[TargetRequest], Field(fail_fast=True, min_length=1, examples=[[{"vertex": 0, "position": [0.3, 0.1, 0]}]])
     ] = Field(description="At least one target, in the frame of the mesh that `latent` is answered with.")
 
 

@@ -1,8 +1,9 @@
-"""Calls that answer latent codes: of meshes, of edited vertices, and random ones."""
+"""Calls that answer latent codes: of meshes, of edited vertices, of scans, and random ones."""
 
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from typing import Annotated
 
 from fastapi import APIRouter, Depends, Query, Request, Response
@@ -11,6 +12,7 @@ from shapespace.model.options import EditOptions, EncodeOptions, Target
 from shapespace.service.http.dependencies import CallerDependency, MeshQuery, Model, ServiceDependency, one_of
 from shapespace.service.http.description import problems, upload
 from shapespace.service.http.messages.bodies import JSONBody, gather
+from shapespace.service.http.messages.fit import FitAnswer, FitQuery, fit_options
 from shapespace.service.http.messages.options import options_of
 from shapespace.service.http.messages.schemas import (
     EditAnswer,
@@ -22,8 +24,9 @@ from shapespace.service.http.messages.schemas import (
 )
 from shapespace.service.http.responses import found_response
 from shapespace.service.use_cases import codes
+from shapespace.service.use_cases.batch import require_count
 from shapespace.service.use_cases.shape_formats import dump_json
-from shapespace.service.use_cases.uploads import FORMATS
+from shapespace.service.use_cases.uploads import FORMATS, POINT_FORMATS
 
 router = APIRouter(prefix="/v1/models/{name}", tags=["codes"])
 
@@ -41,9 +44,7 @@ async def encode(
     model: Model,
     options: Annotated[EncodeQuery, Query()],
     format: Annotated[
-        str | None,
-        one_of(FORMATS),
-        Query(description="Format of the file, which wins over `Content-Type`."),
+        str | None, one_of(FORMATS), Query(description="Format of the file, which wins over `Content-Type`.")
     ] = None,
 ) -> Response:
     """Find the code whose shape comes closest to a mesh in correspondence, in any rigid pose.
@@ -57,11 +58,7 @@ async def encode(
     return found_response(service, found)
 
 
-@router.post(
-    "/edit",
-    responses=problems(400, 404, 413, 415, 422, 503, 504),
-    response_model=EditAnswer,
-)
+@router.post("/edit", responses=problems(400, 404, 413, 415, 422, 503, 504), response_model=EditAnswer)
 async def edit(
     service: ServiceDependency,
     caller: CallerDependency,
@@ -81,15 +78,43 @@ async def edit(
     return found_response(service, found)
 
 
-@router.post(
-    "/sample",
-    responses=problems(400, 404, 413, 415, 422),
-    response_model=SampleAnswer,
-)
+@router.post("/sample", responses=problems(400, 404, 413, 415, 422), response_model=SampleAnswer)
 async def sample(
     service: ServiceDependency, model: Model, body: Annotated[SampleRequest, Depends(JSONBody(SampleRequest))]
 ) -> Response:
     """Draw random codes, inside the bounds or from the population; one seed gives the same codes everywhere."""
-    most = service.settings.max_codes
-    latents = codes.sample(model, body.count, body.seed, body.distribution, body.temperature, most)
+    require_count(body.count, service.settings.max_codes, "count")
+    latents = model.sample(body.count, body.seed, body.distribution, body.temperature)
     return Response(dump_json({"latents": latents}), media_type="application/json")
+
+
+_FORM_OPTIONS = {
+    "type": "string",
+    "contentMediaType": "application/json",
+    "description": "The parameters of the query as one JSON object, which has priority.",
+}
+
+
+@router.post(
+    "/fit",
+    responses=problems(400, 404, 413, 415, 422, 503, 504),
+    response_model=FitAnswer,
+    openapi_extra=upload("A mesh or a point cloud.", {"options": _FORM_OPTIONS}),
+)
+async def fit(
+    service: ServiceDependency,
+    request: Request,
+    caller: CallerDependency,
+    model: Model,
+    options: Annotated[FitQuery, Query()],
+    format: Annotated[
+        str | None, one_of(POINT_FORMATS), Query(description="Format of the file, which wins over `Content-Type`.")
+    ] = None,
+) -> Response:
+    """Find the code, the placement and the size that explain a scan without correspondence, with their covariance.
+
+    The file holds a mesh of any connectivity or points without faces, in any rigid pose, whole or in part.
+    """
+    file = codes.Upload(await gather(request), request.headers.get("content-type", ""), format)
+    found = await codes.fit(service.workers, service.sandbox, caller, model, file, partial(fit_options, options))
+    return found_response(service, found)

@@ -1,6 +1,7 @@
 """``fit``: from points in any pose to the code of their shape, for every way to send a file and options."""
 
 import json
+from pathlib import Path
 
 import httpx
 import numpy as np
@@ -15,6 +16,7 @@ from tests.service.conftest import ROOT, starting
 
 FIT = "/v1/models/figure/fit"
 CODE = np.linspace(-0.4, 0.4, 20)
+TURN = Rotation.random(random_state=1).as_matrix()
 
 
 @pytest.fixture(scope="module")
@@ -25,7 +27,7 @@ def figure() -> ShapeModel:
 @pytest.fixture(scope="module")
 def points(figure: ShapeModel) -> np.ndarray:
     shape = figure.decode(CODE)
-    turned = shape @ Rotation.random(random_state=1).as_matrix().T + [2, 0, 1]
+    turned = shape @ TURN.T + [2, 0, 1]
     return np.random.default_rng(0).permutation(turned)[:3000].astype(np.float32).astype(np.float64)
 
 
@@ -59,23 +61,27 @@ def as_npz(points: np.ndarray) -> bytes:
 POINTS = {"xyz": as_xyz, "json": as_json, "ply": as_ply, "obj": as_obj, "off": as_off, "npz": as_npz}
 
 
-def test_points_in_every_format_give_what_the_library_gives(
-    client: httpx.Client, figure: ShapeModel, points: np.ndarray
-) -> None:
-    expected = figure.fit_scan(points)
-    for format, write in POINTS.items():
-        found = client.post(FIT, content=write(points), params={"format": format}).raise_for_status().json()
-        np.testing.assert_allclose(found["latent"], expected.code, atol=1e-6)
-        np.testing.assert_allclose(found["covariance"], expected.covariance, rtol=1e-6, atol=1e-12)
-        place = found["placement"]
-        np.testing.assert_allclose(place["rotation"], expected.placement.rotation, atol=1e-9)
-        np.testing.assert_allclose(place["translation"], expected.placement.translation, atol=1e-9)
-        assert (found["status"], found["reason"]) == (expected.status, expected.reason)
-        assert found["distances"]["scan"]["p95"] == pytest.approx(expected.scan.p95)
-        assert "samples" not in found
-        # The shape of the code found, placed on the scan.
-        there = place["scale"] * figure.decode(found["latent"]) @ np.array(place["rotation"]).T + place["translation"]
-        assert np.linalg.norm(points[:, None] - there[None, ::7], axis=-1).min(axis=1).max() < 0.15
+@pytest.mark.parametrize("format", POINTS)
+def test_points_in_every_format_give_what_the_library_gives(client: httpx.Client, models: Path, format: str) -> None:
+    model = load(models / "with-fine")
+    points = 1.5 * np.random.default_rng(0).permutation(model.decode([0.1, 0.7, 0.4])) @ TURN.T + [2, 0, 1]
+    points = points.astype(np.float32).astype(np.float64)
+    expected = model.fit_scan(points, scale="free")
+    params = {"format": format, "scale": "free"}
+    answer = client.post("/v1/models/with-fine/fit", content=POINTS[format](points), params=params)
+    found = answer.raise_for_status().json()
+    np.testing.assert_allclose(found["latent"], expected.code, atol=1e-6)
+    np.testing.assert_allclose(found["covariance"], expected.covariance, rtol=1e-6, atol=1e-12)
+    place = found["placement"]
+    np.testing.assert_allclose(place["rotation"], expected.placement.rotation, atol=1e-9)
+    np.testing.assert_allclose(place["translation"], expected.placement.translation, atol=1e-9)
+    assert (found["status"], found["reason"]) == (expected.status, expected.reason)
+    assert found["distances"]["scan"]["p95"] == pytest.approx(expected.scan.p95)
+    assert "samples" not in found
+    assert "used" not in found
+    # The shape of the code found, placed on the scan.
+    there = place["scale"] * model.decode(found["latent"]) @ np.array(place["rotation"]).T + place["translation"]
+    assert np.linalg.norm(points[:, None] - there[None], axis=-1).min(axis=1).max() < 0.15
 
 
 @pytest.mark.long
@@ -197,4 +203,3 @@ def test_the_points_that_stood_for_the_scan_are_answered_where_asked_for(
     assert len(used) == len(distances) == len(points)
     assert np.abs(used[:, None] - points[None]).max(axis=2).min(axis=1).max() < 1e-5
     assert distances.mean() == pytest.approx(found["distances"]["scan"]["mean"], rel=1e-4)
-    assert "used" not in client.post(FIT, content=as_xyz(points), params={"format": "xyz"}).json()

@@ -5,7 +5,7 @@ import io
 import json
 import time
 from collections import deque
-from collections.abc import AsyncIterator, Awaitable, Callable, Iterator, Mapping
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
 from contextlib import asynccontextmanager
 from typing import TypeVar
 
@@ -19,7 +19,7 @@ from shapespace.files.formats import MESH_FORMATS
 from shapespace.model.decoder import MeshChoice, Quality
 from shapespace.model.edit import InvalidTargetError
 from shapespace.model.exact_shapes import NoTangentSpaceError
-from shapespace.model.latent_space import Bounds, Distribution
+from shapespace.model.latent_space import Bounds
 from shapespace.model.options import EditOptions, EncodeOptions, Target
 from shapespace.model.shape_model import ShapeModel
 from shapespace.service.limits.sandbox import Sandbox
@@ -28,12 +28,10 @@ from shapespace.service.use_cases import batch, codes, many_shapes
 from shapespace.service.use_cases.animation import Animation
 from shapespace.service.use_cases.batch import (
     EncodedFile,
-    NoCodesError,
     PiecewiseFile,
     TooManyCodesError,
-    require_count,
 )
-from shapespace.service.use_cases.many_shapes import infer, nric_file, vertices_file
+from shapespace.service.use_cases.many_shapes import infer, vertices_file
 from shapespace.service.use_cases.one_shape import ColourOptions, ShapeRequest, shape_file
 from shapespace.service.use_cases.sequence import (
     TooManyFramesError,
@@ -117,18 +115,6 @@ def test_without_a_code_it_is_the_reference_and_colours_come_with_a_legend(model
     assert found.seconds["reconstruct"] > 0, "the time to reconstruct the other shape"
 
 
-def test_many_shapes_are_those_of_each_code(model: ShapeModel) -> None:
-    written = run(lambda workers: vertices_file(workers, CALLER, model, CODES, Bounds.ALLOW, MeshChoice.FINE, "npz"))
-    found = content(written)
-    each = [model.shape(code).vertices for code in model.latents.codes(CODES)[0]]
-    assert written.diagnostics
-    assert written.diagnostics["inside_bounds"]
-    assert set(written.seconds) == {"network", "reconstruct", "encode"}
-    with np.load(io.BytesIO(found)) as arrays:
-        assert np.array_equal(arrays["vertices"], np.array(each, np.float32))
-        assert arrays["status"].tolist() == ["converged", "converged"]
-
-
 def test_a_large_file_comes_in_pieces_and_holds_its_memory_until_it_is_read(
     model: ShapeModel, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -148,39 +134,6 @@ def test_a_large_file_comes_in_pieces_and_holds_its_memory_until_it_is_read(
 
     whole, pieces = run(both)
     assert whole == pieces
-
-
-def test_lengths_and_angles_come_with_those_of_each_factor(model: ShapeModel) -> None:
-    written = run(lambda workers: nric_file(workers, CALLER, model, CODES, Bounds.ALLOW, factors=True))
-    answer = json.loads(content(written))
-    assert written.diagnostics is None
-    assert set(written.seconds) == {"network", "encode"}
-    expected = expected_nric(np.array(CODES[1]))
-    half = len(expected) // 2
-    assert np.allclose(answer["lengths"][1], SCALE * expected[:half], atol=1e-5)
-    assert np.allclose(answer["angles"][1], expected[half:], atol=1e-5)
-    assert np.shape(answer["factors"]) == (2, 2, 2 * half)
-    # The combiner is the affine sum of the factors.
-    lengths = np.array(answer["factors"][1])[:, :half]
-    reference = SCALE * nric(model.reference.vertices, model.reference.connectivity)[:half]
-    assert np.allclose(lengths.sum(axis=0) - reference, answer["lengths"][1], atol=1e-5)
-
-
-@pytest.mark.parametrize("outputs", [["nric"], ["vertices"], ["vertices", "nric"]])
-def test_inference_computes_the_outputs_that_are_wanted(model: ShapeModel, outputs: list[str]) -> None:
-    seen: dict[str, tuple[int, ...]] = {}
-
-    def write(arrays: Mapping[str, np.ndarray]) -> tuple[Iterator[bytes], dict[str, int]]:
-        seen.update({name: array.shape for name, array in arrays.items()})
-        return iter([b"x"]), {"length": 1}
-
-    latents = np.array(CODES)
-    how = (Bounds.ALLOW, MeshChoice.FINE, Quality.FULL)
-    written = run(lambda workers: infer(workers, CALLER, model, latents, *how, outputs, write))
-    assert list(seen) == outputs
-    assert content(written) == b"x"
-    assert written.facts == {"length": 1}
-    assert (written.diagnostics is None) == (outputs == ["nric"])
 
 
 def test_frames_are_those_of_one_file_and_of_the_lines(model: ShapeModel) -> None:
@@ -238,15 +191,6 @@ def test_a_vertex_is_pulled_to_where_another_code_has_it(model: ShapeModel) -> N
     for bad in ([Target(len(goal), [0, 0, 0])], targets * len(goal)):
         with pytest.raises(InvalidTargetError):
             edit(bad)
-
-
-def test_one_seed_gives_the_same_codes_and_a_limit_holds(model: ShapeModel) -> None:
-    first, second = (codes.sample(model, 3, 7, Distribution.UNIFORM, 1.0, 3) for _ in range(2))
-    assert np.array_equal(first, second)
-    with pytest.raises(TooManyCodesError, match="count asks for 4 codes; the limit is 3"):
-        codes.sample(model, 4, 7, Distribution.UNIFORM, 1.0, 3)
-    with pytest.raises(NoCodesError):
-        require_count(0, 3)
 
 
 def test_more_than_an_answer_may_hold_is_refused_before_any_work(

@@ -193,7 +193,7 @@ def test_a_code_outside_is_answered_only_where_none_inside_is_as_near(figure: Sh
     rng = np.random.default_rng(2)
     latents = figure.latents
     away = 0.004 * np.linalg.norm(np.ptp(figure.vertices, axis=0))
-    for k in range(3):
+    for k in range(2):
         code = np.where(rng.random(latents.dimension) < 0.5, latents.lower, latents.upper)
         shape = figure.decode(code)
         found = figure.encode(shape + away * rng.normal(size=shape.shape))
@@ -206,18 +206,17 @@ def test_a_code_outside_is_answered_only_where_none_inside_is_as_near(figure: Sh
     assert outside.distances.mean() < 0.1 * away
 
 
-@pytest.mark.long
-def test_a_code_outside_is_no_farther_than_one_inside(figure: ShapeModel) -> None:
+@pytest.mark.parametrize("seed", [pytest.param(1, marks=pytest.mark.long), 2])
+def test_a_code_outside_is_no_farther_than_one_inside(figure: ShapeModel, seed: int) -> None:
     """Of twisted shapes, which no code makes: what a search far outside comes to need not be the shape of its code."""
-    for k in (1, 2):
-        shape = figure.decode(figure.sample(1, k)[0])
-        turn = 4 * (shape[:, 1] - figure.vertices[:, 1].mean()) / np.linalg.norm(np.ptp(figure.vertices, axis=0))
-        x, y, z = shape.T
-        twisted = np.stack([x * np.cos(turn) - z * np.sin(turn), y, x * np.sin(turn) + z * np.cos(turn)], axis=1)
-        allowed, clamped = (
-            np.sqrt(np.square(figure.encode(twisted, bounds=bounds).distances).mean()) for bounds in ("allow", "clamp")
-        )
-        assert allowed < 1.03 * clamped, k
+    shape = figure.decode(figure.sample(1, seed)[0])
+    turn = 4 * (shape[:, 1] - figure.vertices[:, 1].mean()) / np.linalg.norm(np.ptp(figure.vertices, axis=0))
+    x, y, z = shape.T
+    twisted = np.stack([x * np.cos(turn) - z * np.sin(turn), y, x * np.sin(turn) + z * np.cos(turn)], axis=1)
+    allowed, clamped = (
+        np.sqrt(np.square(figure.encode(twisted, bounds=bounds).distances).mean()) for bounds in ("allow", "clamp")
+    )
+    assert allowed < 1.03 * clamped
 
 
 def ending_elsewhere(
