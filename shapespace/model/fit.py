@@ -31,7 +31,7 @@ CHUNK = 50_000
 
 
 @dataclass(frozen=True)
-class FitSettings:
+class ScanFitSettings:
     """Sizes and thresholds of a fit. Distances are fractions of the reference's diagonal.
 
     Attributes:
@@ -80,7 +80,7 @@ class FitSettings:
     rivals: int = 2
 
 
-SETTINGS = FitSettings()
+SETTINGS = ScanFitSettings()
 
 
 class Fitter:
