@@ -144,7 +144,7 @@ def test_wrong_options_are_named(
         (b"", "xyz", "invalid-mesh"),
         (b"nan 0 0\n" * 20, "xyz", "invalid-scan"),
         (b"".join(b"%d %d 0\n" % (k % 7, k // 7) for k in range(40)), "xyz", "invalid-scan"),
-        (b"0 0 0\n", "pcd", "unsupported-media-type"),
+        (b"0 0 0\n", "fbx", "unsupported-media-type"),
     ],
 )
 def test_what_is_no_scan_is_refused(client: httpx.Client, content: bytes, format: str, kind: str) -> None:
