@@ -1,4 +1,4 @@
-// Print as JSON where three.js shows the vertices of the first mesh of each file: `node poses.mjs FILE.glb …`.
+// Print as JSON where three.js shows the vertices of each file: `node poses.mjs FILE.glb …`.
 
 import { readFileSync } from "node:fs";
 import { Vector3 } from "three";

@@ -1,8 +1,8 @@
 import { here } from "./memory.js";
 
 /**
- * Tabs by the pattern of the WAI-ARIA practices: one tab stop, with arrow keys between tabs. A reload keeps the
- * selected tab.
+ * Tabs by the pattern of the WAI-ARIA practices: one tab stop, with arrow keys between tabs. A reload keeps
+ * the selected tab.
  */
 export function tabs(list) {
   const all = [...list.querySelectorAll("[role=tab]")];

@@ -20,6 +20,7 @@ from shapespace.client import (
     EncodeParameters,
     FitParameters,
     Interpolation,
+    SearchParameters,
 )
 from shapespace.model.options import EditOptions, EncodeOptions, FitOptions
 from tests.service.bundles import SCALE, expected_nric, reference
@@ -128,8 +129,9 @@ def test_codes_are_drawn_found_and_changed(shapes: Client, tmp_path: Path) -> No
 )
 def test_parameters_are_the_options_of_the_library(parameters: type, options: type) -> None:
     assert set(parameters.__annotations__) == {"version", *(field.name for field in fields(options))}
+    described = f"{SearchParameters.__doc__}{parameters.__doc__}"
     for name in parameters.__annotations__:
-        assert re.search(rf"^ +(\w+, )*{name}(, \w+)*: ", parameters.__doc__ or "", re.MULTILINE), name
+        assert re.search(rf"^ +(\w+, )*{name}(, \w+)*: ", described, re.MULTILINE), name
 
 
 def test_problems_are_exceptions_that_say_what_to_do(shapes: Client) -> None:

@@ -26,7 +26,7 @@ import pytest
 import uvicorn
 
 from shapespace.service.http.problems import TYPE_PREFIX
-from shapespace.service.use_cases.animation import ID
+from shapespace.service.use_cases.animation import ID_LENGTH
 from tests.service.bundles import write_bundle
 from tests.service.conftest import ROOT, Server, starting
 from tests.service.watching import admitted, eventually, samples, value
@@ -351,7 +351,7 @@ def test_replicas_are_told_the_address_that_a_client_has_not_what_it_says(tmp_pa
 def test_long_ids_pass(proxy: str) -> None:
     most = re.search(r"large_client_header_buffers \d+ (\d+)k;", CONFIGURATION.read_text())
     assert most
-    assert int(most[1]) * 2**10 > ID.length + 1000, "the request's line has to fit"
+    assert int(most[1]) * 2**10 > ID_LENGTH + 1000, "the request's line has to fit"
     with client(proxy) as own:
         body = {"keyframes": np.random.default_rng(7).random((600, 3)).tolist(), "frames": 10}
         made = own.post("/v1/models/small/interpolations", json=body).raise_for_status()

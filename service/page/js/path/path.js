@@ -64,8 +64,8 @@ export class Path {
   }
 
   /**
-   * Return the request for a file that moves as the player does. The server moves evenly between keyframes. If
-   * the player does not, each frame becomes a keyframe, up to the limit of an address.
+   * Return the request for a file that moves as the player does. The server moves evenly between keyframes.
+   * If the player does not, each frame becomes a keyframe, up to the limit of an address.
    */
   get request() {
     const { easing, keyframes, loop, model } = this.store;

@@ -1,6 +1,6 @@
 /**
- * Reads files as shapes. A file with the model's vertices in their order is encoded. Any other is a scan, and is
- * fitted. A poor fit never replaces the user's shape, and the user can always return to that shape.
+ * Reads files as shapes. A file with the model's vertices in their order is encoded. Any other is a scan,
+ * and is fitted. A poor fit never replaces the user's shape, and the user can always return to that shape.
  */
 
 import * as api from "../server/api.js";

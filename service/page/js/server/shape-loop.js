@@ -2,11 +2,11 @@
  * Keeps the shown shape up to date with the code: a draft while the code moves, the full shape when it rests,
  * both on one mesh.
  *
- * One request runs at a time. A newer request replaces a waiting one, so there is no queue. When the code moves
- * on, the loop cancels a request for a full shape, and a draft that takes too long. It lets a quick draft finish:
- * cancelling it for each pixel of a drag would show nothing until the end of the drag. If the server answers a
- * draft with the full shape, the loop requests no more. From a draft to its full shape, vertices move in steps of
- * a pixel, so that nothing jumps.
+ * One request runs at a time. A newer request replaces a waiting one, so there is no queue. When the code
+ * moves on, the loop cancels a request for a full shape, and a draft that takes too long. It lets a quick
+ * draft finish: cancelling it for each pixel of a drag would show nothing until the end of the drag. If the
+ * server answers a draft with the full shape, the loop requests no more. From a draft to its full shape,
+ * vertices move in steps of a pixel, so that nothing jumps.
  */
 
 import { Matrix4 } from "three";

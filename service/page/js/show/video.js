@@ -65,7 +65,7 @@ export async function turntable(viewer, seconds) {
   }
 }
 
-/** Draw for every picture of the screen until a promise resolves, because only drawn pictures are recorded. */
+/** Draw for every picture of the screen until a promise resolves: only drawn pictures are recorded. */
 async function drawnUntil(viewer, promise) {
   let waiting = true;
   const step = () => {

@@ -5,8 +5,8 @@ import * as THREE from "three";
 const WIDTH = 1.5; // of the disc and of the shadow, in radii of the model
 const CELLS = 96; // along each side of the shadow
 const BLUR = 2; // cells on each side that a blur averages
-// Shadows of parts on the ground and of parts above it: darkness, height at which it ends, and number of blurs.
-// Where feet touch the ground, their shadow is sharper.
+// Shadows of parts on the ground and of parts above it: darkness, height at which it ends, and number of
+// blurs. Where feet touch the ground, their shadow is sharper.
 const CONTACT = { dark: 0.62, end: 0.08, blurred: 1 };
 const BODY = { dark: 0.26, end: 1.6, blurred: 5 };
 

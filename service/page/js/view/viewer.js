@@ -183,8 +183,8 @@ export class Viewer {
   }
 
   /**
-   * Show positions (3V numbers) beside the reference in the view; null shows the reference alone. The direction
-   * of the view stays; the camera's position stays, too, if it is `given`.
+   * Show positions (3V numbers) beside the reference in the view; null shows the reference alone. The
+   * direction of the view stays; the camera's position stays, too, if it is `given`.
    */
   makeRoom(positions, given = false) {
     const { middle } = this;
