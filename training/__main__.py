@@ -6,17 +6,21 @@ import argparse
 import os
 import shlex
 import shutil
+import signal
 import sys
 import tempfile
 import traceback
+import warnings
 from pathlib import Path
 
 from shapespace.training.collection import init
 from shapespace.training.collection.checks import IngestError
 from shapespace.training.learning import ExportError
 from shapespace.training.report.record import Record, ReportError
+from shapespace.training.runs import workers
+from shapespace.training.runs.atomic_files import DamagedFileError
 from shapespace.training.runs.config import ConfigError, load
-from shapespace.training.runs.directory import RunDirectory
+from shapespace.training.runs.directory import NotARunError, RunDirectory
 from shapespace.training.runs.sampling import SamplesError
 from shapespace.training.runs.workers import WorkersError
 from shapespace.training.space.factors import FactorError
@@ -25,17 +29,19 @@ from shapespace.training.stages.mean import MeanError
 from shapespace.training.stages.run import STAGES, LostTooMuchError, OldRunError, execute, refuse_old
 from shapespace.training.stages.stage import Run
 
-#: Exit codes: a fault of the input or of the machine, a defect of the program (EX_SOFTWARE), and Ctrl+C as in shells.
-FAILURE, DEFECT, STOPPED = 1, 70, 130
+#: Exit codes: a fault of the input or of the machine, and a defect of the program (EX_SOFTWARE).
+FAILURE, DEFECT = 1, 70
 #: Errors whose message is a sentence for the user.
 EXPECTED = (
     ConfigError,
+    DamagedFileError,
     ExportError,
     FactorError,
     IngestError,
     LostTooMuchError,
     MeanError,
     ModeError,
+    NotARunError,
     OldRunError,
     ReportError,
     SamplesError,
@@ -186,7 +192,8 @@ def _keep_traceback(arguments: argparse.Namespace) -> Path:
     """Write the traceback of the current exception into the run directory, or into a temporary folder."""
     text = traceback.format_exc()
     folders = [] if "meshes" in arguments else [_folder(arguments)]
-    for folder in (*folders, Path(tempfile.mkdtemp())):
+    runs = [folder for folder in folders if RunDirectory(folder).is_run()]
+    for folder in (*runs, Path(tempfile.mkdtemp())):
         path = RunDirectory(folder).traceback.path
         try:
             path.write_text(text, encoding="utf-8")
@@ -199,14 +206,25 @@ def _keep_traceback(arguments: argparse.Namespace) -> Path:
 def main() -> int:
     """Run the command. Every error ends with a message instead of a traceback."""
     arguments = parser().parse_args()
+    received = [signal.SIGINT]
+
+    def terminate(number: int, _: object) -> None:
+        received[0] = signal.Signals(number)
+        warnings.filterwarnings("ignore", category=UserWarning, module=r"joblib\b")  # on work that is cut short
+        raise KeyboardInterrupt
+
+    signal.signal(signal.SIGINT, terminate)
+    signal.signal(signal.SIGTERM, terminate)
     try:
         arguments.do(arguments)
     except EXPECTED as error:
         print(f"shapespace-train: {error}", file=sys.stderr)
         return FAILURE
     except KeyboardInterrupt:
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)
+        workers.stop()
         print("\nshapespace-train: stopped; the same command continues here", file=sys.stderr)
-        return STOPPED
+        return 128 + received[0]  # as shells report the end by a signal
     except Exception as error:
         what = " ".join(str(error).split())[:300]
         print(

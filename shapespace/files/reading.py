@@ -72,6 +72,8 @@ def read_arrays(
     beside = source if isinstance(source, Path) else None
     if isinstance(source, Path):
         format = format or source.suffix.lstrip(".").lower()
+        if source.exists() and not source.is_file():
+            raise MeshError("can't be read: it is no file")
         try:
             source = source.read_bytes()
         except OSError as error:

@@ -53,13 +53,15 @@ def read_shapes(path: Path) -> FileShapes:
     """
     if not path.exists():
         raise IngestError(f"{path}: no such file or folder")
+    if not path.is_file() and not path.is_dir():
+        raise IngestError(f"{path}: is neither a file nor a folder; name the folder that holds the meshes, or one NPZ")
     return _read_folder(path) if path.is_dir() else _read_npz(path)
 
 
 def data_files(path: Path) -> list[Path]:
     """Return the files that a collection is read from, sorted; none if the path doesn't exist."""
     if not path.is_dir():
-        return [path] if path.exists() else []
+        return [path] if path.is_file() else []
     return sorted(
         p for p in path.iterdir() if _extension(p) in (*READ_FORMATS, *_COMPANIONS) and p.is_file() and p.name[0] != "."
     )

@@ -1,8 +1,13 @@
-"""Files of a run that are replaced as a whole, so that a killed run or a power cut leaves no half-written file."""
+"""Files of a run that are replaced as a whole, so that a killed run or a power cut leaves no half-written file.
+
+A file can be damaged all the same, by a disk or a copy. Whoever reads it learns which one: DamagedFileError.
+"""
 
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,6 +17,29 @@ from numpy.typing import NDArray
 
 from shapespace.files.atomic import replaced_file
 from shapespace.files.npz import read_npz
+
+
+class DamagedFileError(ValueError):
+    """A file of a run that can't be understood.
+
+    Attributes:
+        path: the file.
+    """
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(f"{path} is damaged; run the same command again, which makes it anew")
+        self.path = path
+
+
+@contextmanager
+def reading(path: Path) -> Iterator[None]:
+    """Turn errors of a damaged file into DamagedFileError; OSError passes."""
+    try:
+        yield
+    except (OSError, MemoryError, DamagedFileError):
+        raise
+    except Exception as error:  # `zipfile`, `zlib`, `json` and NumPy raise exceptions of many classes
+        raise DamagedFileError(path) from error
 
 
 @dataclass(frozen=True)
@@ -40,8 +68,9 @@ class JsonFile(_AtomicFile):
     """A file with a JSON object."""
 
     def read(self) -> dict[str, Any]:
-        """Return the object; raises OSError or ValueError."""
-        return dict(json.loads(self.path.read_text(encoding="utf-8")))
+        """Return the object; raises OSError or DamagedFileError."""
+        with reading(self.path):
+            return dict(json.loads(self.path.read_text(encoding="utf-8")))
 
     def read_if_written(self) -> dict[str, Any]:
         """Return the object, or an empty object if the file has not been written."""
@@ -56,8 +85,9 @@ class NpzFile(_AtomicFile):
     """An NPZ file."""
 
     def read(self) -> dict[str, NDArray]:
-        """Return all arrays by name; raises OSError, ValueError, EOFError or zipfile.BadZipFile."""
-        return read_npz(self.path)
+        """Return all arrays by name; raises OSError or DamagedFileError."""
+        with reading(self.path):
+            return read_npz(self.path)
 
     def read_if_written(self) -> dict[str, NDArray]:
         """Return all arrays by name, or none if the file has not been written."""

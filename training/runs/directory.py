@@ -18,6 +18,15 @@ from shapespace.training.runs.atomic_files import JsonFile, NpzFile, TextFile
 File = TypeVar("File")
 
 
+class NotARunError(ValueError):
+    """A folder that holds something else than a run."""
+
+
+def _entries(folder: Path) -> list[Path]:
+    """List a folder; a file in its place is its only entry."""
+    return list(folder.iterdir()) if folder.is_dir() else [folder]
+
+
 class RunFile(Generic[File]):
     """A file or folder of each run directory, by its path there."""
 
@@ -44,17 +53,32 @@ class RunDirectory:
     traceback = RunFile(TextFile, "traceback.txt")
     """Traceback of an error that is a defect of this program."""
     _log = RunFile(Path, "log.jsonl")
+    _stamps = RunFile(Path, "stages")
 
     def is_run(self) -> bool:
-        """Return whether the folder is a run directory."""
-        return self.config.path.is_file()
+        """Return whether the folder is a run directory: one that a run began, not only a folder with a config.toml."""
+        return self.config.path.is_file() and (self._log.is_file() or self._stamps.is_dir())
+
+    def begin(self) -> None:
+        """Make the folder a run directory, with what says so before anything else.
+
+        Raises:
+            NotARunError: it holds something, and no run began it. Nothing is written or removed.
+        """
+        # A run that was killed at its begin has left the folder of stamps and no configuration.
+        if self.folder.exists() and not self.is_run() and {path.name for path in _entries(self.folder)} - {"stages"}:
+            raise NotARunError(
+                f"{self.folder} holds files and is no run directory, so nothing is written there: name an empty or a "
+                "new folder with --out"
+            )
+        self._stamps.mkdir(parents=True, exist_ok=True)
 
     def stamp(self, stage: str) -> JsonFile:
         """``key``, ``basis`` and ``version`` of a stage that has begun, and ``seconds`` once it is done.
 
         A stage that has to be done again keeps ``basis`` and ``version`` only, which its folders of samples have.
         """
-        return JsonFile(self.folder / "stages" / f"{stage}.json")
+        return JsonFile(self._stamps / f"{stage}.json")
 
     def is_of_0_1(self) -> bool:
         """Return whether version 0.1 began the run: it has a log, but no stage has a version."""

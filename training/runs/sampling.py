@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from shapespace.arrays import FloatArray, IntArray
 from shapespace.mesh.triangle_mesh import TriangleMesh
-from shapespace.training.runs.atomic_files import NpzFile
+from shapespace.training.runs.atomic_files import NpzFile, reading
 from shapespace.training.runs.latent_coordinates import Coordinates
 from shapespace.training.runs.progress import bar
 from shapespace.training.runs.workers import run
@@ -242,11 +242,37 @@ def asked_for(part: Mapping[str, NDArray]) -> NDArray:
     return part["asked"] if "asked" in part else part["latents"]
 
 
-def parts(folder: Path) -> Iterator[Mapping[str, NDArray]]:
-    """Open the files of a folder's samples, one after the other. An array is read when it is used."""
+class SamplePart(Mapping[str, NDArray]):
+    """The arrays of one part; an array is read when it is used, and raises DamagedFileError if it can't be."""
+
+    def __init__(self, path: Path, arrays: Mapping[str, NDArray]) -> None:
+        self._path, self._arrays = path, arrays
+
+    def __getitem__(self, name: str) -> NDArray:
+        """Read an array."""
+        if name not in self._arrays:
+            raise KeyError(name)
+        with reading(self._path):
+            return self._arrays[name]
+
+    def __iter__(self) -> Iterator[str]:
+        """Iterate over the names of the arrays."""
+        return iter(self._arrays)
+
+    def __len__(self) -> int:
+        """Return the number of arrays."""
+        return len(self._arrays)
+
+
+def parts(folder: Path) -> Iterator[SamplePart]:
+    """Open the files of a folder's samples, one after the other."""
     for path in sorted(folder.glob("part-*.npz")):
-        with np.load(path) as part:
-            yield part
+        # Opened here, because np.load leaves a damaged file open.
+        with path.open("rb") as file:
+            with reading(path):
+                arrays = np.load(file)
+            with arrays:
+                yield SamplePart(path, arrays)
 
 
 def columns(folder: Path, *names: str, done: bool = False) -> dict[str, NDArray]:

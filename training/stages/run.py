@@ -12,8 +12,9 @@ from pathlib import Path
 from typing import Any
 
 from shapespace.training.collection.reading import data_files
+from shapespace.training.runs.atomic_files import DamagedFileError
 from shapespace.training.runs.config import Config
-from shapespace.training.runs.directory import RunDirectory
+from shapespace.training.runs.directory import NotARunError, RunDirectory
 from shapespace.training.stages import (  # fmt: skip
     evaluation,
     export,
@@ -73,7 +74,35 @@ def execute(
 
     Raises:
         LostTooMuchError: more than a quarter of the logarithms or samples are lost, and ``keep_going`` is false.
+        NotARunError: the run directory holds something else, or the collection's data.
+        DamagedFileError: a file was damaged, and was so again after its stage had made it anew.
     """
+    repaired = set[Path]()
+    while True:
+        try:
+            return _execute(run, until, keep_going=keep_going, command=command, show=show)
+        except DamagedFileError as error:
+            if error.path in repaired:
+                raise
+            repaired.add(error.path)
+            _discard(run.directory, error.path, show)
+
+
+def _discard(directory: RunDirectory, path: Path, show: Callable[[str], None]) -> None:
+    """Remove a damaged file, and have the stage that wrote it make it again."""
+    path.unlink(missing_ok=True)
+    name = path.relative_to(directory.folder)
+    for stage in STAGES.values():
+        results = stage.results(directory)
+        if path in results or set(path.parents) & set(results):
+            stamp = directory.stamp(stage.name).read_if_written()
+            directory.stamp(stage.name).write({key: value for key, value in stamp.items() if key != "seconds"})
+            show(f"{name}: damaged, so it is removed, and {stage.name} makes it again")
+            return
+    show(f"{name}: damaged, so it is removed")
+
+
+def _execute(run: Run, until: str | None, *, keep_going: bool, command: str, show: Callable[[str], None]) -> bool:
     directory = run.directory
     keys, data = _prepare(run, show)
     order = list(STAGES)
@@ -103,6 +132,8 @@ def execute(
 def _prepare(run: Run, show: Callable[[str], None]) -> tuple[dict[str, dict[str, str]], dict[str, dict[str, Any]]]:
     """Remove outdated results and write the configuration. Return the keys of the stages, and facts about the data."""
     directory, source = run.directory, run.config.collection.data
+    directory.begin()
+    _refuse_own_data(run)
     data, known = _data_facts(run), directory.data.read_if_written()
     if data:  # a run from a generator has none, and is done again where it is of version 0.1
         refuse_old(directory)
@@ -120,6 +151,18 @@ def _prepare(run: Run, show: Callable[[str], None]) -> tuple[dict[str, dict[str,
     _forget(directory, keys, show)
     directory.config.write(run.source)
     return keys, data
+
+
+def _refuse_own_data(run: Run) -> None:
+    """Raise NotARunError if the collection's data are where the run would write or remove its results."""
+    source = run.config.collection.data
+    results = {path.resolve() for stage in STAGES.values() for path in stage.results(run.directory)}
+    places = {source.resolve(), *source.resolve().parents} if source else set()
+    if source and (results & places or source.resolve() == run.directory.folder.resolve()):
+        raise NotARunError(
+            f"{source} is where the run {run.directory.folder} writes its results: name another run directory with "
+            "--out, or move the data"
+        )
 
 
 def _do(stage: Stage, run: Run, keys: dict[str, str], stamp: dict[str, Any], show: Callable[[str], None]) -> None:

@@ -25,6 +25,8 @@ def read_attributes(path: Path) -> tuple[MeshAttributes | None, list[str]]:
     Raises:
         OSError: the file can't be read.
     """
+    if path.exists() and not path.is_file():
+        raise OSError(f"{path} is no file")
     faults: list[str] = []
     try:
         with np.errstate(all="ignore"):

@@ -1,0 +1,182 @@
+"""What a run never does: write into other folders, read devices, end for good at a damaged file, or leave processes."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import subprocess
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from shapespace.training.__main__ import main
+from shapespace.training.runs.atomic_files import DamagedFileError, JsonFile, NpzFile
+from shapespace.training.runs.directory import NotARunError, RunDirectory
+from tests.training.conftest import TINY, command
+
+MINE = """
+[collection]
+data = "{}"
+[export]
+name = "mine"
+title = "Mine"
+description = "For the tests."
+licence = "MIT"
+"""
+FOREIGN = ["shapes.npz", "report.html", "samples/mine.txt", "config.toml", "notes.txt", ".hidden"]
+
+
+@pytest.fixture
+def config(tmp_path: Path) -> Path:
+    path = tmp_path / "tiny.toml"
+    path.write_text(TINY)
+    return path
+
+
+def run(monkeypatch: pytest.MonkeyPatch, config: Path, out: Path, *more: str) -> int:
+    monkeypatch.setattr("sys.argv", ["shapespace-train", *command(config, out, *more)[3:]])
+    return main()
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+@pytest.mark.parametrize(
+    "name", ["shapes.npz", "report.html", "samples/mine.txt", "config.toml", "notes.txt", ".hidden"]
+)
+def test_a_folder_with_other_files_is_left_alone(
+    name: str, config: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    mine = tmp_path / "mine"
+    (mine / name).parent.mkdir(parents=True)
+    (mine / name).write_text("mine")
+    assert run(monkeypatch, config, mine, "--until", "ingest") == 1
+    assert "is no run directory" in capsys.readouterr().err
+    assert contents(mine) == {name: b"mine"}
+
+
+def test_a_file_in_place_of_the_folder_is_left_alone(
+    config: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "mine").write_text("mine")
+    assert run(monkeypatch, config, tmp_path / "mine") == 1
+    assert (tmp_path / "mine").read_text() == "mine"
+
+
+def test_empty_folders_and_runs_are_continued(config: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    out = tmp_path / "out"
+    out.mkdir()
+    for _ in range(2):
+        assert run(monkeypatch, config, out, "--until", "ingest") == 0
+    killed = tmp_path / "killed"  # before it had written its configuration
+    (killed / "stages").mkdir(parents=True)
+    assert run(monkeypatch, config, killed, "--until", "ingest") == 0
+
+
+@pytest.mark.parametrize("place", ["", "shapes.npz", "samples/mine.npz"])
+def test_data_inside_the_results_are_refused(
+    place: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    data = out / place
+    RunDirectory(out).begin()
+    RunDirectory(out).config.write("")
+    if place:
+        data.parent.mkdir(exist_ok=True)
+        np.savez(data, vertices=np.zeros((3, 4, 3)), faces=np.zeros((1, 3), int))
+    config = tmp_path / "mine.toml"
+    config.write_text(MINE.format(data))
+    before = contents(out)
+    assert run(monkeypatch, config, out) == 1
+    assert "writes its results" in capsys.readouterr().err
+    assert contents(out) == before
+
+
+def test_devices_are_no_collections(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    config = tmp_path / "mine.toml"
+    config.write_text(MINE.format("/dev/zero"))
+    assert run(monkeypatch, config, tmp_path / "out") == 1
+    assert "neither a file nor a folder" in capsys.readouterr().err
+    os.mkfifo(tmp_path / "pipe.obj")
+    config.write_text(MINE.format(tmp_path))
+    for name in ("a", "b"):
+        (tmp_path / f"{name}.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
+    assert run(monkeypatch, config, tmp_path / "out") == 1
+    assert "pipe.obj: can't be read" in capsys.readouterr().err
+
+
+def flip(path: Path, place: int) -> None:
+    content = bytearray(path.read_bytes())
+    content[place] ^= 1
+    path.write_bytes(content)
+
+
+def test_damaged_results_are_named_and_made_again(
+    config: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    assert run(monkeypatch, config, out, "--until", "samples") == 0
+    part = out / "samples" / "part-00001.npz"
+    arrays = NpzFile(part).read()
+    flip(part, part.read_bytes().index(b"nric.npy") + 5000)
+    capsys.readouterr()
+    assert run(monkeypatch, config, out, "--until", "networks") == 0
+    assert "samples/part-00001.npz: damaged, so it is removed, and samples makes it again" in capsys.readouterr().out
+    np.testing.assert_equal(NpzFile(part).read(), arrays)
+    RunDirectory(out).stamp("samples").path.write_bytes(b"damaged")
+    assert run(monkeypatch, config, out, "--until", "samples") == 0
+    assert "stages/samples.json: damaged" in capsys.readouterr().out
+    np.testing.assert_equal(NpzFile(part).read(), arrays)
+
+
+def test_a_damaged_file_is_told_from_one_that_is_missing(tmp_path: Path) -> None:
+    path = tmp_path / "x.json"
+    with pytest.raises(FileNotFoundError):
+        JsonFile(path).read()
+    path.write_text("{")
+    with pytest.raises(DamagedFileError, match=r"x\.json is damaged; run the same command again"):
+        JsonFile(path).read()
+    with pytest.raises(NotARunError):
+        RunDirectory(tmp_path).begin()
+
+
+def processes(session: int) -> list[int]:
+    found = []
+    for stat in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            fields = stat.read_text().rpartition(")")[2].split()
+        except (FileNotFoundError, ProcessLookupError):
+            continue
+        if int(fields[3]) == session and fields[0] != "Z":
+            found.append(int(stat.parent.name))
+    return found
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_signal_ends_the_run_with_a_sentence_and_all_its_processes(
+    number: signal.Signals, config: Path, tmp_path: Path
+) -> None:
+    config.write_text(TINY.replace("count = 60", "count = 400000", 1))
+    out = tmp_path / "out"
+    environment = os.environ | {"LOKY_MAX_CPU_COUNT": "2"}
+    process = subprocess.Popen(
+        command(config, out), stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, start_new_session=True,
+        env=environment,
+    )  # fmt: skip
+    while not any((out / "samples").glob("part-*.npz")):
+        assert process.poll() is None, "the run ended by itself"
+        time.sleep(0.01)
+    process.send_signal(number)
+    said = process.communicate()[1]
+    assert process.returncode == 128 + number
+    lines = [line for line in said.replace("\r", "\n").splitlines() if line.strip() and "sample" not in line]
+    assert lines == ["shapespace-train: stopped; the same command continues here"]
+    while processes(process.pid):  # ends by the tests' own limit, if ever
+        time.sleep(0.01)
+    shutil.rmtree(out)
