@@ -192,7 +192,7 @@ def _keep_traceback(arguments: argparse.Namespace) -> Path:
     """Write the traceback of the current exception into the run directory, or into a temporary folder."""
     text = traceback.format_exc()
     folders = [] if "meshes" in arguments else [_folder(arguments)]
-    runs = [folder for folder in folders if RunDirectory(folder).is_run()]
+    runs = [folder for folder in folders if RunDirectory(folder).was_begun()]
     for folder in (*runs, Path(tempfile.mkdtemp())):
         path = RunDirectory(folder).traceback.path
         try:

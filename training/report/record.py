@@ -16,7 +16,7 @@ import numpy as np
 from shapespace.arrays import FloatArray
 from shapespace.coordinates.nric import WeightedNorm
 from shapespace.mesh.triangle_mesh import TriangleMesh
-from shapespace.training.runs.atomic_files import DamagedFileError, JsonFile, NpzFile
+from shapespace.training.runs.atomic_files import JsonFile, NpzFile
 from shapespace.training.runs.directory import RunDirectory
 from shapespace.training.space.modes import edge_magnitudes
 from shapespace.training.stages.run import STAGES
@@ -42,7 +42,7 @@ class FactorRecord:
 def _readable(path: Path, read: Callable[[], Value]) -> Value:
     try:
         return read()
-    except (OSError, DamagedFileError) as error:
+    except (OSError, ValueError) as error:
         raise ReportError(f"{path} can't be read: {str(error).splitlines()[0]}") from error
 
 

@@ -53,11 +53,18 @@ class RunDirectory:
     traceback = RunFile(TextFile, "traceback.txt")
     """Traceback of an error that is a defect of this program."""
     _log = RunFile(Path, "log.jsonl")
-    _stamps = RunFile(Path, "stages")
 
     def is_run(self) -> bool:
-        """Return whether the folder is a run directory: one that a run began, not only a folder with a config.toml."""
-        return self.config.path.is_file() and (self._log.is_file() or self._stamps.is_dir())
+        """Return whether the folder looks like a run directory, so that it can be read."""
+        return self.config.path.is_file()
+
+    def was_begun(self) -> bool:
+        """Return whether a run wrote the folder, so that it may be written to."""
+        return self.is_run() and (self._log.is_file() or self._stamps.is_dir())
+
+    @property
+    def _stamps(self) -> Path:
+        return self.folder / "stages"
 
     def begin(self) -> None:
         """Make the folder a run directory, with what says so before anything else.
@@ -66,7 +73,7 @@ class RunDirectory:
             NotARunError: it holds something, and no run began it. Nothing is written or removed.
         """
         # A run that was killed at its begin has left the folder of stamps and no configuration.
-        if self.folder.exists() and not self.is_run() and {path.name for path in _entries(self.folder)} - {"stages"}:
+        if self.folder.exists() and not self.was_begun() and {path.name for path in _entries(self.folder)} - {"stages"}:
             raise NotARunError(
                 f"{self.folder} holds files and is no run directory, so nothing is written there: name an empty or a "
                 "new folder with --out"
