@@ -1,4 +1,4 @@
-"""Limits on the size of a mesh, and text from files as messages quote it."""
+"""Limits on the size of a mesh, and text from files: its encoding, and how messages quote it."""
 
 from __future__ import annotations
 
@@ -25,6 +25,15 @@ class Limits:
 
 #: For files of the user's own.
 UNLIMITED = Limits()
+
+
+def as_utf8(data: memoryview) -> memoryview:
+    """Return a text in UTF-8 without its byte-order mark; raises ValueError if it is damaged UTF-16."""
+    if bytes(data[:3]) == b"\xef\xbb\xbf":
+        return data[3:]
+    if bytes(data[:2]) in (b"\xff\xfe", b"\xfe\xff"):
+        return memoryview(str(data, "utf-16").encode())
+    return data
 
 
 def label(text: object) -> str | None:

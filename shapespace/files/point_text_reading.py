@@ -14,7 +14,7 @@ from itertools import islice
 import numpy as np
 
 from shapespace.arrays import FloatArray, IntArray
-from shapespace.files.limits import Limits, clipped
+from shapespace.files.limits import Limits, as_utf8, clipped
 from shapespace.mesh.triangle_mesh import MeshError
 
 #: Lines with points in which the dialect is looked for, and lines that may stand before the first point.
@@ -41,8 +41,7 @@ def read_point_text(data: memoryview, limits: Limits) -> tuple[FloatArray, IntAr
         MeshError: the text can be read in two ways, or has more points than the limits allow.
         ValueError: a line is no point; the message shows the line.
     """
-    start = bytes(data[:1000])
-    text = str(data, "utf-16" if start[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig", "replace")
+    text = str(as_utf8(data), "utf-8", "replace")
     if "\0" in text[:1000] or "\ufffd" in text[:100]:
         raise ValueError("it is no text")
     points, counts = _Dialect.of(text).read(text)

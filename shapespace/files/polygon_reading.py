@@ -16,7 +16,7 @@ from typing import Self
 import numpy as np
 
 from shapespace.arrays import FloatArray, IntArray
-from shapespace.files.limits import Limits, clipped
+from shapespace.files.limits import Limits, as_utf8, clipped
 from shapespace.mesh.triangle_mesh import MeshError
 
 #: Bytes that are copied at once to count the lines before an error.
@@ -44,7 +44,7 @@ class Lines:
     """
 
     def __init__(self, data: memoryview, line: re.Pattern[bytes] = _LINE) -> None:
-        self._data, self._place = _as_utf8(data), 0
+        self._data, self._place = as_utf8(data), 0
         self._matches = line.finditer(self._data)
         self._lines = self._all()
 
@@ -80,15 +80,6 @@ class Lines:
             line = _LINE.match(self._data[self._place : self._place + 1000])
             text = line[1].decode(errors="replace") if line else ""
             raise ValueError(f"line {self._number} is {clipped(text)!r}") from None
-
-
-def _as_utf8(data: memoryview) -> memoryview:
-    """Return a text without its byte-order mark."""
-    if data[:3] == _BYTE_ORDER_MARK:
-        return data[3:]
-    if bytes(data[:2]) in (b"\xff\xfe", b"\xfe\xff"):
-        return memoryview(str(data, "utf-16").encode())
-    return data
 
 
 def joined_lines(data: memoryview) -> memoryview:

@@ -225,6 +225,21 @@ def vertex_areas(vertices: FloatArray, faces: IntArray) -> FloatArray:
     return areas
 
 
+def on_shared_vertices(
+    corners: FloatArray, faces: IntArray, count: int, tolerance: float
+) -> tuple[FloatArray, IntArray]:
+    """Put the corners (F, 3, 3) of triangles on the vertices of faces (F, 3).
+
+    Returns:
+        The ``count`` vertices, at the origin if they are in no face. And the torn faces: a corner is farther from its
+        vertex than ``tolerance``, as a share of the diagonal.
+    """
+    vertices = np.zeros((count, 3))
+    vertices[faces] = corners
+    apart = np.linalg.norm(vertices[faces] - corners, axis=-1).max(axis=1)
+    return vertices, np.flatnonzero(apart > tolerance * diagonal(corners.reshape(-1, 3)))
+
+
 def diagonal(vertices: FloatArray) -> FloatArray:
     """Compute the lengths (…) of the diagonals of the bounding boxes of shapes (…, V, 3)."""
     return np.linalg.norm(np.ptp(vertices, axis=-2), axis=-1)

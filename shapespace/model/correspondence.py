@@ -8,11 +8,13 @@ import numpy as np
 
 from shapespace.arrays import FloatArray, IntArray
 from shapespace.files.limits import Limits
-from shapespace.mesh.triangle_mesh import diagonal
+from shapespace.mesh.triangle_mesh import on_shared_vertices
 from shapespace.model.decoder import Decoder, MeshChoice
 
 #: Larger meshes than the model's are read up to these limits, so that the error message can name their size.
 _VERTICES_READ, _FACES_READ = 2**15, 2**16
+#: Largest distance between corners of one vertex, as a share of the diagonal.
+_TOLERANCE = 1e-5
 
 
 class InvalidMeshError(ValueError):
@@ -67,10 +69,10 @@ def match(model: Decoder, vertices: FloatArray, faces: IntArray) -> Matched:
             faults.append(fault)
     for layout in layouts:
         if len(faces) == len(layout.faces) and faces.min() >= 0 and faces.max() < len(vertices):
-            shape, torn = _on_vertices(layout.faces, vertices[faces])
-            # The other way round too: vertices that the file shares have to coincide in the reference.
             reference = model.mesh(layout.mesh).vertices
-            more = _on_vertices(faces, reference[layout.faces])[1]
+            shape, torn = on_shared_vertices(vertices[faces], layout.faces, len(reference), _TOLERANCE)
+            # The other way round too: vertices that the file shares have to coincide in the reference.
+            more = on_shared_vertices(reference[layout.faces], faces, len(vertices), _TOLERANCE)[1]
             if not len(torn) and not len(more):
                 return Matched(shape, layout.mesh)
             faults.append(
@@ -150,11 +152,3 @@ def _layouts(model: Decoder) -> list[_Layout]:
         places[of_file[there]] = there
         layouts.append(_Layout(choices[0], layouts[0].faces, of_file, places))
     return layouts
-
-
-def _on_vertices(faces: IntArray, corners: FloatArray) -> tuple[FloatArray, IntArray]:
-    """Return the vertices (V, 3) of faces (F, 3) whose corners (F, 3, 3) are given, and the faces that are torn."""
-    vertices = np.zeros((faces.max() + 1, 3))
-    vertices[faces] = corners
-    apart = np.linalg.norm(vertices[faces] - corners, axis=-1).max(axis=1)
-    return vertices, np.flatnonzero(apart > 1e-5 * diagonal(vertices))

@@ -13,7 +13,7 @@ import numpy as np
 from shapespace.arrays import FloatArray, IntArray
 from shapespace.files.npz import read_mesh_npz
 from shapespace.files.reading import READ_FORMATS, read_arrays
-from shapespace.mesh.triangle_mesh import MeshError, PlaceError, diagonal
+from shapespace.mesh.triangle_mesh import MeshError, PlaceError, on_shared_vertices
 from shapespace.training.collection.checks import (
     TOLERANCES,
     IngestError,
@@ -184,11 +184,7 @@ def _on_shared_vertices(corners: FloatArray, faces: IntArray, vertex_count: int,
         raise MeshError(
             f"has {len(corners)} faces, but {other} has {len(faces)}; all meshes need the same connectivity"
         )
-    # Vertices in no face are dropped later; until then they are at the origin.
-    vertices = np.zeros((vertex_count, 3))
-    vertices[faces] = corners
-    apart = np.linalg.norm(vertices[faces] - corners, axis=-1).max(axis=1)
-    torn = np.flatnonzero(apart > TOLERANCES.weld * diagonal(corners.reshape(-1, 3)))
+    vertices, torn = on_shared_vertices(corners, faces, vertex_count, TOLERANCES.weld)
     if len(torn):
         raise PlaceError(
             f"face {{face}} is not where it is in {other}: STL files must list the faces in the same order",
