@@ -5,17 +5,19 @@ This module imports no writer, because the process that reads uploads should sta
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 import numpy as np
 
 from shapespace.files.gltf_reading import read_gltf
-from shapespace.files.limits import UNLIMITED, Limits, clipped
+from shapespace.files.limits import UNLIMITED, Limits, reason
 from shapespace.files.npz import read_mesh_npz
 from shapespace.files.pcd_reading import read_pcd
 from shapespace.files.ply_reading import read_ply
 from shapespace.files.point_text_reading import read_point_text
 from shapespace.files.polygon_reading import read_obj, read_off, read_stl
+from shapespace.files.recognition import FormatError, decide
 from shapespace.mesh.triangle_mesh import MeshError
 
 #: Media type of formats that have none registered at IANA.
@@ -57,7 +59,7 @@ def read_arrays(
 
     Args:
         source: content of the file, or its path.
-        format: one of READ_FORMATS; by default the extension of the path.
+        format: one of READ_FORMATS; by default the first bytes decide, then the extension of the path.
         limits: largest numbers of vertices and faces. A larger mesh is refused.
         points: whether points without faces are accepted. The format can then be one of SCAN_FORMATS.
 
@@ -71,14 +73,14 @@ def read_arrays(
     """
     beside = source if isinstance(source, Path) else None
     if isinstance(source, Path):
-        format = format or source.suffix.lstrip(".").lower()
         if source.exists() and not source.is_file():
             raise MeshError("can't be read: it is no file")
         try:
             source = source.read_bytes()
         except OSError as error:
             raise MeshError(f"can't be read: {error.strerror}") from error
-    data = memoryview(source)
+    data, formats = memoryview(source), SCAN_FORMATS if points else READ_FORMATS
+    format = format.lower() if format else _decided(data, formats, beside)
     try:
         # The caller decides whether coordinates that are not finite are a fault.
         with np.errstate(all="ignore"):
@@ -93,9 +95,23 @@ def read_arrays(
                     return read_point_text(data, limits)
                 case "pcd" if points:
                     return read_pcd(data, limits)
+                case _ if format in _READERS:
+                    return _READERS[format](data, limits)
                 case _:
-                    return _READERS[str(format)](data, limits)
+                    raise _unknown(f"there is no format {format!r} here", formats)
     except (MeshError, MemoryError):
         raise
     except Exception as error:  # damaged files raise exceptions of many classes
-        raise MeshError(f"not a readable {format} file: {clipped(error, 300)}") from error
+        raise MeshError(f"not a readable {format} file: {reason(error)}") from error
+
+
+def _decided(data: memoryview, formats: Mapping[str, str], path: Path | None) -> str:
+    """Return the format of a file that names none; raises FormatError with the formats that can be read."""
+    try:
+        return decide(data, formats, path.name if path else "").name
+    except FormatError as error:
+        raise _unknown(str(error), formats) from None
+
+
+def _unknown(fault: str, formats: Iterable[str]) -> FormatError:
+    return FormatError(f"{fault}; these can be read: {', '.join(formats)}")

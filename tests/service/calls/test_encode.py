@@ -18,7 +18,7 @@ from shapespace.mesh.triangle_mesh import TriangleMesh
 from shapespace.model.correspondence import InvalidMeshError, Matched, limits, match
 from shapespace.model.decoder import MeshChoice
 from shapespace.model.shape_model import ShapeModel
-from shapespace.service.use_cases.uploads import FORMATS, POINT_FORMATS, read_mesh_file
+from shapespace.service.use_cases.uploads import FORMATS, POINT_FORMATS, read_mesh_files
 from tests.hostile import HOSTILE, MIB
 from tests.service.bundles import SCALE, fine_reference, reference, seal, write_bundle
 
@@ -275,7 +275,7 @@ def of_files(tmp_path: Path) -> ShapeModel:
 
 
 def matched(model: ShapeModel, data: bytes, format: str) -> Matched:
-    vertices, faces, *_ = read_mesh_file(data, "", format, limits(model.decoder))
+    ((vertices, faces, _),), _ = read_mesh_files(data, "", format, limits(model.decoder))
     return match(model.decoder, vertices, faces)
 
 
