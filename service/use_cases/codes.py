@@ -293,7 +293,12 @@ def read_upload(
         BusyError: no process is available.
         EndingError: the server ends.
     """
-    facts = {"content_type": upload.content_type, "format": upload.format, "points": points, "most": most}
+    facts: dict[str, Any] = {
+        "content_type": upload.content_type,
+        "format": upload.format,
+        "points": points,
+        "most": most,
+    }
     facts |= {"vertices": limits.vertices, "faces": limits.faces, "known": list(upload.known)}
     together = limits if most == 1 else TOGETHER
     size = 24 * (together.vertices + together.faces) + _ANSWER

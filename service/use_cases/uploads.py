@@ -219,7 +219,7 @@ def read_in_sandbox(
         meshes, fields = read_mesh_files(body, content_type, format, limits, points=points, known=known, most=most)
     except UploadError as error:
         raise FailedError(type(error).__name__, str(error)) from None
-    arrays = {f"vertices {k}": mesh.vertices for k, mesh in enumerate(meshes)}
+    arrays: Arrays = {f"vertices {k}": mesh.vertices for k, mesh in enumerate(meshes)}
     arrays |= {f"faces {k}": m.faces for k, m in enumerate(meshes) if not k or m.faces is not meshes[0].faces}
     return {"fields": fields, "names": [mesh.name for mesh in meshes]}, arrays
 

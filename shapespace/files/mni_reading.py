@@ -46,7 +46,7 @@ def read_mni(data: memoryview, limits: Limits) -> tuple[FloatArray, IntArray]:
         warnings.simplefilter("error", DeprecationWarning)  # NumPy's word for text among the numbers
         try:
             numbers = np.fromstring(str(data[head.end() :], "ascii"), np.float64, sep=" ")
-        except (DeprecationWarning, UnicodeDecodeError):
+        except (DeprecationWarning, ValueError):
             raise ValueError(
                 "text stands among the numbers of MNI's OBJ: it has several objects, or is damaged"
             ) from None

@@ -5,7 +5,7 @@ This module imports no writer, because the process that reads uploads should sta
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -79,39 +79,45 @@ def read_arrays(
             source = source.read_bytes()
         except OSError as error:
             raise MeshError(f"can't be read: {error.strerror}") from error
-    data, formats = memoryview(source), SCAN_FORMATS if points else READ_FORMATS
-    format = format.lower() if format else _decided(data, formats, beside)
+    data = memoryview(source)
+    format = format.lower() if format else _decided(data, SCAN_FORMATS if points else READ_FORMATS, beside)
     try:
         # The caller decides whether coordinates that are not finite are a fault.
         with np.errstate(all="ignore"):
-            match format:
-                case "glb" | "gltf":
-                    return read_gltf(data, limits, binary=format == "glb", beside=beside)
-                case "npz":
-                    needed = ("vertices",) if points else ("vertices", "faces")
-                    arrays = read_mesh_npz(data, limits=limits, needed=needed)
-                    return arrays["vertices"], arrays.get("faces", np.zeros((0, 3), np.int64))
-                case "xyz" | "pts" | "csv" | "txt" if points:
-                    return read_point_text(data, limits)
-                case "pcd" if points:
-                    return read_pcd(data, limits)
-                case _ if format in _READERS:
-                    return _READERS[format](data, limits)
-                case _:
-                    raise _unknown(f"there is no format {format!r} here", formats)
+            vertices, faces = _read(data, format, limits, points=points, beside=beside)
     except (MeshError, MemoryError):
         raise
     except Exception as error:  # damaged files raise exceptions of many classes
         raise MeshError(f"not a readable {format} file: {reason(error)}") from error
+    if not vertices.size:
+        raise MeshError(f"not a readable {format} file: it holds no vertices")
+    return vertices, faces
 
 
-def _decided(data: memoryview, formats: Mapping[str, str], path: Path | None) -> str:
+def _read(
+    data: memoryview, format: str, limits: Limits, *, points: bool, beside: Path | None
+) -> tuple[np.ndarray, np.ndarray]:
+    match format:
+        case "glb" | "gltf":
+            return read_gltf(data, limits, binary=format == "glb", beside=beside)
+        case "npz":
+            needed = ("vertices",) if points else ("vertices", "faces")
+            arrays = read_mesh_npz(data, limits=limits, needed=needed)
+            return arrays["vertices"], arrays.get("faces", np.zeros((0, 3), np.int64))
+        case "xyz" | "pts" | "csv" | "txt" if points:
+            return read_point_text(data, limits)
+        case "pcd" if points:
+            return read_pcd(data, limits)
+        case _ if format in _READERS:
+            return _READERS[format](data, limits)
+        case _:
+            known = ", ".join(SCAN_FORMATS if points else READ_FORMATS)
+            raise FormatError(f"not a readable {format} file: there is no such format; these can be read: {known}")
+
+
+def _decided(data: memoryview, formats: Iterable[str], path: Path | None) -> str:
     """Return the format of a file that names none; raises FormatError with the formats that can be read."""
     try:
-        return decide(data, formats, path.name if path else "").name
+        return decide(data, [*formats], path.name if path else "").name
     except FormatError as error:
-        raise _unknown(str(error), formats) from None
-
-
-def _unknown(fault: str, formats: Iterable[str]) -> FormatError:
-    return FormatError(f"{fault}; these can be read: {', '.join(formats)}")
+        raise FormatError(f"{error}; these can be read: {', '.join(formats)}") from None

@@ -55,6 +55,7 @@ async def _upload(request: Request, format: str | None) -> codes.Upload:
 
 def _asked(
     service: Service,
+    request: Request,
     model: ShapeModel,
     kind: type[K],
     query: BaseModel,
@@ -63,7 +64,7 @@ def _asked(
 ) -> tuple[ShapeModel, K]:
     """Return the model and the options that the query and the fields of a form ask for."""
     if version := fields.get("version"):
-        model = service.repository.get(model.name, version)
+        model = service.repository.get(request.path_params["name"], version)
     return model, options_with_fields(kind, query, body, fields)
 
 
@@ -87,7 +88,7 @@ async def encode(
     units of the training meshes. A mesh with less than a third or more than three times their size is refused. A ZIP
     archive may hold several meshes.
     """
-    asked = partial(_asked, service, model, EncodeOptions, options, EncodeRequest)
+    asked = partial(_asked, service, request, model, EncodeOptions, options, EncodeRequest)
     file, most = await _upload(request, format), service.settings.max_codes
     found = await codes.encode(service.workers, service.sandbox, caller, asked, file, most)
     return found_response(service, found)
@@ -141,6 +142,6 @@ async def fit(
 
     The file holds a mesh of any connectivity or points without faces, in any rigid pose, whole or in part.
     """
-    asked = partial(_asked, service, model, FitOptions, options, FitRequest)
+    asked = partial(_asked, service, request, model, FitOptions, options, FitRequest)
     found = await codes.fit(service.workers, service.sandbox, caller, asked, await _upload(request, format))
     return found_response(service, found)

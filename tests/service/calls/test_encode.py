@@ -241,7 +241,7 @@ def test_files_that_cannot_be_used_are_refused_in_one_line(client: httpx.Client,
 def test_requests_without_a_known_format_or_a_file_are_refused(client: httpx.Client) -> None:
     content = mesh_file(client, "obj").content
     for arguments, status, says in (
-        ({"content": content}, 415, "No content type tells no format"),
+        ({"content": b"neither a mesh nor points"}, 415, "neither its content nor a name or a media type"),
         ({"content": content, "headers": {"Content-Type": "image/png"}}, 415, "image/png tells no format"),
         ({"content": content, "params": {"format": "fbx"}}, 415, "no format 'fbx' here"),
         ({"files": {"file": ("shape.fbx", content)}}, 415, "tells no format"),
