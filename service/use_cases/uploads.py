@@ -195,7 +195,7 @@ def _read_member(archive: zipfile.ZipFile, entry: zipfile.ZipInfo, limits: Limit
 
 
 def _hidden(name: str) -> bool:
-    """Whether a member of an archive is hidden, as those that macOS adds."""
+    """Whether a member of an archive is hidden. macOS adds such members."""
     return any(part.startswith((".", "__MACOSX")) for part in name.split("/"))
 
 
