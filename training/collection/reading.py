@@ -157,8 +157,8 @@ def _unfinished(path: Path) -> str:
         return ""
     with path.open("rb") as file:
         file.seek(max(0, path.stat().st_size - 200))
-        last = file.read().decode("latin-1")
-    if last[-1:] in ("\n", "\r", ""):
+        last = file.read().decode(errors="replace")
+    if last[-1:] in ("\n", "\r", "") or not last.replace("\n", "").replace("\r", "").isprintable():
         return ""
     return f"; its last line, {last.splitlines()[-1][-60:]!r}, has no end: if the file is cut short, copy it again"
 
