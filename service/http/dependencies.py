@@ -95,10 +95,15 @@ def one_of(names: Iterable[str]) -> WithJsonSchema:
     return WithJsonSchema({"type": "string", "enum": [*names]})
 
 
+def query_names(request: Request) -> list[str] | None:
+    """Return the query parameters of a call; None if its description lists none, as for the page."""
+    known: dict[tuple[str, str], list[str]] = request.app.state.query_parameters
+    return known.get((request.scope["route"].path, request.method))
+
+
 async def known_query(request: Request) -> None:
     """Raise ProblemError for query parameters that the description of a call does not list."""
-    known: dict[tuple[str, str], list[str]] = request.app.state.query_parameters
-    listed = known.get((request.scope["route"].path, request.method))
+    listed = query_names(request)
     unknown = [] if listed is None else [name for name in request.query_params if name not in listed]
     if unknown:
         choice = f"choose among {', '.join(listed)}" if listed else "this call has none"

@@ -16,6 +16,7 @@ from shapespace.service.http.messages.open_inference import InferenceRequest
 from shapespace.service.http.messages.schemas import MeshAnswer, Problem
 from shapespace.service.http.middleware.access import OPEN
 from shapespace.service.http.problems import KINDS, MEDIA_TYPE
+from shapespace.service.use_cases.forms import OPTIONS
 from shapespace.service.use_cases.shape_formats import SHAPE_FORMATS
 from shapespace.service.use_cases.uploads import MEDIA_TYPES
 
@@ -37,6 +38,12 @@ _HEADERS = {
         ),
         "Server-Timing": "Milliseconds by stage: `network`, `reconstruct`, `encode`.",
     }.items()
+}
+_FORM = "multipart/form-data"
+_OPTIONS = {
+    "type": "string",
+    "contentMediaType": "application/json",
+    "description": "Options as one JSON object, which may be a file. Fields have priority over the query.",
 }
 #: Models of bodies that FastAPI does not see, in addition to the models of JSONBody.
 _MODELS: tuple[type[BaseModel], ...] = (InferenceRequest, Problem)
@@ -69,6 +76,7 @@ def describe(app: FastAPI, routers: Iterable[APIRouter]) -> None:
             for path, calls in schema["paths"].items():
                 for method, call in calls.items():
                     _correct_responses(path, call)
+                    _add_fields(call)
                     if model := bodies.get((path, method)):
                         schema_of = {"schema": {"$ref": f"#/components/schemas/{model.__name__}"}}
                         call["requestBody"] = {"required": True, "content": {"application/json": schema_of}}
@@ -109,14 +117,14 @@ def mesh_answers(description: str) -> dict[int | str, dict[str, Any]]:
     return answers
 
 
-def upload(description: str, fields: Mapping[str, Any] | None = None) -> dict[str, Any]:
-    """Describe a body that is a file, JSON of a mesh, or a form with a file and further fields."""
+def upload(description: str) -> dict[str, Any]:
+    """Describe a body that is a file, JSON of a mesh, or a form with a file; `_add_fields` adds its other fields."""
     file = {"type": "string", "format": "binary", "description": description}
-    form = {"type": "object", "properties": {"file": file, **(fields or {})}, "required": ["file"]}
+    form = {"type": "object", "properties": {"file": file}, "required": ["file"], "additionalProperties": False}
     content = {
-        **{media_type: {"schema": file} for media_type in (*MEDIA_TYPES, "application/octet-stream")},
+        **{media_type: {"schema": file} for media_type in (*MEDIA_TYPES, "text/plain", "application/octet-stream")},
         "application/json": {"schema": {"$ref": f"#/components/schemas/{MeshAnswer.__name__}"}},
-        "multipart/form-data": {"schema": form},
+        _FORM: {"schema": form},
     }
     return {"requestBody": {"required": True, "content": content}}
 
@@ -141,6 +149,15 @@ def _bodies(routers: Iterable[APIRouter]) -> Iterator[tuple[tuple[str, str], typ
         for dependency in route.dependant.dependencies:
             if isinstance(dependency.call, JSONBody):
                 yield from (((route.path, method.lower()), dependency.call.model) for method in route.methods or ())
+
+
+def _add_fields(call: Mapping[str, Any]) -> None:
+    """Describe the query parameters of a call that takes forms as fields of the form too."""
+    if form := call.get("requestBody", {}).get("content", {}).get(_FORM):
+        for parameter in call["parameters"]:
+            if parameter["in"] == "query":
+                form["schema"]["properties"][parameter["name"]] = parameter["schema"]
+        form["schema"]["properties"][OPTIONS] = _OPTIONS
 
 
 def _correct_responses(path: str, call: dict[str, Any]) -> None:

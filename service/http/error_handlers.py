@@ -25,9 +25,10 @@ from shapespace.service.limits.workers import BusyError, DeadlineError, Disconne
 from shapespace.service.repository.repository import UnknownModelError, UnknownVersionError
 from shapespace.service.use_cases.animation import PathTooLongError, UnknownInterpolationError
 from shapespace.service.use_cases.batch import NoCodesError, TooManyCodesError
+from shapespace.service.use_cases.forms import FormFieldError, UnreadableFormError
 from shapespace.service.use_cases.sequence import TooManyFramesError, UnknownFrameError
 from shapespace.service.use_cases.shape_formats import NoRoomError
-from shapespace.service.use_cases.uploads import UnknownFormatError, UnreadableFormError, UnusableMeshError
+from shapespace.service.use_cases.uploads import UnknownFormatError, UnusableMeshError
 
 #: Kind of problem of each exception of the model and the use cases; the message becomes the detail.
 _KINDS: dict[type[Exception], str] = {
@@ -46,6 +47,7 @@ _KINDS: dict[type[Exception], str] = {
     PathTooLongError: "path-too-long",
     InvalidTargetError: "invalid-request",
     UnreadableFormError: "malformed-request",
+    FormFieldError: "invalid-request",
     UnknownFormatError: "unsupported-media-type",
     UnusableMeshError: "invalid-mesh",
     InvalidMeshError: "invalid-mesh",

@@ -32,9 +32,9 @@ def choose(
         unavailable: reason why a format is missing that a client may expect, by name.
     """
     if format is not None:
-        if format in formats:
-            return format
-        raise _not_acceptable(formats, unavailable.get(format, f"There is no format {format!r} here"))
+        if (name := format.lower()) in formats:
+            return name
+        raise _not_acceptable(formats, unavailable.get(name, f"There is no format {format!r} here"))
     if accept is None or not accept.strip():
         return next(iter(formats))
     ranges = [_parse(part) for part in accept.split(",", maxsplit=MOST_RANGES)[:MOST_RANGES] if part.strip()]

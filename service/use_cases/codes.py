@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
-from shapespace.arrays import FloatArray, IntArray
 from shapespace.files.limits import Limits
 from shapespace.mesh.rigid_motion import Placement
-from shapespace.model.correspondence import limits, match
+from shapespace.model.correspondence import InvalidMeshError, limits, match
 from shapespace.model.edit import require_targets
 from shapespace.model.fit_result import Distances, FitStatus
 from shapespace.model.latent_space import Bounds
@@ -31,9 +30,11 @@ from shapespace.service.limits.sandbox_errors import (
 from shapespace.service.limits.workers import BusyError, Caller, DeadlineError, EndingError, Workers
 from shapespace.service.use_cases.batch import Timings, require_count
 from shapespace.service.use_cases.shape_formats import dump_json, float32
-from shapespace.service.use_cases.uploads import UPLOAD_ERRORS, UnusableMeshError
+from shapespace.service.use_cases.uploads import TOGETHER, UPLOAD_ERRORS, UnusableMeshError, UploadedMesh
 from shapespace.solve.deadline import Deadline
 from shapespace.solve.outcome import Status
+
+K = TypeVar("K")
 
 logger = logging.getLogger(__name__)
 #: Memory in bytes that reading a file may take in addition to the file.
@@ -69,23 +70,30 @@ class Upload:
         pieces: pieces of the file, or of the form that holds it; reading empties them.
         content_type: declared media type, or an empty string.
         format: format from the query, which has priority.
+        known: names of the fields that a form may have beside the file.
     """
 
     pieces: Pieces
     content_type: str
     format: str | None
+    known: Sequence[str] = ()
+
+
+#: A function that returns the model and the options that a client asks for, given the fields of the form.
+Asked = Callable[[Mapping[str, str]], tuple[ShapeModel, K]]
 
 
 async def encode(
     workers: Workers,
     sandbox: Sandbox,
     caller: Caller,
-    model: ShapeModel,
+    asked: Asked[EncodeOptions],
     upload: Upload,
-    options: EncodeOptions,
     most: int,
 ) -> Found:
     """Find the code of an uploaded mesh in correspondence, with at most ``most`` samples; see ShapeModel.encode.
+
+    An archive may hold up to ``most`` meshes. The answer then has the code of each, with the name of its file.
 
     Raises:
         UploadError, InvalidMeshError: the mesh can't be used.
@@ -94,32 +102,52 @@ async def encode(
         TooManyCodesError: more than ``most`` samples.
         BusyError, DeadlineError, DisconnectedError, EndingError: the server is busy, or the call ended early.
     """
-    _require_few_samples(options, most)
-    model.latents.fixed(options.fixed)  # refused before the file is read
+
+    def checked(fields: Mapping[str, str]) -> tuple[ShapeModel, EncodeOptions]:
+        model, options = asked(fields)
+        _require_few_samples(options, most)
+        model.latents.fixed(options.fixed)
+        return model, options
+
+    model, _ = checked({})  # refused before the file is read
 
     def make(deadline: Deadline) -> Answered:
         began = time.perf_counter()
-        vertices, faces, _ = read_upload(sandbox, upload, limits(model.decoder), deadline)
-        given = match(model.decoder, vertices, faces)
+        meshes, fields = read_upload(sandbox, upload, limits(model.decoder), deadline, most=most)
+        chosen, options = checked(fields)
         read = time.perf_counter()
-        found = model.encode(given, options, deadline=deadline)
+        answers = [_encoded(chosen, mesh, options, deadline) for mesh in meshes]
         seconds = {"read": read - began, "search": time.perf_counter() - read}
-        content = {
-            "latent": found.code,
-            "residual": found.residual,
-            "vertex_error": {"mean": found.distances.mean(), "max": found.distances.max()},
-            "vertex_errors": float32(found.distances),
-            "inside_bounds": found.inside_bounds,
-            "status": found.status,
-            "iterations": found.iterations,
-            "mesh": found.mesh,
-            "diagnostics": asdict(found.shape.diagnostics),
-            "covariance": found.covariance,
-            "samples": found.samples,
-        }
-        return content, seconds
+        if len(meshes) == 1:
+            return answers[0], seconds
+        if any(answer["status"] == Status.DEADLINE for answer in answers):
+            raise workers.late()
+        named = [{"name": mesh.name, **answer} for mesh, answer in zip(meshes, answers, strict=True)]
+        return {"meshes": named}, seconds
 
     return await _searched(workers, caller, make)
+
+
+def _encoded(model: ShapeModel, mesh: UploadedMesh, options: EncodeOptions, deadline: Deadline) -> dict[str, Any]:
+    """Return the answer for one mesh; raises InvalidMeshError with the name of its file, if it has one."""
+    try:
+        given = match(model.decoder, mesh.vertices, mesh.faces)
+    except InvalidMeshError as error:
+        raise InvalidMeshError(f"{mesh.name}: {error}" if mesh.name else str(error)) from None
+    found = model.encode(given, options, deadline=deadline)
+    return {
+        "latent": found.code,
+        "residual": found.residual,
+        "vertex_error": {"mean": found.distances.mean(), "max": found.distances.max()},
+        "vertex_errors": float32(found.distances),
+        "inside_bounds": found.inside_bounds,
+        "status": found.status,
+        "iterations": found.iterations,
+        "mesh": found.mesh,
+        "diagnostics": asdict(found.shape.diagnostics),
+        "covariance": found.covariance,
+        "samples": found.samples,
+    }
 
 
 async def edit(
@@ -171,13 +199,10 @@ async def fit(
     workers: Workers,
     sandbox: Sandbox,
     caller: Caller,
-    model: ShapeModel,
+    asked: Asked[FitOptions],
     upload: Upload,
-    options: Callable[[str], FitOptions],
 ) -> Found:
     """Find the code, placement and size that explain an uploaded scan; see ShapeModel.fit_scan.
-
-    ``options`` returns the options, given the form's field ``options``, which may be empty.
 
     Raises:
         UploadError, InvalidScanError: the scan can't be used.
@@ -186,10 +211,10 @@ async def fit(
 
     def make(deadline: Deadline) -> Answered:
         began = time.perf_counter()
-        points, faces, said = read_upload(sandbox, upload, SCAN_LIMITS, deadline, points=True, memory=SCAN_MEMORY)
-        asked = options(said)
+        meshes, fields = read_upload(sandbox, upload, SCAN_LIMITS, deadline, points=True, memory=SCAN_MEMORY)
+        model, options = asked(fields)
         read = time.perf_counter()
-        found = model.fit_scan((points, faces), asked, deadline=deadline)
+        found = model.fit_scan((meshes[0].vertices, meshes[0].faces), options, deadline=deadline)
         content = {
             "latent": found.code,
             "covariance": found.covariance,
@@ -207,7 +232,7 @@ async def fit(
         }
         if found.used is not None:
             content["used"] = {"positions": float32(found.used[:, :3]), "distances": float32(found.used[:, 3])}
-        if asked.samples:
+        if options.samples:
             content["samples"] = found.samples
         return content, {"read": read - began, "search": time.perf_counter() - read}
 
@@ -217,7 +242,7 @@ async def fit(
 async def _searched(workers: Workers, caller: Caller, make: Callable[[Deadline], Answered]) -> Found:
     def search(deadline: Deadline) -> Found:
         content, seconds = make(deadline)
-        if content["status"] in (Status.DEADLINE, FitStatus.DEADLINE):
+        if content.get("status") in (Status.DEADLINE, FitStatus.DEADLINE):
             raise workers.late()
         return Found(dump_json(content), seconds)
 
@@ -242,9 +267,16 @@ def placement(found: Placement) -> dict[str, Any]:
 
 
 def read_upload(
-    sandbox: Sandbox, upload: Upload, limits: Limits, deadline: Deadline, *, points: bool = False, memory: int = MEMORY
-) -> tuple[FloatArray, IntArray, str]:
-    """Read vertices (V, 3), faces (F, 3) and the form's ``options`` of an uploaded file in a process of its own.
+    sandbox: Sandbox,
+    upload: Upload,
+    limits: Limits,
+    deadline: Deadline,
+    *,
+    points: bool = False,
+    memory: int = MEMORY,
+    most: int = 1,
+) -> tuple[list[UploadedMesh], Mapping[str, str]]:
+    """Read the meshes of an uploaded file, and the fields of the form, in a process of its own.
 
     Args:
         sandbox: sandbox whose child processes know the task ``read``.
@@ -253,6 +285,7 @@ def read_upload(
         deadline: time limit of the child process.
         points: whether the file may hold points without faces.
         memory: bytes that reading may take in addition to the file.
+        most: largest number of meshes; only an archive has several.
 
     Raises:
         UploadError: the mesh can't be used.
@@ -260,11 +293,17 @@ def read_upload(
         BusyError: no process is available.
         EndingError: the server ends.
     """
-    facts = {"content_type": upload.content_type, "format": upload.format, "points": points}
-    bounds = {"vertices": limits.vertices, "faces": limits.faces}
-    most = 24 * (limits.vertices + limits.faces) + _ANSWER
+    facts: dict[str, Any] = {
+        "content_type": upload.content_type,
+        "format": upload.format,
+        "points": points,
+        "most": most,
+    }
+    facts |= {"vertices": limits.vertices, "faces": limits.faces, "known": list(upload.known)}
+    together = limits if most == 1 else TOGETHER
+    size = 24 * (together.vertices + together.faces) + _ANSWER
     try:
-        said, arrays = sandbox.call("read", facts | bounds, upload.pieces, deadline=deadline, memory=memory, most=most)
+        said, arrays = sandbox.call("read", facts, upload.pieces, deadline=deadline, memory=memory, most=size)
     except FailedError as error:
         if error.kind in UPLOAD_ERRORS:
             raise UPLOAD_ERRORS[error.kind](error.sentence) from None
@@ -282,7 +321,9 @@ def read_upload(
     except SandboxError as error:
         logger.warning("the process that reads an uploaded file ended: %s", error)
         raise _unusable("it breaks its reader") from None
-    return arrays["vertices"], arrays["faces"], str(said["options"])
+    faces = [arrays.get(f"faces {k}", arrays["faces 0"]) for k in range(len(said["names"]))]
+    meshes = [UploadedMesh(arrays[f"vertices {k}"], faces[k], name) for k, name in enumerate(said["names"])]
+    return meshes, said["fields"]
 
 
 def _unusable(why: str) -> UnusableMeshError:

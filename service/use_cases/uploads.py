@@ -7,199 +7,221 @@ time and memory of reading, see `shapespace.service.limits.sandbox`.
 from __future__ import annotations
 
 import json
+import zipfile
 from array import array
 from collections.abc import Collection, Iterable
 from itertools import chain
-from pathlib import PurePath
+from typing import NamedTuple
 
 import numpy as np
-from python_multipart.exceptions import FormParserError
-from python_multipart.multipart import MultipartParser, parse_options_header
+from python_multipart.multipart import parse_options_header
 
 from shapespace.arrays import FloatArray, IntArray
-from shapespace.files.limits import Limits, clipped
+from shapespace.files.archives import natural_order, seekable
+from shapespace.files.limits import Limits, clipped, label, reason
 from shapespace.files.reading import OCTET_STREAM, READ_FORMATS, SCAN_FORMATS, read_arrays
+from shapespace.files.recognition import Assumed, FormatError, decide
 from shapespace.mesh.triangle_mesh import MeshError
 from shapespace.service.limits.sandbox_errors import FailedError
 from shapespace.service.limits.sandbox_wire import Arrays, JsonObject
+from shapespace.service.use_cases.forms import (
+    LONGEST_HEADER,
+    FormFieldError,
+    UnreadableFormError,
+    UploadError,
+    read_form,
+)
 
 #: Media types of the formats that can be read, by name.
 FORMATS = READ_FORMATS | {"json": "application/json"}
 #: Media types of the formats of scans, which may be points without faces.
 POINT_FORMATS = SCAN_FORMATS | {"json": "application/json"}
+#: An archive of files of these formats.
+ARCHIVE = "zip"
 #: Formats by media type, with further names of media types.
 MEDIA_TYPES = {
-    "text/plain": "obj",
+    "application/zip": ARCHIVE,
+    "application/x-zip-compressed": ARCHIVE,
     "model/x.stl-ascii": "stl",
     "model/x.stl-binary": "stl",
     "application/sla": "stl",
     "application/ply": "ply",
     "application/x-npz": "npz",
-} | {media_type: name for name, media_type in FORMATS.items() if media_type != OCTET_STREAM}
-_MAGIC = {b"glTF": "glb", b"ply": "ply", b"PK": "npz", b"OFF": "off"}
-#: Most characters of a Content-Type or Content-Disposition header.
-_LONGEST_HEADER = 1000
-#: Most fields of a form besides the file.
-_MOST_FIELDS = 16
-#: Most bytes of the field ``options``.
-_LONGEST_OPTIONS = 2**18
-
-
-class UploadError(ValueError):
-    """An upload that can't be used. The message says what is wrong and what to do."""
+} | {media_type: name for name, media_type in POINT_FORMATS.items() if media_type not in (OCTET_STREAM, "text/plain")}
+#: What the format follows from where a client says it.
+_GIVEN = "?format="
+#: Most vertices, and most faces, of all meshes of an archive.
+TOGETHER = Limits(2**21, 2**21)
 
 
 class UnusableMeshError(UploadError):
     """There is no file, or it holds no mesh within the limits."""
 
 
-class UnreadableFormError(UploadError):
-    """The form breaks the rules of its format, or holds more than one file."""
-
-
 class UnknownFormatError(UploadError):
-    """The request names no format, or an unknown one."""
+    """The file has an unknown format, or one that is not read."""
 
 
 #: Classes of errors by name. A sandbox process sends the name.
-UPLOAD_ERRORS = {error.__name__: error for error in (UnusableMeshError, UnreadableFormError, UnknownFormatError)}
+UPLOAD_ERRORS = {
+    error.__name__: error for error in (UnusableMeshError, UnreadableFormError, FormFieldError, UnknownFormatError)
+}
 
 
-def read_mesh_file(
-    body: bytes | bytearray, content_type: str, format: str | None, limits: Limits, *, points: bool = False
-) -> tuple[FloatArray, IntArray, str]:
-    """Read the mesh in the body of a request.
+class UploadedMesh(NamedTuple):
+    """A mesh as it is in its file: vertices (V, 3), faces (F, 3) or none, and the file's name in an archive."""
 
-    The format is ``format``, or else follows from the content type, the name of the file, or its first bytes.
+    vertices: FloatArray
+    faces: IntArray
+    name: str = ""
+
+
+def read_mesh_files(
+    body: bytes | bytearray,
+    content_type: str,
+    format: str | None,
+    limits: Limits,
+    *,
+    points: bool = False,
+    known: Collection[str] | None = None,
+    most: int = 1,
+) -> tuple[list[UploadedMesh], dict[str, str]]:
+    """Read the mesh in the body of a request, or the meshes of an archive in the order of their names.
+
+    The format is ``format``, or else follows from the file's first bytes, its name, or the content type.
 
     Args:
-        body: a mesh file, or a ``multipart/form-data`` form with a mesh file.
+        body: a mesh file, an archive of mesh files, or a ``multipart/form-data`` form with such a file.
         content_type: the header; empty if there is none.
-        format: value of ``?format=``, if any.
-        limits: largest numbers of vertices and faces.
+        format: value of ``?format=``, if any. A field ``format`` of a form has priority.
+        limits: largest numbers of vertices and faces of a mesh.
         points: whether points without faces are accepted.
+        known: names of the fields that the form may have; None accepts all.
+        most: largest number of meshes.
 
     Returns:
-        Vertices (V, 3) as in the file, faces (F, 3) or none, and the form's field ``options``.
+        The meshes, and the fields of the form.
 
     Raises:
         UploadError: there is no file, the form or the file can't be read, or the format is unknown.
     """
-    data, name, said, formats = memoryview(body), "", b"", POINT_FORMATS if points else FORMATS
-    declared, options = parse_options_header(content_type[:_LONGEST_HEADER])
+    name, fields, formats = "", dict[str, str](), POINT_FORMATS if points else FORMATS
+    declared, options = parse_options_header(content_type[:LONGEST_HEADER])
+    data, media_type = memoryview(body), declared.decode("latin-1")
     if declared == b"multipart/form-data":
-        form = _Form(body, options.get(b"boundary"))
-        data, name, declared = form.file()
-        said = form.options
+        file, fields = read_form(body, options.get(b"boundary"), known)
+        if file is None:
+            raise UnusableMeshError(
+                "The form holds no file. Send the mesh file as one of its fields, with a file name: -F file=@mesh.obj"
+            )
+        data, name, media_type = file.data, file.file_name or "", file.media_type
     if not data:
         raise UnusableMeshError("The file is empty. Send a mesh file as the body, or as a file of a form.")
-    found = format or _guess(declared.decode("latin-1"), name, bytes(data[:4]), formats)
-    if found not in formats:
-        listed = ", ".join(f"{name} ({media_type})" for name, media_type in formats.items())
-        told = clipped(declared.decode("latin-1")) or "No content type"
-        fault = f"There is no format {clipped(format)!r} here" if format else f"{told} tells no format"
-        raise UnknownFormatError(f"{fault}. Say by ?format= or Content-Type which: {listed}.")
+    accepted = ", ".join((*formats, ARCHIVE))
     try:
-        if found == "json":
-            vertices, faces = _read_json(data, limits)
-        else:
-            vertices, faces = read_arrays(data, found, limits, points=points)
-        return *_checked(vertices, faces), said.decode(errors="replace")
+        found = _format(data, (*formats, ARCHIVE), fields.get("format") or format, name, media_type)
+    except FormatError as error:
+        sentence = f"The file {str(error).rstrip('.')}. Send one of {accepted}. ?format= says which it is."
+        raise UnknownFormatError(sentence) from None
+    try:
+        if found.name == ARCHIVE:
+            return _read_archive(data, limits, points=points, most=most), fields
+        return [_read(data, found.name, limits, points=points)], fields
     except MeshError as error:
-        sentence = f"The mesh can't be used: {str(error).rstrip('.')}. Send one {found} file."
-        raise UnusableMeshError(sentence) from None
+        fault = str(error).rstrip(".") + (_looks_otherwise(data, found) if found.because == _GIVEN else "")
+        raise UnusableMeshError(
+            f"The mesh can't be used: {fault}. The server read it as {found.name}, as {found.because} says. "
+            f"Send one {found.name} file, or by ?format= another of {accepted}."
+        ) from None
 
 
-def _guess(declared: str, name: str, start: bytes, formats: Collection[str]) -> str | None:
-    suffix = PurePath(name).suffix.lstrip(".").lower()
-    magic = next((format for magic, format in _MAGIC.items() if start.startswith(magic)), "")
-    return next((guess for guess in (MEDIA_TYPES.get(declared), suffix, magic) if guess in formats), None)
+def _format(data: memoryview, formats: Collection[str], given: str | None, name: str, media_type: str) -> Assumed:
+    if not given:
+        return decide(data, formats, name, media_type, MEDIA_TYPES)
+    if given.lower() not in formats:
+        raise FormatError(f"can't be read: there is no format {clipped(given)!r} here")
+    return Assumed(given.lower(), _GIVEN)
+
+
+def _looks_otherwise(data: memoryview, assumed: Assumed) -> str:
+    """Return the end of a sentence about a file that is not what a client says."""
+    try:
+        found = decide(data, (*POINT_FORMATS, ARCHIVE))
+    except FormatError as error:
+        return f"; it {error}" if str(error).startswith("is ") else ""
+    return f"; it looks like {found.name}" if found.name != assumed.name else ""
+
+
+def _read(data: memoryview, format: str, limits: Limits, *, points: bool, name: str = "") -> UploadedMesh:
+    found = _read_json(data, limits) if format == "json" else read_arrays(data, format, limits, points=points)
+    return UploadedMesh(*_checked(*found), name)
+
+
+def _read_archive(data: memoryview, limits: Limits, *, points: bool, most: int) -> list[UploadedMesh]:
+    """Read the meshes of an archive in the natural order of their names; other files are left out."""
+    try:
+        with zipfile.ZipFile(seekable(data)) as archive:
+            there = [e for e in archive.infolist() if not e.is_dir() and not _hidden(e.filename)]
+            # A folder of meshes may have a README.txt.
+            for formats in (READ_FORMATS, SCAN_FORMATS) if points else (READ_FORMATS,):
+                if entries := [e for e in there if _extension(e.filename) in formats]:
+                    break
+            if not entries:
+                names = clipped(", ".join(label(e.filename) or "" for e in there)) or "nothing"
+                raise MeshError(f"the archive holds no mesh file, only {names}")
+            if len(entries) > most:
+                many = f"more than {most} meshes" if most > 1 else f"{len(entries)} meshes, where one is needed"
+                raise MeshError(f"the archive holds {many}: send fewer at once")
+            meshes: list[UploadedMesh] = []
+            for entry in sorted(entries, key=lambda e: (natural_order(e.filename), e.filename)):
+                meshes.append(_read_member(archive, entry, limits, points=points))
+                if np.array_equal(meshes[-1].faces, meshes[0].faces):
+                    meshes[-1] = meshes[-1]._replace(faces=meshes[0].faces)  # so that they take memory once
+                TOGETHER.check(sum(len(m.vertices) for m in meshes), sum(len(m.faces) for m in meshes))
+            return meshes
+    except (MeshError, MemoryError):
+        raise
+    except Exception as error:  # damaged files raise exceptions of many classes
+        raise MeshError("the archive is damaged, or protected by a password") from error
+
+
+def _read_member(archive: zipfile.ZipFile, entry: zipfile.ZipInfo, limits: Limits, *, points: bool) -> UploadedMesh:
+    content, name = archive.read(entry), label(entry.filename) or ""
+    try:
+        format = decide(memoryview(content), SCAN_FORMATS if points else READ_FORMATS, entry.filename).name
+        return _read(memoryview(content), format, limits, points=points, name=name)
+    except MeshError as error:
+        raise MeshError(f"{name}: {error}") from None
+
+
+def _hidden(name: str) -> bool:
+    """Whether a member of an archive is hidden. macOS adds such members."""
+    return any(part.startswith((".", "__MACOSX")) for part in name.split("/"))
+
+
+def _extension(name: str) -> str:
+    return name.rpartition(".")[2].lower()
 
 
 def read_in_sandbox(
-    body: bytearray, content_type: str, format: str | None, vertices: int, faces: int, points: bool = False
+    body: bytearray,
+    content_type: str,
+    format: str | None,
+    vertices: int,
+    faces: int,
+    points: bool,
+    known: list[str],
+    most: int,
 ) -> tuple[JsonObject, Arrays]:
-    """Run `read_mesh_file` as a task of a sandbox; raises FailedError."""
+    """Run `read_mesh_files` as a task of a sandbox; raises FailedError. Equal faces are sent once."""
+    limits = Limits(vertices, faces)
     try:
-        found = read_mesh_file(body, content_type, format, Limits(vertices, faces), points=points)
+        meshes, fields = read_mesh_files(body, content_type, format, limits, points=points, known=known, most=most)
     except UploadError as error:
         raise FailedError(type(error).__name__, str(error)) from None
-    return {"options": found[2]}, {"vertices": found[0], "faces": found[1]}
-
-
-class _Form:
-    """Parser of a ``multipart/form-data`` form with one file, and maybe a field ``options``. It copies no file."""
-
-    def __init__(self, body: bytes | bytearray, boundary: bytes | None) -> None:
-        self._body, self._boundary = body, boundary
-        self._headers: dict[bytes, bytes] = {}
-        self._header, self._name = b"", ""
-        self._fields = self._files = 0
-        self._is_file, self._start, self._stop = False, 0, 0
-        self._found: tuple[memoryview, str, bytes] | None = None
-        self._field = b""
-        self.options = b""
-
-    def file(self) -> tuple[memoryview, str, bytes]:
-        """Return content, name and declared media type of the file; raises UploadError if there is not one."""
-        if self._boundary is None:
-            raise self._unreadable("Missing boundary in multipart.")
-        if self._body.count(b"\r\n--" + self._boundary) > 2 * _MOST_FIELDS:
-            raise self._unreadable("Too many parts.")
-        try:
-            parser = MultipartParser(
-                self._boundary,
-                {
-                    "on_part_begin": self._headers.clear,
-                    "on_header_field": self._on_header_field,
-                    "on_header_value": self._on_header_value,
-                    "on_headers_finished": self._on_headers_finished,
-                    "on_part_data": self._on_part_data,
-                    "on_part_end": self._on_part_end,
-                },
-            )
-            # In one call, so that positions are positions in the body.
-            parser.write(self._body)  # type: ignore[arg-type]
-        except FormParserError:
-            raise self._unreadable("Invalid multipart data.") from None
-        if self._found is None:
-            raise UnusableMeshError("The form holds no file. Send the mesh file as one of its fields.")
-        return self._found
-
-    def _unreadable(self, why: str) -> UnreadableFormError:
-        return UnreadableFormError(f"The form can't be read: {why} Send one file in it.")
-
-    def _on_header_field(self, data: bytes, start: int, stop: int) -> None:
-        self._header = bytes(data[start : min(stop, start + _LONGEST_HEADER)]).lower()
-
-    def _on_header_value(self, data: bytes, start: int, stop: int) -> None:
-        self._headers[self._header] = bytes(data[start : min(stop, start + _LONGEST_HEADER)])
-
-    def _on_headers_finished(self) -> None:
-        _, options = parse_options_header(self._headers.get(b"content-disposition"))
-        if b"name" not in options:
-            raise self._unreadable('The Content-Disposition header field "name" must be provided.')
-        self._is_file, self._start, self._stop = b"filename" in options, 0, 0
-        self._files += self._is_file
-        self._fields += not self._is_file
-        if self._files > 1:
-            raise self._unreadable("Too many files. Maximum number of files is 1.")
-        if self._fields > _MOST_FIELDS:
-            raise self._unreadable(f"Too many fields. Maximum number of fields is {_MOST_FIELDS}.")
-        self._name = options.get(b"filename", b"").decode(errors="replace")
-        self._field = options[b"name"]
-
-    def _on_part_data(self, data: bytes, start: int, stop: int) -> None:
-        self._start, self._stop = self._start or start, stop
-
-    def _on_part_end(self) -> None:
-        if self._is_file:
-            declared, _ = parse_options_header(self._headers.get(b"content-type"))
-            self._found = memoryview(self._body)[self._start : self._stop], self._name, declared
-        elif self._field == b"options":
-            if self._stop - self._start > _LONGEST_OPTIONS:
-                raise self._unreadable(f"options has more than {_LONGEST_OPTIONS} bytes.")
-            self.options = bytes(self._body[self._start : self._stop])
+    arrays: Arrays = {f"vertices {k}": mesh.vertices for k, mesh in enumerate(meshes)}
+    arrays |= {f"faces {k}": m.faces for k, m in enumerate(meshes) if not k or m.faces is not meshes[0].faces}
+    return {"fields": fields, "names": [mesh.name for mesh in meshes]}, arrays
 
 
 def _read_json(data: memoryview, limits: Limits) -> tuple[FloatArray, IntArray]:
@@ -207,7 +229,7 @@ def _read_json(data: memoryview, limits: Limits) -> tuple[FloatArray, IntArray]:
         # orjson would crash at the end of its memory, where this module raises MemoryError.
         content = json.loads(bytes(data))
     except (ValueError, RecursionError) as error:
-        raise MeshError(f"not JSON: {clipped(error)}") from None
+        raise MeshError(f"not JSON: {reason(error)}") from None
     if not isinstance(content, dict) or "vertices" not in content:
         raise MeshError('not an object {"vertices": [[x, y, z], …], "faces": [[a, b, c], …]}')
     vertices = _triples("d", content["vertices"], "vertices must be lists of three numbers each")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from dataclasses import dataclass
 
@@ -27,18 +28,42 @@ class Limits:
 UNLIMITED = Limits()
 
 
+#: Encodings by their byte-order marks. The mark of UTF-32 begins with the mark of UTF-16.
+_MARKS = {b"\xff\xfe\0\0": "utf-32", b"\0\0\xfe\xff": "utf-32", b"\xff\xfe": "utf-16", b"\xfe\xff": "utf-16"}
+
+
 def as_utf8(data: memoryview) -> memoryview:
-    """Return a text in UTF-8 without its byte-order mark; raises ValueError if it is damaged UTF-16."""
-    if bytes(data[:3]) == b"\xef\xbb\xbf":
+    """Return a text in UTF-8 without its byte-order mark; raises ValueError if it is damaged UTF-16 or UTF-32.
+
+    UTF-16 without a mark is recognised by its first four characters, which must be ASCII.
+    """
+    start = bytes(data[:8])
+    if start.startswith(b"\xef\xbb\xbf"):
         return data[3:]
-    if bytes(data[:2]) in (b"\xff\xfe", b"\xfe\xff"):
-        return memoryview(str(data, "utf-16").encode())
-    return data
+    encoding = next((name for mark, name in _MARKS.items() if start.startswith(mark)), None)
+    if encoding is None and len(start) == 8 and start.count(0) == 4:
+        encoding = {start[1::2]: "utf-16-le", start[::2]: "utf-16-be"}.get(bytes(4))
+    return memoryview(str(data, encoding).encode()) if encoding else data
 
 
 def label(text: object) -> str | None:
     """Return a name from a file on one line, shortened; None if it has no printable character."""
     return clipped("".join(c if c.isprintable() else " " for c in str(text)[:1000])) or None
+
+
+def quoted(text: str) -> str:
+    """Return text from a file in quotation marks, shortened; bytes that are no text are not repeated."""
+    line = clipped(text)
+    return repr(line) if line.isprintable() and "\ufffd" not in line else "no text"
+
+
+def reason(error: Exception) -> str:
+    """Return the message of an error on one line, shortened, unless it repeats bytes that are no text."""
+    line = clipped(error, 300)
+    unfit = (
+        not line.isprintable() or "\ufffd" in line or re.search(r"\\x[0-9a-f]|\\0|codec can't|invalid literal", line)
+    )
+    return "it is damaged, or another kind of file" if unfit else line
 
 
 def clipped(text: object, most: int = 100) -> str:

@@ -4,17 +4,15 @@ from __future__ import annotations
 
 import io
 import math
-import os
 import zipfile
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
-from pathlib import Path
-from typing import IO, cast
+from typing import IO
 
 import numpy as np
 from numpy.typing import NDArray
 
-from shapespace.files.archives import Buffer, zip_pieces
+from shapespace.files.archives import Buffer, Source, seekable, zip_pieces
 from shapespace.files.limits import UNLIMITED, Limits, clipped
 from shapespace.mesh.triangle_mesh import MeshError
 
@@ -23,8 +21,6 @@ PIECE = 2**16
 #: Bytes of the longest number of NumPy, a complex long double. Longer entries are text.
 _LONGEST_NUMBER = 32
 _READ_HEADER = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
-#: What an NPZ file can be read from.
-Source = Path | bytes | memoryview
 
 
 @dataclass(frozen=True)
@@ -47,7 +43,7 @@ def npz_headers(source: Source) -> dict[str, ArrayHeader]:
         OSError: the file can't be opened.
         Exception: the file is damaged; `zipfile`, `zlib` and NumPy raise exceptions of many classes.
     """
-    with zipfile.ZipFile(_seekable(source)) as archive:
+    with zipfile.ZipFile(seekable(source)) as archive:
         found = {}
         for name, entry in _entries(archive).items():
             with archive.open(entry) as member:
@@ -67,7 +63,7 @@ def read_npz(source: Source, names: Collection[str] | None = None) -> dict[str, 
         ValueError: an array holds pickled objects, or more bytes than the file.
         Exception: the file is damaged, as for `npz_headers`.
     """
-    with zipfile.ZipFile(_seekable(source)) as archive:
+    with zipfile.ZipFile(seekable(source)) as archive:
         arrays = {}
         for name, entry in _entries(archive).items():
             if names is None or name in names:
@@ -155,35 +151,3 @@ def _header(member: IO[bytes], entry: zipfile.ZipInfo) -> ArrayHeader:
     if not dtype.hasobject and not 0 <= header.nbytes <= entry.file_size:
         raise ValueError(f"{entry.filename} can't be {dtype} {shape}")
     return header
-
-
-def _seekable(source: Source) -> Path | IO[bytes]:
-    if isinstance(source, memoryview):
-        return cast("IO[bytes]", _MemoryFile(source))
-    return io.BytesIO(source) if isinstance(source, bytes) else source
-
-
-class _MemoryFile:
-    """A buffer as an open file. `io.BytesIO` would copy a buffer that is not ``bytes``."""
-
-    def __init__(self, data: memoryview) -> None:
-        self._data, self._position = data, 0
-
-    def seekable(self) -> bool:
-        return True
-
-    def tell(self) -> int:
-        return self._position
-
-    def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
-        start = {os.SEEK_SET: 0, os.SEEK_CUR: self._position, os.SEEK_END: len(self._data)}[whence]
-        if start + offset < 0:
-            raise OSError("before the beginning")
-        self._position = start + offset
-        return self._position
-
-    def read(self, size: int | None = -1) -> bytes:
-        stop = len(self._data) if size is None or size < 0 else self._position + size
-        piece = bytes(self._data[self._position : stop])
-        self._position += len(piece)
-        return piece

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shapespace.arrays import FloatArray, IntArray
-from shapespace.files.limits import Limits, clipped
+from shapespace.files.limits import Limits, as_utf8, clipped
 from shapespace.files.polygon_reading import Lines, TriangleFans, first_values
 
 #: Bytes at the start of a file in which its header has to end.
@@ -106,6 +106,7 @@ def read_ply(data: memoryview, limits: Limits) -> tuple[FloatArray, IntArray]:
 
 def read_header(data: memoryview) -> tuple[bool, list[PlyElement], memoryview]:
     """Return whether a file is ASCII, its elements, and the content after its header."""
+    data = as_utf8(data)
     head = bytes(data[:_LONGEST_HEADER])
     end = re.search(rb"^end_header[ \t]*\r?\n", head, re.MULTILINE)
     if not head.startswith(b"ply") or not end:

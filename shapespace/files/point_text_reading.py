@@ -14,7 +14,7 @@ from itertools import islice
 import numpy as np
 
 from shapespace.arrays import FloatArray, IntArray
-from shapespace.files.limits import Limits, as_utf8, clipped
+from shapespace.files.limits import Limits, as_utf8, quoted
 from shapespace.mesh.triangle_mesh import MeshError
 
 #: Lines with points in which the dialect is looked for, and lines that may stand before the first point.
@@ -105,7 +105,7 @@ class _Dialect:
         if found == cls(",", False) and named != len(values) and all(_may_be_decimals(line) for _, line in sample):
             other = [f"{whole}.{part}" for whole, part in zip(values[::2], values[1::2], strict=True)]
             raise MeshError(
-                f"line {_number(text, sample[0][0])}, {clipped(sample[0][1])!r}, can be read as "
+                f"line {_number(text, sample[0][0])}, {quoted(sample[0][1])}, can be read as "
                 f"({', '.join(values[:3])}) and as ({', '.join(other[:3])}): write decimals with a point, or separate "
                 "columns by semicolons"
             )
@@ -160,7 +160,9 @@ class _Dialect:
         if self.numbered and not _counts_up(found[:, 0]):
             k = int(np.flatnonzero(np.diff(found[:, 0]) != 1)[0]) + 1
             place, line = next(islice(self._rows(text, []), k, None))
-            raise ValueError(f"its first column counts the points, but not in line {_number(text, place)}, {line!r}")
+            raise ValueError(
+                f"its first column counts the points, but not in line {_number(text, place)}, {quoted(line)}"
+            )
         return found[:, 1:].copy() if self.numbered else found, counts
 
     def _rows(self, text: str, counts: list[int]) -> Iterator[tuple[int, str]]:
@@ -218,4 +220,4 @@ def _counts_up(numbers: FloatArray) -> bool:
 
 
 def _fault(text: str, place: int, line: str) -> ValueError:
-    return ValueError(f"line {_number(text, place)} is {clipped(line)!r}, and has no three numbers in front")
+    return ValueError(f"line {_number(text, place)} is {quoted(line)}, and has no three numbers in front")

@@ -16,7 +16,8 @@ from typing import Self
 import numpy as np
 
 from shapespace.arrays import FloatArray, IntArray
-from shapespace.files.limits import Limits, as_utf8, clipped
+from shapespace.files.limits import Limits, as_utf8, quoted
+from shapespace.files.mni_reading import is_mni, read_mni
 from shapespace.mesh.triangle_mesh import MeshError
 
 #: Bytes that are copied at once to count the lines before an error.
@@ -79,11 +80,12 @@ class Lines:
         if isinstance(error, ValueError | LookupError | OverflowError) and not isinstance(error, MeshError):
             line = _LINE.match(self._data[self._place : self._place + 1000])
             text = line[1].decode(errors="replace") if line else ""
-            raise ValueError(f"line {self._number} is {clipped(text)!r}") from None
+            raise ValueError(f"line {self._number} is {quoted(text)}") from None
 
 
 def joined_lines(data: memoryview) -> memoryview:
-    """Return an OBJ or MTL text with lines that end in a backslash joined to the next one."""
+    """Return an OBJ or MTL text, in UTF-8, with lines that end in a backslash joined to the next one."""
+    data = as_utf8(data)
     return memoryview(_CONTINUED.sub(b" ", data)) if _CONTINUED.search(data) else data
 
 
@@ -109,9 +111,14 @@ class TriangleFans:
 
 
 def read_obj(data: memoryview, limits: Limits) -> tuple[FloatArray, IntArray]:
-    """Return vertices (V, 3) and faces (F, 3) of an OBJ file; everything else is ignored."""
+    """Return vertices (V, 3) and faces (F, 3) of an OBJ file, Wavefront's or MNI's; everything else is ignored."""
     coordinates, triangles = array("d"), TriangleFans(limits)
-    with Lines(joined_lines(data), _OBJ_LINE) as lines:
+    text = as_utf8(data)
+    if is_mni(start := bytes(text[:1000])):
+        return read_mni(text, limits)
+    if b"\0" in start:
+        raise ValueError("it is no text")
+    with Lines(joined_lines(text), _OBJ_LINE) as lines:
         for line in lines:
             keyword, *values = line.split(None, 1)
             if keyword in b"vV":

@@ -5,17 +5,19 @@ This module imports no writer, because the process that reads uploads should sta
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
 
 from shapespace.files.gltf_reading import read_gltf
-from shapespace.files.limits import UNLIMITED, Limits, clipped
+from shapespace.files.limits import UNLIMITED, Limits, reason
 from shapespace.files.npz import read_mesh_npz
 from shapespace.files.pcd_reading import read_pcd
 from shapespace.files.ply_reading import read_ply
 from shapespace.files.point_text_reading import read_point_text
 from shapespace.files.polygon_reading import read_obj, read_off, read_stl
+from shapespace.files.recognition import FormatError, decide
 from shapespace.mesh.triangle_mesh import MeshError
 
 #: Media type of formats that have none registered at IANA.
@@ -57,7 +59,7 @@ def read_arrays(
 
     Args:
         source: content of the file, or its path.
-        format: one of READ_FORMATS; by default the extension of the path.
+        format: one of READ_FORMATS; by default the first bytes decide, then the extension of the path.
         limits: largest numbers of vertices and faces. A larger mesh is refused.
         points: whether points without faces are accepted. The format can then be one of SCAN_FORMATS.
 
@@ -71,7 +73,6 @@ def read_arrays(
     """
     beside = source if isinstance(source, Path) else None
     if isinstance(source, Path):
-        format = format or source.suffix.lstrip(".").lower()
         if source.exists() and not source.is_file():
             raise MeshError("can't be read: it is no file")
         try:
@@ -79,23 +80,44 @@ def read_arrays(
         except OSError as error:
             raise MeshError(f"can't be read: {error.strerror}") from error
     data = memoryview(source)
+    format = format.lower() if format else _decided(data, SCAN_FORMATS if points else READ_FORMATS, beside)
     try:
         # The caller decides whether coordinates that are not finite are a fault.
         with np.errstate(all="ignore"):
-            match format:
-                case "glb" | "gltf":
-                    return read_gltf(data, limits, binary=format == "glb", beside=beside)
-                case "npz":
-                    needed = ("vertices",) if points else ("vertices", "faces")
-                    arrays = read_mesh_npz(data, limits=limits, needed=needed)
-                    return arrays["vertices"], arrays.get("faces", np.zeros((0, 3), np.int64))
-                case "xyz" | "pts" | "csv" | "txt" if points:
-                    return read_point_text(data, limits)
-                case "pcd" if points:
-                    return read_pcd(data, limits)
-                case _:
-                    return _READERS[str(format)](data, limits)
+            vertices, faces = _read(data, format, limits, points=points, beside=beside)
     except (MeshError, MemoryError):
         raise
     except Exception as error:  # damaged files raise exceptions of many classes
-        raise MeshError(f"not a readable {format} file: {clipped(error, 300)}") from error
+        raise MeshError(f"not a readable {format} file: {reason(error)}") from error
+    if len(data) and not vertices.size:  # of an empty file the caller says that it is empty
+        raise MeshError(f"not a readable {format} file: it holds no vertices")
+    return vertices, faces
+
+
+def _read(
+    data: memoryview, format: str, limits: Limits, *, points: bool, beside: Path | None
+) -> tuple[np.ndarray, np.ndarray]:
+    match format:
+        case "glb" | "gltf":
+            return read_gltf(data, limits, binary=format == "glb", beside=beside)
+        case "npz":
+            needed = ("vertices",) if points else ("vertices", "faces")
+            arrays = read_mesh_npz(data, limits=limits, needed=needed)
+            return arrays["vertices"], arrays.get("faces", np.zeros((0, 3), np.int64))
+        case "xyz" | "pts" | "csv" | "txt" if points:
+            return read_point_text(data, limits)
+        case "pcd" if points:
+            return read_pcd(data, limits)
+        case _ if format in _READERS:
+            return _READERS[format](data, limits)
+        case _:
+            known = ", ".join(SCAN_FORMATS if points else READ_FORMATS)
+            raise FormatError(f"not a readable {format} file: there is no such format; these can be read: {known}")
+
+
+def _decided(data: memoryview, formats: Iterable[str], path: Path | None) -> str:
+    """Return the format of a file that names none; raises FormatError with the formats that can be read."""
+    try:
+        return decide(data, [*formats], path.name if path else "").name
+    except FormatError as error:
+        raise FormatError(f"{error}; these can be read: {', '.join(formats)}") from None

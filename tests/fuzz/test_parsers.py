@@ -35,7 +35,7 @@ from shapespace.model.shape_model import ShapeModel
 from shapespace.service.http.negotiation import choose
 from shapespace.service.http.problems import ProblemError
 from shapespace.service.use_cases.animation import Animation, UnknownInterpolationError
-from shapespace.service.use_cases.uploads import FORMATS, UploadError, read_mesh_file
+from shapespace.service.use_cases.uploads import FORMATS, UploadError, read_mesh_files
 from shapespace.training.collection.checks import IngestError
 from shapespace.training.collection.ingest import read_collection
 from tests.hostile import BINARY, MATRIX, document, glb
@@ -237,7 +237,7 @@ def test_uploads(format: str) -> None:
 
 
 def matched(data: bytes, format: str | None, content_type: str = "") -> Matched:
-    vertices, faces, *_ = read_mesh_file(data, content_type, format, limits(model().decoder))
+    ((vertices, faces, _),), _ = read_mesh_files(data, content_type, format, limits(model().decoder))
     return match(model().decoder, vertices, faces)
 
 

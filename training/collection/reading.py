@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
@@ -11,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from shapespace.arrays import FloatArray, IntArray
+from shapespace.files.archives import natural_order
 from shapespace.files.npz import read_mesh_npz
 from shapespace.files.reading import READ_FORMATS, read_arrays
 from shapespace.mesh.triangle_mesh import MeshError, PlaceError, on_shared_vertices
@@ -67,12 +67,6 @@ def data_files(path: Path) -> list[Path]:
     )
 
 
-def _natural(path: Path) -> tuple[list[str | int], str]:
-    """Key that sorts files by the words and the numbers in their names."""
-    pieces = re.split(r"(\d+)", path.stem.casefold())
-    return [int(piece) if k % 2 else piece for k, piece in enumerate(pieces)], path.name
-
-
 def _extension(path: Path) -> str:
     return path.suffix.lstrip(".").lower()
 
@@ -80,7 +74,10 @@ def _extension(path: Path) -> str:
 def _mesh_files(folder: Path) -> list[Path]:
     """List the mesh files of a folder in natural order, at least 3 and with different names."""
     files = [path for path in folder.iterdir() if not path.name.startswith(".") and not path.is_dir()]
-    paths = sorted((path for path in files if _extension(path) in READ_FORMATS), key=_natural)
+    paths = sorted(
+        (path for path in files if _extension(path) in READ_FORMATS),
+        key=lambda path: (natural_order(path.stem), path.name),
+    )
     if not paths:
         others = sorted({path.suffix or path.name for path in files})
         found = f"only {', '.join(others[:8])}" if others else "it has no files"
@@ -160,8 +157,8 @@ def _unfinished(path: Path) -> str:
         return ""
     with path.open("rb") as file:
         file.seek(max(0, path.stat().st_size - 200))
-        last = file.read().decode("latin-1")
-    if last[-1:] in ("\n", "\r", ""):
+        last = file.read().decode(errors="replace")
+    if last[-1:] in ("\n", "\r", "") or not last.replace("\n", "").replace("\r", "").isprintable():
         return ""
     return f"; its last line, {last.splitlines()[-1][-60:]!r}, has no end: if the file is cut short, copy it again"
 

@@ -1,4 +1,4 @@
-"""Options of a fit, in the query or in a field of a form, and its answer."""
+"""Options of a fit, in the query or in fields of a form, and its answer."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ from pydantic import AfterValidator, BaseModel, Field
 
 from shapespace.model.fit_constraints import LANDMARKS
 from shapespace.model.options import FitOptions, Landmark
-from shapespace.service.http.messages.bodies import read
 from shapespace.service.http.messages.options import body_of, options_of, query_of
 from shapespace.service.http.messages.schemas import DiagnosticsAnswer, PlacementAnswer
 from shapespace.service.use_cases.fields import Body
@@ -39,12 +38,7 @@ class FitQuery(BaseModel):
 
 @body_of(FitOptions, _LANDMARKS, samples={"le": MOST_SAMPLES})
 class FitRequest(Body):
-    """Options of a fit in a field of a form."""
-
-
-def fit_options(query: FitQuery, field: str) -> FitOptions:
-    """Return the options from the query and from the form's field ``options``, which has priority and may be empty."""
-    return options_of(FitOptions, query, *([read(field.encode(), FitRequest)] if field.strip() else []))
+    """Options of a fit in the field `options` of a form."""
 
 
 class DistancesAnswer(BaseModel):

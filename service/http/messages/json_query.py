@@ -1,4 +1,4 @@
-"""JSON in query parameters: ``?fixed=``, ``?landmarks=`` and ``?place=``."""
+"""JSON in query parameters and fields of forms: ``fixed``, ``landmarks``, ``place`` and ``options``."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Query parameters and JSON bodies derived from the library's options.
+"""Query parameters, fields of forms and JSON bodies derived from the library's options.
 
 Names, defaults, limits and descriptions come from the dataclasses in ``shapespace.model.options``.
 """
@@ -12,10 +12,13 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import MISSING, asdict, fields
 from typing import Annotated, Any, TypeVar, get_type_hints
 
-from pydantic import AfterValidator, BaseModel, Field, TypeAdapter, ValidationInfo, create_model
+from fastapi.exceptions import RequestValidationError
+from pydantic import AfterValidator, BaseModel, Field, TypeAdapter, ValidationError, ValidationInfo, create_model
 
 from shapespace.service.http.messages.json_query import read_query
+from shapespace.service.http.problems import ProblemError
 from shapespace.service.use_cases.fields import Number, NumbersByIndex, Whole
+from shapespace.service.use_cases.forms import OPTIONS
 
 M = TypeVar("M", bound=BaseModel)
 K = TypeVar("K")
@@ -61,6 +64,36 @@ def options_of(kind: type[K], *given: BaseModel) -> K:
     for model in given:
         sent |= {name: getattr(model, name) for name in model.model_fields_set & names}
     return kind(**sent)
+
+
+def options_with_fields(kind: type[K], query: BaseModel, body: type[BaseModel], fields: Mapping[str, str]) -> K:
+    """Return the options from the query and from the fields of a form, which have priority.
+
+    Args:
+        kind: class of the options.
+        query: the query. Fields are checked as its parameters.
+        body: model of the field ``options``, which holds several options as JSON.
+        fields: fields of the form by name, with those that are no options.
+
+    Raises:
+        RequestValidationError, ProblemError: a field has a wrong value, or the form says the same option twice.
+    """
+    names, text = type(query).model_fields, fields.get(OPTIONS, "")
+    given = {name: value for name, value in fields.items() if name in names}
+    try:
+        sent = [read_query(text, OPTIONS, TypeAdapter(body))] if text.strip() else []
+        checked = type(query).model_validate(given)
+    except (RequestValidationError, ValidationError) as error:
+        faults = ({**fault, "loc": ("form", *_place(fault["loc"]))} for fault in error.errors())
+        raise RequestValidationError([*faults]) from None
+    if twice := [name for name in given for each in sent if name in each.model_fields_set]:
+        raise ProblemError("invalid-request", f"The form has {twice[0]} as a field and in {OPTIONS}. Send it once.")
+    return options_of(kind, query, checked, *sent)
+
+
+def _place(where: tuple) -> tuple:
+    """Return the place of a fault in a form, without the word for a query."""
+    return where[1:] if where[:1] == ("query",) else where
 
 
 def _decorator(

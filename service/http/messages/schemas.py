@@ -93,6 +93,11 @@ class EncodeQuery(BaseModel):
     """Options of ``encode`` in the query."""
 
 
+@body_of(EncodeOptions)
+class EncodeRequest(Body):
+    """Options of ``encode`` in the field `options` of a form."""
+
+
 class SampleRequest(Body):
     """How many random codes, and which."""
 
@@ -207,6 +212,18 @@ class EncodeAnswer(BaseModel):
     diagnostics: DiagnosticsAnswer = Field(description="Of the code's shape.")
     covariance: list[list[float]] = Field(description=_COVARIANCE)
     samples: list[list[float]] = Field(description=_SAMPLED)
+
+
+class NamedEncodeAnswer(EncodeAnswer):
+    """The code of a mesh in an archive."""
+
+    name: str = Field(description="Name of the mesh's file in the archive.")
+
+
+class ArchiveAnswer(BaseModel):
+    """The codes of several meshes in one ZIP archive."""
+
+    meshes: list[NamedEncodeAnswer] = Field(description="In the order of the files' names, pose2 before pose10.")
 
 
 class EditAnswer(BaseModel):

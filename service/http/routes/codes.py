@@ -2,23 +2,36 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
-from typing import Annotated
+from typing import Annotated, TypeVar
 
 from fastapi import APIRouter, Depends, Query, Request, Response
+from pydantic import BaseModel
 
-from shapespace.model.options import EditOptions, EncodeOptions, Target
-from shapespace.service.http.dependencies import CallerDependency, MeshQuery, Model, ServiceDependency, one_of
+from shapespace.model.options import EditOptions, EncodeOptions, FitOptions, Target
+from shapespace.model.shape_model import ShapeModel
+from shapespace.service.http.dependencies import (
+    CallerDependency,
+    MeshQuery,
+    Model,
+    Service,
+    ServiceDependency,
+    one_of,
+    query_names,
+)
 from shapespace.service.http.description import problems, upload
 from shapespace.service.http.messages.bodies import JSONBody, gather
-from shapespace.service.http.messages.fit import FitAnswer, FitQuery, fit_options
-from shapespace.service.http.messages.options import options_of
+from shapespace.service.http.messages.fit import FitAnswer, FitQuery, FitRequest
+from shapespace.service.http.messages.options import options_of, options_with_fields
 from shapespace.service.http.messages.schemas import (
+    ArchiveAnswer,
     EditAnswer,
     EditRequest,
     EncodeAnswer,
     EncodeQuery,
+    EncodeRequest,
     SampleAnswer,
     SampleRequest,
 )
@@ -26,15 +39,39 @@ from shapespace.service.http.responses import found_response
 from shapespace.service.use_cases import codes
 from shapespace.service.use_cases.batch import require_count
 from shapespace.service.use_cases.shape_formats import dump_json
-from shapespace.service.use_cases.uploads import FORMATS, POINT_FORMATS
+from shapespace.service.use_cases.uploads import ARCHIVE, FORMATS, POINT_FORMATS
+
+K = TypeVar("K")
 
 router = APIRouter(prefix="/v1/models/{name}", tags=["codes"])
+
+_FORMAT = Query(description="Format of the file, in any case. Without it the server finds it out.")
+
+
+async def _upload(request: Request, format: str | None) -> codes.Upload:
+    known = query_names(request) or ()
+    return codes.Upload(await gather(request), request.headers.get("content-type", ""), format, known)
+
+
+def _asked(
+    service: Service,
+    request: Request,
+    model: ShapeModel,
+    kind: type[K],
+    query: BaseModel,
+    body: type[BaseModel],
+    fields: Mapping[str, str],
+) -> tuple[ShapeModel, K]:
+    """Return the model and the options that the query and the fields of a form ask for."""
+    if version := fields.get("version"):
+        model = service.repository.get(request.path_params["name"], version)
+    return model, options_with_fields(kind, query, body, fields)
 
 
 @router.post(
     "/encode",
     responses=problems(400, 404, 413, 415, 422, 503, 504),
-    response_model=EncodeAnswer,
+    response_model=EncodeAnswer | ArchiveAnswer,
     openapi_extra=upload("A mesh file."),
 )
 async def encode(
@@ -43,18 +80,17 @@ async def encode(
     caller: CallerDependency,
     model: Model,
     options: Annotated[EncodeQuery, Query()],
-    format: Annotated[
-        str | None, one_of(FORMATS), Query(description="Format of the file, which wins over `Content-Type`.")
-    ] = None,
+    format: Annotated[str | None, one_of((*FORMATS, ARCHIVE)), _FORMAT] = None,
 ) -> Response:
     """Find the code whose shape comes closest to a mesh in correspondence, in any rigid pose.
 
     The file holds the fine or the coarse mesh of the model in its vertex order (STL: in its order of faces), in the
-    units of the training meshes. A mesh with less than a third or more than three times their size is refused.
+    units of the training meshes. A mesh with less than a third or more than three times their size is refused. A ZIP
+    archive may hold several meshes.
     """
-    file = codes.Upload(await gather(request), request.headers.get("content-type", ""), format)
-    asked, most = options_of(EncodeOptions, options), service.settings.max_codes
-    found = await codes.encode(service.workers, service.sandbox, caller, model, file, asked, most)
+    asked = partial(_asked, service, request, model, EncodeOptions, options, EncodeRequest)
+    file, most = await _upload(request, format), service.settings.max_codes
+    found = await codes.encode(service.workers, service.sandbox, caller, asked, file, most)
     return found_response(service, found)
 
 
@@ -88,18 +124,11 @@ async def sample(
     return Response(dump_json({"latents": latents}), media_type="application/json")
 
 
-_FORM_OPTIONS = {
-    "type": "string",
-    "contentMediaType": "application/json",
-    "description": "The parameters of the query as one JSON object, which has priority.",
-}
-
-
 @router.post(
     "/fit",
     responses=problems(400, 404, 413, 415, 422, 503, 504),
     response_model=FitAnswer,
-    openapi_extra=upload("A mesh or a point cloud.", {"options": _FORM_OPTIONS}),
+    openapi_extra=upload("A mesh or a point cloud."),
 )
 async def fit(
     service: ServiceDependency,
@@ -107,14 +136,12 @@ async def fit(
     caller: CallerDependency,
     model: Model,
     options: Annotated[FitQuery, Query()],
-    format: Annotated[
-        str | None, one_of(POINT_FORMATS), Query(description="Format of the file, which wins over `Content-Type`.")
-    ] = None,
+    format: Annotated[str | None, one_of((*POINT_FORMATS, ARCHIVE)), _FORMAT] = None,
 ) -> Response:
     """Find the code, the placement and the size that explain a scan without correspondence, with their covariance.
 
     The file holds a mesh of any connectivity or points without faces, in any rigid pose, whole or in part.
     """
-    file = codes.Upload(await gather(request), request.headers.get("content-type", ""), format)
-    found = await codes.fit(service.workers, service.sandbox, caller, model, file, partial(fit_options, options))
+    asked = partial(_asked, service, request, model, FitOptions, options, FitRequest)
+    found = await codes.fit(service.workers, service.sandbox, caller, asked, await _upload(request, format))
     return found_response(service, found)

@@ -7,7 +7,9 @@ from pathlib import Path
 import numpy as np
 
 from shapespace.files.attributes import gltf, obj, ply
-from shapespace.files.limits import clipped
+from shapespace.files.limits import as_utf8, clipped
+from shapespace.files.mni_reading import is_mni
+from shapespace.files.recognition import START, decide
 from shapespace.mesh.attributes import MeshAttributes
 from shapespace.mesh.triangle_mesh import MeshError
 
@@ -30,7 +32,11 @@ def read_attributes(path: Path) -> tuple[MeshAttributes | None, list[str]]:
     faults: list[str] = []
     try:
         with np.errstate(all="ignore"):
-            surface = _READERS[path.suffix.lstrip(".").lower()](path, faults)
+            with path.open("rb") as file:
+                start = as_utf8(memoryview(file.read(START)))
+            if is_mni(bytes(start)):
+                return None, []
+            surface = _READERS[decide(start, FORMATS, path.name).name](path, faults)
         surface.check(
             int(surface.corners.max()) + 1 if surface.colors is None else len(surface.colors), surface.triangles
         )

@@ -18,7 +18,7 @@ from shapespace.mesh.triangle_mesh import TriangleMesh
 from shapespace.model.correspondence import InvalidMeshError, Matched, limits, match
 from shapespace.model.decoder import MeshChoice
 from shapespace.model.shape_model import ShapeModel
-from shapespace.service.use_cases.uploads import FORMATS, POINT_FORMATS, read_mesh_file
+from shapespace.service.use_cases.uploads import FORMATS, POINT_FORMATS, read_mesh_files
 from tests.hostile import HOSTILE, MIB
 from tests.service.bundles import SCALE, fine_reference, reference, seal, write_bundle
 
@@ -241,7 +241,7 @@ def test_files_that_cannot_be_used_are_refused_in_one_line(client: httpx.Client,
 def test_requests_without_a_known_format_or_a_file_are_refused(client: httpx.Client) -> None:
     content = mesh_file(client, "obj").content
     for arguments, status, says in (
-        ({"content": content}, 415, "No content type tells no format"),
+        ({"content": b"neither a mesh nor points"}, 415, "neither its content nor a name or a media type"),
         ({"content": content, "headers": {"Content-Type": "image/png"}}, 415, "image/png tells no format"),
         ({"content": content, "params": {"format": "fbx"}}, 415, "no format 'fbx' here"),
         ({"files": {"file": ("shape.fbx", content)}}, 415, "tells no format"),
@@ -275,7 +275,7 @@ def of_files(tmp_path: Path) -> ShapeModel:
 
 
 def matched(model: ShapeModel, data: bytes, format: str) -> Matched:
-    vertices, faces, *_ = read_mesh_file(data, "", format, limits(model.decoder))
+    ((vertices, faces, _),), _ = read_mesh_files(data, "", format, limits(model.decoder))
     return match(model.decoder, vertices, faces)
 
 

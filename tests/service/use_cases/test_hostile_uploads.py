@@ -49,7 +49,7 @@ def test_an_attack_is_refused_in_one_sentence_or_read_as_the_mesh_it_holds(
     upload = Upload(deque([memoryview(body)]), said if form else "", None if form else said)
     sentence = ""
     try:
-        vertices, faces, _ = read_upload(sandbox, upload, LIMITS, Deadline(SECONDS))
+        ((vertices, faces, _),), _ = read_upload(sandbox, upload, LIMITS, Deadline(SECONDS))
     except UploadError as error:
         sentence = str(error)
     assert (sentence and "\n" not in sentence and len(sentence) < 400) or (

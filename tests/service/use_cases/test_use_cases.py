@@ -166,7 +166,7 @@ def test_a_mesh_is_searched_for_its_code(model: ShapeModel, sandbox: Sandbox) ->
         return codes.Upload(deque([memoryview(data)]), "model/obj", format)
 
     def encode(given: codes.Upload) -> codes.Found:
-        return run(lambda workers: codes.encode(workers, sandbox, CALLER, model, given, EncodeOptions(), 0))
+        return run(lambda workers: codes.encode(workers, sandbox, CALLER, lambda _: (model, EncodeOptions()), given, 1))
 
     found = encode(upload(file))
     assert np.allclose(json.loads(found.content)["latent"], code, atol=1e-3)

@@ -409,3 +409,14 @@ def test_bad_input_is_refused_in_one_line(fault: str, tmp_path: Path) -> None:
         read_collection(path)
     assert str(refusal.value).startswith(str(path))
     assert "\n" not in str(refusal.value)
+
+
+def test_the_content_of_a_file_decides_its_format(tmp_path: Path) -> None:
+    mesh = trimesh.creation.icosphere(1)
+    for k in range(3):
+        (tmp_path / f"{k}.obj").write_bytes(MESH_FORMATS["ply"].encode(mesh.vertices * [1, 1 + k, 1], mesh.faces))
+    found = read_collection(tmp_path)
+    assert found.vertices.shape == (3, *mesh.vertices.shape)
+    (tmp_path / "2.obj").write_bytes(b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR")
+    with pytest.raises(IngestError, match=r"2.obj: is a PNG picture; these can be read: .*off$"):
+        read_collection(tmp_path)
