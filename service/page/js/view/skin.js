@@ -43,10 +43,7 @@ export class Skin {
       this.geometry.setAttribute(name, values.setUsage(THREE.DynamicDrawUsage));
     }
     if (attributes.TEXCOORD_0 !== undefined) {
-      this.geometry.setAttribute(
-        "uv",
-        new THREE.BufferAttribute(array(attributes.TEXCOORD_0), 2),
-      );
+      this.geometry.setAttribute("uv", new THREE.BufferAttribute(array(attributes.TEXCOORD_0), 2));
     }
     const parts = primitives.map(({ indices }) => array(indices));
     const index = new Uint32Array(parts.reduce((sum, part) => sum + part.length, 0));
