@@ -161,7 +161,7 @@ $(VENV)-lowest/.installed: requirements/lowest.txt
 $(VENV)-blender/.bpy:
 	@$(BPY_PYTHON) -m venv --clear $(VENV)-blender || { \
 		echo "Blender's package needs Python 3.11: name one with 'make long clients BPY_PYTHON=/path/to/python3.11'." >&2; exit 1; }
-	$(VENV)-blender/bin/python -m pip install $(BPY)
+	$(VENV)-blender/bin/python -m pip install $(BPY) openapi-generator-cli
 	@touch $@
 
 # The page is tested in Chromium: the system's, or where there is none the one that Playwright fetches.

@@ -19,6 +19,7 @@ from shapespace.service.http.connections import Connections
 from shapespace.service.http.dependencies import Service, known_query
 from shapespace.service.http.description import describe
 from shapespace.service.http.middleware.access import RequireHost, RequireKey
+from shapespace.service.http.middleware.compress import Compress
 from shapespace.service.http.middleware.memory import LimitBody, LimitUnreadAnswers
 from shapespace.service.http.middleware.observe import Observe
 from shapespace.service.http.routes import codes, interpolations, models, open_inference, operation, page, shapes
@@ -101,6 +102,7 @@ def _middleware(settings: Settings) -> list[Middleware]:
     stack = [
         Middleware(Observe),
         Middleware(LimitUnreadAnswers),
+        Middleware(Compress),
         Middleware(RequireHost, hosts=_hosts(settings)),
         *([Middleware(RequireKey, key=settings.api_key)] if settings.api_key else []),
         Middleware(LimitBody, limit=settings.max_body, upload=settings.max_upload),

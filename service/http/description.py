@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
@@ -11,6 +12,7 @@ from fastapi.routing import APIRoute
 from pydantic import BaseModel
 from pydantic.json_schema import models_json_schema
 
+from shapespace.files.reading import OCTET_STREAM
 from shapespace.service.http.messages.bodies import JSONBody
 from shapespace.service.http.messages.open_inference import InferenceRequest
 from shapespace.service.http.messages.schemas import MeshAnswer, Problem
@@ -18,7 +20,6 @@ from shapespace.service.http.middleware.access import OPEN
 from shapespace.service.http.problems import KINDS, MEDIA_TYPE
 from shapespace.service.use_cases.forms import OPTIONS
 from shapespace.service.use_cases.shape_formats import SHAPE_FORMATS
-from shapespace.service.use_cases.uploads import MEDIA_TYPES
 
 DESCRIPTION = """\
 Learned product shape manifolds of triangle meshes. Small networks map a latent code to edge lengths and
@@ -70,6 +71,8 @@ def describe(app: FastAPI, routers: Iterable[APIRouter]) -> None:
             for superfluous in ("HTTPValidationError", "ValidationError"):
                 components["schemas"].pop(superfluous, None)
             components["schemas"] = dict(sorted((components["schemas"] | definitions["$defs"]).items()))
+            for part in components["schemas"].values():
+                _say_defaults(part)
             components["securitySchemes"] = _KEYS
             # The empty requirement stands for a server without a key, the default.
             schema["security"] = [{}, *({name: []} for name in _KEYS)]
@@ -77,6 +80,9 @@ def describe(app: FastAPI, routers: Iterable[APIRouter]) -> None:
                 for method, call in calls.items():
                     _correct_responses(path, call)
                     _add_fields(call)
+                    for parameter in call.get("parameters", ()):
+                        if parameter["schema"].get("type") == "array":
+                            parameter |= {"style": "form", "explode": False}
                     if model := bodies.get((path, method)):
                         schema_of = {"schema": {"$ref": f"#/components/schemas/{model.__name__}"}}
                         call["requestBody"] = {"required": True, "content": {"application/json": schema_of}}
@@ -94,7 +100,9 @@ def describe(app: FastAPI, routers: Iterable[APIRouter]) -> None:
 def binary(media_types: Mapping[str, str], description: str, *, cached: bool = True) -> dict[int | str, dict[str, Any]]:
     """Describe an answer in one of several binary formats, with an entity tag if ``cached``."""
     schema = {"schema": {"type": "string", "format": "binary"}}
-    others = {media_type: schema for media_type in media_types.values() if media_type != "application/json"}
+    # Generators of clients take the first type that they know, and read others than plain bytes as JSON or not at all.
+    ordered = sorted({*media_types.values()} - {"application/json"}, key=lambda name: (name != OCTET_STREAM, name))
+    others = dict.fromkeys(ordered, schema)
     headers = {name: header for name, header in _HEADERS.items() if cached or name != "ETag"}
     answers: dict[int | str, dict[str, Any]] = {
         200: {"description": description, "content": others, "headers": headers}
@@ -118,13 +126,16 @@ def mesh_answers(description: str) -> dict[int | str, dict[str, Any]]:
 
 
 def upload(description: str) -> dict[str, Any]:
-    """Describe a body that is a file, JSON of a mesh, or a form with a file; `_add_fields` adds its other fields."""
+    """Describe a body that is a file, JSON of a mesh, or a form with a file; `_add_fields` adds its other fields.
+
+    A file may also have its own media type. These are not listed, because generators of clients don't know them.
+    """
     file = {"type": "string", "format": "binary", "description": description}
     form = {"type": "object", "properties": {"file": file}, "required": ["file"], "additionalProperties": False}
     content = {
-        **{media_type: {"schema": file} for media_type in (*MEDIA_TYPES, "text/plain", "application/octet-stream")},
-        "application/json": {"schema": {"$ref": f"#/components/schemas/{MeshAnswer.__name__}"}},
         _FORM: {"schema": form},
+        "application/json": {"schema": {"$ref": f"#/components/schemas/{MeshAnswer.__name__}"}},
+        OCTET_STREAM: {"schema": file},
     }
     return {"requestBody": {"required": True, "content": content}}
 
@@ -158,6 +169,14 @@ def _add_fields(call: Mapping[str, Any]) -> None:
             if parameter["in"] == "query":
                 form["schema"]["properties"][parameter["name"]] = parameter["schema"]
         form["schema"]["properties"][OPTIONS] = _OPTIONS
+
+
+def _say_defaults(schema: dict[str, Any]) -> None:
+    """Move default values into descriptions: openapi-typescript requires every member with a default."""
+    for member in schema.get("properties", {}).values():
+        default = member.pop("default", None)
+        if isinstance(default, str | int | float):
+            member["description"] = f"{member.get('description', '')} Default: `{json.dumps(default)}`.".strip()
 
 
 def _correct_responses(path: str, call: dict[str, Any]) -> None:

@@ -54,7 +54,8 @@ def animated_glb(
 
     Frame 0 is the mesh at rest. Up to DENSE_FRAMES frames, each later frame is a target, so that keys are exact to
     float32. Longer sequences use the leading singular vectors of the displacements from frame 0 as targets. Weights are
-    between 0 and 1. The vertex error is measured on the written values, and is in ``asset.extras`` too.
+    between 0 and 1. Targets are named "frame 1", "frame 2", … or "component 1", …. The vertex error is measured on the
+    written values, and is in ``asset.extras`` too.
 
     Positions are float32. Displacements are computed block by block, because together they can take hundreds of
     megabytes.
@@ -92,7 +93,9 @@ def animated_glb(
     document = GltfBuilder(rest, faces, first, surface, name="animation")
     normal_targets = _normal_targets(frames, document.normals, fit)
     if len(targets):
-        document.add_targets(targets, normal_targets, colors=_colour_targets(colourings, fit) if first else None)
+        kind = "frame" if len(frames) <= DENSE_FRAMES else "component"
+        names = [f"{kind} {k}" for k in range(1, len(targets) + 1)]
+        document.add_targets(targets, normal_targets, names, _colour_targets(colourings, fit) if first else None)
         times = document.add(np.arange(len(frames)) / fps, bounds=True)
         sampler = {"input": times, "output": document.add(keys.ravel()), "interpolation": "LINEAR"}
         channels = [{"sampler": 0, "target": {"node": k, "path": "weights"}} for k in range(document.nodes)]

@@ -20,7 +20,7 @@ from shapespace.mesh.attributes import NONE, MeshAttributes, SurfaceMaterial, li
 from shapespace.mesh.triangle_mesh import vertex_normals
 from shapespace.mesh.vectors import dots
 
-FLOAT, UNSIGNED_INT = 5126, 5125
+FLOAT, UNSIGNED_SHORT, UNSIGNED_INT = 5126, 5123, 5125
 ARRAY_BUFFER, ELEMENT_ARRAY_BUFFER = 34962, 34963
 #: Default material. Without one, viewers assume bare metal, which is black if there is nothing to reflect.
 MATERIAL = {
@@ -206,12 +206,18 @@ class GltfBuilder:
         return len(self.views) - 1
 
     def add(self, array: NDArray, *, bounds: bool = False, target: int | None = None) -> int:
-        """Append an array of scalars or vectors; return the index of its accessor."""
-        indices = np.issubdtype(array.dtype, np.integer)
-        data = np.ascontiguousarray(array, dtype="<u4" if indices else "<f4")
+        """Append an array of scalars or vectors; return the index of its accessor.
+
+        Numbers become float32. Indices become uint16 where they fit; the largest uint16 is reserved (3.7.2.1).
+        """
+        component, dtype = FLOAT, "<f4"
+        if np.issubdtype(array.dtype, np.integer):
+            short = array.max(initial=0) < np.iinfo(np.uint16).max
+            component, dtype = (UNSIGNED_SHORT, "<u2") if short else (UNSIGNED_INT, "<u4")
+        data = np.ascontiguousarray(array, dtype)
         accessor: dict[str, Any] = {
             "bufferView": self._view(data.tobytes(), target),
-            "componentType": UNSIGNED_INT if indices else FLOAT,
+            "componentType": component,
             "count": len(data),
             "type": "SCALAR" if data.ndim == 1 else f"VEC{data.shape[1]}",
         }

@@ -89,7 +89,7 @@ def read_arrays(
         raise
     except Exception as error:  # damaged files raise exceptions of many classes
         raise MeshError(f"not a readable {format} file: {reason(error)}") from error
-    if len(data) and not vertices.size:  # of an empty file the caller says that it is empty
+    if data and not vertices.size:  # of an empty file the caller says that it is empty
         raise MeshError(f"not a readable {format} file: it holds no vertices")
     return vertices, faces
 

@@ -1,6 +1,7 @@
 """``python -m tests.clients BLENDER_PYTHON``: open the server's files of all bundled models elsewhere.
 
-``make long clients`` installs Blender's package in an environment of its own and calls this.
+A client in Java, which openapi-generator makes, calls the server too. ``make long clients`` installs Blender's package
+and the generator in an environment of their own, and calls this.
 """
 
 import subprocess
@@ -11,8 +12,10 @@ from tempfile import TemporaryDirectory
 import httpx
 
 from tests.clients.files import write_files
+from tests.clients.java import build, call
 from tests.service.conftest import ROOT, starting
 
+GENERATOR = "openapi-generator-cli"
 HERE = Path(__file__).parent
 
 
@@ -22,7 +25,8 @@ def main(blender: str) -> bool:
     with TemporaryDirectory() as scratch, starting() as start:
         models = Path(scratch, "models")
         models.symlink_to(ROOT / "models")
-        with httpx.Client(base_url=start(models, deadline=600).url, timeout=600) as client:
+        server = start(models, deadline=600)
+        with httpx.Client(base_url=server.url, timeout=600) as client:
             for model in [card["name"] for card in client.get("/v1/models").json()["models"]]:
                 folder = Path(scratch, model)
                 folder.mkdir()
@@ -33,6 +37,7 @@ def main(blender: str) -> bool:
                     output = subprocess.DEVNULL if command[0] == blender else None
                     found = subprocess.run([*command, folder], stdout=output, check=False)
                     good &= found.returncode == 0
+        print("client in Java:", call(build(Path(blender).with_name(GENERATOR), Path(scratch, "java")), server.url))
     return good
 
 

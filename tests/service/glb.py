@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-_COMPONENTS = {5125: "<u4", 5126: "<f4"}
+_COMPONENTS = {5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTH = {"SCALAR": 1, "VEC3": 3}
 VALIDATOR = Path(__file__).parents[1] / "validate_gltf.mjs"
 

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import numpy as np
 from fastapi import Depends, Query, Request
-from pydantic import Field, TypeAdapter, model_validator
+from pydantic import Field, TypeAdapter, WithJsonSchema, model_validator
 
 from shapespace.files.colouring import Quantity
 from shapespace.mesh.attributes import Topology
@@ -25,9 +25,8 @@ from shapespace.service.use_cases.fields import Body, Number
 from shapespace.service.use_cases.one_shape import ColourOptions, ShapeRequest
 from shapespace.service.use_cases.shape_formats import SHAPE_FORMATS, UNAVAILABLE, writable
 
-_NUMBER = r"[-+]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][-+]?[0-9]+)?"
-#: Pattern of comma-separated numbers in a query, for the description of the interface.
-NUMBERS = f"^{_NUMBER}(,{_NUMBER})*$"
+#: Numbers in a query, separated by commas. Generated clients repeat the key instead, which is read alike.
+Numbers = Annotated[list[str] | None, WithJsonSchema({"type": "array", "items": {"type": "number"}})]
 #: Tolerance of the products of a rotation's rows, which should be 0 or 1.
 _ROUNDING = 1e-3
 _EXAMPLE = '{"rotation": [[0, -1, 0], [1, 0, 0], [0, 0, 1]], "translation": [0, 0, 2], "scale": 1}'
@@ -38,8 +37,9 @@ _UNCOLOURED = {
 }
 
 
-def numbers(text: str, name: str) -> list[float]:
+def numbers(parts: Sequence[str], name: str) -> list[float]:
     """Read a code from a query; raises ProblemError, invalid-request."""
+    text = ",".join(parts)
     try:
         if "_" in text or not text.isascii():  # Python accepts more spellings of numbers than other languages
             raise ValueError
@@ -85,12 +85,11 @@ async def _color(
         ),
     ] = None,
     against: Annotated[
-        str | None,
+        Numbers,
         Query(
             description="With `color`: code of the other shape, coordinates separated by commas; without it the "
             "reference.",
-            openapi_examples={"a code": {"value": "0,0,0,0"}},
-            json_schema_extra={"pattern": NUMBERS},
+            openapi_examples={"a code": {"value": [0, 0, 0, 0]}},
         ),
     ] = None,
 ) -> ColourParameters:

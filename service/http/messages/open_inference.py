@@ -42,9 +42,13 @@ _Numbers = Annotated[list[Number], Field(fail_fast=True)]
 
 
 def _as_json(schema: dict[str, Any]) -> None:
-    """Require ``data``: this schema is for bodies without bytes after the JSON."""
+    """Require ``data``: this schema is for bodies without bytes after the JSON.
+
+    The items are not described: clients of openapi-generator in Java can't be compiled with two kinds of lists.
+    """
     schema["required"].append("data")
-    del schema["properties"]["data"]["default"]
+    data = schema["properties"]["data"]
+    schema["properties"]["data"] = {"type": "array", "items": {}, "title": "Data", "description": data["description"]}
 
 
 class InputTensor(_Message):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import zlib
+
 from starlette.datastructures import Headers
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
@@ -11,15 +13,18 @@ from shapespace.service.limits.quota import UPLOADS, Quota, QuotaError
 
 #: Most bytes of all answers that wait to be read.
 UNREAD_BYTES = 256 * 2**20
-#: Bytes of an answer that are sent at once.
+#: Bytes of an answer that are sent at once, and of a compressed body that are unpacked at once.
 PIECE_BYTES = 2**18
+#: Window sizes by which zlib tells the formats of ``Content-Encoding``.
+WINDOWS = {"gzip": 16 + zlib.MAX_WBITS, "deflate": zlib.MAX_WBITS}
 
 
 class LimitBody(HTTPMiddleware):
-    """Refuses request bodies over a limit, announced or not, and compressed bodies.
+    """Refuses request bodies over a limit, announced or not, and unpacks those compressed by gzip or deflate.
 
-    All bodies in memory have a limit together as well; mesh files, for ``…/encode`` and ``…/fit``, have their own,
-    ``upload``. Starlette's own limit for a single body answers in plain text.
+    The limit holds for the unpacked body. All bodies in memory have a limit together as well. Mesh files,
+    for ``…/encode`` and ``…/fit``, have their own, ``upload``. Starlette's own limit for one body answers in plain
+    text.
     """
 
     def __init__(self, app: ASGIApp, limit: int, upload: int) -> None:
@@ -33,7 +38,8 @@ class LimitBody(HTTPMiddleware):
         headers = Headers(scope=scope)
         announced = headers.get("content-length", "")
         length = int(announced) if announced.isdecimal() else 0
-        encoding = headers.get("content-encoding", "identity")
+        encoding = headers.get("content-encoding", "identity").strip().lower()
+        given = _Unpacked(receive, WINDOWS[encoding]) if encoding in WINDOWS else receive
         client = client_of(scope)
         received = 0
 
@@ -41,10 +47,10 @@ class LimitBody(HTTPMiddleware):
             nonlocal received
             if length > limit:
                 raise _too_large(limit)
-            if encoding.lower() != "identity":
-                detail = f"The body is encoded as {encoding}. Send it as it is, without Content-Encoding."
+            if encoding not in ("identity", *WINDOWS):
+                detail = "The body has a Content-Encoding that isn't read here. Send it plain, or with gzip or deflate."
                 raise ProblemError("unsupported-media-type", detail)
-            message = await receive()
+            message = await given()
             size = len(message.get("body", b""))
             if received + size > limit:
                 raise _too_large(limit)
@@ -59,6 +65,33 @@ class LimitBody(HTTPMiddleware):
             await self.app(scope, limited, send)
         finally:
             self._held.give_back(client, received)
+
+
+class _Unpacked:
+    """The messages of a compressed body, unpacked in pieces of a size that holds up no other request."""
+
+    def __init__(self, receive: Receive, window: int) -> None:
+        self._receive = receive
+        self._unpacker = zlib.decompressobj(window)
+        self._more = True  # whether further messages follow
+        self._full = False  # whether the last piece was as large as pieces may be, so that more may be left of it
+
+    async def __call__(self) -> Message:
+        packed = self._unpacker.unconsumed_tail
+        if not self._full:
+            message = await self._receive()
+            if message["type"] != "http.request":
+                return message
+            packed, self._more = message.get("body", b""), message.get("more_body", False)
+        try:
+            body = self._unpacker.decompress(packed, PIECE_BYTES)
+        except zlib.error:
+            raise _damaged() from None
+        self._full = len(body) == PIECE_BYTES
+        more = self._more or self._full
+        if self._unpacker.unused_data or not (more or self._unpacker.eof):
+            raise _damaged()
+        return {"type": "http.request", "body": body, "more_body": more}
 
 
 class LimitUnreadAnswers(HTTPMiddleware):
@@ -107,6 +140,11 @@ class LimitUnreadAnswers(HTTPMiddleware):
             await self.app(scope, receive, paced)
         finally:
             self._held.give_back(client, held)
+
+
+def _damaged() -> ProblemError:
+    detail = "The body isn't compressed as its Content-Encoding says, or it is cut short. Send all of it."
+    return ProblemError("malformed-request", detail)
 
 
 def _too_large(limit: int) -> ProblemError:

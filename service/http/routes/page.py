@@ -12,7 +12,6 @@ from pathlib import Path
 from fastapi import APIRouter, Request, Response
 from fastapi.responses import FileResponse
 from starlette.datastructures import Headers
-from starlette.middleware.gzip import GZipMiddleware
 from starlette.routing import BaseRoute, Mount
 from starlette.staticfiles import NotModifiedResponse, StaticFiles
 from starlette.types import Scope
@@ -59,8 +58,8 @@ async def page(request: Request, service: ServiceDependency) -> Response:
 
 
 def assets() -> BaseRoute:
-    """Return the route of the page's styles and scripts, with compression."""
-    return Mount("/page", GZipMiddleware(_FILES), name="page")
+    """Return the route of the page's styles and scripts."""
+    return Mount("/page", _FILES, name="page")
 
 
 @cache

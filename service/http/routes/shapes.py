@@ -21,7 +21,7 @@ from shapespace.service.http.dependencies import (
 )
 from shapespace.service.http.description import binary, mesh_answers, problems
 from shapespace.service.http.messages.bodies import JSONBody
-from shapespace.service.http.messages.mesh_query import NUMBERS, PlaceQuery, SingleMeshQuery, numbers
+from shapespace.service.http.messages.mesh_query import Numbers, PlaceQuery, SingleMeshQuery, numbers
 from shapespace.service.http.messages.schemas import (
     MeshRequest,
     NRICAnswer,
@@ -49,11 +49,10 @@ async def get_mesh(
     model: Model,
     options: SingleMeshQuery,
     latent: Annotated[
-        str | None,
+        Numbers,
         Query(
             description="Coordinates separated by commas; by default the reference shape.",
-            openapi_examples={"a code": {"value": "1,2,3,4"}},
-            json_schema_extra={"pattern": NUMBERS},
+            openapi_examples={"a code": {"value": [1, 2, 3, 4]}},
         ),
     ] = None,
     mesh: Annotated[MeshChoice, Query(description="The mesh, if the model has a fine one.")] = MeshChoice.FINE,

@@ -70,6 +70,8 @@ def read(path: Path, faults: list[str]) -> MeshAttributes:
                 libraries.append(values[0].decode(errors="replace").strip())
     if not len(starts) > 1:
         raise MeshError("it has no faces")
+    # One smoothing group for all faces is the default.
+    told = told and (0 in smoothing or len(set(smoothing)) > 1)
     coordinates = np.array(uv).reshape(-1, 2)
     of_uv = np.array(uv_corners)
     if not (of_uv >= 0).any():
@@ -244,7 +246,9 @@ def obj_faces(surface: MeshAttributes) -> str:
             for k in np.flatnonzero(np.diff(labels.of, prepend=NONE)).tolist():
                 name = "" if labels.of[k] == NONE else f" {labels.names[labels.of[k]]}"
                 lines[k] = f"{keyword}{name}\n{lines[k]}"
-    return uv + "".join(lines.tolist())
+    # Without normals and smoothing groups, Blender shows flat faces.
+    smooth = "" if surface.normals else "s 1\n"
+    return uv + smooth + "".join(lines.tolist())
 
 
 def _face_lines(surface: MeshAttributes) -> NDArray:

@@ -69,7 +69,14 @@ def test_it_infers_what_the_other_calls_answer(
     inference: triton.InferenceServerClient, client: httpx.Client, binary_input: bool, binary_output: bool
 ) -> None:
     outputs = [triton.InferRequestedOutput(name, binary_data=binary_output) for name in ("vertices", "nric")]
-    answer = inference.infer("small", [latent(CODES, binary=binary_input)], request_id="seven", outputs=outputs)
+    answer = inference.infer(
+        "small",
+        [latent(CODES, binary=binary_input)],
+        request_id="seven",
+        outputs=outputs,
+        request_compression_algorithm="gzip" if binary_input else "deflate",
+        response_compression_algorithm="gzip",
+    )
     response = answer.get_response()
     assert (response["model_name"], response["model_version"], response["id"]) == ("small", "10", "seven")
     assert [output["name"] for output in response["outputs"]] == ["vertices", "nric"]

@@ -342,7 +342,7 @@ def test_of_two_formats_with_one_media_type_accept_gets_the_first(client: httpx.
     for accept, name in (("application/octet-stream", "npz"), ("application/zip;q=0.4, application/jsonl", "jsonl")):
         answer = client.get(links["self"], headers={"Accept": accept}).raise_for_status()
         assert answer.headers["ETag"] == client.get(links[name]).headers["ETag"]
-        assert answer.headers["Vary"] == "Accept"
+        assert answer.headers["Vary"].split(", ")[0] == "Accept"
     cache = client.get(links["pc2"], headers={"Accept": accept}).raise_for_status()
     assert cache.headers["Content-Type"] == "application/octet-stream"
     assert "animation.pc2" in cache.headers["Content-Disposition"]

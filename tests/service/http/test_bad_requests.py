@@ -117,8 +117,12 @@ REQUESTS = {
         "POST", MESH, 415, "unsupported-media-type", "Content-Type: application/json", "latent=1",
         {"Content-Type": "application/x-www-form-urlencoded"},
     ),
-    "compressed body": Bad(
-        "POST", MESH, 415, "unsupported-media-type", "without Content-Encoding", "{}",
+    "body of an unknown encoding": Bad(
+        "POST", MESH, 415, "unsupported-media-type", "with gzip or deflate", "{}",
+        {"Content-Type": "application/json", "Content-Encoding": "br"},
+    ),
+    "body that is not compressed as it says": Bad(
+        "POST", MESH, 400, "malformed-request", "Content-Encoding", "{}",
         {"Content-Type": "application/json", "Content-Encoding": "gzip"},
     ),
     "body of no type": Bad("POST", MESH, 415, "unsupported-media-type", "Content-Type: application/json", "{}"),

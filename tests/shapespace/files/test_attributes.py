@@ -100,6 +100,7 @@ def test_obj_by_itself_names_no_files() -> None:
         assert vertices == SURFACE.corners[start:stop].tolist()
         np.testing.assert_allclose(np.array(found["vt"])[coordinates], SURFACE.uv[SURFACE.uv_corners[start:stop]])
         assert names == {
+            "s": "1",
             "o": "Bar",
             "g": SURFACE.groups.names[SURFACE.groups.of[k]],
             "usemtl": SURFACE.materials[SURFACE.material_of[k]].name,
@@ -257,6 +258,9 @@ def test_smooth_files_stay_smooth_across_welded_seams(tmp_path: Path) -> None:
     found, _ = cube(["s 1"], PLAIN, tmp_path)
     assert found
     assert found.welded(np.arange(8)).shading is None
+    assert not found.normals
+    # Without "s 1", Blender shows the faces that were smooth as flat ones.
+    assert b"\ns 1\nf " in MESH_FORMATS["obj"].encode(CUBE, found.triangles, None, found)
     assert len(GLB(MESH_FORMATS["glb"].encode(CUBE, found.triangles, None, found)).positions) == 8
 
 

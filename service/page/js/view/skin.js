@@ -5,6 +5,7 @@
 import * as THREE from "three";
 
 const WIDTH = { SCALAR: 1, VEC2: 2 };
+const NUMBERS = { 5123: Uint16Array, 5125: Uint32Array, 5126: Float32Array };
 
 export class Skin {
   /** Read the server's GLB of the reference. */
@@ -12,8 +13,9 @@ export class Skin {
     const size = new DataView(buffer).getUint32(12, true);
     const tree = JSON.parse(new TextDecoder().decode(new Uint8Array(buffer, 20, size)));
     const start = 28 + size;
-    const array = (index, Type) => {
-      const { bufferView, count, type } = tree.accessors[index];
+    const array = (index) => {
+      const { bufferView, componentType, count, type } = tree.accessors[index];
+      const Type = NUMBERS[componentType];
       return new Type(buffer, start + tree.bufferViews[bufferView].byteOffset, count * WIDTH[type]);
     };
     const pictures = await Promise.all(
@@ -34,19 +36,16 @@ export class Skin {
     this.rows =
       attributes._VERTEX === undefined
         ? Array.from({ length: count }, (_, k) => k)
-        : array(attributes._VERTEX, Float32Array);
+        : array(attributes._VERTEX);
     this.geometry = new THREE.BufferGeometry();
     for (const name of ["position", "normal"]) {
       const values = new THREE.BufferAttribute(new Float32Array(3 * count), 3);
       this.geometry.setAttribute(name, values.setUsage(THREE.DynamicDrawUsage));
     }
     if (attributes.TEXCOORD_0 !== undefined) {
-      this.geometry.setAttribute(
-        "uv",
-        new THREE.BufferAttribute(array(attributes.TEXCOORD_0, Float32Array), 2),
-      );
+      this.geometry.setAttribute("uv", new THREE.BufferAttribute(array(attributes.TEXCOORD_0), 2));
     }
-    const parts = primitives.map(({ indices }) => array(indices, Uint32Array));
+    const parts = primitives.map(({ indices }) => array(indices));
     const index = new Uint32Array(parts.reduce((sum, part) => sum + part.length, 0));
     let begin = 0;
     parts.forEach((part, k) => {

@@ -1,0 +1,77 @@
+"""Compressed requests and answers."""
+
+import gzip
+import io
+import json
+import zlib
+
+import httpx
+import numpy as np
+import pytest
+
+MESH = "/v1/models/small/mesh"
+CODE = {"latent": [0.1, 0.2, 0.3]}
+
+
+def fetch(client: httpx.Client, format: str, encoding: str, **headers: str) -> tuple[httpx.Response, bytes]:
+    """Return an answer and its bytes as they were sent."""
+    wanted = {"latent": "0.1,0.2,0.3", "format": format}
+    with client.stream("GET", MESH, params=wanted, headers={"Accept-Encoding": encoding, **headers}) as answer:
+        return answer, b"".join(answer.iter_raw())
+
+
+@pytest.mark.parametrize("format", ["obj", "gltf", "json"])
+def test_text_is_compressed_and_has_an_entity_tag_of_its_own(client: httpx.Client, format: str) -> None:
+    plain, text = fetch(client, format, "identity")
+    packed, data = fetch(client, format, "gzip")
+    assert "Content-Encoding" not in plain.headers
+    assert packed.headers["Content-Encoding"] == "gzip"
+    assert gzip.decompress(data) == text
+    assert len(data) < 0.8 * len(text)
+    assert {name.strip() for name in packed.headers["Vary"].split(",")} == {"Accept", "Accept-Encoding"}
+    tags = [answer.headers["ETag"] for answer in (plain, packed)]
+    assert len(set(tags)) == 2
+    assert not any(tag.startswith("W/") for tag in tags)
+    for tag in tags:
+        again, nothing = fetch(client, format, "gzip", **{"If-None-Match": tag})
+        assert (again.status_code, again.headers["ETag"], nothing) == (304, tag, b"")
+
+
+@pytest.mark.parametrize(("format", "encoding"), [("glb", "gzip"), ("npz", "gzip"), ("obj", "gzip;q=0"), ("obj", "br")])
+def test_numbers_and_other_clients_get_the_plain_file(client: httpx.Client, format: str, encoding: str) -> None:
+    answer, _ = fetch(client, format, encoding)
+    assert answer.status_code == 200
+    assert "Content-Encoding" not in answer.headers
+
+
+@pytest.mark.parametrize(("encoding", "pack"), [("gzip", gzip.compress), ("deflate", zlib.compress)])
+def test_compressed_requests_are_read(client: httpx.Client, encoding: str, pack) -> None:  # type: ignore[no-untyped-def]
+    headers = {"Content-Type": "application/json", "Content-Encoding": encoding}
+    plain = client.post(MESH, json=CODE).raise_for_status()
+    body = json.dumps(CODE).encode()
+    assert client.post(MESH, content=pack(body), headers=headers).content == plain.content
+
+    def in_pieces():  # type: ignore[no-untyped-def]
+        packed = pack(body)
+        yield packed[:7]
+        yield packed[7:]
+
+    assert client.post(MESH, content=in_pieces(), headers=headers).content == plain.content
+    for broken in (pack(body)[:-5], pack(body) + b"more", b""):
+        answer = client.post(MESH, content=broken, headers=headers)
+        assert answer.json()["type"] == "urn:shapespace:problem:malformed-request"
+
+
+def test_a_large_file_is_unpacked_piece_by_piece(client: httpx.Client) -> None:
+    with np.load(io.BytesIO(fetch(client, "npz", "identity")[1])) as found:
+        mesh = {"vertices": found["vertices"].tolist(), "faces": found["faces"].tolist()}
+    text = json.dumps(mesh).encode() + b" " * 2**20
+    headers = {"Content-Type": "application/json", "Content-Encoding": "gzip"}
+    packed = client.post("/v1/models/small/encode", content=gzip.compress(text), headers=headers)
+    assert packed.raise_for_status().json()["latent"] == pytest.approx(CODE["latent"], abs=1e-3)
+
+
+def test_what_unpacks_to_more_than_a_body_may_have_is_refused(client: httpx.Client) -> None:
+    headers = {"Content-Type": "application/json", "Content-Encoding": "gzip"}
+    answer = client.post(MESH, content=gzip.compress(bytes(2**26)), headers=headers)
+    assert answer.json()["type"] == "urn:shapespace:problem:body-too-large"
