@@ -44,7 +44,8 @@ _FORM = "multipart/form-data"
 _OPTIONS = {
     "type": "string",
     "contentMediaType": "application/json",
-    "description": "Options as one JSON object, which may be a file. Fields have priority over the query.",
+    "description": "Parameters of the query as one JSON object, which may be a file. Each may also be a field of its "
+    "name. Fields have priority over the query.",
 }
 #: Models of bodies that FastAPI does not see, in addition to the models of JSONBody.
 _MODELS: tuple[type[BaseModel], ...] = (InferenceRequest, Problem)
@@ -79,7 +80,6 @@ def describe(app: FastAPI, routers: Iterable[APIRouter]) -> None:
             for path, calls in schema["paths"].items():
                 for method, call in calls.items():
                     _correct_responses(path, call)
-                    _add_fields(call)
                     for parameter in call.get("parameters", ()):
                         if parameter["schema"].get("type") == "array":
                             parameter |= {"style": "form", "explode": False}
@@ -126,12 +126,13 @@ def mesh_answers(description: str) -> dict[int | str, dict[str, Any]]:
 
 
 def upload(description: str) -> dict[str, Any]:
-    """Describe a body that is a file, JSON of a mesh, or a form with a file; `_add_fields` adds its other fields.
+    """Describe a body that is a file, JSON of a mesh, or a form with a file.
 
-    A file may also have its own media type. These are not listed, because generators of clients don't know them.
+    A file may have its own media type, and a form the query's parameters as fields. Neither is listed: generators of
+    clients don't know the types, and would make two arguments of each parameter.
     """
     file = {"type": "string", "format": "binary", "description": description}
-    form = {"type": "object", "properties": {"file": file}, "required": ["file"], "additionalProperties": False}
+    form = {"type": "object", "properties": {"file": file, OPTIONS: _OPTIONS}, "required": ["file"]}
     content = {
         _FORM: {"schema": form},
         "application/json": {"schema": {"$ref": f"#/components/schemas/{MeshAnswer.__name__}"}},
@@ -160,15 +161,6 @@ def _bodies(routers: Iterable[APIRouter]) -> Iterator[tuple[tuple[str, str], typ
         for dependency in route.dependant.dependencies:
             if isinstance(dependency.call, JSONBody):
                 yield from (((route.path, method.lower()), dependency.call.model) for method in route.methods or ())
-
-
-def _add_fields(call: Mapping[str, Any]) -> None:
-    """Describe the query parameters of a call that takes forms as fields of the form too."""
-    if form := call.get("requestBody", {}).get("content", {}).get(_FORM):
-        for parameter in call["parameters"]:
-            if parameter["in"] == "query":
-                form["schema"]["properties"][parameter["name"]] = parameter["schema"]
-        form["schema"]["properties"][OPTIONS] = _OPTIONS
 
 
 def _say_defaults(schema: dict[str, Any]) -> None:

@@ -27,7 +27,8 @@ public class Generated {
         Animation path = new Animation().keyframes(List.of(code, end)).frames(3);
         String id = interpolations.createInterpolation("figure", path, null, null).getId();
         File animation = interpolations.getInterpolation(id, null, null, null, null, null, null);
-        EncodeAnswer found = new CodesApi(client).encode("figure", byBody, null, null, null, null, null, null, null);
+        CodesApi codes = new CodesApi(client);
+        EncodeAnswer found = codes.encode("figure", byBody, null, null, null, null, null, null, null, null);
         System.out.println(byBody.length() + " " + animation.length() + " " + found.getLatent());
     }
 }

@@ -214,18 +214,6 @@ class EncodeAnswer(BaseModel):
     samples: list[list[float]] = Field(description=_SAMPLED)
 
 
-class NamedEncodeAnswer(EncodeAnswer):
-    """The code of a mesh in an archive."""
-
-    name: str = Field(description="Name of the mesh's file in the archive.")
-
-
-class ArchiveAnswer(BaseModel):
-    """The codes of several meshes in one ZIP archive."""
-
-    meshes: list[NamedEncodeAnswer] = Field(description="In the order of the files' names, pose2 before pose10.")
-
-
 class EditAnswer(BaseModel):
     """The code whose shape comes closest to the targets."""
 

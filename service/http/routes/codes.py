@@ -26,7 +26,6 @@ from shapespace.service.http.messages.bodies import JSONBody, gather
 from shapespace.service.http.messages.fit import FitAnswer, FitQuery, FitRequest
 from shapespace.service.http.messages.options import options_of, options_with_fields
 from shapespace.service.http.messages.schemas import (
-    ArchiveAnswer,
     EditAnswer,
     EditRequest,
     EncodeAnswer,
@@ -71,7 +70,7 @@ def _asked(
 @router.post(
     "/encode",
     responses=problems(400, 404, 413, 415, 422, 503, 504),
-    response_model=EncodeAnswer | ArchiveAnswer,
+    response_model=EncodeAnswer,
     openapi_extra=upload("A mesh file."),
 )
 async def encode(
@@ -86,7 +85,7 @@ async def encode(
 
     The file holds the fine or the coarse mesh of the model in its vertex order (STL: in its order of faces), in the
     units of the training meshes. A mesh with less than a third or more than three times their size is refused. A ZIP
-    archive may hold several meshes.
+    archive with several meshes is answered with `{"meshes": […]}`: this answer for each, with the `name` of its file.
     """
     asked = partial(_asked, service, request, model, EncodeOptions, options, EncodeRequest)
     file, most = await _upload(request, format), service.settings.max_codes
