@@ -269,7 +269,8 @@ class Client:
             options: see EncodeParameters.
 
         Returns:
-            ``latent``, ``residual``, ``vertex_error``, ``covariance``, ``samples`` and more.
+            ``latent``, ``status``, ``reason``, ``vertex_error``, ``covariance``, ``samples`` and more. The status is
+            "poor" if the mesh has another vertex order, is mirrored, or has vertices far off: ``cause`` says which.
         """
         content, format = _file(mesh, format)
         headers = {"Content-Type": "application/octet-stream"}

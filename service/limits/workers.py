@@ -2,7 +2,7 @@
 
 The event loop answers a request by its deadline, when its client leaves, or when the server ends, whatever its thread
 does. Work checks its deadline itself and ends soon after. A thread that does not is abandoned, and a new one takes its
-place.
+place. A search may answer its best result a little later than its deadline.
 """
 
 from __future__ import annotations
@@ -23,12 +23,16 @@ from shapespace.solve.deadline import Deadline
 logger = logging.getLogger(__name__)
 S = TypeVar("S")
 T = TypeVar("T")
-#: Seconds after its deadline in which a thread has to stop. Otherwise it is abandoned.
+#: Seconds in which a thread has to stop after the end of its call. Otherwise it is abandoned.
 GRACE_SECONDS = 2.0
+#: Seconds after its deadline in which a search may complete its best result.
+SEARCH_GRACE_SECONDS = 5.0
 #: Largest number of abandoned threads.
 MOST_ABANDONED = 16
 #: Bytes that all answers with many shapes may use together.
 MEMORY = 384 * 2**20
+#: What a client can do whose request was not answered by its deadline.
+ADVICE = "Ask for fewer shapes at once, stream the frames as JSON lines, or try again when there is less to do."
 
 
 class BusyError(RuntimeError):
@@ -59,20 +63,31 @@ class Caller:
 
 
 class Call(Deadline):
-    """A deadline that also ends the waiting of a request on the event loop, with the error ``late``."""
+    """A deadline that also ends the waiting of a request on the event loop, with the error ``late``.
+
+    Attributes:
+        searching: whether the work is a search, for whose result the event loop waits SEARCH_GRACE_SECONDS more.
+    """
 
     def __init__(self, seconds: float, late: Exception) -> None:
         super().__init__(seconds)
         loop = asyncio.get_running_loop()
         self._over: asyncio.Future[None] = loop.create_future()
         self._over.add_done_callback(lambda end: end.cancelled() or end.exception())  # or asyncio complains
-        self._timer = loop.call_later(seconds, self.give_up, late)
+        self._timer = loop.call_later(seconds, self._expire, late)
+        self.searching = False
 
     def give_up(self, error: Exception) -> None:
         """End the call with an error."""
         self.call_off()
         if not self._over.done():
             self._over.set_exception(error)
+
+    def _expire(self, late: Exception) -> None:
+        if self.searching:
+            self._timer = asyncio.get_running_loop().call_later(SEARCH_GRACE_SECONDS, self.give_up, late)
+        else:
+            self.give_up(late)
 
     def close(self) -> None:
         """Stop the timer, because the work is done."""
@@ -118,9 +133,12 @@ class Workers:
         return ThreadPoolExecutor(self.threads, thread_name_prefix="shapespace")
 
     @asynccontextmanager
-    async def admit(self, caller: Caller) -> AsyncIterator[Call]:
-        """Admit a request for the duration of the block, and yield its deadline; raises BusyError."""
-        with self._place(self.places, caller), self._call() as call:
+    async def admit(self, caller: Caller, advice: str = ADVICE) -> AsyncIterator[Call]:
+        """Admit a request for the duration of the block, and yield its deadline; raises BusyError.
+
+        The DeadlineError of a late request ends with the advice.
+        """
+        with self._place(self.places, caller), self._call(advice) as call:
             watching = asyncio.create_task(self._watch(caller, call))
             try:
                 yield call
@@ -186,12 +204,9 @@ class Workers:
         with self._call() as own:
             return await self.run(function, own)
 
-    def late(self) -> DeadlineError:
+    def late(self, advice: str = ADVICE) -> DeadlineError:
         """Return the error for work whose deadline has passed."""
-        return DeadlineError(
-            f"The answer was not ready within {self.deadline:g} s. Ask for fewer shapes at once, "
-            "stream the frames as JSON lines, or try again when there is less to do."
-        )
+        return DeadlineError(f"The answer was not ready within {self.deadline:g} s. {advice}")
 
     def end(self) -> None:
         """End every call, because the server ends."""
@@ -218,8 +233,8 @@ class Workers:
             quota.give_back(caller.client, amount)
 
     @contextmanager
-    def _call(self) -> Iterator[Call]:
-        call = Call(self.deadline, self.late())
+    def _call(self, advice: str = ADVICE) -> Iterator[Call]:
+        call = Call(self.deadline, self.late(advice))
         self._calls.add(call)
         if self._ending:
             call.give_up(_ending())

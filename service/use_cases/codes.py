@@ -14,7 +14,7 @@ from shapespace.files.limits import Limits
 from shapespace.mesh.rigid_motion import Placement
 from shapespace.model.correspondence import InvalidMeshError, limits, match
 from shapespace.model.edit import require_targets
-from shapespace.model.fit_result import Distances, FitStatus
+from shapespace.model.fit_result import Distances
 from shapespace.model.latent_space import Bounds
 from shapespace.model.options import EditOptions, EncodeOptions, FitOptions, SearchOptions, Target
 from shapespace.model.shape_model import ShapeModel
@@ -27,7 +27,7 @@ from shapespace.service.limits.sandbox_errors import (
     OutOfMemoryError,
     SandboxError,
 )
-from shapespace.service.limits.workers import BusyError, Caller, DeadlineError, EndingError, Workers
+from shapespace.service.limits.workers import BusyError, Call, Caller, DeadlineError, EndingError, Workers
 from shapespace.service.use_cases.batch import Timings, require_count
 from shapespace.service.use_cases.shape_formats import dump_json, float32
 from shapespace.service.use_cases.uploads import TOGETHER, UPLOAD_ERRORS, UnusableMeshError, UploadedMesh
@@ -43,6 +43,9 @@ MEMORY = 64 * 2**20
 SCAN_LIMITS, SCAN_MEMORY = Limits(2**21, 2**21), 256 * 2**20
 #: Bytes of a reading process's answer beside the arrays.
 _ANSWER = 2**16
+#: Advice for a search that has no result at its deadline: for `encode` and `edit`, and for `fit`.
+_LATER = "Try again when there is less to do."
+_SMALLER = f"Fit fewer points or a coarser scan. {_LATER}"
 
 
 #: Members of an answer, and the time by stage.
@@ -116,16 +119,18 @@ async def encode(
         meshes, fields = read_upload(sandbox, upload, limits(model.decoder), deadline, most=most)
         chosen, options = checked(fields)
         read = time.perf_counter()
-        answers = [_encoded(chosen, mesh, options, deadline) for mesh in meshes]
+        answers = []
+        for mesh in meshes:
+            answers.append(_encoded(chosen, mesh, options, deadline))
+            if len(meshes) > 1 and answers[-1]["status"] == Status.DEADLINE:
+                raise workers.late(f"Send fewer meshes at once. {_LATER}")
         seconds = {"read": read - began, "search": time.perf_counter() - read}
         if len(meshes) == 1:
             return answers[0], seconds
-        if any(answer["status"] == Status.DEADLINE for answer in answers):
-            raise workers.late()
         named = [{"name": mesh.name, **answer} for mesh, answer in zip(meshes, answers, strict=True)]
         return {"meshes": named}, seconds
 
-    return await _searched(workers, caller, make)
+    return await _searched(workers, caller, _LATER, make)
 
 
 def _encoded(model: ShapeModel, mesh: UploadedMesh, options: EncodeOptions, deadline: Deadline) -> dict[str, Any]:
@@ -142,6 +147,9 @@ def _encoded(model: ShapeModel, mesh: UploadedMesh, options: EncodeOptions, dead
         "vertex_errors": float32(found.distances),
         "inside_bounds": found.inside_bounds,
         "status": found.status,
+        "reason": found.reason,
+        "cause": found.cause,
+        "misplaced": found.misplaced,
         "iterations": found.iterations,
         "mesh": found.mesh,
         "diagnostics": asdict(found.shape.diagnostics),
@@ -192,7 +200,7 @@ async def edit(
         }
         return content, seconds
 
-    return await _searched(workers, caller, make)
+    return await _searched(workers, caller, _LATER, make)
 
 
 async def fit(
@@ -236,17 +244,20 @@ async def fit(
             content["samples"] = found.samples
         return content, {"read": read - began, "search": time.perf_counter() - read}
 
-    return await _searched(workers, caller, make)
+    return await _searched(workers, caller, _SMALLER, make)
 
 
-async def _searched(workers: Workers, caller: Caller, make: Callable[[Deadline], Answered]) -> Found:
-    def search(deadline: Deadline) -> Found:
-        content, seconds = make(deadline)
-        if content.get("status") in (Status.DEADLINE, FitStatus.DEADLINE):
-            raise workers.late()
+async def _searched(workers: Workers, caller: Caller, advice: str, make: Callable[[Deadline], Answered]) -> Found:
+    """Run a search, which answers its best result so far at its deadline; ``advice`` is for one without a result."""
+
+    def search(call: Call) -> Found:
+        if call.passed:
+            raise workers.late(advice)
+        call.searching = True
+        content, seconds = make(call)
         return Found(dump_json(content), seconds)
 
-    async with workers.admit(caller) as call:
+    async with workers.admit(caller, advice) as call:
         return await workers.run(search, call)
 
 

@@ -114,14 +114,15 @@ def edited(
     begin = fixed.into(start.astype(np.float64))
     # Decoded before the edit borrows a solver, because decoding needs a solver too.
     before = decoder.shape(start, True, MeshChoice.COARSE, deadline)
+    searching = deadline and deadline.for_searching()
     with decoder.solver() as reconstruct:
         vertices = np.array([target.vertex for target in targets])
         rough, pulled = (
-            PulledVertices(decoder, reconstruct, vertices, options.mesh, deadline, rough=rough)
+            PulledVertices(decoder, reconstruct, vertices, options.mesh, searching, rough=rough)
             for rough in (True, False)
         )
         here = pulled.placed(before.vertices / scale)
-        search = EditSearch(decoder, rough, pulled, begin, here, positions, sigmas, options, fixed, deadline)
+        search = EditSearch(decoder, rough, pulled, begin, here, positions, sigmas, options, fixed, searching)
         try:
             best = search.best()
             code, inside = decoder.latents.found(best.x, Bounds.CLAMP, fixed)

@@ -13,9 +13,10 @@ from shapespace.mesh.rigid_motion import align, aligned_change
 from shapespace.model.correspondence import InvalidMeshError, Matched
 from shapespace.model.decoder import Decoder, MeshChoice, Shape
 from shapespace.model.derivatives import derivatives
+from shapespace.model.encode_faults import EncodeCause, EncodeFault, OrderCheck, mirror_image
 from shapespace.model.encode_search import EncodePreparation, EncodeSearch, VertexObjective
 from shapespace.model.latent_space import Codes, Fixed, NotFiniteError
-from shapespace.model.options import EncodeOptions
+from shapespace.model.options import EncodeOptions, Objective
 from shapespace.model.posterior import Posterior, independent_share, patches_of
 from shapespace.solve.cholesky import NotPositiveDefiniteError
 from shapespace.solve.deadline import Deadline
@@ -25,6 +26,13 @@ from shapespace.solve.outcome import Status
 UNITS = 3.0
 #: Least standard deviation of a vertex that the posterior assumes, as a fraction of the diagonal.
 LEAST_DEVIATION = 2e-5
+#: How a search ended, in words; with any other status than these it is _STUCK.
+_STUCK = "The search could get no nearer"
+_ENDS = {
+    Status.CONVERGED: "The search has converged",
+    Status.DEADLINE: "The time was over before the search was done",
+    Status.ITERATION_LIMIT: "The search ended at its largest number of shapes",
+}
 
 
 @dataclass(frozen=True)
@@ -34,7 +42,10 @@ class Encoded:
     Attributes:
         code: (m,) code, float32, as the networks take it.
         inside_bounds: whether the code lies inside the bounds.
-        status: how the iteration ended.
+        status: how the iteration ended; POOR if the mesh is no shape of the model, see ``cause``.
+        reason: the status in words.
+        cause: why the mesh is no shape of the model, None if it may be one.
+        misplaced: (k,) vertices that are exchanged or far off.
         iterations: number of shapes that the search by vertices reconstructed, 0 if the first shape had nearly
             collapsed; for the objective ``nric``, the number of network evaluations.
         residual: relative misfit of lengths and angles, in the weighted norm of the reconstruction.
@@ -49,6 +60,9 @@ class Encoded:
     code: Codes
     inside_bounds: bool
     status: Status
+    reason: str
+    cause: EncodeCause | None
+    misplaced: IntArray
     iterations: int
     residual: float
     shape: Shape
@@ -100,28 +114,56 @@ class Encoder:
         fixed = latents.fixed(options.fixed)
         nearby = decoder.nearby(given.mesh)
         aim = VertexObjective(vertices, nearby / nearby.sum())
-        search = EncodeSearch(self._prepared, target, aim, fixed, options.bounds, deadline)
+        searching = deadline and deadline.for_searching()
+        search = EncodeSearch(self._prepared, target, aim, fixed, options.bounds, searching)
         fit = search(options.objective)
         code, inside = latents.found(fit.x, options.bounds, fixed)
         coarse = decoder.shape(code, inside, MeshChoice.COARSE, deadline)
         posterior = self._posterior(code, coarse.vertices / decoder.manifest.scale, vertices, fixed)
         shape = replace(coarse, vertices=decoder.finish(coarse.vertices / decoder.manifest.scale, given.mesh))
-        distances = np.linalg.norm(align(shape.vertices, given.vertices) - given.vertices, axis=1)
-        left = search.difference(decoder.nric(code.astype(np.float64)))
-        residual = float(np.sqrt(norm.square(left) / norm.square(target)))
+        placed = align(shape.vertices, given.vertices)
+        distances = np.linalg.norm(placed - given.vertices, axis=1)
+        z = decoder.nric(code.astype(np.float64))
         status = Status.DEADLINE if shape.diagnostics.status is Status.DEADLINE else fit.status
+        fault = None
+        if status is not Status.DEADLINE:
+            mirrored = EncodeSearch(self._prepared, *_mirrored(target, aim), fixed, options.bounds, searching)
+            fault = self._mirror_image(search, fit.x, mirrored, z, options.objective)
+            fault = fault or self._order_checks[given.mesh](given.vertices, placed)
+        mean = float(distances.mean()) / (decoder.manifest.scale * decoder.reference.diagonal)
+        ended = f"{_ENDS.get(status, _STUCK)}: the vertices lie {mean:.2g} of the diagonal away on average."
         return Encoded(
             code,
             inside,
-            status,
+            Status.POOR if fault else status,
+            fault.sentence if fault else ended,
+            fault.cause if fault else None,
+            fault.misplaced if fault else np.zeros(0, np.int64),
             fit.iterations,
-            residual,
+            float(np.sqrt(norm.square(search.difference(z)) / norm.square(target))),
             shape,
             distances,
             given.mesh,
             posterior.covariance,
             posterior.sample(latents, code, options.samples, options.seed),
         )
+
+    def _mirror_image(
+        self, search: EncodeSearch, x: FloatArray, mirrored: EncodeSearch, z: FloatArray, objective: Objective
+    ) -> EncodeFault | None:
+        """Return the fault of a mesh that is a mirror image.
+
+        Its mirror image is searched for too if it has angles nearer to the lengths and angles z (2E,) of the code x.
+        """
+        norm, diagonal = self._prepared.norm, self._decoder.reference.diagonal
+        if norm.square(mirrored.difference(z)) >= norm.square(search.difference(z)):
+            return None
+        return mirror_image(search.away(x) / diagonal, mirrored.away(mirrored(objective).x) / diagonal)
+
+    @cached_property
+    def _order_checks(self) -> dict[MeshChoice, OrderCheck]:
+        diagonal = self._decoder.manifest.scale * self._decoder.reference.diagonal
+        return {choice: OrderCheck(self._decoder.mesh(choice).connectivity, diagonal) for choice in MeshChoice}
 
     def _require_size(self, vertices: FloatArray) -> None:
         """Raise InvalidMeshError if the size of a mesh (V, 3) suggests other units."""
@@ -153,6 +195,12 @@ class Encoder:
     def _patches(self) -> list[IntArray]:
         """Patches of the coarse mesh; made once, because they take as long as a shape."""
         return patches_of(self._decoder.reference.vertices)
+
+
+def _mirrored(target: FloatArray, aim: VertexObjective) -> tuple[FloatArray, VertexObjective]:
+    """Return the lengths and angles (2E,) and the vertices of the mirror image of a mesh."""
+    half = len(target) // 2
+    return np.concatenate([target[:half], -target[half:]]), replace(aim, vertices=aim.vertices * [-1, 1, 1])
 
 
 def _extent(vertices: FloatArray) -> float:

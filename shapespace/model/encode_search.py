@@ -296,7 +296,7 @@ class EncodeSearch:
         if np.array_equal(moved.x, fit.x) or fit.status is Status.DEADLINE:
             return fit
         other = self._by_vertices(moved, box, most=SETTINGS.shapes + SETTINGS.inside - fit.iterations)
-        near = other.status is not Status.DEADLINE and self._away(other.x) <= SETTINGS.as_near * self._away(fit.x)
+        near = other.status is not Status.DEADLINE and self.away(other.x) <= SETTINGS.as_near * self.away(fit.x)
         return replace(other if near else fit, iterations=fit.iterations + other.iterations)
 
     def _from_training_shape_if_nearer(self, known: FloatArray, near: Fit, fit: Fit) -> Fit:
@@ -315,10 +315,10 @@ class EncodeSearch:
         if np.abs(self._decoder.latents.shorter(other.x - near.x) / box.scale).max() < SETTINGS.different:
             return fit
         other = self._by_vertices(other, box, most=left)
-        nearer = min((fit, other), key=lambda each: self._away(each.x))
+        nearer = min((fit, other), key=lambda each: self.away(each.x))
         return replace(nearer, iterations=fit.iterations + other.iterations)
 
-    def _away(self, x: FloatArray) -> float:
+    def away(self, x: FloatArray) -> float:
         """Return the root mean square distance from the vertices of a code (m,) as the model answers it.
 
         The search solves each shape from the last one, and far outside the bounds it may reach another solution.

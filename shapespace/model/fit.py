@@ -165,6 +165,7 @@ class _Fit:
         self, fitter: Fitter, points: FloatArray, faces: IntArray, options: FitOptions, deadline: Deadline | None
     ) -> None:
         self.decoder, self.fitter, self.options, self.deadline = fitter.decoder, fitter, options, deadline
+        self.searching = deadline and deadline.for_searching()
         self.points, self.unit = points, fitter.decoder.manifest.scale
         self.scan = scan_of(np.asarray(points, np.float64) / self.unit, faces, np.random.default_rng(options.seed))
         self.constraints = FitConstraints.of(options, fitter.decoder)
@@ -179,6 +180,7 @@ class _Fit:
             best, others = self._roughly(rough, QUICK, *([THOROUGH] if self.constraints.partial else []))
             full = self._search(reconstruct, self.scan, self.constraints, SOLVED)
             final, rival = self._fully(full, best, others)
+            self.ended = self._late
             ratio = None
             posterior = self._posterior(full, final)
             explained, seen = full.shares(final)
@@ -193,7 +195,7 @@ class _Fit:
 
     @property
     def _late(self) -> bool:
-        return self.deadline is not None and self.deadline.passed
+        return self.searching is not None and self.searching.passed
 
     def _require_units(self) -> None:
         sizes = np.sqrt(self.shapes.var(axis=1).sum(axis=1))
@@ -208,7 +210,7 @@ class _Fit:
         self, reconstruct: Reconstructor, scan: Scan, constraints: FitConstraints, accuracy: SearchAccuracy
     ) -> FitSearch:
         vertex_faces, looking = self.fitter.reach[accuracy.mesh]
-        return FitSearch(self.decoder, reconstruct, scan, constraints, accuracy, vertex_faces, looking, self.deadline)
+        return FitSearch(self.decoder, reconstruct, scan, constraints, accuracy, vertex_faces, looking, self.searching)
 
     def _placed(self, search: FitSearch, effort: PlacementEffort) -> list[StartPlacement]:
         """Return the placements at which a search begins, the best first."""
@@ -322,7 +324,7 @@ class _Fit:
         to_model = surface.closest(self.unit * self.scan.points).distances
         to_scan = self.unit * self.scan.distances(surface.vertices / self.unit)
         parts = np.array_split(self.points, -(-len(self.points) // CHUNK)) if options.points else []
-        found = [surface.closest(part).distances for part in parts if not self._late]
+        found = [surface.closest(part).distances for part in parts if not (self.deadline and self.deadline.passed)]
         every = np.concatenate(found) if found and len(found) == len(parts) else None
         status, reason = self._status(state, explained, seen, mirrored, rival, shape)
         return Fitted(
@@ -356,8 +358,9 @@ class _Fit:
     ) -> tuple[FitStatus, str]:
         """Return how the fit ended, and the reason in words."""
         shares = f"{explained:.0%} of the scan lie at the model, {seen:.0%} of the model at the scan"
-        if self._late or shape.diagnostics.status is Status.DEADLINE:
-            status, reason = FitStatus.DEADLINE, f"The time was over before the fit was done: {shares} so far."
+        if self.ended or shape.diagnostics.status is Status.DEADLINE:
+            status = FitStatus.DEADLINE
+            reason = f"The time was over before the fit was done: {shares} so far. Send fewer points or a coarser scan."
         elif self._is_poor(explained, seen):
             status, reason = FitStatus.POOR, f"Only {shares}: the scan is no such shape, or the search went astray."
             if mirrored is not None and mirrored < SETTINGS.mirrored:

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import time
 
+#: Time that a search leaves for completing its result: this share of all time, but at most these seconds.
+COMPLETING_SHARE, COMPLETING_SECONDS = 0.25, 2.0
+
 
 class Deadline:
     """The time by which work has to end, in seconds from now. It can be called off earlier, from any thread.
@@ -24,3 +27,23 @@ class Deadline:
     def call_off(self) -> None:
         """Stop the work now, because its result is no longer needed."""
         self._called_off = True
+
+    def for_searching(self) -> Deadline:
+        """Return an earlier deadline, for a search whose best result has to be completed by this deadline."""
+        return _Searching(self)
+
+
+class _Searching(Deadline):
+    """The earlier deadline of a search; calling off either deadline calls off the other."""
+
+    def __init__(self, whole: Deadline) -> None:
+        left = max(whole.time - time.monotonic(), 0.0)
+        super().__init__(left - min(COMPLETING_SHARE * left, COMPLETING_SECONDS))
+        self._whole = whole
+
+    @property
+    def passed(self) -> bool:
+        return super().passed or self._whole.passed
+
+    def call_off(self) -> None:
+        self._whole.call_off()

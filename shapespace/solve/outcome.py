@@ -9,7 +9,10 @@ import numpy as np
 
 
 class Status(StrEnum):
-    """How an iteration ended. Vertices are finite with every status."""
+    """How an iteration or a search ended. Vertices are finite with every status.
+
+    ``poor``: the search ended, but its result does not describe what was given. Only `encode` answers it.
+    """
 
     CONVERGED = "converged"
     STALLED = "stalled"
@@ -17,6 +20,7 @@ class Status(StrEnum):
     DEADLINE = "deadline"
     NOT_FINITE = "not_finite"
     DEGENERATE = "degenerate"
+    POOR = "poor"
 
 
 @dataclass(frozen=True, kw_only=True)

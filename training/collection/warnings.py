@@ -13,11 +13,11 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from shapespace.arrays import FloatArray, IntArray
 from shapespace.mesh.triangle_mesh import Connectivity, face_areas
+from shapespace.mesh.vertex_order import ORDER, VertexEdges, extent, times_longer
 from shapespace.training.collection.large_arrays import TOGETHER, columns, room
 
 
@@ -26,14 +26,6 @@ class WarningThresholds:
     """Differences between shapes that cause a warning."""
 
     area_factor: float = 3.0  # an area that differs from the median by more than this factor suggests another unit
-    # A vertex is misplaced in a shape if its shortest edge is longer than ``stretch`` times its longest edge in other
-    # shapes, and longer than ``long`` times the shape's median edge.
-    stretch: float = 2.0
-    long: float = 3.0
-    # The vertices have another order if the median of all ratios of edges to the same edges in other shapes is larger.
-    scrambled: float = 2.5
-    # "In other shapes" means this quantile over all shapes, so that it is enough if a quarter of the shapes are right.
-    quantile: float = 0.25
     # A reflection, or a rotation, explains why a shape differs from another if it reduces the squared distance to less
     # than this share.
     mirrored: float = 0.5
@@ -189,48 +181,30 @@ def _duplicate_warnings(vertices: FloatArray, names: Sequence[str]) -> list[Coll
 
 
 class _EdgeLengths:
-    """Lengths of the edges of all shapes, each compared with the same edge of the other shapes.
-
-    A shape may be in another unit, or rolled up. An edge counts as long only if it is long in the units of the file
-    and also as a share of the shape's extent.
-    """
+    """Lengths of the edges of all shapes, each compared with the same edge of the other shapes."""
 
     def __init__(self, vertices: FloatArray, connectivity: Connectivity) -> None:
         self.vertices = vertices
-        tail, head = np.concatenate([connectivity.edges, connectivity.edges[:, ::-1]]).T
-        order = np.argsort(tail, kind="stable")
-        tail, head = tail[order], head[order]
-        starts = np.flatnonzero(np.diff(tail, prepend=-1))
-        count = connectivity.vertex_count
+        edges, count = VertexEdges(connectivity), connectivity.vertex_count
         shortest, longest = (room((len(vertices), count), np.float32) for _ in range(2))
-        extent, self._middle = np.empty((2, len(vertices)))
+        extents, self._middle = np.empty((2, len(vertices)))
         most = min(20 * SAMPLE, TOGETHER // len(vertices))
         some = np.unique(np.linspace(0, connectivity.edge_count - 1, most).astype(int))
         i, j = connectivity.edges[some].T
         sample = np.empty((len(vertices), len(some)))
         for k, shape in enumerate(vertices):
-            lengths = np.linalg.norm(shape[tail] - shape[head], axis=1)
-            shortest[k] = np.minimum.reduceat(lengths, starts)
-            longest[k] = np.maximum.reduceat(lengths, starts)
-            self._middle[k] = np.median(lengths)
-            # A median, since a vertex far off would hide itself in a mean.
-            extent[k] = np.median(np.linalg.norm(shape - np.median(shape, axis=0), axis=1))
+            lengths = edges.lengths(shape)
+            (shortest[k], longest[k]), self._middle[k] = edges.range(lengths), np.median(lengths)
+            extents[k] = extent(shape)
             sample[k] = np.linalg.norm(shape[i] - shape[j], axis=1)
-        relative = extent[:, None]
-
-        def ratios(values: NDArray, usual: NDArray) -> NDArray:
-            """Divide values (n, …) by the usual ones, in file units and relative to the extent; take the smaller."""
-            raw = values / np.quantile(usual, THRESHOLDS.quantile, axis=0)
-            scaled = (values / relative) / np.quantile(usual / relative, THRESHOLDS.quantile, axis=0)
-            return np.minimum(raw, scaled)
-
         # Indices of shapes whose vertices have another order.
-        self.scrambled = np.flatnonzero(np.median(ratios(sample, sample), axis=1) > THRESHOLDS.scrambled)
+        times = times_longer(sample, extents, sample, extents)
+        self.scrambled = np.flatnonzero(np.median(times, axis=1) > ORDER.scrambled)
         places = []
         for part in columns(*shortest.shape):
             short, long = shortest[:, part], longest[:, part]
-            stretched = ratios(short, long) > THRESHOLDS.stretch
-            stretched &= short > THRESHOLDS.long * self._middle[:, None]
+            stretched = times_longer(short, extents, long, extents) > ORDER.stretch
+            stretched &= short > ORDER.long * self._middle[:, None]
             places.append(np.argwhere(stretched) + np.array([0, part.start]))
         shape_of, vertex_of = np.concatenate(places).T
         # By the index of a shape, its vertices that are far from their neighbours.
@@ -257,4 +231,4 @@ class _EdgeLengths:
     def _exchanged(self, k: int, misplaced: IntArray) -> bool:
         """Whether most misplaced vertices lie on the surface: then they are exchanged, not moved away."""
         near = np.asarray(KDTree(self.vertices[k]).query(self.vertices[k][misplaced], 2)[0])[:, 1]
-        return len(misplaced) > 1 and bool((near < THRESHOLDS.long * self._middle[k]).mean() > 0.5)
+        return len(misplaced) > 1 and bool((near < ORDER.long * self._middle[k]).mean() > 0.5)

@@ -87,7 +87,7 @@ class FitAnswer(BaseModel):
         description="Cost of the scan's mirror image as a share of the scan's own cost, where the fit is poor. "
         "A small value means that the scan is mirrored."
     )
-    status: str = Field(description="converged, ambiguous, poor, stalled.")
+    status: str = Field(description="converged, ambiguous, poor, stalled, or deadline (with the best result so far).")
     reason: str = Field(description="The status in words.")
     sampled: bool = Field(description="Whether fewer points, or points spread over the faces, represented the scan.")
     shapes: ShapesAnswer

@@ -9,6 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from shapespace.bundle.schema import AttributesEntry
 from shapespace.files.colouring import Quantity
 from shapespace.model.decoder import MeshChoice, Quality
+from shapespace.model.encode_faults import EncodeCause
 from shapespace.model.latent_space import Bounds, Distribution
 from shapespace.model.options import EditOptions, EncodeOptions, Target
 from shapespace.service.http.messages.options import body_of, query_of
@@ -206,7 +207,16 @@ class EncodeAnswer(BaseModel):
     vertex_error: VertexError = Field(description="Between the mesh and the code's shape, after rigid alignment.")
     vertex_errors: list[float] = Field(description="The same vertex by vertex.")
     inside_bounds: bool = Field(description="Whether the code lies inside the model's bounds.")
-    status: str = Field(description="How the search ended: converged, stalled, iteration_limit.")
+    status: str = Field(
+        description="How the search ended: converged, stalled, iteration_limit, deadline (with the best result so "
+        "far), or poor: the mesh is no shape of the model, so do not use the code."
+    )
+    reason: str = Field(description="The status in words.")
+    cause: EncodeCause | None = Field(
+        description="With `poor`: all vertices have another `order`, some are `exchanged` or are `outliers` far off, "
+        "or the mesh is `mirrored`. Otherwise null."
+    )
+    misplaced: list[int] = Field(description="Vertices that are exchanged or lie far off, from 0.")
     iterations: int = Field(description="Shapes that it looked at; evaluations of the networks if by `nric`.")
     mesh: MeshChoice = Field(description="Which mesh of the model was sent.")
     diagnostics: DiagnosticsAnswer = Field(description="Of the code's shape.")
@@ -228,7 +238,9 @@ class EditAnswer(BaseModel):
     )
     covariance: list[list[float]] = Field(description=_COVARIANCE)
     samples: list[list[float]] = Field(description=_SAMPLED)
-    status: str = Field(description="How the search ended: converged, stalled, iteration_limit.")
+    status: str = Field(
+        description="How the search ended: converged, stalled, iteration_limit, deadline (with the best result so far)."
+    )
     iterations: int = Field(description="Shapes that it looked at.")
     diagnostics: DiagnosticsAnswer = Field(description="Of the code's shape.")
 

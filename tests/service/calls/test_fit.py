@@ -12,7 +12,7 @@ from shapespace.client import Client, ClientError, Mesh
 from shapespace.files.formats import MESH_FORMATS
 from shapespace.files.npz import npz_bytes
 from shapespace.model.shape_model import ShapeModel, load
-from tests.service.conftest import ROOT, starting
+from tests.service.conftest import ROOT
 
 FIT = "/v1/models/figure/fit"
 CODE = np.linspace(-0.4, 0.4, 20)
@@ -172,14 +172,6 @@ def test_the_client_fits_points_meshes_and_files(
         assert caller.fit("figure", shape)["status"] == "converged"
         with pytest.raises(ClientError, match="scale=free"):
             caller.fit("figure", 100 * points)
-
-
-def test_a_fit_that_takes_too_long_is_ended(points: np.ndarray) -> None:
-    with starting() as start, httpx.Client(base_url=start(ROOT / "models", deadline=0.2).url, timeout=60) as client:
-        answer = client.post(FIT, content=as_xyz(points), params={"format": "xyz"})
-        assert answer.status_code == 504
-        assert answer.json()["type"] == "urn:shapespace:problem:deadline-passed"
-        assert client.get("/v2/health/ready").json() == {"ready": True}
 
 
 def test_a_million_points_are_sampled_and_a_large_file_is_no_larger_than_others(

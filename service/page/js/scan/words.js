@@ -18,14 +18,15 @@ const FAIR = 0.03;
 
 /**
  * Describe a mesh in correspondence.
- * @param {{residual: number, vertex_error: {mean: number, max: number}}} answer of `encode`
+ * @param {{residual: number, vertex_error: {mean: number, max: number}, status: string,
+ *   reason: string}} answer of `encode`
  * @param {{file: string, model: string, diagonal: number}} about names of the file and the model, and
  *   the model's diagonal
  * @returns {Verdict}
  */
-export function encodeInWords({ residual, vertex_error: error }, { file, model, diagonal }) {
+export function encodeInWords({ residual, vertex_error: error, status, reason }, { file, model, diagonal }) {
   const off = error.mean / diagonal;
-  const how = off < GOOD ? "good" : off < FAIR ? "fair" : "poor";
+  const how = status === "poor" || off >= FAIR ? "poor" : off < GOOD ? "good" : "fair";
   const title = {
     good: `This is the code of ${file}`,
     fair: `This is the code that comes closest to ${file}`,
@@ -37,6 +38,7 @@ export function encodeInWords({ residual, vertex_error: error }, { file, model, 
     words: [
       `Its vertices are off by ${percent(off)} of the diagonal on average (${readable(error.mean)} units),` +
         ` by ${percent(error.max / diagonal)} at most.`,
+      ...(status === "poor" ? [reason] : []),
       ...(how === "poor"
         ? [`${model} has nothing nearer that matches vertex by vertex. Your shape was left as it was.`]
         : []),
@@ -68,6 +70,7 @@ export function fitInWords(answer, { file, model, diagonal }) {
     ambiguous: ["fair", `${file} fits, but another shape fits nearly as well`],
     stalled: ["fair", `${file} fits, though the search had not quite come to rest`],
     poor: ["poor", `${file} is no such shape, or the search went astray`],
+    deadline: ["fair", `The time was over: this is the best fit to ${file} so far`],
   };
   const [how, title] = titles[status] ?? ["fair", `The fit of ${file} ended as “${status}”`];
   const words = [
