@@ -7,6 +7,7 @@ is cut into its sections, of which the package reads the numbers, and cells are 
 from __future__ import annotations
 
 import re
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib.util import find_spec
@@ -23,6 +24,8 @@ from shapespace.mesh.triangle_mesh import MeshError
 if TYPE_CHECKING:
     from vtkmodules.vtkCommonDataModel import vtkPolyData
 
+#: Names of the formats: legacy files and XML files.
+VTK_FORMATS = ("vtk", "vtp")
 #: The first line of a legacy file, its title, the encoding of its numbers, and the kind of its data.
 _HEAD = re.compile(
     rb"# vtk DataFile Version (\d+)\.\d+[^\n]*\n[^\n]*\n\s*(ASCII|BINARY)\s+DATASET\s+(\w+)", re.IGNORECASE
@@ -33,7 +36,7 @@ _SECTION = re.compile(
 )
 _LEGACY_CELLS = re.compile(rb"\w+\s+(\d+)\s+(\d+)(?=\s)")
 _XML_KIND = re.compile(rb"<VTKFile\b[^>]*?\btype\s*=\s*[\"'](\w+)[\"']")
-_XML_COUNT = re.compile(rb"\bNumberOf(?:Points|Verts|Lines|Strips|Polys)\s*=\s*[\"']\s*(\d+)")
+_XML_COUNT = re.compile(rb"\bNumberOf(Points|Verts|Lines|Strips|Polys)\s*=\s*[\"']\s*(\d+)")
 #: Largest ratio of a compressed file's data to the file: the limit of zlib.
 _LARGEST_RATIO = 1032
 
@@ -41,6 +44,11 @@ _LARGEST_RATIO = 1032
 def vtk_installed() -> bool:
     """Return whether the package ``vtk`` is installed."""
     return find_spec("vtkmodules") is not None
+
+
+def vtk_loaded() -> bool:
+    """Return whether this process has loaded the package."""
+    return "vtkmodules.vtkCommonDataModel" in sys.modules
 
 
 def read_vtk(data: memoryview, limits: Limits) -> tuple[FloatArray, IntArray]:
@@ -85,9 +93,11 @@ def read_vtp(data: memoryview, limits: Limits) -> tuple[FloatArray, IntArray]:
         raise ValueError("damaged, or another kind of file")
     if kind[1] != b"PolyData":
         raise MeshError(_other_kind(kind[1].decode()))
-    counts = [int(match[1]) for match in _XML_COUNT.finditer(data)]
-    if max(counts, default=0) > _LARGEST_RATIO * len(data):
-        raise EOFError(ENDS_EARLY)
+    for match in _XML_COUNT.finditer(data):
+        count = int(match[2])
+        limits.check(count if match[1] == b"Points" else 0, count if match[1] == b"Polys" else 0)
+        if count > _LARGEST_RATIO * len(data):
+            raise EOFError(ENDS_EARLY)
     from vtkmodules.vtkIOXML import vtkXMLPolyDataReader
 
     reader = vtkXMLPolyDataReader()
@@ -95,7 +105,6 @@ def read_vtp(data: memoryview, limits: Limits) -> tuple[FloatArray, IntArray]:
     reader.SetInputString(bytes(data))
     with _errors():
         reader.UpdateInformation()
-        limits.check(reader.GetNumberOfPoints(), reader.GetNumberOfPolys())
         for attributes in (reader.GetPointDataArraySelection(), reader.GetCellDataArraySelection()):
             attributes.DisableAllArrays()
         reader.Update()

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from shapespace.files.formats import MESH_FORMATS
+from shapespace.files.formats import MESH_FORMATS, VTK_FORMATS
 from shapespace.files.reading import READ_FORMATS
 from shapespace.mesh.triangle_mesh import TriangleMesh, face_areas
 from shapespace.training.collection.checks import IngestError
@@ -32,7 +32,7 @@ SHAPES = np.stack(
 def encoded(vertices: np.ndarray, faces: np.ndarray, format: str) -> bytes:
     if format == "off":
         return trimesh.Trimesh(vertices, faces, process=False).export(file_type="off").encode()
-    return MESH_FORMATS[format].encode(vertices, faces)
+    return (MESH_FORMATS | VTK_FORMATS)[format].encode(vertices, faces)
 
 
 def write(
