@@ -100,8 +100,11 @@ def read_morph_shapes(data: memoryview, *, binary: bool, beside: Path | None = N
     scene = Scene(document, buffers, UNLIMITED, every_target=True)
     names = list(dict.fromkeys(target.name for part in scene.read for target in part.targets))
     base = next(name for name in chain(["base"], (f"base {k}" for k in count(2))) if name not in names)
-    shapes = [scene.posed(lambda target, name=name: float(target.name == name)) for name in (base, *names)]
-    return MorphShapes((base, *names), np.stack(shapes), scene.faces)
+
+    def alone(name: str) -> FloatArray:
+        return scene.posed(lambda target: float(target.name == name))
+
+    return MorphShapes((base, *names), np.stack([alone(name) for name in (base, *names)]), scene.faces)
 
 
 class Scene:

@@ -100,9 +100,9 @@ class TriangleFans:
         if len(polygon) < 3:
             raise ValueError(f"a face has {len(polygon)} corners")
         self._limits.check(0, len(self._corners) // 3 + len(polygon) - 2)
-        first = polygon[0]
-        for a, b in pairwise(polygon[1:]):
-            self._corners.extend((first, a, b))
+        self._corners.extend(polygon[:3])
+        for a, b in pairwise(polygon[2:]):
+            self._corners.extend((polygon[0], a, b))
 
     @property
     def faces(self) -> IntArray:
@@ -126,7 +126,8 @@ def read_obj(data: memoryview, limits: Limits) -> tuple[FloatArray, IntArray]:
                 limits.check(len(coordinates) // 3, 0)
             else:
                 here = len(coordinates) // 3
-                numbers = [int(value.partition(b"/")[0]) for value in values[0].partition(b"#")[0].split()]
+                corners = values[0].partition(b"#")[0].split()
+                numbers = map(int, corners if b"/" not in values[0] else (c.partition(b"/")[0] for c in corners))
                 # Negative numbers count back from the last vertex before this line.
                 triangles.add([number - 1 if number > 0 else here + number for number in numbers])
     return np.array(coordinates, np.float64).reshape(-1, 3), triangles.faces

@@ -102,7 +102,7 @@ def read_vtp(data: memoryview, limits: Limits) -> tuple[FloatArray, IntArray]:
 
     reader = vtkXMLPolyDataReader()
     reader.ReadFromInputStringOn()
-    reader.SetInputString(bytes(data))
+    reader.SetInputString(bytes(data))  # type: ignore[call-overload]
     with _errors():
         reader.UpdateInformation()
         for attributes in (reader.GetPointDataArraySelection(), reader.GetCellDataArraySelection()):
@@ -170,14 +170,16 @@ def _legacy_cells(begin: bytes, section: memoryview, close: bytes, version: int)
 def _numbers(array: object) -> IntArray:
     from vtkmodules.util.numpy_support import vtk_to_numpy
 
-    return vtk_to_numpy(array).astype(np.int64).ravel()
+    numbers: IntArray = vtk_to_numpy(array).astype(np.int64).ravel()  # type: ignore[no-untyped-call]
+    return numbers
 
 
 def _vertices(found: vtkPolyData, count: int) -> FloatArray:
     from vtkmodules.util.numpy_support import vtk_to_numpy
 
     points = found.GetPoints()
-    vertices = np.zeros((0, 3)) if points is None else vtk_to_numpy(points.GetData()).astype(np.float64)
+    found_points = vtk_to_numpy(points.GetData())  # type: ignore[no-untyped-call]
+    vertices: FloatArray = found_points.astype(np.float64)
     if vertices.shape != (count, 3):
         raise EOFError(ENDS_EARLY)
     return vertices

@@ -33,7 +33,8 @@ def write_vtk(
     writer.SetInputData(_polygons(vertices, faces, colouring, surface))
     writer.WriteToOutputStringOn()
     writer.Write()
-    return bytes(writer.GetOutputStdString())
+    content: str | bytes = writer.GetOutputStdString()  # the package decodes content that happens to be UTF-8
+    return content if isinstance(content, bytes) else content.encode()
 
 
 def write_vtp(
@@ -58,7 +59,7 @@ def _polygons(
 
     surface = surface or MeshAttributes.of_triangles(faces)
     mesh, points, cells = vtkPolyData(), vtkPoints(), vtkCellArray()
-    points.SetData(numpy_to_vtk(np.ascontiguousarray(vertices, np.float32), deep=True))
+    points.SetData(_array(vertices.astype(np.float32)))
     offsets, corners = (
         numpy_to_vtkIdTypeArray(np.ascontiguousarray(array, np.int64), deep=True)
         for array in (surface.starts, surface.corners)
@@ -73,7 +74,7 @@ def _polygons(
     if colors is not None:
         arrays["RGB"] = np.rint(255 * colors).astype(np.uint8)
     for name, values in arrays.items():
-        array = numpy_to_vtk(np.ascontiguousarray(values), deep=True)
+        array = _array(values)
         array.SetName(name)
         mesh.GetPointData().AddArray(array)
     if arrays:
