@@ -60,7 +60,7 @@ def test_every_format_that_is_read_has_a_test_of_its_dialects() -> None:
     table = page("files").split("## Dialects that are read")[1]
     rows = [line.split(" | ") for line in table.splitlines() if line.startswith("| ")][1:]
     told = {name.lower() for row in rows for name in re.findall(r"[A-Za-z]+", re.sub(r"\(.*?\)|glTF", "", row[0]))}
-    assert told | {"gltf"} == SCAN_FORMATS.keys()
+    assert told >= SCAN_FORMATS.keys() - {"gltf"}
     for row in rows:
         tests = re.findall(r"`(.*?)`", row[2])
         assert tests

@@ -5,12 +5,14 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from shapespace.arrays import FloatArray, IntArray
 from shapespace.files.colouring import Colouring
 from shapespace.mesh.attributes import MeshAttributes
 
 if TYPE_CHECKING:
+    from vtkmodules.vtkCommonCore import vtkDataArray
     from vtkmodules.vtkCommonDataModel import vtkPolyData
 
 #: Version of legacy files that every program reads. Few programs other than VTK read version 5.
@@ -53,17 +55,13 @@ def write_vtp(
 def _polygons(
     vertices: FloatArray, faces: IntArray, colouring: Colouring | None, surface: MeshAttributes | None
 ) -> vtkPolyData:
-    from vtkmodules.util.numpy_support import numpy_to_vtk, numpy_to_vtkIdTypeArray
     from vtkmodules.vtkCommonCore import vtkPoints
     from vtkmodules.vtkCommonDataModel import vtkCellArray, vtkPolyData
 
     surface = surface or MeshAttributes.of_triangles(faces)
     mesh, points, cells = vtkPolyData(), vtkPoints(), vtkCellArray()
     points.SetData(_array(vertices.astype(np.float32)))
-    offsets, corners = (
-        numpy_to_vtkIdTypeArray(np.ascontiguousarray(array, np.int64), deep=True)
-        for array in (surface.starts, surface.corners)
-    )
+    offsets, corners = (_array(array.astype(np.int64)) for array in (surface.starts, surface.corners))
     cells.SetData(offsets, corners)
     mesh.SetPoints(points)
     mesh.SetPolys(cells)
@@ -80,3 +78,9 @@ def _polygons(
     if arrays:
         mesh.GetPointData().SetActiveScalars(next(iter(arrays)))
     return mesh
+
+
+def _array(values: NDArray) -> vtkDataArray:
+    from vtkmodules.util.numpy_support import numpy_to_vtk
+
+    return numpy_to_vtk(np.ascontiguousarray(values), deep=True)  # type: ignore[no-untyped-call, no-any-return]
