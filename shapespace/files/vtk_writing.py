@@ -83,4 +83,4 @@ def _polygons(
 def _array(values: NDArray) -> vtkDataArray:
     from vtkmodules.util.numpy_support import numpy_to_vtk
 
-    return numpy_to_vtk(np.ascontiguousarray(values), deep=True)  # type: ignore[no-untyped-call, no-any-return]
+    return numpy_to_vtk(np.ascontiguousarray(values), deep=True)  # type: ignore[no-untyped-call]

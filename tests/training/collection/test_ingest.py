@@ -418,5 +418,5 @@ def test_the_content_of_a_file_decides_its_format(tmp_path: Path) -> None:
     found = read_collection(tmp_path)
     assert found.vertices.shape == (3, *mesh.vertices.shape)
     (tmp_path / "2.obj").write_bytes(b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR")
-    with pytest.raises(IngestError, match=r"2.obj: is a PNG picture; these can be read: .*off$"):
+    with pytest.raises(IngestError, match=r"2.obj: is a PNG picture; these can be read: .*vtp$"):
         read_collection(tmp_path)
