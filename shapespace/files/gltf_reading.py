@@ -328,7 +328,7 @@ def _placed_primitive(
 def _targets(
     document: GltfDocument, primitive: dict[str, Any], placed: PlacedMesh, vertices: int, *, every_target: bool
 ) -> Iterator[MorphTarget]:
-    """Yield the morph targets that move vertices: all, or only targets with a weight. The weights of a node win (3.7.2.2)."""
+    """Yield the morph targets that move vertices: all, or only active targets. The weights of a node win (3.7.2.2)."""
     weights = placed.node.get("weights", placed.mesh.get("weights", []))
     targets = objects(primitive, "targets")
     names = _target_names(placed.mesh, len(targets)) if every_target else [""] * len(targets)
