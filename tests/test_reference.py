@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from shapespace.bundle.schema import ARRAYS, MANIFEST, Manifest
-from shapespace.files.formats import MESH_FORMATS, USD_FORMATS
+from shapespace.files.formats import MESH_FORMATS, USD_FORMATS, VTK_FORMATS
 from shapespace.files.reading import SCAN_FORMATS
 from shapespace.training.runs.directory import RunDirectory, RunFile
 
@@ -52,5 +52,18 @@ def test_every_call() -> None:
 
 def test_every_format() -> None:
     text = page("http") + page("files")
-    for name in {*MESH_FORMATS, *USD_FORMATS, *SCAN_FORMATS}:
+    for name in {*MESH_FORMATS, *USD_FORMATS, *VTK_FORMATS, *SCAN_FORMATS}:
         assert re.search(rf"\b{name}\b", text, re.IGNORECASE), name
+
+
+def test_every_format_that_is_read_has_a_test_of_its_dialects() -> None:
+    table = page("files").split("## Dialects that are read")[1]
+    rows = [line.split(" | ") for line in table.splitlines() if line.startswith("| ")][1:]
+    told = {name.lower() for row in rows for name in re.findall(r"[A-Za-z]+", re.sub(r"\(.*?\)|glTF", "", row[0]))}
+    assert told >= SCAN_FORMATS.keys() - {"gltf"}
+    for row in rows:
+        tests = re.findall(r"`(.*?)`", row[2])
+        assert tests
+        for name in tests:
+            folder = ROOT if "/" in name else ROOT / "tests" / "shapespace" / "files"
+            assert (folder / name).is_file(), name

@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 
 from shapespace.arrays import FloatArray, IntArray
 from shapespace.files.colouring import Colouring
-from shapespace.files.formats import MESH_FORMATS, OBJ_ZIP, USD_FORMATS, MeshFormat
+from shapespace.files.formats import MESH_FORMATS, OBJ_ZIP, USD_FORMATS, VTK_FORMATS, MeshFormat
 from shapespace.files.usd import usd_installed
+from shapespace.files.vtk_reading import vtk_installed
 from shapespace.mesh.attributes import MeshAttributes, Topology
 from shapespace.model.decoder import Diagnostics, Quality
 from shapespace.model.exact_shapes import ExactShape
@@ -55,10 +56,18 @@ def _mesh_json(
 
 
 #: Formats of one shape; the first is the default.
-SHAPE_FORMATS = {**MESH_FORMATS, "zip": OBJ_ZIP, "json": MeshFormat("application/json", _mesh_json), **USD_FORMATS}
+SHAPE_FORMATS = {
+    **MESH_FORMATS,
+    "zip": OBJ_ZIP,
+    "json": MeshFormat("application/json", _mesh_json),
+    **USD_FORMATS,
+    **VTK_FORMATS,
+}
 #: Reason why a format may be missing on a server.
 UNAVAILABLE = dict.fromkeys(
     USD_FORMATS, "This server can't write USD, for which it needs the package usd-core: pip install usd-core"
+) | dict.fromkeys(
+    VTK_FORMATS, 'This server can\'t write VTK files, for which it needs the package vtk: pip install "shapespace[vtk]"'
 )
 
 
@@ -80,7 +89,8 @@ def catch_write_errors() -> Iterator[None]:
 
 def writable(media_types: Mapping[str, str]) -> dict[str, str]:
     """Return the formats that this server can write, with their media types."""
-    return {name: kind for name, kind in media_types.items() if name not in UNAVAILABLE or usd_installed()}
+    missing = {*(() if usd_installed() else USD_FORMATS), *(() if vtk_installed() else VTK_FORMATS)}
+    return {name: kind for name, kind in media_types.items() if name not in missing}
 
 
 def with_topology(surface: MeshAttributes | None, topology: Topology) -> MeshAttributes | None:

@@ -16,6 +16,7 @@ from shapespace.files.gltf_writing import write_glb, write_gltf
 from shapespace.files.npz import npz_bytes
 from shapespace.files.reading import OCTET_STREAM, READ_FORMATS
 from shapespace.files.usd import still_usd
+from shapespace.files.vtk_writing import write_vtk, write_vtp
 from shapespace.mesh.attributes import MeshAttributes
 
 #: A function that writes one mesh, see `MeshFormat.encode`.
@@ -79,4 +80,9 @@ OBJ_ZIP = MeshFormat("application/zip", write_obj_zip, polygons=True)
 USD_FORMATS = {
     "usd": MeshFormat(OCTET_STREAM, still_usd, polygons=True),
     "usdz": MeshFormat("model/vnd.usdz+zip", partial(still_usd, packed=True), polygons=True),
+}
+#: VTK's files of polygons, legacy and XML. Writing and reading them needs the package ``vtk``.
+VTK_FORMATS = {
+    "vtk": MeshFormat(READ_FORMATS["vtk"], write_vtk, polygons=True),
+    "vtp": MeshFormat(READ_FORMATS["vtp"], write_vtp, polygons=True),
 }

@@ -8,8 +8,9 @@ comments are sections of the Khronos Group's glTF 2.0 specification.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from itertools import count
+from itertools import chain, count
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +26,7 @@ from shapespace.files.gltf_document import (
     objects,
     read_document,
 )
-from shapespace.files.limits import Limits
+from shapespace.files.limits import UNLIMITED, Limits, label
 from shapespace.mesh.triangle_mesh import MeshError
 
 #: Most primitives of a scene, counted at each of their places.
@@ -69,6 +70,43 @@ def open_scene(data: memoryview, limits: Limits, *, binary: bool, beside: Path |
     return Scene(document, buffers, limits)
 
 
+@dataclass(frozen=True, eq=False)
+class MorphShapes:
+    """Shapes of one file: the base, and each morph target with weight 1 alone.
+
+    Attributes:
+        names: names of the n shapes.
+        vertices: (n, V, 3).
+        faces: (F, 3), the same as `read_gltf` returns.
+    """
+
+    names: tuple[str, ...]
+    vertices: FloatArray
+    faces: IntArray
+
+
+def read_morph_shapes(data: memoryview, *, binary: bool, beside: Path | None = None) -> MorphShapes:
+    """Return the shapes of a file whose morph targets are shapes; arguments and errors as for `open_scene`.
+
+    A target has the name that ``extras.targetNames`` of its mesh gives it, or else "target 1" and so on. Targets of
+    several meshes that have one name make one shape. A mesh without such a target stays as it is at weight 0. Targets
+    that move no vertices are left out. The first shape is called "base", or "base 2" if a target has that name. Skins
+    and nodes pose every shape alike.
+
+    Raises:
+        MeshError: two targets of a mesh have one name.
+    """
+    document, buffers = read_document(data, binary=binary, beside=beside)
+    scene = Scene(document, buffers, UNLIMITED, every_target=True)
+    names = list(dict.fromkeys(target.name for part in scene.read for target in part.targets))
+    base = next(name for name in chain(["base"], (f"base {k}" for k in count(2))) if name not in names)
+
+    def alone(name: str) -> FloatArray:
+        return scene.posed(lambda target: float(target.name == name))
+
+    return MorphShapes((base, *names), np.stack([alone(name) for name in (base, *names)]), scene.faces)
+
+
 class Scene:
     """The triangles of a scene.
 
@@ -84,8 +122,10 @@ class Scene:
         first: (V,) for each vertex the first listed vertex with its number.
     """
 
-    def __init__(self, document: GltfDocument, buffers: Buffers, limits: Limits) -> None:
-        self.document, self.buffers, self.parts = document, buffers, _placed_primitives(document)
+    def __init__(self, document: GltfDocument, buffers: Buffers, limits: Limits, *, every_target: bool = False) -> None:
+        """Read a scene, with all morph targets of ``parts`` if ``every_target``, or else the active ones."""
+        self.document, self.buffers = document, buffers
+        self.parts = _placed_primitives(document, every_target=every_target)
         numbered = all(part.numbers for part in self.parts)
         # Files of this project have one primitive for each material, with common vertices.
         still = [part.place is None and part.skin is None for part in self.parts]
@@ -97,17 +137,29 @@ class Scene:
         limits.check(sum(part.positions.count for part in self.read), sum(part.most_faces for part in self.parts))
         begins = np.cumsum([0, *(part.positions.count for part in self.read)])
         place = dict(zip(dict.fromkeys(sources), begins.tolist(), strict=False))
-        listed = np.concatenate([part.vertices(buffers) for part in self.read])
         parts = zip(sources, self.parts, strict=True)
         self.corners = np.concatenate([place[source] + part.faces(buffers) for source, part in parts])
-        numbers = self._numbers(len(listed)) if numbered else None
-        self.first = np.arange(len(listed)) if numbers is None else np.unique(numbers, return_index=True)[1]
-        self.vertices = listed[self.first]
-        self.faces = self.corners if numbers is None else numbers[self.corners]
-        if numbers is not None and not np.array_equal(listed, self.vertices[numbers], equal_nan=True):
-            raise MeshError("its _VERTEX has one number for vertices at different places")
+        self._numbers = self._vertex_numbers(int(begins[-1])) if numbered else None
+        everyone = np.arange(begins[-1])
+        self.first = everyone if self._numbers is None else np.unique(self._numbers, return_index=True)[1]
+        self.faces = self.corners if self._numbers is None else self._numbers[self.corners]
+        self.vertices = self.posed(lambda target: target.weight)
 
-    def _numbers(self, count: int) -> IntArray:
+    def posed(self, weight: Callable[[MorphTarget], float]) -> FloatArray:
+        """Return the vertices (V, 3) with a weight for each morph target.
+
+        Raises:
+            MeshError: _VERTEX has one number for vertices at different places.
+        """
+        listed = np.concatenate([part.vertices(self.buffers, weight) for part in self.read])
+        if self._numbers is None:
+            return listed
+        vertices: FloatArray = listed[self.first]
+        if not np.array_equal(listed, vertices[self._numbers], equal_nan=True):
+            raise MeshError("its _VERTEX has one number for vertices at different places")
+        return vertices
+
+    def _vertex_numbers(self, count: int) -> IntArray:
         """Return the attribute _VERTEX of the listed vertices (count,)."""
         values = np.concatenate([part.numbers.read(self.buffers).ravel() for part in self.read if part.numbers])
         if not ((values >= 0) & (values < count) & (values == np.floor(values))).all():
@@ -121,6 +173,15 @@ class Scene:
 
 
 @dataclass(frozen=True)
+class MorphTarget:
+    """A morph target that moves vertices (3.7.2.2)."""
+
+    moves: Accessor  # motion of each vertex at weight 1
+    weight: float  # weight that the file gives it
+    name: str  # its name, see `read_morph_shapes`; empty where only active targets are read
+
+
+@dataclass(frozen=True)
 class PlacedPrimitive:
     """A primitive as one node of the scene poses it (3.7.2)."""
 
@@ -128,7 +189,7 @@ class PlacedPrimitive:
     indices: Accessor | None  # accessor of the corners; None if each vertex is one corner, in order
     numbers: Accessor | None  # accessor of the attribute _VERTEX, if any
     mode: int  # how the corners form triangles
-    targets: tuple[tuple[Accessor, float], ...]  # morph targets with their weights, where these are not zero
+    targets: tuple[MorphTarget, ...]  # morph targets, in the order of the file
     skin: Skin | None  # joints that move the vertices, if any
     place: FloatArray | None  # matrix (4, 4); None for the identity, and for a skin, whose node has no effect (3.7.3.3)
     primitive: dict[str, Any]  # entry of the primitive in the file
@@ -144,13 +205,14 @@ class PlacedPrimitive:
         """Upper bound of the number of faces: some faces of a strip may have no area."""
         return self.corners // 3 if self.mode == _TRIANGLES else max(0, self.corners - 2)
 
-    def vertices(self, buffers: Buffers) -> FloatArray:
-        """Return the vertices (count, 3) in the scene."""
+    def vertices(self, buffers: Buffers, weight: Callable[[MorphTarget], float]) -> FloatArray:
+        """Return the vertices (count, 3) in the scene, with a weight for each morph target."""
         vertices = self.positions.real(buffers)
         # The caller decides about coordinates that aren't finite.
         with np.errstate(all="ignore"):
-            for target, weight in self.targets:
-                vertices += weight * target.real(buffers)
+            for target in self.targets:
+                if share := weight(target):
+                    vertices += share * target.moves.real(buffers)
             if self.skin:
                 return self.skin.posed(vertices, buffers)
             if self.place is not None:
@@ -224,20 +286,22 @@ class Skin:
         return posed
 
 
-def _placed_primitives(document: GltfDocument) -> list[PlacedPrimitive]:
+def _placed_primitives(document: GltfDocument, *, every_target: bool) -> list[PlacedPrimitive]:
     """Return every primitive of the scene, once for each node that places it."""
     found: list[PlacedPrimitive] = []
     for placed in document.placed_meshes():
         for primitive in objects(placed.mesh, "primitives"):
             if len(found) == _MOST_PRIMITIVES:
                 raise MeshError(f"its scene comes to more than {_MOST_PRIMITIVES} parts")
-            found.append(_placed_primitive(document, primitive, placed))
+            found.append(_placed_primitive(document, primitive, placed, every_target=every_target))
     if not found:
         raise MeshError("holds no mesh")
     return found
 
 
-def _placed_primitive(document: GltfDocument, primitive: dict[str, Any], placed: PlacedMesh) -> PlacedPrimitive:
+def _placed_primitive(
+    document: GltfDocument, primitive: dict[str, Any], placed: PlacedMesh, *, every_target: bool
+) -> PlacedPrimitive:
     mode, attributes = primitive.get("mode", _TRIANGLES), primitive["attributes"]
     if mode not in (_TRIANGLES, _STRIP, _FAN):
         raise MeshError("has points or lines: export triangles only")
@@ -250,7 +314,8 @@ def _placed_primitive(document: GltfDocument, primitive: dict[str, Any], placed:
         numbers = Accessor.of(document, attributes["_VERTEX"], "SCALAR", _NUMBERS)
         if numbers.count != positions.count:
             raise ValueError(f"_VERTEX numbers {numbers.count} of {positions.count} vertices")
-    targets, skin = _targets(document, primitive, placed, positions.count), None
+    targets = tuple(_targets(document, primitive, placed, positions.count, every_target=every_target))
+    skin = None
     if "skin" in placed.node and "JOINTS_0" in attributes:
         skin = _skin(document, attributes, placed, positions.count)
     place = None if skin else placed.place
@@ -261,18 +326,33 @@ def _placed_primitive(document: GltfDocument, primitive: dict[str, Any], placed:
 
 
 def _targets(
-    document: GltfDocument, primitive: dict[str, Any], placed: PlacedMesh, vertices: int
-) -> tuple[tuple[Accessor, float], ...]:
-    """Return the morph targets that move vertices, with their weights: the weights of a node win (3.7.2.2)."""
+    document: GltfDocument, primitive: dict[str, Any], placed: PlacedMesh, vertices: int, *, every_target: bool
+) -> Iterator[MorphTarget]:
+    """Yield the morph targets that move vertices: all, or only active targets. The weights of a node win (3.7.2.2)."""
     weights = placed.node.get("weights", placed.mesh.get("weights", []))
-    found = []
-    for target, weight in zip(objects(primitive, "targets"), map(float, weights), strict=False):
-        if weight and "POSITION" in target:
-            accessor = Accessor.of(document, target["POSITION"], "VEC3", _POSITIONS)
-            if accessor.count != vertices:
-                raise ValueError(f"a morph target has {accessor.count} of {vertices} vertices")
-            found.append((accessor, weight))
-    return tuple(found)
+    targets = objects(primitive, "targets")
+    names = _target_names(placed.mesh, len(targets)) if every_target else [""] * len(targets)
+    for k, (target, name) in enumerate(zip(targets, names, strict=True)):
+        weight = float(weights[k]) if k < len(weights) else 0.0
+        if "POSITION" not in target or not (weight or every_target):
+            continue
+        moves = Accessor.of(document, target["POSITION"], "VEC3", _POSITIONS)
+        if moves.count != vertices:
+            raise ValueError(f"a morph target has {moves.count} of {vertices} vertices")
+        yield MorphTarget(moves, weight, name)
+
+
+def _target_names(mesh: dict[str, Any], count: int) -> list[str]:
+    """Return the names of a mesh's morph targets: "target 1" and so on where the file has none."""
+    extras = mesh.get("extras")
+    given = extras.get("targetNames") if isinstance(extras, dict) else None
+    given = given[:count] if isinstance(given, list) else []
+    labels = [label(name) if isinstance(name, str) else None for name in (*given, *[None] * (count - len(given)))]
+    names = [name or f"target {k}" for k, name in enumerate(labels, 1)]
+    if len(set(names)) < count:
+        twice = next(name for k, name in enumerate(names) if name in names[:k])
+        raise MeshError(f"two morph targets are called {twice!r}; each needs a name of its own")
+    return names
 
 
 def _skin(document: GltfDocument, attributes: dict[str, Any], placed: PlacedMesh, vertices: int) -> Skin:

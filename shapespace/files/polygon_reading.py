@@ -93,16 +93,17 @@ class TriangleFans:
     """Triangles from polygons: the triangles of a polygon have its first corner in common."""
 
     def __init__(self, limits: Limits) -> None:
-        self._limits, self._corners = limits, array("q")
+        self._limits, self._most, self._corners = limits, 3 * limits.faces, array("q")
 
     def add(self, polygon: Sequence[int]) -> None:
         """Append a polygon; raises ValueError if it has fewer than three corners."""
         if len(polygon) < 3:
             raise ValueError(f"a face has {len(polygon)} corners")
-        self._limits.check(0, len(self._corners) // 3 + len(polygon) - 2)
-        first = polygon[0]
-        for a, b in pairwise(polygon[1:]):
-            self._corners.extend((first, a, b))
+        if (corners := len(self._corners) + 3 * (len(polygon) - 2)) > self._most:
+            self._limits.check(0, corners // 3)
+        self._corners.extend(polygon[:3])
+        for a, b in pairwise(polygon[2:]):
+            self._corners.extend((polygon[0], a, b))
 
     @property
     def faces(self) -> IntArray:
@@ -112,7 +113,7 @@ class TriangleFans:
 
 def read_obj(data: memoryview, limits: Limits) -> tuple[FloatArray, IntArray]:
     """Return vertices (V, 3) and faces (F, 3) of an OBJ file, Wavefront's or MNI's; everything else is ignored."""
-    coordinates, triangles = array("d"), TriangleFans(limits)
+    coordinates, triangles, most = array("d"), TriangleFans(limits), 3 * limits.vertices
     text = as_utf8(data)
     if is_mni(start := bytes(text[:1000])):
         return read_mni(text, limits)
@@ -123,10 +124,12 @@ def read_obj(data: memoryview, limits: Limits) -> tuple[FloatArray, IntArray]:
             keyword, *values = line.split(None, 1)
             if keyword in b"vV":
                 coordinates.extend(_point(values[0]))
-                limits.check(len(coordinates) // 3, 0)
+                if len(coordinates) > most:
+                    limits.check(len(coordinates) // 3, 0)
             else:
                 here = len(coordinates) // 3
-                numbers = [int(value.partition(b"/")[0]) for value in values[0].partition(b"#")[0].split()]
+                corners = values[0].partition(b"#")[0].split()
+                numbers = map(int, corners if b"/" not in values[0] else (c.partition(b"/")[0] for c in corners))
                 # Negative numbers count back from the last vertex before this line.
                 triangles.add([number - 1 if number > 0 else here + number for number in numbers])
     return np.array(coordinates, np.float64).reshape(-1, 3), triangles.faces
@@ -160,7 +163,9 @@ def read_off(data: memoryview, limits: Limits) -> tuple[FloatArray, IntArray]:
         for _ in range(face_count):
             row = _row(lines, 1)
             corners = int(row[0])
-            triangles.add([int(value) for value in first_values(corners, _row(lines, 1 + corners, row)[1:])])
+            if len(row) != 1 + corners:
+                row = [row[0], *first_values(corners, _row(lines, 1 + corners, row)[1:])]
+            triangles.add([*map(int, row[1:])])
     return np.array(coordinates, np.float64).reshape(-1, 3), triangles.faces
 
 

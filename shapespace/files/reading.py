@@ -5,12 +5,13 @@ This module imports no writer, because the process that reads uploads should sta
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 
-from shapespace.files.gltf_reading import read_gltf
+from shapespace.files.gltf_reading import MorphShapes, read_gltf, read_morph_shapes
 from shapespace.files.limits import UNLIMITED, Limits, reason
 from shapespace.files.npz import read_mesh_npz
 from shapespace.files.pcd_reading import read_pcd
@@ -18,6 +19,7 @@ from shapespace.files.ply_reading import read_ply
 from shapespace.files.point_text_reading import read_point_text
 from shapespace.files.polygon_reading import read_obj, read_off, read_stl
 from shapespace.files.recognition import FormatError, decide
+from shapespace.files.vtk_reading import read_vtk, read_vtp
 from shapespace.mesh.triangle_mesh import MeshError
 
 #: Media type of formats that have none registered at IANA.
@@ -31,6 +33,8 @@ READ_FORMATS = {
     "stl": "model/stl",
     "npz": OCTET_STREAM,
     "off": OCTET_STREAM,
+    "vtk": OCTET_STREAM,
+    "vtp": OCTET_STREAM,
 }
 #: Media types of the formats of point clouds, which may have no faces.
 SCAN_FORMATS = READ_FORMATS | {
@@ -40,7 +44,9 @@ SCAN_FORMATS = READ_FORMATS | {
     "txt": "text/plain",
     "pcd": OCTET_STREAM,
 }
-_READERS = {"obj": read_obj, "off": read_off, "ply": read_ply, "stl": read_stl}
+#: Formats whose files can hold a collection as morph targets.
+MORPH_FORMATS = ("glb", "gltf")
+_READERS = {"obj": read_obj, "off": read_off, "ply": read_ply, "stl": read_stl, "vtk": read_vtk, "vtp": read_vtp}
 
 
 def read_arrays(
@@ -73,25 +79,47 @@ def read_arrays(
     """
     beside = source if isinstance(source, Path) else None
     if isinstance(source, Path):
-        if source.exists() and not source.is_file():
-            raise MeshError("can't be read: it is no file")
-        try:
-            source = source.read_bytes()
-        except OSError as error:
-            raise MeshError(f"can't be read: {error.strerror}") from error
+        source = _content(source)
     data = memoryview(source)
     format = format.lower() if format else _decided(data, SCAN_FORMATS if points else READ_FORMATS, beside)
+    # The caller decides whether coordinates that are not finite are a fault.
+    with _refusing(format), np.errstate(all="ignore"):
+        vertices, faces = _read(data, format, limits, points=points, beside=beside)
+    if data and not vertices.size:  # of an empty file the caller says that it is empty
+        raise MeshError(f"not a readable {format} file: it holds no vertices")
+    return vertices, faces
+
+
+def read_morph_file(path: Path) -> MorphShapes:
+    """Return the shapes of a file of MORPH_FORMATS whose morph targets are the shapes, see `read_morph_shapes`.
+
+    Raises:
+        MeshError: the file is unreadable, or two targets of a mesh have one name.
+    """
+    data = memoryview(_content(path))
+    format = _decided(data, MORPH_FORMATS, path)
+    with _refusing(format), np.errstate(all="ignore"):
+        return read_morph_shapes(data, binary=format == "glb", beside=path)
+
+
+def _content(path: Path) -> bytes:
+    if path.exists() and not path.is_file():
+        raise MeshError("can't be read: it is no file")
     try:
-        # The caller decides whether coordinates that are not finite are a fault.
-        with np.errstate(all="ignore"):
-            vertices, faces = _read(data, format, limits, points=points, beside=beside)
+        return path.read_bytes()
+    except OSError as error:
+        raise MeshError(f"can't be read: {error.strerror}") from error
+
+
+@contextmanager
+def _refusing(format: str) -> Iterator[None]:
+    """Raise every exception of a reader as MeshError."""
+    try:
+        yield
     except (MeshError, MemoryError):
         raise
     except Exception as error:  # damaged files raise exceptions of many classes
         raise MeshError(f"not a readable {format} file: {reason(error)}") from error
-    if data and not vertices.size:  # of an empty file the caller says that it is empty
-        raise MeshError(f"not a readable {format} file: it holds no vertices")
-    return vertices, faces
 
 
 def _read(

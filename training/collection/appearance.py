@@ -10,6 +10,7 @@ from shapespace.files.attributes.reading import FORMATS, read_attributes
 from shapespace.mesh.attributes import MeshAttributes
 from shapespace.mesh.triangle_mesh import MeshError
 from shapespace.training.collection.mesh_collection import MeshCollection
+from shapespace.training.collection.reading import data_files
 
 
 def reference_surface(
@@ -17,15 +18,16 @@ def reference_surface(
 ) -> tuple[MeshAttributes | None, list[str]]:
     """Read the mesh attributes of the reference's file, or of the first file whose format has more than triangles.
 
-    Without a folder of mesh files there are none.
+    One file whose morph targets are the shapes has attributes too. Without mesh files there are none.
 
     Returns:
         The attributes, if any, and a sentence about each attribute that is left out.
     """
-    if data is None or not data.is_dir() or meshes.file_vertices is None:
+    if data is None or meshes.file_vertices is None:
         return None, []
     names = [name for name, _ in (meshes.places[chosen], *meshes.places)]
-    path = next((data / name for name in names if name.rpartition(".")[2].lower() in FORMATS), None)
+    paths = [data / name for name in names] if data.is_dir() else []
+    path = next((path for path in (*paths, *data_files(data)) if path.suffix.lstrip(".").lower() in FORMATS), None)
     if path is None:
         return None, []
     try:

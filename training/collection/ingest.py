@@ -35,7 +35,7 @@ from shapespace.training.collection.welding import (
 
 
 def read_collection(path: Path, wanted: Sequence[str] = ()) -> MeshCollection:
-    """Read a folder of OBJ, PLY, STL, OFF, glTF or NPZ files, or one NPZ of ``vertices`` (n, V, 3) and ``faces``.
+    """Read a folder of mesh files, one NPZ of ``vertices`` (n, V, 3) and ``faces``, or one file of morph targets.
 
     Vertices that coincide in every shape become one, see `welding`. Vertices in no face are left out. Files of other
     kinds and subfolders are ignored.

@@ -19,7 +19,7 @@ TEMPLATE = """\
 # A line such as "# seed = 0" shows a default: take its # away to change it.
 
 [collection]
-data = {data}    # folder of meshes, or one NPZ; relative to this file
+data = {data}    # folder of meshes, one NPZ, or one GLB with morph targets; relative to this file
 # The shape whose area becomes 1 inside, and where served shapes stand: the most central one, {reference},
 # unless another is named here, as in: reference = {other}
 {coarse}{parts}

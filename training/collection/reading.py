@@ -12,7 +12,7 @@ import numpy as np
 from shapespace.arrays import FloatArray, IntArray
 from shapespace.files.archives import natural_order
 from shapespace.files.npz import read_mesh_npz
-from shapespace.files.reading import READ_FORMATS, read_arrays
+from shapespace.files.reading import MORPH_FORMATS, READ_FORMATS, read_arrays, read_morph_file
 from shapespace.mesh.triangle_mesh import MeshError, PlaceError, on_shared_vertices
 from shapespace.training.collection.checks import (
     TOLERANCES,
@@ -41,12 +41,14 @@ class FileShapes:
     sources: tuple[ShapeSource, ...]  # the n shapes' files and names
     vertices: FloatArray  # (n, N, 3)
     faces: IntArray  # (F, 3)
-    paths: tuple[Path, ...] = ()  # the shapes' files, if each shape has one
+    paths: tuple[Path, ...] = ()  # the shapes' files; one file if its morph targets are the shapes
     triangles_only: bool = False  # whether no file says which vertices its triangles share, as in STL
 
 
 def read_shapes(path: Path) -> FileShapes:
-    """Read a folder of mesh files in natural order (pose2 before pose10), or one NPZ.
+    """Read a folder of mesh files in natural order (pose2 before pose10), one NPZ, or one file of morph targets.
+
+    A folder whose only mesh is a glTF file is read like that file.
 
     Raises:
         IngestError: nothing to read, fewer than 3 shapes, an unreadable file, or files with different faces.
@@ -55,13 +57,19 @@ def read_shapes(path: Path) -> FileShapes:
         raise IngestError(f"{path}: no such file or folder")
     if not path.is_file() and not path.is_dir():
         raise IngestError(f"{path}: is neither a file nor a folder; name the folder that holds the meshes, or one NPZ")
-    return _read_folder(path) if path.is_dir() else _read_npz(path)
+    if path.is_dir():
+        only = _only_gltf(path)
+        return _read_morphs(only) if only else _read_folder(path)
+    return _read_morphs(path) if _extension(path) in MORPH_FORMATS else _read_npz(path)
 
 
 def data_files(path: Path) -> list[Path]:
     """Return the files that a collection is read from, sorted; none if the path doesn't exist."""
+    if path.is_file():
+        beside = path.parent.iterdir() if _extension(path) == "gltf" else ()
+        return [path, *sorted(p for p in beside if _extension(p) in _COMPANIONS and p.is_file())]
     if not path.is_dir():
-        return [path] if path.is_file() else []
+        return []
     return sorted(
         p for p in path.iterdir() if _extension(p) in (*READ_FORMATS, *_COMPANIONS) and p.is_file() and p.name[0] != "."
     )
@@ -92,6 +100,12 @@ def _mesh_files(folder: Path) -> list[Path]:
             raise IngestError(f"{path}: {by_name[path.stem].name} has the same name; remove or rename one of them")
         by_name[path.stem] = path
     return paths
+
+
+def _only_gltf(folder: Path) -> Path | None:
+    """Return the mesh file of a folder that holds one, if its format has morph targets."""
+    meshes = [p for p in data_files(folder) if _extension(p) in READ_FORMATS]
+    return meshes[0] if len(meshes) == 1 and _extension(meshes[0]) in MORPH_FORMATS else None
 
 
 def _read_folder(folder: Path) -> FileShapes:
@@ -192,7 +206,10 @@ def _on_shared_vertices(corners: FloatArray, faces: IntArray, vertex_count: int,
 
 def _read_npz(path: Path) -> FileShapes:
     if _extension(path) != "npz":
-        raise IngestError(f"{path}: one file is a collection only as .npz; name the folder that holds the meshes")
+        raise IngestError(
+            f"{path}: one file is a collection only as .npz, or as .glb or .gltf whose morph targets are the shapes; "
+            "name the folder that holds the meshes"
+        )
     with refusing(ShapeSource.of_file(path)):
         arrays = _npz_arrays(path)
     sources = tuple(ShapeSource(f"{path}: shape {name}", name) for name in arrays["names"].tolist())
@@ -203,6 +220,18 @@ def _read_npz(path: Path) -> FileShapes:
                 yield mesh_arrays(shape, arrays["faces"])[0]
 
     return FileShapes(sources, stacked(len(sources), checked()), arrays["faces"].astype(np.int64))
+
+
+def _read_morphs(path: Path) -> FileShapes:
+    with refusing(ShapeSource(str(path), path.stem)):
+        found = read_morph_file(path)
+        if len(found.names) < MIN_SHAPES:
+            raise MeshError(f"{TOO_FEW.format(len(found.names))}: the base, and each morph target that moves vertices")
+    sources = tuple(ShapeSource(f"{path}: shape {name}", name) for name in found.names)
+    for source, shape in zip(sources, found.vertices, strict=True):
+        with refusing(source):
+            mesh_arrays(shape, found.faces)
+    return FileShapes(sources, found.vertices, found.faces, (path,))
 
 
 def _npz_arrays(path: Path) -> dict[str, np.ndarray]:

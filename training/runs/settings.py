@@ -29,8 +29,9 @@ class CollectionSettings(SettingsTable):
     generator: Literal["freaky-torus", "figure"] | None = None
     """A built-in generator of a collection; see training/collection/generators."""
     data: Path | None = None
-    """Folder of OBJ, PLY, STL, OFF or glTF files, or one NPZ file with ``vertices`` (n, V, 3) and ``faces``; relative
-    to the configuration's own folder. The command's ``--data`` takes precedence."""
+    """Folder of OBJ, PLY, STL, OFF, glTF or VTK files, or one NPZ file with ``vertices`` (n, V, 3) and ``faces``, or
+    one GLB or glTF file whose morph targets are the shapes. The path is relative to the configuration's folder. The
+    command's ``--data`` takes precedence."""
     reference: str | None = None
     """Name of the mesh that is scaled to area 1 and whose position and orientation served shapes have; by default the
     most central one."""

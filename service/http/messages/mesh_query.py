@@ -105,7 +105,7 @@ TopologyQuery = Annotated[
     Topology | None,
     Query(
         description="`original`, the default where a format can: faces are the polygons of the files that the model is "
-        "of; OBJ (also in a zip), PLY and USD can. `triangles`: these cut at their first corner."
+        "of; OBJ (also in a zip), PLY, USD and VTK can. `triangles`: these cut at their first corner."
     ),
 ]
 
@@ -118,7 +118,8 @@ def choose_topology(
         if not polygons:
             raise ProblemError(
                 "invalid-request",
-                f"{format.upper()} answers have triangles only. For topology=original ask for obj, zip, ply or usd.",
+                f"{format.upper()} answers have triangles only. "
+                "For topology=original ask for obj, zip, ply, vtk or usd.",
             )
         if model.decoder.fine and not model.decoder.finer(mesh):
             raise ProblemError(

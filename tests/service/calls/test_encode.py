@@ -11,7 +11,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from shapespace.bundle.reader import read_bundle
-from shapespace.files.formats import MESH_FORMATS
+from shapespace.files.formats import MESH_FORMATS, VTK_FORMATS
 from shapespace.files.npz import npz_bytes
 from shapespace.mesh.rigid_motion import align
 from shapespace.mesh.triangle_mesh import TriangleMesh
@@ -68,7 +68,7 @@ def test_codes_come_back_from_turned_and_moved_shapes(client: httpx.Client, name
 
 
 @pytest.mark.parametrize("mesh", ["fine", "coarse"])
-@pytest.mark.parametrize("format", [*MESH_FORMATS, "json"])
+@pytest.mark.parametrize("format", [*MESH_FORMATS, *VTK_FORMATS, "json"])
 def test_every_format_gives_the_same_code(client: httpx.Client, format: str, mesh: str) -> None:
     expected = encode(client, mesh_file(client, mesh="coarse").content)
     file = mesh_file(client, format, mesh=mesh)

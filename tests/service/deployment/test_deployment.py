@@ -25,7 +25,7 @@ EXTRAS = PROJECT["project"]["optional-dependencies"]
 LOCKED = {
     "serve": {"serve"},
     "dev": EXTRAS.keys(),
-    "lowest": {"serve", "client", "usd", "check", "dev"},
+    "lowest": {"serve", "client", "usd", "vtk", "check", "dev"},
 }
 UNLOCKED = {"torch", PROJECT["project"]["name"]}
 

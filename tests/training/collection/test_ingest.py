@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from shapespace.files.formats import MESH_FORMATS
+from shapespace.files.formats import MESH_FORMATS, VTK_FORMATS
 from shapespace.files.reading import READ_FORMATS
 from shapespace.mesh.triangle_mesh import TriangleMesh, face_areas
 from shapespace.training.collection.checks import IngestError
@@ -32,7 +32,7 @@ SHAPES = np.stack(
 def encoded(vertices: np.ndarray, faces: np.ndarray, format: str) -> bytes:
     if format == "off":
         return trimesh.Trimesh(vertices, faces, process=False).export(file_type="off").encode()
-    return MESH_FORMATS[format].encode(vertices, faces)
+    return (MESH_FORMATS | VTK_FORMATS)[format].encode(vertices, faces)
 
 
 def write(
@@ -418,5 +418,5 @@ def test_the_content_of_a_file_decides_its_format(tmp_path: Path) -> None:
     found = read_collection(tmp_path)
     assert found.vertices.shape == (3, *mesh.vertices.shape)
     (tmp_path / "2.obj").write_bytes(b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR")
-    with pytest.raises(IngestError, match=r"2.obj: is a PNG picture; these can be read: .*off$"):
+    with pytest.raises(IngestError, match=r"2.obj: is a PNG picture; these can be read: .*vtp$"):
         read_collection(tmp_path)
