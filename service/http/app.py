@@ -35,8 +35,8 @@ from shapespace.service.settings import Settings, is_loopback
 #: Headers that pages of other origins may send, and headers of answers that they may read.
 CORS_REQUEST = ["Authorization", "Content-Type", "If-None-Match", "Inference-Header-Content-Length"]
 CORS_REQUEST += ["X-API-Key", "X-Request-ID"]
-CORS_ANSWER = ["Content-Disposition", "ETag", "Inference-Header-Content-Length", "Location", "Retry-After"]
-CORS_ANSWER += ["Server-Timing", "Shape-Color", "Shape-Diagnostics", "X-Request-ID"]
+CORS_ANSWER = ["Content-Disposition", "Content-Location", "ETag", "Inference-Header-Content-Length", "Location"]
+CORS_ANSWER += ["Model-Version", "Retry-After", "Server-Timing", "Shape-Color", "Shape-Diagnostics", "X-Request-ID"]
 #: Host names of the loopback interface.
 LOOPBACK = ("localhost", "127.0.0.1", "[::1]")
 
@@ -54,7 +54,13 @@ def create_app(settings: Settings | None = None, validator: BundleValidator | No
         with threadpool_limits(1):
             workers = Workers(settings.workers, settings.queue, settings.deadline)
             connections = Connections(settings.max_connections, settings.deadline, settings.trusted_proxies)
-            repository = ModelRepository(settings.models_dir, settings.workers, validator)
+            repository = ModelRepository(
+                settings.models_dir,
+                settings.workers,
+                validator,
+                settings.default_versions,
+                settings.default_versions_file,
+            )
             metrics = Metrics(repository, workers, connections.quota)
             connections.on_refusal = metrics.refused
             reloader = Reloader(repository, metrics)

@@ -15,6 +15,7 @@ from shapespace.model.shape_model import ShapeModel
 from shapespace.service.http.caching import AnswerCache
 from shapespace.service.http.connections import Connections
 from shapespace.service.http.problems import ProblemError
+from shapespace.service.http.version_key import version_key
 from shapespace.service.limits.quota import client_name
 from shapespace.service.limits.sandbox import Sandbox
 from shapespace.service.limits.workers import Caller, DisconnectedError, Workers
@@ -76,7 +77,7 @@ QualityOfBody = Annotated[
 #: In the path of routes that name it there, as in the Open Inference Protocol; otherwise in the query.
 Version = Annotated[
     str | None,
-    Field(description="Version of the model; by default the newest."),
+    Field(description="Version of the model; by default the server's default version."),
     WithJsonSchema({"type": "string", "examples": ["1"]}),
 ]
 Format = Annotated[str | None, Query(description="Format of the answer; overrides `Accept`. 406 lists the choices.")]
@@ -84,7 +85,16 @@ Format = Annotated[str | None, Query(description="Format of the answer; override
 
 # Calls _service directly, because FastAPI would resolve a nested dependency again for every parameter.
 async def _model(request: Request, name: ModelName, version: Version = None) -> ShapeModel:
-    return (await _service(request)).repository.get(name, version)
+    repository = (await _service(request)).repository
+    key = await version_key(request) if version is None and repository.divides(name) else None
+    model = repository.get(name, version, key)
+    note_model(request, model, chosen=version is None)
+    return model
+
+
+def note_model(request: Request, model: ShapeModel, *, chosen: bool = False) -> None:
+    """Note which model answers a request, and whether the server chose its version, for headers and metrics."""
+    request.state.model, request.state.chosen = model.manifest, chosen
 
 
 Model = Annotated[ShapeModel, Depends(_model)]

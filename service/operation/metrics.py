@@ -41,6 +41,7 @@ class Metrics:
         self._refusals = counter("refusals", "Connections that were refused without a whole request.", "kind")
         for name, text, value in (
             ("bundles_refused", "Bundles that the latest look refused.", lambda: len(repository.refused)),
+            ("default_version_faults", "Default versions that can't be answered.", lambda: len(repository.faults)),
             ("admitted", "Requests at work or waiting for a worker.", lambda: workers.places.used),
             ("admitted_limit", "Requests that may be; more get 503.", lambda: workers.places.limit),
             ("streams", "Answers that are read while they are computed.", lambda: workers.streams.used),
