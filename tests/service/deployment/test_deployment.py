@@ -1,8 +1,12 @@
 """Kubernetes, Compose, Dockerfile and requirements: settings that exist, and pinned versions only."""
 
 import json
+import os
 import re
+import subprocess
+import sys
 import tomllib
+from importlib import metadata, util
 from pathlib import Path
 from typing import Any
 
@@ -23,10 +27,26 @@ PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
 EXTRAS = PROJECT["project"]["optional-dependencies"]
 #: Extras in each locked file. Torch is not locked: its builds, and so their hashes, differ between indexes.
 LOCKED = {
-    "serve": {"serve"},
+    "serve": {"serve", "serve-without-mkl"},
+    "serve-without-mkl": {"serve-without-mkl"},
     "dev": EXTRAS.keys(),
-    "lowest": {"serve", "client", "usd", "check", "dev"},
+    "lowest": {"serve", "serve-without-mkl", "client", "usd", "check", "dev"},
 }
+#: Solves with MKL in both precisions, and prints the results and the names of the libraries that are loaded.
+SOLVE = r"""
+import re
+import numpy as np
+from shapespace.solve import cholesky
+
+n, rng = 400, np.random.default_rng(0)
+pattern = cholesky.SymmetricPattern(n, *rng.integers(n, size=(2, 4000)))
+for precision in (np.float32, np.float64):
+    entries = rng.standard_normal(len(pattern))
+    entries[pattern.diagonal] = n
+    factor = cholesky.analyse(pattern, "pardiso", precision=precision).factorise(entries)
+    print(factor.solve(np.ones(n)).tobytes().hex())
+print(*set(re.findall(r"lib(?:mkl|iomp|tbb)[^/\s]*", open("/proc/self/maps").read())))
+"""
 UNLOCKED = {"torch", PROJECT["project"]["name"]}
 
 
@@ -131,8 +151,55 @@ def test_the_lowest_versions_are_those_that_are_tried() -> None:
 
 def test_the_image_has_what_is_tested() -> None:
     tested = locked("dev")
-    for name in ("serve", "build"):
+    for name in ("serve", "serve-without-mkl", "build"):
         assert all(versions <= tested[package] for package, versions in locked(name).items())
+
+
+def test_no_mkl_comes_where_none_is_asked_for() -> None:
+    without, extra = locked("serve").keys() - locked("serve-without-mkl").keys(), EXTRAS["serve-without-mkl"]
+    assert {"mkl", "pypardiso", "intel-openmp"} <= without
+    assert {requirement.name for requirement in map(Requirement, extra)} <= locked("serve-without-mkl").keys()
+
+
+@pytest.mark.skipif(not util.find_spec("pypardiso"), reason="MKL has wheels for x86-64 only")
+def test_what_the_image_leaves_out_is_never_loaded(tmp_path: Path) -> None:
+    """Solve in a copy of MKL's wheels after the script of the Dockerfile, and compare with the whole wheels."""
+    assert "python scripts/slim.py /opt/shapespace" in (ROOT / "Dockerfile").read_text()
+    packages = tmp_path / "lib" / f"python3.{sys.version_info.minor}" / "site-packages"
+    for wheel in ("mkl", "intel-openmp", "tbb", "numpy"):
+        for file in metadata.files(wheel) or ():
+            whole, copy = Path(str(file.locate())), Path(os.path.normpath(packages / file))
+            wanted = wheel != "numpy" or "tests" in file.parts or file.parts[0].endswith(".dist-info")
+            if wanted and whole.exists() and copy.is_relative_to(tmp_path):
+                copy.parent.mkdir(parents=True, exist_ok=True)
+                copy.symlink_to(whole.resolve())
+    before = {path.name for path in (tmp_path / "lib").glob("lib*")}
+    script = [sys.executable, str(ROOT / "scripts" / "slim.py"), str(tmp_path)]
+    subprocess.run(script, check=True)
+    subprocess.run(script, check=True)  # a second run finds nothing
+    after = {path.name for path in (tmp_path / "lib").glob("lib*")}
+    kernels = {name for name in before if re.match(r"libmkl_(vml_)?(def|mc|avx)", name)}
+    assert len(kernels) > 4
+    assert kernels <= after
+    assert not (packages / "numpy").exists()
+    gone = {name for name in before - after if ".so" in name}
+    assert {"libmkl_intel_thread", "libmkl_tbb_thread", "libiomp5"} <= {name.partition(".")[0] for name in gone}
+    solve = [sys.executable, "-c", SOLVE]
+    found = [
+        subprocess.run(
+            solve,
+            env=os.environ | {"PYTHONPATH": os.pathsep.join(path)},
+            cwd=ROOT,
+            capture_output=True,
+            text=True,
+            check=True,
+        ).stdout
+        for path in ([str(ROOT)], [str(packages), str(ROOT)])
+    ]
+    assert found[0].splitlines()[:2] == found[1].splitlines()[:2]
+    loaded = set(found[0].splitlines()[-1].split())
+    assert {"libmkl_core", "libmkl_sequential"} <= {name.partition(".")[0] for name in loaded}
+    assert loaded <= after
 
 
 def user() -> str:
