@@ -90,6 +90,12 @@ class Settings(BaseSettings):
     )
     host: str = Field(default="127.0.0.1", description="address to listen on")
     port: int = Field(default=8000, ge=0, le=65535, description="port to listen on; 0 takes a free one")
+    metrics_port: int | None = Field(
+        default=None,
+        ge=0,
+        le=65535,
+        description="port that answers /metrics without a key; 0 takes a free one; by default none",
+    )
     workers: PositiveInt = Field(
         default_factory=cpu_quota, description="shapes computed at once; by default the processors allowed"
     )

@@ -106,6 +106,13 @@ class DefaultVersions:
         """Return whether several versions of a model answer, so that a request needs a key."""
         return name in self.shares and len(self._served(name, served)) > 1
 
+    def share(self, name: str, version: int, served: Collection[int]) -> float:
+        """Return the share of the codes, from 0 to 1, that a version answers."""
+        if not self.divides(name, served):
+            return float(version == self.choose(name, served))
+        shares = self._served(name, served)
+        return shares.get(version, 0.0) / sum(shares.values())
+
     def faults(self, served: Mapping[str, Collection[int]]) -> list[str]:
         """Return a sentence for each version that is named and not served."""
         found = []

@@ -21,7 +21,7 @@ from shapespace.service.http.description import describe
 from shapespace.service.http.middleware.access import RequireHost, RequireKey
 from shapespace.service.http.middleware.compress import Compress
 from shapespace.service.http.middleware.memory import LimitBody, LimitUnreadAnswers
-from shapespace.service.http.middleware.observe import Observe
+from shapespace.service.http.middleware.observe import QUIET, Observe
 from shapespace.service.http.routes import codes, interpolations, models, open_inference, operation, page, shapes
 from shapespace.service.limits.quota import UPLOADS
 from shapespace.service.limits.sandbox import Sandbox
@@ -87,6 +87,8 @@ def create_app(settings: Settings | None = None, validator: BundleValidator | No
         lifespan=lifespan,
         middleware=_middleware(settings),
         dependencies=[Depends(known_query)],
+        # Spans of OpenTelemetry, where a provider is configured. The stages of an answer have spans of their own.
+        telemetry={"operation_spans": False, "exclude": lambda scope: scope.get("path") in QUIET},
         generate_unique_id_function=lambda route: route.name,
         # FastAPI's pages load scripts from other servers.
         docs_url=None,

@@ -206,6 +206,11 @@ class ModelRepository:
         """Return the versions of a model, oldest first; raises UnknownModelError."""
         return [str(version) for version in sorted(_named(name, self._served[0]))]
 
+    def share(self, model: ShapeModel) -> float:
+        """Return the share of the codes, from 0 to 1, that a model answers if requests name no version."""
+        (models, defaults), name = self._served, model.manifest.name
+        return defaults.share(name, int(model.manifest.version), models[name]) if name in models else 0.0
+
     def divides(self, name: str) -> bool:
         """Return whether several versions of a model answer requests without a version, each its share."""
         models, defaults = self._served

@@ -70,7 +70,9 @@ class Observe(HTTPMiddleware):
             # With its parameters unfilled, and one word for all paths without a route.
             unmatched = f"{scope['root_path']}/*" if scope.get("root_path") else "unmatched"
             route = scope["route"].path if "route" in scope else unmatched
-            service.metrics.answered(route, method, status, seconds)
+            model = scope.get("state", {}).get("model")
+            name, version = (model.name, model.version) if model else ("", "")
+            service.metrics.answered(route, method, status, seconds, name, version)
             # As received, percent-encoded, so that a path cannot break a line.
             path = scope.get("raw_path", b"")[:LONGEST_PATH].decode("ascii", "replace")
             facts = {"method": method, "path": path, "route": route, "status": status}
