@@ -18,6 +18,7 @@ from packaging.version import Version
 
 from shapespace.service.http.openapi import TARGET
 from shapespace.service.settings import PREFIX, Settings
+from tests.service.bundles import write_bundle
 from tests.service.conftest import ROOT
 from tests.service.watching import ENDING
 
@@ -63,11 +64,23 @@ def test_the_kubernetes_manifest_fits_the_server() -> None:
     assert environment.keys() <= NAMES
     assert pod["terminationGracePeriodSeconds"] > float(environment["SHAPESPACE_DRAIN"]) + ENDING
     served = json.loads(TARGET.read_text())["paths"]
+    ports = {port["name"]: port["containerPort"] for port in container["ports"]}
+    annotations = kinds["Deployment"]["spec"]["template"]["metadata"]["annotations"]
+    assert str(ports["metrics"]) == environment["SHAPESPACE_METRICS_PORT"] == annotations["prometheus.io/port"]
+    assert {port["targetPort"] for port in kinds["Service"]["spec"]["ports"]} == {"http"}
+    mounts = {mount["name"]: mount["mountPath"] for mount in container["volumeMounts"]}
+    volumes = {volume["name"]: volume for volume in pod["volumes"]}
+    assert volumes["models"]["persistentVolumeClaim"]["claimName"] == named(kinds["PersistentVolumeClaim"])
+    assert volumes["versions"]["configMap"]["name"] == named(kinds["ConfigMap"])
+    assert mounts["models"] == f"{working_folder()}/models"
+    (file,) = kinds["ConfigMap"]["data"]
+    assert f"{mounts['versions']}/{file}" == environment["SHAPESPACE_DEFAULT_VERSIONS_FILE"]
     for probe in ("startupProbe", "readinessProbe", "livenessProbe"):
         assert container[probe]["httpGet"]["path"] in served
         assert container[probe]["httpGet"]["port"] == container["ports"][0]["name"]
     # Readiness has to change before the port closes, or requests would be lost.
     readiness = container["readinessProbe"]
+    assert 1 < readiness["timeoutSeconds"] < readiness["periodSeconds"]
     assert readiness["periodSeconds"] * readiness["failureThreshold"] < float(environment["SHAPESPACE_DRAIN"])
     assert container["resources"]["limits"].keys() == {"cpu", "memory"}
     assert container["securityContext"]["readOnlyRootFilesystem"]
@@ -200,6 +213,30 @@ def test_what_the_image_leaves_out_is_never_loaded(tmp_path: Path) -> None:
     loaded = set(found[0].splitlines()[-1].split())
     assert {"libmkl_core", "libmkl_sequential"} <= {name.partition(".")[0] for name in loaded}
     assert loaded <= after
+
+
+def test_an_empty_volume_gets_the_models_of_the_image(tmp_path: Path) -> None:
+    (first,) = manifests()["Deployment"]["spec"]["template"]["spec"]["initContainers"]
+    source, volume = tmp_path / "image" / "models", tmp_path / "volume"
+    write_bundle(source, "small", "1")
+    volume.mkdir()
+    *shell, script = first["command"]
+    script = script.replace(f"{working_folder()}/models", str(source)).replace("/models/", f"{volume}/")
+    script = script.replace(f"{source.parent}{volume}/", f"{source}/").replace("ls /models", f"ls {volume}")
+    for _ in range(2):
+        subprocess.run([*shell, script], check=True, env=os.environ | {"HOSTNAME": "pod-1"})
+        assert [str(path.relative_to(volume)) for path in sorted(volume.glob("*/*"))] == ["small/1"]
+        assert len(list(volume.iterdir())) == 1
+        write_bundle(source, "later", "1")  # it does not come by itself
+
+
+def named(document: Any) -> str:
+    return str(document["metadata"]["name"])
+
+
+def working_folder() -> str:
+    lines = (ROOT / "Dockerfile").read_text().splitlines()
+    return [line.split()[1] for line in lines if line.startswith("WORKDIR ")][-1]
 
 
 def user() -> str:

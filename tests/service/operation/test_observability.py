@@ -12,11 +12,13 @@ from pathlib import Path
 
 import httpx
 import pytest
+import yaml
 from opentelemetry import trace
 from opentelemetry.sdk.trace import ReadableSpan, TracerProvider
 from opentelemetry.sdk.trace.export import SimpleSpanProcessor
 from opentelemetry.sdk.trace.export.in_memory_span_exporter import InMemorySpanExporter
 from opentelemetry.trace import SpanKind
+from prometheus_client.parser import text_string_to_metric_families
 
 from shapespace.service.http.app import create_app
 from shapespace.service.http.server import STARTUP_FAILURE
@@ -281,3 +283,32 @@ def test_metrics_have_a_port_of_their_own_without_a_key(guarded: Server) -> None
         assert before.keys() <= {*samples(own)}
         with_key = client.get("/metrics", headers=KEY)
         assert {name for name, _ in before} <= {line.split("{")[0].split(" ")[0] for line in with_key.text.splitlines()}
+
+
+def test_the_dashboard_and_the_alerts_ask_for_metrics_that_there_are(plain: Server) -> None:
+    board = json.loads((ROOT / "deploy" / "grafana.json").read_text())
+    rules = yaml.safe_load((ROOT / "deploy" / "alerts.yaml").read_text())["groups"]
+    asked = [target["expr"] for panel in board["panels"] for target in panel["targets"]]
+    asked += [rule["expr"] for group in rules for rule in group["rules"]]
+    with httpx.Client(base_url=plain.url, timeout=60) as client:
+        client.post(MESH, json=CODE).raise_for_status()
+        families = list(text_string_to_metric_families(client.get("/metrics").text))
+    labels: dict[str, set[str]] = {}
+    for family in families:
+        endings = {"counter": ["_total"], "histogram": ["_bucket", "_count", "_sum"]}.get(family.type, [""])
+        labels |= {family.name + ending: set() for ending in endings}
+        for sample in family.samples:
+            labels.setdefault(sample.name, set()).update(sample.labels)
+    assert len(asked) > 20
+    for text in asked:
+        names = set(re.findall(r"\b(?:shapespace|process)_[a-z_]+", text))
+        assert names
+        assert names <= labels.keys(), text
+        known = set.union(*(labels[name] for name in names)) | {"job", "instance"}
+        wanted = set(re.findall(r"(\w+)(?:=|!=|=~)\"", text)) | {
+            label for group in re.findall(r"by \(([^)]*)\)", text) for label in group.replace(" ", "").split(",")
+        }
+        if known - {"job", "instance"}:  # those of a family without samples are not known
+            assert wanted <= known, text
+    for rule in (rule for group in rules for rule in group["rules"]):
+        assert {"summary", "description"} == rule["annotations"].keys()
