@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Annotated
 
 from fastapi import Depends, Path, Query, Request
@@ -21,8 +22,11 @@ from shapespace.service.limits.sandbox import Sandbox
 from shapespace.service.limits.workers import Caller, DisconnectedError, Workers
 from shapespace.service.operation.metrics import Metrics
 from shapespace.service.operation.reloading import Reloader
+from shapespace.service.operation.statistics import InferenceTally
 from shapespace.service.repository.repository import ModelRepository
 from shapespace.service.settings import Settings
+
+_Inferences = defaultdict[tuple[str, str], InferenceTally]
 
 
 @dataclass
@@ -37,6 +41,10 @@ class Service:
     reloader: Reloader
     answers: AnswerCache
     sandbox: Sandbox
+    #: Inferences by name and version of the model.
+    inferences: defaultdict[tuple[str, str], InferenceTally] = field(
+        default_factory=lambda: defaultdict(InferenceTally)
+    )
     #: Whether the server is shutting down, so that clients should use another one.
     draining: bool = False
 
