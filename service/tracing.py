@@ -19,7 +19,7 @@ def record_stages(seconds: Mapping[str, float]) -> None:
     if trace is None or not trace.get_current_span().is_recording():
         return
     tracer, end = trace.get_tracer("shapespace"), time.time_ns()
-    for stage, duration in reversed(seconds.items()):
+    for stage, duration in reversed([*seconds.items()]):
         start = end - int(1e9 * duration)
         tracer.start_span(stage, start_time=start).end(end)
         end = start

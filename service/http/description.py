@@ -37,6 +37,7 @@ _HEADERS = {
             "JSON: `status`, `iterations`, `residual`, `flipped_faces`, `integrability`, `plausibility`, "
             "`inside_bounds`, `model`, `quality`."
         ),
+        "Model-Version": "Version of the model that answers.",
         "Server-Timing": "Milliseconds by stage: `network`, `reconstruct`, `encode`.",
     }.items()
 }

@@ -53,7 +53,7 @@ def _key(json: bytes, body: bytes) -> bytes:
             first_bytes = body[len(json) : len(json) + _FLOAT.itemsize * max(size, 0)]
             if len(first_bytes) % _FLOAT.itemsize == 0:
                 code = np.frombuffer(first_bytes, _FLOAT).tolist()
-    return (code and _bytes(code)) or body
+    return (_bytes(code) if code else None) or body
 
 
 def _bytes(code: Sequence[object]) -> bytes | None:

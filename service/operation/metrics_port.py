@@ -28,8 +28,8 @@ class MetricsPort:
     """
 
     def __init__(self, host: str, port: int) -> None:
-        family, *_, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[0]
-        self._server = (_Server6 if family == socket.AF_INET6 else _Server4)(address[:2], _QuietHandler)
+        family, *_ = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[0]
+        self._server = (_Server6 if family == socket.AF_INET6 else _Server4)((host, port), _QuietHandler)
 
     def serve(self, registry: CollectorRegistry) -> None:
         """Begin to answer these metrics."""
@@ -49,7 +49,7 @@ class _Server4(WSGIServer):
     def server_bind(self) -> None:
         """Bind without a look-up of the host's name, which can take seconds."""
         socketserver.TCPServer.server_bind(self)
-        self.server_name, self.server_port = self.server_address[:2]  # type: ignore[assignment, misc]
+        self.server_name, self.server_port = self.server_address[:2]  # type: ignore[assignment]
         self.setup_environ()
 
     def handle_error(self, request: object, client_address: object) -> None:

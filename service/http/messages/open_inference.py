@@ -260,7 +260,7 @@ class StatisticsAnswer(BaseModel):
 class IndexRequest(_Message):
     """Which models the index lists."""
 
-    ready: bool = Field(False, strict=True, description="Only those that are served.")
+    ready: bool = Field(False, strict=True, description="Only those that are served.", examples=[True])
 
 
 class IndexedModel(BaseModel):
