@@ -9,10 +9,14 @@ RUN python -m venv /opt/build && python -m venv --without-pip /opt/shapespace
 ENV PATH=/opt/build/bin:$PATH PIP_NO_CACHE_DIR=1 PIP_DISABLE_PIP_VERSION_CHECK=1
 WORKDIR /src
 # Dependencies first: they are large and rarely change. The secret is an optional pip.conf for private indexes.
-COPY requirements/build.txt requirements/serve.txt requirements/
+# EXTRA=serve-without-mkl makes an image with 0.5 GB less, which solves more slowly.
+ARG EXTRA=serve
+COPY requirements/build.txt requirements/${EXTRA}.txt requirements/
+COPY scripts/slim.py scripts/
 RUN --mount=type=secret,id=pip,target=/etc/pip.conf \
     pip install --require-hashes --requirement requirements/build.txt && \
-    pip --python /opt/shapespace install --require-hashes --requirement requirements/serve.txt
+    pip --python /opt/shapespace install --require-hashes --requirement "requirements/${EXTRA}.txt" && \
+    python scripts/slim.py /opt/shapespace
 COPY pyproject.toml setup.py README.md LICENSE ./
 COPY shapespace shapespace
 COPY service service

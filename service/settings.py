@@ -9,10 +9,20 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
-from pydantic import BeforeValidator, Field, NonNegativeFloat, PositiveFloat, PositiveInt, SecretStr, field_validator
+from pydantic import (
+    BeforeValidator,
+    Field,
+    NonNegativeFloat,
+    PositiveFloat,
+    PositiveInt,
+    SecretStr,
+    ValidationInfo,
+    field_validator,
+)
 from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict
 
 import shapespace
+from shapespace.service.versions import FILE_NAME, DefaultVersions
 
 PREFIX = "SHAPESPACE_"
 #: Folder of the models that are installed with the package.
@@ -50,6 +60,10 @@ def _split(value: object) -> object:
     return tuple(filter(None, map(str.strip, value.split(",")))) if isinstance(value, str) else value
 
 
+def _versions(value: object) -> object:
+    return DefaultVersions.parse(value) if isinstance(value, str) else value
+
+
 #: Values separated by commas.
 Names = Annotated[tuple[str, ...], NoDecode, BeforeValidator(_split)]
 
@@ -63,8 +77,25 @@ class Settings(BaseSettings):
         default_factory=default_models_dir,
         description="folder of bundles, NAME/VERSION/; by default `models` here, or the installed models",
     )
+    default_versions: Annotated[DefaultVersions, NoDecode, BeforeValidator(_versions)] = Field(
+        default=DefaultVersions(),
+        description="version of each model that answers requests without a version, as figure=3,hand=2, or shares of "
+        "the codes, as figure=3:95,4:5; by default the newest",
+    )
+    default_versions_file: Path | None = Field(
+        default=None,
+        validate_default=True,
+        description="file with default versions, which every reload reads again; by default `default-versions` in the "
+        "models folder",
+    )
     host: str = Field(default="127.0.0.1", description="address to listen on")
     port: int = Field(default=8000, ge=0, le=65535, description="port to listen on; 0 takes a free one")
+    metrics_port: int | None = Field(
+        default=None,
+        ge=0,
+        le=65535,
+        description="port that answers /metrics without a key; 0 takes a free one; by default none",
+    )
     workers: PositiveInt = Field(
         default_factory=cpu_quota, description="shapes computed at once; by default the processors allowed"
     )
@@ -98,6 +129,17 @@ class Settings(BaseSettings):
         default=(), description="origins whose pages may show the page's viewer in a frame, separated by commas, or *"
     )
     log_format: LogFormat = Field(default=LogFormat.TEXT, description="text, or json for one object a line")
+
+    @field_validator("default_versions_file")
+    @classmethod
+    def _readable(cls, file: Path | None, others: ValidationInfo) -> Path | None:
+        if file is not None and not file.exists():
+            raise ValueError(f"there is no file {file}")
+        if file is None and "models_dir" in others.data:
+            file = others.data["models_dir"] / FILE_NAME
+        if file is not None:
+            DefaultVersions.read(file)
+        return file
 
     @field_validator("api_key")
     @classmethod

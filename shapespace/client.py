@@ -30,7 +30,7 @@ class SearchParameters(TypedDict, total=False):
     """Parameters of every search for a code, as the server describes them.
 
     Attributes:
-        version: version of the model; by default the newest.
+        version: version of the model; by default the server's default version.
         fixed: values of coordinates that the code keeps, by index.
         samples: number of codes to draw from the posterior.
         seed: seed of the random numbers.
@@ -156,7 +156,7 @@ class Client:
         self._http.close()
 
     def models(self) -> list[dict[str, Any]]:
-        """Return the newest version of every model."""
+        """Return every model, in its default version."""
         models: list[dict[str, Any]] = self._send("GET", "/v1/models").json()["models"]
         return models
 
@@ -225,7 +225,7 @@ class Client:
         Args:
             name: name of the model.
             latents: (n, m) codes.
-            version: version of the model; by default the newest.
+            version: version of the model; by default the server's default version.
             place: placement of the shapes, see ``mesh``.
             options: mesh ("fine" or "coarse"), bounds ("allow", "clamp" or "reject"), quality ("full" or "draft").
         """
@@ -249,7 +249,7 @@ class Client:
         Args:
             name: name of the model.
             keyframes: (k, m) codes, at least two.
-            version: version of the model; by default the newest.
+            version: version of the model; by default the server's default version.
             quality: quality of the frames, "full" or "draft".
             options: frames, times, start, stop, loop, mesh.
         """
@@ -340,7 +340,7 @@ class Client:
         Args:
             name: name of the model.
             count: number of codes.
-            version: version of the model; by default the newest.
+            version: version of the model; by default the server's default version.
             options: seed; distribution, "uniform" or "gaussian" inside the bounds, or "population", the Gaussian of the
                 training codes; temperature, the factor of the population's differences from its mean.
         """

@@ -21,7 +21,7 @@ from shapespace.service.http.description import describe
 from shapespace.service.http.middleware.access import RequireHost, RequireKey
 from shapespace.service.http.middleware.compress import Compress
 from shapespace.service.http.middleware.memory import LimitBody, LimitUnreadAnswers
-from shapespace.service.http.middleware.observe import Observe
+from shapespace.service.http.middleware.observe import QUIET, Observe
 from shapespace.service.http.routes import codes, interpolations, models, open_inference, operation, page, shapes
 from shapespace.service.limits.quota import UPLOADS
 from shapespace.service.limits.sandbox import Sandbox
@@ -35,8 +35,8 @@ from shapespace.service.settings import Settings, is_loopback
 #: Headers that pages of other origins may send, and headers of answers that they may read.
 CORS_REQUEST = ["Authorization", "Content-Type", "If-None-Match", "Inference-Header-Content-Length"]
 CORS_REQUEST += ["X-API-Key", "X-Request-ID"]
-CORS_ANSWER = ["Content-Disposition", "ETag", "Inference-Header-Content-Length", "Location", "Retry-After"]
-CORS_ANSWER += ["Server-Timing", "Shape-Color", "Shape-Diagnostics", "X-Request-ID"]
+CORS_ANSWER = ["Content-Disposition", "Content-Location", "ETag", "Inference-Header-Content-Length", "Location"]
+CORS_ANSWER += ["Model-Version", "Retry-After", "Server-Timing", "Shape-Color", "Shape-Diagnostics", "X-Request-ID"]
 #: Host names of the loopback interface.
 LOOPBACK = ("localhost", "127.0.0.1", "[::1]")
 
@@ -54,7 +54,13 @@ def create_app(settings: Settings | None = None, validator: BundleValidator | No
         with threadpool_limits(1):
             workers = Workers(settings.workers, settings.queue, settings.deadline)
             connections = Connections(settings.max_connections, settings.deadline, settings.trusted_proxies)
-            repository = ModelRepository(settings.models_dir, settings.workers, validator)
+            repository = ModelRepository(
+                settings.models_dir,
+                settings.workers,
+                validator,
+                settings.default_versions,
+                settings.default_versions_file,
+            )
             metrics = Metrics(repository, workers, connections.quota)
             connections.on_refusal = metrics.refused
             reloader = Reloader(repository, metrics)
@@ -81,6 +87,8 @@ def create_app(settings: Settings | None = None, validator: BundleValidator | No
         lifespan=lifespan,
         middleware=_middleware(settings),
         dependencies=[Depends(known_query)],
+        # Spans of OpenTelemetry, where a provider is configured. The stages of an answer have spans of their own.
+        telemetry={"operation_spans": False, "exclude": lambda scope: scope.get("path") in QUIET},
         generate_unique_id_function=lambda route: route.name,
         # FastAPI's pages load scripts from other servers.
         docs_url=None,

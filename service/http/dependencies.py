@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Annotated
 
 from fastapi import Depends, Path, Query, Request
@@ -15,13 +16,17 @@ from shapespace.model.shape_model import ShapeModel
 from shapespace.service.http.caching import AnswerCache
 from shapespace.service.http.connections import Connections
 from shapespace.service.http.problems import ProblemError
+from shapespace.service.http.version_key import version_key
 from shapespace.service.limits.quota import client_name
 from shapespace.service.limits.sandbox import Sandbox
 from shapespace.service.limits.workers import Caller, DisconnectedError, Workers
 from shapespace.service.operation.metrics import Metrics
 from shapespace.service.operation.reloading import Reloader
+from shapespace.service.operation.statistics import InferenceTally
 from shapespace.service.repository.repository import ModelRepository
 from shapespace.service.settings import Settings
+
+_Inferences = defaultdict[tuple[str, str], InferenceTally]
 
 
 @dataclass
@@ -36,6 +41,10 @@ class Service:
     reloader: Reloader
     answers: AnswerCache
     sandbox: Sandbox
+    #: Inferences by name and version of the model.
+    inferences: defaultdict[tuple[str, str], InferenceTally] = field(
+        default_factory=lambda: defaultdict(InferenceTally)
+    )
     #: Whether the server is shutting down, so that clients should use another one.
     draining: bool = False
 
@@ -76,7 +85,7 @@ QualityOfBody = Annotated[
 #: In the path of routes that name it there, as in the Open Inference Protocol; otherwise in the query.
 Version = Annotated[
     str | None,
-    Field(description="Version of the model; by default the newest."),
+    Field(description="Version of the model; by default the server's default version."),
     WithJsonSchema({"type": "string", "examples": ["1"]}),
 ]
 Format = Annotated[str | None, Query(description="Format of the answer; overrides `Accept`. 406 lists the choices.")]
@@ -84,7 +93,16 @@ Format = Annotated[str | None, Query(description="Format of the answer; override
 
 # Calls _service directly, because FastAPI would resolve a nested dependency again for every parameter.
 async def _model(request: Request, name: ModelName, version: Version = None) -> ShapeModel:
-    return (await _service(request)).repository.get(name, version)
+    repository = (await _service(request)).repository
+    key = await version_key(request) if version is None and repository.divides(name) else None
+    model = repository.get(name, version, key)
+    note_model(request, model, chosen=version is None)
+    return model
+
+
+def note_model(request: Request, model: ShapeModel, *, chosen: bool = False) -> None:
+    """Note which model answers a request, and whether the server chose its version, for headers and metrics."""
+    request.state.model, request.state.chosen = model.manifest, chosen
 
 
 Model = Annotated[ShapeModel, Depends(_model)]

@@ -14,7 +14,7 @@ from pydantic.json_schema import models_json_schema
 
 from shapespace.files.reading import OCTET_STREAM
 from shapespace.service.http.messages.bodies import JSONBody
-from shapespace.service.http.messages.open_inference import InferenceRequest
+from shapespace.service.http.messages.open_inference import IndexRequest, InferenceRequest
 from shapespace.service.http.messages.schemas import MeshAnswer, Problem
 from shapespace.service.http.middleware.access import OPEN
 from shapespace.service.http.problems import KINDS, MEDIA_TYPE
@@ -37,6 +37,7 @@ _HEADERS = {
             "JSON: `status`, `iterations`, `residual`, `flipped_faces`, `integrability`, `plausibility`, "
             "`inside_bounds`, `model`, `quality`."
         ),
+        "Model-Version": "Version of the model that answers.",
         "Server-Timing": "Milliseconds by stage: `network`, `reconstruct`, `encode`.",
     }.items()
 }
@@ -48,7 +49,7 @@ _OPTIONS = {
     "name. Fields have priority over the query.",
 }
 #: Models of bodies that FastAPI does not see, in addition to the models of JSONBody.
-_MODELS: tuple[type[BaseModel], ...] = (InferenceRequest, Problem)
+_MODELS: tuple[type[BaseModel], ...] = (IndexRequest, InferenceRequest, Problem)
 _KEYS = {
     "bearer": {"type": "http", "scheme": "bearer"},
     "header": {"type": "apiKey", "in": "header", "name": "X-API-Key"},

@@ -18,6 +18,7 @@ from shapespace.model.shape_model import ShapeModel
 from shapespace.service.http.caching import CachedAnswer, cache_headers, entity_tag, not_modified
 from shapespace.service.http.dependencies import Service
 from shapespace.service.limits.workers import Caller
+from shapespace.service.tracing import record_stages
 from shapespace.service.use_cases.batch import EncodedFile, PiecewiseFile, Timings
 from shapespace.service.use_cases.codes import Found
 from shapespace.service.use_cases.one_shape import ColourOptions, ShapeRequest, shape_file
@@ -30,6 +31,10 @@ _CACHED = {"network": 0.0, "reconstruct": 0.0, "encode": 0.0}
 def timing(service: Service, seconds: Timings) -> dict[str, str]:
     """Return the header ``Server-Timing``, in milliseconds, and count the same times in the metrics."""
     service.metrics.timed(seconds)
+    return _server_timing(seconds)
+
+
+def _server_timing(seconds: Timings) -> dict[str, str]:
     return {"Server-Timing": ", ".join(f"{stage};dur={1e3 * duration:.3f}" for stage, duration in seconds.items())}
 
 
@@ -45,6 +50,7 @@ def diagnostics_header(diagnostics: Mapping[str, Any]) -> dict[str, str]:
 
 def found_response(service: Service, found: Found) -> Response:
     """Return the result of a search, with its time."""
+    record_stages(found.seconds)
     return Response(found.content, headers=timing(service, found.seconds), media_type="application/json")
 
 
@@ -58,11 +64,13 @@ async def cached_response(
     """Return a file from the cache, computed first where it is not there; 304 where the client has it already."""
     if unchanged := not_modified(request, tag):
         return unchanged
-    answer, seconds = service.answers.get(tag), _CACHED
+    answer, times = service.answers.get(tag), _server_timing(_CACHED)
+    service.metrics.looked_up(found=answer is not None)
     if answer is None:
         answer, seconds = await compute()
         service.answers.keep(tag, answer)
-    headers = {**cache_headers(tag), **answer.headers, **timing(service, seconds)}
+        times = timing(service, seconds)
+    headers = {**cache_headers(tag), **answer.headers, **times}
     return Response(answer.content, headers=headers, media_type=media_type)
 
 

@@ -19,6 +19,7 @@ from fastapi import FastAPI
 
 from shapespace.service.http.connections import Connection
 from shapespace.service.http.listener import Listener
+from shapespace.service.operation.metrics_port import MetricsPort
 from shapespace.service.settings import Settings
 
 logger = logging.getLogger(__name__)
@@ -69,12 +70,19 @@ class Server(uvicorn.Server):
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
         """Begin to listen, and print the address."""
+        host, port, metrics_port = self._settings.host, self._settings.port, self._settings.metrics_port
         try:
-            listeners = Listener.bound(self._settings.host, self._settings.port)
+            listeners = Listener.bound(host, port)
+            metrics = None
+            if metrics_port is not None:
+                port = metrics_port
+                metrics = MetricsPort(host, port)
         except OSError as error:
-            logger.error("can't listen on %s, port %d: %s", self._settings.host, self._settings.port, error.strerror)
+            logger.error("can't listen on %s, port %d: %s", host, port, error.strerror)
             raise SystemExit(STARTUP_FAILURE) from None
         await super().startup(sockets=list(listeners))
+        if metrics:
+            metrics.serve(self._app.state.service.metrics.registry)
         asyncio.get_running_loop().add_signal_handler(signal.SIGHUP, self._hang_up)
         # Port 0 lets the system choose one.
         host, port = self.servers[0].sockets[0].getsockname()[:2]

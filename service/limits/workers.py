@@ -13,6 +13,7 @@ from collections import deque
 from collections.abc import AsyncGenerator, AsyncIterator, Awaitable, Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack, asynccontextmanager, contextmanager
+from contextvars import copy_context
 from dataclasses import dataclass
 from functools import partial
 from typing import TypeVar
@@ -167,7 +168,7 @@ class Workers:
             if turn.done() and not turn.cancelled():
                 self._free.release()
             raise
-        work: Future[T] = self._pool.submit(function, call)
+        work: Future[T] = self._pool.submit(copy_context().run, function, call)
         try:
             return await call.first(asyncio.wrap_future(work))
         finally:

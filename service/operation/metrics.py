@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 
-from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, ProcessCollector
+from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, ProcessCollector, disable_created_metrics
 from prometheus_client.core import GaugeMetricFamily, Metric
 from prometheus_client.registry import Collector
 
@@ -15,6 +15,8 @@ from shapespace.service.repository.repository import Changes, ModelRepository
 
 #: Upper ends of histogram buckets in seconds, from a cached answer to the default deadline.
 BUCKETS = (0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1, 2.5, 5, 10, 30, 60)
+# Series that say when each series first appeared; Prometheus needs none of them.
+disable_created_metrics()  # type: ignore[no-untyped-call]
 METHODS = frozenset({"GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS"})
 
 
@@ -34,13 +36,20 @@ class Metrics:
 
         self._requests = counter("requests", "Requests answered.", "route", "method", "status")
         text = "Time from a request's head to the end of its answer."
-        self._seconds = histogram("request_seconds", text, "route", "method")
-        self._stages = histogram("stage_seconds", "Time of an answer by stage, as its Server-Timing says.", "stage")
+        self._seconds = histogram("request_seconds", text, "route", "method", "status", "model")
+        text = "Requests that a version of a model answered."
+        self._versions = counter("version_requests", text, "model", "version", "status")
+        self._hits = counter("cache_hits", "Answers that were taken from the cache.")
+        self._misses = counter("cache_misses", "Answers that were computed because the cache did not have them.")
+        self._stages = histogram(
+            "stage_seconds", "Time of a computed answer by stage, as its Server-Timing says.", "stage"
+        )
         text = "Bundles that reloads loaded, removed or refused, and reloads that failed whole."
         self._reloads = counter("reloaded_bundles", text, "result")
         self._refusals = counter("refusals", "Connections that were refused without a whole request.", "kind")
         for name, text, value in (
             ("bundles_refused", "Bundles that the latest look refused.", lambda: len(repository.refused)),
+            ("default_version_faults", "Default versions that can't be answered.", lambda: len(repository.faults)),
             ("admitted", "Requests at work or waiting for a worker.", lambda: workers.places.used),
             ("admitted_limit", "Requests that may be; more get 503.", lambda: workers.places.limit),
             ("streams", "Answers that are read while they are computed.", lambda: workers.streams.used),
@@ -53,16 +62,26 @@ class Metrics:
             Gauge(f"shapespace_{name}", text, registry=registry).set_function(value)
         Gauge("shapespace_build_info", "Always 1.", ["version"], registry=registry).labels(__version__).set(1)
 
-    def answered(self, route: str, method: str, status: int, seconds: float) -> None:
-        """Count an answer, by the template of its path, and with one label for all unknown methods."""
+    def answered(self, route: str, method: str, status: int, seconds: float, model: str, version: str) -> None:
+        """Count an answer, by the template of its path, and with one label for all unknown methods.
+
+        ``model`` and ``version`` are of a served model, or empty where none answered.
+        """
         method = method if method in METHODS else "other"
         self._requests.labels(route, method, str(status)).inc()
-        self._seconds.labels(route, method).observe(seconds)
+        self._seconds.labels(route, method, str(status), model).observe(seconds)
+        if model:
+            self._versions.labels(model, version, str(status)).inc()
+
+    def looked_up(self, *, found: bool) -> None:
+        """Count whether the cache had an answer."""
+        (self._hits if found else self._misses).inc()
 
     def timed(self, seconds: Mapping[str, float]) -> None:
-        """Count the time of an answer by stage."""
+        """Count the time of a computed answer by stage, without stages that it did not need."""
         for stage, duration in seconds.items():
-            self._stages.labels(stage).observe(duration)
+            if duration:
+                self._stages.labels(stage).observe(duration)
 
     def refused(self, kind: str) -> None:
         """Count a connection refused before a whole request arrived."""
@@ -76,13 +95,17 @@ class Metrics:
 
 
 class _ModelInfo(Collector):
-    """Names, versions and digests of the served models."""
+    """Names, versions and digests of the served models, and the share of the codes that each version answers."""
 
     def __init__(self, repository: ModelRepository) -> None:
         self._repository = repository
 
     def collect(self) -> Iterator[Metric]:
-        family = GaugeMetricFamily("shapespace_model_info", "Always 1.", labels=["model", "version", "digest"])
+        info = GaugeMetricFamily("shapespace_model_info", "Always 1.", labels=["model", "version", "digest"])
+        text = "Share of the codes that a version answers if requests name none, from 0 to 1."
+        share = GaugeMetricFamily("shapespace_version_share", text, labels=["model", "version"])
         for model in self._repository.all():
-            family.add_metric([model.manifest.name, model.manifest.version, model.digest], 1)
-        yield family
+            place = [model.manifest.name, model.manifest.version]
+            info.add_metric([*place, model.digest], 1)
+            share.add_metric(place, self._repository.share(model))
+        yield from (info, share)

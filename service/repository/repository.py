@@ -23,6 +23,7 @@ from shapespace.service.limits.sandbox_errors import (
 )
 from shapespace.service.logs import printable
 from shapespace.service.repository.validation import BundleValidator, bundle_folders
+from shapespace.service.versions import DefaultVersions, DefaultVersionsError
 
 logger = logging.getLogger(__name__)
 
@@ -36,6 +37,9 @@ class UnknownModelError(LookupError):
 
 class UnknownVersionError(LookupError):
     """The model has no such version."""
+
+
+Models = Mapping[str, Mapping[int, ShapeModel]]
 
 
 @dataclass(frozen=True)
@@ -60,14 +64,26 @@ class ModelRepository:
         folder: holds NAME/VERSION/; hidden entries and plain files are ignored.
         threads: number of shapes that a model may compute at once.
         validator: validation that has begun already, for the first load.
+        defaults: versions that answer requests without a version.
+        file: file with more default versions, which every reload reads again. ``defaults`` wins over it.
     """
 
-    def __init__(self, folder: Path, threads: int = 1, validator: BundleValidator | None = None) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        threads: int = 1,
+        validator: BundleValidator | None = None,
+        defaults: DefaultVersions | None = None,
+        file: Path | None = None,
+    ) -> None:
         self._folder, self._threads = folder, threads
-        self._models: Mapping[str, Mapping[int, ShapeModel]] = {}
+        self._given, self._file, self._filed = defaults or DefaultVersions(), file, DefaultVersions()
+        # Replaced in one step, so that no request sees new models with old default versions.
+        self._served: tuple[Models, DefaultVersions] = {}, self._given
         self._validator, self._closed = validator or BundleValidator(), False
-        #: Bundles that the latest reload refused, and signature of the folder before it.
+        #: Bundles that the latest reload refused, faults of default versions, and signature of the folder before it.
         self.refused: list[str] = []
+        self.faults: list[str] = []
         self.seen: Signature = ()
         self.reload()
 
@@ -91,6 +107,7 @@ class ModelRepository:
             folders, unreadable = bundle_folders(self._folder)
         except OSError as error:
             logger.error("the models folder can't be read, so that nothing changes: %s", error)
+            self._serve(self._served[0])
             return Changes(failed=True)
         changes = Changes()
         before = {(model.manifest.name, model.manifest.version): model for model in self.all()}
@@ -126,10 +143,23 @@ class ModelRepository:
         for name, version in before:
             changes.removed.append(f"{name}/{version}")
             logger.info("bundle %s/%s is gone and no longer served", name, version)
-        self._models, self.refused = models, changes.refused
+        self.refused = changes.refused
+        self._serve(models)
         if changes.loaded or changes.removed:
             trim_heap()
         return changes
+
+    def _serve(self, models: Models) -> None:
+        """Serve these models, with the default versions that the file names now."""
+        faults = []
+        try:
+            self._filed = DefaultVersions.read(self._file) if self._file else self._filed
+        except DefaultVersionsError as error:
+            faults.append(f"The default versions stay as they were. {error}")
+        defaults = self._given.over(self._filed)
+        self._served, self.faults = (models, defaults), faults + defaults.faults(models)
+        for fault in self.faults:
+            logger.error("%s", fault)
 
     def close(self) -> None:
         """End running validations; their bundles stay as they are."""
@@ -145,8 +175,12 @@ class ModelRepository:
         return ShapeModel(read_bundle(folder, validator.digest(folder)), self._threads)
 
     def signature(self) -> Signature:
-        """Return the state of the folder, which changes with any bundle, without reading bundles."""
+        """Return the state of the folder and of the file, which changes with any bundle, without reading bundles."""
         found = []
+        if self._file:
+            with suppress(OSError):
+                status = self._file.stat()
+                found.append((str(self._file), status.st_size, status.st_mtime_ns, status.st_ino))
         with suppress(OSError):  # the folder is changing; the next check compares again
             for version in bundle_folders(self._folder)[0]:
                 found.append((str(version), 0, 0, 0))
@@ -157,43 +191,61 @@ class ModelRepository:
         return tuple(sorted(found))
 
     def __iter__(self) -> Iterator[ShapeModel]:
-        """Iterate over the newest version of every model, by name."""
-        return (versions[max(versions)] for _, versions in sorted(self._models.items()))
+        """Iterate over the models by name, each in the version that answers requests without a code."""
+        models, defaults = self._served
+        return (versions[defaults.choose(name, versions)] for name, versions in sorted(models.items()))
 
     def __len__(self) -> int:
-        return len(self._models)
+        return len(self._served[0])
 
     def all(self) -> Iterator[ShapeModel]:
         """Return every version of every model."""
-        return (model for versions in self._models.values() for model in versions.values())
+        return (model for versions in self._served[0].values() for model in versions.values())
 
     def versions(self, name: str) -> list[str]:
         """Return the versions of a model, oldest first; raises UnknownModelError."""
-        return [str(version) for version in sorted(self._named(name))]
+        return [str(version) for version in sorted(_named(name, self._served[0]))]
 
-    def get(self, name: str, version: str | None = None) -> ShapeModel:
-        """Return a model, by default its newest version; raises UnknownModelError or UnknownVersionError."""
-        versions = self._named(name)
+    def share(self, model: ShapeModel) -> float:
+        """Return the share of the codes, from 0 to 1, that a model answers if requests name no version."""
+        (models, defaults), name = self._served, model.manifest.name
+        return defaults.share(name, int(model.manifest.version), models[name]) if name in models else 0.0
+
+    def divides(self, name: str) -> bool:
+        """Return whether several versions of a model answer requests without a version, each its share."""
+        models, defaults = self._served
+        return defaults.divides(name, models.get(name, {}))
+
+    def get(self, name: str, version: str | None = None, key: bytes | None = None) -> ShapeModel:
+        """Return a model; raises UnknownModelError or UnknownVersionError.
+
+        Args:
+            name: name of the model.
+            version: its version; by default what ``DefaultVersions.choose`` chooses.
+            key: what ``DefaultVersions.choose`` divides requests by.
+        """
+        models, defaults = self._served
+        versions = _named(name, models)
+        if version is None:
+            return versions[defaults.choose(name, versions, key)]
         for number, model in versions.items():
             if str(number) == version:
                 return model
-        if version is not None:
-            known = ", ".join(map(str, sorted(versions)))
-            raise UnknownVersionError(
-                f"{name} has no version {version!r}. Choose one of {known}, or none for the newest."
-            )
-        return versions[max(versions)]
+        known = ", ".join(map(str, sorted(versions)))
+        raise UnknownVersionError(
+            f"{name} has no version {version!r}. Choose one of {known}, or none for the default version."
+        )
 
     def by_digest(self, prefix: str) -> ShapeModel | None:
         """Return the model whose digest begins with ``prefix``."""
         return next((model for model in self.all() if model.digest.startswith(prefix)), None)
 
-    def _named(self, name: str) -> Mapping[int, ShapeModel]:
-        models = self._models
-        if name not in models:
-            known = ", ".join(sorted(models)) or "none at the moment"
-            raise UnknownModelError(f"There is no model {name!r}. Choose one of those that /v1/models lists: {known}.")
-        return models[name]
+
+def _named(name: str, models: Models) -> Mapping[int, ShapeModel]:
+    if name not in models:
+        known = ", ".join(sorted(models)) or "none at the moment"
+        raise UnknownModelError(f"There is no model {name!r}. Choose one of those that /v1/models lists: {known}.")
+    return models[name]
 
 
 def _is_new(folder: Path, model: ShapeModel | None) -> bool:

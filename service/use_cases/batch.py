@@ -14,6 +14,7 @@ from shapespace.model.decoder import MeshChoice, Quality, Shape
 from shapespace.model.latent_space import CheckedCode
 from shapespace.model.shape_model import ShapeModel
 from shapespace.service.limits.workers import Call, Caller, Workers
+from shapespace.service.tracing import record_stages
 from shapespace.solve.deadline import Deadline
 from shapespace.solve.outcome import Status
 
@@ -93,7 +94,9 @@ class Batch:
 
         def start(_: Call) -> tuple[bytes | Buffer, Iterator[Buffer], Mapping[str, Any]]:
             pieces, facts = encode()
-            return (next(pieces) if self._size > WHOLE_FILE_BYTES else b"".join(pieces)), pieces, facts
+            first = next(pieces) if self._size > WHOLE_FILE_BYTES else b"".join(pieces)
+            record_stages({"encode": time.perf_counter() - began})
+            return first, pieces, facts
 
         first, rest, facts = await self.workers.run(start, self._call)
         seconds = {**seconds, "encode": time.perf_counter() - began}
@@ -119,6 +122,7 @@ def solve(
     shape = model.shape(*code, mesh, deadline, quality)
     if shape.diagnostics.status is Status.DEADLINE:
         raise workers.late()
+    record_stages(shape.seconds)
     return shape
 
 

@@ -148,6 +148,13 @@ async def infer(
         return await work.write(lambda: write(arrays), seconds, diagnostics)
 
 
+def most_inferred(model: ShapeModel) -> int:
+    """Return the largest number of codes for which ``infer`` answers both outputs, with the fine mesh."""
+    vertices, nric = (3 * len(model.mesh(MeshChoice.FINE).vertices), 2 * model.manifest.edges)
+    together = BYTES_PER_VERTEX * MOST_VERTICES // (4 * (vertices + nric))
+    return min(together, 3 * MOST_VERTICES // vertices, MOST_NRIC_BYTES // (4 * nric))
+
+
 def shapes_size(model: ShapeModel, count: int, mesh: MeshChoice) -> int:
     """Return the size of several shapes in bytes; raises TooManyCodesError above the limit of one answer."""
     vertices = len(model.mesh(mesh).vertices)

@@ -19,6 +19,7 @@ from shapespace.model.latent_space import CheckedCode, NotFiniteError
 from shapespace.model.shape_model import ShapeModel
 from shapespace.model.vertex_uncertainty import vertex_uncertainty
 from shapespace.service.limits.workers import Caller, Workers
+from shapespace.service.tracing import record_stages
 from shapespace.service.use_cases.batch import Timings, solve, total_seconds
 from shapespace.service.use_cases.shape_formats import SHAPE_FORMATS, catch_write_errors, with_topology
 from shapespace.solve.deadline import Deadline
@@ -96,7 +97,9 @@ async def shape_file(workers: Workers, caller: Caller, model: ShapeModel, wanted
         surface = with_topology(model.decoder.surface(mesh), wanted.topology)
         with catch_write_errors():
             content = SHAPE_FORMATS[wanted.format].encode(vertices, model.mesh(mesh).faces, colouring, surface)
-        seconds = {**total_seconds(shape.seconds for shape in found), "encode": time.perf_counter() - began}
+        encoding = {"encode": time.perf_counter() - began}
+        record_stages(encoding)
+        seconds = total_seconds(shape.seconds for shape in found) | encoding
         return ShapeFile(content, found[0].diagnostics, colouring.legend if colouring else None, seconds)
 
     async with workers.admit(caller) as call:

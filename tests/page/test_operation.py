@@ -12,6 +12,7 @@ import pytest
 
 from tests.page.conftest import Open
 from tests.page.studio import OpenPage, difference
+from tests.service.bundles import write_bundle
 from tests.service.conftest import ROOT, Server, Start
 
 AXE = ROOT / "tests" / "node_modules" / "axe-core" / "axe.min.js"
@@ -116,6 +117,25 @@ def test_a_server_with_a_key(window: Open, start: Start, models: Path) -> None:
     studio["#key input"].press("Enter")
     studio.rest()
     assert studio["#key"].is_hidden()
+
+
+def test_the_page_stays_with_the_version_that_it_listed(window: Open, start: Start, tmp_path: Path) -> None:
+    for version in ("1", "2"):
+        write_bundle(tmp_path, "with-fine", version, fine=True)
+    # Half of the codes would get version 2, while the card is of version 1.
+    studio = window(start(tmp_path, default_versions="with-fine=1:51,2:49").url)
+    answered: list[tuple[str, str]] = []
+    studio.page.on("response", lambda got: answered.append((got.url, got.headers.get("model-version", ""))))
+    studio.open()
+    before = studio.picture()
+    studio.slide(0, 0.15)
+    studio.until_different(before)
+    for value in (0.01, 0.02, 0.03, 0.04, 0.05):
+        studio.type(0, value)
+        studio.rest()
+    asked = [version for url, version in answered if "/v1/models/with-fine" in url]
+    assert len(asked) > 8
+    assert {*asked} == {"1"}
 
 
 def test_no_model_is_said(window: Open, start: Start, tmp_path: Path) -> None:

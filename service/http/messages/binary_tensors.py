@@ -23,6 +23,8 @@ from shapespace.service.use_cases.shape_formats import dump_json
 #: Header with the length of the JSON part of a body that continues with bytes.
 HEADER = "Inference-Header-Content-Length"
 _FLOAT = np.dtype("<f4")
+#: Most lengths of rows that a message names.
+_NAMED = 3
 
 
 def read_request(body: bytes, header: str | None) -> tuple[InferenceRequest, bytes]:
@@ -58,8 +60,12 @@ def read_codes(request: InferenceRequest, tail: bytes) -> NDArray[np.floating]:
     tensor = request.inputs[0]
     n, m = tensor.shape
     if tensor.data is not None:
-        rows = (row if isinstance(row, list) else [row] for row in tensor.data)
-        values = np.array(list(chain.from_iterable(rows)), dtype=np.float64)
+        rows = [row for row in tensor.data if isinstance(row, list)]
+        if rows and (len(rows) != n or any(len(row) != m for row in rows)):
+            lengths = ", ".join(map(str, sorted({len(row) for row in rows})[:_NAMED]))
+            told = f"data has {len(rows)} rows of {lengths} numbers, but the shape of {INPUT} is {tensor.shape}"
+            raise _invalid(f"{told}. Send {n} rows of {m}, or all numbers in one list")
+        values = np.array(list(chain.from_iterable(rows)) if rows else tensor.data, dtype=np.float64)
     elif len(tail) % _FLOAT.itemsize:
         raise _invalid(f"The bytes of {INPUT} are no whole number of FP32 values. Send {_FLOAT.itemsize} for each")
     else:

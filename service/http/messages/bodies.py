@@ -101,8 +101,11 @@ async def gather(request: Request) -> deque[memoryview]:
     """Return a request's body in large pieces.
 
     Each piece has its own pages, so its memory is free once it is passed on. On the heap it would be free only after
-    all later pieces.
+    all later pieces. A second call for a request returns the same pieces.
     """
+    if hasattr(request.state, "gathered"):
+        gathered: deque[memoryview] = request.state.gathered
+        return gathered
     pages: list[mmap.mmap] = []
     async for part in request.stream():
         rest = memoryview(part)
@@ -110,4 +113,5 @@ async def gather(request: Request) -> deque[memoryview]:
             if not pages or pages[-1].tell() == _PIECE:
                 pages.append(mmap.mmap(-1, _PIECE))
             rest = rest[pages[-1].write(rest[: _PIECE - pages[-1].tell()]) :]
-    return deque(memoryview(piece)[: piece.tell()] for piece in pages)
+    request.state.gathered = deque(memoryview(piece)[: piece.tell()] for piece in pages)
+    return request.state.gathered

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, NonNegativeInt, field_validator
+from pydantic import BaseModel, ConfigDict, Field, field_validator
 from pydantic.json_schema import SkipJsonSchema
 
 from shapespace.model.decoder import MeshChoice, Quality
@@ -18,10 +18,12 @@ from shapespace.model.latent_space import Bounds
 from shapespace.model.shape_model import ShapeModel
 from shapespace.service.http.messages.schemas import BoundsField, QualityField
 from shapespace.service.http.problems import ProblemError
-from shapespace.service.use_cases.fields import Number
+from shapespace.service.operation.statistics import InferenceTally
+from shapespace.service.use_cases.fields import Number, Whole
 
 INPUT = "latent"
 OutputName = Literal["nric", "vertices"]
+PLATFORM = "shapespace"
 OUTPUTS: tuple[OutputName, ...] = ("nric", "vertices")
 
 
@@ -33,7 +35,7 @@ class _Message(BaseModel):
 class InputParameters(_Message):
     """Parameters of the input."""
 
-    binary_data_size: SkipJsonSchema[NonNegativeInt | None] = Field(
+    binary_data_size: SkipJsonSchema[Annotated[Whole, Field(ge=0)] | None] = Field(
         None, description="Number of its bytes after the JSON."
     )
 
@@ -58,7 +60,7 @@ class InputTensor(_Message):
 
     name: Literal["latent"]
     shape: Annotated[
-        list[Annotated[int, Field(ge=0, json_schema_extra={"minimum": 1})]],
+        list[Annotated[Whole, Field(ge=0, json_schema_extra={"minimum": 1})]],
         Field(min_length=2, max_length=2, description="[n, m]"),
     ]
     datatype: Literal["FP32"]
@@ -166,6 +168,14 @@ class TensorMetadata(BaseModel):
     shape: list[int]
 
 
+class ModelLimits(BaseModel):
+    """Limits on one request for a model."""
+
+    max_codes: int = Field(description="Most codes for which both outputs are answered.")
+    max_body: int = Field(description="Largest body in bytes.")
+    deadline: float = Field(description="Seconds after which the answer is 504.")
+
+
 class ModelMetadata(BaseModel):
     """Description of a model."""
 
@@ -174,6 +184,7 @@ class ModelMetadata(BaseModel):
     platform: str
     inputs: list[TensorMetadata]
     outputs: list[TensorMetadata]
+    parameters: ModelLimits
 
 
 class ServerMetadata(BaseModel):
@@ -191,17 +202,124 @@ class ModelReadiness(BaseModel):
     ready: bool
 
 
-def model_metadata(model: ShapeModel, versions: Sequence[str]) -> ModelMetadata:
+class TensorConfiguration(BaseModel):
+    """An input or output tensor, without the dimension of the batch."""
+
+    name: str
+    data_type: str
+    dims: list[int]
+
+
+class ModelConfiguration(BaseModel):
+    """Configuration of a model, as Triton's extension has it."""
+
+    name: str
+    platform: str
+    version_policy: dict[str, dict[str, int]] = Field(description="`all`: every version in the folder is served.")
+    max_batch_size: int = Field(description="Most codes for which both outputs are answered.")
+    input: list[TensorConfiguration]
+    output: list[TensorConfiguration]
+
+
+class InferenceDuration(BaseModel):
+    """Number of requests, and their time together in nanoseconds."""
+
+    count: int
+    ns: int
+
+
+class InferenceStatistics(BaseModel):
+    """Requests by result, and the time of answered requests by stage."""
+
+    success: InferenceDuration
+    fail: InferenceDuration
+    queue: InferenceDuration
+    compute_input: InferenceDuration
+    compute_infer: InferenceDuration
+    compute_output: InferenceDuration
+
+
+class ModelStatistics(BaseModel):
+    """Inferences of one version of a model since the server started."""
+
+    name: str
+    version: str
+    last_inference: int = Field(description="Milliseconds since 1970; 0 before the first answer.")
+    inference_count: int = Field(description="Codes in requests that were answered.")
+    execution_count: int = Field(description="Requests that were answered.")
+    inference_stats: InferenceStatistics
+    batch_stats: list[InferenceDuration] = Field(description="Empty: codes of several requests are not joined.")
+
+
+class StatisticsAnswer(BaseModel):
+    """Inferences by version."""
+
+    model_stats: list[ModelStatistics]
+
+
+class IndexRequest(_Message):
+    """Which models the index lists."""
+
+    ready: bool = Field(False, strict=True, description="Only those that are served.", examples=[True])
+
+
+class IndexedModel(BaseModel):
+    """A version of a model in the models folder."""
+
+    name: str
+    version: str
+    state: Literal["READY", "UNAVAILABLE"]
+    reason: str
+
+
+def model_metadata(model: ShapeModel, versions: Sequence[str], limits: ModelLimits) -> ModelMetadata:
     """Return the description of a model with its tensors."""
-    facts = model.manifest
-    fine = len(model.mesh(MeshChoice.FINE).vertices)
+    inputs, outputs = _tensors(model)
     return ModelMetadata(
-        name=facts.name,
+        name=model.manifest.name,
         versions=list(versions),
-        platform="shapespace",
-        inputs=[TensorMetadata(name=INPUT, datatype="FP32", shape=[-1, facts.latent_dimension])],
-        outputs=[
-            TensorMetadata(name="nric", datatype="FP32", shape=[-1, 2 * facts.edges]),
-            TensorMetadata(name="vertices", datatype="FP32", shape=[-1, fine, 3]),
-        ],
+        platform=PLATFORM,
+        inputs=[TensorMetadata(name=name, datatype="FP32", shape=[-1, *row]) for name, row in inputs.items()],
+        outputs=[TensorMetadata(name=name, datatype="FP32", shape=[-1, *row]) for name, row in outputs.items()],
+        parameters=limits,
     )
+
+
+def model_configuration(model: ShapeModel, limits: ModelLimits) -> ModelConfiguration:
+    """Return the configuration of a model."""
+    inputs, outputs = (
+        [TensorConfiguration(name=name, data_type="TYPE_FP32", dims=row) for name, row in tensors.items()]
+        for tensors in _tensors(model)
+    )
+    return ModelConfiguration(
+        name=model.manifest.name,
+        platform=PLATFORM,
+        version_policy={"all": {}},
+        max_batch_size=limits.max_codes,
+        input=inputs,
+        output=outputs,
+    )
+
+
+def model_statistics(model: ShapeModel, tally: InferenceTally) -> ModelStatistics:
+    """Return the statistics of a version of a model."""
+    parts = {
+        part: InferenceDuration(count=tally.counts[part], ns=round(1e9 * tally.seconds.get(part, 0.0)))
+        for part in InferenceStatistics.model_fields
+    }
+    return ModelStatistics(
+        name=model.manifest.name,
+        version=model.manifest.version,
+        last_inference=tally.last,
+        inference_count=tally.codes,
+        execution_count=tally.counts["success"],
+        inference_stats=InferenceStatistics(**parts),
+        batch_stats=[],
+    )
+
+
+def _tensors(model: ShapeModel) -> tuple[dict[str, list[int]], dict[str, list[int]]]:
+    """Return the shapes of the inputs and outputs for one code, by name."""
+    facts = model.manifest
+    vertices = [len(model.mesh(MeshChoice.FINE).vertices), 3]
+    return {INPUT: [facts.latent_dimension]}, {"nric": [2 * facts.edges], "vertices": vertices}

@@ -294,7 +294,7 @@ class ModelSummary(BaseModel):
 
 
 class ModelList(BaseModel):
-    """The newest version of every model."""
+    """Every model, in its default version."""
 
     models: list[ModelSummary]
 
@@ -369,6 +369,7 @@ class Readiness(BaseModel):
     """Open Inference Protocol: server ready."""
 
     ready: bool
+    faults: list[str] | None = Field(None, description="Sentences about default versions that can't be answered.")
 
 
 class Problem(BaseModel):

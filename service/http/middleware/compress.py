@@ -36,7 +36,7 @@ class Compress(HTTPMiddleware):
         """Pass a request on, with the tags that routes know, and compress its answer."""
         known = Headers(scope=scope).get("if-none-match", "")
         if SUFFIX in known:
-            scope = {**scope, "headers": [*scope["headers"]]}
+            scope["headers"] = [*scope["headers"]]  # in the same scope, in which the router notes the route
             MutableHeaders(scope=scope)["if-none-match"] = known.replace(SUFFIX, '"')
 
         async def tagged(message: Message) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import re
 import time
+from http import HTTPStatus
 from uuid import uuid4
 
 from starlette.datastructures import Headers, MutableHeaders
@@ -51,6 +52,7 @@ class Observe(HTTPMiddleware):
                 status = message["status"]
                 headers["X-Request-ID"] = id
                 headers["X-Content-Type-Options"] = "nosniff"
+                headers.update(_version_headers(scope, status))
                 if service.draining:  # the client should send its next request to another server
                     headers["Connection"] = "close"
             await send(message)
@@ -68,7 +70,9 @@ class Observe(HTTPMiddleware):
             # With its parameters unfilled, and one word for all paths without a route.
             unmatched = f"{scope['root_path']}/*" if scope.get("root_path") else "unmatched"
             route = scope["route"].path if "route" in scope else unmatched
-            service.metrics.answered(route, method, status, seconds)
+            model = scope.get("state", {}).get("model")
+            name, version = (model.name, model.version) if model else ("", "")
+            service.metrics.answered(route, method, status, seconds, name, version)
             # As received, percent-encoded, so that a path cannot break a line.
             path = scope.get("raw_path", b"")[:LONGEST_PATH].decode("ascii", "replace")
             facts = {"method": method, "path": path, "route": route, "status": status}
@@ -76,3 +80,19 @@ class Observe(HTTPMiddleware):
             level = logging.DEBUG if route in QUIET else logging.INFO
             logger.log(level, "%s %s %d in %.3f s", method, path, status, seconds, extra=facts)
             logs.request_id.reset(context)
+
+
+def _version_headers(scope: Scope, status: int) -> dict[str, str]:
+    """Return headers that say which version of a model answers; none where no model does."""
+    state = scope.get("state", {})
+    if "model" not in state:
+        return {}
+    version = state["model"].version
+    found = {"Model-Version": version}
+    query = scope["query_string"].decode("ascii", "ignore")
+    # Of a POST the address alone does not get the answer again, and below /v2 the version is part of the path.
+    readable = state["chosen"] and scope["method"] == "GET" and scope["path"].startswith("/v1/")
+    if readable and status < HTTPStatus.BAD_REQUEST and len(query) < LONGEST_PATH:
+        path = scope.get("raw_path", b"").decode("ascii", "ignore")
+        found["Content-Location"] = f"{path}?{query}&version={version}" if query else f"{path}?version={version}"
+    return found

@@ -18,6 +18,7 @@ from shapespace.service.http.dependencies import (
     Model,
     Service,
     ServiceDependency,
+    note_model,
     one_of,
     query_names,
 )
@@ -64,6 +65,7 @@ def _asked(
     """Return the model and the options that the query and the fields of a form ask for."""
     if version := fields.get("version"):
         model = service.repository.get(request.path_params["name"], version)
+        note_model(request, model)
     return model, options_with_fields(kind, query, body, fields)
 
 

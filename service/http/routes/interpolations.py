@@ -19,6 +19,7 @@ from shapespace.service.http.dependencies import (
     Model,
     QualityQuery,
     ServiceDependency,
+    note_model,
     one_of,
 )
 from shapespace.service.http.description import binary, mesh_answers, problems
@@ -98,6 +99,7 @@ async def get_interpolation(
     """The animation: GLB, arrays, a zip of OBJ files, a point cache, USD, or a stream of JSON lines."""
     chosen = _choose_format(request, format, color)
     animation, model = find_interpolation(service.repository, id, service.settings.max_frames)
+    note_model(request, model)
     written_as = SEQUENCE_FORMATS.get(chosen)
     if fps is not None and not (written_as and written_as.timed):
         timed = ", ".join(name for name, each in SEQUENCE_FORMATS.items() if each.timed)
@@ -139,6 +141,7 @@ async def get_frame(
 ) -> Response:
     """One frame of an animation in any mesh format."""
     animation, model = find_interpolation(service.repository, id, service.settings.max_frames)
+    note_model(request, model)
     wanted = options.shape(model, frame_code(model, animation, k), animation.mesh, quality)
     return await shape_response(service, request, caller, model, wanted)
 

@@ -24,7 +24,7 @@ router = APIRouter(prefix="/v1/models", tags=["models"])
 
 @router.get("")
 async def list_models(service: ServiceDependency) -> ModelList:
-    """The newest version of every model."""
+    """Every model, in its default version."""
     return ModelList(models=[ModelSummary(**_facts(model)) for model in service.repository])
 
 

@@ -19,15 +19,15 @@ async def live() -> Health:
     return Health(live=True)
 
 
-@router.get("/v2/health/ready", tags=["health"], responses=problems(503))
+@router.get("/v2/health/ready", tags=["health"], responses=problems(503), response_model_exclude_none=True)
 async def ready(service: ServiceDependency) -> Readiness:
-    """Whether the server has a model and is not shutting down."""
+    """Whether the server has a model and is not shutting down; names faults of the default versions."""
     if service.draining:
         raise ProblemError("not-ready", "The server is about to end. Send requests to another one.", ready=False)
     if len(service.repository) == 0:
         detail = "No model is served. Put a bundle into the models folder; the log says more."
         raise ProblemError("not-ready", detail, ready=False)
-    return Readiness(ready=True)
+    return Readiness(ready=True, faults=service.repository.faults or None)
 
 
 @router.get(

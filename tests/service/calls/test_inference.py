@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import httpx
@@ -11,8 +12,19 @@ import tritonclient.http as triton
 from tritonclient.utils import InferenceServerException
 
 from shapespace import __version__
-from tests.service.bundles import SCALE, expected_nric, reference
-from tests.service.conftest import Server
+from shapespace.bundle.reader import read_bundle
+from shapespace.model.decoder import MeshChoice
+from shapespace.model.shape_model import ShapeModel
+from shapespace.service.use_cases.many_shapes import (
+    BYTES_PER_VERTEX,
+    MOST_VERTICES,
+    most_inferred,
+    nric_size,
+    shapes_size,
+)
+from tests.service.bundles import SCALE, expected_nric, reference, write_bundle
+from tests.service.conftest import Server, Start
+from tests.service.repository.test_bundles import flip_a_bit
 
 CODES = np.array([[0.1, 0.7, 0.4], [0.0, -1.0, 0.2]], np.float32)
 INFER = "/v2/models/small/infer"
@@ -46,7 +58,7 @@ def test_the_client_finds_server_and_models_as_they_are(inference: triton.Infere
     assert inference.get_server_metadata() == {
         "name": "shapespace",
         "version": __version__,
-        "extensions": ["binary_tensor_data"],
+        "extensions": ["binary_tensor_data", "model_configuration", "model_repository", "statistics"],
     }
     mesh = reference()
     expected = {
@@ -58,6 +70,7 @@ def test_the_client_finds_server_and_models_as_they_are(inference: triton.Infere
             {"name": "nric", "datatype": "FP32", "shape": [-1, 2 * len(mesh.edges)]},
             {"name": "vertices", "datatype": "FP32", "shape": [-1, len(mesh.vertices), 3]},
         ],
+        "parameters": {"max_codes": 20, "max_body": 100_000, "deadline": 300},  # as the server's settings say
     }
     assert inference.get_model_metadata("small") == expected
     assert inference.get_model_metadata("small", "2") == expected
@@ -139,8 +152,80 @@ def test_its_exceptions_say_what_to_do(inference: triton.InferenceServerClient) 
         inference.infer("small", [latent(CODES * np.nan)])
     with pytest.raises(InferenceServerException, match=r"\[422\].*limit is 20"):
         inference.infer("small", [latent(np.zeros((21, 3), np.float32))])
-    with pytest.raises(InferenceServerException, match=r"\[404\].*Nothing answers at /v2/models/small/config"):
-        inference.get_model_config("small")
+    with pytest.raises(InferenceServerException, match=r"\[404\].*has no version '3'"):
+        inference.get_model_config("small", "3")
+
+
+def test_the_client_finds_configuration_and_limits(inference: triton.InferenceServerClient) -> None:
+    edges, vertices = len(reference().edges), len(reference().vertices)
+    found = inference.get_model_config("small")
+    assert found == inference.get_model_config("small", "1")
+    assert found == {
+        "name": "small",
+        "platform": "shapespace",
+        "version_policy": {"all": {}},
+        "max_batch_size": 20,
+        "input": [{"name": "latent", "data_type": "TYPE_FP32", "dims": [3]}],
+        "output": [
+            {"name": "nric", "data_type": "TYPE_FP32", "dims": [2 * edges]},
+            {"name": "vertices", "data_type": "TYPE_FP32", "dims": [vertices, 3]},
+        ],
+    }
+
+
+def test_the_most_codes_are_answered_and_one_more_is_not(small_models: Path, start: Start) -> None:
+    url = start(small_models, max_codes=10**6, max_body=2**26).url
+    with httpx.Client(base_url=url, timeout=120) as client:
+        most = client.get("/v2/models/small").json()["parameters"]["max_codes"]
+        model = ShapeModel(read_bundle(small_models / "small" / "10"), 1)
+        assert most == most_inferred(model)
+        both = nric_size(model, most) + shapes_size(model, most, MeshChoice.FINE)
+        assert both <= BYTES_PER_VERTEX * MOST_VERTICES
+        codes = np.zeros((most + 1, 3), np.float32)
+        message = body(shape=[most + 1, 3], data=None, parameters={"binary_data_size": codes.nbytes})
+        text = json.dumps(message).encode()
+        headers = {"Inference-Header-Content-Length": str(len(text))}
+        refused = client.post(INFER, content=text + codes.tobytes(), headers=headers)
+        assert refused.status_code == 422
+        assert refused.json()["type"] == "urn:shapespace:problem:too-many-codes"
+
+
+def test_the_client_finds_what_is_in_the_folder_and_what_it_did(tmp_path: Path, start: Start) -> None:
+    write_bundle(tmp_path, "small", "1")
+    write_bundle(tmp_path, "small", "2")
+    flip_a_bit(write_bundle(tmp_path, "broken", "7"))
+    client = triton.InferenceServerClient(start(tmp_path).url.removeprefix("http://"))
+    index = client.get_model_repository_index()
+    assert [(model["name"], model["version"], model["state"]) for model in index] == [
+        ("small", "1", "READY"),
+        ("small", "2", "READY"),
+        ("broken", "7", "UNAVAILABLE"),
+    ]
+    assert "refused" in index[2]["reason"]
+
+    client.infer("small", [latent(CODES)])
+    client.infer("small", [latent(CODES)], model_version="1")
+    with pytest.raises(InferenceServerException, match="Send exactly 3"):
+        client.infer("small", [latent(CODES[:, :2])], model_version="1")
+    every = client.get_inference_statistics()["model_stats"]
+    assert [(model["name"], model["version"]) for model in every] == [("small", "1"), ("small", "2")]
+    assert client.get_inference_statistics("small")["model_stats"] == every
+    (first,) = client.get_inference_statistics("small", "1")["model_stats"]
+    assert first == every[0]
+    assert (first["inference_count"], first["execution_count"]) == (2, 1)
+    assert first["last_inference"] > 0
+    times = first["inference_stats"]
+    assert times["success"]["count"] == times["fail"]["count"] == times["compute_infer"]["count"] == 1
+    assert times["compute_infer"]["ns"] > 0
+    assert 0 < times["compute_output"]["ns"] < times["success"]["ns"]
+    client.close()
+
+
+def test_an_index_of_ready_models_leaves_refused_ones_out(client: httpx.Client) -> None:
+    found = client.post("/v2/repository/index", json={"ready": True}).raise_for_status().json()
+    assert {model["state"] for model in found} == {"READY"}
+    assert client.post("/v2/repository/index", json={"ready": 1}).status_code == 422
+    assert client.post("/v2/repository/index", content=b"{").status_code == 400
 
 
 FAULTS: dict[str, tuple[Any, int, str]] = {
@@ -154,6 +239,14 @@ FAULTS: dict[str, tuple[Any, int, str]] = {
     "too few numbers": (body(data=[1, 2, 3]), 422, "has 3 numbers, but its shape is [2, 3]. Send 6"),
     "many codes of no coordinate": (body(shape=[10**12, 0], data=[]), 422, "the limit is 20"),
     "an empty shape": (body(shape=[0, 3], data=[]), 422, "at least one code"),
+    "rows of unequal length": (body(data=[[1, 2, 3, 4], [5, 6]]), 422, "2 rows of 2, 4 numbers, but the shape"),
+    "one long row": (body(data=[[1, 2, 3, 4, 5, 6]]), 422, "1 rows of 6 numbers, but the shape of latent is [2, 3]"),
+    "rows and columns exchanged": (body(data=[[1, 2], [3, 4], [5, 6]]), 422, "Send 2 rows of 3"),
+    "rows beside numbers": (body(data=[1, 2, 3, [4, 5, 6]]), 422, "inputs[0].data"),
+    "a boolean in shape": (body(shape=[True, 3], data=[1, 2, 3]), 422, "inputs[0].shape[0]"),
+    "a text in shape": (body(shape=["2", 3]), 422, "whole number for inputs[0].shape[0]"),
+    "a boolean in data": (body(data=[True, 2, 3, 4, 5, 6]), 422, "inputs[0].data"),
+    "a boolean as a size": (body(data=None, parameters={"binary_data_size": True}), 422, "binary_data_size"),
     "no data": (body(data=None), 422, "either as data"),
     "an output twice": (body() | {"outputs": [{"name": "nric"}] * 2}, 400, "Name each output once"),
     "outputs without end": (body() | {"outputs": [{"name": "x"}] * 3}, 400, "Name each output once"),

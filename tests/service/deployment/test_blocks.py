@@ -13,6 +13,7 @@ import re
 import shlex
 import subprocess
 import sys
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,7 +24,9 @@ import pytest
 from shapespace.service.settings import PREFIX, Settings
 from shapespace.training.__main__ import parser
 from tests.long.__main__ import TESTS
+from tests.service.bundles import write_bundle
 from tests.service.conftest import ROOT, Server, starting
+from tests.service.watching import eventually
 from tests.test_docs import NAMES, PAGES, text_of
 
 MAKEFILE = (ROOT / "Makefile").read_text(encoding="utf-8")
@@ -156,7 +159,39 @@ TRIALS: dict[str, Callable[[str, Server, Path], None]] = {
 }
 
 
-@pytest.mark.parametrize("block", [block for block in BLOCKS if block.place not in UNTRIED], ids=str)
+#: Blocks that change a folder of models, each after the one before.
+ROLLOUT = [block for block in BLOCKS if "models/default-versions" in block.text]
+
+
+def test_a_new_version_is_rolled_out_and_back_as_the_page_says(tmp_path: Path) -> None:
+    write_bundle(tmp_path / "models", "figure", "3")
+    write_bundle(tmp_path / "new", "figure", "4").rename(tmp_path / "new" / "4")
+    codes = [f"0.1,0.7,{k / 100}" for k in range(120)]
+    answered = []
+    with starting() as start:
+        server = start(tmp_path / "models", watch=0.1)
+        with httpx.Client(base_url=server.url, timeout=60) as client:
+            for line in "".join(block.text for block in ROLLOUT).splitlines():
+                if "grep" in line and "requests" in line:
+                    found = [client.get("/v1/models/figure/mesh", params={"latent": code}) for code in codes]
+                    answered += [Counter(answer.headers["Model-Version"] for answer in found)]
+
+                def works(line: str = line) -> bool:
+                    try:
+                        run(["bash", "-euo", "pipefail", "-c", line], server, tmp_path)
+                    except AssertionError:  # the server has not reloaded yet
+                        return False
+                    return True
+
+                eventually(works, seconds=60)
+    assert (tmp_path / "new.glb").read_bytes()[:4] == b"glTF"
+    assert answered[0]["3"] > 100
+    assert 1 <= answered[0]["4"] <= 19
+
+
+@pytest.mark.parametrize(
+    "block", [block for block in BLOCKS if block.place not in UNTRIED and block not in ROLLOUT], ids=str
+)
 def test_blocks_do_what_they_say(server: Server, tmp_path: Path, block: Block) -> None:
     assert block.language in TRIALS, "add a trial for its language, or list it in UNTRIED"
     TRIALS[block.language](block.text, server, tmp_path)

@@ -1,8 +1,12 @@
 """Kubernetes, Compose, Dockerfile and requirements: settings that exist, and pinned versions only."""
 
 import json
+import os
 import re
+import subprocess
+import sys
 import tomllib
+from importlib import metadata, util
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +18,7 @@ from packaging.version import Version
 
 from shapespace.service.http.openapi import TARGET
 from shapespace.service.settings import PREFIX, Settings
+from tests.service.bundles import write_bundle
 from tests.service.conftest import ROOT
 from tests.service.watching import ENDING
 
@@ -23,10 +28,26 @@ PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
 EXTRAS = PROJECT["project"]["optional-dependencies"]
 #: Extras in each locked file. Torch is not locked: its builds, and so their hashes, differ between indexes.
 LOCKED = {
-    "serve": {"serve"},
+    "serve": {"serve", "serve-without-mkl"},
+    "serve-without-mkl": {"serve-without-mkl"},
     "dev": EXTRAS.keys(),
-    "lowest": {"serve", "client", "usd", "vtk", "check", "dev"},
+    "lowest": {"serve", "serve-without-mkl", "client", "usd", "vtk", "check", "dev"},
 }
+#: Solves with MKL in both precisions, and prints the results and the names of the libraries that are loaded.
+SOLVE = r"""
+import re
+import numpy as np
+from shapespace.solve import cholesky
+
+n, rng = 400, np.random.default_rng(0)
+pattern = cholesky.SymmetricPattern(n, *rng.integers(n, size=(2, 4000)))
+for precision in (np.float32, np.float64):
+    entries = rng.standard_normal(len(pattern))
+    entries[pattern.diagonal] = n
+    factor = cholesky.analyse(pattern, "pardiso", precision=precision).factorise(entries)
+    print(factor.solve(np.ones(n)).tobytes().hex())
+print(*set(re.findall(r"lib(?:mkl|iomp|tbb)[^/\s]*", open("/proc/self/maps").read())))
+"""
 UNLOCKED = {"torch", PROJECT["project"]["name"]}
 
 
@@ -43,11 +64,23 @@ def test_the_kubernetes_manifest_fits_the_server() -> None:
     assert environment.keys() <= NAMES
     assert pod["terminationGracePeriodSeconds"] > float(environment["SHAPESPACE_DRAIN"]) + ENDING
     served = json.loads(TARGET.read_text())["paths"]
+    ports = {port["name"]: port["containerPort"] for port in container["ports"]}
+    annotations = kinds["Deployment"]["spec"]["template"]["metadata"]["annotations"]
+    assert str(ports["metrics"]) == environment["SHAPESPACE_METRICS_PORT"] == annotations["prometheus.io/port"]
+    assert {port["targetPort"] for port in kinds["Service"]["spec"]["ports"]} == {"http"}
+    mounts = {mount["name"]: mount["mountPath"] for mount in container["volumeMounts"]}
+    volumes = {volume["name"]: volume for volume in pod["volumes"]}
+    assert volumes["models"]["persistentVolumeClaim"]["claimName"] == named(kinds["PersistentVolumeClaim"])
+    assert volumes["versions"]["configMap"]["name"] == named(kinds["ConfigMap"])
+    assert mounts["models"] == f"{working_folder()}/models"
+    (file,) = kinds["ConfigMap"]["data"]
+    assert f"{mounts['versions']}/{file}" == environment["SHAPESPACE_DEFAULT_VERSIONS_FILE"]
     for probe in ("startupProbe", "readinessProbe", "livenessProbe"):
         assert container[probe]["httpGet"]["path"] in served
         assert container[probe]["httpGet"]["port"] == container["ports"][0]["name"]
     # Readiness has to change before the port closes, or requests would be lost.
     readiness = container["readinessProbe"]
+    assert 1 < readiness["timeoutSeconds"] < readiness["periodSeconds"]
     assert readiness["periodSeconds"] * readiness["failureThreshold"] < float(environment["SHAPESPACE_DRAIN"])
     assert container["resources"]["limits"].keys() == {"cpu", "memory"}
     assert container["securityContext"]["readOnlyRootFilesystem"]
@@ -131,8 +164,79 @@ def test_the_lowest_versions_are_those_that_are_tried() -> None:
 
 def test_the_image_has_what_is_tested() -> None:
     tested = locked("dev")
-    for name in ("serve", "build"):
+    for name in ("serve", "serve-without-mkl", "build"):
         assert all(versions <= tested[package] for package, versions in locked(name).items())
+
+
+def test_no_mkl_comes_where_none_is_asked_for() -> None:
+    without, extra = locked("serve").keys() - locked("serve-without-mkl").keys(), EXTRAS["serve-without-mkl"]
+    assert {"mkl", "pypardiso", "intel-openmp"} <= without
+    assert {requirement.name for requirement in map(Requirement, extra)} <= locked("serve-without-mkl").keys()
+
+
+@pytest.mark.skipif(not util.find_spec("pypardiso"), reason="MKL has wheels for x86-64 only")
+def test_what_the_image_leaves_out_is_never_loaded(tmp_path: Path) -> None:
+    """Solve in a copy of MKL's wheels after the script of the Dockerfile, and compare with the whole wheels."""
+    assert "python scripts/slim.py /opt/shapespace" in (ROOT / "Dockerfile").read_text()
+    packages = tmp_path / "lib" / f"python3.{sys.version_info.minor}" / "site-packages"
+    for wheel in ("mkl", "intel-openmp", "tbb", "numpy"):
+        for file in metadata.files(wheel) or ():
+            whole, copy = Path(str(file.locate())), Path(os.path.normpath(packages / file))
+            wanted = wheel != "numpy" or "tests" in file.parts or file.parts[0].endswith(".dist-info")
+            if wanted and whole.exists() and copy.is_relative_to(tmp_path):
+                copy.parent.mkdir(parents=True, exist_ok=True)
+                copy.symlink_to(whole.resolve())
+    before = {path.name for path in (tmp_path / "lib").glob("lib*")}
+    script = [sys.executable, str(ROOT / "scripts" / "slim.py"), str(tmp_path)]
+    subprocess.run(script, check=True)
+    subprocess.run(script, check=True)  # a second run finds nothing
+    after = {path.name for path in (tmp_path / "lib").glob("lib*")}
+    kernels = {name for name in before if re.match(r"libmkl_(vml_)?(def|mc|avx)", name)}
+    assert len(kernels) > 4
+    assert kernels <= after
+    assert not (packages / "numpy").exists()
+    gone = {name for name in before - after if ".so" in name}
+    assert {"libmkl_intel_thread", "libmkl_tbb_thread", "libiomp5"} <= {name.partition(".")[0] for name in gone}
+    solve = [sys.executable, "-c", SOLVE]
+    found = [
+        subprocess.run(
+            solve,
+            env=os.environ | {"PYTHONPATH": os.pathsep.join(path)},
+            cwd=ROOT,
+            capture_output=True,
+            text=True,
+            check=True,
+        ).stdout
+        for path in ([str(ROOT)], [str(packages), str(ROOT)])
+    ]
+    assert found[0].splitlines()[:2] == found[1].splitlines()[:2]
+    loaded = set(found[0].splitlines()[-1].split())
+    assert {"libmkl_core", "libmkl_sequential"} <= {name.partition(".")[0] for name in loaded}
+    assert loaded <= after
+
+
+def test_an_empty_volume_gets_the_models_of_the_image(tmp_path: Path) -> None:
+    (first,) = manifests()["Deployment"]["spec"]["template"]["spec"]["initContainers"]
+    source, volume = tmp_path / "image" / "models", tmp_path / "volume"
+    write_bundle(source, "small", "1")
+    volume.mkdir()
+    *shell, script = first["command"]
+    script = script.replace(f"{working_folder()}/models", str(source)).replace("/models/", f"{volume}/")
+    script = script.replace(f"{source.parent}{volume}/", f"{source}/").replace("ls /models", f"ls {volume}")
+    for _ in range(2):
+        subprocess.run([*shell, script], check=True, env=os.environ | {"HOSTNAME": "pod-1"})
+        assert [str(path.relative_to(volume)) for path in sorted(volume.glob("*/*"))] == ["small/1"]
+        assert len(list(volume.iterdir())) == 1
+        write_bundle(source, "later", "1")  # it does not come by itself
+
+
+def named(document: Any) -> str:
+    return str(document["metadata"]["name"])
+
+
+def working_folder() -> str:
+    lines = (ROOT / "Dockerfile").read_text().splitlines()
+    return [line.split()[1] for line in lines if line.startswith("WORKDIR ")][-1]
 
 
 def user() -> str:

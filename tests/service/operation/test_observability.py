@@ -1,7 +1,10 @@
 """Metrics, log lines, request ids, keys and origins."""
 
+import asyncio
 import json
+import os
 import re
+import socket
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -9,7 +12,17 @@ from pathlib import Path
 
 import httpx
 import pytest
+import yaml
+from opentelemetry import trace
+from opentelemetry.sdk.trace import ReadableSpan, TracerProvider
+from opentelemetry.sdk.trace.export import SimpleSpanProcessor
+from opentelemetry.sdk.trace.export.in_memory_span_exporter import InMemorySpanExporter
+from opentelemetry.trace import SpanKind
+from prometheus_client.parser import text_string_to_metric_families
 
+from shapespace.service.http.app import create_app
+from shapespace.service.http.server import STARTUP_FAILURE
+from shapespace.service.settings import Settings
 from tests.service.conftest import ROOT, Server, starting
 from tests.service.watching import eventually, samples, value
 
@@ -28,15 +41,18 @@ def plain(small_models: Path) -> Iterator[Server]:
 @pytest.fixture(scope="module")
 def guarded(small_models: Path) -> Iterator[Server]:
     """A server with a key and some origins, which logs JSON."""
-    origins = "https://a.example, https://b.example"
+    settings = {"api_key": KEY["X-API-Key"], "metrics_port": 0, "log_format": "json"}
     with starting() as start:
-        yield start(small_models, api_key=KEY["X-API-Key"], cors_origins=origins, log_format="json")
+        yield start(small_models, cors_origins="https://a.example, https://b.example", **settings)
 
 
 def test_requests_are_counted_by_route_method_and_status(plain: Server) -> None:
     with httpx.Client(base_url=plain.url, timeout=60) as client:
         for _ in range(3):
-            client.post(MESH, json=CODE).raise_for_status()
+            answer = client.post(MESH, json=CODE).raise_for_status()
+        # As a client asks that has a compressed answer.
+        tag = answer.headers["ETag"][:-1] + '-gzip"'
+        assert client.post(MESH, json=CODE, headers={"If-None-Match": tag}).status_code == 304
         target = {"vertex": 0, "position": [0, 0, 0]}
         edited = client.post("/v1/models/small/edit", json=CODE | {"targets": [target]})
         assert edited.headers["Server-Timing"].startswith("search;dur=")
@@ -48,9 +64,19 @@ def test_requests_are_counted_by_route_method_and_status(plain: Server) -> None:
     assert value(found, "shapespace_requests_total", route=route, method="POST", status="200") == 3
     assert value(found, "shapespace_requests_total", route=route, method="POST", status="422") == 1
     assert value(found, "shapespace_requests_total", route="/v1/models/{name}", method="GET", status="404") == 1
-    assert value(found, "shapespace_request_seconds_count", route=route, method="POST") == 4
+    for status, count in (("200", 3), ("304", 1), ("422", 1)):
+        labels = {"route": route, "method": "POST", "status": status}
+        assert value(found, "shapespace_request_seconds_count", **labels, model="small") == count
+    labels = {"route": "/v1/models/{name}", "method": "GET", "status": "404"}
+    assert value(found, "shapespace_request_seconds_count", **labels, model="") == 1
+    assert value(found, "shapespace_version_requests_total", model="small", version="10", status="422") == 1
+    assert value(found, "shapespace_version_share", model="small", version="10") == 1
+    # The second and the third answer came from the cache, and 304 asked for none.
+    assert value(found, "shapespace_cache_hits_total") == 2
+    assert value(found, "shapespace_cache_misses_total") == 1
+    assert not [name for name, _ in found if name.endswith("_created")]
     for stage in ("network", "reconstruct", "encode"):
-        assert value(found, "shapespace_stage_seconds_count", stage=stage) == 3
+        assert value(found, "shapespace_stage_seconds_count", stage=stage) == 1
         assert value(found, "shapespace_stage_seconds_sum", stage=stage) > 0
     assert value(found, "shapespace_stage_seconds_count", stage="search") == 1
     assert value(found, "shapespace_stage_seconds_count", stage="read") == 0
@@ -58,6 +84,62 @@ def test_requests_are_counted_by_route_method_and_status(plain: Server) -> None:
     assert value(found, "shapespace_admitted") == 0
     assert value(found, "shapespace_admitted_limit") > value(found, "shapespace_workers") > 0
     assert value(found, "process_resident_memory_bytes") > 0
+
+
+def test_a_metrics_port_that_is_taken_stops_the_start(small_models: Path) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        settings = {"SHAPESPACE_MODELS_DIR": str(small_models), "SHAPESPACE_PORT": "0"}
+        ended = subprocess.run(
+            [sys.executable, "-m", "shapespace.service"],
+            cwd=ROOT,
+            env=os.environ | settings | {"SHAPESPACE_METRICS_PORT": str(port)},
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+    assert ended.returncode == STARTUP_FAILURE
+    assert f"can't listen on 127.0.0.1, port {port}: Address already in use" in ended.stderr
+    assert "Traceback" not in ended.stderr
+
+
+def test_spans_follow_the_callers_trace_and_name_the_stages(small_models: Path) -> None:
+    exporter, provider = InMemorySpanExporter(), TracerProvider(shutdown_on_exit=False)
+    provider.add_span_processor(SimpleSpanProcessor(exporter))
+    trace.set_tracer_provider(provider)  # as an operator's program does
+    app = create_app(Settings(models_dir=small_models))
+    caller, parent = "4bf92f3577b34da6a3ce929d0e0e4736", "00f067aa0ba902b7"
+
+    async def ask() -> None:
+        transport = httpx.ASGITransport(app)
+        async with (
+            app.router.lifespan_context(app),
+            httpx.AsyncClient(transport=transport, base_url="http://localhost") as client,
+        ):
+            for _ in range(2):  # the second answer comes from the cache
+                headers = {"traceparent": f"00-{caller}-{parent}-01"}
+                (await client.post(MESH, json=CODE, headers=headers)).raise_for_status()
+            await client.get("/v2/health/live")
+            (await client.post("/v1/models/small/vertices", json={"latents": [CODE["latent"]] * 2})).raise_for_status()
+
+    asyncio.run(ask())
+    spans = exporter.get_finished_spans()
+    first, second, third = (span for span in spans if span.kind is SpanKind.SERVER)
+    assert first.name == second.name == "POST /v1/models/{name}/mesh"
+    for request in (first, second):
+        assert request.parent
+        assert (request.context.trace_id, request.parent.span_id) == (int(caller, 16), int(parent, 16))
+    assert third.context.trace_id != int(caller, 16)
+
+    def stages(request: ReadableSpan) -> list[str]:
+        return [span.name for span in inside if span.parent and span.parent.span_id == request.context.span_id]
+
+    inside = sorted((span for span in spans if span.kind is SpanKind.INTERNAL), key=lambda span: span.start_time or 0)
+    assert stages(first) == ["network", "reconstruct", "encode"]
+    assert stages(second) == []
+    assert sorted(stages(third)) == ["encode", "network", "network", "reconstruct", "reconstruct"]
+    for span in inside:
+        assert first.start_time <= span.start_time <= span.end_time
 
 
 def test_no_request_can_lengthen_the_list_of_labels(plain: Server) -> None:
@@ -190,3 +272,45 @@ def test_nothing_that_is_quoted_makes_a_line_of_the_log(format: str) -> None:
     assert lines[1] == f"ERROR service: a mistake: {escaped}"
     assert lines[2] == "    Traceback (most recent call last):"
     assert all(line.startswith("    ") for line in lines[2:])
+
+
+def test_metrics_have_a_port_of_their_own_without_a_key(guarded: Server) -> None:
+    port = re.search(r"/metrics is at port (\d+)", guarded.log)
+    assert port
+    with httpx.Client(base_url=f"http://127.0.0.1:{port[1]}") as own, httpx.Client(base_url=guarded.url) as client:
+        before = samples(own)
+        assert client.get("/v1/models").status_code == client.get("/metrics").status_code == 401
+        asked = {"route": "unmatched", "method": "GET", "status": "401"}
+        assert value(samples(own), "shapespace_requests_total", **asked) >= 2
+        assert before.keys() <= {*samples(own)}
+        with_key = client.get("/metrics", headers=KEY)
+        assert {name for name, _ in before} <= {line.split("{")[0].split(" ")[0] for line in with_key.text.splitlines()}
+
+
+def test_the_dashboard_and_the_alerts_ask_for_metrics_that_there_are(plain: Server) -> None:
+    board = json.loads((ROOT / "deploy" / "grafana.json").read_text())
+    rules = yaml.safe_load((ROOT / "deploy" / "alerts.yaml").read_text())["groups"]
+    asked = [target["expr"] for panel in board["panels"] for target in panel["targets"]]
+    asked += [rule["expr"] for group in rules for rule in group["rules"]]
+    with httpx.Client(base_url=plain.url, timeout=60) as client:
+        client.post(MESH, json=CODE).raise_for_status()
+        families = list(text_string_to_metric_families(client.get("/metrics").text))
+    labels: dict[str, set[str]] = {}
+    for family in families:
+        endings = {"counter": ["_total"], "histogram": ["_bucket", "_count", "_sum"]}.get(family.type, [""])
+        labels |= {family.name + ending: set() for ending in endings}
+        for sample in family.samples:
+            labels.setdefault(sample.name, set()).update(sample.labels)
+    assert len(asked) > 20
+    for text in asked:
+        names = set(re.findall(r"\b(?:shapespace|process)_[a-z_]+", text))
+        assert names
+        assert names <= labels.keys(), text
+        known = set.union(*(labels[name] for name in names)) | {"job", "instance"}
+        wanted = set(re.findall(r"(\w+)(?:=|!=|=~)\"", text)) | {
+            label for group in re.findall(r"by \(([^)]*)\)", text) for label in group.replace(" ", "").split(",")
+        }
+        if known - {"job", "instance"}:  # those of a family without samples are not known
+            assert wanted <= known, text
+    for rule in (rule for group in rules for rule in group["rules"]):
+        assert {"summary", "description"} == rule["annotations"].keys()

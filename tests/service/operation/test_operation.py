@@ -116,6 +116,9 @@ def test_a_mistake_of_the_server_shows_no_traceback(small_models: Path) -> None:
         ("CORS_ORIGINS", "https://a.example/page"),
         ("EMBED_ORIGINS", "a.example; x"),
         ("DEADLINE", "inf"),
+        ("DEFAULT_VERSIONS", "figure=3:95,4:6"),
+        ("DEFAULT_VERSIONS_FILE", "no such file"),
+        ("DEFAULT_VERSIONS_FILE", "pyproject.toml"),
         # Keys that no header can carry.
         ("API_KEY", "line\nbreak"),
         ("API_KEY", "schlüssel"),

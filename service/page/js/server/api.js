@@ -65,8 +65,15 @@ const post = (path, body, signal) =>
   });
 const json = async (response) => (await response).json();
 
+/**
+ * Return the address of a call of a model, in the version that the page has listed.
+ * Codes of another version mean other shapes.
+ */
+const at = (model, name, query = {}) =>
+  `${model.links.self}${name && "/"}${name}?${new URLSearchParams({ ...query, version: model.version })}`;
+
 export const models = async () => (await json(call("/v1/models"))).models;
-export const modelCard = (model) => json(call(model.links.self));
+export const modelCard = (model) => json(call(at(model, "")));
 export const ready = () =>
   call("/v2/health/ready").then(
     () => true,
@@ -77,13 +84,13 @@ const diagnosticsOf = (response) => JSON.parse(response.headers.get("Shape-Diagn
 
 /** Return positions and faces of the reference. */
 export async function reference(model, mesh) {
-  const response = await call(`${model.links.mesh}?mesh=${mesh}&format=npz`);
+  const response = await call(at(model, "mesh", { mesh, format: "npz" }));
   const { vertices, faces } = await readNpz(await response.arrayBuffer(), ["vertices", "faces"]);
   return { vertices: vertices.data, faces: faces.data };
 }
 
 /** Return the reference as GLB, with the materials and textures of the training files. */
-export const textured = async (model) => (await call(`${model.links.mesh}?format=glb`)).arrayBuffer();
+export const textured = async (model) => (await call(at(model, "mesh", { format: "glb" }))).arrayBuffer();
 
 /**
  * Return the positions (3V numbers each) of some codes, and a summary of their diagnostics.
@@ -94,34 +101,32 @@ export const textured = async (model) => (await call(`${model.links.mesh}?format
  */
 export async function shapes(model, latents, mesh, { quality = "full", signal } = {}) {
   const body = { latents, mesh, quality, faces: false };
-  const response = await post(`${model.links.vertices}?format=npz`, body, signal);
+  const response = await post(at(model, "vertices", { format: "npz" }), body, signal);
   const { vertices } = await readNpz(await response.arrayBuffer(), ["vertices"]);
   return { shapes: split(vertices), diagnostics: diagnosticsOf(response) };
 }
 
 /** Return the id and links of an animation. */
-export const interpolation = (model, path) => json(post(model.links.interpolations, path));
+export const interpolation = (model, path) => json(post(at(model, "interpolations"), path));
 
 /** Return the random code of a seed. */
 export async function sample(model, seed) {
-  const { latents } = await json(
-    post(`${model.links.self}/sample`, { count: 1, seed, distribution: "uniform" }),
-  );
+  const { latents } = await json(post(at(model, "sample"), { count: 1, seed, distribution: "uniform" }));
   return latents[0];
 }
 
 /** Return the code whose shape is closest to the targets of some vertices. */
-export const edit = (model, body, signal) => json(post(`${model.links.self}/edit`, body, signal));
+export const edit = (model, body, signal) => json(post(at(model, "edit"), body, signal));
 
 /** Return the code of a mesh file, with some fixed coordinates. */
 export const encode = (model, file, format, fixed, signal) => {
-  const query = new URLSearchParams({ format, fixed: JSON.stringify(fixed) });
-  return json(call(`${model.links.self}/encode?${query}`, { method: "POST", body: file, signal }));
+  const path = at(model, "encode", { format, fixed: JSON.stringify(fixed) });
+  return json(call(path, { method: "POST", body: file, signal }));
 };
 
 /** Return the standard deviation of each vertex (V) for the covariance of a code, in the model's units. */
 export async function spread(model, { code, covariance }, mesh) {
-  const response = await post(`${model.links.mesh}?color=spread&format=npz`, {
+  const response = await post(at(model, "mesh", { color: "spread", format: "npz" }), {
     latent: code,
     covariance,
     mesh,
@@ -131,8 +136,8 @@ export async function spread(model, { code, covariance }, mesh) {
 
 /** Fit a scan: return its code and placement. */
 export const fit = (model, file, format, options, signal) => {
-  const query = new URLSearchParams({ format, ...options });
-  return json(call(`${model.links.self}/fit?${query}`, { method: "POST", body: file, signal }));
+  const path = at(model, "fit", { format, ...options });
+  return json(call(path, { method: "POST", body: file, signal }));
 };
 
 /** Return a file to save, as a blob. */

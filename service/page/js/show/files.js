@@ -103,7 +103,8 @@ export class Files {
 
   async #shape() {
     const { path, body } = this.#call;
-    keep(await api.file(path, body), `${this.store.model.name}.${this.format.value}`);
+    const { name, version } = this.store.model;
+    keep(await api.file(`${path}&version=${version}`, body), `${name}.${this.format.value}`);
   }
 
   async #picture() {
