@@ -136,8 +136,7 @@ def _place(
     def place(share: float) -> FloatArray:
         code = start.astype(np.float64)
         code[own] += share * (goal - code[own])
-        position: FloatArray = still(model.decode(code), before, limb)[vertex]
-        return position
+        return still(model.decode(code), before, limb)[vertex]
 
     low, high = 0.0, 1.0
     if np.linalg.norm(place(high) - before[vertex]) < PULL:

@@ -157,13 +157,11 @@ class Client:
 
     def models(self) -> list[dict[str, Any]]:
         """Return every model, in its default version."""
-        models: list[dict[str, Any]] = self._send("GET", "/v1/models").json()["models"]
-        return models
+        return self._send("GET", "/v1/models").json()["models"]
 
     def model(self, name: str, version: str | None = None) -> dict[str, Any]:
         """Return a model's card."""
-        card: dict[str, Any] = self._send("GET", f"/v1/models/{name}", params={"version": version}).json()
-        return card
+        return self._send("GET", f"/v1/models/{name}", params={"version": version}).json()
 
     def mesh(
         self,
@@ -348,8 +346,7 @@ class Client:
         return np.array(answer["latents"])
 
     def _post(self, name: str, call: str, params: Mapping[str, Parameter], **sent: Any) -> dict[str, Any]:
-        answer: dict[str, Any] = self._send("POST", f"/v1/models/{name}/{call}", params=params, **sent).json()
-        return answer
+        return self._send("POST", f"/v1/models/{name}/{call}", params=params, **sent).json()
 
     def _send(
         self, method: str, path: str, *, params: Mapping[str, Parameter] | None = None, **sent: Any

@@ -39,18 +39,13 @@ class BundleError(ValueError):
 
 @dataclass(frozen=True, kw_only=True)
 class Bundle(Geometry):
-    """Content of a bundle, verified against its manifest.
-
-    Attributes:
-        manifest: the manifest.
-        digest: SHA-256 of the manifest in hexadecimal. The manifest has the digests of all files, so this digest
-            identifies every byte of the bundle.
-        networks: content of each ONNX file by name.
-    """
+    """Content of a bundle, verified against its manifest."""
 
     manifest: Manifest
+    # SHA-256 of the manifest in hexadecimal. The manifest has the digests of all files, so this digest identifies every
+    # byte of the bundle.
     digest: str
-    networks: Mapping[str, bytes]
+    networks: Mapping[str, bytes]  # content of each ONNX file by name
 
 
 def check_place(folder: Path) -> None:

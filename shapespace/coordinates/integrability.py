@@ -125,14 +125,12 @@ class Integrability:
     def _angles(self, z: FloatArray) -> FloatArray:
         """(3F,) inner angles of all corners."""
         c, S = self._corners(z)
-        gamma: FloatArray = np.arctan2(np.sqrt(S), c).T.ravel()
-        return gamma
+        return np.arctan2(np.sqrt(S), c).T.ravel()
 
     def _cosines(self, z: FloatArray) -> FloatArray:
         """(3F,) cosines of the inner angles, in a fifth of the time of the angles and their cosines."""
         c, S = self._corners(z)
-        cosines: FloatArray = (c / np.sqrt(np.maximum(c * c + S, np.finfo(float).tiny))).T.ravel()
-        return cosines
+        return (c / np.sqrt(np.maximum(c * c + S, np.finfo(float).tiny))).T.ravel()
 
     def _angle_derivatives(self, z: FloatArray) -> FloatArray:
         """(3F, 3) derivatives of each inner angle by the three lengths of its face."""

@@ -32,18 +32,13 @@ class VertexFaces:
 
 @dataclass(frozen=True, eq=False)
 class Closest:
-    """Closest points on a surface to n points.
+    """Closest points on a surface to n points."""
 
-    Attributes:
-        distances: (n,).
-        faces, barycentric: (n,) faces that contain the closest points, and (n, 3) coordinates there.
-        places: (n, 3) positions.
-    """
-
-    distances: FloatArray
+    distances: FloatArray  # (n,)
+    # faces, barycentric: (n,) faces that contain the closest points, and (n, 3) coordinates there
     faces: IntArray
     barycentric: FloatArray
-    places: FloatArray
+    places: FloatArray  # (n, 3) positions
 
 
 class MeshProximity:

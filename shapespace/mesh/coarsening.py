@@ -45,27 +45,17 @@ THINNING = Thinning()
 
 @dataclass(frozen=True)
 class Coarsening:
-    """A coarse connectivity on a subset of the fine vertices.
+    """A coarse connectivity on a subset of the fine vertices."""
 
-    Attributes:
-        fine_index: (V,) fine vertex of each coarse vertex, increasing.
-        faces: (F, 3) in coarse indices.
-        smallest_angle: smallest angle of all faces in all shapes, in radians.
-        folds: number of pairs of neighbouring faces that are folded onto one another in some shape.
-        shrinkage: smallest area of a face in a shape, as a share of the face's geometric mean over all shapes.
-        smallest_area: smallest area of a face in a shape, as a share of the mean over the faces of this shape.
-        specks: number of faces with too small an area or angle in some shape (``triangle_quality``).
-        reason: why the number of vertices differs from the target, or why there are specks; may be empty.
-    """
-
-    fine_index: IntArray
-    faces: IntArray
-    smallest_angle: float
-    folds: int
-    shrinkage: float
+    fine_index: IntArray  # (V,) fine vertex of each coarse vertex, increasing
+    faces: IntArray  # (F, 3) in coarse indices
+    smallest_angle: float  # smallest angle of all faces in all shapes, in radians
+    folds: int  # number of pairs of neighbouring faces that are folded onto one another in some shape
+    shrinkage: float  # smallest area of a face in a shape, as a share of the face's geometric mean over all shapes
+    # smallest area of a face in a shape, as a share of the mean over the faces of this shape
     smallest_area: float = 1.0
-    specks: int = 0
-    reason: str = ""
+    specks: int = 0  # number of faces with too small an area or angle in some shape (``triangle_quality``)
+    reason: str = ""  # why the number of vertices differs from the target, or why there are specks; may be empty
 
 
 def coarsen(fine: TriangleMesh, target: int, shapes: FloatArray) -> Coarsening:

@@ -24,17 +24,14 @@ _Face = tuple[int, int, int]
 
 @dataclass(frozen=True)
 class _Neighbourhood:
-    """Faces that a collapse changes, as triples of vertices in ``rows``. All other lists have indices of rows.
-
-    Attributes:
-        staying, new: faces at the collapsed vertex that don't vanish, and these faces after the collapse.
-        pairs_before, pairs_after: neighbours among the old or the new faces and the faces around them.
-    """
+    """Faces that a collapse changes, as triples of vertices in ``rows``. All other lists have indices of rows."""
 
     rows: list[_Face]
     old: list[int]
+    # staying, new: faces at the collapsed vertex that don't vanish, and these faces after the collapse
     staying: list[int]
     new: list[int]
+    # pairs_before, pairs_after: neighbours among the old or the new faces and the faces around them
     pairs_before: Pairs
     pairs_after: Pairs
 
@@ -124,8 +121,7 @@ class Decimation:
         bad = np.asarray(((triangles.sines < sine**2) | (triangles.sizes < 1)).any(axis=1))
         if folds:
             bad[folded_pairs(connectivity, triangles.normals).ravel()] = True
-        vertices: list[int] = np.unique(faces[bad]).tolist()
-        return vertices
+        return np.unique(faces[bad]).tolist()
 
     def _costs(self, pairs: IntArray) -> FloatArray:
         u, v = pairs.T

@@ -314,8 +314,7 @@ def _scaled_normals(vertices: FloatArray, faces: IntArray, around: sp.csr_array)
     summed = around @ by_face
     length = np.linalg.norm(summed, axis=1)
     area = around @ np.linalg.norm(by_face, axis=1)
-    scaled: FloatArray = summed * (np.sqrt(area) / np.where(length > 0, length, 1))[:, None]
-    return scaled
+    return summed * (np.sqrt(area) / np.where(length > 0, length, 1))[:, None]
 
 
 def _bind(coarse: TriangleMesh, fine: TriangleMesh) -> tuple[IntArray, FloatArray]:
@@ -365,5 +364,4 @@ def _closest_along_surface(coarse: TriangleMesh, fine: TriangleMesh) -> IntArray
     _, _, source = dijkstra(graph, directed=False, indices=np.unique(seeds), min_only=True, return_predecessors=True)
     # For a component of the fine mesh without a coarse vertex only the distance in space is left.
     in_space = cKDTree(coarse.vertices).query(fine.vertices)[1]
-    closest: IntArray = np.where(source >= 0, owner[source], in_space)
-    return closest
+    return np.where(source >= 0, owner[source], in_space)

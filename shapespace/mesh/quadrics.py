@@ -33,8 +33,7 @@ def quadrics_of(connectivity: Connectivity, shapes: FloatArray) -> tuple[FloatAr
 
     def gather(normals: FloatArray, points: FloatArray, weights: FloatArray, at: sparse.csr_array) -> FloatArray:
         plane = np.concatenate([normals, -(normals * points).sum(axis=-1, keepdims=True)], axis=-1)
-        gathered: FloatArray = at @ (plane[:, i] * plane[:, j] * weights[:, None] / len(shapes))
-        return gathered
+        return at @ (plane[:, i] * plane[:, j] * weights[:, None] / len(shapes))
 
     quadrics, areas = np.empty((count, 10 * len(shapes))), np.zeros(len(faces))
     # One shape at a time: the normals of all faces in all shapes take much memory.

@@ -123,8 +123,7 @@ class _Round:
         common = np.diff(others.indptr)
         few = self.valence <= np.where(self.rim, 1, 3)
         allowed = (common == np.where(inner, 2, 1)) & (others @ few == 0) & ~(self.rim[u] & inner)
-        pairs: IntArray = np.stack([u, v], axis=1)[allowed].astype(np.int64)
-        return pairs
+        return np.stack([u, v], axis=1)[allowed].astype(np.int64)
 
     def stars(self, vertices: IntArray) -> tuple[IntArray, IntArray]:
         """List the faces around some vertices, with the index of the vertex for each face."""

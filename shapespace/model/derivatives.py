@@ -58,14 +58,12 @@ def carried(
         (m, k, 3) derivatives along the fields.
     """
     h = SMALL_MOVE * model.reference.diagonal / max(np.abs(fields).max(), np.finfo(float).tiny)
-    result: FloatArray = (place(shape + h * fields) - place(shape)) / h
-    return result
+    return (place(shape + h * fields) - place(shape)) / h
 
 
 def _steps(model: Decoder) -> FloatArray:
     latents = model.latents
-    steps: FloatArray = np.where(latents.periodic, PERIODIC_DIFFERENCE, DIFFERENCE) * latents.width
-    return steps
+    return np.where(latents.periodic, PERIODIC_DIFFERENCE, DIFFERENCE) * latents.width
 
 
 def nodes(model: Decoder, j: int) -> FloatArray:
@@ -93,12 +91,9 @@ class FactorGrids:
 
     Each length or angle, weighted by its norm, is added with a random sign to one of SKETCH sums (a count sketch:
     Charikar, Chen and Farach-Colton 2002), which takes a tenth of the memory.
-
-    Attributes:
-        images: for each factor, sketches (n, SKETCH) of ``ψ_j − z̄`` at its nodes.
     """
 
-    images: dict[int, FloatArray]
+    images: dict[int, FloatArray]  # for each factor, sketches (n, SKETCH) of ``ψ_j − z̄`` at its nodes
     _matrix: sparse.csr_array
 
     @classmethod
@@ -122,5 +117,4 @@ class FactorGrids:
 
     def sketch(self, weighted: FloatArray) -> FloatArray:
         """Return the sketch (SKETCH,) of a weighted difference (2E,) of NRIC."""
-        sums: FloatArray = self._matrix @ weighted
-        return sums
+        return self._matrix @ weighted

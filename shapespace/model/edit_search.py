@@ -21,39 +21,31 @@ from shapespace.solve.outcome import Status
 
 @dataclass(frozen=True)
 class EditSettings:
-    """Weights and limits of an edit. Lengths are fractions of the reference's diagonal.
+    """Weights and limits of an edit. Lengths are fractions of the reference's diagonal."""
 
-    Attributes:
-        sigma: standard deviation of a target that has none.
-        least_sigma: smallest standard deviation of a target.
-        still: weight of the mean movement of all vertices against the targets' distances.
-        small: length beyond which the cost of movement grows linearly instead of quadratically, so that a limb that has
-            to move can move.
-        unmoved: length added to the norm of each factor's change, as a share of the bounds' width, before the factor's
-            weight is computed. Without it an unchanged factor would have an infinite weight.
-        rough_rounds, solved_rounds: maximum number of bounds that are minimised, with rough and with solved shapes.
-        settled: rounds end when no coordinate moves by more than this share of the bounds' width.
-        starts: maximum number of other starts.
-        rough_misfit, solved_misfit: the search tries other starts while the misfit is larger than this length, with
-            rough and with solved shapes.
-        promising: another result replaces the best one only if it leaves at most this share of the reducible cost.
-        ranked: maximum number of targets that take part in choosing another start; each costs three linear solves.
-        rough_shapes, solved_shapes: maximum number of shapes in a round. A longer search rarely improves the result.
-    """
-
-    sigma: float = 5e-3
-    least_sigma: float = 1e-6
-    still: float = 3e-2
+    sigma: float = 5e-3  # standard deviation of a target that has none
+    least_sigma: float = 1e-6  # smallest standard deviation of a target
+    still: float = 3e-2  # weight of the mean movement of all vertices against the targets' distances
+    # length beyond which the cost of movement grows linearly instead of quadratically, so that a limb that has to move
+    # can move
     small: float = 1e-2
+    # Length added to the norm of each factor's change, as a share of the bounds' width, before the factor's weight is
+    # computed. Without it an unchanged factor would have an infinite weight.
     unmoved: float = 3e-3
+    # rough_rounds, solved_rounds: maximum number of bounds that are minimised, with rough and with solved shapes
     rough_rounds: int = 8
     solved_rounds: int = 2
-    settled: float = 2e-3
-    starts: int = 4
+    settled: float = 2e-3  # rounds end when no coordinate moves by more than this share of the bounds' width
+    starts: int = 4  # maximum number of other starts
+    # rough_misfit, solved_misfit: the search tries other starts while the misfit is larger than this length, with rough
+    # and with solved shapes
     rough_misfit: float = 2e-2
     solved_misfit: float = 2e-3
+    # another result replaces the best one only if it leaves at most this share of the reducible cost
     promising: float = 0.9
+    # maximum number of targets that take part in choosing another start; each costs three linear solves
     ranked: int = 32
+    # rough_shapes, solved_shapes: maximum number of shapes in a round. A longer search rarely improves the result.
     rough_shapes: int = 3
     solved_shapes: int = 8
 
@@ -63,35 +55,23 @@ SETTINGS = EditSettings()
 
 @dataclass(frozen=True, eq=False)
 class QuadraticBound:
-    """Weights of a quadratic upper bound of the objective that is tight at one code.
+    """Weights of a quadratic upper bound of the objective that is tight at one code."""
 
-    Attributes:
-        points: (k + V,) weights of squared distances: of vertices from their targets, and of coarse vertices from their
-            positions at the start. Distances are normalised.
-        code: (m,) weights of squared changes of the code.
-    """
-
+    # (k + V,) weights of squared distances: of vertices from their targets, and of coarse vertices from their positions
+    # at the start. Distances are normalised.
     points: FloatArray
-    code: FloatArray
+    code: FloatArray  # (m,) weights of squared changes of the code
 
 
 @dataclass(frozen=True, eq=False)
 class EditCandidate:
-    """A code at which a descent ended.
+    """A code at which a descent ended."""
 
-    Attributes:
-        x: (m,) code.
-        cost: value of the objective.
-        misfit: root mean square distance from the targets, weighted by their sigmas, as a fraction of the diagonal.
-        status: how the descent ended.
-        bound: quadratic bound that is tight at x.
-    """
-
-    x: FloatArray
-    cost: float
-    misfit: float
-    status: Status
-    bound: QuadraticBound
+    x: FloatArray  # (m,) code
+    cost: float  # value of the objective
+    misfit: float  # root mean square distance from the targets, weighted by their sigmas, as a fraction of the diagonal
+    status: Status  # how the descent ended
+    bound: QuadraticBound  # quadratic bound that is tight at x
 
 
 class EditSearch:

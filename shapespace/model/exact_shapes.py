@@ -24,16 +24,12 @@ class NoTangentSpaceError(ValueError):
 
 @dataclass(frozen=True)
 class ExactShape:
-    """Discrete exponential of one code.
+    """Discrete exponential of one code."""
 
-    Attributes:
-        status: how the solver ended.
-        vertices: (V, 3) float32, aligned to the reference, in the units of the training meshes; None if it failed.
-        mean, max: distance of the networks' shape from ``vertices``; None if it failed.
-    """
-
-    status: Status
+    status: Status  # how the solver ended
+    # (V, 3) float32, aligned to the reference, in the units of the training meshes; None if it failed
     vertices: NDArray[np.float32] | None
+    # mean, max: distance of the networks' shape from ``vertices``; None if it failed
     mean: float | None
     max: float | None
 

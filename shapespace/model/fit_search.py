@@ -28,39 +28,28 @@ from shapespace.solve.deadline import Deadline
 
 @dataclass(frozen=True)
 class SearchSettings:
-    """Weights and limits of the search. Lengths are fractions of the reference's diagonal.
+    """Weights and limits of the search. Lengths are fractions of the reference's diagonal."""
 
-    Attributes:
-        width: the robust weight of a pair is one half at this distance, in standard deviations of the distances.
-        farthest: quantile of all distances that is the first such distance.
-        shrinking: factor by which this distance shrinks in each iteration.
-        sliding, last_sliding: weight of the point-to-point distance against the point-to-plane distance, at first and
-            later. It keeps a shape from sliding along its own surface.
-        longest: longest step, in standard deviations of the population.
-        turn: largest rotation in a step, in radians.
-        shortest: a shorter step ends the search, in standard deviations of the population,
-        still: and so does a movement of the shape by less than this length.
-        kept: derivatives are used again until the code has moved this far, in standard deviations of the population.
-        landmark: default standard deviation of a landmark.
-        near: points within this distance of the model count as explained; at most twice this distance with noise.
-        compared: where fits are compared, a point at this distance counts as half explained.
-        plausible: weight of the code's plausibility in that comparison. Four standard deviations cost as much as
-            leaving 16 times this share of the scan unexplained.
-    """
-
+    # the robust weight of a pair is one half at this distance, in standard deviations of the distances
     width: float = 3.0
-    farthest: float = 0.95
-    shrinking: float = 0.7
+    farthest: float = 0.95  # quantile of all distances that is the first such distance
+    shrinking: float = 0.7  # factor by which this distance shrinks in each iteration
+    # sliding, last_sliding: weight of the point-to-point distance against the point-to-plane distance, at first and
+    # later. It keeps a shape from sliding along its own surface.
     sliding: float = 0.3
     last_sliding: float = 0.01
-    longest: float = 1.5
-    turn: float = 0.5
-    shortest: float = 0.01
-    still: float = 2e-4
+    longest: float = 1.5  # longest step, in standard deviations of the population
+    turn: float = 0.5  # largest rotation in a step, in radians
+    shortest: float = 0.01  # a shorter step ends the search, in standard deviations of the population,
+    still: float = 2e-4  # and so does a movement of the shape by less than this length
+    # derivatives are used again until the code has moved this far, in standard deviations of the population
     kept: float = 0.3
-    landmark: float = 0.01
+    landmark: float = 0.01  # default standard deviation of a landmark
+    # points within this distance of the model count as explained; at most twice this distance with noise
     near: float = 0.01
-    compared: float = 0.02
+    compared: float = 0.02  # where fits are compared, a point at this distance counts as half explained
+    # Weight of the code's plausibility in that comparison. Four standard deviations cost as much as leaving 16 times
+    # this share of the scan unexplained.
     plausible: float = 0.001
 
 
@@ -69,20 +58,14 @@ SETTINGS = SearchSettings()
 
 @dataclass(frozen=True)
 class SearchAccuracy:
-    """How accurately a search computes shapes.
+    """How accurately a search computes shapes."""
 
-    Attributes:
-        rough: shapes from face frames on the coarse mesh with the factors' derivatives, instead of solved shapes on the
-            fine mesh with derivatives of the composite.
-        points: number of points of the scan, and of vertices of the model, that count.
-        floor: smallest standard deviation of points, as a fraction of the diagonal: the error of such shapes.
-        independent: share of the points that count as independent observations.
-    """
-
+    # shapes from face frames on the coarse mesh with the factors' derivatives, instead of solved shapes on the fine
+    # mesh with derivatives of the composite
     rough: bool
-    points: int
-    floor: float
-    independent: float
+    points: int  # number of points of the scan, and of vertices of the model, that count
+    floor: float  # smallest standard deviation of points, as a fraction of the diagonal: the error of such shapes
+    independent: float  # share of the points that count as independent observations
 
     @property
     def mesh(self) -> MeshChoice:
@@ -245,8 +228,7 @@ class FitSearch:
 
     def _away(self, code: FloatArray) -> FloatArray:
         """Return the scores (m,) of a code in the prior, angles the shorter way round."""
-        scores: FloatArray = self._whiten @ self._decoder.latents.shorter(code - self.constraints.prior.mean)
-        return scores
+        return self._whiten @ self._decoder.latents.shorter(code - self.constraints.prior.mean)
 
     def _derivatives(self, state: FitState) -> FloatArray:
         """Return derivatives (V, 3, f) of vertices by movable coordinates; cached while the code changes little."""
@@ -377,5 +359,4 @@ class FitSearch:
 
 def _robust(distances: FloatArray, width: float) -> FloatArray:
     """Return robust weights (n,) of distances (Geman and McClure 1987)."""
-    weights: FloatArray = 1 / (1 + (distances / width) ** 2) ** 2
-    return weights
+    return 1 / (1 + (distances / width) ** 2) ** 2

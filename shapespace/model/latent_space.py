@@ -41,15 +41,10 @@ class InvalidFixedError(LatentError):
 
 @dataclass(frozen=True, eq=False)
 class Fixed:
-    """Coordinates of a code that keep their value.
+    """Coordinates of a code that keep their value."""
 
-    Attributes:
-        mask: (m,) whether a coordinate is fixed.
-        values: (m,) values of fixed coordinates, as the networks take them; 0 for other coordinates.
-    """
-
-    mask: NDArray[np.bool_]
-    values: Codes
+    mask: NDArray[np.bool_]  # (m,) whether a coordinate is fixed
+    values: Codes  # (m,) values of fixed coordinates, as the networks take them; 0 for other coordinates
 
     def into(self, x: FloatArray) -> FloatArray:
         """Return a code (m,) with the fixed values inserted."""

@@ -22,23 +22,14 @@ DIFFERENT = 0.35
 
 @dataclass(frozen=True)
 class PlacementEffort:
-    """Effort of the search for placements.
+    """Effort of the search for placements."""
 
-    Attributes:
-        points: number of the scan's points by which placements are scored.
-        rotations: number of rotations beside principal axes.
-        kept: number of placements that go on to closest-point steps.
-        polished: additional number of these placements, with other shapes.
-        steps: number of closest-point steps.
-        count: maximum number of start placements.
-    """
-
-    points: int
-    rotations: int
-    kept: int
-    polished: int
-    steps: int
-    count: int
+    points: int  # number of the scan's points by which placements are scored
+    rotations: int  # number of rotations beside principal axes
+    kept: int  # number of placements that go on to closest-point steps
+    polished: int  # additional number of these placements, with other shapes
+    steps: int  # number of closest-point steps
+    count: int  # maximum number of start placements
 
 
 #: Effort for most scans, and for scans of a part: a flat shape looks alike from both sides.
@@ -48,17 +39,11 @@ THOROUGH = PlacementEffort(points=300, rotations=240, kept=48, polished=48, step
 
 @dataclass(frozen=True, eq=False)
 class StartPlacement:
-    """Placement at which a fit may begin.
+    """Placement at which a fit may begin."""
 
-    Attributes:
-        shape: index of the shape.
-        placement: placement of the shape in the scan's frame.
-        score: mean of the distances that count, in the model's units.
-    """
-
-    shape: int
-    placement: Placement
-    score: float
+    shape: int  # index of the shape
+    placement: Placement  # placement of the shape in the scan's frame
+    score: float  # mean of the distances that count, in the model's units
 
 
 def start_placements(
@@ -158,8 +143,7 @@ def _grid(count: int) -> FloatArray:
     r, outer = np.sqrt(s / count), np.sqrt(1 - s / count)
     phi, psi = 2 * np.pi * s / np.sqrt(2), 2 * np.pi * s / 1.533751168755204288118041
     quaternions = np.stack([r * np.sin(phi), r * np.cos(phi), outer * np.sin(psi), outer * np.cos(psi)], axis=1)
-    rotations: FloatArray = Rotation.from_quat(quaternions).as_matrix()
-    return rotations
+    return Rotation.from_quat(quaternions).as_matrix()
 
 
 def _principal(shape: FloatArray, some: FloatArray) -> FloatArray:

@@ -21,15 +21,10 @@ SMALLEST = 2
 
 @dataclass(frozen=True, eq=False)
 class Posterior:
-    """Gaussian around a code (Laplace's approximation).
+    """Gaussian around a code (Laplace's approximation)."""
 
-    Attributes:
-        covariance: (m, m) covariance, zero in the rows and columns of fixed coordinates.
-        root: (m, f) with f free coordinates, ``root rootᵀ = covariance``.
-    """
-
-    covariance: FloatArray
-    root: FloatArray
+    covariance: FloatArray  # (m, m) covariance, zero in the rows and columns of fixed coordinates
+    root: FloatArray  # (m, f) with f free coordinates, ``root rootᵀ = covariance``
 
     @classmethod
     def of(cls, normal: FloatArray, population: Population, fixed: NDArray[np.bool_]) -> Posterior:

@@ -29,23 +29,14 @@ class InvalidScanError(ValueError):
 
 @dataclass(frozen=True, eq=False)
 class Scan:
-    """Points and normals that represent a scan.
+    """Points and normals that represent a scan."""
 
-    Attributes:
-        points: (n, 3) evenly spread points in the scan's units, at most MOST.
-        normals: (n, 3) unit normals.
-        trust: (n,) weight of each normal, from 0 to 1; 0 where the neighbours form no plane.
-        oriented: whether normals point outwards; normals of local planes may point either way.
-        given: number of points or vertices of the original scan.
-        sampled: whether ``points`` differ from the original points.
-    """
-
-    points: FloatArray
-    normals: FloatArray
-    trust: FloatArray
-    oriented: bool
-    given: int
-    sampled: bool
+    points: FloatArray  # (n, 3) evenly spread points in the scan's units, at most MOST
+    normals: FloatArray  # (n, 3) unit normals
+    trust: FloatArray  # (n,) weight of each normal, from 0 to 1; 0 where the neighbours form no plane
+    oriented: bool  # whether normals point outwards; normals of local planes may point either way
+    given: int  # number of points or vertices of the original scan
+    sampled: bool  # whether ``points`` differ from the original points
 
     @property
     def size(self) -> float:

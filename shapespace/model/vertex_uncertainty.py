@@ -70,5 +70,4 @@ def vertex_uncertainty(
                 "The shape of this code has all but collapsed: how it changes is unknown. Leave color=spread out."
             ) from None
     moves = carried(model, lambda shapes: model.placed(shapes, mesh), coarse, fields)
-    result: FloatArray = scale * np.sqrt((moves**2).sum(axis=(0, 2)))
-    return result
+    return scale * np.sqrt((moves**2).sum(axis=(0, 2)))

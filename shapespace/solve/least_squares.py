@@ -47,22 +47,16 @@ class Box:
 
 @dataclass(frozen=True)
 class Stopping:
-    """When the iteration ends.
+    """When the iteration ends."""
 
-    Attributes:
-        tolerance: the iteration has converged once no unknown would move further than this fraction of its scale.
-        gain_tolerance: it has also converged once ``‖r‖²`` would decrease by at most this fraction of itself.
-        large: if ``‖r‖`` is larger than this, the fraction refers to ``large · ‖r‖``: most of such a residual can't
-            vanish.
-        max_evaluations: largest number of evaluations of the residuals.
-        deadline: no evaluation begins after it.
-    """
-
+    # the iteration has converged once no unknown would move further than this fraction of its scale
     tolerance: float = 1e-4
+    # it has also converged once ``‖r‖²`` would decrease by at most this fraction of itself
     gain_tolerance: float = 1e-6
+    # if ``‖r‖`` is larger than this, the fraction refers to ``large · ‖r‖``: most of such a residual can't vanish
     large: float = np.inf
-    max_evaluations: int = 40
-    deadline: Deadline | None = None
+    max_evaluations: int = 40  # largest number of evaluations of the residuals
+    deadline: Deadline | None = None  # no evaluation begins after it
 
     def nothing_to_gain(self, step: FloatArray, predicted: float, cost: float) -> bool:
         """Whether a step, in units of the scale, is too small or gains too little for another evaluation."""
@@ -79,15 +73,10 @@ class Stopping:
 
 @dataclass(frozen=True, kw_only=True)
 class Fit(Outcome):
-    """The result of the iteration. Its iterations count evaluations of the residuals, without Jacobians.
+    """The result of the iteration. Its iterations count evaluations of the residuals, without Jacobians."""
 
-    Attributes:
-        x: (m,) unknowns in the box.
-        residuals: (n,) r(x), whose norm is the residual.
-    """
-
-    x: FloatArray
-    residuals: FloatArray
+    x: FloatArray  # (m,) unknowns in the box
+    residuals: FloatArray  # (n,) r(x), whose norm is the residual
 
     @property
     def cost(self) -> float:

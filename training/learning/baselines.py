@@ -134,8 +134,7 @@ class MultilinearGrid:
 
     def __call__(self, latents: FloatArray) -> FloatArray:
         """Return NRIC (n, 2E) of the factor's part of codes (n, m)."""
-        result: FloatArray = self.interpolate(latents[:, self.factor])
-        return result
+        return self.interpolate(latents[:, self.factor])
 
 
 def grid_nodes(dimension: int, settings: EvaluationSettings) -> int:

@@ -27,8 +27,7 @@ class Composite:
 
     def __call__(self, latents: Tensor) -> Tensor:
         """Return NRIC (n, 2E) of codes (n, m)."""
-        result: Tensor = self.combiner(self.factor_shapes(latents))
-        return result
+        return self.combiner(self.factor_shapes(latents))
 
     def factor_shapes(self, latents: Tensor) -> Tensor:
         """Return the outputs (n, J, 2E) of the factor networks for codes (n, m)."""

@@ -100,8 +100,7 @@ class HeldOutSamples:
 
     def predicted(self, model: Model) -> NDArray[np.float32]:
         """Return a model's prediction for all codes."""
-        result: NDArray[np.float32] = predict(model, torch.as_tensor(self.latents, dtype=torch.float32)).numpy()
-        return result
+        return predict(model, torch.as_tensor(self.latents, dtype=torch.float32)).numpy()
 
 
 def evaluate(learner: Learner, exact: ExactShapes) -> tuple[dict[str, Any], dict[str, NDArray]]:

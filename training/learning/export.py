@@ -81,8 +81,7 @@ def _narrow(graph: onnx.GraphProto) -> None:
 def _answer(file: bytes, names: Network, rows: NDArray) -> NDArray:
     """Return the output of an ONNX file for some rows, computed as on a server."""
     session = onnxruntime.InferenceSession(file, providers=["CPUExecutionProvider"])
-    answer: NDArray = session.run([names.output], {names.input: rows})[0]
-    return answer
+    return session.run([names.output], {names.input: rows})[0]
 
 
 def difference(composite: Composite, networks: Networks, latents: Tensor, norm: WeightedNorm) -> float:

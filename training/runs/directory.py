@@ -203,8 +203,7 @@ class RunDirectory:
     def own_shapes(self) -> FloatArray:
         """Read the shapes (n, V, 3) of the collection, without mirror images."""
         shapes = self.shapes.read()
-        found: FloatArray = shapes["vertices"][: shapes["original"].max() + 1]
-        return found
+        return shapes["vertices"][: shapes["original"].max() + 1]
 
     def mean_mesh(self) -> TriangleMesh:
         """Read the coarse mesh at the mean shape."""

@@ -30,19 +30,12 @@ SMALLEST_SIDE = 0.1
 
 @dataclass(frozen=True)
 class Codes:
-    """Codes of shapes, and their exponentials.
+    """Codes of shapes, and their exponentials."""
 
-    Attributes:
-        codes: (n, m).
-        vertices: (n, V, 3) exponentials of the codes, aligned to the shapes.
-        exponentials: (n,) number of exponentials of each search.
-        status: (n,) status of each search.
-    """
-
-    codes: FloatArray
-    vertices: FloatArray
-    exponentials: tuple[int, ...]
-    status: tuple[Status, ...]
+    codes: FloatArray  # (n, m)
+    vertices: FloatArray  # (n, V, 3) exponentials of the codes, aligned to the shapes
+    exponentials: tuple[int, ...]  # (n,) number of exponentials of each search
+    status: tuple[Status, ...]  # (n,) status of each search
 
 
 def nearest_codes(

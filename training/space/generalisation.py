@@ -47,17 +47,11 @@ FOLDED_SHARE, FOLDED_SHAPES, FOLDED_MODES = 0.1, 500, 10
 
 @dataclass(frozen=True)
 class PrincipalComponents:
-    """Principal components of shapes aligned to their mean.
+    """Principal components of shapes aligned to their mean."""
 
-    Attributes:
-        mean: (V, 3).
-        axes: (n, 3V) orthonormal, strongest first.
-        coefficients: (n, n) coefficients of the shapes.
-    """
-
-    mean: FloatArray
-    axes: FloatArray
-    coefficients: FloatArray
+    mean: FloatArray  # (V, 3)
+    axes: FloatArray  # (n, 3V) orthonormal, strongest first
+    coefficients: FloatArray  # (n, n) coefficients of the shapes
 
     def explained(self, count: int) -> float:
         """Return the share of the shapes' variance that the first components explain."""
@@ -88,8 +82,7 @@ class PrincipalComponents:
 
 def vertex_distances(shapes: FloatArray, others: FloatArray, diagonal: float) -> FloatArray:
     """Return distances (n, V) between shapes (n, V, 3) and others, (n, V, 3) or (V, 3), as shares of a diagonal."""
-    result: FloatArray = np.linalg.norm(align(shapes, others) - others, axis=-1) / diagonal
-    return result
+    return np.linalg.norm(align(shapes, others) - others, axis=-1) / diagonal
 
 
 def to_nearest(shapes: FloatArray, collection: FloatArray, diagonal: float) -> float:
@@ -111,22 +104,15 @@ def folds(count: int) -> list[IntArray]:
 
 @dataclass(frozen=True)
 class HeldOut:
-    """Held-out shapes, approximated in the space that was found without them.
+    """Held-out shapes, approximated in the space that was found without them."""
 
-    Attributes:
-        index: (k,) indices of the shapes in the collection.
-        counts: numbers of modes.
-        near: (k, V, 3) for each number: ``modes`` has the nearest exponentials, ``components`` the projections onto as
-            many principal components, and ``mirrored_components`` those of the shapes and their mirror images, where
-            there are any.
-        steps: (k,) K of the exponentials.
-        stuck: (k,) for each number: whether the search did not converge, because faces of exponentials collapse.
-    """
-
-    index: IntArray
-    counts: Sequence[float]
+    index: IntArray  # (k,) indices of the shapes in the collection
+    counts: Sequence[float]  # numbers of modes
+    # (k, V, 3) for each number: ``modes`` has the nearest exponentials, ``components`` the projections onto as many
+    # principal components, and ``mirrored_components`` those of the shapes and their mirror images, where there are any
     near: dict[str, list[FloatArray]]
-    steps: IntArray
+    steps: IntArray  # (k,) K of the exponentials
+    # (k,) for each number: whether the search did not converge, because faces of exponentials collapse
     stuck: list[NDArray[np.bool_]]
 
     def distances(self, shapes: FloatArray, diagonal: float) -> dict[str, list[FloatArray]]:

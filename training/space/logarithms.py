@@ -30,21 +30,14 @@ NEIGHBOURS = 4
 
 @dataclass(frozen=True)
 class Logarithms:
-    """Discrete logarithms of the shapes of a collection at their mean.
+    """Discrete logarithms of the shapes of a collection at their mean."""
 
-    Attributes:
-        fields: (n, V, 3) vertex fields, without rigid motion.
-        status: (n,) status of the last geodesic tried. If it is not CONVERGED, the field is the linearised logarithm.
-        steps: (n,) K of the geodesic found, 0 where none was found.
-        via: (n,) neighbour whose geodesic was the initial value, −1 where none was needed.
-        reasons: (n,) why the geodesic was not found from the straight line, or an empty string.
-    """
-
-    fields: FloatArray
+    fields: FloatArray  # (n, V, 3) vertex fields, without rigid motion
+    # (n,) status of the last geodesic tried. If it is not CONVERGED, the field is the linearised logarithm.
     status: tuple[Status, ...]
-    steps: tuple[int, ...]
-    via: tuple[int, ...]
-    reasons: tuple[str, ...]
+    steps: tuple[int, ...]  # (n,) K of the geodesic found, 0 where none was found
+    via: tuple[int, ...]  # (n,) neighbour whose geodesic was the initial value, −1 where none was needed
+    reasons: tuple[str, ...]  # (n,) why the geodesic was not found from the straight line, or an empty string
 
     @property
     def fallbacks(self) -> list[int]:

@@ -59,24 +59,16 @@ class Modes:
 
     Each mode is scaled so that the largest coefficient of a shape is 1, and positive. There may be fewer modes than
     asked for, because a mode that carries nothing is left out.
-
-    Attributes:
-        nric: (m, 2E) changes u_j of lengths and angles.
-        vertices: (m, V, 3) vertex fields d_j, without rigid motion, u_j = J d_j.
-        coefficients: (n, m) orthogonal projections, in the norm, of the shapes' logarithms.
-        explained: share of ``Σ ‖v^i‖²`` that the projections keep.
-        converged: whether the iteration converged.
-        sparsity: λ, see ``spga``.
-        history: one row for each iteration of the sparse analysis: ``iteration, objective, misfit, penalty`` (objective
-            = misfit + penalty, as shares of ``Σ ‖v^i‖²``) and ``support``, the mean of ``localisation``.
     """
 
-    nric: FloatArray
-    vertices: FloatArray
-    coefficients: FloatArray
-    explained: float
-    converged: bool = True
-    sparsity: float = 0.0
+    nric: FloatArray  # (m, 2E) changes u_j of lengths and angles
+    vertices: FloatArray  # (m, V, 3) vertex fields d_j, without rigid motion, u_j = J d_j
+    coefficients: FloatArray  # (n, m) orthogonal projections, in the norm, of the shapes' logarithms
+    explained: float  # share of ``Σ ‖v^i‖²`` that the projections keep
+    converged: bool = True  # whether the iteration converged
+    sparsity: float = 0.0  # λ, see ``spga``
+    # one row for each iteration of the sparse analysis: ``iteration, objective, misfit, penalty`` (objective = misfit +
+    # penalty, as shares of ``Σ ‖v^i‖²``) and ``support``, the mean of ``localisation``
     history: list[dict[str, float]] = field(default_factory=list, repr=False)
 
     def __len__(self) -> int:

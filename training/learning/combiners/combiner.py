@@ -174,8 +174,7 @@ class CombinerNetwork(ShapeNetwork):
 
     def coefficients(self, inputs: Tensor) -> Tensor:
         """Return scaled differences (n, 2E) of the joint shape for factor shapes (n, J, 2E)."""
-        result: Tensor = self.correction(self.scaling.down(inputs))
-        return result
+        return self.correction(self.scaling.down(inputs))
 
     def loss(self, inputs: Tensor, target: Tensor) -> Tensor:
         """Return the loss of the correction, which may be an estimate."""
