@@ -4,8 +4,6 @@ Pulls a fingertip, an elbow or a knee of the bundled figure to its position on t
 what else moves. The two codes differ in one factor, which moves almost only this limb.
 """
 
-from __future__ import annotations
-
 import argparse
 from dataclasses import dataclass
 

@@ -3,8 +3,6 @@
 Usage: ``python -m scripts.draft_errors models/NAME/VERSION …``.
 """
 
-from __future__ import annotations
-
 import json
 import sys
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Mesh attributes as bundles and runs store them: arrays by name, an entry with names, and textures as files."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import numpy as np

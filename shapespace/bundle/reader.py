@@ -1,7 +1,5 @@
 """Reader of bundles. It checks every byte against the manifest before it parses a file."""
 
-from __future__ import annotations
-
 import hashlib
 import os
 import re

@@ -1,7 +1,5 @@
 """Writer of bundles. It writes a whole bundle or nothing."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 from collections.abc import Mapping, Sequence

@@ -15,8 +15,6 @@ angle γ is needed. Its cosine follows from the law of cosines, ``cos γ = (b² 
 ``sin γ/2 = √((1 − cos γ)/2)`` and ``cos γ/2 = √((1 + cos γ)/2)``, without a trigonometric function.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from scipy import sparse
 from scipy.sparse.csgraph import connected_components, dijkstra

@@ -1,7 +1,5 @@
 """Anchors of attached parts: parts of the fine mesh that lie beside the coarse surface, such as eyes and nails."""
 
-from __future__ import annotations
-
 from itertools import product
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Choose a coarse connectivity for all shapes of a collection: how far to decimate, and which result to take."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Decimation of one mesh in all its shapes: half-edge collapses by quadric error, one by one, and edge flips."""
 
-from __future__ import annotations
-
 import heapq
 from collections.abc import Sequence
 from dataclasses import dataclass

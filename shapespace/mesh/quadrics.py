@@ -1,7 +1,5 @@
 """Quadric error metrics (Garland and Heckbert 1997) summed over several shapes: the cost of moving a vertex."""
 
-from __future__ import annotations
-
 import numpy as np
 from scipy import sparse
 

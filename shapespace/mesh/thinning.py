@@ -4,8 +4,6 @@ Decimation makes one collapse after the other, each checked in every shape. For 
 takes far too long. They are so close together that the choice among them matters little.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse

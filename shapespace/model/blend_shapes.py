@@ -1,7 +1,5 @@
 """Linear blend shapes of a model, for programs without networks, and their error against the model."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

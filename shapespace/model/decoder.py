@@ -1,7 +1,5 @@
 """Decoding: networks turn latent codes into lengths and angles, and Gauss–Newton turns these into vertices."""
 
-from __future__ import annotations
-
 import logging
 import queue
 import threading

@@ -1,7 +1,5 @@
 """The search of an edit: quadratic upper bounds of its objective, minimised one after another from several starts."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The search of ``encode``: first by lengths and angles, then by vertices, with restarts from training shapes."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from functools import cached_property
 

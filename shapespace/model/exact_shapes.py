@@ -1,7 +1,5 @@
 """Exact shapes: the discrete exponentials that the networks approximate."""
 
-from __future__ import annotations
-
 import queue
 from dataclasses import dataclass
 

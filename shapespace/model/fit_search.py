@@ -1,7 +1,5 @@
 """The search of a fit: robust weights, and joint Gauss–Newton steps of code, motion and size."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 

@@ -1,7 +1,5 @@
 """Latent codes: their coordinates, bounds and periods."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum

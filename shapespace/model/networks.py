@@ -1,7 +1,5 @@
 """ONNX networks with a time limit for each run."""
 
-from __future__ import annotations
-
 import threading
 import time
 from typing import Any

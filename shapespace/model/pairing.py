@@ -1,7 +1,5 @@
 """Pairs of corresponding points of a scan and a model's surface, for the steps of a fit."""
 
-from __future__ import annotations
-
 from copy import deepcopy
 from dataclasses import dataclass, replace
 

@@ -1,7 +1,5 @@
 """Start placements of a model's shapes in a scan's frame, from which a fit begins."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Positions of edited vertices as functions of the code, with derivatives."""
 
-from __future__ import annotations
-
 import numpy as np
 from scipy import sparse
 

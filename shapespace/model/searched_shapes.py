@@ -1,7 +1,5 @@
 """Shapes of successive codes in a search, with derivatives by the code."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from shapespace.arrays import FloatArray

@@ -1,7 +1,5 @@
 """Standard deviation of a shape's vertices, from the covariance of its code."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import ArrayLike
 

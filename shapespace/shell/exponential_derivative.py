@@ -1,7 +1,5 @@
 """The derivative of the time-discrete exponential map by the velocity, and its transpose."""
 
-from __future__ import annotations
-
 from typing import Literal
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The energy of a path, and initial paths for the geodesic equation: straight, bisected, or of least energy."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Weighted means of shapes: the elastic mean and the Riemannian centre of mass."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 

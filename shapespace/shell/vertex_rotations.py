@@ -1,7 +1,5 @@
 """Rotations of vertices from one shape to another, smooth over the mesh."""
 
-from __future__ import annotations
-
 import numpy as np
 from scipy import sparse
 

@@ -1,7 +1,5 @@
 """Nonlinear least squares in a box, for few unknowns and expensive residuals."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Backtracking line search."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import TypeVar
 

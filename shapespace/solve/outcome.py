@@ -1,7 +1,5 @@
 """The outcome of an iteration: how it ended is a value, not an exception."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from enum import StrEnum
 

@@ -1,7 +1,5 @@
 """Minimisation of an energy with a barrier: Newton steps by conjugate gradients, each with a line search."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol

@@ -1,7 +1,5 @@
 """Baselines without networks: kernel ridge regression on codes, and multilinear interpolation of each factor."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial

@@ -1,7 +1,5 @@
 """The composite network ``Φ = Ψ ∘ (ψ_1, …, ψ_J)`` (paper, section 3), and the affine sum that it corrects."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch

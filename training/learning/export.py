@@ -1,7 +1,5 @@
 """Export trained networks as the ONNX files of a bundle, and check that ONNX and PyTorch agree."""
 
-from __future__ import annotations
-
 import logging
 import warnings
 from dataclasses import replace

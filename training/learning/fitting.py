@@ -1,7 +1,5 @@
 """Gradient descent: the training loop, and the files of networks, from which a killed run continues."""
 
-from __future__ import annotations
-
 import json
 import time
 from collections.abc import Sequence

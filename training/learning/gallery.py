@@ -1,7 +1,5 @@
 """Shapes for the report: test shapes with the least, median and largest error; an interpolation by factors."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The networks of a run, each fitted to the samples once and then read from its file."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 from collections.abc import Callable, Sequence

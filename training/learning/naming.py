@@ -1,7 +1,5 @@
 """Names of factors and coordinates in a bundle: by the sides of the body, and by the configuration."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Mapping, Sequence
 

@@ -1,7 +1,5 @@
 """Factor networks, which also serve as monolithic baselines, and the start network (paper, sections 3 and 4)."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Charts of a run's report, as SVG elements that inherit the page's font and colours."""
 
-from __future__ import annotations
-
 import io
 import re
 from collections.abc import Callable, Iterator, Sequence

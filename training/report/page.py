@@ -1,7 +1,5 @@
 """The report of a run: ``report.html``, one self-contained file of pictures, charts and tables."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The files of a run's directory, as the report needs them."""
 
-from __future__ import annotations
-
 import tomllib
 from collections import deque
 from collections.abc import Callable

@@ -3,8 +3,6 @@
 A file can be damaged all the same, by a disk or a copy. Whoever reads it learns which one: DamagedFileError.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator
 from contextlib import contextmanager

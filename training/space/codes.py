@@ -1,7 +1,5 @@
 """Codes of the shapes of a collection: their exponentials come closest to the shapes, in vertices."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import lru_cache, partial
 

@@ -4,8 +4,6 @@ For modes that move different parts of a surface, the exponential of the sum is 
 does not hold for modes that move the same part. Such modes form one factor, and one network learns it.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Sequence
 

@@ -1,7 +1,5 @@
 """The shapes of a collection as tangent vectors at their mean: the discrete logarithms."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from functools import partial

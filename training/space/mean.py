@@ -1,7 +1,5 @@
 """The mean of a collection, where its tangent space is attached."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 from shapespace.arrays import FloatArray

@@ -18,8 +18,6 @@ nearly zero.
 `sparse_modes` finds modes that each move a small part of the surface.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from typing import Literal
 

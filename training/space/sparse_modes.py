@@ -25,8 +25,6 @@ most 3 %. Principal modes in inner folds estimate this error.
 What a sparsity costs in each norm is in docs/measurements/notes.md.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

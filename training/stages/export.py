@@ -1,7 +1,5 @@
 """Stage `export`: the bundle, and the distance between its shapes and the collection's."""
 
-from __future__ import annotations
-
 import hashlib
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Stage `factors`: groups of modes whose supports overlap, and the modes in the order of the groups."""
 
-from __future__ import annotations
-
 import itertools
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Stage `ingest`: read and check the meshes, scale them, coarsen them, and prepare the way back to the fine mesh."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Iterable
 from typing import Any

@@ -1,7 +1,5 @@
 """Stage `mean`: the mean shape, where the tangent space is attached, and the number of time steps K."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from shapespace.mesh.rigid_motion import align

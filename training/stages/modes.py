@@ -1,7 +1,5 @@
 """Stage `modes`: logarithms of the shapes at the mean, their sparse and principal modes, and codes of the shapes."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

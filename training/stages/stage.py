@@ -1,7 +1,5 @@
 """What all stages share: the description of a stage, its warnings, and the run that it works on."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 from collections.abc import Callable, Sequence

@@ -1,7 +1,5 @@
 """The interface of corrections of the affine sum, and the samples that they are fitted to."""
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Crops of a mesh: connected groups of edges on which convolutions are trained."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Learn a metric of inputs from the gradients of a kernel regression, so that few directions remain."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Fit one patch of edges: kernel regression on the factor shapes there, in a learned metric."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 
