@@ -71,12 +71,7 @@ def box_of(codes: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def _nearest(
-    space: ShellSpace,
-    mean: FloatArray,
-    modes: FloatArray,
-    box: Box,
-    steps: int,
-    item: tuple[FloatArray, FloatArray],
+    space: ShellSpace, mean: FloatArray, modes: FloatArray, box: Box, steps: int, item: tuple[FloatArray, FloatArray]
 ) -> tuple[FloatArray, FloatArray, int, Status]:
     target, start = item
 

@@ -48,14 +48,7 @@ def write_bundle_of(run: Run, figures: dict[str, Any]) -> Path:
         composite = replace(composite, combiner=combiner)
     with waiting("bundle"):
         return export(
-            composite,
-            run.collection,
-            run.config,
-            figures,
-            digest.hexdigest(),
-            run.models,
-            geometry,
-            learner.start(),
+            composite, run.collection, run.config, figures, digest.hexdigest(), run.models, geometry, learner.start()
         )
 
 
