@@ -80,8 +80,7 @@ class Geometry:
     ) -> Geometry:
         """Return the geometry in arrays, after checks against each other and the manifest.
 
-        Raises:
-            GeometryError: the message names the file, the array and the fault.
+        Raises GeometryError, whose message names the file, the array and the fault.
         """
         file = manifest.geometry.file
         try:

@@ -58,10 +58,8 @@ def manifest_digest(folder: Path) -> str:
 
 
 def read_bundle(folder: Path, digest: str | None = None) -> Bundle:
-    """Read and verify ``models/NAME/VERSION``, which must have the digest if one is given.
-
-    Raises:
-        BundleError: the bundle differs from its manifest, or breaks the schema.
+    """Read and verify ``models/NAME/VERSION``, which must have the digest if one is given. Raises BundleError if the
+    bundle differs from its manifest, or breaks the schema.
     """
     check_place(folder)
     name, version = folder.parent.name, folder.name

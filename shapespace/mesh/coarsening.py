@@ -57,7 +57,7 @@ class Coarsening:
 
 
 def coarsen(fine: TriangleMesh, target: int, shapes: FloatArray) -> Coarsening:
-    """Remove vertices until ``target`` are left, the same for all shapes.
+    """Remove vertices of a reference until ``target`` are left, the same for all shapes (n, Vf, 3), n ≥ 0.
 
     Half-edge collapses u → v (Garland and Heckbert 1997, Hoppe 1996) attach the faces of u to v. So every coarse vertex
     is a fine vertex, and the coarse faces have a position in every shape. The cheapest collapse is made first. Its cost
@@ -75,15 +75,8 @@ def coarsen(fine: TriangleMesh, target: int, shapes: FloatArray) -> Coarsening:
     result says what remains.
 
     Each collapse takes a fraction of a millisecond. A large mesh is therefore thinned first, by many collapses at once,
-    in time about linear in its number of vertices. Thinning takes only a few shapes into account.
-
-    Args:
-        fine: the reference.
-        target: number of vertices.
-        shapes: (n, Vf, 3) all shapes of the collection, n ≥ 0.
-
-    Raises:
-        MeshError: the shapes have another number of vertices, or coordinates that are not finite.
+    in time about linear in its number of vertices. Thinning takes only a few shapes into account. Raises MeshError if
+    the shapes have another number of vertices, or coordinates that are not finite.
     """
     shapes = np.asarray(shapes, dtype=np.float64)
     if shapes.ndim != 3 or shapes.shape[1:] != fine.vertices.shape:

@@ -70,16 +70,11 @@ class Prolongation:
 
     An attached part is bound to its anchors as a whole, so its map is affine. If it is rigid, its rest shape then
     replaces the mapped one, aligned to it.
-
-    Args:
-        faces: (F, 3) faces of the coarse mesh.
-        weights: (Vf, 2V) B beside C.
-        rigid: parts that move rigidly.
     """
 
-    faces: IntArray
-    weights: sp.csr_array
-    rigid: tuple[RigidPart, ...] = ()
+    faces: IntArray  # (F, 3) faces of the coarse mesh
+    weights: sp.csr_array  # (Vf, 2V) B beside C
+    rigid: tuple[RigidPart, ...] = ()  # parts that move rigidly
 
     @classmethod
     def of(cls, coarse: TriangleMesh, fine: TriangleMesh, parts: Sequence[AttachedPart] = ()) -> Prolongation:
@@ -116,11 +111,8 @@ class Prolongation:
         present weights. The ridge is isotropic. Changes of the weights on vertices sum to 0, so that fine vertices
         still follow translations. Fine vertices that coincide with coarse ones keep their weights.
 
-        Args:
-            coarse: (n, V, 3) coarse shapes.
-            fine: (n, Vf, 3) the true fine shapes, each aligned to its coarse shape.
-            rows: (k,) fine vertices whose weights may change.
-            shapes: (l,) indices of the shapes to learn from.
+        The coarse shapes are (n, V, 3), and the true fine shapes (n, Vf, 3) are aligned to them. Only the weights of
+        the fine vertices ``rows`` (k,) change. They are learned from the shapes with indices ``shapes`` (l,).
         """
         count, weights = coarse.shape[1], self.weights
         given = np.stack([self._regressors(y) for y in coarse[shapes]])
@@ -165,12 +157,8 @@ class Prolongation:
     def errors(self, coarse: FloatArray, fine: Iterable[FloatArray]) -> dict[str, float]:
         """Compute the ``mean`` and ``max`` distance to the true fine shapes, over all vertices and shapes.
 
-        Args:
-            coarse: (n, V, 3) shapes.
-            fine: n true fine shapes (Vf, 3).
-
-        Returns:
-            Distances after rigid alignment, as fractions of the diagonal of each shape's bounding box.
+        Distances between n coarse shapes (V, 3), mapped and rigidly aligned, and n true fine shapes (Vf, 3) are
+        fractions of the diagonal of each fine shape's bounding box.
         """
         found = [(distance.mean(), distance.max()) for distance in self.distances(coarse, fine)]
         means, largest = zip(*found, strict=True)
@@ -198,11 +186,9 @@ class Prolongation:
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, NDArray]) -> Prolongation:
-        """Read ``arrays()`` back from a mapping, such as an opened NPZ file.
-
-        Raises:
-            ProlongationError: an array is missing, has another shape or type, is out of range or not finite, or the
-                weights of a fine vertex don't sum to 1.
+        """Read ``arrays()`` back from a mapping, such as an opened NPZ file. Raises ProlongationError if an array is
+        missing, has another shape or type, is out of range or not finite, or the weights of a fine vertex don't sum to
+        1.
         """
         faces, weights = _flat(arrays, "faces", np.int64, 2), _flat(arrays, "weights", np.float64, 1)
         indptr, indices = (_flat(arrays, name, np.int64, 1) for name in ("indptr", "indices"))
@@ -240,12 +226,8 @@ def bind_points(
 ) -> sp.csr_array:
     """Weights (k, 2V) that move points (k, 3) with the coarse vertices they are bound to: B beside C of `Prolongation`.
 
-    Args:
-        coarse: the coarse mesh at rest.
-        points: (k, 3) points at rest.
-        rows: (n,) index of a point for each bond.
-        columns: (n,) coarse vertex of each bond.
-        b: (n,) weight of each bond; the weights of one point sum to 1.
+    Each of n bonds has the index of a point in ``rows``, a coarse vertex in ``columns``, and a weight in ``b``. The
+    weights of one point sum to 1.
     """
     count, tail, head = len(coarse.vertices), *np.concatenate([coarse.edges, coarse.edges[:, ::-1]]).T
     around = _around(coarse.faces, count)

@@ -38,10 +38,7 @@ def thin(connectivity: Connectivity, shapes: FloatArray, target: int) -> tuple[I
     checks. The cheapest collapses are made, by the quadrics of all shapes (Garland and Heckbert 1997). Choosing
     vertices that cost less than all their neighbours instead would find too few.
 
-    Args:
-        connectivity: F faces on V vertices.
-        shapes: (n, V, 3) a few shapes of similar size; a collapse may neither fold nor flatten any of them.
-        target: number of vertices.
+    A collapse may neither fold nor flatten any of the shapes (n, V, 3), which are a few of similar size.
 
     Returns:
         The remaining vertices (V'), increasing, and the faces (F', 3) between them.

@@ -125,15 +125,6 @@ class Connectivity:
         """Whether there is no boundary edge."""
         return bool(self.interior.all())
 
-    @property
-    def euler_characteristic(self) -> int:
-        """V − E + F: 2 − 2g − b of a connected surface with g handles and b boundary loops.
-
-        >>> Connectivity([[0, 1, 2], [2, 1, 3]], 4).euler_characteristic
-        1
-        """
-        return self.vertex_count - self.edge_count + len(self.faces)
-
 
 @dataclass(frozen=True, eq=False)
 class TriangleMesh:
@@ -259,12 +250,9 @@ def vertex_normals(
 
     A normal is zero where the normals of the faces around cancel.
 
-    Args:
-        vertices: (V, 3).
-        faces: (F, 3).
-        corners: (F, 3) index of the normal at each corner. By default N = V and a corner has the normal of its vertex.
-        order: order of the summation, face by face (C) or corner by corner (F). Their results differ by rounding; files
-            and fits each keep the order of version 0.2.
+    ``corners`` (F, 3) has the index of the normal at each corner. By default N = V and a corner has the normal of its
+    vertex. Sums are computed face by face (``order`` C) or corner by corner (F). Their results differ by rounding;
+    files and fits each keep the order of version 0.2.
     """
     x = components(vertices)
     a, b, c = (x.take(k, axis=1) for k in np.ascontiguousarray(faces.T))

@@ -114,13 +114,9 @@ class Decoder:
     Each code is decoded separately, and Gauss–Newton begins at fixed starts, so a shape does not depend on other
     codes.
 
-    Args:
-        bundle: verified bundle.
-        threads: number of shapes that may be reconstructed at once, each with its own solver. The first solver is made
-            here, other solvers when they are needed, which takes about as long as a shape.
-
-    Raises:
-        BundleError: a network doesn't load, or its inputs or outputs differ from the manifest.
+    Up to ``threads`` shapes may be reconstructed at once, each with its own solver. The first solver is made here,
+    others when they are needed, which takes about as long as a shape. Raises BundleError if a network doesn't load, or
+    its inputs or outputs differ from the manifest.
     """
 
     def __init__(self, bundle: Bundle, threads: int = 1) -> None:
@@ -189,12 +185,8 @@ class Decoder:
     ) -> Shape:
         """Decode one code (m,), even if Gauss–Newton does not converge: the diagnostics say so.
 
-        Args:
-            code: code from ``latents.codes``.
-            inside_bounds: whether the code lies inside the bounds, for the diagnostics.
-            mesh: fine or coarse mesh.
-            deadline: time limit after which Gauss–Newton stops with Status.DEADLINE.
-            quality: a draft comes from face frames. Where these are inconsistent, the shape is solved nevertheless.
+        A draft comes from face frames. Where these are inconsistent, the shape is solved nevertheless. After the
+        deadline Gauss–Newton stops with Status.DEADLINE. ``inside_bounds`` is for the diagnostics.
 
         Raises:
             NotFiniteError: the code is so far outside the bounds that numbers overflow.
@@ -272,10 +264,8 @@ class Decoder:
             return self._start(codes, until).astype(np.float64)
 
     def self_test(self) -> None:
-        """Run every network at the ends of the bounds and between them, and reconstruct one shape.
-
-        Raises:
-            BundleError: something fails, so the bundle must not be served.
+        """Run every network at the ends of the bounds and between them, and reconstruct one shape. Raises BundleError
+        if something fails, so the bundle must not be served.
         """
         for network in (*self._factors, self._combiner, *([self._start] if self._start else [])):
             network.check()

@@ -48,14 +48,8 @@ def carried(
 ) -> FloatArray:
     """Differentiate a function of a shape, for example alignment and prolongation, by differences.
 
-    Args:
-        model: decoder of the shape.
-        place: function from shapes (…, V, 3) to points (…, k, 3).
-        shape: (V, 3) normalised shape.
-        fields: (m, V, 3) changes of the shape.
-
-    Returns:
-        (m, k, 3) derivatives along the fields.
+    ``place`` maps shapes (…, V, 3) to points (…, k, 3). Returns derivatives (m, k, 3) at a normalised shape (V, 3),
+    along fields (m, V, 3).
     """
     h = SMALL_MOVE * model.reference.diagonal / max(np.abs(fields).max(), np.finfo(float).tiny)
     return (place(shape + h * fields) - place(shape)) / h
@@ -98,13 +92,7 @@ class FactorGrids:
 
     @classmethod
     def of(cls, model: Decoder, centre: FloatArray, root: FloatArray) -> FactorGrids:
-        """Run the factors of a model on their grids.
-
-        Args:
-            model: decoder of the factors.
-            centre: z̄ (2E,).
-            root: (2E,) square roots of the norm's weights.
-        """
+        """Run the factors of a model on their grids, given z̄ (2E,) and roots (2E,) of the norm's weights."""
         rng = np.random.default_rng(0)
         signs, sums = rng.choice([-1.0, 1.0], len(root)), rng.integers(SKETCH, size=len(root))
         matrix = sparse.csr_array((signs, (sums, np.arange(len(root)))), shape=(SKETCH, len(root)))

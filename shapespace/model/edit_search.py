@@ -78,16 +78,8 @@ class EditSearch:
     It minimises the objective twice. Rough shapes cost at most a third of solved shapes and differ from them by about
     half a percent of the diagonal. From the result with rough shapes, a few solved shapes suffice.
 
-    Args:
-        decoder: decoder of the model.
-        rough, pulled: positions of rough shapes and of solved shapes.
-        start: (m,) start, with fixed values inserted.
-        here: (k + V, 3) positions of the start's shape.
-        positions, sigmas: normalised positions (k, 3) of the targets, and their standard deviations (k,) as fractions
-            of the diagonal.
-        options: options of the edit.
-        fixed: coordinates that keep their value.
-        deadline: time limit of the descents.
+    The start (m,) has the fixed values inserted, and ``here`` (k + V, 3) are the positions of its shape. The targets'
+    ``positions`` (k, 3) are normalised, and their ``sigmas`` (k,) are fractions of the diagonal.
     """
 
     def __init__(

@@ -94,15 +94,8 @@ class EncodePreparation:
 
 
 class EncodeSearch:
-    """Search for the code of one mesh.
-
-    Args:
-        prepared: quantities of the model.
-        target: (2E,) lengths and angles of the mesh, normalised.
-        aim: vertices of the mesh.
-        fixed: coordinates that keep their value.
-        bounds: whether the code may lie outside the bounds.
-        deadline: time limit.
+    """Search for the code of one mesh. The target (2E,) has its lengths and angles, normalised, and the aim its
+    vertices.
     """
 
     def __init__(

@@ -47,12 +47,8 @@ def exact_shape(
 ) -> ExactShape:
     """Compute the exponential ``exp_z̄(Σ_j code_j u_j)`` in K steps, with the material and K of the model's manifest.
 
-    Args:
-        model: decoder of a model with a tangent space.
-        code: (m,) code.
-        answer: (V, 3) shape that the networks give for the code, on the mesh of choice.
-        mesh: fine or coarse mesh.
-        deadline: time limit after which the status is Status.DEADLINE.
+    The networks give the shape ``answer`` (V, 3) for the code (m,), on the mesh of choice. After the deadline the
+    status is Status.DEADLINE.
     """
     modes, steps = require_tangent_space(model)
     velocity = np.tensordot(code.astype(np.float64), modes, axes=1)

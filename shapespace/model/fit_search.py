@@ -78,18 +78,8 @@ SOLVED = SearchAccuracy(False, 4000, 3e-4, 0.5)
 class FitSearch:
     """Search for the code and the placement of a shape near a start, with the derivatives of ``encode`` and ``edit``.
 
-    Args:
-        decoder: decoder of the model.
-        reconstruct: solver that the decoder has lent.
-        scan: scan in the model's normalised units.
-        constraints: what the fit knows beside the scan.
-        accuracy: how accurately shapes are computed.
-        vertex_faces: faces around the vertices of the mesh of this accuracy.
-        vertices: evenly spread vertices of the mesh that look for points of the scan.
-        deadline: no step begins after this time limit.
-
-    Attributes:
-        count: number of shapes computed so far.
+    The decoder has lent the solver. The scan is in the model's normalised units. Some evenly spread ``vertices`` of the
+    mesh of this accuracy look for points of the scan. No step begins after the deadline.
     """
 
     def __init__(
@@ -114,7 +104,7 @@ class FitSearch:
         self._changes: Callable[[Decoder, FloatArray], FloatArray] = (
             factor_derivatives if accuracy.rough else derivatives
         )
-        self.count = 0
+        self.count = 0  # number of shapes computed so far
         self._fields: tuple[FloatArray, FloatArray] | None = None
 
     def start(self, code: FloatArray, placement: Placement, like: FloatArray) -> FitState | None:
@@ -125,11 +115,8 @@ class FitSearch:
     def run(self, state: FitState, steps: int, *, first: bool, drawn: int = 0) -> FitState:
         """Take steps from a state.
 
-        Args:
-            state: state to begin at.
-            steps: maximum number of steps.
-            first: whether the first steps also consider distant points.
-            drawn: number of first steps in which unmatched parts of both sides attract each other.
+        With ``first``, the first steps also consider distant points. In the first ``drawn`` steps, unmatched parts of
+        both sides attract each other.
         """
         width, self._fields = np.inf if first else 0.0, None
         for k in range(steps):

@@ -210,12 +210,7 @@ class LatentSpace:
 
 
 class TrainingCodes:
-    """Training codes of a model, which measure how plausible other codes are.
-
-    Args:
-        latents: coordinates of the codes.
-        codes: (n, m) training codes, n ≥ 1.
-    """
+    """Training codes (n, m) of a model, n ≥ 1, which measure how plausible other codes are."""
 
     def __init__(self, latents: LatentSpace, codes: FloatArray) -> None:
         self._latents, self._codes = latents, codes

@@ -75,15 +75,8 @@ _watch = _Watch()
 
 
 class Session:
-    """One ONNX network, whose input and output match the manifest.
-
-    Args:
-        bundle: bundle that holds the network's bytes.
-        network: names of file, input and output.
-        inputs, outputs: expected shapes of one row.
-
-    Raises:
-        BundleError: the network doesn't load, or has other inputs or outputs.
+    """One ONNX network, whose input and output match the manifest. Rows of its input and output have the shapes
+    ``inputs`` and ``outputs``. Raises BundleError if the network doesn't load, or has other inputs or outputs.
     """
 
     def __init__(self, bundle: Bundle, network: Network, inputs: list[int], outputs: list[int]) -> None:

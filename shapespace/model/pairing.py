@@ -41,12 +41,9 @@ class Pairs:
 class Pairing:
     """Finds pairs of a scan and a surface.
 
-    Args:
-        scan: scan in the model's normalised units.
-        count: number of the scan's points that look for the surface.
-        vertices: vertices of the surface that look for the scan.
-        both: whether vertices look for the scan. If the scan shows only a part, the other vertices have no partner.
-        blended: whether pairs that begin at a vertex use the scan's planes where the scan has planes.
+    Some points of the scan, ``count``, look for the surface. If ``both``, the vertices given look for the scan too.
+    If the scan shows only a part, the other vertices have no partner. If ``blended``, pairs that begin at a
+    vertex use the scan's planes where the scan has planes.
     """
 
     def __init__(self, scan: Scan, count: int, vertices: IntArray, *, both: bool, blended: bool) -> None:

@@ -49,12 +49,8 @@ def start_placements(
 ) -> list[StartPlacement]:
     """Find the best placements of shapes in a scan, each clearly different from the better ones.
 
-    Args:
-        scan: scan in the model's units.
-        shapes: (k, n, 3) evenly spread points of k shapes.
-        partial: whether the scan shows only a part of the shape. Points of the shape may then be far from the scan.
-        free: whether the size may change too.
-        effort: effort of the search.
+    The k shapes are evenly spread points (k, n, 3) in the units of the scan. If ``partial``, points of a shape may be
+    far from the scan. If ``free``, the size may change too.
     """
     some = scan.some(effort.points).points
     turns = np.concatenate([_grid(effort.rotations), *(_principal(shape, some) for shape in shapes[:1])])

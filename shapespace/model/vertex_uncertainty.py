@@ -44,13 +44,8 @@ def vertex_uncertainty(
     deadline: Deadline | None = None,
 ) -> FloatArray:
     """Return the standard deviation (V,) of vertices, ``√tr(J C Jᵀ)`` with J the derivative of a vertex by the code.
-
-    Args:
-        model: decoder of the code.
-        code: (m,) code.
-        covariance: (m, m) covariance C, see ``require_covariance``.
-        mesh: mesh of the vertices, which are aligned to the reference.
-        deadline: time limit; the shape is not iterated further after it.
+    For C see ``require_covariance``. The vertices, on ``mesh``, are aligned to the reference. After the deadline the
+    shape is not iterated further.
 
     Raises:
         NotFiniteError: the numbers overflow at this code.

@@ -99,15 +99,9 @@ def extrapolate(
 ) -> DiscretePath:
     """Continue a discrete geodesic from two neighbouring shapes.
 
-    Args:
-        space: Riemannian space of the shapes.
-        first: (V, 3).
-        second: (V, 3), one time step later, or earlier if not ``forward``.
-        steps: number of shapes to add.
-        forward: whether time runs forward. W is not symmetric, so a backward step solves another equation: a forward
-            step from its solution and ``second`` leads to ``first`` exactly.
-        tolerance: tolerance of ``sqrt(Fᵀ A⁻¹ F)`` at every step.
-        deadline: checked before every step; after it the status is Status.DEADLINE.
+    The second shape (V, 3) is one time step later than the first, or earlier if not ``forward``. W is not symmetric, so
+    a backward step solves another equation: a forward step from its solution and ``second`` leads to ``first`` exactly.
+    For tolerance and deadline see ``exponential``.
 
     Returns:
         2 + steps shapes, the given ones first, or fewer if a step failed.
@@ -252,13 +246,9 @@ def _chord(
 ) -> _Solution:
     """Iterate ``X ← X + A⁻¹F(X)`` with a fixed factor, accelerated, until it converges or slows down.
 
-    Args:
-        equation: the step to solve.
-        chord: A⁻¹ at a nearby shape.
-        start: first guess.
-        tolerance: tolerance of ``sqrt(Fᵀ A⁻¹ F)``. Once it is met, one more step is taken. This costs little, and
-            errors grow a hundredfold when shapes are extrapolated.
-        limit: the iteration ends once its rate predicts more iterations than this.
+    Once the tolerance of ``sqrt(Fᵀ A⁻¹ F)`` is met, one more step is taken. This costs little, and errors grow a
+    hundredfold when shapes are extrapolated. The iteration also ends once its rate predicts more than ``limit``
+    iterations.
     """
     space, mixing = equation.current.space, Anderson()
     x, residuals = start, [np.inf, np.inf]

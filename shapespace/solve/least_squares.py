@@ -99,13 +99,8 @@ def least_squares(
     steps. If the point has moved far since, a new one is also computed at the end: where residuals don't vanish, the
     minimum is only as accurate as the Jacobian. ``scipy.optimize.least_squares`` would compute a Jacobian in each step.
 
-    Args:
-        residuals: function r from (m,) to (n,).
-        jacobian: function from x and r(x) to (n, m).
-        start: (m,); unknowns outside the box are clipped to it.
-        box: bounds and scales of the unknowns.
-        stopping: when to end.
-        secant: whether to use secant updates; otherwise a Jacobian is computed in each step.
+    The residuals map (m,) to (n,), and ``jacobian`` maps x and r(x) to (n, m). Unknowns of the start outside the box
+    are clipped to it. Without ``secant``, a Jacobian is computed in each step.
     """
     stopping = stopping or Stopping()
     scale, low, high = box.scale, box.lower / box.scale, box.upper / box.scale

@@ -59,13 +59,8 @@ def descend(energy: Energy, x: FloatArray, tolerance: float, max_iterations: int
     """Minimise by truncated Newton (Nocedal and Wright 2006, algorithm 7.1): short steps always lower the energy.
 
     Products with the Hessian are differences of forces. A step ends at the first direction of negative curvature.
-    Exceptions of ``energy.precondition`` are passed on, such as NotPositiveDefiniteError.
-
-    Args:
-        energy: see Energy.
-        x: start, with finite energy.
-        tolerance: tolerance of the residual.
-        max_iterations: largest number of steps.
+    Exceptions of ``energy.precondition`` are passed on, such as NotPositiveDefiniteError. The energy of the start is
+    finite.
     """
     value, residual, status = energy.value(x), np.inf, Status.ITERATION_LIMIT
     for iteration in range(max_iterations + 1):

@@ -118,11 +118,8 @@ def export(
 ) -> Path:
     """Write ``models/NAME/VERSION/``, replacing a bundle that is there.
 
-    The digest is the SHA-256 of the training samples.
-
-    Raises:
-        ExportError: ONNX and PyTorch differ by more than the tolerance at a code, the bundle contradicts itself, or
-            a code inside the bounds has no shape.
+    The digest is the SHA-256 of the training samples. Raises ExportError if ONNX and PyTorch differ by more than the
+    tolerance at a code, the bundle contradicts itself, or a code inside the bounds has no shape.
     """
     settings, reference = config.export, collection.reference
     try:

@@ -77,19 +77,9 @@ def fit(
     With a last layer of low rank and orthonormal basis, this differs by a constant from the loss on z. An unfinished
     file at ``path`` is continued: it holds parameters, moments, schedule, random state and history.
 
-    Args:
-        network: network with its initial parameters.
-        inputs: (n, …) inputs of all samples.
-        z: (n, 2E) NRIC of all samples.
-        train: (n_train,) indices of the training samples.
-        validation: (n_validation,) indices of the samples that choose the learning rate and the epoch.
-        settings: learning rate, number of epochs, batch size.
-        path: safetensors file of the result.
-        title: title of the progress bar.
-        seed: seed of the order of batches and of dropout.
-
-    Returns:
-        The state, see `SavedNetwork`.
+    Inputs (n, …) and NRIC z (n, 2E) are of all samples. ``train`` and ``validation`` are indices of samples; the
+    validation samples choose the learning rate and the epoch. The seed determines the order of batches and dropout.
+    Returns the state, see `SavedNetwork`.
     """
     with torch.no_grad():
         target = network.target(z)

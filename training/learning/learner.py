@@ -90,8 +90,7 @@ class Learner:
     @cached_property
     def _closing(self) -> sparse.csr_array:
         """Derivatives (q, 2E) of the closing conditions around vertices, at the reference."""
-        conditions = Integrability(self.collection.reference.connectivity)
-        return conditions.jacobian(self._reference)[: 3 * len(conditions.vertices)]
+        return Integrability(self.collection.reference.connectivity).jacobian(self._reference)
 
     def _path(self, kind: str, shares: Sequence[float], *settings: BaseModel) -> Path:
         decides = [self.data_key, shares, self.seed]

@@ -21,11 +21,8 @@ def bundle_names(
 ) -> tuple[dict[str, list[int]], list[str]]:
     """Return the factors and the names of coordinates (m,) in the bundle.
 
-    Args:
-        factors: coordinates by the factor's name in the run.
-        coordinates: (m,) names. A name that begins with the name of its factor is renamed with the factor.
-        settings: ``faces`` and ``up`` turn sides into the body's own; ``names`` renames single factors and
-            coordinates.
+    A coordinate whose name begins with the name of its factor is renamed with the factor. The settings ``faces`` and
+    ``up`` turn sides into the body's own, and ``names`` renames single factors and coordinates.
 
     Raises:
         NamingError: an unknown name, or one name for two.

@@ -44,10 +44,8 @@ CORRECTIONS = {
 
 
 def write_report(run: RunDirectory) -> Path:
-    """Write ``report.html`` from the files of a run, finished or not, and return its path.
-
-    Raises:
-        ReportError: the folder is no run directory, or a file in it can't be read.
+    """Write ``report.html`` from the files of a run, finished or not, and return its path. Raises ReportError if the
+    folder is no run directory, or a file in it can't be read.
     """
     run.report.write(page(Record(run)))
     return run.report.path

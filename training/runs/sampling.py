@@ -145,15 +145,9 @@ def draw(
     Each part is written as soon as it is finished, in any order. It has the status of each sample, done or failed, and
     the reason of a failure. Parts of other codes or of another part size are removed.
 
-    Args:
-        collection: the collection; sent to the workers.
-        folder: folder of the parts.
-        latents: (n, m) codes.
-        part_size: number of codes in a part. A worker computes one part at a time, and loses it if it dies.
-        title: title of the progress bar.
-        shorten: whether a code without a shape is shortened until it has one, see SHORTER. The sample has both codes.
-        scheduler: see workers.run.
-        workers: see workers.run.
+    A worker computes one part of ``part_size`` codes at a time, and loses it if it dies. If ``shorten``, a code without
+    a shape is shortened until it has one, see SHORTER. The sample has both codes. For scheduler and workers see
+    workers.run.
 
     Yields:
         (done, total, failed) after each part; done includes failed.

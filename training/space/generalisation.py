@@ -188,10 +188,8 @@ def _folded(reference: TriangleMesh, shapes: FloatArray, material: Material) -> 
 def _space(
     reference: TriangleMesh, shapes: FloatArray, material: Material, steps: int
 ) -> tuple[ShellSpace, FloatArray, FloatArray]:
-    """Return the space at the mean of shapes (n, V, 3), the mean (V, 3) and the logarithms (n, V, 3).
-
-    Raises:
-        ModeError: the shapes have no mean.
+    """Return the space at the mean of shapes (n, V, 3), the mean (V, 3) and the logarithms (n, V, 3). Raises ModeError
+    if the shapes have no mean.
     """
     found = centred_mean(reference, shapes, material, steps)
     if found.status is not Status.CONVERGED:
@@ -229,10 +227,8 @@ def held_out(
 
     Shapes (n, V, 3) at ``index`` (k,) are held out, with their mirror images: ``original`` (n,) is the index of each
     shape's original. ``counts`` are numbers of modes, by default the configured number and half of it, and at most the
-    number of the other shapes. ``steps`` is K, by default as configured for these, and at most `LIGHT_STEPS`.
-
-    Raises:
-        ModeError: the other shapes have no mean, or no modes.
+    number of the other shapes. ``steps`` is K, by default as configured for these, and at most `LIGHT_STEPS`. Raises
+    ModeError if the other shapes have no mean, or no modes.
     """
     original = np.arange(len(shapes)) if original is None else original
     known = np.flatnonzero(~np.isin(original, index))

@@ -74,10 +74,8 @@ class Modes:
 
 
 def pga(space: ShellSpace, mean: FloatArray, fields: FloatArray, count: int, norm: Norm = "mixed") -> Modes:
-    """Find at most ``count`` modes whose span comes closest to logarithms (n, V, 3) at a mean (V, 3), in a norm.
-
-    Raises:
-        ModeError: the count, at most n, is not possible, or all fields are zero.
+    """Find at most ``count`` modes whose span comes closest to logarithms (n, V, 3) at a mean (V, 3), in a norm. Raises
+    ModeError if the count, at most n, is not possible, or all fields are zero.
     """
     problem = ModeProblem(space, mean, fields, count, norm)
     return problem.modes(problem.principal(count)[0])
@@ -95,15 +93,9 @@ def mode_count(
     The choice m minimises ``error(m) + WORTH · m``. The error is the distance between held-out logarithms and the span
     of m principal modes of the other shapes, as a share of the logarithms' length. No exponentials are computed.
 
-    Args:
-        settings: settings of the modes; only ``count`` and ``norm`` matter.
-        space: the shape space.
-        mean: X̄ (V, 3).
-        fields: (n, V, 3) logarithms.
-        original_index: (n,) index of each shape's original, from 0; a shape and its mirror image are held out together.
-
-    Raises:
-        ModeError: the fields can't be used.
+    Logarithms are (n, V, 3) at X̄ (V, 3); only ``count`` and ``norm`` of the settings matter. ``original_index`` (n,)
+    is the index of each shape's original, from 0: a shape and its mirror image are held out together. Raises ModeError
+    if the fields can't be used.
     """
     if settings.count != "auto":
         return max(1, min(settings.count, len(fields) - 1))

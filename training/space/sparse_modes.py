@@ -61,10 +61,8 @@ def find_modes(
     count: int,
     original_index: IntArray | None = None,
 ) -> Modes:
-    """Find ``count`` modes of logarithms (n, V, 3) at a mean (V, 3), as configured.
-
-    Raises:
-        ModeError: the count or the sparsity is not possible.
+    """Find ``count`` modes of logarithms (n, V, 3) at a mean (V, 3), as configured. Raises ModeError if the count or
+    the sparsity is not possible.
     """
     if settings.sparsity == 0:
         return pga(space, mean, fields, count, settings.norm)
@@ -98,21 +96,11 @@ def spga(
     The meaning of ``sparsity`` does not depend on the number of shapes, on their size or on the mesh. The result is
     deterministic.
 
-    Args:
-        space: the shape space; its η also weighs the angles in the 1-norm.
-        mean: X̄ (V, 3).
-        fields: (n, V, 3) logarithms.
-        count: m, at most n.
-        sparsity: λ as a share of ``max_j 2 |w_j|² ‖u_j‖² / ‖u_j‖_1`` over the modes of the plain analysis. At that
-            price the last of these modes vanishes. 0 gives the span of the plain analysis. None chooses one of
-            `SPARSITIES` by errors in vertices, or in the norm "shell" where that is the norm.
-        norm: norm of the misfit.
-        original_index: see modes.mode_count.
-        max_iterations: most rounds through all modes.
-        tolerance: see `TOLERANCE`.
-
-    Raises:
-        ModeError: the count is not possible, or the sparsity leaves no mode.
+    ``sparsity`` is λ as a share of ``max_j 2 |w_j|² ‖u_j‖² / ‖u_j‖_1`` over the modes of the plain analysis. At that
+    price the last of these modes vanishes. 0 gives the span of the plain analysis. None chooses one of `SPARSITIES` by
+    errors in vertices, or in the norm "shell" where that is the norm. Logarithms are (n, V, 3) at X̄ (V, 3), and η of
+    the space also weighs the angles in the 1-norm. For ``original_index`` see modes.mode_count, for ``tolerance`` see
+    `TOLERANCE`. Raises ModeError if the count is not possible, or the sparsity leaves no mode.
     """
     problem = _SparseProblem(space, mean, fields, count, norm)
     D, W = problem.principal(count)

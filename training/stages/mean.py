@@ -18,11 +18,7 @@ class MeanError(ValueError):
 
 
 def find_mean(run: Run) -> None:
-    """Write ``mean.npz``: the centred elastic mean of all shapes, and K.
-
-    Raises:
-        MeanError: the mean is not found.
-    """
+    """Write ``mean.npz``: the centred elastic mean of all shapes, and K. Raises MeanError if the mean is not found."""
     directory, material = run.directory, run.config.shell_material
     reference, given = directory.reference_mesh(), directory.shapes.read()
     shapes = given["vertices"]

@@ -25,9 +25,7 @@ def learner_of(run: Run) -> Learner:
 
 def train_networks(run: Run) -> None:
     """Write ``networks/``: one file for each network and all histories; files that are no longer needed are removed.
-
-    Raises:
-        SamplesError: there are too few samples to learn from.
+    Raises SamplesError if there are too few samples to learn from.
     """
     directory = run.directory
     kinds = {"joint samples": directory.samples}

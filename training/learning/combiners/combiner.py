@@ -93,11 +93,8 @@ def _components(y: Tensor) -> int:
 class CombinerNetwork(ShapeNetwork):
     """Ψ: factor shapes (n, J, 2E) → NRIC (n, 2E) of the joint shape. Its only input are these shapes.
 
-    Args:
-        scaling: maps NRIC to scaled differences.
-        settings: settings of the correction.
-        correction: maps scaled differences of factor shapes to scaled differences of the joint shape.
-        tried: by kind, the mean square error on held-out codes in scaled differences; empty if nothing was chosen.
+    ``tried`` has, by kind, the mean square error on held-out codes in scaled differences; it is empty if nothing was
+    chosen.
     """
 
     def __init__(
