@@ -239,7 +239,6 @@ class GaussNewton:
         return bool(here.energy <= GOOD_MISFIT**2 * self.squares.norm.square(target))
 
     def _damped(self, entries: FloatArray, share: float) -> FloatArray:
-        """Return the entries with the diagonal increased by a share."""
         damped = entries.copy()
         damped[self.squares.matrix.pattern.diagonal] *= 1 + share
         return damped

@@ -11,12 +11,7 @@ from shapespace.mesh.triangle_mesh import vertex_normals
 
 
 class VertexFaces:
-    """The faces around each vertex of a connectivity, in rows of equal length.
-
-    Attributes:
-        faces: (F, 3).
-        around: (V, k) faces at each vertex; the first face is repeated where a vertex has fewer than k.
-    """
+    """The faces (V, k) around each vertex of a connectivity. The first is repeated where a vertex has fewer than k."""
 
     def __init__(self, faces: IntArray, count: int) -> None:
         self.faces = faces

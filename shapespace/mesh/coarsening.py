@@ -94,7 +94,6 @@ def coarsen(fine: TriangleMesh, target: int, shapes: FloatArray) -> Coarsening:
 
 
 def _best(fine: TriangleMesh, target: int, shapes: FloatArray) -> Coarsening:
-    """Decimate with all weights of motion, and return the best result."""
     shapes = np.concatenate([fine.vertices[None], shapes])
     found = [_coarsen(fine, target, shapes, weight) for weight in MOTION_WEIGHTS]
     fewest = min((coarsening.specks, coarsening.folds) for coarsening in found)
@@ -149,7 +148,6 @@ def _result(decimation: Decimation, target: int) -> Coarsening:
 
 
 def _reason(count: int, target: int, specks: int) -> str:
-    """Say what differs from the target, and why."""
     parts = []
     if count != target:
         why = "thin parts that could only be had with slivers are left to the fine mesh"

@@ -44,11 +44,6 @@ class Decimation:
         small: length of a small edge. In a crumpled place, a vertex whose faces have no longer side may collapse freely
             as long as slivers and folds don't become more: the place is about to become a point.
         motion_weight: weight of the squared distance that a vertex moves, relative to the planes of the faces.
-
-    Attributes:
-        count: number of vertices that are left.
-        faces: remaining faces as triples of fine vertices, by their index in the fine mesh.
-        mean_areas: see the argument.
     """
 
     def __init__(
@@ -62,6 +57,7 @@ class Decimation:
         self._sample = np.ascontiguousarray(self._points[:, chosen])
         self._monomials = monomials(self._sample)
         self._quadrics, self._areas = quadrics_of(connectivity, centred[chosen])
+        # Remaining faces as triples of fine vertices, by their index in the fine mesh, and number of vertices left.
         self.faces: dict[int, _Face] = {f: (a, b, c) for f, (a, b, c) in enumerate(connectivity.faces.tolist())}
         self.count = connectivity.vertex_count
         self._star: list[set[int]] = [set() for _ in range(self.count)]

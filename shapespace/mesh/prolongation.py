@@ -16,7 +16,14 @@ from scipy.spatial import cKDTree
 from shapespace.arrays import FloatArray, IntArray
 from shapespace.mesh.closest_points import closest_barycentric
 from shapespace.mesh.rigid_motion import align
-from shapespace.mesh.triangle_mesh import Connectivity, MeshError, TriangleMesh, diagonal, face_normals
+from shapespace.mesh.triangle_mesh import (
+    Connectivity,
+    MeshError,
+    TriangleMesh,
+    diagonal,
+    face_normals,
+    faces_at_vertices,
+)
 
 #: Weight of a vertex normal relative to the weight of an edge, in the fit of a vertex' local affine map.
 NORMAL_WEIGHT = 0.1
@@ -152,7 +159,7 @@ class Prolongation:
 
     @cached_property
     def _around(self) -> sp.csr_array:
-        return _around(self.faces, self.weights.shape[1] // 2)
+        return faces_at_vertices(self.faces, self.weights.shape[1] // 2)
 
     def errors(self, coarse: FloatArray, fine: Iterable[FloatArray]) -> dict[str, float]:
         """Compute the ``mean`` and ``max`` distance to the true fine shapes, over all vertices and shapes.
@@ -230,7 +237,7 @@ def bind_points(
     weights of one point sum to 1.
     """
     count, tail, head = len(coarse.vertices), *np.concatenate([coarse.edges, coarse.edges[:, ::-1]]).T
-    around = _around(coarse.faces, count)
+    around = faces_at_vertices(coarse.faces, count)
     normals = _scaled_normals(coarse.vertices, coarse.faces, around)
 
     # A_j = Σ_k (y_k − y_j) g_jkᵀ + n_j h_jᵀ, the normal equations which are the same for all three coordinates.
@@ -284,12 +291,6 @@ def _flat(arrays: Mapping[str, NDArray], name: str, kind: type[np.number], dimen
     return array.astype(kind)
 
 
-def _around(faces: IntArray, count: int) -> sp.csr_array:
-    """(V, F) sparse matrix with 1 where a vertex belongs to a face."""
-    columns = np.repeat(np.arange(len(faces)), 3)
-    return sp.csr_array((np.ones(faces.size), (faces.ravel(), columns)), shape=(count, len(faces)))
-
-
 def _scaled_normals(vertices: FloatArray, faces: IntArray, around: sp.csr_array) -> FloatArray:
     """(V, 3) vertex normals, as long as the root of twice the area around; 0 where the faces cancel."""
     by_face = face_normals(vertices, faces, normalised=False)
@@ -306,7 +307,7 @@ def _bind(coarse: TriangleMesh, fine: TriangleMesh) -> tuple[IntArray, FloatArra
     bind fingers and lips to their neighbours.
     """
     near = _closest_along_surface(coarse, fine)
-    around = _around(coarse.faces, len(coarse.vertices))
+    around = faces_at_vertices(coarse.faces, len(coarse.vertices))
     two_rings = sp.csr_array((around @ around.T) @ around)
     found = [
         _bind_some(coarse, fine.vertices[k : k + BOUND_VERTICES], near[k : k + BOUND_VERTICES], two_rings)

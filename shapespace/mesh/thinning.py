@@ -67,18 +67,14 @@ def thin(connectivity: Connectivity, shapes: FloatArray, target: int) -> tuple[I
 
 
 class _Round:
-    """The mesh at the beginning of a round: its faces and adjacency.
-
-    Attributes:
-        sides: (V, V) index of the face of each half-edge, counted from 1.
-        neighbours: (V, V) number of faces at each edge.
-    """
+    """The mesh at the beginning of a round: its faces and adjacency."""
 
     def __init__(self, faces: IntArray, points: FloatArray) -> None:
         self.faces, self.points, self.count = faces, points, len(points)
         tails, heads = faces.T.ravel(), np.roll(faces, -1, axis=1).T.ravel()
         numbers = np.tile(np.arange(1, len(faces) + 1), 3)
         shape = (self.count, self.count)
+        # (V, V) matrices: the index of the face of each half-edge, from 1, and the number of faces at each edge.
         self.sides = sparse.csr_array((numbers, (tails, heads)), shape=shape)
         half = sparse.csr_array((np.ones(len(tails), np.int32), (tails, heads)), shape=shape)
         self.neighbours = sparse.csr_array(half + half.T)

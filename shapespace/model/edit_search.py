@@ -128,7 +128,6 @@ class EditSearch:
         return Placement.between(points, self._goals, self._aligned(bound))
 
     def _aligned(self, bound: QuadraticBound) -> FloatArray:
-        """Return the weights (k + V,) by which a shape is placed."""
         if not self._options.anchored:
             return bound.points
         return np.concatenate([np.zeros(self._count), bound.points[self._count :]])
@@ -161,7 +160,6 @@ class EditSearch:
     def _descend(
         self, x: FloatArray, pulled: PulledVertices, stopping: Stopping, rounds: int, *, secant: bool
     ) -> EditCandidate:
-        """Minimise quadratic bounds one after another, each from the minimum of the last."""
         x = np.clip(x, self._box.lower, self._box.upper)
         bound = self._bound(x, pulled)
         for _ in range(rounds):
@@ -175,7 +173,6 @@ class EditSearch:
     def _fit(
         self, x: FloatArray, pulled: PulledVertices, bound: QuadraticBound, stopping: Stopping, *, secant: bool
     ) -> Fit:
-        """Minimise one quadratic bound by least squares."""
         held = np.sqrt(bound.code)
 
         def residuals(x: FloatArray) -> FloatArray:
@@ -194,7 +191,6 @@ class EditSearch:
         return least_squares(residuals, jacobian, x, self._box, stopping, secant=secant)
 
     def _candidate(self, x: FloatArray, pulled: PulledVertices, bound: QuadraticBound, status: Status) -> EditCandidate:
-        """Evaluate the objective at a code."""
         away = self._misfits(pulled.positions(x), pulled, bound)[1] / self._size
         square = (away**2).sum(axis=1)
         misfit = float(self._pull @ square[: self._count])

@@ -64,19 +64,13 @@ class VertexObjective:
 
 
 class EncodePreparation:
-    """Quantities that the search needs for every mesh of a model; made once.
-
-    Attributes:
-        norm: weighted norm of lengths and angles at the reference.
-        root: (2E,) square roots of its weights.
-        centre: (2E,) lengths and angles of the reference, z̄.
-    """
+    """Quantities that the search needs for every mesh of a model; made once."""
 
     def __init__(self, decoder: Decoder) -> None:
         self.decoder = decoder
         self.norm = WeightedNorm.of(decoder.reference, decoder.manifest.eta_reconstruction)
         self.root = np.sqrt(self.norm.squared)
-        self.centre = nric(decoder.reference.vertices, decoder.reference.connectivity)
+        self.centre = nric(decoder.reference.vertices, decoder.reference.connectivity)  # z̄
 
     @cached_property
     def grids(self) -> FactorGrids:

@@ -243,7 +243,6 @@ class FitSearch:
         return np.concatenate([turns, shifts, *([places[:, :, None]] if self.constraints.free else [])], axis=2)
 
     def _landmarks(self, state: FitState, fields: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the normal matrix and the right-hand side of the landmarks."""
         constraints = self.constraints
         size = fields.shape[-1] + (7 if constraints.free else 6)
         if not len(constraints.landmarks):
@@ -268,7 +267,6 @@ class FitSearch:
         return sparse.csr_array((np.ones(len(vertices)), (own, vertices)), shape=(len(vertices), count))
 
     def _step(self, state: FitState, pairs: Pairs, width: float, sigma: float, sliding: float) -> FitState | None:
-        """Take a Gauss–Newton step, or return None if there is none."""
         try:
             fields = self._derivatives(state)
         except NotPositiveDefiniteError:

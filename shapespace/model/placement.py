@@ -106,7 +106,6 @@ def _scored(
 def _polished(
     start: StartPlacement, shape: FloatArray, some: FloatArray, tree: cKDTree, steps: int, *, partial: bool, free: bool
 ) -> StartPlacement:
-    """Improve a placement by closest-point steps of the rigid motion."""
     placement, own = start.placement, cKDTree(shape)
     for _ in range(steps):
         to_shape, nearest = nearest_points(own, placement.back(some))

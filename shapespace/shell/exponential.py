@@ -287,7 +287,6 @@ def _newton(equation: _Step, chord: ChordSolver, tolerance: float) -> _Solution:
 
 
 def _measured(equation: _Step, chord: ChordSolver, point: ShellPoint) -> tuple[FloatArray, float]:
-    """Compute F at a shape, and the residual."""
     forces = equation.forces(point)
     return forces, step_length(forces, chord.solve(forces))
 

@@ -146,7 +146,6 @@ def _compared(metric: ShellPoint, point: ShellPoint, target: FloatArray) -> _Com
 def _line_search(
     metric: ShellPoint, target: FloatArray, point: ShellPoint, step: FloatArray, square: float
 ) -> _Compared | None:
-    """Find a shape along a step that is closer to the target and has no collapsed face."""
     found = backtrack(
         lambda t: _compared(metric, point.space.point(point.vertices + t * step), target),
         lambda _, there: there[2] < square and keeps_faces(point.space, point.vertices, there[0].vertices),

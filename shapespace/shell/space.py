@@ -49,12 +49,7 @@ STEP = StepLimits()
 
 
 class ShellPoint:
-    """A shape with its derivatives and its energy, each computed on first use.
-
-    Attributes:
-        vertices: (V, 3) X.
-        z: (2E,) lengths and angles.
-    """
+    """A shape X (V, 3) with lengths and angles z (2E,), derivatives and energy, each computed on first use."""
 
     def __init__(self, space: ShellSpace, vertices: FloatArray, z: FloatArray | None = None) -> None:
         self.space = space

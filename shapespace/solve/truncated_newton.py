@@ -88,7 +88,6 @@ def descend(energy: Energy, x: FloatArray, tolerance: float, max_iterations: int
 def _line_search(
     energy: Energy, x: FloatArray, value: float, step: FloatArray, slope: float
 ) -> tuple[float, float] | None:
-    """Find a share of a step that is admitted and lowers the energy enough, and the energy there."""
     rounding = LIMITS.rounding * abs(value)
     return backtrack(
         lambda t: energy.value(x + t * step) if energy.admits(x, t * step) else np.nan,

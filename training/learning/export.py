@@ -77,7 +77,6 @@ def _narrow(graph: onnx.GraphProto) -> None:
 
 
 def _answer(file: bytes, names: Network, rows: NDArray) -> NDArray:
-    """Return the output of an ONNX file for some rows, computed as on a server."""
     session = onnxruntime.InferenceSession(file, providers=["CPUExecutionProvider"])
     return session.run([names.output], {names.input: rows})[0]
 

@@ -133,7 +133,6 @@ def fit(
 
 
 def _optimisers(network: nn.Module, settings: FitSettings) -> list[Optimizer]:
-    """Return the optimisers; each updates a part of the parameters."""
     parameters = list(network.parameters())
     if settings.optimiser == "adam":
         return [Adam(parameters, settings.learning_rate)]

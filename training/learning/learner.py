@@ -276,7 +276,6 @@ class Learner:
         return Slopes(scaling.down(shapes[rows]), indices, own * scaling.factor, missed * scaling.factor)
 
     def _with_images(self, data: TrainingData) -> TrainingData:
-        """Add the images of the training samples under each symmetry of the collection."""
         inputs, z, train = data.inputs, data.z, data.rows["train"]
         rows = dict(data.rows)
         for edges in self.collection.symmetries:
@@ -308,7 +307,6 @@ class Learner:
         return self._joint_network("monolithic-paper", self.config.monolithic_paper)
 
     def _joint_network(self, kind: str, settings: LatentNetworkSettings) -> FactorNetwork:
-        """Return a network from all latents, fitted to the joint samples."""
         index = list(range(len(self.collection.coordinates)))
         path = self._path(kind, [self.share], settings)
         return self._latent_network(settings, index, path, self.share, lambda: (self.joint, self.rows))

@@ -67,5 +67,4 @@ def _of_the_body(name: str, settings: ExportSettings) -> str:
 
 
 def _direction(axis: str) -> FloatArray:
-    """Return the unit vector (3,) of an axis such as "+y"."""
     return (1.0 if axis[0] == "+" else -1.0) * np.eye(3)["xyz".index(axis[1])]

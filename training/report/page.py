@@ -113,7 +113,6 @@ def _qualities(record: Record) -> list[tuple[str, str, str]]:
 
 
 def _correction(correction: dict[str, Any]) -> str:
-    """Return sentences on how the factors are joined, and why."""
     kind, tried = correction["kind"], correction.get("tried", {})
     sentence = f"Factors are joined by {CORRECTIONS.get(kind, kind)}"
     if kind not in tried:

@@ -139,18 +139,7 @@ def localisation(nric: FloatArray, norm: WeightedNorm) -> FloatArray:
 
 
 class ModeProblem:
-    """The tangent space at a mean with the logarithms in it, all as matrices on flat vertex fields (3V,).
-
-    Attributes:
-        areas: (3V,) vertex areas, 1 on average.
-        plain: weight of the norm of vertices.
-        shell: weight of the shell's metric.
-        H: (2E, 2E) the metric on lengths and angles.
-        M: (3V, 3V) the norm.
-        D: (n, 3V) the logarithms.
-        MD: (3V, n) ``M Dᵀ``.
-        total: ``Σ ‖v^i‖²``.
-    """
+    """The tangent space at a mean with the logarithms in it, all as matrices on flat vertex fields (3V,)."""
 
     def __init__(self, space: ShellSpace, mean: FloatArray, fields: FloatArray, count: int, norm: Norm) -> None:
         self.point: ShellPoint = space.point(mean)
@@ -164,19 +153,20 @@ class ModeProblem:
         hessian = self.point.hessian
         self.form = QuadraticForm(hessian.faces / 2, hessian.angles / 2)
         self.J = space.jacobian.matrix(self.point.gradients)
-        self.H = _matrix(self.form, space.energy.sides, space.connectivity.edge_count)
+        self.H = space.energy.matrix(self.form)  # (2E, 2E) the metric on lengths and angles
         areas = vertex_areas(self.point.vertices, space.connectivity.faces)
-        self.areas = np.repeat(areas / areas.mean(), 3)
-        self.D = self.balanced(fields)
+        self.areas = np.repeat(areas / areas.mean(), 3)  # (3V,) vertex areas, 1 on average
+        self.D = self.balanced(fields)  # (n, 3V) the logarithms
         plain, metric = sparse.diags_array(self.areas), self.J.T @ self.H @ self.J
         moved, strained = (float(np.vdot(self.D.T, matrix @ self.D.T)) for matrix in (plain, metric))
         if not strained > 0:
             raise ModeError("there are no modes: all shapes are the same as the mean")
+        # Weights of the norm of vertices and of the shell's metric.
         self.plain = float(norm != "shell")
         self.shell = {"mixed": SHELL_SHARE * moved / strained, "vertices": 0.0, "shell": 1.0}[norm]
-        self.M = sparse.csr_array(self.plain * plain + self.shell * metric)
+        self.M = sparse.csr_array(self.plain * plain + self.shell * metric)  # (3V, 3V) the norm
         self.MD = self.M @ self.D.T
-        self.total = float(np.vdot(self.D.T, self.MD))
+        self.total = float(np.vdot(self.D.T, self.MD))  # ``Σ ‖v^i‖²``
 
     def balanced(self, fields: FloatArray) -> FloatArray:
         """Return fields (n, V, 3) as rows (n, 3V), each with the rigid motion that minimises the norm of vertices."""
@@ -240,11 +230,3 @@ class ModeProblem:
             converged=converged,
             history=history or [],
         )
-
-
-def _matrix(form: QuadraticForm, sides: NDArray[np.int64], edges: int) -> sparse.csr_array:
-    """Return a quadratic form as a matrix (2E, 2E)."""
-    rows = np.broadcast_to(sides[:, None], form.faces.shape).ravel()
-    columns = np.broadcast_to(sides[None], form.faces.shape).ravel()
-    lengths = sparse.csr_array((form.faces.ravel(), (rows, columns)), shape=(edges, edges))
-    return sparse.csr_array(sparse.block_diag([lengths, sparse.diags_array(form.angles)], format="csr"))

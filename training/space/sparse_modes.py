@@ -25,6 +25,7 @@ most 3 %. Principal modes in inner folds estimate this error.
 What a sparsity costs in each norm is in docs/measurements/notes.md.
 """
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -105,7 +106,7 @@ def spga(
     problem = _SparseProblem(space, mean, fields, count, norm)
     D, W = problem.principal(count)
     highest = problem.highest_price(D, W)
-    enough = _SparsityCriterion(space, mean, fields, D, norm, original_index) if sparsity is None else None
+    enough = _sparsity_criterion(space, mean, fields, D, norm, original_index) if sparsity is None else None
     rotation = _varimax(problem.scaled(D))
     D, W = _normalised(rotation.T @ D, rotation.T @ W)
     for share in SPARSITIES if sparsity is None else [sparsity]:
@@ -116,18 +117,12 @@ def spga(
 
 
 class _SparseProblem(ModeProblem):
-    """A mode problem with the 1-norm.
-
-    Attributes:
-        norm: weighted norm at the mean.
-        weights: (2E,) weights of the 1-norm.
-        penalty: scale of the metric's diagonal that makes it weigh on the logarithms as much as the norm.
-        G: (2E,) the scaled diagonal.
-    """
+    """A mode problem with the 1-norm."""
 
     def __init__(self, space: ShellSpace, mean: FloatArray, fields: FloatArray, count: int, norm: Norm) -> None:
         super().__init__(space, mean, fields, count, norm)
         diagonal: FloatArray = self.H.diagonal()
+        # Scale of the metric's diagonal that makes it weigh on the logarithms as much as the norm.
         self.penalty = 1.0 if norm == "shell" else self.total / float(diagonal @ ((self.J @ self.D.T) ** 2).sum(axis=1))
         self.G = self.penalty * diagonal
         eta = space.material.eta
@@ -152,25 +147,14 @@ class _SparseProblem(ModeProblem):
         return float((2 * self.energies(D, W) / self.one_norms(D)).max())
 
 
-class _SparsityCriterion:
-    """Whether sparse modes keep enough of the logarithms, compared with principal modes (m, 3V); see `SPARSITIES`."""
-
-    def __init__(
-        self,
-        space: ShellSpace,
-        mean: FloatArray,
-        fields: FloatArray,
-        D: FloatArray,
-        norm: Norm,
-        original_index: IntArray | None,
-    ) -> None:
-        self._problem = ModeProblem(space, mean, fields, 1, validation_norm(norm))
-        left = self._problem.left_of_held_out(original_index)[:, min(len(D), len(fields) - 1)].sum()
-        self._least = self._problem.project(D)[1] - ALLOWED_ERROR * float(left) / self._problem.total
-
-    def __call__(self, D: FloatArray) -> bool:
-        """Return whether modes (m, 3V) keep enough."""
-        return self._problem.project(D)[1] >= self._least
+def _sparsity_criterion(
+    space: ShellSpace, mean: FloatArray, fields: FloatArray, D: FloatArray, norm: Norm, original_index: IntArray | None
+) -> Callable[[FloatArray], bool]:
+    """Whether modes (m, 3V) keep enough of the logarithms, compared with principal modes D; see `SPARSITIES`."""
+    problem = ModeProblem(space, mean, fields, 1, validation_norm(norm))
+    left = problem.left_of_held_out(original_index)[:, min(len(D), len(fields) - 1)].sum()
+    least = problem.project(D)[1] - ALLOWED_ERROR * float(left) / problem.total
+    return lambda modes: problem.project(modes)[1] >= least
 
 
 class _Shrinkage:

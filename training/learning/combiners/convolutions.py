@@ -243,7 +243,6 @@ def _gather(x: Tensor, neighbours: Tensor) -> Tensor:
 
 
 def _side_by_side(around: Tensor) -> Tensor:
-    """Reshape (E, k, n, C) to (E, n, k C)."""
     return around.transpose(1, 2).flatten(2)
 
 

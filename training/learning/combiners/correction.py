@@ -35,10 +35,6 @@ class Slopes:
             result[:, index, j] = own[:, index] @ axes[j]
         return result.flatten(2).flatten(0, 1)
 
-    def repeated(self, inputs: Tensor) -> Tensor:
-        """Repeat rows (k, …), one for each sample, once for each latent: (k m, …)."""
-        return inputs.repeat_interleave(self.own.shape[1], dim=0)
-
 
 @dataclass(frozen=True)
 class Motion:

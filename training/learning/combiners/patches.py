@@ -99,7 +99,7 @@ class Patch:
         """Return coordinates (k m, rank) of samples with derivatives, their derivatives, and residual's (k m, S)."""
         axes, metric = self.axes.double().transpose(1, 2), self.metric[:rank].double().T
         along = (slopes.coefficients(axes, self.columns) * self.units) @ metric
-        at = slopes.repeated(self.coordinates(slopes.inputs, rank))
+        at = self.coordinates(slopes.inputs, rank).repeat_interleave(slopes.own.shape[1], dim=0)  # once a latent
         return at, along, slopes.missed[:, :, self.columns].flatten(0, 1).double()
 
     def fit(self, own: Pairs, held_out: Pairs, slopes: Slopes | None, rank: int, most: int, outputs: int) -> None:
