@@ -212,7 +212,7 @@ def face_areas(vertices: FloatArray, faces: IntArray) -> FloatArray:
 def vertex_areas(vertices: FloatArray, faces: IntArray) -> FloatArray:
     """Compute the areas (V,) of the vertices of a shape (V, 3): a third of each face around."""
     thirds = np.repeat(face_areas(vertices, faces) / 3, 3)
-    return np.bincount(faces.ravel(), thirds, minlength=len(vertices))
+    return np.bincount(faces.ravel(), thirds, minlength=len(vertices)).astype(np.float64, copy=False)
 
 
 def faces_at_vertices(faces: IntArray, count: int) -> sparse.csr_array:
