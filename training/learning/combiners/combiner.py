@@ -166,7 +166,6 @@ class CombinerNetwork(ShapeNetwork):
         return {"correction": self.settings.model_dump_json(), "tried": json.dumps(self.tried)}
 
     def target(self, z: Tensor) -> Tensor:
-        """Return scaled differences (n, 2E) of NRIC (n, 2E)."""
         return self.scaling.down(z)
 
     def coefficients(self, inputs: Tensor) -> Tensor:
@@ -174,7 +173,6 @@ class CombinerNetwork(ShapeNetwork):
         return self.correction(self.scaling.down(inputs))
 
     def loss(self, inputs: Tensor, target: Tensor) -> Tensor:
-        """Return the loss of the correction, which may be an estimate."""
         return self.correction.loss(self.scaling.down(inputs), target)
 
     def forward(self, factors: Tensor) -> Tensor:

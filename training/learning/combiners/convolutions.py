@@ -63,7 +63,6 @@ class ConvolutionCorrection(Correction):
         held_out: JointSamples,
         seed: int,
     ) -> ConvolutionCorrection:
-        """Return the untrained network, with fitted products; see `Correction`."""
         products = None
         if settings.products:
             how = ProductSettings(coefficients=settings.products)
@@ -74,7 +73,6 @@ class ConvolutionCorrection(Correction):
     def load(
         cls, settings: ConvolutionSettings, reference: TriangleMesh, tensors: Mapping[str, Tensor]
     ) -> ConvolutionCorrection:
-        """Return the network with these tensors; see `Correction`."""
         prefix, products = "products.", None
         if settings.products:
             own = {name.removeprefix(prefix): t for name, t in tensors.items() if name.startswith(prefix)}
@@ -87,7 +85,6 @@ class ConvolutionCorrection(Correction):
 
     @property
     def descent(self) -> FitSettings:
-        """Settings of the training; the products are not trained."""
         return self.settings.fit
 
     @cached_property

@@ -91,7 +91,6 @@ class FieldCorrection(Correction):
 
     @classmethod
     def load(cls, settings: FieldSettings, reference: TriangleMesh, tensors: Mapping[str, Tensor]) -> FieldCorrection:
-        """Return the network with these tensors, which determine the sizes; see `Correction`."""
         places, edges = tensors["places"], tensors["edges"]
         known = edges.shape[1] + 2 * places.shape[1] * (1 + len(settings.concentrations))
         factor_count = (tensors["perceptron.0.weight"].shape[1] - known) // 2
@@ -101,7 +100,6 @@ class FieldCorrection(Correction):
 
     @property
     def descent(self) -> FitSettings:
-        """Settings of the perceptron's training. The code reader is fitted in closed form."""
         return self.settings.fit
 
     def _fit_reader(
