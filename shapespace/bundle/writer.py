@@ -99,13 +99,10 @@ def entry(content: bytes) -> FileEntry:
 
 def _manifest(facts: Facts, geometry: Geometry, files: Mapping[str, bytes]) -> Manifest:
     reference = geometry.reference
+    same = ("name", "version", "licence", "title", "description", "eta_reconstruction", "exponential_steps", "scale")
     return Manifest.model_validate({
         "schema_version": SCHEMA_VERSION,
-        "name": facts.name,
-        "version": facts.version,
-        "licence": facts.licence,
-        "title": facts.title,
-        "description": facts.description,
+        **{name: getattr(facts, name) for name in (*same, "draft_error", "origin")},
         "latent_dimension": len(facts.lower),
         "latent_names": list(facts.latent_names),
         "factors": [
@@ -121,16 +118,11 @@ def _manifest(facts: Facts, geometry: Geometry, files: Mapping[str, bytes]) -> M
         "mu": facts.material.mu,
         "lambda": facts.material.lambda_,
         "eta": facts.material.eta,
-        "eta_reconstruction": facts.eta_reconstruction,
-        "exponential_steps": facts.exponential_steps,
-        "scale": facts.scale,
         "combiner": COMBINER,
         "start": START if START.file in files else None,
         "geometry": GEOMETRY,
         "surface": surface_entry(geometry.surface) if geometry.surface else None,
         "onnx_tolerance": facts.tolerance,
         "figures": dict(facts.figures),
-        "draft_error": facts.draft_error,
-        "origin": facts.origin,
         "files": {name: entry(files[name]) for name in sorted(files)},
     })  # fmt: skip

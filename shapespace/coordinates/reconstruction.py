@@ -34,14 +34,10 @@ class Reconstruction(Outcome):
 
     An iteration is one evaluation of z(X) and one solve. The residual is ``‖z(X) − z*‖ / ‖z*‖`` in the weighted norm,
     about the relative misfit of an edge.
-
-    Attributes:
-        vertices: (V, 3), always finite.
-        flipped_faces: number of faces at edges whose angle differs from the target by more than π/2.
     """
 
-    vertices: FloatArray
-    flipped_faces: int = 0
+    vertices: FloatArray  # (V, 3), always finite
+    flipped_faces: int = 0  # number of faces at edges whose angle differs from the target by more than π/2
 
 
 class Reconstructor:

@@ -34,15 +34,10 @@ class Renewals:
     slow: float = 0.5  # an iteration with a factor fails if two iterations leave more than this share of the residual
 
 
-@dataclass(frozen=True)
-class ExactNewton:
-    """Limits of exact Newton."""
-
-    iterations: int = 12  # 4 to 8 suffice where it converges; beyond, a face collapses (posed bodies)
-    smallest_step: float = 1 / 16  # smallest step length of the line search
-
-
-RENEWALS, NEWTON = Renewals(), ExactNewton()
+RENEWALS = Renewals()
+#: Most steps of exact Newton: 4 to 8 suffice where it converges, beyond, a face collapses (posed bodies). Smallest step
+#: length of its line search.
+NEWTON_STEPS, SMALLEST_STEP = 12, 1 / 16
 
 
 def exponential(
@@ -270,10 +265,10 @@ def _chord(
 def _newton(equation: _Step, chord: ChordSolver, tolerance: float) -> _Solution:
     """Solve by exact Newton with a line search, from the present shape. A factor measures the residuals."""
     point, forces, residual = equation.current, *_measured(equation, chord, equation.current)
-    for iteration in range(NEWTON.iterations + 1):
+    for iteration in range(NEWTON_STEPS + 1):
         if residual <= tolerance:
             return _accepted(equation, point, iteration, residual)
-        if iteration == NEWTON.iterations:
+        if iteration == NEWTON_STEPS:
             break
         try:
             step = -splu(equation.derivative(point)).solve(forces.ravel()).reshape(-1, 3)
@@ -283,7 +278,7 @@ def _newton(equation: _Step, chord: ChordSolver, tolerance: float) -> _Solution:
         if found is None:
             return _stalled(point, iteration, residual, f"Newton stalls at residual {residual:.1e}")
         point, forces, residual = found
-    return _stalled(point, NEWTON.iterations, residual, f"Newton is slow, residual {residual:.1e}")
+    return _stalled(point, NEWTON_STEPS, residual, f"Newton is slow, residual {residual:.1e}")
 
 
 def _measured(equation: _Step, chord: ChordSolver, point: ShellPoint) -> tuple[FloatArray, float]:
@@ -300,5 +295,5 @@ def _line_search(
         there = point.space.point(point.vertices + t * step)
         return there, *_measured(equation, chord, there)
 
-    found = backtrack(trial, lambda t, there: there[2] < (1 - t / 4) * residual, NEWTON.smallest_step)
+    found = backtrack(trial, lambda t, there: there[2] < (1 - t / 4) * residual, SMALLEST_STEP)
     return found and found[1]

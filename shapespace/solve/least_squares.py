@@ -8,15 +8,11 @@ from scipy.linalg import cholesky, solve_triangular
 
 from shapespace.arrays import FloatArray
 from shapespace.solve.deadline import Deadline
-from shapespace.solve.outcome import Outcome, Status
+from shapespace.solve.outcome import Outcome, Status, limit_reached
 
-
-@dataclass(frozen=True)
-class SecantLimits:
-    """When an updated Jacobian is replaced by a new one."""
-
-    distance: float = 0.05  # at a minimum, largest distance to where it was computed, in units of the scale
-    gain: float = 0.25  # smallest ratio of a step's actual to its predicted gain at which it is kept
+#: An updated Jacobian is replaced at a minimum farther than `SECANT_DISTANCE` from where it was computed, in units of
+#: the scale, and after a step with a smaller ratio of actual to predicted gain than `SECANT_GAIN`.
+SECANT_DISTANCE, SECANT_GAIN = 0.05, 0.25
 
 
 @dataclass(frozen=True)
@@ -31,7 +27,7 @@ class StepControl:
     factor: float = 10  # increase and decrease of the damping
 
 
-SECANT, CONTROL = SecantLimits(), StepControl()
+CONTROL = StepControl()
 
 
 @dataclass(frozen=True)
@@ -61,12 +57,6 @@ class Stopping:
         return bool(
             np.abs(step).max() <= self.tolerance or predicted <= self.gain_tolerance * shrinkable(cost, self.large)
         )
-
-    def reached(self, evaluations: int) -> Status | None:
-        """Return the limit that is reached after a number of evaluations, or None."""
-        if evaluations >= self.max_evaluations:
-            return Status.ITERATION_LIMIT
-        return Status.DEADLINE if self.deadline is not None and self.deadline.passed else None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -115,7 +105,7 @@ def least_squares(
     if not np.isfinite(r).all():
         return fit(Status.NOT_FINITE, "the residuals at the start are not finite")
     J = _Jacobian(lambda u, r: jacobian(u * scale, r) * scale, secant, u, r)
-    while (reached := stopping.reached(evaluations)) is None:
+    while (reached := limit_reached(evaluations, stopping.max_evaluations, stopping.deadline)) is None:
         if not np.isfinite(J.matrix).all():
             return fit(Status.STALLED, "the Jacobian is not finite")
         step = _step(J.matrix, r, low - u, high - u, damping)
@@ -161,7 +151,7 @@ class _Jacobian:
 
     def is_outdated(self, u: FloatArray) -> bool:
         """Whether the Jacobian has been updated and was computed too far from this point to identify a minimum."""
-        return self.updates > 0 and bool(np.abs(u - self._made_at).max() > SECANT.distance)
+        return self.updates > 0 and bool(np.abs(u - self._made_at).max() > SECANT_DISTANCE)
 
     def follow(self, step: FloatArray, change: FloatArray) -> None:
         """Update the Jacobian so that it predicts the change of the residuals along a step that was taken.
@@ -173,7 +163,7 @@ class _Jacobian:
 
     def renew_or_keep(self, u: FloatArray, r: FloatArray, taken: bool, gain: float) -> None:
         """Compute a new Jacobian if necessary, after a step with this ratio of actual to predicted gain."""
-        disappointing = self.updates > 0 and not gain > SECANT.gain
+        disappointing = self.updates > 0 and not gain > SECANT_GAIN
         if (taken and not self._secant) or disappointing or self.updates == len(u):
             self.renew(u, r)
         else:

@@ -5,6 +5,8 @@ from enum import StrEnum
 
 import numpy as np
 
+from shapespace.solve.deadline import Deadline
+
 
 class Status(StrEnum):
     """How an iteration or a search ended. Vertices are finite with every status.
@@ -41,3 +43,10 @@ class Outcome:
     def converged(self) -> bool:
         """Whether the tolerance is met."""
         return self.status is Status.CONVERGED
+
+
+def limit_reached(iterations: int, most: int, deadline: Deadline | None) -> Status | None:
+    """Return the limit that an iteration has reached, if any."""
+    if iterations >= most:
+        return Status.ITERATION_LIMIT
+    return Status.DEADLINE if deadline is not None and deadline.passed else None
