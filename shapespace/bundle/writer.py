@@ -69,11 +69,8 @@ class Facts:
 def write_bundle(models: Path, facts: Facts, networks: Networks, geometry: Geometry) -> Path:
     """Write or replace the bundle ``models/NAME/VERSION/``, and return its folder.
 
-    Equal contents give equal bytes.
-
-    Raises:
-        pydantic.ValidationError: the facts contradict each other or the files. Nothing is written.
-        OSError: the folder can't be written.
+    Equal contents give equal bytes. Raises pydantic.ValidationError if the facts contradict each other or the files;
+    then nothing is written. Raises OSError if the folder can't be written.
     """
     files = {factor_network(j).file: content for j, content in enumerate(networks.factors)}
     files |= {COMBINER.file: networks.combiner, GEOMETRY.file: npz_bytes(geometry.arrays(), compressed=False)}

@@ -37,13 +37,10 @@ class _Neighbourhood:
 class Decimation:
     """A mesh during its decimation. See ``coarsening.coarsen`` for the collapses that are refused.
 
-    Args:
-        connectivity: connectivity of the fine mesh with Vf vertices.
-        shapes: (n, Vf, 3).
-        mean_areas: (n,) expected mean area of the coarse faces in each shape.
-        small: length of a small edge. In a crumpled place, a vertex whose faces have no longer side may collapse freely
-            as long as slivers and folds don't become more: the place is about to become a point.
-        motion_weight: weight of the squared distance that a vertex moves, relative to the planes of the faces.
+    The shapes are (n, Vf, 3), and the coarse faces in each have an expected mean area (n,). In a crumpled place, a
+    vertex whose faces have no side longer than ``small`` may collapse freely as long as slivers and folds don't become
+    more: the place is about to become a point. The squared distance that a vertex moves has the weight
+    ``motion_weight``, relative to the planes of the faces.
     """
 
     def __init__(

@@ -20,9 +20,8 @@ def monomials(points: FloatArray) -> FloatArray:
 def quadrics_of(connectivity: Connectivity, shapes: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Compute area-weighted squared distances to the planes at each vertex, in all shapes (n, Vf, 3).
 
-    Returns:
-        Quadrics (Vf, 10n), whose dot product with ``monomials`` is the sum over the shapes, and the areas (Vf,) around
-        the vertices, both averaged over the shapes.
+    Returns quadrics (Vf, 10n), whose dot product with ``monomials`` is the sum over the shapes, and the areas (Vf,)
+    around the vertices, both averaged over the shapes.
     """
     count, (i, j) = connectivity.vertex_count, np.triu_indices(4)
     faces, rim = connectivity.faces, connectivity.edges[~connectivity.interior]

@@ -38,10 +38,8 @@ def thin(connectivity: Connectivity, shapes: FloatArray, target: int) -> tuple[I
     checks. The cheapest collapses are made, by the quadrics of all shapes (Garland and Heckbert 1997). Choosing
     vertices that cost less than all their neighbours instead would find too few.
 
-    A collapse may neither fold nor flatten any of the shapes (n, V, 3), which are a few of similar size.
-
-    Returns:
-        The remaining vertices (V'), increasing, and the faces (F', 3) between them.
+    A collapse may neither fold nor flatten any of the shapes (n, V, 3), which are a few of similar size. Returns the
+    remaining vertices (V'), increasing, and the faces (F', 3) between them.
     """
     points = np.ascontiguousarray(np.moveaxis(shapes - shapes.mean(axis=1, keepdims=True), 0, 1))
     quadrics, areas = quadrics_of(connectivity, np.moveaxis(points, 1, 0))

@@ -22,9 +22,8 @@ class MeshError(ValueError):
 class PlaceError(MeshError):
     """A fault at some vertices or faces, which the caller may count in another way.
 
-    Args:
-        sentence: message with a field ``{name}`` for each entry of ``numbers``; names of faces begin with ``face``.
-        numbers: indices by name, counted from 0; several indices are written as ``(2, 48)``.
+    The sentence has a field ``{name}`` for each entry of ``numbers``; names of faces begin with ``face``. Numbers are
+    indices by name, counted from 0; several indices are written as ``(2, 48)``.
     """
 
     def __init__(self, sentence: str, numbers: Mapping[str, Sequence[int]]) -> None:

@@ -188,9 +188,8 @@ class Decoder:
         A draft comes from face frames. Where these are inconsistent, the shape is solved nevertheless. After the
         deadline Gauss–Newton stops with Status.DEADLINE. ``inside_bounds`` is for the diagnostics.
 
-        Raises:
-            NotFiniteError: the code is so far outside the bounds that numbers overflow.
-            ModelFailedError: the networks failed at this code, or took too long.
+        Raises NotFiniteError if the code is so far outside the bounds that numbers overflow, and ModelFailedError if
+        the networks failed at this code, or took too long.
         """
         began = time.perf_counter()
         _, target = self._networks(code[None])

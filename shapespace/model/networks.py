@@ -116,11 +116,8 @@ class Session:
             raise BundleError(f"{self._file} does not give finite numbers for zeros")
 
     def __call__(self, rows: NDArray[np.float32], until: float) -> NDArray[np.float32]:
-        """Return outputs for rows (n, …) before the time ``until`` of ``time.monotonic``.
-
-        Raises:
-            TerminatedError: the time was over.
-            NetworkError: the network failed, or its output has another shape.
+        """Return outputs for rows (n, …) before the time ``until`` of ``time.monotonic``. Raises TerminatedError if the
+        time was over, and NetworkError if the network failed or its output has another shape.
         """
         options = onnxruntime.RunOptions()
         options.log_severity_level = _FATAL

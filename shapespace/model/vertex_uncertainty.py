@@ -47,9 +47,8 @@ def vertex_uncertainty(
     For C see ``require_covariance``. The vertices, on ``mesh``, are aligned to the reference. After the deadline the
     shape is not iterated further.
 
-    Raises:
-        NotFiniteError: the numbers overflow at this code.
-        InvalidCovarianceError: the shape has nearly collapsed, so it has no derivative.
+    Raises NotFiniteError if the numbers overflow at this code, and InvalidCovarianceError if the shape has nearly
+    collapsed, so that it has no derivative.
     """
     scale, x = model.manifest.scale, code.astype(np.float64)
     values, vectors = np.linalg.eigh(covariance)

@@ -56,9 +56,8 @@ def reconstruct(
 ) -> tuple[FloatArray, FloatArray, dict[str, Any]]:
     """Reconstruct predicted NRIC (n, 2E), and compare with exact vertices (n, V, 3) after rigid alignment.
 
-    Returns:
-        The aligned vertices (n, V, 3); vertex distances (n, V), as fractions of the reference's bounding-box diagonal;
-        ``mean`` and ``max`` distance, mean Gauss–Newton ``iterations``, and the count of each ``status``.
+    Returns the aligned vertices (n, V, 3); vertex distances (n, V), as fractions of the reference's bounding-box
+    diagonal; ``mean`` and ``max`` distance, mean Gauss–Newton ``iterations``, and the count of each ``status``.
     """
     reconstructor = Reconstructor(reference, eta)
     shapes = progress(predicted, "reconstructed shapes", "shape", len(predicted))
@@ -105,10 +104,8 @@ class HeldOutSamples:
 
 
 def evaluate(learner: Learner, exact: ExactShapes) -> tuple[dict[str, Any], dict[str, NDArray]]:
-    """Compare every model with the exact shapes of the test codes.
-
-    Returns:
-        The contents of evaluation.json and of gallery.npz.
+    """Compare every model with the exact shapes of the test codes. Returns the contents of evaluation.json and of
+    gallery.npz.
     """
     config, collection = learner.config, learner.collection
     settings, reference = config.evaluation, collection.reference
@@ -205,9 +202,8 @@ def on_fresh_codes(
 def exact_factors(learner: Learner, rows: IntArray, exact: ExactShapes) -> tuple[NDArray[np.float32], IntArray]:
     """Return exact shapes of each factor's part of joint samples (n,).
 
-    Returns:
-        NRIC (k, J, 2E) of the samples for which all factors have a shape, and the indices (k,) of these samples. A
-        joint shape can exist where the shape of one factor does not.
+    Returns NRIC (k, J, 2E) of the samples for which all factors have a shape, and the indices (k,) of these samples. A
+    joint shape can exist where the shape of one factor does not.
     """
     count = len(learner.collection.factors)
     shapes = np.stack([_exact_factor(learner, rows, j, exact) for j in range(count)], axis=1)
@@ -292,10 +288,8 @@ def extremes(predicted: NDArray, exact: NDArray, errors: NDArray, index: NDArray
 def strip(collection: Collection, composite: Composite, eta: float) -> dict[str, NDArray]:
     """Interpolate between two codes, jointly and by each factor alone, as in the paper's figure of SCAPE.
 
-    The reconstruction of each frame starts from the previous frame.
-
-    Returns:
-        ``strip_joint`` (T, V, 3) and ``strip_factors`` (J, T, V, 3), aligned to the reference.
+    The reconstruction of each frame starts from the previous frame. Returns ``strip_joint`` (T, V, 3) and
+    ``strip_factors`` (J, T, V, 3), aligned to the reference.
     """
     coordinates = collection.coordinates
     ends = coordinates.uniform(2, np.random.default_rng(0))

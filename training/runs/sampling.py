@@ -149,11 +149,8 @@ def draw(
     a shape is shortened until it has one, see SHORTER. The sample has both codes. For scheduler and workers see
     workers.run.
 
-    Yields:
-        (done, total, failed) after each part; done includes failed.
-
-    Raises:
-        workers.WorkersError: there are no workers. Finished parts stay.
+    Yields (done, total, failed) after each part; done includes failed. Raises workers.WorkersError if there are no
+    workers. Finished parts stay.
     """
     folder.mkdir(parents=True, exist_ok=True)
     indices = np.split(np.arange(len(latents)), range(part_size, len(latents), part_size))

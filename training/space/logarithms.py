@@ -61,10 +61,7 @@ def logarithms(space: ShellSpace, mean: FloatArray, shapes: ArrayLike, steps: in
     1/K: on real collections, logarithms of 4 and of 8 steps differ by 10 to 35 % of their length.
 
     Shapes (n, V, 3) may be in any position; the mean is (V, 3). The result does not depend on the number of workers.
-
-    Raises:
-        ModeError: a coordinate of a shape is not finite.
-        WorkersError: processes are killed repeatedly.
+    Raises ModeError if a coordinate of a shape is not finite, and WorkersError if processes are killed repeatedly.
     """
     x = np.stack([space.shape(shape) for shape in np.asarray(shapes, dtype=np.float64)])
     bad = np.flatnonzero(~np.isfinite(x).all(axis=(1, 2)))

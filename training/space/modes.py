@@ -115,11 +115,8 @@ def coefficients(
 ) -> tuple[FloatArray, float]:
     """Project logarithms (n, V, 3) orthogonally onto the span of modes (m, V, 3), at a mean (V, 3).
 
-    Returns:
-        Coefficients (n, m), and the share of ``Σ ‖v^i‖²`` that the projections keep.
-
-    Raises:
-        ModeError: the logarithms can't be used.
+    Returns coefficients (n, m), and the share of ``Σ ‖v^i‖²`` that the projections keep. Raises ModeError if the
+    logarithms can't be used.
     """
     problem = ModeProblem(space, mean, fields, 1, norm)
     W, explained = problem.project(problem.balanced(modes))

@@ -189,10 +189,8 @@ class _Shrinkage:
 def _alternate(
     problem: _SparseProblem, D: FloatArray, W: FloatArray, price: float, max_iterations: int, tolerance: float
 ) -> tuple[bool, list[dict[str, float]]]:
-    """Minimise in place over modes D (m, 3V) and coefficients W (m, n), block by block, never uphill.
-
-    Returns:
-        Whether the iteration converged, and its history, see `Modes`.
+    """Minimise in place over modes D (m, 3V) and coefficients W (m, n), block by block, never uphill. Returns whether
+    the iteration converged, and its history, see `Modes`.
     """
     shrink = _Shrinkage(problem, D)
     history: list[dict[str, float]] = []
