@@ -1,5 +1,7 @@
 """A limit on the time of an iteration."""
 
+from __future__ import annotations
+
 import time
 
 #: Time that a search leaves for completing its result: this share of all time, but at most these seconds.
